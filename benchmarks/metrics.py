@@ -1,0 +1,217 @@
+"""The quality measures of EVALUATION.md: arrays in, numbers out.
+
+All lengths are in the frame's unit: reference mesh centred on its bounding box, box diagonal 1.
+P are the points drawn from the reference, Q those drawn from the result.
+
+References
+----------
+Chen and Zhang, Neural Marching Cubes (2021): F1 at 0.003, edge points, ECD and EF1 at 0.005.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from export.sampling import TriMesh, distance
+
+SAMPLE_COUNT = 100_000
+F1_DISTANCE = 0.003
+EDGE_DISTANCE = 0.005
+SHARP_COSINE = np.cos(np.radians(30))
+# A sampled point is an edge point if one this near has a normal turned by more than the angle.
+EDGE_RADIUS = 0.004
+# So many of the nearest points are looked at: all within the radius if the area is over 0.1, and
+# a bound on the work if the result is a mere crumb, where all 1e5 points are within the radius.
+EDGE_NEIGHBOURS = 64
+
+Numbers = dict[str, float | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Points (n, 3) of a surface and the unit normals (n, 3) of the faces that they lie on."""
+
+    points: np.ndarray
+    normals: np.ndarray
+
+
+# What stands in for a result without a surface. Its normal agrees with none.
+DOT = Samples(np.zeros((1, 3)), np.zeros((1, 3)))
+
+
+def normalise(mesh: TriMesh) -> TriMesh:
+    """Return the mesh centred on its bounding box and scaled to a box diagonal of 1."""
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    scale = 1.0 / np.linalg.norm(high - low)
+    return TriMesh((mesh.vertices - (low + high) / 2) * scale, mesh.faces)
+
+
+def face_vectors(mesh: TriMesh) -> np.ndarray:
+    """Return each face's normal times twice its area, (m, 3); outward if counter-clockwise."""
+    a, b, c = mesh.vertices[mesh.faces.T]
+    return np.cross(b - a, c - a)
+
+
+def sample_surface(mesh: TriMesh, seed: tuple[int, int], count: int = SAMPLE_COUNT) -> Samples:
+    """Draw points area-uniformly; a mesh without area gives one dot at the origin."""
+    vectors = face_vectors(mesh)
+    lengths = np.linalg.norm(vectors, axis=1)
+    if not lengths.sum() > 0:
+        return DOT
+    random = np.random.default_rng(seed)
+    face = draw_index(lengths, random.random(count))
+    root, v = np.sqrt(random.random(count)), random.random(count)
+    weights = np.stack([1 - root, root * (1 - v), root * v], axis=1)  # uniform in the triangle
+    points = np.einsum("nk,nkd->nd", weights, mesh.vertices[mesh.faces[face]])
+    return Samples(points, vectors[face] / lengths[face, None])
+
+
+def draw_index(weights: np.ndarray, uniform: np.ndarray) -> np.ndarray:
+    """Turn numbers of [0, 1), (n,), into indices drawn in proportion to the weights, (m,)."""
+    cumulative = np.cumsum(weights)
+    index = np.searchsorted(cumulative, uniform * cumulative[-1], side="right")
+    return np.minimum(index, np.flatnonzero(weights)[-1])  # rounding may reach past the last one
+
+
+def compare_samples(reference: Samples, result: Samples) -> Numbers:
+    """Return CD (squared, summed), F1 with recall and precision at 0.003, NC and signed NC."""
+    there, there_at = cKDTree(result.points).query(reference.points)
+    back, back_at = cKDTree(reference.points).query(result.points)
+    there_dot = np.einsum("nd,nd->n", reference.normals, result.normals[there_at])
+    back_dot = np.einsum("nd,nd->n", result.normals, reference.normals[back_at])
+    recall, precision = np.mean(there < F1_DISTANCE), np.mean(back < F1_DISTANCE)
+    return {
+        "cd": float(np.mean(there**2) + np.mean(back**2)),
+        "f1": harmonic_mean(recall, precision),
+        "recall": float(recall),
+        "precision": float(precision),
+        "nc": float(np.abs(there_dot).mean() + np.abs(back_dot).mean()) / 2,
+        "signed_nc": float(there_dot.mean() + back_dot.mean()) / 2,
+    }
+
+
+def harmonic_mean(recall: float, precision: float) -> float:
+    """Return 2rp/(r + p), and 0 if both are 0."""
+    total = recall + precision
+    return float(2 * recall * precision / total) if total > 0 else 0.0
+
+
+def compare_surfaces(
+    reference: TriMesh, result: TriMesh, drawn: Samples, result_drawn: Samples
+) -> Numbers:
+    """Return exact point-to-triangle distances: mean, 99th percentile and maximum, both ways.
+
+    ``drawn`` and ``result_drawn`` are P and Q. "there" is from P to the result's triangles, "back"
+    from Q to the reference's; the figure without a direction is their mean, or the larger maximum.
+    """
+    there = distance_or_dot(result, drawn.points)
+    back = distance_or_dot(reference, result_drawn.points)
+    mean, p99 = (there.mean(), back.mean()), (np.quantile(there, 0.99), np.quantile(back, 0.99))
+    return {
+        "p2s": float(sum(mean)) / 2,
+        "p2s_there": float(mean[0]),
+        "p2s_back": float(mean[1]),
+        "p99": float(sum(p99)) / 2,
+        "p99_there": float(p99[0]),
+        "p99_back": float(p99[1]),
+        "max": float(max(there.max(), back.max())),
+        "max_there": float(there.max()),
+        "max_back": float(back.max()),
+    }
+
+
+def distance_or_dot(mesh: TriMesh, points: np.ndarray) -> np.ndarray:
+    """Return each point's distance to the mesh, (n,), or to the origin if it has no faces."""
+    if not len(mesh.faces):
+        return np.linalg.norm(points, axis=1)
+    found = distance(mesh, points)
+    if not np.isfinite(found).all():
+        raise ValueError(f"{np.sum(~np.isfinite(found))} point-to-triangle distances not finite")
+    return found
+
+
+def sample_sharp_edges(
+    mesh: TriMesh, seed: tuple[int, int], count: int = SAMPLE_COUNT
+) -> np.ndarray:
+    """Draw points length-uniformly from edges whose two faces turn by over 30 degrees.
+
+    The result is (count, 3), or (0, 3) if the mesh has no such edge.
+    """
+    ends = mesh.vertices[sharp_edges(mesh)]  # (e, 2, 3)
+    if not len(ends):
+        return np.zeros((0, 3))
+    random = np.random.default_rng(seed)
+    lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    low, high = ends[draw_index(lengths, random.random(count))].swapaxes(0, 1)
+    return low + random.random((count, 1)) * (high - low)
+
+
+def sharp_edges(mesh: TriMesh) -> np.ndarray:
+    """Return the edges of exactly two faces whose normals differ by over 30 degrees, (e, 2)."""
+    vectors = face_vectors(mesh)
+    lengths = np.linalg.norm(vectors, axis=1)
+    edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    order = np.lexsort((edges[:, 1], edges[:, 0]))
+    _, first, count = np.unique(edges[order], axis=0, return_index=True, return_counts=True)
+    pairs = order[first[count == 2][:, None] + [0, 1]]
+    one, other = pairs.T // 3
+    # A face without area has no normal, so its edges have no angle.
+    whole = (lengths[one] > 0) & (lengths[other] > 0)
+    dot = np.einsum("nd,nd->n", vectors[one], vectors[other])
+    return edges[pairs[whole & (dot < SHARP_COSINE * lengths[one] * lengths[other]), 0]]
+
+
+def edge_points(samples: Samples) -> np.ndarray:
+    """Return the sampled points, (k, 3), that lie near a sharp edge.
+
+    As in NMC, NDC and PoNQ: the points with another one nearby whose normal is turned, up or
+    down, so that the two sides of a thin sheet are no edge. The angle is that of `sharp_edges`.
+    """
+    points, normals = samples.points, samples.normals
+    # A row's missing neighbours get the index n: itself is put there, which is no edge.
+    nearby = cKDTree(points).query(points, EDGE_NEIGHBOURS, distance_upper_bound=EDGE_RADIUS)[1]
+    nearby = np.where(nearby == len(points), np.arange(len(points))[:, None], nearby)
+    turned = np.zeros(len(points), bool)
+    for column in nearby.T:
+        turned |= np.abs(np.einsum("nd,nd->n", normals, normals[column])) < SHARP_COSINE
+    return points[turned]
+
+
+def compare_edges(reference: np.ndarray, result: np.ndarray) -> Numbers:
+    """Return ECD (squared, summed) and EF1 at 0.005 of two sets of edge points, (n, 3) each.
+
+    None where the reference has no sharp edge; a result without any is a dot at the origin.
+    """
+    if not len(reference):
+        return {"ecd": None, "ef1": None}
+    result = result if len(result) else DOT.points
+    there = cKDTree(result).query(reference)[0]
+    back = cKDTree(reference).query(result)[0]
+    recall, precision = np.mean(there < EDGE_DISTANCE), np.mean(back < EDGE_DISTANCE)
+    return {
+        "ecd": float(np.mean(there**2) + np.mean(back**2)),
+        "ef1": harmonic_mean(recall, precision),
+    }
+
+
+def is_closed(faces: np.ndarray) -> bool:
+    """Say whether every edge stands in exactly two of the faces, (m, 3), in opposite directions."""
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    if not len(edges) or (edges[:, 0] == edges[:, 1]).any():
+        return False
+    directed = np.unique(edges, axis=0)
+    # The directed edges are all different, and turning them all round gives the same set.
+    return len(directed) == len(edges) and np.array_equal(
+        directed, np.unique(edges[:, ::-1], axis=0)
+    )
+
+
+def volume(mesh: TriMesh) -> float:
+    """Return the enclosed volume, positive if the faces look outward."""
+    if not len(mesh.faces):
+        return 0.0
+    a, b, c = mesh.vertices[mesh.faces.T] - mesh.vertices.mean(0)
+    return float(np.einsum("nd,nd->", a, np.cross(b, c))) / 6

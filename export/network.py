@@ -1,0 +1,175 @@
+"""The network: voxels are encoded once, then decoded at any offsets.
+
+    patches (V, 27), neighbour table (V, 27) -> features (V, C)          the encoder
+    features of D voxels, offsets (Q, 3)     -> values (D, Q)            the head
+
+The encoder is a stem on the 27 samples and a stack of residual blocks, each a convolution over
+the 27 neighbours (a gather and a matrix product) and a pointwise layer. The head is a branch and
+a trunk: coefficients per voxel times functions of the offset. It adds a residual to the quadratic
+interpolation of the patch. All lengths are in half voxels (Eqs. 4 and 5).
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import torch
+from torch import Tensor, nn
+
+from super_sdf.band import CENTRE
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Sizes of the network."""
+
+    channels: int = 64
+    blocks: int = 5  # receptive field: blocks + 1 voxels in each direction
+    hidden: int = 128
+    functions: int = 256  # of the offset, in the head
+    trunk: int = 128
+    frequencies: int = 4
+
+    @property
+    def receptive_field(self) -> int:
+        """Voxels in each direction that a prediction depends on."""
+        return self.blocks + 1
+
+    def as_dict(self) -> dict[str, int]:
+        """Return the sizes by name, for a checkpoint."""
+        return asdict(self)
+
+
+class GatherMatMul(torch.autograd.Function):
+    """``gather(features, table) @ weight``, differentiated without a scatter.
+
+    If u is v's neighbour at place k, then v is u's at place 26 - k. So the gradient is a
+    convolution too, with the places reversed, and nothing is added up at random addresses.
+    """
+
+    @staticmethod
+    def forward(ctx, features: Tensor, weight: Tensor, table: Tensor) -> Tensor:
+        """Take features (V, C), weight (27 C, C_out), table (V, 27); return (V, C_out)."""
+        columns = gather(features, table)
+        ctx.save_for_backward(columns, weight, table)
+        return columns @ weight
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, None]:
+        columns, weight, table = ctx.saved_tensors
+        grad = grad.contiguous()
+        channels_out = weight.shape[1]
+        reversed_weight = weight.view(27, -1, channels_out).flip(0).transpose(1, 2)
+        grad_features = gather(grad, table) @ reversed_weight.reshape(27 * channels_out, -1)
+        return grad_features, columns.T @ grad, None
+
+
+def gather(features: Tensor, table: Tensor) -> Tensor:
+    """Return the features of all 27 neighbours side by side, zeros for absent ones (index V)."""
+    padded = torch.cat([features, features.new_zeros(1, features.shape[1])])
+    return padded.index_select(0, table.reshape(-1)).view(len(table), -1)
+
+
+class NeighbourConv(nn.Module):
+    """A sparse 3x3x3 convolution over the band."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.randn(27 * channels, channels) / (27 * channels) ** 0.5)
+        self.bias = nn.Parameter(torch.zeros(channels))
+
+    def forward(self, features: Tensor, table: Tensor) -> Tensor:
+        """Map (V, C) to (V, C)."""
+        dtype = torch.bfloat16 if torch.is_autocast_enabled(features.device.type) else torch.float32
+        mixed = GatherMatMul.apply(features.to(dtype), self.weight.to(dtype), table)
+        return mixed + self.bias.to(dtype)
+
+
+class Block(nn.Module):
+    """A residual block: neighbour convolution, then a pointwise layer; starts as the identity."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.conv = NeighbourConv(config.channels)
+        self.expand = nn.Linear(config.channels, config.hidden)
+        self.reduce = nn.Linear(config.hidden, config.channels)
+        nn.init.normal_(self.reduce.weight, std=0.02)
+        nn.init.zeros_(self.reduce.bias)
+
+    def forward(self, features: Tensor, table: Tensor) -> Tensor:
+        """Map (V, C) to (V, C)."""
+        mixed = torch.relu(self.conv(features, table))
+        return features + self.reduce(torch.relu(self.expand(mixed)))
+
+
+class Trunk(nn.Module):
+    """Functions of the offset that vanish at the sample, so that the sample itself is kept."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.register_buffer("waves", torch.pi / 2 * 2.0 ** torch.arange(config.frequencies))
+        self.layers = nn.Sequential(
+            nn.Linear(3 + 6 * config.frequencies, config.trunk),
+            nn.SiLU(),
+            nn.Linear(config.trunk, config.trunk),
+            nn.SiLU(),
+            nn.Linear(config.trunk, config.functions),
+        )
+        nn.init.normal_(self.layers[-1].weight, std=0.3 / config.trunk**0.5)
+
+    def forward(self, offsets: Tensor) -> Tensor:
+        """Map (Q, 3) to (Q, functions)."""
+        return self.raw(offsets) - self.raw(torch.zeros_like(offsets[:1]))
+
+    def raw(self, offsets: Tensor) -> Tensor:
+        """Evaluate the layers on the offsets and their sines and cosines."""
+        angles = (offsets[:, :, None] * self.waves).flatten(1)
+        return self.layers(torch.cat([offsets, angles.sin(), angles.cos()], 1))
+
+
+class SuperSdfNet(nn.Module):
+    """The whole network; its inputs and output are those of the ONNX file."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.stem = nn.Sequential(
+            nn.Linear(27, config.hidden), nn.ReLU(), nn.Linear(config.hidden, config.channels)
+        )
+        self.blocks = nn.ModuleList(Block(config) for _ in range(config.blocks))
+        self.branch = nn.Linear(config.channels, config.functions - config.channels)
+        self.trunk = Trunk(config)
+
+    def encode(self, patches: Tensor, table: Tensor) -> Tensor:
+        """Map patches (V, 27) and neighbours (V, 27; V where absent) to features (V, C)."""
+        features = self.stem(patches)
+        for block in self.blocks:
+            features = block(features, table)
+        return features
+
+    def decode(self, features: Tensor, patches: Tensor, offsets: Tensor) -> Tensor:
+        """Return the values (D, Q) of voxels (D, C), (D, 27) at offsets (Q, 3)."""
+        coefficients = torch.cat([features, torch.relu(self.branch(features))], 1)
+        residual = coefficients.float() @ self.trunk(offsets).float().T
+        return residual + patches @ interpolation_weights(offsets).T
+
+    def forward(self, patches: Tensor, table: Tensor, voxels: Tensor, offsets: Tensor) -> Tensor:
+        """Return the values (D, Q) of the voxels (D,) at the offsets (Q, 3)."""
+        table = torch.where(table < 0, len(patches), table)  # the row of zeros
+        features = self.encode(patches, table)
+        return self.decode(features[voxels], patches[voxels], offsets)
+
+
+def interpolation_weights(offsets: Tensor) -> Tensor:
+    """Return the weights (Q, 27) of quadratic interpolation in the patch.
+
+    Through the three samples of an axis, at -1, 0 and 1 voxels, runs one parabola; the product
+    over the axes keeps the sample and reproduces linear functions exactly.
+    """
+    at = offsets / 2
+    axis = torch.stack([at * (at - 1) / 2, 1 - at * at, at * (at + 1) / 2], 2)
+    x, y, z = axis.unbind(1)
+    return (x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]).flatten(1)
+
+
+assert CENTRE == 13  # the product above lists the neighbourhood in C order

@@ -1,0 +1,250 @@
+"""Write a trained network as the ONNX file that the runtime loads, and check that they agree.
+
+    python -m export.to_onnx --run work/run --out models/base.onnx --data "..." --accuracy "..."
+
+The graph is written by hand because of one thing an exporter would not do: each neighbour
+convolution runs as a Scan over chunks of the neighbour table. Gathered rows are 27 times as large
+as the features; chunk by chunk they stay in cache and need no memory to speak of. Standard
+operators only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from onnx import TensorProto, helper, numpy_helper
+
+from export.network import NetworkConfig, SuperSdfNet
+from super_sdf.band import find_band, gather_patches, neighbour_table
+from super_sdf.network import FORMAT_VERSION, load_network
+from super_sdf.nodes import block_offsets
+
+OPSET = 18
+CHUNK = 512  # rows of the neighbour table at a time; 256 to 2048 differ by a few percent
+PARITY = 2e-4  # half voxels: 1e-4 of a voxel
+
+
+class Graph:
+    """Nodes and constants of an ONNX graph in the making; every method returns a value's name."""
+
+    def __init__(self, prefix: str = "") -> None:
+        self.prefix = prefix
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: list[onnx.TensorProto] = []
+
+    def op(self, kind: str, *inputs: str, **attributes: Any) -> str:
+        """Add a node with one output."""
+        name = f"{self.prefix}{kind.lower()}_{len(self.nodes)}"
+        self.nodes.append(helper.make_node(kind, inputs, [name], name=name, **attributes))
+        return name
+
+    def constant(self, array: Any) -> str:
+        """Add a constant."""
+        name = f"{self.prefix}constant_{len(self.constants)}"
+        self.constants.append(numpy_helper.from_array(np.asarray(array), name))
+        return name
+
+    def integers(self, *numbers: int) -> str:
+        """Add a constant of int64."""
+        return self.constant(np.array(numbers, np.int64))
+
+    def linear(self, value: str, weight: torch.Tensor, bias: torch.Tensor) -> str:
+        """Add ``value @ weight + bias``."""
+        product = self.op("MatMul", value, self.constant(weight.detach().numpy()))
+        return self.op("Add", product, self.constant(bias.detach().numpy()))
+
+    def layer(self, value: str, layer: torch.nn.Linear) -> str:
+        """Add a linear layer (torch keeps its weight transposed)."""
+        return self.linear(value, layer.weight.T.contiguous(), layer.bias)
+
+    def relu(self, value: str) -> str:
+        """Add a rectifier."""
+        return self.op("Relu", value)
+
+    def silu(self, value: str) -> str:
+        """Add ``x sigmoid(x)``."""
+        return self.op("Mul", value, self.op("Sigmoid", value))
+
+
+def build_graph(net: SuperSdfNet) -> onnx.GraphProto:
+    """Write the network as a graph."""
+    graph = Graph()
+    features = graph.layer(graph.relu(graph.layer("patches", net.stem[0])), net.stem[2])
+    rows = graph.op("Shape", "patches", start=0, end=1)
+    chunks = chunked_table(graph, rows)
+    for number, block in enumerate(net.blocks):
+        features = graph.op("Add", features, scan_block(graph, number, block, features, chunks, rows))
+    chosen = graph.op("Gather", features, "voxels", axis=0)
+    branch = graph.relu(graph.layer(chosen, net.branch))
+    patches = graph.op("Gather", "patches", "voxels", axis=0)
+    per_voxel = graph.op("Concat", chosen, branch, patches, axis=1)
+    per_offset = graph.op("Concat", trunk(graph, net), interpolation(graph), axis=1)
+    transposed = graph.op("Transpose", per_offset, perm=[1, 0])
+    graph.nodes.append(helper.make_node("MatMul", [per_voxel, transposed], ["values"]))
+    return helper.make_graph(graph.nodes, "super_sdf", inputs(), [output()], graph.constants)
+
+
+def inputs() -> list[onnx.ValueInfoProto]:
+    """Return the declared inputs."""
+    return [
+        helper.make_tensor_value_info("patches", TensorProto.FLOAT, ["V", 27]),
+        helper.make_tensor_value_info("neighbours", TensorProto.INT32, ["V", 27]),
+        helper.make_tensor_value_info("voxels", TensorProto.INT32, ["D"]),
+        helper.make_tensor_value_info("offsets", TensorProto.FLOAT, ["Q", 3]),
+    ]
+
+
+def output() -> onnx.ValueInfoProto:
+    """Return the declared output."""
+    return helper.make_tensor_value_info("values", TensorProto.FLOAT, ["D", "Q"])
+
+
+def chunked_table(graph: Graph, rows: str) -> str:
+    """Fill the neighbour table up with absent rows and cut it into (n, CHUNK, 27)."""
+    size = graph.integers(CHUNK)
+    missing = graph.op("Sub", size, graph.op("Mod", rows, size))  # 1 to CHUNK: one row is spare
+    pads = graph.op("Concat", graph.integers(0, 0), missing, graph.integers(0), axis=0)
+    absent = graph.constant(np.array(-1, np.int32))
+    filled = graph.op("Pad", "neighbours", pads, absent)
+    return graph.op("Reshape", filled, graph.integers(-1, CHUNK, 27))
+
+
+def scan_block(
+    graph: Graph, number: int, block: torch.nn.Module, features: str, chunks: str, rows: str
+) -> str:
+    """Add a residual block without its sum, chunk by chunk; return (V, C)."""
+    channels = block.conv.bias.shape[0]
+    zeros = graph.constant(np.zeros((1, channels), np.float32))
+    padded = graph.op("Concat", features, zeros, axis=0)  # index -1 is the row of zeros
+    body = Graph(f"block{number}_")
+    gathered = body.op("Gather", padded, "chunk", axis=0)
+    columns = body.op("Reshape", gathered, body.integers(CHUNK, 27 * channels))
+    mixed = body.relu(body.linear(columns, block.conv.weight, block.conv.bias))
+    reduced = body.layer(body.relu(body.layer(mixed, block.expand)), block.reduce)
+    subgraph = helper.make_graph(
+        body.nodes,
+        f"block{number}",
+        [helper.make_tensor_value_info("chunk", TensorProto.INT32, [CHUNK, 27])],
+        [helper.make_tensor_value_info(reduced, TensorProto.FLOAT, [CHUNK, channels])],
+        body.constants,
+    )
+    stacked = graph.op("Scan", chunks, body=subgraph, num_scan_inputs=1)
+    flat = graph.op("Reshape", stacked, graph.integers(-1, channels))
+    return graph.op("Slice", flat, graph.integers(0), rows, graph.integers(0))
+
+
+def trunk(graph: Graph, net: SuperSdfNet) -> str:
+    """Add the functions of the offset, (Q, functions)."""
+    origin = torch.zeros(1, 3)
+    at_sample = graph.constant(net.trunk.raw(origin).detach().numpy())
+    waves = graph.constant(net.trunk.waves.numpy())
+    angles = graph.op("Mul", graph.op("Unsqueeze", "offsets", graph.integers(2)), waves)
+    flat = graph.op("Flatten", angles, axis=1)
+    value = graph.op("Concat", "offsets", graph.op("Sin", flat), graph.op("Cos", flat), axis=1)
+    first, _, second, _, last = net.trunk.layers
+    value = graph.silu(graph.layer(value, first))
+    value = graph.silu(graph.layer(value, second))
+    return graph.op("Sub", graph.layer(value, last), at_sample)
+
+
+def interpolation(graph: Graph) -> str:
+    """Add the weights (Q, 27) of quadratic interpolation: see network.interpolation_weights."""
+    at = graph.op("Mul", "offsets", graph.constant(np.float32(0.5)))
+    half = graph.op("Mul", at, graph.constant(np.float32(0.5)))
+    square = graph.op("Mul", at, at)
+    half_square = graph.op("Mul", square, graph.constant(np.float32(0.5)))
+    below = graph.op("Sub", half_square, half)
+    middle = graph.op("Sub", graph.constant(np.float32(1)), square)
+    above = graph.op("Add", half_square, half)
+    axis = graph.integers(2)
+    parts = [graph.op("Unsqueeze", part, axis) for part in (below, middle, above)]
+    weights = graph.op("Concat", *parts, axis=2)  # (Q, 3, 3)
+    x, y, z = (
+        graph.op("Gather", weights, graph.constant(np.array(n, np.int64)), axis=1) for n in range(3)
+    )
+    x = graph.op("Unsqueeze", x, graph.integers(2, 3))
+    y = graph.op("Unsqueeze", y, graph.integers(1, 3))
+    z = graph.op("Unsqueeze", z, graph.integers(1, 2))
+    return graph.op("Flatten", graph.op("Mul", graph.op("Mul", x, y), z), axis=1)
+
+
+def write_model(net: SuperSdfNet, path: Path, card: dict[str, Any]) -> None:
+    """Write graph and metadata."""
+    imports = [helper.make_opsetid("", OPSET)]
+    model = helper.make_model(build_graph(net), opset_imports=imports, ir_version=9)
+    model.producer_name = "super-sdf"
+    helper.set_model_props(model, {key: str(value) for key, value in card.items()})
+    onnx.checker.check_model(model)
+    onnx.save(model, path)
+
+
+def parity(net: SuperSdfNet, path: Path, seed: int = 0) -> float:
+    """Return the largest difference (half voxels) between torch and onnxruntime on a noisy ball."""
+    rng = np.random.default_rng(seed)
+    ijk = np.indices((24, 20, 22))
+    radius = np.linalg.norm(ijk - np.array([11, 9, 10])[:, None, None, None], axis=0)
+    rescaled = (2 * (radius - 7) + rng.normal(0, 0.3, radius.shape)).astype(np.float32)
+    band = find_band(rescaled)
+    patches, table = gather_patches(rescaled, band), neighbour_table(band, rescaled.shape)
+    voxels = np.flatnonzero(rng.random(len(band)) < 0.7).astype(np.int32)
+    offsets = block_offsets(4)
+    got = load_network(path, device="cpu")(patches, table, voxels, offsets)
+    with torch.no_grad():
+        want = net(*(torch.from_numpy(array) for array in (patches, table, voxels, offsets)))
+    return float(np.abs(got - want.numpy()).max())
+
+
+def load_run(folder: Path) -> SuperSdfNet:
+    """Return the averaged network of a run."""
+    state = torch.load(folder / "checkpoint.pt", weights_only=True)
+    net = SuperSdfNet(NetworkConfig(**state["config"]))
+    net.load_state_dict(state["average"])
+    return net.eval()
+
+
+def make_card(net: SuperSdfNet, name: str, data: str, accuracy: str) -> dict[str, Any]:
+    """Return the metadata that the runtime shows."""
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
+    ).stdout.strip()
+    return {
+        "format_version": FORMAT_VERSION,
+        "name": name,
+        "band": "abs(value) < 1.5 h",
+        "receptive_field": net.config.receptive_field,
+        "value_scaling": "2 / h",
+        "training_factors": [2, 4, 8, 16],
+        "parameters": sum(p.numel() for p in net.parameters()),
+        "trained_on": data,
+        "trained_from_commit": commit,
+        "accuracy": accuracy,
+        "licence": "MIT",
+    }
+
+
+def main() -> None:
+    """Export a run and refuse to keep a file that does not agree with it."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--run", type=Path, required=True, help="folder of the run")
+    parser.add_argument("--out", type=Path, required=True, help="the .onnx file")
+    parser.add_argument("--data", required=True, help="what it was trained on")
+    parser.add_argument("--accuracy", default="not measured", help="measured figures, in words")
+    options = parser.parse_args()
+    net = load_run(options.run)
+    write_model(net, options.out, make_card(net, options.out.stem, options.data, options.accuracy))
+    difference = parity(net, options.out)
+    if difference > PARITY:
+        options.out.unlink()
+        raise SystemExit(f"torch and onnxruntime differ by {difference / 2:.2e} voxels: not kept")
+    size = options.out.stat().st_size / 1e6
+    print(f"{options.out}: {size:.1f} MB, differs from torch by {difference / 2:.1e} voxels")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""The networks that come with super-sdf, and their card."""

@@ -1,0 +1,129 @@
+"""The band of voxels near the surface, their patches, and who is whose neighbour (Eqs. 2 and 4).
+
+Everything here lives in index space with rescaled values: a voxel has side 2, so a distance of
+one spacing h is 2 and the band is ``abs(value) < 3``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .grid import BoolArray, FloatArray, IntArray, SdfGrid
+
+HALF_BAND = 3.0  # Eq. 2 after Eq. 4: 1.5 h
+# Patch values are cut off here (3 h): farther samples say nothing about this voxel's surface, and
+# a field that was truncated at 3 h or beyond gives the same result as the whole one.
+PATCH_LIMIT = 6.0
+# A voxel whose sample is farther than its corners, sqrt(3)/2 h, cannot hold the surface of an
+# exact distance. The margin, a quarter of h, is for the network's own error.
+DECODE_LIMIT = 3**0.5 + 0.5
+# Neighbouring distances may differ by no more than the samples are apart; slack for rounding.
+LIPSCHITZ_SLACK = 0.1
+
+# The 27 voxels of a neighbourhood, in the order of patches and neighbour tables; 13 is the centre.
+NEIGHBOURHOOD: IntArray = np.indices((3, 3, 3)).reshape(3, 27).T.astype(np.int32) - 1
+CENTRE = 13
+
+
+def rescale(grid: SdfGrid, offset: float = 0.0) -> FloatArray:
+    """Return the samples in half voxels, ``(values - offset) * 2 / h`` (Eq. 4).
+
+    ``offset`` (world units) shifts the field, so that the level ``values == offset`` becomes the
+    zero level (Sec. 5.3). The band's values then lie in [-3, 3] whatever the unit.
+    """
+    rescaled = np.empty(grid.shape, np.float32)
+    scale = 2.0 / grid.voxel_size
+    limit = float(np.finfo(np.float32).max) / 4
+    for plane, out in zip(grid.values, rescaled):  # plane by plane: no second copy of the grid
+        out[...] = np.clip((plane.astype(np.float64) - offset) * scale, -limit, limit)
+    return rescaled
+
+
+def find_band(rescaled: FloatArray) -> IntArray:
+    """Return the active voxels, ``abs(rescaled) < 3`` (Eq. 2), as (V, 3) indices in C order.
+
+    A distance cannot jump from beyond the band on one side to beyond it on the other. Where the
+    input does so all the same, both voxels are taken in: a surface must pass between them.
+    """
+    active = np.abs(rescaled) < HALF_BAND
+    above, below = ~active & (rescaled > 0), ~active & (rescaled <= 0)
+    active |= (above & _dilate(below)) | (below & _dilate(above))
+    return np.argwhere(active).astype(np.int32)
+
+
+def _dilate(mask: BoolArray) -> BoolArray:
+    """Grow a mask by one voxel in all 26 directions."""
+    grown = mask.copy()
+    for axis in range(3):
+        source = np.moveaxis(grown.copy(), axis, 0)
+        target = np.moveaxis(grown, axis, 0)
+        target[1:] |= source[:-1]
+        target[:-1] |= source[1:]
+    return grown
+
+
+def pad_by_extrapolation(rescaled: FloatArray) -> FloatArray:
+    """Continue the grid by one sample on every side, linearly, and cut it off at 3 h."""
+    padded = np.pad(np.clip(rescaled, -2 * PATCH_LIMIT, 2 * PATCH_LIMIT), 1)
+    for axis in range(3):
+        planes = np.moveaxis(padded, axis, 0)
+        planes[0] = 2 * planes[1] - planes[2]
+        planes[-1] = 2 * planes[-2] - planes[-3]
+    return np.clip(padded, -PATCH_LIMIT, PATCH_LIMIT, out=padded)
+
+
+def gather_patches(rescaled: FloatArray, voxel_ijk: IntArray) -> FloatArray:
+    """Return the 27 samples round each voxel, (V, 27) in the order of ``NEIGHBOURHOOD``."""
+    padded = pad_by_extrapolation(rescaled)
+    centre, steps = _flat_steps(voxel_ijk, rescaled.shape)
+    patches = np.empty((len(voxel_ijk), 27), np.float32)
+    for column, step in enumerate(steps):
+        np.take(padded.ravel(), centre + step, out=patches[:, column])
+    return patches
+
+
+def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, ...]) -> IntArray:
+    """Return who stands at each of the 27 places round each voxel.
+
+    Parameters
+    ----------
+    voxel_ijk : (V, 3) int32
+        The voxels, all different.
+    shape : three ints
+        Samples of the grid along each axis.
+
+    Returns
+    -------
+    (V, 27) int32
+        Row numbers into ``voxel_ijk`` in the order of ``NEIGHBOURHOOD``, -1 where there is none.
+        As an index, -1 is the last row: append a row of zeros to what is gathered.
+    """
+    centre, steps = _flat_steps(voxel_ijk, shape)
+    row_at = np.full([n + 2 for n in shape], -1, np.int32).ravel()
+    row_at[centre] = np.arange(len(voxel_ijk), dtype=np.int32)
+    table = np.empty((len(voxel_ijk), 27), np.int32)
+    for column, step in enumerate(steps):
+        np.take(row_at, centre + step, out=table[:, column])
+    return table
+
+
+def _flat_steps(
+    voxel_ijk: IntArray, shape: tuple[int, ...]
+) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], list[int]]:
+    """Return flat positions in the grid padded by one, and the 27 steps to the neighbours."""
+    strides = np.array([(shape[1] + 2) * (shape[2] + 2), shape[2] + 2, 1], np.int64)
+    return (voxel_ijk + 1) @ strides, [int(step) for step in NEIGHBOURHOOD @ strides]
+
+
+def can_hold_surface(patches: FloatArray) -> BoolArray:
+    """Say which voxels, (V,) of bool, may contain a piece of the surface.
+
+    An exact distance is 1-Lipschitz, so a voxel whose sample is farther than its corner holds no
+    surface. Where a patch breaks that bound the field is no distance, and the voxel is kept.
+    """
+    centre = patches[:, CENTRE]
+    keep = np.abs(centre) <= DECODE_LIMIT
+    reach = 2 * np.linalg.norm(NEIGHBOURHOOD, axis=1) + LIPSCHITZ_SLACK
+    for column in range(27):
+        keep |= np.abs(patches[:, column] - centre) > reach[column]
+    return keep

@@ -1,0 +1,34 @@
+"""Everything that this package raises on purpose.
+
+- ``SuperSdfError``: the base; its text is one line: what was wrong, the value seen, the way out.
+
+  - ``GridError`` (also ``ValueError``): the samples are not a usable signed distance grid.
+  - ``OptionError`` (also ``ValueError``): an argument has no meaning (an odd factor, say).
+  - ``FileError`` (also ``OSError``): a file cannot be read or written.
+  - ``ModelError`` (also ``ValueError``): an ONNX file that does not keep the network's contract.
+  - ``DeviceError`` (also ``RuntimeError``): a device was asked for that cannot run here.
+"""
+
+
+class SuperSdfError(Exception):
+    """Base of this package's errors."""
+
+
+class GridError(SuperSdfError, ValueError):
+    """The samples are not a usable signed distance grid."""
+
+
+class OptionError(SuperSdfError, ValueError):
+    """An argument has no meaning."""
+
+
+class FileError(SuperSdfError, OSError):
+    """A file cannot be read or written."""
+
+
+class ModelError(SuperSdfError, ValueError):
+    """A network file does not keep the network's contract."""
+
+
+class DeviceError(SuperSdfError, RuntimeError):
+    """A device was asked for that cannot run here."""

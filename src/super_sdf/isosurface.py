@@ -1,0 +1,149 @@
+"""Marching cubes on the blocks of a sparse field.
+
+Every cell of the fine lattice lies in exactly one voxel, and a shared node has one value, so the
+cells need no search and no welding by distance: a vertex is named by the lattice edge it lies on.
+Two cells see the same edges on their common face, hence the mesh is a closed, oriented
+2-manifold wherever the field's blocks do not end.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, triangle_table
+from .field import FineField
+from .grid import FloatArray, IntArray, SdfGrid
+from .mesh import Mesh
+from .nodes import block_ijk
+
+# A vertex keeps this share of its lattice edge from either end: where a node's value is 0 several
+# vertices would otherwise fall together, and programs that merge such points would tear the mesh.
+CLEARANCE = 1e-3
+# Nodes beyond the grid's border (a closed surface, see field.close_at_border) lie this far out, in
+# fine spacings: enough for distinct vertices.
+CAP_HEIGHT = 0.02
+
+
+def extract_mesh(field: FineField, grid: SdfGrid) -> Mesh:
+    """Return the zero level of a field as triangles in world coordinates.
+
+    A node with value 0 is inside. Vertices lie on lattice edges, by linear interpolation.
+    References: Lorensen and Cline, "Marching Cubes", 1987.
+    """
+    active = _crossed_blocks(field)
+    numbers, voxel_ijk = field.numbers[active], field.voxel_ijk[active]
+    inside = (field.values <= 0)[numbers].reshape(-1, *(field.factor + 1,) * 3)
+    vertex_at, position = _edge_vertices(field, numbers, voxel_ijk, inside)
+    faces = _triangles(inside, numbers, vertex_at)
+    return Mesh(_to_world(position, field, grid), faces)
+
+
+def _crossed_blocks(field: FineField) -> NDArray[np.int64]:
+    """Return the voxels whose nodes are not all on one side."""
+    inside = (field.values <= 0)[field.numbers]
+    return np.flatnonzero(inside.any(1) & ~inside.all(1))
+
+
+def _edge_vertices(
+    field: FineField, numbers: IntArray, voxel_ijk: IntArray, inside: NDArray[np.bool_]
+) -> tuple[IntArray, FloatArray]:
+    """Put a vertex on every lattice edge whose ends are on different sides.
+
+    Returns
+    -------
+    (3 n,) int32 and (m, 3) float64
+        The vertex on the edge that runs from node v along axis a, at ``3 v + a``; and the
+        positions, in fine spacings from the fine lattice's first node.
+    """
+    local = block_ijk(field.factor)
+    vertex_at = np.full(3 * len(field.values), -1, np.int32)
+    edges, low, high, place = [], [], [], []
+    for axis in range(3):
+        voxel, start, end = _crossed_edges(inside, axis)
+        key = 3 * numbers[voxel, start].astype(np.int64) + axis
+        vertex_at[key] = np.arange(len(key), dtype=np.int32)
+        first = vertex_at[key] == np.arange(len(key))  # an edge of several blocks: one stays
+        voxel, start, end = voxel[first], start[first], end[first]
+        edges.append(key[first])
+        low.append(field.values[numbers[voxel, start]])
+        high.append(field.values[numbers[voxel, end]])
+        place.append(field.factor * voxel_ijk[voxel] + local[start])
+    keys = np.concatenate(edges)
+    position = np.concatenate(place).astype(np.float64)
+    share = _crossing(np.concatenate(low), np.concatenate(high))
+    axes = np.repeat(np.arange(3), [len(e) for e in edges])
+    end_position = position.copy()
+    end_position[np.arange(len(axes)), axes] += 1
+    lattice = np.array(field.shape) * field.factor
+    position, end_position = _onto_border(position, lattice), _onto_border(end_position, lattice)
+    position += share[:, None] * (end_position - position)
+    vertex_at[keys] = np.arange(len(keys), dtype=np.int32)
+    return vertex_at, position
+
+
+def _crossed_edges(
+    inside: NDArray[np.bool_], axis: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return voxel, first and last block node of each edge along an axis that is crossed."""
+    side = inside.shape[1]
+    moved = np.moveaxis(inside, axis + 1, 1)
+    crossed = np.zeros_like(moved)
+    crossed[:, :-1] = moved[:, :-1] != moved[:, 1:]
+    flat = np.flatnonzero(np.moveaxis(crossed, 1, axis + 1))
+    voxel, start = np.divmod(flat, side**3)
+    return voxel, start, start + side ** (2 - axis)
+
+
+def _crossing(low: FloatArray, high: FloatArray) -> NDArray[np.float64]:
+    """Return where linear interpolation is 0, as a share of the edge from its low end."""
+    low64, high64 = low.astype(np.float64), high.astype(np.float64)
+    return np.clip(low64 / (low64 - high64), CLEARANCE, 1 - CLEARANCE)
+
+
+def _onto_border(position: NDArray[np.float64], lattice: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Bring nodes from beyond the border of the fine lattice back to it."""
+    return np.clip(position, -CAP_HEIGHT, lattice + CAP_HEIGHT)
+
+
+def _triangles(inside: NDArray[np.bool_], numbers: IntArray, vertex_at: IntArray) -> IntArray:
+    """Return the triangles of all cells, in the order of voxels and cells."""
+    factor = inside.shape[1] - 1
+    case = np.zeros((len(inside),) + (factor,) * 3, np.uint8)
+    for bit, (x, y, z) in enumerate(CORNERS):
+        corner = inside[:, x : x + factor, y : y + factor, z : z + factor]
+        case |= corner.astype(np.uint8) << np.uint8(bit)
+    counts, table = triangle_table()
+    cell = np.flatnonzero((case != 0) & (case != 255))
+    case_of_cell = case.ravel()[cell]
+    times = counts[case_of_cell]
+    of_triangle = np.repeat(np.arange(len(cell)), times)
+    nth = np.arange(len(of_triangle)) - np.repeat(np.cumsum(times) - times, times)
+    edges = table[case_of_cell[of_triangle], nth]
+    voxel, low_node = _low_nodes(cell, factor)
+    step = np.array([(factor + 1) ** 2, factor + 1, 1])
+    start = (CORNERS @ step)[np.array(EDGE_START)]
+    node = numbers[voxel[of_triangle, None], low_node[of_triangle, None] + start[edges]]
+    return vertex_at[3 * node.astype(np.int64) + np.array(EDGE_AXIS)[edges]]
+
+
+def _low_nodes(
+    cell: NDArray[np.int64], factor: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the voxel of each cell, and the block node at the cell's low corner."""
+    voxel, within = np.divmod(cell, factor**3)
+    x, rest = np.divmod(within, factor**2)
+    y, z = np.divmod(rest, factor)
+    return voxel, (x * (factor + 1) + y) * (factor + 1) + z
+
+
+def _to_world(
+    position: NDArray[np.float64], field: FineField, grid: SdfGrid
+) -> NDArray[np.float64] | FloatArray:
+    """Turn fine lattice positions into world ones: fine index K i + K/2 is sample i."""
+    sample = position / field.factor - 0.5
+    world: NDArray[np.float64] = sample * np.array(grid.spacing) + np.array(grid.origin)
+    reach = np.abs(grid.origin) + np.array(grid.spacing) * field.shape
+    fine_spacing = grid.voxel_size / field.factor
+    single = np.finfo(np.float32).eps * reach.max() < CLEARANCE / 2 * fine_spacing
+    return world.astype(np.float32) if single else world

@@ -1,0 +1,43 @@
+"""A triangle mesh and what can be said of it without leaving NumPy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .grid import IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles of a surface, outward: seen from outside, counter-clockwise.
+
+    Attributes
+    ----------
+    vertices : (n, 3) float32 or float64
+        World positions; double where single could not tell neighbouring vertices apart.
+    faces : (m, 3) int32
+        Rows of ``vertices``.
+    """
+
+    vertices: NDArray[Any]
+    faces: IntArray
+
+    def volume(self) -> float:
+        """Return the enclosed volume, in cubic world units; positive if faces look outward."""
+        corners = self.vertices.astype(np.float64)
+        corners -= corners.mean(0) if len(corners) else 0.0
+        a, b, c = corners[self.faces.T]
+        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+    def open_edges(self) -> int:
+        """Count edges that are not used exactly once in each direction: 0 for a closed mesh."""
+        start = self.faces.ravel().astype(np.int64)
+        end = np.roll(self.faces, -1, axis=1).ravel().astype(np.int64)
+        size = len(self.vertices)
+        forward, times = np.unique(start * size + end, return_counts=True)
+        backward = np.unique(end * size + start)
+        return int((times > 1).sum()) + len(np.setxor1d(forward, backward))

@@ -1,0 +1,155 @@
+"""The network: an ONNX file that keeps a contract, run by onnxruntime (only here).
+
+Inputs ``patches`` (V, 27), ``neighbours`` (V, 27), ``voxels`` (D,), ``offsets`` (Q, 3); output
+``values`` (D, Q). All lengths are in half voxels. The file's metadata says what it was made for.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import onnxruntime as ort
+
+from .errors import DeviceError, FileError, ModelError
+from .grid import FloatArray, IntArray
+
+FORMAT_VERSION = 1
+DEFAULT_MODEL = "base"
+DEVICES = ("auto", "cpu", "cuda")
+INPUTS = {
+    "patches": "tensor(float)",
+    "neighbours": "tensor(int32)",
+    "voxels": "tensor(int32)",
+    "offsets": "tensor(float)",
+}
+OUTPUT = "values"
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """A loaded network; safe to call from several threads.
+
+    Attributes
+    ----------
+    card : dict
+        The file's metadata: receptive field, training factors, data, commit, accuracy.
+    device : str
+        Where it runs: "cpu" or "cuda".
+    """
+
+    session: ort.InferenceSession
+    card: Mapping[str, Any]
+    device: str
+
+    def __call__(
+        self, patches: FloatArray, table: IntArray, voxels: IntArray, offsets: FloatArray
+    ) -> FloatArray:
+        """Return the values (D, Q) of voxels (D,) at offsets (Q, 3), in half voxels."""
+        feeds = {"patches": patches, "neighbours": table, "voxels": voxels, "offsets": offsets}
+        values: FloatArray = self.session.run([OUTPUT], feeds)[0]
+        return values
+
+
+def shipped_models() -> dict[str, Path]:
+    """Return the networks that come with the package, by name."""
+    folder = Path(str(resources.files("super_sdf.models")))
+    return {path.stem: path for path in sorted(folder.glob("*.onnx"))}
+
+
+def load_network(
+    model: str | Path = DEFAULT_MODEL, *, device: str = "auto", threads: int = 0
+) -> Network:
+    """Load a network.
+
+    Parameters
+    ----------
+    model : str or path
+        The name of a shipped network, or an ONNX file.
+    device : str
+        "cuda", "cpu", or "auto": CUDA where it runs, else the CPU.
+    threads : int
+        CPU threads; 0 for one a core.
+
+    Raises
+    ------
+    FileError
+        If there is no such file.
+    ModelError
+        If it is not a network of this format.
+    DeviceError
+        If CUDA was asked for and cannot run.
+    """
+    path = shipped_models().get(str(model), Path(model))
+    if not path.is_file():
+        names = ", ".join(shipped_models())
+        raise FileError(f"no model {str(model)!r}: give an ONNX file or one of: {names}")
+    session = _open_session(path, _providers(device), threads)
+    used = "cuda" if "CUDAExecutionProvider" in session.get_providers() else "cpu"
+    if device == "cuda" and used != "cuda":
+        raise DeviceError(
+            "cuda was asked for, but onnxruntime could not start its CUDA provider (are the CUDA "
+            "and cuDNN libraries it wants installed?); use --device cpu"
+        )
+    return Network(session, _read_card(session, path), used)
+
+
+def available_devices() -> list[str]:
+    """Return the devices that this onnxruntime was built for."""
+    built = ort.get_available_providers()
+    return ["cpu"] + ["cuda"] * ("CUDAExecutionProvider" in built)
+
+
+def _providers(device: str) -> list[str]:
+    """Return the execution providers to try, in order."""
+    if device not in DEVICES:
+        raise DeviceError(f"device is {device!r}: give one of {', '.join(DEVICES)}")
+    with_cuda = "cuda" in available_devices()
+    if device == "cuda" and not with_cuda:
+        raise DeviceError(
+            f"cuda was asked for, but onnxruntime {ort.__version__} here has no CUDA provider; "
+            "install onnxruntime-gpu in place of onnxruntime, or use --device cpu"
+        )
+    wanted = ["CUDAExecutionProvider"] * (with_cuda and device != "cpu")
+    return [*wanted, "CPUExecutionProvider"]
+
+
+def _open_session(path: Path, providers: list[str], threads: int) -> ort.InferenceSession:
+    """Open an ONNX file."""
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 4  # errors come as exceptions; the rest is not for users
+    # Arrays of another size at every call: an arena would keep the largest of each.
+    options.enable_cpu_mem_arena = False
+    options.enable_mem_pattern = False
+    try:
+        return ort.InferenceSession(str(path), options, providers=providers)
+    except Exception as error:  # onnxruntime's errors have no common base but this
+        reason = str(error).strip().splitlines()[0]
+        raise ModelError(f"{path} is not an ONNX file that onnxruntime can run: {reason}") from error
+
+
+def _read_card(session: ort.InferenceSession, path: Path) -> dict[str, Any]:
+    """Return a file's metadata after checking that it keeps the contract."""
+    inputs = {given.name: given.type for given in session.get_inputs()}
+    outputs = [given.name for given in session.get_outputs()]
+    metadata = session.get_modelmeta().custom_metadata_map
+    version = metadata.get("format_version", "none")
+    if inputs != INPUTS or outputs != [OUTPUT] or version != str(FORMAT_VERSION):
+        raise ModelError(
+            f"{path} is no super-sdf network of format {FORMAT_VERSION} (format {version}, inputs "
+            f"{', '.join(inputs)}); export one with export/to_onnx.py"
+        )
+    return {key: _parse(text) for key, text in metadata.items()}
+
+
+def _parse(text: str) -> Any:
+    """Read a metadata value: JSON where it is JSON, else text."""
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text

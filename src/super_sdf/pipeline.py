@@ -1,0 +1,165 @@
+"""The method on a page: the paper's Section 4, a named step a line.
+
+    grid -> band -> patches and neighbours -> network -> shared nodes averaged -> isosurface
+
+>>> from super_sdf import SdfGrid, reconstruct
+>>> mesh = reconstruct(SdfGrid(values, spacing=0.1))            # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+
+from .band import (
+    NEIGHBOURHOOD,
+    can_hold_surface,
+    find_band,
+    gather_patches,
+    neighbour_table,
+    rescale,
+)
+from .errors import GridError
+from .field import FineField, close_at_border
+from .grid import BoolArray, FloatArray, IntArray, SdfGrid
+from .isosurface import extract_mesh
+from .mesh import Mesh
+from .nodes import (
+    average_shared,
+    block_offsets,
+    check_factor,
+    keep_samples,
+    number_shared_nodes,
+    pin_to_skipped,
+)
+
+Progress = Callable[[int, int], None]
+"""Called with (steps done, steps in all)."""
+
+STEPS = ("band", "network", "nodes", "isosurface")
+
+
+class Decoder(Protocol):
+    """What the pipeline asks of a network: see ``network.Network``."""
+
+    def __call__(
+        self, patches: FloatArray, table: IntArray, voxels: IntArray, offsets: FloatArray
+    ) -> FloatArray:
+        """Map patches (V, 27), neighbours (V, 27), voxels (D,), offsets (Q, 3) to (D, Q)."""
+        ...
+
+
+def upsample(
+    grid: SdfGrid,
+    network: Decoder,
+    factor: int = 4,
+    *,
+    offset: float = 0.0,
+    progress: Progress | None = None,
+) -> FineField:
+    """Refine a coarse grid near its surface.
+
+    Parameters
+    ----------
+    grid : SdfGrid
+        Coarse signed distances, negative inside.
+    network : Network
+        From ``load_network``.
+    factor : int
+        How many times finer, K: 2, 4, 8, 16 (any even number up to 16).
+    offset : float
+        Refine round the level ``values == offset`` (world units) instead of 0 (Sec. 5.3).
+    progress : callable, optional
+        Called with (steps done, steps in all).
+
+    Returns
+    -------
+    FineField
+        Values at the nodes of spacing h/K in every voxel that can hold the surface.
+
+    Raises
+    ------
+    OptionError
+        If the factor is odd or out of range.
+    GridError
+        If all samples are on one side of the surface.
+    """
+    check_factor(factor)
+    tell = progress or (lambda done, total: None)
+    rescaled = rescale(grid, offset)  # Eq. 4
+    check_both_sides(rescaled, grid, offset)
+    band_ijk = find_band(rescaled)  # Eq. 2
+    patches = gather_patches(rescaled, band_ijk)
+    table = neighbour_table(band_ijk, grid.shape)
+    voxels = np.flatnonzero(can_hold_surface(patches)).astype(np.int32)
+    tell(1, len(STEPS))
+
+    blocks = network(patches, table, voxels, block_offsets(factor))  # Eqs. 3 and 5
+    tell(2, len(STEPS))
+
+    voxel_ijk = band_ijk[voxels]
+    own_table = neighbours_among(voxels, table)
+    numbers, count = number_shared_nodes(own_table, factor)
+    values = average_shared(blocks, numbers, count)  # Eq. 7
+    keep_samples(values, numbers, rescaled[tuple(voxel_ijk.T)])
+    skipped = skipped_neighbours(own_table, patches[voxels], voxel_ijk, grid.shape)
+    pinned = pin_to_skipped(values, numbers, skipped, factor)
+    tell(3, len(STEPS))
+    return FineField(grid.shape, factor, voxel_ijk, numbers, values, len(band_ijk), pinned)
+
+
+def reconstruct(
+    grid: SdfGrid,
+    network: Decoder | None = None,
+    factor: int = 4,
+    *,
+    offset: float = 0.0,
+    cap: bool = False,
+    progress: Progress | None = None,
+) -> Mesh:
+    """Turn a coarse grid into a fine mesh: ``upsample``, then ``extract_mesh``.
+
+    ``network`` is the shipped one unless given. A surface that runs out of the grid is left open
+    there, or closed along the border with ``cap``. Otherwise as ``upsample``.
+    """
+    if network is None:
+        from .network import load_network
+
+        network = load_network()
+    field = upsample(grid, network, factor, offset=offset, progress=progress)
+    if cap:
+        field = close_at_border(field, rescale(grid, offset) <= 0)
+    mesh = extract_mesh(field, grid)
+    if progress:
+        progress(len(STEPS), len(STEPS))
+    return mesh
+
+
+def check_both_sides(rescaled: FloatArray, grid: SdfGrid, offset: float) -> None:
+    """Raise if no sample, or every sample, is inside."""
+    inside = int((rescaled <= 0).sum())
+    if inside in (0, rescaled.size):
+        low, high = grid.values.min(), grid.values.max()
+        raise GridError(
+            f"no surface: the values go from {low:.6g} to {high:.6g} and never cross {offset:g}"
+        )
+
+
+def neighbours_among(voxels: IntArray, table: IntArray) -> IntArray:
+    """Return the neighbour table, (D, 27), of a part of the band among itself."""
+    row_of = np.full(len(table) + 1, -1, np.int32)
+    row_of[voxels] = np.arange(len(voxels), dtype=np.int32)
+    among: IntArray = row_of[table[voxels]]  # -1, absent, reads the last row: -1 again
+    return among
+
+
+def skipped_neighbours(
+    own_table: IntArray, patches: FloatArray, voxel_ijk: IntArray, shape: tuple[int, int, int]
+) -> IntArray:
+    """Return the sign, (D, 27), of each neighbour in the grid that was not decoded, else 0."""
+    around = voxel_ijk[:, None] + NEIGHBOURHOOD
+    in_grid: BoolArray = ((around >= 0) & (around < np.array(shape))).all(2)
+    sign = np.where(patches > 0, 1, -1)
+    return np.where((own_table < 0) & in_grid, sign, 0).astype(np.int32)
