@@ -28,14 +28,25 @@ import numpy as np
 from scipy import ndimage
 from skimage.measure import marching_cubes
 
+import super_sdf
 from benchmarks import metrics
 from export.sampling import TriMesh, distance, is_inside, load_mesh, sample_grid, unit_grid
+from super_sdf import SdfGrid, load_network, reconstruct
+from super_sdf.band import find_band, gather_patches, neighbour_table, rescale
+from super_sdf.network import DEFAULT_MODEL, shipped_models
+from super_sdf.nodes import (
+    average_shared,
+    block_ijk,
+    block_offsets,
+    keep_samples,
+    number_shared_nodes,
+)
+from super_sdf.pipeline import Decoder
 
 Row = dict[str, Any]
 Key = tuple[Any, ...]
 
 PROTOCOL = 1  # count up when a figure changes its meaning: the lines kept so far are then void
-BAND = 1.5  # Eq. 2, in coarse spacings
 NUDGE = np.float32(1e-9)  # what an exact zero becomes: a vertex on a node can open the surface
 EMPTY = TriMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
 FLOOR = "floor"
@@ -90,17 +101,25 @@ class Case:
         self.shape, self.size, self.factor = shape, size, factor
         grid_shape, self.spacing, self.origin = unit_grid(size)
         self.coarse = sample_grid(shape.mesh, grid_shape, self.spacing, self.origin)
+        self.grid = SdfGrid(self.coarse, (self.spacing,) * 3, tuple(self.origin))
         self.fine = self.spacing / factor
 
     @cached_property
-    def truth(self) -> np.ndarray:
-        """The exact distance wherever a crossing cell has a node, else the nearest sample."""
-        return exact_field(self)
+    def voxels(self) -> np.ndarray:
+        """The band (Eq. 2), (V, 3)."""
+        return find_band(rescale(self.grid))
 
     @cached_property
     def band(self) -> np.ndarray:
         """Which fine nodes lie in the blocks of the band, faces included (bool)."""
-        return spread_to_nodes(np.abs(self.coarse) < BAND * self.spacing, self.factor)
+        active = np.zeros(self.coarse.shape, bool)
+        active[tuple(self.voxels.T)] = True
+        return spread_to_nodes(active, self.factor)
+
+    @cached_property
+    def truth(self) -> np.ndarray:
+        """The exact distance at the nodes of the band and of every cell that can be crossed."""
+        return exact_field(self)
 
 
 def spread_to_nodes(voxels: np.ndarray, factor: int) -> np.ndarray:
@@ -115,15 +134,15 @@ def spread_to_nodes(voxels: np.ndarray, factor: int) -> np.ndarray:
 
 
 def exact_field(case: Case) -> np.ndarray:
-    """Return the signed distance at the fine nodes of every block that a crossing cell can touch.
+    """Return the signed distance, float32, at the fine nodes of the band and of crossing cells.
 
-    A node of such a cell is within sqrt(3) h/K of the surface, so its block's sample within
+    A node of a crossing cell is within sqrt(3) h/K of the surface, so its block's sample within
     sqrt(3) (1/2 + 1/K) h. Elsewhere stands the nearest sample, which has the right sign.
     """
-    reach = max(BAND, 3**0.5 * (0.5 + 1 / case.factor)) * case.spacing
+    reach = 3**0.5 * (0.5 + 1 / case.factor) * case.spacing
     nearest = np.minimum(np.arange(case.factor * case.size + 1) // case.factor, case.size - 1)
     field = case.coarse.astype(np.float32)[np.ix_(nearest, nearest, nearest)]
-    nodes = np.argwhere(spread_to_nodes(np.abs(case.coarse) < reach, case.factor))
+    nodes = np.argwhere(case.band | spread_to_nodes(np.abs(case.coarse) < reach, case.factor))
     samples = nearest[nodes]
     apart = np.linalg.norm(nodes - (case.factor * samples + case.factor / 2), axis=1) * case.fine
     points = nodes * case.fine - 0.5
@@ -199,27 +218,42 @@ def bound_surface(case: Case) -> tuple[TriMesh, np.ndarray | None]:
     return isosurface(case.truth.copy(), case.fine, -0.5), None
 
 
-def our_surface(case: Case, model: str | None) -> tuple[TriMesh, np.ndarray | None]:
+def our_surface(case: Case, model: str) -> tuple[TriMesh, np.ndarray | None]:
     """Mesh the coarse grid with super-sdf."""
-    from super_sdf import SdfGrid, reconstruct
+    network = load_once(model)
+    mesh = reconstruct(case.grid, network, factor=case.factor)
+    found = TriMesh(mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64))
+    return found, our_field(case, network)
 
-    grid = SdfGrid(case.coarse, spacing=(case.spacing,) * 3, origin=tuple(case.origin))
-    mesh = reconstruct(grid, load_once(model), factor=case.factor)
-    return TriMesh(mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64)), None
+
+def our_field(case: Case, network: Decoder) -> np.ndarray:
+    """Return the network's distances at all nodes of the band, dense float32, NaN elsewhere.
+
+    The pipeline decodes only the voxels that can hold the surface; the protocol asks for all.
+    """
+    rescaled, voxels, factor = rescale(case.grid), case.voxels, case.factor
+    table = neighbour_table(voxels, case.grid.shape)
+    every = np.arange(len(voxels), dtype=np.int32)
+    blocks = network(gather_patches(rescaled, voxels), table, every, block_offsets(factor))
+    numbers, count = number_shared_nodes(table, factor)
+    values = average_shared(blocks, numbers, count)
+    keep_samples(values, numbers, rescaled[tuple(voxels.T)])
+    nodes = factor * voxels[:, None] + block_ijk(factor)  # (V, Q, 3)
+    field = np.full(case.band.shape, np.nan, np.float32)
+    field[tuple(np.moveaxis(nodes, 2, 0))] = values[numbers] * np.float32(case.spacing / 2)
+    return field
 
 
 @lru_cache(maxsize=1)
-def load_once(model: str | None) -> Any:
-    """Return the network of a file, or the shipped one."""
-    from super_sdf import load_network
-
+def load_once(model: str) -> Decoder:
+    """Return the network of a name or a file."""
     return load_network(model)
 
 
 Method = Callable[[Case], tuple[TriMesh, np.ndarray | None]]
 
 
-def make_method(name: str, model: str | None) -> Method:
+def make_method(name: str, model: str) -> Method:
     """Return the function that makes a method's surface."""
     methods: dict[str, Method] = {
         "mc": coarse_surface,
@@ -255,27 +289,24 @@ def measure_field(case: Case, field: np.ndarray | None) -> Row:
     return {"field_mse": float(np.mean(error**2)), "field_mae": float(np.abs(error).mean())}
 
 
-def measure_method(case: Case, name: str, model: str | None) -> Row:
+def measure_method(case: Case, name: str, model: str) -> Row:
     """Return the figures of a method; if it raises, those of a dot, with the reason in "error"."""
-    start = time.perf_counter()
     try:
         mesh, field = make_method(name, model)(case)
         error = None
-    except Exception as problem:  # noqa: BLE001 - named in the table; the others still count
+    except Exception as problem:  # named in the table; the other shapes still count
         traceback.print_exc(file=sys.stderr)
         mesh, field, error = EMPTY, None, f"{type(problem).__name__}: {problem}"
-    seconds = time.perf_counter() - start
-    figures = {**measure_surface(case.shape, mesh), **measure_field(case, field)}
-    return {**figures, "surface_seconds": round(seconds, 3), "error": error}
+    return {**measure_surface(case.shape, mesh), **measure_field(case, field), "error": error}
 
 
 @dataclass(frozen=True)
 class Task:
-    """What is to be measured of one shape: the keys, and the network file (None: the shipped)."""
+    """What is to be measured of one shape, size by size, and the network's name or file."""
 
     path: Path
     keys: tuple[Key, ...]
-    model: str | None
+    model: str
 
 
 def measure_shape(task: Task) -> list[Row]:
@@ -283,7 +314,7 @@ def measure_shape(task: Task) -> list[Row]:
     shape = Shape(task.path)
     rows: list[Row] = []
     case: Case | None = None
-    for key in sorted(task.keys, key=lambda key: key[1]):  # size by size: one grid in memory
+    for key in task.keys:
         _, size, method, factor, _ = key
         if method == FLOOR:
             figures = {**measure_surface(shape, shape.mesh), "error": None}
@@ -314,14 +345,13 @@ def read_rows(path: Path) -> dict[Key, Row]:
     return {tuple(row[name] for name in KEY_NAMES): row for row in rows}
 
 
-def digest_of(model: str | None) -> str:
+def digest_of(model: str) -> str:
     """Return the sha256 of the network file and of the code that runs it."""
-    import super_sdf
-
-    package = Path(super_sdf.__file__).parent
-    code = sorted(path for path in package.glob("*.py") if path.stem not in ("cli", "io"))
-    digest = hashlib.sha256(Path(model or shipped_model()).read_bytes())
-    for path in code:
+    load_once(model)  # says what is wrong with the file, before anything is measured
+    code = sorted(Path(super_sdf.__file__).parent.glob("*.py"))
+    parts = [path for path in code if path.stem not in ("cli", "io")]
+    digest = hashlib.sha256()
+    for path in [shipped_models().get(model, Path(model)), *parts]:
         digest.update(path.read_bytes())
     return digest.hexdigest()
 
@@ -336,14 +366,17 @@ def measure_missing(tasks: list[Task], jobs: int) -> Iterator[list[Row]]:
 
 
 def complete(
-    kept: dict[Key, Row], wanted: dict[Path, list[Key]], store: Path, model: str | None, jobs: int
+    kept: dict[Key, Row], wanted: dict[Path, list[Key]], store: Path, model: str, jobs: int
 ) -> None:
     """Measure what is wanted and not kept, and keep it: in the file at once, shape by shape."""
-    missing = {path: tuple(key for key in keys if key not in kept) for path, keys in wanted.items()}
+    missing = {  # each key once: the floor is wanted for every size
+        path: tuple(key for key in dict.fromkeys(keys) if key not in kept)
+        for path, keys in wanted.items()
+    }
     tasks = [Task(path, keys, model) for path, keys in missing.items() if keys]
     start = time.perf_counter()
     for done, (task, rows) in enumerate(zip(tasks, measure_missing(tasks, jobs)), 1):
-        kept.update(zip(sorted(task.keys, key=lambda key: key[1]), rows))
+        kept.update(zip(task.keys, rows))
         with store.open("a") as out:  # a row with an error is tried again by the next run
             out.writelines(json.dumps(row) + "\n" for row in rows if row["error"] is None)
         seconds = time.perf_counter() - start
@@ -445,7 +478,7 @@ def parse_arguments() -> argparse.Namespace:
     add("--meshes", type=Path, required=True, help="folder of closed reference meshes")
     add("--sizes", type=int, nargs="+", default=[32, 64], help="samples along an axis")
     add("--factor", type=int, default=4, help="K, how many times finer; even")
-    add("--model", help="the network's .onnx file (default: the shipped one)")
+    add("--model", default=DEFAULT_MODEL, help="a shipped network or an .onnx file")
     add("--out", type=Path, required=True, help="folder of results.jsonl and per_shape.md")
     add("--limit", type=int, help="take the first so many shapes only")
     add("--methods", nargs="+", choices=LABELS, default=list(LABELS), help="floor always runs")

@@ -1,4 +1,6 @@
-"""The measures against closed forms."""
+"""The measures against closed forms, and the methods against each other."""
+
+# ruff: noqa: D103 - a test's name says what it holds
 
 from __future__ import annotations
 
@@ -8,12 +10,11 @@ from scipy import ndimage
 
 from benchmarks import metrics, quality
 from export.sampling import TriMesh, signed_distance
+from super_sdf.band import NEIGHBOURHOOD
 
 N = metrics.SAMPLE_COUNT
-CUBE_FACES = np.array(
-    [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]]
-    + [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
-)
+CUBE_CORNERS = "013 032 467 475 045 051 237 276 026 064 157 173"
+CUBE_FACES = np.array([[int(corner) for corner in face] for face in CUBE_CORNERS.split()])
 
 
 def square(z: float = 0.0) -> TriMesh:
@@ -32,6 +33,21 @@ def sphere(radius: float = 0.4, size: int = 32) -> TriMesh:
     axis = np.linspace(-0.5, 0.5, size + 1, dtype=np.float32)
     field = np.sqrt(sum(x**2 for x in np.meshgrid(axis, axis, axis))) - np.float32(radius)
     return quality.isosurface(field, 1 / size, -0.5)
+
+
+def case_of(mesh: TriMesh, size: int, factor: int) -> quality.Case:
+    """Return the mesh, put into the frame and sampled."""
+    shape = quality.Shape.__new__(quality.Shape)  # not from a file
+    shape.mesh = metrics.normalise(mesh)
+    return quality.Case(shape, size, factor)
+
+
+def trilinear_network(
+    patches: np.ndarray, table: np.ndarray, voxels: np.ndarray, offsets: np.ndarray
+) -> np.ndarray:
+    """Stand in for the network: trilinear interpolation of the patch, (D, Q)."""
+    to_sample = np.abs(offsets[:, None] - 2 * NEIGHBOURHOOD).clip(0, 2) / 2  # (Q, 27, 3)
+    return patches[voxels] @ (1 - to_sample).prod(2).T.astype(np.float32)
 
 
 def inverted(mesh: TriMesh) -> TriMesh:
@@ -156,14 +172,26 @@ def test_upsampling_is_that_of_scipy() -> None:
 
 @pytest.mark.parametrize("factor", [2, 4])
 def test_the_truth_is_exact_near_the_surface_and_right_in_sign(factor: int) -> None:
-    shape = quality.Shape.__new__(quality.Shape)
-    shape.mesh = metrics.normalise(cube())
-    case = quality.Case(shape, 12, factor)
+    case = case_of(cube(), 12, factor)
     nodes = np.indices(case.truth.shape).reshape(3, -1).T
-    exact = signed_distance(shape.mesh, nodes * case.fine - 0.5).reshape(case.truth.shape)
+    exact = signed_distance(case.shape.mesh, nodes * case.fine - 0.5).reshape(case.truth.shape)
     # On the very surface the winding number may say either; the distance there is 0.
     away = np.abs(exact) > 1e-6
     assert (np.sign(case.truth) == np.sign(exact))[away].all()
     near = np.abs(exact) < 3**0.5 * case.fine
     np.testing.assert_allclose(np.abs(case.truth[near]), np.abs(exact[near]), atol=1e-6)
     np.testing.assert_allclose(case.truth[case.band & away], exact[case.band & away], atol=1e-6)
+
+
+def test_ours_with_a_trilinear_network_is_the_trilinear_baseline(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    case = case_of(sphere(), 16, 4)
+    monkeypatch.setattr(quality, "load_once", lambda model: trilinear_network)
+    ours, our_field = quality.our_surface(case, "any")
+    mesh, field = quality.upsampled_surface(case, 1)
+    near = case.band & (np.abs(field) < case.spacing)  # patches are cut off at 3 h
+    np.testing.assert_allclose(our_field[near], field[near], atol=1e-6)
+    assert metrics.is_closed(ours.faces)
+    assert metrics.volume(ours) == pytest.approx(metrics.volume(mesh), rel=1e-3)
+    assert metrics.distance_or_dot(mesh, ours.vertices).max() < case.fine / 4

@@ -1,1 +1,1 @@
-"""From meshes to a shipped network: sampling, data, training, ONNX export. Never imported by super_sdf."""
+"""From meshes to a shipped network: shapes, sampling, data, training, ONNX export."""

@@ -166,8 +166,10 @@ def main() -> None:
             samples += [sample] if sample else []
             refused += sample is None
         write_shard(path, samples)
-        print(f"{path.name}: {sum(len(s.voxel_ijk) for s in samples)} voxels, {refused} refused",
-              flush=True)
+        print(
+            f"{path.name}: {sum(len(s.voxel_ijk) for s in samples)} voxels, {refused} refused",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

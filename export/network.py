@@ -56,6 +56,7 @@ class GatherMatMul(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, None]:
+        """Take the gradient (V, C_out); return those of features and weight."""
         columns, weight, table = ctx.saved_tensors
         grad = grad.contiguous()
         channels_out = weight.shape[1]

@@ -37,9 +37,7 @@ def load_mesh(path: str) -> TriMesh:
 def distance(mesh: TriMesh, points: np.ndarray, limit: float = np.inf) -> np.ndarray:
     """Return the unsigned distance of each point, NaN beyond ``limit``."""
     unsigned = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_UNSIGNED
-    found, _, _, _ = igl.signed_distance(
-        points, mesh.vertices, mesh.faces, unsigned, -limit, limit
-    )
+    found, _, _, _ = igl.signed_distance(points, mesh.vertices, mesh.faces, unsigned, -limit, limit)
     return found
 
 

@@ -17,13 +17,15 @@ from operator import mul
 import numpy as np
 from manifold3d import CrossSection, Error, Manifold, OpType
 from scipy.interpolate import PchipInterpolator
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from export.sampling import TriMesh
 
 ATTEMPTS = 20  # a candidate fails about once in fifty
 MAX_FACES = 25_000  # more faces say nothing new about a surface seen on coarse grids
 MIN_VOLUME = 1e-4  # of the cubed diagonal; the thinnest shells and frames hold some 1e-3
-TOLERANCE = 1e-6  # of the diagonal; shorter edges only spoil the normals of their triangles
+TOLERANCE = 1e-5  # of the diagonal; shorter edges only spoil the normals of their triangles
 
 Family = Callable[[np.random.Generator], Manifold]
 
@@ -62,6 +64,19 @@ def unit_sized(solid: Manifold) -> Manifold:
     low, high = np.reshape(solid.bounding_box(), (2, 3))
     centred = solid.translate(list(-(low + high) / 2))
     return centred.scale([1 / float(np.linalg.norm(high - low))] * 3)
+
+
+def twisted(solid: Manifold, rate: float) -> Manifold:
+    """Twist a solid about the z axis by ``rate`` radians a unit, its faces first cut fine.
+
+    `Manifold.extrude` twists whole side faces, whose diagonals then cut through thin walls.
+    """
+
+    def turn(points: np.ndarray) -> np.ndarray:
+        turns = np.exp(1j * rate * points[:, 2]) * (points[:, 0] + 1j * points[:, 1])
+        return np.stack([turns.real, turns.imag, points[:, 2]], axis=1)
+
+    return solid.refine_to_length(0.05).warp_batch(turn)
 
 
 def polar_polygon(angles: np.ndarray, radii: np.ndarray) -> CrossSection:
@@ -134,9 +149,8 @@ def prism(rng: np.random.Generator) -> Manifold:
         hole = draw_outline(rng).scale([log_uniform(rng, 0.1, 0.5)] * 2)
         outline -= hole.translate(list(rng.uniform(-0.25, 0.25, 2)))
     height, taper = log_uniform(rng, 0.1, 2), rng.choice([1, rng.uniform(0.2, 1.2)], 2)
-    twist = rng.choice([0, 0, rng.uniform(-120, 120), rng.uniform(-360, 360) * height])
-    # Fine steps keep the walls between two layers from cutting into one another.
-    return outline.extrude(height, math.ceil(abs(twist) / 5), twist, list(taper))
+    solid = outline.extrude(height, scale_top=list(taper))
+    return twisted(solid, rng.uniform(-3, 3)) if rng.random() < 0.3 else solid
 
 
 def primitive(rng: np.random.Generator) -> Manifold:
@@ -267,7 +281,7 @@ def frame(rng: np.random.Generator) -> Manifold:
     """Draw struts: along the edges of a lattice or of a polyhedron, or from node to node."""
     radius, sides = log_uniform(rng, 0.012, 0.06), int(rng.choice([4, 8, 12]))
     if rng.random() < 0.5:
-        counts = rng.integers(1, 3, 3) + [1, 1, 0]
+        counts = rng.integers([2, 2, 1], [4, 4, 3])
         nodes = np.indices(counts).reshape(3, -1).T * rng.uniform(0.3, 0.5, 3)
         gaps = np.abs(nodes[:, None] - nodes[None])
         linked = (gaps.max(2) < 0.51) & ((gaps > 0).sum(2) <= rng.choice([1, 1, 2]))
@@ -283,7 +297,7 @@ def frame(rng: np.random.Generator) -> Manifold:
 
 def pipe(rng: np.random.Generator) -> Manifold:
     """Draw a coil or a bent pipe, solid or hollow: a bar laid along a helix."""
-    turns, coil, rise = rng.uniform(0.2, 4), rng.uniform(0.15, 0.4), rng.uniform(0.15, 0.4)
+    turns, coil, rise = log_uniform(rng, 0.15, 4), rng.uniform(0.15, 0.4), rng.uniform(0.15, 0.4)
     bar = min(coil, rise) * rng.uniform(0.15, 0.45)  # keeps neighbouring windings apart
     outline = draw_outline(rng) if rng.random() < 0.5 else CrossSection.circle(0.5, 24)
     if rng.random() < 0.4:
@@ -312,26 +326,30 @@ def wave_sum(terms: Callable[[int, float], Sequence[float]]) -> Callable[..., fl
 def blobs(rng: np.random.Generator) -> Manifold:
     """Draw blobs, from balls to soft boxes, that blend into one another."""
     centres = rng.uniform(-0.3, 0.3, (3, int(rng.integers(2, 8))))
-    widths, power = rng.uniform(0.1, 0.35, centres.shape), rng.choice([2, 4, 8])
-    field = wave_sum(
+    widths, power = rng.uniform(0.1, 0.35, centres.shape), int(rng.choice([2, 4, 8]))
+    blend = wave_sum(
         lambda axis, x: np.exp(-(((x - centres[axis]) / widths[axis]) ** power)).tolist()
     )
-    return Manifold.level_set(field, [-0.75] * 3 + [0.75] * 3, rng.uniform(0.04, 0.07), 0.3)
+
+    def field(x: float, y: float, z: float) -> float:
+        # Made to run almost linearly through the surface, which is interpolated linearly.
+        return 1 - max(-math.log(blend(x, y, z) + 1e-99), 0) ** (1 / power)
+
+    return Manifold.level_set(field, [-0.7] * 3 + [0.7] * 3, rng.uniform(0.04, 0.07))
 
 
 def gyroid(rng: np.random.Generator) -> Manifold:
     """Draw a body filled with a gyroid: one side of it, or a wall along it."""
-    rates, level, walls = rng.uniform(5, 16, 3), rng.uniform(-0.5, 0.5), rng.random() < 0.5
+    rates, level, walls = rng.uniform(5, 12, 3), rng.uniform(-0.5, 0.5), rng.random() < 0.5
 
     def terms(axis: int, x: float) -> tuple[float, ...]:
         sin, cos = math.sin(rates[axis] * x), math.cos(rates[axis] * x)
         return ((sin, 1.0, cos), (cos, sin, 1.0), (1.0, cos, sin))[axis]
 
-    wave = wave_sum(terms)
-    body = unit_sized(turned(rng, PARTS[rng.integers(len(PARTS))](rng)))
+    wave, body = wave_sum(terms), unit_sized(rounded(rng))
     filling = Manifold.level_set(
         (lambda x, y, z: 0.4 - abs(wave(x, y, z) - level)) if walls else wave,
-        body.bounding_box(), rng.uniform(0.03, 0.05), 0.0 if walls else level,
+        body.bounding_box(), rng.uniform(0.025, 0.04), 0.0 if walls else level,
     )  # fmt: skip
     return body ^ filling
 
@@ -400,13 +418,13 @@ def bent(rng: np.random.Generator, solid: Manifold) -> Manifold:
     if kind == 0:
         return swayed(rng, fine, 0.6)
 
+    if kind == 1:
+        return twisted(fine, 2 * rate)
+
     def bend(points: np.ndarray) -> np.ndarray:
-        x, y, z = points.T
-        if kind == 1:  # round an axis parallel to y, 1 / rate away: more than the solid reaches
-            arm, angle = 1 / rate - x, rate * z
-            return np.stack([1 / rate - arm * np.cos(angle), y, arm * np.sin(angle)], axis=1)
-        cos, sin = np.cos(2 * rate * z), np.sin(2 * rate * z)
-        return np.stack([x * cos - y * sin, x * sin + y * cos, z], axis=1)
+        # Round an axis parallel to y, 1 / rate away: farther than the solid reaches.
+        arm, angle = 1 / rate - points[:, 0], rate * points[:, 2]
+        return np.stack([1 / rate - arm * np.cos(angle), points[:, 1], arm * np.sin(angle)], axis=1)
 
     return fine.warp_batch(bend)
 
@@ -459,6 +477,18 @@ def is_usable(solid: Manifold) -> bool:
     return solid.volume() > MIN_VOLUME
 
 
+def without_crumbs(mesh: TriMesh) -> TriMesh:
+    """Drop the pieces, and fill the cavities, of less than 2 % of the largest piece's volume."""
+    edges = mesh.faces[:, [0, 1, 2]], mesh.faces[:, [1, 2, 0]]
+    links = coo_array((np.ones(mesh.faces.size), [side.ravel() for side in edges]))
+    piece = connected_components(links, directed=False)[1][mesh.faces[:, 0]]
+    volumes = np.abs(np.bincount(piece, np.linalg.det(mesh.vertices[mesh.faces])))
+    used, faces = np.unique(
+        mesh.faces[(volumes > 0.02 * volumes.max())[piece]], return_inverse=True
+    )
+    return TriMesh(mesh.vertices[used], faces.reshape(-1, 3))
+
+
 def random_solid(rng: np.random.Generator) -> TriMesh:
     """Draw a closed solid that does not intersect itself, outward faces.
 
@@ -473,6 +503,10 @@ def random_solid(rng: np.random.Generator) -> TriMesh:
     for _ in range(ATTEMPTS):
         solid = draw_candidate(rng)
         if is_usable(solid):
-            mesh = unit_sized(solid).to_mesh64()
-            return TriMesh(np.array(mesh.vert_properties[:, :3]), mesh.tri_verts.astype(np.int64))
+            drawn = solid.to_mesh64()
+            vertices, faces = drawn.vert_properties[:, :3], drawn.tri_verts.astype(np.int64)
+            mesh = without_crumbs(TriMesh(vertices, faces))
+            low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+            scale = 1 / float(np.linalg.norm(high - low))
+            return mesh.transformed(scale * np.eye(3), -scale * (low + high) / 2)
     raise RuntimeError(f"none of {ATTEMPTS} drawn solids was usable; draw from another seed")

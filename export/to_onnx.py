@@ -79,7 +79,8 @@ def build_graph(net: SuperSdfNet) -> onnx.GraphProto:
     rows = graph.op("Shape", "patches", start=0, end=1)
     chunks = chunked_table(graph, rows)
     for number, block in enumerate(net.blocks):
-        features = graph.op("Add", features, scan_block(graph, number, block, features, chunks, rows))
+        change = scan_block(graph, number, block, features, chunks, rows)
+        features = graph.op("Add", features, change)
     chosen = graph.op("Gather", features, "voxels", axis=0)
     branch = graph.relu(graph.layer(chosen, net.branch))
     patches = graph.op("Gather", "patches", "voxels", axis=0)

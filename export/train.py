@@ -22,7 +22,7 @@ from torch import Tensor
 
 from export.dataset import Sample, read_shard
 from export.network import NetworkConfig, SuperSdfNet
-from super_sdf.band import CENTRE, NEIGHBOURHOOD, find_band, gather_patches, neighbour_table
+from super_sdf.band import NEIGHBOURHOOD, find_band, gather_patches, neighbour_table
 
 PEAK_RATE = 2e-3  # ten times less is too slow, three times more diverges
 WARM_UP = 0.02  # share of the budget
@@ -192,8 +192,11 @@ def held_out_error(net: SuperSdfNet, samples: list[Prepared]) -> float:
 def train(run: Run, store: Store, minutes: float, seed: int) -> None:
     """Train until the budget is spent."""
     rng = np.random.default_rng([seed, run.step])
-    held_out = [prepare(s) for path in sorted(store.folder.glob("shard-*.npz"))[:HELD_OUT]
-                for s in read_shard(path)]
+    held_out = [
+        prepare(s)
+        for path in sorted(store.folder.glob("shard-*.npz"))[:HELD_OUT]
+        for s in read_shard(path)
+    ]
     store.refresh()
     saved, errors = time.monotonic(), []
     while run.seconds < 60 * minutes:
@@ -212,8 +215,9 @@ def train(run: Run, store: Store, minutes: float, seed: int) -> None:
 
 def log(run: Run, samples: int, error: float, held_out: list[Prepared]) -> None:
     """Append a line to the log and print it."""
-    held = held_out_error(run.average, held_out) if run.step % (10 * LOG_STEPS) == 0 else float("nan")
-    row = [run.step, round(run.seconds), samples, f"{error:.5f}", f"{held:.5f}"]
+    seldom = run.step % (10 * LOG_STEPS) == 0
+    held = f"{held_out_error(run.average, held_out):.5f}" if seldom else ""
+    row = [run.step, round(run.seconds), samples, f"{error:.5f}", held]
     with (run.path.parent / "log.csv").open("a", newline="") as file:
         csv.writer(file).writerow(row)
     print("step {} seconds {} samples {} error {} held-out {}".format(*row), flush=True)

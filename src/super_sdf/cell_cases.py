@@ -86,14 +86,14 @@ def _triangulate(loop: list[int]) -> list[tuple[int, int, int]]:
         if all(len(part) == 2 or not _share_face(part[0], part[-1]) for part in (left, right)):
             try:
                 parts = _triangulate(left) + _triangulate(right)
-            except _NoTriangulation:
+            except _CannotCutError:
                 continue
             return [(first, loop[middle], last), *parts]
-    raise _NoTriangulation
+    raise _CannotCutError
 
 
-class _NoTriangulation(Exception):
-    """This part of a loop cannot be cut; another middle may do."""
+class _CannotCutError(Exception):
+    """Raised for a part of a loop that cannot be cut; another middle may do."""
 
 
 def _share_face(a: int, b: int) -> bool:

@@ -106,7 +106,7 @@ def check_values(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _check_finite(values: NDArray[Any]) -> None:
-    """Raise on the first plane with a NaN or an infinity (plane by plane: the grid may be mapped)."""
+    """Raise on the first NaN or infinity; plane by plane, for the grid may be a mapped file."""
     for i, plane in enumerate(values):
         bad = np.argwhere(~np.isfinite(plane))
         if len(bad):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, triangle_table
 from .field import FineField
-from .grid import FloatArray, IntArray, SdfGrid
+from .grid import BoolArray, FloatArray, IntArray, SdfGrid
 from .mesh import Mesh
 from .nodes import block_ijk
 
@@ -46,8 +46,8 @@ def _crossed_blocks(field: FineField) -> NDArray[np.int64]:
 
 
 def _edge_vertices(
-    field: FineField, numbers: IntArray, voxel_ijk: IntArray, inside: NDArray[np.bool_]
-) -> tuple[IntArray, FloatArray]:
+    field: FineField, numbers: IntArray, voxel_ijk: IntArray, inside: BoolArray
+) -> tuple[IntArray, NDArray[np.float64]]:
     """Put a vertex on every lattice edge whose ends are on different sides.
 
     Returns
@@ -83,7 +83,7 @@ def _edge_vertices(
 
 
 def _crossed_edges(
-    inside: NDArray[np.bool_], axis: int
+    inside: BoolArray, axis: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Return voxel, first and last block node of each edge along an axis that is crossed."""
     side = inside.shape[1]
@@ -106,7 +106,7 @@ def _onto_border(position: NDArray[np.float64], lattice: NDArray[np.int64]) -> N
     return np.clip(position, -CAP_HEIGHT, lattice + CAP_HEIGHT)
 
 
-def _triangles(inside: NDArray[np.bool_], numbers: IntArray, vertex_at: IntArray) -> IntArray:
+def _triangles(inside: BoolArray, numbers: IntArray, vertex_at: IntArray) -> IntArray:
     """Return the triangles of all cells, in the order of voxels and cells."""
     factor = inside.shape[1] - 1
     case = np.zeros((len(inside),) + (factor,) * 3, np.uint8)
@@ -124,12 +124,11 @@ def _triangles(inside: NDArray[np.bool_], numbers: IntArray, vertex_at: IntArray
     step = np.array([(factor + 1) ** 2, factor + 1, 1])
     start = (CORNERS @ step)[np.array(EDGE_START)]
     node = numbers[voxel[of_triangle, None], low_node[of_triangle, None] + start[edges]]
-    return vertex_at[3 * node.astype(np.int64) + np.array(EDGE_AXIS)[edges]]
+    faces: IntArray = vertex_at[3 * node.astype(np.int64) + np.array(EDGE_AXIS)[edges]]
+    return faces
 
 
-def _low_nodes(
-    cell: NDArray[np.int64], factor: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _low_nodes(cell: NDArray[np.int64], factor: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the voxel of each cell, and the block node at the cell's low corner."""
     voxel, within = np.divmod(cell, factor**3)
     x, rest = np.divmod(within, factor**2)

@@ -130,7 +130,7 @@ def _open_session(path: Path, providers: list[str], threads: int) -> ort.Inferen
         return ort.InferenceSession(str(path), options, providers=providers)
     except Exception as error:  # onnxruntime's errors have no common base but this
         reason = str(error).strip().splitlines()[0]
-        raise ModelError(f"{path} is not an ONNX file that onnxruntime can run: {reason}") from error
+        raise ModelError(f"{path} is no ONNX file that onnxruntime can run: {reason}") from error
 
 
 def _read_card(session: ort.InferenceSession, path: Path) -> dict[str, Any]:

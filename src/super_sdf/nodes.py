@@ -108,9 +108,7 @@ def keep_samples(values: FloatArray, numbers: IntArray, samples: FloatArray) -> 
     values[numbers[:, numbers.shape[1] // 2]] = samples
 
 
-def pin_to_skipped(
-    values: FloatArray, numbers: IntArray, skipped: IntArray, factor: int
-) -> int:
+def pin_to_skipped(values: FloatArray, numbers: IntArray, skipped: IntArray, factor: int) -> int:
     """Give nodes shared with a voxel that was not decoded that voxel's sign.
 
     Such a voxel holds no surface, so all its nodes have its sign; with this no sign change can

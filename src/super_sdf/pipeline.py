@@ -130,11 +130,16 @@ def reconstruct(
         network = load_network()
     field = upsample(grid, network, factor, offset=offset, progress=progress)
     if cap:
-        field = close_at_border(field, rescale(grid, offset) <= 0)
+        field = close_at_border(field, inside_samples(grid, offset))
     mesh = extract_mesh(field, grid)
     if progress:
         progress(len(STEPS), len(STEPS))
     return mesh
+
+
+def inside_samples(grid: SdfGrid, offset: float = 0.0) -> BoolArray:
+    """Return which samples, (nx, ny, nz), are inside the surface at a distance ``offset``."""
+    return np.less_equal(rescale(grid, offset), 0)
 
 
 def check_both_sides(rescaled: FloatArray, grid: SdfGrid, offset: float) -> None:
@@ -160,6 +165,6 @@ def skipped_neighbours(
 ) -> IntArray:
     """Return the sign, (D, 27), of each neighbour in the grid that was not decoded, else 0."""
     around = voxel_ijk[:, None] + NEIGHBOURHOOD
-    in_grid: BoolArray = ((around >= 0) & (around < np.array(shape))).all(2)
+    in_grid = np.logical_and(around >= 0, around < np.array(shape)).all(axis=2)
     sign = np.where(patches > 0, 1, -1)
     return np.where((own_table < 0) & in_grid, sign, 0).astype(np.int32)

@@ -1,0 +1,207 @@
+"""What an array says of itself: which sign is inside, and how far apart the samples are.
+
+A distance field says both. The border of a grid is outside; and wherever the field is smooth its
+gradient has length 1, so its change from sample to sample, near the surface, is the spacing.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import GridError, OptionError
+from .grid import SdfGrid, Triple, check_spacing, check_values
+
+INSIDE = ("auto", "negative", "positive")
+SNAP = 0.02  # an estimate this near to a usual spacing is taken for it
+TOLERATED, REFUSED = 1.1, 2.0  # ratio of measured to given spacing: noted beyond, refused beyond
+UNEQUAL = 1.2  # ratio of the spacings along two axes that the values themselves show
+ENOUGH = 30  # samples for a statement about one axis
+
+
+def make_grid(
+    values: NDArray[Any],
+    *,
+    spacing: Any = None,
+    origin: Any = None,
+    inside: str = "auto",
+    level: float = 0.0,
+) -> SdfGrid:
+    """Make a grid from an array of signed distances, inferring what is not given.
+
+    Parameters
+    ----------
+    values : (nx, ny, nz) array
+        Signed distances.
+    spacing : number or three, optional
+        World distance between samples; estimated from the gradient if not given.
+    origin : three numbers, optional
+        World position of sample (0, 0, 0); the world's origin if not given.
+    inside : {"auto", "negative", "positive"}
+        The sign of samples inside the solid; "auto" takes the border of the grid for outside.
+    level : float
+        The surface is where ``values == level``, after the sign was made negative inside.
+
+    Returns
+    -------
+    SdfGrid
+        Negative inside; ``notes`` says what was inferred.
+
+    Raises
+    ------
+    GridError
+        If the values are no signed distances, or contradict the spacing.
+    """
+    values = check_values(values)
+    check_signed_distances(values, level)
+    notes: list[str] = []
+    if _is_positive_inside(values, inside, level, notes):
+        values = -values.astype(np.promote_types(values.dtype, np.float32))
+    gradients = surface_gradients(values, level)
+    measured = typical_length(gradients)
+    _check_equal_axes(gradients)
+    if spacing is None:
+        chosen = _infer_spacing(measured, values.shape, notes)
+    else:
+        chosen = check_spacing(spacing)
+        _check_unit(measured, chosen, notes)
+    if origin is None:
+        notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
+    return SdfGrid(values, chosen, (0.0, 0.0, 0.0) if origin is None else origin, tuple(notes))
+
+
+def check_signed_distances(values: NDArray[Any], level: float = 0.0) -> None:
+    """Raise if the values are constant, an occupancy grid, or on one side of the level."""
+    low, high = values.min(), values.max()
+    if low == high:
+        raise GridError(f"every value is {low:.6g}: a constant field has no surface")
+    if min(values.shape) > 2 and all(((p == low) | (p == high)).all() for p in values):
+        raise GridError(
+            f"the only values are {low:.6g} and {high:.6g}: an occupancy grid holds no distances; "
+            "make them with scipy.ndimage.distance_transform_edt"
+        )
+    if low >= level:
+        raise GridError(
+            f"no value is below {level:g} (the smallest is {low:.6g}): an unsigned field has no "
+            "inside, and a grid that misses the solid has no surface"
+        )
+    if high <= level:
+        raise GridError(
+            f"no value is above {level:g} (the largest is {high:.6g}): the grid lies within the "
+            "solid and has no surface"
+        )
+
+
+def _is_positive_inside(values: NDArray[Any], inside: str, level: float, notes: list[str]) -> bool:
+    """Say whether the values are positive inside, by word or by what the border is."""
+    if inside not in INSIDE:
+        raise OptionError(f"inside is {inside!r}: give one of {', '.join(INSIDE)}")
+    if inside != "auto":
+        return inside == "positive"
+    faces = [values.take(end, axis=axis) for axis in range(3) for end in (0, -1)]
+    below = sum(int((face < level).sum()) for face in faces)
+    total = sum(int(face.size) for face in faces)
+    positive = bool(2 * below > total)
+    share = max(below, total - below) / total
+    if positive or share < 1:
+        sign = "positive" if positive else "negative"
+        notes.append(
+            f"{sign} values are taken as inside: {share:.0%} of the grid's border has the other "
+            "sign (say otherwise with --inside)"
+        )
+    return positive
+
+
+def surface_gradients(values: NDArray[Any], level: float = 0.0) -> NDArray[np.float64]:
+    """Return index-space gradients, (n, 3), at samples next to the surface.
+
+    Central differences, at the half of the samples where the field is most nearly linear: thin
+    walls, edges and noise bend it, and would make the gradient too small or too large. At most 64
+    planes are looked at.
+    """
+    planes = np.unique(np.linspace(0, len(values) - 1, 64).astype(int))
+    found = [_plane_gradients(values, int(i), level) for i in planes]
+    gradients, bend = (np.concatenate(parts) for parts in zip(*found))
+    keep: NDArray[np.float64] = gradients[bend <= np.median(bend)] if len(bend) else gradients
+    return keep
+
+
+def _plane_gradients(
+    values: NDArray[Any], i: int, level: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return gradients (n, 3) and second differences (n,) next to the surface in plane i."""
+    first = max(i - 1, 0)
+    slab = values[first : i + 2].astype(np.float64) - level
+    inside = slab <= 0
+    near = np.zeros(slab.shape, bool)
+    bend = np.zeros(slab.shape)
+    for axis in range(3):
+        s, d, n, b = (np.moveaxis(a, axis, 0) for a in (inside, slab, near, bend))
+        crossed = s[1:] != s[:-1]
+        n[1:] |= crossed
+        n[:-1] |= crossed
+        b[1:-1] += np.abs(d[2:] - 2 * d[1:-1] + d[:-2])
+    chosen = near[i - first]
+    gradient = np.asarray(np.gradient(slab))[:, i - first][:, chosen].T
+    return gradient, bend[i - first][chosen]
+
+
+def typical_length(gradients: NDArray[np.float64]) -> float:
+    """Return the length round which the gradients cluster (their half-sample mode).
+
+    Reference: Bickel and Frühwirth, "On a fast, robust estimator of the mode", 2006.
+    """
+    length: NDArray[np.float64] = np.sort(np.sqrt((gradients**2).sum(1)))
+    while len(length) > 2:
+        half = (len(length) + 1) // 2
+        width = length[half - 1 :] - length[: len(length) - half + 1]
+        start = int(width.argmin())
+        length = length[start : start + half]
+    return float(length.mean())
+
+
+def _check_equal_axes(gradients: NDArray[np.float64]) -> None:
+    """Raise if the values themselves show different spacings along the axes."""
+    length = np.sqrt((gradients**2).sum(1))
+    seen: dict[str, float] = {}
+    for axis, name in enumerate("xyz"):
+        along = length[np.abs(gradients[:, axis]) > 0.95 * length]
+        if len(along) >= ENOUGH:
+            seen[name] = float(np.median(along))
+    if seen and max(seen.values()) > UNEQUAL * min(seen.values()):
+        steps = ", ".join(f"{step:.4g} along {name}" for name, step in seen.items())
+        raise GridError(
+            f"the values change by {steps} from sample to sample: the method needs cubic voxels; "
+            "resample the grid to one spacing on all axes"
+        )
+
+
+def _infer_spacing(measured: float, shape: tuple[int, ...], notes: list[str]) -> Triple:
+    """Return the measured spacing, or the usual one that it is close to."""
+    n = max(shape)
+    usual = {"1": 1.0, f"1/{n}": 1 / n, f"1/{n - 1}": 1 / (n - 1)}
+    usual |= {f"2/{n}": 2 / n, f"2/{n - 1}": 2 / (n - 1)}
+    name = min(usual, key=lambda key: abs(np.log(usual[key] / measured)))
+    if abs(measured / usual[name] - 1) <= SNAP:
+        notes.append(f"spacing not given: taken as {name}, the values show {measured:.6g}")
+        return (usual[name],) * 3
+    notes.append(
+        f"spacing not given: estimated as {measured:.6g} from the values, so the size of the mesh "
+        "is approximate (give --spacing)"
+    )
+    return (measured,) * 3
+
+
+def _check_unit(measured: float, spacing: Triple, notes: list[str]) -> None:
+    """Raise or note if the values contradict the given spacing."""
+    ratio = measured / (sum(spacing) / 3)
+    said = f"the values change by {measured:.6g} from sample to sample, but spacing is "
+    if not 1 / REFUSED <= ratio <= REFUSED:
+        raise GridError(
+            f"{said}{spacing[0]:.6g}: distances and spacing must be in one unit; "
+            f"scale the values by {1 / ratio:.6g} or give another --spacing"
+        )
+    if not 1 / TOLERATED <= ratio <= TOLERATED:
+        notes.append(f"{said}{spacing[0]:.6g}: they are no exact distances, or the unit is wrong")

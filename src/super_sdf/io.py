@@ -1,0 +1,228 @@
+"""Grids from files, meshes to files. Files are checked before they are read, and appear whole.
+
+Grids: ``.npy`` (an array) and ``.npz`` (keys ``values``, and optionally ``spacing``, ``origin``).
+Meshes: ``.ply`` written here in chunks; ``.stl .obj .off .glb .3mf`` by trimesh.
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from math import prod
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from .conventions import make_grid
+from .errors import FileError, GridError, OptionError
+from .grid import SdfGrid
+from .mesh import Mesh
+
+GRID_SUFFIXES = (".npy", ".npz")
+MESH_SUFFIXES = (".ply", ".stl", ".obj", ".off", ".glb", ".3mf")
+NPZ_KEYS = ("values", "spacing", "origin")
+# The pipeline's own arrays over the coarse grid: rescaled, padded, and their masks.
+WORK_BYTES_PER_SAMPLE = 16
+CHUNK = 1 << 20  # vertices or faces written at a time
+
+
+def read_grid(
+    path: str | Path,
+    *,
+    spacing: Any = None,
+    origin: Any = None,
+    inside: str = "auto",
+    level: float = 0.0,
+) -> SdfGrid:
+    """Read a grid; ``spacing`` and ``origin`` go before those in the file. See ``make_grid``.
+
+    An ``.npy`` file is mapped, not loaded.
+
+    Raises
+    ------
+    FileError
+        If the file is missing, damaged, truncated, of another kind, or larger than memory.
+    GridError
+        If its values are no signed distance grid.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in GRID_SUFFIXES:
+        raise OptionError(f"{path} is no grid file: give {' or '.join(GRID_SUFFIXES)}")
+    try:
+        found = _read_npy(path) if path.suffix.lower() == ".npy" else _read_npz(path)
+    except FileNotFoundError:
+        raise FileError(f"{path} does not exist") from None
+    except IsADirectoryError:
+        raise FileError(f"{path} is a folder: give a file") from None
+    except PermissionError:
+        raise FileError(f"{path} cannot be read: permission denied") from None
+    given = {"spacing": spacing, "origin": origin}
+    chosen = {key: found.get(key) if own is None else own for key, own in given.items()}
+    return make_grid(found["values"], inside=inside, level=level, **chosen)
+
+
+def _read_npy(path: Path) -> dict[str, NDArray[Any]]:
+    """Map the array of an .npy file."""
+    with path.open("rb") as file:
+        shape, dtype = _read_header(file, str(path))
+        follow = path.stat().st_size - file.tell()
+    _check_promise(shape, dtype, follow, str(path))
+    return {"values": np.load(path, mmap_mode="r", allow_pickle=False)}
+
+
+def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
+    """Read the known arrays of an .npz file."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [name.removesuffix(".npy") for name in archive.namelist()]
+            if "values" not in names:
+                held = ", ".join(names) or "nothing"
+                raise FileError(f"{path} has no key 'values' (it holds {held})")
+            return {key: _read_member(archive, key, path) for key in NPZ_KEYS if key in names}
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+        if isinstance(error, FileError):
+            raise
+        raise FileError(f"{path} is no readable .npz archive: {error}") from None
+
+
+def _read_member(archive: zipfile.ZipFile, key: str, path: Path) -> NDArray[Any]:
+    """Read one array of an archive, after its size was checked."""
+    name = f"{path}[{key}]"
+    member = archive.getinfo(f"{key}.npy")
+    with archive.open(member) as file:
+        shape, dtype = _read_header(file, name)
+        if key != "values" and prod(shape) > 3:
+            raise GridError(f"{name} has shape {shape}: give one number or three")
+        _check_promise(shape, dtype, member.file_size - file.tell(), name, loaded=True)
+    with archive.open(member) as file:
+        array: NDArray[Any] = npy.read_array(file, allow_pickle=False)
+    return array
+
+
+def _read_header(file: IO[bytes], name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Return shape and dtype that an .npy header declares."""
+    readers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+    try:
+        shape, _, dtype = readers[npy.read_magic(file)](file)
+    except (ValueError, KeyError, EOFError):
+        raise FileError(f"{name} is no .npy array: its header cannot be read") from None
+    if dtype.hasobject:
+        raise FileError(f"{name} holds Python objects: save the numbers alone")
+    return shape, dtype
+
+
+def _check_promise(
+    shape: tuple[int, ...], dtype: np.dtype[Any], follow: int, name: str, loaded: bool = False
+) -> None:
+    """Raise if an array is longer than its file or than memory allows, before it is read."""
+    size = prod(shape) * dtype.itemsize
+    said = f"{' x '.join(map(str, shape))} {dtype}, {size:,} bytes"
+    if size > follow:
+        raise FileError(f"{name} is truncated: its header promises {said}, but {follow:,} follow")
+    need = prod(shape) * WORK_BYTES_PER_SAMPLE + size * loaded
+    free = free_memory()
+    if free is not None and need > free:
+        raise FileError(
+            f"{name} is too large: {said}, needs {need / 1e9:,.1f} GB of memory, "
+            f"{free / 1e9:,.1f} GB are free; cut it into pieces"
+        )
+
+
+def free_memory() -> int | None:
+    """Return the bytes of memory that are free, None where the system does not say."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    sizes = dict(line.split(":") for line in lines)
+    return int(sizes["MemAvailable"].split()[0]) * 1024 if "MemAvailable" in sizes else None
+
+
+def check_target(path: str | Path, *, force: bool = False) -> Path:
+    """Return the path of a mesh file to be if it can be written; asked before the work starts."""
+    path = Path(path)
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise OptionError(f"{path} is no mesh file: give one of {', '.join(MESH_SUFFIXES)}")
+    if path.is_dir():
+        raise FileError(f"{path} is a folder: give a file")
+    if path.exists() and not force:
+        raise FileError(f"{path} exists: remove it or use --force")
+    if not path.parent.is_dir():
+        raise FileError(f"{path.parent} is no folder: make it first")
+    if not os.access(path.parent, os.W_OK):
+        raise FileError(f"{path} cannot be written: no permission in {path.parent}")
+    return path
+
+
+def write_mesh(mesh: Mesh, path: str | Path, *, force: bool = False) -> None:
+    """Write a mesh; the suffix tells the format.
+
+    Raises
+    ------
+    OptionError
+        If the suffix is unknown.
+    FileError
+        If the file exists and ``force`` is not set, or cannot be written.
+    """
+    path = check_target(path, force=force)
+    try:
+        with _replacing(path) as part:
+            if path.suffix.lower() == ".ply":
+                _write_ply(mesh, part)
+            else:
+                _write_by_trimesh(mesh, part, path.suffix.lower()[1:])
+    except FileError:
+        raise
+    except OSError as error:
+        raise FileError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
+@contextmanager
+def _replacing(path: Path) -> Iterator[Path]:
+    """Yield a path beside the target; it takes the target's place only if all goes well."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        yield part
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _write_ply(mesh: Mesh, path: Path) -> None:
+    """Write binary little-endian PLY."""
+    number = "double" if mesh.vertices.dtype == np.float64 else "float"
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment made by super-sdf",
+        f"element vertex {len(mesh.vertices)}",
+        *(f"property {number} {axis}" for axis in "xyz"),
+        f"element face {len(mesh.faces)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+    ]
+    row = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
+    with path.open("wb") as file:
+        file.write(("\n".join(header) + "\n").encode("ascii"))
+        for start in range(0, len(mesh.vertices), CHUNK):
+            chunk = mesh.vertices[start : start + CHUNK]
+            file.write(chunk.astype(chunk.dtype.newbyteorder("<")).tobytes())
+        for start in range(0, len(mesh.faces), CHUNK):
+            corners = mesh.faces[start : start + CHUNK]
+            rows = np.empty(len(corners), row)
+            rows["count"], rows["corners"] = 3, corners
+            file.write(rows.tobytes())
+
+
+def _write_by_trimesh(mesh: Mesh, path: Path, file_type: str) -> None:
+    """Write one of trimesh's formats."""
+    import trimesh
+
+    copy = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    copy.export(path, file_type=file_type)
