@@ -17,7 +17,7 @@ from .grid import SdfGrid, Triple, check_spacing, check_values
 INSIDE = ("auto", "negative", "positive")
 SNAP = 0.02  # an estimate this near to a usual spacing is taken for it
 TOLERATED, REFUSED = 1.1, 2.0  # ratio of measured to given spacing: noted beyond, refused beyond
-UNEQUAL = 1.2  # ratio of the spacings along two axes that the values themselves show
+UNEQUAL = 1.3  # ratio of the spacings along two axes that the values themselves show
 ENOUGH = 30  # samples for a statement about one axis
 
 
@@ -59,9 +59,9 @@ def make_grid(
     notes: list[str] = []
     if _is_positive_inside(values, inside, level, notes):
         values = -values.astype(np.promote_types(values.dtype, np.float32))
-    gradients = surface_gradients(values, level)
-    measured = typical_length(gradients)
-    _check_equal_axes(gradients)
+    gradients, bend = surface_gradients(values, level)
+    measured = typical_length(gradients, bend)
+    _check_equal_axes(gradients, bend)
     if spacing is None:
         chosen = _infer_spacing(measured, values.shape, notes)
     else:
@@ -114,24 +114,27 @@ def _is_positive_inside(values: NDArray[Any], inside: str, level: float, notes: 
     return positive
 
 
-def surface_gradients(values: NDArray[Any], level: float = 0.0) -> NDArray[np.float64]:
-    """Return index-space gradients, (n, 3), at samples next to the surface.
+def surface_gradients(
+    values: NDArray[Any], level: float = 0.0
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return index-space gradients at samples next to the surface, and how bent the field is there.
 
-    Central differences, at the half of the samples where the field is most nearly linear: thin
-    walls, edges and noise bend it, and would make the gradient too small or too large. At most 64
-    planes are looked at.
+    Returns
+    -------
+    (n, 3) and (n,) float64
+        Central differences; and the sum of the second differences over the gradient's length. At
+        most 64 planes are looked at.
     """
     planes = np.unique(np.linspace(0, len(values) - 1, 64).astype(int))
     found = [_plane_gradients(values, int(i), level) for i in planes]
     gradients, bend = (np.concatenate(parts) for parts in zip(*found))
-    keep: NDArray[np.float64] = gradients[bend <= np.median(bend)] if len(bend) else gradients
-    return keep
+    return gradients, bend
 
 
 def _plane_gradients(
     values: NDArray[Any], i: int, level: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return gradients (n, 3) and second differences (n,) next to the surface in plane i."""
+    """Return gradients (n, 3) and their relative change (n,) next to the surface in plane i."""
     first = max(i - 1, 0)
     slab = values[first : i + 2].astype(np.float64) - level
     inside = slab <= 0
@@ -145,15 +148,19 @@ def _plane_gradients(
         b[1:-1] += np.abs(d[2:] - 2 * d[1:-1] + d[:-2])
     chosen = near[i - first]
     gradient = np.asarray(np.gradient(slab))[:, i - first][:, chosen].T
-    return gradient, bend[i - first][chosen]
+    length = np.sqrt((gradient**2).sum(1))
+    return gradient, bend[i - first][chosen] / np.maximum(length, np.finfo(float).tiny)
 
 
-def typical_length(gradients: NDArray[np.float64]) -> float:
-    """Return the length round which the gradients cluster (their half-sample mode).
+def typical_length(gradients: NDArray[np.float64], bend: NDArray[np.float64]) -> float:
+    """Return the length round which the gradients (n, 3) cluster: their half-sample mode.
 
+    Only the straighter half counts: thin walls, edges and noise bend the field, and make its
+    gradient too small or too large.
     Reference: Bickel and Frühwirth, "On a fast, robust estimator of the mode", 2006.
     """
-    length: NDArray[np.float64] = np.sort(np.sqrt((gradients**2).sum(1)))
+    straight = gradients[bend <= np.median(bend)]
+    length: NDArray[np.float64] = np.sort(np.sqrt((straight**2).sum(1)))
     while len(length) > 2:
         half = (len(length) + 1) // 2
         width = length[half - 1 :] - length[: len(length) - half + 1]
@@ -162,14 +169,14 @@ def typical_length(gradients: NDArray[np.float64]) -> float:
     return float(length.mean())
 
 
-def _check_equal_axes(gradients: NDArray[np.float64]) -> None:
+def _check_equal_axes(gradients: NDArray[np.float64], bend: NDArray[np.float64]) -> None:
     """Raise if the values themselves show different spacings along the axes."""
     length = np.sqrt((gradients**2).sum(1))
     seen: dict[str, float] = {}
     for axis, name in enumerate("xyz"):
-        along = length[np.abs(gradients[:, axis]) > 0.95 * length]
-        if len(along) >= ENOUGH:
-            seen[name] = float(np.median(along))
+        along = np.abs(gradients[:, axis]) > 0.95 * length
+        if along.sum() >= ENOUGH:
+            seen[name] = typical_length(gradients[along], bend[along])
     if seen and max(seen.values()) > UNEQUAL * min(seen.values()):
         steps = ", ".join(f"{step:.4g} along {name}" for name, step in seen.items())
         raise GridError(

@@ -84,13 +84,15 @@ def upsample(
     OptionError
         If the factor is odd or out of range.
     GridError
-        If all samples are on one side of the surface.
+        If no surface is found: thin parts may pass between samples that are all outside, so this
+        is known only in the end.
     """
     check_factor(factor)
     tell = progress or (lambda done, total: None)
     rescaled = rescale(grid, offset)  # Eq. 4
-    check_both_sides(rescaled, grid, offset)
     band_ijk = find_band(rescaled)  # Eq. 2
+    if not len(band_ijk):
+        raise no_surface(grid, offset)
     patches = gather_patches(rescaled, band_ijk)
     table = neighbour_table(band_ijk, grid.shape)
     voxels = np.flatnonzero(can_hold_surface(patches)).astype(np.int32)
@@ -106,6 +108,8 @@ def upsample(
     keep_samples(values, numbers, rescaled[tuple(voxel_ijk.T)])
     skipped = skipped_neighbours(own_table, patches[voxels], voxel_ijk, grid.shape)
     pinned = pin_to_skipped(values, numbers, skipped, factor)
+    if (values > 0).all() or (values <= 0).all():
+        raise no_surface(grid, offset)
     tell(3, len(STEPS))
     return FineField(grid.shape, factor, voxel_ijk, numbers, values, len(band_ijk), pinned)
 
@@ -142,14 +146,10 @@ def inside_samples(grid: SdfGrid, offset: float = 0.0) -> BoolArray:
     return np.less_equal(rescale(grid, offset), 0)
 
 
-def check_both_sides(rescaled: FloatArray, grid: SdfGrid, offset: float) -> None:
-    """Raise if no sample, or every sample, is inside."""
-    inside = int((rescaled <= 0).sum())
-    if inside in (0, rescaled.size):
-        low, high = grid.values.min(), grid.values.max()
-        raise GridError(
-            f"no surface: the values go from {low:.6g} to {high:.6g} and never cross {offset:g}"
-        )
+def no_surface(grid: SdfGrid, offset: float) -> GridError:
+    """Return the error for a grid in which nothing is to be found."""
+    low, high = grid.values.min(), grid.values.max()
+    return GridError(f"no surface at {offset:g}: the values go from {low:.6g} to {high:.6g}")
 
 
 def neighbours_among(voxels: IntArray, table: IntArray) -> IntArray:

@@ -1,0 +1,116 @@
+"""Procedural solids: closed, outward, of the promised size, the same for the same seed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from manifold3d import Manifold
+
+from export import shapes
+from export.sampling import TriMesh
+from export.shapes import FAMILIES, MAX_FACES, log_uniform, random_solid, unit_sized, without_crumbs
+
+SEEDS = range(20)
+
+
+def directed_edges(mesh: TriMesh) -> np.ndarray:
+    """Return the directed edges of all faces, (3 m, 2)."""
+    return mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+
+
+def volume(mesh: TriMesh) -> float:
+    """Return the enclosed volume, positive if faces point outward."""
+    return float(np.linalg.det(mesh.vertices[mesh.faces]).sum() / 6)
+
+
+def as_mesh(solid: Manifold) -> TriMesh:
+    """Return vertices and faces of a solid."""
+    mesh = solid.to_mesh64()
+    return TriMesh(mesh.vert_properties[:, :3], mesh.tri_verts.astype(np.int64))
+
+
+def check_closed(mesh: TriMesh) -> None:
+    """Each directed edge occurs once, and so does its opposite; every vertex is used."""
+    edges = directed_edges(mesh)
+    there = {tuple(edge) for edge in edges.tolist()}
+    assert len(there) == len(edges)
+    assert there == {(b, a) for a, b in there}
+    assert np.array_equal(np.unique(mesh.faces), np.arange(len(mesh.vertices)))
+
+
+def check_size(mesh: TriMesh) -> None:
+    """The bounding box is centred at the origin and has a diagonal of 1."""
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    assert np.linalg.norm(high - low) == pytest.approx(1, abs=1e-12)
+    assert low == pytest.approx(-high, abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_random_solid(seed: int) -> None:
+    """Solids of many seeds keep every promise."""
+    mesh = random_solid(np.random.default_rng(seed))
+    assert mesh.vertices.dtype == np.float64 and mesh.faces.dtype == np.int64
+    assert np.isfinite(mesh.vertices).all()
+    assert 4 <= len(mesh.faces) <= MAX_FACES
+    check_closed(mesh)
+    check_size(mesh)
+    assert volume(mesh) > 5e-5
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_each_family_through_random_solid(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So do those of each family, with features and bends."""
+    monkeypatch.setattr(shapes, "FAMILIES", {name: FAMILIES[name]})
+    for seed in range(3):
+        mesh = random_solid(np.random.default_rng(seed))
+        check_closed(mesh)
+        check_size(mesh)
+        assert volume(mesh) > 0
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_family_alone_is_usually_usable(name: str) -> None:
+    """A family seldom draws what has to be drawn again."""
+    solids = [unit_sized(FAMILIES[name](np.random.default_rng(seed))) for seed in range(8)]
+    assert sum(shapes.is_usable(solid) for solid in solids) >= 6
+
+
+def test_same_seed_same_solid() -> None:
+    """Vertices and faces are equal to the last bit."""
+    for seed in range(8):
+        first, second = (random_solid(np.random.default_rng(seed)) for _ in range(2))
+        assert np.array_equal(first.vertices, second.vertices)
+        assert np.array_equal(first.faces, second.faces)
+
+
+def test_stream_of_solids_varies() -> None:
+    """One generator gives a new solid each time."""
+    rng = np.random.default_rng(0)
+    volumes = [round(volume(random_solid(rng)), 6) for _ in range(10)]
+    assert len(set(volumes)) == 10
+
+
+def test_gives_up_on_unusable_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The search is bounded and ends in an error."""
+    monkeypatch.setattr(shapes, "FAMILIES", {"nothing": lambda rng: Manifold()})
+    with pytest.raises(RuntimeError, match="none of 20"):
+        random_solid(np.random.default_rng(0))
+
+
+def test_crumbs_go_and_cavities_stay() -> None:
+    """A small loose piece goes; a cavity, a piece of its own to the faces, stays."""
+    box = Manifold.cube([1, 1, 1], True)
+    hollow = box - box.scale([0.8, 0.8, 0.8])
+    crumb = Manifold.cube([0.1, 0.1, 0.1]).translate([2, 0, 0])
+    mesh = without_crumbs(as_mesh(hollow + crumb))
+    check_closed(mesh)
+    assert volume(mesh) == pytest.approx(1 - 0.8**3)
+    assert mesh.vertices.max() == 0.5
+
+
+def test_log_uniform_stays_between() -> None:
+    """Draws stay in range, with the geometric mean as their median."""
+    rng = np.random.default_rng(0)
+    drawn = [log_uniform(rng, 0.01, 1) for _ in range(400)]
+    assert min(drawn) >= 0.01 and max(drawn) <= 1
+    assert np.median(drawn) == pytest.approx(0.1, rel=0.3)

@@ -1,0 +1,73 @@
+"""Fields with known surfaces, and a network whose answer is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from super_sdf import SdfGrid
+from super_sdf.band import NEIGHBOURHOOD
+
+
+def trilinear(
+    patches: np.ndarray, table: np.ndarray, voxels: np.ndarray, offsets: np.ndarray
+) -> np.ndarray:
+    """Stand in for the network: trilinear interpolation of the patch, exact on linear fields."""
+    distance = np.abs(offsets[:, None] / 2 - NEIGHBOURHOOD)
+    weights = np.clip(1 - distance, 0, None).prod(2)
+    return (patches[voxels] @ weights.T).astype(np.float32)
+
+
+def ball(n: int = 20, radius: float = 6.0, shape: tuple[int, int, int] | None = None) -> SdfGrid:
+    """A ball in the middle of a grid of spacing 1, a little off the samples."""
+    ijk = np.indices(shape or (n, n, n)).astype(np.float64)
+    middle = np.array(ijk.shape[1:])[:, None, None, None] / 2 - 0.37
+    values = np.linalg.norm(ijk - middle, axis=0) - radius
+    return SdfGrid(values.astype(np.float32), (1.0, 1.0, 1.0))
+
+
+def walled(values: np.ndarray) -> np.ndarray:
+    """Make the outer two layers of a field as far outside as anything, so no surface leaves."""
+    out = np.full_like(values, np.abs(values).max() + 1)
+    out[2:-2, 2:-2, 2:-2] = values[2:-2, 2:-2, 2:-2]
+    return out
+
+
+def count_fans(faces: np.ndarray) -> np.ndarray:
+    """Return for each used vertex how many closed fans of triangles meet there: 1 in a manifold."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    turns = np.concatenate([np.roll(faces, shift, axis=1) for shift in range(3)]).astype(np.int64)
+    size = faces.max() + 1
+    keys, spoke = np.unique(
+        np.concatenate([turns[:, 0] * size + turns[:, 1], turns[:, 0] * size + turns[:, 2]]),
+        return_inverse=True,
+    )
+    pairs = spoke.reshape(2, -1)
+    graph = coo_matrix((np.ones(len(turns)), pairs), shape=(len(keys),) * 2)
+    _, fan = connected_components(graph, directed=False)
+    _, first = np.unique(fan, return_index=True)
+    return np.bincount(keys[first] // size)[np.unique(faces)]
+
+
+@pytest.fixture
+def command(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., tuple[int, str, str]]:
+    """Run the command line in this process; return exit code, stdout and stderr."""
+    from super_sdf.cli import main
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr("sys.argv", ["super-sdf", *map(str, arguments)])
+        code = 0
+        try:
+            main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return run

@@ -1,0 +1,272 @@
+"""The command line: what it prints, its exit codes, and bad input of every kind."""
+
+import json
+import os
+import zipfile
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+import trimesh
+from conftest import ball
+
+import super_sdf
+from super_sdf import cli
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A folder of its own with a good grid in it."""
+    monkeypatch.chdir(tmp_path)
+    np.save("in.npy", ball().values)
+    return tmp_path
+
+
+def test_the_main_job(here, command):
+    code, out, err = command("upsample", "in.npy", "out.ply")
+    assert (code, out) == (0, "")
+    assert err.splitlines()[:2] == [
+        "Note: spacing not given: taken as 1, the values show 1",
+        "Note: origin not given: sample (0, 0, 0) is at 0, 0, 0",
+    ] or "taken as 1, the values show" in err
+    mesh = trimesh.load("out.ply")
+    assert mesh.is_watertight and mesh.volume == pytest.approx(4 / 3 * np.pi * 216, rel=0.01)
+
+
+def test_json_has_counts_times_and_findings(here, command):
+    arguments = ("--spacing", "1", "--origin", "1,2,3", "--json", "--quiet")
+    code, out, err = command("upsample", "in.npy", "out.stl", *arguments)
+    report = json.loads(out)
+    assert (code, err) == (0, "")
+    assert report["origin"] == [1, 2, 3] and report["inferred"] == [] and report["warnings"] == []
+    assert report["triangles"] > report["vertices"] > report["band_voxels"] > 0
+    stages = ["start", "read", "load network", "band", "network", "nodes", "isosurface", "write"]
+    assert list(report["seconds"]) == stages
+
+
+@pytest.mark.parametrize("factor", [2, 8, 16])
+def test_factors(here, command, factor):
+    assert command("upsample", "in.npy", "out.ply", "--factor", factor)[0] == 0
+    assert trimesh.load("out.ply").is_watertight
+
+
+def test_options_reach_the_result(here, command):
+    np.save("out-in.npy", -ball().values)
+    assert command("upsample", "out-in.npy", "a.ply", "--inside", "positive", "--offset", 1)[0] == 0
+    assert trimesh.load("a.ply").extents == pytest.approx([14] * 3, rel=0.01)
+    assert command("upsample", "in.npy", "a.ply", "--force", "--threads", 1, "-v")[0] == 0
+
+
+def test_a_surface_that_leaves_the_grid_is_reported_and_capped(here, command):
+    np.save("cut.npy", ball().values[:12])
+    _, _, err = command("upsample", "cut.npy", "open.ply")
+    assert "Warning: the surface runs out of the grid and is open there (close it with --cap)" in err
+    assert not trimesh.load("open.ply").is_watertight
+    _, _, err = command("upsample", "cut.npy", "closed.ply", "--cap")
+    assert "Warning" not in err
+    assert trimesh.load("closed.ply").is_watertight
+
+
+def test_values_that_are_no_distances_are_warned_of(here, command):
+    values = np.where(ball().values > 0, 9.0, -9.0) + np.random.default_rng(0).random((20, 20, 20))
+    np.save("steps.npy", values)
+    _, _, err = command("upsample", "steps.npy", "out.ply", "--cap")
+    assert trimesh.load("out.ply").is_watertight
+
+
+def test_info_names_versions_devices_and_models(command):
+    code, out, _ = command("info")
+    assert code == 0 and out.startswith(f"super-sdf {super_sdf.__version__}\n")
+    assert "model base\n" in out and "devices: cpu" in out
+    facts = json.loads(command("info", "--json")[1])
+    assert facts["models"]["base"]["format_version"] == 1
+
+
+def test_version_and_help(command):
+    assert command("--version") == (0, f"super-sdf, version {super_sdf.__version__}\n", "")
+    for flag in ("-h", "--help"):
+        assert "Turn coarse signed distance grids into fine meshes" in command(flag)[1]
+
+
+def save_archive(name, **members):
+    with zipfile.ZipFile(name, "w") as archive:
+        for key, data in members.items():
+            archive.writestr(f"{key}.npy", data)
+
+
+def bad_files() -> None:
+    """Write one file of each bad kind."""
+    good = Path("in.npy").read_bytes()
+    Path("short.npy").write_bytes(good[: len(good) // 2])
+    Path("text.npy").write_text("hello")
+    Path("empty.npy").write_bytes(b"")
+    Path("text.npz").write_text("hello")
+    np.save("objects.npy", np.array([{}], object), allow_pickle=True)
+    np.savez("other.npz", field=np.zeros(3), more=np.zeros(3))
+    save_archive("short.npz", values=good[: len(good) // 2])
+    np.savez("spaced.npz", values=np.load("in.npy"), spacing=np.ones(7))
+    damaged = bytearray((np.savez("damaged.npz", values=np.load("in.npy")), Path("damaged.npz"))[1].read_bytes())
+    damaged[5000] ^= 0xFF
+    Path("damaged.npz").write_bytes(damaged)
+    huge = np.lib.format.header_data_from_array_1_0(np.zeros(1))
+    with open("huge.npy", "wb") as file:
+        np.lib.format.write_array_header_1_0(file, {**huge, "shape": (4000, 4000, 4000)})
+        file.truncate(file.tell() + 8 * 4000**3)  # sparse: no bytes on disk
+    np.save("flat.npy", np.zeros((5, 5)))
+    np.save("nan.npy", np.full((3, 3, 3), np.nan))
+    np.save("constant.npy", np.ones((3, 3, 3)))
+    np.save("unsigned.npy", np.abs(ball().values) + 0.25)
+    Path("folder.npy").mkdir()
+
+
+CASES = {
+    ("none.npy",): (1, "none.npy does not exist"),
+    ("folder.npy",): (1, "folder.npy is a folder: give a file"),
+    ("in.vdb",): (2, "in.vdb is no grid file: give .npy or .npz"),
+    ("text.npy",): (1, "text.npy is no .npy array: its header cannot be read"),
+    ("empty.npy",): (1, "empty.npy is no .npy array: its header cannot be read"),
+    ("text.npz",): (1, "text.npz is no readable .npz archive: File is not a zip file"),
+    ("objects.npy",): (1, "objects.npy holds Python objects: save the numbers alone"),
+    ("other.npz",): (1, "other.npz has no key 'values' (it holds field, more)"),
+    ("spaced.npz",): (1, "spaced.npz[spacing] has shape (7,): give one number or three"),
+    ("short.npy",): (
+        1,
+        "short.npy is truncated: its header promises 20 x 20 x 20 float32, 32,000 bytes, "
+        "but 15,936 follow",
+    ),
+    ("short.npz",): (
+        1,
+        "short.npz[values] is truncated: its header promises 20 x 20 x 20 float32, 32,000 bytes, "
+        "but 15,936 follow",
+    ),
+    ("damaged.npz",): (
+        1,
+        "damaged.npz is no readable .npz archive: Bad CRC-32 for file 'values.npy'",
+    ),
+    ("flat.npy",): (1, "values have shape (5, 5): give three axes (x, y, z)"),
+    ("nan.npy",): (
+        1,
+        "values[0, 0, 0] is nan: every sample must be finite; replace unknown far samples by a "
+        "large distance of the right sign",
+    ),
+    ("constant.npy",): (1, "every value is 1: a constant field has no surface"),
+    ("unsigned.npy",): (
+        1,
+        "no value is below 0 (the smallest is 0.255889): an unsigned field has no inside, and a "
+        "grid that misses the solid has no surface",
+    ),
+    ("in.npy", "--offset", "99"): (
+        1,
+        "no value is above 99 (the largest is 10.6796): the grid lies within the solid and has no "
+        "surface",
+    ),
+    ("in.npy", "--factor", "5"): (
+        2,
+        "factor is 5: give an even number from 2 to 16 (an odd one has no node on the samples)",
+    ),
+    ("in.npy", "--factor", "four"): (
+        2,
+        "Invalid value for '--factor': 'four' is not a valid integer.",
+    ),
+    ("in.npy", "--spacing", "1,2"): (
+        2,
+        "Invalid value for '--spacing': '1,2': give one number, or three with commas between",
+    ),
+    ("in.npy", "--spacing", "1,1,2"): (
+        1,
+        "spacing is 1, 1, 2: the method needs cubic voxels; resample the grid to one spacing on "
+        "all axes",
+    ),
+    ("in.npy", "--spacing", "-1"): (1, "spacing is -1, -1, -1: it must be greater than 0"),
+    ("in.npy", "--model", "huge"): (
+        1,
+        "no model 'huge': give an ONNX file or one of: base",
+    ),
+}
+
+
+@pytest.mark.parametrize("arguments", CASES, ids=" ".join)
+def test_bad_input_is_one_line_and_no_file(here, command, arguments):
+    bad_files()
+    before = sorted(os.listdir())
+    code, want = CASES[arguments]
+    source, *options = arguments
+    assert command("upsample", source, "out.ply", *options) == (code, "", f"Error: {want}\n")
+    assert sorted(os.listdir()) == before
+
+
+def test_a_file_larger_than_memory_is_refused_unread(here, command, monkeypatch):
+    bad_files()
+    monkeypatch.setattr("super_sdf.io.free_memory", lambda: 8 * 10**9)
+    want = (
+        "huge.npy is too large: 4000 x 4000 x 4000 float64, 512,000,000,000 bytes, needs "
+        "1,024.0 GB of memory, 8.0 GB are free; cut it into pieces"
+    )
+    assert command("upsample", "huge.npy", "out.ply") == (1, "", f"Error: {want}\n")
+
+
+def test_a_zip_bomb_is_refused_unread(here, command, monkeypatch):
+    np.savez_compressed("bomb.npz", values=np.zeros((200, 200, 200), np.float32))
+    assert os.path.getsize("bomb.npz") < 40_000
+    monkeypatch.setattr("super_sdf.io.free_memory", lambda: 10**8)
+    want = (
+        "bomb.npz[values] is too large: 200 x 200 x 200 float32, 32,000,000 bytes, needs 0.2 GB "
+        "of memory, 0.1 GB are free; cut it into pieces"
+    )
+    assert command("upsample", "bomb.npz", "out.ply") == (1, "", f"Error: {want}\n")
+
+
+TARGETS = {
+    "out.xyz": (2, "out.xyz is no mesh file: give one of .ply, .stl, .obj, .off, .glb, .3mf"),
+    "there.ply": (1, "there.ply exists: remove it or use --force"),
+    "no/out.ply": (1, "no is no folder: make it first"),
+    "dir.ply": (1, "dir.ply is a folder: give a file"),
+}
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_targets_are_checked_before_the_work(here, command, target):
+    Path("there.ply").write_text("mine")
+    Path("dir.ply").mkdir()
+    code, want = TARGETS[target]
+    assert command("upsample", "none.npy", target) == (code, "", f"Error: {want}\n")
+    assert Path("there.ply").read_text() == "mine"
+
+
+def test_a_folder_without_permission_is_named(here, command, monkeypatch):
+    monkeypatch.setattr("super_sdf.io.os.access", lambda path, mode: False)
+    want = "Error: out.ply cannot be written: no permission in .\n"
+    assert command("upsample", "in.npy", "out.ply") == (1, "", want)
+
+
+@pytest.mark.parametrize("stage", ["pipeline.upsample", "isosurface.extract_mesh", "io._write_ply"])
+def test_an_interrupt_at_any_stage_leaves_nothing(here, command, monkeypatch, stage):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"super_sdf.{stage}", interrupt)
+    code, out, err = command("upsample", "in.npy", "out.ply", "--quiet")
+    assert (code, out, err.strip()) == (1, "", "Error: interrupted; nothing was written")
+    assert os.listdir() == ["in.npy"]
+
+
+def test_running_out_of_memory_is_one_line(here, command, monkeypatch):
+    def exhaust(*_, **__):
+        raise MemoryError
+
+    monkeypatch.setattr("super_sdf.pipeline.upsample", exhaust)
+    want = "Error: out of memory: use a smaller --factor or grid\n"
+    assert command("upsample", "in.npy", "out.ply") == (1, "", want)
+
+
+def test_usage_errors_exit_with_2(command):
+    assert command("upsample")[0] == 2
+    assert command("nonsense") == (2, "", "Error: No such command 'nonsense'.\n")
+
+
+def test_every_option_has_help():
+    for subcommand in cli.cli.commands.values():
+        for parameter in subcommand.params:
+            if isinstance(parameter, click.Option):
+                assert parameter.help, parameter.name

@@ -1,0 +1,124 @@
+"""What an array says of itself: spacing, sign, and what it is not."""
+
+import numpy as np
+import pytest
+from conftest import ball
+
+from super_sdf.conventions import make_grid, surface_gradients, typical_length
+from super_sdf.errors import GridError, OptionError
+
+
+def torus(n: int, unit: float = 1.0) -> np.ndarray:
+    """A torus in [-1/2, 1/2]^3, sampled at the n^3 voxel centres, distances times unit."""
+    x, y, z = (np.indices((n, n, n)) + 0.5) / n - 0.5
+    return (np.hypot(np.hypot(x, y) - 0.28, z) - 0.11) * unit
+
+
+@pytest.mark.parametrize("n", [32, 64])
+def test_the_spacing_is_measured_to_half_a_percent(n):
+    assert typical_length(*surface_gradients(torus(n))) * n == pytest.approx(1, abs=0.005)
+
+
+def test_thin_walls_and_edges_do_not_bend_the_measure():
+    x, y, z = np.indices((40, 40, 40)) - 19.6
+    plate = np.maximum(np.abs(x) - 14, np.maximum(np.abs(y) - 14, np.abs(z) - 0.6))
+    assert typical_length(*surface_gradients(plate)) == pytest.approx(1, abs=0.005)
+
+
+@pytest.mark.parametrize(
+    "unit, want, said",
+    [
+        (64.0, 1.0, "taken as 1,"),
+        (1.0, 1 / 64, "taken as 1/64,"),
+        (64 / 63, 1 / 63, "taken as 1/63,"),
+        (2.0, 2 / 64, "taken as 2/64,"),
+        (10.0, 10 / 64, "estimated as 0.156"),
+    ],
+)
+def test_usual_spacings_are_recognised(unit, want, said):
+    grid = make_grid(torus(64, unit))
+    assert grid.spacing == pytest.approx((want,) * 3, rel=0.003)
+    assert any(f"spacing not given: {said}" in note for note in grid.notes)
+
+
+def test_what_is_given_is_taken_silently():
+    grid = make_grid(torus(32), spacing=1 / 32, origin=(1, 2, 3))
+    assert grid.spacing == (1 / 32,) * 3 and grid.origin == (1.0, 2.0, 3.0) and grid.notes == ()
+
+
+@pytest.mark.parametrize("inside, flips", [("auto", True), ("positive", True), ("negative", False)])
+def test_the_sign_is_negative_inside_in_the_end(inside, flips):
+    values = -torus(32)
+    grid = make_grid(values, spacing=1 / 32, origin=0, inside=inside)
+    np.testing.assert_array_equal(grid.values, -values if flips else values)
+
+
+def test_small_integers_are_turned_without_overflow():
+    values = np.clip(-torus(32) * 32 * 16, -128, 127).astype(np.int8)
+    assert make_grid(values, origin=0).values.max() == 128
+
+
+REFUSED = {
+    "every value is 3: a constant field has no surface": np.full((4, 4, 4), 3.0),
+    "the only values are 0 and 1: an occupancy grid holds no distances; "
+    "make them with scipy.ndimage.distance_transform_edt": (torus(8) < 0).astype(np.uint8),
+    "values are true or false: an occupancy grid holds no distances; "
+    "make them with scipy.ndimage.distance_transform_edt": torus(8) < 0,
+    "no value is below 0 (the smallest is 0.5): an unsigned field has no inside, and a grid that "
+    "misses the solid has no surface": np.abs(torus(8)) + 0.5 - np.abs(torus(8)).min(),
+    "no value is above 0 (the largest is -1): the grid lies within the solid and has no surface": (
+        -1 - np.indices((3, 3, 3)).sum(0)
+    ),
+    "values[1, 2, 0] is nan: every sample must be finite; replace unknown far samples by a large "
+    "distance of the right sign": np.where(np.arange(27).reshape(3, 3, 3) == 15, np.nan, 1.0),
+    "values[0, 0, 2] is -inf: every sample must be finite; replace unknown far samples by a large "
+    "distance of the right sign": np.where(np.arange(27).reshape(3, 3, 3) == 2, -np.inf, 1.0),
+    "values have shape (4, 4): give three axes (x, y, z)": np.zeros((4, 4)),
+    "values have shape (4, 1, 4): give at least 2 samples on each axis": np.zeros((4, 1, 4)),
+    "values have dtype complex128: give floating-point or integer numbers": np.zeros(
+        (4, 4, 4), complex
+    ),
+}
+
+
+@pytest.mark.parametrize("message", REFUSED)
+def test_what_is_no_signed_distance_grid_is_refused(message):
+    with pytest.raises(GridError) as caught:
+        make_grid(REFUSED[message])
+    assert str(caught.value) == message
+
+
+def test_a_wrong_unit_is_refused_with_the_way_out():
+    with pytest.raises(GridError) as caught:
+        make_grid(ball(24, 8.0).values, spacing=0.1)
+    assert str(caught.value).startswith("the values change by ")
+    assert "from sample to sample, but spacing is 0.1: distances and spacing must be in one unit" in (
+        str(caught.value)
+    )
+
+
+def test_values_that_are_not_quite_distances_are_noted():
+    grid = make_grid(torus(64) * 1.3, spacing=1 / 64, origin=0)
+    assert len(grid.notes) == 1 and "they are no exact distances" in grid.notes[0]
+
+
+def test_spacing_must_be_equal_positive_and_finite():
+    for spacing, message in (
+        ((1, 1, 2), "spacing is 1, 1, 2: the method needs cubic voxels"),
+        (0, "spacing is 0, 0, 0: it must be greater than 0"),
+        (float("nan"), "spacing is nan: it must be finite"),
+        ((1, 2), r"spacing is \(1, 2\): give one number or three"),
+    ):
+        with pytest.raises(GridError, match=message):
+            make_grid(torus(32), spacing=spacing)
+
+
+def test_values_sampled_unequally_are_refused_whatever_the_spacing():
+    values = torus(64)[:, :, ::2]
+    with pytest.raises(GridError, match=r"the values change by .* along x, .* along y, .* along z"):
+        make_grid(values)
+
+
+def test_inside_has_three_words():
+    with pytest.raises(OptionError, match="inside is 'out': give one of auto, negative, positive"):
+        make_grid(torus(16), inside="out")

@@ -1,0 +1,49 @@
+"""Surfaces that leave the grid: reported, left open, or closed along the border."""
+
+import numpy as np
+import pytest
+from conftest import ball, trilinear
+
+from super_sdf import SdfGrid, reconstruct, upsample
+from super_sdf.field import border_is_crossed
+
+
+def cut_ball() -> SdfGrid:
+    """A ball of radius 6 whose middle lies 2 samples inside a corner of the grid."""
+    ijk = np.indices((14, 15, 16)).astype(np.float64)
+    return SdfGrid(np.linalg.norm(ijk - 2.3, axis=0) - 6, (0.5,) * 3, (1.0, 2.0, 3.0))
+
+
+def test_a_surface_inside_the_grid_does_not_cross_the_border():
+    assert not border_is_crossed(upsample(ball(), trilinear))
+
+
+def test_a_surface_that_leaves_is_found_and_left_open():
+    grid = cut_ball()
+    assert border_is_crossed(upsample(grid, trilinear))
+    assert reconstruct(grid, trilinear).open_edges() > 0
+
+
+@pytest.mark.parametrize("factor", [2, 4])
+def test_the_cap_closes_it_along_the_border(factor):
+    grid = cut_ball()
+    mesh = reconstruct(grid, trilinear, factor, cap=True)
+    assert mesh.open_edges() == 0
+    low = np.array(grid.origin) - 0.25  # the fine lattice starts half a voxel before the samples
+    assert np.abs(mesh.vertices.min(0) - low).max() < 0.02 * 0.5 / factor
+    assert mesh.volume() == pytest.approx(inside_volume(grid, low), rel=0.01)
+
+
+def inside_volume(grid: SdfGrid, low: np.ndarray) -> float:
+    """Count the ball's part in the grid on a lattice of 100^3 points."""
+    middle = np.array(grid.origin) + 2.3 * 0.5
+    side = 4.5
+    points = low + (np.indices((100,) * 3).reshape(3, -1).T + 0.5) * side / 100
+    return float((np.linalg.norm(points - middle, axis=1) < 3).mean() * side**3)
+
+
+def test_the_cap_changes_nothing_where_nothing_leaves():
+    grid = ball()
+    plain, capped = reconstruct(grid, trilinear), reconstruct(grid, trilinear, cap=True)
+    np.testing.assert_array_equal(plain.faces, capped.faces)
+    np.testing.assert_array_equal(plain.vertices, capped.vertices)

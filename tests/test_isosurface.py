@@ -1,0 +1,131 @@
+"""Marching cubes: the table, manifoldness on anything, and scikit-image as an oracle."""
+
+import numpy as np
+import pytest
+from conftest import ball, count_fans, trilinear, walled
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy.spatial import cKDTree
+from skimage.measure import marching_cubes
+
+from super_sdf import SdfGrid, extract_mesh, load_network, reconstruct, upsample
+from super_sdf.band import neighbour_table
+from super_sdf.cell_cases import CORNERS, EDGE_AXIS, EDGE_START, triangle_table
+from super_sdf.field import FineField
+from super_sdf.isosurface import CLEARANCE
+from super_sdf.nodes import block_ijk, number_shared_nodes
+
+
+def dense_field(lattice: np.ndarray, factor: int = 2) -> tuple[FineField, SdfGrid]:
+    """Wrap a dense fine lattice as a field in which every voxel is decoded."""
+    shape = tuple((n - 1) // factor for n in lattice.shape)
+    voxels = np.argwhere(np.ones(shape)).astype(np.int32)
+    numbers, count = number_shared_nodes(neighbour_table(voxels, shape), factor)
+    position = voxels[:, None] * factor + block_ijk(factor)
+    values = np.empty(count, np.float32)
+    values[numbers] = lattice[tuple(np.moveaxis(position, 2, 0))]
+    half = 0.5 - 0.5 / factor  # so that vertices come out in fine lattice indices
+    grid = SdfGrid(np.zeros(shape, np.float32), (float(factor),) * 3, (half * factor + 0.5,) * 3)
+    return FineField(shape, factor, voxels, numbers, values, len(voxels), 0), grid
+
+
+def test_every_case_uses_exactly_its_crossed_edges():
+    counts, table = triangle_table()
+    for case in range(256):
+        inside = np.array([bool(case >> corner & 1) for corner in range(8)])
+        ends = [(start, start + (4, 2, 1)[axis]) for start, axis in zip(EDGE_START, EDGE_AXIS)]
+        crossed = {edge for edge, (a, b) in enumerate(ends) if inside[a] != inside[b]}
+        assert set(table[case, : counts[case]].ravel().tolist()) == crossed
+
+
+@pytest.mark.parametrize("corner", range(8))
+def test_one_inside_corner_gives_one_triangle_that_looks_away(corner):
+    counts, table = triangle_table()
+    assert counts[1 << corner] == 1
+    middle = CORNERS[list(EDGE_START)] + 0.5 * np.eye(3)[list(EDGE_AXIS)]
+    a, b, c = middle[table[1 << corner, 0]]
+    assert np.cross(b - a, c - a) @ (CORNERS[corner] - a) < 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_vertices_are_those_of_scikit_image(seed):
+    lattice = np.random.default_rng(seed).normal(size=(13, 11, 15)).astype(np.float32)
+    mesh = extract_mesh(*dense_field(lattice))
+    want, _, _, _ = marching_cubes(lattice, 0.0, method="lorensen")
+    want = np.unique(np.round(want, 5), axis=0)
+    assert len(mesh.vertices) == len(want)
+    assert cKDTree(want).query(mesh.vertices)[0].max() < 2 * CLEARANCE
+
+
+def test_a_smooth_surface_is_that_of_scikit_image():
+    ijk = np.indices((33, 33, 33)) - 16.3
+    lattice = (np.hypot(np.hypot(ijk[0], ijk[1]) - 9, ijk[2]) - 4).astype(np.float32)
+    mesh = extract_mesh(*dense_field(lattice))
+    verts, faces, _, _ = marching_cubes(lattice, 0.0, method="lorensen")
+    a, b, c = verts[faces].transpose(1, 0, 2).astype(np.float64)
+    want = abs(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+    assert mesh.volume() == pytest.approx(want, rel=1e-3)  # quads are cut otherwise
+    assert len(mesh.faces) == len(faces)
+    assert mesh.open_edges() == 0
+
+
+fields = hnp.arrays(
+    np.float32,
+    st.tuples(*[st.integers(6, 9)] * 3),
+    elements=st.one_of(
+        st.floats(-3, 3, width=32), st.sampled_from([0.0, -0.0, 1e-30, -1e-30, 1.5, -1.5, 50, -50])
+    ),
+    fill=st.nothing(),
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(fields, st.sampled_from([2, 4]))
+def test_any_field_gives_a_closed_oriented_manifold(values, factor):
+    values = walled(values)
+    values[3, 3, 3] = -1
+    mesh = reconstruct(SdfGrid(values, (1.0, 1.0, 1.0)), trilinear, factor)
+    assert mesh.open_edges() == 0
+    assert (count_fans(mesh.faces) == 1).all()
+    assert mesh.volume() > 0
+
+
+@settings(max_examples=15, deadline=None)
+@given(fields)
+def test_any_field_is_closed_by_the_network_and_the_cap(values):
+    values[2, 2, 2], values[3, 3, 3] = -1, 1
+    mesh = reconstruct(SdfGrid(values, (1.0, 1.0, 1.0)), load_network(), cap=True)
+    assert mesh.open_edges() == 0
+    assert (count_fans(mesh.faces) == 1).all()
+
+
+@pytest.mark.parametrize("limit", [0.25, 1.0, 1.5, 3.0])
+def test_truncated_fields_are_closed(limit):
+    grid = ball()
+    values = np.clip(grid.values, -limit, limit)
+    mesh = reconstruct(SdfGrid(values, grid.spacing), load_network())
+    assert mesh.open_edges() == 0
+    assert mesh.volume() == pytest.approx(4 / 3 * np.pi * 6**3, rel=0.02)
+
+
+def test_exact_zeros_survive_merging_by_position():
+    """Many programs merge vertices at one place: a cube whose faces run through nodes."""
+    import trimesh
+
+    ijk = np.indices((14, 14, 14)) - 6
+    values = (np.abs(ijk).max(0) - 3.0).astype(np.float32)
+    mesh = reconstruct(SdfGrid(values, (0.1, 0.1, 0.1)), trilinear)
+    merged = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
+    assert len(merged.vertices) == len(mesh.vertices)
+    assert merged.is_watertight and merged.is_winding_consistent
+    assert merged.volume == pytest.approx(0.6**3, rel=2e-3)
+
+
+def test_far_from_the_origin_vertices_are_double():
+    grid = ball()
+    field = upsample(grid, trilinear)
+    near = extract_mesh(field, grid)
+    far = extract_mesh(field, SdfGrid(grid.values, grid.spacing, (1e6, 0, 0)))
+    assert near.vertices.dtype == np.float32 and far.vertices.dtype == np.float64
+    np.testing.assert_allclose(far.vertices - [1e6, 0, 0], near.vertices, atol=1e-5)

@@ -1,0 +1,84 @@
+"""The ONNX file's contract, and devices asked for."""
+
+import numpy as np
+import onnxruntime as ort
+import pytest
+from conftest import ball
+
+from super_sdf import load_network
+from super_sdf.band import find_band, gather_patches, neighbour_table, rescale
+from super_sdf.errors import DeviceError, FileError, ModelError
+from super_sdf.network import shipped_models
+from super_sdf.nodes import block_offsets
+
+
+def network_inputs(grid):
+    field = rescale(grid)
+    voxels = find_band(field)
+    rows = np.arange(len(voxels), dtype=np.int32)
+    return gather_patches(field, voxels), neighbour_table(voxels, grid.shape), rows
+
+
+def test_the_card_says_what_the_file_is():
+    card = load_network("base").card
+    for key in ("receptive_field", "value_scaling", "training_factors", "trained_on",
+                "trained_from_commit", "accuracy", "licence", "parameters"):
+        assert card[key], key
+
+
+def test_voxels_and_offsets_may_be_asked_in_any_order():
+    patches, table, rows = network_inputs(ball())
+    network, offsets = load_network(), block_offsets(2)
+    whole = network(patches, table, rows, offsets)
+    some = network(patches, table, rows[::-3].copy(), offsets[::-2].copy())
+    np.testing.assert_allclose(some, whole[::-3, ::-2], atol=1e-5)
+
+
+def test_a_prediction_depends_on_the_receptive_field_and_no_more():
+    patches, table, rows = network_inputs(ball())
+    network = load_network()
+    voxels = find_band(rescale(ball()))
+    reach = network.card["receptive_field"]
+    before = network(patches, table, rows[:1], block_offsets(2))
+    far = np.abs(voxels - voxels[0]).max(1) >= reach
+    patches[far] += 1
+    np.testing.assert_array_equal(network(patches, table, rows[:1], block_offsets(2)), before)
+    near = np.abs(voxels - voxels[0]).max(1) == 2
+    patches[near] += 1
+    assert (network(patches, table, rows[:1], block_offsets(2)) != before).any()
+
+
+def test_operators_are_standard():
+    import onnxruntime
+
+    for path in shipped_models().values():
+        onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        assert path.stat().st_size < 8e6
+
+
+def test_cuda_where_it_is_not_built_in_is_an_error(monkeypatch):
+    monkeypatch.setattr(ort, "get_available_providers", lambda: ["CPUExecutionProvider"])
+    with pytest.raises(DeviceError, match="has no CUDA provider; install onnxruntime-gpu"):
+        load_network(device="cuda")
+    assert load_network(device="auto").device == "cpu"
+
+
+def test_cuda_that_does_not_start_is_an_error(monkeypatch):
+    names = ["CUDAExecutionProvider", "CPUExecutionProvider"]
+    monkeypatch.setattr(ort, "get_available_providers", lambda: names)
+    real = ort.InferenceSession
+    monkeypatch.setattr(
+        ort, "InferenceSession", lambda path, options, providers: real(path, options, ["CPUExecutionProvider"])
+    )
+    with pytest.raises(DeviceError, match="onnxruntime could not start its CUDA provider"):
+        load_network(device="cuda")
+
+
+def test_what_is_no_network_is_refused(tmp_path):
+    with pytest.raises(FileError, match="no model 'other': give an ONNX file or one of: base"):
+        load_network("other")
+    (tmp_path / "bad.onnx").write_bytes(b"not a graph")
+    with pytest.raises(ModelError, match=r"bad\.onnx is no ONNX file that onnxruntime can run"):
+        load_network(tmp_path / "bad.onnx")
+    with pytest.raises(DeviceError, match="device is 'tpu': give one of auto, cpu, cuda"):
+        load_network(device="tpu")
