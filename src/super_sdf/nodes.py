@@ -6,8 +6,6 @@ C order. The fine index of coarse sample i is ``K*i + K/2``.
 
 from __future__ import annotations
 
-from itertools import product
-
 import numpy as np
 
 from .band import CENTRE, NEIGHBOURHOOD
@@ -43,7 +41,9 @@ def block_offsets(factor: int) -> FloatArray:
 def number_shared_nodes(table: IntArray, factor: int) -> tuple[IntArray, int]:
     """Number the nodes of all blocks so that a shared node has one number.
 
-    A node belongs to the first of the 1, 2, 4 or 8 voxels that share it, so no sorting is needed.
+    A block has 27 parts: 8 corners, 12 edges, 6 faces and the inside. A part is shared as a whole;
+    it belongs to the first of the voxels that share it, and its nodes have consecutive numbers. So
+    numbering 27 parts a voxel numbers all nodes, and nothing is sorted.
 
     Parameters
     ----------
@@ -57,39 +57,39 @@ def number_shared_nodes(table: IntArray, factor: int) -> tuple[IntArray, int]:
     (D, Q) int32 and int
         The number of each block's nodes, and how many different nodes there are.
     """
-    owner, owner_local = _owners(table, factor)
+    part_of, place_in_part = _parts(factor)
+    owner, owner_part = _owners(table)
     own = owner == np.arange(len(table), dtype=np.int32)[:, None]
-    numbers = np.cumsum(own.ravel(), dtype=np.int32).reshape(own.shape) - np.int32(1)
-    count = int(numbers.flat[-1]) + 1 if numbers.size else 0
-    return numbers[owner, owner_local], count
+    sizes = own * np.bincount(part_of, minlength=27).astype(np.int32)
+    ends = np.cumsum(sizes.ravel(), dtype=np.int32).reshape(sizes.shape)
+    starts = (ends - sizes)[owner, owner_part]
+    count = int(ends.flat[-1]) if ends.size else 0
+    return starts[:, part_of] + place_in_part, count
 
 
-def _owners(table: IntArray, factor: int) -> tuple[IntArray, IntArray]:
-    """Return for each block node the voxel it belongs to and its place in that voxel's block."""
+def _parts(factor: int) -> tuple[IntArray, IntArray]:
+    """Return for each block node its part, 0 to 26 as ``NEIGHBOURHOOD``, and its place in it."""
     block = block_ijk(factor)
-    side = np.where(block == 0, -1, np.where(block == factor, 1, 0))
-    strides = np.array([(factor + 1) ** 2, factor + 1, 1])
-    voxels, nodes = len(table), len(block)
-    owner = np.empty((voxels, nodes), np.int32)
-    local = np.empty((voxels, nodes), np.int32)
-    for sides in product((-1, 0, 1), repeat=3):
-        columns = np.flatnonzero((side == sides).all(1))
-        sharing = _sharing_voxels(sides)
-        present = table[:, sharing] >= 0
-        first = present.argmax(1)
-        shift = (factor * NEIGHBOURHOOD[sharing] @ strides).astype(np.int32)
-        owner[:, columns] = table[np.arange(voxels), np.asarray(sharing)[first]][:, None]
-        local[:, columns] = columns[None, :] - shift[first][:, None]
-    return owner, local
+    side = np.where(block == 0, 0, np.where(block == factor, 2, 1))
+    part = (side @ np.array([9, 3, 1])).astype(np.int32)
+    place = np.empty_like(part)
+    for number in range(27):
+        columns = np.flatnonzero(part == number)
+        place[columns] = np.arange(len(columns))
+    return part, place
 
 
-def _sharing_voxels(sides: tuple[int, ...]) -> list[int]:
-    """Return the places of the neighbourhood whose voxels share a node on these sides."""
-    return [
-        place
-        for place, step in enumerate(NEIGHBOURHOOD)
-        if all(move in (0, side) for move, side in zip(step, sides))
-    ]
+def _owners(table: IntArray) -> tuple[IntArray, IntArray]:
+    """Return for each part of each voxel, (D, 27), the voxel it belongs to, and as which part."""
+    owner, owner_part = np.empty_like(table), np.empty_like(table)
+    for part, sides in enumerate(NEIGHBOURHOOD):
+        sharing = np.flatnonzero(((NEIGHBOURHOOD == 0) | (NEIGHBOURHOOD == sides)).all(1))
+        first = sharing[(table[:, sharing] >= 0).argmax(1)]
+        owner[:, part] = np.take_along_axis(table, first[:, None], 1)[:, 0]
+        # Seen from the owner, one step away on some axes, the part is on the other side there.
+        mirrored = sides - 2 * NEIGHBOURHOOD[first]
+        owner_part[:, part] = (mirrored + 1) @ np.array([9, 3, 1])
+    return owner, owner_part
 
 
 def average_shared(blocks: FloatArray, numbers: IntArray, count: int) -> FloatArray:
