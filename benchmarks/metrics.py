@@ -38,8 +38,11 @@ class Samples:
     normals: np.ndarray
 
 
-# What stands in for a result without a surface. Its normal agrees with none.
+# What stands in for a result without a surface; it has no normal.
 DOT = Samples(np.zeros((1, 3)), np.zeros((1, 3)))
+# NC of a point without a normal: the mean of |n.n'| over all directions of n. The figures of
+# EVALUATION.md have this for shapes that were not found.
+NO_NORMAL_NC = 0.5
 
 
 def normalise(mesh: TriMesh) -> TriMesh:
@@ -80,17 +83,24 @@ def compare_samples(reference: Samples, result: Samples) -> Numbers:
     """Return CD (squared, summed), F1 with recall and precision at 0.003, NC and signed NC."""
     there, there_at = cKDTree(result.points).query(reference.points)
     back, back_at = cKDTree(reference.points).query(result.points)
-    there_dot = np.einsum("nd,nd->n", reference.normals, result.normals[there_at])
-    back_dot = np.einsum("nd,nd->n", result.normals, reference.normals[back_at])
+    there_nc = normal_agreement(reference.normals, result.normals[there_at])
+    back_nc = normal_agreement(result.normals, reference.normals[back_at])
     recall, precision = np.mean(there < F1_DISTANCE), np.mean(back < F1_DISTANCE)
     return {
         "cd": float(np.mean(there**2) + np.mean(back**2)),
         "f1": harmonic_mean(recall, precision),
         "recall": float(recall),
         "precision": float(precision),
-        "nc": float(np.abs(there_dot).mean() + np.abs(back_dot).mean()) / 2,
-        "signed_nc": float(there_dot.mean() + back_dot.mean()) / 2,
+        "nc": (there_nc[0] + back_nc[0]) / 2,
+        "signed_nc": (there_nc[1] + back_nc[1]) / 2,
     }
+
+
+def normal_agreement(normals: np.ndarray, others: np.ndarray) -> tuple[float, float]:
+    """Return the means of |n.n'| and of n.n' over pairs of normals, (n, 3) each."""
+    dot = np.einsum("nd,nd->n", normals, others)
+    known = normals.any(1) & others.any(1)
+    return float(np.where(known, np.abs(dot), NO_NORMAL_NC).mean()), float(dot.mean())
 
 
 def harmonic_mean(recall: float, precision: float) -> float:

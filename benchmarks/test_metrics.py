@@ -120,7 +120,7 @@ def test_an_empty_result_is_a_dot_at_the_origin() -> None:
     figures = metrics.compare_samples(drawn, dot)
     mean_square = np.mean(np.sum(drawn.points**2, axis=1))
     assert figures["cd"] == pytest.approx(mean_square + 0.25, rel=1e-3)
-    assert figures["f1"] == figures["nc"] == 0
+    assert (figures["f1"], figures["nc"], figures["signed_nc"]) == (0, 0.5, 0)
     exact = metrics.compare_surfaces(cube(), quality.EMPTY, drawn, dot)
     assert exact["p2s_back"] == pytest.approx(0.5)
     assert not metrics.is_closed(quality.EMPTY.faces)

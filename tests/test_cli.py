@@ -153,13 +153,13 @@ CASES = {
     ("constant.npy",): (1, "every value is 1: a constant field has no surface"),
     ("unsigned.npy",): (
         1,
-        "no value is below 0 (the smallest is 0.255889): an unsigned field has no inside, and a "
-        "grid that misses the solid has no surface",
+        "no value is below 0 (the smallest is 0.255889): an unsigned field has no inside; if the "
+        "solid is thinner than the spacing, say --inside negative",
     ),
     ("in.npy", "--offset", "99"): (
         1,
-        "no value is above 99 (the largest is 10.6796): the grid lies within the solid and has no "
-        "surface",
+        "no value is above 99 (the largest is 10.6796): the grid lies within the solid; if "
+        "that is outside and the solid thin, say --inside positive",
     ),
     ("in.npy", "--factor", "5"): (
         2,

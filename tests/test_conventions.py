@@ -64,9 +64,10 @@ REFUSED = {
     "make them with scipy.ndimage.distance_transform_edt": (torus(8) < 0).astype(np.uint8),
     "values are true or false: an occupancy grid holds no distances; "
     "make them with scipy.ndimage.distance_transform_edt": torus(8) < 0,
-    "no value is below 0 (the smallest is 0.5): an unsigned field has no inside, and a grid that "
-    "misses the solid has no surface": np.abs(torus(8)) + 0.5 - np.abs(torus(8)).min(),
-    "no value is above 0 (the largest is -1): the grid lies within the solid and has no surface": (
+    "no value is below 0 (the smallest is 0.5): an unsigned field has no inside; if the solid is "
+    "thinner than the spacing, say --inside negative": np.abs(torus(8)) + 0.5 - np.abs(torus(8)).min(),
+    "no value is above 0 (the largest is -1): the grid lies within the solid; if that is "
+    "outside and the solid thin, say --inside positive": (
         -1 - np.indices((3, 3, 3)).sum(0)
     ),
     "values[1, 2, 0] is nan: every sample must be finite; replace unknown far samples by a large "
@@ -122,3 +123,13 @@ def test_values_sampled_unequally_are_refused_whatever_the_spacing():
 def test_inside_has_three_words():
     with pytest.raises(OptionError, match="inside is 'out': give one of auto, negative, positive"):
         make_grid(torus(16), inside="out")
+
+
+def test_a_solid_between_the_samples_needs_a_word_and_a_spacing():
+    x, y = np.indices((12, 12, 12))[:2] - 5.5
+    rod = np.hypot(x, y) - 0.6  # nearest samples are 0.7 away
+    with pytest.raises(GridError, match="say --inside negative"):
+        make_grid(rod)
+    with pytest.raises(GridError, match="all values are on one side of the surface: give --spacing"):
+        make_grid(rod, inside="negative")
+    assert make_grid(rod, inside="negative", spacing=1, origin=0).notes == ()

@@ -9,6 +9,7 @@ from conftest import ball, trilinear
 
 from super_sdf import Mesh, read_grid, reconstruct, write_mesh
 from super_sdf.errors import FileError, OptionError
+from super_sdf.io import check_target
 
 
 @pytest.fixture
@@ -41,7 +42,7 @@ def test_npy_is_mapped_not_loaded(tmp_path):
     assert isinstance(read_grid(tmp_path / "in.npy").values, np.memmap)
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj", ".off", ".glb"])
+@pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj", ".off", ".glb", ".3mf"])
 def test_formats_come_back_the_same(tmp_path, mesh, suffix):
     write_mesh(mesh, tmp_path / f"out{suffix}")
     back = trimesh.load(tmp_path / f"out{suffix}", force="mesh")
@@ -71,6 +72,14 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, mesh, monkeypatch):
     with pytest.raises(FileError, match=r"out\.ply cannot be written: No space left on device"):
         write_mesh(mesh, target, force=True)
     assert target.read_text() == "before" and os.listdir(tmp_path) == ["out.ply"]
+
+
+def test_3mf_without_its_packages_is_refused_before_the_work(tmp_path, monkeypatch):
+    monkeypatch.setattr("super_sdf.io.find_spec", lambda name: None)
+    with pytest.raises(FileError) as caught:
+        check_target(tmp_path / "out.3mf")
+    want = "writing .3mf needs lxml and networkx: pip install 'super-sdf[3mf]'"
+    assert str(caught.value) == want
 
 
 def test_only_known_formats_and_free_places_are_written(tmp_path, mesh):

@@ -55,25 +55,18 @@ def make_grid(
         If the values are no signed distances, or contradict the spacing.
     """
     values = check_values(values)
-    check_signed_distances(values, level)
+    check_not_flat(values)
     notes: list[str] = []
     if _is_positive_inside(values, inside, level, notes):
         values = -values.astype(np.promote_types(values.dtype, np.float32))
-    gradients, bend = surface_gradients(values, level)
-    measured = typical_length(gradients, bend)
-    _check_equal_axes(gradients, bend)
-    if spacing is None:
-        chosen = _infer_spacing(measured, values.shape, notes)
-    else:
-        chosen = check_spacing(spacing)
-        _check_unit(measured, chosen, notes)
+    chosen = _choose_spacing(values, level, spacing, notes)
     if origin is None:
         notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
     return SdfGrid(values, chosen, (0.0, 0.0, 0.0) if origin is None else origin, tuple(notes))
 
 
-def check_signed_distances(values: NDArray[Any], level: float = 0.0) -> None:
-    """Raise if the values are constant, an occupancy grid, or on one side of the level."""
+def check_not_flat(values: NDArray[Any]) -> None:
+    """Raise if the values are constant or an occupancy grid."""
     low, high = values.min(), values.max()
     if low == high:
         raise GridError(f"every value is {low:.6g}: a constant field has no surface")
@@ -82,15 +75,20 @@ def check_signed_distances(values: NDArray[Any], level: float = 0.0) -> None:
             f"the only values are {low:.6g} and {high:.6g}: an occupancy grid holds no distances; "
             "make them with scipy.ndimage.distance_transform_edt"
         )
+
+
+def check_both_sides(values: NDArray[Any], level: float) -> None:
+    """Raise if all values are on one side of the level."""
+    low, high = values.min(), values.max()
     if low >= level:
         raise GridError(
             f"no value is below {level:g} (the smallest is {low:.6g}): an unsigned field has no "
-            "inside, and a grid that misses the solid has no surface"
+            "inside; if the solid is thinner than the spacing, say --inside negative"
         )
     if high <= level:
         raise GridError(
             f"no value is above {level:g} (the largest is {high:.6g}): the grid lies within the "
-            "solid and has no surface"
+            "solid; if that is outside and the solid thin, say --inside positive"
         )
 
 
@@ -100,6 +98,7 @@ def _is_positive_inside(values: NDArray[Any], inside: str, level: float, notes: 
         raise OptionError(f"inside is {inside!r}: give one of {', '.join(INSIDE)}")
     if inside != "auto":
         return inside == "positive"
+    check_both_sides(values, level)
     faces = [values.take(end, axis=axis) for axis in range(3) for end in (0, -1)]
     below = sum(int((face < level).sum()) for face in faces)
     total = sum(int(face.size) for face in faces)
@@ -159,6 +158,8 @@ def typical_length(gradients: NDArray[np.float64], bend: NDArray[np.float64]) ->
     gradient too small or too large.
     Reference: Bickel and Frühwirth, "On a fast, robust estimator of the mode", 2006.
     """
+    if not len(gradients):
+        raise GridError("all values are on one side of the surface: give --spacing")
     straight = gradients[bend <= np.median(bend)]
     length: NDArray[np.float64] = np.sort(np.sqrt((straight**2).sum(1)))
     while len(length) > 2:
@@ -183,6 +184,20 @@ def _check_equal_axes(gradients: NDArray[np.float64], bend: NDArray[np.float64])
             f"the values change by {steps} from sample to sample: the method needs cubic voxels; "
             "resample the grid to one spacing on all axes"
         )
+
+
+def _choose_spacing(values: NDArray[Any], level: float, spacing: Any, notes: list[str]) -> Triple:
+    """Return the spacing that is given, or else measured; they must not contradict each other."""
+    given = None if spacing is None else check_spacing(spacing)
+    gradients, bend = surface_gradients(values, level)
+    if given and not len(gradients):
+        return given
+    measured = typical_length(gradients, bend)
+    _check_equal_axes(gradients, bend)
+    if given is None:
+        return _infer_spacing(measured, values.shape, notes)
+    _check_unit(measured, given, notes)
+    return given
 
 
 def _infer_spacing(measured: float, shape: tuple[int, ...], notes: list[str]) -> Triple:

@@ -1,7 +1,8 @@
 """Grids from files, meshes to files. Files are checked before they are read, and appear whole.
 
 Grids: ``.npy`` (an array) and ``.npz`` (keys ``values``, and optionally ``spacing``, ``origin``).
-Meshes: ``.ply`` written here in chunks; ``.stl .obj .off .glb .3mf`` by trimesh.
+Meshes: ``.ply`` written here in chunks; ``.stl .obj .off .glb .3mf`` by trimesh, which wants two
+more packages for the last (extra ``3mf``).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from math import prod
 from pathlib import Path
 from typing import IO, Any
@@ -26,6 +28,7 @@ from .mesh import Mesh
 
 GRID_SUFFIXES = (".npy", ".npz")
 MESH_SUFFIXES = (".ply", ".stl", ".obj", ".off", ".glb", ".3mf")
+NEEDED_FOR_3MF = ("lxml", "networkx")
 NPZ_KEYS = ("values", "spacing", "origin")
 # The pipeline's own arrays over the coarse grid: rescaled, padded, and their masks.
 WORK_BYTES_PER_SAMPLE = 16
@@ -149,6 +152,9 @@ def check_target(path: str | Path, *, force: bool = False) -> Path:
     path = Path(path)
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise OptionError(f"{path} is no mesh file: give one of {', '.join(MESH_SUFFIXES)}")
+    if path.suffix.lower() == ".3mf" and not all(map(find_spec, NEEDED_FOR_3MF)):
+        needed = " and ".join(NEEDED_FOR_3MF)
+        raise FileError(f"writing .3mf needs {needed}: pip install 'super-sdf[3mf]'")
     if path.is_dir():
         raise FileError(f"{path} is a folder: give a file")
     if path.exists() and not force:

@@ -1,0 +1,19 @@
+"""From an array to a mesh: three lines. Here the array is that of a real part.
+
+    python examples/array_to_mesh.py [OUT.ply]
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from super_sdf import SdfGrid, reconstruct, write_mesh
+
+part = np.load(Path(__file__).parent / "part.npz")
+
+grid = SdfGrid(part["values"], spacing=part["spacing"], origin=part["origin"])
+mesh = reconstruct(grid)
+write_mesh(mesh, sys.argv[1] if len(sys.argv) > 1 else "part.ply", force=True)
+
+print(f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles, {mesh.volume():.0f} mm^3")
