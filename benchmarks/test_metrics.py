@@ -1,7 +1,5 @@
 """The measures against closed forms, and the methods against each other."""
 
-# ruff: noqa: D103 - a test's name says what it holds
-
 from __future__ import annotations
 
 import numpy as np

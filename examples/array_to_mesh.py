@@ -1,6 +1,6 @@
 """From an array to a mesh: three lines. Here the array is that of a real part.
 
-    python examples/array_to_mesh.py [OUT.ply]
+python examples/array_to_mesh.py [OUT.ply]
 """
 
 import sys

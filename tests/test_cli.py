@@ -26,10 +26,14 @@ def here(tmp_path, monkeypatch):
 def test_the_main_job(here, command):
     code, out, err = command("upsample", "in.npy", "out.ply")
     assert (code, out) == (0, "")
-    assert err.splitlines()[:2] == [
-        "Note: spacing not given: taken as 1, the values show 1",
-        "Note: origin not given: sample (0, 0, 0) is at 0, 0, 0",
-    ] or "taken as 1, the values show" in err
+    assert (
+        err.splitlines()[:2]
+        == [
+            "Note: spacing not given: taken as 1, the values show 1",
+            "Note: origin not given: sample (0, 0, 0) is at 0, 0, 0",
+        ]
+        or "taken as 1, the values show" in err
+    )
     mesh = trimesh.load("out.ply")
     assert mesh.is_watertight and mesh.volume == pytest.approx(4 / 3 * np.pi * 216, rel=0.01)
 
@@ -61,17 +65,30 @@ def test_options_reach_the_result(here, command):
 def test_a_surface_that_leaves_the_grid_is_reported_and_capped(here, command):
     np.save("cut.npy", ball().values[:12])
     _, _, err = command("upsample", "cut.npy", "open.ply")
-    assert "Warning: the surface runs out of the grid and is open there (close it with --cap)" in err
+    want = "Warning: the surface runs out of the grid and is open there (close it with --cap)"
+    assert want in err
     assert not trimesh.load("open.ply").is_watertight
     _, _, err = command("upsample", "cut.npy", "closed.ply", "--cap")
     assert "Warning" not in err
     assert trimesh.load("closed.ply").is_watertight
 
 
-def test_values_that_are_no_distances_are_warned_of(here, command):
+def test_steps_in_place_of_distances_are_closed_all_the_same(here, command):
     values = np.where(ball().values > 0, 9.0, -9.0) + np.random.default_rng(0).random((20, 20, 20))
     np.save("steps.npy", values)
-    _, _, err = command("upsample", "steps.npy", "out.ply", "--cap")
+    assert command("upsample", "steps.npy", "out.ply", "--cap")[0] == 0
+    assert trimesh.load("out.ply").is_watertight
+
+
+def test_fine_values_that_contradict_the_coarse_ones_are_warned_of(here, command, monkeypatch):
+    from super_sdf.network import Network
+
+    def all_inside(self, patches, table, voxels, offsets):
+        return np.full((len(voxels), len(offsets)), -1, np.float32)
+
+    monkeypatch.setattr(Network, "__call__", all_inside)
+    code, _, err = command("upsample", "in.npy", "out.ply")
+    assert code == 0 and "fine values contradict the coarse ones around them" in err
     assert trimesh.load("out.ply").is_watertight
 
 
@@ -106,7 +123,8 @@ def bad_files() -> None:
     np.savez("other.npz", field=np.zeros(3), more=np.zeros(3))
     save_archive("short.npz", values=good[: len(good) // 2])
     np.savez("spaced.npz", values=np.load("in.npy"), spacing=np.ones(7))
-    damaged = bytearray((np.savez("damaged.npz", values=np.load("in.npy")), Path("damaged.npz"))[1].read_bytes())
+    np.savez("damaged.npz", values=np.load("in.npy"))
+    damaged = bytearray(Path("damaged.npz").read_bytes())
     damaged[5000] ^= 0xFF
     Path("damaged.npz").write_bytes(damaged)
     huge = np.lib.format.header_data_from_array_1_0(np.zeros(1))

@@ -65,11 +65,11 @@ REFUSED = {
     "values are true or false: an occupancy grid holds no distances; "
     "make them with scipy.ndimage.distance_transform_edt": torus(8) < 0,
     "no value is below 0 (the smallest is 0.5): an unsigned field has no inside; if the solid is "
-    "thinner than the spacing, say --inside negative": np.abs(torus(8)) + 0.5 - np.abs(torus(8)).min(),
+    "thinner than the spacing, say --inside negative": np.abs(torus(8))
+    + 0.5
+    - np.abs(torus(8)).min(),
     "no value is above 0 (the largest is -1): the grid lies within the solid; if that is "
-    "outside and the solid thin, say --inside positive": (
-        -1 - np.indices((3, 3, 3)).sum(0)
-    ),
+    "outside and the solid thin, say --inside positive": (-1 - np.indices((3, 3, 3)).sum(0)),
     "values[1, 2, 0] is nan: every sample must be finite; replace unknown far samples by a large "
     "distance of the right sign": np.where(np.arange(27).reshape(3, 3, 3) == 15, np.nan, 1.0),
     "values[0, 0, 2] is -inf: every sample must be finite; replace unknown far samples by a large "
@@ -93,9 +93,8 @@ def test_a_wrong_unit_is_refused_with_the_way_out():
     with pytest.raises(GridError) as caught:
         make_grid(ball(24, 8.0).values, spacing=0.1)
     assert str(caught.value).startswith("the values change by ")
-    assert "from sample to sample, but spacing is 0.1: distances and spacing must be in one unit" in (
-        str(caught.value)
-    )
+    want = "from sample to sample, but spacing is 0.1: distances and spacing must be in one unit"
+    assert want in str(caught.value)
 
 
 def test_values_that_are_not_quite_distances_are_noted():
@@ -130,6 +129,6 @@ def test_a_solid_between_the_samples_needs_a_word_and_a_spacing():
     rod = np.hypot(x, y) - 0.6  # nearest samples are 0.7 away
     with pytest.raises(GridError, match="say --inside negative"):
         make_grid(rod)
-    with pytest.raises(GridError, match="all values are on one side of the surface: give --spacing"):
+    with pytest.raises(GridError, match=r"all values are on one side .* give --spacing"):
         make_grid(rod, inside="negative")
     assert make_grid(rod, inside="negative", spacing=1, origin=0).notes == ()

@@ -83,7 +83,7 @@ def test_3mf_without_its_packages_is_refused_before_the_work(tmp_path, monkeypat
 
 
 def test_only_known_formats_and_free_places_are_written(tmp_path, mesh):
-    with pytest.raises(OptionError, match="give one of .ply, .stl, .obj, .off, .glb, .3mf"):
+    with pytest.raises(OptionError, match=r"give one of \.ply, \.stl, \.obj, \.off, \.glb, \.3mf"):
         write_mesh(mesh, tmp_path / "out.xyz")
     write_mesh(mesh, tmp_path / "out.ply")
     with pytest.raises(FileError, match="exists: remove it or use --force"):

@@ -1,0 +1,1 @@
+"""Tests of the training side; they need the export extra."""

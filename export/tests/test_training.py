@@ -111,7 +111,9 @@ def test_the_gradient_of_the_neighbour_convolution():
     table = torch.from_numpy(np.where(table < 0, len(voxels), table))
     features = torch.randn(len(voxels), 3, dtype=torch.double, requires_grad=True)
     weight = torch.randn(81, 2, dtype=torch.double, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda f, w: GatherMatMul.apply(f, w, table), (features, weight))
+    assert torch.autograd.gradcheck(
+        lambda f, w: GatherMatMul.apply(f, w, table), (features, weight)
+    )
 
 
 def test_an_untrained_network_keeps_samples_and_planes():

@@ -83,7 +83,7 @@ def _owners(table: IntArray) -> tuple[IntArray, IntArray]:
     """Return for each part of each voxel, (D, 27), the voxel it belongs to, and as which part."""
     owner, owner_part = np.empty_like(table), np.empty_like(table)
     for part, sides in enumerate(NEIGHBOURHOOD):
-        sharing = np.flatnonzero(((NEIGHBOURHOOD == 0) | (NEIGHBOURHOOD == sides)).all(1))
+        sharing = np.flatnonzero(((NEIGHBOURHOOD == 0) | (sides == NEIGHBOURHOOD)).all(1))
         first = sharing[(table[:, sharing] >= 0).argmax(1)]
         owner[:, part] = np.take_along_axis(table, first[:, None], 1)[:, 0]
         # Seen from the owner, one step away on some axes, the part is on the other side there.
