@@ -93,7 +93,8 @@ class Shape:
         self.name = path.stem
         self.mesh = metrics.normalise(load_mesh(str(path)))
         self.drawn = metrics.sample_surface(self.mesh, self.seed(0))
-        self.edges = metrics.sample_sharp_edges(self.mesh, self.seed(1))
+        self.sharp = metrics.sharp_edges(self.mesh)
+        self.sharp_drawn = metrics.sample_edges(self.mesh.vertices, self.sharp, self.seed(1))
 
     def seed(self, stream: int) -> tuple[int, int]:
         """Return the seed of a stream of random numbers: the shape's name and the stream."""
@@ -277,10 +278,11 @@ def make_method(name: str, model: str) -> Method:
 def measure_surface(shape: Shape, mesh: TriMesh) -> Row:
     """Return every mesh figure of a result; without faces, a dot at the origin is measured."""
     drawn = metrics.sample_surface(mesh, shape.seed(2))
+    edge_points = metrics.edge_points(drawn)
     return {
         **metrics.compare_samples(shape.drawn, drawn),
         **metrics.compare_surfaces(shape.mesh, mesh, shape.drawn, drawn),
-        **metrics.compare_edges(shape.edges, metrics.edge_points(drawn)),
+        **metrics.compare_edges(shape.mesh.vertices, shape.sharp, shape.sharp_drawn, edge_points),
         "closed": metrics.is_closed(mesh.faces),
         "outward": metrics.volume(mesh) > 0,
         "faces": len(mesh.faces),

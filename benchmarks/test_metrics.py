@@ -126,22 +126,27 @@ def test_an_empty_result_is_a_dot_at_the_origin() -> None:
 
 def test_the_sharp_edges_of_a_cube() -> None:
     box = TriMesh(cube().vertices * 0.2, CUBE_FACES)
-    assert len(metrics.sharp_edges(box)) == 12  # not the 6 diagonals of its sides
-    edges = metrics.sample_sharp_edges(box, (7, 0))
-    assert (np.isclose(np.abs(edges), 0.1).sum(1) >= 2).all()
+    sharp = metrics.sharp_edges(box)
+    assert len(sharp) == 12  # not the 6 diagonals of its sides
+    drawn = metrics.sample_edges(box.vertices, sharp, (7, 0))
+    assert (np.isclose(np.abs(drawn), 0.1).sum(1) >= 2).all()
     near = metrics.edge_points(metrics.sample_surface(box, (7, 1)))
     off_edge = np.linalg.norm(0.1 - np.sort(np.abs(near), axis=1)[:, 1:], axis=1)
     assert len(near) and off_edge.max() < metrics.EDGE_RADIUS
-    figures = metrics.compare_edges(edges, near)
+    figures = metrics.compare_edges(box.vertices, sharp, drawn, near)
     assert figures["ef1"] == pytest.approx(1, abs=0.02)
-    assert metrics.compare_edges(edges, metrics.DOT.points[:0])["ef1"] == 0
+    assert 0 < figures["ecd"] < 2 * metrics.EDGE_RADIUS**2
+    assert metrics.compare_edges(box.vertices, sharp, drawn, np.zeros((0, 3)))["ef1"] == 0
 
 
 def test_a_smooth_shape_has_no_edge_to_compare() -> None:
     ball = sphere()
-    assert not len(metrics.sample_sharp_edges(ball, (7, 0)))
-    assert not len(metrics.edge_points(metrics.sample_surface(ball, (7, 0))))
-    assert metrics.compare_edges(np.zeros((0, 3)), np.zeros((0, 3))) == {"ecd": None, "ef1": None}
+    sharp = metrics.sharp_edges(ball)
+    drawn = metrics.sample_edges(ball.vertices, sharp, (7, 0))
+    near = metrics.edge_points(metrics.sample_surface(ball, (7, 0)))
+    assert len(sharp) == len(drawn) == len(near) == 0
+    figures = metrics.compare_edges(ball.vertices, sharp, drawn, near)
+    assert figures == {"ecd": None, "ef1": None}
 
 
 def test_the_frame() -> None:

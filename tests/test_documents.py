@@ -43,7 +43,8 @@ def test_the_main_job_of_the_readme(tmp_path, monkeypatch):
     assert mesh.is_watertight and mesh.volume > 0
     with np.load("examples/part.npz") as grid:  # the samples inside tell where the part is
         inside = np.argwhere(grid["values"] < 0)
-        low, high = (grid["origin"] + grid["spacing"] * ijk for ijk in (inside.min(0), inside.max(0)))
+        low = grid["origin"] + grid["spacing"] * inside.min(0)
+        high = grid["origin"] + grid["spacing"] * inside.max(0)
     assert (mesh.bounds[0] > low - 1.5).all() and (mesh.bounds[1] < high + 1.5).all()
 
 
