@@ -9,7 +9,7 @@ ROOT = Path(__file__).parent.parent
 SOURCES = sorted((ROOT / "src" / "super_sdf").glob("*.py"))
 FLOORS = [
     {"errors"},
-    {"grid"},
+    {"grid", "memory"},
     {"band", "mesh", "conventions", "network", "cell_cases"},
     {"nodes", "io"},
     {"field"},

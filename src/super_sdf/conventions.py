@@ -62,7 +62,7 @@ def make_grid(
     chosen = _choose_spacing(values, level, spacing, notes)
     if origin is None:
         notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
-    return SdfGrid(values, chosen, (0.0, 0.0, 0.0) if origin is None else origin, tuple(notes))
+    return SdfGrid(values, chosen, 0.0 if origin is None else origin, tuple(notes))
 
 
 def check_not_flat(values: NDArray[Any]) -> None:

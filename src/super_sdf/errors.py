@@ -7,6 +7,7 @@
   - ``FileError`` (also ``OSError``): a file cannot be read or written.
   - ``ModelError`` (also ``ValueError``): an ONNX file that does not keep the network's contract.
   - ``DeviceError`` (also ``RuntimeError``): a device was asked for that cannot run here.
+  - ``OutOfMemoryError`` (also ``MemoryError``): the work would not fit in memory; it was not begun.
 """
 
 
@@ -32,3 +33,7 @@ class ModelError(SuperSdfError, ValueError):
 
 class DeviceError(SuperSdfError, RuntimeError):
     """A device was asked for that cannot run here."""
+
+
+class OutOfMemoryError(SuperSdfError, MemoryError):
+    """The work would not fit in memory; it was not begun."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from .errors import GridError
 
@@ -19,18 +19,18 @@ Triple: TypeAlias = tuple[float, float, float]
 EQUAL_SPACING = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class SdfGrid:
     """Signed distances at the points ``world = origin + spacing * (i, j, k)``.
 
     Parameters
     ----------
-    values : (nx, ny, nz) array
+    values : (nx, ny, nz) array_like
         Signed distances in world units, negative inside; i runs along x, j along y, k along z.
     spacing : float or three floats
         World distance between neighbouring samples; equal on all axes.
-    origin : three floats
-        World position of sample (0, 0, 0).
+    origin : float or three floats
+        World position of sample (0, 0, 0); the world's origin unless given.
     notes : tuple of str
         What was inferred rather than given, a sentence each.
 
@@ -43,13 +43,20 @@ class SdfGrid:
 
     values: NDArray[Any]
     spacing: Triple
-    origin: Triple = (0.0, 0.0, 0.0)
-    notes: tuple[str, ...] = ()
+    origin: Triple
+    notes: tuple[str, ...]
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "values", check_values(np.asanyarray(self.values)))
-        object.__setattr__(self, "spacing", check_spacing(self.spacing))
-        object.__setattr__(self, "origin", as_triple(self.origin, "origin"))
+    def __init__(
+        self,
+        values: ArrayLike,
+        spacing: ArrayLike,
+        origin: ArrayLike = 0.0,
+        notes: tuple[str, ...] = (),
+    ) -> None:
+        object.__setattr__(self, "values", check_values(np.asanyarray(values)))
+        object.__setattr__(self, "spacing", check_spacing(spacing))
+        object.__setattr__(self, "origin", as_triple(origin, "origin"))
+        object.__setattr__(self, "notes", notes)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -63,7 +70,7 @@ class SdfGrid:
         return sum(self.spacing) / 3
 
 
-def as_triple(number: Any, name: str) -> Triple:
+def as_triple(number: ArrayLike, name: str) -> Triple:
     """Return one number or three as three finite floats."""
     try:
         triple = np.broadcast_to(np.asarray(number, np.float64).ravel(), (3,))
@@ -74,7 +81,7 @@ def as_triple(number: Any, name: str) -> Triple:
     return float(triple[0]), float(triple[1]), float(triple[2])
 
 
-def check_spacing(spacing: Any) -> Triple:
+def check_spacing(spacing: ArrayLike) -> Triple:
     """Return the spacing as three floats; they must be positive and equal (within 0.1 %)."""
     triple = as_triple(spacing, "spacing")
     if min(triple) <= 0:

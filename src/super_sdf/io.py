@@ -22,8 +22,9 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from .conventions import make_grid
-from .errors import FileError, GridError, OptionError
+from .errors import FileError, GridError, OptionError, SuperSdfError
 from .grid import SdfGrid
+from .memory import check_fits
 from .mesh import Mesh
 
 GRID_SUFFIXES = (".npy", ".npz")
@@ -50,7 +51,9 @@ def read_grid(
     Raises
     ------
     FileError
-        If the file is missing, damaged, truncated, of another kind, or larger than memory.
+        If the file is missing, damaged, truncated or of another kind.
+    OutOfMemoryError
+        If it is larger than memory.
     GridError
         If its values are no signed distance grid.
     """
@@ -89,7 +92,7 @@ def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
                 raise FileError(f"{path} has no key 'values' (it holds {held})")
             return {key: _read_member(archive, key, path) for key in NPZ_KEYS if key in names}
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
-        if isinstance(error, FileError):
+        if isinstance(error, SuperSdfError):
             raise
         raise FileError(f"{path} is no readable .npz archive: {error}") from None
 
@@ -129,22 +132,7 @@ def _check_promise(
     if size > follow:
         raise FileError(f"{name} is truncated: its header promises {said}, but {follow:,} follow")
     need = prod(shape) * WORK_BYTES_PER_SAMPLE + size * loaded
-    free = free_memory()
-    if free is not None and need > free:
-        raise FileError(
-            f"{name} is too large: {said}, needs {need / 1e9:,.1f} GB of memory, "
-            f"{free / 1e9:,.1f} GB are free; cut it into pieces"
-        )
-
-
-def free_memory() -> int | None:
-    """Return the bytes of memory that are free, None where the system does not say."""
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:
-        return None
-    sizes = dict(line.split(":") for line in lines)
-    return int(sizes["MemAvailable"].split()[0]) * 1024 if "MemAvailable" in sizes else None
+    check_fits(need, f"{name}, {said},", "cut the grid into pieces")
 
 
 def check_target(path: str | Path, *, force: bool = False) -> Path:

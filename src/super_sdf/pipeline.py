@@ -25,6 +25,7 @@ from .errors import GridError
 from .field import FineField, close_at_border
 from .grid import BoolArray, FloatArray, IntArray, SdfGrid
 from .isosurface import extract_mesh
+from .memory import check_fits
 from .mesh import Mesh
 from .nodes import (
     average_shared,
@@ -37,6 +38,9 @@ from .nodes import (
 
 Progress = Callable[[int, int], None]
 """Called with (steps done, steps in all)."""
+
+# At most, from the network's output to the mesh, for each node of each decoded block.
+BYTES_PER_BLOCK_NODE = 36
 
 STEPS = ("band", "network", "nodes", "isosurface")
 
@@ -83,6 +87,8 @@ def upsample(
     ------
     OptionError
         If the factor is odd or out of range.
+    OutOfMemoryError
+        If the fine values would not fit in memory.
     GridError
         If no surface is found: thin parts may pass between samples that are all outside, so this
         is known only in the end.
@@ -96,6 +102,8 @@ def upsample(
     patches = gather_patches(rescaled, band_ijk)
     table = neighbour_table(band_ijk, grid.shape)
     voxels = np.flatnonzero(can_hold_surface(patches)).astype(np.int32)
+    need = len(voxels) * (factor + 1) ** 3 * BYTES_PER_BLOCK_NODE
+    check_fits(need, f"factor {factor} on {len(voxels):,} voxels", "use a smaller factor")
     tell(1, len(STEPS))
 
     blocks = network(patches, table, voxels, block_offsets(factor))  # Eqs. 3 and 5

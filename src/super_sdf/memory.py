@@ -1,0 +1,26 @@
+"""How much memory is free, asked before it is taken: a killed process says nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from .errors import OutOfMemoryError
+
+
+def free_memory() -> int | None:
+    """Return the bytes of memory that are free, None where the system does not say."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    sizes = dict(line.split(":") for line in lines)
+    return int(sizes["MemAvailable"].split()[0]) * 1024 if "MemAvailable" in sizes else None
+
+
+def check_fits(need: int, what: str, way_out: str) -> None:
+    """Raise if ``need`` bytes are not free; ``what`` needs them."""
+    free = free_memory()
+    if free is not None and need > free:
+        raise OutOfMemoryError(
+            f"{what} needs {need / 1e9:,.1f} GB of memory, {free / 1e9:,.1f} GB are free; {way_out}"
+        )
