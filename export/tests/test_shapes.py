@@ -7,8 +7,9 @@ import pytest
 from manifold3d import Manifold
 
 from export import shapes
+from export.families import FAMILIES, log_uniform, unit_sized
 from export.sampling import TriMesh
-from export.shapes import FAMILIES, MAX_FACES, log_uniform, random_solid, unit_sized, without_crumbs
+from export.shapes import MAX_FACES, random_solid, without_crumbs
 
 SEEDS = range(20)
 
