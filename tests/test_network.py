@@ -82,6 +82,12 @@ def test_cuda_that_does_not_start_is_an_error(monkeypatch):
         load_network(device="cuda")
 
 
+def test_a_failing_run_is_one_error_of_ours():
+    patches, table, rows = network_inputs(ball())
+    with pytest.raises(DeviceError, match="the network failed on cpu: "):
+        load_network()(patches, table, rows + 10**6, block_offsets(2))
+
+
 def test_what_is_no_network_is_refused(tmp_path):
     with pytest.raises(FileError, match="no model 'other': give an ONNX file or one of: base"):
         load_network("other")

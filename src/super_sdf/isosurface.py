@@ -56,30 +56,37 @@ def _edge_vertices(
         The vertex on the edge that runs from node v along axis a, at ``3 v + a``; and the
         positions, in fine spacings from the fine lattice's first node.
     """
-    local = block_ijk(field.factor)
+    along = [_vertices_along(axis, field, numbers, voxel_ijk, inside) for axis in range(3)]
+    keys, position = (np.concatenate(parts) for parts in zip(*along))
     vertex_at = np.full(3 * len(field.values), -1, np.int32)
-    edges, low, high, place = [], [], [], []
-    for axis in range(3):
-        voxel, start, end = _crossed_edges(inside, axis)
-        key = 3 * numbers[voxel, start].astype(np.int64) + axis
-        vertex_at[key] = np.arange(len(key), dtype=np.int32)
-        first = vertex_at[key] == np.arange(len(key))  # an edge of several blocks: one stays
-        voxel, start, end = voxel[first], start[first], end[first]
-        edges.append(key[first])
-        low.append(field.values[numbers[voxel, start]])
-        high.append(field.values[numbers[voxel, end]])
-        place.append(field.factor * voxel_ijk[voxel] + local[start])
-    keys = np.concatenate(edges)
-    position = np.concatenate(place).astype(np.float64)
-    share = _crossing(np.concatenate(low), np.concatenate(high))
-    axes = np.repeat(np.arange(3), [len(e) for e in edges])
-    end_position = position.copy()
-    end_position[np.arange(len(axes)), axes] += 1
-    lattice = np.array(field.shape) * field.factor
-    position, end_position = _onto_border(position, lattice), _onto_border(end_position, lattice)
-    position += share[:, None] * (end_position - position)
     vertex_at[keys] = np.arange(len(keys), dtype=np.int32)
     return vertex_at, position
+
+
+def _vertices_along(
+    axis: int, field: FineField, numbers: IntArray, voxel_ijk: IntArray, inside: BoolArray
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the names ``3 v + axis`` of crossed edges along an axis, and their vertices."""
+    voxel, start, end = _crossed_edges(inside, axis)
+    node = numbers[voxel, start]
+    one = _one_of_each(node, len(field.values))  # up to four blocks share an edge
+    voxel, start, end, node = voxel[one], start[one], end[one], node[one]
+    share = _crossing(field.values[node], field.values[numbers[voxel, end]])
+
+    low = (field.factor * voxel_ijk[voxel] + block_ijk(field.factor)[start]).astype(np.float64)
+    high = low + np.eye(3)[axis]
+    lattice = np.array(field.shape) * field.factor
+    low, high = _onto_border(low, lattice), _onto_border(high, lattice)
+    return 3 * node.astype(np.int64) + axis, low + share[:, None] * (high - low)
+
+
+def _one_of_each(node: IntArray, count: int) -> BoolArray:
+    """Mark one place of each different number below ``count``, without sorting."""
+    places = np.arange(len(node), dtype=np.int32)
+    last = np.empty(count, np.int32)
+    last[node] = places
+    one: BoolArray = last[node] == places
+    return one
 
 
 def _crossed_edges(

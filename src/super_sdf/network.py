@@ -49,9 +49,20 @@ class Network:
     def __call__(
         self, patches: FloatArray, table: IntArray, voxels: IntArray, offsets: FloatArray
     ) -> FloatArray:
-        """Return the values (D, Q) of voxels (D,) at offsets (Q, 3), in half voxels."""
+        """Return the values (D, Q) of voxels (D,) at offsets (Q, 3), in half voxels.
+
+        Raises
+        ------
+        DeviceError
+            If onnxruntime fails, for want of memory on a GPU, say.
+        """
         feeds = {"patches": patches, "neighbours": table, "voxels": voxels, "offsets": offsets}
-        values: FloatArray = self.session.run([OUTPUT], feeds)[0]
+        try:
+            values: FloatArray = self.session.run([OUTPUT], feeds)[0]
+        except Exception as error:  # onnxruntime's errors have no common base but this
+            raise DeviceError(
+                f"the network failed on {self.device}: {_first_line(error)}"
+            ) from error
         return values
 
 
@@ -129,8 +140,13 @@ def _open_session(path: Path, providers: list[str], threads: int) -> ort.Inferen
     try:
         return ort.InferenceSession(str(path), options, providers=providers)
     except Exception as error:  # onnxruntime's errors have no common base but this
-        reason = str(error).strip().splitlines()[0]
+        reason = _first_line(error)
         raise ModelError(f"{path} is no ONNX file that onnxruntime can run: {reason}") from error
+
+
+def _first_line(error: Exception) -> str:
+    """Return what an error says, in one line."""
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)
 
 
 def _read_card(session: ort.InferenceSession, path: Path) -> dict[str, Any]:
