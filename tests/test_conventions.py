@@ -25,6 +25,12 @@ def test_thin_walls_and_edges_do_not_bend_the_measure():
     assert typical_length(*surface_gradients(plate)) == pytest.approx(1, abs=0.005)
 
 
+def test_walls_thinner_than_the_spacing_are_not_taken_for_unequal_axes():
+    x, y, z = np.abs(np.indices((40, 40, 40)) - 19.4)
+    shell = np.abs(np.maximum(x - 14, np.maximum(y - 12, z - 9))) - 0.45
+    assert make_grid(shell, origin=0).spacing == (1.0, 1.0, 1.0)
+
+
 @pytest.mark.parametrize(
     "unit, want, said",
     [
@@ -114,7 +120,8 @@ def test_spacing_must_be_equal_positive_and_finite():
 
 
 def test_values_sampled_unequally_are_refused_whatever_the_spacing():
-    values = torus(64)[:, :, ::2]
+    x, y, z = np.abs(np.indices((40, 40, 40)) - 19.4)
+    values = np.maximum(x - 12, np.maximum(y - 9, z - 14))[:, :, ::2]
     with pytest.raises(GridError, match=r"the values change by .* along x, .* along y, .* along z"):
         make_grid(values)
 

@@ -18,7 +18,8 @@ INSIDE = ("auto", "negative", "positive")
 SNAP = 0.02  # an estimate this near to a usual spacing is taken for it
 TOLERATED, REFUSED = 1.1, 2.0  # ratio of measured to given spacing: noted beyond, refused beyond
 UNEQUAL = 1.3  # ratio of the spacings along two axes that the values themselves show
-ENOUGH = 30  # samples for a statement about one axis
+ENOUGH = 30  # samples for a statement
+STRAIGHT = 0.3  # bend (see surface_gradients) below which a field is linear enough to measure
 
 
 def make_grid(
@@ -154,13 +155,16 @@ def _plane_gradients(
 def typical_length(gradients: NDArray[np.float64], bend: NDArray[np.float64]) -> float:
     """Return the length round which the gradients (n, 3) cluster: their half-sample mode.
 
-    Only the straighter half counts: thin walls, edges and noise bend the field, and make its
-    gradient too small or too large.
+    Only the straighter half counts, and of it what is straight indeed if that is enough: thin
+    walls, edges and noise bend the field, and make its gradient too small or too large.
     Reference: Bickel and Frühwirth, "On a fast, robust estimator of the mode", 2006.
     """
     if not len(gradients):
         raise GridError("all values are on one side of the surface: give --spacing")
-    straight = gradients[bend <= np.median(bend)]
+    limit = float(np.median(bend))
+    if (bend < STRAIGHT).sum() >= ENOUGH:
+        limit = min(limit, STRAIGHT)
+    straight = gradients[bend <= limit]
     length: NDArray[np.float64] = np.sort(np.sqrt((straight**2).sum(1)))
     while len(length) > 2:
         half = (len(length) + 1) // 2
@@ -175,7 +179,7 @@ def _check_equal_axes(gradients: NDArray[np.float64], bend: NDArray[np.float64])
     length = np.sqrt((gradients**2).sum(1))
     seen: dict[str, float] = {}
     for axis, name in enumerate("xyz"):
-        along = np.abs(gradients[:, axis]) > 0.95 * length
+        along = (np.abs(gradients[:, axis]) > 0.95 * length) & (bend < STRAIGHT)
         if along.sum() >= ENOUGH:
             seen[name] = typical_length(gradients[along], bend[along])
     if seen and max(seen.values()) > UNEQUAL * min(seen.values()):
