@@ -22,6 +22,11 @@ if TYPE_CHECKING:
     from .mesh import Mesh
     from .network import Network
 
+EXAMPLES = """\b
+Examples:
+  super-sdf upsample part.npz part.ply
+  super-sdf upsample field.npy part.stl --spacing 0.5 --factor 8
+"""
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
 
@@ -46,7 +51,9 @@ def cli() -> None:
     """Turn coarse signed distance grids into fine meshes."""
 
 
-@cli.command(context_settings=CONTEXT)
+@cli.command(
+    context_settings=CONTEXT, epilog=EXAMPLES, short_help="Refine a grid and write its surface."
+)
 @click.argument("source", metavar="IN")
 @click.argument("target", metavar="OUT")
 @click.option(
@@ -96,15 +103,10 @@ def cli() -> None:
 @click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
 @click.option("-v", "--verbose", is_flag=True, help="Print counts and stage times too.")
 def upsample(source: str, target: str, **options: Any) -> None:
-    r"""Refine the signed distance grid IN and write its surface as the mesh OUT.
+    """Refine the signed distance grid IN and write its surface as the mesh OUT.
 
     IN is .npy (a 3D array: x, y, z) or .npz (keys values, spacing, origin). OUT is .ply, .stl,
     .obj, .off, .glb or .3mf.
-
-    \b
-    Examples:
-      super-sdf upsample part.npz part.ply
-      super-sdf upsample field.npy part.stl --spacing 0.5 --factor 8
     """
     with one_line_errors():
         run = Upsampling(source, target, options)
@@ -243,7 +245,7 @@ class Upsampling:
         )
 
 
-@cli.command(context_settings=CONTEXT)
+@cli.command(context_settings=CONTEXT, short_help="Show versions, devices and networks.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def info(as_json: bool) -> None:
     """Show versions, devices, and the shipped networks with their cards."""
