@@ -1,4 +1,4 @@
-"""The quality measures of EVALUATION.md: arrays in, numbers out.
+"""The quality measures that NMC, NDC, VoroMesh and PoNQ share: arrays in, numbers out.
 
 All lengths are in the frame's unit: reference mesh centred on its bounding box, box diagonal 1.
 P are the points drawn from the reference, Q those drawn from the result.
@@ -41,8 +41,7 @@ class Samples:
 
 # What stands in for a result without a surface; it has no normal.
 DOT = Samples(np.zeros((1, 3)), np.zeros((1, 3)))
-# NC of a point without a normal: the mean of |n.n'| over all directions of n. The figures of
-# EVALUATION.md have this for shapes that were not found.
+# NC of a point without a normal: the mean of |n.n'| over all directions of n.
 NO_NORMAL_NC = 0.5
 
 

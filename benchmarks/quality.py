@@ -1,4 +1,4 @@
-"""How good the surfaces are: super-sdf beside its baselines and its bound (EVALUATION.md).
+"""How good the surfaces are: super-sdf beside its baselines and its bound.
 
     python -m benchmarks.quality --meshes DIR --sizes 32 64 --out report/
 
@@ -79,7 +79,7 @@ GAPS = (
     ("NC", "nc"),
     ("excess CD", "excess_cd"),
     ("point-to-surface", "p2s"),
-    ("result to reference only", "p2s_back"),  # what EVALUATION.md quotes for the validation shapes
+    ("result to reference only", "p2s_back"),  # one-sided: thin parts that are lost do not count
 )
 
 

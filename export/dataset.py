@@ -1,6 +1,6 @@
 """Training samples: windows of coarse grids with exact distances at fine query points.
 
-    python -m export.dataset --meshes DIR --out work/store --count 3000
+    python -m export.dataset --meshes DIR --out training/store --count 3000
 
 A sample is one shape in one pose at one resolution. It holds a window of the coarse grid and, for
 each voxel that can hold the surface, the exact distance at a set of query offsets that is drawn

@@ -1,6 +1,6 @@
 """Write a trained network as the ONNX file that the runtime loads, and check that they agree.
 
-    python -m export.to_onnx --run work/run --out models/base.onnx --data "..." --accuracy "..."
+    python -m export.to_onnx --run training/run --out models/base.onnx --data "..." --accuracy "..."
 
 The graph is written by hand because of one thing an exporter would not do: each neighbour
 convolution runs as a Scan over chunks of the neighbour table. Gathered rows are 27 times as large

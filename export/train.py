@@ -1,7 +1,7 @@
 """Train the network; resumable, one log line an interval.
 
-    python -m export.train --store work/store --run work/run --minutes 90
-    python -m export.train --store work/store --run work/run --minutes 90     # goes on
+    python -m export.train --store training/store --run training/run --minutes 90
+    python -m export.train --store training/store --run training/run --minutes 90     # goes on
 
 A run folder holds ``checkpoint.pt`` (weights, averaged weights, optimiser, time spent) and
 ``log.csv``. The learning rate follows the share of ``--minutes`` that is spent, so a run always
