@@ -16,8 +16,6 @@ from dataclasses import asdict, dataclass
 import torch
 from torch import Tensor, nn
 
-from super_sdf.band import CENTRE
-
 
 @dataclass(frozen=True)
 class NetworkConfig:
@@ -162,7 +160,7 @@ class SuperSdfNet(nn.Module):
 
 
 def interpolation_weights(offsets: Tensor) -> Tensor:
-    """Return the weights (Q, 27) of quadratic interpolation in the patch.
+    """Return the weights (Q, 27) of quadratic interpolation in the patch, in its (C) order.
 
     Through the three samples of an axis, at -1, 0 and 1 voxels, runs one parabola; the product
     over the axes keeps the sample and reproduces linear functions exactly.
@@ -171,6 +169,3 @@ def interpolation_weights(offsets: Tensor) -> Tensor:
     axis = torch.stack([at * (at - 1) / 2, 1 - at * at, at * (at + 1) / 2], 2)
     x, y, z = axis.unbind(1)
     return (x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]).flatten(1)
-
-
-assert CENTRE == 13  # the product above lists the neighbourhood in C order

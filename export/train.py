@@ -100,11 +100,12 @@ def loss_of(net: SuperSdfNet, batch: list[Prepared]) -> tuple[Tensor, Tensor]:
 
 
 class Store:
-    """Prepared samples of all shards in a folder, read as they appear."""
+    """The samples of all shards in a folder, read as they appear; the first are held out."""
 
     def __init__(self, folder: Path, held_out: int) -> None:
-        self.folder, self.skip = folder, held_out
-        self.seen: set[Path] = set()
+        self.folder = folder
+        self.seen = set(sorted(folder.glob("shard-*.npz"))[:held_out])
+        self.held_out = [prepare(s) for path in sorted(self.seen) for s in read_shard(path)]
         self.samples: list[Sample] = []
         self.order: list[int] = []
 
@@ -112,8 +113,7 @@ class Store:
         """Read the shards that are new."""
         for path in sorted(set(self.folder.glob("shard-*.npz")) - self.seen):
             self.seen.add(path)
-            if len(self.seen) > self.skip:
-                self.samples += list(read_shard(path))
+            self.samples += list(read_shard(path))
 
     def draw_batch(self, rng: np.random.Generator) -> list[Prepared]:
         """Return samples of about ``BATCH_VOXELS`` voxels together, each once an epoch."""
@@ -192,11 +192,6 @@ def held_out_error(net: SuperSdfNet, samples: list[Prepared]) -> float:
 def train(run: Run, store: Store, minutes: float, seed: int) -> None:
     """Train until the budget is spent."""
     rng = np.random.default_rng([seed, run.step])
-    held_out = [
-        prepare(s)
-        for path in sorted(store.folder.glob("shard-*.npz"))[:HELD_OUT]
-        for s in read_shard(path)
-    ]
     store.refresh()
     saved, errors = time.monotonic(), []
     while run.seconds < 60 * minutes:
@@ -204,7 +199,7 @@ def train(run: Run, store: Store, minutes: float, seed: int) -> None:
         errors.append(run.advance(store.draw_batch(rng), run.seconds / (60 * minutes)))
         run.seconds += time.monotonic() - start
         if run.step % LOG_STEPS == 0:
-            log(run, len(store.samples), float(np.mean(errors)), held_out)
+            log(run, len(store.samples), float(np.mean(errors)), store.held_out)
             errors.clear()
             store.refresh()
         if time.monotonic() - saved > CHECKPOINT_SECONDS:

@@ -134,12 +134,11 @@ class Upsampling:
 
     def work(self) -> None:
         """Read, refine, mesh and write."""
-        from .field import border_is_crossed, close_at_border
+        from .field import border_is_crossed
         from .io import check_target, read_grid, write_mesh
-        from .isosurface import extract_mesh
         from .network import load_network
         from .nodes import check_factor
-        from .pipeline import STEPS, inside_samples, upsample
+        from .pipeline import STEPS, mesh_field, upsample
 
         asked = self.options
         check_factor(asked["factor"])
@@ -167,10 +166,7 @@ class Upsampling:
                 self.grid, self.network, asked["factor"], offset=asked["offset"], progress=tell
             )
             self.find_warnings(border_is_crossed(self.field))
-            if asked["cap"]:
-                inside = inside_samples(self.grid, asked["offset"])
-                self.field = close_at_border(self.field, inside)
-            self.mesh = extract_mesh(self.field, self.grid)
+            self.mesh = mesh_field(self.field, self.grid, offset=asked["offset"], cap=asked["cap"])
             tell(len(STEPS), len(STEPS))
         write_mesh(self.mesh, self.target, force=asked["force"])
         self.lap("write")

@@ -42,17 +42,18 @@ class FineField:
     band_voxels: int
     pinned: int
 
-    def blocks(self) -> FloatArray:
-        """Return the values block by block, (D, K+1, K+1, K+1)."""
-        return self.values[self.numbers].reshape(-1, *(self.factor + 1,) * 3)
+    def inside_blocks(self, rows: BoolArray) -> BoolArray:
+        """Say which nodes of some voxels' blocks are inside, (n, K+1, K+1, K+1)."""
+        inside: BoolArray = (self.values <= 0)[self.numbers[rows]]
+        return inside.reshape(-1, *(self.factor + 1,) * 3)
 
 
 def border_is_crossed(field: FineField) -> bool:
     """Say whether the surface runs through the outer faces of the grid."""
-    inside = field.blocks() <= 0
     for axis, samples in enumerate(field.shape):
         for voxel, node in ((0, 0), (samples - 1, field.factor)):
-            outer = inside[field.voxel_ijk[:, axis] == voxel].take(node, axis=axis + 1)
+            at_face = field.voxel_ijk[:, axis] == voxel
+            outer = np.moveaxis(field.inside_blocks(at_face), axis + 1, 0)[node]
             if (outer.any((1, 2)) & ~outer.all((1, 2))).any():
                 return True
     return False

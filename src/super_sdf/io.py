@@ -92,6 +92,7 @@ def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
                 raise FileError(f"{path} has no key 'values' (it holds {held})")
             return {key: _read_member(archive, key, path) for key in NPZ_KEYS if key in names}
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+        # The last two are zipfile's for an unknown compression and for an encrypted member.
         if isinstance(error, SuperSdfError):
             raise
         raise FileError(f"{path} is no readable .npz archive: {error}") from None

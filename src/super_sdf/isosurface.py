@@ -31,18 +31,12 @@ def extract_mesh(field: FineField, grid: SdfGrid) -> Mesh:
     A node with value 0 is inside. Vertices lie on lattice edges, by linear interpolation.
     References: Lorensen and Cline, "Marching Cubes", 1987.
     """
-    active = _crossed_blocks(field)
-    numbers, voxel_ijk = field.numbers[active], field.voxel_ijk[active]
-    inside = (field.values <= 0)[numbers].reshape(-1, *(field.factor + 1,) * 3)
+    inside = field.inside_blocks(np.ones(len(field.numbers), bool))
+    crossed = inside.any((1, 2, 3)) & ~inside.all((1, 2, 3))
+    inside, numbers, voxel_ijk = inside[crossed], field.numbers[crossed], field.voxel_ijk[crossed]
     vertex_at, position = _edge_vertices(field, numbers, voxel_ijk, inside)
     faces = _triangles(inside, numbers, vertex_at)
     return Mesh(_to_world(position, field, grid), faces)
-
-
-def _crossed_blocks(field: FineField) -> NDArray[np.int64]:
-    """Return the voxels whose nodes are not all on one side."""
-    inside = (field.values <= 0)[field.numbers]
-    return np.flatnonzero(inside.any(1) & ~inside.all(1))
 
 
 def _edge_vertices(

@@ -23,7 +23,7 @@ from .band import (
 )
 from .errors import GridError
 from .field import FineField, close_at_border
-from .grid import BoolArray, FloatArray, IntArray, SdfGrid
+from .grid import FloatArray, IntArray, SdfGrid
 from .isosurface import extract_mesh
 from .memory import check_fits
 from .mesh import Mesh
@@ -141,17 +141,17 @@ def reconstruct(
 
         network = load_network()
     field = upsample(grid, network, factor, offset=offset, progress=progress)
-    if cap:
-        field = close_at_border(field, inside_samples(grid, offset))
-    mesh = extract_mesh(field, grid)
+    mesh = mesh_field(field, grid, offset=offset, cap=cap)
     if progress:
         progress(len(STEPS), len(STEPS))
     return mesh
 
 
-def inside_samples(grid: SdfGrid, offset: float = 0.0) -> BoolArray:
-    """Return which samples, (nx, ny, nz), are inside the surface at a distance ``offset``."""
-    return np.less_equal(rescale(grid, offset), 0)
+def mesh_field(field: FineField, grid: SdfGrid, *, offset: float = 0.0, cap: bool = False) -> Mesh:
+    """Mesh what ``upsample`` returned, with ``cap`` closed along the grid's border."""
+    if cap:
+        field = close_at_border(field, np.less_equal(rescale(grid, offset), 0))
+    return extract_mesh(field, grid)
 
 
 def no_surface(grid: SdfGrid, offset: float) -> GridError:
