@@ -19,13 +19,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import igl
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from export.sampling import TriMesh, is_inside, load_mesh, pseudonormal_distance, sample_grid
 from export.shapes import random_solid
+from super_sdf import Mesh, SdfGrid
 from super_sdf.band import can_hold_surface, find_band, gather_patches, rescale
-from super_sdf.grid import SdfGrid
+from super_sdf.evaluation.sampling import sample_grid
+from super_sdf.evaluation.solid import Solid, read_mesh
 from super_sdf.nodes import block_offsets
 
 QUERIES = {"factor 4": 24, "factor 16": 8, "anywhere": 8}
@@ -43,15 +45,15 @@ class Sample:
     targets: np.ndarray
 
 
-def draw_mesh(rng: np.random.Generator, prisms: list[Path], others: list[Path]) -> TriMesh:
+def draw_mesh(rng: np.random.Generator, prisms: list[Path], others: list[Path]) -> Mesh:
     """Draw a shape: of the files, one in six is a simple prism; a fifth of all is procedural."""
     if not others or rng.random() < 0.2:
         return random_solid(rng)
     few = prisms if prisms and rng.random() < 1 / 6 else others
-    return load_mesh(str(few[rng.integers(len(few))]))
+    return read_mesh(few[rng.integers(len(few))])
 
 
-def draw_pose(rng: np.random.Generator, mesh: TriMesh) -> TriMesh:
+def draw_pose(rng: np.random.Generator, mesh: Mesh) -> Mesh:
     """Place a shape in index space: spacing 1/16 to 1/90 of its diagonal, half of them turned."""
     turn = Rotation.random(rng=rng).as_matrix() if rng.random() < 0.5 else np.eye(3)
     size = np.exp(rng.uniform(np.log(16), np.log(90)))
@@ -61,7 +63,7 @@ def draw_pose(rng: np.random.Generator, mesh: TriMesh) -> TriMesh:
     return posed.transformed(np.eye(3), rng.uniform(2, 3, 3) - low)
 
 
-def draw_window(rng: np.random.Generator, mesh: TriMesh) -> tuple[tuple[int, int, int], np.ndarray]:
+def draw_window(rng: np.random.Generator, mesh: Mesh) -> tuple[tuple[int, int, int], np.ndarray]:
     """Return shape and first sample of a window: the whole shape, or a piece round a vertex."""
     whole = np.ceil(mesh.vertices.max(0)).astype(int) + 3
     shape = np.minimum(whole, WINDOW)
@@ -79,11 +81,11 @@ def draw_offsets(rng: np.random.Generator) -> np.ndarray:
     return np.concatenate([*lattices, anywhere]).astype(np.float32)
 
 
-def make_sample(rng: np.random.Generator, mesh: TriMesh) -> Sample | None:
+def make_sample(rng: np.random.Generator, mesh: Mesh) -> Sample | None:
     """Sample a shape; None where its distances are not to be trusted or nothing is in sight."""
     posed = draw_pose(rng, mesh)
     shape, first = draw_window(rng, posed)
-    values = sample_grid(posed, shape, 1.0, first)
+    values = sample_grid(Solid(posed), (shape, 1.0, first))
     if not (values < 0).any() or not (values > 0).any():
         return None
     window = rescale(SdfGrid(values, (1.0, 1.0, 1.0)))
@@ -98,13 +100,19 @@ def make_sample(rng: np.random.Generator, mesh: TriMesh) -> Sample | None:
     return Sample(window, offsets, voxel_ijk.astype(np.uint8), targets)
 
 
+def pseudonormal_distance(mesh: Mesh, points: np.ndarray) -> np.ndarray:
+    """Return the signed distance, sign by the nearest triangle: wrong on meshes to be refused."""
+    kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
+    return igl.signed_distance(points, mesh.vertices, mesh.faces, kind)[0]
+
+
 def signs_agree(
-    rng: np.random.Generator, mesh: TriMesh, points: np.ndarray, distances: np.ndarray
+    rng: np.random.Generator, mesh: Mesh, points: np.ndarray, distances: np.ndarray
 ) -> bool:
     """Check the sign at 2,000 points by winding number: meshes that self-intersect fail."""
     some = rng.integers(len(points), size=min(len(points), 2000))
     clear = np.abs(distances[some]) > 1e-4  # on the surface either sign is right
-    inside = is_inside(mesh, points[some])
+    inside = Solid(mesh).is_inside(points[some])
     return bool((inside == (distances[some] < 0))[clear].all())
 
 

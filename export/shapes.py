@@ -21,7 +21,7 @@ from export.families import (
     twisted,
     unit_sized,
 )
-from export.sampling import TriMesh
+from super_sdf import Mesh
 
 ATTEMPTS = 20  # about one candidate in a hundred fails, mostly by too many faces
 MAX_FACES = 25_000  # more faces say nothing new about a surface seen on coarse grids
@@ -98,7 +98,7 @@ def is_usable(solid: Manifold) -> bool:
     return float(solid.volume()) > MIN_VOLUME
 
 
-def without_crumbs(mesh: TriMesh) -> TriMesh:
+def without_crumbs(mesh: Mesh) -> Mesh:
     """Drop the pieces, and fill the cavities, of less than 2 % of the largest piece's volume."""
     edges = mesh.faces[:, [0, 1, 2]], mesh.faces[:, [1, 2, 0]]
     links = coo_array((np.ones(mesh.faces.size), [side.ravel() for side in edges]))
@@ -106,10 +106,10 @@ def without_crumbs(mesh: TriMesh) -> TriMesh:
     volumes = np.abs(np.bincount(piece, np.linalg.det(mesh.vertices[mesh.faces])))
     kept = mesh.faces[(volumes > 0.02 * volumes.max())[piece]]
     used, faces = np.unique(kept, return_inverse=True)
-    return TriMesh(mesh.vertices[used], faces.reshape(-1, 3))
+    return Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32))
 
 
-def random_solid(rng: np.random.Generator) -> TriMesh:
+def random_solid(rng: np.random.Generator) -> Mesh:
     """Draw a closed solid with outward faces, its bounding box centred and of diagonal 1.
 
     The same state of ``rng`` gives the same solid. About one solid in 300 touches or intersects
@@ -124,8 +124,8 @@ def random_solid(rng: np.random.Generator) -> TriMesh:
         solid = draw_candidate(rng)
         if is_usable(solid):
             drawn = solid.to_mesh64()
-            vertices, faces = drawn.vert_properties[:, :3], drawn.tri_verts.astype(np.int64)
-            mesh = without_crumbs(TriMesh(vertices, faces))
+            vertices, faces = drawn.vert_properties[:, :3], drawn.tri_verts.astype(np.int32)
+            mesh = without_crumbs(Mesh(vertices, faces))
             low, high = mesh.vertices.min(0), mesh.vertices.max(0)
             scale = 1 / float(np.linalg.norm(high - low))
             return mesh.transformed(scale * np.eye(3), -scale * (low + high) / 2)

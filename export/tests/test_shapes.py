@@ -8,29 +8,24 @@ from manifold3d import Manifold
 
 from export import shapes
 from export.families import FAMILIES, log_uniform, unit_sized
-from export.sampling import TriMesh
 from export.shapes import MAX_FACES, random_solid, without_crumbs
+from super_sdf import Mesh
 
 SEEDS = range(20)
 
 
-def directed_edges(mesh: TriMesh) -> np.ndarray:
+def directed_edges(mesh: Mesh) -> np.ndarray:
     """Return the directed edges of all faces, (3 m, 2)."""
     return mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
 
 
-def volume(mesh: TriMesh) -> float:
-    """Return the enclosed volume, positive if faces point outward."""
-    return float(np.linalg.det(mesh.vertices[mesh.faces]).sum() / 6)
-
-
-def as_mesh(solid: Manifold) -> TriMesh:
+def as_mesh(solid: Manifold) -> Mesh:
     """Return vertices and faces of a solid."""
     mesh = solid.to_mesh64()
-    return TriMesh(mesh.vert_properties[:, :3], mesh.tri_verts.astype(np.int64))
+    return Mesh(mesh.vert_properties[:, :3], mesh.tri_verts.astype(np.int32))
 
 
-def check_closed(mesh: TriMesh) -> None:
+def check_closed(mesh: Mesh) -> None:
     """Each directed edge occurs once, and so does its opposite; every vertex is used."""
     edges = directed_edges(mesh)
     there = {tuple(edge) for edge in edges.tolist()}
@@ -39,7 +34,7 @@ def check_closed(mesh: TriMesh) -> None:
     assert np.array_equal(np.unique(mesh.faces), np.arange(len(mesh.vertices)))
 
 
-def check_size(mesh: TriMesh) -> None:
+def check_size(mesh: Mesh) -> None:
     """The bounding box is centred at the origin and has a diagonal of 1."""
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     assert np.linalg.norm(high - low) == pytest.approx(1, abs=1e-12)
@@ -50,12 +45,12 @@ def check_size(mesh: TriMesh) -> None:
 def test_random_solid(seed: int) -> None:
     """Solids of many seeds keep every promise."""
     mesh = random_solid(np.random.default_rng(seed))
-    assert mesh.vertices.dtype == np.float64 and mesh.faces.dtype == np.int64
+    assert mesh.vertices.dtype == np.float64 and mesh.faces.dtype == np.int32
     assert np.isfinite(mesh.vertices).all()
     assert 4 <= len(mesh.faces) <= MAX_FACES
     check_closed(mesh)
     check_size(mesh)
-    assert volume(mesh) > 5e-5
+    assert mesh.volume() > 5e-5
 
 
 @pytest.mark.parametrize("name", FAMILIES)
@@ -66,7 +61,7 @@ def test_each_family_through_random_solid(name: str, monkeypatch: pytest.MonkeyP
         mesh = random_solid(np.random.default_rng(seed))
         check_closed(mesh)
         check_size(mesh)
-        assert volume(mesh) > 0
+        assert mesh.volume() > 0
 
 
 @pytest.mark.parametrize("name", FAMILIES)
@@ -87,7 +82,7 @@ def test_same_seed_same_solid() -> None:
 def test_stream_of_solids_varies() -> None:
     """One generator gives a new solid each time."""
     rng = np.random.default_rng(0)
-    volumes = [round(volume(random_solid(rng)), 6) for _ in range(10)]
+    volumes = [round(random_solid(rng).volume(), 6) for _ in range(10)]
     assert len(set(volumes)) == 10
 
 
@@ -105,7 +100,7 @@ def test_crumbs_go_and_cavities_stay() -> None:
     crumb = Manifold.cube([0.1, 0.1, 0.1]).translate([2, 0, 0])
     mesh = without_crumbs(as_mesh(hollow + crumb))
     check_closed(mesh)
-    assert volume(mesh) == pytest.approx(1 - 0.8**3)
+    assert mesh.volume() == pytest.approx(1 - 0.8**3)
     assert mesh.vertices.max() == 0.5
 
 

@@ -3,6 +3,7 @@
 - ``SuperSdfError``: the base; its text is one line: what was wrong, the value seen, the way out.
 
   - ``GridError`` (also ``ValueError``): the samples are not a usable signed distance grid.
+  - ``MeshError`` (also ``ValueError``): a reference mesh bounds no solid.
   - ``OptionError`` (also ``ValueError``): an argument has no meaning (an odd factor, say).
   - ``FileError`` (also ``OSError``): a file cannot be read or written.
   - ``ModelError`` (also ``ValueError``): an ONNX file that does not keep the network's contract.
@@ -17,6 +18,10 @@ class SuperSdfError(Exception):
 
 class GridError(SuperSdfError, ValueError):
     """The samples are not a usable signed distance grid."""
+
+
+class MeshError(SuperSdfError, ValueError):
+    """A reference mesh bounds no solid."""
 
 
 class OptionError(SuperSdfError, ValueError):

@@ -26,11 +26,16 @@ class Mesh:
     vertices: NDArray[Any]
     faces: IntArray
 
+    def transformed(self, linear: NDArray[Any], shift: NDArray[Any]) -> Mesh:
+        """Return the mesh with ``vertices @ linear.T + shift`` (``linear`` keeps orientation)."""
+        return Mesh(self.vertices @ linear.T + shift, self.faces)
+
     def volume(self) -> float:
         """Return the enclosed volume, in cubic world units; positive if faces look outward."""
+        if not len(self.faces):
+            return 0.0
         corners = self.vertices.astype(np.float64)
-        corners -= corners.mean(0) if len(corners) else 0.0
-        a, b, c = corners[self.faces.T]
+        a, b, c = (corners - corners.mean(0))[self.faces.T]
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
     def open_edges(self) -> int:
@@ -40,4 +45,9 @@ class Mesh:
         size = len(self.vertices)
         forward, times = np.unique(start * size + end, return_counts=True)
         backward = np.unique(end * size + start)
-        return int((times > 1).sum()) + len(np.setxor1d(forward, backward))
+        points = int((start == end).sum())
+        return points + int((times > 1).sum()) + len(np.setxor1d(forward, backward))
+
+    def is_closed(self) -> bool:
+        """Say whether there are faces, and no edge is open."""
+        return len(self.faces) > 0 and self.open_edges() == 0

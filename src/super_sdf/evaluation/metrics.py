@@ -14,9 +14,12 @@ from dataclasses import dataclass
 
 import igl
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from export.sampling import TriMesh, distance
+from ..grid import IntArray
+from ..mesh import Mesh
+from .solid import Distances, Points, Solid
 
 SAMPLE_COUNT = 100_000
 F1_DISTANCE = 0.003
@@ -35,8 +38,8 @@ Numbers = dict[str, float | None]
 class Samples:
     """Points (n, 3) of a surface and the unit normals (n, 3) of the faces that they lie on."""
 
-    points: np.ndarray
-    normals: np.ndarray
+    points: Points
+    normals: Points
 
 
 # What stands in for a result without a surface; it has no normal.
@@ -45,20 +48,20 @@ DOT = Samples(np.zeros((1, 3)), np.zeros((1, 3)))
 NO_NORMAL_NC = 0.5
 
 
-def normalise(mesh: TriMesh) -> TriMesh:
-    """Return the mesh centred on its bounding box and scaled to a box diagonal of 1."""
-    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
-    scale = 1.0 / np.linalg.norm(high - low)
-    return TriMesh((mesh.vertices - (low + high) / 2) * scale, mesh.faces)
+def normalise(mesh: Mesh) -> Mesh:
+    """Return the mesh, float64, centred on its bounding box and scaled to a diagonal of 1."""
+    vertices = mesh.vertices.astype(np.float64)
+    low, high = vertices.min(0), vertices.max(0)
+    return Mesh((vertices - (low + high) / 2) / np.linalg.norm(high - low), mesh.faces)
 
 
-def face_vectors(mesh: TriMesh) -> np.ndarray:
+def face_vectors(mesh: Mesh) -> Points:
     """Return each face's normal times twice its area, (m, 3); outward if counter-clockwise."""
     a, b, c = mesh.vertices[mesh.faces.T]
     return np.cross(b - a, c - a)
 
 
-def sample_surface(mesh: TriMesh, seed: tuple[int, int], count: int = SAMPLE_COUNT) -> Samples:
+def sample_surface(mesh: Mesh, seed: tuple[int, int], count: int = SAMPLE_COUNT) -> Samples:
     """Draw points area-uniformly; a mesh without area gives one dot at the origin."""
     vectors = face_vectors(mesh)
     lengths = np.linalg.norm(vectors, axis=1)
@@ -72,7 +75,7 @@ def sample_surface(mesh: TriMesh, seed: tuple[int, int], count: int = SAMPLE_COU
     return Samples(points, vectors[face] / lengths[face, None])
 
 
-def draw_index(weights: np.ndarray, uniform: np.ndarray) -> np.ndarray:
+def draw_index(weights: Distances, uniform: Distances) -> NDArray[np.intp]:
     """Turn numbers of [0, 1), (n,), into indices drawn in proportion to the weights, (m,)."""
     cumulative = np.cumsum(weights)
     index = np.searchsorted(cumulative, uniform * cumulative[-1], side="right")
@@ -96,7 +99,7 @@ def compare_samples(reference: Samples, result: Samples) -> Numbers:
     }
 
 
-def normal_agreement(normals: np.ndarray, others: np.ndarray) -> tuple[float, float]:
+def normal_agreement(normals: Points, others: Points) -> tuple[float, float]:
     """Return the means of |n.n'| and of n.n' over pairs of normals, (n, 3) each."""
     dot = np.einsum("nd,nd->n", normals, others)
     known = normals.any(1) & others.any(1)
@@ -110,14 +113,14 @@ def harmonic_mean(recall: float, precision: float) -> float:
 
 
 def compare_surfaces(
-    reference: TriMesh, result: TriMesh, drawn: Samples, result_drawn: Samples
+    reference: Solid, result: Mesh, drawn: Samples, result_drawn: Samples
 ) -> Numbers:
     """Return exact point-to-triangle distances: mean, 99th percentile and maximum, both ways.
 
     ``drawn`` and ``result_drawn`` are P and Q. "there" is from P to the result's triangles, "back"
     from Q to the reference's; the figure without a direction is their mean, or the larger maximum.
     """
-    there = distance_or_dot(result, drawn.points)
+    there = distance_or_dot(Solid(result), drawn.points)
     back = distance_or_dot(reference, result_drawn.points)
     mean, p99 = (there.mean(), back.mean()), (np.quantile(there, 0.99), np.quantile(back, 0.99))
     return {
@@ -133,19 +136,20 @@ def compare_surfaces(
     }
 
 
-def distance_or_dot(mesh: TriMesh, points: np.ndarray) -> np.ndarray:
+def distance_or_dot(solid: Solid, points: Points) -> Distances:
     """Return each point's distance to the mesh, (n,), or to the origin if it has no faces."""
-    if not len(mesh.faces):
-        return np.linalg.norm(points, axis=1)
-    found = distance(mesh, points)
+    if not len(solid.mesh.faces):
+        distances: Distances = np.linalg.norm(points, axis=1)
+        return distances
+    found = solid.distance(points)
     if not np.isfinite(found).all():
         raise ValueError(f"{np.sum(~np.isfinite(found))} point-to-triangle distances not finite")
     return found
 
 
 def sample_edges(
-    vertices: np.ndarray, edges: np.ndarray, seed: tuple[int, int], count: int = SAMPLE_COUNT
-) -> np.ndarray:
+    vertices: Points, edges: IntArray, seed: tuple[int, int], count: int = SAMPLE_COUNT
+) -> Points:
     """Draw points, (count, 3), length-uniformly from edges, (e, 2); (0, 3) if there is none."""
     ends = vertices[edges]  # (e, 2, 3)
     if not len(ends):
@@ -156,7 +160,7 @@ def sample_edges(
     return low + random.random((count, 1)) * (high - low)
 
 
-def sharp_edges(mesh: TriMesh) -> np.ndarray:
+def sharp_edges(mesh: Mesh) -> IntArray:
     """Return the edges of exactly two faces whose normals differ by over 30 degrees, (e, 2)."""
     vectors = face_vectors(mesh)
     lengths = np.linalg.norm(vectors, axis=1)
@@ -171,7 +175,7 @@ def sharp_edges(mesh: TriMesh) -> np.ndarray:
     return edges[pairs[whole & (dot < SHARP_COSINE * lengths[one] * lengths[other]), 0]]
 
 
-def edge_points(samples: Samples) -> np.ndarray:
+def edge_points(samples: Samples) -> Points:
     """Return the sampled points, (k, 3), that lie near a sharp edge.
 
     As in NMC, NDC and PoNQ: the points with another one nearby whose normal is turned, up or
@@ -187,9 +191,7 @@ def edge_points(samples: Samples) -> np.ndarray:
     return points[turned]
 
 
-def compare_edges(
-    vertices: np.ndarray, edges: np.ndarray, drawn: np.ndarray, result: np.ndarray
-) -> Numbers:
+def compare_edges(vertices: Points, edges: IntArray, drawn: Points, result: Points) -> Numbers:
     """Return ECD (squared, summed) and EF1 at 0.005 of a result's edge points, (k, 3).
 
     The reference is given by its vertices, its sharp edges (e, 2) and points drawn from them. The
@@ -207,23 +209,3 @@ def compare_edges(
         "ecd": float(np.mean(there**2) + np.mean(back**2)),
         "ef1": harmonic_mean(recall, precision),
     }
-
-
-def is_closed(faces: np.ndarray) -> bool:
-    """Say whether every edge stands in exactly two of the faces, (m, 3), in opposite directions."""
-    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    if not len(edges) or (edges[:, 0] == edges[:, 1]).any():
-        return False
-    directed = np.unique(edges, axis=0)
-    # The directed edges are all different, and turning them all round gives the same set.
-    return len(directed) == len(edges) and np.array_equal(
-        directed, np.unique(edges[:, ::-1], axis=0)
-    )
-
-
-def volume(mesh: TriMesh) -> float:
-    """Return the enclosed volume, positive if the faces look outward."""
-    if not len(mesh.faces):
-        return 0.0
-    a, b, c = mesh.vertices[mesh.faces.T] - mesh.vertices.mean(0)
-    return float(np.einsum("nd,nd->", a, np.cross(b, c))) / 6

@@ -1,0 +1,183 @@
+"""Grids from meshes: exact to closed forms, right in sign, and plain words about bad meshes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from solids import TORUS, cube, inverted, joined, saved, sphere, torus
+
+from super_sdf import Mesh, SuperSdfError, load_network, reconstruct
+from super_sdf.evaluation import sampling
+from super_sdf.evaluation.sampling import (
+    fitted_layout,
+    grid_points,
+    sample_grid,
+    sample_solid,
+    unit_layout,
+)
+from super_sdf.evaluation.solid import Solid, examine, load_solid, read_mesh
+
+
+def cube_distance(points: np.ndarray) -> np.ndarray:
+    beyond = np.abs(points) - 0.5
+    return np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(1), 0)
+
+
+def sphere_distance(points: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(points, axis=1) - 0.4
+
+
+def torus_distance(points: np.ndarray) -> np.ndarray:
+    ring = np.linalg.norm(points[:, :2], axis=1) - TORUS[0]
+    return np.hypot(ring, points[:, 2]) - TORUS[1]
+
+
+def distance_by_force(mesh: Mesh, points: np.ndarray) -> np.ndarray:
+    """The distance to every triangle: inside it to its plane, else to its nearest side."""
+    a, b, c = mesh.vertices[mesh.faces.T]  # (m, 3)
+    normal = np.cross(b - a, c - a)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    best = np.full(len(points), np.inf)
+    p = points[:, None]
+    height = np.abs(np.einsum("nmd,md->nm", p - a, normal))
+    over = np.ones(height.shape, bool)
+    for one, other in ((a, b), (b, c), (c, a)):
+        side = other - one
+        over &= np.einsum("nmd,md->nm", p - one, np.cross(normal, side)) >= 0
+        along = np.einsum("nmd,md->nm", p - one, side) / (side**2).sum(1)
+        foot = one + along.clip(0, 1)[..., None] * side
+        best = np.minimum(best, np.linalg.norm(p - foot, axis=2).min(1))
+    return np.minimum(best, np.where(over, height, np.inf).min(1))
+
+
+SOLIDS = {
+    "cube": (cube(), cube_distance, 1e-12),
+    # Chords lie under the surface: by an eighth of edge^2 over radius, or twice that.
+    "sphere": (sphere(size=64), sphere_distance, 2.5e-4),
+    "torus": (torus(192, 96), torus_distance, 2e-4),
+}
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_a_sampled_solid_is_exact_everywhere(name):
+    mesh, closed_form, chord = SOLIDS[name]
+    layout = (21, 18, 13), 0.071, np.array([-0.71, -0.62, -0.43])
+    points = grid_points(layout)
+    found = sample_grid(Solid(mesh), layout).ravel()
+    np.testing.assert_allclose(found, closed_form(points), atol=chord + 1e-6)
+    some = np.random.default_rng(0).permutation(len(points))[:60]
+    forced = distance_by_force(mesh, points[some])
+    np.testing.assert_allclose(np.abs(found[some]), forced, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_the_sign_is_right_at_random_points(name):
+    mesh, closed_form, chord = SOLIDS[name]
+    points = np.random.default_rng(1).uniform(-0.6, 0.6, (100_000, 3))
+    expected = closed_form(points)
+    clear = np.abs(expected) > chord  # else the mesh and the closed form may differ
+    assert clear.sum() > 99_000
+    assert (Solid(mesh).is_inside(points) == (expected < 0))[clear].all()
+
+
+def test_a_band_is_exact_in_it_and_cut_off_beyond():
+    solid, layout = Solid(torus()), unit_layout(40)
+    exact = sample_grid(solid, layout)
+    limit = 2.0 / 40
+    expected = np.clip(exact, -limit, limit)
+    np.testing.assert_allclose(sample_grid(solid, layout, band=2), expected, atol=1e-7)
+
+
+def test_big_grids_are_cut_off_and_make_the_same_mesh(monkeypatch):
+    solid, layout = Solid(torus()), unit_layout(24)
+    exact = sample_solid(solid, layout)
+    monkeypatch.setattr(sampling, "EXACT_SAMPLES", 1000)
+    cut = sample_solid(solid, layout)
+    assert not exact.notes and "cut off" in cut.notes[0]
+    assert cut.values.max() == pytest.approx(4 / 24)
+    network = load_network()
+    one, other = reconstruct(exact, network), reconstruct(cut, network)
+    np.testing.assert_array_equal(one.faces, other.faces)
+    np.testing.assert_array_equal(one.vertices, other.vertices)
+
+
+def test_progress_ends_with_all_cubes_done():
+    seen = []
+    sample_grid(Solid(cube()), unit_layout(20), progress=lambda *step: seen.append(step))
+    assert seen[-1] == (27, 27)
+
+
+def test_overlapping_pieces_are_one_solid():
+    apart = Mesh(cube().vertices + np.array([0.4, 0, 0]), cube().faces)
+    both = Solid(joined(cube(), apart))
+    assert examine(both).overlapping > 0
+    points = np.random.default_rng(2).uniform(-1, 1.2, (1000, 3))
+    expected = (cube_distance(points) < 0) | (cube_distance(points - [0.4, 0, 0]) < 0)
+    assert (both.is_inside(points) == expected).all()
+
+
+def test_a_cavity_is_no_overlap():
+    hollow = joined(cube(), inverted(Mesh(cube().vertices * 0.5, cube().faces)))
+    assert examine(Solid(hollow)) == examine(Solid(cube()))
+    assert not Solid(hollow).is_inside(np.zeros((1, 3)))[0]
+
+
+def test_an_inverted_mesh_is_turned_round_and_named(tmp_path):
+    solid, notes = load_solid(saved(inverted(cube()), tmp_path / "in.ply"))
+    assert notes == ["inverted, its faces look inward: turned round"]
+    assert solid.signed_distance(np.zeros((1, 3)))[0] == -0.5
+
+
+def test_an_open_mesh_is_refused_or_guessed(tmp_path):
+    lidless = saved(Mesh(cube().vertices, cube().faces[2:]), tmp_path / "open.ply")
+    with pytest.raises(SuperSdfError, match=r"open\.ply is open: 4 edges have no partner"):
+        load_solid(lidless)
+    solid, notes = load_solid(lidless, allow_open=True)
+    assert notes == ["open at 4 edges: inside is guessed across the holes"]
+    assert solid.is_inside(np.array([[0.2, 0, 0], [2, 0, 0]])).tolist() == [True, False]
+
+
+def test_bad_files_are_named(tmp_path):
+    with pytest.raises(SuperSdfError, match=r"none\.ply does not exist"):
+        read_mesh(tmp_path / "none.ply")
+    (tmp_path / "text.ply").write_text("no mesh")
+    with pytest.raises(SuperSdfError, match=r"text\.ply cannot be read as a mesh: "):
+        read_mesh(tmp_path / "text.ply")
+    (tmp_path / "points.obj").write_text("v 0 0 0\nv 1 0 0\n")
+    with pytest.raises(SuperSdfError, match=r"points\.obj"):
+        read_mesh(tmp_path / "points.obj")
+    flat = Mesh(cube().vertices * [1, 1, 0], cube().faces)
+    with pytest.raises(SuperSdfError, match=r"flat\.ply is flat: it encloses no volume"):
+        load_solid(saved(flat, tmp_path / "flat.ply"))
+
+
+@pytest.mark.parametrize("padding", [0.0, 2.0, 3.5])
+def test_the_layout_fits_round_the_box(padding):
+    mesh = Mesh(cube().vertices * [3, 1, 2] + 10, cube().faces)
+    shape, spacing, origin = fitted_layout(mesh, n=40, padding=padding)
+    last = origin + spacing * (np.array(shape) - 1)
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    room = np.minimum(low - origin, last - high) / spacing
+    assert shape[0] == 40
+    assert (room > padding - 1e-4).all() and (room < padding + 1).all()
+    np.testing.assert_allclose(low - origin, last - high)  # centred
+    assert fitted_layout(mesh, spacing=0.25)[1] == 0.25
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({}, "give either the number of samples or the spacing"),
+        ({"n": 5}, "5 samples leave no room within a padding of 2 voxels"),
+        ({"spacing": -1.0}, "spacing is -1: it must be greater than 0"),
+        ({"n": 9, "padding": -1.0}, "padding is -1: give 0 voxels or more"),
+    ],
+)
+def test_layouts_that_make_no_sense(arguments, message):
+    with pytest.raises(SuperSdfError, match=message):
+        fitted_layout(cube(), **arguments)
+
+
+def test_a_band_that_the_pipeline_cannot_use_is_refused():
+    with pytest.raises(SuperSdfError, match=r"band is 1: give at least 1\.5 voxels"):
+        sample_grid(Solid(cube()), unit_layout(8), band=1)
