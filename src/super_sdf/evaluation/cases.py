@@ -1,0 +1,196 @@
+"""What is measured against what: a shape in the frame, sampled in a setting, and the truth there.
+
+The frame: the shape centred on its bounding box, the box diagonal 1. All lengths are in its unit.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..band import find_band, rescale
+from ..errors import OptionError
+from ..grid import BoolArray, FloatArray, IntArray, SdfGrid
+from ..mesh import Mesh
+from ..nodes import check_factor
+from . import metrics
+from .sampling import sample_grid, unit_layout
+from .solid import Distances, Solid, load_solid
+
+# Streams of random numbers, each seeded by the shape's name and its own number.
+REFERENCE_POINTS, REFERENCE_EDGES, RESULT_POINTS, NOISE = range(4)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How a shape is sampled and refined.
+
+    Attributes
+    ----------
+    size : int
+        Samples along each axis of the grid; 0 where nothing is sampled (the floor).
+    factor : int
+        K, how many times finer.
+    noise : float
+        Added to each sample: uniform in plus or minus this share of half a voxel.
+    scale : float
+        Longest side of the shape's box over that of the grid; 0 for the frame: the grid's side is
+        the box diagonal.
+    passes : int
+        How often the result is refined again.
+    """
+
+    size: int
+    factor: int = 4
+    noise: float = 0.0
+    scale: float = 0.0
+    passes: int = 1
+
+    def check(self) -> None:
+        """Raise OptionError if a number is out of range."""
+        check_factor(self.factor)
+        if self.size < 4:
+            raise OptionError(f"size is {self.size}: give at least 4 samples along an axis")
+
+
+class Shape:
+    """A reference in the frame, and what is drawn from it once for all methods."""
+
+    def __init__(self, name: str, mesh: Mesh) -> None:
+        self.name = name
+        self.solid = Solid(metrics.normalise(mesh))
+        self.mesh = self.solid.mesh
+        self.notes: Sequence[str] = ()
+        self.drawn = metrics.sample_surface(self.mesh, self.seed(REFERENCE_POINTS))
+        self.sharp = metrics.sharp_edges(self.mesh)
+        self.sharp_drawn = metrics.sample_edges(
+            self.mesh.vertices, self.sharp, self.seed(REFERENCE_EDGES)
+        )
+
+    @classmethod
+    def read(cls, path: Path) -> Shape:
+        """Read a shape from a mesh file; it is named after the file.
+
+        Raises
+        ------
+        FileError, MeshError
+            If it cannot be read or bounds no solid.
+        """
+        solid, notes = load_solid(path)
+        shape = cls(path.stem, solid.mesh)
+        shape.notes = notes
+        return shape
+
+    def seed(self, stream: int) -> tuple[int, int]:
+        """Return the seed of a stream of random numbers."""
+        return zlib.crc32(self.name.encode()), stream
+
+
+class Case:
+    """A shape sampled in a setting.
+
+    Attributes
+    ----------
+    coarse : (n, n, n) float32
+        Exact signed distances at the samples.
+    grid : SdfGrid
+        What the methods are given: the same, with noise if the setting has any.
+    spacing, fine : float
+        Between samples, and between the nodes of the fine lattice, of which the first is at
+        ``low`` on every axis.
+    """
+
+    def __init__(self, shape: Shape, setting: Setting) -> None:
+        self.shape, self.setting, self.factor = shape, setting, setting.factor
+        self.side = side_of(shape.mesh, setting.scale)
+        self.low = -self.side / 2
+        layout = unit_layout(setting.size, self.side)
+        _, self.spacing, origin = layout
+        self.fine = self.spacing / self.factor
+        self.coarse = sample_grid(shape.solid, layout)
+        random = np.random.default_rng(shape.seed(NOISE))
+        reach = setting.noise * self.spacing / 2
+        noise = random.uniform(-1, 1, self.coarse.shape) * reach if reach else 0
+        self.grid = SdfGrid((self.coarse + noise).astype(np.float32), self.spacing, origin)
+
+    @cached_property
+    def voxels(self) -> IntArray:
+        """The band of the exact distances (Eq. 2), (V, 3)."""
+        return find_band(rescale(SdfGrid(self.coarse, self.spacing)))
+
+    @cached_property
+    def band(self) -> BoolArray:
+        """Which fine nodes lie in the blocks of the band, faces included, (K n + 1)^3."""
+        active = np.zeros(self.coarse.shape, bool)
+        active[tuple(self.voxels.T)] = True
+        return spread_to_nodes(active, self.factor)
+
+    @cached_property
+    def truth(self) -> FloatArray:
+        """The exact distance at the nodes of the band and of every cell that can be crossed."""
+        return exact_field(self)
+
+
+def side_of(mesh: Mesh, scale: float) -> float:
+    """Return the side of the grid's cube in which a mesh of the frame has that scale."""
+    if not scale:
+        return 1.0
+    return float(np.ptp(mesh.vertices, axis=0).max()) / scale
+
+
+def spread_to_nodes(voxels: BoolArray, factor: int) -> BoolArray:
+    """Return which fine nodes lie in the blocks of the given voxels, faces included."""
+    for axis in range(3):
+        source = np.moveaxis(voxels, axis, 0)
+        target = np.zeros((factor * len(source) + 1, *source.shape[1:]), bool)
+        for offset in range(factor + 1):
+            target[offset : offset + factor * (len(source) - 1) + 1 : factor] |= source
+        voxels = np.moveaxis(target, 0, axis)
+    return voxels
+
+
+def spread_samples(samples: FloatArray, factor: int) -> FloatArray:
+    """Return a sample of the voxel that each fine node lies in, (K n + 1)^3."""
+    nearest = [np.minimum(np.arange(factor * n + 1) // factor, n - 1) for n in samples.shape]
+    return samples[np.ix_(*nearest)]
+
+
+def exact_field(case: Case) -> FloatArray:
+    """Return the signed distance at the fine nodes of the band and of crossing cells.
+
+    A node of a crossing cell is within sqrt(3) h/K of the surface, so its block's sample within
+    sqrt(3) (1/2 + 1/K) h. Elsewhere stands the nearest sample, which has the right sign.
+    """
+    factor = case.factor
+    reach = 3**0.5 * (0.5 + 1 / factor) * case.spacing
+    field = spread_samples(case.coarse, factor)
+    nodes = np.argwhere(case.band | spread_to_nodes(np.abs(case.coarse) < reach, factor))
+    samples = np.minimum(nodes // factor, case.setting.size - 1)
+    steps = nodes - factor * (samples + 0.5)
+    apart = np.linalg.norm(steps, axis=1) * case.fine
+    field[tuple(nodes.T)] = signed_from_samples(
+        case.shape.solid, nodes * case.fine + case.low, case.coarse[tuple(samples.T)], apart
+    )
+    return field
+
+
+def signed_from_samples(
+    solid: Solid, points: NDArray[Any], known: FloatArray, apart: NDArray[Any]
+) -> Distances:
+    """Return the signed distance of points (n, 3), each ``apart`` from one where it is known.
+
+    If the balls round the two points that hold no surface overlap, the two have one sign. The
+    winding number is asked for the others only.
+    """
+    found = solid.distance(points)
+    inside = known < 0
+    unsure = found + np.abs(known) < apart * (1 + 1e-6)
+    inside[unsure] = solid.is_inside(points[unsure])
+    return np.where(inside, -found, found)

@@ -1,0 +1,132 @@
+"""The paper's experiments, ours beside what is printed of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from . import published
+from .cases import Setting
+from .measuring import OURS, Row
+from .plan import BASE_SIZE, FACTORS, NOISES, PASSES, SCALES
+from .results import Results
+from .tables import CD, F1, LABELS, NC, SHORT, gap_closed, markdown, mean_of, mean_row, percent
+from .timing import RUNS, describe_machine
+
+
+def factor_section(results: Results) -> str:
+    """Return ours at the factors 2 to 16, each beside its own bound (Fig. 9)."""
+    paths = results.plan.experiment_paths()
+    rows = [
+        ["1", *mean_row(LABELS["mc"], results.rows(Setting(BASE_SIZE), "mc", paths), SHORT), "-"]
+    ]
+    for factor in FACTORS:
+        setting = Setting(BASE_SIZE, factor)
+        found = {name: results.rows(setting, name, paths) for name in ("bspline", OURS, "bound")}
+        gap = percent(gap_closed(found[OURS], found["bspline"], found["bound"], "f1"))
+        rows += [
+            [str(factor), *mean_row(LABELS[name], found[name], SHORT), gap if name == OURS else "-"]
+            for name in found
+        ]
+    titles = ["factor", "method", *(column.title for column in SHORT), "F1 gap closed"]
+    table = markdown(titles, rows)
+    return f"{title_of('Upscaling factors', paths)}\n\n{table}\n\n{published.FACTORS}"
+
+
+def noise_section(results: Results) -> str:
+    """Return F1 by noise, beside the published (supplement, Table 1)."""
+    paths = results.plan.experiment_paths()
+    rows = []
+    for noise in NOISES:
+        setting = Setting(BASE_SIZE, noise=noise)
+        names = ("mc", "bspline", OURS)
+        mine = [mean_of(results.rows(setting, name, paths), "f1") for name in names]
+        theirs = published.NOISE_F1[noise]
+        figures = [*mine, gain(mine[2], mine[0]), *theirs, gain(theirs[1], theirs[0])]
+        rows.append([f"{100 * noise:.0f} %", *(F1.cell(figure) for figure in figures)])
+    titles = ["noise", "MC", "B-spline + MC", "super-sdf", "gain on MC"]
+    titles += ["*MC, published*", f"*{published.PAPER}*", "*its gain*"]
+    title = title_of("Noise: F1, uniform noise in percent of half a voxel", paths)
+    return f"{title}\n\n{markdown(titles, rows)}"
+
+
+def iterated_section(results: Results) -> str:
+    """Return ours refined once and twice, beside the published (supplement, Table 2)."""
+    paths, rows = results.plan.experiment_paths(), []
+    for passes in PASSES:
+        setting = Setting(BASE_SIZE, passes=passes)
+        sizes = " -> ".join(f"{BASE_SIZE * setting.factor**n}^3" for n in range(passes + 1))
+        mine = mean_row(sizes, results.rows(setting, OURS, paths), SHORT)
+        rows.append(mine + published_cells(published.ITERATED[passes]))
+    titles = ["grids", *(column.title for column in SHORT), *published_titles()]
+    return f"{title_of('Iterated', paths)}\n\n{markdown(titles, rows)}"
+
+
+def scale_section(results: Results) -> str:
+    """Return all methods on shapes that fill a part of the grid (supplement, Table 3)."""
+    paths, rows = results.plan.experiment_paths(), []
+    for size in results.plan.sizes:
+        for scale in SCALES:
+            setting = Setting(size, scale=scale)
+            names = ("mc", "bspline", OURS, "bound")
+            found = {name: results.rows(setting, name, paths) for name in names}
+            gap = percent(gap_closed(found[OURS], found["bspline"], found["bound"], "f1"))
+            for name in names:
+                other = published.SCALED.get((scale, size)) if name == OURS else None
+                row = [f"{scale:g}, {size}^3", *mean_row(LABELS[name], found[name], SHORT)]
+                rows.append([*row, gap if name == OURS else "-", *published_cells(other)])
+    titles = ["scale, grid", "method", *(column.title for column in SHORT), "F1 gap closed"]
+    title = title_of("Scale: longest side of the shape over that of the grid", paths)
+    return f"{title}\n\n{markdown([*titles, *published_titles()], rows)}"
+
+
+SECTIONS = {
+    "factors": factor_section,
+    "noise": noise_section,
+    "iterated": iterated_section,
+    "scale": scale_section,
+}
+
+
+def timing_section(timings: Mapping[int, Sequence[Row]]) -> str:
+    """Return whole processes' times beside the published (Table 2)."""
+    rows = []
+    for size, found in timings.items():
+        seconds = [row["seconds"] for row in found]
+        cells = [sum(seconds) / len(seconds), min(seconds), max(seconds)]
+        peak = max(row["peak_mb"] for row in found)
+        rows.append([f"{size}^3", LABELS[OURS], *(f"{s:.2f}" for s in cells), f"{peak:.0f}"])
+        for name, theirs in published.SECONDS.get(size, {}).items():
+            cells = [f"{s:.2f}" for s in theirs]
+            rows.append([f"{size}^3", f"*{name}, published, Thingi30*", *cells, "-"])
+    titles = ["grid", "method", "mean s", "least", "most", "highest peak MB"]
+    count = len(next(iter(timings.values())))
+    return "\n\n".join(
+        [
+            f"## Timings, {count} shapes",
+            f"Whole processes, start and files included, one at a time, median of {RUNS}. "
+            "The paper and PoNQ ran on an RTX 3080.",
+            describe_machine(),
+            markdown(titles, rows),
+        ]
+    )
+
+
+def title_of(title: str, paths: Sequence[Path]) -> str:
+    """Return the heading of an experiment."""
+    return f"## {title}, {len(paths)} shapes"
+
+
+def gain(one: float | None, other: float | None) -> float | None:
+    """Return a difference if both are known."""
+    return None if one is None or other is None else one - other
+
+
+def published_titles() -> list[str]:
+    """Return the titles of what is printed of the paper's method."""
+    return [f"*{column.title}, paper*" for column in (CD, F1, NC)]
+
+
+def published_cells(figures: tuple[float, float, float] | None) -> list[str]:
+    """Return what is printed of the paper's method, CD x1e5, or dashes."""
+    return ["-"] * 3 if figures is None else [f"{figure:.3f}" for figure in figures]

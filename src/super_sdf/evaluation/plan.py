@@ -1,0 +1,161 @@
+"""What is to be measured: the main table, the paper's experiments, the peers. No measuring here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ..errors import FileError, OptionError
+from .cases import Setting
+from .measuring import FLOOR, NO_SETTING, OURS, Task, digest_of_file, digest_of_ours
+from .methods import METHODS
+
+MESH_SUFFIXES = (".ply", ".stl", ".obj", ".off", ".glb", ".gltf", ".3mf")
+BASE_SIZE = 32  # the paper's experiments start from it
+FACTORS = (2, 4, 8, 16)
+NOISES = (0.0, 0.2, 0.5, 1.0)
+PASSES = (1, 2)
+SCALES = (0.25, 0.5, 0.75)
+EXPERIMENTS = ("factors", "noise", "iterated", "scale", "timings")
+
+Wanted = tuple[Setting, tuple[str, ...]]
+"""A setting and the methods that are measured in it."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What was asked for.
+
+    Attributes
+    ----------
+    paths : mesh files
+    sizes, factor, methods : of the main table
+    model : a shipped network or an ONNX file
+    experiments : of ``EXPERIMENTS``; ``experiment_shapes`` shapes, spread over the list
+    peers : of ``PEERS``; at ``peer_size`` on ``peer_shapes`` shapes, each within ``peer_limit`` s
+    jobs, threads : processes, and threads of the network in each
+    """
+
+    paths: tuple[Path, ...]
+    sizes: tuple[int, ...] = (32, 64, 128)
+    factor: int = 4
+    methods: tuple[str, ...] = tuple(METHODS)
+    model: str = "base"
+    experiments: tuple[str, ...] = ()
+    experiment_shapes: int = 10
+    peers: tuple[str, ...] = ()
+    peer_shapes: int = 5
+    peer_size: int = 32
+    peer_limit: float = 900.0
+    jobs: int = 1
+    threads: int = 1
+
+    def check(self) -> None:
+        """Raise OptionError if something makes no sense."""
+        for size in self.sizes:
+            Setting(size, self.factor).check()
+        if not self.paths or not self.sizes:
+            raise OptionError("nothing to measure: give meshes and sizes")
+
+    def settings(self) -> list[Setting]:
+        """Return the settings of the main table."""
+        return [Setting(size, self.factor) for size in self.sizes]
+
+    def experiment_paths(self) -> tuple[Path, ...]:
+        """Return the shapes that the experiments take."""
+        return spread(self.paths, self.experiment_shapes)
+
+    def peer_paths(self) -> tuple[Path, ...]:
+        """Return the shapes that the peers take."""
+        return spread(self.paths, self.peer_shapes)
+
+    def tasks(self) -> list[Task]:
+        """Return what is to be measured, main table first, no method twice."""
+        wanted: list[tuple[Path, Wanted]] = [(path, (NO_SETTING, (FLOOR,))) for path in self.paths]
+        for setting in self.settings():
+            wanted += [(path, (setting, self.methods)) for path in self.paths]
+        for name in self.experiments:
+            pairs = experiment(name, self.sizes)
+            wanted += [(path, pair) for pair in pairs for path in self.experiment_paths()]
+        # Ours and the coarse mesh stand beside the peers.
+        beside = (Setting(self.peer_size), ("mc", "bspline", OURS)) if self.peers else None
+        wanted += [(path, beside) for path in self.peer_paths() if beside]
+        return self._as_tasks(merged(wanted)) + self._peer_tasks()
+
+    def _as_tasks(self, wanted: Iterable[tuple[Path, Wanted]]) -> list[Task]:
+        """Return a task for each shape and setting."""
+        ours = digest_of_ours(self.model)
+        sums = {path: digest_of_file(path) for path in self.paths}
+        return [
+            Task(path, sums[path], setting, methods, self.model, ours, self.threads)
+            for path, (setting, methods) in wanted
+        ]
+
+    def _peer_tasks(self) -> list[Task]:
+        """Return a task for each shape and peer: the limit is for one of them."""
+        setting = Setting(self.peer_size)
+        wanted = [(path, (setting, (peer,))) for peer in self.peers for path in self.peer_paths()]
+        return [replace(task, limit=self.peer_limit) for task in self._as_tasks(wanted)]
+
+
+def experiment(name: str, sizes: Sequence[int]) -> list[Wanted]:
+    """Return what an experiment of the paper measures; the scales at the sizes of the main table.
+
+    Nothing for "timings": those are of whole processes, one at a time (see ``timing``).
+    """
+    refined = ("bspline", OURS, "bound")
+    if name == "factors":
+        coarse: list[Wanted] = [(Setting(BASE_SIZE), ("mc",))]
+        return coarse + [(Setting(BASE_SIZE, factor), refined) for factor in FACTORS]
+    if name == "noise":
+        return [(Setting(BASE_SIZE, noise=noise), ("mc", "bspline", OURS)) for noise in NOISES]
+    if name == "iterated":
+        return [(Setting(BASE_SIZE, passes=passes), (OURS,)) for passes in PASSES]
+    if name == "scale":
+        return [(Setting(n, scale=s), ("mc", *refined)) for n in sizes for s in SCALES]
+    if name == "timings":
+        return []
+    raise OptionError(f"experiment is {name!r}: give one of {', '.join(EXPERIMENTS)}")
+
+
+def merged(wanted: Iterable[tuple[Path, Wanted]]) -> list[tuple[Path, Wanted]]:
+    """Join what is wanted of one shape in one setting; each method once."""
+    methods: dict[tuple[Path, Setting], dict[str, None]] = {}
+    for path, (setting, names) in wanted:
+        methods.setdefault((path, setting), {}).update(dict.fromkeys(names))
+    return [(path, (setting, tuple(names))) for (path, setting), names in methods.items()]
+
+
+def spread(paths: tuple[Path, ...], count: int) -> tuple[Path, ...]:
+    """Return so many of the paths, evenly spread over them."""
+    if count >= len(paths):
+        return paths
+    return tuple(paths[i * len(paths) // count] for i in range(count))
+
+
+def find_meshes(sources: Sequence[Path]) -> tuple[Path, ...]:
+    """Return mesh files, and those in folders, by name.
+
+    Raises
+    ------
+    FileError
+        If a source is missing or holds no mesh, or two shapes have one name.
+    """
+    found: list[Path] = []
+    for source in sources:
+        if not source.exists():
+            raise FileError(f"{source} does not exist")
+        inside = (
+            sorted(p for p in source.iterdir() if p.suffix.lower() in MESH_SUFFIXES)
+            if (source.is_dir())
+            else [source]
+        )
+        if not inside:
+            raise FileError(f"{source} holds no mesh: give {', '.join(MESH_SUFFIXES)}")
+        found += inside
+    names = [path.stem for path in found]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice:
+        raise FileError(f"two meshes are named {twice!r}: shapes are known by their file names")
+    return tuple(found)

@@ -1,0 +1,208 @@
+"""Processes that measure, and the file that remembers: killed at any moment, it goes on.
+
+Each task runs in a process of its own, so that one that crashes, runs out of memory or out of time
+takes nothing with it. Rows are appended to a file of JSON lines as they come.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any
+
+from ..errors import SuperSdfError
+from .measuring import PROTOCOL, Row, Task, failed_row, measure_task
+
+# What a row is known by; the rest of it are figures.
+KEY_NAMES = (
+    *("shape", "mesh", "size", "factor", "noise", "scale", "passes"),
+    *("method", "digest", "protocol"),
+)
+POLL = 0.5  # seconds between looks at the clock where there is a limit
+# Modules that every task wants, loaded once: processes are then forked in milliseconds.
+PRELOAD = ["super_sdf.evaluation.measuring"]
+
+Progress = Callable[[int, int, Task], None]
+"""Called with (tasks done, tasks in all, the task just done)."""
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A shape that could not be measured at all, and why."""
+
+    shape: str
+    reason: str
+
+
+class Store:
+    """The rows of a file of JSON lines, by key."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.rows: dict[tuple[Any, ...], Row] = {}
+        text = path.read_text() if path.exists() else ""
+        for line in text.splitlines():
+            with suppress(ValueError):  # a line that was being written when the writer was killed
+                self._take(json.loads(line))
+        if text and not text.endswith("\n"):
+            self._write("\n")
+
+    def add(self, row: Row) -> None:
+        """Keep a row, in memory and in the file."""
+        self._take(row)
+        self._write(json.dumps(row) + "\n")
+
+    def get(self, task: Task, method: str) -> Row | None:
+        """Return a method's row, if it was measured."""
+        key = task.key(method)
+        return self.rows.get(tuple(key[name] for name in KEY_NAMES))
+
+    def is_final(self, task: Task, method: str) -> bool:
+        """Say whether a row is there that another run would not better.
+
+        A failure may have had a passing cause; one by the limit has not, unless given more time.
+        """
+        row = self.get(task, method)
+        if row is None or row["error"] is None:
+            return row is not None
+        limit = row.get("limit")
+        return limit is not None and task.limit is not None and limit >= task.limit
+
+    def _take(self, row: Row) -> None:
+        if row.get("protocol") == PROTOCOL:
+            self.rows[tuple(row[name] for name in KEY_NAMES)] = row
+
+    def _write(self, text: str) -> None:
+        with self.path.open("a") as out:
+            out.write(text)
+
+
+@dataclass(eq=False)
+class Running:
+    """A task under way: its process, the pipe that its rows come by, and when it began."""
+
+    task: Task
+    process: BaseProcess
+    rows: Connection
+    began: float
+    owed: list[str]
+
+    def is_late(self) -> bool:
+        """Say whether its time is over."""
+        return self.task.limit is not None and time.monotonic() - self.began > self.task.limit
+
+
+class Runner:
+    """Measures tasks, so many at a time; iterate over ``results``."""
+
+    def __init__(self, tasks: Sequence[Task], jobs: int) -> None:
+        self.waiting, self.jobs = list(reversed(tasks)), jobs
+        self.running: dict[Connection, Running] = {}
+        self.left_out: set[str] = set()
+        self.context = make_context()
+
+    def results(self) -> Iterator[tuple[Task, Row | LeftOut | None]]:
+        """Yield each row as it comes, with None after the last one of a task."""
+        try:
+            while self.waiting or self.running:
+                while self.waiting and len(self.running) < self.jobs:
+                    self._start(self.waiting.pop())
+                for source in wait(list(self.running), POLL):
+                    yield from self._receive(self.running[source])  # type: ignore[index]
+                for late in [entry for entry in self.running.values() if entry.is_late()]:
+                    yield from self._give_up(late, f"over the limit of {late.task.limit:g} s")
+        finally:
+            for entry in self.running.values():
+                entry.process.kill()
+
+    def _start(self, task: Task) -> None:
+        ours, theirs = self.context.Pipe(duplex=False)
+        process = self.context.Process(target=work, args=(task, theirs), daemon=True)  # type: ignore[attr-defined]
+        process.start()
+        theirs.close()
+        self.running[ours] = Running(task, process, ours, time.monotonic(), list(task.methods))
+
+    def _receive(self, entry: Running) -> Iterator[tuple[Task, Row | LeftOut | None]]:
+        """Take what a process has sent; if it ended owing rows, the first of them has failed."""
+        try:
+            found: Row | LeftOut = entry.rows.recv()
+        except EOFError:
+            entry.process.join()
+            yield from self._give_up(entry, f"its process ended with {entry.process.exitcode}")
+            return
+        if isinstance(found, LeftOut):
+            entry.owed = []
+            known = entry.task.mesh in self.left_out
+            self.left_out.add(entry.task.mesh)
+            if known:
+                return
+        else:
+            entry.owed.remove(found["method"])
+        yield entry.task, found
+
+    def _give_up(self, entry: Running, error: str) -> Iterator[tuple[Task, Row | None]]:
+        """End a task; what it owes after the method under way is put back in the queue."""
+        entry.process.kill()
+        entry.process.join()
+        del self.running[entry.rows]
+        entry.rows.close()
+        if entry.owed:
+            limit = entry.task.limit if entry.is_late() else None
+            yield entry.task, {**failed_row(entry.task, entry.owed[0], error), "limit": limit}
+        if entry.owed[1:]:
+            self.waiting.append(replace(entry.task, methods=tuple(entry.owed[1:])))
+        else:
+            yield entry.task, None
+
+
+def make_context() -> multiprocessing.context.BaseContext:
+    """Return how processes are started: forked from one that has the modules, where there is."""
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(PRELOAD)
+    return context
+
+
+def work(task: Task, rows: Connection) -> None:
+    """Measure a task in a process of its own; send rows, or why there are none."""
+    try:
+        for row in measure_task(task):
+            rows.send(row)
+    except SuperSdfError as error:
+        rows.send(LeftOut(task.path.stem, str(error)))
+
+
+def missing_tasks(tasks: Sequence[Task], store: Store) -> list[Task]:
+    """Return the tasks with the methods that are not in the store."""
+    cut = [
+        replace(task, methods=tuple(m for m in task.methods if not store.is_final(task, m)))
+        for task in tasks
+    ]
+    return [task for task in cut if task.methods]
+
+
+def complete(
+    tasks: Sequence[Task], store: Store, jobs: int, progress: Progress | None = None
+) -> list[LeftOut]:
+    """Measure what is not in the store, and keep it; return the shapes that were left out."""
+    missing = missing_tasks(tasks, store)
+    left_out: list[LeftOut] = []
+    done = 0
+    for task, found in Runner(missing, jobs).results():
+        if isinstance(found, LeftOut):
+            left_out.append(found)
+        elif found is not None:
+            store.add(found)
+        else:
+            done += 1
+            if progress:
+                progress(done, len(missing), task)
+    return left_out

@@ -1,0 +1,180 @@
+"""Tables in Markdown from rows of figures; rows with time and memory apart from the rest.
+
+What is measured of quality comes out the same in every run, so its tables do too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from . import published
+from .measuring import FLOOR, OURS, Row
+
+LABELS = {
+    "mc": "MC",
+    "mc-lewiner": "MC, Lewiner's table",
+    "trilinear": "trilinear + MC",
+    "bspline": "B-spline + MC",
+    OURS: "super-sdf",
+    "bound": "bound: true distance at the nodes",
+    FLOOR: "floor: the reference against itself",
+    "rfta": "RFTA",
+    "dual-contouring": "dual contouring of distances",
+}
+
+
+@dataclass(frozen=True)
+class Column:
+    """A figure of the rows, how it is titled, scaled and rounded."""
+
+    title: str
+    key: str
+    scale: float = 1.0
+    digits: int = 3
+
+    def cell(self, figure: float | None) -> str:
+        """Return a figure as it stands in the table."""
+        return "-" if figure is None else f"{figure * self.scale:.{self.digits}f}"
+
+
+CD, F1, NC = Column("CD x1e5", "cd", 1e5), Column("F1", "f1"), Column("NC", "nc")
+P2S = Column("p2s x1e4", "p2s", 1e4, 2)
+BACK = Column("res to ref", "p2s_back", 1e4, 2)
+SURFACE = (
+    *(CD, Column("excess CD x1e5", "excess_cd", 1e5), F1, NC, Column("signed NC", "signed_nc")),
+    *(P2S, Column("ref to res", "p2s_there", 1e4, 2), BACK),
+    *(Column("p99 x1e4", "p99", 1e4, 1), Column("max x1e4", "max", 1e4, 0)),
+    *(Column("ECD x1e5", "ecd", 1e5, 2), Column("EF1", "ef1")),
+    *(Column("field MSE x1e6", "field_mse", 1e6), Column("field MAE x1e4", "field_mae", 1e4, 2)),
+    Column("triangles", "faces", 1, 0),
+)
+SHORT = (CD, F1, NC, P2S, BACK)
+COST = (
+    Column("mean s", "seconds", 1, 2),
+    Column("slowest s", "seconds_max", 1, 2),
+    Column("mean peak MB", "peak_mb", 1, 0),
+    Column("highest peak MB", "peak_mb_max", 1, 0),
+)
+GAPS = (
+    ("F1", "f1"),
+    ("NC", "nc"),
+    ("excess CD", "excess_cd"),
+    ("point-to-surface", "p2s"),
+    ("result to reference only", "p2s_back"),  # one-sided: thin parts that are lost do not count
+)
+
+
+def markdown(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table, its first column to the left and the others to the right."""
+    head = [f"| {' | '.join(titles)} |", "| --- " + "| ---: " * (len(titles) - 1) + "|"]
+    return "\n".join(head + [f"| {' | '.join(row)} |" for row in rows])
+
+
+def mean_of(rows: Sequence[Row], key: str) -> float | None:
+    """Return the plain mean over the rows that have this figure; of ``..._max`` the greatest."""
+    figures = [row[key.removesuffix("_max")] for row in rows]
+    figures = [figure for figure in figures if figure is not None]
+    if not figures:
+        return None
+    return float(max(figures) if key.endswith("_max") else np.mean(figures))
+
+
+def mean_row(label: str, rows: Sequence[Row], columns: Sequence[Column] = SURFACE) -> list[str]:
+    """Return a table's row of means."""
+    return [label, *(column.cell(mean_of(rows, column.key)) for column in columns)]
+
+
+def count_row(rows: Sequence[Row]) -> list[str]:
+    """Return how many of the rows are closed, and how many face outward."""
+    return [f"{sum(row[key] for row in rows)} of {len(rows)}" for key in ("closed", "outward")]
+
+
+def surface_table(by_method: Mapping[str, Sequence[Row]], size: int) -> str:
+    """Return the main table of one size, the published rows below ours."""
+    rows = [mean_row(LABELS[name], found) + count_row(found) for name, found in by_method.items()]
+    titles = ["method", *(column.title for column in SURFACE), "closed", "outward"]
+    return markdown(titles, rows + published_rows(size))
+
+
+def published_rows(size: int) -> list[list[str]]:
+    """Return what is printed of others at this size, marked so; "-" where it was not given."""
+    rows = []
+    for name, (cd, f1, nc) in published.SURFACES.get(size, {}).items():
+        mse, mae = published.FIELDS[size].get(name, (None, None))
+        given = {"cd": cd * 1e-5, "f1": f1, "nc": nc, "field_mse": mse, "field_mae": mae}
+        cells = [column.cell(given.get(column.key)) for column in SURFACE]
+        rows.append([f"*{name}, published, Thingi30*", *cells, "-", "-"])
+    return rows
+
+
+def shape_table(by_method: Mapping[str, Sequence[Row]]) -> str:
+    """Return a table with a row for each shape and method."""
+    titles = ["shape, method", *(column.title for column in SURFACE), "closed", "outward"]
+    rows = [
+        mean_row(f"{row['shape']}, {name}", [row]) + count_row([row])
+        for found in zip(*by_method.values())
+        for name, row in zip(by_method, found)
+    ]
+    return markdown(titles, rows)
+
+
+def cost_table(by_label: Mapping[str, Sequence[Row]]) -> str:
+    """Return a table of time and memory."""
+    titles = ["method", *(column.title for column in COST)]
+    return markdown(titles, [mean_row(label, rows, COST) for label, rows in by_label.items()])
+
+
+def gap_closed(
+    ours: Sequence[Row], base: Sequence[Row], bound: Sequence[Row], key: str
+) -> float | None:
+    """Return the share of the way from B-spline to the bound that ours has gone, in the mean."""
+    figures = [mean_of(rows, key) for rows in (ours, base, bound)]
+    if None in figures:
+        return None
+    mine, start, end = (float(figure or 0) for figure in figures)
+    return (mine - start) / (end - start) if end != start else None
+
+
+def percent(share: float | None) -> str:
+    """Return a share as it stands in a text."""
+    return "-" if share is None else f"{100 * share:.0f} %"
+
+
+def gap_line(by_method: Mapping[str, Sequence[Row]]) -> str:
+    """Return the gaps closed, if the three methods were measured."""
+    if not {OURS, "bspline", "bound"} <= set(by_method):
+        return ""
+    three = by_method[OURS], by_method["bspline"], by_method["bound"]
+    shares = [f"{title} {percent(gap_closed(*three, key))}" for title, key in GAPS]
+    return f"Gap between B-spline and the bound closed by super-sdf: {', '.join(shares)}."
+
+
+def win_line(by_method: Mapping[str, Sequence[Row]]) -> str:
+    """Return on how many shapes ours has the better F1, and those on which it has not."""
+    if not {OURS, "bspline"} <= set(by_method):
+        return ""
+    pairs = list(zip(by_method[OURS], by_method["bspline"]))
+    lost = [
+        f"{mine['shape']} ({mine['f1']:.3f}, B-spline {other['f1']:.3f})"
+        for mine, other in pairs
+        if mine["f1"] <= other["f1"]
+    ]
+    line = f"super-sdf beats B-spline in F1 on {len(pairs) - len(lost)} of {len(pairs)}."
+    return f"{line} Not on: {', '.join(lost)}." if lost else line
+
+
+def failure_lines(by_method: Mapping[str, Sequence[Row]]) -> list[str]:
+    """Return a line for each method that left shapes without a surface, with their names."""
+    lines = []
+    for method, rows in by_method.items():
+        names = [
+            row["shape"] + (f" ({row['error']})" if row["error"] else "")
+            for row in rows
+            if not row["faces"]
+        ]
+        if names:
+            lines.append(f"No surface (a dot stands in), {LABELS[method]}: {', '.join(names)}.")
+    return lines

@@ -1,0 +1,74 @@
+"""How long the command takes and how much memory, whole processes, start and files included."""
+
+from __future__ import annotations
+
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import SuperSdfError
+from .cases import Case, Setting, Shape
+from .measuring import Row
+
+RUNS = 5
+
+
+def describe_machine() -> str:
+    """Return the processor and the versions that figures of time depend on, in a line."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return (
+        f"{processor_name()}, {cores} cores, {platform.system()}, Python "
+        f"{platform.python_version()}, NumPy {np.__version__}, onnxruntime {version('onnxruntime')}"
+    )
+
+
+def processor_name() -> str:
+    """Return the model of the processor, or its kind where the system does not say."""
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def time_command(grid: Path, options: Sequence[str] = ()) -> tuple[float, float]:
+    """Run ``super-sdf upsample`` on a grid once; return seconds and its peak of memory in MB.
+
+    Raises
+    ------
+    SuperSdfError
+        If the command fails.
+    """
+    command = [sys.executable, "-m", "super_sdf.cli", "upsample", str(grid)]
+    command += [str(grid.with_suffix(".ply")), "--force", "--quiet", "--inside", "negative"]
+    start = time.perf_counter()
+    child = subprocess.Popen([*command, *options])
+    _, status, usage = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    if child.returncode:
+        raise SuperSdfError(f"{grid.name}: the command ended with {child.returncode}")
+    kilobyte = 1 if sys.platform == "darwin" else 1024
+    return time.perf_counter() - start, usage.ru_maxrss * kilobyte / 1e6
+
+
+def time_shape(shape: Shape, setting: Setting, options: Sequence[str] = ()) -> Row:
+    """Time the command on a shape's grid: median seconds of ``RUNS`` after one not counted."""
+    case = Case(shape, setting)
+    with tempfile.TemporaryDirectory() as folder:
+        grid = Path(folder) / "grid.npz"
+        np.savez(grid, values=case.coarse, spacing=case.spacing, origin=case.grid.origin)
+        options = ["--factor", str(setting.factor), *options]
+        time_command(grid, options)
+        runs = [time_command(grid, options) for _ in range(RUNS)]
+    seconds, peaks = zip(*runs)
+    return {"seconds": statistics.median(seconds), "peak_mb": max(peaks), "error": None}
