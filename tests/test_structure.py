@@ -7,6 +7,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 SOURCES = sorted((ROOT / "src" / "super_sdf").glob("*.py"))
+EVALUATION = sorted((ROOT / "src" / "super_sdf" / "evaluation").glob("*.py"))
 FLOORS = [
     {"errors"},
     {"grid", "memory"},
@@ -15,29 +16,51 @@ FLOORS = [
     {"field"},
     {"isosurface"},
     {"pipeline"},
-    {"cli", "__init__"},
+    {"cli_common", "__init__"},
+    {"cli_evaluation"},
+    {"cli"},
+]
+EVALUATION_FLOORS = [
+    {"solid", "published", "page", "__init__"},
+    {"sampling", "metrics", "rendering", "sections"},
+    {"cases"},
+    {"methods"},
+    {"peers"},
+    {"measuring"},
+    {"plan", "runner", "tables", "timing"},
+    {"results", "plots"},
+    {"experiment_tables"},
+    {"report"},
+    {"evaluate"},
 ]
 
 
 def imported(path: Path) -> set[str]:
-    """Return the modules that a file imports anywhere, relative ones with a dot before."""
+    """Return the modules that a file imports anywhere, relative ones with their dots before."""
     names = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             names |= {alias.name.split(".")[0] for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             module = (node.module or "").split(".")[0]
-            names.add(("." if node.level else "") + module)
+            names.add("." * node.level + module)
+            if not module:  # from . import metrics
+                names |= {"." * node.level + alias.name for alias in node.names}
     return names
 
 
+def check_floors(sources: list[Path], floors: list[set[str]]) -> None:
+    """Every module stands on one floor and imports from floors below, within its package."""
+    floor = {name: level for level, names in enumerate(floors) for name in names}
+    assert set(floor) == {path.stem for path in sources}
+    for path in sources:
+        for name in imported(path) & {f".{other}" for other in floor}:
+            assert floor[name[1:]] < floor[path.stem], f"{path.stem} imports {name}"
+
+
 def test_every_module_imports_only_from_floors_below():
-    floor = {name: level for level, names in enumerate(FLOORS) for name in names}
-    assert set(floor) == {path.stem for path in SOURCES}
-    for path in SOURCES:
-        for name in imported(path):
-            if name.startswith(".") and name != ".":
-                assert floor[name[1:]] < floor[path.stem], f"{path.stem} imports {name}"
+    check_floors(SOURCES, FLOORS)
+    check_floors(EVALUATION, EVALUATION_FLOORS)
 
 
 def test_the_runtime_needs_four_packages():
@@ -47,6 +70,16 @@ def test_the_runtime_needs_four_packages():
         assert not foreign, f"{path.stem} imports {foreign}"
         if path.stem != "network" and path.stem != "cli":
             assert "onnxruntime" not in imported(path)
+
+
+def test_the_runtime_does_not_know_the_evaluation():
+    for path in SOURCES:
+        assert path.stem == "cli_evaluation" or ".evaluation" not in imported(path)
+
+
+def test_the_evaluation_does_not_know_the_command_line():
+    for path in EVALUATION:
+        assert not {"..cli", "..cli_common", "..cli_evaluation", "torch"} & imported(path)
 
 
 def test_help_loads_click_and_nothing_heavier():

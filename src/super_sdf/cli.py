@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from . import __version__
+from .cli_common import CONTEXT, one_line_errors
+from .cli_evaluation import evaluate, render, sample
 
 if TYPE_CHECKING:
     from .field import FineField
@@ -27,7 +29,6 @@ Examples:
   super-sdf upsample part.npz part.ply
   super-sdf upsample field.npy part.stl --spacing 0.5 --factor 8
 """
-CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
 
 def parse_numbers(
@@ -273,19 +274,8 @@ def info(as_json: bool) -> None:
             click.echo(f"  {key.replace('_', ' ')}: {value}")
 
 
-@contextmanager
-def one_line_errors() -> Iterator[None]:
-    """Turn this package's errors into click's: one line, exit code 2 for usage, else 1."""
-    from .errors import OptionError, SuperSdfError
-
-    try:
-        yield
-    except OptionError as error:
-        raise click.UsageError(str(error)) from error
-    except SuperSdfError as error:
-        raise click.ClickException(str(error)) from error
-    except MemoryError:
-        raise click.ClickException("out of memory: use a smaller --factor or grid") from None
+for command in (sample, evaluate, render):
+    cli.add_command(command)
 
 
 def main() -> None:

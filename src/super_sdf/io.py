@@ -144,6 +144,19 @@ def check_target(path: str | Path, *, force: bool = False) -> Path:
     if path.suffix.lower() == ".3mf" and not all(map(find_spec, NEEDED_FOR_3MF)):
         needed = " and ".join(NEEDED_FOR_3MF)
         raise FileError(f"writing .3mf needs {needed}: pip install 'super-sdf[3mf]'")
+    return check_free(path, force=force)
+
+
+def check_grid_target(path: str | Path, *, force: bool = False) -> Path:
+    """Return the path of a grid file to be if it can be written; asked before the work starts."""
+    path = Path(path)
+    if path.suffix.lower() != ".npz":
+        raise OptionError(f"{path} is no grid file that keeps spacing and origin: give .npz")
+    return check_free(path, force=force)
+
+
+def check_free(path: Path, *, force: bool = False) -> Path:
+    """Return the path if a file can be made there."""
     if path.is_dir():
         raise FileError(f"{path} is a folder: give a file")
     if path.exists() and not force:
@@ -167,7 +180,7 @@ def write_mesh(mesh: Mesh, path: str | Path, *, force: bool = False) -> None:
     """
     path = check_target(path, force=force)
     try:
-        with _replacing(path) as part:
+        with replacing(path) as part:
             if path.suffix.lower() == ".ply":
                 _write_ply(mesh, part)
             else:
@@ -178,8 +191,28 @@ def write_mesh(mesh: Mesh, path: str | Path, *, force: bool = False) -> None:
         raise FileError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
+def write_grid(grid: SdfGrid, path: str | Path, *, force: bool = False) -> None:
+    """Write a grid as ``.npz``: values, spacing and origin, as ``read_grid`` reads them.
+
+    Raises
+    ------
+    OptionError
+        If the suffix is another.
+    FileError
+        If the file exists and ``force`` is not set, or cannot be written.
+    """
+    path = check_grid_target(path, force=force)
+    try:
+        with replacing(path) as part, part.open("wb") as file:
+            np.savez(file, values=grid.values, spacing=grid.spacing, origin=grid.origin)
+    except FileError:
+        raise
+    except OSError as error:
+        raise FileError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
 @contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path) -> Iterator[Path]:
     """Yield a path beside the target; it takes the target's place only if all goes well."""
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:

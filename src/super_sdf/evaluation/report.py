@@ -1,0 +1,183 @@
+"""The report: tables of quality, the paper's experiments, peers, pictures, time and memory.
+
+OUT/report.md      all of it
+OUT/shapes.md      every figure of every shape
+OUT/results.jsonl  the rows it is made from, a line for each shape, setting and method
+OUT/plots, OUT/pictures
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from . import experiment_tables
+from .cases import Case, Setting, Shape
+from .measuring import OURS, Row
+from .methods import METHODS
+from .plots import draw_plots
+from .rendering import Panel, can_render, render_panels, vertex_errors
+from .results import Results
+from .tables import (
+    COST,
+    LABELS,
+    SHORT,
+    cost_table,
+    failure_lines,
+    gap_line,
+    markdown,
+    mean_row,
+    shape_table,
+    surface_table,
+    win_line,
+)
+from .timing import describe_machine
+
+EXTREMES = 5  # best shapes shown, and worst
+ERROR_TOP = 0.25  # of a voxel: the end of the colour bar in the pictures
+PROTOCOL_LINES = """\
+Lengths are in units of the reference's box diagonal. 100,000 points are drawn from each surface; CD
+is the sum of the mean squared distances both ways, F1 at 0.003, NC the normal consistency. p2s is
+the mean exact distance from point to triangle, of both directions ("ref to res", "res to ref");
+ECD and EF1 (at 0.005) compare sharp edges. Field errors are those at the fine nodes of the band.
+The bound is marching cubes of the true distance at the same nodes; the floor is what two perfect
+samplings of the reference score. A result without a surface counts as a dot at the origin.
+Published rows are of other shapes (Thingi30)."""
+
+
+def write_report(
+    results: Results, out: Path, timings: Mapping[int, Sequence[Row]], *, up: str, pictures: bool
+) -> Path:
+    """Write report.md, shapes.md, plots and pictures; return the path of the report.
+
+    Parameters
+    ----------
+    results : Results
+        What was measured.
+    out : Path
+        A folder.
+    timings : rows by size
+        Of whole processes; empty if they were not asked for.
+    up : {"x", "y", "z"}
+        The axis that points up in the pictures.
+    pictures : bool
+        Whether the best and the worst shapes are drawn.
+    """
+    plan = results.plan
+    sections = [title_section(results)]
+    sections += [size_section(results, setting) for setting in plan.settings()]
+    tables = experiment_tables.SECTIONS
+    sections += [tables[name](results) for name in plan.experiments if name in tables]
+    sections += [peer_section(results)] if plan.peers else []
+    sections += [experiment_tables.timing_section(timings)] if timings else []
+    sections += [cost_section(results), plot_section(results, out)]
+    sections += [picture_section(results, out, up)] if pictures and OURS in plan.methods else []
+    report = out / "report.md"
+    report.write_text("\n\n".join(sections) + "\n")
+    shapes = [f"## {s.size}^3\n\n{shape_table(results.by_method(s))}" for s in plan.settings()]
+    (out / "shapes.md").write_text("\n\n".join(shapes) + "\n")
+    return report
+
+
+def title_section(results: Results) -> str:
+    """Return what was measured, how, and what could not be."""
+    lines = [f"# Quality of super-sdf on {len(results.floors)} shapes", PROTOCOL_LINES]
+    lines += [f"Left out, {entry.shape}: {entry.reason}." for entry in results.left_out]
+    noted = {row["shape"]: row["notes"] for row in results.floors.values() if row["notes"]}
+    lines += [f"{name}: {'; '.join(notes)}." for name, notes in noted.items()]
+    return "\n\n".join(lines)
+
+
+def size_section(results: Results, setting: Setting) -> str:
+    """Return all that is said of the quality at one size."""
+    by_method = results.by_method(setting)
+    lines = [win_line(by_method), gap_line(by_method), *failure_lines(by_method)]
+    title = f"## {setting.size}^3, factor {setting.factor}"
+    return "\n\n".join([title, surface_table(by_method, setting.size), *filter(None, lines)])
+
+
+def peer_section(results: Results) -> str:
+    """Return the peers beside ours, each on the shapes that it finished."""
+    plan, rows = results.plan, []
+    setting, paths = Setting(plan.peer_size), plan.peer_paths()
+    columns = (*SHORT, *COST)
+    for name in ("mc", "bspline", OURS, *plan.peers):
+        found = results.rows(setting, name, paths)
+        done = [row for row in found if not row["error"]]
+        closed = f"{sum(row['closed'] for row in done)} of {len(done)}"
+        rows.append(
+            [*mean_row(LABELS[name], done, columns), closed, f"{len(done)} of {len(found)}"]
+        )
+    titles = ["method", *(column.title for column in columns), "closed", "finished"]
+    failed = [
+        f"{LABELS[name]}, {row['shape']}: {row['error']}."
+        for name in plan.peers
+        for row in results.rows(setting, name, paths)
+        if row["error"]
+    ]
+    title = f"## Peers, {plan.peer_size}^3, {len(results.names(paths))} shapes"
+    return "\n\n".join([title, markdown(titles, rows), *failed])
+
+
+def cost_section(results: Results) -> str:
+    """Return time and memory of making each mesh, from grid to mesh in memory."""
+    names = [name for name in results.plan.methods if name != "bound"]  # nobody could run that
+    tables = [
+        f"**{setting.size}^3**\n\n"
+        + cost_table({LABELS[name]: results.rows(setting, name) for name in names})
+        for setting in results.plan.settings()
+    ]
+    jobs = results.plan.jobs
+    said = (
+        f"From the samples in memory to the mesh in memory, {jobs} at a time on one machine, the "
+        f"network with {results.plan.threads or 'all'} threads: to compare methods, not to quote. "
+        "The peak is what was held beyond what was held before."
+    )
+    return "\n\n".join(["## Time and memory", describe_machine(), said, *tables])
+
+
+def plot_section(results: Results, out: Path) -> str:
+    """Draw the plots and return where they are shown."""
+    by_size = {setting.size: results.by_method(setting) for setting in results.plan.settings()}
+    titles = draw_plots(by_size, out / "plots")
+    return "\n\n".join(["## Plots", *(f"![{text}](plots/{name})" for name, text in titles.items())])
+
+
+def picture_section(results: Results, out: Path, up: str) -> str:
+    """Draw the shapes on which ours is best and worst, and return where they are shown."""
+    setting = results.plan.settings()[0]
+    ranked = sorted(results.rows(setting, OURS), key=lambda row: -row["f1"])
+    count = min(EXTREMES, len(ranked) // 2)
+    title = f"## The {count} best and the {count} worst shapes by F1 at {setting.size}^3"
+    if not can_render():
+        return f"{title}\n\nNot drawn: PyVista is not installed (extra `view`)."
+    paths = {path.stem: path for path in results.plan.paths}
+    lines = [title]
+    for row in ranked[:count] + ranked[len(ranked) - count :]:
+        picture = out / "pictures" / f"{row['shape']}.png"
+        draw_shape(paths[row["shape"]], setting, results.plan.model, picture, up)
+        lines.append(f"**{row['shape']}**, F1 {row['f1']:.3f}, NC {row['nc']:.3f}")
+        lines.append(f"![{row['shape']}](pictures/{picture.name})")
+    return "\n\n".join(lines)
+
+
+def draw_shape(path: Path, setting: Setting, model: str, target: Path, up: str) -> None:
+    """Draw coarse marching cubes, ours, the reference, and ours coloured by its error."""
+    shape = Shape.read(path)
+    case = Case(shape, setting)
+    coarse, ours = (METHODS[name](case, model).mesh for name in ("mc", OURS))
+    panels = [
+        Panel(coarse, f"marching cubes of {setting.size}^3"),
+        Panel(ours, "super-sdf"),
+        Panel(shape.mesh, "reference"),
+        Panel(ours, "error of super-sdf", vertex_errors(ours, shape.solid)),
+    ]
+    target.parent.mkdir(exist_ok=True)
+    render_panels(
+        [panel for panel in panels if len(panel.mesh.faces)],
+        target,
+        colour="error",
+        up=up,
+        top=ERROR_TOP * case.spacing,
+        unit="box diagonal 1",
+    )

@@ -1,0 +1,284 @@
+"""The evaluation as a whole: kept rows, processes that die, reports that come out the same."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from solids import cube, saved, sphere, torus
+
+from super_sdf import Mesh
+from super_sdf.cli import cli
+from super_sdf.evaluation import measuring, plan, published, runner, tables
+from super_sdf.evaluation.cases import Setting
+from super_sdf.evaluation.measuring import Task
+from super_sdf.evaluation.plan import Plan
+from super_sdf.evaluation.runner import LeftOut, Runner, Store, complete
+
+QUALITY = ("cd", "f1", "nc", "signed_nc", "p2s", "ecd", "ef1", "field_mse", "faces", "closed")
+
+
+@pytest.fixture
+def meshes(tmp_path: Path) -> Path:
+    """A folder of three shapes."""
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    for name, mesh in {"box": cube(), "ball": sphere(), "ring": torus()}.items():
+        saved(mesh, folder / f"{name}.ply")
+    return folder
+
+
+def task_of(path: Path, methods: tuple[str, ...] = ("mc",), **options) -> Task:
+    return Task(path, "sum", Setting(8), methods, "base", "digest", **options)
+
+
+def evaluate(*words: object) -> subprocess.CompletedProcess[str]:
+    """Run the command as a user does: its processes need a program that can be imported."""
+    command = [sys.executable, "-m", "super_sdf.cli", "evaluate", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
+def quality_of(out: Path) -> dict[tuple, tuple]:
+    """Return the figures of quality of each row."""
+    rows = [json.loads(line) for line in (out / "results.jsonl").read_text().splitlines()]
+    return {
+        tuple(row[name] for name in runner.KEY_NAMES): tuple(row[name] for name in QUALITY)
+        for row in rows
+    }
+
+
+def tables_of(out: Path) -> str:
+    """Return the report up to the times."""
+    return (out / "report.md").read_text().split("## Time and memory")[0]
+
+
+def test_killed_and_started_again_it_ends_with_the_same_tables(meshes, tmp_path):
+    words = [meshes, "--sizes", 12, "--methods", "mc", "ours", "--jobs", 2, "--no-pictures"]
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    done = evaluate(*words, "--out", whole)
+    assert done.returncode == 0, done.stderr
+
+    command = [sys.executable, "-m", "super_sdf.cli", "evaluate", *map(str, words)]
+    child = subprocess.Popen([*command, "--out", str(cut)], stderr=subprocess.DEVNULL)
+    store = cut / "results.jsonl"
+    while not (store.exists() and len(store.read_text().splitlines()) > 3):
+        assert child.poll() is None
+        time.sleep(0.02)
+    child.send_signal(signal.SIGKILL)
+    child.wait()
+    with store.open("a") as file:
+        file.write('{"shape": "torn')  # as if killed while writing
+    kept = len(store.read_text().splitlines())
+    assert kept < len((whole / "results.jsonl").read_text().splitlines())
+    done = evaluate(*words, "--out", cut)
+    assert done.returncode == 0, done.stderr
+
+    store.write_text(store.read_text().replace('{"shape": "torn\n', ""))
+    assert quality_of(cut) == quality_of(whole)
+    assert tables_of(cut) == tables_of(whole)
+    again = evaluate(*words, "--out", cut)
+    assert again.stderr.count(" of ") == 0  # nothing left to measure
+    assert tables_of(cut) == tables_of(whole)
+
+
+def test_a_bad_shape_is_named_and_the_others_are_measured(meshes, tmp_path):
+    saved(Mesh(cube().vertices, cube().faces[1:]), meshes / "lidless.ply")
+    (meshes / "junk.stl").write_text("junk")
+    out = tmp_path / "out"
+    done = evaluate(meshes, "--sizes", 8, "--methods", "mc", "ours", "--out", out, "--no-pictures")
+    assert done.returncode == 1
+    assert "Left out: lidless: " in done.stderr and "is open: 3 edges" in done.stderr
+    assert "Left out: junk: " in done.stderr
+    text = (out / "report.md").read_text()
+    assert "# Quality of super-sdf on 3 shapes" in text and "Left out, lidless: " in text
+    assert "| super-sdf |" in text and "3 of 3" in text
+    assert (out / "plots" / "time.png").stat().st_size > 5000
+
+
+def test_pictures_of_the_best_and_worst(meshes, tmp_path):
+    out = tmp_path / "out"
+    done = evaluate(meshes, "--sizes", 8, "--methods", "mc", "ours", "--out", out)
+    assert done.returncode == 0, done.stderr
+    shown = [line for line in (out / "report.md").read_text().splitlines() if "](pictures/" in line]
+    assert len(shown) == 2
+    assert all((out / line.split("(")[1][:-1]).exists() for line in shown)
+
+
+def test_a_store_keeps_rows_and_forgets_other_protocols(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    task = task_of(tmp_path / "box.ply")
+    store = Store(path)
+    store.add({**task.key("mc"), "f1": 0.5, "error": None})
+    store.add({**task.key("ours"), "protocol": measuring.PROTOCOL - 1, "f1": 0.5, "error": None})
+    with path.open("a") as file:
+        file.write('{"shape": "to')
+    again = Store(path)
+    assert again.get(task, "mc") == {**task.key("mc"), "f1": 0.5, "error": None}
+    assert again.get(task, "ours") is None
+    again.add({**task.key("bound"), "f1": 1.0, "error": None})
+    assert Store(path).get(task, "bound")["f1"] == 1.0
+
+
+def test_a_row_of_another_mesh_network_or_setting_is_another_row(tmp_path):
+    from dataclasses import replace
+
+    task = task_of(tmp_path / "box.ply")
+    store = Store(tmp_path / "rows.jsonl")
+    store.add({**task.key("ours"), "error": None})
+    assert store.get(task, "ours")
+    for changed in (
+        replace(task, mesh="other"),
+        replace(task, digest="other"),
+        replace(task, setting=Setting(8, noise=0.5)),
+        replace(task, setting=Setting(8, 2)),
+    ):
+        assert store.get(changed, "ours") is None
+    assert task.key("mc") == replace(task, digest="other").key("mc")  # not made by our code
+
+
+def test_failures_are_tried_again_but_not_what_ran_out_of_time(tmp_path):
+    task = task_of(tmp_path / "box.ply", limit=10.0)
+    store = Store(tmp_path / "rows.jsonl")
+    store.add({**task.key("mc"), "error": "OSError: disk"})
+    assert not store.is_final(task, "mc")
+    store.add({**task.key("mc"), "error": "over the limit of 10 s", "limit": 10.0})
+    assert store.is_final(task, "mc")
+    assert not store.is_final(task_of(tmp_path / "box.ply", limit=20.0), "mc")
+
+
+def die(task: Task, rows) -> None:
+    """Stand in for a process that is killed after its first row."""
+    row = {**task.key(task.methods[0]), "error": None}
+    rows.send(row)
+    if len(task.methods) > 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    for method in task.methods[1:]:
+        rows.send({**row, "method": method})
+
+
+def sleep(task: Task, rows) -> None:
+    """Stand in for a process that does not end."""
+    time.sleep(60)
+
+
+def test_a_process_that_dies_fails_one_method_and_the_rest_go_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "work", die)
+    task = task_of(saved(cube(), tmp_path / "box.ply"), ("mc", "ours", "bspline", "bound"))
+    store = Store(tmp_path / "rows.jsonl")
+    seen = []
+    assert complete([task], store, 1, lambda *step: seen.append(step[:2])) == []
+    errors = {name: store.get(task, name)["error"] for name in task.methods}
+    assert errors == {
+        "mc": None,
+        "ours": "its process ended with -9",
+        "bspline": None,
+        "bound": None,
+    }
+    assert store.get(task, "ours")["f1"] == 0  # a dot stands in
+    assert seen == [(1, 1)]
+
+
+def test_a_process_over_its_limit_is_ended(tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "work", sleep)
+    task = task_of(saved(cube(), tmp_path / "box.ply"), limit=0.2)
+    (_, row), (_, end) = Runner([task], 1).results()
+    assert row["error"] == "over the limit of 0.2 s" and row["limit"] == 0.2
+    assert end is None
+
+
+def refuse(task: Task, rows) -> None:
+    rows.send(LeftOut(task.path.stem, "no good"))
+
+
+def test_a_shape_is_left_out_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "work", refuse)
+    tasks = [task_of(tmp_path / "box.ply"), task_of(tmp_path / "box.ply", ("ours",))]
+    assert complete(tasks, Store(tmp_path / "rows.jsonl"), 1) == [LeftOut("box", "no good")]
+
+
+def test_the_plan_measures_each_method_once(meshes):
+    paths = plan.find_meshes([meshes])
+    asked = Plan(paths, sizes=(32,), experiments=("factors", "noise", "iterated", "scale"))
+    tasks = asked.tasks()
+    keys = [tuple(task.key(m).values()) for task in tasks for m in task.methods]
+    assert len(keys) == len(set(keys))
+    settings = {task.setting for task in tasks}
+    assert {Setting(32, factor) for factor in (2, 4, 8, 16)} <= settings
+    assert Setting(32, noise=1.0) in settings and Setting(32, passes=2) in settings
+    assert {Setting(32, scale=scale) for scale in (0.25, 0.5, 0.75)} <= settings
+
+
+def test_shapes_are_spread_over_the_list():
+    paths = tuple(Path(str(n)) for n in range(10))
+    assert plan.spread(paths, 3) == (paths[0], paths[3], paths[6])
+    assert plan.spread(paths, 20) == paths
+
+
+def test_two_shapes_of_one_name_are_refused(meshes, tmp_path):
+    twin = saved(cube(), tmp_path / "box.stl")
+    with pytest.raises(Exception, match="two meshes are named 'box'"):
+        plan.find_meshes([meshes, twin])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["none.ply"], "Error: none.ply does not exist"),
+        ([".", "--sizes", "2"], "Error: size is 2: give at least 4 samples along an axis"),
+        ([".", "--factor", "3"], "Error: factor is 3"),
+        ([".", "--model", "none"], "Error: no model 'none': give an ONNX file"),
+        (["empty"], "Error: empty holds no mesh: give .ply"),
+    ],
+)
+def test_what_makes_no_sense_is_said_in_one_line(words, message, meshes, monkeypatch):
+    monkeypatch.chdir(meshes)
+    (meshes / "empty").mkdir()
+    result = CliRunner().invoke(cli, ["evaluate", *words, "--out", "out", "--quiet"])
+    assert result.exit_code != 0
+    assert result.output.splitlines()[-1].startswith(message)
+    assert not Path("out").exists()
+
+
+def row(name: str, f1: float, **figures: object) -> measuring.Row:
+    known = dict.fromkeys((column.key for column in tables.SURFACE), 0.0)
+    said = {"shape": name, "f1": f1, "closed": True, "outward": True, "faces": 4, "error": None}
+    return {**known, **said, **figures}
+
+
+def test_gaps_and_wins_are_what_they_are_called():
+    by_method = {
+        "bspline": [row("a", 0.5), row("b", 0.7)],
+        "ours": [row("a", 0.8), row("b", 0.6)],
+        "bound": [row("a", 1.0), row("b", 0.8)],
+    }
+    assert "F1 33 %" in tables.gap_line(by_method)
+    assert tables.win_line(by_method) == (
+        "super-sdf beats B-spline in F1 on 1 of 2. Not on: b (0.600, B-spline 0.700)."
+    )
+
+
+def test_tables_show_means_and_name_failures():
+    rows = [row("a", 0.5), row("b", 0.0, faces=0, closed=False, error="ValueError: no")]
+    table = tables.surface_table({"mc": rows}, 32)
+    mine = next(line for line in table.splitlines() if line.startswith("| MC |"))
+    assert "| 0.250 |" in mine and mine.endswith("| 1 of 2 | 2 of 2 |")
+    assert "*PoNQ, published, Thingi30*" in table
+    lines = tables.failure_lines({"mc": rows})
+    assert lines == ["No surface (a dot stands in), MC: b (ValueError: no)."]
+
+
+def test_published_figures_are_in_their_tables_order():
+    """In the paper more samples are better, and so is its method than B-spline."""
+    for size in (32, 64, 128):
+        cd, f1, nc = np.array(published.SURFACES[size][published.PAPER])
+        base = published.SURFACES[size]["B-spline + MC"]
+        assert cd < base[0] and f1 > base[1] and nc >= base[2]
+    assert all(ours > mc for mc, ours in published.NOISE_F1.values())
