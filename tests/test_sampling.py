@@ -65,9 +65,14 @@ def test_a_sampled_solid_is_exact_everywhere(name):
     points = grid_points(layout)
     found = sample_grid(Solid(mesh), layout).ravel()
     np.testing.assert_allclose(found, closed_form(points), atol=chord + 1e-6)
-    some = np.random.default_rng(0).permutation(len(points))[:60]
-    forced = distance_by_force(mesh, points[some])
-    np.testing.assert_allclose(np.abs(found[some]), forced, atol=1e-7)
+
+
+@pytest.mark.parametrize("mesh", [sphere(size=8), torus(24, 12)], ids=["sphere", "torus"])
+def test_every_sample_is_the_distance_to_the_nearest_triangle(mesh):
+    layout = (15, 14, 10), 0.09, np.array([-0.65, -0.6, -0.4])
+    found = sample_grid(Solid(mesh), layout).ravel()
+    expected = distance_by_force(mesh, grid_points(layout))
+    np.testing.assert_allclose(np.abs(found), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", SOLIDS)

@@ -294,13 +294,13 @@ def run_evaluate(sources: tuple[Path, ...], options: dict[str, Any]) -> bool:
     return bool(outcome.left_out)
 
 
-def progress_lines() -> Callable[[int, int, str], None]:
+def progress_lines() -> Callable[[int, int, str, float], None]:
     """Return a function that prints a line a task, with the time that the rest will take."""
     start = time.monotonic()
 
-    def tell(done: int, total: int, what: str) -> None:
+    def tell(done: int, total: int, what: str, share: float) -> None:
         spent = time.monotonic() - start
-        left = spent / done * (total - done)
+        left = spent / share * (1 - share)
         click.echo(f"{done} of {total}: {what}, {spent:.0f} s, {left:.0f} s left", err=True)
 
     return tell

@@ -18,8 +18,8 @@ from .results import Results
 from .runner import LeftOut, Store, complete
 from .timing import time_shape
 
-Progress = Callable[[int, int, str], None]
-"""Called with (tasks done, tasks in all, what was just done)."""
+Progress = Callable[[int, int, str, float], None]
+"""Called with (tasks done, tasks in all, what was just done, the share of the work done)."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def evaluate(
     pictures : bool
         Whether the best and worst shapes are drawn.
     progress : callable, optional
-        Called with (tasks done, tasks in all, what was just done).
+        See ``Progress``.
 
     Raises
     ------
@@ -73,9 +73,12 @@ def evaluate(
     except OSError as error:
         raise FileError(f"{out} cannot be made: {error.strerror}") from error
     store = Store(out / "results.jsonl")
-    tell = progress or (lambda done, total, what: None)
+    tell = progress or (lambda done, total, what, share: None)
     left_out = complete(
-        tasks, store, plan.jobs, lambda done, total, task: tell(done, total, name_of(task))
+        tasks,
+        store,
+        plan.jobs,
+        lambda done, total, task, share: tell(done, total, name_of(task), share),
     )
     results = Results(plan, store, left_out)
     if not results.floors:
@@ -109,5 +112,5 @@ def time_processes(results: Results, tell: Progress) -> dict[int, list[Row]]:
                 results.store.add({**task.key(PROCESS), **row})
             timings.setdefault(setting.size, []).append(results.store.get(task, PROCESS) or {})
             done += 1
-            tell(done, total, f"timing {name_of(task)}")
+            tell(done, total, f"timing {name_of(task)}", done / total)
     return timings

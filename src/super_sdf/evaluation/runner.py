@@ -29,8 +29,8 @@ POLL = 0.5  # seconds between looks at the clock where there is a limit
 # Modules that every task wants, loaded once: processes are then forked in milliseconds.
 PRELOAD = ["super_sdf.evaluation.measuring"]
 
-Progress = Callable[[int, int, Task], None]
-"""Called with (tasks done, tasks in all, the task just done)."""
+Progress = Callable[[int, int, Task, float], None]
+"""Called with (tasks done, tasks in all, the task just done, the share of the work done)."""
 
 
 @dataclass(frozen=True)
@@ -189,13 +189,18 @@ def missing_tasks(tasks: Sequence[Task], store: Store) -> list[Task]:
     return [task for task in cut if task.methods]
 
 
+def expected_work(task: Task) -> float:
+    """Return about how long a task takes: it grows with the fine lattice's axis."""
+    return 1 + task.setting.size * task.setting.factor**task.setting.passes / 40
+
+
 def complete(
     tasks: Sequence[Task], store: Store, jobs: int, progress: Progress | None = None
 ) -> list[LeftOut]:
     """Measure what is not in the store, and keep it; return the shapes that were left out."""
     missing = missing_tasks(tasks, store)
     left_out: list[LeftOut] = []
-    done = 0
+    done, work_done, work = 0, 0.0, sum(map(expected_work, missing))
     for task, found in Runner(missing, jobs).results():
         if isinstance(found, LeftOut):
             left_out.append(found)
@@ -203,6 +208,7 @@ def complete(
             store.add(found)
         else:
             done += 1
+            work_done += expected_work(task)
             if progress:
-                progress(done, len(missing), task)
+                progress(done, len(missing), task, work_done / work)
     return left_out
