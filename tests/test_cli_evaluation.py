@@ -12,7 +12,7 @@ from conftest import ball
 from solids import cube, inverted, joined, saved, torus
 
 from super_sdf import Mesh, read_grid
-from super_sdf.cli_evaluation import ListCommand
+from super_sdf.cli_evaluate import ListCommand
 
 
 @pytest.fixture

@@ -16,7 +16,9 @@ import click
 
 from . import __version__
 from .cli_common import CONTEXT, one_line_errors
-from .cli_evaluation import evaluate, render, sample
+from .cli_evaluate import evaluate
+from .cli_render import render
+from .cli_sample import sample
 
 if TYPE_CHECKING:
     from .field import FineField

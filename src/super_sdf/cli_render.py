@@ -1,0 +1,124 @@
+"""The command ``render``: parse, call the library. No numerics here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from .cli_common import CONTEXT, check_extra, one_line_errors
+from .errors import OptionError
+
+EXAMPLES = """\b
+Examples:
+  super-sdf render coarse.ply fine.ply pair.png --colour normal --up y
+  super-sdf render fine.ply error.png --colour error --reference true.ply
+  super-sdf render part.npz section.png --axis z
+"""
+
+
+@click.command(
+    context_settings=CONTEXT,
+    epilog=EXAMPLES,
+    short_help="Draw meshes, or a cross-section of a grid.",
+)
+@click.argument(
+    "sources", metavar="MESH...", nargs=-1, required=True, type=click.Path(path_type=Path)
+)
+@click.argument("target", metavar="OUT.png", type=click.Path(path_type=Path))
+@click.option(
+    "--colour",
+    type=click.Choice(["shaded", "normal", "error"]),
+    default="shaded",
+    show_default=True,
+    help="By light, by the direction of the face, or by the distance to the reference.",
+)
+@click.option(
+    "--reference", type=click.Path(path_type=Path), help="The mesh that errors are measured to."
+)
+@click.option(
+    "--top",
+    type=float,
+    metavar="D",
+    help="Distance at the end of the colour bar.",
+)
+@click.option(
+    "--up",
+    type=click.Choice(["x", "y", "z"]),
+    default="z",
+    show_default=True,
+    help="The axis that points up.",
+)
+@click.option("--zoom", type=float, default=1.0, show_default=True, help="Closer in.")
+@click.option(
+    "--size", type=click.IntRange(100), default=700, show_default=True, help="Pixels a panel."
+)
+@click.option(
+    "--axis",
+    type=click.Choice(["x", "y", "z"]),
+    default="z",
+    show_default=True,
+    help="Of a grid: the axis that the section cuts across.",
+)
+@click.option(
+    "--at", type=float, metavar="D", help="Of a grid: where on that axis; else the middle."
+)
+@click.option(
+    "--factor", type=int, default=4, show_default=True, help="Of a grid: how many times finer."
+)
+@click.option("--force", is_flag=True, help="Replace OUT if it exists.")
+def render(sources: tuple[Path, ...], target: Path, **options: Any) -> None:
+    """Draw meshes side by side from one camera, or a section of a grid before and after.
+
+    MESH is any file that trimesh reads; a single .npy or .npz grid is drawn as a cross-section in
+    false colours with its zero line, as it is and as super-sdf refines it. No display is needed.
+    """
+    from .io import GRID_SUFFIXES
+
+    with one_line_errors():
+        check_extra("render")
+        check_picture(target, force=options["force"])
+        grids = [source for source in sources if source.suffix.lower() in GRID_SUFFIXES]
+        if grids and len(sources) > 1:
+            raise OptionError(f"{grids[0]} is a grid: give it alone, or meshes only")
+        (render_grid if grids else render_meshes)(sources, target, options)
+
+
+def check_picture(target: Path, *, force: bool) -> None:
+    """Raise if a picture cannot be written there; asked before the work starts."""
+    from .io import check_free
+
+    if target.suffix.lower() != ".png":
+        raise OptionError(f"{target} is no picture file: give .png")
+    check_free(target, force=force)
+
+
+def render_meshes(sources: tuple[Path, ...], target: Path, options: dict[str, Any]) -> None:
+    """Draw meshes; by their errors, if there is a reference to compare with."""
+    from .evaluation.rendering import Panel, render_panels, vertex_errors
+    from .evaluation.solid import Solid, read_mesh
+
+    if (options["colour"] == "error") != (options["reference"] is not None):
+        raise OptionError("--colour error and --reference MESH go together: give both or neither")
+    meshes = [(source.name, read_mesh(source)) for source in sources]
+    if options["reference"] is None:
+        panels = [Panel(mesh, name) for name, mesh in meshes]
+    else:
+        reference = Solid(read_mesh(options["reference"]))
+        panels = [Panel(mesh, name, vertex_errors(mesh, reference)) for name, mesh in meshes]
+    chosen = {name: options[name] for name in ("colour", "up", "zoom", "size", "top")}
+    render_panels(panels, target, **chosen)
+
+
+def render_grid(sources: tuple[Path, ...], target: Path, options: dict[str, Any]) -> None:
+    """Draw a grid's section before and after upsampling."""
+    from .evaluation.sections import render_section
+    from .io import read_grid
+    from .network import load_network
+    from .pipeline import upsample
+
+    grid = read_grid(sources[0])
+    field = upsample(grid, load_network(), options["factor"])
+    chosen = {name: options[name] for name in ("axis", "at", "size")}
+    render_section(grid, target, field=field, **chosen)

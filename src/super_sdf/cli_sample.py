@@ -1,0 +1,105 @@
+"""The command ``sample``: parse, call the library, say what happened. No numerics here."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+
+from .cli_common import CONTEXT, check_extra, one_line_errors
+from .errors import OptionError
+
+EXAMPLES = """\b
+Examples:
+  super-sdf sample part.stl part.npz -n 64
+  super-sdf sample part.stl part.npz --spacing 0.5 --padding 4
+"""
+
+
+@click.command(
+    context_settings=CONTEXT, epilog=EXAMPLES, short_help="Make a grid from a closed mesh."
+)
+@click.argument("source", metavar="MESH", type=click.Path(path_type=Path))
+@click.argument("target", metavar="OUT", type=click.Path(path_type=Path))
+@click.option("-n", "samples", type=int, help="Samples along the longest axis.")
+@click.option("--spacing", type=float, metavar="H", help="World distance between samples instead.")
+@click.option(
+    "--padding",
+    type=float,
+    default=2.0,
+    show_default=True,
+    help="Voxels between the mesh's box and the outer samples.",
+)
+@click.option(
+    "--frame",
+    type=click.Choice(["world", "unit"]),
+    default="world",
+    show_default=True,
+    help="unit: box diagonal scaled to 1, centred in a cube of side 1 (n^3 voxel centres).",
+)
+@click.option(
+    "--band",
+    type=float,
+    metavar="VOXELS",
+    help="Exact only so near to the surface, cut off beyond; else all samples are exact up to "
+    "256^3, and those within 4 voxels in larger grids.",
+)
+@click.option("--allow-open", is_flag=True, help="Guess what is inside a mesh with holes.")
+@click.option("--force", is_flag=True, help="Replace OUT if it exists.")
+@click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
+def sample(source: Path, target: Path, **options: Any) -> None:
+    """Write the signed distances to the closed mesh MESH on a regular grid, OUT.
+
+    MESH is any file that trimesh reads. OUT is .npz (keys values, spacing, origin), in the mesh's
+    units, negative inside.
+    """
+    with one_line_errors():
+        check_extra("sample")
+        run_sample(source, target, options)
+
+
+def run_sample(source: Path, target: Path, options: dict[str, Any]) -> None:
+    """Read the mesh, lay out the grid, sample it, write it, say what was found."""
+    from .evaluation.metrics import normalise
+    from .evaluation.sampling import fitted_layout, sample_solid, unit_layout
+    from .evaluation.solid import Solid, load_solid
+    from .io import check_grid_target, write_grid
+
+    start = time.perf_counter()
+    check_grid_target(target, force=options["force"])
+    samples, spacing = options["samples"], options["spacing"]
+    if (samples is None) == (spacing is None):
+        raise OptionError("give either -n (samples along the longest axis) or --spacing")
+    if options["frame"] == "unit" and samples is None:
+        raise OptionError("--frame unit has a side of 1: give -n, not --spacing")
+    solid, notes = load_solid(source, allow_open=options["allow_open"])
+    if options["frame"] == "unit":
+        solid, layout = Solid(normalise(solid.mesh)), unit_layout(samples)
+    else:
+        layout = fitted_layout(solid.mesh, n=samples, spacing=spacing, padding=options["padding"])
+    with bar("sampling", options["quiet"]) as progress:
+        grid = sample_solid(solid, layout, band=options["band"], progress=progress)
+    write_grid(grid, target, force=options["force"])
+    if not options["quiet"]:
+        for note in (*notes, *grid.notes):
+            click.echo(f"Note: {note}", err=True)
+        size = " x ".join(map(str, grid.shape))
+        seconds = time.perf_counter() - start
+        click.echo(
+            f"{target}: {size} samples, spacing {grid.voxel_size:g}, {seconds:.1f} s", err=True
+        )
+
+
+@contextmanager
+def bar(label: str, quiet: bool) -> Iterator[Callable[[int, int], None]]:
+    """Draw a bar on stderr, if somebody is there to see it."""
+    if quiet or not sys.stderr.isatty():
+        yield lambda done, total: None
+        return
+    with click.progressbar(length=1000, label=label, file=sys.stderr) as shown:
+        yield lambda done, total: shown.update(1000 * done // total - shown.pos)
