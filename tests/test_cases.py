@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from conftest import trilinear
 from scipy import ndimage
-from solids import cube, sphere, torus
+from solids import cube, saved, sphere, torus
 
 from super_sdf import Mesh
 from super_sdf.evaluation import methods
 from super_sdf.evaluation.cases import Case, Setting, Shape
-from super_sdf.evaluation.measuring import measure_method
+from super_sdf.evaluation.measuring import Task, measure_method, measure_task
 from super_sdf.evaluation.metrics import distance_or_dot
 from super_sdf.evaluation.solid import Solid
 
@@ -117,6 +117,15 @@ def test_a_method_that_raises_counts_as_a_dot_and_is_named(monkeypatch):
     row = measure_method(*shape_and_case(cube(), Setting(8)), "mc", "base")
     assert row["error"] == "ValueError: no luck"
     assert row["f1"] == 0 and row["faces"] == 0 and not row["closed"]
+
+
+def test_a_lattice_beyond_memory_fails_its_methods_and_not_the_shape(tmp_path):
+    path = saved(cube(), tmp_path / "box.ply")
+    task = Task(path, "sum", Setting(8000, 16), ("mc", "bound"), "base", "digest")
+    rows = list(measure_task(task, Shape.read(path)))
+    assert [row["method"] for row in rows] == ["mc", "bound"]
+    assert all("measuring 8000^3 refined to " in row["error"] for row in rows)
+    assert all(row["f1"] == 0 for row in rows)
 
 
 def shape_and_case(mesh: Mesh, setting: Setting) -> tuple[Shape, Case]:

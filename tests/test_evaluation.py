@@ -15,12 +15,13 @@ import pytest
 from click.testing import CliRunner
 from solids import cube, saved, sphere, torus
 
-from super_sdf import Mesh
+from super_sdf import Mesh, SuperSdfError
 from super_sdf.cli import cli
-from super_sdf.evaluation import measuring, plan, published, runner, tables
-from super_sdf.evaluation.cases import Setting
+from super_sdf.evaluation import measuring, plan, published, runner, tables, timing
+from super_sdf.evaluation.cases import Setting, Shape
 from super_sdf.evaluation.measuring import Task
 from super_sdf.evaluation.plan import Plan
+from super_sdf.evaluation.results import Results
 from super_sdf.evaluation.runner import LeftOut, Runner, Store, complete
 
 QUALITY = ("cd", "f1", "nc", "signed_nc", "p2s", "ecd", "ef1", "field_mse", "faces", "closed")
@@ -156,6 +157,7 @@ def test_failures_are_tried_again_but_not_what_ran_out_of_time(tmp_path):
 
 def die(task: Task, rows) -> None:
     """Stand in for a process that is killed after its first row."""
+    rows.send(runner.READ)
     row = {**task.key(task.methods[0]), "error": None}
     rows.send(row)
     if len(task.methods) > 2:
@@ -166,6 +168,7 @@ def die(task: Task, rows) -> None:
 
 def sleep(task: Task, rows) -> None:
     """Stand in for a process that does not end."""
+    rows.send(runner.READ)
     time.sleep(60)
 
 
@@ -192,6 +195,18 @@ def test_a_process_over_its_limit_is_ended(tmp_path, monkeypatch):
     (_, row), (_, end) = Runner([task], 1).results()
     assert row["error"] == "over the limit of 0.2 s" and row["limit"] == 0.2
     assert end is None
+
+
+def crash(task: Task, rows) -> None:
+    """Stand in for a reader that takes its process down."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_mesh_that_crashes_its_reader_is_left_out(tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "work", crash)
+    tasks = [task_of(tmp_path / "box.ply"), task_of(tmp_path / "box.ply", ("ours", "bound"))]
+    left_out = complete(tasks, Store(tmp_path / "rows.jsonl"), 1)
+    assert left_out == [LeftOut("box", "while it was read its process ended with -9")]
 
 
 def refuse(task: Task, rows) -> None:
@@ -248,9 +263,56 @@ def test_what_makes_no_sense_is_said_in_one_line(words, message, meshes, monkeyp
 
 
 def row(name: str, f1: float, **figures: object) -> measuring.Row:
-    known = dict.fromkeys((column.key for column in tables.SURFACE), 0.0)
+    known = dict.fromkeys((column.key for column in tables.SURFACE), 0.001)
     said = {"shape": name, "f1": f1, "closed": True, "outward": True, "faces": 4, "error": None}
     return {**known, **said, **figures}
+
+
+def made_up(meshes: Path, out: Path, **options: object) -> Results:
+    """Results of a plan as if measured: F1 falls with noise and grows with everything else."""
+    asked = Plan(plan.find_meshes([meshes]), sizes=(32,), **options)
+    store = Store(out / "results.jsonl")
+    for task in asked.tasks():
+        for method in task.methods:
+            f1 = 0.5 + task.setting.factor / 100 - task.setting.noise / 10
+            cost = {"seconds": 1.0, "peak_mb": 10.0, "notes": []}
+            late = {"error": "over the limit of 1 s"} if method == "rfta" else {}
+            store.add({**row(task.path.stem, f1), **cost, **task.key(method), **late})
+    return Results(asked, store, [])
+
+
+def test_experiments_stand_beside_what_is_published(meshes, tmp_path):
+    from super_sdf.evaluation.report import write_report
+
+    options = {
+        "experiments": ("factors", "noise", "iterated", "scale"),
+        "peers": ("rfta", "dual-contouring"),
+        "peer_limit": 1.0,
+        "experiment_shapes": 2,
+    }
+    results = made_up(meshes, tmp_path, **options)
+    timings = {32: [{"seconds": 0.25, "peak_mb": 200.0}, {"seconds": 0.75, "peak_mb": 300.0}]}
+    path = write_report(results, tmp_path, timings, up="z", pictures=False)
+    lines = path.read_text().splitlines()
+    assert "| 50 % | 0.490 | 0.490 | 0.490 | 0.000 | 0.430 | 0.487 | 0.057 |" in lines
+    assert any(line.startswith("| 16 | super-sdf | 100.000 | 0.660 |") for line in lines)
+    assert any(line.startswith("| 32^3 -> 128^3 -> 512^3 |") for line in lines)
+    assert any("| 1.317 | 0.824 | 0.952 |" in line for line in lines)  # the paper's, iterated
+    scaled = next(line for line in lines if line.startswith("| 0.25, 32^3 | super-sdf |"))
+    assert scaled.endswith("| 13.826 | 0.425 | 0.871 |")
+    assert "| 32^3 | super-sdf | 0.50 | 0.25 | 0.75 | 300 |" in lines
+    assert any(line.startswith("| 32^3 | *PoNQ, published, Thingi30* | 0.97 |") for line in lines)
+    rfta = next(line for line in lines if line.startswith("| RFTA |"))
+    assert rfta.endswith("| 0 of 0 | 0 of 3 |")
+    assert "RFTA, box: over the limit of 1 s." in lines
+
+
+def test_the_command_is_timed_as_a_process(monkeypatch):
+    monkeypatch.setattr(timing, "RUNS", 1)
+    figures = timing.time_shape(Shape("ring", torus()), Setting(12))
+    assert 0.05 < figures["seconds"] < 60 and 20 < figures["peak_mb"] < 2000
+    with pytest.raises(SuperSdfError, match=r"super-sdf upsample none\.npz x\.ply ended with 1"):
+        timing.run_command(["upsample", "none.npz", "x.ply"])
 
 
 def test_gaps_and_wins_are_what_they_are_called():

@@ -18,11 +18,15 @@ from numpy.typing import NDArray
 from ..band import find_band, rescale
 from ..errors import OptionError
 from ..grid import BoolArray, FloatArray, IntArray, SdfGrid
+from ..memory import check_fits
 from ..mesh import Mesh
 from ..nodes import check_factor
 from . import metrics
 from .sampling import sample_grid, unit_layout
 from .solid import Distances, Solid, load_solid
+
+# At most, of the dense fields, their masks, and the meshing of one of them.
+BYTES_PER_NODE = 20
 
 # Streams of random numbers, each seeded by the shape's name and its own number.
 REFERENCE_POINTS, REFERENCE_EDGES, RESULT_POINTS, NOISE = range(4)
@@ -96,6 +100,9 @@ class Shape:
 class Case:
     """A shape sampled in a setting.
 
+    The baselines and the truth are dense on the fine lattice, so its size is bounded by memory:
+    OutOfMemoryError if it would not fit.
+
     Attributes
     ----------
     coarse : (n, n, n) float32
@@ -108,6 +115,9 @@ class Case:
     """
 
     def __init__(self, shape: Shape, setting: Setting) -> None:
+        nodes = (setting.size * setting.factor**setting.passes + 1) ** 3
+        what = f"measuring {setting.size}^3 refined to {nodes:,} nodes"
+        check_fits(nodes * BYTES_PER_NODE, what, "use smaller sizes or fewer --jobs")
         self.shape, self.setting, self.factor = shape, setting, setting.factor
         self.side = side_of(shape.mesh, setting.scale)
         self.low = -self.side / 2

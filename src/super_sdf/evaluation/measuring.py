@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import OutOfMemoryError
 from ..memory import forget_peak, held_memory
 from ..mesh import Mesh
 from ..network import shipped_models
@@ -60,12 +61,15 @@ class Task:
         }
 
 
-def measure_task(task: Task) -> Iterator[Row]:
-    """Yield a row for each method of a task."""
-    shape = Shape.read(task.path)
+def measure_task(task: Task, shape: Shape) -> Iterator[Row]:
+    """Yield a row for each method of a task, which is of that shape."""
     if OURS in task.methods:
         network_of(task.model, task.threads)
-    case = None if task.setting == NO_SETTING else Case(shape, task.setting)
+    try:
+        case = None if task.setting == NO_SETTING else Case(shape, task.setting)
+    except OutOfMemoryError as error:
+        yield from (failed_row(task, shape, method, str(error)) for method in task.methods)
+        return
     for method in task.methods:
         figures = measure_method(shape, case, method, task.model)
         yield {**task.key(method), **figures, "notes": list(shape.notes)}
@@ -96,11 +100,11 @@ def make_surface(shape: Shape, case: Case | None, method: str, model: str) -> Su
     return {**METHODS, **PEERS}[method](case, model)
 
 
-def failed_row(task: Task, method: str, error: str) -> Row:
-    """Return the row of a method whose process ended before it did."""
-    shape = Shape.read(task.path)
+def failed_row(task: Task, shape: Shape, method: str, error: str) -> Row:
+    """Return the row of a method that made nothing: a dot's figures."""
     none = {"field_mse": None, "field_mae": None, "seconds": None, "peak_mb": None}
-    return {**task.key(method), **measure_surface(shape, EMPTY), **none, "error": error}
+    figures = {**measure_surface(shape, EMPTY), **none}
+    return {**task.key(method), **figures, "error": error, "notes": list(shape.notes)}
 
 
 def measure_surface(shape: Shape, mesh: Mesh) -> Row:

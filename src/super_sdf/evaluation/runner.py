@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import SuperSdfError
+from .cases import Shape
 from .measuring import PROTOCOL, Row, Task, failed_row, measure_task
 
 # What a row is known by; the rest of it are figures.
@@ -25,6 +26,7 @@ KEY_NAMES = (
     *("shape", "mesh", "size", "factor", "noise", "scale", "passes"),
     *("method", "digest", "protocol"),
 )
+READ = "read"  # what a process sends once it has its shape
 POLL = 0.5  # seconds between looks at the clock where there is a limit
 # Modules that every task wants, loaded once: processes are then forked in milliseconds.
 PRELOAD = ["super_sdf.evaluation.measuring"]
@@ -86,17 +88,22 @@ class Store:
 
 @dataclass(eq=False)
 class Running:
-    """A task under way: its process, the pipe that its rows come by, and when it began."""
+    """A task under way: its process, the pipe that its rows come by, what it has still to send.
+
+    ``began`` is when it had read its shape; the limit counts from there.
+    """
 
     task: Task
     process: BaseProcess
     rows: Connection
-    began: float
     owed: list[str]
+    began: float | None = None
 
     def is_late(self) -> bool:
         """Say whether its time is over."""
-        return self.task.limit is not None and time.monotonic() - self.began > self.task.limit
+        if self.began is None or self.task.limit is None:
+            return False
+        return time.monotonic() - self.began > self.task.limit
 
 
 class Runner:
@@ -127,35 +134,43 @@ class Runner:
         process = self.context.Process(target=work, args=(task, theirs), daemon=True)  # type: ignore[attr-defined]
         process.start()
         theirs.close()
-        self.running[ours] = Running(task, process, ours, time.monotonic(), list(task.methods))
+        self.running[ours] = Running(task, process, ours, list(task.methods))
 
     def _receive(self, entry: Running) -> Iterator[tuple[Task, Row | LeftOut | None]]:
         """Take what a process has sent; if it ended owing rows, the first of them has failed."""
         try:
-            found: Row | LeftOut = entry.rows.recv()
+            found: Row | LeftOut | str = entry.rows.recv()
         except EOFError:
             entry.process.join()
             yield from self._give_up(entry, f"its process ended with {entry.process.exitcode}")
             return
         if isinstance(found, LeftOut):
-            entry.owed = []
-            known = entry.task.mesh in self.left_out
-            self.left_out.add(entry.task.mesh)
-            if known:
-                return
+            yield from self._leave_out(entry, found.reason)
+        elif isinstance(found, str):
+            entry.began = time.monotonic()
         else:
             entry.owed.remove(found["method"])
-        yield entry.task, found
+            yield entry.task, found
 
-    def _give_up(self, entry: Running, error: str) -> Iterator[tuple[Task, Row | None]]:
+    def _leave_out(self, entry: Running, reason: str) -> Iterator[tuple[Task, LeftOut]]:
+        """Drop what a task owes; name its shape, once."""
+        entry.owed = []
+        if entry.task.mesh not in self.left_out:
+            self.left_out.add(entry.task.mesh)
+            yield entry.task, LeftOut(entry.task.path.stem, reason)
+
+    def _give_up(self, entry: Running, error: str) -> Iterator[tuple[Task, Row | LeftOut | None]]:
         """End a task; what it owes after the method under way is put back in the queue."""
         entry.process.kill()
         entry.process.join()
         del self.running[entry.rows]
         entry.rows.close()
+        if entry.owed and entry.began is None:
+            yield from self._leave_out(entry, f"while it was read {error}")
         if entry.owed:
-            limit = entry.task.limit if entry.is_late() else None
-            yield entry.task, {**failed_row(entry.task, entry.owed[0], error), "limit": limit}
+            task, limit = entry.task, entry.task.limit if entry.is_late() else None
+            row = failed_row(task, Shape.read(task.path), entry.owed[0], error)
+            yield task, {**row, "limit": limit}
         if entry.owed[1:]:
             self.waiting.append(replace(entry.task, methods=tuple(entry.owed[1:])))
         else:
@@ -172,12 +187,15 @@ def make_context() -> multiprocessing.context.BaseContext:
 
 
 def work(task: Task, rows: Connection) -> None:
-    """Measure a task in a process of its own; send rows, or why there are none."""
+    """Measure a task in a process of its own; send ``READ`` and rows, or why there are none."""
     try:
-        for row in measure_task(task):
-            rows.send(row)
+        shape = Shape.read(task.path)
     except SuperSdfError as error:
         rows.send(LeftOut(task.path.stem, str(error)))
+        return
+    rows.send(READ)
+    for row in measure_task(task, shape):
+        rows.send(row)
 
 
 def missing_tasks(tasks: Sequence[Task], store: Store) -> list[Task]:
