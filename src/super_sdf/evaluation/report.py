@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from ..mesh import Mesh
 from . import experiment_tables
 from .cases import Case, Setting, Shape
 from .measuring import OURS, Row
@@ -73,7 +74,7 @@ def write_report(
     sections += [cost_section(results), plot_section(results, out)]
     sections += [picture_section(results, out, up)] if pictures and OURS in plan.methods else []
     report = out / "report.md"
-    report.write_text("\n\n".join(sections) + "\n")
+    report.write_text("\n\n".join(filter(None, [*sections, note_section(results)])) + "\n")
     shapes = [f"## {s.size}^3\n\n{shape_table(results.by_method(s))}" for s in plan.settings()]
     (out / "shapes.md").write_text("\n\n".join(shapes) + "\n")
     return report
@@ -83,9 +84,17 @@ def title_section(results: Results) -> str:
     """Return what was measured, how, and what could not be."""
     lines = [f"# Quality of super-sdf on {len(results.floors)} shapes", PROTOCOL_LINES]
     lines += [f"Left out, {entry.shape}: {entry.reason}." for entry in results.left_out]
-    noted = {row["shape"]: row["notes"] for row in results.floors.values() if row["notes"]}
-    lines += [f"{name}: {'; '.join(notes)}." for name, notes in noted.items()]
     return "\n\n".join(lines)
+
+
+def note_section(results: Results) -> str:
+    """Return what is odd about the shapes themselves."""
+    lines = [
+        f"- {row['shape']}: {'; '.join(row['notes'])}."
+        for row in results.floors.values()
+        if row["notes"]
+    ]
+    return "\n".join(["## Notes on the shapes\n", *lines]) if lines else ""
 
 
 def size_section(results: Results, setting: Setting) -> str:
@@ -144,11 +153,16 @@ def plot_section(results: Results, out: Path) -> str:
 
 
 def picture_section(results: Results, out: Path, up: str) -> str:
-    """Draw the shapes on which ours is best and worst, and return where they are shown."""
-    setting = results.plan.settings()[0]
-    ranked = sorted(results.rows(setting, OURS), key=lambda row: -row["f1"])
+    """Draw the shapes on which ours is best and worst, and return where they are shown.
+
+    By F1 over the floor's, which is low where 100,000 points lie far apart: on large surfaces.
+    """
+    setting, floors = results.plan.settings()[0], results.floors
+    ranked = results.rows(setting, OURS)
+    ranked.sort(key=lambda row: row["f1"] / floors[row["shape"]]["f1"], reverse=True)
     count = min(EXTREMES, len(ranked) // 2)
-    title = f"## The {count} best and the {count} worst shapes by F1 at {setting.size}^3"
+    title = f"## The {count} best and the {count} worst shapes at {setting.size}^3, by F1 over the "
+    title += "floor's"
     if not can_render():
         return f"{title}\n\nNot drawn: PyVista is not installed (extra `view`)."
     paths = {path.stem: path for path in results.plan.paths}
@@ -156,7 +170,10 @@ def picture_section(results: Results, out: Path, up: str) -> str:
     for row in ranked[:count] + ranked[len(ranked) - count :]:
         picture = out / "pictures" / f"{row['shape']}.png"
         draw_shape(paths[row["shape"]], setting, results.plan.model, picture, up)
-        lines.append(f"**{row['shape']}**, F1 {row['f1']:.3f}, NC {row['nc']:.3f}")
+        floor = floors[row["shape"]]["f1"]
+        lines.append(
+            f"**{row['shape']}**, F1 {row['f1']:.3f} (floor {floor:.3f}), NC {row['nc']:.3f}"
+        )
         lines.append(f"![{row['shape']}](pictures/{picture.name})")
     return "\n\n".join(lines)
 
@@ -167,17 +184,22 @@ def draw_shape(path: Path, setting: Setting, model: str, target: Path, up: str) 
     case = Case(shape, setting)
     coarse, ours = (METHODS[name](case, model).mesh for name in ("mc", OURS))
     panels = [
-        Panel(coarse, f"marching cubes of {setting.size}^3"),
-        Panel(ours, "super-sdf"),
+        Panel(coarse, titled(coarse, f"marching cubes of {setting.size}^3")),
+        Panel(ours, titled(ours, "super-sdf")),
         Panel(shape.mesh, "reference"),
         Panel(ours, "error of super-sdf", vertex_errors(ours, shape.solid)),
     ]
     target.parent.mkdir(exist_ok=True)
     render_panels(
-        [panel for panel in panels if len(panel.mesh.faces)],
+        panels,
         target,
         colour="error",
         up=up,
         top=ERROR_TOP * case.spacing,
         unit="box diagonal 1",
     )
+
+
+def titled(mesh: Mesh, title: str) -> str:
+    """Return a panel's title, which says so if there is nothing below it."""
+    return title if len(mesh.faces) else f"{title}: no surface"

@@ -170,8 +170,8 @@ def load_solid(path: str | Path, *, allow_open: bool = False) -> tuple[Solid, li
     if found.overlapping:
         notes.append(
             f"pieces overlap, fold over or are inverted at {found.overlapping:,} of "
-            f"{len(solid.mesh.faces):,} faces: inside is what the mesh winds round at least once, "
-            "distances are to the nearest triangle, walls inside included"
+            f"{len(solid.mesh.faces):,} faces: inside is by winding number, and distances are to "
+            "inner walls, too"
         )
     return solid, notes
 
