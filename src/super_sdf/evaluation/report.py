@@ -21,6 +21,7 @@ from .rendering import Panel, can_render, render_panels, vertex_errors
 from .results import Results
 from .tables import (
     COST,
+    EF1,
     LABELS,
     SHORT,
     cost_table,
@@ -109,7 +110,7 @@ def peer_section(results: Results) -> str:
     """Return the peers beside ours, each on the shapes that it finished."""
     plan, rows = results.plan, []
     setting, paths = Setting(plan.peer_size), plan.peer_paths()
-    columns = (*SHORT, *COST)
+    columns = (*SHORT, EF1, *COST)
     for name in ("mc", "bspline", OURS, *plan.peers):
         found = results.rows(setting, name, paths)
         done = [row for row in found if not row["error"]]
