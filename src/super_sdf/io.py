@@ -179,16 +179,11 @@ def write_mesh(mesh: Mesh, path: str | Path, *, force: bool = False) -> None:
         If the file exists and ``force`` is not set, or cannot be written.
     """
     path = check_target(path, force=force)
-    try:
-        with replacing(path) as part:
-            if path.suffix.lower() == ".ply":
-                _write_ply(mesh, part)
-            else:
-                _write_by_trimesh(mesh, part, path.suffix.lower()[1:])
-    except FileError:
-        raise
-    except OSError as error:
-        raise FileError(f"{path} cannot be written: {error.strerror or error}") from error
+    with replacing(path) as part:
+        if path.suffix.lower() == ".ply":
+            _write_ply(mesh, part)
+        else:
+            _write_by_trimesh(mesh, part, path.suffix.lower()[1:])
 
 
 def write_grid(grid: SdfGrid, path: str | Path, *, force: bool = False) -> None:
@@ -202,22 +197,22 @@ def write_grid(grid: SdfGrid, path: str | Path, *, force: bool = False) -> None:
         If the file exists and ``force`` is not set, or cannot be written.
     """
     path = check_grid_target(path, force=force)
-    try:
-        with replacing(path) as part, part.open("wb") as file:
-            np.savez(file, values=grid.values, spacing=grid.spacing, origin=grid.origin)
-    except FileError:
-        raise
-    except OSError as error:
-        raise FileError(f"{path} cannot be written: {error.strerror or error}") from error
+    with replacing(path) as part, part.open("wb") as file:
+        np.savez(file, values=grid.values, spacing=grid.spacing, origin=grid.origin)
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a path beside the target; it takes the target's place only if all goes well."""
+    """Yield a path beside the target; it takes the target's place only if all goes well.
+
+    What the system has against it is raised as FileError.
+    """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         yield part
         os.replace(part, path)
+    except OSError as error:
+        raise FileError(f"{path} cannot be written: {error.strerror or error}") from error
     finally:
         part.unlink(missing_ok=True)
 

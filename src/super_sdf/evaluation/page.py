@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, MaxNLocator
 from numpy.typing import NDArray
 
-from ..errors import FileError
 from ..io import replacing
 
 Image = NDArray[np.uint8]
@@ -33,11 +32,8 @@ def write_picture(figure: Figure, target: Path) -> None:
     FileError
         If it cannot be written.
     """
-    try:
-        with replacing(target) as part:
-            figure.savefig(part, format="png", dpi=figure.dpi)
-    except OSError as error:
-        raise FileError(f"{target} cannot be written: {error.strerror or error}") from error
+    with replacing(target) as part:
+        figure.savefig(part, format="png", dpi=figure.dpi)
 
 
 class Page:
