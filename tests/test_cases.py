@@ -8,7 +8,7 @@ from conftest import trilinear
 from scipy import ndimage
 from solids import cube, saved, sphere, torus
 
-from super_sdf import Mesh
+from super_sdf import Mesh, load_network
 from super_sdf.evaluation import methods
 from super_sdf.evaluation.cases import Case, Setting, Shape
 from super_sdf.evaluation.measuring import Task, measure_method, measure_task
@@ -52,11 +52,10 @@ def test_the_truth_is_exact_near_the_surface_and_right_in_sign(setting):
     np.testing.assert_allclose(case.truth[case.band & away], exact[case.band & away], atol=1e-6)
 
 
-def test_ours_with_a_trilinear_network_is_the_trilinear_baseline(monkeypatch):
+def test_ours_with_a_trilinear_network_is_the_trilinear_baseline():
     case = case_of(sphere(), Setting(16))
-    monkeypatch.setattr(methods, "network_of", lambda model: trilinear)
-    ours = methods.our_surface(case, "any")
-    baseline = methods.upsampled_surface(case, "any", order=1)
+    ours = methods.our_surface(case, trilinear)
+    baseline = methods.upsampled_surface(case, trilinear, order=1)
     near = case.band & (np.abs(baseline.field()) < case.spacing)  # patches are cut off at 3 h
     np.testing.assert_allclose(ours.field()[near], baseline.field()[near], atol=1e-6)
     assert ours.mesh.is_closed()
@@ -80,7 +79,7 @@ def test_a_second_pass_starts_from_the_first():
 
 @pytest.mark.parametrize("method", methods.METHODS)
 def test_every_method_finds_the_torus_where_it_is(method):
-    row = measure_method(*shape_and_case(torus(), Setting(24)), method, "base")
+    row = measure_method(*shape_and_case(torus(), Setting(24)), method, load_network())
     assert row["error"] is None and row["closed"] and row["outward"]
     assert row["p2s"] < 0.05 / 24 and row["nc"] > 0.98
     assert row["seconds"] > 0
@@ -88,7 +87,8 @@ def test_every_method_finds_the_torus_where_it_is(method):
 
 def test_the_bound_is_better_than_ours_and_ours_than_the_coarse_grid():
     shape, case = shape_and_case(cube(), Setting(20))
-    rows = {name: measure_method(shape, case, name, "base") for name in ("mc", "ours", "bound")}
+    network = load_network()
+    rows = {name: measure_method(shape, case, name, network) for name in ("mc", "ours", "bound")}
     assert rows["mc"]["p2s"] > rows["ours"]["p2s"] > rows["bound"]["p2s"]
     assert rows["mc"]["f1"] < rows["ours"]["f1"] <= rows["bound"]["f1"]
 
@@ -110,11 +110,11 @@ def test_a_scale_is_the_longest_side_over_that_of_the_grid():
 
 
 def test_a_method_that_raises_counts_as_a_dot_and_is_named(monkeypatch):
-    def broken(case, model):
+    def broken(case, network):
         raise ValueError("no luck")
 
     monkeypatch.setitem(methods.METHODS, "mc", broken)
-    row = measure_method(*shape_and_case(cube(), Setting(8)), "mc", "base")
+    row = measure_method(*shape_and_case(cube(), Setting(8)), "mc", trilinear)
     assert row["error"] == "ValueError: no luck"
     assert row["f1"] == 0 and row["faces"] == 0 and not row["closed"]
 

@@ -15,10 +15,11 @@ import numpy as np
 from ..errors import OutOfMemoryError
 from ..memory import forget_peak, held_memory
 from ..mesh import Mesh
-from ..network import shipped_models
+from ..network import load_network, shipped_models
+from ..pipeline import Decoder
 from . import metrics
 from .cases import RESULT_POINTS, Case, Setting, Shape
-from .methods import EMPTY, METHODS, Surface, network_of
+from .methods import EMPTY, METHODS, Surface
 from .peers import PEERS
 
 Row = dict[str, Any]
@@ -63,19 +64,19 @@ class Task:
 
 def measure_task(task: Task, shape: Shape) -> Iterator[Row]:
     """Yield a row for each method of a task, which is of that shape."""
-    if OURS in task.methods:
-        network_of(task.model, task.threads)
+    # On the CPU, so that every machine agrees.
+    network = load_network(task.model, device="cpu", threads=task.threads)
     try:
         case = None if task.setting == NO_SETTING else Case(shape, task.setting)
     except OutOfMemoryError as error:
         yield from (failed_row(task, shape, method, str(error)) for method in task.methods)
         return
     for method in task.methods:
-        figures = measure_method(shape, case, method, task.model)
+        figures = measure_method(shape, case, method, network)
         yield {**task.key(method), **figures, "notes": list(shape.notes)}
 
 
-def measure_method(shape: Shape, case: Case | None, method: str, model: str) -> Row:
+def measure_method(shape: Shape, case: Case | None, method: str, network: Decoder) -> Row:
     """Return a method's figures; if it raises, those of a dot, with the reason in "error".
 
     ``seconds`` and ``peak_mb`` are those of making the mesh: from the grid in memory to the mesh
@@ -84,7 +85,7 @@ def measure_method(shape: Shape, case: Case | None, method: str, model: str) -> 
     error = None
     clock, held = time.perf_counter(), start_memory()
     try:
-        surface = make_surface(shape, case, method, model)
+        surface = make_surface(shape, case, method, network)
     except Exception as problem:  # named in the report; the other shapes still count
         traceback.print_exc()
         surface, error = Surface(EMPTY), f"{type(problem).__name__}: {problem}"
@@ -93,11 +94,11 @@ def measure_method(shape: Shape, case: Case | None, method: str, model: str) -> 
     return {**figures, "seconds": seconds, "peak_mb": peak, "error": error}
 
 
-def make_surface(shape: Shape, case: Case | None, method: str, model: str) -> Surface:
+def make_surface(shape: Shape, case: Case | None, method: str, network: Decoder) -> Surface:
     """Return what a method makes of a case; of the floor, the reference itself."""
     if case is None:
         return Surface(shape.mesh)
-    return {**METHODS, **PEERS}[method](case, model)
+    return {**METHODS, **PEERS}[method](case, network)
 
 
 def failed_row(task: Task, shape: Shape, method: str, error: str) -> Row:
@@ -148,7 +149,7 @@ def digest_of_file(path: Path) -> str:
 
 def digest_of_ours(model: str) -> str:
     """Return the sum of the network's file and of the code that runs it."""
-    network_of(model)  # says what is wrong with the file, before anything is measured
+    load_network(model, device="cpu")  # says what is wrong, before anything is measured
     code = sorted(Path(__file__).parent.parent.glob("*.py"))
     parts = [path for path in code if not path.stem.startswith(NOT_THE_METHOD)]
     digest = hashlib.sha256()

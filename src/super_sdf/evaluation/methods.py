@@ -1,6 +1,6 @@
 """The methods that make a surface of a coarse grid: ours, what it is compared with, its bound.
 
-Each is given a case and the name of a network, and returns a surface in the frame.
+Each is given a case and a network, which only ours runs, and returns a surface in the frame.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from skimage.measure import marching_cubes
 from ..band import find_band, gather_patches, neighbour_table, rescale
 from ..grid import FloatArray, IntArray, SdfGrid
 from ..mesh import Mesh
-from ..network import Network, load_network
 from ..nodes import average_shared, block_ijk, block_offsets, keep_samples, number_shared_nodes
 from ..pipeline import Decoder, reconstruct
 from .cases import Case, spread_samples
@@ -37,33 +36,33 @@ class Surface:
     field: Callable[[], FloatArray] | None = None
 
 
-Method = Callable[[Case, str], Surface]
+Method = Callable[[Case, Decoder], Surface]
 
 
-def coarse_surface(case: Case, model: str, *, table: str) -> Surface:
+def coarse_surface(case: Case, network: Decoder, *, table: str) -> Surface:
     """Mesh the coarse grid as it is, by one of scikit-image's tables: lorensen or lewiner."""
     field = np.array(case.grid.values)
     return Surface(isosurface(field, case.spacing, case.low + case.spacing / 2, table))
 
 
-def upsampled_surface(case: Case, model: str, *, order: int) -> Surface:
+def upsampled_surface(case: Case, network: Decoder, *, order: int) -> Surface:
     """Mesh the spline interpolation of the coarse grid at the fine nodes."""
     field = upsample(case.grid.values, case.factor, order)
     return Surface(isosurface(field, case.fine, case.low), lambda: field)
 
 
-def bound_surface(case: Case, model: str) -> Surface:
+def bound_surface(case: Case, network: Decoder) -> Surface:
     """Mesh the true distance at the fine nodes: what no upsampling to them can beat."""
     return Surface(isosurface(case.truth.copy(), case.fine, case.low))
 
 
-def our_surface(case: Case, model: str) -> Surface:
+def our_surface(case: Case, network: Decoder) -> Surface:
     """Mesh the coarse grid with super-sdf, as often as the setting says.
 
     Capped, as one would ask who wants solids: where no surface leaves the grid that changes
     nothing.
     """
-    network, grid = network_of(model), case.grid
+    grid = case.grid
     for _ in range(case.setting.passes - 1):
         grid = refined_grid(grid, network, case.factor)
     mesh = reconstruct(grid, network, factor=case.factor, cap=True)
@@ -100,12 +99,6 @@ def band_field(grid: SdfGrid, voxels: IntArray, network: Decoder, factor: int) -
     field = np.full([factor * n + 1 for n in grid.shape], np.nan, np.float32)
     field[tuple(np.moveaxis(nodes, 2, 0))] = values[numbers] * np.float32(grid.voxel_size / 2)
     return field
-
-
-@lru_cache(maxsize=1)
-def network_of(model: str, threads: int = 0) -> Network:
-    """Return the network of a name or a file, on the CPU so that every machine agrees."""
-    return load_network(model, device="cpu", threads=threads)
 
 
 def isosurface(field: FloatArray, spacing: float, low: float, table: str = "lorensen") -> Mesh:

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..grid import IntArray, SdfGrid
 from ..mesh import Mesh
+from ..pipeline import Decoder
 from .cases import Case
 from .methods import Method, Surface
 from .sampling import grid_points
@@ -24,7 +25,7 @@ def samples_of(grid: SdfGrid) -> Points:
     return grid_points((grid.shape, grid.voxel_size, np.array(grid.origin)))
 
 
-def reach_for_the_arcs(case: Case, model: str) -> Surface:
+def reach_for_the_arcs(case: Case, network: Decoder) -> Surface:
     """Mesh the grid with Reach for the Arcs (Sellán et al. 2024), its defaults."""
     from gpytoolbox import reach_for_the_arcs
 
@@ -33,7 +34,7 @@ def reach_for_the_arcs(case: Case, model: str) -> Surface:
     return Surface(Mesh(np.asarray(vertices), np.asarray(faces, np.int32)))
 
 
-def dual_contouring(case: Case, model: str) -> Surface:
+def dual_contouring(case: Case, network: Decoder) -> Surface:
     """Mesh the grid with Dual Contouring of Signed Distance Data (Carrera et al. 2026)."""
     from gpytoolbox import dual_contouring_of_signed_distance_data
 

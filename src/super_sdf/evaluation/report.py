@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ..mesh import Mesh
+from ..network import load_network
 from . import experiment_tables
 from .cases import Case, Setting, Shape
 from .measuring import OURS, Row
@@ -183,7 +184,8 @@ def draw_shape(path: Path, setting: Setting, model: str, target: Path, up: str) 
     """Draw coarse marching cubes, ours, the reference, and ours coloured by its error."""
     shape = Shape.read(path)
     case = Case(shape, setting)
-    coarse, ours = (METHODS[name](case, model).mesh for name in ("mc", OURS))
+    network = load_network(model, device="cpu")
+    coarse, ours = (METHODS[name](case, network).mesh for name in ("mc", OURS))
     panels = [
         Panel(coarse, titled(coarse, f"marching cubes of {setting.size}^3")),
         Panel(ours, titled(ours, "super-sdf")),
