@@ -11,9 +11,9 @@ import sys
 
 import numpy as np
 import pyvista as pv
-from skimage.measure import marching_cubes
 
 from super_sdf import Mesh, SdfGrid, read_grid, reconstruct
+from super_sdf.evaluation.methods import isosurface
 
 SIZE = (1400, 900)
 ZOOM = 2.3
@@ -22,10 +22,8 @@ LIGHT_BLUE = "#b9c7df"
 
 def coarse_mesh(grid: SdfGrid) -> Mesh:
     """Return marching cubes of the samples themselves, in world units."""
-    corners, faces, _, _ = marching_cubes(
-        np.asarray(grid.values), 0.0, spacing=grid.spacing, gradient_direction="ascent"
-    )
-    return Mesh(corners + np.array(grid.origin), faces.astype(np.int32))
+    mesh = isosurface(np.array(grid.values, np.float32), grid.voxel_size, 0.0)
+    return mesh.transformed(np.eye(3), np.array(grid.origin))
 
 
 def draw(plotter: pv.Plotter, mesh: Mesh, title: str, close: bool) -> None:

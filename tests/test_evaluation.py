@@ -272,13 +272,14 @@ def made_up(meshes: Path, out: Path, **options: object) -> Results:
     """Results of a plan as if measured: F1 falls with noise and grows with everything else."""
     asked = Plan(plan.find_meshes([meshes]), sizes=(32,), **options)
     store = Store(out / "results.jsonl")
-    for task in asked.tasks():
+    tasks = asked.tasks()
+    for task in tasks:
         for method in task.methods:
             f1 = 0.5 + task.setting.factor / 100 - task.setting.noise / 10
             cost = {"seconds": 1.0, "peak_mb": 10.0, "notes": []}
             late = {"error": "over the limit of 1 s"} if method == "rfta" else {}
             store.add({**row(task.path.stem, f1), **cost, **task.key(method), **late})
-    return Results(asked, store, [])
+    return Results(asked, tasks, store, [])
 
 
 def test_experiments_stand_beside_what_is_published(meshes, tmp_path):

@@ -142,6 +142,16 @@ def test_an_open_mesh_is_refused_or_guessed(tmp_path):
     assert solid.is_inside(np.array([[0.2, 0, 0], [2, 0, 0]])).tolist() == [True, False]
 
 
+@pytest.mark.parametrize("band", [2.0, np.inf])
+def test_every_sample_of_an_open_mesh_is_asked(band):
+    """Across a hole the sign changes where there is no surface near."""
+    lidless = Solid(Mesh(cube().vertices, cube().faces[2:]))
+    layout = (20, 20, 20), 0.1, np.full(3, -0.97)
+    inside = lidless.is_inside(grid_points(layout))
+    assert inside.any()
+    assert ((sample_grid(lidless, layout, band=band) < 0).ravel() == inside).all()
+
+
 def test_bad_files_are_named(tmp_path):
     with pytest.raises(SuperSdfError, match=r"none\.ply does not exist"):
         read_mesh(tmp_path / "none.ply")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -151,17 +150,17 @@ def run_evaluate(sources: tuple[Path, ...], options: dict[str, Any]) -> bool:
     from .evaluation.methods import METHODS
     from .evaluation.peers import peers_are_installed
     from .evaluation.plan import Plan, find_meshes, spread
+    from .evaluation.timing import count_cores
 
     if options["peers"] and not peers_are_installed():
         raise FileError("peers need gpytoolbox: pip install 'super-sdf[peers]'")
     paths = find_meshes(sources)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    jobs = options["jobs"] or cores or 1
+    jobs = options["jobs"] or count_cores()
     plan = Plan(
         spread(paths, options["limit"] or len(paths)),
         methods=tuple(name for name in METHODS if name in (options["methods"] or METHODS)),
         jobs=jobs,
-        threads=max(1, (cores or 1) // jobs),
+        threads=max(1, count_cores() // jobs),
         **{
             name: options[name]
             for name in (

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ..errors import FileError
 from .cases import Shape
-from .measuring import PROCESS, Row, Task, digest_of_file, digest_of_ours
+from .measuring import PROCESS, Row, Task
 from .plan import Plan
 from .report import write_report
 from .results import Results
@@ -80,7 +80,7 @@ def evaluate(
         plan.jobs,
         lambda done, total, task, share: tell(done, total, name_of(task), share),
     )
-    results = Results(plan, store, left_out)
+    results = Results(plan, tasks, store, left_out)
     if not results.floors:
         raise FileError(f"no shape could be measured; {left_out[0].shape}: {left_out[0].reason}")
     timings = time_processes(results, tell) if "timings" in plan.experiments else {}
@@ -100,17 +100,14 @@ def name_of(task: Task) -> str:
 def time_processes(results: Results, tell: Progress) -> dict[int, list[Row]]:
     """Return the times of the command by size, each shape's kept; nothing else runs meanwhile."""
     plan, timings = results.plan, dict[int, list[Row]]()
-    names = set(results.names(plan.paths))
-    paths = [path for path in plan.experiment_paths() if path.stem in names]
-    digest, total, done = digest_of_ours(plan.model), len(paths) * len(plan.sizes), 0
-    for setting in plan.settings():
-        for path in paths:
-            sums = digest_of_file(path)
-            task = Task(path, sums, setting, (PROCESS,), plan.model, digest)
-            if not results.store.is_final(task, PROCESS):
-                row = time_shape(Shape.read(path), setting, ["--model", plan.model])
-                results.store.add({**task.key(PROCESS), **row})
-            timings.setdefault(setting.size, []).append(results.store.get(task, PROCESS) or {})
-            done += 1
-            tell(done, total, f"timing {name_of(task)}", done / total)
+    names = results.names(plan.experiment_paths())
+    settings = plan.settings()
+    tasks = [t for t in results.tasks if t.setting in settings and t.path.stem in names]
+    tasks = [task for task in tasks if task.limit is None]
+    for done, task in enumerate(tasks, 1):
+        if not results.store.is_final(task, PROCESS):
+            row = time_shape(Shape.read(task.path), task.setting, ["--model", plan.model])
+            results.store.add({**task.key(PROCESS), **row})
+        timings.setdefault(task.setting.size, []).append(results.store.get(task, PROCESS) or {})
+        tell(done, len(tasks), f"timing {name_of(task)}", done / len(tasks))
     return timings

@@ -83,7 +83,7 @@ def measure_method(shape: Shape, case: Case | None, method: str, network: Decode
     in memory, and what was held at most beyond what was held before.
     """
     error = None
-    clock, held = time.perf_counter(), start_memory()
+    held, clock = start_memory(), time.perf_counter()
     try:
         surface = make_surface(shape, case, method, network)
     except Exception as problem:  # named in the report; the other shapes still count

@@ -81,7 +81,15 @@ class Plan:
         # Ours and the coarse mesh stand beside the peers.
         beside = (Setting(self.peer_size), ("mc", "bspline", OURS)) if self.peers else None
         wanted += [(path, beside) for path in self.peer_paths() if beside]
-        return self._as_tasks(merged(wanted)) + self._peer_tasks()
+        tasks = self._as_tasks(merged(wanted))
+        # A task for each peer, for the limit is for one of them.
+        alike = [task for task in tasks if task.setting == Setting(self.peer_size)]
+        return tasks + [
+            replace(task, methods=(peer,), limit=self.peer_limit)
+            for peer in self.peers
+            for task in alike
+            if task.path in self.peer_paths()
+        ]
 
     def _as_tasks(self, wanted: Iterable[tuple[Path, Wanted]]) -> list[Task]:
         """Return a task for each shape and setting."""
@@ -91,12 +99,6 @@ class Plan:
             Task(path, sums[path], setting, methods, self.model, ours, self.threads)
             for path, (setting, methods) in wanted
         ]
-
-    def _peer_tasks(self) -> list[Task]:
-        """Return a task for each shape and peer: the limit is for one of them."""
-        setting = Setting(self.peer_size)
-        wanted = [(path, (setting, (peer,))) for peer in self.peers for path in self.peer_paths()]
-        return [replace(task, limit=self.peer_limit) for task in self._as_tasks(wanted)]
 
 
 def experiment(name: str, sizes: Sequence[int]) -> list[Wanted]:
@@ -146,11 +148,9 @@ def find_meshes(sources: Sequence[Path]) -> tuple[Path, ...]:
     for source in sources:
         if not source.exists():
             raise FileError(f"{source} does not exist")
-        inside = (
-            sorted(p for p in source.iterdir() if p.suffix.lower() in MESH_SUFFIXES)
-            if (source.is_dir())
-            else [source]
-        )
+        inside = [source]
+        if source.is_dir():
+            inside = sorted(p for p in source.iterdir() if p.suffix.lower() in MESH_SUFFIXES)
         if not inside:
             raise FileError(f"{source} holds no mesh: give {', '.join(MESH_SUFFIXES)}")
         found += inside

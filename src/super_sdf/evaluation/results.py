@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from .cases import Setting
-from .measuring import FLOOR, NO_SETTING, Row
+from .measuring import FLOOR, NO_SETTING, Row, Task
 from .plan import Plan
 from .runner import LeftOut, Store
 
@@ -14,11 +14,10 @@ from .runner import LeftOut, Store
 class Results:
     """The rows of a plan, shape by shape, without the shapes that could not be measured."""
 
-    def __init__(self, plan: Plan, store: Store, left_out: Sequence[LeftOut]) -> None:
-        self.plan, self.left_out = plan, list(left_out)
-        names = {entry.shape for entry in left_out}
-        self.tasks = [task for task in plan.tasks() if task.path.stem not in names]
-        self.store = store
+    def __init__(
+        self, plan: Plan, tasks: Sequence[Task], store: Store, left_out: Sequence[LeftOut]
+    ) -> None:
+        self.plan, self.tasks, self.store, self.left_out = plan, tasks, store, left_out
         self.floors = {
             row["shape"]: row for row in self._rows(NO_SETTING, FLOOR, self.names(plan.paths))
         }

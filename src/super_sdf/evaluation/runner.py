@@ -112,7 +112,7 @@ class Runner:
     def __init__(self, tasks: Sequence[Task], jobs: int) -> None:
         self.waiting, self.jobs = list(reversed(tasks)), jobs
         self.running: dict[Connection, Running] = {}
-        self.left_out: set[str] = set()
+        self.left_out: set[Path] = set()
         self.context = make_context()
 
     def results(self) -> Iterator[tuple[Task, Row | LeftOut | None]]:
@@ -120,7 +120,11 @@ class Runner:
         try:
             while self.waiting or self.running:
                 while self.waiting and len(self.running) < self.jobs:
-                    self._start(self.waiting.pop())
+                    task = self.waiting.pop()
+                    if task.path in self.left_out:
+                        yield task, None
+                    else:
+                        self._start(task)
                 for source in wait(list(self.running), POLL):
                     yield from self._receive(self.running[source])  # type: ignore[index]
                 for late in [entry for entry in self.running.values() if entry.is_late()]:
@@ -155,8 +159,8 @@ class Runner:
     def _leave_out(self, entry: Running, reason: str) -> Iterator[tuple[Task, LeftOut]]:
         """Drop what a task owes; name its shape, once."""
         entry.owed = []
-        if entry.task.mesh not in self.left_out:
-            self.left_out.add(entry.task.mesh)
+        if entry.task.path not in self.left_out:
+            self.left_out.add(entry.task.path)
             yield entry.task, LeftOut(entry.task.path.stem, reason)
 
     def _give_up(self, entry: Running, error: str) -> Iterator[tuple[Task, Row | LeftOut | None]]:

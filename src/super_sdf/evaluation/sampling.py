@@ -2,7 +2,8 @@
 
 The grid is worked through in cubes of 8^3 samples. The distance at a cube's centre tells whether
 any of its samples can lie in the band; only those cubes are evaluated. The sign is asked once for
-each connected region away from the surface, since it cannot change there.
+each connected region away from the surface, since it cannot change there; of an open mesh it can,
+so every sample is asked.
 """
 
 from __future__ import annotations
@@ -142,10 +143,12 @@ def _sample_cubes(
     _, spacing, origin = layout
     centres = (corners + (EDGE - 1) / 2) * spacing + origin
     reach = limit + 3**0.5 * (EDGE - 1) / 2 * spacing
-    near = solid.distance(centres) <= reach if np.isfinite(limit) else np.ones(len(corners), bool)
+    near = np.ones(len(corners), bool)
+    if np.isfinite(limit) and solid.is_closed:
+        near = solid.distance(centres) <= reach
     values = np.empty((len(corners), EDGE, EDGE, EDGE), np.float32)
     outside = np.where(solid.is_inside(centres[~near]), -1, 1)
-    values[~near] = (outside * min(limit, 1e30))[:, None, None, None]
+    values[~near] = (outside * limit)[:, None, None, None]
     offsets = np.moveaxis(np.indices((EDGE,) * 3), 0, -1)
     points = (corners[near][:, None, None, None] + offsets) * spacing + origin
     if len(points):
@@ -162,7 +165,7 @@ def _signed(solid: Solid, points: Points, spacing: float) -> NDArray[np.float64]
     shape = points.shape[:-1]
     points = points.reshape(-1, 3)
     found = solid.distance(points).reshape(shape)
-    away = found > 0.5 * spacing * (1 + 1e-9)
+    away = (found > 0.5 * spacing * (1 + 1e-9)) & solid.is_closed
     within_cube = np.zeros((3, 3, 3, 3), bool)
     within_cube[1] = ndimage.generate_binary_structure(3, 1)
     regions, count = ndimage.label(away, within_cube)

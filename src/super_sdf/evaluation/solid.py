@@ -50,6 +50,11 @@ class Solid:
         tree.init(self.mesh.vertices, self.mesh.faces)
         return tree
 
+    @cached_property
+    def is_closed(self) -> bool:
+        """Whether the winding number can change at the surface only."""
+        return count_unbalanced_edges(self.mesh.faces) == 0
+
     def distance(self, points: Points) -> Distances:
         """Return the unsigned distance, (n,), of points (n, 3) to the nearest triangle."""
         if not len(points):

@@ -35,11 +35,15 @@ print(os.waitstatus_to_exitcode(status), seconds, usage.ru_maxrss)
 
 def describe_machine() -> str:
     """Return the processor and the versions that figures of time depend on, in a line."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return (
-        f"{processor_name()}, {cores} cores, {platform.system()}, Python "
+        f"{processor_name()}, {count_cores()} cores, {platform.system()}, Python "
         f"{platform.python_version()}, NumPy {np.__version__}, onnxruntime {version('onnxruntime')}"
     )
+
+
+def count_cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def processor_name() -> str:
