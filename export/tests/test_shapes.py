@@ -7,7 +7,8 @@ import pytest
 from manifold3d import Manifold
 
 from export import shapes
-from export.families import FAMILIES, log_uniform, unit_sized
+from export.draws import log_uniform, unit_sized
+from export.families import FAMILIES
 from export.shapes import MAX_FACES, random_solid, without_crumbs
 from super_sdf import Mesh
 

@@ -1,0 +1,188 @@
+"""Families of machine parts: plates, gears, patterns, screws and ribbed castings."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from manifold3d import CrossSection, Manifold, OpType
+
+from export.basic import primitive
+from export.draws import (
+    draw_outline,
+    joined,
+    log_uniform,
+    polar_polygon,
+    turned,
+    unit_sized,
+    wound,
+)
+
+
+def plate(rng: np.random.Generator) -> Manifold:
+    """Draw a plate with holes, slots, pockets, bosses and ribs."""
+    outline, thickness = draw_outline(rng), log_uniform(rng, 0.02, 0.25)
+    solid = outline.extrude(thickness)
+    for _ in range(rng.integers(1, 12)):
+        foot = draw_outline(rng).rotate(float(rng.choice([0, 90, rng.uniform(0, 360)])))
+        foot = foot.scale([log_uniform(rng, 0.04, 0.4)] * 2)
+        foot = foot.translate(list(rng.uniform(-0.4, 0.4, 2)))
+        bottom = thickness * rng.choice([-1, rng.uniform(0.1, 0.9)])  # a hole or a pocket
+        if rng.random() < 0.6:
+            solid -= foot.extrude(3 * thickness).translate([0, 0, bottom])
+        else:
+            boss = foot.extrude(log_uniform(rng, 0.02, 0.4)) ^ outline.extrude(1)
+            solid += boss.translate([0, 0, thickness * rng.uniform(0.1, 0.9)])
+    return solid
+
+
+def gear(rng: np.random.Generator) -> Manifold:
+    """Draw a spur or helical gear with a bore, a hub or recess, and holes in its web."""
+    teeth, root = int(rng.integers(6, 40)), rng.uniform(0.3, 0.46)
+    duty = np.cumsum(rng.dirichlet([4, 2, 3, 2]))
+    angles = (np.arange(teeth)[:, None] + duty).ravel() * 2 * np.pi / teeth
+    outline = polar_polygon(angles, np.tile([root, 0.5, 0.5, root], teeth))
+    height, holes = log_uniform(rng, 0.05, 0.6), int(rng.choice([0, 3, 4, 5, 6, 8]))
+    for angle in np.arange(holes) * 2 * np.pi / max(holes, 1):
+        place = 0.65 * root * np.array([math.cos(angle), math.sin(angle)])
+        outline -= CrossSection.circle(root * min(0.2, 1.2 / holes), 32).translate(list(place))
+    twist = rng.choice([0.0, rng.uniform(-60, 60)])
+    hub = CrossSection.circle(rng.uniform(0.25, 0.4) * root, 48).extrude(height * 2)
+    solid = outline.extrude(height, math.ceil(abs(twist) / 4), twist)
+    solid += hub.translate([0, 0, -height * rng.uniform(0, 1)])
+    bore = CrossSection.circle(rng.uniform(0.1, 0.2) * root, int(rng.choice([6, 32])))
+    return solid - bore.extrude(4 * height).translate([0, 0, -1.5 * height])
+
+
+def repeated(rng: np.random.Generator) -> Manifold:
+    """Draw a ring or a grid of one part, on or cut into a base: fins, combs, studs, castles."""
+    part = unit_sized(turned(rng, primitive(rng)))
+    part = part.scale([log_uniform(rng, 0.1, 0.4), log_uniform(rng, 0.1, 1), rng.uniform(0.1, 0.8)])
+    base = unit_sized(draw_outline(rng).extrude(log_uniform(rng, 0.03, 0.5)))
+    top, most = base.bounding_box()[5], 2 + math.isqrt(4000 // part.num_tri())
+    if rng.random() < 0.4:
+        count, radius = int(rng.integers(3, min(2 * most, 17))), rng.uniform(0.1, 0.35)
+        arm = part.translate([radius, 0, top])
+        copies = [arm.rotate([0, 0, 360 * n / count]) for n in range(count)]
+    else:
+        counts, gap = rng.integers(1, min(most, 8), 2), rng.uniform(0.5, 0.9) / 7
+        places = np.indices(tuple(counts)).reshape(2, -1).T - (counts - 1) / 2
+        copies = [part.scale([0.3] * 3).translate([*(p * gap), top]) for p in places]
+    return base - joined(copies) if rng.random() < 0.35 else base + joined(copies)
+
+
+def tooth(rng: np.random.Generator, pitch: float, depth: float) -> CrossSection:
+    """Draw the section of a thread from its root outward: pointed, flat, round, or a blade."""
+    root, top = 0.49 * pitch * rng.uniform(0.6, 1), rng.choice([0.05, 0.12, 0.25]) * pitch
+    lean = rng.choice([0, 0, 1]) * (root - top)  # of a buttress thread
+    match rng.integers(4):
+        case 0:
+            return CrossSection.circle(1, 24).scale([depth, root])
+        case 1:
+            thin = log_uniform(rng, 0.012, 0.1)
+            return CrossSection.square([2 * depth, min(thin, root)], True)
+    low = [[-depth / 4, -root], [0, -root]]
+    return CrossSection(
+        [np.array([*low, [depth, lean - top], [depth, lean + top], [0, root], [-depth / 4, root]])]
+    )
+
+
+def screw(rng: np.random.Generator, length: float, radius: float) -> Manifold:
+    """Draw a rod with a thread of one to three starts, right- or left-handed, its ends cut flat."""
+    starts, pitch = int(rng.choice([1, 1, 1, 2, 3])), length / log_uniform(rng, 2.5, 16)
+    depth = min(rng.uniform(0.4, 1) * pitch, rng.uniform(0.1, 0.45) * radius)
+    turns = math.ceil(length / pitch / starts) + 2
+    bar = tooth(rng, pitch, depth).extrude(1, 36 * turns - 1)
+    ridge = wound(bar, radius - depth, starts * pitch, turns).translate([0, 0, -starts * pitch])
+    ridges = [ridge.rotate([0, 0, 360 * n / starts]) for n in range(starts)]
+    core = Manifold.cylinder(length, radius - depth, circular_segments=36)
+    rod = joined([*ridges, core]).trim_by_plane([0, 0, 1], 0).trim_by_plane([0, 0, -1], -length)
+    return rod if rng.random() < 0.5 else rod.mirror([1, 0, 0])
+
+
+def head(rng: np.random.Generator, wide: float) -> Manifold:
+    """Draw the head of a screw, below z = 0: round, square or hexagonal, with a slot or socket."""
+    height, sides = wide * rng.uniform(0.3, 0.9), int(rng.choice([4, 6, 6, 48]))
+    body = Manifold.cylinder(height, wide, wide * rng.choice([0.7, 1, 1]), sides)
+    tool = Manifold.cylinder(wide, wide * rng.uniform(0.3, 0.6), -1, int(rng.choice([4, 6, 48])))
+    if rng.random() < 0.4:
+        tool = Manifold.cube([3 * wide, 0.2 * wide, wide], True).translate([0, 0, wide / 2])
+    depth = rng.choice([0, rng.uniform(0.2, 0.8)]) * height
+    return (body - tool.translate([0, 0, height - depth])).mirror([0, 0, 1])
+
+
+def threads(rng: np.random.Generator) -> Manifold:
+    """Draw a threaded rod, a bolt or screw with a head, or a nut or block with a threaded bore."""
+    radius, length = log_uniform(rng, 0.06, 0.4), log_uniform(rng, 0.2, 1)
+    rod = screw(rng, length, radius)
+    match rng.integers(4):
+        case 0:
+            return rod
+        case 1 | 2:
+            shank = Manifold.cylinder(rng.uniform(0, 0.4) * length + 0.01, radius, -1, 36)
+            tip = Manifold.cylinder(length, length + 0.6 * radius, 0.6 * radius, 48)
+            return joined([rod ^ tip, shank, head(rng, radius * rng.uniform(1.3, 2.2))])
+    sides, wide = int(rng.choice([4, 6, 6, 48])), radius * rng.uniform(1.5, 2.2)
+    return Manifold.cylinder(0.9 * length, wide, -1, sides).translate([0, 0, 0.05 * length]) - rod
+
+
+def fan(count: int, wall: float) -> CrossSection:
+    """Return ``count`` long bars through the origin."""
+    bar = CrossSection.square([2, wall], True)
+    return CrossSection.batch_boolean(
+        [bar.rotate(180 * n / count) for n in range(count)], OpType.Add
+    )
+
+
+def fins(rng: np.random.Generator, wall: float) -> CrossSection:
+    """Draw parallel bars, a grid of bars or a fan, all over the unit square."""
+    count = int(rng.integers(1, min(12, 2 + 0.3 / wall)))
+    places = (np.arange(count) + 0.5) / count - 0.5
+    bars = [CrossSection.square([2, wall], True).translate([0, y]) for y in places]
+    if rng.random() < 0.25:
+        return fan(count, wall)
+    if rng.random() < 0.4:
+        bars += [bar.rotate(rng.choice([60, 90])) for bar in bars]
+    section = CrossSection.batch_boolean(bars, OpType.Add)
+    return section.rotate(float(rng.choice([0, 0, 45])))
+
+
+def gusset(wall: float, size: tuple[float, float], hollow: float) -> Manifold:
+    """Return a triangular web in the xz plane with its right angle at the origin."""
+    triangle = CrossSection([np.array([[-0.02, -0.02], [size[0], -0.02], [-0.02, size[1]]])])
+    triangle -= triangle.offset(-hollow)
+    return triangle.extrude(wall).rotate([90, 0, 0]).translate([0, wall / 2, 0])
+
+
+def bracket(rng: np.random.Generator, wall: float) -> Manifold:
+    """Draw two plates at a right angle, or a post on a plate, held by gussets."""
+    base, width = log_uniform(rng, 0.015, 0.1), rng.uniform(0.3, 1)
+    length, height = rng.uniform(0.3, 0.8, 2)
+    size, count = (rng.uniform(0.4, 1) * length, rng.uniform(0.4, 1) * height), rng.integers(1, 7)
+    web = gusset(wall, size, rng.choice([9, rng.uniform(0.02, 0.06)]))
+    if rng.random() < 0.5:
+        floor = Manifold.cube([length + base, width, base]).translate([-base, -width / 2, -base])
+        back = Manifold.cube([base, width, height]).translate([-base, -width / 2, 0])
+        places = np.linspace(-0.5, 0.5, count + 2)[1:-1] * width
+        return joined([floor, back, *(web.translate([0, y, 0]) for y in places)])
+    post = Manifold.cylinder(height, rng.uniform(0.06, 0.2), -1, 48)
+    reach = post.bounding_box()[3] - 0.01
+    webs = [web.translate([reach, 0, 0]).rotate([0, 0, 360 * n / count]) for n in range(count)]
+    floor = Manifold.cylinder(base, reach + length, -1, int(rng.choice([4, 48]))).rotate([0, 0, 45])
+    return joined([post, floor.translate([0, 0, -base]), *webs])
+
+
+def ribs(rng: np.random.Generator) -> Manifold:
+    """Draw a plate, tray or shaft stiffened by thin ribs, or plates held by gussets."""
+    wall, height = log_uniform(rng, 0.008, 0.06), log_uniform(rng, 0.05, 0.5)
+    kind, floor, outline = rng.integers(5), log_uniform(rng, 0.01, 0.1), draw_outline(rng)
+    if kind == 0:
+        return bracket(rng, wall)
+    if kind == 1:  # a shaft, its ribs all round
+        core = Manifold.cylinder(height * rng.choice([0.8, 1, 1.5]), rng.uniform(0.05, 0.3), -1, 48)
+        return core + (fan(int(rng.integers(1, 13)), wall) ^ outline).extrude(height)
+    walls = fins(rng, wall) ^ outline
+    if kind == 2:  # a tray with webs inside
+        walls += outline - outline.offset(-rng.choice([1, 2]) * wall)
+    level = rng.choice([0.01, 0.01, height / 2]) - floor  # of the plate: below, or half-way up
+    return walls.extrude(height) + outline.extrude(floor).translate([0, 0, level])

@@ -1,0 +1,184 @@
+"""Families of smooth bodies, most of them level sets: blends, grown limbs and rough skins."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import cache
+from operator import mul
+
+import numpy as np
+from manifold3d import Manifold, Mesh64
+from skimage.measure import marching_cubes
+
+from export.basic import rounded
+from export.draws import log_uniform, unit_sized
+
+FLATNESS = 3e-4  # of the unit; how far fewer faces may depart from a level set
+
+
+def wave_sum(terms: Callable[[int, float], Sequence[float]]) -> Callable[..., float]:
+    """Return the field whose value at (x, y, z) is the sum over k of X_k(x) Y_k(y) Z_k(z).
+
+    ``terms(axis, coordinate)`` gives the factors of all k; `level_set` asks for few different
+    coordinates, so remembering them makes its many calls cheap.
+    """
+    factors = cache(terms)
+    return lambda x, y, z: sum(map(mul, map(mul, factors(0, x), factors(1, y)), factors(2, z)))
+
+
+def blobs(rng: np.random.Generator) -> Manifold:
+    """Draw blobs, from balls to soft boxes, that blend into one another."""
+    centres = rng.uniform(-0.3, 0.3, (3, int(rng.integers(2, 8))))
+    widths, power = rng.uniform(0.1, 0.35, centres.shape), int(rng.choice([2, 4, 8]))
+    blend = wave_sum(
+        lambda axis, x: np.exp(-(((x - centres[axis]) / widths[axis]) ** power)).tolist()
+    )
+
+    def field(x: float, y: float, z: float) -> float:
+        # Made to run almost linearly through the surface, which is interpolated linearly.
+        return 1 - math.pow(max(-math.log(blend(x, y, z) + 1e-99), 0), 1 / power)
+
+    return Manifold.level_set(field, [-0.7] * 3 + [0.7] * 3, rng.uniform(0.04, 0.07))
+
+
+def gyroid(rng: np.random.Generator) -> Manifold:
+    """Draw a body filled with a gyroid: one side of it, or a wall along it."""
+    rates, level, walls = rng.uniform(5, 12, 3), rng.uniform(-0.5, 0.5), rng.random() < 0.5
+
+    def terms(axis: int, x: float) -> tuple[float, ...]:
+        sin, cos = math.sin(rates[axis] * x), math.cos(rates[axis] * x)
+        return ((sin, 1.0, cos), (cos, sin, 1.0), (1.0, cos, sin))[axis]
+
+    wave, body = wave_sum(terms), unit_sized(rounded(rng))
+
+    def field(x: float, y: float, z: float) -> float:
+        height = wave(x, y, z) - level
+        return 0.4 - abs(height) if walls else height
+
+    # A level set is ragged where its bounds cut it, so they lie outside the body.
+    bounds = np.array(body.bounding_box()) + np.repeat([-0.05, 0.05], 3)
+    return body ^ Manifold.level_set(field, list(bounds), rng.uniform(0.025, 0.04))
+
+
+def marched(values: np.ndarray, low: float, step: float) -> Manifold:
+    """Return the solid where ``values`` (n, n, n), on a grid from ``low``, are below 0."""
+    if values.min() >= 0:
+        return Manifold()
+    closed = np.pad(values, 1, constant_values=step)
+    vertices, faces, _, _ = marching_cubes(closed, 0.0)
+    corners = (vertices.astype(np.float64) - 1) * step + low
+    mesh = Mesh64(np.ascontiguousarray(corners), np.ascontiguousarray(faces, dtype=np.uint64))
+    return Manifold(mesh).simplify(FLATNESS)
+
+
+def grid(half: float, step: float) -> np.ndarray:
+    """Return the points (n, n, n, 3) of a grid over the cube from ``-half`` to ``half``."""
+    axis = np.arange(-half, half, step, dtype=np.float32)
+    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+
+
+def roughness(rng: np.random.Generator, points: np.ndarray, finest: float) -> np.ndarray:
+    """Draw a sum of waves at points (..., 3), the finer the lower, mostly between -1 and 1."""
+    count, fall = int(rng.integers(4, 25)), rng.uniform(0.3, 1.3)
+    rates = np.exp(rng.uniform(math.log(3), math.log(finest), count))
+    waves = rng.normal(size=(count, 3))
+    waves *= (rates / np.linalg.norm(waves, axis=1))[:, None]
+    heights, total = rates**-fall, np.zeros(points.shape[:-1], points.dtype)
+    phases, ridged = rng.uniform(0, 2 * np.pi, count), rng.random() < 0.3
+    for wave, height, phase in zip(waves, heights / np.linalg.norm(heights), phases):
+        sine = np.sin(points @ wave.astype(points.dtype) + points.dtype.type(phase))
+        total += points.dtype.type(height) * (1 - 2 * np.abs(sine) if ridged else sine)
+    return total
+
+
+def displaced(rng: np.random.Generator) -> Manifold:
+    """Draw a stone, fruit, star or crumpled ball: a sphere pushed in and out by waves."""
+    depth, finest = log_uniform(rng, 0.06, 0.5), log_uniform(rng, 10, 60)
+
+    def push(points: np.ndarray) -> np.ndarray:
+        return points * np.exp(depth * roughness(rng, points, finest))[:, None]
+
+    return Manifold.sphere(0.5, 180).warp_batch(push).scale(list(rng.uniform(0.3, 1, 3)))
+
+
+def limbs(rng: np.random.Generator) -> np.ndarray:
+    """Draw rods (n, 2, 4) of a creature or a plant: for each end a place and a radius."""
+    rods: list[np.ndarray] = []
+    starts = [np.array([0, 0, 0, log_uniform(rng, 0.03, 0.16)])]
+    while starts and len(rods) < 28:
+        end, way = starts.pop(0), rng.normal(size=3)
+        for _ in range(rng.integers(2, 6)):
+            start, way = end, way / np.linalg.norm(way) + rng.normal(0, 0.4, 3)
+            step = way / np.linalg.norm(way) * start[3] * rng.uniform(1.5, 4)
+            end = np.append(start[:3] + step, max(start[3] * rng.uniform(0.7, 1.1), 0.015))
+            rods.append(np.stack([start, end]))
+            if rng.random() < 0.8:  # a branch
+                starts.append(np.append(end[:3], max(end[3] * rng.uniform(0.4, 0.8), 0.015)))
+        knob = [1, 1, 1, rng.choice([1, rng.uniform(1.2, 2)])]
+        rods.append(np.stack([end * knob, end * knob + [0, 0, 1e-3, 0]]))
+    trunk = np.array(rods)
+    return np.concatenate([trunk, trunk * [-1, 1, 1, 1]]) if rng.random() < 0.6 else trunk
+
+
+def creature(rng: np.random.Generator) -> Manifold:
+    """Draw limbs that grow from a trunk and blend into it, their skin smooth or rough."""
+    rods, step, blend = limbs(rng), 0.016, log_uniform(rng, 0.008, 0.03)
+    places = rods[..., :3].reshape(-1, 3)
+    rods[..., :3] -= (places.min(0) + places.max(0)) / 2
+    rods *= 0.5 / (np.abs(rods[..., :3]) + rods[..., 3:]).max()
+    points = grid(0.5 + 4 * step, step)
+    near = np.zeros(points.shape[:3], np.float32)
+    for rod in rods.astype(np.float32):
+        reach = rod[:, 3].max() + 6 * blend
+        low, high = rod[:, :3].min(0) - reach, rod[:, :3].max(0) + reach
+        box = tuple(slice(*np.searchsorted(points[:, 0, 0, 0], ends)) for ends in zip(low, high))
+        near[box] += np.exp(-rod_distance(points[box], rod) / np.float32(blend))
+    values = -blend * np.log(near + np.float32(1e-30))
+    if rng.random() < 0.5:
+        values += log_uniform(rng, 0.002, 0.012) * roughness(rng, points, 50)
+    return marched(values, points[0, 0, 0, 0], step)
+
+
+def rod_distance(points: np.ndarray, rod: np.ndarray) -> np.ndarray:
+    """Return the distance to a rod (2, 4) of two round ends, roughly where these differ much."""
+    way, offset = rod[1, :3] - rod[0, :3], points - rod[0, :3]
+    along = np.clip(offset @ way / (way @ way), 0, 1)
+    radius = rod[0, 3] + along * (rod[1, 3] - rod[0, 3])
+    return np.linalg.norm(offset - along[..., None] * way, axis=-1) - radius
+
+
+def draw_distance(rng: np.random.Generator, points: np.ndarray) -> np.ndarray:
+    """Draw a soft box or cylinder, a ring or an ellipsoid: its distance at points (..., 3)."""
+    axes = np.linalg.qr(rng.normal(size=(3, 3)))[0] if rng.random() < 0.5 else np.eye(3)
+    local = (points - rng.uniform(-0.25, 0.25, 3).astype(np.float32)) @ axes.astype(np.float32)
+    half = np.exp(rng.uniform(math.log(0.05), math.log(0.32), 3)).astype(np.float32)
+    soft = half.min() * np.float32(rng.uniform(0.4, 0.9))
+    across = np.linalg.norm(local[..., :2], axis=-1)
+    match rng.integers(4):
+        case 0:
+            return outside(np.abs(local) - half + soft) - soft
+        case 1:
+            ends = np.abs(local[..., 2]) - half[1]
+            return outside(np.stack([across - half[0], ends], axis=-1) + soft) - soft
+        case 2:
+            return np.hypot(across - half.max(), local[..., 2]) - half.min()
+    reach = np.linalg.norm(local / half, axis=-1)
+    return reach * (reach - 1) / (np.linalg.norm(local / half**2, axis=-1) + np.float32(1e-6))
+
+
+def outside(beyond: np.ndarray) -> np.ndarray:
+    """Return the distance of what is ``beyond`` (..., k) the sides of a box or cylinder."""
+    return np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(-1), 0)
+
+
+def blends(rng: np.random.Generator) -> Manifold:
+    """Draw bodies that flow into, or are scooped out of, one another with rounded seams."""
+    points, blend = grid(0.75, 0.018), np.float32(log_uniform(rng, 0.01, 0.15))
+    values = draw_distance(rng, points)
+    for _ in range(rng.integers(1, 6)):
+        other = draw_distance(rng, points)
+        sign = 1 if rng.random() < 0.7 else -1
+        gap = np.maximum(blend - np.abs(sign * values - other), 0)
+        values = sign * (np.minimum(sign * values, other) - gap**2 / (4 * blend))
+    return marched(values, -0.75, 0.018)
