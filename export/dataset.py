@@ -1,21 +1,25 @@
 """Training samples: windows of coarse grids with exact distances at fine query points.
 
-    python -m export.dataset --meshes DIR --out training/store --count 3000
+    python -m export.dataset --meshes DIR --procedural 0.3 --out training/store --count 5000
 
 A sample is one shape in one pose at one resolution. It holds a window of the coarse grid and, for
 each voxel that can hold the surface, the exact distance at a set of query offsets that is drawn
-anew for every sample: mostly nodes of the K = 4 lattice, some of the K = 16 lattice (which has
-those of 2 and 8), some anywhere in the voxel. Values are rescaled (half voxels, Eqs. 4 and 5).
+anew for every sample: ``CORNERS`` nodes of the K = 4 lattice, each followed by its next nodes along
+x, y and z (the differences are what the loss knows of the gradient), then some nodes of the K = 16
+lattice (which has those of 2 and 8), then some points anywhere in the voxel. Values are rescaled
+(half voxels, Eqs. 4 and 5).
 
 Samples are stored in shards, ``shard-<seed>-<number>.npz``, of flat arrays laid end to end:
 ``windows`` (float32) with ``window_shape``, ``offsets`` (n, Q, 3), ``voxel_ijk`` (D, 3) and
-``targets`` (D, Q) float16 with ``voxel_count``. Without ``--meshes`` all shapes are procedural.
+``targets`` (D, Q) float16 with ``voxel_count``. Without ``--meshes`` all shapes are procedural;
+with it, each mesh comes once before any comes again, but only as many of the simple prisms as make
+a sixth, and ``--procedural`` says what share is procedural besides.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,8 +34,9 @@ from super_sdf.evaluation.sampling import sample_grid
 from super_sdf.evaluation.solid import Solid, read_mesh
 from super_sdf.nodes import block_offsets
 
-QUERIES = {"factor 4": 24, "factor 16": 8, "anywhere": 8}
-WINDOW = 36  # samples along each axis: a whole shape at 32^3, a piece of it at 64^3
+CORNERS, FINE_NODES, ANYWHERE = 5, 4, 4  # queries: 4 a corner, 28 in all
+SMALLEST, LARGEST = 7, 100  # voxels along a shape's diagonal
+WINDOW = 32  # samples along each axis: a whole shape at 32^3, a piece of it at 64^3
 SHARD = 50  # samples a file
 
 
@@ -45,18 +50,10 @@ class Sample:
     targets: np.ndarray
 
 
-def draw_mesh(rng: np.random.Generator, prisms: list[Path], others: list[Path]) -> Mesh:
-    """Draw a shape: of the files, one in six is a simple prism; a fifth of all is procedural."""
-    if not others or rng.random() < 0.2:
-        return random_solid(rng)
-    few = prisms if prisms and rng.random() < 1 / 6 else others
-    return read_mesh(few[rng.integers(len(few))])
-
-
 def draw_pose(rng: np.random.Generator, mesh: Mesh) -> Mesh:
-    """Place a shape in index space: spacing 1/16 to 1/90 of its diagonal, half of them turned."""
+    """Place a shape in index space: 7 to 100 voxels along its diagonal, half of them turned."""
     turn = Rotation.random(rng=rng).as_matrix() if rng.random() < 0.5 else np.eye(3)
-    size = np.exp(rng.uniform(np.log(16), np.log(90)))
+    size = np.exp(rng.uniform(np.log(SMALLEST), np.log(LARGEST)))
     diagonal = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
     posed = mesh.transformed(turn * size / diagonal, np.zeros(3))
     low = posed.vertices.min(0)
@@ -73,19 +70,21 @@ def draw_window(rng: np.random.Generator, mesh: Mesh) -> tuple[tuple[int, int, i
 
 
 def draw_offsets(rng: np.random.Generator) -> np.ndarray:
-    """Return the sample's query offsets, (Q, 3) in [-1, 1]."""
-    lattices = [
-        rng.permutation(block_offsets(factor))[: QUERIES[f"factor {factor}"]] for factor in (4, 16)
-    ]
-    anywhere = rng.uniform(-1, 1, (QUERIES["anywhere"], 3))
-    return np.concatenate([*lattices, anywhere]).astype(np.float32)
+    """Return the sample's query offsets, (Q, 3) in [-1, 1]: see the module."""
+    corners = rng.integers(0, 4, (CORNERS, 3)) / 2 - 1
+    steps = np.concatenate([np.zeros((1, 3)), np.eye(3)]) / 2
+    quadruples = (corners[:, None] + steps).reshape(-1, 3)
+    fine = rng.permutation(block_offsets(16))[:FINE_NODES]
+    anywhere = rng.uniform(-1, 1, (ANYWHERE, 3))
+    return np.concatenate([quadruples, fine, anywhere]).astype(np.float32)
 
 
 def make_sample(rng: np.random.Generator, mesh: Mesh) -> Sample | None:
-    """Sample a shape; None where its distances are not to be trusted or nothing is in sight."""
+    """Sample a shape; None where none of its samples is inside, or all are."""
     posed = draw_pose(rng, mesh)
     shape, first = draw_window(rng, posed)
-    values = sample_grid(Solid(posed), (shape, 1.0, first))
+    solid = Solid(posed)
+    values = sample_grid(solid, (shape, 1.0, first))
     if not (values < 0).any() or not (values > 0).any():
         return None
     window = rescale(SdfGrid(values, (1.0, 1.0, 1.0)))
@@ -93,27 +92,24 @@ def make_sample(rng: np.random.Generator, mesh: Mesh) -> Sample | None:
     voxel_ijk = band[can_hold_surface(gather_patches(window, band))]
     offsets = draw_offsets(rng)
     points = (voxel_ijk[:, None] + first + offsets / 2).reshape(-1, 3)
-    distances = pseudonormal_distance(posed, points)
-    if not signs_agree(rng, posed, points, distances):
-        return None
-    targets = (2 * distances).reshape(len(voxel_ijk), -1).astype(np.float16)
-    return Sample(window, offsets, voxel_ijk.astype(np.uint8), targets)
+    targets = 2 * signed_distance(rng, solid, points).reshape(len(voxel_ijk), -1)
+    return Sample(window, offsets, voxel_ijk.astype(np.uint8), targets.astype(np.float16))
 
 
-def pseudonormal_distance(mesh: Mesh, points: np.ndarray) -> np.ndarray:
-    """Return the signed distance, sign by the nearest triangle: wrong on meshes to be refused."""
+def signed_distance(rng: np.random.Generator, solid: Solid, points: np.ndarray) -> np.ndarray:
+    """Return the signed distance of points (n, 3).
+
+    The nearest triangle gives the sign quickly, but wrongly on meshes that intersect themselves.
+    So it is checked at 2,000 points by winding number; where any differs, all are asked for it.
+    """
     kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-    return igl.signed_distance(points, mesh.vertices, mesh.faces, kind)[0]
-
-
-def signs_agree(
-    rng: np.random.Generator, mesh: Mesh, points: np.ndarray, distances: np.ndarray
-) -> bool:
-    """Check the sign at 2,000 points by winding number: meshes that self-intersect fail."""
+    distances = igl.signed_distance(points, solid.mesh.vertices, solid.mesh.faces, kind)[0]
     some = rng.integers(len(points), size=min(len(points), 2000))
     clear = np.abs(distances[some]) > 1e-4  # on the surface either sign is right
-    inside = Solid(mesh).is_inside(points[some])
-    return bool((inside == (distances[some] < 0))[clear].all())
+    inside = solid.is_inside(points[some])
+    if (inside == (distances[some] < 0))[clear].all():
+        return distances
+    return np.where(solid.is_inside(points), -np.abs(distances), np.abs(distances))
 
 
 def write_shard(path: Path, samples: list[Sample]) -> None:
@@ -152,32 +148,47 @@ def find_meshes(folder: Path | None) -> tuple[list[Path], list[Path]]:
     return prisms, sorted(set(files) - set(prisms))
 
 
+def mesh_order(seed: int, prisms: list[Path], others: list[Path], count: int) -> list[Path]:
+    """Return ``count`` files, all others once before any again, a sixth of them prisms."""
+    rng = np.random.default_rng(seed)
+    order: list[Path] = []
+    while others and len(order) < count:
+        few = rng.permutation(prisms)[: len(others) // 5].tolist()
+        order += rng.permutation([*others, *few]).tolist()
+    return order
+
+
+def fill_shard(rng: np.random.Generator, files: Sequence[Path], procedural: float) -> list[Sample]:
+    """Make a shard's samples; a procedural shape stands in for a mesh that shows nothing."""
+    samples: list[Sample] = []
+    for number in range(SHARD):
+        drawn = not files or rng.random() < procedural
+        sample = make_sample(rng, random_solid(rng) if drawn else read_mesh(files[number]))
+        while sample is None:
+            sample = make_sample(rng, random_solid(rng))
+        samples.append(sample)
+    return samples
+
+
 def main() -> None:
     """Fill a store; a shard that is there already is kept."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--meshes", type=Path, help="folder of closed .ply meshes")
+    parser.add_argument("--procedural", type=float, default=0.3, help="share beside --meshes")
     parser.add_argument("--out", type=Path, required=True, help="folder for the shards")
-    parser.add_argument("--count", type=int, default=3000, help="samples to make")
+    parser.add_argument("--count", type=int, default=5000, help="samples to make")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    prisms, others = find_meshes(options.meshes)
+    files = mesh_order(options.seed, *find_meshes(options.meshes), options.count + SHARD)
     for number in range(-(-options.count // SHARD)):
         path = options.out / f"shard-{options.seed}-{number:04d}.npz"
-        if path.exists():
-            continue
-        rng = np.random.default_rng([options.seed, number])
-        samples: list[Sample] = []
-        refused = 0
-        while len(samples) < SHARD:
-            sample = make_sample(rng, draw_mesh(rng, prisms, others))
-            samples += [sample] if sample else []
-            refused += sample is None
-        write_shard(path, samples)
-        print(
-            f"{path.name}: {sum(len(s.voxel_ijk) for s in samples)} voxels, {refused} refused",
-            flush=True,
-        )
+        if not path.exists():
+            rng = np.random.default_rng([options.seed, number])
+            drawn = files[number * SHARD : (number + 1) * SHARD]
+            samples = fill_shard(rng, drawn, options.procedural)
+            write_shard(path, samples)
+            print(f"{path.name}: {sum(len(s.voxel_ijk) for s in samples)} voxels", flush=True)
 
 
 if __name__ == "__main__":
