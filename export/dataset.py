@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from export.shapes import random_solid
 from super_sdf import Mesh, SdfGrid
-from super_sdf.band import can_hold_surface, find_band, gather_patches, rescale
+from super_sdf.band import DECODE_LIMIT, find_band, rescale
 from super_sdf.evaluation.sampling import sample_grid
 from super_sdf.evaluation.solid import Solid, read_mesh
 from super_sdf.nodes import block_offsets
@@ -89,7 +89,7 @@ def make_sample(rng: np.random.Generator, mesh: Mesh) -> Sample | None:
         return None
     window = rescale(SdfGrid(values, (1.0, 1.0, 1.0)))
     band = find_band(window)
-    voxel_ijk = band[can_hold_surface(gather_patches(window, band))]
+    voxel_ijk = band[np.abs(window[tuple(band.T)]) <= DECODE_LIMIT]
     offsets = draw_offsets(rng)
     points = (voxel_ijk[:, None] + first + offsets / 2).reshape(-1, 3)
     targets = 2 * signed_distance(rng, solid, points).reshape(len(voxel_ijk), -1)

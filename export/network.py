@@ -7,14 +7,24 @@ The encoder is a stem on the 27 samples and a stack of residual blocks, each a c
 the 27 neighbours (a gather and a matrix product) and a pointwise layer. The head is a branch and
 a trunk: coefficients per voxel times functions of the offset. It adds a residual to the quadratic
 interpolation of the patch. All lengths are in half voxels (Eqs. 4 and 5).
+
+Interpolation and functions leave the sample as it is (Sec. 4.1). A noisy sample should not stay, so
+there is a correction of the whole voxel besides; below ``DEAD_ZONE`` it is exactly 0, which it is
+wherever the samples are distances.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
+import numpy as np
 import torch
 from torch import Tensor, nn
+
+from export.augment import Prepared, batch_table
+
+DEAD_ZONE = 0.05  # half voxels
 
 
 @dataclass(frozen=True)
@@ -22,7 +32,7 @@ class NetworkConfig:
     """Sizes of the network."""
 
     channels: int = 64
-    blocks: int = 5  # receptive field: blocks + 1 voxels in each direction
+    blocks: int = 8  # receptive field: blocks + 1 voxels in each direction
     hidden: int = 128
     functions: int = 256  # of the offset, in the head
     trunk: int = 128
@@ -36,6 +46,13 @@ class NetworkConfig:
     def as_dict(self) -> dict[str, int]:
         """Return the sizes by name, for a checkpoint."""
         return asdict(self)
+
+
+SIZES = {
+    "fast": NetworkConfig(channels=48, blocks=3, hidden=96, functions=128),
+    "base": NetworkConfig(),
+}
+"""The networks that are shipped, by name."""
 
 
 class GatherMatMul(torch.autograd.Function):
@@ -57,9 +74,9 @@ class GatherMatMul(torch.autograd.Function):
         """Take the gradient (V, C_out); return those of features and weight."""
         columns, weight, table = ctx.saved_tensors
         grad = grad.contiguous()
-        channels_out = weight.shape[1]
-        reversed_weight = weight.view(27, -1, channels_out).flip(0).transpose(1, 2)
-        grad_features = gather(grad, table) @ reversed_weight.reshape(27 * channels_out, -1)
+        places, channels_out = table.shape[1], weight.shape[1]
+        reversed_weight = weight.view(places, -1, channels_out).flip(0).transpose(1, 2)
+        grad_features = gather(grad, table) @ reversed_weight.reshape(places * channels_out, -1)
         return grad_features, columns.T @ grad, None
 
 
@@ -70,17 +87,22 @@ def gather(features: Tensor, table: Tensor) -> Tensor:
 
 
 class NeighbourConv(nn.Module):
-    """A sparse 3x3x3 convolution over the band."""
+    """A sparse 3x3x3 convolution over the band, or one over fewer of the 27 places."""
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, places: int = 27) -> None:
         super().__init__()
-        self.weight = nn.Parameter(torch.randn(27 * channels, channels) / (27 * channels) ** 0.5)
+        rows = places * channels
+        self.weight = nn.Parameter(torch.randn(rows, channels) / rows**0.5)
         self.bias = nn.Parameter(torch.zeros(channels))
 
     def forward(self, features: Tensor, table: Tensor) -> Tensor:
         """Map (V, C) to (V, C)."""
         dtype = torch.bfloat16 if torch.is_autocast_enabled(features.device.type) else torch.float32
-        mixed = GatherMatMul.apply(features.to(dtype), self.weight.to(dtype), table)
+        features, weight = features.to(dtype), self.weight.to(dtype)
+        if torch.is_grad_enabled():
+            mixed = GatherMatMul.apply(features, weight, table)
+        else:
+            mixed = gather(features, table) @ weight
         return mixed + self.bias.to(dtype)
 
 
@@ -97,8 +119,11 @@ class Block(nn.Module):
 
     def forward(self, features: Tensor, table: Tensor) -> Tensor:
         """Map (V, C) to (V, C)."""
-        mixed = torch.relu(self.conv(features, table))
-        return features + self.reduce(torch.relu(self.expand(mixed)))
+        return features + self.reduce(torch.relu(self.expand(self.mix(features, table))))
+
+    def mix(self, features: Tensor, table: Tensor) -> Tensor:
+        """Look at the neighbours."""
+        return torch.relu(self.conv(features, table))
 
 
 class Trunk(nn.Module):
@@ -106,7 +131,8 @@ class Trunk(nn.Module):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        self.register_buffer("waves", torch.pi / 2 * 2.0 ** torch.arange(config.frequencies))
+        waves = torch.pi / 2 * 2.0 ** torch.arange(config.frequencies)
+        self.register_buffer("waves", waves, persistent=False)
         self.layers = nn.Sequential(
             nn.Linear(3 + 6 * config.frequencies, config.trunk),
             nn.SiLU(),
@@ -137,6 +163,7 @@ class SuperSdfNet(nn.Module):
         )
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.blocks))
         self.branch = nn.Linear(config.channels, config.functions - config.channels)
+        self.correction = nn.Linear(config.channels, 1)
         self.trunk = Trunk(config)
 
     def encode(self, patches: Tensor, table: Tensor) -> Tensor:
@@ -146,11 +173,27 @@ class SuperSdfNet(nn.Module):
             features = block(features, table)
         return features
 
+    def encode_batch(self, batch: Sequence[Prepared]) -> tuple[Tensor, Tensor]:
+        """Return patches and features of samples laid end to end."""
+        device = next(self.parameters()).device
+        patches = torch.from_numpy(np.concatenate([sample.patches for sample in batch]))
+        table = torch.from_numpy(batch_table([sample.table for sample in batch]))
+        patches = patches.to(device)
+        return patches, self.encode(patches, table.to(device))
+
     def decode(self, features: Tensor, patches: Tensor, offsets: Tensor) -> Tensor:
         """Return the values (D, Q) of voxels (D, C), (D, 27) at offsets (Q, 3)."""
+        correction = nn.functional.softshrink(self.correction(features).float(), DEAD_ZONE)
+        return self.residual(features, offsets) + correction + self.base(patches, offsets)
+
+    def residual(self, features: Tensor, offsets: Tensor) -> Tensor:
+        """Return what the network adds to the interpolation, (D, Q); 0 at the sample."""
         coefficients = torch.cat([features, torch.relu(self.branch(features))], 1)
-        residual = coefficients.float() @ self.trunk(offsets).float().T
-        return residual + patches @ interpolation_weights(offsets).T
+        return coefficients.float() @ self.trunk(offsets).float().T
+
+    def base(self, patches: Tensor, offsets: Tensor) -> Tensor:
+        """Return the interpolation, (D, Q)."""
+        return patches @ interpolation_weights(offsets).T
 
     def forward(self, patches: Tensor, table: Tensor, voxels: Tensor, offsets: Tensor) -> Tensor:
         """Return the values (D, Q) of the voxels (D,) at the offsets (Q, 3)."""

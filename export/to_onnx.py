@@ -20,7 +20,7 @@ import onnx
 import torch
 from onnx import TensorProto, helper, numpy_helper
 
-from export.network import NetworkConfig, SuperSdfNet
+from export.network import DEAD_ZONE, NetworkConfig, SuperSdfNet
 from super_sdf.band import find_band, gather_patches, neighbour_table
 from super_sdf.network import FORMAT_VERSION, load_network
 from super_sdf.nodes import block_offsets
@@ -33,8 +33,9 @@ PARITY = 2e-4  # half voxels: 1e-4 of a voxel
 class Graph:
     """Nodes and constants of an ONNX graph in the making; every method returns a value's name."""
 
-    def __init__(self, prefix: str = "") -> None:
+    def __init__(self, net: SuperSdfNet, prefix: str = "") -> None:
         self.prefix = prefix
+        self.names = {id(tensor): name for name, tensor in net.named_parameters()}
         self.nodes: list[onnx.NodeProto] = []
         self.constants: list[onnx.TensorProto] = []
 
@@ -54,14 +55,19 @@ class Graph:
         """Add a constant of int64."""
         return self.constant(np.array(numbers, np.int64))
 
-    def linear(self, value: str, weight: torch.Tensor, bias: torch.Tensor) -> str:
-        """Add ``value @ weight + bias``."""
-        product = self.op("MatMul", value, self.constant(weight.detach().numpy()))
-        return self.op("Add", product, self.constant(bias.detach().numpy()))
+    def parameter(self, tensor: torch.Tensor, *, transposed: bool = False) -> str:
+        """Add a parameter of the network, under its name there: ``read_weights`` finds it so."""
+        array = tensor.detach().numpy()
+        name = self.names[id(tensor)]
+        self.constants.append(
+            numpy_helper.from_array(array.T.copy() if transposed else array, name)
+        )
+        return name
 
     def layer(self, value: str, layer: torch.nn.Linear) -> str:
         """Add a linear layer (torch keeps its weight transposed)."""
-        return self.linear(value, layer.weight.T.contiguous(), layer.bias)
+        product = self.op("MatMul", value, self.parameter(layer.weight, transposed=True))
+        return self.op("Add", product, self.parameter(layer.bias))
 
     def relu(self, value: str) -> str:
         """Add a rectifier."""
@@ -74,12 +80,12 @@ class Graph:
 
 def build_graph(net: SuperSdfNet) -> onnx.GraphProto:
     """Write the network as a graph."""
-    graph = Graph()
+    graph = Graph(net)
     features = graph.layer(graph.relu(graph.layer("patches", net.stem[0])), net.stem[2])
     rows = graph.op("Shape", "patches", start=0, end=1)
     chunks = chunked_table(graph, rows)
-    for number, block in enumerate(net.blocks):
-        change = scan_block(graph, number, block, features, chunks, rows)
+    for number in range(len(net.blocks)):
+        change = scan_block(graph, net, number, features, chunks, rows)
         features = graph.op("Add", features, change)
     chosen = graph.op("Gather", features, "voxels", axis=0)
     branch = graph.relu(graph.layer(chosen, net.branch))
@@ -87,7 +93,10 @@ def build_graph(net: SuperSdfNet) -> onnx.GraphProto:
     per_voxel = graph.op("Concat", chosen, branch, patches, axis=1)
     per_offset = graph.op("Concat", trunk(graph, net), interpolation(graph), axis=1)
     transposed = graph.op("Transpose", per_offset, perm=[1, 0])
-    graph.nodes.append(helper.make_node("MatMul", [per_voxel, transposed], ["values"]))
+    kept = graph.op("MatMul", per_voxel, transposed)
+    shift = graph.layer(chosen, net.correction)
+    correction = graph.op("Shrink", shift, lambd=DEAD_ZONE, bias=DEAD_ZONE)
+    graph.nodes.append(helper.make_node("Add", [kept, correction], ["values"]))
     return helper.make_graph(graph.nodes, "super_sdf", inputs(), [output()], graph.constants)
 
 
@@ -117,16 +126,17 @@ def chunked_table(graph: Graph, rows: str) -> str:
 
 
 def scan_block(
-    graph: Graph, number: int, block: torch.nn.Module, features: str, chunks: str, rows: str
+    graph: Graph, net: SuperSdfNet, number: int, features: str, chunks: str, rows: str
 ) -> str:
     """Add a residual block without its sum, chunk by chunk; return (V, C)."""
-    channels = block.conv.bias.shape[0]
+    block, channels = net.blocks[number], net.config.channels
     zeros = graph.constant(np.zeros((1, channels), np.float32))
     padded = graph.op("Concat", features, zeros, axis=0)  # index -1 is the row of zeros
-    body = Graph(f"block{number}_")
+    body = Graph(net, f"block{number}_")
     gathered = body.op("Gather", padded, "chunk", axis=0)
     columns = body.op("Reshape", gathered, body.integers(CHUNK, 27 * channels))
-    mixed = body.relu(body.linear(columns, block.conv.weight, block.conv.bias))
+    product = body.op("MatMul", columns, body.parameter(block.conv.weight))
+    mixed = body.relu(body.op("Add", product, body.parameter(block.conv.bias)))
     reduced = body.layer(body.relu(body.layer(mixed, block.expand)), block.reduce)
     subgraph = helper.make_graph(
         body.nodes,
@@ -173,6 +183,19 @@ def interpolation(graph: Graph) -> str:
     y = graph.op("Unsqueeze", y, graph.integers(1, 3))
     z = graph.op("Unsqueeze", z, graph.integers(1, 2))
     return graph.op("Flatten", graph.op("Mul", graph.op("Mul", x, y), z), axis=1)
+
+
+def read_weights(path: Path) -> dict[str, torch.Tensor]:
+    """Return the parameters and buffers in an exported file, to train on from there."""
+    graphs = [onnx.load(path).graph]
+    graphs += [a.g for node in graphs[0].node for a in node.attribute if a.name == "body"]
+    arrays = {i.name: numpy_helper.to_array(i).copy() for g in graphs for i in g.initializer}
+    linear = {name for name, array in arrays.items() if array.ndim == 2 and "conv" not in name}
+    return {
+        name: torch.from_numpy(array.T.copy() if name in linear else array)
+        for name, array in arrays.items()
+        if "." in name
+    }
 
 
 def write_model(net: SuperSdfNet, path: Path, card: dict[str, Any]) -> None:

@@ -8,9 +8,11 @@ from super_sdf import SdfGrid
 from super_sdf.band import (
     CENTRE,
     NEIGHBOURHOOD,
+    all_around,
     can_hold_surface,
     find_band,
     gather_patches,
+    is_lipschitz,
     neighbour_table,
     rescale,
 )
@@ -78,7 +80,9 @@ def test_voxels_with_a_surface_of_an_exact_distance_are_kept(seed):
     voxels = find_band(field)
     reach = np.abs(normal).sum()  # half voxels from the sample to the farthest corner
     holds = np.abs(field[tuple(voxels.T)]) < reach
-    keep = can_hold_surface(gather_patches(field, voxels))
+    patches = gather_patches(field, voxels)
+    assert is_lipschitz(patches).all()
+    keep = can_hold_surface(patches, is_lipschitz(patches))
     assert keep[holds].all()
     assert not keep.all()
 
@@ -86,4 +90,12 @@ def test_voxels_with_a_surface_of_an_exact_distance_are_kept(seed):
 def test_where_the_samples_are_no_distance_all_voxels_are_kept():
     rng = np.random.default_rng(0)
     field = rng.uniform(-20, 20, (8, 8, 8)).astype(np.float32)
-    assert can_hold_surface(gather_patches(field, find_band(field))).all()
+    patches = gather_patches(field, find_band(field))
+    assert can_hold_surface(patches, is_lipschitz(patches)).all()
+
+
+def test_all_around_asks_the_neighbours_that_there_are():
+    voxels = np.argwhere(np.ones((4, 1, 1))).astype(np.int32)
+    flags = np.array([False, True, True, True])
+    around = all_around(flags, neighbour_table(voxels, (4, 1, 1)))
+    np.testing.assert_array_equal(around, [False, False, True, True])

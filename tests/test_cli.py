@@ -196,7 +196,7 @@ CASES = {
     ("in.npy", "--spacing", "-1"): (1, "spacing is -1, -1, -1: it must be greater than 0"),
     ("in.npy", "--model", "huge"): (
         1,
-        "no model 'huge': give an ONNX file or one of: base",
+        "no model 'huge': give an ONNX file or one of: fast, base, best",
     ),
 }
 

@@ -8,7 +8,7 @@ from conftest import ball
 from super_sdf import load_network
 from super_sdf.band import find_band, gather_patches, neighbour_table, rescale
 from super_sdf.errors import DeviceError, FileError, ModelError
-from super_sdf.network import shipped_models
+from super_sdf.network import QUALITIES, shipped_models
 from super_sdf.nodes import block_offsets
 
 
@@ -57,7 +57,7 @@ def test_a_prediction_depends_on_the_receptive_field_and_no_more():
 
 
 def test_shipped_networks_are_small_and_keep_the_contract():
-    assert "base" in shipped_models()
+    assert {name for name, _ in QUALITIES.values()} == set(shipped_models())
     for name, path in shipped_models().items():
         assert path.stat().st_size < 8e6
         assert load_network(name).card["name"] == name
@@ -88,7 +88,9 @@ def test_a_failing_run_is_one_error_of_ours():
 
 
 def test_what_is_no_network_is_refused(tmp_path):
-    with pytest.raises(FileError, match="no model 'other': give an ONNX file or one of: base"):
+    with pytest.raises(
+        FileError, match="no model 'other': give an ONNX file or one of: fast, base, best"
+    ):
         load_network("other")
     (tmp_path / "bad.onnx").write_bytes(b"not a graph")
     with pytest.raises(ModelError, match=r"bad\.onnx is no ONNX file that onnxruntime can run"):

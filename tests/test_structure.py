@@ -11,9 +11,9 @@ EVALUATION = sorted((ROOT / "src" / "super_sdf" / "evaluation").glob("*.py"))
 FLOORS = [
     {"errors"},
     {"grid", "memory"},
-    {"band", "mesh", "conventions", "network", "cell_cases"},
-    {"nodes", "io"},
-    {"field"},
+    {"band", "mesh", "conventions", "cell_cases"},
+    {"nodes", "io", "symmetry"},
+    {"field", "network"},
     {"isosurface"},
     {"pipeline"},
     {"cli_common", "__init__"},

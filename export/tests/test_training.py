@@ -1,22 +1,45 @@
 """From a mesh to an ONNX file in small: distances, samples, gradients, resuming, parity."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from export.dataset import make_sample, read_shard, write_shard
+from export.augment import (
+    CLEAN,
+    Prepared,
+    Shares,
+    batch_table,
+    inverted,
+    noisy,
+    prepare,
+    shifted,
+    turned,
+)
+from export.compare import ENTRIES, append_row, format_table, read_rows
+from export.dataset import (
+    CORNERS,
+    draw_offsets,
+    make_sample,
+    mesh_order,
+    read_shard,
+    write_shard,
+)
 from export.network import (
     GatherMatMul,
     NetworkConfig,
     SuperSdfNet,
     interpolation_weights,
 )
+from export.recipe import RECIPE, differences, rate_factor
 from export.shapes import random_solid
-from export.to_onnx import make_card, parity, write_model
-from export.train import Run, Store, augment, learning_rate, prepare, train
+from export.to_onnx import make_card, parity, read_weights, write_model
+from export.train import Errors, Run, Store, log, read_log, sample_errors, train
 from super_sdf import Mesh, load_network
-from super_sdf.band import NEIGHBOURHOOD, find_band, neighbour_table
+from super_sdf.band import CENTRE, NEIGHBOURHOOD, find_band, neighbour_table
 from super_sdf.evaluation.sampling import sample_grid
 from super_sdf.evaluation.solid import Solid
 from super_sdf.nodes import block_offsets
@@ -87,23 +110,67 @@ def test_augmentation_is_a_symmetry():
     """A linear field stays linear: patches, table and offsets are turned together."""
     normal = np.array([0.5, -0.3, 0.8])
     ijk = np.argwhere(np.ones((5, 5, 5))).astype(np.int32)
-    sample = prepare(some_samples(1)[0])
-    sample = type(sample)(
+    offsets = block_offsets(2)
+    sample = Prepared(
+        ijk,
         patches=np.tile(NEIGHBOURHOOD @ normal, (125, 1)).astype(np.float32),
         table=neighbour_table(ijk, (5, 5, 5)),
         voxels=np.arange(125),
-        offsets=sample.offsets,
-        targets=np.tile(sample.offsets / 2 @ normal, (125, 1)).astype(np.float32),
+        offsets=offsets,
+        targets=np.tile(offsets / 2 @ normal, (125, 1)).astype(np.float32),
     )
     for seed in range(20):
-        turned = augment(np.random.default_rng(seed), sample)
-        weights = interpolation_weights(torch.from_numpy(turned.offsets)).numpy()
-        np.testing.assert_allclose(turned.patches @ weights.T, turned.targets, atol=1e-5)
-        present = turned.table >= 0
-        moves = (ijk[turned.table] - ijk[:, None])[present]
+        now = turned(np.random.default_rng(seed), sample)
+        weights = interpolation_weights(torch.from_numpy(now.offsets)).numpy()
+        np.testing.assert_allclose(now.patches @ weights.T, now.targets, atol=1e-5)
+        present = now.table >= 0
+        moves = (now.ijk[now.table] - now.ijk[:, None])[present]
         places = np.broadcast_to(np.arange(27), present.shape)[present]
-        one_place = moves[places == 14]
-        assert (one_place == one_place[0]).all() and np.abs(one_place[0]).sum() == 1
+        np.testing.assert_array_equal(moves, NEIGHBOURHOOD[places])
+
+
+def test_targets_follow_the_level_and_the_side_but_not_the_noise(samples):
+    rng = np.random.default_rng(0)
+    sample = samples[0]
+    inside_out = inverted(rng, sample, Shares(inverted=1))
+    np.testing.assert_array_equal(inside_out.window, -sample.window)
+    np.testing.assert_array_equal(inside_out.targets, -sample.targets)
+    moved = shifted(rng, sample, Shares(shifted=1))
+    level = (sample.window - moved.window).mean()
+    assert 0 < abs(level) <= 1
+    np.testing.assert_allclose(sample.targets - moved.targets, level, atol=1e-3)
+    rough = noisy(rng, sample, Shares(noisy=1))
+    assert 0 < np.abs(rough.window - sample.window).max() <= 1
+    np.testing.assert_array_equal(rough.targets, sample.targets)
+
+
+def test_noise_may_push_voxels_with_targets_out_of_the_band(samples):
+    sample = samples[0]
+    window = sample.window.copy()
+    window[tuple(sample.voxel_ijk[0])] = 5.0
+    prepared = prepare(replace(sample, window=window))
+    assert len(prepared.voxels) == len(prepared.targets) == len(sample.voxel_ijk) - 1
+    np.testing.assert_array_equal(prepared.ijk[prepared.voxels], sample.voxel_ijk[1:])
+
+
+def test_a_batch_has_the_tables_of_its_samples():
+    one, two = np.array([[-1, 0], [1, -1]]), np.array([[0, -1]])
+    np.testing.assert_array_equal(batch_table([one, two]), [[3, 0], [1, 3], [2, 3]])
+
+
+def test_differences_are_the_gradient_of_a_linear_field():
+    offsets = draw_offsets(np.random.default_rng(0))
+    normal = np.array([0.5, -0.3, 0.8], np.float32)
+    slopes = differences(torch.from_numpy(offsets @ normal)[None])
+    np.testing.assert_allclose(slopes[0], np.tile(normal, (CORNERS, 1)), atol=1e-6)
+
+
+def test_meshes_come_once_each_with_a_sixth_of_prisms():
+    prisms, others = [Path(f"p{n}") for n in range(900)], [Path(f"o{n}") for n in range(500)]
+    order = mesh_order(0, prisms, others, 600)
+    assert len(order) == len(set(order)) == 600
+    assert set(others) < set(order)
+    assert len(set(mesh_order(0, prisms, others, 1200)[600:]) & set(prisms)) == 100
 
 
 def test_the_gradient_of_the_neighbour_convolution():
@@ -123,6 +190,8 @@ def test_an_untrained_network_keeps_samples_and_planes():
     np.testing.assert_allclose(weights.sum(1), 1, atol=1e-6)
     np.testing.assert_allclose(weights @ NEIGHBOURHOOD, block_offsets(4) / 2, atol=1e-6)
     net = SuperSdfNet(SMALL)
+    torch.nn.init.zeros_(net.correction.weight)
+    torch.nn.init.zeros_(net.correction.bias)
     patches, table = torch.randn(1, 27), torch.full((1, 27), -1)
     at_sample = net(patches, table, torch.tensor([0]), torch.zeros(1, 3))
     assert at_sample.item() == pytest.approx(patches[0, 13].item(), abs=1e-6)
@@ -132,34 +201,89 @@ def test_a_run_learns_and_goes_on_where_it_stopped(tmp_path, samples):
     write_shard(tmp_path / "shard-0-0000.npz", samples[:1])
     write_shard(tmp_path / "shard-0-0001.npz", samples[1:])
     torch.manual_seed(0)
-    run = Run(tmp_path, SMALL)
+    run = Run(tmp_path, SuperSdfNet(SMALL))
     rng = np.random.default_rng(0)
-    batch = [prepare(sample) for sample in samples]
-    first = run.advance(batch, 0.1)
-    for _ in range(30):
-        last = run.advance([augment(rng, sample) for sample in batch], 0.1)
+    store = Store(tmp_path, 1)
+    recipe = replace(RECIPE, batch_voxels=1, shares=CLEAN)
+    first = np.mean([run.advance(store.draw_batch(rng, recipe), 0.1) for _ in range(4)])
+    for _ in range(40):
+        run.advance(store.draw_batch(rng, recipe), 0.1)
+    last = np.mean([run.advance(store.draw_batch(rng, recipe), 0.1) for _ in range(4)])
     assert last < 0.9 * first
     run.save()
-    again = Run(tmp_path, SMALL)
+    again = Run(tmp_path, SuperSdfNet(SMALL))
     again.resume()
-    assert again.step == 31
+    assert again.step == 48
     for one, other in zip(run.net.parameters(), again.net.parameters()):
         torch.testing.assert_close(one, other)
-    train(again, Store(tmp_path, 1), again.seconds / 60 + 0.01, seed=0)
-    assert again.step > 31
+    train(again, store, again.seconds / 60 + 0.01, seed=0)
+    assert again.step > 48
+
+
+def test_the_held_out_errors_of_the_truth_are_zero(samples):
+    target = torch.from_numpy(samples[0].targets.astype(np.float32))
+    np.testing.assert_allclose(sample_errors(target, target), 0, atol=1e-6)
+    off = sample_errors(target + 0.2, target)
+    np.testing.assert_allclose(off, [0.1, 0.1, 0], atol=1e-6)  # in voxels
+
+
+def test_a_log_is_drawn(tmp_path, samples):
+    write_shard(tmp_path / "shard-0-0000.npz", samples)
+    run = Run(tmp_path, SuperSdfNet(SMALL))
+    store = Store(tmp_path, 1)
+    for run.step in (900, 1000):
+        log(run, store, 0.5)
+    lines = read_log(tmp_path)
+    assert np.isnan(lines[0, 4:]).all() and np.isfinite(lines[1]).all()
+    assert (tmp_path / "loss.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("entry", ENTRIES)
+def test_every_compared_network_keeps_the_sample(entry, samples):
+    make, config, _ = ENTRIES[entry]
+    net = make(replace(config, channels=8, hidden=16, blocks=2, functions=24))
+    batch = [prepare(sample) for sample in samples[:2]]
+    with torch.no_grad():
+        patches, features = net.encode_batch(batch)
+        net.correction.weight.zero_()
+        net.correction.bias.zero_()
+        at_sample = net.decode(features, patches, torch.zeros(1, 3))
+    assert len(features) == sum(len(sample.patches) for sample in batch)
+    np.testing.assert_allclose(at_sample[:, 0], patches[:, CENTRE], atol=1e-5)
+
+
+def test_a_row_is_kept_and_shown(tmp_path):
+    run = Run(tmp_path, SuperSdfNet(SMALL))
+    append_row(tmp_path / "rows.jsonl", "ours", run, Errors(0.01, 0.02, 0.03))
+    table = format_table(read_rows(tmp_path / "rows.jsonl"))
+    assert table.endswith("| ours | 6 k | 0 | 1.00 | 2.00 | 3.00 |")
 
 
 def test_the_rate_warms_up_and_anneals():
-    rates = [learning_rate(spent) for spent in np.linspace(0, 1, 101)]
-    assert rates[0] < 1e-5 and rates[-1] < 1e-5
-    assert 1.8e-3 < max(rates) <= 2e-3 + 2e-6
+    factors = [rate_factor(spent, RECIPE) for spent in np.linspace(0, 1, 101)]
+    assert factors[0] < 2e-3 and factors[-1] < 2e-3
+    assert 0.9 < max(factors) <= 1.001
 
 
-def test_the_onnx_file_agrees_with_torch_and_carries_its_card(tmp_path):
+def small_net():
     torch.manual_seed(0)
     net = SuperSdfNet(SMALL)
     for parameter in net.parameters():  # away from the start, where the blocks do nothing
         torch.nn.init.normal_(parameter, std=0.1)
+    return net
+
+
+def test_the_onnx_file_agrees_with_torch_and_carries_its_card(tmp_path):
+    net = small_net()
     write_model(net, tmp_path / "small.onnx", make_card(net, "small", "nothing", "none"))
     assert parity(net, tmp_path / "small.onnx") < 2e-4
     assert load_network(tmp_path / "small.onnx").card["receptive_field"] == 3
+
+
+def test_training_can_start_from_an_onnx_file(tmp_path):
+    net = small_net()
+    write_model(net, tmp_path / "small.onnx", make_card(net, "small", "nothing", "none"))
+    run = Run(tmp_path, SuperSdfNet(SMALL))
+    run.start_from(read_weights(tmp_path / "small.onnx"))
+    for one, other in zip(net.parameters(), run.average.parameters()):
+        torch.testing.assert_close(one, other)

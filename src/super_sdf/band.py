@@ -115,15 +115,32 @@ def _flat_steps(
     return (voxel_ijk + 1) @ strides, [int(step) for step in NEIGHBOURHOOD @ strides]
 
 
-def can_hold_surface(patches: FloatArray) -> BoolArray:
-    """Say which voxels, (V,) of bool, may contain a piece of the surface.
+def is_lipschitz(patches: FloatArray) -> BoolArray:
+    """Say of each patch, (V,) of bool, whether its samples can be distances.
 
-    An exact distance is 1-Lipschitz, so a voxel whose sample is farther than its corner holds no
-    surface. Where a patch breaks that bound the field is no distance, and the voxel is kept.
+    Distances of two points differ by no more than the points are apart. In a noisy field that is
+    broken nearly everywhere, in one that is no distance in many places.
     """
     centre = patches[:, CENTRE]
-    keep = np.abs(centre) <= DECODE_LIMIT
+    keeps = np.ones(len(patches), bool)
     reach = 2 * np.linalg.norm(NEIGHBOURHOOD, axis=1) + LIPSCHITZ_SLACK
     for column in range(27):
-        keep |= np.abs(patches[:, column] - centre) > reach[column]
-    return keep
+        keeps &= np.abs(patches[:, column] - centre) <= reach[column]
+    return keeps
+
+
+def can_hold_surface(patches: FloatArray, lipschitz: BoolArray) -> BoolArray:
+    """Say which voxels, (V,) of bool, may contain a piece of the surface.
+
+    If its patch is of distances (``is_lipschitz``), a voxel whose sample is farther than its corner
+    holds no surface. Else the sample proves nothing, and the voxel is kept.
+    """
+    near: BoolArray = np.abs(patches[:, CENTRE]) <= DECODE_LIMIT
+    return near | ~lipschitz
+
+
+def all_around(flags: BoolArray, table: IntArray) -> BoolArray:
+    """Say of which rows of a neighbour table, (D, 27), every neighbour is flagged, (V,)."""
+    around = np.append(flags, True)[table]  # -1, absent, reads the last
+    held: BoolArray = np.logical_and.reduce(around, axis=1)
+    return held

@@ -91,8 +91,13 @@ def cli() -> None:
 )
 @click.option("--cap", is_flag=True, help="Close a surface that runs out of the grid.")
 @click.option(
-    "--model", default="base", show_default=True, help="A shipped network, or an ONNX file."
+    "--quality",
+    type=click.Choice(["fast", "base", "best"]),
+    default="base",
+    show_default=True,
+    help="The network: fast is small, best asks base eight times.",
 )
+@click.option("--model", metavar="FILE", help="Another network, an ONNX file, in place of these.")
 @click.option(
     "--device",
     type=click.Choice(["auto", "cpu", "cuda"]),
@@ -156,7 +161,7 @@ class Upsampling:
         )
         self.lap("read")
         self.network = load_network(
-            asked["model"], device=asked["device"], threads=asked["threads"]
+            asked["model"] or asked["quality"], device=asked["device"], threads=asked["threads"]
         )
         self.lap("load network")
         with self.progress_bar() as advance:
@@ -209,7 +214,7 @@ class Upsampling:
             "offset": self.options["offset"],
             "inferred": list(self.grid.notes),
             "warnings": self.warnings,
-            "model": self.options["model"],
+            "model": self.options["model"] or self.options["quality"],
             "device": self.network.device,
             "band_voxels": self.field.band_voxels,
             "decoded_voxels": len(self.field.voxel_ijk),

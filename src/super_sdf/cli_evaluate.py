@@ -118,7 +118,7 @@ def takes(option: click.Option, word: str, ctx: click.Context) -> bool:
 )
 @click.option("--limit", type=click.IntRange(1), help="Take so many meshes, spread over the list.")
 @click.option(
-    "--model", default="base", show_default=True, help="A shipped network, or an ONNX file."
+    "--model", default="base", show_default=True, help="fast, base, best, or an ONNX file."
 )
 @click.option("--jobs", type=click.IntRange(1), help="Processes; one a core unless given.")
 @click.option(

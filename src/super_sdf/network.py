@@ -13,13 +13,17 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import onnxruntime as ort
 
 from .errors import DeviceError, FileError, ModelError
 from .grid import FloatArray, IntArray
+from .symmetry import cube_symmetries, turn
 
 FORMAT_VERSION = 1
-DEFAULT_MODEL = "base"
+DEFAULT_QUALITY = "base"
+# A shipped file, and over how many symmetries of the cube its answers are averaged.
+QUALITIES = {"fast": ("fast", 1), "base": ("base", 1), "best": ("base", 8)}
 DEVICES = ("auto", "cpu", "cuda")
 INPUTS = {
     "patches": "tensor(float)",
@@ -40,11 +44,14 @@ class Network:
         The file's metadata: receptive field, training factors, data, commit, accuracy.
     device : str
         Where it runs: "cpu" or "cuda".
+    symmetries : int
+        Over how many symmetries of the cube the values are averaged.
     """
 
     session: ort.InferenceSession
     card: Mapping[str, Any]
     device: str
+    symmetries: int = 1
 
     def __call__(
         self, patches: FloatArray, table: IntArray, voxels: IntArray, offsets: FloatArray
@@ -56,6 +63,18 @@ class Network:
         DeviceError
             If onnxruntime fails, for want of memory on a GPU, say.
         """
+        if self.symmetries == 1:
+            return self._run(patches, table, voxels, offsets)
+        mean = np.zeros((len(voxels), len(offsets)), np.float32)
+        for symmetry in cube_symmetries()[: self.symmetries]:
+            turned, turned_table, moved = turn(symmetry, patches, table, offsets)
+            mean += self._run(turned, turned_table, voxels, moved) / self.symmetries
+        return mean
+
+    def _run(
+        self, patches: FloatArray, table: IntArray, voxels: IntArray, offsets: FloatArray
+    ) -> FloatArray:
+        """Run the session."""
         feeds = {"patches": patches, "neighbours": table, "voxels": voxels, "offsets": offsets}
         try:
             values: FloatArray = self.session.run([OUTPUT], feeds)[0]
@@ -72,15 +91,31 @@ def shipped_models() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("*.onnx"))}
 
 
+def find_model(model: str | Path) -> tuple[Path, int]:
+    """Return the file of a quality or of a path, and how many symmetries it is averaged over.
+
+    Raises
+    ------
+    FileError
+        If there is no such file.
+    """
+    name, symmetries = QUALITIES.get(str(model), ("", 1))
+    path = shipped_models()[name] if name else Path(model)
+    if not path.is_file():
+        names = ", ".join(QUALITIES)
+        raise FileError(f"no model {str(model)!r}: give an ONNX file or one of: {names}")
+    return path, symmetries
+
+
 def load_network(
-    model: str | Path = DEFAULT_MODEL, *, device: str = "auto", threads: int = 0
+    model: str | Path = DEFAULT_QUALITY, *, device: str = "auto", threads: int = 0
 ) -> Network:
     """Load a network.
 
     Parameters
     ----------
     model : str or path
-        The name of a shipped network, or an ONNX file.
+        "fast", "base" or "best" (base, averaged over reflections), or an ONNX file.
     device : str
         "cuda", "cpu", or "auto": CUDA where it runs, else the CPU.
     threads : int
@@ -95,10 +130,7 @@ def load_network(
     DeviceError
         If CUDA was asked for and cannot run.
     """
-    path = shipped_models().get(str(model), Path(model))
-    if not path.is_file():
-        names = ", ".join(shipped_models())
-        raise FileError(f"no model {str(model)!r}: give an ONNX file or one of: {names}")
+    path, symmetries = find_model(model)
     session = _open_session(path, _providers(device), threads)
     used = "cuda" if "CUDAExecutionProvider" in session.get_providers() else "cpu"
     if device == "cuda" and used != "cuda":
@@ -106,7 +138,7 @@ def load_network(
             "cuda was asked for, but onnxruntime could not start its CUDA provider (are the CUDA "
             "and cuDNN libraries it wants installed?); use --device cpu"
         )
-    return Network(session, _read_card(session, path), used)
+    return Network(session, _read_card(session, path), used, symmetries)
 
 
 def available_devices() -> list[str]:

@@ -13,7 +13,14 @@ import numpy as np
 from scipy import ndimage
 from skimage.measure import marching_cubes
 
-from ..band import find_band, gather_patches, neighbour_table, rescale
+from ..band import (
+    all_around,
+    find_band,
+    gather_patches,
+    is_lipschitz,
+    neighbour_table,
+    rescale,
+)
 from ..grid import FloatArray, IntArray, SdfGrid
 from ..mesh import Mesh
 from ..nodes import average_shared, block_ijk, block_offsets, keep_samples, number_shared_nodes
@@ -91,10 +98,12 @@ def band_field(grid: SdfGrid, voxels: IntArray, network: Decoder, factor: int) -
     rescaled = rescale(grid)
     table = neighbour_table(voxels, grid.shape)
     every = np.arange(len(voxels), dtype=np.int32)
-    blocks = network(gather_patches(rescaled, voxels), table, every, block_offsets(factor))
+    patches = gather_patches(rescaled, voxels)
+    blocks = network(patches, table, every, block_offsets(factor))
     numbers, count = number_shared_nodes(table, factor)
     values = average_shared(blocks, numbers, count)
-    keep_samples(values, numbers, rescaled[tuple(voxels.T)])
+    kept = all_around(is_lipschitz(patches), table)
+    keep_samples(values, numbers[kept], rescaled[tuple(voxels[kept].T)])
     nodes = factor * voxels[:, None] + block_ijk(factor)  # (V, Q, 3)
     field = np.full([factor * n + 1 for n in grid.shape], np.nan, np.float32)
     field[tuple(np.moveaxis(nodes, 2, 0))] = values[numbers] * np.float32(grid.voxel_size / 2)

@@ -1,0 +1,113 @@
+"""What is done to a sample each time it is shown: no network sees the same one twice.
+
+A distance field stays one when the cube it is sampled in is turned and (near the surface) when
+another level is called zero. What users bring besides is cut off at some distance, or noisy: the
+targets stay clean, so the network learns to undo it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from export.dataset import Sample
+from super_sdf.band import find_band, gather_patches, neighbour_table
+from super_sdf.symmetry import cube_symmetries, turn
+
+
+@dataclass(frozen=True)
+class Shares:
+    """How many of the samples each change is made to, from 0 to 1."""
+
+    inverted: float = 0.0  # worse: solids are oftener convex than not, and networks learn that
+    shifted: float = 1 / 6
+    noisy: float = 1 / 4
+    truncated: float = 1 / 6
+
+
+USUAL = Shares()
+CLEAN = Shares(0, 0, 0, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A sample as the network takes it: band patches and neighbours, and where its targets are."""
+
+    ijk: np.ndarray  # (V, 3) the voxels, in the window or turned with it
+    patches: np.ndarray  # (V, 27) float32
+    table: np.ndarray  # (V, 27) int32, -1 where absent
+    voxels: np.ndarray  # (D,) rows of the band that have targets
+    offsets: np.ndarray  # (Q, 3) float32
+    targets: np.ndarray  # (D, Q) float32
+
+
+def augment(rng: np.random.Generator, sample: Sample, shares: Shares) -> Prepared:
+    """Change a sample at random and gather it."""
+    changed = noisy(rng, shifted(rng, inverted(rng, sample, shares), shares), shares)
+    return turned(rng, truncated(rng, prepare(changed), shares))
+
+
+def prepare(sample: Sample) -> Prepared:
+    """Gather a sample with the runtime's own functions; targets outside its band are dropped."""
+    band = find_band(sample.window)
+    strides = np.array([sample.window.shape[1] * sample.window.shape[2], sample.window.shape[2], 1])
+    keys, wanted = band @ strides, sample.voxel_ijk.astype(np.int64) @ strides
+    rows = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    in_band = keys[rows] == wanted
+    return Prepared(
+        band,
+        gather_patches(sample.window, band),
+        neighbour_table(band, sample.window.shape),
+        rows[in_band],
+        sample.offsets,
+        sample.targets[in_band].astype(np.float32),
+    )
+
+
+def inverted(rng: np.random.Generator, sample: Sample, shares: Shares) -> Sample:
+    """Let inside and outside change places."""
+    if rng.random() >= shares.inverted:
+        return sample
+    return replace(sample, window=-sample.window, targets=-sample.targets)
+
+
+def shifted(rng: np.random.Generator, sample: Sample, shares: Shares) -> Sample:
+    """Call a level within half a voxel the surface (Sec. 5.3)."""
+    if rng.random() >= shares.shifted:
+        return sample
+    level = np.float32(rng.uniform(-1, 1))
+    targets = sample.targets.astype(np.float32) - level
+    return replace(sample, window=sample.window - level, targets=targets)
+
+
+def noisy(rng: np.random.Generator, sample: Sample, shares: Shares) -> Sample:
+    """Add uniform noise of up to half a voxel, oftener little than much."""
+    if rng.random() >= shares.noisy:
+        return sample
+    noise = rng.uniform(-1, 1, sample.window.shape) * rng.random() ** 1.5
+    return replace(sample, window=sample.window + noise.astype(np.float32))
+
+
+def truncated(rng: np.random.Generator, sample: Prepared, shares: Shares) -> Prepared:
+    """Cut the values off at 1.5 to 3 voxels."""
+    if rng.random() >= shares.truncated:
+        return sample
+    limit = rng.uniform(3, 6)
+    return replace(sample, patches=np.clip(sample.patches, -limit, limit))
+
+
+def batch_table(tables: Sequence[np.ndarray]) -> np.ndarray:
+    """Lay neighbour tables end to end; absent is then the number of all rows, not -1."""
+    starts = np.cumsum([0] + [len(table) for table in tables])
+    moved = [np.where(t < 0, starts[-1], t + at) for t, at in zip(tables, starts[:-1])]
+    return np.concatenate(moved).astype(np.int32)
+
+
+def turned(rng: np.random.Generator, sample: Prepared) -> Prepared:
+    """Turn and mirror a sample by one of the 48 symmetries of the cube."""
+    symmetry = rng.choice(cube_symmetries())
+    patches, table, offsets = turn(symmetry, sample.patches, sample.table, sample.offsets)
+    ijk = sample.ijk @ symmetry.T
+    return replace(sample, ijk=ijk, patches=patches, table=table, offsets=offsets)

@@ -1,0 +1,83 @@
+"""How a network is trained: what counts as an error, what moves the weights, and how fast.
+
+What else was tried is in README's table; ``compare`` tried it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from export.augment import USUAL, Shares
+from export.dataset import CORNERS
+from export.network import SuperSdfNet
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """The choices of a run."""
+
+    muon: bool = True  # for the matrices of the blocks; AdamW for all else
+    hidden_rate: float = 4e-3  # of the blocks; 2e-3 and 1e-2 are worse
+    outer_rate: float = 2e-3
+    warm_up: float = 0.03  # share of the budget
+    batch_voxels: int = 12_000  # a step's arrays stay in cache
+    average_decay: float = 0.998  # of the weights, a step
+    power: int = 1  # of the error: 1 or 2
+    reach: float = 0.5  # half voxels: so far from the surface the weight has fallen by 1/e ...
+    far_weight: float = 0.25  # ... towards this
+    gradient_weight: float = 0.5
+    eikonal_weight: float = 0.0
+    shares: Shares = USUAL
+
+
+RECIPE = Recipe()
+
+
+def differences(values: Tensor) -> Tensor:
+    """Return the gradients (D, CORNERS, 3) of values (D, Q) at the corners: see ``dataset``."""
+    quadruples = values[:, : 4 * CORNERS].view(len(values), CORNERS, 4)
+    return 2 * (quadruples[:, :, 1:] - quadruples[:, :, :1])
+
+
+def nearness(target: Tensor, recipe: Recipe) -> Tensor:
+    """Return how much an error counts: more near the surface, for there it moves the mesh."""
+    return recipe.far_weight + torch.exp(-target.abs() / recipe.reach)
+
+
+def loss_of(prediction: Tensor, target: Tensor, recipe: Recipe) -> Tensor:
+    """Return the weighted error of the values and of their gradient."""
+    error = (prediction - target).abs() ** recipe.power
+    loss = (nearness(target, recipe) * error).mean()
+    corners = nearness(target[:, : 4 * CORNERS : 4], recipe)
+    slope = differences(prediction)
+    if recipe.gradient_weight:
+        apart = (slope - differences(target)).abs().sum(2)
+        loss = loss + recipe.gradient_weight * (corners * apart).mean()
+    if recipe.eikonal_weight:
+        unit = (slope.norm(dim=2) - 1).abs()
+        loss = loss + recipe.eikonal_weight * (corners * unit).mean()
+    return loss
+
+
+def make_optimisers(net: SuperSdfNet, recipe: Recipe) -> list[torch.optim.Optimizer]:
+    """Return Muon for the matrices of the blocks, AdamW for all other parameters."""
+    hidden = [p for p in net.blocks.parameters() if p.ndim == 2 and recipe.muon]
+    chosen = {id(p) for p in hidden}
+    others = [p for p in net.parameters() if id(p) not in chosen]
+    optimisers: list[torch.optim.Optimizer] = [
+        torch.optim.AdamW(others, lr=recipe.outer_rate, weight_decay=1e-3)
+    ]
+    if hidden:
+        rate = {"lr": recipe.hidden_rate, "adjust_lr_fn": "match_rms_adamw"}
+        optimisers.append(torch.optim.Muon(hidden, weight_decay=1e-3, **rate))
+    return optimisers
+
+
+def rate_factor(spent: float, recipe: Recipe) -> float:
+    """Return the rate over its peak after this share of the budget: warm-up, then half a cosine."""
+    cosine = 0.5 * (1 + np.cos(np.pi * min(spent, 1.0)))
+    return float(min(spent / recipe.warm_up, cosine) + 1e-3)

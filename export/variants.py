@@ -1,0 +1,250 @@
+"""Other networks of the same contract, to be compared with ours (``compare``)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from export.augment import Prepared, batch_table
+from export.network import (
+    Block,
+    NeighbourConv,
+    NetworkConfig,
+    SuperSdfNet,
+    Trunk,
+    gather,
+    interpolation_weights,
+)
+from super_sdf.band import NEIGHBOURHOOD, neighbour_table
+
+AXES = tuple(np.flatnonzero((np.delete(NEIGHBOURHOOD, axis, 1) == 0).all(1)) for axis in range(3))
+
+
+# How voxels look at their neighbours.
+
+
+class AxesBlock(Block):
+    """Mixes by three convolutions of three places, along x, y and z."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__(config)
+        self.conv = nn.ModuleList(NeighbourConv(config.channels, 3) for _ in AXES)
+
+    def mix(self, features: Tensor, table: Tensor) -> Tensor:
+        """Look along one axis after the other."""
+        for conv, places in zip(self.conv, AXES):
+            features = torch.relu(conv(features, table[:, places].contiguous()))
+        return features
+
+
+class BottleneckBlock(Block):
+    """Mixes half as many channels."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__(config)
+        half = config.channels // 2
+        self.down = nn.Linear(config.channels, half)
+        self.conv = NeighbourConv(half)
+        self.expand = nn.Linear(half, config.hidden)
+
+    def mix(self, features: Tensor, table: Tensor) -> Tensor:
+        """Look at the neighbours' reduced features."""
+        return torch.relu(self.conv(torch.relu(self.down(features)), table))
+
+
+class PointBlock(Block):
+    """Does not look at the neighbours: the patch alone counts."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__(config)
+        self.conv = nn.Linear(config.channels, config.channels)
+
+    def mix(self, features: Tensor, table: Tensor) -> Tensor:
+        """Look at the voxel itself."""
+        return torch.relu(self.conv(features))
+
+
+class BlockNet(SuperSdfNet):
+    """Ours with blocks of another kind."""
+
+    def __init__(self, config: NetworkConfig, kind: type[Block]) -> None:
+        super().__init__(config)
+        self.blocks = nn.ModuleList(kind(config) for _ in range(config.blocks))
+
+
+class DilatedNet(SuperSdfNet):
+    """Every other block looks two voxels far: at the neighbour's neighbour at the same place."""
+
+    def encode(self, patches: Tensor, table: Tensor) -> Tensor:
+        """Map patches (V, 27) and neighbours (V, 27; V where absent) to features (V, C)."""
+        ended = torch.cat([table, torch.full_like(table[:1], len(table))]).long()
+        far = torch.stack([ended[ended[:-1, k], k] for k in range(27)], 1).int()
+        features = self.stem(patches)
+        for number, block in enumerate(self.blocks):
+            features = block(features, far if number % 2 else table)
+        return features
+
+
+class WidePatchNet(SuperSdfNet):
+    """Is given the patches of all 27 neighbours: 5x5x5 samples, the inner ones several times."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__(config)
+        self.stem[0] = nn.Linear(27 * 27, config.hidden)
+
+    def encode(self, patches: Tensor, table: Tensor) -> Tensor:
+        """Map patches (V, 27) and neighbours (V, 27; V where absent) to features (V, C)."""
+        features = self.stem(gather(patches, table))
+        for block in self.blocks:
+            features = block(features, table)
+        return features
+
+
+class UNet(SuperSdfNet):
+    """The paper's shape: two coarser levels, of half the resolution each, and skips between.
+
+    A coarse voxel is the mean of up to eight children; two blocks work on each level on the way
+    down and two on the way up.
+    """
+
+    LEVELS = 2
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__(config)
+        channels = config.channels
+        self.downs = nn.ModuleList(nn.Linear(channels, channels) for _ in range(self.LEVELS))
+        self.ups = nn.ModuleList(nn.Linear(channels, channels) for _ in range(self.LEVELS))
+        self.coarse = nn.ModuleList(Block(config) for _ in range(4 * self.LEVELS - 2))
+
+    def encode_batch(self, batch: Sequence[Prepared]) -> tuple[Tensor, Tensor]:
+        """Return patches and features of samples laid end to end."""
+        patches = torch.from_numpy(np.concatenate([sample.patches for sample in batch]))
+        ijk, tables = [sample.ijk for sample in batch], [sample.table for sample in batch]
+        levels, parents = [torch.from_numpy(batch_table(tables))], []
+        for _ in range(self.LEVELS):
+            ijk, rows, tables = zip(*map(coarsen, ijk))
+            parents.append(torch.from_numpy(join_parents(rows, tables)))
+            levels.append(torch.from_numpy(batch_table(tables)))
+        return patches, self.descend(self.stem(patches), levels, parents, list(self.coarse), 0)
+
+    def descend(
+        self, features: Tensor, tables: list[Tensor], parents: list[Tensor], blocks: list, at: int
+    ) -> Tensor:
+        """Work on a level and, in between, on those below it."""
+        own = list(self.blocks) if at == 0 else [blocks.pop() for _ in range(2)]
+        half = len(own) // 2 if at == 0 else len(own)
+        for block in own[:half]:
+            features = block(features, tables[at])
+        if at == self.LEVELS:
+            return features
+        below = mean_of_children(self.downs[at](features), parents[at], len(tables[at + 1]))
+        below = self.descend(below, tables, parents, blocks, at + 1)
+        features = features + self.ups[at](below)[parents[at].long()]
+        rest = own[half:] if at == 0 else [blocks.pop() for _ in range(2)]
+        for block in rest:
+            features = block(features, tables[at])
+        return features
+
+
+def coarsen(ijk: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the coarse voxels of twice the side, each voxel's parent, the coarse neighbours."""
+    half = (ijk - ijk.min(0)) >> 1
+    coarse, rows = np.unique(half, axis=0, return_inverse=True)
+    coarse = coarse.astype(np.int32)
+    shape = tuple(int(n) for n in coarse.max(0) + 1)
+    return coarse, rows.ravel(), neighbour_table(coarse, shape)
+
+
+def join_parents(rows: Sequence[np.ndarray], tables: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the parents of samples laid end to end."""
+    starts = np.cumsum([0] + [len(table) for table in tables])
+    return np.concatenate([row + start for row, start in zip(rows, starts)])
+
+
+def mean_of_children(features: Tensor, parents: Tensor, count: int) -> Tensor:
+    """Return the mean over the children of each of so many parents, (count, C)."""
+    ones = torch.ones(len(parents), 1)
+    number = torch.zeros(count, 1).index_add_(0, parents, ones)
+    return torch.zeros(count, features.shape[1]).index_add_(0, parents, features.float()) / number
+
+
+# How values are read from the features.
+
+
+class BlockHead(SuperSdfNet):
+    """Gives the 125 values of K = 4 outright, and at other offsets the nearest node's."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__(config)
+        self.branch = nn.Sequential(
+            nn.Linear(config.channels, 2 * config.channels),
+            nn.ReLU(),
+            nn.Linear(2 * config.channels, 125),
+        )
+
+    def residual(self, features: Tensor, offsets: Tensor) -> Tensor:
+        """Return what the network adds to the interpolation, (D, Q); 0 at the sample."""
+        nodes = ((offsets + 1) * 2).round().long()
+        block = self.branch(features).float()
+        return block[:, nodes @ torch.tensor([25, 5, 1])] - block[:, 62:63]
+
+
+class QueryHead(SuperSdfNet):
+    """Runs a small network for every pair of voxel and offset."""
+
+    WIDTH = 64
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__(config)
+        self.branch = nn.Linear(config.channels, self.WIDTH)
+        self.trunk = Trunk(NetworkConfig(functions=self.WIDTH))
+        self.last = nn.Sequential(
+            nn.ReLU(), nn.Linear(self.WIDTH, self.WIDTH), nn.ReLU(), nn.Linear(self.WIDTH, 1)
+        )
+
+    def residual(self, features: Tensor, offsets: Tensor) -> Tensor:
+        """Return what the network adds to the interpolation, (D, Q); 0 at the sample."""
+        voxels = self.branch(features)[:, None]
+        at_offsets = self.last(voxels + self.trunk(offsets)[None])
+        return (at_offsets - self.last(voxels)).squeeze(2).float()
+
+
+class DeepBranch(SuperSdfNet):
+    """Has a hidden layer before the coefficients."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__(config)
+        hidden = config.functions
+        self.branch = nn.Sequential(
+            nn.Linear(config.channels, hidden), nn.ReLU(), nn.Linear(hidden, hidden)
+        )
+
+    def residual(self, features: Tensor, offsets: Tensor) -> Tensor:
+        """Return what the network adds to the interpolation, (D, Q); 0 at the sample."""
+        return self.branch(features).float() @ self.trunk(offsets).float().T
+
+
+# What the network adds to.
+
+
+class TrilinearBase(SuperSdfNet):
+    """Adds to trilinear interpolation."""
+
+    def base(self, patches: Tensor, offsets: Tensor) -> Tensor:
+        """Return the interpolation, (D, Q)."""
+        at = offsets / 2
+        axis = torch.stack([(-at).clamp(min=0), 1 - at.abs(), at.clamp(min=0)], 2)
+        x, y, z = axis.unbind(1)
+        weights = x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]
+        return patches @ weights.flatten(1).T
+
+
+class SampleBase(SuperSdfNet):
+    """Adds to the sample."""
+
+    def base(self, patches: Tensor, offsets: Tensor) -> Tensor:
+        """Return the sample at every offset, (D, Q)."""
+        return patches @ interpolation_weights(torch.zeros_like(offsets)).T
