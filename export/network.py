@@ -9,8 +9,8 @@ a trunk: coefficients per voxel times functions of the offset. It adds a residua
 interpolation of the patch. All lengths are in half voxels (Eqs. 4 and 5).
 
 Interpolation and functions leave the sample as it is (Sec. 4.1). A noisy sample should not stay, so
-there is a correction of the whole voxel besides; below ``DEAD_ZONE`` it is exactly 0, which it is
-wherever the samples are distances.
+there is a correction of the whole voxel besides. It is 0 where the samples can be distances, as far
+as the voxel's neighbours see: there they are kept.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from export.augment import Prepared, batch_table
-
-DEAD_ZONE = 0.05  # half voxels
+from super_sdf.band import CENTRE, REACH
 
 
 @dataclass(frozen=True)
@@ -152,6 +151,29 @@ class Trunk(nn.Module):
         return self.layers(torch.cat([offsets, angles.sin(), angles.cos()], 1))
 
 
+@dataclass(frozen=True)
+class Encoded:
+    """Voxels as the head takes them."""
+
+    features: Tensor  # (V, C)
+    patches: Tensor  # (V, 27)
+    noisy: Tensor  # (V, 1) of 0 and 1
+
+    def some(self, rows: Tensor) -> Encoded:
+        """Return some of the voxels."""
+        return Encoded(self.features[rows], self.patches[rows], self.noisy[rows])
+
+
+def is_noisy(patches: Tensor, table: Tensor) -> Tensor:
+    """Say of each voxel, (V, 1), by 1 or 0 whether its or a neighbour's patch is of no distance.
+
+    That is: two samples differ by more than they are apart, as ``super_sdf.band.is_lipschitz``.
+    """
+    excess = (patches - patches[:, CENTRE, None]).abs() - patches.new_tensor(REACH)
+    most = torch.cat([excess.amax(1), patches.new_zeros(1)])
+    return (most[table].amax(1, keepdim=True) > 0).float()
+
+
 class SuperSdfNet(nn.Module):
     """The whole network; its inputs and output are those of the ONNX file."""
 
@@ -173,18 +195,18 @@ class SuperSdfNet(nn.Module):
             features = block(features, table)
         return features
 
-    def encode_batch(self, batch: Sequence[Prepared]) -> tuple[Tensor, Tensor]:
-        """Return patches and features of samples laid end to end."""
+    def encode_batch(self, batch: Sequence[Prepared]) -> Encoded:
+        """Encode samples laid end to end."""
         device = next(self.parameters()).device
-        patches = torch.from_numpy(np.concatenate([sample.patches for sample in batch]))
-        table = torch.from_numpy(batch_table([sample.table for sample in batch]))
-        patches = patches.to(device)
-        return patches, self.encode(patches, table.to(device))
+        patches = torch.from_numpy(np.concatenate([sample.patches for sample in batch])).to(device)
+        table = torch.from_numpy(batch_table([sample.table for sample in batch])).to(device)
+        return Encoded(self.encode(patches, table), patches, is_noisy(patches, table))
 
-    def decode(self, features: Tensor, patches: Tensor, offsets: Tensor) -> Tensor:
-        """Return the values (D, Q) of voxels (D, C), (D, 27) at offsets (Q, 3)."""
-        correction = nn.functional.softshrink(self.correction(features).float(), DEAD_ZONE)
-        return self.residual(features, offsets) + correction + self.base(patches, offsets)
+    def decode(self, voxels: Encoded, offsets: Tensor) -> Tensor:
+        """Return the values (D, Q) of voxels at offsets (Q, 3)."""
+        correction = self.correction(voxels.features).float() * voxels.noisy
+        values = self.residual(voxels.features, offsets) + self.base(voxels.patches, offsets)
+        return values + correction
 
     def residual(self, features: Tensor, offsets: Tensor) -> Tensor:
         """Return what the network adds to the interpolation, (D, Q); 0 at the sample."""
@@ -198,8 +220,8 @@ class SuperSdfNet(nn.Module):
     def forward(self, patches: Tensor, table: Tensor, voxels: Tensor, offsets: Tensor) -> Tensor:
         """Return the values (D, Q) of the voxels (D,) at the offsets (Q, 3)."""
         table = torch.where(table < 0, len(patches), table)  # the row of zeros
-        features = self.encode(patches, table)
-        return self.decode(features[voxels], patches[voxels], offsets)
+        encoded = Encoded(self.encode(patches, table), patches, is_noisy(patches, table))
+        return self.decode(encoded.some(voxels), offsets)
 
 
 def interpolation_weights(offsets: Tensor) -> Tensor:

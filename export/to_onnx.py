@@ -20,8 +20,8 @@ import onnx
 import torch
 from onnx import TensorProto, helper, numpy_helper
 
-from export.network import DEAD_ZONE, NetworkConfig, SuperSdfNet
-from super_sdf.band import find_band, gather_patches, neighbour_table
+from export.network import NetworkConfig, SuperSdfNet
+from super_sdf.band import CENTRE, REACH, find_band, gather_patches, neighbour_table
 from super_sdf.network import FORMAT_VERSION, load_network
 from super_sdf.nodes import block_offsets
 
@@ -94,8 +94,8 @@ def build_graph(net: SuperSdfNet) -> onnx.GraphProto:
     per_offset = graph.op("Concat", trunk(graph, net), interpolation(graph), axis=1)
     transposed = graph.op("Transpose", per_offset, perm=[1, 0])
     kept = graph.op("MatMul", per_voxel, transposed)
-    shift = graph.layer(chosen, net.correction)
-    correction = graph.op("Shrink", shift, lambd=DEAD_ZONE, bias=DEAD_ZONE)
+    noisy = graph.op("Gather", noisy_voxels(graph), "voxels", axis=0)
+    correction = graph.op("Mul", graph.layer(chosen, net.correction), noisy)
     graph.nodes.append(helper.make_node("Add", [kept, correction], ["values"]))
     return helper.make_graph(graph.nodes, "super_sdf", inputs(), [output()], graph.constants)
 
@@ -148,6 +148,19 @@ def scan_block(
     stacked = graph.op("Scan", chunks, body=subgraph, num_scan_inputs=1)
     flat = graph.op("Reshape", stacked, graph.integers(-1, channels))
     return graph.op("Slice", flat, graph.integers(0), rows, graph.integers(0))
+
+
+def noisy_voxels(graph: Graph) -> str:
+    """Add which voxels are noisy, (V, 1) of 0 and 1: see network.is_noisy."""
+    centre = graph.op("Gather", "patches", graph.integers(CENTRE), axis=1)
+    apart = graph.op("Abs", graph.op("Sub", "patches", centre))
+    excess = graph.op("Sub", apart, graph.constant(REACH))
+    most = graph.op("ReduceMax", excess, graph.integers(1), keepdims=0)
+    ended = graph.op("Concat", most, graph.constant(np.zeros(1, np.float32)), axis=0)
+    around = graph.op("Gather", ended, "neighbours", axis=0)
+    worst = graph.op("ReduceMax", around, graph.integers(1), keepdims=1)
+    above = graph.op("Greater", worst, graph.constant(np.float32(0)))
+    return graph.op("Cast", above, to=TensorProto.FLOAT)
 
 
 def trunk(graph: Graph, net: SuperSdfNet) -> str:

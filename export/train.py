@@ -41,13 +41,13 @@ LOG_COLUMNS = ("step", "seconds", "samples", "loss", "held-out", "near", "normal
 def predict(net: SuperSdfNet, batch: list[Prepared]) -> list[tuple[Tensor, Tensor]]:
     """Return prediction and target, (D, Q), of each sample."""
     device = next(net.parameters()).device
-    patches, features = net.encode_batch(batch)
+    encoded = net.encode_batch(batch)
     starts = np.cumsum([0] + [len(sample.patches) for sample in batch])
     pairs = []
     for sample, start in zip(batch, starts[:-1]):
         rows = torch.from_numpy(sample.voxels + start).to(device)
         offsets, target = (torch.from_numpy(a).to(device) for a in (sample.offsets, sample.targets))
-        pairs.append((net.decode(features[rows], patches[rows], offsets), target))
+        pairs.append((net.decode(encoded.some(rows), offsets), target))
     return pairs
 
 

@@ -11,12 +11,14 @@ from torch import Tensor, nn
 from export.augment import Prepared, batch_table
 from export.network import (
     Block,
+    Encoded,
     NeighbourConv,
     NetworkConfig,
     SuperSdfNet,
     Trunk,
     gather,
     interpolation_weights,
+    is_noisy,
 )
 from super_sdf.band import NEIGHBOURHOOD, neighbour_table
 
@@ -119,8 +121,8 @@ class UNet(SuperSdfNet):
         self.ups = nn.ModuleList(nn.Linear(channels, channels) for _ in range(self.LEVELS))
         self.coarse = nn.ModuleList(Block(config) for _ in range(4 * self.LEVELS - 2))
 
-    def encode_batch(self, batch: Sequence[Prepared]) -> tuple[Tensor, Tensor]:
-        """Return patches and features of samples laid end to end."""
+    def encode_batch(self, batch: Sequence[Prepared]) -> Encoded:
+        """Encode samples laid end to end."""
         patches = torch.from_numpy(np.concatenate([sample.patches for sample in batch]))
         ijk, tables = [sample.ijk for sample in batch], [sample.table for sample in batch]
         levels, parents = [torch.from_numpy(batch_table(tables))], []
@@ -128,7 +130,8 @@ class UNet(SuperSdfNet):
             ijk, rows, tables = zip(*map(coarsen, ijk))
             parents.append(torch.from_numpy(join_parents(rows, tables)))
             levels.append(torch.from_numpy(batch_table(tables)))
-        return patches, self.descend(self.stem(patches), levels, parents, list(self.coarse), 0)
+        features = self.descend(self.stem(patches), levels, parents, list(self.coarse), 0)
+        return Encoded(features, patches, is_noisy(patches, levels[0]))
 
     def descend(
         self, features: Tensor, tables: list[Tensor], parents: list[Tensor], blocks: list, at: int

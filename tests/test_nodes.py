@@ -10,7 +10,6 @@ from super_sdf.nodes import (
     block_ijk,
     block_offsets,
     check_factor,
-    keep_samples,
     number_shared_nodes,
     pin_to_skipped,
 )
@@ -62,16 +61,6 @@ def test_shared_nodes_are_plain_means():
     node = position[123]
     same = (position == node).all(1)
     assert values[numbers.ravel()[123]] == pytest.approx(blocks.ravel()[same].mean(), rel=1e-6)
-
-
-def test_samples_come_back_bit_for_bit():
-    voxels, table = some_voxels(3)
-    numbers, count = number_shared_nodes(table, 4)
-    samples = np.random.default_rng(0).normal(size=len(voxels)).astype(np.float32)
-    values = np.zeros(count, np.float32)
-    keep_samples(values, numbers, samples)
-    middle = (block_offsets(4) == 0).all(1)
-    np.testing.assert_array_equal(values[numbers[:, middle]].ravel(), samples)
 
 
 def test_pinned_nodes_take_the_sign_of_the_skipped_voxel():

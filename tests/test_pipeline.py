@@ -112,9 +112,7 @@ def test_decoding_only_what_can_hold_the_surface_loses_nothing(noise, monkeypatc
     noisy = SdfGrid(values, grid.spacing)
     some = upsample(noisy, trilinear)
     part = reconstruct(noisy, trilinear)
-    monkeypatch.setattr(
-        pipeline, "can_hold_surface", lambda patches, _: np.ones(len(patches), bool)
-    )
+    monkeypatch.setattr(pipeline, "can_hold_surface", lambda patches: np.ones(len(patches), bool))
     whole = reconstruct(noisy, trilinear)
     assert some.pinned == 0
     assert len(part.faces) == len(whole.faces)

@@ -23,6 +23,8 @@ LIPSCHITZ_SLACK = 0.1
 # The 27 voxels of a neighbourhood, in the order of patches and neighbour tables; 13 is the centre.
 NEIGHBOURHOOD: IntArray = np.indices((3, 3, 3)).reshape(3, 27).T.astype(np.int32) - 1
 CENTRE = 13
+# How far the sample in the middle and that at each place may differ.
+REACH = (2 * np.linalg.norm(NEIGHBOURHOOD, axis=1) + LIPSCHITZ_SLACK).astype(np.float32)
 
 
 def rescale(grid: SdfGrid, offset: float = 0.0) -> FloatArray:
@@ -123,24 +125,16 @@ def is_lipschitz(patches: FloatArray) -> BoolArray:
     """
     centre = patches[:, CENTRE]
     keeps = np.ones(len(patches), bool)
-    reach = 2 * np.linalg.norm(NEIGHBOURHOOD, axis=1) + LIPSCHITZ_SLACK
     for column in range(27):
-        keeps &= np.abs(patches[:, column] - centre) <= reach[column]
+        keeps &= np.abs(patches[:, column] - centre) <= REACH[column]
     return keeps
 
 
-def can_hold_surface(patches: FloatArray, lipschitz: BoolArray) -> BoolArray:
+def can_hold_surface(patches: FloatArray) -> BoolArray:
     """Say which voxels, (V,) of bool, may contain a piece of the surface.
 
     If its patch is of distances (``is_lipschitz``), a voxel whose sample is farther than its corner
     holds no surface. Else the sample proves nothing, and the voxel is kept.
     """
     near: BoolArray = np.abs(patches[:, CENTRE]) <= DECODE_LIMIT
-    return near | ~lipschitz
-
-
-def all_around(flags: BoolArray, table: IntArray) -> BoolArray:
-    """Say of which rows of a neighbour table, (D, 27), every neighbour is flagged, (V,)."""
-    around = np.append(flags, True)[table]  # -1, absent, reads the last
-    held: BoolArray = np.logical_and.reduce(around, axis=1)
-    return held
+    return near | ~is_lipschitz(patches)

@@ -103,11 +103,6 @@ def average_shared(blocks: FloatArray, numbers: IntArray, count: int) -> FloatAr
     return (total / np.bincount(flat, minlength=count)).astype(np.float32)
 
 
-def keep_samples(values: FloatArray, numbers: IntArray, samples: FloatArray) -> None:
-    """Put the coarse samples, (D,), back at their nodes: the middles of the blocks (Sec. 4.1)."""
-    values[numbers[:, numbers.shape[1] // 2]] = samples
-
-
 def pin_to_skipped(values: FloatArray, numbers: IntArray, skipped: IntArray, factor: int) -> int:
     """Give nodes shared with a voxel that was not decoded that voxel's sign.
 

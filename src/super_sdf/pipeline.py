@@ -15,11 +15,9 @@ import numpy as np
 
 from .band import (
     NEIGHBOURHOOD,
-    all_around,
     can_hold_surface,
     find_band,
     gather_patches,
-    is_lipschitz,
     neighbour_table,
     rescale,
 )
@@ -33,7 +31,6 @@ from .nodes import (
     average_shared,
     block_offsets,
     check_factor,
-    keep_samples,
     number_shared_nodes,
     pin_to_skipped,
 )
@@ -103,8 +100,7 @@ def upsample(
         raise no_surface(grid, offset)
     patches = gather_patches(rescaled, band_ijk)
     table = neighbour_table(band_ijk, grid.shape)
-    lipschitz = is_lipschitz(patches)
-    voxels = np.flatnonzero(can_hold_surface(patches, lipschitz)).astype(np.int32)
+    voxels = np.flatnonzero(can_hold_surface(patches)).astype(np.int32)
     need = len(voxels) * (factor + 1) ** 3 * BYTES_PER_BLOCK_NODE
     check_fits(need, f"factor {factor} on {len(voxels):,} voxels", "use a smaller factor")
     tell(1, len(STEPS))
@@ -116,8 +112,6 @@ def upsample(
     own_table = neighbours_among(voxels, table)
     numbers, count = number_shared_nodes(own_table, factor)
     values = average_shared(blocks, numbers, count)  # Eq. 7
-    kept = all_around(lipschitz, table[voxels])  # a noisy sample is the network's to correct
-    keep_samples(values, numbers[kept], rescaled[tuple(voxel_ijk[kept].T)])
     skipped = skipped_neighbours(own_table, patches[voxels], voxel_ijk, grid.shape)
     pinned = pin_to_skipped(values, numbers, skipped, factor)
     if (values > 0).all() or (values <= 0).all():

@@ -14,16 +14,14 @@ from scipy import ndimage
 from skimage.measure import marching_cubes
 
 from ..band import (
-    all_around,
     find_band,
     gather_patches,
-    is_lipschitz,
     neighbour_table,
     rescale,
 )
 from ..grid import FloatArray, IntArray, SdfGrid
 from ..mesh import Mesh
-from ..nodes import average_shared, block_ijk, block_offsets, keep_samples, number_shared_nodes
+from ..nodes import average_shared, block_ijk, block_offsets, number_shared_nodes
 from ..pipeline import Decoder, reconstruct
 from .cases import Case, spread_samples
 
@@ -102,8 +100,6 @@ def band_field(grid: SdfGrid, voxels: IntArray, network: Decoder, factor: int) -
     blocks = network(patches, table, every, block_offsets(factor))
     numbers, count = number_shared_nodes(table, factor)
     values = average_shared(blocks, numbers, count)
-    kept = all_around(is_lipschitz(patches), table)
-    keep_samples(values, numbers[kept], rescaled[tuple(voxels[kept].T)])
     nodes = factor * voxels[:, None] + block_ijk(factor)  # (V, Q, 3)
     field = np.full([factor * n + 1 for n in grid.shape], np.nan, np.float32)
     field[tuple(np.moveaxis(nodes, 2, 0))] = values[numbers] * np.float32(grid.voxel_size / 2)
