@@ -21,6 +21,7 @@ import torch
 
 from export import variants
 from export.augment import CLEAN, USUAL
+from export.latency import ball, microseconds
 from export.network import NetworkConfig, SuperSdfNet
 from export.recipe import RECIPE, Recipe
 from export.train import Errors, Run, Store, measure
@@ -102,7 +103,7 @@ def main() -> None:
             errors = measure(run.average, store.held_out)
             append_row(rows, name, run, errors)
             print(name, errors, flush=True)
-    print(format_table(read_rows(rows)))
+    print(format_table(with_times(read_rows(rows))))
 
 
 def append_row(path: Path, name: str, run: Run, errors: Errors) -> None:
@@ -119,15 +120,25 @@ def read_rows(path: Path) -> dict[str, dict[str, float]]:
     return {row["name"]: row for row in map(json.loads, lines)}
 
 
+def with_times(rows: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
+    """Add to each row how long the network takes on one thread."""
+    sample = ball(20.0)
+    makers = {name: ENTRIES[name][:2] for name in rows}
+    return {
+        name: {**rows[name], "us": microseconds(make(config), sample, 1)}
+        for name, (make, config) in makers.items()
+    }
+
+
 def format_table(rows: dict[str, dict[str, float]]) -> str:
     """Return the table in Markdown."""
     lines = [
-        "| network | parameters | steps | error | near the surface | normal |",
-        "| --- | ---: | ---: | ---: | ---: | ---: |",
+        "| network | parameters | us a voxel | steps | error | near the surface | normal |",
+        "| --- | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]
     for name, row in rows.items():
         lines.append(
-            f"| {name} | {row['parameters'] / 1e3:.0f} k | {row['steps']} | "
+            f"| {name} | {row['parameters'] / 1e3:.0f} k | {row['us']:.1f} | {row['steps']} | "
             f"{100 * row['everywhere']:.2f} | {100 * row['near']:.2f} | {100 * row['normal']:.2f} |"
         )
     return "\n".join(lines)

@@ -124,14 +124,29 @@ class UNet(SuperSdfNet):
     def encode_batch(self, batch: Sequence[Prepared]) -> Encoded:
         """Encode samples laid end to end."""
         patches = torch.from_numpy(np.concatenate([sample.patches for sample in batch]))
+        tables, parents = self.levels(batch)
+        features = self.descend(self.stem(patches), tables, parents, list(self.coarse), 0)
+        return Encoded(features, patches, is_noisy(patches, tables[0]))
+
+    def levels(self, batch: Sequence[Prepared]) -> tuple[list[Tensor], list[Tensor]]:
+        """Return the neighbour table of each level, and the parents of all but the coarsest."""
         ijk, tables = [sample.ijk for sample in batch], [sample.table for sample in batch]
         levels, parents = [torch.from_numpy(batch_table(tables))], []
         for _ in range(self.LEVELS):
             ijk, rows, tables = zip(*map(coarsen, ijk))
             parents.append(torch.from_numpy(join_parents(rows, tables)))
             levels.append(torch.from_numpy(batch_table(tables)))
-        features = self.descend(self.stem(patches), levels, parents, list(self.coarse), 0)
-        return Encoded(features, patches, is_noisy(patches, levels[0]))
+        return levels, parents
+
+    def forward(
+        self, patches: Tensor, table: Tensor, voxels: Tensor, offsets: Tensor, *coarser: Tensor
+    ) -> Tensor:
+        """Return the values (D, Q), given the coarser tables and all parents besides."""
+        table = torch.where(table < 0, len(patches), table)
+        tables, parents = [table, *coarser[: self.LEVELS]], list(coarser[self.LEVELS :])
+        features = self.descend(self.stem(patches), tables, parents, list(self.coarse), 0)
+        encoded = Encoded(features, patches, is_noisy(patches, table))
+        return self.decode(encoded.some(voxels), offsets)
 
     def descend(
         self, features: Tensor, tables: list[Tensor], parents: list[Tensor], blocks: list, at: int
@@ -169,9 +184,11 @@ def join_parents(rows: Sequence[np.ndarray], tables: Sequence[np.ndarray]) -> np
 
 def mean_of_children(features: Tensor, parents: Tensor, count: int) -> Tensor:
     """Return the mean over the children of each of so many parents, (count, C)."""
-    ones = torch.ones(len(parents), 1)
-    number = torch.zeros(count, 1).index_add_(0, parents, ones)
-    return torch.zeros(count, features.shape[1]).index_add_(0, parents, features.float()) / number
+    # A column of ones counts the children.
+    marked = torch.cat([features.float(), features.new_ones(len(features), 1).float()], 1)
+    rows = parents[:, None].expand(-1, marked.shape[1])
+    total = torch.zeros(count, marked.shape[1]).scatter_add(0, rows, marked)
+    return total[:, :-1] / total[:, -1:]
 
 
 # How values are read from the features.

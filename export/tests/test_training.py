@@ -28,6 +28,7 @@ from export.dataset import (
     read_shard,
     write_shard,
 )
+from export.latency import ball, microseconds
 from export.network import (
     GatherMatMul,
     NetworkConfig,
@@ -39,6 +40,7 @@ from export.recipe import RECIPE, differences, rate_factor
 from export.shapes import random_solid
 from export.to_onnx import make_card, parity, read_weights, write_model
 from export.train import Errors, Run, Store, log, read_log, sample_errors, train
+from export.variants import UNet
 from super_sdf import Mesh, load_network
 from super_sdf.band import CENTRE, NEIGHBOURHOOD, find_band, is_lipschitz, neighbour_table
 from super_sdf.evaluation.sampling import sample_grid
@@ -266,8 +268,14 @@ def test_noisy_are_the_voxels_whose_neighbours_are_no_distance(samples):
 def test_a_row_is_kept_and_shown(tmp_path):
     run = Run(tmp_path, SuperSdfNet(SMALL))
     append_row(tmp_path / "rows.jsonl", "ours", run, Errors(0.01, 0.02, 0.03))
-    table = format_table(read_rows(tmp_path / "rows.jsonl"))
-    assert table.endswith("| ours | 6 k | 0 | 1.00 | 2.00 | 3.00 |")
+    (row,) = read_rows(tmp_path / "rows.jsonl").values()
+    table = format_table({"ours": {**row, "us": 7.03}})
+    assert table.endswith("| ours | 6 k | 7.0 | 0 | 1.00 | 2.00 | 3.00 |")
+
+
+@pytest.mark.parametrize("make", [SuperSdfNet, UNet])
+def test_any_make_is_timed_in_onnxruntime(make):
+    assert 0 < microseconds(make(SMALL), ball(3.0), 1) < 1e4
 
 
 def test_the_rate_warms_up_and_anneals():
