@@ -50,6 +50,7 @@ ENTRIES: dict[str, Entry] = {
     "U-Net, two coarser levels": (variants.UNet, replace(OURS, blocks=4), HIGH),
     "head: block of 125 values": (variants.BlockHead, OURS, HIGH),
     "head: network a query": (variants.QueryHead, OURS, HIGH),
+    "head: planes": (variants.PlanesHead, OURS, HIGH),
     "over trilinear": (variants.TrilinearBase, OURS, HIGH),
     "loss: squared": (SuperSdfNet, OURS, replace(HIGH, power=2)),
     "loss: no gradient": (SuperSdfNet, OURS, replace(HIGH, gradient_weight=0.0)),

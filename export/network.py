@@ -48,7 +48,7 @@ class NetworkConfig:
 
 
 SIZES = {
-    "fast": NetworkConfig(channels=48, blocks=3, hidden=96, functions=128),
+    "fast": NetworkConfig(blocks=3, functions=192),
     "base": NetworkConfig(),
 }
 """The networks that are shipped, by name."""

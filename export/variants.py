@@ -247,6 +247,23 @@ class DeepBranch(SuperSdfNet):
         return self.branch(features).float() @ self.trunk(offsets).float().T
 
 
+class PlanesHead(SuperSdfNet):
+    """Adds ramps in the voxel: what bends along planes of its own, as distances do at an edge."""
+
+    PLANES = 16
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__(config)
+        self.planes = nn.Linear(config.channels, 5 * self.PLANES)
+
+    def residual(self, features: Tensor, offsets: Tensor) -> Tensor:
+        """Return what the network adds to the interpolation, (D, Q); 0 at the sample."""
+        planes = self.planes(features).float().view(len(features), self.PLANES, 5)
+        normal, shift, height = planes.split([3, 1, 1], 2)
+        ramps = torch.relu(normal @ offsets.T + shift) - torch.relu(shift)
+        return super().residual(features, offsets) + (height.transpose(1, 2) @ ramps)[:, 0]
+
+
 # What the network adds to.
 
 
