@@ -27,6 +27,7 @@ import igl
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from export.draws import draw_sway
 from export.shapes import random_solid
 from super_sdf import Mesh, SdfGrid
 from super_sdf.band import DECODE_LIMIT, find_band, rescale
@@ -36,6 +37,7 @@ from super_sdf.nodes import block_offsets
 
 CORNERS, FINE_NODES, ANYWHERE = 5, 4, 4  # queries: 4 a corner, 28 in all
 SMALLEST, LARGEST = 7, 100  # voxels along a shape's diagonal
+SWAYED = 0.3  # of the meshes
 WINDOW = 32  # samples along each axis: a whole shape at 32^3, a piece of it at 64^3
 SHARD = 50  # samples a file
 
@@ -158,12 +160,21 @@ def mesh_order(seed: int, prisms: list[Path], others: list[Path], count: int) ->
     return order
 
 
+def draw_mesh(rng: np.random.Generator, path: Path) -> Mesh:
+    """Read a mesh; some are bent by smooth waves, so that few faces stay flat or in line."""
+    mesh = read_mesh(path)
+    if rng.random() >= SWAYED:
+        return mesh
+    diagonal = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
+    return Mesh(draw_sway(rng, 0.6)(mesh.vertices / diagonal), mesh.faces)
+
+
 def fill_shard(rng: np.random.Generator, files: Sequence[Path], procedural: float) -> list[Sample]:
     """Make a shard's samples; a procedural shape stands in for a mesh that shows nothing."""
     samples: list[Sample] = []
     for number in range(SHARD):
         drawn = not files or rng.random() < procedural
-        sample = make_sample(rng, random_solid(rng) if drawn else read_mesh(files[number]))
+        sample = make_sample(rng, random_solid(rng) if drawn else draw_mesh(rng, files[number]))
         while sample is None:
             sample = make_sample(rng, random_solid(rng))
         samples.append(sample)

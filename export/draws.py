@@ -7,7 +7,7 @@ them, else in radians.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -58,8 +58,8 @@ def twisted(solid: Manifold, rate: float) -> Manifold:
     return solid.refine_to_length(0.05).warp_batch(turn)
 
 
-def swayed(rng: np.random.Generator, solid: Manifold, strength: float) -> Manifold:
-    """Move each point by sine waves of the position.
+def draw_sway(rng: np.random.Generator, strength: float) -> Callable[[np.ndarray], np.ndarray]:
+    """Draw a map of points (n, 3) of about unit size that adds sine waves of the position.
 
     With ``strength`` below 1, which bounds the derivative of the shift, no two points can meet.
     """
@@ -69,7 +69,12 @@ def swayed(rng: np.random.Generator, solid: Manifold, strength: float) -> Manifo
     lengths = np.linalg.norm(shifts, axis=1) * np.linalg.norm(waves, axis=1)
     shifts *= (strength / 3 / lengths)[:, None]
     phases = rng.uniform(0, 2 * np.pi, 3)
-    return solid.warp_batch(lambda points: points + np.sin(points @ waves.T + phases) @ shifts)
+    return lambda points: points + np.sin(points @ waves.T + phases) @ shifts
+
+
+def swayed(rng: np.random.Generator, solid: Manifold, strength: float) -> Manifold:
+    """Move each point of a solid by sine waves of the position: see ``draw_sway``."""
+    return solid.warp_batch(draw_sway(rng, strength))
 
 
 def wound(bar: Manifold, coil: float, rise: float, turns: float) -> Manifold:

@@ -20,13 +20,19 @@ from export.slender import frame, lattice, pipe, shell, thin
 
 Family = Callable[[np.random.Generator], Manifold]
 
-FAMILIES: dict[str, Family] = {
-    family.__name__: family
-    for family in (
-        prism, csg, lathe, rounded, facets,
-        filleted, chamfered,
-        plate, gear, repeated, threads, ribs,
-        shell, frame, pipe, thin, lattice, text,
-        blobs, gyroid, blends, creature, displaced,
-    )
-}  # fmt: skip
+MACHINED: tuple[Family, ...] = (
+    prism, csg, lathe, rounded, facets,
+    filleted, chamfered,
+    plate, gear, repeated, threads, ribs,
+    shell, frame, pipe, thin, lattice, text,
+)  # fmt: skip
+GROWN: tuple[Family, ...] = (blobs, gyroid, blends, creature, displaced)
+FAMILIES: dict[str, Family] = {family.__name__: family for family in (*MACHINED, *GROWN)}
+
+GROWN_SHARE = 0.4  # few of the meshes at hand have smooth, irregular shapes
+
+
+def draw_family(rng: np.random.Generator) -> Family:
+    """Draw a family."""
+    families = GROWN if rng.random() < GROWN_SHARE else MACHINED
+    return families[rng.integers(len(families))]

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from export.basic import primitive
 from export.draws import joined, log_uniform, swayed, turned, twisted, unit_sized
-from export.families import FAMILIES
+from export.families import draw_family
 from super_sdf import Mesh
 
 ATTEMPTS = 20  # about one candidate in a hundred fails, mostly by too many faces
@@ -71,10 +71,9 @@ def with_features(rng: np.random.Generator, solid: Manifold) -> Manifold:
 
 def draw_candidate(rng: np.random.Generator) -> Manifold:
     """Draw a solid of one family or two, perhaps with features and a bend, its diagonal 1."""
-    families = list(FAMILIES.values())
-    solid = unit_sized(families[rng.integers(len(families))](rng))
+    solid = unit_sized(draw_family(rng)(rng))
     if rng.random() < 0.15:
-        other = unit_sized(turned(rng, families[rng.integers(len(families))](rng)))
+        other = unit_sized(turned(rng, draw_family(rng)(rng)))
         other = other.scale([rng.uniform(0.3, 0.9)] * 3).translate(list(rng.uniform(-0.2, 0.2, 3)))
         solid = solid + other if rng.random() < 0.6 else solid - other
     if rng.random() < 0.4:
