@@ -27,8 +27,8 @@ import igl
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from export.draws import draw_sway
 from export.shapes import random_solid
+from export.shapes.draws import draw_sway
 from super_sdf import Mesh, SdfGrid
 from super_sdf.band import DECODE_LIMIT, find_band, rescale
 from super_sdf.evaluation.sampling import sample_grid

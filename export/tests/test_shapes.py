@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from manifold3d import Manifold
 
-from export import shapes
-from export.draws import log_uniform, unit_sized
-from export.families import FAMILIES
-from export.shapes import MAX_FACES, random_solid, without_crumbs
+from export.shapes import solid as shapes
+from export.shapes.draws import log_uniform, unit_sized
+from export.shapes.families import FAMILIES
+from export.shapes.solid import MAX_FACES, random_solid, without_crumbs
 from super_sdf import Mesh
 
 SEEDS = range(20)

@@ -10,7 +10,14 @@ import numpy as np
 from manifold3d import CrossSection, Manifold
 from scipy.spatial import cKDTree
 
-from export.draws import bars, draw_outline, joined, log_uniform, polar_polygon, sharp_outline
+from export.shapes.draws import (
+    bars,
+    draw_outline,
+    joined,
+    log_uniform,
+    polar_polygon,
+    sharp_outline,
+)
 
 QUARTER = np.linspace(0, np.pi / 2, 7)
 ROUND = np.stack([1 - np.cos(QUARTER), np.sin(QUARTER)], axis=1)  # inset and rise, from the wall on

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from manifold3d import CrossSection, Manifold, OpType
 
-from export.draws import draw_outline, log_uniform, polyline
+from export.shapes.draws import draw_outline, log_uniform, polyline
 
 GRID = np.stack(np.meshgrid([0.0, 0.5], [0.0, 0.5, 1.0]), axis=-1).reshape(-1, 2)
 

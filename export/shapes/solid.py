@@ -11,9 +11,9 @@ from manifold3d import Error, Manifold
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from export.basic import primitive
-from export.draws import joined, log_uniform, swayed, turned, twisted, unit_sized
-from export.families import draw_family
+from export.shapes.basic import primitive
+from export.shapes.draws import joined, log_uniform, swayed, turned, twisted, unit_sized
+from export.shapes.families import draw_family
 from super_sdf import Mesh
 
 ATTEMPTS = 20  # about one candidate in a hundred fails, mostly by too many faces

@@ -10,8 +10,16 @@ from manifold3d import CrossSection, Manifold
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial import Delaunay
 
-from export.basic import PARTS
-from export.draws import draw_outline, joined, log_uniform, polyline, swayed, unit_sized, wound
+from export.shapes.basic import PARTS
+from export.shapes.draws import (
+    draw_outline,
+    joined,
+    log_uniform,
+    polyline,
+    swayed,
+    unit_sized,
+    wound,
+)
 
 
 def shell(rng: np.random.Generator) -> Manifold:

@@ -8,7 +8,7 @@ import numpy as np
 from manifold3d import CrossSection, Manifold
 from scipy.interpolate import PchipInterpolator
 
-from export.draws import draw_outline, draw_segments, joined, log_uniform, turned, twisted
+from export.shapes.draws import draw_outline, draw_segments, joined, log_uniform, turned, twisted
 
 
 def prism(rng: np.random.Generator) -> Manifold:

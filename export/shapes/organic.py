@@ -11,8 +11,8 @@ import numpy as np
 from manifold3d import Manifold, Mesh64
 from skimage.measure import marching_cubes
 
-from export.basic import rounded
-from export.draws import log_uniform, unit_sized
+from export.shapes.basic import rounded
+from export.shapes.draws import log_uniform, unit_sized
 
 FLATNESS = 3e-4  # of the unit; how far fewer faces may depart from a level set
 

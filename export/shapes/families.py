@@ -11,12 +11,12 @@ from collections.abc import Callable
 import numpy as np
 from manifold3d import Manifold
 
-from export.basic import csg, facets, lathe, prism, rounded
-from export.edges import chamfered, filleted
-from export.lettering import text
-from export.mechanical import gear, plate, repeated, ribs, threads
-from export.organic import blends, blobs, creature, displaced, gyroid
-from export.slender import frame, lattice, pipe, shell, thin
+from export.shapes.basic import csg, facets, lathe, prism, rounded
+from export.shapes.edges import chamfered, filleted
+from export.shapes.lettering import text
+from export.shapes.mechanical import gear, plate, repeated, ribs, threads
+from export.shapes.organic import blends, blobs, creature, displaced, gyroid
+from export.shapes.slender import frame, lattice, pipe, shell, thin
 
 Family = Callable[[np.random.Generator], Manifold]
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from manifold3d import CrossSection, Manifold, OpType
 
-from export.basic import primitive
-from export.draws import (
+from export.shapes.basic import primitive
+from export.shapes.draws import (
     draw_outline,
     joined,
     log_uniform,
