@@ -82,16 +82,19 @@ def draw_offsets(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_sample(rng: np.random.Generator, mesh: Mesh) -> Sample | None:
-    """Sample a shape; None where none of its samples is inside, or all are."""
+    """Sample a shape; None where it is not seen: no sample is near it, or all are inside.
+
+    What is so thin that no sample lies inside is kept: it can be told from its distances.
+    """
     posed = draw_pose(rng, mesh)
     shape, first = draw_window(rng, posed)
     solid = Solid(posed)
     values = sample_grid(solid, (shape, 1.0, first))
-    if not (values < 0).any() or not (values > 0).any():
-        return None
     window = rescale(SdfGrid(values, (1.0, 1.0, 1.0)))
     band = find_band(window)
     voxel_ijk = band[np.abs(window[tuple(band.T)]) <= DECODE_LIMIT]
+    if not len(voxel_ijk) or (values < 0).all():
+        return None
     offsets = draw_offsets(rng)
     points = (voxel_ijk[:, None] + first + offsets / 2).reshape(-1, 3)
     targets = 2 * signed_distance(rng, solid, points).reshape(len(voxel_ijk), -1)

@@ -21,7 +21,13 @@ import torch
 from export.augment import Prepared
 from export.network import SuperSdfNet
 from export.variants import UNet
-from super_sdf.band import can_hold_surface, find_band, gather_patches, neighbour_table
+from super_sdf.band import (
+    can_hold_surface,
+    find_band,
+    gather_patches,
+    is_lipschitz,
+    neighbour_table,
+)
 from super_sdf.network import load_network
 from super_sdf.nodes import block_offsets
 
@@ -36,7 +42,7 @@ def ball(radius: float = 35.0) -> Prepared:
     field = (2 * distance).astype(np.float32)
     band = find_band(field)
     patches = gather_patches(field, band)
-    voxels = np.flatnonzero(can_hold_surface(patches)).astype(np.int32)
+    voxels = np.flatnonzero(can_hold_surface(patches, is_lipschitz(patches))).astype(np.int32)
     targets = np.zeros((len(voxels), 0), np.float32)
     return Prepared(band, patches, neighbour_table(band, shape), voxels, block_offsets(4), targets)
 

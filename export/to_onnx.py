@@ -174,7 +174,11 @@ def trunk(graph: Graph, net: SuperSdfNet) -> str:
     first, _, second, _, last = net.trunk.layers
     value = graph.silu(graph.layer(value, first))
     value = graph.silu(graph.layer(value, second))
-    return graph.op("Sub", graph.layer(value, last), at_sample)
+    functions = graph.op("Sub", graph.layer(value, last), at_sample)
+    # Exactly 0 at the sample, however that was rounded: samples that are 0 must stay 0.
+    length = graph.op("ReduceMax", graph.op("Abs", "offsets"), graph.integers(1), keepdims=1)
+    elsewhere = graph.op("Greater", length, graph.constant(np.float32(0)))
+    return graph.op("Mul", functions, graph.op("Cast", elsewhere, to=TensorProto.FLOAT))
 
 
 def interpolation(graph: Graph) -> str:

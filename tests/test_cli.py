@@ -77,6 +77,14 @@ def test_steps_in_place_of_distances_are_closed_all_the_same(here, command):
     assert trimesh.load("out.ply").is_watertight
 
 
+def test_noise_is_told(here, command):
+    values = ball().values + np.random.default_rng(0).uniform(-0.3, 0.3, (20, 20, 20))
+    np.save("noisy.npy", values)
+    code, out, err = command("upsample", "noisy.npy", "out.ply", "--spacing", "1", "--json")
+    assert code == 0 and json.loads(out)["noisy_voxels"] > 0
+    assert " % of the band the values differ by more than distances can: they are taken" in err
+
+
 def test_fine_values_that_contradict_the_coarse_ones_are_warned_of(here, command, monkeypatch):
     from super_sdf.network import Network
 

@@ -27,7 +27,7 @@ def dense_field(lattice: np.ndarray, factor: int = 2) -> tuple[FineField, SdfGri
     values[numbers] = lattice[tuple(np.moveaxis(position, 2, 0))]
     half = 0.5 - 0.5 / factor  # so that vertices come out in fine lattice indices
     grid = SdfGrid(np.zeros(shape, np.float32), (float(factor),) * 3, (half * factor + 0.5,) * 3)
-    return FineField(shape, factor, voxels, numbers, values, len(voxels), 0), grid
+    return FineField(shape, factor, voxels, numbers, values, len(voxels), 0, 0), grid
 
 
 def test_every_case_uses_exactly_its_crossed_edges():

@@ -46,12 +46,32 @@ def test_a_sphere_is_within_a_twentieth_of_a_voxel(network, factor):
     assert mesh.open_edges() == 0 and mesh.volume() > 0
 
 
+def values_at_samples(field):
+    middle = (block_ijk(4) == 2).all(1)
+    return field.values[field.numbers[:, middle]].ravel() / 2
+
+
 def test_coarse_samples_are_kept(network):
     grid = ball()
     field = upsample(grid, network)
-    middle = (block_ijk(4) == 2).all(1)
-    kept = field.values[field.numbers[:, middle]].ravel() / 2
-    np.testing.assert_allclose(kept, grid.values[tuple(field.voxel_ijk.T)], rtol=1e-6)
+    assert field.noisy_voxels == 0
+    samples = grid.values[tuple(field.voxel_ijk.T)]
+    np.testing.assert_allclose(values_at_samples(field), samples, rtol=1e-6)
+    grid.values[np.abs(grid.values) < 0.02] = 0
+    field = upsample(grid, network)
+    kept, samples = values_at_samples(field), grid.values[tuple(field.voxel_ijk.T)]
+    assert (kept[samples == 0] == 0).all() and (samples == 0).any()
+
+
+def test_noisy_samples_are_corrected(network):
+    clean = ball(24, 8.0)
+    noise = np.random.default_rng(0).uniform(-0.4, 0.4, clean.shape)
+    field = upsample(SdfGrid(clean.values + noise, clean.spacing), network)
+    assert field.noisy_voxels > 0.5 * field.band_voxels
+    before, after = noise[tuple(field.voxel_ijk.T)], values_at_samples(field)
+    wanted = clean.values[tuple(field.voxel_ijk.T)]
+    near = np.abs(wanted) < 0.5
+    assert np.abs(after - wanted)[near].mean() < 0.5 * np.abs(before)[near].mean()
 
 
 def test_voxels_agree_on_shared_faces_by_construction(network):
@@ -112,7 +132,9 @@ def test_decoding_only_what_can_hold_the_surface_loses_nothing(noise, monkeypatc
     noisy = SdfGrid(values, grid.spacing)
     some = upsample(noisy, trilinear)
     part = reconstruct(noisy, trilinear)
-    monkeypatch.setattr(pipeline, "can_hold_surface", lambda patches: np.ones(len(patches), bool))
+    monkeypatch.setattr(
+        pipeline, "can_hold_surface", lambda patches, _: np.ones(len(patches), bool)
+    )
     whole = reconstruct(noisy, trilinear)
     assert some.pinned == 0
     assert len(part.faces) == len(whole.faces)

@@ -130,11 +130,11 @@ def is_lipschitz(patches: FloatArray) -> BoolArray:
     return keeps
 
 
-def can_hold_surface(patches: FloatArray) -> BoolArray:
+def can_hold_surface(patches: FloatArray, lipschitz: BoolArray) -> BoolArray:
     """Say which voxels, (V,) of bool, may contain a piece of the surface.
 
     If its patch is of distances (``is_lipschitz``), a voxel whose sample is farther than its corner
     holds no surface. Else the sample proves nothing, and the voxel is kept.
     """
     near: BoolArray = np.abs(patches[:, CENTRE]) <= DECODE_LIMIT
-    return near | ~is_lipschitz(patches)
+    return near | ~lipschitz

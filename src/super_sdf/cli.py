@@ -196,6 +196,12 @@ class Upsampling:
             self.warnings.append(
                 "the surface runs out of the grid and is open there (close it with --cap)"
             )
+        if self.field.noisy_voxels:
+            share = 100 * self.field.noisy_voxels / self.field.band_voxels
+            self.warnings.append(
+                f"in {share:.2g} % of the band the values differ by more than distances can: they "
+                "are taken for noisy there, and corrected"
+            )
         if self.field.pinned:
             self.warnings.append(
                 f"{self.field.pinned} fine values contradict the coarse ones around them and were "
@@ -217,6 +223,7 @@ class Upsampling:
             "model": self.options["model"] or self.options["quality"],
             "device": self.network.device,
             "band_voxels": self.field.band_voxels,
+            "noisy_voxels": self.field.noisy_voxels,
             "decoded_voxels": len(self.field.voxel_ijk),
             "nodes": len(self.field.values),
             "vertices": len(self.mesh.vertices),

@@ -29,6 +29,8 @@ class FineField:
         Signed distances in half voxels, negative inside.
     band_voxels : int
         Voxels that the network saw.
+    noisy_voxels : int
+        Those of them round which samples differ by more than distances can.
     pinned : int
         Nodes whose sign had to be set to that of a voxel that holds no surface: where this is not
         0, the input is no distance field there, or the network failed.
@@ -40,6 +42,7 @@ class FineField:
     numbers: IntArray
     values: FloatArray
     band_voxels: int
+    noisy_voxels: int
     pinned: int
 
     def inside_blocks(self, rows: BoolArray) -> BoolArray:

@@ -18,6 +18,7 @@ from .band import (
     can_hold_surface,
     find_band,
     gather_patches,
+    is_lipschitz,
     neighbour_table,
     rescale,
 )
@@ -100,7 +101,8 @@ def upsample(
         raise no_surface(grid, offset)
     patches = gather_patches(rescaled, band_ijk)
     table = neighbour_table(band_ijk, grid.shape)
-    voxels = np.flatnonzero(can_hold_surface(patches)).astype(np.int32)
+    lipschitz = is_lipschitz(patches)
+    voxels = np.flatnonzero(can_hold_surface(patches, lipschitz)).astype(np.int32)
     need = len(voxels) * (factor + 1) ** 3 * BYTES_PER_BLOCK_NODE
     check_fits(need, f"factor {factor} on {len(voxels):,} voxels", "use a smaller factor")
     tell(1, len(STEPS))
@@ -117,7 +119,8 @@ def upsample(
     if (values > 0).all() or (values <= 0).all():
         raise no_surface(grid, offset)
     tell(3, len(STEPS))
-    return FineField(grid.shape, factor, voxel_ijk, numbers, values, len(band_ijk), pinned)
+    noisy = int((~lipschitz).sum())
+    return FineField(grid.shape, factor, voxel_ijk, numbers, values, len(band_ijk), noisy, pinned)
 
 
 def reconstruct(
