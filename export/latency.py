@@ -3,7 +3,7 @@
     python -m export.latency models/base.onnx
 
 The graphs are those of PyTorch's exporter, which gathers all rows of a convolution at once; what is
-shipped goes chunk by chunk (``to_onnx``) and takes about two thirds of that.
+shipped goes chunk by chunk (``to_onnx``) and takes less.
 """
 
 from __future__ import annotations

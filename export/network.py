@@ -200,6 +200,10 @@ class SuperSdfNet(nn.Module):
         device = next(self.parameters()).device
         patches = torch.from_numpy(np.concatenate([sample.patches for sample in batch])).to(device)
         table = torch.from_numpy(batch_table([sample.table for sample in batch])).to(device)
+        return self.encode_all(patches, table)
+
+    def encode_all(self, patches: Tensor, table: Tensor) -> Encoded:
+        """Return the voxels of ``encode`` with all that the head takes."""
         return Encoded(self.encode(patches, table), patches, is_noisy(patches, table))
 
     def decode(self, voxels: Encoded, offsets: Tensor) -> Tensor:
@@ -220,8 +224,7 @@ class SuperSdfNet(nn.Module):
     def forward(self, patches: Tensor, table: Tensor, voxels: Tensor, offsets: Tensor) -> Tensor:
         """Return the values (D, Q) of the voxels (D,) at the offsets (Q, 3)."""
         table = torch.where(table < 0, len(patches), table)  # the row of zeros
-        encoded = Encoded(self.encode(patches, table), patches, is_noisy(patches, table))
-        return self.decode(encoded.some(voxels), offsets)
+        return self.decode(self.encode_all(patches, table).some(voxels), offsets)
 
 
 def interpolation_weights(offsets: Tensor) -> Tensor:

@@ -63,7 +63,7 @@ class Store:
         self.refresh()
 
     def refresh(self) -> None:
-        """Read the shards that are new, up to so many in all."""
+        """Read the shards that are new, up to so many at a time."""
         new = sorted(set(self.folder.glob("shard-*.npz")) - set(self.seen))
         for path in new[: self.most]:
             self.seen.append(path)

@@ -99,10 +99,7 @@ class WidePatchNet(SuperSdfNet):
 
     def encode(self, patches: Tensor, table: Tensor) -> Tensor:
         """Map patches (V, 27) and neighbours (V, 27; V where absent) to features (V, C)."""
-        features = self.stem(gather(patches, table))
-        for block in self.blocks:
-            features = block(features, table)
-        return features
+        return super().encode(gather(patches, table), table)
 
 
 class UNet(SuperSdfNet):
