@@ -5,7 +5,7 @@ What else was tried is in README's table; ``compare`` tried it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -32,6 +32,15 @@ class Recipe:
     gradient_weight: float = 0.5
     eikonal_weight: float = 0.0
     shares: Shares = USUAL
+
+    def at(self, rate: float, noisy: float) -> Recipe:
+        """Return the recipe with so many times its rates, and so many samples noisy."""
+        return replace(
+            self,
+            hidden_rate=rate * self.hidden_rate,
+            outer_rate=rate * self.outer_rate,
+            shares=replace(self.shares, noisy=noisy),
+        )
 
 
 RECIPE = Recipe()

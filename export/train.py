@@ -3,6 +3,7 @@
     python -m export.train --store training/store --run training/run --minutes 90
     python -m export.train --store training/store --run training/run --minutes 90     # goes on
     python -m export.train --store training/store --run training/run --device cuda    # a GPU
+    python -m export.train ... --start models/base.onnx --rate 0.7      # on from there
 
 A run folder holds ``checkpoint.pt`` (weights, averaged weights, optimisers, time spent),
 ``log.csv`` and ``loss.png``. The learning rate follows the share of ``--minutes`` that is spent, so
@@ -24,7 +25,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from export.augment import Prepared, augment, prepare
+from export.augment import USUAL, Prepared, augment, prepare
 from export.dataset import CORNERS, Sample, read_shard
 from export.network import SIZES, SuperSdfNet
 from export.recipe import RECIPE, Recipe, differences, loss_of, make_optimisers, rate_factor
@@ -232,12 +233,15 @@ def main() -> None:
     parser.add_argument("--size", choices=SIZES, default="base", help="of the network")
     parser.add_argument("--start", type=Path, help="an .onnx file of that size to start from")
     parser.add_argument("--minutes", type=float, default=90.0, help="of training, in all")
+    parser.add_argument("--rate", type=float, default=1.0, help="times the usual learning rates")
+    parser.add_argument("--noisy", type=float, default=USUAL.noisy, help="share of the samples")
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     options.run.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(options.seed)
-    run = Run(options.run, SuperSdfNet(SIZES[options.size]), device=options.device)
+    recipe = RECIPE.at(options.rate, options.noisy)
+    run = Run(options.run, SuperSdfNet(SIZES[options.size]), recipe, options.device)
     if options.start:
         run.start_from(read_weights(options.start))
     run.resume()

@@ -107,9 +107,15 @@ SYMMETRIES = [
 
 
 @pytest.mark.parametrize("name", ["stand-in", "shipped"])
-def test_symmetries_of_the_cube_carry_the_vertices_along(network, name):
-    """Exactly for an interpolation; the network was only trained to it: see the bounds."""
+def test_symmetries_of_the_cube_carry_the_vertices_along(network, name, monkeypatch):
+    """Exactly for an interpolation alone.
+
+    The network was only trained to it, and on the faces of cells the fit to the spheres takes one
+    side's gradient: see the bounds.
+    """
     answer, most, mean = (trilinear, 1e-5, 1e-5) if name == "stand-in" else (network, 0.25, 0.02)
+    if name == "stand-in":
+        monkeypatch.setattr(pipeline, "fit_to_spheres", lambda values, *_: values)
     ijk = np.indices((12, 12, 12)) - 5.5
     box = np.abs(ijk - np.array([0.3, -0.2, 0.1])[:, None, None, None])
     values = np.maximum(box[0] - 3.2, np.maximum(box[1] - 2.3, box[2] - 3.6))
@@ -138,9 +144,7 @@ def test_decoding_only_what_can_hold_the_surface_loses_nothing(noise, monkeypatc
     whole = reconstruct(noisy, trilinear)
     assert some.pinned == 0
     assert len(part.faces) == len(whole.faces)
-    np.testing.assert_array_equal(
-        np.unique(part.vertices, axis=0), np.unique(whole.vertices, axis=0)
-    )
+    assert cKDTree(part.vertices).query(whole.vertices)[0].max() < 1e-5  # sums in another order
 
 
 def test_an_offset_is_a_shift_of_the_field(network):

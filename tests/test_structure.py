@@ -13,7 +13,7 @@ FLOORS = [
     {"grid", "memory"},
     {"band", "mesh", "conventions", "cell_cases"},
     {"nodes", "io", "symmetry"},
-    {"field", "network"},
+    {"field", "network", "spheres"},
     {"isosurface"},
     {"pipeline"},
     {"cli_common", "__init__"},

@@ -1,6 +1,7 @@
 """The method on a page: the paper's Section 4, a named step a line.
 
-    grid -> band -> patches and neighbours -> network -> shared nodes averaged -> isosurface
+    grid -> band -> patches and neighbours -> network -> shared nodes averaged
+         -> surface moved to touch the samples' spheres -> isosurface
 
 >>> from super_sdf import SdfGrid, reconstruct
 >>> mesh = reconstruct(SdfGrid(values, spacing=0.1))            # doctest: +SKIP
@@ -35,6 +36,7 @@ from .nodes import (
     number_shared_nodes,
     pin_to_skipped,
 )
+from .spheres import Blocks, fit_to_spheres
 
 Progress = Callable[[int, int], None]
 """Called with (steps done, steps in all)."""
@@ -111,9 +113,11 @@ def upsample(
     tell(2, len(STEPS))
 
     voxel_ijk = band_ijk[voxels]
-    own_table = neighbours_among(voxels, table)
+    row_of = rows_among(voxels, len(band_ijk))
+    own_table = row_of[table[voxels]]  # -1, absent, reads the last row: -1 again
     numbers, count = number_shared_nodes(own_table, factor)
     values = average_shared(blocks, numbers, count)  # Eq. 7
+    values = fit_to_spheres(values, patches, Blocks(table, row_of, own_table, numbers, factor))
     skipped = skipped_neighbours(own_table, patches[voxels], voxel_ijk, grid.shape)
     pinned = pin_to_skipped(values, numbers, skipped, factor)
     if (values > 0).all() or (values <= 0).all():
@@ -161,12 +165,11 @@ def no_surface(grid: SdfGrid, offset: float) -> GridError:
     return GridError(f"no surface at {offset:g}: the values go from {low:.6g} to {high:.6g}")
 
 
-def neighbours_among(voxels: IntArray, table: IntArray) -> IntArray:
-    """Return the neighbour table, (D, 27), of a part of the band among itself."""
-    row_of = np.full(len(table) + 1, -1, np.int32)
+def rows_among(voxels: IntArray, count: int) -> IntArray:
+    """Return which row of ``voxels`` each of ``count`` voxels is, -1 if none; one -1 more."""
+    row_of = np.full(count + 1, -1, np.int32)
     row_of[voxels] = np.arange(len(voxels), dtype=np.int32)
-    among: IntArray = row_of[table[voxels]]  # -1, absent, reads the last row: -1 again
-    return among
+    return row_of
 
 
 def skipped_neighbours(

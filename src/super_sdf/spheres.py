@@ -1,0 +1,243 @@
+"""Every sample is the radius of a sphere that touches the surface: move the surface to touch them.
+
+The foot point of a sample x with distance d is the surface point nearest to it, x - d n with the
+surface's normal n there. What the refined field says at foot points should be 0. It is not quite,
+for a network sees a sample as one number among many. What it says there is spread over the
+neighbourhood and subtracted, first coarsely, so that walls between samples are found, then finer.
+
+Reference: Sellán, Batty and Stein, "Reach For the Spheres: Tangency-Aware Surface Reconstruction
+of SDFs", 2023, for the constraint; the solution here is another.
+
+Lengths are in half voxels, as in ``band``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .band import CENTRE, is_lipschitz
+from .grid import FloatArray, IntArray
+from .nodes import block_ijk, number_shared_nodes
+
+LATTICES = (1, 2)  # cells along a voxel on which the correction is piecewise linear, in turn
+DIRECTIONS = 3  # tried for each sample: the patch's gradient, then the field's where that led
+FARTHEST = 2.8  # samples near the band's edge, 3, may have been cut off there
+USUAL = 0.2  # a value at a foot point that is larger is less likely a matter of position ...
+LARGEST = 0.6  # ... and counts as no more than this
+ALIGNMENT_POWER = 8  # of the cosine between a sample's direction and the normal where it touches
+PRIOR = 0.3  # foot points that speak for no correction at all
+DISAGREEMENT = 0.5  # how much the variance of what foot points say speaks against it
+MOST_NOISY = 0.02  # share of samples that are no distances: beyond, none is taken for exact
+
+STRIDES = np.array([9, 3, 1])  # of the places in a neighbourhood
+CELL = np.indices((2, 2, 2)).reshape(3, 8).T
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Blocks of nodes, and where a sample of the band finds those round it.
+
+    Attributes
+    ----------
+    table : (V, 27) int32
+        Neighbours in the band, -1 where there is none.
+    row_of : (V + 1,) int32
+        Which block is a voxel's, -1 if it was not decoded; the last stands for absent ones.
+    own_table : (D, 27) int32
+        Neighbours among the decoded voxels.
+    numbers : (D, (K+1)^3) int32
+        The nodes of each block.
+    factor : int
+        K.
+    """
+
+    table: IntArray
+    row_of: IntArray
+    own_table: IntArray
+    numbers: IntArray
+    factor: int
+
+
+@dataclass(frozen=True, eq=False)
+class FootPoints:
+    """Where spheres should touch the surface.
+
+    Attributes
+    ----------
+    rows : (n,) int32
+        The block each lies in.
+    place : (n, 3) float32
+        Where in the block, from 0 to 1.
+    values : (n,) float32
+        What the field says there.
+    weights : (n,) float32
+        How far to trust that.
+    """
+
+    rows: IntArray
+    place: FloatArray
+    values: FloatArray
+    weights: FloatArray
+
+
+def fit_to_spheres(values: FloatArray, patches: FloatArray, blocks: Blocks) -> FloatArray:
+    """Return the node values, (n,), moved so that the surface touches the samples' spheres.
+
+    ``patches`` are those of the band, (V, 27). Samples that cannot be distances are left out; where
+    they are many, nothing is moved. Nodes at exact samples keep the sample.
+    """
+    samples = exact_samples(patches)
+    fitted = values
+    for cells in LATTICES:
+        feet = find_foot_points(fitted, patches, samples, blocks)
+        fitted = subtract(fitted, feet, blocks, cells)
+    return keep_samples(fitted, patches, samples, blocks)
+
+
+def exact_samples(patches: FloatArray) -> IntArray:
+    """Return the samples, rows of the band, that can be taken for exact distances."""
+    lipschitz = is_lipschitz(patches)
+    if (~lipschitz).mean() > MOST_NOISY:
+        return np.empty(0, np.int32)
+    near = np.abs(patches[:, CENTRE]) < FARTHEST
+    return np.flatnonzero(lipschitz & near).astype(np.int32)
+
+
+def find_foot_points(
+    values: FloatArray, patches: FloatArray, samples: IntArray, blocks: Blocks
+) -> FootPoints:
+    """Return the foot points of samples; those beyond the blocks are left out.
+
+    The direction to the surface is the field's gradient where it is reached, hence found by
+    turns. Of all points at the right distance the nearest to the surface, or deepest beyond, is
+    the best: if the sphere touches, it is outside there.
+    """
+    near = patches[samples]
+    distance = near[:, CENTRE]
+    direction = _unit(near[:, CENTRE + STRIDES] - near[:, CENTRE - STRIDES])
+    tries = []
+    for _ in range(DIRECTIONS):
+        rows, place = locate(-distance[:, None] * direction, samples, blocks)
+        value, gradient = interpolate(values, rows, place, blocks)
+        normal = _unit(gradient)
+        tries.append((rows, place, value, np.einsum("na,na->n", direction, normal)))
+        direction = np.where((rows >= 0)[:, None], normal, direction)
+    rows, place, value, cosine = (np.stack(parts) for parts in zip(*tries))
+    clearance = np.where(rows >= 0, np.copysign(1, distance) * value, np.inf)
+    best = clearance.argmin(0), np.arange(len(samples))
+    return weighted_feet(rows[best], place[best], value[best], cosine[best])
+
+
+def weighted_feet(
+    rows: IntArray, place: FloatArray, values: FloatArray, cosine: FloatArray
+) -> FootPoints:
+    """Return the foot points that count, by the angle at which they are met and what is there."""
+    weights = np.clip(cosine, 0, 1) ** ALIGNMENT_POWER / (1 + (values / USUAL) ** 2)
+    kept = (rows >= 0) & (weights > 1e-3)
+    values = np.clip(values[kept], -LARGEST, LARGEST)
+    return FootPoints(rows[kept], place[kept], values, weights[kept])
+
+
+def locate(steps: FloatArray, samples: IntArray, blocks: Blocks) -> tuple[IntArray, FloatArray]:
+    """Return the blocks, (n,), that points at ``steps`` (n, 3) from samples lie in, and where.
+
+    No step is longer than 3 along an axis, so a point lies in the sample's voxel or a neighbour's.
+    The place is from 0 to 1 along each axis; the block -1 where there is none.
+    """
+    aside = np.clip(np.rint(steps / 2), -1, 1)
+    neighbour = blocks.table[samples, ((aside + 1) @ STRIDES).astype(np.intp)]
+    return blocks.row_of[neighbour], np.clip(steps / 2 - aside + 0.5, 0, 1).astype(np.float32)
+
+
+def cells_of(place: FloatArray, cells: int) -> tuple[IntArray, FloatArray]:
+    """Return the corners, (n, 8) nodes of a block of so many cells, and where in the cell."""
+    low = np.minimum((place * cells).astype(np.int32), cells - 1)
+    corners = (low[:, None] + CELL) @ np.array([(cells + 1) ** 2, cells + 1, 1])
+    return corners.astype(np.int32), place * cells - low
+
+
+def interpolate(
+    values: FloatArray, rows: IntArray, place: FloatArray, blocks: Blocks
+) -> tuple[FloatArray, FloatArray]:
+    """Return the values, (n,), at places in blocks, and the gradient there, (n, 3), unscaled."""
+    corners, within = cells_of(place, blocks.factor)
+    cell = values[np.take_along_axis(blocks.numbers[rows], corners, 1)].reshape(-1, 2, 2, 2)
+    x, y, z = (np.stack([1 - t, t], 1) for t in within.T)
+    along_z = np.einsum("nxyz,nz->nxy", cell, z)
+    value = np.einsum("nxy,nx,ny->n", along_z, x, y)
+    gradient = [
+        np.einsum("ny,ny->n", along_z[:, 1] - along_z[:, 0], y),
+        np.einsum("nx,nx->n", along_z[:, :, 1] - along_z[:, :, 0], x),
+        np.einsum("nxy,nx,ny->n", cell[..., 1] - cell[..., 0], x, y),
+    ]
+    return value, np.stack(gradient, 1)
+
+
+def subtract(values: FloatArray, feet: FootPoints, blocks: Blocks, cells: int) -> FloatArray:
+    """Return the node values less what the field says at the foot points nearby.
+
+    Each foot point speaks to the eight nodes round it of a lattice of so many cells a voxel; there
+    a weighted mean is formed, and between them it is interpolated.
+    """
+    numbers, count = number_shared_nodes(blocks.own_table, cells)
+    corners, within = cells_of(feet.place, cells)
+    nodes = numbers[feet.rows[:, None], corners].ravel()
+    weights = (_trilinear(within) * feet.weights[:, None]).astype(np.float64)
+
+    def gathered(power: int) -> NDArray[np.float64]:
+        spoken = weights * feet.values[:, None].astype(np.float64) ** power
+        return np.bincount(nodes, spoken.ravel(), count)
+
+    correction = agreed_mean(gathered(0), gathered(1), gathered(2)).astype(np.float32)
+    spread = correction[numbers] @ _lattice_to_block(cells, blocks.factor).T
+    change = np.zeros_like(values)
+    change[blocks.numbers] = spread  # the same from every block that shares a node
+    return values - change
+
+
+def agreed_mean(
+    weight: NDArray[np.float64], total: NDArray[np.float64], squares: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the means of weighted sums, drawn to 0 where there is little weight or agreement."""
+    mean = total / np.maximum(weight, 1e-9)
+    variance = np.maximum(squares / np.maximum(weight, 1e-9) - mean**2, 0)
+    agreement = mean**2 / np.maximum(mean**2 + DISAGREEMENT * variance, 1e-12)
+    drawn: NDArray[np.float64] = agreement * total / (weight + PRIOR)
+    return drawn
+
+
+def keep_samples(
+    values: FloatArray, patches: FloatArray, samples: IntArray, blocks: Blocks
+) -> FloatArray:
+    """Put exact samples back where they are nodes: in the middle of blocks."""
+    kept = values.copy()
+    decoded = samples[blocks.row_of[samples] >= 0]
+    middle = blocks.numbers[blocks.row_of[decoded], blocks.numbers.shape[1] // 2]
+    kept[middle] = patches[decoded, CENTRE]
+    return kept
+
+
+def _lattice_to_block(cells: int, factor: int) -> FloatArray:
+    """Return the weights (Q, (cells+1)^3) that interpolate from a lattice to a block's nodes."""
+    place = (block_ijk(factor) / factor).astype(np.float32)
+    corners, within = cells_of(place, cells)
+    weights = np.zeros((len(place), (cells + 1) ** 3), np.float32)
+    np.put_along_axis(weights, corners, _trilinear(within), 1)
+    return weights
+
+
+def _trilinear(within: FloatArray) -> FloatArray:
+    """Return the weights (n, 8) of a cell's corners at places (n, 3) from 0 to 1."""
+    sides = np.where(CELL == 1, within[:, None], 1 - within[:, None])
+    weights: FloatArray = sides.prod(2)
+    return weights
+
+
+def _unit(vectors: FloatArray) -> FloatArray:
+    """Return vectors (n, 3) of length 1; 0 stays 0."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    unit: FloatArray = (vectors / np.maximum(length, 1e-6)).astype(np.float32)
+    return unit

@@ -1,0 +1,153 @@
+"""The fit of the surface to the samples' spheres: closed forms, and what must be left alone."""
+
+import numpy as np
+import pytest
+from conftest import ball, trilinear
+
+from super_sdf import SdfGrid, load_network, pipeline, reconstruct
+from super_sdf.band import (
+    can_hold_surface,
+    find_band,
+    gather_patches,
+    is_lipschitz,
+    neighbour_table,
+    rescale,
+)
+from super_sdf.nodes import block_ijk, number_shared_nodes
+from super_sdf.spheres import (
+    LATTICES,
+    PRIOR,
+    Blocks,
+    agreed_mean,
+    exact_samples,
+    find_foot_points,
+    fit_to_spheres,
+    interpolate,
+    subtract,
+)
+
+CENTRE_OF_BALL = 10 - 0.37
+
+
+def blocks_of(grid, factor=4):
+    """Return patches, blocks and the positions of the nodes, in half voxels from sample 0."""
+    rescaled = rescale(grid)
+    band = find_band(rescaled)
+    patches, table = gather_patches(rescaled, band), neighbour_table(band, grid.shape)
+    voxels = np.flatnonzero(can_hold_surface(patches, is_lipschitz(patches))).astype(np.int32)
+    row_of = pipeline.rows_among(voxels, len(band))
+    own_table = row_of[table[voxels]]
+    numbers, count = number_shared_nodes(own_table, factor)
+    nodes = np.empty((count, 3))
+    nodes[numbers] = 2 * band[voxels][:, None] + block_ijk(factor) * (2 / factor) - 1
+    return patches, Blocks(table, row_of, own_table, numbers, factor), nodes
+
+
+def distance_to_ball(nodes, radius=6.0):
+    exact = np.linalg.norm(nodes - 2 * CENTRE_OF_BALL, axis=1) - 2 * radius
+    return exact.astype(np.float32)
+
+
+@pytest.mark.parametrize("factor", [2, 4, 8])
+def test_foot_points_lie_on_the_surface(factor):
+    patches, blocks, nodes = blocks_of(ball(), factor)
+    feet = find_foot_points(distance_to_ball(nodes), patches, exact_samples(patches), blocks)
+    assert len(feet.rows) == len(exact_samples(patches))
+    assert np.abs(feet.values).max() < 0.12 / factor  # linear interpolation of a curved field
+    assert feet.weights.min() > 0.95
+
+
+def test_the_gradient_of_a_linear_field_is_exact():
+    _, blocks, nodes = blocks_of(ball())
+    slope = np.array([0.48, -0.6, 0.64])
+    values = (nodes @ slope).astype(np.float32)
+    rng = np.random.default_rng(0)
+    rows = rng.integers(len(blocks.numbers), size=100).astype(np.int32)
+    place = rng.random((100, 3)).astype(np.float32)
+    value, gradient = interpolate(values, rows, place, blocks)
+    low = nodes[blocks.numbers[rows, 0]]
+    np.testing.assert_allclose(value, (low + 2 * place) @ slope, atol=1e-4)
+    np.testing.assert_allclose(gradient * blocks.factor / 2, np.tile(slope, (100, 1)), atol=1e-3)
+
+
+@pytest.mark.parametrize("bias", [-0.2, 0.1, 0.2])
+def test_a_surface_that_is_off_everywhere_is_brought_back(bias):
+    patches, blocks, nodes = blocks_of(ball())
+    exact = distance_to_ball(nodes)
+    fitted = fit_to_spheres(exact + np.float32(bias), patches, blocks)
+    near = np.abs(exact) < 0.3
+    assert np.abs(fitted - exact)[near].max() < 0.4 * abs(bias)
+    assert np.abs(fitted - exact)[near].mean() < 0.15 * abs(bias)
+
+
+def test_an_exact_field_stays():
+    patches, blocks, nodes = blocks_of(ball())
+    exact = distance_to_ball(nodes)
+    assert np.abs(fit_to_spheres(exact, patches, blocks) - exact).max() < 0.03
+
+
+def test_exact_samples_are_kept():
+    patches, blocks, nodes = blocks_of(ball())
+    fitted = fit_to_spheres(distance_to_ball(nodes) + np.float32(0.1), patches, blocks)
+    decoded = np.flatnonzero(blocks.row_of[:-1] >= 0)
+    middle = blocks.numbers[blocks.row_of[decoded], 62]
+    np.testing.assert_array_equal(fitted[middle], patches[decoded, 13])
+
+
+def test_noisy_samples_move_nothing():
+    grid = ball()
+    noise = np.random.default_rng(0).uniform(-0.3, 0.3, grid.shape)
+    patches, blocks, nodes = blocks_of(SdfGrid(grid.values + noise, grid.spacing))
+    assert not len(exact_samples(patches))
+    values = distance_to_ball(nodes)
+    np.testing.assert_array_equal(fit_to_spheres(values, patches, blocks), values)
+
+
+def test_one_bad_sample_costs_only_its_neighbours_their_word():
+    grid = ball()
+    grid.values[3, 9, 9] += 3  # near the surface
+    patches, _, _ = blocks_of(grid)
+    bad = ~is_lipschitz(patches)
+    assert 0 < bad.sum() <= 27
+    near = np.abs(patches[:, 13]) < 2.8
+    np.testing.assert_array_equal(exact_samples(patches), np.flatnonzero(near & ~bad))
+
+
+def test_means_are_drawn_to_nothing_by_little_weight_and_by_disagreement():
+    one = np.ones(1)
+    assert agreed_mean(one, 0.2 * one, 0.04 * one) == pytest.approx(0.2 / (1 + PRIOR))
+    split = agreed_mean(2 * one, 0.2 * one, 0.2 * one)  # mean 0.1, variance 0.09
+    assert split == pytest.approx(0.2 / (2 + PRIOR) * 0.01 / (0.01 + 0.5 * 0.09))
+    assert agreed_mean(0 * one, 0 * one, 0 * one) == 0
+
+
+@pytest.mark.parametrize("cells", LATTICES)
+def test_nodes_that_no_foot_point_is_near_stay(cells):
+    patches, blocks, nodes = blocks_of(ball())
+    values = distance_to_ball(nodes) + np.float32(0.2)
+    above = exact_samples(patches)[:40]  # on one side of the ball: samples come in C order
+    feet = find_foot_points(values, patches, above, blocks)
+    moved = subtract(values, feet, blocks, cells) != values
+    assert moved.any() and nodes[moved, 0].max() < 2 * 8
+
+
+def test_a_ball_by_interpolation_gets_better(monkeypatch):
+    def error(mesh):
+        return np.abs(np.linalg.norm(mesh.vertices - CENTRE_OF_BALL, axis=1) - 6).mean()
+
+    fitted = error(reconstruct(ball(), trilinear))
+    monkeypatch.setattr(pipeline, "fit_to_spheres", lambda values, *_: values)
+    assert fitted < 0.35 * error(reconstruct(ball(), trilinear))
+
+
+def test_a_wall_between_the_samples_is_found():
+    """A third of a voxel thick, and no sample inside: all values are positive."""
+    ijk = np.indices((16, 16, 16)) - 7.5
+    beyond = np.abs(ijk) - np.array([4.6, 0.17, 4.6])[:, None, None, None]
+    outer = np.linalg.norm(np.maximum(beyond, 0), axis=0) + np.minimum(beyond.max(0), 0)
+    assert outer.min() > 0
+    mesh = reconstruct(SdfGrid(outer, (1.0,) * 3, (-7.5,) * 3), load_network())
+    assert mesh.is_closed()
+    thickness = np.ptp(mesh.vertices, axis=0)
+    assert thickness == pytest.approx([9.2, 0.34, 9.2], abs=0.25)
+    assert mesh.volume() == pytest.approx(9.2 * 9.2 * 0.34, rel=0.2)
