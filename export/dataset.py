@@ -13,7 +13,8 @@ Samples are stored in shards, ``shard-<seed>-<number>.npz``, of flat arrays laid
 ``windows`` (float32) with ``window_shape``, ``offsets`` (n, Q, 3), ``voxel_ijk`` (D, 3) and
 ``targets`` (D, Q) float16 with ``voxel_count``. Without ``--meshes`` all shapes are procedural;
 with it, each mesh comes once before any comes again, but only as many of the simple prisms as make
-a sixth, and ``--procedural`` says what share is procedural besides.
+a sixth, and ``--procedural`` says what share is procedural besides. ``--thin`` of the samples are
+of solids so thin that hardly a sample lies inside.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from super_sdf.nodes import block_offsets
 CORNERS, FINE_NODES, ANYWHERE = 5, 4, 4  # queries: 4 a corner, 28 in all
 SMALLEST, LARGEST = 7, 100  # voxels along a shape's diagonal
 SWAYED = 0.3  # of the meshes
+THIN = -0.2, 0.6  # between them, in spacings, is the lowest sample of a thin solid
 WINDOW = 32  # samples along each axis: a whole shape at 32^3, a piece of it at 64^3
 SHARD = 50  # samples a file
 
@@ -81,15 +83,20 @@ def draw_offsets(rng: np.random.Generator) -> np.ndarray:
     return np.concatenate([quadruples, fine, anywhere]).astype(np.float32)
 
 
-def make_sample(rng: np.random.Generator, mesh: Mesh) -> Sample | None:
+def make_sample(
+    rng: np.random.Generator, mesh: Mesh, lowest: tuple[float, float] = (-np.inf, np.inf)
+) -> Sample | None:
     """Sample a shape; None where it is not seen: no sample is near it, or all are inside.
 
-    What is so thin that no sample lies inside is kept: it can be told from its distances.
+    What is so thin that no sample lies inside is kept: it can be told from its distances. None
+    also where the lowest sample is not between two bounds (spacings).
     """
     posed = draw_pose(rng, mesh)
     shape, first = draw_window(rng, posed)
     solid = Solid(posed)
     values = sample_grid(solid, (shape, 1.0, first))
+    if not lowest[0] < values.min() < lowest[1]:
+        return None
     window = rescale(SdfGrid(values, (1.0, 1.0, 1.0)))
     band = find_band(window)
     voxel_ijk = band[np.abs(window[tuple(band.T)]) <= DECODE_LIMIT]
@@ -172,10 +179,29 @@ def draw_mesh(rng: np.random.Generator, path: Path) -> Mesh:
     return Mesh(draw_sway(rng, 0.6)(mesh.vertices / diagonal), mesh.faces)
 
 
-def fill_shard(rng: np.random.Generator, files: Sequence[Path], procedural: float) -> list[Sample]:
+def make_thin_sample(rng: np.random.Generator) -> Sample:
+    """Squeeze procedural shapes along their axes until one is thin where it is seen."""
+    sample = None
+    while sample is None:
+        solid = random_solid(rng)
+        squeezed = solid.transformed(np.diag(np.exp(rng.normal(0, 1, 3))), np.zeros(3))
+        sample = make_sample(rng, squeezed, THIN)
+    return sample
+
+
+def fill_shard(
+    rng: np.random.Generator,
+    files: Sequence[Path],
+    procedural: float,
+    thin: float,
+    count: int = SHARD,
+) -> list[Sample]:
     """Make a shard's samples; a procedural shape stands in for a mesh that shows nothing."""
     samples: list[Sample] = []
-    for number in range(SHARD):
+    for number in range(count):
+        if rng.random() < thin:
+            samples.append(make_thin_sample(rng))
+            continue
         drawn = not files or rng.random() < procedural
         sample = make_sample(rng, random_solid(rng) if drawn else draw_mesh(rng, files[number]))
         while sample is None:
@@ -189,6 +215,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--meshes", type=Path, help="folder of closed .ply meshes")
     parser.add_argument("--procedural", type=float, default=0.3, help="share beside --meshes")
+    parser.add_argument("--thin", type=float, default=0.05, help="share of thin solids")
     parser.add_argument("--out", type=Path, required=True, help="folder for the shards")
     parser.add_argument("--count", type=int, default=5000, help="samples to make")
     parser.add_argument("--seed", type=int, default=0)
@@ -200,7 +227,7 @@ def main() -> None:
         if not path.exists():
             rng = np.random.default_rng([options.seed, number])
             drawn = files[number * SHARD : (number + 1) * SHARD]
-            samples = fill_shard(rng, drawn, options.procedural)
+            samples = fill_shard(rng, drawn, options.procedural, options.thin)
             write_shard(path, samples)
             print(f"{path.name}: {sum(len(s.voxel_ijk) for s in samples)} voxels", flush=True)
 

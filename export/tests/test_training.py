@@ -23,6 +23,7 @@ from export.compare import ENTRIES, append_row, format_table, read_rows
 from export.dataset import (
     CORNERS,
     draw_offsets,
+    fill_shard,
     make_sample,
     mesh_order,
     read_shard,
@@ -123,6 +124,13 @@ def test_what_no_sample_lies_in_is_kept():
     samples = [make_sample(np.random.default_rng(seed), sheet) for seed in range(10)]
     missed = [sample for sample in samples if sample and (sample.window > 0).all()]
     assert any((sample.targets < 0).any() for sample in missed)
+
+
+def test_thin_solids_have_hardly_a_sample_inside():
+    samples = fill_shard(np.random.default_rng(0), [], 1.0, thin=1.0, count=4)
+    lowest = [sample.window.min() / 2 for sample in samples]
+    assert -0.2 < min(lowest) and max(lowest) < 0.6
+    assert all((sample.targets < 0).any() for sample in samples)
 
 
 def test_shards_come_back_the_same(tmp_path, samples):
@@ -307,6 +315,13 @@ def test_the_rate_warms_up_and_anneals():
     factors = [rate_factor(spent, RECIPE) for spent in np.linspace(0, 1, 101)]
     assert factors[0] < 2e-3 and factors[-1] < 2e-3
     assert 0.9 < max(factors) <= 1.001
+
+
+def test_a_recipe_with_other_rates_and_less_noise():
+    recipe = RECIPE.at(0.5, 0.1)
+    assert (recipe.hidden_rate, recipe.outer_rate) == (2e-3, 1e-3)
+    assert recipe.shares == replace(RECIPE.shares, noisy=0.1)
+    assert RECIPE.at(1.0, RECIPE.shares.noisy) == RECIPE
 
 
 def small_net():

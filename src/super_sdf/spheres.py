@@ -189,7 +189,8 @@ def subtract(values: FloatArray, feet: FootPoints, blocks: Blocks, cells: int) -
 
     def gathered(power: int) -> NDArray[np.float64]:
         spoken = weights * feet.values[:, None].astype(np.float64) ** power
-        return np.bincount(nodes, spoken.ravel(), count)
+        sums: NDArray[np.float64] = np.bincount(nodes, spoken.ravel(), count).astype(np.float64)
+        return sums
 
     correction = agreed_mean(gathered(0), gathered(1), gathered(2)).astype(np.float32)
     spread = correction[numbers] @ _lattice_to_block(cells, blocks.factor).T
