@@ -36,7 +36,7 @@ from .nodes import (
     number_shared_nodes,
     pin_to_skipped,
 )
-from .spheres import Blocks, fit_to_spheres
+from .spheres import Blocks, Lattice, fit_to_spheres
 
 Progress = Callable[[int, int], None]
 """Called with (steps done, steps in all)."""
@@ -117,7 +117,8 @@ def upsample(
     own_table = row_of[table[voxels]]  # -1, absent, reads the last row: -1 again
     numbers, count = number_shared_nodes(own_table, factor)
     values = average_shared(blocks, numbers, count)  # Eq. 7
-    values = fit_to_spheres(values, patches, Blocks(table, row_of, own_table, numbers, factor))
+    decoded = Blocks(table, row_of, own_table, Lattice(numbers, count, factor))
+    values = fit_to_spheres(values, patches, decoded)
     skipped = skipped_neighbours(own_table, patches[voxels], voxel_ijk, grid.shape)
     pinned = pin_to_skipped(values, numbers, skipped, factor)
     if (values > 0).all() or (values <= 0).all():

@@ -3,7 +3,8 @@
 The foot point of a sample x with distance d is the surface point nearest to it, x - d n with the
 surface's normal n there. What the refined field says at foot points should be 0. It is not quite,
 for a network sees a sample as one number among many. What it says there is spread over the
-neighbourhood and subtracted, first coarsely, so that walls between samples are found, then finer.
+neighbourhood and subtracted: first between the corners of voxels, so that walls which no sample
+lies in are found; what is left, on a lattice twice as fine.
 
 Reference: Sellán, Batty and Stein, "Reach For the Spheres: Tangency-Aware Surface Reconstruction
 of SDFs", 2023, for the constraint; the solution here is another.
@@ -13,7 +14,7 @@ Lengths are in half voxels, as in ``band``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,6 @@ from .band import CENTRE, is_lipschitz
 from .grid import FloatArray, IntArray
 from .nodes import block_ijk, number_shared_nodes
 
-LATTICES = (1, 2)  # cells along a voxel on which the correction is piecewise linear, in turn
 DIRECTIONS = 3  # tried for each sample: the patch's gradient, then the field's where that led
 FARTHEST = 2.8  # samples near the band's edge, 3, may have been cut off there
 USUAL = 0.2  # a value at a foot point that is larger is less likely a matter of position ...
@@ -37,8 +37,27 @@ CELL = np.indices((2, 2, 2)).reshape(3, 8).T
 
 
 @dataclass(frozen=True, eq=False)
+class Lattice:
+    """Nodes of all blocks, so many cells along a voxel.
+
+    Attributes
+    ----------
+    numbers : (D, (cells+1)^3) int32
+        The nodes of each block: a node that blocks share has one number.
+    count : int
+        How many different nodes there are.
+    cells : int
+        Along a voxel; K for the nodes of the fine field.
+    """
+
+    numbers: IntArray
+    count: int
+    cells: int
+
+
+@dataclass(frozen=True, eq=False)
 class Blocks:
-    """Blocks of nodes, and where a sample of the band finds those round it.
+    """The decoded voxels, and where a sample of the band finds those round it.
 
     Attributes
     ----------
@@ -48,17 +67,18 @@ class Blocks:
         Which block is a voxel's, -1 if it was not decoded; the last stands for absent ones.
     own_table : (D, 27) int32
         Neighbours among the decoded voxels.
-    numbers : (D, (K+1)^3) int32
-        The nodes of each block.
-    factor : int
-        K.
+    nodes : Lattice
+        The fine field's nodes.
     """
 
     table: IntArray
     row_of: IntArray
     own_table: IntArray
-    numbers: IntArray
-    factor: int
+    nodes: Lattice
+
+    def lattice(self, cells: int) -> Lattice:
+        """Return a coarser lattice of the same blocks."""
+        return Lattice(*number_shared_nodes(self.own_table, cells), cells)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,10 +110,12 @@ def fit_to_spheres(values: FloatArray, patches: FloatArray, blocks: Blocks) -> F
     they are many, nothing is moved. Nodes at exact samples keep the sample.
     """
     samples = exact_samples(patches)
-    fitted = values
-    for cells in LATTICES:
-        feet = find_foot_points(fitted, patches, samples, blocks)
-        fitted = subtract(fitted, feet, blocks, cells)
+    feet = find_foot_points(values, patches, samples, blocks)
+    coarse, fine = blocks.lattice(1), blocks.lattice(2)
+    first = mean_at_nodes(feet, coarse)
+    left = replace(feet, values=feet.values - interpolate(first, coarse, feet.rows, feet.place))
+    correction = carry(first, coarse, fine) + mean_at_nodes(left, fine)
+    fitted = values - carry(correction, fine, blocks.nodes)
     return keep_samples(fitted, patches, samples, blocks)
 
 
@@ -121,8 +143,8 @@ def find_foot_points(
     tries = []
     for _ in range(DIRECTIONS):
         rows, place = locate(-distance[:, None] * direction, samples, blocks)
-        value, gradient = interpolate(values, rows, place, blocks)
-        normal = _unit(gradient)
+        value = interpolate(values, blocks.nodes, rows, place)
+        normal = _unit(gradient_at(values, blocks.nodes, rows, place))
         tries.append((rows, place, value, np.einsum("na,na->n", direction, normal)))
         direction = np.where((rows >= 0)[:, None], normal, direction)
     rows, place, value, cosine = (np.stack(parts) for parts in zip(*tries))
@@ -152,51 +174,55 @@ def locate(steps: FloatArray, samples: IntArray, blocks: Blocks) -> tuple[IntArr
     return blocks.row_of[neighbour], np.clip(steps / 2 - aside + 0.5, 0, 1).astype(np.float32)
 
 
-def cells_of(place: FloatArray, cells: int) -> tuple[IntArray, FloatArray]:
-    """Return the corners, (n, 8) nodes of a block of so many cells, and where in the cell."""
-    low = np.minimum((place * cells).astype(np.int32), cells - 1)
-    corners = (low[:, None] + CELL) @ np.array([(cells + 1) ** 2, cells + 1, 1])
-    return corners.astype(np.int32), place * cells - low
+def cells_at(lattice: Lattice, rows: IntArray, place: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Return the nodes, (n, 8), of the cells that places in blocks lie in, and where in them."""
+    corners, within = _corners(place, lattice.cells)
+    return lattice.numbers[rows[:, None], corners], within
 
 
 def interpolate(
-    values: FloatArray, rows: IntArray, place: FloatArray, blocks: Blocks
-) -> tuple[FloatArray, FloatArray]:
-    """Return the values, (n,), at places in blocks, and the gradient there, (n, 3), unscaled."""
-    corners, within = cells_of(place, blocks.factor)
-    cell = values[np.take_along_axis(blocks.numbers[rows], corners, 1)].reshape(-1, 2, 2, 2)
+    values: FloatArray, lattice: Lattice, rows: IntArray, place: FloatArray
+) -> FloatArray:
+    """Return the values, (n,), that a lattice's nodes give places (n, 3) in blocks (n,)."""
+    nodes, within = cells_at(lattice, rows, place)
+    read: FloatArray = np.einsum("nc,nc->n", values[nodes], _trilinear(within))
+    return read
+
+
+def gradient_at(
+    values: FloatArray, lattice: Lattice, rows: IntArray, place: FloatArray
+) -> FloatArray:
+    """Return the gradient, (n, 3) in units of cells, at places in blocks."""
+    nodes, within = cells_at(lattice, rows, place)
+    cell = values[nodes].reshape(-1, 2, 2, 2)
     x, y, z = (np.stack([1 - t, t], 1) for t in within.T)
     along_z = np.einsum("nxyz,nz->nxy", cell, z)
-    value = np.einsum("nxy,nx,ny->n", along_z, x, y)
-    gradient = [
+    across_z = cell[..., 1] - cell[..., 0]
+    parts = [
         np.einsum("ny,ny->n", along_z[:, 1] - along_z[:, 0], y),
         np.einsum("nx,nx->n", along_z[:, :, 1] - along_z[:, :, 0], x),
-        np.einsum("nxy,nx,ny->n", cell[..., 1] - cell[..., 0], x, y),
+        np.einsum("nxy,nx,ny->n", across_z, x, y),
     ]
-    return value, np.stack(gradient, 1)
+    return np.stack(parts, 1)
 
 
-def subtract(values: FloatArray, feet: FootPoints, blocks: Blocks, cells: int) -> FloatArray:
-    """Return the node values less what the field says at the foot points nearby.
-
-    Each foot point speaks to the eight nodes round it of a lattice of so many cells a voxel; there
-    a weighted mean is formed, and between them it is interpolated.
-    """
-    numbers, count = number_shared_nodes(blocks.own_table, cells)
-    corners, within = cells_of(feet.place, cells)
-    nodes = numbers[feet.rows[:, None], corners].ravel()
+def mean_at_nodes(feet: FootPoints, lattice: Lattice) -> FloatArray:
+    """Return for each node of a lattice what the foot points in the cells round it say."""
+    nodes, within = cells_at(lattice, feet.rows, feet.place)
     weights = (_trilinear(within) * feet.weights[:, None]).astype(np.float64)
 
-    def gathered(power: int) -> NDArray[np.float64]:
+    def total(power: int) -> NDArray[np.float64]:
         spoken = weights * feet.values[:, None].astype(np.float64) ** power
-        sums: NDArray[np.float64] = np.bincount(nodes, spoken.ravel(), count).astype(np.float64)
-        return sums
+        return np.bincount(nodes.ravel(), spoken.ravel(), lattice.count).astype(np.float64)
 
-    correction = agreed_mean(gathered(0), gathered(1), gathered(2)).astype(np.float32)
-    spread = correction[numbers] @ _lattice_to_block(cells, blocks.factor).T
-    change = np.zeros_like(values)
-    change[blocks.numbers] = spread  # the same from every block that shares a node
-    return values - change
+    return agreed_mean(total(0), total(1), total(2)).astype(np.float32)
+
+
+def carry(values: FloatArray, lattice: Lattice, finer: Lattice) -> FloatArray:
+    """Return the values at a finer lattice's nodes; blocks that share a node agree on it."""
+    carried = np.zeros(finer.count, np.float32)
+    carried[finer.numbers] = values[lattice.numbers] @ _weights_from(lattice.cells, finer.cells).T
+    return carried
 
 
 def agreed_mean(
@@ -216,15 +242,22 @@ def keep_samples(
     """Put exact samples back where they are nodes: in the middle of blocks."""
     kept = values.copy()
     decoded = samples[blocks.row_of[samples] >= 0]
-    middle = blocks.numbers[blocks.row_of[decoded], blocks.numbers.shape[1] // 2]
-    kept[middle] = patches[decoded, CENTRE]
+    numbers = blocks.nodes.numbers
+    kept[numbers[blocks.row_of[decoded], numbers.shape[1] // 2]] = patches[decoded, CENTRE]
     return kept
 
 
-def _lattice_to_block(cells: int, factor: int) -> FloatArray:
-    """Return the weights (Q, (cells+1)^3) that interpolate from a lattice to a block's nodes."""
-    place = (block_ijk(factor) / factor).astype(np.float32)
-    corners, within = cells_of(place, cells)
+def _corners(place: FloatArray, cells: int) -> tuple[IntArray, FloatArray]:
+    """Return which of a block's nodes, (n, 8), are round places (n, 3), and where between them."""
+    low = np.minimum((place * cells).astype(np.int32), cells - 1)
+    corners = (low[:, None] + CELL) @ np.array([(cells + 1) ** 2, cells + 1, 1], np.int32)
+    return corners.astype(np.int32), place * cells - low
+
+
+def _weights_from(cells: int, finer: int) -> FloatArray:
+    """Return the weights that interpolate from a lattice's nodes to those of a finer one."""
+    place = (block_ijk(finer) / finer).astype(np.float32)
+    corners, within = _corners(place, cells)
     weights = np.zeros((len(place), (cells + 1) ** 3), np.float32)
     np.put_along_axis(weights, corners, _trilinear(within), 1)
     return weights
