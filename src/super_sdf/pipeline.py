@@ -112,13 +112,9 @@ def upsample(
     blocks = network(patches, table, voxels, block_offsets(factor))  # Eqs. 3 and 5
     tell(2, len(STEPS))
 
+    values, decoded = join_blocks(blocks, patches, table, voxels, factor)
+    own_table, numbers = decoded.own_table, decoded.nodes.numbers
     voxel_ijk = band_ijk[voxels]
-    row_of = rows_among(voxels, len(band_ijk))
-    own_table = row_of[table[voxels]]  # -1, absent, reads the last row: -1 again
-    numbers, count = number_shared_nodes(own_table, factor)
-    values = average_shared(blocks, numbers, count)  # Eq. 7
-    decoded = Blocks(table, row_of, own_table, Lattice(numbers, count, factor))
-    values = fit_to_spheres(values, patches, decoded)
     skipped = skipped_neighbours(own_table, patches[voxels], voxel_ijk, grid.shape)
     pinned = pin_to_skipped(values, numbers, skipped, factor)
     if (values > 0).all() or (values <= 0).all():
@@ -164,6 +160,18 @@ def no_surface(grid: SdfGrid, offset: float) -> GridError:
     """Return the error for a grid in which nothing is to be found."""
     low, high = grid.values.min(), grid.values.max()
     return GridError(f"no surface at {offset:g}: the values go from {low:.6g} to {high:.6g}")
+
+
+def join_blocks(
+    blocks: FloatArray, patches: FloatArray, table: IntArray, voxels: IntArray, factor: int
+) -> tuple[FloatArray, Blocks]:
+    """Return one value a node, (n,), from what each block (D, Q) says, and who has which node."""
+    row_of = rows_among(voxels, len(table))
+    own_table = row_of[table[voxels]]  # -1, absent, reads the last row: -1 again
+    numbers, count = number_shared_nodes(own_table, factor)
+    values = average_shared(blocks, numbers, count)  # Eq. 7
+    decoded = Blocks(table, row_of, own_table, Lattice(numbers, count, factor))
+    return fit_to_spheres(values, patches, decoded), decoded
 
 
 def rows_among(voxels: IntArray, count: int) -> IntArray:

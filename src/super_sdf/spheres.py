@@ -23,12 +23,12 @@ from .band import CENTRE, is_lipschitz
 from .grid import FloatArray, IntArray
 from .nodes import block_ijk, number_shared_nodes
 
-DIRECTIONS = 3  # tried for each sample: the patch's gradient, then the field's where that led
+DIRECTIONS = 5  # tried for each sample: see find_foot_points
 FARTHEST = 2.8  # samples near the band's edge, 3, may have been cut off there
 USUAL = 0.2  # a value at a foot point that is larger is less likely a matter of position ...
 LARGEST = 0.6  # ... and counts as no more than this
 ALIGNMENT_POWER = 8  # of the cosine between a sample's direction and the normal where it touches
-PRIOR = 0.3  # foot points that speak for no correction at all
+PRIOR = 0.2  # foot points that speak for no correction at all
 DISAGREEMENT = 0.5  # how much the variance of what foot points say speaks against it
 MOST_NOISY = 0.02  # share of samples that are no distances: beyond, none is taken for exact
 
@@ -134,8 +134,9 @@ def find_foot_points(
     """Return the foot points of samples; those beyond the blocks are left out.
 
     The direction to the surface is the field's gradient where it is reached, hence found by
-    turns. Of all points at the right distance the nearest to the surface, or deepest beyond, is
-    the best: if the sphere touches, it is outside there.
+    turns: first the patch's gradient, then half-way towards the field's where that led. Of all
+    points at the right distance the nearest to the surface, or deepest beyond, is the best: a
+    sphere that touches is outside everywhere else.
     """
     near = patches[samples]
     distance = near[:, CENTRE]
@@ -146,7 +147,7 @@ def find_foot_points(
         value = interpolate(values, blocks.nodes, rows, place)
         normal = _unit(gradient_at(values, blocks.nodes, rows, place))
         tries.append((rows, place, value, np.einsum("na,na->n", direction, normal)))
-        direction = np.where((rows >= 0)[:, None], normal, direction)
+        direction = np.where((rows >= 0)[:, None], _unit(direction + normal), direction)
     rows, place, value, cosine = (np.stack(parts) for parts in zip(*tries))
     clearance = np.where(rows >= 0, np.copysign(1, distance) * value, np.inf)
     best = clearance.argmin(0), np.arange(len(samples))

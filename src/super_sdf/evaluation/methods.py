@@ -13,16 +13,11 @@ import numpy as np
 from scipy import ndimage
 from skimage.measure import marching_cubes
 
-from ..band import (
-    find_band,
-    gather_patches,
-    neighbour_table,
-    rescale,
-)
+from ..band import find_band, gather_patches, neighbour_table, rescale
 from ..grid import FloatArray, IntArray, SdfGrid
 from ..mesh import Mesh
-from ..nodes import average_shared, block_ijk, block_offsets, number_shared_nodes
-from ..pipeline import Decoder, reconstruct
+from ..nodes import block_ijk, block_offsets
+from ..pipeline import Decoder, join_blocks, reconstruct
 from .cases import Case, spread_samples
 
 NUDGE = np.float32(1e-9)  # what an exact zero becomes: a vertex on a node can open the surface
@@ -89,7 +84,7 @@ def refined_grid(grid: SdfGrid, network: Decoder, factor: int) -> SdfGrid:
 
 
 def band_field(grid: SdfGrid, voxels: IntArray, network: Decoder, factor: int) -> FloatArray:
-    """Return the network's distances at all nodes of some voxels' blocks, NaN elsewhere.
+    """Return our distances at all nodes of some voxels' blocks, NaN elsewhere.
 
     The pipeline decodes only the voxels that can hold the surface; the protocol asks for all.
     """
@@ -98,11 +93,11 @@ def band_field(grid: SdfGrid, voxels: IntArray, network: Decoder, factor: int) -
     every = np.arange(len(voxels), dtype=np.int32)
     patches = gather_patches(rescaled, voxels)
     blocks = network(patches, table, every, block_offsets(factor))
-    numbers, count = number_shared_nodes(table, factor)
-    values = average_shared(blocks, numbers, count)
+    values, decoded = join_blocks(blocks, patches, table, every, factor)
     nodes = factor * voxels[:, None] + block_ijk(factor)  # (V, Q, 3)
     field = np.full([factor * n + 1 for n in grid.shape], np.nan, np.float32)
-    field[tuple(np.moveaxis(nodes, 2, 0))] = values[numbers] * np.float32(grid.voxel_size / 2)
+    world = values * np.float32(grid.voxel_size / 2)
+    field[tuple(np.moveaxis(nodes, 2, 0))] = world[decoded.nodes.numbers]
     return field
 
 
