@@ -118,6 +118,15 @@ def test_one_bad_sample_costs_only_its_neighbours_their_word():
     np.testing.assert_array_equal(exact_samples(patches), np.flatnonzero(near & ~bad))
 
 
+def test_samples_that_were_cut_off_say_nothing():
+    grid = ball()
+    cut = SdfGrid(np.clip(grid.values, -0.25, 0.25), grid.spacing)
+    patches, _, _ = blocks_of(cut)
+    samples = exact_samples(patches)
+    assert len(samples) and (np.abs(patches[samples, 13]) < 0.5).all()
+    np.testing.assert_array_equal(samples, np.flatnonzero(np.abs(patches[:, 13]) < 0.5))
+
+
 def test_means_are_drawn_to_nothing_by_little_weight_and_by_disagreement():
     one = np.ones(1)
     assert agreed_mean(one, 0.2 * one, 0.04 * one) == pytest.approx(0.2 / (1 + PRIOR))

@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .band import CENTRE, is_lipschitz
-from .grid import FloatArray, IntArray
+from .band import CENTRE, REACH, is_lipschitz
+from .grid import BoolArray, FloatArray, IntArray
 from .nodes import block_ijk, number_shared_nodes
 
 DIRECTIONS = 5  # tried for each sample: see find_foot_points
@@ -30,6 +30,7 @@ LARGEST = 0.6  # ... and counts as no more than this
 ALIGNMENT_POWER = 8  # of the cosine between a sample's direction and the normal where it touches
 PRIOR = 0.2  # foot points that speak for no correction at all
 DISAGREEMENT = 0.5  # how much the variance of what foot points say speaks against it
+FLAT = 0.7  # the largest slope towards a neighbour; that of a distance is near 1
 MOST_NOISY = 0.02  # share of samples that are no distances: beyond, none is taken for exact
 
 STRIDES = np.array([9, 3, 1])  # of the places in a neighbourhood
@@ -125,7 +126,16 @@ def exact_samples(patches: FloatArray) -> IntArray:
     if (~lipschitz).mean() > MOST_NOISY:
         return np.empty(0, np.int32)
     near = np.abs(patches[:, CENTRE]) < FARTHEST
-    return np.flatnonzero(lipschitz & near).astype(np.int32)
+    return np.flatnonzero(lipschitz & near & ~is_cut_off(patches)).astype(np.int32)
+
+
+def is_cut_off(patches: FloatArray) -> BoolArray:
+    """Say which samples, (V,), were cut off: at the limit of their sign, and no neighbour steep."""
+    sample = patches[:, CENTRE]
+    at_limit = sample == np.where(sample > 0, sample.max(), sample.min())
+    slope = np.abs(patches - sample[:, None]) / np.maximum(REACH, 1)
+    cut_off: BoolArray = at_limit & (slope.max(1) < FLAT)
+    return cut_off
 
 
 def find_foot_points(
