@@ -111,6 +111,8 @@ def fit_to_spheres(values: FloatArray, patches: FloatArray, blocks: Blocks) -> F
     they are many, nothing is moved. Nodes at exact samples keep the sample.
     """
     samples = exact_samples(patches)
+    if not len(samples):  # a noisy field, say: nothing to carry to the nodes
+        return values
     feet = find_foot_points(values, patches, samples, blocks)
     coarse, fine = blocks.lattice(1), blocks.lattice(2)
     first = mean_at_nodes(feet, coarse)
