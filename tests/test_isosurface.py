@@ -21,13 +21,13 @@ def dense_field(lattice: np.ndarray, factor: int = 2) -> tuple[FineField, SdfGri
     """Wrap a dense fine lattice as a field in which every voxel is decoded."""
     shape = tuple((n - 1) // factor for n in lattice.shape)
     voxels = np.argwhere(np.ones(shape)).astype(np.int32)
-    numbers, count = number_shared_nodes(neighbour_table(voxels, shape), factor)
+    nodes = number_shared_nodes(neighbour_table(voxels, shape), factor)
     position = voxels[:, None] * factor + block_ijk(factor)
-    values = np.empty(count, np.float32)
-    values[numbers] = lattice[tuple(np.moveaxis(position, 2, 0))]
+    values = np.empty(nodes.count, np.float32)
+    values[nodes.numbers()] = lattice[tuple(np.moveaxis(position, 2, 0))]
     half = 0.5 - 0.5 / factor  # so that vertices come out in fine lattice indices
     grid = SdfGrid(np.zeros(shape, np.float32), (float(factor),) * 3, (half * factor + 0.5,) * 3)
-    return FineField(shape, factor, voxels, numbers, values, len(voxels), 0, 0), grid
+    return FineField(shape, factor, voxels, nodes, values, (0, shape[0])), grid
 
 
 def test_every_case_uses_exactly_its_crossed_edges():

@@ -44,30 +44,40 @@ def test_odd_and_absurd_factors_are_refused(factor):
 @pytest.mark.parametrize("seed", range(4))
 def test_nodes_have_one_number_for_each_position(seed, factor):
     voxels, table = some_voxels(seed)
-    numbers, count = number_shared_nodes(table, factor)
+    nodes = number_shared_nodes(table, factor)
     position = (voxels[:, None] * factor + block_ijk(factor)).reshape(-1, 3)
     different, inverse = np.unique(position, axis=0, return_inverse=True)
-    assert count == len(different)
-    pairs = np.unique(np.stack([inverse.ravel(), numbers.ravel()]), axis=1)
-    assert pairs.shape[1] == count
+    assert nodes.count == len(different)
+    pairs = np.unique(np.stack([inverse.ravel(), nodes.numbers().ravel()]), axis=1)
+    assert pairs.shape[1] == nodes.count
+
+
+def test_nodes_belong_to_the_first_voxel_that_has_them_and_come_in_its_order():
+    voxels, table = some_voxels(3)
+    nodes = number_shared_nodes(table, 4)
+    owner = np.full(nodes.count, len(voxels))
+    np.minimum.at(owner, nodes.numbers(), np.arange(len(voxels))[:, None])
+    assert (np.diff(owner) >= 0).all()
+    for row in range(len(voxels) + 1):
+        assert nodes.owned_before(row) == (owner < row).sum()
 
 
 def test_shared_nodes_are_plain_means():
-    voxels, table = some_voxels(7)
-    numbers, count = number_shared_nodes(table, 4)
+    _, table = some_voxels(7)
+    nodes = number_shared_nodes(table, 4)
+    numbers = nodes.numbers()
     blocks = np.random.default_rng(0).normal(size=numbers.shape).astype(np.float32)
-    values = average_shared(blocks, numbers, count)
-    position = (voxels[:, None] * 4 + block_ijk(4)).reshape(-1, 3)
-    node = position[123]
-    same = (position == node).all(1)
-    assert values[numbers.ravel()[123]] == pytest.approx(blocks.ravel()[same].mean(), rel=1e-6)
+    values = average_shared(blocks, nodes)
+    total = np.bincount(numbers.ravel(), blocks.ravel())
+    np.testing.assert_array_equal(values, (total / np.bincount(numbers.ravel())).astype(np.float32))
 
 
 def test_pinned_nodes_take_the_sign_of_the_skipped_voxel():
-    numbers = np.arange(27, dtype=np.int32)[None]
+    nodes = number_shared_nodes(np.where(np.arange(27) == 13, 0, -1)[None].astype(np.int32), 2)
     values = np.ones(27, np.float32)
-    skipped = np.zeros((1, 27), np.int32)
-    skipped[0, 22] = -1  # the neighbour at +x, +0, +0 is inside
-    assert pin_to_skipped(values, numbers, skipped, 2) == 9
-    on_face = block_ijk(2)[:, 0] == 2
-    assert (values[on_face] < 0).all() and (values[~on_face] == 1).all()
+    patches = np.ones((1, 27), np.float32)
+    patches[0, 22] = -1  # the neighbour at +x is inside; others are beyond the grid, but that at -x
+    changed = pin_to_skipped(values, nodes, np.array([[1, 0, 0]], np.int32), patches, (3, 1, 1))
+    on_face = nodes.numbers()[0, block_ijk(2)[:, 0] == 2]
+    assert changed.sum() == 9 and changed[on_face].all()
+    np.testing.assert_array_equal(values < 0, changed)

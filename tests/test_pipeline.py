@@ -7,7 +7,7 @@ import pytest
 from conftest import ball, trilinear
 from scipy.spatial import cKDTree
 
-from super_sdf import SdfGrid, load_network, pipeline, reconstruct, upsample
+from super_sdf import SdfGrid, load_network, pipeline, reconstruct, survey, upsample
 from super_sdf.errors import GridError
 from super_sdf.isosurface import CLEARANCE
 from super_sdf.nodes import block_ijk
@@ -138,9 +138,7 @@ def test_decoding_only_what_can_hold_the_surface_loses_nothing(noise, monkeypatc
     noisy = SdfGrid(values, grid.spacing)
     some = upsample(noisy, trilinear)
     part = reconstruct(noisy, trilinear)
-    monkeypatch.setattr(
-        pipeline, "can_hold_surface", lambda patches, _: np.ones(len(patches), bool)
-    )
+    monkeypatch.setattr(survey, "can_hold_surface", lambda patches, _: np.ones(len(patches), bool))
     whole = reconstruct(noisy, trilinear)
     assert some.pinned == 0
     assert len(part.faces) == len(whole.faces)

@@ -14,6 +14,7 @@ from matplotlib.image import imread
 from solids import cube, sphere
 
 from super_sdf import Mesh, SdfGrid, upsample
+from super_sdf.border import close_at_border
 from super_sdf.errors import FileError, OptionError
 from super_sdf.evaluation import rendering
 from super_sdf.evaluation.rendering import Panel, render_panels, vertex_errors, view_axes
@@ -24,7 +25,6 @@ from super_sdf.evaluation.sections import (
     render_section,
 )
 from super_sdf.evaluation.solid import Solid
-from super_sdf.field import close_at_border
 
 WHITE = np.full(3, 255)
 # Of the faces of a cube that the default view shows, z up: to +x, -y and +z.
@@ -293,7 +293,7 @@ def test_cells_of_the_fine_section_surround_those_of_the_coarse_one():
 def test_a_field_closed_at_the_border_has_the_same_section():
     grid = slope(0)
     field = upsample(grid, trilinear, 2)
-    closed = close_at_border(field, np.asarray(grid.values <= 0))
+    closed = close_at_border(field, grid)
     open_section, section = (fine_section(each, grid, "x", 6).values for each in (field, closed))
     known = np.isfinite(open_section)
     np.testing.assert_array_equal(section[known], open_section[known])

@@ -1,48 +1,42 @@
 """The fit of the surface to the samples' spheres: closed forms, and what must be left alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import ball, trilinear
 
 from super_sdf import SdfGrid, load_network, pipeline, reconstruct
-from super_sdf.band import (
-    can_hold_surface,
-    find_band,
-    gather_patches,
-    is_lipschitz,
-    neighbour_table,
-    rescale,
-)
+from super_sdf.band import neighbour_table
+from super_sdf.lattice import carry, read
 from super_sdf.nodes import block_ijk, number_shared_nodes
 from super_sdf.spheres import (
     PRIOR,
-    Blocks,
-    Lattice,
+    Samples,
     agreed_mean,
-    carry,
     exact_samples,
     find_foot_points,
     fit_to_spheres,
-    gradient_at,
-    interpolate,
     mean_at_nodes,
 )
+from super_sdf.survey import survey
 
 CENTRE_OF_BALL = 10 - 0.37
 
 
 def blocks_of(grid, factor=4):
-    """Return patches, blocks and the positions of the nodes, in half voxels from sample 0."""
-    rescaled = rescale(grid)
-    band = find_band(rescaled)
-    patches, table = gather_patches(rescaled, band), neighbour_table(band, grid.shape)
-    voxels = np.flatnonzero(can_hold_surface(patches, is_lipschitz(patches))).astype(np.int32)
-    row_of = pipeline.rows_among(voxels, len(band))
-    own_table = row_of[table[voxels]]
-    numbers, count = number_shared_nodes(own_table, factor)
-    nodes = np.empty((count, 3))
-    nodes[numbers] = 2 * band[voxels][:, None] + block_ijk(factor) * (2 / factor) - 1
-    return patches, Blocks(table, row_of, own_table, Lattice(numbers, count, factor)), nodes
+    """Return samples, nodes and the nodes' positions, in half voxels from sample 0."""
+    band = survey(grid)
+    table = neighbour_table(band.voxel_ijk, grid.shape)
+    voxels = np.flatnonzero(band.decoded).astype(np.int32)
+    row_of = pipeline.rows_among(voxels, len(table))
+    nodes = number_shared_nodes(row_of[table[voxels]], factor)
+    position = np.empty((nodes.count, 3))
+    position[nodes.numbers()] = (
+        2 * band.voxel_ijk[voxels][:, None] + block_ijk(factor) * (2 / factor) - 1
+    )
+    exact = np.flatnonzero(band.exact).astype(np.int32)
+    return Samples(band.patches, exact, table, row_of), nodes, position
 
 
 def distance_to_ball(nodes, radius=6.0):
@@ -52,79 +46,77 @@ def distance_to_ball(nodes, radius=6.0):
 
 @pytest.mark.parametrize("factor", [2, 4, 8])
 def test_foot_points_lie_on_the_surface(factor):
-    patches, blocks, nodes = blocks_of(ball(), factor)
-    feet = find_foot_points(distance_to_ball(nodes), patches, exact_samples(patches), blocks)
-    assert len(feet.rows) == len(exact_samples(patches))
+    samples, nodes, position = blocks_of(ball(), factor)
+    feet = find_foot_points(distance_to_ball(position), nodes, samples)
+    assert len(feet.rows) == len(samples.exact)
     assert np.abs(feet.values).max() < 0.12 / factor  # linear interpolation of a curved field
     assert feet.weights.min() > 0.95
 
 
-def test_the_gradient_of_a_linear_field_is_exact():
-    _, blocks, nodes = blocks_of(ball())
+def test_a_linear_field_is_read_exactly():
+    _, nodes, position = blocks_of(ball())
     slope = np.array([0.48, -0.6, 0.64])
-    values = (nodes @ slope).astype(np.float32)
+    values = (position @ slope).astype(np.float32)
     rng = np.random.default_rng(0)
-    rows = rng.integers(len(blocks.nodes.numbers), size=100).astype(np.int32)
-    place = rng.random((100, 3)).astype(np.float32)
-    value = interpolate(values, blocks.nodes, rows, place)
-    gradient = gradient_at(values, blocks.nodes, rows, place)
-    low = nodes[blocks.nodes.numbers[rows, 0]]
-    np.testing.assert_allclose(value, (low + 2 * place) @ slope, atol=1e-4)
-    np.testing.assert_allclose(
-        gradient * blocks.nodes.cells / 2, np.tile(slope, (100, 1)), atol=1e-3
-    )
+    rows = rng.integers(len(nodes.table), size=100).astype(np.int32)
+    place = rng.random((3, 100)).astype(np.float32)
+    value, gradient = read(values, nodes, rows, place)
+    low = position[nodes.numbers(rows)[:, 0]]
+    np.testing.assert_allclose(value, (low + 2 * place.T) @ slope, atol=1e-4)
+    np.testing.assert_allclose(gradient.T * 4 / 2, np.tile(slope, (100, 1)), atol=1e-3)
 
 
 @pytest.mark.parametrize("bias", [-0.2, 0.1, 0.2])
 def test_a_surface_that_is_off_everywhere_is_brought_back(bias):
-    patches, blocks, nodes = blocks_of(ball())
-    exact = distance_to_ball(nodes)
-    fitted = fit_to_spheres(exact + np.float32(bias), patches, blocks)
+    samples, nodes, position = blocks_of(ball())
+    exact = distance_to_ball(position)
+    fitted = fit_to_spheres(exact + np.float32(bias), nodes, samples)
     near = np.abs(exact) < 0.3
     assert np.abs(fitted - exact)[near].max() < 0.4 * abs(bias)
     assert np.abs(fitted - exact)[near].mean() < 0.2 * abs(bias)
 
 
 def test_an_exact_field_stays():
-    patches, blocks, nodes = blocks_of(ball())
-    exact = distance_to_ball(nodes)
-    assert np.abs(fit_to_spheres(exact, patches, blocks) - exact).max() < 0.03
+    samples, nodes, position = blocks_of(ball())
+    exact = distance_to_ball(position)
+    assert np.abs(fit_to_spheres(exact, nodes, samples) - exact).max() < 0.03
 
 
 def test_exact_samples_are_kept():
-    patches, blocks, nodes = blocks_of(ball())
-    fitted = fit_to_spheres(distance_to_ball(nodes) + np.float32(0.1), patches, blocks)
-    decoded = np.flatnonzero(blocks.row_of[:-1] >= 0)
-    middle = blocks.nodes.numbers[blocks.row_of[decoded], 62]
-    np.testing.assert_array_equal(fitted[middle], patches[decoded, 13])
+    samples, nodes, position = blocks_of(ball())
+    fitted = fit_to_spheres(distance_to_ball(position) + np.float32(0.1), nodes, samples)
+    decoded = np.flatnonzero(samples.row_of[:-1] >= 0)
+    middle = nodes.numbers()[samples.row_of[decoded], 62]
+    np.testing.assert_array_equal(fitted[middle], samples.patches[decoded, 13])
 
 
 def test_noisy_samples_move_nothing():
     grid = ball()
     noise = np.random.default_rng(0).uniform(-0.3, 0.3, grid.shape)
-    patches, blocks, nodes = blocks_of(SdfGrid(grid.values + noise, grid.spacing))
-    assert not len(exact_samples(patches))
-    values = distance_to_ball(nodes)
-    np.testing.assert_array_equal(fit_to_spheres(values, patches, blocks), values)
+    samples, nodes, position = blocks_of(SdfGrid(grid.values + noise, grid.spacing))
+    assert not len(samples.exact)
+    values = distance_to_ball(position)
+    np.testing.assert_array_equal(fit_to_spheres(values, nodes, samples), values)
 
 
 def test_one_bad_sample_costs_only_its_neighbours_their_word():
     grid = ball()
     grid.values[3, 9, 9] += 3  # near the surface
-    patches, _, _ = blocks_of(grid)
-    bad = ~is_lipschitz(patches)
-    assert 0 < bad.sum() <= 27
-    near = np.abs(patches[:, 13]) < 2.8
-    np.testing.assert_array_equal(exact_samples(patches), np.flatnonzero(near & ~bad))
+    band = survey(grid)
+    assert 0 < (~band.lipschitz).sum() <= 27
+    near = np.abs(band.patches[:, 13]) < 2.8
+    np.testing.assert_array_equal(band.exact, near & band.lipschitz)
 
 
 def test_samples_that_were_cut_off_say_nothing():
     grid = ball()
-    cut = SdfGrid(np.clip(grid.values, -0.25, 0.25), grid.spacing)
-    patches, _, _ = blocks_of(cut)
-    samples = exact_samples(patches)
-    assert len(samples) and (np.abs(patches[samples, 13]) < 0.5).all()
-    np.testing.assert_array_equal(samples, np.flatnonzero(np.abs(patches[:, 13]) < 0.5))
+    band = survey(SdfGrid(np.clip(grid.values, -0.25, 0.25), grid.spacing))
+    np.testing.assert_array_equal(band.exact, np.abs(band.patches[:, 13]) < 0.5)
+    assert band.exact.any()
+
+
+def test_of_no_samples_none_is_exact():
+    assert not len(exact_samples(np.empty((0, 27), np.float32), np.empty(0, bool)))
 
 
 def test_means_are_drawn_to_nothing_by_little_weight_and_by_disagreement():
@@ -137,21 +129,22 @@ def test_means_are_drawn_to_nothing_by_little_weight_and_by_disagreement():
 
 @pytest.mark.parametrize("cells", [1, 2])
 def test_nodes_that_no_foot_point_is_near_hear_nothing(cells):
-    patches, blocks, nodes = blocks_of(ball())
-    values = distance_to_ball(nodes) + np.float32(0.2)
-    above = exact_samples(patches)[:40]  # on one side of the ball: samples come in C order
-    feet = find_foot_points(values, patches, above, blocks)
-    lattice = blocks.lattice(cells)
-    heard = carry(mean_at_nodes(feet, lattice), lattice, blocks.nodes) != 0
-    assert heard.any() and nodes[heard, 0].max() < 2 * 8
+    samples, nodes, position = blocks_of(ball())
+    values = distance_to_ball(position) + np.float32(0.2)
+    above = replace(samples, exact=samples.exact[:40])  # on one side: samples come in C order
+    feet = find_foot_points(values, nodes, above)
+    lattice = number_shared_nodes(nodes.table, cells)
+    heard = carry(mean_at_nodes(feet, lattice), lattice, nodes) != 0
+    assert heard.any() and position[heard, 0].max() < 2 * 8
 
 
 @pytest.mark.parametrize("factor", [2, 4, 16])
 def test_a_linear_function_is_carried_exactly(factor):
-    _, blocks, fine = blocks_of(ball(), factor)
+    _, nodes, fine = blocks_of(ball(), factor)
     _, _, coarse = blocks_of(ball(), 2)
     slope = np.array([0.48, -0.6, 0.64])
-    carried = carry((coarse @ slope).astype(np.float32), blocks.lattice(2), blocks.nodes)
+    lattice = number_shared_nodes(nodes.table, 2)
+    carried = carry((coarse @ slope).astype(np.float32), lattice, nodes)
     np.testing.assert_allclose(carried, fine @ slope, atol=1e-4)
 
 

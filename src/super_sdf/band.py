@@ -6,6 +6,8 @@ one spacing h is 2 and the band is ``abs(value) < 3``.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from .grid import BoolArray, FloatArray, IntArray, SdfGrid
@@ -20,24 +22,34 @@ DECODE_LIMIT = 3**0.5 + 0.5
 # Neighbouring distances may differ by no more than the samples are apart; slack for rounding.
 LIPSCHITZ_SLACK = 0.1
 
+# Whole planes of about so many samples are worked on at a time: what is made of them is small.
+BLOCK_SAMPLES = 1 << 20
+
 # The 27 voxels of a neighbourhood, in the order of patches and neighbour tables; 13 is the centre.
 NEIGHBOURHOOD: IntArray = np.indices((3, 3, 3)).reshape(3, 27).T.astype(np.int32) - 1
 CENTRE = 13
+STRIDES = np.array([9, 3, 1])  # of the places in a neighbourhood
 # How far the sample in the middle and that at each place may differ.
 REACH = (2 * np.linalg.norm(NEIGHBOURHOOD, axis=1) + LIPSCHITZ_SLACK).astype(np.float32)
 
 
-def rescale(grid: SdfGrid, offset: float = 0.0) -> FloatArray:
+def rescale(
+    grid: SdfGrid, offset: float = 0.0, first: int = 0, last: int | None = None
+) -> FloatArray:
     """Return the samples in half voxels, ``(values - offset) * 2 / h`` (Eq. 4).
 
     ``offset`` (world units) shifts the field, so that the level ``values == offset`` becomes the
-    zero level (Sec. 5.3). The band's values then lie in [-3, 3] whatever the unit.
+    zero level (Sec. 5.3). The band's values then lie in [-3, 3] whatever the unit. Of planes
+    ``first`` to before ``last`` only, if these are given.
     """
-    rescaled = np.empty(grid.shape, np.float32)
+    planes = grid.planes(first, grid.shape[0] if last is None else last)
+    rescaled = np.empty(planes.shape, np.float32)
     scale = 2.0 / grid.voxel_size
     limit = float(np.finfo(np.float32).max) / 4
-    for plane, out in zip(grid.values, rescaled):  # plane by plane: no second copy of the grid
-        out[...] = np.clip((plane.astype(np.float64) - offset) * scale, -limit, limit)
+    for plane, out in zip(planes, rescaled):  # plane by plane: in cache, and no second copy
+        shifted = plane.astype(np.float64) - offset
+        shifted *= scale
+        np.clip(shifted, -limit, limit, out=out, casting="same_kind")
     return rescaled
 
 
@@ -48,9 +60,11 @@ def find_band(rescaled: FloatArray) -> IntArray:
     input does so all the same, both voxels are taken in: a surface must pass between them.
     """
     active = np.abs(rescaled) < HALF_BAND
-    above, below = ~active & (rescaled > 0), ~active & (rescaled <= 0)
-    active |= (above & _dilate(below)) | (below & _dilate(above))
-    return np.argwhere(active).astype(np.int32)
+    outside = rescaled > 0
+    above, below = outside & ~active, ~(outside | active)
+    if (above & _dilate(below)).any():
+        active |= (above & _dilate(below)) | (below & _dilate(above))
+    return np.ascontiguousarray(np.argwhere(active), np.int32)
 
 
 def _dilate(mask: BoolArray) -> BoolArray:
@@ -90,7 +104,7 @@ def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, ...]) -> IntArray:
     Parameters
     ----------
     voxel_ijk : (V, 3) int32
-        The voxels, all different.
+        The voxels, all different, in C order.
     shape : three ints
         Samples of the grid along each axis.
 
@@ -100,13 +114,28 @@ def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, ...]) -> IntArray:
         Row numbers into ``voxel_ijk`` in the order of ``NEIGHBOURHOOD``, -1 where there is none.
         As an index, -1 is the last row: append a row of zeros to what is gathered.
     """
-    centre, steps = _flat_steps(voxel_ijk, shape)
-    row_at = np.full([n + 2 for n in shape], -1, np.int32).ravel()
-    row_at[centre] = np.arange(len(voxel_ijk), dtype=np.int32)
     table = np.empty((len(voxel_ijk), 27), np.int32)
-    for column, step in enumerate(steps):
-        np.take(row_at, centre + step, out=table[:, column])
+    for first, last in plane_blocks(shape):
+        start, low, high, stop = np.searchsorted(
+            voxel_ijk[:, 0], [first - 1, first, last, last + 1]
+        )
+        around = voxel_ijk[start:stop] - np.array([first, 0, 0], np.int32)
+        at, steps = _flat_steps(around, shape)
+        row_at = np.full((last - first + 2) * (shape[1] + 2) * (shape[2] + 2), -1, np.int32)
+        row_at[at] = np.arange(start, stop, dtype=np.int32)
+        for column, step in enumerate(steps):
+            np.take(row_at, at[low - start : high - start] + step, out=table[low:high, column])
     return table
+
+
+def plane_blocks(
+    shape: tuple[int, ...], first: int = 0, last: int | None = None
+) -> Iterator[tuple[int, int]]:
+    """Yield planes in blocks of about ``BLOCK_SAMPLES``, (first, behind the last)."""
+    step = max(BLOCK_SAMPLES // (shape[1] * shape[2]), 1)
+    end = shape[0] if last is None else last
+    for start in range(first, end, step):
+        yield start, min(start + step, end)
 
 
 def _flat_steps(

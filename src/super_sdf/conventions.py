@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from .errors import GridError, OptionError
 from .grid import SdfGrid, Triple, check_spacing, check_values
+from .memory import release_pages
 
 INSIDE = ("auto", "negative", "positive")
 SNAP = 0.02  # an estimate this near to a usual spacing is taken for it
@@ -55,20 +56,21 @@ def make_grid(
     GridError
         If the values are no signed distances, or contradict the spacing.
     """
-    values = check_values(values)
-    check_not_flat(values)
+    extremes = check_values(values)
+    check_not_flat(values, extremes)
     notes: list[str] = []
-    if _is_positive_inside(values, inside, level, notes):
-        values = -values.astype(np.promote_types(values.dtype, np.float32))
-    chosen = _choose_spacing(values, level, spacing, notes)
+    flipped = _is_positive_inside(values, inside, level, extremes, notes)
+    chosen = _choose_spacing(values, -level if flipped else level, spacing, notes)
+    release_pages(values)
     if origin is None:
         notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
-    return SdfGrid(values, chosen, 0.0 if origin is None else origin, tuple(notes))
+    at = 0.0 if origin is None else origin
+    return SdfGrid(values, chosen, at, tuple(notes), positive_inside=flipped, extremes=extremes)
 
 
-def check_not_flat(values: NDArray[Any]) -> None:
+def check_not_flat(values: NDArray[Any], extremes: tuple[float, float]) -> None:
     """Raise if the values are constant or an occupancy grid."""
-    low, high = values.min(), values.max()
+    low, high = extremes
     if low == high:
         raise GridError(f"every value is {low:.6g}: a constant field has no surface")
     if min(values.shape) > 2 and all(((p == low) | (p == high)).all() for p in values):
@@ -78,9 +80,9 @@ def check_not_flat(values: NDArray[Any]) -> None:
         )
 
 
-def check_both_sides(values: NDArray[Any], level: float) -> None:
+def check_both_sides(extremes: tuple[float, float], level: float) -> None:
     """Raise if all values are on one side of the level."""
-    low, high = values.min(), values.max()
+    low, high = extremes
     if low >= level:
         raise GridError(
             f"no value is below {level:g} (the smallest is {low:.6g}): an unsigned field has no "
@@ -93,16 +95,20 @@ def check_both_sides(values: NDArray[Any], level: float) -> None:
         )
 
 
-def _is_positive_inside(values: NDArray[Any], inside: str, level: float, notes: list[str]) -> bool:
+def _is_positive_inside(
+    values: NDArray[Any],
+    inside: str,
+    level: float,
+    extremes: tuple[float, float],
+    notes: list[str],
+) -> bool:
     """Say whether the values are positive inside, by word or by what the border is."""
     if inside not in INSIDE:
         raise OptionError(f"inside is {inside!r}: give one of {', '.join(INSIDE)}")
     if inside != "auto":
         return inside == "positive"
-    check_both_sides(values, level)
-    faces = [values.take(end, axis=axis) for axis in range(3) for end in (0, -1)]
-    below = sum(int((face < level).sum()) for face in faces)
-    total = sum(int(face.size) for face in faces)
+    check_both_sides(extremes, level)
+    below, total = _count_border(values, level)
     positive = bool(2 * below > total)
     share = max(below, total - below) / total
     if positive or share < 1:
@@ -112,6 +118,19 @@ def _is_positive_inside(values: NDArray[Any], inside: str, level: float, notes: 
             "sign (say otherwise with --inside)"
         )
     return positive
+
+
+def _count_border(values: NDArray[Any], level: float) -> tuple[int, int]:
+    """Return how many samples of the grid's six faces are below the level, and how many there are.
+
+    A sample on an edge counts for each of its faces.
+    """
+    below = sum(int((values[end] < level).sum()) for end in (0, -1))
+    for plane in values:
+        below += sum(int((edge < level).sum()) for edge in (plane[0], plane[-1], *plane.T[[0, -1]]))
+        release_pages(values)
+    nx, ny, nz = values.shape
+    return below, 2 * (nx * ny + ny * nz + nz * nx)
 
 
 def surface_gradients(
@@ -147,6 +166,7 @@ def _plane_gradients(
         n[:-1] |= crossed
         b[1:-1] += np.abs(d[2:] - 2 * d[1:-1] + d[:-2])
     chosen = near[i - first]
+    release_pages(values)
     gradient = np.asarray(np.gradient(slab))[:, i - first][:, chosen].T
     length = np.sqrt((gradient**2).sum(1))
     return gradient, bend[i - first][chosen] / np.maximum(length, np.finfo(float).tiny)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from math import isfinite
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import GridError
+from .memory import release_pages
 
 FloatArray: TypeAlias = NDArray[np.float32]
 IntArray: TypeAlias = NDArray[np.int32]
@@ -26,13 +29,23 @@ class SdfGrid:
     Parameters
     ----------
     values : (nx, ny, nz) array_like
-        Signed distances in world units, negative inside; i runs along x, j along y, k along z.
+        Signed distances in world units, negative inside; i runs along x, j along y, k along z. A
+        mapped file stays one: it is read plane by plane.
     spacing : float or three floats
         World distance between neighbouring samples; equal on all axes.
     origin : float or three floats
         World position of sample (0, 0, 0); the world's origin unless given.
     notes : tuple of str
         What was inferred rather than given, a sentence each.
+    positive_inside : bool
+        The values given are positive inside: read them with the other sign.
+
+    Attributes
+    ----------
+    values : (nx, ny, nz) array
+        All samples, negative inside.
+    low, high : float
+        The smallest and the largest of them.
 
     Raises
     ------
@@ -41,10 +54,13 @@ class SdfGrid:
         or if the spacing is not positive and equal on all axes.
     """
 
-    values: NDArray[Any]
+    samples: NDArray[Any]
     spacing: Triple
     origin: Triple
     notes: tuple[str, ...]
+    positive_inside: bool
+    low: float
+    high: float
 
     def __init__(
         self,
@@ -52,22 +68,46 @@ class SdfGrid:
         spacing: ArrayLike,
         origin: ArrayLike = 0.0,
         notes: tuple[str, ...] = (),
+        *,
+        positive_inside: bool = False,
+        extremes: tuple[float, float] | None = None,
     ) -> None:
-        object.__setattr__(self, "values", check_values(np.asanyarray(values)))
-        object.__setattr__(self, "spacing", check_spacing(spacing))
-        object.__setattr__(self, "origin", as_triple(origin, "origin"))
-        object.__setattr__(self, "notes", notes)
+        samples = np.asanyarray(values)
+        low, high = extremes or check_values(samples)  # given: they were checked before
+        set_ = partial(object.__setattr__, self)
+        set_("samples", samples)
+        set_("spacing", check_spacing(spacing))
+        set_("origin", as_triple(origin, "origin"))
+        set_("notes", notes)
+        set_("positive_inside", positive_inside)
+        set_("low", -high if positive_inside else low)
+        set_("high", -low if positive_inside else high)
+
+    @property
+    def values(self) -> NDArray[Any]:
+        """All samples, negative inside."""
+        return negated(self.samples) if self.positive_inside else self.samples
+
+    def planes(self, first: int, last: int) -> NDArray[Any]:
+        """Return the samples with i from ``first`` to before ``last``, negative inside."""
+        samples = self.samples[first:last]
+        return negated(samples) if self.positive_inside else samples
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Samples along x, y and z."""
-        nx, ny, nz = self.values.shape
+        nx, ny, nz = self.samples.shape
         return nx, ny, nz
 
     @property
     def voxel_size(self) -> float:
         """The spacing h, in world units."""
         return sum(self.spacing) / 3
+
+
+def negated(values: NDArray[Any]) -> NDArray[Any]:
+    """Return the values with the other sign, unsigned integers among them."""
+    return -values.astype(np.promote_types(values.dtype, np.float32))
 
 
 def as_triple(number: ArrayLike, name: str) -> Triple:
@@ -94,8 +134,8 @@ def check_spacing(spacing: ArrayLike) -> Triple:
     return triple
 
 
-def check_values(values: NDArray[Any]) -> NDArray[Any]:
-    """Return the samples if they are a finite, numeric, three-dimensional array."""
+def check_values(values: NDArray[Any]) -> tuple[float, float]:
+    """Return the smallest and largest sample of a finite, numeric, three-dimensional array."""
     if values.dtype == np.bool_:
         raise GridError(
             "values are true or false: an occupancy grid holds no distances; "
@@ -107,21 +147,28 @@ def check_values(values: NDArray[Any]) -> NDArray[Any]:
         raise GridError(f"values have shape {values.shape}: give three axes (x, y, z)")
     if min(values.shape) < 2:
         raise GridError(f"values have shape {values.shape}: give at least 2 samples on each axis")
-    if values.dtype.kind == "f":
-        _check_finite(values)
-    return values
+    return _find_extremes(values)
 
 
-def _check_finite(values: NDArray[Any]) -> None:
-    """Raise on the first NaN or infinity; plane by plane, for the grid may be a mapped file."""
+def _find_extremes(values: NDArray[Any]) -> tuple[float, float]:
+    """Return the smallest and the largest sample, or raise on the first NaN or infinity.
+
+    Plane by plane, for the grid may be a mapped file. Extremes tell of bad samples, too: the
+    smallest of numbers and a NaN is NaN.
+    """
+    extremes = []
     for i, plane in enumerate(values):
-        bad = np.argwhere(~np.isfinite(plane))
-        if len(bad):
-            j, k = bad[0]
+        low, high = float(plane.min()), float(plane.max())
+        if not (isfinite(low) and isfinite(high)):
+            j, k = np.argwhere(~np.isfinite(plane))[0]
             raise GridError(
                 f"values[{i}, {j}, {k}] is {plane[j, k]}: every sample must be finite; "
                 "replace unknown far samples by a large distance of the right sign"
             )
+        extremes.append((low, high))
+        release_pages(values)
+    lows, highs = zip(*extremes)
+    return min(lows), max(highs)
 
 
 def _join(triple: Triple) -> str:

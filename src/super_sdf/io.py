@@ -8,11 +8,14 @@ more packages for the last (extra ``3mf``).
 from __future__ import annotations
 
 import os
+import shutil
+import tempfile
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
+from functools import partial
 from math import prod
 from pathlib import Path
 from typing import IO, Any
@@ -25,15 +28,15 @@ from .conventions import make_grid
 from .errors import FileError, GridError, OptionError, SuperSdfError
 from .grid import SdfGrid
 from .memory import check_fits
-from .mesh import Mesh
+from .mesh import Mesh, join_meshes
 
 GRID_SUFFIXES = (".npy", ".npz")
 MESH_SUFFIXES = (".ply", ".stl", ".obj", ".off", ".glb", ".3mf")
 NEEDED_FOR_3MF = ("lxml", "networkx")
 NPZ_KEYS = ("values", "spacing", "origin")
-# The pipeline's own arrays over the coarse grid: rescaled, padded, and their masks.
-WORK_BYTES_PER_SAMPLE = 16
-CHUNK = 1 << 20  # vertices or faces written at a time
+CHUNK = 1 << 18  # vertices or faces written at a time
+SPOOL_BYTES = 64_000_000  # triangles that wait in memory before they go to a file beside
+HEADER_BYTES = 320
 
 
 def read_grid(
@@ -127,13 +130,13 @@ def _read_header(file: IO[bytes], name: str) -> tuple[tuple[int, ...], np.dtype[
 def _check_promise(
     shape: tuple[int, ...], dtype: np.dtype[Any], follow: int, name: str, loaded: bool = False
 ) -> None:
-    """Raise if an array is longer than its file or than memory allows, before it is read."""
+    """Raise if an array is longer than its file or, to be loaded, than memory."""
     size = prod(shape) * dtype.itemsize
     said = f"{' x '.join(map(str, shape))} {dtype}, {size:,} bytes"
     if size > follow:
         raise FileError(f"{name} is truncated: its header promises {said}, but {follow:,} follow")
-    need = prod(shape) * WORK_BYTES_PER_SAMPLE + size * loaded
-    check_fits(need, f"{name}, {said},", "cut the grid into pieces")
+    if loaded:
+        check_fits(size, f"{name}, {said},", "save it as .npy, which is read piece by piece")
 
 
 def check_target(path: str | Path, *, force: bool = False) -> Path:
@@ -178,12 +181,21 @@ def write_mesh(mesh: Mesh, path: str | Path, *, force: bool = False) -> None:
     FileError
         If the file exists and ``force`` is not set, or cannot be written.
     """
+    write_pieces([mesh], path, force=force)
+
+
+def write_pieces(pieces: Iterable[Mesh], path: str | Path, *, force: bool = False) -> None:
+    """Write a mesh that comes in pieces, whose triangles use the vertices of all pieces so far.
+
+    To a ``.ply`` file each piece is written as it comes; for other formats all are kept until the
+    last. Otherwise as ``write_mesh``.
+    """
     path = check_target(path, force=force)
     with replacing(path) as part:
         if path.suffix.lower() == ".ply":
-            _write_ply(mesh, part)
+            _write_ply(pieces, part)
         else:
-            _write_by_trimesh(mesh, part, path.suffix.lower()[1:])
+            _write_by_trimesh(join_meshes(list(pieces)), part, path.suffix.lower()[1:])
 
 
 def write_grid(grid: SdfGrid, path: str | Path, *, force: bool = False) -> None:
@@ -217,30 +229,60 @@ def replacing(path: Path) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
-def _write_ply(mesh: Mesh, path: Path) -> None:
-    """Write binary little-endian PLY."""
-    number = "double" if mesh.vertices.dtype == np.float64 else "float"
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        "comment made by super-sdf",
-        f"element vertex {len(mesh.vertices)}",
+def _write_ply(pieces: Iterable[Mesh], path: Path) -> None:
+    """Write binary little-endian PLY.
+
+    All vertices come before all triangles, and their numbers before both: triangles wait beside,
+    and the header, which is padded to one length, is written last.
+    """
+    vertices, faces, number = 0, 0, "float"
+    spool = partial(tempfile.SpooledTemporaryFile, SPOOL_BYTES, dir=path.parent)
+    with path.open("wb") as file, spool() as waiting:
+        file.write(_ply_header(number, 0, 0))
+        for piece in pieces:
+            _write_in_chunks(file, piece.vertices, _little_endian)
+            _write_in_chunks(waiting, piece.faces, _ply_rows)
+            number = "double" if piece.vertices.dtype == np.float64 else "float"
+            vertices, faces = vertices + len(piece.vertices), faces + len(piece.faces)
+        waiting.seek(0)
+        shutil.copyfileobj(waiting, file, SPOOL_BYTES // 4)
+        file.seek(0)
+        file.write(_ply_header(number, vertices, faces))
+
+
+def _ply_header(number: str, vertices: int, faces: int) -> bytes:
+    """Return the header, of the same length whatever the numbers: its comment is padded."""
+    first = "ply\nformat binary_little_endian 1.0\ncomment made by super-sdf"
+    lines = [
+        "",
+        f"element vertex {vertices}",
         *(f"property {number} {axis}" for axis in "xyz"),
-        f"element face {len(mesh.faces)}",
+        f"element face {faces}",
         "property list uchar int vertex_indices",
-        "end_header",
+        "end_header\n",
     ]
-    row = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
-    with path.open("wb") as file:
-        file.write(("\n".join(header) + "\n").encode("ascii"))
-        for start in range(0, len(mesh.vertices), CHUNK):
-            chunk = mesh.vertices[start : start + CHUNK]
-            file.write(chunk.astype(chunk.dtype.newbyteorder("<")).tobytes())
-        for start in range(0, len(mesh.faces), CHUNK):
-            corners = mesh.faces[start : start + CHUNK]
-            rows = np.empty(len(corners), row)
-            rows["count"], rows["corners"] = 3, corners
-            file.write(rows.tobytes())
+    rest = "\n".join(lines)
+    return (first + " " * (HEADER_BYTES - len(first) - len(rest)) + rest).encode("ascii")
+
+
+def _write_in_chunks(
+    file: IO[bytes], array: NDArray[Any], to_bytes: Callable[[NDArray[Any]], bytes]
+) -> None:
+    """Write rows of an array, some at a time: the bytes are a copy."""
+    for start in range(0, len(array), CHUNK):
+        file.write(to_bytes(array[start : start + CHUNK]))
+
+
+def _little_endian(array: NDArray[Any]) -> bytes:
+    """Return the bytes of numbers, least significant first."""
+    return array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()
+
+
+def _ply_rows(faces: NDArray[Any]) -> bytes:
+    """Return triangles as PLY's lists: how many corners, then which."""
+    rows = np.empty(len(faces), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
+    rows["count"], rows["corners"] = 3, faces
+    return rows.tobytes()
 
 
 def _write_by_trimesh(mesh: Mesh, path: Path, file_type: str) -> None:

@@ -4,96 +4,185 @@ Every cell of the fine lattice lies in exactly one voxel, and a shared node has 
 cells need no search and no welding by distance: a vertex is named by the lattice edge it lies on.
 Two cells see the same edges on their common face, hence the mesh is a closed, oriented
 2-manifold wherever the field's blocks do not end.
+
+Vertices and triangles come in the order of the voxels, so a surface made slab by slab is the same
+as one made at once.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
+from .band import NEIGHBOURHOOD, STRIDES
 from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, triangle_table
+from .chunks import CHUNK, in_chunks, side_by_side
+from .compiling import compiled_twin
 from .field import FineField
 from .grid import BoolArray, FloatArray, IntArray, SdfGrid
 from .mesh import Mesh
-from .nodes import block_ijk
+from .nodes import block_ijk, part_of_node
 
 # A vertex keeps this share of its lattice edge from either end: where a node's value is 0 several
 # vertices would otherwise fall together, and programs that merge such points would tear the mesh.
 CLEARANCE = 1e-3
-# Nodes beyond the grid's border (a closed surface, see field.close_at_border) lie this far out, in
+# Nodes beyond the grid's border (a closed surface, see border.close_at_border) lie this far out, in
 # fine spacings: enough for distinct vertices.
 CAP_HEIGHT = 0.02
 
 
-def extract_mesh(field: FineField, grid: SdfGrid) -> Mesh:
-    """Return the zero level of a field as triangles in world coordinates.
+def extract_mesh(field: FineField, grid: SdfGrid, first_vertex: int = 0) -> Mesh:
+    """Return the zero level of a field's planes as triangles in world coordinates.
 
-    A node with value 0 is inside. Vertices lie on lattice edges, by linear interpolation.
+    A node with value 0 is inside. Vertices lie on lattice edges, by linear interpolation. Those of
+    planes before the field's own are numbered up to ``first_vertex``, the own ones from there on;
+    faces may use both.
     References: Lorensen and Cline, "Marching Cubes", 1987.
     """
-    inside = field.inside_blocks(np.ones(len(field.numbers), bool))
-    crossed = inside.any((1, 2, 3)) & ~inside.all((1, 2, 3))
-    inside, numbers, voxel_ijk = inside[crossed], field.numbers[crossed], field.voxel_ijk[crossed]
-    vertex_at, position = _edge_vertices(field, numbers, voxel_ijk, inside)
-    faces = _triangles(inside, numbers, vertex_at)
-    return Mesh(_to_world(position, field, grid), faces)
+    times = count_vertices(field)
+    core = field.rows(*field.planes)
+    ends = np.cumsum(times, dtype=np.int64)
+    before = int(ends[core.start - 1]) if core.start else 0
+    firsts = np.append(0, ends) + (first_vertex - before)
+    parts = side_by_side(_groups(field), lambda rows: _extract_group(field, grid, firsts, rows))
+    if not parts:
+        return Mesh(_to_world(np.empty((0, 3)), field, grid), np.empty((0, 3), np.int32))
+    vertices, faces = (np.concatenate(arrays) for arrays in zip(*parts))
+    return Mesh(vertices, faces)
 
 
-def _edge_vertices(
-    field: FineField, numbers: IntArray, voxel_ijk: IntArray, inside: BoolArray
-) -> tuple[IntArray, NDArray[np.float64]]:
-    """Put a vertex on every lattice edge whose ends are on different sides.
+def count_vertices(field: FineField) -> IntArray:
+    """Return how many vertices belong to each voxel, (D,): those on crossed edges that it owns."""
+    count = compiled_twin(_count_chunk)
+    return np.concatenate(in_chunks(len(field.voxel_ijk), lambda rows: count(field, rows)))
 
-    Returns
-    -------
-    (3 n,) int32 and (m, 3) float64
-        The vertex on the edge that runs from node v along axis a, at ``3 v + a``; and the
-        positions, in fine spacings from the fine lattice's first node.
+
+def _count_chunk(field: FineField, rows: slice) -> IntArray:
+    """Count the vertices of some voxels."""
+    times: IntArray = _own_edges(field, rows).sum(1, dtype=np.int32)
+    return times
+
+
+def _groups(field: FineField) -> list[slice]:
+    """Cut a field's planes into runs of whole planes with about ``CHUNK`` voxels or one plane."""
+    core = field.rows(*field.planes)
+    plane = field.voxel_ijk[core, 0]
+    starts = core.start + np.flatnonzero(np.diff(plane, prepend=plane[:1] - 1))
+    chosen = np.unique(np.searchsorted(starts, np.arange(core.start, core.stop, CHUNK)))
+    bounds = [*starts[chosen[chosen < len(starts)]].tolist(), core.stop]
+    return [slice(a, b) for a, b in pairwise(bounds)]
+
+
+@dataclass(frozen=True, eq=False)
+class BlockEdges:
+    """The lattice edges in a block, axis by axis in the order of their first nodes: 3 K (K+1)^2.
+
+    Attributes
+    ----------
+    axis : (E,) int32
+        Along which axis each runs.
+    start, end : (E,) int32
+        Its block nodes.
+    part : (E,) int32
+        The part of the block that it lies in: an edge belongs to the voxel that owns its part.
     """
-    along = [_vertices_along(axis, field, numbers, voxel_ijk, inside) for axis in range(3)]
-    keys, position = (np.concatenate(parts) for parts in zip(*along))
-    vertex_at = np.full(3 * len(field.values), -1, np.int32)
-    vertex_at[keys] = np.arange(len(keys), dtype=np.int32)
-    return vertex_at, position
+
+    axis: IntArray
+    start: IntArray
+    end: IntArray
+    part: IntArray
 
 
-def _vertices_along(
-    axis: int, field: FineField, numbers: IntArray, voxel_ijk: IntArray, inside: BoolArray
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the names ``3 v + axis`` of crossed edges along an axis, and their vertices."""
-    voxel, start, end = _crossed_edges(inside, axis)
-    node = numbers[voxel, start]
-    one = _one_of_each(node, len(field.values))  # up to four blocks share an edge
-    voxel, start, end, node = voxel[one], start[one], end[one], node[one]
-    share = _crossing(field.values[node], field.values[numbers[voxel, end]])
+@lru_cache
+def edges_of_block(factor: int) -> BlockEdges:
+    """Return the edges of a block."""
+    block = block_ijk(factor)
+    starts = [np.flatnonzero(block[:, axis] < factor) for axis in range(3)]
+    axis = np.repeat(np.arange(3), [len(start) for start in starts])
+    start = np.concatenate(starts)
+    end = start + np.array([(factor + 1) ** 2, factor + 1, 1])[axis]
+    side = NEIGHBOURHOOD[part_of_node(factor)[0][start]].copy()
+    side[np.arange(len(side)), axis] = 0  # not at either end of its axis
+    arrays = axis, start, end, (side + 1) @ STRIDES
+    return BlockEdges(*(array.astype(np.int32) for array in arrays))
 
-    low = (field.factor * voxel_ijk[voxel] + block_ijk(field.factor)[start]).astype(np.float64)
-    high = low + np.eye(3)[axis]
+
+def _own_edges(field: FineField, rows: slice | IntArray) -> BoolArray:
+    """Say which edges of some voxels' blocks are crossed and belong to the voxel, (n, E)."""
+    edges = edges_of_block(field.factor)
+    inside = field.inside_blocks(rows).reshape(-1, (field.factor + 1) ** 3)
+    crossed = inside[:, edges.start] != inside[:, edges.end]
+    own: BoolArray = crossed & field.nodes.owned[rows][:, edges.part]
+    return own
+
+
+def _extract_group(
+    field: FineField, grid: SdfGrid, firsts: NDArray[np.int64], rows: slice
+) -> tuple[NDArray[np.float64] | FloatArray, IntArray]:
+    """Return the vertices and triangles of some whole planes of voxels."""
+    extract = compiled_twin(_extract_rows)
+    plane = int(field.voxel_ijk[rows.start, 0])
+    position, faces = extract(field, firsts, field.rows(plane - 1, plane), rows)
+    return _to_world(position, field, grid), faces
+
+
+def _extract_rows(
+    field: FineField, firsts: NDArray[np.int64], before: slice, rows: slice
+) -> tuple[NDArray[np.float64], IntArray]:
+    """Return positions, in fine spacings, and triangles of some planes, given the plane before.
+
+    ``firsts`` is the number of each voxel's first vertex, (D + 1,).
+    An edge belongs to a voxel of its own plane or the one before. The vertex on the edge that runs
+    from node v along axis a is looked up at ``3 v + a``.
+    """
+    first_node = field.nodes.owned_before(before.start)
+    nodes = field.nodes.owned_before(rows.stop) - first_node
+    vertex_at = np.full(3 * nodes, -1, np.int32)
+    for some in (before, rows):
+        voxel, edge = np.nonzero(_own_edges(field, some))
+        voxel += some.start
+        own = np.arange(len(voxel)) - np.searchsorted(voxel, voxel)  # the voxel's first is 0
+        start, end = _ends(field, voxel, edge)
+        axis = edges_of_block(field.factor).axis[edge]
+        near = start >= first_node  # not on the far side of the plane before
+        at = 3 * (start - first_node) + axis
+        vertex_at[at[near]] = (firsts[voxel] + own)[near]
+    position = _positions(field, voxel, edge, field.values[start], field.values[end])
+    return position, _triangles(field, rows, vertex_at, first_node)
+
+
+def _ends(
+    field: FineField, voxel: NDArray[np.intp], edge: NDArray[np.intp]
+) -> tuple[IntArray, IntArray]:
+    """Return the nodes at both ends of edges of blocks."""
+    edges = edges_of_block(field.factor)
+    part, place = part_of_node(field.factor)
+    low, high = (
+        field.nodes.starts[voxel, part[node]] + place[node]
+        for node in (edges.start[edge], edges.end[edge])
+    )
+    return low, high
+
+
+def _positions(
+    field: FineField,
+    voxel: NDArray[np.intp],
+    edge: NDArray[np.intp],
+    low: FloatArray,
+    high: FloatArray,
+) -> NDArray[np.float64]:
+    """Return the vertices on edges with values at both ends, from the fine lattice's first node."""
+    edges = edges_of_block(field.factor)
+    start = field.factor * field.voxel_ijk[voxel] + block_ijk(field.factor)[edges.start[edge]]
     lattice = np.array(field.shape) * field.factor
-    low, high = _onto_border(low, lattice), _onto_border(high, lattice)
-    return 3 * node.astype(np.int64) + axis, low + share[:, None] * (high - low)
-
-
-def _one_of_each(node: IntArray, count: int) -> BoolArray:
-    """Mark one place of each different number below ``count``, without sorting."""
-    places = np.arange(len(node), dtype=np.int32)
-    last = np.empty(count, np.int32)
-    last[node] = places
-    one: BoolArray = last[node] == places
-    return one
-
-
-def _crossed_edges(
-    inside: BoolArray, axis: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return voxel, first and last block node of each edge along an axis that is crossed."""
-    side = inside.shape[1]
-    moved = np.moveaxis(inside, axis + 1, 1)
-    crossed = np.zeros_like(moved)
-    crossed[:, :-1] = moved[:, :-1] != moved[:, 1:]
-    flat = np.flatnonzero(np.moveaxis(crossed, 1, axis + 1))
-    voxel, start = np.divmod(flat, side**3)
-    return voxel, start, start + side ** (2 - axis)
+    share = _crossing(low, high)
+    first = _onto_border(start.astype(np.float64), lattice)
+    last = _onto_border(start + np.eye(3)[edges.axis[edge]], lattice)
+    return first + share[:, None] * (last - first)
 
 
 def _crossing(low: FloatArray, high: FloatArray) -> NDArray[np.float64]:
@@ -107,9 +196,10 @@ def _onto_border(position: NDArray[np.float64], lattice: NDArray[np.int64]) -> N
     return np.clip(position, -CAP_HEIGHT, lattice + CAP_HEIGHT)
 
 
-def _triangles(inside: BoolArray, numbers: IntArray, vertex_at: IntArray) -> IntArray:
-    """Return the triangles of all cells, in the order of voxels and cells."""
-    factor = inside.shape[1] - 1
+def _triangles(field: FineField, rows: slice, vertex_at: IntArray, first_node: int) -> IntArray:
+    """Return the triangles of some voxels' cells, in the order of voxels and cells."""
+    factor = field.factor
+    inside = field.inside_blocks(rows)
     case = np.zeros((len(inside),) + (factor,) * 3, np.uint8)
     for bit, (x, y, z) in enumerate(CORNERS):
         corner = inside[:, x : x + factor, y : y + factor, z : z + factor]
@@ -124,8 +214,11 @@ def _triangles(inside: BoolArray, numbers: IntArray, vertex_at: IntArray) -> Int
     voxel, low_node = _low_nodes(cell, factor)
     step = np.array([(factor + 1) ** 2, factor + 1, 1])
     start = (CORNERS @ step)[np.array(EDGE_START)]
-    node = numbers[voxel[of_triangle, None], low_node[of_triangle, None] + start[edges]]
-    faces: IntArray = vertex_at[3 * node.astype(np.int64) + np.array(EDGE_AXIS)[edges]]
+    block_node = low_node[of_triangle, None] + start[edges]
+    part, place = part_of_node(factor)
+    starts = field.nodes.starts[rows]
+    node = starts[voxel[of_triangle, None], part[block_node]] + place[block_node] - first_node
+    faces: IntArray = vertex_at[3 * node + np.array(EDGE_AXIS)[edges]]
     return faces
 
 

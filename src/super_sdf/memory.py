@@ -2,20 +2,65 @@
 
 from __future__ import annotations
 
+import mmap
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
 
 from .errors import OutOfMemoryError
 
+# Of the memory that is free, what is taken unless told otherwise.
+SHARE = 0.6
+
 
 def free_memory() -> int | None:
-    """Return the bytes of memory that are free, None where the system does not say."""
+    """Return the bytes of memory that are free, None where the system does not say.
+
+    In a container that is bounded, what is left of its bound if that is less.
+    """
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
     except OSError:
         return None
     sizes = dict(line.split(":") for line in lines)
-    return int(sizes["MemAvailable"].split()[0]) * 1024 if "MemAvailable" in sizes else None
+    if "MemAvailable" not in sizes:
+        return None
+    free = int(sizes["MemAvailable"].split()[0]) * 1024
+    left = _left_in_container()
+    return free if left is None else min(free, left)
+
+
+def _left_in_container() -> int | None:
+    """Return what a Linux control group lets this process still take, None without a bound."""
+    group = Path("/sys/fs/cgroup")
+    try:
+        bound, used = ((group / f"memory.{name}").read_text() for name in ("max", "current"))
+        return max(int(bound) - int(used), 0)
+    except (OSError, ValueError):  # no such group, or its bound is the word "max"
+        return None
+
+
+def memory_bound(max_memory: int | None = None) -> int | None:
+    """Return how many bytes this process may hold in all, None if nobody can say.
+
+    ``max_memory`` if that is given, else what it holds and ``SHARE`` of what is free.
+    """
+    free = free_memory()
+    if max_memory is not None or free is None:
+        return max_memory
+    return (held_memory() or 0) + int(SHARE * free)
+
+
+def release_pages(array: NDArray[Any]) -> None:
+    """Let go of the pages of a mapped file that were read: they count as this process's memory.
+
+    Nothing happens to other arrays, nor where the system has no such call; to read on is safe.
+    """
+    file = getattr(array, "_mmap", None)
+    if file is not None and hasattr(mmap, "MADV_DONTNEED"):
+        file.madvise(mmap.MADV_DONTNEED)
 
 
 def held_memory(peak: bool = False) -> int | None:
@@ -46,5 +91,5 @@ def check_fits(need: int, what: str, way_out: str) -> None:
     free = free_memory()
     if free is not None and need > free:
         raise OutOfMemoryError(
-            f"{what} needs {need / 1e9:,.1f} GB of memory, {free / 1e9:,.1f} GB are free; {way_out}"
+            f"{what} needs {need / 1e9:,.2f} GB of memory, {free / 1e9:,.2f} GB are free; {way_out}"
         )

@@ -51,3 +51,13 @@ class Mesh:
     def is_closed(self) -> bool:
         """Say whether there are faces, and no edge is open."""
         return len(self.faces) > 0 and self.open_edges() == 0
+
+
+def join_meshes(pieces: list[Mesh]) -> Mesh:
+    """Return pieces whose triangles use the vertices of all of them as one mesh."""
+    if len(pieces) == 1:
+        return pieces[0]
+    return Mesh(
+        np.concatenate([piece.vertices for piece in pieces]),
+        np.concatenate([piece.faces for piece in pieces]),
+    )

@@ -46,12 +46,21 @@ class Network:
         Where it runs: "cpu" or "cuda".
     symmetries : int
         Over how many symmetries of the cube the values are averaged.
+    threads : int
+        CPU threads; 0 for one a core.
     """
 
     session: ort.InferenceSession
     card: Mapping[str, Any]
     device: str
     symmetries: int = 1
+    threads: int = 0
+
+    @property
+    def receptive_field(self) -> int | None:
+        """Voxels to each side that a prediction depends on, None if the file does not say."""
+        field = self.card.get("receptive_field")
+        return field if isinstance(field, int) else None
 
     def __call__(
         self, patches: FloatArray, table: IntArray, voxels: IntArray, offsets: FloatArray
@@ -138,7 +147,7 @@ def load_network(
             "cuda was asked for, but onnxruntime could not start its CUDA provider (are the CUDA "
             "and cuDNN libraries it wants installed?); use --device cpu"
         )
-    return Network(session, _read_card(session, path), used, symmetries)
+    return Network(session, _read_card(session, path), used, symmetries, threads)
 
 
 def available_devices() -> list[str]:

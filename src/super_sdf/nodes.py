@@ -2,19 +2,37 @@
 
 Nodes are points of spacing h/K. A voxel's block is its (K+1)^3 nodes, faces included (Eq. 3), in
 C order. The fine index of coarse sample i is ``K*i + K/2``.
+
+A block has 27 parts: 8 corners, 12 edges, 6 faces and the inside, in the order of
+``NEIGHBOURHOOD``. A part is shared as a whole; it belongs to the first of the voxels that share it,
+and its nodes have consecutive numbers. So numbering 27 parts a voxel numbers all nodes, and nothing
+is sorted or searched.
 """
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
 
-from .band import CENTRE, NEIGHBOURHOOD
+import numpy as np
+from numpy.typing import NDArray
+
+from .band import CENTRE, NEIGHBOURHOOD, STRIDES
+from .chunks import in_chunks
+from .compiling import compiled_twin
 from .errors import OptionError
 from .grid import BoolArray, FloatArray, IntArray
 
 MAX_FACTOR = 16
 # What a node is set to when only its sign is known.
 BARELY_INSIDE, BARELY_OUTSIDE = np.float32(-1e-3), np.float32(1e-3)
+
+# The neighbours that share each part, the voxel itself among them: those that lie on its side.
+SHARING = [
+    np.flatnonzero(((NEIGHBOURHOOD == 0) | (sides == NEIGHBOURHOOD)).all(1))
+    for sides in NEIGHBOURHOOD
+]
 
 
 def check_factor(factor: int) -> int:
@@ -38,72 +56,121 @@ def block_offsets(factor: int) -> FloatArray:
     return (block_ijk(factor) * (2.0 / factor) - 1.0).astype(np.float32)
 
 
-def number_shared_nodes(table: IntArray, factor: int) -> tuple[IntArray, int]:
-    """Number the nodes of all blocks so that a shared node has one number.
-
-    A block has 27 parts: 8 corners, 12 edges, 6 faces and the inside. A part is shared as a whole;
-    it belongs to the first of the voxels that share it, and its nodes have consecutive numbers. So
-    numbering 27 parts a voxel numbers all nodes, and nothing is sorted.
-
-    Parameters
-    ----------
-    table : (D, 27) int32
-        Neighbours among the D voxels themselves, -1 where there is none.
-    factor : int
-        K.
-
-    Returns
-    -------
-    (D, Q) int32 and int
-        The number of each block's nodes, and how many different nodes there are.
-    """
-    part_of, place_in_part = _parts(factor)
-    owner, owner_part = _owners(table)
-    own = owner == np.arange(len(table), dtype=np.int32)[:, None]
-    sizes = own * np.bincount(part_of, minlength=27).astype(np.int32)
-    ends = np.cumsum(sizes.ravel(), dtype=np.int32).reshape(sizes.shape)
-    starts = (ends - sizes)[owner, owner_part]
-    count = int(ends.flat[-1]) if ends.size else 0
-    return starts[:, part_of] + place_in_part, count
-
-
-def _parts(factor: int) -> tuple[IntArray, IntArray]:
-    """Return for each block node its part, 0 to 26 as ``NEIGHBOURHOOD``, and its place in it."""
+@lru_cache
+def part_of_node(factor: int) -> tuple[IntArray, IntArray]:
+    """Return for each block node its part, 0 to 26, and its place in it."""
     block = block_ijk(factor)
-    side = np.where(block == 0, 0, np.where(block == factor, 2, 1))
-    part = (side @ np.array([9, 3, 1])).astype(np.int32)
+    part = (np.where(block == 0, 0, np.where(block == factor, 2, 1)) @ STRIDES).astype(np.int32)
     place = np.empty_like(part)
     for number in range(27):
-        columns = np.flatnonzero(part == number)
-        place[columns] = np.arange(len(columns))
+        place[part == number] = np.arange((part == number).sum())
     return part, place
 
 
-def _owners(table: IntArray) -> tuple[IntArray, IntArray]:
-    """Return for each part of each voxel, (D, 27), the voxel it belongs to, and as which part."""
-    owner, owner_part = np.empty_like(table), np.empty_like(table)
-    for part, sides in enumerate(NEIGHBOURHOOD):
-        sharing = np.flatnonzero(((NEIGHBOURHOOD == 0) | (sides == NEIGHBOURHOOD)).all(1))
+@lru_cache
+def nodes_of_part(factor: int) -> list[NDArray[np.intp]]:
+    """Return the block nodes of each part."""
+    part, _ = part_of_node(factor)
+    return [np.flatnonzero(part == number) for number in range(27)]
+
+
+def seen_from(part: int, neighbour: int | np.integer[Any]) -> int:
+    """Return which part of a neighbour that shares it a part is: it is on the other side there."""
+    return int((NEIGHBOURHOOD[part] - 2 * NEIGHBOURHOOD[neighbour] + 1) @ STRIDES)
+
+
+@dataclass(frozen=True, eq=False)
+class SharedNodes:
+    """Numbers for the nodes of some blocks: a node that blocks share has one number.
+
+    Attributes
+    ----------
+    factor : int
+        K.
+    table : (D, 27) int32
+        Neighbours among the D voxels themselves, -1 where there is none.
+    starts : (D, 27) int32
+        The number of the first node of each part.
+    owned : (D, 27) bool
+        Which parts belong to the voxel itself.
+    count : int
+        How many different nodes there are.
+    """
+
+    factor: int
+    table: IntArray
+    starts: IntArray
+    owned: BoolArray
+    count: int
+
+    def numbers(self, rows: slice | NDArray[np.integer[Any]] = slice(None)) -> IntArray:
+        """Return the nodes of some blocks, (n, Q)."""
+        part, place = part_of_node(self.factor)
+        return self.starts[rows][:, part] + place
+
+    def owned_before(self, row: int) -> int:
+        """Return how many nodes belong to the voxels before a row: theirs come first."""
+        if row == len(self.starts):
+            return self.count
+        return int(self.starts[row][self.owned[row]].min())
+
+
+def number_shared_nodes(table: IntArray, factor: int) -> SharedNodes:
+    """Number the nodes of all blocks of voxels whose neighbours among themselves are given."""
+    sizes = np.array([len(nodes) for nodes in nodes_of_part(factor)], np.int32)
+    starts, owned, count = compiled_twin(_number_parts)(table, sizes)
+    return SharedNodes(factor, table, starts, owned, count)
+
+
+def _number_parts(table: IntArray, sizes: IntArray) -> tuple[IntArray, BoolArray, int]:
+    """Return ``starts``, ``owned`` and ``count`` for parts of so many nodes each."""
+    owned = np.stack([(table[:, sharing[sharing < CENTRE]] < 0).all(1) for sharing in SHARING], 1)
+    ends = np.cumsum((owned * sizes).ravel(), dtype=np.int32).reshape(table.shape)
+    own_starts = ends - owned * sizes
+    starts = np.empty_like(own_starts)
+    for part, sharing in enumerate(SHARING):
         first = sharing[(table[:, sharing] >= 0).argmax(1)]
-        owner[:, part] = np.take_along_axis(table, first[:, None], 1)[:, 0]
-        # Seen from the owner, one step away on some axes, the part is on the other side there.
-        mirrored = sides - 2 * NEIGHBOURHOOD[first]
-        owner_part[:, part] = (mirrored + 1) @ np.array([9, 3, 1])
-    return owner, owner_part
+        as_part = np.array([seen_from(part, neighbour) for neighbour in range(27)])[first]
+        owner = np.take_along_axis(table, first[:, None], 1)[:, 0]
+        starts[:, part] = own_starts[owner, as_part]
+    return starts, owned, int(ends.flat[-1]) if ends.size else 0
 
 
-def average_shared(blocks: FloatArray, numbers: IntArray, count: int) -> FloatArray:
+def average_shared(blocks: FloatArray, nodes: SharedNodes) -> FloatArray:
     """Return one value a node: the mean over the blocks that predict it (Eq. 7).
 
-    ``blocks`` and ``numbers`` are (D, Q); the result is (count,). The sum runs in the order of
-    the voxels, in double precision, so it does not depend on how the work was divided.
+    ``blocks`` is (D, Q); the result is (count,). The sum runs in the order of the voxels, in double
+    precision, so it does not depend on how the work was divided.
     """
-    flat = numbers.ravel()
-    total = np.bincount(flat, weights=blocks.ravel(), minlength=count)
-    return (total / np.bincount(flat, minlength=count)).astype(np.float32)
+    values = np.empty(nodes.count, np.float32)
+    average = compiled_twin(_average_chunk)
+    in_chunks(len(blocks), lambda rows: average(blocks, nodes, rows, values))
+    return values
 
 
-def pin_to_skipped(values: FloatArray, numbers: IntArray, skipped: IntArray, factor: int) -> int:
+def _average_chunk(blocks: FloatArray, nodes: SharedNodes, rows: slice, values: FloatArray) -> None:
+    """Set the values of the nodes that some voxels own."""
+    columns = nodes_of_part(nodes.factor)
+    for part, sharing in enumerate(SHARING):
+        own = rows.start + np.flatnonzero(nodes.owned[rows, part])
+        total = np.zeros((len(own), len(columns[part])))
+        times = np.zeros((len(own), 1))
+        for neighbour in sharing:
+            other = nodes.table[own, neighbour]
+            there = other >= 0
+            seen = columns[seen_from(part, neighbour)]
+            total[there] += blocks[other[there, None], seen]
+            times += there[:, None]
+        values[nodes.starts[own, part, None] + np.arange(total.shape[1])] = total / times
+
+
+def pin_to_skipped(
+    values: FloatArray,
+    nodes: SharedNodes,
+    voxel_ijk: IntArray,
+    patches: FloatArray,
+    shape: tuple[int, int, int],
+) -> BoolArray:
     """Give nodes shared with a voxel that was not decoded that voxel's sign.
 
     Such a voxel holds no surface, so all its nodes have its sign; with this no sign change can
@@ -111,35 +178,46 @@ def pin_to_skipped(values: FloatArray, numbers: IntArray, skipped: IntArray, fac
 
     Parameters
     ----------
-    values : (n,) float32
+    values : (count,) float32
         Node values, changed in place.
-    numbers : (D, Q) int32
-        The nodes of each decoded voxel.
-    skipped : (D, 27) int8
-        The sign of each neighbour that was not decoded (-1 inside, 1 outside), else 0.
+    nodes : SharedNodes
+        The nodes of the decoded voxels.
+    voxel_ijk : (D, 3) int32
+        The decoded voxels.
+    patches : (D, 27) float32
+        Their samples, which have the signs of the neighbours.
+    shape : three ints
+        Samples of the grid: beyond it nothing was skipped.
 
     Returns
     -------
-    int
-        How many nodes had the other sign.
+    (count,) bool
+        Which nodes had the other sign.
     """
-    block = block_ijk(factor)
-    pinned = 0
+    changed = np.zeros(len(values), bool)
+    compiled_twin(_pin)(values, nodes, voxel_ijk, patches, shape, changed)
+    return changed
+
+
+def _pin(
+    values: FloatArray,
+    nodes: SharedNodes,
+    voxel_ijk: IntArray,
+    patches: FloatArray,
+    shape: tuple[int, int, int],
+    changed: BoolArray,
+) -> None:
+    """Change the values, and say which. No two skipped voxels round a node differ in sign."""
+    last = np.array(shape) - 1
+    parts = nodes_of_part(nodes.factor)
     for place, step in enumerate(NEIGHBOURHOOD):
-        rows = np.flatnonzero(skipped[:, place])
-        if place == CENTRE or not len(rows):
-            continue
-        columns = np.flatnonzero(_on_side(block, step, factor))
-        nodes = numbers[rows[:, None], columns]
-        outside = np.broadcast_to(skipped[rows, place, None] > 0, nodes.shape)
-        wrong = (values[nodes] > 0) != outside
-        pinned += len(np.unique(nodes[wrong]))
-        values[nodes[wrong]] = np.where(outside[wrong], BARELY_OUTSIDE, BARELY_INSIDE)
-    return pinned
-
-
-def _on_side(block: IntArray, step: IntArray, factor: int) -> BoolArray:
-    """Say which block nodes are shared with the neighbour at ``step``."""
-    edge = np.where(step > 0, factor, 0)
-    on_side: BoolArray = ((step == 0) | (block == edge)).all(1)
-    return on_side
+        rows = np.flatnonzero(nodes.table[:, place] < 0)
+        beside = voxel_ijk[rows] + step
+        rows = rows[((beside >= 0) & (beside <= last)).all(1)]
+        outside = patches[rows, place] > 0
+        for part in np.flatnonzero([place in sharing for sharing in SHARING]):
+            number = nodes.starts[rows, part, None] + np.arange(len(parts[part]))
+            wrong = (values[number] > 0) != outside[:, None]
+            changed[number[wrong]] = True
+            signed = np.where(outside, BARELY_OUTSIDE, BARELY_INSIDE)[:, None]
+            values[number[wrong]] = np.broadcast_to(signed, wrong.shape)[wrong]

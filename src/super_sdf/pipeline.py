@@ -3,32 +3,31 @@
     grid -> band -> patches and neighbours -> network -> shared nodes averaged
          -> surface moved to touch the samples' spheres -> isosurface
 
+A grid that is too large to be refined at once is refined slab by slab (see ``plan``); the mesh is
+the same.
+
 >>> from super_sdf import SdfGrid, reconstruct
 >>> mesh = reconstruct(SdfGrid(values, spacing=0.1))            # doctest: +SKIP
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
-from .band import (
-    NEIGHBOURHOOD,
-    can_hold_surface,
-    find_band,
-    gather_patches,
-    is_lipschitz,
-    neighbour_table,
-    rescale,
-)
+from .band import neighbour_table
+from .border import close_at_border
+from .chunks import working_threads
+from .compiling import use_compiled
 from .errors import GridError
-from .field import FineField, close_at_border
+from .field import FineField, border_is_crossed
 from .grid import FloatArray, IntArray, SdfGrid
 from .isosurface import extract_mesh
-from .memory import check_fits
-from .mesh import Mesh
+from .memory import memory_bound
+from .mesh import Mesh, join_meshes
 from .nodes import (
     average_shared,
     block_offsets,
@@ -36,19 +35,22 @@ from .nodes import (
     number_shared_nodes,
     pin_to_skipped,
 )
-from .spheres import Blocks, Lattice, fit_to_spheres
+from .plan import Slab, plan_slabs
+from .spheres import Samples, fit_to_spheres
+from .survey import Band, survey
 
 Progress = Callable[[int, int], None]
 """Called with (steps done, steps in all)."""
 
-# At most, from the network's output to the mesh, for each node of each decoded block.
-BYTES_PER_BLOCK_NODE = 36
-
+# The first once, the others for each slab.
 STEPS = ("band", "network", "nodes", "isosurface")
 
 
 class Decoder(Protocol):
-    """What the pipeline asks of a network: see ``network.Network``."""
+    """What the pipeline asks of a network: see ``network.Network``.
+
+    If it has a ``receptive_field`` (voxels to each side), it need not see the whole band at once.
+    """
 
     def __call__(
         self, patches: FloatArray, table: IntArray, voxels: IntArray, offsets: FloatArray
@@ -65,7 +67,7 @@ def upsample(
     offset: float = 0.0,
     progress: Progress | None = None,
 ) -> FineField:
-    """Refine a coarse grid near its surface.
+    """Refine a coarse grid near its surface, all at once.
 
     Parameters
     ----------
@@ -95,33 +97,14 @@ def upsample(
         If no surface is found: thin parts may pass between samples that are all outside, so this
         is known only in the end.
     """
-    check_factor(factor)
-    tell = progress or (lambda done, total: None)
-    rescaled = rescale(grid, offset)  # Eq. 4
-    band_ijk = find_band(rescaled)  # Eq. 2
-    if not len(band_ijk):
+    with working_threads(getattr(network, "threads", 0)):
+        band = find_surface(grid, factor, offset, memory_bound())
+        (slab,) = plan_slabs(band, factor, None, memory_bound())
+        steps = Steps(progress, slabs=1)
+        field = refine(band, network, factor, slab, steps)
+    if len(field.signs()) < 2:
         raise no_surface(grid, offset)
-    patches = gather_patches(rescaled, band_ijk)
-    table = neighbour_table(band_ijk, grid.shape)
-    lipschitz = is_lipschitz(patches)
-    voxels = np.flatnonzero(can_hold_surface(patches, lipschitz)).astype(np.int32)
-    need = len(voxels) * (factor + 1) ** 3 * BYTES_PER_BLOCK_NODE
-    check_fits(need, f"factor {factor} on {len(voxels):,} voxels", "use a smaller factor")
-    tell(1, len(STEPS))
-
-    blocks = network(patches, table, voxels, block_offsets(factor))  # Eqs. 3 and 5
-    tell(2, len(STEPS))
-
-    values, decoded = join_blocks(blocks, patches, table, voxels, factor)
-    own_table, numbers = decoded.own_table, decoded.nodes.numbers
-    voxel_ijk = band_ijk[voxels]
-    skipped = skipped_neighbours(own_table, patches[voxels], voxel_ijk, grid.shape)
-    pinned = pin_to_skipped(values, numbers, skipped, factor)
-    if (values > 0).all() or (values <= 0).all():
-        raise no_surface(grid, offset)
-    tell(3, len(STEPS))
-    noisy = int((~lipschitz).sum())
-    return FineField(grid.shape, factor, voxel_ijk, numbers, values, len(band_ijk), noisy, pinned)
+    return field
 
 
 def reconstruct(
@@ -131,47 +114,185 @@ def reconstruct(
     *,
     offset: float = 0.0,
     cap: bool = False,
+    max_memory: int | None = None,
     progress: Progress | None = None,
 ) -> Mesh:
-    """Turn a coarse grid into a fine mesh: ``upsample``, then ``extract_mesh``.
+    """Turn a coarse grid into a fine mesh.
 
     ``network`` is the shipped one unless given. A surface that runs out of the grid is left open
-    there, or closed along the border with ``cap``. Otherwise as ``upsample``.
+    there, or closed along the border with ``cap``. ``max_memory`` bounds what the process may hold,
+    in bytes, beside the mesh; a share of what is free unless given. Otherwise as ``upsample``.
     """
     if network is None:
         from .network import load_network
 
         network = load_network()
-    field = upsample(grid, network, factor, offset=offset, progress=progress)
-    mesh = mesh_field(field, grid, offset=offset, cap=cap)
-    if progress:
-        progress(len(STEPS), len(STEPS))
-    return mesh
+    options = {"offset": offset, "cap": cap, "max_memory": max_memory, "progress": progress}
+    pieces = reconstruct_slabs(grid, network, factor, **options)  # type: ignore[arg-type]
+    return join_meshes([piece.mesh for piece in pieces])
 
 
-def mesh_field(field: FineField, grid: SdfGrid, *, offset: float = 0.0, cap: bool = False) -> Mesh:
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """What came of a slab.
+
+    Attributes
+    ----------
+    mesh : Mesh
+        Triangles of the slab: rows of the vertices of all pieces so far, this one's among them.
+    slabs : int
+        How many pieces there are in all.
+    band_voxels, noisy_voxels : int
+        Of the whole grid: see ``FineField``.
+    decoded_voxels, nodes, pinned : int
+        Of the slab.
+    is_cut : bool
+        Whether the surface runs out of the grid here.
+    signs : set of bool
+        Whether there are outer nodes (True), and others (False).
+    """
+
+    mesh: Mesh
+    slabs: int
+    band_voxels: int
+    noisy_voxels: int
+    decoded_voxels: int
+    nodes: int
+    pinned: int
+    is_cut: bool
+    signs: set[bool]
+
+
+def reconstruct_slabs(
+    grid: SdfGrid,
+    network: Decoder,
+    factor: int = 4,
+    *,
+    offset: float = 0.0,
+    cap: bool = False,
+    max_memory: int | None = None,
+    progress: Progress | None = None,
+) -> Iterator[Piece]:
+    """Yield the mesh slab by slab, as few slabs as fit in memory. Otherwise as ``reconstruct``.
+
+    Joined, the pieces are the same mesh, bit for bit, whatever the slabs and threads.
+    """
+    threads = getattr(network, "threads", 0)
+    bound = memory_bound(max_memory)
+    with working_threads(threads):
+        band = find_surface(grid, factor, offset, bound)
+        slabs = plan_slabs(band, factor, getattr(network, "receptive_field", None), bound)
+    steps = Steps(progress, len(slabs))
+    vertices = 0
+    seen: set[bool] = set()
+    for slab in slabs:
+        with working_threads(threads):
+            field = refine(band, network, factor, slab, steps)
+            mesh = mesh_field(field, grid, offset=offset, cap=cap, first_vertex=vertices)
+            piece = describe_piece(field, mesh, len(slabs))
+            del field, mesh  # no more of them than one at a time
+        steps.finish_one()
+        vertices += len(piece.mesh.vertices)
+        seen |= piece.signs
+        yield piece
+    if len(seen) < 2:
+        raise no_surface(grid, offset)
+
+
+class Steps:
+    """Counts the steps that are done and tells of each."""
+
+    def __init__(self, progress: Progress | None, slabs: int) -> None:
+        self.progress = progress or (lambda done, total: None)
+        self.done, self.total = 0, 1 + (len(STEPS) - 1) * slabs
+        self.finish_one()  # the band
+
+    def finish_one(self) -> None:
+        """Count one more."""
+        self.done += 1
+        self.progress(self.done, self.total)
+
+
+def find_surface(grid: SdfGrid, factor: int, offset: float, bound: int | None) -> Band:
+    """Return the band of a grid, if there is one."""
+    check_factor(factor)
+    band = survey(grid, offset, bound)  # Eqs. 2 and 4
+    if not len(band.voxel_ijk):
+        raise no_surface(grid, offset)
+    use_compiled(int(band.decoded.sum()))
+    return band
+
+
+def refine(
+    band: Band, network: Decoder, factor: int, slab: Slab, steps: Steps | None = None
+) -> FineField:
+    """Return the fine field of a slab, or of the whole band."""
+    steps = steps or Steps(None, slabs=1)
+    voxel_ijk, patches = band.voxel_ijk[slab.seen], band.patches[slab.seen]
+    table = neighbour_table(*in_slab(voxel_ijk, band.shape))
+    voxels = np.flatnonzero(band.decoded[slab.decoded]) + slab.decoded.start - slab.seen.start
+    voxels = voxels.astype(np.int32)
+    blocks = network(patches, table, voxels, block_offsets(factor))  # Eqs. 3 and 5
+    steps.finish_one()
+
+    row_of = rows_among(voxels, len(table))
+    nodes = number_shared_nodes(row_of[table[voxels]], factor)
+    values = average_shared(blocks, nodes)  # Eq. 7
+    del blocks
+    exact = np.flatnonzero(band.exact[slab.seen]).astype(np.int32)
+    values = fit_to_spheres(values, nodes, Samples(patches, exact, table, row_of))
+    pinned = pin_to_skipped(values, nodes, voxel_ijk[voxels], patches[voxels], band.shape)
+    steps.finish_one()
+    field = FineField(band.shape, factor, voxel_ijk[voxels], nodes, values, slab.planes)
+    return replace(
+        field,
+        band_voxels=len(band.voxel_ijk),
+        noisy_voxels=int(np.count_nonzero(~band.lipschitz)),
+        pinned=int(np.count_nonzero(pinned[field.own_nodes()])),
+    )
+
+
+def mesh_field(
+    field: FineField,
+    grid: SdfGrid,
+    *,
+    offset: float = 0.0,
+    cap: bool = False,
+    first_vertex: int = 0,
+) -> Mesh:
     """Mesh what ``upsample`` returned, with ``cap`` closed along the grid's border."""
     if cap:
-        field = close_at_border(field, np.less_equal(rescale(grid, offset), 0))
-    return extract_mesh(field, grid)
+        field = close_at_border(field, grid, offset)
+    return extract_mesh(field, grid, first_vertex)
+
+
+def describe_piece(field: FineField, mesh: Mesh, slabs: int) -> Piece:
+    """Return what there is to say of a slab beside its mesh."""
+    own, nodes = field.rows(*field.planes), field.own_nodes()
+    return Piece(
+        mesh,
+        slabs,
+        field.band_voxels,
+        field.noisy_voxels,
+        own.stop - own.start,
+        nodes.stop - nodes.start,
+        field.pinned,
+        border_is_crossed(field),
+        field.signs(),
+    )
 
 
 def no_surface(grid: SdfGrid, offset: float) -> GridError:
     """Return the error for a grid in which nothing is to be found."""
-    low, high = grid.values.min(), grid.values.max()
-    return GridError(f"no surface at {offset:g}: the values go from {low:.6g} to {high:.6g}")
+    return GridError(
+        f"no surface at {offset:g}: the values go from {grid.low:.6g} to {grid.high:.6g}"
+    )
 
 
-def join_blocks(
-    blocks: FloatArray, patches: FloatArray, table: IntArray, voxels: IntArray, factor: int
-) -> tuple[FloatArray, Blocks]:
-    """Return one value a node, (n,), from what each block (D, Q) says, and who has which node."""
-    row_of = rows_among(voxels, len(table))
-    own_table = row_of[table[voxels]]  # -1, absent, reads the last row: -1 again
-    numbers, count = number_shared_nodes(own_table, factor)
-    values = average_shared(blocks, numbers, count)  # Eq. 7
-    decoded = Blocks(table, row_of, own_table, Lattice(numbers, count, factor))
-    return fit_to_spheres(values, patches, decoded), decoded
+def in_slab(voxel_ijk: IntArray, shape: tuple[int, int, int]) -> tuple[IntArray, tuple[int, ...]]:
+    """Return voxels counted from the first plane in which there is one, and so many planes."""
+    first, last = int(voxel_ijk[0, 0]), int(voxel_ijk[-1, 0])
+    return voxel_ijk - np.array([first, 0, 0], np.int32), (last - first + 1, *shape[1:])
 
 
 def rows_among(voxels: IntArray, count: int) -> IntArray:
@@ -179,13 +300,3 @@ def rows_among(voxels: IntArray, count: int) -> IntArray:
     row_of = np.full(count + 1, -1, np.int32)
     row_of[voxels] = np.arange(len(voxels), dtype=np.int32)
     return row_of
-
-
-def skipped_neighbours(
-    own_table: IntArray, patches: FloatArray, voxel_ijk: IntArray, shape: tuple[int, int, int]
-) -> IntArray:
-    """Return the sign, (D, 27), of each neighbour in the grid that was not decoded, else 0."""
-    around = voxel_ijk[:, None] + NEIGHBOURHOOD
-    in_grid = np.logical_and(around >= 0, around < np.array(shape)).all(axis=2)
-    sign = np.where(patches > 0, 1, -1)
-    return np.where((own_table < 0) & in_grid, sign, 0).astype(np.int32)

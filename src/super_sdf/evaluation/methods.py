@@ -6,18 +6,19 @@ Each is given a case and a network, which only ours runs, and returns a surface 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 
 import numpy as np
 from scipy import ndimage
 from skimage.measure import marching_cubes
 
-from ..band import find_band, gather_patches, neighbour_table, rescale
-from ..grid import FloatArray, IntArray, SdfGrid
+from ..grid import FloatArray, SdfGrid
 from ..mesh import Mesh
-from ..nodes import block_ijk, block_offsets
-from ..pipeline import Decoder, join_blocks, reconstruct
+from ..nodes import block_ijk
+from ..pipeline import Decoder, reconstruct, refine
+from ..plan import cut
+from ..survey import survey
 from .cases import Case, spread_samples
 
 NUDGE = np.float32(1e-9)  # what an exact zero becomes: a vertex on a node can open the surface
@@ -68,7 +69,7 @@ def our_surface(case: Case, network: Decoder) -> Surface:
     mesh = reconstruct(grid, network, factor=case.factor, cap=True)
     if case.setting.passes > 1 or case.setting.noise:
         return Surface(mesh)  # no field of the very nodes and voxels that the protocol compares
-    return Surface(mesh, lambda: band_field(case.grid, case.voxels, network, case.factor))
+    return Surface(mesh, lambda: band_field(case.grid, network, case.factor))
 
 
 def refined_grid(grid: SdfGrid, network: Decoder, factor: int) -> SdfGrid:
@@ -76,28 +77,24 @@ def refined_grid(grid: SdfGrid, network: Decoder, factor: int) -> SdfGrid:
 
     Elsewhere stands the nearest sample: it has the right sign, and is beyond the finer band.
     """
-    voxels = find_band(rescale(grid))
-    field = band_field(grid, voxels, network, factor)
+    field = band_field(grid, network, factor)
     rest = spread_samples(np.asarray(grid.values, np.float32), factor)
     first = np.array(grid.origin) - grid.voxel_size / 2
     return SdfGrid(np.where(np.isnan(field), rest, field), grid.voxel_size / factor, first)
 
 
-def band_field(grid: SdfGrid, voxels: IntArray, network: Decoder, factor: int) -> FloatArray:
-    """Return our distances at all nodes of some voxels' blocks, NaN elsewhere.
+def band_field(grid: SdfGrid, network: Decoder, factor: int) -> FloatArray:
+    """Return our distances at all nodes of the band's blocks, NaN elsewhere.
 
     The pipeline decodes only the voxels that can hold the surface; the protocol asks for all.
     """
-    rescaled = rescale(grid)
-    table = neighbour_table(voxels, grid.shape)
-    every = np.arange(len(voxels), dtype=np.int32)
-    patches = gather_patches(rescaled, voxels)
-    blocks = network(patches, table, every, block_offsets(factor))
-    values, decoded = join_blocks(blocks, patches, table, every, factor)
-    nodes = factor * voxels[:, None] + block_ijk(factor)  # (V, Q, 3)
+    band = survey(grid)
+    band = replace(band, decoded=np.ones(len(band.voxel_ijk), bool))
+    fine = refine(band, network, factor, cut(band, 1, 0)[0])
+    nodes = factor * fine.voxel_ijk[:, None] + block_ijk(factor)  # (V, Q, 3)
     field = np.full([factor * n + 1 for n in grid.shape], np.nan, np.float32)
-    world = values * np.float32(grid.voxel_size / 2)
-    field[tuple(np.moveaxis(nodes, 2, 0))] = world[decoded.nodes.numbers]
+    world = fine.values * np.float32(grid.voxel_size / 2)
+    field[tuple(np.moveaxis(nodes, 2, 0))] = world[fine.numbers]
     return field
 
 

@@ -161,7 +161,7 @@ def _node_plane(field: FineField, number: int, index: int) -> NDArray[np.float64
     across, along = _others(number)
     in_grid = ((field.voxel_ijk >= 0) & (field.voxel_ijk < np.array(field.shape))).all(1)
     rows = np.flatnonzero(in_grid & (field.voxel_ijk[:, number] == index))
-    blocks = field.numbers[rows].reshape(-1, *(factor + 1,) * 3)
+    blocks = field.nodes.numbers(rows).reshape(-1, *(factor + 1,) * 3)
     nodes = np.take(blocks, factor // 2, axis=number + 1)
     place = factor * field.voxel_ijk[rows, :, None] + np.arange(factor + 1)
     plane = np.full((factor * field.shape[across] + 1, factor * field.shape[along] + 1), np.nan)

@@ -1,0 +1,119 @@
+"""How a grid is cut into slabs so that the work fits in memory: decided before it begins.
+
+The result is the same for every cut. What a block's values depend on ends some planes away:
+
+    planes of the slab                   its vertices and triangles are made
+    + FINAL_BESIDE                       values must be final: which vertices are whose
+    + spheres.REACH_IN_VOXELS            blocks are decoded
+    + the network's receptive field      voxels are shown to the network
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from .errors import OutOfMemoryError
+from .memory import held_memory
+from .spheres import REACH_IN_VOXELS
+from .survey import Band
+
+FINAL_BESIDE = 1
+DECODED_BESIDE = FINAL_BESIDE + REACH_IN_VOXELS
+# What a process holds at most, found by measuring (see benchmarks.memory) and rounded up: for each
+# voxel that the network sees, for each that is decoded, for each node of its block, for each
+# triangle's worth of surface in it.
+BYTES_PER_VOXEL = 1850
+BYTES_PER_DECODED = 1000
+BYTES_PER_BLOCK_NODE = 8
+# Chunks in work, whatever the grid.
+WORK_BYTES = 60_000_000
+
+
+@dataclass(frozen=True)
+class Slab:
+    """Planes of voxels to be meshed, from the first to before the last, and rows of the band.
+
+    Attributes
+    ----------
+    planes : two ints
+        The slab's own planes.
+    decoded : slice
+        Voxels among which are those to decode.
+    seen : slice
+        Voxels that the network sees.
+    """
+
+    planes: tuple[int, int]
+    decoded: slice
+    seen: slice
+
+
+def cut(band: Band, pieces: int, receptive_field: int) -> list[Slab]:
+    """Cut a band into slabs with about the same number of decoded voxels."""
+    per_plane = np.bincount(band.voxel_ijk[band.decoded, 0], minlength=band.shape[0])
+    share = np.cumsum(per_plane) / max(per_plane.sum(), 1)
+    inner = np.searchsorted(share, np.arange(1, pieces) / pieces) + 1
+    bounds = np.unique([0, *inner, band.shape[0]]).tolist()
+    return [_slab(band, first, last, receptive_field) for first, last in pairwise(bounds)]
+
+
+def _slab(band: Band, first: int, last: int, receptive_field: int) -> Slab:
+    """Return a slab with what it depends on."""
+    decoded = band.rows(first - DECODED_BESIDE, last + DECODED_BESIDE)
+    beside = DECODED_BESIDE + receptive_field
+    return Slab((first, last), decoded, band.rows(first - beside, last + beside))
+
+
+def slab_bytes(band: Band, slab: Slab, factor: int) -> int:
+    """Return what a process needs for a slab beside what it holds already, at most."""
+    seen = int(slab.seen.stop) - int(slab.seen.start)
+    decoded = int(np.count_nonzero(band.decoded[slab.decoded]))
+    per_decoded = BYTES_PER_DECODED + BYTES_PER_BLOCK_NODE * (factor + 1) ** 3
+    return WORK_BYTES + seen * BYTES_PER_VOXEL + decoded * per_decoded
+
+
+def plan_slabs(
+    band: Band, factor: int, receptive_field: int | None, bound: int | None
+) -> list[Slab]:
+    """Return the fewest slabs that fit, in order.
+
+    Parameters
+    ----------
+    band : Band
+        Of the whole grid.
+    factor : int
+        K.
+    receptive_field : int, optional
+        Voxels to each side that the network's answer depends on; if it is not known, the network
+        must see the whole band at once.
+    bound : int, optional
+        Bytes that the process may hold in all: see ``memory.memory_bound``.
+
+    Raises
+    ------
+    OutOfMemoryError
+        If the thinnest slabs do not fit.
+    """
+    held = held_memory() or band.patches.nbytes + WORK_BYTES
+    for slabs in _ways_to_cut(band, receptive_field):
+        need = held + max(slab_bytes(band, slab, factor) for slab in slabs)
+        if bound is None or need <= bound:
+            return slabs
+    assert bound is not None
+    raise OutOfMemoryError(
+        f"factor {factor} on {int(band.decoded.sum()):,} voxels needs {need / 1e9:,.2f} GB of "
+        f"memory in {len(slabs)} slabs, {bound / 1e9:,.2f} GB may be taken; use a smaller factor, "
+        "or allow more (--max-memory)"
+    )
+
+
+def _ways_to_cut(band: Band, receptive_field: int | None) -> Iterator[list[Slab]]:
+    """Yield cuts into more and more slabs, down to slabs of one plane."""
+    yield cut(band, 1, receptive_field or 0)
+    if receptive_field is not None:
+        for pieces in range(2, band.shape[0] + 1):
+            yield cut(band, pieces, receptive_field)

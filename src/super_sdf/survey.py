@@ -1,0 +1,118 @@
+"""The band of a whole grid, found plane by plane: all that is kept of the input.
+
+It grows with the surface, 123 bytes a voxel, not with the grid, and the grid is read once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .band import can_hold_surface, find_band, gather_patches, is_lipschitz, plane_blocks, rescale
+from .chunks import side_by_side
+from .errors import OutOfMemoryError
+from .grid import BoolArray, FloatArray, IntArray, SdfGrid
+from .memory import release_pages
+from .spheres import exact_samples
+
+BYTES_PER_VOXEL = 123  # of a band
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """The active voxels of a grid (Eq. 2) and what their samples say.
+
+    Attributes
+    ----------
+    shape : three ints
+        Samples of the grid along each axis.
+    voxel_ijk : (V, 3) int32
+        The voxels, in C order.
+    patches : (V, 27) float32
+        The samples round each, in half voxels.
+    lipschitz : (V,) bool
+        Where they can be distances.
+    decoded : (V,) bool
+        Which voxels can hold the surface.
+    exact : (V,) bool
+        Which samples can be taken for exact distances.
+    """
+
+    shape: tuple[int, int, int]
+    voxel_ijk: IntArray
+    patches: FloatArray
+    lipschitz: BoolArray
+    decoded: BoolArray
+    exact: BoolArray
+
+    def rows(self, first: int, last: int) -> slice:
+        """Return the rows of the voxels in planes ``first`` to before ``last``."""
+        start, stop = np.searchsorted(self.voxel_ijk[:, 0], [first, last])
+        return slice(int(start), int(stop))
+
+
+def survey(grid: SdfGrid, offset: float = 0.0, bound: int | None = None) -> Band:
+    """Read a grid once and return its band.
+
+    ``offset`` (world units) moves the surface to the level ``values == offset``. ``bound`` is how
+    many bytes the process may hold.
+
+    Raises
+    ------
+    OutOfMemoryError
+        As soon as the band alone is larger than the bound: it is not worth reading on.
+    """
+    sizes: list[int] = []
+
+    def read(planes: slice) -> tuple[IntArray, FloatArray]:
+        found = _band_of_planes(grid, offset, planes.start, planes.stop)
+        sizes.append(len(found[0]))
+        _check_bound(sum(sizes), planes.stop, bound)
+        return found
+
+    parts = side_by_side([slice(*block) for block in plane_blocks(grid.shape)], read)
+    voxel_ijk = np.concatenate([ijk for ijk, _ in parts])
+    patches = [part for _, part in parts]
+    del parts
+    return describe(grid.shape, voxel_ijk, _joined(patches))
+
+
+def _check_bound(voxels: int, planes: int, bound: int | None) -> None:
+    """Raise if so many voxels of the band do not fit in the bound."""
+    if bound is not None and voxels * BYTES_PER_VOXEL > bound:
+        raise OutOfMemoryError(
+            f"the band of the first {planes:,} planes has {voxels:,} voxels already, which alone "
+            f"take {voxels * BYTES_PER_VOXEL / 1e9:,.2f} GB of memory, {bound / 1e9:,.2f} GB may "
+            "be taken; is this a distance field? If so, allow more (--max-memory)"
+        )
+
+
+def describe(shape: tuple[int, int, int], voxel_ijk: IntArray, patches: FloatArray) -> Band:
+    """Return a band with all that its patches say."""
+    lipschitz = is_lipschitz(patches)
+    decoded = can_hold_surface(patches, lipschitz)
+    return Band(shape, voxel_ijk, patches, lipschitz, decoded, exact_samples(patches, lipschitz))
+
+
+def _band_of_planes(
+    grid: SdfGrid, offset: float, first: int, last: int
+) -> tuple[IntArray, FloatArray]:
+    """Return the voxels of some planes, and their patches: they see one plane further."""
+    low, high = max(first - 1, 0), min(last + 1, grid.shape[0])
+    rescaled = rescale(grid, offset, low, high)
+    release_pages(grid.samples)
+    ijk = find_band(rescaled)
+    own = ijk[(ijk[:, 0] >= first - low) & (ijk[:, 0] < last - low)]
+    return own + np.array([low, 0, 0], np.int32), gather_patches(rescaled, own)
+
+
+def _joined(parts: list[FloatArray]) -> FloatArray:
+    """Return the arrays in one and empty the list, so that there is hardly a second copy."""
+    joined = np.empty((sum(map(len, parts)), 27), np.float32)
+    start = len(joined)
+    while parts:
+        part = parts.pop()
+        start -= len(part)
+        joined[start : start + len(part)] = part
+    return joined
