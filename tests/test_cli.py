@@ -234,7 +234,7 @@ def test_a_factor_beyond_memory_is_refused_before_the_work(here, command, monkey
     monkeypatch.setattr("super_sdf.memory.free_memory", lambda: 10**8)
     code, _, err = command("upsample", "in.npy", "out.ply", "--factor", 16)
     assert code == 1 and err.startswith("Error: factor 16 on ")
-    assert err.endswith(" GB of memory, 0.1 GB are free; use a smaller factor\n")
+    assert "GB of memory even plane by plane" in err and err.endswith("(--max-memory)\n")
 
 
 TARGETS = {

@@ -14,8 +14,8 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from importlib.util import find_spec
 from functools import partial
+from importlib.util import find_spec
 from math import prod
 from pathlib import Path
 from typing import IO, Any

@@ -23,9 +23,8 @@ from .survey import Band
 
 FINAL_BESIDE = 1
 DECODED_BESIDE = FINAL_BESIDE + REACH_IN_VOXELS
-# What a process holds at most, found by measuring (see benchmarks.memory) and rounded up: for each
-# voxel that the network sees, for each that is decoded, for each node of its block, for each
-# triangle's worth of surface in it.
+# What a process takes at most, measured (benchmarks.memory) and rounded up: for each voxel that the
+# network sees, for each that is decoded, and for each node of its block.
 BYTES_PER_VOXEL = 1850
 BYTES_PER_DECODED = 1000
 BYTES_PER_BLOCK_NODE = 8
@@ -52,28 +51,10 @@ class Slab:
     seen: slice
 
 
-def cut(band: Band, pieces: int, receptive_field: int) -> list[Slab]:
-    """Cut a band into slabs with about the same number of decoded voxels."""
-    per_plane = np.bincount(band.voxel_ijk[band.decoded, 0], minlength=band.shape[0])
-    share = np.cumsum(per_plane) / max(per_plane.sum(), 1)
-    inner = np.searchsorted(share, np.arange(1, pieces) / pieces) + 1
-    bounds = np.unique([0, *inner, band.shape[0]]).tolist()
-    return [_slab(band, first, last, receptive_field) for first, last in pairwise(bounds)]
-
-
-def _slab(band: Band, first: int, last: int, receptive_field: int) -> Slab:
-    """Return a slab with what it depends on."""
-    decoded = band.rows(first - DECODED_BESIDE, last + DECODED_BESIDE)
-    beside = DECODED_BESIDE + receptive_field
-    return Slab((first, last), decoded, band.rows(first - beside, last + beside))
-
-
-def slab_bytes(band: Band, slab: Slab, factor: int) -> int:
-    """Return what a process needs for a slab beside what it holds already, at most."""
-    seen = int(slab.seen.stop) - int(slab.seen.start)
-    decoded = int(np.count_nonzero(band.decoded[slab.decoded]))
-    per_decoded = BYTES_PER_DECODED + BYTES_PER_BLOCK_NODE * (factor + 1) ** 3
-    return WORK_BYTES + seen * BYTES_PER_VOXEL + decoded * per_decoded
+def whole(band: Band) -> Slab:
+    """Return the whole band as one slab."""
+    rows = slice(0, len(band.voxel_ijk))
+    return Slab((0, band.shape[0]), rows, rows)
 
 
 def plan_slabs(
@@ -98,22 +79,59 @@ def plan_slabs(
     OutOfMemoryError
         If the thinnest slabs do not fit.
     """
-    held = held_memory() or band.patches.nbytes + WORK_BYTES
-    for slabs in _ways_to_cut(band, receptive_field):
-        need = held + max(slab_bytes(band, slab, factor) for slab in slabs)
+    if receptive_field is None:
+        need, slabs = held_bytes(band) + slab_bytes(band, whole(band), factor), [whole(band)]
+        if bound is not None and need > bound:
+            raise _does_not_fit(band, factor, "at once", need, bound)
+        return slabs
+    for slabs in ways_to_cut(band, receptive_field):
+        need = held_bytes(band) + max(slab_bytes(band, slab, factor) for slab in slabs)
         if bound is None or need <= bound:
             return slabs
     assert bound is not None
-    raise OutOfMemoryError(
-        f"factor {factor} on {int(band.decoded.sum()):,} voxels needs {need / 1e9:,.2f} GB of "
-        f"memory in {len(slabs)} slabs, {bound / 1e9:,.2f} GB may be taken; use a smaller factor, "
-        "or allow more (--max-memory)"
-    )
+    raise _does_not_fit(band, factor, "even plane by plane", need, bound)
 
 
-def _ways_to_cut(band: Band, receptive_field: int | None) -> Iterator[list[Slab]]:
+def cut(band: Band, pieces: int, receptive_field: int) -> list[Slab]:
+    """Cut a band into slabs with about the same number of decoded voxels, at most so many."""
+    share = band.decoded_before / max(int(band.decoded_before[-1]), 1)
+    inner = np.searchsorted(share, np.arange(1, pieces) / pieces)
+    bounds = np.unique(np.clip([0, *inner, band.shape[0]], 0, band.shape[0])).tolist()
+    return [_slab(band, first, last, receptive_field) for first, last in pairwise(bounds)]
+
+
+def ways_to_cut(band: Band, receptive_field: int) -> Iterator[list[Slab]]:
     """Yield cuts into more and more slabs, down to slabs of one plane."""
-    yield cut(band, 1, receptive_field or 0)
-    if receptive_field is not None:
-        for pieces in range(2, band.shape[0] + 1):
-            yield cut(band, pieces, receptive_field)
+    for pieces in range(1, band.shape[0]):
+        yield cut(band, pieces, receptive_field)
+    planes = range(band.shape[0])
+    yield [_slab(band, plane, plane + 1, receptive_field) for plane in planes]
+
+
+def _slab(band: Band, first: int, last: int, receptive_field: int) -> Slab:
+    """Return a slab with what it depends on."""
+    decoded = band.rows(first - DECODED_BESIDE, last + DECODED_BESIDE)
+    beside = DECODED_BESIDE + receptive_field
+    return Slab((first, last), decoded, band.rows(first - beside, last + beside))
+
+
+def held_bytes(band: Band) -> int:
+    """Return what the process holds already, the band among it."""
+    return held_memory() or band.patches.nbytes + WORK_BYTES
+
+
+def slab_bytes(band: Band, slab: Slab, factor: int) -> int:
+    """Return what a process takes for a slab beside what it holds already, at most."""
+    seen = slab.seen.stop - slab.seen.start
+    decoded = band.count_decoded(slab.decoded)
+    per_decoded = BYTES_PER_DECODED + BYTES_PER_BLOCK_NODE * (factor + 1) ** 3
+    return int(WORK_BYTES + seen * BYTES_PER_VOXEL + decoded * per_decoded)
+
+
+def _does_not_fit(band: Band, factor: int, how: str, need: int, bound: int) -> OutOfMemoryError:
+    """Return the error for work that is too large."""
+    return OutOfMemoryError(
+        f"factor {factor} on {int(band.decoded_before[-1]):,} voxels needs {need / 1e9:,.2f} GB of "
+        f"memory {how}, {bound / 1e9:,.2f} GB may be taken; use a smaller factor, or allow more "
+        "(--max-memory)"
+    )

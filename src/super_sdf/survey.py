@@ -6,8 +6,10 @@ It grows with the surface, 123 bytes a voxel, not with the grid, and the grid is
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .band import can_hold_surface, find_band, gather_patches, is_lipschitz, plane_blocks, rescale
 from .chunks import side_by_side
@@ -48,8 +50,23 @@ class Band:
 
     def rows(self, first: int, last: int) -> slice:
         """Return the rows of the voxels in planes ``first`` to before ``last``."""
-        start, stop = np.searchsorted(self.voxel_ijk[:, 0], [first, last])
-        return slice(int(start), int(stop))
+        low, high = max(first, 0), min(last, self.shape[0])
+        return slice(int(self.seen_before[low]), int(self.seen_before[high]))
+
+    @cached_property
+    def seen_before(self) -> NDArray[np.int64]:
+        """How many voxels there are before each plane, and in all, (nx + 1,)."""
+        return np.searchsorted(self.voxel_ijk[:, 0], np.arange(self.shape[0] + 1))
+
+    @cached_property
+    def decoded_before(self) -> NDArray[np.int64]:
+        """How many voxels to decode there are before each plane, and in all, (nx + 1,)."""
+        return np.append(0, np.cumsum(self.decoded))[self.seen_before]
+
+    def count_decoded(self, rows: slice) -> int:
+        """Return how many voxels are to be decoded in rows of whole planes."""
+        first, last = np.searchsorted(self.seen_before, [rows.start, rows.stop])
+        return int(self.decoded_before[last] - self.decoded_before[first])
 
 
 def survey(grid: SdfGrid, offset: float = 0.0, bound: int | None = None) -> Band:

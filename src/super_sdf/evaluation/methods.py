@@ -17,7 +17,7 @@ from ..grid import FloatArray, SdfGrid
 from ..mesh import Mesh
 from ..nodes import block_ijk
 from ..pipeline import Decoder, reconstruct, refine
-from ..plan import cut
+from ..plan import whole
 from ..survey import survey
 from .cases import Case, spread_samples
 
@@ -90,7 +90,7 @@ def band_field(grid: SdfGrid, network: Decoder, factor: int) -> FloatArray:
     """
     band = survey(grid)
     band = replace(band, decoded=np.ones(len(band.voxel_ijk), bool))
-    fine = refine(band, network, factor, cut(band, 1, 0)[0])
+    fine = refine(band, network, factor, whole(band))
     nodes = factor * fine.voxel_ijk[:, None] + block_ijk(factor)  # (V, Q, 3)
     field = np.full([factor * n + 1 for n in grid.shape], np.nan, np.float32)
     world = fine.values * np.float32(grid.voxel_size / 2)
