@@ -5,6 +5,8 @@ measure a real one.
 """
 
 import ctypes
+import runpy
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,6 +23,7 @@ from super_sdf.errors import DeviceError, ModelError
 from super_sdf.network import INPUTS, one_voxel, shipped_models
 from super_sdf.nodes import block_offsets
 
+ROOT = Path(__file__).parent.parent
 ASKED = "cuda was asked for, but "
 HERE = f"onnxruntime {ort.__version__}"
 
@@ -257,3 +260,11 @@ def test_shipped_files_let_the_chunk_be_chosen():
     for path in shipped_models().values():
         session = load_network(path, device="cpu").session
         assert [given.name for given in session.get_overridable_initializers()] == [CHUNK_INPUT]
+
+
+def test_the_benchmark_says_that_there_is_nothing_to_measure(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["benchmarks.cuda"])
+    runpy.run_path(str(ROOT / "benchmarks" / "cuda.py"), run_name="__main__")
+    said = capsys.readouterr().out
+    assert said.startswith(f"nothing to measure: {ASKED}{HERE} here has no CUDA provider")
+    assert said.count("\n") == 1
