@@ -11,6 +11,7 @@ are noisy balls. Where CUDA does not run, one line says why.
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -26,10 +27,9 @@ from super_sdf.band import (
     neighbour_table,
     rescale,
 )
-from super_sdf.cuda import describe_gpu, query_gpu
+from super_sdf.cuda import describe_gpu, onnxruntime_version, query_gpu
 from super_sdf.device import CUDA_CHUNK, run_bound
 from super_sdf.errors import DeviceError
-from super_sdf.evaluation.timing import describe_machine
 from super_sdf.network import INPUTS, QUALITIES, Network
 from super_sdf.nodes import block_offsets
 
@@ -152,7 +152,8 @@ def main() -> None:
     except DeviceError as error:
         print(f"nothing to measure: {error}")
         return
-    print(f"{describe_machine()}; {describe_gpu() or 'no GPU'}; least of {RUNS} runs each")
+    gpu = describe_gpu() or "no GPU"
+    print(f"{gpu}; {os.cpu_count()} cores; {onnxruntime_version()}; least of {RUNS} runs each")
     compare_values(asked.device, asked.sizes)
     compare_chunks(asked.device, max(asked.sizes))
     watch_memory(asked.device, max(asked.sizes))

@@ -23,6 +23,7 @@ from super_sdf.errors import DeviceError, ModelError
 from super_sdf.network import INPUTS, one_voxel, shipped_models
 from super_sdf.nodes import block_offsets
 
+pytestmark = pytest.mark.usefixtures("cpu_build")
 ROOT = Path(__file__).parent.parent
 ASKED = "cuda was asked for, but "
 HERE = f"onnxruntime {ort.__version__}"
@@ -39,7 +40,7 @@ def no_library(missing):
 
 
 @pytest.fixture
-def cuda_build(monkeypatch):
+def cuda_build(cpu_build, monkeypatch):
     """An onnxruntime that was built for CUDA 13, and a driver and all libraries."""
     monkeypatch.setattr(ort, "get_available_providers", lambda: [CUDA, CPU])
     monkeypatch.setattr(ort, "cuda_version", "13.0", raising=False)

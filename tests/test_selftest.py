@@ -10,6 +10,8 @@ from super_sdf import cli_common, selftest
 from super_sdf.errors import DeviceError
 from super_sdf.selftest import EXTRAS, Finding, run_checks
 
+pytestmark = pytest.mark.usefixtures("cpu_build")
+
 
 def find(findings, what):
     """Return the finding on something."""
