@@ -1,11 +1,18 @@
 """Write a trained network as the ONNX file that the runtime loads, and check that they agree.
 
     python -m export.to_onnx --run training/run --out models/base.onnx --data "..." --accuracy "..."
+    python -m export.to_onnx --from models/base.onnx --out models/base.onnx
+
+The second writes a file's weights and card anew in the graph of today, and keeps it only if it
+gives the same values, bit for bit.
 
 The graph is written by hand because of one thing an exporter would not do: each neighbour
 convolution runs as a Scan over chunks of the neighbour table. Gathered rows are 27 times as large
 as the features; chunk by chunk they stay in cache and need no memory to speak of. Standard
 operators only.
+
+A chunk that suits a processor's cache keeps a GPU waiting for the next one. So its size is an
+initializer that is an input as well: who runs the file may override it.
 """
 
 from __future__ import annotations
@@ -20,13 +27,14 @@ import onnx
 import torch
 from onnx import TensorProto, helper, numpy_helper
 
-from export.network import NetworkConfig, SuperSdfNet
+from export.network import SIZES, NetworkConfig, SuperSdfNet
 from super_sdf.band import CENTRE, REACH, find_band, gather_patches, neighbour_table
+from super_sdf.device import CHUNK_INPUT
 from super_sdf.network import FORMAT_VERSION, load_network
 from super_sdf.nodes import block_offsets
 
 OPSET = 18
-CHUNK = 512  # rows of the neighbour table at a time; 256 to 2048 differ by a few percent
+CHUNK = 512  # rows of the neighbour table at a time; 256 to 2048 differ by a few percent on a CPU
 PARITY = 2e-4  # half voxels: 1e-4 of a voxel
 
 
@@ -97,16 +105,18 @@ def build_graph(net: SuperSdfNet) -> onnx.GraphProto:
     noisy = graph.op("Gather", noisy_voxels(graph), "voxels", axis=0)
     correction = graph.op("Mul", graph.layer(chosen, net.correction), noisy)
     graph.nodes.append(helper.make_node("Add", [kept, correction], ["values"]))
+    graph.constants.append(numpy_helper.from_array(np.array([CHUNK], np.int64), CHUNK_INPUT))
     return helper.make_graph(graph.nodes, "super_sdf", inputs(), [output()], graph.constants)
 
 
 def inputs() -> list[onnx.ValueInfoProto]:
-    """Return the declared inputs."""
+    """Return the declared inputs; the last has a default."""
     return [
         helper.make_tensor_value_info("patches", TensorProto.FLOAT, ["V", 27]),
         helper.make_tensor_value_info("neighbours", TensorProto.INT32, ["V", 27]),
         helper.make_tensor_value_info("voxels", TensorProto.INT32, ["D"]),
         helper.make_tensor_value_info("offsets", TensorProto.FLOAT, ["Q", 3]),
+        helper.make_tensor_value_info(CHUNK_INPUT, TensorProto.INT64, [1]),
     ]
 
 
@@ -116,13 +126,14 @@ def output() -> onnx.ValueInfoProto:
 
 
 def chunked_table(graph: Graph, rows: str) -> str:
-    """Fill the neighbour table up with absent rows and cut it into (n, CHUNK, 27)."""
-    size = graph.integers(CHUNK)
-    missing = graph.op("Sub", size, graph.op("Mod", rows, size))  # 1 to CHUNK: one row is spare
+    """Fill the neighbour table up with absent rows and cut it into (n, chunk, 27)."""
+    partial = graph.op("Mod", rows, CHUNK_INPUT)
+    missing = graph.op("Sub", CHUNK_INPUT, partial)  # 1 to a chunk: one row is spare
     pads = graph.op("Concat", graph.integers(0, 0), missing, graph.integers(0), axis=0)
     absent = graph.constant(np.array(-1, np.int32))
     filled = graph.op("Pad", "neighbours", pads, absent)
-    return graph.op("Reshape", filled, graph.integers(-1, CHUNK, 27))
+    shape = graph.op("Concat", graph.integers(-1), CHUNK_INPUT, graph.integers(27), axis=0)
+    return graph.op("Reshape", filled, shape)
 
 
 def scan_block(
@@ -134,15 +145,15 @@ def scan_block(
     padded = graph.op("Concat", features, zeros, axis=0)  # index -1 is the row of zeros
     body = Graph(net, f"block{number}_")
     gathered = body.op("Gather", padded, "chunk", axis=0)
-    columns = body.op("Reshape", gathered, body.integers(CHUNK, 27 * channels))
+    columns = body.op("Reshape", gathered, body.integers(-1, 27 * channels))
     product = body.op("MatMul", columns, body.parameter(block.conv.weight))
     mixed = body.relu(body.op("Add", product, body.parameter(block.conv.bias)))
     reduced = body.layer(body.relu(body.layer(mixed, block.expand)), block.reduce)
     subgraph = helper.make_graph(
         body.nodes,
         f"block{number}",
-        [helper.make_tensor_value_info("chunk", TensorProto.INT32, [CHUNK, 27])],
-        [helper.make_tensor_value_info(reduced, TensorProto.FLOAT, [CHUNK, channels])],
+        [helper.make_tensor_value_info("chunk", TensorProto.INT32, ["rows", 27])],
+        [helper.make_tensor_value_info(reduced, TensorProto.FLOAT, ["rows", channels])],
         body.constants,
     )
     stacked = graph.op("Scan", chunks, body=subgraph, num_scan_inputs=1)
@@ -225,8 +236,8 @@ def write_model(net: SuperSdfNet, path: Path, card: dict[str, Any]) -> None:
     onnx.save(model, path)
 
 
-def parity(net: SuperSdfNet, path: Path, seed: int = 0) -> float:
-    """Return the largest difference (half voxels) between torch and onnxruntime on a noisy ball."""
+def noisy_ball(seed: int = 0) -> tuple[np.ndarray, ...]:
+    """Return inputs to compare networks on, with noise and some voxels that are not decoded."""
     rng = np.random.default_rng(seed)
     ijk = np.indices((24, 20, 22))
     radius = np.linalg.norm(ijk - np.array([11, 9, 10])[:, None, None, None], axis=0)
@@ -234,10 +245,15 @@ def parity(net: SuperSdfNet, path: Path, seed: int = 0) -> float:
     band = find_band(rescaled)
     patches, table = gather_patches(rescaled, band), neighbour_table(band, rescaled.shape)
     voxels = np.flatnonzero(rng.random(len(band)) < 0.7).astype(np.int32)
-    offsets = block_offsets(4)
-    got = load_network(path, device="cpu")(patches, table, voxels, offsets)
+    return patches, table, voxels, block_offsets(4)
+
+
+def parity(net: SuperSdfNet, path: Path, seed: int = 0) -> float:
+    """Return the largest difference (half voxels) between torch and onnxruntime on a noisy ball."""
+    arrays = noisy_ball(seed)
+    got = load_network(path, device="cpu")(*arrays)
     with torch.no_grad():
-        want = net(*(torch.from_numpy(array) for array in (patches, table, voxels, offsets)))
+        want = net(*(torch.from_numpy(array) for array in arrays))
     return float(np.abs(got - want.numpy()).max())
 
 
@@ -247,6 +263,38 @@ def load_run(folder: Path) -> SuperSdfNet:
     net = SuperSdfNet(NetworkConfig(**state["config"]))
     net.load_state_dict(state["average"])
     return net.eval()
+
+
+def rewrite(source: Path, target: Path) -> None:
+    """Write the weights and the card of an exported file in the graph of today.
+
+    Raises
+    ------
+    SystemExit
+        If the values are not the same, bit for bit, or the file's sizes are none of ours.
+    """
+    card = {prop.key: prop.value for prop in onnx.load(source).metadata_props}
+    net = load_weights(read_weights(source))
+    want = load_network(source, device="cpu")(*noisy_ball())
+    fresh = target.with_suffix(".new.onnx")  # the target may be the source
+    write_model(net, fresh, card)
+    same = np.array_equal(load_network(fresh, device="cpu")(*noisy_ball()), want)
+    if not same:
+        fresh.unlink()
+        raise SystemExit(f"{source}: the new graph gives other values; {target} was not written")
+    fresh.replace(target)
+    print(f"{target}: the same values as {source} had, bit for bit")
+
+
+def load_weights(weights: dict[str, torch.Tensor]) -> SuperSdfNet:
+    """Return the shipped network, whichever it is, that has these weights."""
+    for config in SIZES.values():
+        net = SuperSdfNet(config)
+        shapes = {name: tensor.shape for name, tensor in net.state_dict().items()}
+        if shapes == {name: tensor.shape for name, tensor in weights.items()}:
+            net.load_state_dict(weights)
+            return net.eval()
+    raise SystemExit(f"weights of no network in export.network.SIZES: {', '.join(SIZES)}")
 
 
 def make_card(net: SuperSdfNet, name: str, data: str, accuracy: str) -> dict[str, Any]:
@@ -270,13 +318,18 @@ def make_card(net: SuperSdfNet, name: str, data: str, accuracy: str) -> dict[str
 
 
 def main() -> None:
-    """Export a run and refuse to keep a file that does not agree with it."""
+    """Export a run, or a file anew, and refuse to keep a file that does not agree with it."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--run", type=Path, required=True, help="folder of the run")
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--run", type=Path, help="folder of the run")
+    source.add_argument("--from", type=Path, dest="source", help="an .onnx file to write anew")
     parser.add_argument("--out", type=Path, required=True, help="the .onnx file")
-    parser.add_argument("--data", required=True, help="what it was trained on")
+    parser.add_argument("--data", default="not said", help="what it was trained on")
     parser.add_argument("--accuracy", default="not measured", help="measured figures, in words")
     options = parser.parse_args()
+    if options.source:
+        rewrite(options.source, options.out)
+        return
     net = load_run(options.run)
     write_model(net, options.out, make_card(net, options.out.stem, options.data, options.accuracy))
     difference = parity(net, options.out)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import onnxruntime as ort
 import pytest
 
 from super_sdf import SdfGrid
@@ -71,3 +72,10 @@ def command(
         return code, out, err
 
     return run
+
+
+@pytest.fixture
+def cpu_build(monkeypatch):
+    """Make onnxruntime one that was built without CUDA, whichever is installed."""
+    monkeypatch.setattr(ort, "get_available_providers", lambda: ["CPUExecutionProvider"])
+    monkeypatch.setattr(ort, "cuda_version", "", raising=False)

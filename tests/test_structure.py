@@ -10,9 +10,9 @@ SOURCES = sorted((ROOT / "src" / "super_sdf").glob("*.py"))
 EVALUATION = sorted((ROOT / "src" / "super_sdf" / "evaluation").glob("*.py"))
 FLOORS = [
     {"errors", "chunks", "compiling"},
-    {"memory"},
+    {"memory", "cuda"},
     {"grid"},
-    {"band", "mesh", "conventions", "cell_cases"},
+    {"band", "mesh", "conventions", "cell_cases", "device"},
     {"nodes", "io", "symmetry"},
     {"field", "network", "lattice"},
     {"isosurface", "border", "spheres"},
@@ -21,7 +21,8 @@ FLOORS = [
     {"plan"},
     {"pipeline"},
     {"cli_common", "__init__"},
-    {"cli_sample", "cli_evaluate", "cli_render"},
+    {"selftest"},
+    {"cli_sample", "cli_evaluate", "cli_render", "cli_info"},
     {"cli"},
 ]
 EVALUATION_FLOORS = [
@@ -74,7 +75,7 @@ def test_the_runtime_needs_four_packages():
         if path.stem == "kernels":  # loaded only where numba is
             foreign -= {"numba"}
         assert not foreign, f"{path.stem} imports {foreign}"
-        if path.stem != "network" and path.stem != "cli":
+        if path.stem not in ("cuda", "device", "network", "cli_info"):
             assert "onnxruntime" not in imported(path)
 
 

@@ -40,13 +40,23 @@ from export.network import (
 )
 from export.recipe import RECIPE, differences, rate_factor
 from export.shapes import random_solid
-from export.to_onnx import make_card, parity, read_weights, write_model
+from export.to_onnx import (
+    load_weights,
+    make_card,
+    noisy_ball,
+    parity,
+    read_weights,
+    rewrite,
+    write_model,
+)
 from export.train import Errors, Run, Store, log, read_log, sample_errors, train
 from export.variants import UNet
 from super_sdf import Mesh, load_network
 from super_sdf.band import CENTRE, NEIGHBOURHOOD, find_band, is_lipschitz, neighbour_table
+from super_sdf.device import CHUNK_INPUT
 from super_sdf.evaluation.sampling import sample_grid
 from super_sdf.evaluation.solid import Solid
+from super_sdf.network import INPUTS, shipped_models
 from super_sdf.nodes import block_offsets
 
 SMALL = NetworkConfig(channels=8, blocks=2, hidden=16, functions=24, trunk=16, frequencies=2)
@@ -337,6 +347,26 @@ def test_the_onnx_file_agrees_with_torch_and_carries_its_card(tmp_path):
     write_model(net, tmp_path / "small.onnx", make_card(net, "small", "nothing", "none"))
     assert parity(net, tmp_path / "small.onnx") < 2e-4
     assert load_network(tmp_path / "small.onnx").card["receptive_field"] == 3
+
+
+def test_the_chunk_is_a_matter_of_who_runs_the_file(tmp_path):
+    write_model(small_net(), tmp_path / "small.onnx", make_card(small_net(), "small", "", ""))
+    session = load_network(tmp_path / "small.onnx", device="cpu").session
+    feeds = dict(zip(INPUTS, noisy_ball()))
+    want = session.run(None, feeds)[0]
+    for rows in (7, 512, len(feeds["patches"]), 10**4):
+        got = session.run(None, {**feeds, CHUNK_INPUT: np.array([rows])})[0]
+        np.testing.assert_allclose(got, want, atol=1e-5)
+
+
+def test_a_file_is_written_anew_with_the_same_values_and_card(tmp_path):
+    shipped = shipped_models()["fast"]
+    rewrite(shipped, tmp_path / "fast.onnx")
+    one, other = load_network(shipped, device="cpu"), load_network(tmp_path / "fast.onnx")
+    assert one.card == other.card and [path.name for path in tmp_path.iterdir()] == ["fast.onnx"]
+    np.testing.assert_array_equal(one(*noisy_ball()), other(*noisy_ball()))
+    with pytest.raises(SystemExit, match=r"weights of no network in export\.network\.SIZES"):
+        load_weights({})
 
 
 def test_training_can_start_from_an_onnx_file(tmp_path):

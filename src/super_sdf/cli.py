@@ -17,6 +17,7 @@ import click
 from . import __version__
 from .cli_common import CONTEXT, one_line_errors
 from .cli_evaluate import evaluate
+from .cli_info import info
 from .cli_render import render
 from .cli_sample import sample
 
@@ -222,6 +223,7 @@ class Upsampling:
             "warnings": self.warnings,
             "model": self.options["model"] or self.options["quality"],
             "device": self.network.device,
+            "device_notes": list(self.network.notes),
             "band_voxels": self.field.band_voxels,
             "noisy_voxels": self.field.noisy_voxels,
             "decoded_voxels": len(self.field.voxel_ijk),
@@ -239,7 +241,7 @@ class Upsampling:
             click.echo(json.dumps(report, indent=2))
         if self.options["quiet"]:
             return
-        for note in self.grid.notes:
+        for note in (*self.grid.notes, *self.network.notes):
             click.echo(f"Note: {note}", err=True)
         for warning in self.warnings:
             click.echo(f"Warning: {warning}", err=True)
@@ -256,39 +258,7 @@ class Upsampling:
         )
 
 
-@cli.command(context_settings=CONTEXT, short_help="Show versions, devices and networks.")
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
-def info(as_json: bool) -> None:
-    """Show versions, devices, and the shipped networks with their cards."""
-    import platform
-
-    import onnxruntime
-
-    from .network import available_devices, load_network, shipped_models
-
-    with one_line_errors():
-        facts = {
-            "super-sdf": __version__,
-            "python": platform.python_version(),
-            "onnxruntime": onnxruntime.__version__,
-            "devices": available_devices(),
-            "models": {
-                name: dict(load_network(name, device="cpu").card) for name in shipped_models()
-            },
-        }
-    if as_json:
-        click.echo(json.dumps(facts, indent=2))
-        return
-    for key in ("super-sdf", "python", "onnxruntime"):
-        click.echo(f"{key} {facts[key]}")
-    click.echo(f"devices: {', '.join(facts['devices'])}")
-    for name, card in facts["models"].items():
-        click.echo(f"model {name}")
-        for key, value in sorted(card.items()):
-            click.echo(f"  {key.replace('_', ' ')}: {value}")
-
-
-for command in (sample, evaluate, render):
+for command in (sample, evaluate, render, info):
     cli.add_command(command)
 
 

@@ -1,7 +1,8 @@
-"""The network: an ONNX file that keeps a contract, run by onnxruntime (only here).
+"""The network: an ONNX file that keeps a contract.
 
 Inputs ``patches`` (V, 27), ``neighbours`` (V, 27), ``voxels`` (D,), ``offsets`` (Q, 3); output
 ``values`` (D, Q). All lengths are in half voxels. The file's metadata says what it was made for.
+``device`` runs it.
 """
 
 from __future__ import annotations
@@ -14,8 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime as ort
+from onnxruntime import InferenceSession
 
+from .cuda import first_line
+from .device import open_session, run_bound, run_on_cpu
 from .errors import DeviceError, FileError, ModelError
 from .grid import FloatArray, IntArray
 from .symmetry import cube_symmetries, turn
@@ -24,7 +27,6 @@ FORMAT_VERSION = 1
 DEFAULT_QUALITY = "base"
 # A shipped file, and over how many symmetries of the cube its answers are averaged.
 QUALITIES = {"fast": ("fast", 1), "base": ("base", 1), "best": ("base", 8)}
-DEVICES = ("auto", "cpu", "cuda")
 INPUTS = {
     "patches": "tensor(float)",
     "neighbours": "tensor(int32)",
@@ -48,13 +50,16 @@ class Network:
         Over how many symmetries of the cube the values are averaged.
     threads : int
         CPU threads; 0 for one a core.
+    notes : tuple of str
+        What the user should know of the device.
     """
 
-    session: ort.InferenceSession
+    session: InferenceSession
     card: Mapping[str, Any]
     device: str
     symmetries: int = 1
     threads: int = 0
+    notes: tuple[str, ...] = ()
 
     @property
     def receptive_field(self) -> int | None:
@@ -84,14 +89,14 @@ class Network:
         self, patches: FloatArray, table: IntArray, voxels: IntArray, offsets: FloatArray
     ) -> FloatArray:
         """Run the session."""
-        feeds = {"patches": patches, "neighbours": table, "voxels": voxels, "offsets": offsets}
+        feeds = dict(zip(INPUTS, (patches, table, voxels, offsets)))
         try:
-            values: FloatArray = self.session.run([OUTPUT], feeds)[0]
+            run = run_bound if self.device == "cuda" else run_on_cpu
+            return run(self.session, feeds)
         except Exception as error:  # onnxruntime's errors have no common base but this
             raise DeviceError(
-                f"the network failed on {self.device}: {_first_line(error)}"
+                f"the network failed on {self.device}: {first_line(error)}"
             ) from error
-        return values
 
 
 def shipped_models() -> dict[str, Path]:
@@ -140,57 +145,22 @@ def load_network(
         If CUDA was asked for and cannot run.
     """
     path, symmetries = find_model(model)
-    session = _open_session(path, _providers(device), threads)
-    used = "cuda" if "CUDAExecutionProvider" in session.get_providers() else "cpu"
-    if device == "cuda" and used != "cuda":
-        raise DeviceError(
-            "cuda was asked for, but onnxruntime could not start its CUDA provider (are the CUDA "
-            "and cuDNN libraries it wants installed?); use --device cpu"
-        )
-    return Network(session, _read_card(session, path), used, symmetries, threads)
+    opened = open_session(path, device, threads, one_voxel())
+    card = _read_card(opened.session, path)
+    return Network(opened.session, card, opened.device, symmetries, threads, opened.notes)
 
 
-def available_devices() -> list[str]:
-    """Return the devices that this onnxruntime was built for."""
-    built = ort.get_available_providers()
-    return ["cpu"] + ["cuda"] * ("CUDAExecutionProvider" in built)
+def one_voxel() -> dict[str, Any]:
+    """Return the least that a network can be asked: one voxel, without neighbours, one offset."""
+    return {
+        "patches": np.zeros((1, 27), np.float32),
+        "neighbours": np.full((1, 27), -1, np.int32),
+        "voxels": np.zeros(1, np.int32),
+        "offsets": np.zeros((1, 3), np.float32),
+    }
 
 
-def _providers(device: str) -> list[str]:
-    """Return the execution providers to try, in order."""
-    if device not in DEVICES:
-        raise DeviceError(f"device is {device!r}: give one of {', '.join(DEVICES)}")
-    with_cuda = "cuda" in available_devices()
-    if device == "cuda" and not with_cuda:
-        raise DeviceError(
-            f"cuda was asked for, but onnxruntime {ort.__version__} here has no CUDA provider; "
-            "install onnxruntime-gpu in place of onnxruntime, or use --device cpu"
-        )
-    wanted = ["CUDAExecutionProvider"] * (with_cuda and device != "cpu")
-    return [*wanted, "CPUExecutionProvider"]
-
-
-def _open_session(path: Path, providers: list[str], threads: int) -> ort.InferenceSession:
-    """Open an ONNX file."""
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.log_severity_level = 4  # errors come as exceptions; the rest is not for users
-    # Arrays of another size at every call: an arena would keep the largest of each.
-    options.enable_cpu_mem_arena = False
-    options.enable_mem_pattern = False
-    try:
-        return ort.InferenceSession(str(path), options, providers=providers)
-    except Exception as error:  # onnxruntime's errors have no common base but this
-        reason = _first_line(error)
-        raise ModelError(f"{path} is no ONNX file that onnxruntime can run: {reason}") from error
-
-
-def _first_line(error: Exception) -> str:
-    """Return what an error says, in one line."""
-    return next(iter(str(error).strip().splitlines()), type(error).__name__)
-
-
-def _read_card(session: ort.InferenceSession, path: Path) -> dict[str, Any]:
+def _read_card(session: InferenceSession, path: Path) -> dict[str, Any]:
     """Return a file's metadata after checking that it keeps the contract."""
     inputs = {given.name: given.type for given in session.get_inputs()}
     outputs = [given.name for given in session.get_outputs()]

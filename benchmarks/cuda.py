@@ -1,0 +1,164 @@
+"""CUDA against the CPU: values, speed, memory over many shapes, whole runs. Needs a GPU.
+
+    python -m benchmarks.cuda --sizes 64 128 256
+
+Prints Markdown: the machine; for each network and size the largest difference and the microseconds
+a voxel, copies to and from the GPU included; the microseconds for several chunks of the neighbour
+table; the GPU's memory after ever larger shapes; and the seconds from a grid to its mesh. All grids
+are noisy balls. Where CUDA does not run, one line says why.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from super_sdf import SdfGrid, load_network, reconstruct
+from super_sdf.band import (
+    can_hold_surface,
+    find_band,
+    gather_patches,
+    is_lipschitz,
+    neighbour_table,
+    rescale,
+)
+from super_sdf.cuda import describe_gpu, onnxruntime_version, query_gpu
+from super_sdf.device import CUDA_CHUNK, run_bound
+from super_sdf.errors import DeviceError
+from super_sdf.network import INPUTS, QUALITIES, Network
+from super_sdf.nodes import block_offsets
+
+RUNS = 3
+CHUNKS = (512, 2048, 8192, CUDA_CHUNK, 65536)
+SHAPES = 40  # for the memory
+
+
+def noisy_ball(size: int) -> SdfGrid:
+    """Return a ball that fills most of the grid, with noise on some samples: every branch runs."""
+    rng = np.random.default_rng(0)
+    ijk = np.indices((size,) * 3, np.float32)
+    values = np.linalg.norm(ijk - (size / 2 - 0.37), axis=0) - 0.38 * size
+    values[: size // 4] += rng.uniform(-0.2, 0.2, values[: size // 4].shape)
+    return SdfGrid(values.astype(np.float32), (1.0, 1.0, 1.0))
+
+
+def network_inputs(size: int) -> tuple[np.ndarray, ...]:
+    """Return what the pipeline asks the network for a ball at factor 4."""
+    grid = noisy_ball(size)
+    rescaled = rescale(grid)
+    band_ijk = find_band(rescaled)
+    patches = gather_patches(rescaled, band_ijk)
+    voxels = np.flatnonzero(can_hold_surface(patches, is_lipschitz(patches))).astype(np.int32)
+    return patches, neighbour_table(band_ijk, grid.shape), voxels, block_offsets(4)
+
+
+def best_seconds(work: Callable[..., Any], *arguments: Any) -> float:
+    """Return the least seconds of several runs, after one that does not count."""
+    work(*arguments)
+    seconds = []
+    for _ in range(RUNS):
+        start = time.perf_counter()
+        work(*arguments)
+        seconds.append(time.perf_counter() - start)
+    return min(seconds)
+
+
+def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """Print a Markdown table."""
+    print(f"\n{title}\n\n| {' | '.join(head)} |\n|{' ---: |' * len(head)}")
+    for row in rows:
+        print(f"| {' | '.join(str(cell) for cell in row)} |", flush=True)
+
+
+def compare_values(device: str, sizes: Sequence[int]) -> None:
+    """Print how far CUDA's values are from the CPU's and how long both take."""
+    rows = []
+    for quality in QUALITIES:
+        here, there = load_network(quality, device="cpu"), load_network(quality, device=device)
+        for size in sizes:
+            asked = network_inputs(size)
+            apart = np.abs(here(*asked) - there(*asked)).max() / 2
+            seconds = [best_seconds(network, *asked) for network in (here, there)]
+            shown = [f"{1e6 * value / len(asked[0]):.2f}" for value in seconds]
+            rows.append([quality, f"{size}^3", f"{len(asked[0]):,}", *shown, f"{apart:.1e}"])
+    head = ["network", "grid", "voxels", "CPU us a voxel", f"{device} us a voxel", "apart, voxels"]
+    print_table("Values and speed of the network", head, rows)
+
+
+def compare_chunks(device: str, size: int) -> None:
+    """Print how long the network takes with other chunks of the neighbour table."""
+    network = load_network("base", device=device)
+    feeds = dict(zip(INPUTS, network_inputs(size)))
+    rows = []
+    for chunk in CHUNKS:
+        seconds = best_seconds(run_bound, network.session, feeds, device, chunk)
+        rows.append([chunk, f"{1e6 * seconds / len(feeds['patches']):.2f}"])
+    print_table(f"Chunks of the neighbour table at {size}^3", ["rows", "us a voxel"], rows)
+
+
+def watch_memory(device: str, size: int) -> None:
+    """Print the GPU's memory after many shapes, each with more voxels than the last."""
+    rows = [["nothing", used_memory()]]
+    network = load_network("base", device=device)
+    rows.append(["loaded", used_memory()])
+    whole = network_inputs(size)
+    for count, share in enumerate(np.linspace(0.2, 1, SHAPES), 1):
+        ask_part(network, whole, share)
+        if count in (1, 2, 5, 10, 20, SHAPES):
+            rows.append([f"{count} shapes", used_memory()])
+    ask_part(network, whole, 0.2)
+    rows.append(["a small one", used_memory()])
+    print_table(f"Memory of the GPU in MiB, shapes up to {size}^3", ["after", "used"], rows)
+
+
+def ask_part(network: Network, asked: Sequence[np.ndarray], share: float) -> None:
+    """Ask for the first part of a band, cut off from the rest."""
+    patches, table, voxels, offsets = asked
+    count = int(share * len(patches))
+    table = np.where(table[:count] < count, table[:count], -1).astype(np.int32)
+    network(patches[:count], table, voxels[voxels < count], offsets)
+
+
+def used_memory() -> str:
+    """Return the GPU's memory in use, by nvidia-smi."""
+    answer = query_gpu("memory.used")
+    return answer[0] if answer else "unknown"
+
+
+def compare_pipeline(device: str, sizes: Sequence[int]) -> None:
+    """Print the seconds from a grid to its mesh, the network loaded already."""
+    rows = []
+    for size in sizes:
+        grid = noisy_ball(size)
+        networks = [load_network("base", device=place) for place in ("cpu", device)]
+        seconds = [best_seconds(reconstruct, grid, network) for network in networks]
+        rows.append([f"{size}^3", *(f"{value:.2f}" for value in seconds)])
+    print_table("From a grid to its mesh", ["grid", "CPU s", f"{device} s"], rows)
+
+
+def main() -> None:
+    """Print everything, or in one line why there is nothing to measure."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128, 256])
+    parser.add_argument("--device", default="cuda", help="cpu tries this command itself")
+    asked = parser.parse_args()
+    try:
+        load_network("fast", device=asked.device)
+    except DeviceError as error:
+        print(f"nothing to measure: {error}")
+        return
+    gpu = describe_gpu() or "no GPU"
+    print(f"{gpu}; {os.cpu_count()} cores; {onnxruntime_version()}; least of {RUNS} runs each")
+    compare_values(asked.device, asked.sizes)
+    compare_chunks(asked.device, max(asked.sizes))
+    watch_memory(asked.device, max(asked.sizes))
+    compare_pipeline(asked.device, asked.sizes)
+
+
+if __name__ == "__main__":
+    main()

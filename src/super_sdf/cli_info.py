@@ -1,0 +1,97 @@
+"""The command ``info``: versions, devices and networks, and with --check whether they work."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+import click
+
+from . import __version__
+from .cli_common import CONTEXT, one_line_errors
+
+EXAMPLES = """\b
+Examples:
+  super-sdf info --check
+  super-sdf info --check --device cuda
+"""
+
+
+@click.command(
+    context_settings=CONTEXT, epilog=EXAMPLES, short_help="Show versions, devices and networks."
+)
+@click.option("--check", is_flag=True, help="Try everything; exit code 1 if something fails.")
+@click.option(
+    "--device",
+    type=click.Choice(["auto", "cpu", "cuda"]),
+    default="auto",
+    show_default=True,
+    help="With --check: cpu leaves CUDA out, cuda insists on it.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+def info(check: bool, device: str, as_json: bool) -> None:
+    """Show versions, devices, and the shipped networks with their cards.
+
+    With --check also whether they work here: each network is run on a ball, whose distances are
+    known, on the CPU and on CUDA, and what is missing is named with the way to install it.
+    """
+    with one_line_errors():
+        if check:
+            sys.exit(0 if tell_checks(device, as_json) else 1)
+        tell_facts(as_json)
+
+
+def tell_checks(device: str, as_json: bool) -> bool:
+    """Run the checks and print each as it ends; return whether none failed."""
+    from dataclasses import asdict
+
+    from .selftest import FAILED, run_checks
+
+    findings = []
+    for finding in run_checks(device):
+        findings.append(finding)
+        if not as_json:
+            click.echo(f"{finding.state:<8} {finding.what}: {finding.says}")
+    failed = [finding for finding in findings if finding.state == FAILED]
+    if as_json:
+        report = {"works": not failed, "findings": [asdict(finding) for finding in findings]}
+        click.echo(json.dumps(report, indent=2))
+    elif failed:
+        click.echo(f"{len(failed)} of {len(findings)} checks failed")
+    else:
+        click.echo("What is installed works.")
+    return not failed
+
+
+def tell_facts(as_json: bool) -> None:
+    """Print versions, devices and cards."""
+    facts = gather_facts()
+    if as_json:
+        click.echo(json.dumps(facts, indent=2))
+        return
+    for key in ("super-sdf", "python", "onnxruntime"):
+        click.echo(f"{key} {facts[key]}")
+    click.echo(f"devices: {', '.join(facts['devices'])}")
+    for name, card in facts["models"].items():
+        click.echo(f"model {name}")
+        for key, value in sorted(card.items()):
+            click.echo(f"  {key.replace('_', ' ')}: {value}")
+
+
+def gather_facts() -> dict[str, Any]:
+    """Return versions, devices and cards."""
+    import platform
+
+    import onnxruntime
+
+    from .cuda import available_devices
+    from .network import load_network, shipped_models
+
+    return {
+        "super-sdf": __version__,
+        "python": platform.python_version(),
+        "onnxruntime": onnxruntime.__version__,
+        "devices": available_devices(),
+        "models": {name: dict(load_network(name, device="cpu").card) for name in shipped_models()},
+    }

@@ -1,0 +1,189 @@
+"""What works on this machine and what is missing: the checks of ``super-sdf info --check``.
+
+The networks are asked for a ball, whose distances are known, on every device there is.
+"""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+
+import numpy as np
+
+from . import __version__
+from .band import (
+    can_hold_surface,
+    find_band,
+    gather_patches,
+    is_lipschitz,
+    neighbour_table,
+    rescale,
+)
+from .cuda import available_devices, check_cuda, describe_gpu, onnxruntime_version
+from .errors import DeviceError, SuperSdfError
+from .grid import FloatArray, IntArray, SdfGrid
+from .memory import free_memory
+from .network import load_network, shipped_models
+from .nodes import block_offsets
+
+OK, MISSING, FAILED = "ok", "missing", "failed"
+# Modules that the extras bring.
+EXTRAS = {
+    "fast": ("numba",),
+    "3mf": ("lxml", "networkx"),
+    "eval": ("igl", "matplotlib", "scipy", "skimage"),
+    "view": ("pyvista",),
+}
+BALL_SAMPLES, BALL_CENTRE, BALL_RADIUS = 32, 15.63, 12.0  # off the samples
+WORST = 0.05  # voxels; the shipped networks stay under 0.025, a broken one is off by whole voxels
+CUDA_APART = 1e-4  # voxels between the CPU's values and CUDA's
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One check: "ok", "missing" (an option that is not installed) or "failed"."""
+
+    state: str
+    what: str
+    says: str
+    figures: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Ball:
+    """What a network is asked, in its own terms, and the true distances, (D, Q), in voxels."""
+
+    asked: tuple[FloatArray, IntArray, IntArray, FloatArray]
+    exact: FloatArray
+
+
+def run_checks(device: str = "auto") -> Iterator[Finding]:
+    """Check everything, a finding at a time.
+
+    Parameters
+    ----------
+    device : str
+        "cpu" leaves CUDA out; "cuda" makes it a failure if it is missing; "auto" does that only
+        where the onnxruntime that is installed was built for it.
+    """
+    yield check_versions()
+    yield check_memory()
+    devices = ["cpu"]
+    if device != "cpu":
+        found = find_cuda(needed=device == "cuda" or "cuda" in available_devices())
+        devices += ["cuda"] * (found.state == OK)
+        yield found
+    ball = make_ball()
+    for name in shipped_models():
+        yield from check_network(name, devices, ball)
+    for name, modules in EXTRAS.items():
+        yield check_extra(name, modules)
+
+
+def check_versions() -> Finding:
+    """Name the versions; both kinds of onnxruntime at once overwrite each other's files."""
+    says = (
+        f"super-sdf {__version__}, Python {platform.python_version()}, NumPy "
+        f"{np.__version__}, {onnxruntime_version()}"
+    )
+    if is_installed("onnxruntime") and is_installed("onnxruntime-gpu"):
+        way_out = "uninstall both, then install one"
+        says += f"; onnxruntime and onnxruntime-gpu are both installed: {way_out}"
+        return Finding(FAILED, "versions", says)
+    return Finding(OK, "versions", says)
+
+
+def is_installed(package: str) -> bool:
+    """Say whether pip knows of a package."""
+    try:
+        version(package)
+    except PackageNotFoundError:
+        return False
+    return True
+
+
+def check_memory() -> Finding:
+    """Say how much memory is free."""
+    free = free_memory()
+    if free is None:
+        return Finding(OK, "memory", "the system does not say how much is free")
+    return Finding(OK, "memory", f"{free / 1e9:.1f} GB free", {"free_bytes": free})
+
+
+def find_cuda(needed: bool) -> Finding:
+    """Say which GPU there is, or what CUDA lacks here."""
+    try:
+        check_cuda()
+    except DeviceError as error:
+        return Finding(FAILED if needed else MISSING, "cuda", str(error))
+    return Finding(OK, "cuda", describe_gpu() or "its libraries are there")
+
+
+def make_ball() -> Ball:
+    """Sample a ball and return its voxels that can hold the surface."""
+    ijk = np.indices((BALL_SAMPLES,) * 3)
+    values = np.linalg.norm(ijk - BALL_CENTRE, axis=0) - BALL_RADIUS
+    rescaled = rescale(SdfGrid(values.astype(np.float32), (1.0, 1.0, 1.0)))
+    band_ijk = find_band(rescaled)
+    patches = gather_patches(rescaled, band_ijk)
+    voxels = np.flatnonzero(can_hold_surface(patches, is_lipschitz(patches))).astype(np.int32)
+    offsets = block_offsets(4)
+    nodes = band_ijk[voxels, None] + offsets / 2  # offsets are in half voxels
+    exact = np.linalg.norm(nodes - BALL_CENTRE, axis=2) - BALL_RADIUS
+    table = neighbour_table(band_ijk, values.shape)
+    return Ball((patches, table, voxels, offsets), exact.astype(np.float32))
+
+
+def check_network(name: str, devices: list[str], ball: Ball) -> Iterator[Finding]:
+    """Ask a shipped network for the ball on each device, the CPU first."""
+    reference: FloatArray | None = None
+    for device in devices:
+        what = f"network {name} on {device}"
+        try:
+            values, microseconds = ask(name, device, ball)
+        except SuperSdfError as error:
+            yield Finding(FAILED, what, str(error))
+            continue
+        yield judge(what, values, microseconds, ball, reference)
+        reference = values if device == "cpu" else reference
+
+
+def ask(name: str, device: str, ball: Ball) -> tuple[FloatArray, float]:
+    """Return a network's values, (D, Q) in voxels, and its microseconds a voxel of the band."""
+    network = load_network(name, device=device)
+    network(*ball.asked)  # the first run is slower
+    start = time.perf_counter()
+    half_voxels = network(*ball.asked)
+    seconds = time.perf_counter() - start
+    return half_voxels * np.float32(0.5), 1e6 * seconds / len(ball.asked[0])
+
+
+def judge(
+    what: str, values: FloatArray, microseconds: float, ball: Ball, reference: FloatArray | None
+) -> Finding:
+    """Compare values with the ball's, and with the CPU's if there are any."""
+    off = float(np.abs(values - ball.exact).max())
+    works = off <= WORST  # not if they are NaN
+    says = f"off by {off:.3f} voxels at most on a ball, {microseconds:.1f} us a voxel"
+    figures = {"off_voxels": off, "microseconds_a_voxel": microseconds}
+    if reference is not None:
+        apart = float(np.abs(values - reference).max())
+        works = works and apart <= CUDA_APART
+        says += f", {apart:.0e} voxels from the CPU's values"
+        figures["from_cpu_voxels"] = apart
+    if not works:
+        says += f"; allowed are {WORST} on the ball and {CUDA_APART:.0e} from the CPU"
+    return Finding(OK if works else FAILED, what, says, figures)
+
+
+def check_extra(name: str, modules: tuple[str, ...]) -> Finding:
+    """Say whether an extra's modules are there."""
+    missing = [module for module in modules if find_spec(module) is None]
+    if missing:
+        way_out = f"pip install 'super-sdf[{name}]'"
+        return Finding(MISSING, f"extra {name}", f"no {', '.join(missing)}: {way_out}")
+    return Finding(OK, f"extra {name}", ", ".join(modules))

@@ -1,0 +1,271 @@
+"""CUDA without a GPU: what is bound where, what is missing is said, nothing falls back in silence.
+
+The GPU is played by fakes; `python -m benchmarks.cuda` and `super-sdf info --check --device cuda`
+measure a real one.
+"""
+
+import ctypes
+import runpy
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import onnxruntime as ort
+import pytest
+from conftest import ball
+from test_network import network_inputs
+
+from super_sdf import cuda, device, load_network
+from super_sdf.cuda import CUDA, first_line
+from super_sdf.device import CHUNK_INPUT, CPU, CUDA_CHUNK, CUDA_OPTIONS, run_bound
+from super_sdf.errors import DeviceError, ModelError
+from super_sdf.network import INPUTS, one_voxel, shipped_models
+from super_sdf.nodes import block_offsets
+
+pytestmark = pytest.mark.usefixtures("cpu_build")
+ROOT = Path(__file__).parent.parent
+ASKED = "cuda was asked for, but "
+HERE = f"onnxruntime {ort.__version__}"
+
+
+def no_library(missing):
+    """Return a loader that finds every library but one."""
+
+    def load(name, *arguments):
+        if missing and (name == missing or str(name).endswith("providers_cuda.so")):
+            raise OSError(f"{missing}: cannot open shared object file: No such file or directory")
+
+    return load
+
+
+@pytest.fixture
+def cuda_build(cpu_build, monkeypatch):
+    """An onnxruntime that was built for CUDA 13, and a driver and all libraries."""
+    monkeypatch.setattr(ort, "get_available_providers", lambda: [CUDA, CPU])
+    monkeypatch.setattr(ort, "cuda_version", "13.0", raising=False)
+    monkeypatch.setattr(ctypes, "CDLL", no_library(None))
+
+
+class FakeBinding:
+    """Notes what is bound where."""
+
+    def __init__(self):
+        self.inputs, self.outputs, self.copies = {}, {}, 0
+
+    def bind_ortvalue_input(self, name, value):
+        assert name not in self.inputs
+        self.inputs[name] = value
+
+    def bind_output(self, name, place, number):
+        self.outputs[name] = (place, number)
+
+    def copy_outputs_to_cpu(self):
+        self.copies += 1
+        return [np.ones((1, 1), np.float32)]
+
+
+class FakeSession:
+    """A session on CUDA with the contract of ours."""
+
+    def __init__(self):
+        self.bindings, self.fails = [], ""
+        self.get_providers = lambda: [CUDA, CPU]
+        self.get_inputs = lambda: [SimpleNamespace(name=n, type=t) for n, t in INPUTS.items()]
+        self.get_outputs = lambda: [SimpleNamespace(name="values")]
+        self.get_overridable_initializers = lambda: [SimpleNamespace(name=CHUNK_INPUT)]
+        metadata = SimpleNamespace(custom_metadata_map={"format_version": "1"})
+        self.get_modelmeta = lambda: metadata
+
+    def io_binding(self):
+        self.bindings.append(FakeBinding())
+        return self.bindings[-1]
+
+    def run_with_iobinding(self, binding, options):
+        self.options = options
+        if self.fails:
+            raise RuntimeError(self.fails)
+
+
+@pytest.fixture
+def cuda_session(cuda_build, monkeypatch):
+    """What onnxruntime opens on CUDA; on the CPU it opens the real thing."""
+    fake, real = FakeSession(), ort.InferenceSession
+
+    def opened(path, options, providers, **more):
+        if providers == [CPU]:
+            return real(path, options, providers=providers)
+        assert providers == [(CUDA, CUDA_OPTIONS), CPU] and more == {"enable_fallback": 0}
+        return fake
+
+    def uploaded(array, place, number):
+        assert number == 0
+        return SimpleNamespace(place=place, array=array)
+
+    monkeypatch.setattr(ort, "InferenceSession", opened)
+    monkeypatch.setattr(ort.OrtValue, "ortvalue_from_numpy", uploaded)
+    return fake
+
+
+@pytest.mark.parametrize("name", ["base", "fast"])
+def test_bound_runs_give_the_values_of_plain_ones(name):
+    patches, table, rows = network_inputs(ball())
+    feeds = dict(zip(INPUTS, (patches, table, rows[::2].copy(), block_offsets(4))))
+    session = load_network(name, device="cpu").session
+    plain = session.run(None, feeds)[0]
+    np.testing.assert_allclose(run_bound(session, feeds, "cpu"), plain, atol=1e-5)
+
+
+def test_old_files_without_a_chunk_run_bound(monkeypatch):
+    session = load_network("fast", device="cpu").session
+    plain = run_bound(session, one_voxel(), "cpu")
+    monkeypatch.setattr(type(session), "get_overridable_initializers", lambda self: [])
+    np.testing.assert_allclose(run_bound(session, one_voxel(), "cpu"), plain, atol=1e-5)
+
+
+def test_on_cuda_everything_is_bound_there_and_copied_once(cuda_session):
+    run_bound(cuda_session, one_voxel())
+    [binding] = cuda_session.bindings
+    chunk = binding.inputs.pop(CHUNK_INPUT)
+    assert (chunk.place, chunk.array) == ("cpu", [CUDA_CHUNK])
+    assert {name: value.place for name, value in binding.inputs.items()} == dict.fromkeys(
+        INPUTS, "cuda"
+    )
+    assert binding.outputs == {"values": ("cuda", 0)} and binding.copies == 1
+    shrinks = cuda_session.options.get_run_config_entry("memory.enable_memory_arena_shrinkage")
+    assert shrinks == "gpu:0"
+
+
+def test_cuda_options_keep_precision_and_memory():
+    assert CUDA_OPTIONS["use_tf32"] == "0"
+    assert CUDA_OPTIONS["arena_extend_strategy"] == "kSameAsRequested"
+
+
+@pytest.mark.parametrize("asked", ["auto", "cuda"])
+def test_cuda_that_works_is_used(cuda_session, asked):
+    network = load_network(device=asked)
+    assert (network.device, network.notes) == ("cuda", ())
+    assert len(cuda_session.bindings) == 1  # it was tried
+    network(*one_voxel().values())
+    assert cuda_session.bindings[1].outputs == {"values": ("cuda", 0)}
+
+
+def test_best_asks_cuda_eight_times(cuda_session):
+    load_network("best", device="cuda")(*one_voxel().values())
+    assert len(cuda_session.bindings) == 1 + 8  # the trial first
+
+
+def test_onnxruntime_without_cuda_is_an_error_that_names_the_package():
+    reason = f"{HERE} here has no CUDA provider: install onnxruntime-gpu in place of onnxruntime"
+    with pytest.raises(DeviceError, match=f"^{ASKED}{reason}; or use --device cpu$"):
+        load_network(device="cuda")
+
+
+@pytest.mark.parametrize(
+    ("missing", "reason"),
+    [
+        ("libcuda.so.1", "there is no libcuda.so.1: install the NVIDIA driver"),
+        (
+            "libcublasLt.so.13",
+            f"{HERE} for CUDA 13.0 does not find libcublasLt.so.13: pip install "
+            "'onnxruntime-gpu[cuda,cudnn]' brings CUDA's libraries",
+        ),
+    ],
+)
+def test_a_missing_library_is_named(cuda_build, monkeypatch, missing, reason):
+    monkeypatch.setattr(ctypes, "CDLL", no_library(missing))
+    with pytest.raises(DeviceError) as caught:
+        load_network(device="cuda")
+    assert str(caught.value) == f"{ASKED}{reason}; or use --device cpu"
+
+
+def test_a_provider_that_falls_back_in_silence_is_an_error(cuda_session, monkeypatch):
+    monkeypatch.setattr(cuda_session, "get_providers", lambda: [CPU])
+    with pytest.raises(DeviceError, match="could not start its CUDA provider; or use --device"):
+        load_network(device="cuda")
+
+
+def test_a_gpu_on_which_the_network_does_not_run_is_an_error(cuda_session):
+    cuda_session.fails = "/a.cc:1 T f() [with T = int] CUDA failure 2: out of memory ; GPU=0 ; x"
+    with pytest.raises(DeviceError) as caught:
+        load_network(device="cuda")
+    reason = "CUDA does not run here: CUDA failure 2: out of memory"
+    assert str(caught.value) == f"{ASKED}{reason}; or use --device cpu"
+
+
+def test_a_run_that_fails_later_is_an_error(cuda_session):
+    network = load_network(device="cuda")
+    cuda_session.fails = "CUDA failure 2: out of memory ; GPU=0"
+    with pytest.raises(DeviceError, match=r"^the network failed on cuda: CUDA failure 2: out of"):
+        network(*one_voxel().values())
+
+
+@pytest.mark.parametrize("gpu", [True, False])
+def test_auto_falls_back_and_says_so_where_there_is_a_gpu(monkeypatch, gpu):
+    monkeypatch.setattr(device, "has_gpu", lambda: gpu)
+    network = load_network(device="auto")
+    reason = f"{HERE} here has no CUDA provider: install onnxruntime-gpu in place of onnxruntime"
+    note = f"a GPU seems to be here, but the network runs on the CPU: {reason}"
+    assert network.device == "cpu" and network.notes == (note,) * gpu
+
+
+def test_the_command_prints_the_note(tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(device, "has_gpu", lambda: True)
+    np.save("in.npy", ball().values)
+    code, _, err = command("upsample", "in.npy", "out.ply", "--device", "auto")
+    assert code == 0
+    assert "\nNote: a GPU seems to be here, but the network runs on the CPU: onnxruntime" in err
+
+
+def test_the_cpu_is_asked_for_and_used_without_a_look_at_cuda(monkeypatch):
+    monkeypatch.setattr(device, "check_cuda", lambda: pytest.fail("CUDA was looked at"))
+    network = load_network(device="cpu")
+    assert (network.device, network.notes) == ("cpu", ())
+
+
+@pytest.mark.parametrize("asked", ["auto", "cpu", "cuda"])
+def test_a_bad_file_is_no_fault_of_cuda(tmp_path, monkeypatch, asked):
+    (tmp_path / "bad.onnx").write_bytes(b"not a graph")
+    with pytest.raises(ModelError, match=r"bad\.onnx is no ONNX file that onnxruntime can run"):
+        load_network(tmp_path / "bad.onnx", device=asked)
+
+
+def test_a_gpu_is_seen_by_its_driver(monkeypatch):
+    monkeypatch.setattr(Path, "exists", lambda self: False)
+    monkeypatch.setattr(ctypes, "CDLL", no_library("libcuda.so.1"))
+    assert not cuda.has_gpu()
+    monkeypatch.setattr(ctypes, "CDLL", no_library(None))
+    assert cuda.has_gpu()
+    monkeypatch.setattr(ctypes, "CDLL", no_library("libcuda.so.1"))
+    monkeypatch.setattr(Path, "exists", lambda self: str(self) == "/dev/nvidia0")
+    assert cuda.has_gpu()
+
+
+def test_nvidia_smi_describes_the_gpu(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert cuda.describe_gpu() is None
+    fake = tmp_path / "nvidia-smi"
+    fake.write_text("#!/bin/sh\necho 'NVIDIA H100, 580.1, 81559, 1559'\n")
+    fake.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/bin:/usr/bin")
+    assert cuda.describe_gpu() == "NVIDIA H100, driver 580.1, 83.9 GB free"
+
+
+def test_errors_of_onnxruntime_become_one_line():
+    assert first_line(RuntimeError("one\ntwo")) == "one"
+    assert first_line(RuntimeError()) == "RuntimeError"
+
+
+def test_shipped_files_let_the_chunk_be_chosen():
+    for path in shipped_models().values():
+        session = load_network(path, device="cpu").session
+        assert [given.name for given in session.get_overridable_initializers()] == [CHUNK_INPUT]
+
+
+def test_the_benchmark_says_that_there_is_nothing_to_measure(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["benchmarks.cuda"])
+    runpy.run_path(str(ROOT / "benchmarks" / "cuda.py"), run_name="__main__")
+    said = capsys.readouterr().out
+    assert said.startswith(f"nothing to measure: {ASKED}{HERE} here has no CUDA provider")
+    assert said.count("\n") == 1

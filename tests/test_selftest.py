@@ -1,0 +1,130 @@
+"""The self-test: what it says, and when it fails."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from super_sdf import cli_common, selftest
+from super_sdf.errors import DeviceError
+from super_sdf.selftest import EXTRAS, Finding, run_checks
+
+pytestmark = pytest.mark.usefixtures("cpu_build")
+
+
+def find(findings, what):
+    """Return the finding on something."""
+    return next(finding for finding in findings if finding.what == what)
+
+
+@pytest.fixture
+def gpu(monkeypatch):
+    """A GPU as far as the self-test sees: its values are the CPU's, and something besides."""
+    besides = {"voxels": 0.0}
+    ask = selftest.ask
+
+    def asked(name, device, ball):
+        values, microseconds = ask(name, "cpu", ball)
+        return values + besides["voxels"] * (device == "cuda"), microseconds
+
+    monkeypatch.setattr(selftest, "check_cuda", lambda: None)
+    monkeypatch.setattr(selftest, "describe_gpu", lambda: "NVIDIA H100, driver 580.1, 83.9 GB free")
+    monkeypatch.setattr(selftest, "ask", asked)
+    return besides
+
+
+def test_everything_is_checked_on_the_cpu():
+    findings = list(run_checks("cpu"))
+    assert [finding.what for finding in findings] == [
+        "versions",
+        "memory",
+        "network base on cpu",
+        "network fast on cpu",
+        *(f"extra {name}" for name in EXTRAS),
+    ]
+    assert all(finding.state != "failed" for finding in findings)
+    said = find(findings, "network base on cpu").says
+    assert re.fullmatch(r"off by 0\.0\d\d voxels at most on a ball, [\d.]+ us a voxel", said)
+    assert re.fullmatch(r"[\d.]+ GB free", find(findings, "memory").says)
+
+
+def test_cuda_that_is_missing_fails_only_where_it_should_be(monkeypatch):
+    assert find(run_checks("auto"), "cuda").state == "missing"
+    found = find(run_checks("cuda"), "cuda")
+    assert found.state == "failed" and "install onnxruntime-gpu in place of" in found.says
+    monkeypatch.setattr(selftest, "available_devices", lambda: ["cpu", "cuda"])
+    assert find(run_checks("auto"), "cuda").state == "failed"
+
+
+def test_cuda_is_compared_with_the_cpu(gpu):
+    findings = list(run_checks())
+    assert find(findings, "cuda").says == "NVIDIA H100, driver 580.1, 83.9 GB free"
+    found = find(findings, "network fast on cuda")
+    assert found.state == "ok" and found.says.endswith(
+        " a voxel, 0e+00 voxels from the CPU's values"
+    )
+    gpu["voxels"] = 2e-4
+    found = find(run_checks(), "network fast on cuda")
+    assert found.state == "failed" and found.figures["from_cpu_voxels"] == pytest.approx(2e-4, 0.1)
+    assert found.says.endswith(
+        "2e-04 voxels from the CPU's values; allowed are 0.05 on the ball and 1e-04 from the CPU"
+    )
+
+
+@pytest.mark.parametrize("wrong", [0.1, np.nan])
+def test_wrong_values_fail(monkeypatch, wrong):
+    ask = selftest.ask
+    monkeypatch.setattr(selftest, "ask", lambda *asked: (ask(*asked)[0] + wrong, 1.0))
+    assert find(run_checks("cpu"), "network base on cpu").state == "failed"
+
+
+def test_a_network_that_cannot_run_is_a_finding_and_the_checks_go_on(monkeypatch):
+    def broken(*asked):
+        raise DeviceError("the network failed on cpu: no")
+
+    monkeypatch.setattr(selftest, "ask", broken)
+    findings = list(run_checks("cpu"))
+    assert find(findings, "network base on cpu").says == "the network failed on cpu: no"
+    assert findings[-1].what == "extra view"
+
+
+def test_both_kinds_of_onnxruntime_at_once_fail(monkeypatch):
+    monkeypatch.setattr(selftest, "is_installed", lambda package: True)
+    found = selftest.check_versions()
+    assert found.state == "failed" and found.says.endswith(
+        "; onnxruntime and onnxruntime-gpu are both installed: uninstall both, then install one"
+    )
+
+
+def test_a_missing_extra_is_named_with_its_way_out(monkeypatch):
+    monkeypatch.setattr(selftest, "find_spec", lambda module: None)
+    assert selftest.check_extra("3mf", EXTRAS["3mf"]) == Finding(
+        "missing", "extra 3mf", "no lxml, networkx: pip install 'super-sdf[3mf]'"
+    )
+    assert EXTRAS["eval"] == cli_common.NEEDED
+
+
+def test_a_system_that_does_not_tell_its_memory(monkeypatch):
+    monkeypatch.setattr(selftest, "free_memory", lambda: None)
+    assert selftest.check_memory().says == "the system does not say how much is free"
+
+
+def test_the_command_prints_a_line_a_check_and_its_exit_code_tells(command):
+    code, out, err = command("info", "--check")
+    lines = out.splitlines()
+    assert (code, err) == (0, "") and lines[-1] == "What is installed works."
+    assert lines[0].startswith("ok       versions: super-sdf ")
+    assert all(re.match(r"(ok      |missing ) \w+", line) for line in lines[:-1])
+    code, out, _ = command("info", "--check", "--device", "cuda")
+    assert code == 1 and out.splitlines()[-1] == "1 of 9 checks failed"
+    assert "\nfailed   cuda: onnxruntime " in out
+
+
+def test_the_command_prints_json(command):
+    code, out, _ = command("info", "--check", "--device", "cpu", "--json")
+    report = json.loads(out)
+    assert code == 0 and report["works"] is True
+    found = next(f for f in report["findings"] if f["what"] == "network fast on cpu")
+    assert found["state"] == "ok" and found["figures"]["off_voxels"] < 0.05
+    assert command("info", "--check", "--device", "cuda", "--json")[0] == 1
