@@ -16,7 +16,8 @@ FLOORS = [
     {"field", "network", "spheres"},
     {"isosurface"},
     {"pipeline"},
-    {"cli_common", "__init__"},
+    {"convert"},
+    {"cli_common", "cli_conversion", "__init__"},
     {"cli_sample", "cli_evaluate", "cli_render"},
     {"cli"},
 ]
