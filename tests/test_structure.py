@@ -10,15 +10,19 @@ SOURCES = sorted((ROOT / "src" / "super_sdf").glob("*.py"))
 EVALUATION = sorted((ROOT / "src" / "super_sdf" / "evaluation").glob("*.py"))
 FLOORS = [
     {"errors"},
-    {"grid", "memory"},
+    {"grid", "memory", "fingerprint"},
     {"band", "mesh", "conventions", "cell_cases"},
     {"nodes", "io", "symmetry"},
     {"field", "network", "spheres"},
     {"isosurface"},
     {"pipeline"},
     {"convert"},
-    {"cli_common", "cli_conversion", "__init__"},
-    {"cli_sample", "cli_evaluate", "cli_render"},
+    {"batch_job", "batch_lock"},
+    {"batch_manifest", "batch_workers", "ledger"},
+    {"batch_inputs", "batch_plan", "batch_pool"},
+    {"batch"},
+    {"cli_common", "cli_conversion", "cli_batch_report", "__init__"},
+    {"cli_batch", "cli_sample", "cli_evaluate", "cli_render"},
     {"cli"},
 ]
 EVALUATION_FLOORS = [

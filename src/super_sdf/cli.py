@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from . import __version__
+from .cli_batch import batch
 from .cli_common import CONTEXT, one_line_errors
 from .cli_conversion import conversion_options, make_options
 from .cli_evaluate import evaluate
@@ -174,7 +175,7 @@ def info(as_json: bool) -> None:
             click.echo(f"  {key.replace('_', ' ')}: {value}")
 
 
-for command in (sample, evaluate, render):
+for command in (batch, sample, evaluate, render):
     cli.add_command(command)
 
 
