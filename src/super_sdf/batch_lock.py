@@ -42,9 +42,10 @@ class FolderLock:
             self.file.close()
             raise FileError(f"{folder} is in use by another batch: wait for it, or give another")
         self.begun = read_begun(folder)
+        self.left = [folder / target for target in self.begun]
 
     def __enter__(self) -> FolderLock:
-        remove_parts(self.folder / target for target in self.begun)
+        remove_parts(self.left)
         return self
 
     def __exit__(
@@ -53,6 +54,7 @@ class FolderLock:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        remove_parts(self.left)  # once more: orphans of a killed process may have lived on a moment
         with suppress(OSError):
             self.file.truncate(0)
             self._note(sorted(self.begun))

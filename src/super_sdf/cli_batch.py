@@ -75,12 +75,14 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
     """Find the inputs, do what is to be done, say what came of it."""
     from .batch_inputs import find_jobs
     from .batch_plan import Settings, preview
+    from .network import find_model
     from .nodes import check_factor
 
     start = time.perf_counter()
     check_factor(options["factor"])
     jobs = find_jobs(sources, f".{options['kind']}", make_options(options))
     model = options["model"] or options["quality"]
+    find_model(model)
     flags = {name: options[name] for name in ("force", "retry", "fail_fast")}
     settings = Settings(
         folder, model, options["device"], options["threads"], options["jobs"], **flags

@@ -15,6 +15,7 @@ from .batch_job import Row
 from .errors import WriteError
 
 NAME = "report.jsonl"
+KEYS = {"in", "out", "status", "reason", "retry", "content", "output", "options"}
 
 
 class Ledger:
@@ -65,7 +66,7 @@ class Ledger:
             row = json.loads(line)
         except ValueError:
             return
-        if isinstance(row, dict) and {"out", "status", "options"} <= row.keys():
+        if isinstance(row, dict) and row.keys() >= KEYS:
             self._take(row)
 
     def _take(self, row: Row) -> None:
