@@ -68,7 +68,11 @@ def files(folder="out"):
 def test_folders_are_mirrored_failures_named_and_meshes_those_of_single_runs(run, command):
     code, out, err = run("in")
     assert (code, out) == (1, "")
-    assert err == f"Failed: in/bad.npy: {CONSTANT}\n3 done, 1 failed; 2 meshes closed, 1 open\n"
+    assert err == (
+        f"Failed: in/bad.npy: {CONSTANT}\n"
+        f"Note: spacing, origin or sign of 1 was inferred: see {Path('out/report.jsonl')}\n"
+        "3 done, 1 failed; 2 meshes closed, 1 open\n"
+    )
     made = {"a.ply": "a.npy", "deep/b.ply": "deep/b.npz", "deep/er/c.d.ply": "deep/er/c.d.npy"}
     assert files().keys() == made.keys() | {"report.jsonl"}
     for mesh, grid in made.items():
@@ -257,6 +261,16 @@ def test_json_is_the_summary(run):
     }
 
 
+def test_that_something_was_inferred_or_noisy_is_said_once(command):
+    noise = np.random.default_rng(0).uniform(-0.3, 0.3, (12, 12, 12))
+    np.save("in/noisy.npy", ball(12, 4.0).values + noise)
+    _, _, err = command("batch", "in", "--out", "out", *LONE[:6])
+    report = Path("out/report.jsonl")
+    assert f"Note: spacing, origin or sign of 4 was inferred: see {report}\n" in err
+    assert f"Warning: 1 are from noisy or contradictory values: see {report}\n" in err
+    assert "Note" not in command("batch", "in", "--out", "out", *LONE[:6])[2]
+
+
 def test_of_many_failures_twenty_are_shown(run):
     for i in range(23):
         shutil.copy("in/bad.npy", f"in/bad{i}.npy")
@@ -286,7 +300,8 @@ def test_a_list_names_files_from_where_it_lies(run):
 def test_a_list_of_objects_has_options_of_its_own(run, command):
     np.save("in/a.npy", -2 * ball(12, 3.0).values)
     line = {"in": "in/a.npy", "out": "x/y.stl", "spacing": 2, "origin": [1, 2, 3], "factor": 4}
-    lines = [{**line, "inside": "positive", "offset": 1}, {"in": "in/deep/er/c.d.npy", "cap": True}]
+    other = {"in": "in/deep/er/c.d.npy", "cap": True, "inside": "negative"}
+    lines = [{**line, "inside": "positive", "offset": 1}, other]
     Path("list.jsonl").write_text("\n".join(map(json.dumps, lines)))
     assert run("list.jsonl") == (0, "", "2 done, 0 failed; 2 meshes closed, 0 open\n")
     options = ("--spacing", 2, "--origin", "1,2,3", "--inside", "positive", "--offset", 1)

@@ -19,6 +19,9 @@ from .batch_pool import Pool
 from .batch_workers import Loading, choose_workers, convert_here, usable_cores
 from .ledger import Ledger
 
+# Of what ``expected_work`` counts: done in the time that several processes would take to start.
+LITTLE = 30_000
+
 Progress = Callable[[Batch], None]
 """Called after each file."""
 
@@ -50,7 +53,8 @@ class Run:
         asked, queue = self.settings, self._queue()
         if not self.batch.waiting or self._is_over():
             return
-        workers = asked.workers or choose_workers(asked.device, len(self.batch.waiting))
+        jobs = len(self.batch.waiting) if self.batch.work > LITTLE else 1
+        workers = asked.workers or choose_workers(asked.device, jobs)
         threads = asked.threads or (max(1, usable_cores() // workers) if workers > 1 else 0)
         loading = Loading(asked.model, asked.device, threads)
         if workers == 1:

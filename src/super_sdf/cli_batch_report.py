@@ -86,7 +86,22 @@ def tell_summary(batch: Batch, options: dict[str, Any]) -> None:
     if more > 0:
         click.echo(f"and {more} more, see {batch.settings.folder / 'report.jsonl'}", err=True)
     if not options["quiet"]:
-        click.echo(sentence(batch), err=True)
+        for remark in (*remarks(batch), sentence(batch)):
+            click.echo(remark, err=True)
+
+
+def remarks(batch: Batch) -> list[str]:
+    """Say of how many new meshes the report tells more; that one is open is counted anyhow."""
+    rows = [result.row for result in batch.done]
+    inferred = sum(bool(row["inferred"]) for row in rows)
+    warned = sum(len(row["warnings"]) > (not row["closed"]) for row in rows)
+    report = batch.settings.folder / "report.jsonl"
+    said = []
+    if inferred:
+        said.append(f"Note: spacing, origin or sign of {inferred} was inferred: see {report}")
+    if warned:
+        said.append(f"Warning: {warned} are from noisy or contradictory values: see {report}")
+    return said
 
 
 def sentence(batch: Batch) -> str:
