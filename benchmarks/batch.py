@@ -82,22 +82,27 @@ class Place:
         process.wait()
 
 
-def is_right(path: Path, solid: Placed, n: int) -> bool:
-    """Say whether a mesh is closed and lies where the solid's surface is."""
+def is_right(path: Path, solid: Placed, spacing: float, n: int) -> bool:
+    """Say whether a mesh is closed and lies where the solid's surface is, among the samples.
+
+    The spacing of an .npy is inferred: of a coarse grid approximately, as the report says.
+    """
     read = trimesh.load(path, process=False)
     if not Mesh(np.asarray(read.vertices), np.asarray(read.faces, np.int32)).is_closed():
         return False
-    away = np.abs(solid.distance(np.asarray(read.vertices))) * n
+    away = np.abs(solid.distance(np.asarray(read.vertices) / spacing / n)) * n
     return bool(away.max() < FAR and away.mean() < MEAN)
 
 
 def count_right(place: Place, solids: dict[str, Placed]) -> int:
     """Count the meshes that are there and right."""
-    found = ((place.meshes / name).with_suffix(".ply") for name in solids)
-    return sum(
-        path.exists() and is_right(path, solid, int(name.split("/")[0]))
-        for path, (name, solid) in zip(found, solids.items())
-    )
+    rows, right = {row["out"]: row for row in map(json.loads, place.lines())}, 0
+    for name, solid in solids.items():
+        target = Path(name).with_suffix(".ply")
+        path, row = place.meshes / target, rows.get(target.as_posix(), {})
+        if path.exists() and row.get("status") == "ok":
+            right += is_right(path, solid, row["spacing"][0], row["shape"][0])
+    return right
 
 
 def count_named(place: Place) -> int:
