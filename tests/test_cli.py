@@ -41,7 +41,7 @@ def test_json_has_counts_times_and_findings(here, command):
     assert (code, err) == (0, "")
     assert report["origin"] == [1, 2, 3] and report["inferred"] == [] and report["warnings"] == []
     assert report["triangles"] > report["vertices"] > report["band_voxels"] > 0
-    stages = ["start", "read", "load network", "band", "network", "nodes", "isosurface", "write"]
+    stages = ["start", "load network", "read", "band", "network", "nodes", "isosurface", "write"]
     assert list(report["seconds"]) == stages
 
 
@@ -260,7 +260,7 @@ def test_a_folder_without_permission_is_named(here, command, monkeypatch):
     assert command("upsample", "in.npy", "out.ply") == (1, "", want)
 
 
-@pytest.mark.parametrize("stage", ["pipeline.upsample", "pipeline.extract_mesh", "io._write_ply"])
+@pytest.mark.parametrize("stage", ["pipeline.refine", "pipeline.extract_mesh", "io._write_ply"])
 def test_an_interrupt_at_any_stage_leaves_nothing(here, command, monkeypatch, stage):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
@@ -275,7 +275,7 @@ def test_running_out_of_memory_is_one_line(here, command, monkeypatch):
     def exhaust(*_, **__):
         raise MemoryError
 
-    monkeypatch.setattr("super_sdf.pipeline.upsample", exhaust)
+    monkeypatch.setattr("super_sdf.pipeline.refine", exhaust)
     want = "Error: out of memory: use a smaller --factor or grid\n"
     assert command("upsample", "in.npy", "out.ply") == (1, "", want)
 

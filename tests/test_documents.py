@@ -45,10 +45,12 @@ def test_the_main_job_of_the_readme(tmp_path, monkeypatch):
     assert (mesh.bounds[1] < np.array([66.06, 73.45, 15.55]) + 0.1).all()
 
 
-def test_the_help_text_in_the_readme_is_what_the_command_prints():
-    printed = CliRunner().invoke(cli, ["upsample", "--help"], terminal_width=100).output
-    shown = next(block for block in blocks("text") if block.startswith("Usage:"))
-    assert shown == printed.replace("cli upsample", "super-sdf upsample")
+@pytest.mark.parametrize("command", ["upsample", "batch"])
+def test_the_help_text_in_the_readme_is_what_the_command_prints(command):
+    printed = CliRunner().invoke(cli, [command, "--help"], terminal_width=100).output
+    usage = f"Usage: super-sdf {command}"
+    shown = next(block for block in blocks("text") if block.startswith(usage))
+    assert shown == printed.replace(f"cli {command}", f"super-sdf {command}")
 
 
 def test_the_python_in_the_readme_runs(tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ SOURCES = sorted((ROOT / "src" / "super_sdf").glob("*.py"))
 EVALUATION = sorted((ROOT / "src" / "super_sdf" / "evaluation").glob("*.py"))
 FLOORS = [
     {"errors", "chunks", "compiling"},
-    {"memory", "cuda"},
+    {"memory", "cuda", "fingerprint"},
     {"grid"},
     {"band", "mesh", "conventions", "cell_cases", "device"},
     {"nodes", "io", "symmetry"},
@@ -20,9 +20,14 @@ FLOORS = [
     {"compiled"},
     {"plan"},
     {"pipeline"},
-    {"cli_common", "__init__"},
+    {"convert"},
+    {"batch_job", "batch_lock"},
+    {"batch_manifest", "batch_workers", "ledger"},
+    {"batch_inputs", "batch_plan", "batch_pool"},
+    {"batch"},
+    {"cli_common", "cli_conversion", "cli_batch_report", "__init__"},
     {"selftest"},
-    {"cli_sample", "cli_evaluate", "cli_render", "cli_info"},
+    {"cli_batch", "cli_sample", "cli_evaluate", "cli_render", "cli_info"},
     {"cli"},
 ]
 EVALUATION_FLOORS = [

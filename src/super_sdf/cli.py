@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -15,16 +14,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from . import __version__
+from .cli_batch import batch
 from .cli_common import CONTEXT, one_line_errors
+from .cli_conversion import conversion_options, make_options
 from .cli_evaluate import evaluate
 from .cli_info import info
 from .cli_render import render
 from .cli_sample import sample
 
 if TYPE_CHECKING:
-    from .field import FineField
-    from .grid import SdfGrid
-    from .mesh import Mesh
+    from .convert import Conversion
     from .network import Network
 
 EXAMPLES = """\b
@@ -32,21 +31,6 @@ Examples:
   super-sdf upsample part.npz part.ply
   super-sdf upsample field.npy part.stl --spacing 0.5 --factor 8
 """
-
-
-def parse_numbers(
-    ctx: click.Context, param: click.Parameter, value: str | None
-) -> tuple[float, ...] | None:
-    """Parse one number, or three with commas between: "0.5" or "0.5,0.5,0.5"."""
-    if value is None:
-        return None
-    try:
-        numbers = tuple(float(part) for part in value.split(","))
-    except ValueError:
-        numbers = ()
-    if len(numbers) not in (1, 3):
-        raise click.BadParameter(f"{value!r}: give one number, or three with commas between")
-    return numbers
 
 
 @click.group(context_settings=CONTEXT)
@@ -60,53 +44,7 @@ def cli() -> None:
 )
 @click.argument("source", metavar="IN")
 @click.argument("target", metavar="OUT")
-@click.option(
-    "--factor", type=int, default=4, show_default=True, help="How many times finer: 2, 4, 8 or 16."
-)
-@click.option(
-    "--spacing",
-    callback=parse_numbers,
-    metavar="H",
-    help="World distance between samples; from the file or the values if not given.",
-)
-@click.option(
-    "--origin",
-    callback=parse_numbers,
-    metavar="X,Y,Z",
-    help="World position of sample (0, 0, 0); from the file, else 0.",
-)
-@click.option(
-    "--inside",
-    type=click.Choice(["negative", "positive", "auto"]),
-    default="auto",
-    show_default=True,
-    help="The sign of values inside; auto takes the grid's border for outside.",
-)
-@click.option(
-    "--offset",
-    type=float,
-    default=0.0,
-    show_default=True,
-    metavar="D",
-    help="Mesh the surface at distance D (world units, positive outwards).",
-)
-@click.option("--cap", is_flag=True, help="Close a surface that runs out of the grid.")
-@click.option(
-    "--quality",
-    type=click.Choice(["fast", "base", "best"]),
-    default="base",
-    show_default=True,
-    help="The network: fast is small, best asks base eight times.",
-)
-@click.option("--model", metavar="FILE", help="Another network, an ONNX file, in place of these.")
-@click.option(
-    "--device",
-    type=click.Choice(["auto", "cpu", "cuda"]),
-    default="auto",
-    show_default=True,
-    help="Where the network runs; auto takes CUDA where it can.",
-)
-@click.option("--threads", type=click.IntRange(0), default=0, help="CPU threads; 0: one a core.")
+@conversion_options
 @click.option("--force", is_flag=True, help="Replace OUT if it exists.")
 @click.option("--json", "as_json", is_flag=True, help="Print counts, times and findings as JSON.")
 @click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
@@ -129,108 +67,60 @@ class Upsampling:
     def __init__(self, source: str, target: str, options: dict[str, Any]) -> None:
         self.source, self.target, self.options = source, target, options
         self.seconds: dict[str, float] = {}
-        self.clock = time.perf_counter()
-        self.grid: SdfGrid
         self.network: Network
-        self.field: FineField
-        self.mesh: Mesh
-        self.warnings: list[str] = []
-
-    def lap(self, stage: str) -> None:
-        """Book the time since the last lap under a stage."""
-        now = time.perf_counter()
-        self.seconds[stage], self.clock = now - self.clock, now
+        self.done: Conversion
 
     def work(self) -> None:
-        """Read, refine, mesh and write."""
-        from .field import border_is_crossed
-        from .io import check_target, read_grid, write_mesh
+        """Check what is asked, load the network, convert."""
+        from .convert import Stopwatch, convert
+        from .io import check_target
         from .network import load_network
         from .nodes import check_factor
-        from .pipeline import STEPS, mesh_field, upsample
 
-        asked = self.options
+        asked, watch = self.options, Stopwatch()
         check_factor(asked["factor"])
         check_target(self.target, force=asked["force"])
-        self.lap("start")
-        self.grid = read_grid(
-            self.source,
-            spacing=asked["spacing"],
-            origin=asked["origin"],
-            inside=asked["inside"],
-            level=asked["offset"],
-        )
-        self.lap("read")
+        watch.lap("start")
         self.network = load_network(
             asked["model"] or asked["quality"], device=asked["device"], threads=asked["threads"]
         )
-        self.lap("load network")
-        with self.progress_bar() as advance:
-
-            def tell(done: int, total: int) -> None:
-                self.lap(STEPS[done - 1])
-                advance(1)
-
-            self.field = upsample(
-                self.grid, self.network, asked["factor"], offset=asked["offset"], progress=tell
+        watch.lap("load network")
+        with self.progress_bar() as progress:
+            self.done = convert(
+                self.source,
+                self.target,
+                self.network,
+                make_options(asked),
+                force=asked["force"],
+                progress=progress,
             )
-            self.find_warnings(border_is_crossed(self.field))
-            self.mesh = mesh_field(self.field, self.grid, offset=asked["offset"], cap=asked["cap"])
-            tell(len(STEPS), len(STEPS))
-        write_mesh(self.mesh, self.target, force=asked["force"])
-        self.lap("write")
+        self.seconds = watch.seconds | self.done.seconds
 
     @contextmanager
     def progress_bar(self) -> Iterator[Any]:
         """Draw a bar on stderr if somebody is there to see it."""
-        from .pipeline import STEPS
-
         if self.options["quiet"] or not sys.stderr.isatty():
-            yield lambda steps: None
+            yield None
             return
-        with click.progressbar(length=len(STEPS), label="upsampling", file=sys.stderr) as bar:
-            yield bar.update
+        with click.progressbar(length=1, label="upsampling", file=sys.stderr) as bar:
 
-    def find_warnings(self, crossed: bool) -> None:
-        """Note what a user should know of the result."""
-        if crossed and not self.options["cap"]:
-            self.warnings.append(
-                "the surface runs out of the grid and is open there (close it with --cap)"
-            )
-        if self.field.noisy_voxels:
-            share = 100 * self.field.noisy_voxels / self.field.band_voxels
-            self.warnings.append(
-                f"in {share:.2g} % of the band the values differ by more than distances can: they "
-                "are taken for noisy there, and corrected"
-            )
-        if self.field.pinned:
-            self.warnings.append(
-                f"{self.field.pinned} fine values contradict the coarse ones around them and were "
-                "given their sign: the input is no distance field there"
-            )
+            def show(done: int, total: int) -> None:
+                bar.length = total
+                bar.update(1)
+
+            yield show
 
     def report(self) -> dict[str, Any]:
         """Return counts, times and findings."""
         return {
             "input": self.source,
             "output": self.target,
-            "shape": list(self.grid.shape),
-            "spacing": list(self.grid.spacing),
-            "origin": list(self.grid.origin),
-            "factor": self.field.factor,
+            "factor": self.options["factor"],
             "offset": self.options["offset"],
-            "inferred": list(self.grid.notes),
-            "warnings": self.warnings,
             "model": self.options["model"] or self.options["quality"],
             "device": self.network.device,
             "device_notes": list(self.network.notes),
-            "band_voxels": self.field.band_voxels,
-            "noisy_voxels": self.field.noisy_voxels,
-            "decoded_voxels": len(self.field.voxel_ijk),
-            "nodes": len(self.field.values),
-            "vertices": len(self.mesh.vertices),
-            "triangles": len(self.mesh.faces),
-            "pinned_nodes": self.field.pinned,
+            **self.done.report(),
             "seconds": {stage: round(spent, 4) for stage, spent in self.seconds.items()},
         }
 
@@ -241,9 +131,9 @@ class Upsampling:
             click.echo(json.dumps(report, indent=2))
         if self.options["quiet"]:
             return
-        for note in (*self.grid.notes, *self.network.notes):
+        for note in (*self.done.notes, *self.network.notes):
             click.echo(f"Note: {note}", err=True)
-        for warning in self.warnings:
+        for warning in self.done.warnings:
             click.echo(f"Warning: {warning}", err=True)
         if self.options["verbose"]:
             for key in ("shape", "spacing", "origin", "device", "band_voxels", "nodes"):
@@ -258,7 +148,7 @@ class Upsampling:
         )
 
 
-for command in (sample, evaluate, render, info):
+for command in (batch, sample, evaluate, render, info):
     cli.add_command(command)
 
 

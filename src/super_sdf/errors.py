@@ -6,6 +6,9 @@
   - ``MeshError`` (also ``ValueError``): a reference mesh bounds no solid.
   - ``OptionError`` (also ``ValueError``): an argument has no meaning (an odd factor, say).
   - ``FileError`` (also ``OSError``): a file cannot be read or written.
+
+    - ``WriteError``: it cannot be made where it was asked for, which is not the input's fault.
+
   - ``ModelError`` (also ``ValueError``): an ONNX file that does not keep the network's contract.
   - ``DeviceError`` (also ``RuntimeError``): a device was asked for that cannot run here.
   - ``OutOfMemoryError`` (also ``MemoryError``): the work would not fit in memory; it was not begun.
@@ -30,6 +33,10 @@ class OptionError(SuperSdfError, ValueError):
 
 class FileError(SuperSdfError, OSError):
     """A file cannot be read or written."""
+
+
+class WriteError(FileError):
+    """A file cannot be made where it was asked for: no room, no permission, a name taken."""
 
 
 class ModelError(SuperSdfError, ValueError):

@@ -25,7 +25,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from .conventions import make_grid
-from .errors import FileError, GridError, OptionError, SuperSdfError
+from .errors import FileError, GridError, OptionError, SuperSdfError, WriteError
 from .grid import SdfGrid
 from .memory import check_fits
 from .mesh import Mesh, join_meshes
@@ -141,13 +141,17 @@ def _check_promise(
 
 def check_target(path: str | Path, *, force: bool = False) -> Path:
     """Return the path of a mesh file to be if it can be written; asked before the work starts."""
-    path = Path(path)
+    check_mesh_suffix(Path(path))
+    return check_free(Path(path), force=force)
+
+
+def check_mesh_suffix(path: Path) -> None:
+    """Raise if the suffix is no mesh file's, or if what writes such files is not installed."""
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise OptionError(f"{path} is no mesh file: give one of {', '.join(MESH_SUFFIXES)}")
     if path.suffix.lower() == ".3mf" and not all(map(find_spec, NEEDED_FOR_3MF)):
         needed = " and ".join(NEEDED_FOR_3MF)
         raise FileError(f"writing .3mf needs {needed}: pip install 'super-sdf[3mf]'")
-    return check_free(path, force=force)
 
 
 def check_grid_target(path: str | Path, *, force: bool = False) -> Path:
@@ -161,13 +165,13 @@ def check_grid_target(path: str | Path, *, force: bool = False) -> Path:
 def check_free(path: Path, *, force: bool = False) -> Path:
     """Return the path if a file can be made there."""
     if path.is_dir():
-        raise FileError(f"{path} is a folder: give a file")
+        raise WriteError(f"{path} is a folder: give a file")
     if path.exists() and not force:
-        raise FileError(f"{path} exists: remove it or use --force")
+        raise WriteError(f"{path} exists: remove it or use --force")
     if not path.parent.is_dir():
-        raise FileError(f"{path.parent} is no folder: make it first")
+        raise WriteError(f"{path.parent} is no folder: make it first")
     if not os.access(path.parent, os.W_OK):
-        raise FileError(f"{path} cannot be written: no permission in {path.parent}")
+        raise WriteError(f"{path} cannot be written: no permission in {path.parent}")
     return path
 
 
@@ -217,14 +221,14 @@ def write_grid(grid: SdfGrid, path: str | Path, *, force: bool = False) -> None:
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a path beside the target; it takes the target's place only if all goes well.
 
-    What the system has against it is raised as FileError.
+    What the system has against it is raised as WriteError.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         yield part
         os.replace(part, path)
     except OSError as error:
-        raise FileError(f"{path} cannot be written: {error.strerror or error}") from error
+        raise WriteError(f"{path} cannot be written: {error.strerror or error}") from error
     finally:
         part.unlink(missing_ok=True)
 

@@ -46,6 +46,11 @@ Progress = Callable[[int, int], None]
 STEPS = ("band", "network", "nodes", "isosurface")
 
 
+def step_name(done: int) -> str:
+    """Return what was done when a progress callback is told of so many steps."""
+    return STEPS[0] if done == 1 else STEPS[1 + (done - 2) % (len(STEPS) - 1)]
+
+
 class Decoder(Protocol):
     """What the pipeline asks of a network: see ``network.Network``.
 

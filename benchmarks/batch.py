@@ -1,0 +1,234 @@
+"""Many grids, some broken, killed on the way: whether the batch keeps what it promises.
+
+    python -m benchmarks.batch                                # 500 grids, 16^3 to 128^3
+    python -m benchmarks.batch --count 20 --sizes 12 16 24    # in half a minute
+
+Writes the grids, runs ``super-sdf batch``, kills it with SIGKILL as often as asked, goes on, runs
+it once more, and prints what came of it, beside what each file costs over the warm pipeline.
+"""
+
+from __future__ import annotations
+
+import argparse
+import filecmp
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from super_sdf.batch import Run
+from super_sdf.batch_inputs import find_jobs
+from super_sdf.batch_job import Job
+from super_sdf.batch_lock import FolderLock
+from super_sdf.batch_plan import Settings
+from super_sdf.chunks import count_cores
+from super_sdf.convert import ConvertOptions, convert
+from super_sdf.evaluation.timing import describe_machine
+from super_sdf.mesh import Mesh
+from super_sdf.network import load_network
+
+from .mixed_grids import BROKEN, Placed, write_broken, write_mixed
+
+COMMAND = [sys.executable, "-m", "super_sdf.cli"]
+FAR, MEAN = 1.0, 0.05  # voxels that vertices may be from the truth: any, and in the mean
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the grids are, and where the meshes go."""
+
+    grids: Path
+    meshes: Path
+    jobs: int
+
+    def threads(self) -> int:
+        """Return how many threads each process has; sums are rounded otherwise with another."""
+        return max(1, count_cores() // self.jobs)
+
+    def start(self) -> subprocess.Popen[str]:
+        """Start the batch."""
+        options = ["--out", str(self.meshes), "--jobs", str(self.jobs)]
+        options += ["--threads", str(self.threads())]
+        return subprocess.Popen(
+            [*COMMAND, "batch", str(self.grids), *options], stderr=subprocess.PIPE, text=True
+        )
+
+    def lines(self) -> list[str]:
+        """Return the whole lines of the report."""
+        report = self.meshes / "report.jsonl"
+        return report.read_text().split("\n")[:-1] if report.exists() else []
+
+    def run(self) -> tuple[int, str, float]:
+        """Run the batch to its end; return exit code, last line and seconds."""
+        start = time.perf_counter()
+        process = self.start()
+        _, said = process.communicate()
+        return process.returncode, said.strip().splitlines()[-1], time.perf_counter() - start
+
+    def run_and_kill(self, lines: int) -> None:
+        """Kill the batch when the report has so many lines."""
+        process = self.start()
+        while len(self.lines()) < lines and process.poll() is None:
+            time.sleep(0.02)
+        process.kill()
+        process.wait()
+
+
+def is_right(path: Path, solid: Placed, spacing: float, n: int) -> bool:
+    """Say whether a mesh is closed and lies where the solid's surface is, among the samples.
+
+    The spacing of an .npy is inferred: of a coarse grid approximately, as the report says.
+    """
+    read = trimesh.load(path, process=False)
+    if not Mesh(np.asarray(read.vertices), np.asarray(read.faces, np.int32)).is_closed():
+        return False
+    away = np.abs(solid.distance(np.asarray(read.vertices) / spacing / n)) * n
+    return bool(away.max() < FAR and away.mean() < MEAN)
+
+
+def count_right(place: Place, solids: dict[str, Placed]) -> int:
+    """Count the meshes that are there and right."""
+    rows, right = {row["out"]: row for row in map(json.loads, place.lines())}, 0
+    for name, solid in solids.items():
+        target = Path(name).with_suffix(".ply")
+        path, row = place.meshes / target, rows.get(target.as_posix(), {})
+        if path.exists() and row.get("status") == "ok":
+            right += is_right(path, solid, row["spacing"][0], row["shape"][0])
+    return right
+
+
+def count_named(place: Place) -> int:
+    """Count the broken files whose failure says what is wrong with them."""
+    rows = {row["in"]: row for row in map(json.loads, place.lines())}
+    reasons = {Path(name).name: row["reason"] for name, row in rows.items() if row["reason"]}
+    return sum(text in reasons.get(name, "") for name, text in BROKEN.items())
+
+
+def count_equal(place: Place, names: list[str]) -> int:
+    """Count the meshes that are, byte for byte, those of ``super-sdf upsample``."""
+    single, equal = place.meshes.parent / "single.ply", 0
+    for name in names:
+        words = ["upsample", str(place.grids / name), str(single), "--force", "--quiet"]
+        words += ["--threads", str(place.threads())]
+        subprocess.run([*COMMAND, *words], check=True)
+        made = (place.meshes / name).with_suffix(".ply")
+        equal += made.exists() and filecmp.cmp(single, made, shallow=False)
+    return equal
+
+
+def measure_overhead(place: Place, names: list[str], repeats: int = 3) -> tuple[float, float]:
+    """Return the seconds of the warm pipeline alone and in a batch, each file's best of repeats.
+
+    The first file is left out: with it the batch loads the network.
+    """
+    jobs = find_jobs([str(place.grids / name) for name in names], ".ply", ConvertOptions())
+    alone, batched = np.full((2, repeats, len(jobs)), np.inf)
+    for i in range(repeats):
+        with tempfile.TemporaryDirectory() as folder:
+            found = dict(time_batch(jobs, Path(folder)))
+        order = [job for job in jobs if job in found]
+        batched[i, : len(order)] = [found[job] for job in order]
+        alone[i, : len(order)] = time_alone(order)
+    kept = len(order)
+    return float(alone[:, :kept].min(0).sum()), float(batched[:, :kept].min(0).sum())
+
+
+def time_alone(jobs: list[Job]) -> list[float]:
+    """Return the seconds that the pipeline takes for each file, with its network loaded."""
+    network, seconds = load_network(), []
+    with tempfile.TemporaryDirectory() as folder:
+        for job in jobs:
+            start = time.perf_counter()
+            convert(job.source, Path(folder) / job.target, network, job.options, force=True)
+            seconds.append(time.perf_counter() - start)
+    return seconds
+
+
+def time_batch(jobs: list[Job], folder: Path) -> Iterator[tuple[Job, float]]:
+    """Yield the seconds from file to file in a batch in this process; not for the first."""
+    times = [0.0]
+    with FolderLock(folder) as lock:
+        run = Run(jobs, Settings(folder, workers=1), lock)
+        run.complete(lambda batch: times.append(time.perf_counter()))
+    for result, seconds in list(zip(run.batch.done, np.diff(times)))[1:]:
+        yield result.job, float(seconds)
+
+
+@contextmanager
+def working_folder(given: Path | None) -> Iterator[Path]:
+    """Yield the folder asked for, or one that is removed afterwards."""
+    if given:
+        given.mkdir(parents=True, exist_ok=True)
+        yield given
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder)
+
+
+def spread(names: list[str], count: int) -> list[str]:
+    """Return so many of the names, evenly."""
+    chosen = np.linspace(0, len(names) - 1, min(count, len(names))).round().astype(int)
+    return [names[i] for i in chosen]
+
+
+def parse() -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--count", type=int, default=500, help="grids, broken ones not counted")
+    parser.add_argument("--sizes", type=int, nargs="+", default=[16, 24, 32, 48, 64, 96, 128])
+    parser.add_argument("--kills", type=int, default=3)
+    parser.add_argument("--jobs", type=int, default=count_cores(), help="processes")
+    parser.add_argument("--equal", type=int, default=40, help="meshes held against single runs")
+    parser.add_argument("--overhead", type=int, default=40, help="files timed, each three times")
+    parser.add_argument("--folder", type=Path, help="to work in, and to leave as it is at the end")
+    return parser.parse_args()
+
+
+def main() -> None:
+    """Print the machine and a Markdown table."""
+    asked = parse()
+    with working_folder(asked.folder) as folder:
+        place = Place(folder / "grids", folder / "meshes", asked.jobs)
+        solids = write_mixed(place.grids, asked.count, asked.sizes)
+        write_broken(place.grids / "broken")
+        total = asked.count + len(BROKEN)
+        print(f"{describe_machine()}; {total} files\n\n| | |\n| --- | --- |", flush=True)
+        for kill in range(1, asked.kills + 1):
+            place.run_and_kill(total * kill // (asked.kills + 1))
+            print(f"| killed after | {len(place.lines())} files |", flush=True)
+        report(place, solids, asked, total)
+
+
+def report(place: Place, solids: dict[str, Placed], asked: argparse.Namespace, total: int) -> None:
+    """Print what came of it, row by row as it is known."""
+
+    def row(name: str, value: object) -> None:
+        print(f"| {name} | {value} |", flush=True)
+
+    code, said, seconds = place.run()
+    row("the last run", f"exit code {code}, {seconds:.1f} s: {said}")
+    row("lines in the report", f"{len(place.lines())} of {total}")
+    row("right meshes", f"{count_right(place, solids)} of {asked.count}")
+    row("failures that name the fault", f"{count_named(place)} of {len(BROKEN)}")
+    parts = [p for p in place.meshes.rglob("*") if p.suffix == ".part"]
+    row("unfinished files left", len(parts))
+    code, said, seconds = place.run()
+    row("run again", f"exit code {code}, {seconds:.2f} s: {said}")
+    names = spread(sorted(solids), asked.equal)
+    row("equal to single runs", f"{count_equal(place, names)} of {len(names)}")
+    names = spread(sorted(solids), asked.overhead)
+    alone, batched = measure_overhead(place, names)
+    share = 100 * (batched / alone - 1)
+    row("over the warm pipeline", f"{batched:.2f} s for {alone:.2f} s: {share:+.1f} %")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,101 @@
+"""One file of a batch: what is to be done, and the row that says what came of it."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from .convert import ConvertOptions, convert
+from .errors import FileError, GridError, OptionError, WriteError
+from .fingerprint import fingerprint
+from .pipeline import Decoder
+
+Row = dict[str, Any]
+"""A line of the ledger.
+
+in, out : the input's absolute path; the output's, relative to the output folder
+status, reason : "ok", None; or "failed", why
+retry : whether it failed for a reason that another run may not meet
+content, output : fingerprints of the input, and of the mesh
+options : digest of all that the mesh depends on beside the input
+seconds : the time it took in all; the stages' are in ``stages``
+"""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A grid to convert: its path as it was given, the mesh's within the output folder."""
+
+    source: Path
+    target: str
+    options: ConvertOptions
+
+
+class Result(NamedTuple):
+    """What came of a job, now or in a run before."""
+
+    job: Job
+    row: Row
+
+    def failure(self) -> str:
+        """Return which file failed, and why, in a line."""
+        source, reason = str(self.job.source), str(self.row["reason"])
+        return reason if source in reason else f"{source}: {reason}"
+
+
+def attempt(job: Job, folder: Path, network: Decoder) -> Row:
+    """Convert a file and return its row; whatever goes wrong stands in the row."""
+    start, target = time.perf_counter(), folder / job.target
+    content = fingerprint(job.source)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        done = convert(job.source, target, network, job.options, force=True)
+    except Exception as error:  # a bug that one file shows must not cost the others
+        row = failed_row(job, _reason(error), retry=not _is_inputs_fault(error), content=content)
+        return {**row, "seconds": _since(start)}
+    return {
+        **_head(job),
+        "status": "ok",
+        "reason": None,
+        "retry": False,
+        "content": content,
+        "output": fingerprint(target),
+        **done.report(),
+        "seconds": _since(start),
+        "stages": {stage: round(spent, 4) for stage, spent in done.seconds.items()},
+    }
+
+
+def failed_row(job: Job, reason: str, *, retry: bool = True, content: Any = None) -> Row:
+    """Return the row of a job that failed."""
+    said = {"status": "failed", "reason": reason, "retry": retry, "content": content}
+    return {**_head(job), **said, "output": None, "seconds": 0.0}
+
+
+def _head(job: Job) -> Row:
+    return {"in": os.path.abspath(job.source), "out": job.target}
+
+
+def _since(start: float) -> float:
+    return round(time.perf_counter() - start, 4)
+
+
+def _is_inputs_fault(error: Exception) -> bool:
+    """Say whether the same file with the same options will always fail so."""
+    by_input = isinstance(error, (GridError, OptionError, FileError))
+    return by_input and not isinstance(error, WriteError)
+
+
+def _reason(error: Exception) -> str:
+    """Return what went wrong, in a line."""
+    if isinstance(error, MemoryError) and not str(error):
+        return "out of memory: use a smaller --factor or grid"
+    first = next(iter(str(error).splitlines()), "")
+    return first if _is_ours(error) else f"{type(error).__name__}: {first}"
+
+
+def _is_ours(error: Exception) -> bool:
+    return type(error).__module__ == GridError.__module__

@@ -1,0 +1,116 @@
+"""The command ``batch``: parse, call the library, say what happened. No numerics here."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from .cli_batch_report import progress_line, tell_plan, tell_summary
+from .cli_common import CONTEXT, one_line_errors
+from .cli_conversion import conversion_options, make_options
+
+if TYPE_CHECKING:
+    from .batch_job import Job
+    from .batch_plan import Batch, Settings
+
+EXAMPLES = """\b
+Examples:
+  super-sdf batch grids/ --out meshes/
+  super-sdf batch 'scans/**/*.npz' more.txt --out meshes/ --format stl --factor 2
+"""
+
+
+@click.command(
+    context_settings=CONTEXT, epilog=EXAMPLES, short_help="Convert many grids, and go on later."
+)
+@click.argument("sources", metavar="IN...", nargs=-1, required=True)
+@click.option(
+    "--out",
+    "folder",
+    metavar="DIR",
+    required=True,
+    type=click.Path(path_type=Path),
+    help="Where the meshes go, with report.jsonl; folders below IN are kept.",
+)
+@click.option(
+    "--format",
+    "kind",
+    type=click.Choice(["ply", "stl", "obj", "off", "glb", "3mf"]),
+    default="ply",
+    show_default=True,
+    help="Of the meshes.",
+)
+@conversion_options
+@click.option(
+    "--jobs",
+    type=click.IntRange(0),
+    default=0,
+    help="Processes; 0: one a core, on CUDA one. They share the cores unless --threads is given.",
+)
+@click.option("--fail-fast", is_flag=True, help="Begin nothing more after the first failure.")
+@click.option("--retry", is_flag=True, help="Try unchanged inputs again that failed before.")
+@click.option("--force", is_flag=True, help="Do all again; replace meshes of another origin.")
+@click.option("--dry-run", is_flag=True, help="Say what would be done; write nothing.")
+@click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
+@click.option("-q", "--quiet", is_flag=True, help="Print failures only.")
+def batch(sources: tuple[str, ...], folder: Path, **options: Any) -> None:
+    """Convert every grid that IN names to a mesh in DIR, as upsample would.
+
+    IN are .npy and .npz files, folders of them, patterns ('**/*.npy'), and lists: .txt, a path a
+    line, or .jsonl, an object a line: {"in": "a.npy", "out": "a.ply", "spacing": 0.5}, paths
+    relative to the list.
+
+    What failed is named and stops nothing. Run again, after a kill, with more inputs or other
+    options, it does what is not done yet.
+    """
+    with one_line_errors():
+        run_batch(sources, folder, options)
+
+
+def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -> None:
+    """Find the inputs, do what is to be done, say what came of it."""
+    from .batch_inputs import find_jobs
+    from .batch_plan import Settings, preview
+    from .network import find_model
+    from .nodes import check_factor
+
+    start = time.perf_counter()
+    check_factor(options["factor"])
+    jobs = find_jobs(sources, f".{options['kind']}", make_options(options))
+    model = options["model"] or options["quality"]
+    find_model(model)
+    flags = {name: options[name] for name in ("force", "retry", "fail_fast")}
+    settings = Settings(
+        folder, model, options["device"], options["threads"], options["jobs"], **flags
+    )
+    if options["dry_run"]:
+        tell_plan(preview(jobs, settings))
+        return
+    done = complete(jobs, settings, options["quiet"])
+    done.seconds = time.perf_counter() - start
+    tell_summary(done, options)
+    if done.failures():
+        sys.exit(1)
+
+
+def complete(jobs: list[Job], settings: Settings, quiet: bool) -> Batch:
+    """Run the batch; if interrupted, say what is kept."""
+    from .batch import Run
+    from .batch_lock import FolderLock
+
+    with FolderLock(settings.folder) as lock:
+        run = Run(jobs, settings, lock)
+        total = len(run.batch.waiting)
+        try:
+            with progress_line(total, quiet) as progress:
+                run.complete(progress)
+        except KeyboardInterrupt:
+            raise click.ClickException(
+                f"interrupted: {len(run.batch.done)} of {total} are done and kept; run it again "
+                "to go on"
+            ) from None
+    return run.batch
