@@ -28,7 +28,7 @@ from super_sdf.batch import Run
 from super_sdf.batch_inputs import find_jobs
 from super_sdf.batch_job import Job
 from super_sdf.batch_lock import FolderLock
-from super_sdf.batch_plan import Settings
+from super_sdf.batch_plan import Batch, Settings
 from super_sdf.chunks import count_cores
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.evaluation.timing import describe_machine
@@ -130,36 +130,33 @@ def measure_overhead(place: Place, names: list[str], repeats: int = 3) -> tuple[
     The first file is left out: with it the batch loads the network.
     """
     jobs = find_jobs([str(place.grids / name) for name in names], ".ply", ConvertOptions())
-    alone, batched = np.full((2, repeats, len(jobs)), np.inf)
-    for i in range(repeats):
+    rounds = []
+    for _ in range(repeats):
         with tempfile.TemporaryDirectory() as folder:
-            found = dict(time_batch(jobs, Path(folder)))
-        order = [job for job in jobs if job in found]
-        batched[i, : len(order)] = [found[job] for job in order]
-        alone[i, : len(order)] = time_alone(order)
-    kept = len(order)
-    return float(alone[:, :kept].min(0).sum()), float(batched[:, :kept].min(0).sum())
+            rounds.append(time_pairs(jobs, Path(folder))[1:])
+    alone, batched = np.min(rounds, axis=0).sum(axis=0)
+    return float(alone), float(batched)
 
 
-def time_alone(jobs: list[Job]) -> list[float]:
-    """Return the seconds that the pipeline takes for each file, with its network loaded."""
-    network, seconds = load_network(), []
-    with tempfile.TemporaryDirectory() as folder:
-        for job in jobs:
-            start = time.perf_counter()
-            convert(job.source, Path(folder) / job.target, network, job.options, force=True)
-            seconds.append(time.perf_counter() - start)
-    return seconds
+def time_pairs(jobs: list[Job], folder: Path) -> list[tuple[float, float]]:
+    """Return for each file the seconds of the pipeline alone, and from file to file in a batch.
 
+    They are taken in turn, file by file, so that what else the machine does is the same for both.
+    """
+    network, pairs = load_network(), []
+    clock = time.perf_counter()
 
-def time_batch(jobs: list[Job], folder: Path) -> Iterator[tuple[Job, float]]:
-    """Yield the seconds from file to file in a batch in this process; not for the first."""
-    times = [0.0]
+    def take(batch: Batch) -> None:
+        nonlocal clock
+        batched, job = time.perf_counter() - clock, batch.done[-1].job
+        start = time.perf_counter()
+        convert(job.source, folder / f"alone-{len(pairs)}.ply", network, job.options)
+        pairs.append((time.perf_counter() - start, batched))
+        clock = time.perf_counter()
+
     with FolderLock(folder) as lock:
-        run = Run(jobs, Settings(folder, workers=1), lock)
-        run.complete(lambda batch: times.append(time.perf_counter()))
-    for result, seconds in list(zip(run.batch.done, np.diff(times)))[1:]:
-        yield result.job, float(seconds)
+        Run(jobs, Settings(folder, workers=1), lock).complete(take)
+    return pairs
 
 
 @contextmanager

@@ -62,6 +62,17 @@ def test_shipped_networks_are_small_and_keep_the_contract():
         assert load_network(name).card["name"] == name
 
 
+@pytest.mark.parametrize("factor", [4, 8])
+def test_a_prediction_depends_neither_on_threads_nor_on_what_else_is_asked(factor):
+    """To the last bit: so a mesh may be made in slabs, or by another number of threads."""
+    patches, table, rows = network_inputs(ball())
+    offsets = block_offsets(factor)
+    one, two = (load_network("fast", threads=threads) for threads in (1, 2))
+    values = one(patches, table, rows, offsets)
+    for some in (rows, rows[40:], rows[100:103], rows[7:8]):
+        np.testing.assert_array_equal(two(patches, table, some, offsets), values[some])
+
+
 def test_a_failing_run_is_one_error_of_ours():
     patches, table, rows = network_inputs(ball())
     with pytest.raises(DeviceError, match="the network failed on cpu: "):

@@ -106,8 +106,8 @@ def find_chunk(
 ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
     """See ``spheres._find_chunk``."""
     exact = samples.exact[chunk]
-    rows, place = np.empty(len(exact), np.int32), np.empty((3, len(exact)), np.float32)
-    value, cosine = np.empty((2, len(exact)), np.float32)
+    rows, place = np.empty(len(exact), np.int32), np.zeros((3, len(exact)), np.float32)
+    value, cosine = np.zeros((2, len(exact)), np.float32)
     kernels.find_foot_points(
         values, nodes.starts, *part_of_node(nodes.factor), nodes.factor, samples.patches, exact,
         samples.table, samples.row_of, rows, place, value, cosine,

@@ -88,11 +88,17 @@ class Network:
     def _run(
         self, patches: FloatArray, table: IntArray, voxels: IntArray, offsets: FloatArray
     ) -> FloatArray:
-        """Run the session."""
+        """Run the session.
+
+        Of fewer voxels than offsets onnxruntime would make the sums in an order that depends on how
+        many threads there are, so voxels are repeated until there are as many.
+        """
+        count = len(voxels)
+        voxels = np.resize(voxels, max(count, len(offsets)))
         feeds = dict(zip(INPUTS, (patches, table, voxels, offsets)))
         try:
             run = run_bound if self.device == "cuda" else run_on_cpu
-            return run(self.session, feeds)
+            return run(self.session, feeds)[:count]
         except Exception as error:  # onnxruntime's errors have no common base but this
             raise DeviceError(
                 f"the network failed on {self.device}: {first_line(error)}"
