@@ -41,6 +41,7 @@ COUNTS = (
     "triangles",
     "pinned_nodes",
     "slabs",
+    "planned_bytes",
 )
 
 
@@ -173,7 +174,8 @@ class Total:
                 pinned_nodes=piece.pinned,
             )
             whole = {"band_voxels": piece.band_voxels, "noisy_voxels": piece.noisy_voxels}
-            self.counts |= Counter(whole | {"slabs": piece.slabs})
+            plan = {"slabs": piece.slabs, "planned_bytes": piece.planned_bytes}
+            self.counts |= Counter(whole | plan)
             yield piece.mesh
             watch.lap("write")
 

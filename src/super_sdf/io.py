@@ -35,7 +35,7 @@ MESH_SUFFIXES = (".ply", ".stl", ".obj", ".off", ".glb", ".3mf")
 NEEDED_FOR_3MF = ("lxml", "networkx")
 NPZ_KEYS = ("values", "spacing", "origin")
 CHUNK = 1 << 18  # vertices or faces written at a time
-SPOOL_BYTES = 64_000_000  # triangles that wait in memory before they go to a file beside
+SPOOL_BYTES = 16_000_000  # triangles that wait in memory before they go to a file beside
 HEADER_BYTES = 320
 
 

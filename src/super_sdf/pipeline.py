@@ -35,7 +35,7 @@ from .nodes import (
     number_shared_nodes,
     pin_to_skipped,
 )
-from .plan import Slab, plan_slabs
+from .plan import Slab, peak_bytes, plan_slabs
 from .spheres import Samples, fit_to_spheres
 from .survey import Band, survey
 
@@ -147,6 +147,8 @@ class Piece:
         Triangles of the slab: rows of the vertices of all pieces so far, this one's among them.
     slabs : int
         How many pieces there are in all.
+    planned_bytes : int
+        What the plan says that the process holds at the most.
     band_voxels, noisy_voxels : int
         Of the whole grid: see ``FineField``.
     decoded_voxels, nodes, pinned : int
@@ -159,6 +161,7 @@ class Piece:
 
     mesh: Mesh
     slabs: int
+    planned_bytes: int
     band_voxels: int
     noisy_voxels: int
     decoded_voxels: int
@@ -187,6 +190,7 @@ def reconstruct_slabs(
     with working_threads(threads):
         band = find_surface(grid, factor, offset, bound)
         slabs = plan_slabs(band, factor, getattr(network, "receptive_field", None), bound)
+        planned = peak_bytes(band, slabs, factor)
     steps = Steps(progress, len(slabs))
     vertices = 0
     seen: set[bool] = set()
@@ -194,7 +198,7 @@ def reconstruct_slabs(
         with working_threads(threads):
             field = refine(band, network, factor, slab, steps)
             mesh = mesh_field(field, grid, offset=offset, cap=cap, first_vertex=vertices)
-            piece = describe_piece(field, mesh, len(slabs))
+            piece = describe_piece(field, mesh, len(slabs), planned)
             del field, mesh  # no more of them than one at a time
         steps.finish_one()
         vertices += len(piece.mesh.vertices)
@@ -271,12 +275,13 @@ def mesh_field(
     return extract_mesh(field, grid, first_vertex)
 
 
-def describe_piece(field: FineField, mesh: Mesh, slabs: int) -> Piece:
+def describe_piece(field: FineField, mesh: Mesh, slabs: int, planned: int) -> Piece:
     """Return what there is to say of a slab beside its mesh."""
     own, nodes = field.rows(*field.planes), field.own_nodes()
     return Piece(
         mesh,
         slabs,
+        planned,
         field.band_voxels,
         field.noisy_voxels,
         own.stop - own.start,

@@ -23,13 +23,18 @@ from .survey import Band
 
 FINAL_BESIDE = 1
 DECODED_BESIDE = FINAL_BESIDE + REACH_IN_VOXELS
-# What a process takes at most, measured (benchmarks.memory) and rounded up: for each voxel that the
-# network sees, for each that is decoded, and for each node of its block.
-BYTES_PER_VOXEL = 1850
-BYTES_PER_DECODED = 1000
-BYTES_PER_BLOCK_NODE = 8
+# What a process takes at the most in each stage, measured (``benchmarks.memory``), in bytes: for
+# each voxel that the network sees, for each that is decoded, for each node of a decoded block.
+STAGES = {
+    "encoder": (1300, 1230, 4.0),
+    "head": (100, 0, 8.0),
+    "average": (108, 800, 6.5),
+    "fit and mesh": (108, 1110, 2.6),
+}
+# The mesh of the slab before, which may still be in use, for each node of a face of a decoded block.
+MESH_BYTES = 19
 # Chunks in work, whatever the grid.
-WORK_BYTES = 60_000_000
+WORK_BYTES = 80_000_000
 
 
 @dataclass(frozen=True)
@@ -80,16 +85,22 @@ def plan_slabs(
         If the thinnest slabs do not fit.
     """
     if receptive_field is None:
-        need, slabs = held_bytes(band) + slab_bytes(band, whole(band), factor), [whole(band)]
+        need = peak_bytes(band, [whole(band)], factor)
         if bound is not None and need > bound:
             raise _does_not_fit(band, factor, "at once", need, bound)
-        return slabs
+        return [whole(band)]
     for slabs in ways_to_cut(band, receptive_field):
-        need = held_bytes(band) + max(slab_bytes(band, slab, factor) for slab in slabs)
+        need = peak_bytes(band, slabs, factor)
         if bound is None or need <= bound:
             return slabs
     assert bound is not None
     raise _does_not_fit(band, factor, "even plane by plane", need, bound)
+
+
+def peak_bytes(band: Band, slabs: list[Slab], factor: int) -> int:
+    """Return what the process will hold at the most: now, and for the largest slab."""
+    held = held_memory() or band.patches.nbytes + WORK_BYTES
+    return held + max(slab_bytes(band, slab, factor) for slab in slabs)
 
 
 def cut(band: Band, pieces: int, receptive_field: int) -> list[Slab]:
@@ -115,17 +126,13 @@ def _slab(band: Band, first: int, last: int, receptive_field: int) -> Slab:
     return Slab((first, last), decoded, band.rows(first - beside, last + beside))
 
 
-def held_bytes(band: Band) -> int:
-    """Return what the process holds already, the band among it."""
-    return held_memory() or band.patches.nbytes + WORK_BYTES
-
-
 def slab_bytes(band: Band, slab: Slab, factor: int) -> int:
-    """Return what a process takes for a slab beside what it holds already, at most."""
+    """Return what a process takes for a slab beside what it holds already, at the most."""
     seen = slab.seen.stop - slab.seen.start
     decoded = band.count_decoded(slab.decoded)
-    per_decoded = BYTES_PER_DECODED + BYTES_PER_BLOCK_NODE * (factor + 1) ** 3
-    return int(WORK_BYTES + seen * BYTES_PER_VOXEL + decoded * per_decoded)
+    sizes = np.array([seen, decoded, decoded * (factor + 1) ** 3])
+    work = WORK_BYTES + int((np.array(list(STAGES.values())) @ sizes).max())
+    return work + MESH_BYTES * decoded * factor**2
 
 
 def _does_not_fit(band: Band, factor: int, how: str, need: int, bound: int) -> OutOfMemoryError:
