@@ -85,6 +85,16 @@ def test_noise_is_told(here, command):
     assert " % of the band the values differ by more than distances can: they are taken" in err
 
 
+def test_the_precision_may_be_chosen(here, command):
+    code, out, _ = command("upsample", "in.npy", "out.ply", "--precision", "int8", "--json")
+    assert code == 0 and json.loads(out)["precision"] == "int8"
+    assert trimesh.load("out.ply").is_watertight
+    code, _, err = command(
+        "upsample", "in.npy", "fast.ply", "--quality", "fast", "--precision", "int8"
+    )
+    assert code == 2 and "fast has no int8 variant" in err
+
+
 def test_fine_values_that_contradict_the_coarse_ones_are_warned_of(here, command, monkeypatch):
     from super_sdf.network import Network
 

@@ -82,7 +82,10 @@ class Upsampling:
         check_target(self.target, force=asked["force"])
         watch.lap("start")
         self.network = load_network(
-            asked["model"] or asked["quality"], device=asked["device"], threads=asked["threads"]
+            asked["model"] or asked["quality"],
+            device=asked["device"],
+            threads=asked["threads"],
+            precision=asked["precision"],
         )
         watch.lap("load network")
         with self.progress_bar() as progress:
@@ -118,6 +121,7 @@ class Upsampling:
             "factor": self.options["factor"],
             "offset": self.options["offset"],
             "model": self.options["model"] or self.options["quality"],
+            "precision": self.options["precision"],
             "device": self.network.device,
             "device_notes": list(self.network.notes),
             **self.done.report(),

@@ -31,7 +31,7 @@ STAGES = {
     "average": (108, 800, 6.5),
     "fit and mesh": (108, 1110, 2.6),
 }
-# The mesh of the slab before, which may still be in use, for each node of a face of a decoded block.
+# The mesh of the slab before, which may still be in use, for each cell of a face of a block.
 MESH_BYTES = 19
 # Chunks in work, whatever the grid.
 WORK_BYTES = 80_000_000

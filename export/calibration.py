@@ -1,0 +1,94 @@
+"""What the layers of a network read, on samples as in training: their ranges.
+
+``quantize`` makes steps of them, and ``prune`` finds what never reacts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from export.augment import USUAL, Prepared, augment, batch_table
+from export.dataset import fill_shard
+from export.latency import ball
+from export.network import Block, NetworkConfig, SuperSdfNet
+from export.to_onnx import read_weights
+from super_sdf.network import load_network
+
+THIN = 0.05  # share of thin solids, as in training
+SAMPLES = 200
+
+
+@dataclass
+class Ranges:
+    """What a block reads: the least and the most of each channel at its three layers."""
+
+    low: Tensor  # (C,) features
+    high: Tensor  # (C,)
+    mixed: Tensor  # (C,) the most; after a rectifier the least is 0
+    expanded: Tensor  # (hidden,) alike
+
+    @classmethod
+    def of_zeros(cls, block: Block) -> Ranges:
+        """Return ranges that hold nothing but 0."""
+        zeros = torch.zeros(block.expand.in_features)
+        return cls(zeros, zeros, zeros, torch.zeros(block.expand.out_features))
+
+    def widen(self, features: Tensor, mixed: Tensor, expanded: Tensor) -> None:
+        """Take in what was read."""
+        self.low = torch.minimum(self.low, features.amin(0))
+        self.high = torch.maximum(self.high, features.amax(0))
+        self.mixed = torch.maximum(self.mixed, mixed.amax(0))
+        self.expanded = torch.maximum(self.expanded, expanded.amax(0))
+
+
+def draw_samples(count: int = SAMPLES, seed: int = 0) -> list[Prepared]:
+    """Return samples of procedural shapes; some noisy, some cut off."""
+    rng = np.random.default_rng(seed)
+    samples = fill_shard(rng, [], 1.0, THIN, count)
+    return [augment(rng, sample, USUAL) for sample in samples]
+
+
+@torch.no_grad()
+def find_ranges(net: SuperSdfNet, samples: list[Prepared]) -> list[Ranges]:
+    """Return what each block reads on these samples."""
+    ranges = [Ranges.of_zeros(block) for block in net.blocks]
+    for sample in samples:
+        table = torch.from_numpy(batch_table([sample.table]))
+        features = net.stem(torch.from_numpy(sample.patches))
+        for block, seen in zip(net.blocks, ranges):
+            mixed = block.mix(features, table)
+            expanded = torch.relu(block.expand(mixed))
+            seen.widen(features, mixed, expanded)
+            features = features + block.reduce(expanded)
+    return ranges
+
+
+def read_network(path: Path) -> SuperSdfNet:
+    """Return the network in an exported file."""
+    weights = read_weights(path)
+    trunk, inputs = weights["trunk.layers.0.weight"].shape
+    channels = len(weights["correction.weight"][0])
+    config = NetworkConfig(
+        channels=channels,
+        blocks=sum(name.endswith("conv.bias") for name in weights),
+        hidden=len(weights["stem.0.bias"]),
+        functions=channels + len(weights["branch.bias"]),
+        trunk=trunk,
+        frequencies=(inputs - 3) // 6,
+    )
+    net = SuperSdfNet(config)
+    net.load_state_dict(weights)
+    return net.eval()
+
+
+def distance_apart(one: Path, other: Path) -> np.ndarray:
+    """Return how far the values of two files are apart on a ball, in voxels."""
+    sample = ball(15.0)
+    arrays = (sample.patches, sample.table, sample.voxels, sample.offsets)
+    first, second = (load_network(path, device="cpu")(*arrays) for path in (one, other))
+    return np.abs(first - second) / 2

@@ -1,0 +1,74 @@
+"""Leave out the blocks of a network that never react: they add the same to every voxel.
+
+    python -m export.prune models/base.onnx --out pruned.onnx
+
+A block whose first rectifier lets nothing through, whatever the neighbours are, adds a constant.
+That goes into the bias of the layer before it, and the values stay what they were.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import onnx
+import torch
+from torch import nn
+
+from export.calibration import (
+    Ranges,
+    distance_apart,
+    draw_samples,
+    find_ranges,
+    read_network,
+)
+from export.network import SuperSdfNet
+from export.to_onnx import PARITY, write_model
+
+
+@torch.no_grad()
+def without_idle_blocks(net: SuperSdfNet, ranges: list[Ranges]) -> SuperSdfNet:
+    """Return the network without the blocks in which nothing got through the first rectifier."""
+    pruned = copy.deepcopy(net)
+    before, kept = pruned.stem[2], []
+    for block, seen in zip(pruned.blocks, ranges):
+        if seen.mixed.any():
+            before = block.reduce
+            kept.append(block)
+        else:
+            before.bias += block.reduce(torch.relu(block.expand.bias))
+    pruned.blocks = nn.ModuleList(kept)
+    pruned.config = replace(net.config, blocks=len(kept))
+    return pruned
+
+
+def card_of(source: Path, net: SuperSdfNet, **changed: str) -> dict[str, Any]:
+    """Return the card of a file for what a network made from it is."""
+    card = {prop.key: prop.value for prop in onnx.load(source).metadata_props}
+    size = sum(parameter.numel() for parameter in net.parameters())
+    field = net.config.receptive_field
+    return {**card, "parameters": size, "receptive_field": field, **changed}
+
+
+def main() -> None:
+    """Write the file and refuse to keep one that gives other values."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("source", type=Path, help="an .onnx file of export.to_onnx")
+    parser.add_argument("--out", type=Path, required=True, help="the .onnx file, another one")
+    options = parser.parse_args()
+    whole = read_network(options.source)
+    net = without_idle_blocks(whole, find_ranges(whole, draw_samples()))
+    write_model(net, options.out, card_of(options.source, net))
+    apart = distance_apart(options.source, options.out).max()
+    if apart > PARITY / 2:
+        options.out.unlink()
+        raise SystemExit(f"{apart:.1e} voxels from {options.source}: not kept")
+    blocks = f"{net.config.blocks} of {whole.config.blocks} blocks"
+    print(f"{options.out}: {blocks}, {apart:.1e} voxels from {options.source}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,119 @@
+"""Write the int8 variant of an exported network, and check how far it is from it.
+
+    python -m export.quantize models/base.onnx --out models/base-int8.onnx
+
+Only the blocks change, and those that never react are left out (``prune``); stem, head and the
+stream of features between the blocks stay float32. Weights are whole numbers with a scale for each
+output channel; what a layer reads is whole numbers with a step for each input channel. The steps
+are fixed beforehand, from what the network computes on procedural shapes: steps found in each call
+would make a voxel's values depend on all others in it.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import onnx
+from torch import Tensor
+
+from export.augment import Prepared
+from export.calibration import (
+    Ranges,
+    distance_apart,
+    draw_samples,
+    find_ranges,
+    read_network,
+)
+from export.int8_graph import IntBlock, IntLayer, replace_blocks
+from export.network import Block
+from export.prune import card_of, without_idle_blocks
+from export.to_onnx import write_model
+
+LEVELS = 255  # of what a layer reads: uint8
+# Two products must fit into 16 bits: processors without VNNI add them up there, and cut them off.
+MOST = 64  # of a weight; 2 * 255 * 64 < 2^15
+MOST_BIAS = 2**30
+LEAST_STEP = 1e-3  # over the largest step: for channels that hardly ever differ from 0
+FARTHEST = 0.01  # voxels, on average: farther from float32 a file is not kept
+Array = np.ndarray
+
+
+def quantize(
+    source: Path, target: Path, samples: list[Prepared], accuracy: str = "not measured"
+) -> None:
+    """Write the int8 variant of a file, with its card."""
+    net = read_network(source)
+    net = without_idle_blocks(net, find_ranges(net, samples))
+    changed = {"name": target.stem, "precision": "int8", "accuracy": accuracy}
+    write_model(net, target, card_of(source, net, **changed))
+    model = onnx.load(target)
+    blocks = [whole_block(*pair) for pair in zip(net.blocks, find_ranges(net, samples))]
+    replace_blocks(model.graph, blocks)
+    onnx.checker.check_model(model)
+    onnx.save(model, target)
+
+
+def whole_block(block: Block, ranges: Ranges) -> IntBlock:
+    """Round a block's three layers."""
+    steps = steps_of(ranges.high - ranges.low)
+    zeros = np.rint(-ranges.low.numpy() / steps).clip(0, LEVELS)
+    mixed, expanded = steps_of(ranges.mixed), steps_of(ranges.expanded)
+    plain = np.ones(len(steps))
+    return IntBlock(
+        steps,
+        zeros.astype(np.uint8),
+        whole_layer(block.conv.weight, block.conv.bias, np.tile(steps, 27), mixed, zeros),
+        whole_layer(block.expand.weight.T, block.expand.bias, mixed, expanded),
+        whole_layer(block.reduce.weight.T, block.reduce.bias, expanded, plain),
+    )
+
+
+def steps_of(width: Tensor) -> Array:
+    """Return how much one is worth in each channel, (n,)."""
+    steps = width.numpy() / LEVELS
+    return np.maximum(steps, LEAST_STEP * (steps.max() or 1)).astype(np.float32)
+
+
+def whole_layer(
+    weight: Tensor, bias: Tensor, steps: Array, out: Array, zeros: Array | None = None
+) -> IntLayer:
+    """Round a layer.
+
+    Parameters
+    ----------
+    weight, bias : (K, n), (n,)
+        The layer, ``values @ weight + bias``.
+    steps, out : (K,), (n,)
+        What one is worth in what the layer reads and in what it gives.
+    zeros : (C,), optional
+        Which whole numbers stand for 0 in what it reads, repeated if K > C; else 0 does.
+    """
+    scaled = weight.detach().double().numpy() * steps[:, None] / out
+    start = bias.detach().double().numpy() / out
+    scales = np.maximum(np.abs(scaled).max(0) / MOST, np.abs(start) / MOST_BIAS) + 1e-30
+    whole = np.rint(scaled / scales)
+    start = np.rint(start / scales)
+    if zeros is not None:
+        start -= np.tile(zeros, len(whole) // len(zeros)) @ whole
+    return IntLayer(whole.astype(np.int8), scales.astype(np.float32), start.astype(np.int32))
+
+
+def main() -> None:
+    """Write the file and refuse to keep one that is far from its source."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("source", type=Path, help="an .onnx file of export.to_onnx")
+    parser.add_argument("--out", type=Path, required=True, help="the int8 .onnx file")
+    parser.add_argument("--accuracy", default="not measured", help="measured figures, in words")
+    options = parser.parse_args()
+    quantize(options.source, options.out, draw_samples(), options.accuracy)
+    apart = distance_apart(options.source, options.out).mean()
+    if apart > FARTHEST:
+        options.out.unlink()
+        raise SystemExit(f"{apart:.4f} voxels from {options.source} on average: not kept")
+    print(f"{options.out}: {options.out.stat().st_size / 1e6:.1f} MB, {apart:.5f} voxels away")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,109 @@
+"""From float32 to int8: rounding, what onnxruntime makes of the graph, idle blocks, invariance."""
+
+import copy
+
+import numpy as np
+import onnx
+import onnxruntime as ort
+import pytest
+import torch
+
+from export.calibration import distance_apart, draw_samples, find_ranges, read_network
+from export.network import NetworkConfig, SuperSdfNet
+from export.prune import without_idle_blocks
+from export.quantize import LEVELS, MOST, quantize, steps_of, whole_block, whole_layer
+from export.to_onnx import make_card, write_model
+from super_sdf.network import load_network
+
+SMALL = NetworkConfig(channels=16, blocks=3, hidden=32, functions=24, trunk=16, frequencies=2)
+
+
+@pytest.fixture(scope="module")
+def samples():
+    return draw_samples(6)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory, samples):
+    """A network in float32, and twice in int8."""
+    torch.manual_seed(0)
+    net = SuperSdfNet(SMALL)
+    for block in net.blocks:  # away from the start, where the blocks do nothing
+        torch.nn.init.normal_(block.reduce.weight, std=0.1)
+    folder = tmp_path_factory.mktemp("files")
+    paths = [folder / name for name in ("small.onnx", "small-int8.onnx", "again.onnx")]
+    write_model(net, paths[0], make_card(net, "small", "nothing", "none"))
+    quantize(paths[0], paths[1], samples)
+    quantize(paths[0], paths[2], samples)
+    return paths
+
+
+def test_a_rounded_layer_is_near_and_zero_is_exact():
+    rng = np.random.default_rng(0)
+    weight, bias = torch.randn(27 * 4, 5), torch.randn(5)
+    steps, zeros = rng.uniform(0.01, 0.02, 4), rng.integers(0, 255, 4)
+    layer = whole_layer(weight, bias, np.tile(steps, 27), np.full(5, 0.5), zeros)
+    assert layer.weight.dtype == np.int8 and np.abs(layer.weight).max() == MOST
+    absent = np.tile(zeros, 27) @ layer.weight.astype(int) + layer.bias
+    assert np.abs(absent * layer.scales * 0.5 - bias.numpy()).max() <= layer.scales.max()
+    read = rng.integers(0, LEVELS + 1, (100, 27 * 4))
+    got = (read @ layer.weight.astype(int) + layer.bias) * layer.scales * 0.5
+    want = ((read - np.tile(zeros, 27)) * np.tile(steps, 27)) @ weight.numpy() + bias.numpy()
+    assert np.abs(got - want).mean() < 0.02 * np.abs(want).mean()
+
+
+def test_no_pair_of_products_is_cut_off_on_processors_without_vnni():
+    assert 2 * LEVELS * MOST < 2**15
+
+
+def test_layers_without_weights_keep_their_bias():
+    bias = torch.tensor([3.0, 0.0])
+    layer = whole_layer(torch.zeros(4, 2), bias, np.ones(4), np.ones(2))
+    np.testing.assert_allclose(layer.bias * layer.scales, bias, rtol=1e-6)
+
+
+def test_what_is_read_fits_into_a_byte(samples):
+    block = SuperSdfNet(SMALL).blocks[0]
+    net = SuperSdfNet(SMALL)
+    ranges = find_ranges(net, samples)[0]
+    whole = whole_block(block, ranges)
+    for value in (ranges.low, ranges.high):
+        read = value.numpy() / whole.steps + whole.zeros
+        assert read.min() > -1 and read.max() < LEVELS + 1
+    assert (steps_of(torch.zeros(3)) > 0).all()
+
+
+def test_the_int8_file_is_near_the_float32_one_and_carries_its_card(files):
+    assert distance_apart(*files[:2]).mean() < 3e-3
+    card = load_network(files[1]).card
+    assert (card["name"], card["precision"], card["receptive_field"]) == ("small-int8", "int8", 4)
+    assert load_network(files[0], precision="int8").card == card  # the one beside it
+
+
+def test_the_same_file_is_written_again(files):
+    one, other = (onnx.load(path) for path in files[1:])
+    assert one.graph == other.graph
+
+
+def test_onnxruntime_runs_each_layer_in_whole_numbers(files, tmp_path):
+    options = ort.SessionOptions()
+    options.optimized_model_filepath = str(tmp_path / "optimised.onnx")
+    ort.InferenceSession(str(files[1]), options, providers=["CPUExecutionProvider"])
+    nodes = onnx.load(tmp_path / "optimised.onnx").graph.node
+    bodies = [a.g for node in nodes for a in node.attribute if a.name == "body"]
+    kinds = ["Gather", "Reshape", "QGemm", "QGemm", "QGemm"]
+    assert [[node.op_type for node in body.node] for body in bodies] == [kinds] * 3
+
+
+def test_idle_blocks_are_left_out_and_change_nothing(files, samples, tmp_path):
+    net = read_network(files[0])
+    idle = copy.deepcopy(net)
+    with torch.no_grad():
+        idle.blocks[0].conv.bias -= 1000
+        idle.blocks[2].conv.bias -= 1000
+    pruned = without_idle_blocks(idle, find_ranges(idle, samples))
+    assert (len(pruned.blocks), pruned.config.receptive_field) == (1, 2)
+    for number, made in enumerate((idle, pruned)):
+        write_model(made, tmp_path / f"{number}.onnx", make_card(made, "x", "nothing", "none"))
+    assert distance_apart(tmp_path / "0.onnx", tmp_path / "1.onnx").max() < 1e-5
+    assert len(idle.blocks) == 3
