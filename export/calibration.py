@@ -15,8 +15,7 @@ from torch import Tensor
 from export.augment import USUAL, Prepared, augment, batch_table
 from export.dataset import fill_shard
 from export.latency import ball
-from export.network import Block, NetworkConfig, SuperSdfNet
-from export.to_onnx import read_weights
+from export.network import Block, SuperSdfNet
 from super_sdf.network import load_network
 
 THIN = 0.05  # share of thin solids, as in training
@@ -66,24 +65,6 @@ def find_ranges(net: SuperSdfNet, samples: list[Prepared]) -> list[Ranges]:
             seen.widen(features, mixed, expanded)
             features = features + block.reduce(expanded)
     return ranges
-
-
-def read_network(path: Path) -> SuperSdfNet:
-    """Return the network in an exported file."""
-    weights = read_weights(path)
-    trunk, inputs = weights["trunk.layers.0.weight"].shape
-    channels = len(weights["correction.weight"][0])
-    config = NetworkConfig(
-        channels=channels,
-        blocks=sum(name.endswith("conv.bias") for name in weights),
-        hidden=len(weights["stem.0.bias"]),
-        functions=channels + len(weights["branch.bias"]),
-        trunk=trunk,
-        frequencies=(inputs - 3) // 6,
-    )
-    net = SuperSdfNet(config)
-    net.load_state_dict(weights)
-    return net.eval()
 
 
 def distance_apart(one: Path, other: Path) -> np.ndarray:

@@ -75,7 +75,7 @@ class Writer:
 
 def replace_blocks(graph: onnx.GraphProto, blocks: list[IntBlock]) -> None:
     """Put the blocks in the place of a graph's own, the Scan nodes in their order."""
-    scans = [node for node in graph.node if node.op_type == "Scan"]
+    scans = [node for node in graph.node if node.op_type == "Scan"][: len(blocks)]  # then the head
     graph.initializer.append(numpy_helper.from_array(np.float32(1), ONE))
     graph.initializer.append(numpy_helper.from_array(np.uint8(0), NONE))
     for scan, block in zip(scans, blocks, strict=True):

@@ -23,10 +23,9 @@ from export.calibration import (
     distance_apart,
     draw_samples,
     find_ranges,
-    read_network,
 )
 from export.network import SuperSdfNet
-from export.to_onnx import PARITY, write_model
+from export.to_onnx import PARITY, read_network, write_model
 
 
 @torch.no_grad()

@@ -24,12 +24,11 @@ from export.calibration import (
     distance_apart,
     draw_samples,
     find_ranges,
-    read_network,
 )
 from export.int8_graph import IntBlock, IntLayer, replace_blocks
 from export.network import Block
 from export.prune import card_of, without_idle_blocks
-from export.to_onnx import write_model
+from export.to_onnx import read_network, write_model
 
 LEVELS = 255  # of what a layer reads: uint8
 # Two products must fit into 16 bits: processors without VNNI add them up there, and cut them off.

@@ -27,7 +27,7 @@ import onnx
 import torch
 from onnx import TensorProto, helper, numpy_helper
 
-from export.network import SIZES, NetworkConfig, SuperSdfNet
+from export.network import NetworkConfig, SuperSdfNet
 from super_sdf.band import CENTRE, REACH, find_band, gather_patches, neighbour_table
 from super_sdf.device import CHUNK_INPUT
 from super_sdf.network import FORMAT_VERSION, load_network
@@ -95,16 +95,9 @@ def build_graph(net: SuperSdfNet) -> onnx.GraphProto:
     for number in range(len(net.blocks)):
         change = scan_block(graph, net, number, features, chunks, rows)
         features = graph.op("Add", features, change)
-    chosen = graph.op("Gather", features, "voxels", axis=0)
-    branch = graph.relu(graph.layer(chosen, net.branch))
-    patches = graph.op("Gather", "patches", "voxels", axis=0)
-    per_voxel = graph.op("Concat", chosen, branch, patches, axis=1)
     per_offset = graph.op("Concat", trunk(graph, net), interpolation(graph), axis=1)
     transposed = graph.op("Transpose", per_offset, perm=[1, 0])
-    kept = graph.op("MatMul", per_voxel, transposed)
-    noisy = graph.op("Gather", noisy_voxels(graph), "voxels", axis=0)
-    correction = graph.op("Mul", graph.layer(chosen, net.correction), noisy)
-    graph.nodes.append(helper.make_node("Add", [kept, correction], ["values"]))
+    scan_head(graph, net, features, transposed)
     graph.constants.append(numpy_helper.from_array(np.array([CHUNK], np.int64), CHUNK_INPUT))
     return helper.make_graph(graph.nodes, "super_sdf", inputs(), [output()], graph.constants)
 
@@ -159,6 +152,43 @@ def scan_block(
     stacked = graph.op("Scan", chunks, body=subgraph, num_scan_inputs=1)
     flat = graph.op("Reshape", stacked, graph.integers(-1, channels))
     return graph.op("Slice", flat, graph.integers(0), rows, graph.integers(0))
+
+
+def scan_head(graph: Graph, net: SuperSdfNet, features: str, per_offset: str) -> None:
+    """Add the head, chunk by chunk of the voxels; its result is the output.
+
+    What it makes for each voxel is five times as large as the features. A chunk has at least as
+    many rows as there are offsets: of fewer, sums would depend on the number of threads.
+    """
+    count, offsets = (graph.op("Shape", name, start=0, end=1) for name in ("voxels", "offsets"))
+    size = graph.op("Max", CHUNK_INPUT, offsets)
+    missing = graph.op("Sub", size, graph.op("Mod", count, size))
+    first = graph.constant(np.array(0, np.int32))
+    filled = graph.op(
+        "Pad", "voxels", graph.op("Concat", graph.integers(0), missing, axis=0), first
+    )
+    chunks = graph.op("Reshape", filled, graph.op("Concat", graph.integers(-1), size, axis=0))
+    subgraph = head_body(net, features, per_offset, noisy_voxels(graph))
+    stacked = graph.op("Scan", chunks, body=subgraph, num_scan_inputs=1)
+    flat = graph.op("Reshape", stacked, graph.op("Concat", graph.integers(-1), offsets, axis=0))
+    ends = [flat, graph.integers(0), count, graph.integers(0)]
+    graph.nodes.append(helper.make_node("Slice", ends, ["values"]))
+
+
+def head_body(net: SuperSdfNet, features: str, per_offset: str, noisy: str) -> onnx.GraphProto:
+    """Return the head of some voxels: coefficients times functions, and the correction."""
+    body = Graph(net, "head_")
+    chosen = body.op("Gather", features, "some", axis=0)
+    branch = body.relu(body.layer(chosen, net.branch))
+    patches = body.op("Gather", "patches", "some", axis=0)
+    per_voxel = body.op("Concat", chosen, branch, patches, axis=1)
+    kept = body.op("MatMul", per_voxel, per_offset)
+    where = body.op("Gather", noisy, "some", axis=0)
+    correction = body.op("Mul", body.layer(chosen, net.correction), where)
+    values = body.op("Add", kept, correction)
+    given = helper.make_tensor_value_info("some", TensorProto.INT32, ["chunk"])
+    made = helper.make_tensor_value_info(values, TensorProto.FLOAT, ["chunk", "Q"])
+    return helper.make_graph(body.nodes, "head", [given], [made], body.constants)
 
 
 def noisy_voxels(graph: Graph) -> str:
@@ -271,10 +301,10 @@ def rewrite(source: Path, target: Path) -> None:
     Raises
     ------
     SystemExit
-        If the values are not the same, bit for bit, or the file's sizes are none of ours.
+        If the values are not the same, bit for bit.
     """
     card = {prop.key: prop.value for prop in onnx.load(source).metadata_props}
-    net = load_weights(read_weights(source))
+    net = read_network(source)
     want = load_network(source, device="cpu")(*noisy_ball())
     fresh = target.with_suffix(".new.onnx")  # the target may be the source
     write_model(net, fresh, card)
@@ -286,15 +316,22 @@ def rewrite(source: Path, target: Path) -> None:
     print(f"{target}: the same values as {source} had, bit for bit")
 
 
-def load_weights(weights: dict[str, torch.Tensor]) -> SuperSdfNet:
-    """Return the shipped network, whichever it is, that has these weights."""
-    for config in SIZES.values():
-        net = SuperSdfNet(config)
-        shapes = {name: tensor.shape for name, tensor in net.state_dict().items()}
-        if shapes == {name: tensor.shape for name, tensor in weights.items()}:
-            net.load_state_dict(weights)
-            return net.eval()
-    raise SystemExit(f"weights of no network in export.network.SIZES: {', '.join(SIZES)}")
+def read_network(path: Path) -> SuperSdfNet:
+    """Return the network in an exported file."""
+    weights = read_weights(path)
+    trunk, inputs = weights["trunk.layers.0.weight"].shape
+    channels = len(weights["correction.weight"][0])
+    config = NetworkConfig(
+        channels=channels,
+        blocks=sum(name.endswith("conv.bias") for name in weights),
+        hidden=len(weights["stem.0.bias"]),
+        functions=channels + len(weights["branch.bias"]),
+        trunk=trunk,
+        frequencies=(inputs - 3) // 6,
+    )
+    net = SuperSdfNet(config)
+    net.load_state_dict(weights)
+    return net.eval()
 
 
 def make_card(net: SuperSdfNet, name: str, data: str, accuracy: str) -> dict[str, Any]:

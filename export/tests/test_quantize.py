@@ -8,11 +8,11 @@ import onnxruntime as ort
 import pytest
 import torch
 
-from export.calibration import distance_apart, draw_samples, find_ranges, read_network
+from export.calibration import distance_apart, draw_samples, find_ranges
 from export.network import NetworkConfig, SuperSdfNet
 from export.prune import without_idle_blocks
 from export.quantize import LEVELS, MOST, quantize, steps_of, whole_block, whole_layer
-from export.to_onnx import make_card, write_model
+from export.to_onnx import make_card, read_network, write_model
 from super_sdf.network import load_network
 
 SMALL = NetworkConfig(channels=16, blocks=3, hidden=32, functions=24, trunk=16, frequencies=2)

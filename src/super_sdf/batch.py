@@ -59,7 +59,7 @@ class Run:
         jobs = len(self.batch.waiting) if self.batch.work > LITTLE else 1
         workers = asked.workers or choose_workers(asked.device, jobs)
         threads = asked.threads or (max(1, count_cores() // workers) if workers > 1 else 0)
-        loading = Loading(asked.model, asked.device, threads)
+        loading = Loading(asked.model, asked.precision, asked.device, threads)
         queue = self._queue(workers)
         if workers == 1:
             yield from convert_here(queue, asked.folder, loading, self._begin)

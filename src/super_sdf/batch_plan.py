@@ -23,6 +23,7 @@ class Settings:
 
     folder: Path
     model: str = "base"
+    precision: str = "float32"
     device: str = "auto"
     threads: int = 0
     workers: int = 0
@@ -71,7 +72,7 @@ class Planner:
 
     def __init__(self, settings: Settings, ledger: Ledger, begun: set[str]) -> None:
         self.settings, self.ledger, self.begun = settings, ledger, begun
-        path, symmetries = find_model(settings.model)
+        path, symmetries = find_model(settings.model, settings.precision)
         network = fingerprint(path)
         self.network = network and network["sha256"], symmetries
 

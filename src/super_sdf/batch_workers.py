@@ -17,7 +17,7 @@ from .chunks import count_cores
 from .cuda import available_devices
 from .errors import SuperSdfError
 from .memory import free_memory
-from .network import load_network
+from .network import Network, load_network
 
 # Of memory, for each process that is started unasked: the network, and a grid of 128^3.
 BYTES_PER_WORKER = 10**9
@@ -31,8 +31,15 @@ class Loading:
     """How a worker loads its network: see ``load_network``."""
 
     model: str
+    precision: str
     device: str
     threads: int
+
+    def load(self) -> Network:
+        """Load the network."""
+        return load_network(
+            self.model, device=self.device, threads=self.threads, precision=self.precision
+        )
 
 
 def choose_workers(device: str, jobs: int) -> int:
@@ -48,7 +55,7 @@ def convert_here(
     jobs: Iterator[Job], folder: Path, loading: Loading, begin: Begin
 ) -> Iterator[Result]:
     """Convert one file after another in this process; yield each as it is done."""
-    network = load_network(loading.model, device=loading.device, threads=loading.threads)
+    network = loading.load()
     for job in jobs:
         begin(job)
         yield Result(job, attempt(job, folder, network))
@@ -59,7 +66,7 @@ def serve(pipe: Connection, folder: Path, loading: Loading) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=end_with_parent, daemon=True).start()
     try:
-        network = load_network(loading.model, device=loading.device, threads=loading.threads)
+        network = loading.load()
     except SuperSdfError as error:
         pipe.send(error)
         return

@@ -82,10 +82,16 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
     check_factor(options["factor"])
     jobs = find_jobs(sources, f".{options['kind']}", make_options(options))
     model = options["model"] or options["quality"]
-    find_model(model)
+    find_model(model, options["precision"])
     flags = {name: options[name] for name in ("force", "retry", "fail_fast")}
     settings = Settings(
-        folder, model, options["device"], options["threads"], options["jobs"], **flags
+        folder,
+        model,
+        options["precision"],
+        options["device"],
+        options["threads"],
+        options["jobs"],
+        **flags,
     )
     if options["dry_run"]:
         tell_plan(preview(jobs, settings))

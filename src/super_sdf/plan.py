@@ -26,9 +26,8 @@ DECODED_BESIDE = FINAL_BESIDE + REACH_IN_VOXELS
 # What a process takes at the most in each stage, measured (``benchmarks.memory``), in bytes: for
 # each voxel that the network sees, for each that is decoded, for each node of a decoded block.
 STAGES = {
-    "encoder": (1300, 1230, 4.0),
-    "head": (100, 0, 8.0),
-    "average": (108, 800, 6.5),
+    "network": (1450, 0, 8.0),
+    "average": (108, 800, 7.5),
     "fit and mesh": (108, 1110, 2.6),
 }
 # The mesh of the slab before, which may still be in use, for each cell of a face of a block.
