@@ -77,7 +77,9 @@ def test_pinned_nodes_take_the_sign_of_the_skipped_voxel():
     values = np.ones(27, np.float32)
     patches = np.ones((1, 27), np.float32)
     patches[0, 22] = -1  # the neighbour at +x is inside; others are beyond the grid, but that at -x
-    changed = pin_to_skipped(values, nodes, np.array([[1, 0, 0]], np.int32), patches, (3, 1, 1))
+    changed = pin_to_skipped(
+        values, nodes, np.array([[1, 0, 0]], np.int32), patches, np.zeros(1, np.int32), (3, 1, 1)
+    )
     on_face = nodes.numbers()[0, block_ijk(2)[:, 0] == 2]
     assert changed.sum() == 9 and changed[on_face].all()
     np.testing.assert_array_equal(values < 0, changed)

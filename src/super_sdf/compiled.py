@@ -63,6 +63,7 @@ def pin(
     nodes: SharedNodes,
     voxel_ijk: IntArray,
     patches: FloatArray,
+    voxels: IntArray,
     shape: tuple[int, int, int],
     changed: BoolArray,
 ) -> None:
@@ -72,7 +73,7 @@ def pin(
     shared = np.array([[place in sharing for sharing in SHARING] for place in range(27)])
     signs = BARELY_INSIDE, BARELY_OUTSIDE
     kernels.pin(
-        values, nodes.table, nodes.starts, ijk, patches, limits, NEIGHBOURHOOD, shared,
+        values, nodes.table, nodes.starts, ijk, patches, voxels, limits, NEIGHBOURHOOD, shared,
         np.diff(ends), *signs, changed,
     )  # fmt: skip
 
@@ -85,13 +86,13 @@ def average_chunk(blocks: FloatArray, nodes: SharedNodes, rows: slice, values: F
 
 
 def carry_chunk(
-    values: FloatArray, nodes: SharedNodes, finer: SharedNodes, rows: slice, carried: FloatArray
+    values: FloatArray, nodes: SharedNodes, finer: SharedNodes, rows: slice, onto: FloatArray
 ) -> None:
     """See ``lattice._carry_chunk``."""
     kernels.carry(
         values, nodes.starts, *part_of_node(nodes.factor), nodes.factor + 1,
         finer.starts, finer.owned, *part_of_node(finer.factor), finer.factor + 1,
-        *finer_places(nodes.factor, finer.factor), rows.start, rows.stop, carried,
+        *finer_places(nodes.factor, finer.factor), rows.start, rows.stop, onto,
     )  # fmt: skip
 
 
@@ -142,8 +143,11 @@ def extract_rows(
         block_ijk(field.factor), lattice, before.start, rows.start, rows.stop, first_node,
         vertex_at, position,
     )  # fmt: skip
+    # A vertex lies in four cells, and a cell has fewer triangles than vertices.
+    faces = np.empty((4 * (firsts[rows.stop] - firsts[before.start]), 3), np.int32)
     cells = *_cells(field.factor), rows.start, rows.stop
-    return position, kernels.make_triangles(*shared, *cells, first_node, vertex_at)
+    count = kernels.make_triangles(*shared, *cells, first_node, vertex_at, faces)
+    return position, faces[:count].copy()
 
 
 @lru_cache

@@ -169,14 +169,14 @@ class Total:
             self.counts.update(
                 decoded_voxels=piece.decoded_voxels,
                 nodes=piece.nodes,
-                vertices=len(piece.mesh.vertices),
-                triangles=len(piece.mesh.faces),
+                vertices=sum(len(mesh.vertices) for mesh in piece.meshes),
+                triangles=sum(len(mesh.faces) for mesh in piece.meshes),
                 pinned_nodes=piece.pinned,
             )
             whole = {"band_voxels": piece.band_voxels, "noisy_voxels": piece.noisy_voxels}
             plan = {"slabs": piece.slabs, "planned_bytes": piece.planned_bytes}
             self.counts |= Counter(whole | plan)
-            yield piece.mesh
+            yield from piece.meshes
             watch.lap("write")
 
 

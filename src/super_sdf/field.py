@@ -65,8 +65,10 @@ class FineField:
 
     def signs(self) -> set[bool]:
         """Return whether there are outer nodes in ``planes`` (True), and others (False)."""
-        outside = self.values[self.own_nodes()] > 0
-        return set(np.unique(outside).tolist())
+        values = self.values[self.own_nodes()]
+        if not len(values):
+            return set()
+        return {bool(values.min() > 0), bool(values.max() > 0)}
 
     def inside_blocks(self, rows: slice | IntArray) -> BoolArray:
         """Say which nodes of some voxels' blocks are inside, (n, K+1, K+1, K+1)."""

@@ -24,7 +24,7 @@ from .chunks import CHUNK, in_chunks, side_by_side
 from .compiling import compiled_twin
 from .field import FineField
 from .grid import BoolArray, FloatArray, IntArray, SdfGrid
-from .mesh import Mesh
+from .mesh import Mesh, join_meshes
 from .nodes import block_ijk, part_of_node
 
 # A vertex keeps this share of its lattice edge from either end: where a node's value is 0 several
@@ -43,16 +43,18 @@ def extract_mesh(field: FineField, grid: SdfGrid, first_vertex: int = 0) -> Mesh
     faces may use both.
     References: Lorensen and Cline, "Marching Cubes", 1987.
     """
+    return join_meshes(extract_pieces(field, grid, first_vertex))
+
+
+def extract_pieces(field: FineField, grid: SdfGrid, first_vertex: int = 0) -> list[Mesh]:
+    """Return the mesh of ``extract_mesh`` in pieces, at least one, as they are made."""
     times = count_vertices(field)
     core = field.rows(*field.planes)
     ends = np.cumsum(times, dtype=np.int64)
     before = int(ends[core.start - 1]) if core.start else 0
     firsts = np.append(0, ends) + (first_vertex - before)
     parts = side_by_side(_groups(field), lambda rows: _extract_group(field, grid, firsts, rows))
-    if not parts:
-        return Mesh(_to_world(np.empty((0, 3)), field, grid), np.empty((0, 3), np.int32))
-    vertices, faces = (np.concatenate(arrays) for arrays in zip(*parts))
-    return Mesh(vertices, faces)
+    return parts or [Mesh(_to_world(np.empty((0, 3)), field, grid), np.empty((0, 3), np.int32))]
 
 
 def count_vertices(field: FineField) -> IntArray:
@@ -120,14 +122,12 @@ def _own_edges(field: FineField, rows: slice | IntArray) -> BoolArray:
     return own
 
 
-def _extract_group(
-    field: FineField, grid: SdfGrid, firsts: NDArray[np.int64], rows: slice
-) -> tuple[NDArray[np.float64] | FloatArray, IntArray]:
+def _extract_group(field: FineField, grid: SdfGrid, firsts: NDArray[np.int64], rows: slice) -> Mesh:
     """Return the vertices and triangles of some whole planes of voxels."""
     extract = compiled_twin(_extract_rows)
     plane = int(field.voxel_ijk[rows.start, 0])
     position, faces = extract(field, firsts, field.rows(plane - 1, plane), rows)
-    return _to_world(position, field, grid), faces
+    return Mesh(_to_world(position, field, grid), faces)
 
 
 def _extract_rows(

@@ -36,13 +36,15 @@ def number_parts(table, sizes, sharers, seen, first_sharer, starts, owned):
 
 
 @compiled
-def pin(values, table, starts, ijk, patches, limits, steps, shared, sizes, inner, outer, changed):
+def pin(
+    values, table, starts, ijk, patches, voxels, limits, steps, shared, sizes, inner, outer, changed
+):
     """Give nodes shared with skipped voxels their sign."""
     for voxel in range(len(table)):
         for place in range(27):
             if table[voxel, place] >= 0 or not _is_within(ijk[voxel], steps[place], limits):
                 continue
-            outside = patches[voxel, place] > 0
+            outside = patches[voxels[voxel], place] > 0
             for part in range(27):
                 if not shared[place, part]:
                     continue
@@ -83,7 +85,7 @@ def average(
 @compiled
 def carry(
     values, starts, part, place, side, finer_starts, finer_owned, finer_part, finer_place,
-    finer_side, low, share, first, last, carried,
+    finer_side, low, share, first, last, onto,
 ):  # fmt: skip
     """Carry values to a finer lattice: along x, then y, then z."""
     coarse = np.empty((side, side, side), np.float32)
@@ -109,7 +111,7 @@ def carry(
                     if finer_owned[voxel, finer_part[node]]:
                         below, above = along_y[i, j, low[k]], along_y[i, j, low[k] + 1]
                         number = finer_starts[voxel, finer_part[node]] + finer_place[node]
-                        carried[number] = below + (above - below) * share[k]
+                        onto[number] += below + (above - below) * share[k]
                     node += 1
 
 
@@ -291,16 +293,10 @@ def _onto_border(position, nodes):
 @compiled
 def make_triangles(
     values, starts, owned, part, place, low, corners, edge_start, edge_axis, counts, table,
-    first, last, first_node, vertex_at,
+    first, last, first_node, vertex_at, faces,
 ):  # fmt: skip
-    """Make the triangles of voxels."""
+    """Make the triangles of voxels; return how many."""
     inside = np.empty(len(part), np.bool_)
-    total = 0
-    for voxel in range(first, last):
-        if _fill_inside(values, starts[voxel], part, place, inside):
-            for cell in range(len(low)):
-                total += counts[_case(inside, low[cell], corners)]
-    faces = np.empty((total, 3), np.int32)
     total = 0
     for voxel in range(first, last):
         if not _fill_inside(values, starts[voxel], part, place, inside):
@@ -314,7 +310,7 @@ def make_triangles(
                     number = starts[voxel, part[node]] + place[node] - first_node
                     faces[total, corner] = vertex_at[3 * number + edge_axis[edge]]
                 total += 1
-    return faces
+    return total
 
 
 @compiled

@@ -117,18 +117,23 @@ def _add_chunk(said: Said, nodes: SharedNodes, chunk: slice, sums: NDArray[np.fl
         spoken = spoken * value
 
 
-def carry(values: FloatArray, nodes: SharedNodes, finer: SharedNodes) -> FloatArray:
-    """Return the values at the nodes of a finer lattice of the same blocks, (count,)."""
-    carried = np.empty(finer.count, np.float32)
+def carry(
+    values: FloatArray, nodes: SharedNodes, finer: SharedNodes, onto: FloatArray | None = None
+) -> FloatArray:
+    """Return the values at the nodes of a finer lattice of the same blocks, (count,).
+
+    They are added to those of ``onto``, in place, if that is given.
+    """
+    onto = np.zeros(finer.count, np.float32) if onto is None else onto
     carry_some = compiled_twin(_carry_chunk)
-    in_chunks(len(nodes.table), lambda rows: carry_some(values, nodes, finer, rows, carried))
-    return carried
+    in_chunks(len(nodes.table), lambda rows: carry_some(values, nodes, finer, rows, onto))
+    return onto
 
 
 def _carry_chunk(
-    values: FloatArray, nodes: SharedNodes, finer: SharedNodes, rows: slice, carried: FloatArray
+    values: FloatArray, nodes: SharedNodes, finer: SharedNodes, rows: slice, onto: FloatArray
 ) -> None:
-    """Set the values of the finer nodes that some voxels own."""
+    """Add to the values of the finer nodes that some voxels own."""
     low, share = finer_places(nodes.factor, finer.factor)
     block: FloatArray = values[nodes.numbers(rows)].reshape(-1, *(nodes.factor + 1,) * 3)
     for axis in (1, 2, 3):
@@ -138,7 +143,7 @@ def _carry_chunk(
     for part, columns in enumerate(nodes_of_part(finer.factor)):
         own = np.flatnonzero(finer.owned[rows, part])
         number = finer.starts[rows][own, part, None] + np.arange(len(columns))
-        carried[number] = block[own[:, None], columns]
+        onto[number] += block[own[:, None], columns]
 
 
 @lru_cache

@@ -169,6 +169,7 @@ def pin_to_skipped(
     nodes: SharedNodes,
     voxel_ijk: IntArray,
     patches: FloatArray,
+    voxels: IntArray,
     shape: tuple[int, int, int],
 ) -> BoolArray:
     """Give nodes shared with a voxel that was not decoded that voxel's sign.
@@ -184,8 +185,10 @@ def pin_to_skipped(
         The nodes of the decoded voxels.
     voxel_ijk : (D, 3) int32
         The decoded voxels.
-    patches : (D, 27) float32
-        Their samples, which have the signs of the neighbours.
+    patches : (V, 27) float32
+        The band's samples, which have the signs of the neighbours.
+    voxels : (D,) int32
+        Which rows of the band were decoded.
     shape : three ints
         Samples of the grid: beyond it nothing was skipped.
 
@@ -195,7 +198,7 @@ def pin_to_skipped(
         Which nodes had the other sign.
     """
     changed = np.zeros(len(values), bool)
-    compiled_twin(_pin)(values, nodes, voxel_ijk, patches, shape, changed)
+    compiled_twin(_pin)(values, nodes, voxel_ijk, patches, voxels, shape, changed)
     return changed
 
 
@@ -204,6 +207,7 @@ def _pin(
     nodes: SharedNodes,
     voxel_ijk: IntArray,
     patches: FloatArray,
+    voxels: IntArray,
     shape: tuple[int, int, int],
     changed: BoolArray,
 ) -> None:
@@ -214,7 +218,7 @@ def _pin(
         rows = np.flatnonzero(nodes.table[:, place] < 0)
         beside = voxel_ijk[rows] + step
         rows = rows[((beside >= 0) & (beside <= last)).all(1)]
-        outside = patches[rows, place] > 0
+        outside = patches[voxels[rows], place] > 0
         for part in np.flatnonzero([place in sharing for sharing in SHARING]):
             number = nodes.starts[rows, part, None] + np.arange(len(parts[part]))
             wrong = (values[number] > 0) != outside[:, None]

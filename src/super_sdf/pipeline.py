@@ -25,7 +25,7 @@ from .compiling import use_compiled
 from .errors import GridError
 from .field import FineField, border_is_crossed
 from .grid import FloatArray, IntArray, SdfGrid
-from .isosurface import extract_mesh
+from .isosurface import extract_pieces
 from .memory import memory_bound
 from .mesh import Mesh, join_meshes
 from .nodes import (
@@ -134,7 +134,7 @@ def reconstruct(
         network = load_network()
     options = {"offset": offset, "cap": cap, "max_memory": max_memory, "progress": progress}
     pieces = reconstruct_slabs(grid, network, factor, **options)  # type: ignore[arg-type]
-    return join_meshes([piece.mesh for piece in pieces])
+    return join_meshes([mesh for piece in pieces for mesh in piece.meshes])
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,8 +143,8 @@ class Piece:
 
     Attributes
     ----------
-    mesh : Mesh
-        Triangles of the slab: rows of the vertices of all pieces so far, this one's among them.
+    meshes : list of Mesh
+        Triangles of the slab: rows of all vertices so far, those of the slab among them.
     slabs : int
         How many pieces there are in all.
     planned_bytes : int
@@ -159,7 +159,7 @@ class Piece:
         Whether there are outer nodes (True), and others (False).
     """
 
-    mesh: Mesh
+    meshes: list[Mesh]
     slabs: int
     planned_bytes: int
     band_voxels: int
@@ -197,11 +197,12 @@ def reconstruct_slabs(
     for slab in slabs:
         with working_threads(threads):
             field = refine(band, network, factor, slab, steps)
-            mesh = mesh_field(field, grid, offset=offset, cap=cap, first_vertex=vertices)
-            piece = describe_piece(field, mesh, len(slabs), planned)
-            del field, mesh  # no more of them than one at a time
+            whole = close_at_border(field, grid, offset) if cap else field
+            meshes = extract_pieces(whole, grid, first_vertex=vertices)
+            piece = describe_piece(field, meshes, len(slabs), planned)
+            del field, whole, meshes  # no more of them than one at a time
         steps.finish_one()
-        vertices += len(piece.mesh.vertices)
+        vertices += sum(len(mesh.vertices) for mesh in piece.meshes)
         seen |= piece.signs
         yield piece
     if len(seen) < 2:
@@ -250,9 +251,10 @@ def refine(
     del blocks
     exact = np.flatnonzero(band.exact[slab.seen]).astype(np.int32)
     values = fit_to_spheres(values, nodes, Samples(patches, exact, table, row_of))
-    pinned = pin_to_skipped(values, nodes, voxel_ijk[voxels], patches[voxels], band.shape)
+    own_ijk = voxel_ijk[voxels]
+    pinned = pin_to_skipped(values, nodes, own_ijk, patches, voxels, band.shape)
     steps.finish_one()
-    field = FineField(band.shape, factor, voxel_ijk[voxels], nodes, values, slab.planes)
+    field = FineField(band.shape, factor, own_ijk, nodes, values, slab.planes)
     return replace(
         field,
         band_voxels=len(band.voxel_ijk),
@@ -261,25 +263,11 @@ def refine(
     )
 
 
-def mesh_field(
-    field: FineField,
-    grid: SdfGrid,
-    *,
-    offset: float = 0.0,
-    cap: bool = False,
-    first_vertex: int = 0,
-) -> Mesh:
-    """Mesh what ``upsample`` returned, with ``cap`` closed along the grid's border."""
-    if cap:
-        field = close_at_border(field, grid, offset)
-    return extract_mesh(field, grid, first_vertex)
-
-
-def describe_piece(field: FineField, mesh: Mesh, slabs: int, planned: int) -> Piece:
+def describe_piece(field: FineField, meshes: list[Mesh], slabs: int, planned: int) -> Piece:
     """Return what there is to say of a slab beside its mesh."""
     own, nodes = field.rows(*field.planes), field.own_nodes()
     return Piece(
-        mesh,
+        meshes,
         slabs,
         planned,
         field.band_voxels,

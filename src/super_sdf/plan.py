@@ -99,7 +99,9 @@ def plan_slabs(
 def peak_bytes(band: Band, slabs: list[Slab], factor: int) -> int:
     """Return what the process will hold at the most: now, and for the largest slab."""
     held = held_memory() or band.patches.nbytes + WORK_BYTES
-    return held + max(slab_bytes(band, slab, factor) for slab in slabs)
+    mesh_before = max(band.count_decoded(slab.decoded) for slab in slabs) * MESH_BYTES * factor**2
+    need = max(slab_bytes(band, slab, factor) for slab in slabs)
+    return held + need + mesh_before * (len(slabs) > 1)
 
 
 def cut(band: Band, pieces: int, receptive_field: int) -> list[Slab]:
@@ -130,8 +132,7 @@ def slab_bytes(band: Band, slab: Slab, factor: int) -> int:
     seen = slab.seen.stop - slab.seen.start
     decoded = band.count_decoded(slab.decoded)
     sizes = np.array([seen, decoded, decoded * (factor + 1) ** 3])
-    work = WORK_BYTES + int((np.array(list(STAGES.values())) @ sizes).max())
-    return work + MESH_BYTES * decoded * factor**2
+    return WORK_BYTES + int((np.array(list(STAGES.values())) @ sizes).max())
 
 
 def _does_not_fit(band: Band, factor: int, how: str, need: int, bound: int) -> OutOfMemoryError:

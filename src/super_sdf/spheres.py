@@ -67,7 +67,8 @@ class Samples:
 def fit_to_spheres(values: FloatArray, nodes: SharedNodes, samples: Samples) -> FloatArray:
     """Return the node values, (count,), moved so that the surface touches the samples' spheres.
 
-    Nodes at exact samples keep the sample; without such samples nothing is moved.
+    They are changed in place. Nodes at exact samples keep the sample; without such samples nothing
+    is moved.
     """
     if not len(samples.exact):  # a noisy field, say
         return values
@@ -76,10 +77,9 @@ def fit_to_spheres(values: FloatArray, nodes: SharedNodes, samples: Samples) -> 
     first = mean_at_nodes(feet, coarse)
     left = replace(feet, values=feet.values - read(first, coarse, feet.rows, feet.place)[0])
     correction = carry(first, coarse, fine) + mean_at_nodes(left, fine)
-    fitted = carry(correction, fine, nodes)
-    np.subtract(values, fitted, out=fitted)
-    keep_samples(fitted, nodes, samples)
-    return fitted
+    carry(-correction, fine, nodes, onto=values)
+    keep_samples(values, nodes, samples)
+    return values
 
 
 def exact_samples(patches: FloatArray, lipschitz: BoolArray) -> BoolArray:
