@@ -468,7 +468,7 @@ def test_a_dead_worker_costs_its_file_alone(run):
     larger_grids(6)
     folder, options = Path("out"), ConvertOptions(4, (1.0,), (0.0,))
     jobs, dead = find_jobs(["in/more*.npy"], ".ply", options), []
-    pool = Pool(iter(jobs), folder, Loading("fast", "cpu", 1), lambda job: None)
+    pool = Pool(iter(jobs), folder, Loading("fast", "float32", "cpu", 1), lambda job: None)
     results = []
     for result in pool.results(2):
         results.append(result)

@@ -41,6 +41,7 @@ def test_everything_is_checked_on_the_cpu():
         "memory",
         "network base on cpu",
         "network fast on cpu",
+        "network base-int8 on cpu",
         *(f"extra {name}" for name in EXTRAS),
     ]
     assert all(finding.state != "failed" for finding in findings)
@@ -117,7 +118,7 @@ def test_the_command_prints_a_line_a_check_and_its_exit_code_tells(command):
     assert lines[0].startswith("ok       versions: super-sdf ")
     assert all(re.match(r"(ok      |missing ) \w+", line) for line in lines[:-1])
     code, out, _ = command("info", "--check", "--device", "cuda")
-    assert code == 1 and out.splitlines()[-1] == "1 of 9 checks failed"
+    assert code == 1 and out.splitlines()[-1] == "1 of 10 checks failed"
     assert "\nfailed   cuda: onnxruntime " in out
 
 

@@ -78,8 +78,8 @@ def run_checks(device: str = "auto") -> Iterator[Finding]:
         devices += ["cuda"] * (found.state == OK)
         yield found
     ball = make_ball()
-    for name in shipped_models():
-        yield from check_network(name, devices, ball)
+    for name in sorted(shipped_models(), key=lambda name: "int8" in name):  # made from the others
+        yield from check_network(name, ["cpu"] if "int8" in name else devices, ball)
     for name, modules in EXTRAS.items():
         yield check_extra(name, modules)
 
