@@ -24,11 +24,11 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from super_sdf.batch import Run
-from super_sdf.batch_inputs import find_jobs
-from super_sdf.batch_job import Job
-from super_sdf.batch_lock import FolderLock
-from super_sdf.batch_plan import Batch, Settings
+from super_sdf.batch.inputs import find_jobs
+from super_sdf.batch.job import Job
+from super_sdf.batch.lock import FolderLock
+from super_sdf.batch.plan import Batch, Settings
+from super_sdf.batch.run import Run
 from super_sdf.chunks import count_cores
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.evaluation.timing import describe_machine

@@ -15,18 +15,18 @@ import pytest
 import trimesh
 from conftest import ball
 
-from super_sdf import batch_job
-from super_sdf.batch_inputs import find_jobs
-from super_sdf.batch_job import Result
-from super_sdf.batch_lock import FolderLock, remove_parts
-from super_sdf.batch_plan import Batch, Settings
-from super_sdf.batch_pool import Pool
-from super_sdf.batch_workers import Loading, choose_workers
+from super_sdf.batch import job as batch_job
+from super_sdf.batch.fingerprint import fingerprint, is_unchanged
+from super_sdf.batch.inputs import find_jobs
+from super_sdf.batch.job import Result
+from super_sdf.batch.lock import FolderLock, remove_parts
+from super_sdf.batch.plan import Batch, Settings
+from super_sdf.batch.pool import Pool
+from super_sdf.batch.workers import Loading, choose_workers
 from super_sdf.chunks import count_cores
 from super_sdf.cli_batch_report import describe_progress, duration
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.errors import FileError
-from super_sdf.fingerprint import fingerprint, is_unchanged
 
 LONE = ("--jobs", 1, "--factor", 2, "--quality", "fast", "--spacing", 1, "--origin", 0)
 CONSTANT = "every value is 1: a constant field has no surface"
@@ -143,7 +143,7 @@ def test_what_has_changed_is_done_again(run, monkeypatch):
     assert len(redone(run, "--offset", 0.5)) == 4
     assert redone(run, "--offset", 0.5, "--threads", 1) == []
     assert len(redone(run, "--offset", 0.5, "--force")) == 4
-    monkeypatch.setattr("super_sdf.batch_plan.__version__", "next")
+    monkeypatch.setattr("super_sdf.batch.plan.__version__", "next")
     assert len(redone(run, "--offset", 0.5)) == 4
 
 
@@ -493,7 +493,7 @@ def test_content_is_read_only_where_time_or_path_differ(monkeypatch):
     assert fingerprint(Path("in")) is None and is_unchanged(Path("in/none"), None)
     assert not is_unchanged(path, None) and not is_unchanged(Path("in/none"), known)
     assert not is_unchanged(path, {**known, "sha256": "", "mtime_ns": 0})
-    monkeypatch.setattr("super_sdf.fingerprint.fingerprint", lambda path: 1 / 0)
+    monkeypatch.setattr("super_sdf.batch.fingerprint.fingerprint", lambda path: 1 / 0)
     assert is_unchanged(path, known) and not is_unchanged(path, {**known, "size": 1})
 
 
@@ -506,10 +506,10 @@ def test_parts_of_a_given_process_are_removed_even_while_others_live():
 
 
 def test_as_many_processes_as_cores_and_memory_allow(monkeypatch):
-    monkeypatch.setattr("super_sdf.batch_workers.count_cores", lambda: 8)
-    monkeypatch.setattr("super_sdf.batch_workers.free_memory", lambda: 3_500_000_000)
+    monkeypatch.setattr("super_sdf.batch.workers.count_cores", lambda: 8)
+    monkeypatch.setattr("super_sdf.batch.workers.free_memory", lambda: 3_500_000_000)
     assert choose_workers("cpu", 100) == 3
-    monkeypatch.setattr("super_sdf.batch_workers.free_memory", lambda: None)
+    monkeypatch.setattr("super_sdf.batch.workers.free_memory", lambda: None)
     assert [choose_workers("cpu", jobs) for jobs in (0, 5, 100)] == [1, 5, 8]
     assert choose_workers("cuda", 100) == 1 and count_cores() >= 1
 

@@ -14,8 +14,8 @@ from .cli_common import CONTEXT, one_line_errors
 from .cli_conversion import conversion_options, make_options
 
 if TYPE_CHECKING:
-    from .batch_job import Job
-    from .batch_plan import Batch, Settings
+    from .batch.job import Job
+    from .batch.plan import Batch, Settings
 
 EXAMPLES = """\b
 Examples:
@@ -73,8 +73,8 @@ def batch(sources: tuple[str, ...], folder: Path, **options: Any) -> None:
 
 def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -> None:
     """Find the inputs, do what is to be done, say what came of it."""
-    from .batch_inputs import find_jobs
-    from .batch_plan import Settings, preview
+    from .batch.inputs import find_jobs
+    from .batch.plan import Settings, preview
     from .network import find_model
     from .nodes import check_factor
 
@@ -105,8 +105,8 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
 
 def complete(jobs: list[Job], settings: Settings, quiet: bool) -> Batch:
     """Run the batch; if interrupted, say what is kept."""
-    from .batch import Run
-    from .batch_lock import FolderLock
+    from .batch.lock import FolderLock
+    from .batch.run import Run
 
     with FolderLock(settings.folder) as lock:
         run = Run(jobs, settings, lock)

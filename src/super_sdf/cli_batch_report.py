@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
-    from .batch import Progress
-    from .batch_plan import Batch
+    from .batch.plan import Batch
+    from .batch.run import Progress
 
 SHOWN = 20  # failures on the screen; all are in the report
 REDRAW = 0.1  # seconds between two drawings of the progress line

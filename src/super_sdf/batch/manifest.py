@@ -14,12 +14,12 @@ from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any
 
-from .batch_job import Job
-from .conventions import INSIDE
-from .convert import ConvertOptions
-from .errors import FileError, OptionError
-from .io import MESH_SUFFIXES
-from .nodes import check_factor
+from ..conventions import INSIDE
+from ..convert import ConvertOptions
+from ..errors import FileError, OptionError
+from ..io import MESH_SUFFIXES
+from ..nodes import check_factor
+from .job import Job
 
 Entry = dict[str, Any]
 

@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-from . import __version__
-from .batch_job import Job, Result, Row, failed_row
-from .batch_lock import read_begun
+from .. import __version__
+from ..network import find_model
 from .fingerprint import fingerprint, is_unchanged
+from .job import Job, Result, Row, failed_row
 from .ledger import Ledger
-from .network import find_model
+from .lock import read_begun
 
 
 @dataclass(frozen=True)

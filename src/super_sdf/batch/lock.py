@@ -16,7 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
 
-from .errors import FileError, WriteError
+from ..errors import FileError, WriteError
 
 NAME = ".super-sdf-batch"
 PART = re.compile(r"\.(?P<name>.+)\.(?P<pid>\d+)\.part", re.DOTALL)

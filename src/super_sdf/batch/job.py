@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from .convert import ConvertOptions, convert
-from .errors import FileError, GridError, OptionError, WriteError
+from ..convert import ConvertOptions, convert
+from ..errors import FileError, GridError, OptionError, WriteError
+from ..pipeline import Decoder
 from .fingerprint import fingerprint
-from .pipeline import Decoder
 
 Row = dict[str, Any]
 """A line of the ledger.

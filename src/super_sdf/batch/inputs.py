@@ -11,11 +11,11 @@ import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePath
 
-from .batch_job import Job
-from .batch_manifest import read_manifest
-from .convert import ConvertOptions
-from .errors import OptionError
-from .io import GRID_SUFFIXES, check_mesh_suffix
+from ..convert import ConvertOptions
+from ..errors import OptionError
+from ..io import GRID_SUFFIXES, check_mesh_suffix
+from .job import Job
+from .manifest import read_manifest
 
 MANIFEST_SUFFIXES = (".txt", ".jsonl")
 

@@ -11,8 +11,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from .batch_job import Row
-from .errors import WriteError
+from ..errors import WriteError
+from .job import Row
 
 NAME = "report.jsonl"
 KEYS = {"in", "out", "status", "reason", "retry", "content", "output", "options"}

@@ -13,14 +13,14 @@ from contextlib import closing
 from dataclasses import replace
 from typing import Any
 
-from .batch_job import Job, Result
-from .batch_lock import FolderLock
-from .batch_plan import Batch, Planner, Settings, expected_work
-from .batch_pool import Pool
-from .batch_workers import Loading, choose_workers, convert_here
-from .chunks import count_cores
+from ..chunks import count_cores
+from ..memory import memory_bound
+from .job import Job, Result
 from .ledger import Ledger
-from .memory import memory_bound
+from .lock import FolderLock
+from .plan import Batch, Planner, Settings, expected_work
+from .pool import Pool
+from .workers import Loading, choose_workers, convert_here
 
 # Of what ``expected_work`` counts: done in the time that several processes would take to start.
 LITTLE = 30_000

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
-from .batch_job import Job, Result, attempt
-from .chunks import count_cores
-from .cuda import available_devices
-from .errors import SuperSdfError
-from .memory import free_memory
-from .network import Network, load_network
+from ..chunks import count_cores
+from ..cuda import available_devices
+from ..errors import SuperSdfError
+from ..memory import free_memory
+from ..network import Network, load_network
+from .job import Job, Result, attempt
 
 # Of memory, for each process that is started unasked: the network, and a grid of 128^3.
 BYTES_PER_WORKER = 10**9

@@ -16,10 +16,10 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
-from .batch_job import Job, Result, failed_row
-from .batch_lock import remove_parts
-from .batch_workers import Begin, Loading, serve
-from .errors import DeviceError, SuperSdfError
+from ..errors import DeviceError, SuperSdfError
+from .job import Job, Result, failed_row
+from .lock import remove_parts
+from .workers import Begin, Loading, serve
 
 
 @dataclass(eq=False)

@@ -1,0 +1,1 @@
+"""Many grids to meshes: found, planned, shared out, resumed. The command is ``super-sdf batch``."""
