@@ -290,6 +290,33 @@ def test_running_out_of_memory_is_one_line(here, command, monkeypatch):
     assert command("upsample", "in.npy", "out.ply") == (1, "", want)
 
 
+def test_less_memory_gives_the_same_file(here, command, monkeypatch):
+    values = np.concatenate([ball().values] * 4)  # four balls in a row: longer than a slab needs
+    np.save("row.npy", values)
+    monkeypatch.setattr("super_sdf.plan.held_memory", lambda: 10**8)
+    monkeypatch.setattr("super_sdf.plan.WORK_BYTES", 0)
+    options = "row.npy", "--spacing", "1", "--quality", "fast", "--json"
+    _, out, _ = command("upsample", *options, "one.ply", "--max-memory", "4G")
+    _, other, _ = command("upsample", *options, "two.ply", "--max-memory", "106M")
+    one, two = json.loads(out), json.loads(other)
+    assert one["slabs"] == 1 and two["slabs"] > 1 and two["planned_bytes"] <= 106e6
+    assert one["triangles"] == two["triangles"]
+    assert Path("one.ply").read_bytes() == Path("two.ply").read_bytes()
+
+
+@pytest.mark.parametrize("size", ["much", "", "-4G", "0", "4T", "1e999"])
+def test_a_size_that_is_none_is_named(here, command, size):
+    code, _, err = command("upsample", "in.npy", "out.ply", "--max-memory", size)
+    assert code == 2 and f"{size!r}: give a number of bytes such as 1500M or 4G" in err
+
+
+@pytest.mark.parametrize("size, want", [("1500M", 1_500_000_000), ("4g", 4 * 10**9), ("123", 123)])
+def test_sizes_are_numbers_with_a_unit(size, want):
+    from super_sdf.cli_conversion import parse_size
+
+    assert parse_size(None, None, size) == want
+
+
 def test_usage_errors_exit_with_2(command):
     assert command("upsample")[0] == 2
     assert command("nonsense") == (2, "", "Error: No such command 'nonsense'.\n")

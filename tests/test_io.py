@@ -7,8 +7,8 @@ import pytest
 import trimesh
 from conftest import ball, trilinear
 
-from super_sdf import Mesh, read_grid, reconstruct, write_mesh
-from super_sdf.errors import FileError, OptionError
+from super_sdf import Mesh, SdfGrid, io, read_grid, reconstruct, write_mesh
+from super_sdf.errors import FileError, GridError, OptionError
 from super_sdf.io import check_target
 
 
@@ -88,3 +88,41 @@ def test_only_known_formats_and_free_places_are_written(tmp_path, mesh):
     write_mesh(mesh, tmp_path / "out.ply")
     with pytest.raises(FileError, match="exists: remove it or use --force"):
         write_mesh(mesh, tmp_path / "out.ply")
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".stl"])
+def test_a_mesh_in_pieces_makes_the_same_file(mesh, tmp_path, monkeypatch, suffix):
+    monkeypatch.setattr(io, "SPOOL_BYTES", 1000)  # triangles go to a file beside
+    half, some = len(mesh.vertices) // 2, len(mesh.faces) // 3
+    pieces = [
+        Mesh(mesh.vertices[:half], mesh.faces[:0]),
+        Mesh(mesh.vertices[half:], mesh.faces[:some]),
+        Mesh(mesh.vertices[:0], mesh.faces[some:]),
+    ]
+    one, other = tmp_path / f"one{suffix}", tmp_path / f"other{suffix}"
+    write_mesh(mesh, one)
+    io.write_pieces(iter(pieces), other)
+    assert one.read_bytes() == other.read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [one.name, other.name]
+
+
+def test_pieces_that_end_in_an_error_leave_nothing(mesh, tmp_path):
+    def pieces():
+        yield mesh
+        raise GridError("no surface")
+
+    with pytest.raises(GridError):
+        io.write_pieces(pieces(), tmp_path / "out.ply")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("dtype", ["<f4", ">f8", "<i2"])
+def test_a_mapped_file_is_read_as_the_array_is(tmp_path, dtype, order):
+    values = np.asarray(np.round(100 * ball(14, 4.0).values), dtype, order=order)
+    np.save(tmp_path / "in.npy", values)
+    grid = read_grid(tmp_path / "in.npy", spacing=100)
+    assert isinstance(grid.samples, np.memmap)
+    mapped, loaded = (reconstruct(g, trilinear) for g in (grid, SdfGrid(values, 100)))
+    np.testing.assert_array_equal(mapped.vertices, loaded.vertices)
+    np.testing.assert_array_equal(mapped.faces, loaded.faces)

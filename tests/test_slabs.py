@@ -1,0 +1,171 @@
+"""Cut in slabs, by any threads, compiled or not: the same mesh, to the last bit."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from conftest import ball, trilinear
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from super_sdf import SdfGrid, load_network, pipeline, plan, reconstruct
+from super_sdf.errors import OutOfMemoryError
+from super_sdf.mesh import join_meshes
+from super_sdf.pipeline import reconstruct_slabs
+from super_sdf.plan import cut, plan_slabs, slab_bytes
+from super_sdf.survey import survey
+
+
+@pytest.fixture(scope="module")
+def network():
+    return load_network("fast")
+
+
+def rod(seed=0):
+    """A bent rod along x, longer than what a slab depends on."""
+    i, j, k = np.indices((56, 14, 15)).astype(np.float64)
+    middle = np.hypot(j - 6.6 - 1.5 * np.sin(i / 6), k - 7.2)
+    return np.maximum(middle - 3.4, np.abs(i - 27.6) - 24.3)
+
+
+def bad_samples(values):
+    rng = np.random.default_rng(0)
+    return values + (rng.random(values.shape) < 0.002)
+
+
+def noise(values):
+    return values + np.random.default_rng(0).uniform(-0.3, 0.3, values.shape)
+
+
+FIELDS = {
+    "clean": rod(),
+    "bad samples": bad_samples(rod()),
+    "noisy": noise(rod()),
+    "cut off": np.clip(rod(), -0.4, 0.4),
+    "leaves the grid": rod()[8:44, :10],
+}
+
+
+def in_pieces(grid, network, monkeypatch, pieces, **options):
+    """Reconstruct in so many slabs."""
+    monkeypatch.setattr(
+        pipeline, "plan_slabs", lambda band, factor, field, bound: cut(band, pieces, field)
+    )
+    return list(reconstruct_slabs(grid, network, **options))
+
+
+@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("factor, cap", [(2, True), (4, False), (4, True)])
+def test_slabs_change_nothing(network, monkeypatch, field, factor, cap):
+    grid = SdfGrid(FIELDS[field], (1.0,) * 3)
+    (whole,) = in_pieces(grid, network, monkeypatch, 1, factor=factor, cap=cap)
+    one = join_meshes(whole.meshes)
+    for pieces in (2, 3, 7, 56):
+        parts = in_pieces(grid, network, monkeypatch, pieces, factor=factor, cap=cap)
+        assert len(parts) > 1
+        mesh = join_meshes([mesh for part in parts for mesh in part.meshes])
+        np.testing.assert_array_equal(mesh.faces, one.faces)
+        np.testing.assert_array_equal(mesh.vertices, one.vertices)
+        for count in ("decoded_voxels", "nodes", "pinned"):
+            assert sum(getattr(part, count) for part in parts) == getattr(whole, count)
+        assert any(part.is_cut for part in parts) == whole.is_cut
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 10**6), st.integers(2, 30))
+def test_slabs_change_nothing_on_anything(network, seed, pieces):
+    values = np.random.default_rng(seed).uniform(-3, 3, (36, 5, 6))
+    grid = SdfGrid(values, (1.0,) * 3)
+    with pytest.MonkeyPatch.context() as patch:
+        (whole,) = in_pieces(grid, network, patch, 1, factor=2, cap=True)
+        parts = in_pieces(grid, network, patch, pieces, factor=2, cap=True)
+    one = join_meshes(whole.meshes)
+    mesh = join_meshes([mesh for part in parts for mesh in part.meshes])
+    np.testing.assert_array_equal(mesh.faces, one.faces)
+    np.testing.assert_array_equal(mesh.vertices, one.vertices)
+
+
+def test_what_a_slab_depends_on_is_needed(network, monkeypatch):
+    """With less round it the mesh would be another: the test above can fail."""
+    grid = SdfGrid(FIELDS["clean"], (1.0,) * 3)
+    one = reconstruct(grid, network)
+    monkeypatch.setattr(plan, "DECODED_BESIDE", 2)
+    parts = in_pieces(grid, network, monkeypatch, 4)
+    mesh = join_meshes([mesh for part in parts for mesh in part.meshes])
+    assert not np.array_equal(mesh.vertices, one.vertices)
+
+
+@pytest.mark.parametrize("field", ["clean", "bad samples", "noisy"])
+@pytest.mark.parametrize("factor", [2, 4, 8])
+def test_compiled_and_threads_change_nothing(monkeypatch, field, factor):
+    grid = SdfGrid(FIELDS[field], (1.0,) * 3, (1.0, 2.0, 3.0))
+    monkeypatch.setattr("super_sdf.chunks.CHUNK", 100)
+    meshes = []
+    for compiled, threads in (("0", 1), ("0", 2), ("1", 1), ("1", 3)):
+        monkeypatch.setenv("SUPER_SDF_COMPILED", compiled)
+        meshes.append(reconstruct(grid, load_network("fast", threads=threads), factor))
+    for mesh in meshes[1:]:
+        np.testing.assert_array_equal(mesh.faces, meshes[0].faces)
+        np.testing.assert_array_equal(mesh.vertices, meshes[0].vertices)
+
+
+def test_compiled_changes_nothing_where_signs_are_pinned_and_nothing_is_near(monkeypatch):
+    """A field that is none: pinned nodes, foot points beyond the blocks, a cap."""
+    grid = SdfGrid(np.random.default_rng(2).uniform(-3, 3, (9, 10, 11)), (1.0,) * 3)
+    meshes = []
+    for compiled in "01":
+        monkeypatch.setenv("SUPER_SDF_COMPILED", compiled)
+        for answer in (trilinear, lambda patches, *rest: trilinear(patches, *rest) - 1):
+            meshes.append(reconstruct(grid, answer, 2, cap=True))
+    for plain, compiled in zip(meshes[:2], meshes[2:]):
+        np.testing.assert_array_equal(plain.faces, compiled.faces)
+        np.testing.assert_array_equal(plain.vertices, compiled.vertices)
+
+
+def test_a_function_that_does_not_say_how_far_it_sees_is_asked_once():
+    asked = []
+
+    def answer(patches, table, voxels, offsets):
+        asked.append(len(patches))
+        return trilinear(patches, table, voxels, offsets)
+
+    band = survey(ball())
+    list(reconstruct_slabs(ball(), answer, max_memory=10**12))
+    assert asked == [len(band.voxel_ijk)]
+    with pytest.raises(OutOfMemoryError, match="GB of memory at once, "):
+        list(reconstruct_slabs(ball(), answer, max_memory=10**8))
+
+
+@pytest.mark.parametrize("pieces", [1, 2, 5, 1000])
+def test_slabs_cover_the_grid_once(pieces):
+    band = survey(SdfGrid(rod(), (1.0,) * 3))
+    slabs = cut(band, pieces, receptive_field=4)
+    assert slabs[0].planes[0] == 0 and slabs[-1].planes[1] == 56
+    assert all(a.planes[1] == b.planes[0] for a, b in pairwise(slabs))
+    for slab in slabs:
+        ijk = band.voxel_ijk[slab.seen]
+        first, last = max(slab.planes[0] - 10, 0), min(slab.planes[1] + 10, 56)
+        want = (band.voxel_ijk[:, 0] >= first) & (band.voxel_ijk[:, 0] < last)
+        assert len(ijk) == want.sum() and first <= ijk[0, 0] and ijk[-1, 0] < last
+
+
+def test_less_memory_makes_more_slabs_and_too_little_is_refused(monkeypatch):
+    monkeypatch.setattr(plan, "held_memory", lambda: 10**8)
+    monkeypatch.setattr(plan, "WORK_BYTES", 0)
+    band = survey(SdfGrid(rod(), (1.0,) * 3))
+    need = 10**8 + slab_bytes(band, plan.whole(band), 4)
+    assert len(plan_slabs(band, 4, 2, need)) == 1
+    counts = [
+        len(plan_slabs(band, 4, 2, 10**8 + int(share * (need - 10**8)))) for share in (0.9, 0.7)
+    ]
+    assert 1 < counts[0] <= counts[1]
+    with pytest.raises(OutOfMemoryError, match=r"^factor 4 on [\d,]+ voxels needs 0\.\d\d GB of "):
+        plan_slabs(band, 4, 2, 10**8 + 1)
+    assert len(plan_slabs(band, 4, 2, None)) == 1
+
+
+def test_a_band_larger_than_memory_is_refused_while_it_is_read():
+    with pytest.raises(
+        OutOfMemoryError, match=r"the band of the first \d+ planes has [\d,]+ voxels"
+    ):
+        survey(ball(), bound=1000)
