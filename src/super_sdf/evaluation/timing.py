@@ -63,13 +63,26 @@ def run_command(words: Sequence[str]) -> tuple[float, float]:
     SuperSdfError
         If the command fails.
     """
-    command = [sys.executable, "-c", LAUNCHER, "-m", "super_sdf.cli", *words]
+    seconds, peak, _ = run_python(["-m", "super_sdf.cli", *words])
+    return seconds, peak
+
+
+def run_python(words: Sequence[str]) -> tuple[float, float, str]:
+    """Run Python once with these arguments; return seconds, peak in MB, and what it printed.
+
+    Raises
+    ------
+    SuperSdfError
+        If it fails.
+    """
+    command = [sys.executable, "-c", LAUNCHER, *words]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-    code, seconds, peak = done.stdout.splitlines()[-1].split()
+    printed, _, last = done.stdout.rstrip("\n").rpartition("\n")
+    code, seconds, peak = last.split()
     if int(code):
-        raise SuperSdfError(f"super-sdf {' '.join(words)} ended with {code}")
+        raise SuperSdfError(f"python {' '.join(words)} ended with {code}")
     kilobyte = 1 if sys.platform == "darwin" else 1024
-    return float(seconds), int(peak) * kilobyte / 1e6
+    return float(seconds), int(peak) * kilobyte / 1e6, printed
 
 
 def time_shape(shape: Shape, setting: Setting, options: Sequence[str] = ()) -> Row:
