@@ -151,7 +151,8 @@ def test_slabs_cover_the_grid_once(pieces):
 
 def test_less_memory_makes_more_slabs_and_too_little_is_refused(monkeypatch):
     monkeypatch.setattr(plan, "held_memory", lambda: 10**8)
-    monkeypatch.setattr(plan, "WORK_BYTES", 0)
+    for name, value in (("WORK_BYTES", 0), ("CODE_BYTES", 0), ("FRAGMENTS", 1), ("MESH_BYTES", 0)):
+        monkeypatch.setattr(plan, name, value)
     band = survey(SdfGrid(rod(), (1.0,) * 3))
     need = 10**8 + slab_bytes(band, plan.whole(band), 4)
     assert len(plan_slabs(band, 4, 2, need)) == 1

@@ -17,7 +17,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 MODULE = "super_sdf.compiled"
 # Decoded voxels from which compiled code saves more than loading it takes.
-WORTH = 50_000
+WORTH = 100_000
 # Set to 0, compiled code is not used; set to 1, always where numba is installed.
 SWITCH = "SUPER_SDF_COMPILED"
 

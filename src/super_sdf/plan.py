@@ -16,6 +16,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from .compiling import is_loaded
 from .errors import OutOfMemoryError
 from .memory import held_memory
 from .spheres import REACH_IN_VOXELS
@@ -23,7 +24,7 @@ from .survey import Band
 
 FINAL_BESIDE = 1
 DECODED_BESIDE = FINAL_BESIDE + REACH_IN_VOXELS
-# What a process takes at the most in each stage, measured (``benchmarks.memory``), in bytes: for
+# What a process takes at the most in each stage, measured (``benchmarks.large``), in bytes: for
 # each voxel that the network sees, for each that is decoded, for each node of a decoded block.
 STAGES = {
     "network": (1450, 0, 8.0),
@@ -32,8 +33,12 @@ STAGES = {
 }
 # The mesh of the slab before, which may still be in use, for each cell of a face of a block.
 MESH_BYTES = 19
+# What is freed after a slab is not all given back: with several, a process holds a little more.
+FRAGMENTS = 1.06
 # Chunks in work, whatever the grid.
-WORK_BYTES = 80_000_000
+WORK_BYTES = 35_000_000
+# Compiled functions, which come from the disk as they are called.
+CODE_BYTES = 30_000_000
 
 
 @dataclass(frozen=True)
@@ -100,8 +105,8 @@ def peak_bytes(band: Band, slabs: list[Slab], factor: int) -> int:
     """Return what the process will hold at the most: now, and for the largest slab."""
     held = held_memory() or band.patches.nbytes + WORK_BYTES
     mesh_before = max(band.count_decoded(slab.decoded) for slab in slabs) * MESH_BYTES * factor**2
-    need = max(slab_bytes(band, slab, factor) for slab in slabs)
-    return held + need + mesh_before * (len(slabs) > 1)
+    need = held + max(slab_bytes(band, slab, factor) for slab in slabs)
+    return need if len(slabs) == 1 else int(FRAGMENTS * (need + mesh_before))
 
 
 def cut(band: Band, pieces: int, receptive_field: int) -> list[Slab]:
@@ -132,7 +137,8 @@ def slab_bytes(band: Band, slab: Slab, factor: int) -> int:
     seen = slab.seen.stop - slab.seen.start
     decoded = band.count_decoded(slab.decoded)
     sizes = np.array([seen, decoded, decoded * (factor + 1) ** 3])
-    return WORK_BYTES + int((np.array(list(STAGES.values())) @ sizes).max())
+    work = WORK_BYTES + CODE_BYTES * is_loaded()
+    return work + int((np.array(list(STAGES.values())) @ sizes).max())
 
 
 def _does_not_fit(band: Band, factor: int, how: str, need: int, bound: int) -> OutOfMemoryError:
