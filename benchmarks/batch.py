@@ -49,14 +49,9 @@ class Place:
     meshes: Path
     jobs: int
 
-    def threads(self) -> int:
-        """Return how many threads each process has; sums are rounded otherwise with another."""
-        return max(1, count_cores() // self.jobs)
-
     def start(self) -> subprocess.Popen[str]:
         """Start the batch."""
         options = ["--out", str(self.meshes), "--jobs", str(self.jobs)]
-        options += ["--threads", str(self.threads())]
         return subprocess.Popen(
             [*COMMAND, "batch", str(self.grids), *options], stderr=subprocess.PIPE, text=True
         )
@@ -117,7 +112,6 @@ def count_equal(place: Place, names: list[str]) -> int:
     single, equal = place.meshes.parent / "single.ply", 0
     for name in names:
         words = ["upsample", str(place.grids / name), str(single), "--force", "--quiet"]
-        words += ["--threads", str(place.threads())]
         subprocess.run([*COMMAND, *words], check=True)
         made = (place.meshes / name).with_suffix(".ply")
         equal += made.exists() and filecmp.cmp(single, made, shallow=False)

@@ -20,6 +20,7 @@ from unittest import mock
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, ScalarFormatter
 
 from super_sdf import convert, io, load_network, pipeline
 from super_sdf.compiling import is_loaded
@@ -169,6 +170,8 @@ def draw(rows: dict[int, dict[str, Any]]) -> Figure:
         axes.set(xscale="log", yscale="log", xlabel="samples along an axis")
         axes.set_xticks(sizes, [str(n) for n in sizes])
         axes.minorticks_off()
+    memory.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    memory.yaxis.set_major_formatter(ScalarFormatter())
     seconds.legend(fontsize=8, ncols=2)
     return figure
 
