@@ -180,3 +180,9 @@ def test_two_samples_an_axis_are_enough(network):
     values = np.array([-0.5, 0.5])[:, None, None] + np.zeros((2, 2, 2))
     mesh = reconstruct(SdfGrid(values, (1.0,) * 3), network)
     np.testing.assert_allclose(mesh.vertices[:, 0], 0.5, atol=0.05)
+
+
+def test_samples_too_far_for_a_surface_are_none(network):
+    values = 1.3 + 0.01 * np.indices((8, 8, 8))[0]  # in the band, but nothing can be between them
+    with pytest.raises(GridError, match=r"no surface at 0: the values go from 1\.3 to 1\.37"):
+        reconstruct(SdfGrid(values, (1.0,) * 3), network, cap=True)

@@ -149,6 +149,15 @@ def test_slabs_cover_the_grid_once(pieces):
         assert len(ijk) == want.sum() and first <= ijk[0, 0] and ijk[-1, 0] < last
 
 
+def test_the_thinnest_slabs_all_decode_something():
+    values = np.full((60, 14, 15), 9.0)
+    values[40:] = rod()[:20]
+    band = survey(SdfGrid(values, (1.0,) * 3))
+    *_, thinnest = plan.ways_to_cut(band, receptive_field=2)
+    assert thinnest[0].planes[0] == 0 and thinnest[-1].planes[1] == 60
+    assert all(band.count_decoded(band.rows(*slab.planes)) for slab in thinnest)
+
+
 def test_less_memory_makes_more_slabs_and_too_little_is_refused(monkeypatch):
     monkeypatch.setattr(plan, "held_memory", lambda: 10**8)
     for name, value in (("WORK_BYTES", 0), ("CODE_BYTES", 0), ("FRAGMENTS", 1), ("MESH_BYTES", 0)):

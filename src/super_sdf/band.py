@@ -22,8 +22,10 @@ DECODE_LIMIT = 3**0.5 + 0.5
 # Neighbouring distances may differ by no more than the samples are apart; slack for rounding.
 LIPSCHITZ_SLACK = 0.1
 
-# Whole planes of about so many samples are worked on at a time: what is made of them is small.
-BLOCK_SAMPLES = 1 << 20
+# Planes of about so many samples are worked on at a time, to stay small; but never fewer than so
+# many planes, for a block looks at one more on either side.
+BLOCK_SAMPLES = 1 << 18
+BLOCK_PLANES = 4
 
 # The 27 voxels of a neighbourhood, in the order of patches and neighbour tables; 13 is the centre.
 NEIGHBOURHOOD: IntArray = np.indices((3, 3, 3)).reshape(3, 27).T.astype(np.int32) - 1
@@ -132,7 +134,7 @@ def plane_blocks(
     shape: tuple[int, ...], first: int = 0, last: int | None = None
 ) -> Iterator[tuple[int, int]]:
     """Yield planes in blocks of about ``BLOCK_SAMPLES``, (first, behind the last)."""
-    step = max(BLOCK_SAMPLES // (shape[1] * shape[2]), 1)
+    step = max(BLOCK_SAMPLES // (shape[1] * shape[2]), BLOCK_PLANES)
     end = shape[0] if last is None else last
     for start in range(first, end, step):
         yield start, min(start + step, end)

@@ -224,10 +224,10 @@ class Steps:
 
 
 def find_surface(grid: SdfGrid, factor: int, offset: float, bound: int | None) -> Band:
-    """Return the band of a grid, if there is one."""
+    """Return the band of a grid, if a surface can be in it."""
     check_factor(factor)
     band = survey(grid, offset, bound)  # Eqs. 2 and 4
-    if not len(band.voxel_ijk):
+    if not band.decoded.any():
         raise no_surface(grid, offset)
     use_compiled(int(band.decoded.sum()))
     return band

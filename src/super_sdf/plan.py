@@ -121,8 +121,9 @@ def ways_to_cut(band: Band, receptive_field: int) -> Iterator[list[Slab]]:
     """Yield cuts into more and more slabs, down to slabs of one plane."""
     for pieces in range(1, band.shape[0]):
         yield cut(band, pieces, receptive_field)
-    planes = range(band.shape[0])
-    yield [_slab(band, plane, plane + 1, receptive_field) for plane in planes]
+    planes = np.flatnonzero(np.diff(band.decoded_before)).tolist()  # each slab decodes something
+    bounds = [0, *planes[1:], band.shape[0]]
+    yield [_slab(band, first, last, receptive_field) for first, last in pairwise(bounds)]
 
 
 def _slab(band: Band, first: int, last: int, receptive_field: int) -> Slab:
