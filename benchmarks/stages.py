@@ -22,7 +22,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, ScalarFormatter
 
-from super_sdf import convert, io, load_network, pipeline
+from super_sdf import convert, load_network, pipeline, ply
 from super_sdf.compiling import is_loaded
 from super_sdf.evaluation.timing import describe_machine, run_command
 from super_sdf.memory import forget_peak, held_memory
@@ -38,7 +38,7 @@ STAGES = {
     "average": [(pipeline, "average_shared")],
     "fit": [(pipeline, "fit_to_spheres"), (pipeline, "pin_to_skipped")],
     "isosurface": [(pipeline, "extract_pieces")],
-    "write": [(io, "_write_in_chunks")],
+    "write": [(ply, "write_in_chunks")],
 }
 AFTER = ("number", "average", "fit", "isosurface", "write")
 

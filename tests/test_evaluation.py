@@ -312,7 +312,9 @@ def test_the_command_is_timed_as_a_process(monkeypatch):
     monkeypatch.setattr(timing, "RUNS", 1)
     figures = timing.time_shape(Shape("ring", torus()), Setting(12))
     assert 0.05 < figures["seconds"] < 60 and 20 < figures["peak_mb"] < 2000
-    with pytest.raises(SuperSdfError, match=r"super-sdf upsample none\.npz x\.ply ended with 1"):
+    with pytest.raises(
+        SuperSdfError, match=r"super_sdf\.cli upsample none\.npz x\.ply ended with 1"
+    ):
         timing.run_command(["upsample", "none.npz", "x.ply"])
 
 

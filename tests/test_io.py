@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from conftest import ball, trilinear
 
-from super_sdf import Mesh, SdfGrid, io, read_grid, reconstruct, write_mesh
+from super_sdf import Mesh, SdfGrid, io, ply, read_grid, reconstruct, write_mesh
 from super_sdf.errors import FileError, GridError, OptionError
 from super_sdf.io import check_target
 
@@ -52,7 +52,7 @@ def test_formats_come_back_the_same(tmp_path, mesh, suffix):
 
 
 def test_ply_holds_the_very_numbers(tmp_path, mesh, monkeypatch):
-    monkeypatch.setattr("super_sdf.io.CHUNK", 1000)
+    monkeypatch.setattr("super_sdf.ply.CHUNK", 1000)
     for dtype in (np.float32, np.float64):
         exact = Mesh(mesh.vertices.astype(dtype), mesh.faces)
         write_mesh(exact, tmp_path / "out.ply", force=True)
@@ -68,7 +68,7 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, mesh, monkeypatch):
     def fail(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("super_sdf.io._write_ply", fail)
+    monkeypatch.setattr("super_sdf.io.write_ply", fail)
     with pytest.raises(FileError, match=r"out\.ply cannot be written: No space left on device"):
         write_mesh(mesh, target, force=True)
     assert target.read_text() == "before" and os.listdir(tmp_path) == ["out.ply"]
@@ -92,7 +92,7 @@ def test_only_known_formats_and_free_places_are_written(tmp_path, mesh):
 
 @pytest.mark.parametrize("suffix", [".ply", ".stl"])
 def test_a_mesh_in_pieces_makes_the_same_file(mesh, tmp_path, monkeypatch, suffix):
-    monkeypatch.setattr(io, "SPOOL_BYTES", 1000)  # triangles go to a file beside
+    monkeypatch.setattr(ply, "SPOOL_BYTES", 1000)  # triangles go to a file beside
     half, some = len(mesh.vertices) // 2, len(mesh.faces) // 3
     pieces = [
         Mesh(mesh.vertices[:half], mesh.faces[:0]),

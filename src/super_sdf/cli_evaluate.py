@@ -146,11 +146,11 @@ def evaluate(sources: tuple[Path, ...], **options: Any) -> None:
 
 def run_evaluate(sources: tuple[Path, ...], options: dict[str, Any]) -> bool:
     """Plan, measure, report; say which shapes were left out, and return whether any was."""
+    from .chunks import count_cores
     from .evaluation.evaluate import evaluate
     from .evaluation.methods import METHODS
     from .evaluation.peers import peers_are_installed
     from .evaluation.plan import Plan, find_meshes, spread
-    from .evaluation.timing import count_cores
 
     if options["peers"] and not peers_are_installed():
         raise FileError("peers need gpytoolbox: pip install 'super-sdf[peers]'")

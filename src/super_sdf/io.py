@@ -1,20 +1,17 @@
 """Grids from files, meshes to files. Files are checked before they are read, and appear whole.
 
 Grids: ``.npy`` (an array) and ``.npz`` (keys ``values``, and optionally ``spacing``, ``origin``).
-Meshes: ``.ply`` written here in chunks; ``.stl .obj .off .glb .3mf`` by trimesh, which wants two
+Meshes: ``.ply`` by our own ``ply``; ``.stl .obj .off .glb .3mf`` by trimesh, which wants two
 more packages for the last (extra ``3mf``).
 """
 
 from __future__ import annotations
 
 import os
-import shutil
-import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from importlib.util import find_spec
 from math import prod
 from pathlib import Path
@@ -29,14 +26,12 @@ from .errors import FileError, GridError, OptionError, SuperSdfError, WriteError
 from .grid import SdfGrid
 from .memory import check_fits
 from .mesh import Mesh, join_meshes
+from .ply import write_ply
 
 GRID_SUFFIXES = (".npy", ".npz")
 MESH_SUFFIXES = (".ply", ".stl", ".obj", ".off", ".glb", ".3mf")
 NEEDED_FOR_3MF = ("lxml", "networkx")
 NPZ_KEYS = ("values", "spacing", "origin")
-CHUNK = 1 << 18  # vertices or faces written at a time
-SPOOL_BYTES = 16_000_000  # triangles that wait in memory before they go to a file beside
-HEADER_BYTES = 320
 
 
 def read_grid(
@@ -197,7 +192,7 @@ def write_pieces(pieces: Iterable[Mesh], path: str | Path, *, force: bool = Fals
     path = check_target(path, force=force)
     with replacing(path) as part:
         if path.suffix.lower() == ".ply":
-            _write_ply(pieces, part)
+            write_ply(pieces, part)
         else:
             _write_by_trimesh(join_meshes(list(pieces)), part, path.suffix.lower()[1:])
 
@@ -231,62 +226,6 @@ def replacing(path: Path) -> Iterator[Path]:
         raise WriteError(f"{path} cannot be written: {error.strerror or error}") from error
     finally:
         part.unlink(missing_ok=True)
-
-
-def _write_ply(pieces: Iterable[Mesh], path: Path) -> None:
-    """Write binary little-endian PLY.
-
-    All vertices come before all triangles, and their numbers before both: triangles wait beside,
-    and the header, which is padded to one length, is written last.
-    """
-    vertices, faces, number = 0, 0, "float"
-    spool = partial(tempfile.SpooledTemporaryFile, SPOOL_BYTES, dir=path.parent)
-    with path.open("wb") as file, spool() as waiting:
-        file.write(_ply_header(number, 0, 0))
-        for piece in pieces:
-            _write_in_chunks(file, piece.vertices, _little_endian)
-            _write_in_chunks(waiting, piece.faces, _ply_rows)
-            number = "double" if piece.vertices.dtype == np.float64 else "float"
-            vertices, faces = vertices + len(piece.vertices), faces + len(piece.faces)
-        waiting.seek(0)
-        shutil.copyfileobj(waiting, file, SPOOL_BYTES // 4)
-        file.seek(0)
-        file.write(_ply_header(number, vertices, faces))
-
-
-def _ply_header(number: str, vertices: int, faces: int) -> bytes:
-    """Return the header, of the same length whatever the numbers: its comment is padded."""
-    first = "ply\nformat binary_little_endian 1.0\ncomment made by super-sdf"
-    lines = [
-        "",
-        f"element vertex {vertices}",
-        *(f"property {number} {axis}" for axis in "xyz"),
-        f"element face {faces}",
-        "property list uchar int vertex_indices",
-        "end_header\n",
-    ]
-    rest = "\n".join(lines)
-    return (first + " " * (HEADER_BYTES - len(first) - len(rest)) + rest).encode("ascii")
-
-
-def _write_in_chunks(
-    file: IO[bytes], array: NDArray[Any], to_bytes: Callable[[NDArray[Any]], bytes]
-) -> None:
-    """Write rows of an array, some at a time: the bytes are a copy."""
-    for start in range(0, len(array), CHUNK):
-        file.write(to_bytes(array[start : start + CHUNK]))
-
-
-def _little_endian(array: NDArray[Any]) -> bytes:
-    """Return the bytes of numbers, least significant first."""
-    return array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()
-
-
-def _ply_rows(faces: NDArray[Any]) -> bytes:
-    """Return triangles as PLY's lists: how many corners, then which."""
-    rows = np.empty(len(faces), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
-    rows["count"], rows["corners"] = 3, faces
-    return rows.tobytes()
 
 
 def _write_by_trimesh(mesh: Mesh, path: Path, file_type: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import statistics
 import subprocess
@@ -15,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..chunks import count_cores
 from ..errors import SuperSdfError
 from .cases import Case, Setting, Shape
 from .measuring import Row
@@ -39,11 +39,6 @@ def describe_machine() -> str:
         f"{processor_name()}, {count_cores()} cores, {platform.system()}, Python "
         f"{platform.python_version()}, NumPy {np.__version__}, onnxruntime {version('onnxruntime')}"
     )
-
-
-def count_cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def processor_name() -> str:
