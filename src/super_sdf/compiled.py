@@ -35,6 +35,11 @@ from .spheres import Samples
 Arrays = tuple[NDArray[Any], ...]
 
 
+def wake() -> None:
+    """Call something, so that the next call is quick."""
+    kernels.wake()
+
+
 @lru_cache
 def _parts(factor: int) -> Arrays:
     """Return the block nodes of all parts in a row, and where each part's begin."""

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
+from threading import Thread
 from typing import Any, TypeVar
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -26,8 +27,9 @@ def use_compiled(voxels: int) -> bool:
     """Load the compiled functions if that is worth it for so many decoded voxels; say whether."""
     asked = os.environ.get(SWITCH)
     worth = voxels >= WORTH or "numba" in sys.modules or asked == "1"
-    if asked != "0" and worth and find_spec("numba") is not None:
-        import_module(MODULE)
+    if asked != "0" and worth and MODULE not in sys.modules and find_spec("numba") is not None:
+        # Its first call takes a quarter of a second: let that pass while the network runs.
+        Thread(target=import_module(MODULE).wake).start()
     return is_loaded()
 
 

@@ -17,6 +17,11 @@ compiled = njit(cache=True, nogil=True, error_model="numpy")
 
 
 @compiled
+def wake():
+    """Do nothing."""
+
+
+@compiled
 def number_parts(table, sizes, sharers, seen, first_sharer, starts, owned):
     """Number the parts of blocks; return how many nodes there are."""
     count = np.int32(0)
