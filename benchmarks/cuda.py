@@ -19,19 +19,12 @@ from typing import Any
 import numpy as np
 
 from super_sdf import SdfGrid, load_network, reconstruct
-from super_sdf.band import (
-    can_hold_surface,
-    find_band,
-    gather_patches,
-    is_lipschitz,
-    neighbour_table,
-    rescale,
-)
 from super_sdf.cuda import describe_gpu, onnxruntime_version, query_gpu
 from super_sdf.device import CUDA_CHUNK, run_bound
 from super_sdf.errors import DeviceError
 from super_sdf.network import INPUTS, QUALITIES, Network
 from super_sdf.nodes import block_offsets
+from super_sdf.survey import survey
 
 RUNS = 3
 CHUNKS = (512, 2048, 8192, CUDA_CHUNK, 65536)
@@ -49,12 +42,7 @@ def noisy_ball(size: int) -> SdfGrid:
 
 def network_inputs(size: int) -> tuple[np.ndarray, ...]:
     """Return what the pipeline asks the network for a ball at factor 4."""
-    grid = noisy_ball(size)
-    rescaled = rescale(grid)
-    band_ijk = find_band(rescaled)
-    patches = gather_patches(rescaled, band_ijk)
-    voxels = np.flatnonzero(can_hold_surface(patches, is_lipschitz(patches))).astype(np.int32)
-    return patches, neighbour_table(band_ijk, grid.shape), voxels, block_offsets(4)
+    return *survey(noisy_ball(size)).network_inputs(), block_offsets(4)
 
 
 def best_seconds(work: Callable[..., Any], *arguments: Any) -> float:

@@ -1,21 +1,41 @@
-"""How long the command takes and how much memory: whole processes, start included.
+"""How long a conversion takes and how much memory.
 
-    python -m benchmarks.speed MESHES --sizes 32 64 128 --shapes 10 [-- --factor 8]
+    python -m benchmarks.speed MESHES --sizes 32 64 128 --shapes 10 [-- --precision int8]
+    python -m benchmarks.speed MESHES --sizes 32 64 128 --shapes 10 --warm
 
-Samples every shape at every size, runs ``super-sdf upsample`` on it several times, and prints the
-machine and, for each size, the mean over shapes of the median time, the slowest shape, and the
-highest peak of memory. What follows ``--`` goes to the command.
+Samples every shape at every size, converts it several times, and prints the machine and, for each
+size, the mean over shapes of the median time, the slowest shape, and the highest peak of memory.
+Whole processes, start included, and what follows ``--`` goes to the command; or, with ``--warm``,
+from file to file in this process, which has its network already.
 """
 
 from __future__ import annotations
 
 import argparse
 import statistics
+import time
 from pathlib import Path
 
+from super_sdf.convert import ConvertOptions, convert
 from super_sdf.evaluation.cases import Setting, Shape
+from super_sdf.evaluation.measuring import Row
 from super_sdf.evaluation.plan import find_meshes, spread
-from super_sdf.evaluation.timing import RUNS, describe_machine, time_shape
+from super_sdf.evaluation.timing import RUNS, describe_machine, grid_file, time_shape
+from super_sdf.memory import forget_peak, held_memory
+from super_sdf.network import Network, load_network
+
+
+def time_warm(shape: Shape, setting: Setting, network: Network) -> Row:
+    """Time a conversion in this process, as ``time_shape`` times the command."""
+    seconds, options = [], ConvertOptions(setting.factor, inside="negative")
+    with grid_file(shape, setting) as grid:
+        forget_peak()
+        for _ in range(RUNS + 1):
+            start = time.perf_counter()
+            convert(grid, grid.with_suffix(".ply"), network, options, force=True)
+            seconds.append(time.perf_counter() - start)
+    peak = (held_memory(peak=True) or 0) / 1e6
+    return {"seconds": statistics.median(seconds[1:]), "peak_mb": peak}
 
 
 def main() -> None:
@@ -25,17 +45,25 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[32, 64, 128])
     parser.add_argument("--shapes", type=int, default=10, help="how many, spread over them")
     parser.add_argument("--factor", type=int, default=4)
+    parser.add_argument("--warm", action="store_true", help="in this process")
     parser.add_argument("options", nargs="*", help="further options of the command, after --")
     asked = parser.parse_args()
     paths = spread(find_meshes(asked.meshes), asked.shapes)
+    network = load_network() if asked.warm else None
+
+    def measure(path: Path, setting: Setting) -> Row:
+        shape = Shape.read(path)
+        if network:
+            return time_warm(shape, setting, network)
+        return time_shape(shape, setting, asked.options)
+
     print(f"{describe_machine()}; {len(paths)} shapes, factor {asked.factor}, median of {RUNS}\n")
     print("| grid | mean s | slowest s | peak MB |\n| --- | ---: | ---: | ---: |")
     for size in asked.sizes:
-        setting = Setting(size, asked.factor)
-        rows = [time_shape(Shape.read(path), setting, asked.options) for path in paths]
+        rows = [measure(path, Setting(size, asked.factor)) for path in paths]
         seconds, peak = [row["seconds"] for row in rows], max(row["peak_mb"] for row in rows)
         mean = statistics.mean(seconds)
-        print(f"| {size}^3 | {mean:.2f} | {max(seconds):.2f} | {peak:.0f} |", flush=True)
+        print(f"| {size}^3 | {mean:.3f} | {max(seconds):.3f} | {peak:.0f} |", flush=True)
 
 
 if __name__ == "__main__":

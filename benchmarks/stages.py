@@ -27,12 +27,13 @@ from super_sdf.compiling import is_loaded
 from super_sdf.evaluation.timing import describe_machine, run_command
 from super_sdf.memory import forget_peak, held_memory
 from super_sdf.network import Network
+from super_sdf.survey import Band
 
 # The functions that are a stage, where they are looked up.
 STAGES = {
     "read": [(convert, "read_grid")],
     "band": [(pipeline, "survey")],
-    "gather": [(pipeline, "neighbour_table")],
+    "gather": [(Band, "network_inputs")],
     "network": [(Network, "__call__")],
     "number": [(pipeline, "number_shared_nodes")],
     "average": [(pipeline, "average_shared")],

@@ -21,15 +21,10 @@ import torch
 from export.augment import Prepared
 from export.network import SuperSdfNet
 from export.variants import UNet
-from super_sdf.band import (
-    can_hold_surface,
-    find_band,
-    gather_patches,
-    is_lipschitz,
-    neighbour_table,
-)
+from super_sdf.grid import SdfGrid
 from super_sdf.network import load_network
 from super_sdf.nodes import block_offsets
+from super_sdf.survey import survey
 
 NAMES = ["patches", "neighbours", "voxels", "offsets"]
 RUNS = 5
@@ -39,12 +34,10 @@ def ball(radius: float = 35.0) -> Prepared:
     """Return the band of a ball; the targets are empty."""
     shape = (int(2 * radius + 8),) * 3
     distance = np.linalg.norm(np.indices(shape) - (shape[0] - 1) / 2, axis=0) - radius
-    field = (2 * distance).astype(np.float32)
-    band = find_band(field)
-    patches = gather_patches(field, band)
-    voxels = np.flatnonzero(can_hold_surface(patches, is_lipschitz(patches))).astype(np.int32)
+    band = survey(SdfGrid(distance.astype(np.float32), 1.0))
+    patches, table, voxels = band.network_inputs()
     targets = np.zeros((len(voxels), 0), np.float32)
-    return Prepared(band, patches, neighbour_table(band, shape), voxels, block_offsets(4), targets)
+    return Prepared(band.voxel_ijk, patches, table, voxels, block_offsets(4), targets)
 
 
 def microseconds(net: SuperSdfNet, sample: Prepared, threads: int) -> float:

@@ -8,9 +8,11 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import trimesh
 from conftest import ball
@@ -423,18 +425,11 @@ def start_batch(*options):
     return process
 
 
-def children(pid):
-    """Return the processes that a process has started."""
-    found = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    return [int(child) for child in found]
-
-
-def is_over(pid):
+def is_over(process):
     """Say whether a process has ended, if only its parent has still to hear of it."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except OSError:
-        return True
+    with suppress(psutil.NoSuchProcess):
+        return process.status() == psutil.STATUS_ZOMBIE
+    return True
 
 
 def larger_grids(count):
@@ -443,11 +438,10 @@ def larger_grids(count):
         np.save(f"in/more{i}.npy", ball(32, 10 + i / 8).values)
 
 
-@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs Linux's /proc")
 def test_killed_on_the_way_it_goes_on(command):
     larger_grids(8)
     process = start_batch("--quality", "fast")
-    workers = children(process.pid)
+    workers = psutil.Process(process.pid).children()
     assert len(workers) >= 2
     process.kill()
     process.communicate()

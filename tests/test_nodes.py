@@ -12,6 +12,7 @@ from super_sdf.nodes import (
     check_factor,
     number_shared_nodes,
     pin_to_skipped,
+    signs_of_skipped,
 )
 
 
@@ -77,8 +78,9 @@ def test_pinned_nodes_take_the_sign_of_the_skipped_voxel():
     values = np.ones(27, np.float32)
     patches = np.ones((1, 27), np.float32)
     patches[0, 22] = -1  # the neighbour at +x is inside; others are beyond the grid, but that at -x
+    ijk, voxels = np.array([[1, 0, 0]], np.int32), np.zeros(1, np.int32)
     changed = pin_to_skipped(
-        values, nodes, np.array([[1, 0, 0]], np.int32), patches, np.zeros(1, np.int32), (3, 1, 1)
+        values, nodes, signs_of_skipped(nodes.table, ijk, patches, voxels, (3, 1, 1))
     )
     on_face = nodes.numbers()[0, block_ijk(2)[:, 0] == 2]
     assert changed.sum() == 9 and changed[on_face].all()

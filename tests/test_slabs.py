@@ -66,8 +66,8 @@ def test_slabs_change_nothing(network, monkeypatch, field, factor, cap):
         mesh = join_meshes([mesh for part in parts for mesh in part.meshes])
         np.testing.assert_array_equal(mesh.faces, one.faces)
         np.testing.assert_array_equal(mesh.vertices, one.vertices)
-        for count in ("decoded_voxels", "nodes", "pinned"):
-            assert sum(getattr(part, count) for part in parts) == getattr(whole, count)
+        for name, count in whole.counts.items():
+            assert sum(part.counts[name] for part in parts) == count
         assert any(part.is_cut for part in parts) == whole.is_cut
 
 

@@ -87,10 +87,10 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
     settings = Settings(
         folder,
         model,
-        options["precision"],
-        options["device"],
-        options["threads"],
-        options["jobs"],
+        precision=options["precision"],
+        device=options["device"],
+        threads=options["threads"],
+        workers=options["jobs"],
         **flags,
     )
     if options["dry_run"]:

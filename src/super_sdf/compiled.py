@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import kernels
-from .band import NEIGHBOURHOOD
 from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, triangle_table
 from .field import FineField
 from .grid import BoolArray, FloatArray, IntArray
@@ -25,6 +24,7 @@ from .nodes import (
     BARELY_OUTSIDE,
     SHARING,
     SharedNodes,
+    Signs,
     block_ijk,
     nodes_of_part,
     part_of_node,
@@ -63,24 +63,12 @@ def number_parts(table: IntArray, sizes: IntArray) -> tuple[IntArray, BoolArray,
     return starts, owned, int(count)
 
 
-def pin(
-    values: FloatArray,
-    nodes: SharedNodes,
-    voxel_ijk: IntArray,
-    patches: FloatArray,
-    voxels: IntArray,
-    shape: tuple[int, int, int],
-    changed: BoolArray,
-) -> None:
+def pin(values: FloatArray, nodes: SharedNodes, skipped: Signs, changed: BoolArray) -> None:
     """See ``nodes._pin``."""
     _, ends = _parts(nodes.factor)
-    ijk, limits = np.ascontiguousarray(voxel_ijk), np.array(shape)
     shared = np.array([[place in sharing for sharing in SHARING] for place in range(27)])
-    signs = BARELY_INSIDE, BARELY_OUTSIDE
-    kernels.pin(
-        values, nodes.table, nodes.starts, ijk, patches, voxels, limits, NEIGHBOURHOOD, shared,
-        np.diff(ends), *signs, changed,
-    )  # fmt: skip
+    barely = BARELY_INSIDE, BARELY_OUTSIDE
+    kernels.pin(values, nodes.starts, skipped, shared, np.diff(ends), *barely, changed)
 
 
 def average_chunk(blocks: FloatArray, nodes: SharedNodes, rows: slice, values: FloatArray) -> None:

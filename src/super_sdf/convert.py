@@ -166,16 +166,8 @@ class Total:
         """Pass the meshes on, and count; the time until the next is asked for is for writing."""
         for piece in pieces:
             self.is_cut |= piece.is_cut
-            self.counts.update(
-                decoded_voxels=piece.decoded_voxels,
-                nodes=piece.nodes,
-                vertices=sum(len(mesh.vertices) for mesh in piece.meshes),
-                triangles=sum(len(mesh.faces) for mesh in piece.meshes),
-                pinned_nodes=piece.pinned,
-            )
-            whole = {"band_voxels": piece.band_voxels, "noisy_voxels": piece.noisy_voxels}
-            plan = {"slabs": piece.slabs, "planned_bytes": piece.planned_bytes}
-            self.counts |= Counter(whole | plan)
+            self.counts.update(piece.counts)
+            self.counts |= Counter(piece.whole)
             yield from piece.meshes
             watch.lap("write")
 

@@ -41,15 +41,13 @@ def number_parts(table, sizes, sharers, seen, first_sharer, starts, owned):
 
 
 @compiled
-def pin(
-    values, table, starts, ijk, patches, voxels, limits, steps, shared, sizes, inner, outer, changed
-):
+def pin(values, starts, skipped, shared, sizes, inner, outer, changed):
     """Give nodes shared with skipped voxels their sign."""
-    for voxel in range(len(table)):
+    for voxel in range(len(starts)):
         for place in range(27):
-            if table[voxel, place] >= 0 or not _is_within(ijk[voxel], steps[place], limits):
+            if skipped[voxel, place] == 0:
                 continue
-            outside = patches[voxels[voxel], place] > 0
+            outside = skipped[voxel, place] > 0
             for part in range(27):
                 if not shared[place, part]:
                     continue
@@ -57,14 +55,6 @@ def pin(
                     if (values[node] > 0) != outside:
                         changed[node] = True
                         values[node] = outer if outside else inner
-
-
-@compiled
-def _is_within(ijk, step, limits):
-    within = True
-    for axis in range(3):
-        within &= 0 <= ijk[axis] + step[axis] < limits[axis]
-    return within
 
 
 @compiled

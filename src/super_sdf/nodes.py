@@ -24,6 +24,8 @@ from .compiling import compiled_twin
 from .errors import OptionError
 from .grid import BoolArray, FloatArray, IntArray
 
+Signs = NDArray[np.int8]
+
 MAX_FACTOR = 16
 # What a node is set to when only its sign is known.
 BARELY_INSIDE, BARELY_OUTSIDE = np.float32(-1e-3), np.float32(1e-3)
@@ -164,25 +166,19 @@ def _average_chunk(blocks: FloatArray, nodes: SharedNodes, rows: slice, values: 
         values[nodes.starts[own, part, None] + np.arange(total.shape[1])] = total / times
 
 
-def pin_to_skipped(
-    values: FloatArray,
-    nodes: SharedNodes,
+def signs_of_skipped(
+    table: IntArray,
     voxel_ijk: IntArray,
     patches: FloatArray,
     voxels: IntArray,
     shape: tuple[int, int, int],
-) -> BoolArray:
-    """Give nodes shared with a voxel that was not decoded that voxel's sign.
-
-    Such a voxel holds no surface, so all its nodes have its sign; with this no sign change can
-    reach the edge of what was decoded, and the isosurface has no hole there.
+) -> Signs:
+    """Return the signs of the voxels beside the decoded ones that were not decoded.
 
     Parameters
     ----------
-    values : (count,) float32
-        Node values, changed in place.
-    nodes : SharedNodes
-        The nodes of the decoded voxels.
+    table : (D, 27) int32
+        Neighbours among the decoded voxels, -1 where there is none.
     voxel_ijk : (D, 3) int32
         The decoded voxels.
     patches : (V, 27) float32
@@ -194,31 +190,51 @@ def pin_to_skipped(
 
     Returns
     -------
+    (D, 27) int8
+        1 outside, -1 inside; 0 where nothing was skipped.
+    """
+    signs = np.empty(table.shape, np.int8)
+
+    def fill(rows: slice) -> None:
+        beside = voxel_ijk[rows, None] + NEIGHBOURHOOD
+        skipped = (table[rows] < 0) & ((beside >= 0) & (beside < shape)).all(2)
+        signs[rows] = np.where(patches[voxels[rows]] > 0, skipped, -skipped.astype(np.int8))
+
+    in_chunks(len(table), fill)
+    return signs
+
+
+def pin_to_skipped(values: FloatArray, nodes: SharedNodes, skipped: Signs) -> BoolArray:
+    """Give nodes shared with a voxel that was not decoded that voxel's sign.
+
+    Such a voxel holds no surface, so all its nodes have its sign; with this no sign change can
+    reach the edge of what was decoded, and the isosurface has no hole there.
+
+    Parameters
+    ----------
+    values : (count,) float32
+        Node values, changed in place.
+    nodes : SharedNodes
+        The nodes of the decoded voxels.
+    skipped : (D, 27) int8
+        From ``signs_of_skipped``.
+
+    Returns
+    -------
     (count,) bool
         Which nodes had the other sign.
     """
     changed = np.zeros(len(values), bool)
-    compiled_twin(_pin)(values, nodes, voxel_ijk, patches, voxels, shape, changed)
+    compiled_twin(_pin)(values, nodes, skipped, changed)
     return changed
 
 
-def _pin(
-    values: FloatArray,
-    nodes: SharedNodes,
-    voxel_ijk: IntArray,
-    patches: FloatArray,
-    voxels: IntArray,
-    shape: tuple[int, int, int],
-    changed: BoolArray,
-) -> None:
+def _pin(values: FloatArray, nodes: SharedNodes, skipped: Signs, changed: BoolArray) -> None:
     """Change the values, and say which. No two skipped voxels round a node differ in sign."""
-    last = np.array(shape) - 1
     parts = nodes_of_part(nodes.factor)
-    for place, step in enumerate(NEIGHBOURHOOD):
-        rows = np.flatnonzero(nodes.table[:, place] < 0)
-        beside = voxel_ijk[rows] + step
-        rows = rows[((beside >= 0) & (beside <= last)).all(1)]
-        outside = patches[voxels[rows], place] > 0
+    for place in range(27):
+        rows = np.flatnonzero(skipped[:, place])
+        outside = skipped[rows, place] > 0
         for part in np.flatnonzero([place in sharing for sharing in SHARING]):
             number = nodes.starts[rows, part, None] + np.arange(len(parts[part]))
             wrong = (values[number] > 0) != outside[:, None]

@@ -18,7 +18,6 @@ from typing import Protocol
 
 import numpy as np
 
-from .band import neighbour_table
 from .border import close_at_border
 from .chunks import working_threads
 from .compiling import use_compiled
@@ -34,6 +33,7 @@ from .nodes import (
     check_factor,
     number_shared_nodes,
     pin_to_skipped,
+    signs_of_skipped,
 )
 from .plan import Slab, peak_bytes, plan_slabs
 from .spheres import Samples, fit_to_spheres
@@ -132,8 +132,9 @@ def reconstruct(
         from .network import load_network
 
         network = load_network()
-    options = {"offset": offset, "cap": cap, "max_memory": max_memory, "progress": progress}
-    pieces = reconstruct_slabs(grid, network, factor, **options)  # type: ignore[arg-type]
+    pieces = reconstruct_slabs(
+        grid, network, factor, offset=offset, cap=cap, max_memory=max_memory, progress=progress
+    )
     return join_meshes([mesh for piece in pieces for mesh in piece.meshes])
 
 
@@ -145,14 +146,11 @@ class Piece:
     ----------
     meshes : list of Mesh
         Triangles of the slab: rows of all vertices so far, those of the slab among them.
-    slabs : int
-        How many pieces there are in all.
-    planned_bytes : int
-        What the plan says that the process holds at the most.
-    band_voxels, noisy_voxels : int
-        Of the whole grid: see ``FineField``.
-    decoded_voxels, nodes, pinned : int
-        Of the slab.
+    counts : dict
+        Of the slab: ``decoded_voxels``, ``nodes``, ``pinned_nodes``, ``vertices``, ``triangles``.
+    whole : dict
+        Of all pieces, the same in each: ``band_voxels``, ``noisy_voxels`` (see ``FineField``), how
+        many ``slabs``, and ``planned_bytes``, what the plan says that the process holds at most.
     is_cut : bool
         Whether the surface runs out of the grid here.
     signs : set of bool
@@ -160,13 +158,8 @@ class Piece:
     """
 
     meshes: list[Mesh]
-    slabs: int
-    planned_bytes: int
-    band_voxels: int
-    noisy_voxels: int
-    decoded_voxels: int
-    nodes: int
-    pinned: int
+    counts: dict[str, int]
+    whole: dict[str, int]
     is_cut: bool
     signs: set[bool]
 
@@ -190,7 +183,7 @@ def reconstruct_slabs(
     with working_threads(threads):
         band = find_surface(grid, factor, offset, bound)
         slabs = plan_slabs(band, factor, getattr(network, "receptive_field", None), bound)
-        planned = peak_bytes(band, slabs, factor)
+        planned = {"slabs": len(slabs), "planned_bytes": peak_bytes(band, slabs, factor)}
     steps = Steps(progress, len(slabs))
     vertices = 0
     seen: set[bool] = set()
@@ -199,10 +192,10 @@ def reconstruct_slabs(
             field = refine(band, network, factor, slab, steps)
             whole = close_at_border(field, grid, offset) if cap else field
             meshes = extract_pieces(whole, grid, first_vertex=vertices)
-            piece = describe_piece(field, meshes, len(slabs), planned)
+            piece = describe_piece(field, meshes, planned)
             del field, whole, meshes  # no more of them than one at a time
         steps.finish_one()
-        vertices += sum(len(mesh.vertices) for mesh in piece.meshes)
+        vertices += piece.counts["vertices"]
         seen |= piece.signs
         yield piece
     if len(seen) < 2:
@@ -238,10 +231,7 @@ def refine(
 ) -> FineField:
     """Return the fine field of a slab, or of the whole band."""
     steps = steps or Steps(None, slabs=1)
-    voxel_ijk, patches = band.voxel_ijk[slab.seen], band.patches[slab.seen]
-    table = neighbour_table(*in_slab(voxel_ijk, band.shape))
-    voxels = np.flatnonzero(band.decoded[slab.decoded]) + slab.decoded.start - slab.seen.start
-    voxels = voxels.astype(np.int32)
+    patches, table, voxels = band.network_inputs(slab.seen, slab.decoded)
     blocks = network(patches, table, voxels, block_offsets(factor))  # Eqs. 3 and 5
     steps.finish_one()
 
@@ -251,8 +241,9 @@ def refine(
     del blocks
     exact = np.flatnonzero(band.exact[slab.seen]).astype(np.int32)
     values = fit_to_spheres(values, nodes, Samples(patches, exact, table, row_of))
-    own_ijk = voxel_ijk[voxels]
-    pinned = pin_to_skipped(values, nodes, own_ijk, patches, voxels, band.shape)
+    own_ijk = band.voxel_ijk[slab.seen][voxels]
+    skipped = signs_of_skipped(nodes.table, own_ijk, patches, voxels, band.shape)
+    pinned = pin_to_skipped(values, nodes, skipped)
     steps.finish_one()
     field = FineField(band.shape, factor, own_ijk, nodes, values, slab.planes)
     return replace(
@@ -263,21 +254,18 @@ def refine(
     )
 
 
-def describe_piece(field: FineField, meshes: list[Mesh], slabs: int, planned: int) -> Piece:
-    """Return what there is to say of a slab beside its mesh."""
+def describe_piece(field: FineField, meshes: list[Mesh], planned: dict[str, int]) -> Piece:
+    """Return the meshes of a slab with what there is to say of them."""
     own, nodes = field.rows(*field.planes), field.own_nodes()
-    return Piece(
-        meshes,
-        slabs,
-        planned,
-        field.band_voxels,
-        field.noisy_voxels,
-        own.stop - own.start,
-        nodes.stop - nodes.start,
-        field.pinned,
-        border_is_crossed(field),
-        field.signs(),
-    )
+    counts = {
+        "decoded_voxels": own.stop - own.start,
+        "nodes": nodes.stop - nodes.start,
+        "pinned_nodes": field.pinned,
+        "vertices": sum(len(mesh.vertices) for mesh in meshes),
+        "triangles": sum(len(mesh.faces) for mesh in meshes),
+    }
+    whole = {"band_voxels": field.band_voxels, "noisy_voxels": field.noisy_voxels, **planned}
+    return Piece(meshes, counts, whole, border_is_crossed(field), field.signs())
 
 
 def no_surface(grid: SdfGrid, offset: float) -> GridError:
@@ -285,12 +273,6 @@ def no_surface(grid: SdfGrid, offset: float) -> GridError:
     return GridError(
         f"no surface at {offset:g}: the values go from {grid.low:.6g} to {grid.high:.6g}"
     )
-
-
-def in_slab(voxel_ijk: IntArray, shape: tuple[int, int, int]) -> tuple[IntArray, tuple[int, ...]]:
-    """Return voxels counted from the first plane in which there is one, and so many planes."""
-    first, last = int(voxel_ijk[0, 0]), int(voxel_ijk[-1, 0])
-    return voxel_ijk - np.array([first, 0, 0], np.int32), (last - first + 1, *shape[1:])
 
 
 def rows_among(voxels: IntArray, count: int) -> IntArray:

@@ -62,8 +62,7 @@ class Slab:
 
 def whole(band: Band) -> Slab:
     """Return the whole band as one slab."""
-    rows = slice(0, len(band.voxel_ijk))
-    return Slab((0, band.shape[0]), rows, rows)
+    return Slab((0, band.shape[0]), band.all_rows, band.all_rows)
 
 
 def plan_slabs(

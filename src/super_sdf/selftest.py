@@ -15,20 +15,13 @@ from importlib.util import find_spec
 import numpy as np
 
 from . import __version__
-from .band import (
-    can_hold_surface,
-    find_band,
-    gather_patches,
-    is_lipschitz,
-    neighbour_table,
-    rescale,
-)
 from .cuda import available_devices, check_cuda, describe_gpu, onnxruntime_version
 from .errors import DeviceError, SuperSdfError
 from .grid import FloatArray, IntArray, SdfGrid
 from .memory import free_memory
 from .network import load_network, shipped_models
 from .nodes import block_offsets
+from .survey import survey
 
 OK, MISSING, FAILED = "ok", "missing", "failed"
 # Modules that the extras bring.
@@ -127,14 +120,11 @@ def make_ball() -> Ball:
     """Sample a ball and return its voxels that can hold the surface."""
     ijk = np.indices((BALL_SAMPLES,) * 3)
     values = np.linalg.norm(ijk - BALL_CENTRE, axis=0) - BALL_RADIUS
-    rescaled = rescale(SdfGrid(values.astype(np.float32), (1.0, 1.0, 1.0)))
-    band_ijk = find_band(rescaled)
-    patches = gather_patches(rescaled, band_ijk)
-    voxels = np.flatnonzero(can_hold_surface(patches, is_lipschitz(patches))).astype(np.int32)
+    band = survey(SdfGrid(values.astype(np.float32), (1.0, 1.0, 1.0)))
+    patches, table, voxels = band.network_inputs()
     offsets = block_offsets(4)
-    nodes = band_ijk[voxels, None] + offsets / 2  # offsets are in half voxels
+    nodes = band.voxel_ijk[voxels, None] + offsets / 2  # offsets are in half voxels
     exact = np.linalg.norm(nodes - BALL_CENTRE, axis=2) - BALL_RADIUS
-    table = neighbour_table(band_ijk, values.shape)
     return Ball((patches, table, voxels, offsets), exact.astype(np.float32))
 
 

@@ -11,7 +11,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from .band import can_hold_surface, find_band, gather_patches, is_lipschitz, plane_blocks, rescale
+from .band import (
+    can_hold_surface,
+    find_band,
+    gather_patches,
+    is_lipschitz,
+    neighbour_table,
+    plane_blocks,
+    rescale,
+)
 from .chunks import side_by_side
 from .errors import OutOfMemoryError
 from .grid import BoolArray, FloatArray, IntArray, SdfGrid
@@ -48,6 +56,11 @@ class Band:
     decoded: BoolArray
     exact: BoolArray
 
+    @property
+    def all_rows(self) -> slice:
+        """The rows of all voxels."""
+        return slice(0, len(self.voxel_ijk))
+
     def rows(self, first: int, last: int) -> slice:
         """Return the rows of the voxels in planes ``first`` to before ``last``."""
         low, high = max(first, 0), min(last, self.shape[0])
@@ -67,6 +80,25 @@ class Band:
         """Return how many voxels are to be decoded in rows of whole planes."""
         first, last = np.searchsorted(self.seen_before, [rows.start, rows.stop])
         return int(self.decoded_before[last] - self.decoded_before[first])
+
+    def network_inputs(
+        self, seen: slice | None = None, decoded: slice | None = None
+    ) -> tuple[FloatArray, IntArray, IntArray]:
+        """Return what the network is asked: patches, neighbours, and which voxels to decode.
+
+        It sees the voxels in rows ``seen``, and decodes of those in rows ``decoded`` what can hold
+        the surface; all unless given.
+        """
+        seen, decoded = seen or self.all_rows, decoded or self.all_rows
+        table = neighbour_table(*_cropped(self.voxel_ijk[seen], self.shape))
+        voxels = np.flatnonzero(self.decoded[decoded]) + decoded.start - seen.start
+        return self.patches[seen], table, voxels.astype(np.int32)
+
+
+def _cropped(voxel_ijk: IntArray, shape: tuple[int, int, int]) -> tuple[IntArray, tuple[int, ...]]:
+    """Return voxels counted from the first plane in which there is one, and so many planes."""
+    first, last = int(voxel_ijk[0, 0]), int(voxel_ijk[-1, 0])
+    return voxel_ijk - np.array([first, 0, 0], np.int32), (last - first + 1, *shape[1:])
 
 
 def survey(grid: SdfGrid, offset: float = 0.0, bound: int | None = None) -> Band:

@@ -7,8 +7,8 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 
@@ -80,12 +80,19 @@ def run_python(words: Sequence[str]) -> tuple[float, float, str]:
     return float(seconds), int(peak) * kilobyte / 1e6, printed
 
 
-def time_shape(shape: Shape, setting: Setting, options: Sequence[str] = ()) -> Row:
-    """Time the command on a shape's grid: median seconds of ``RUNS`` after one not counted."""
+@contextmanager
+def grid_file(shape: Shape, setting: Setting) -> Iterator[Path]:
+    """Yield a file with a shape's grid, in a folder that is removed afterwards."""
     case = Case(shape, setting)
     with tempfile.TemporaryDirectory() as folder:
         grid = Path(folder) / "grid.npz"
         np.savez(grid, values=case.coarse, spacing=case.spacing, origin=case.grid.origin)
+        yield grid
+
+
+def time_shape(shape: Shape, setting: Setting, options: Sequence[str] = ()) -> Row:
+    """Time the command on a shape's grid: median seconds of ``RUNS`` after one not counted."""
+    with grid_file(shape, setting) as grid:
         words = ["upsample", str(grid), str(grid.with_suffix(".ply")), "--force", "--quiet"]
         words += ["--inside", "negative", "--factor", str(setting.factor), *options]
         run_command(words)  # files into the cache
