@@ -75,43 +75,41 @@ class Writer:
 
 def replace_blocks(graph: onnx.GraphProto, blocks: list[IntBlock]) -> None:
     """Put the blocks in the place of a graph's own, the Scan nodes in their order."""
-    scans = [node for node in graph.node if node.op_type == "Scan"][: len(blocks)]  # then the head
+    scans = [node for node in graph.node if node.op_type == "Scan"]
     graph.initializer.append(numpy_helper.from_array(np.float32(1), ONE))
     graph.initializer.append(numpy_helper.from_array(np.uint8(0), NONE))
-    for scan, block in zip(scans, blocks, strict=True):
+    for scan, block in zip(scans[1:-1], blocks, strict=True):  # between stem and head
         body = next(attribute.g for attribute in scan.attribute if attribute.name == "body")
-        replace_padding(graph, body.node[0].input[0], block)
-        replace_body(body, block)
+        round_features(graph, body, block)
+        replace_layers(body, block)
 
 
-def replace_padding(graph: onnx.GraphProto, padded: str, block: IntBlock) -> None:
-    """Round the features before the row of absent neighbours, which is exactly zero, is added."""
-    number, concat = next((n, node) for n, node in enumerate(graph.node) if padded in node.output)
-    writer = Writer(f"{padded}_")
-    scaled = writer.op("Mul", concat.input[0], writer.constant(1 / block.steps, "rates"))
+def round_features(graph: onnx.GraphProto, body: onnx.GraphProto, block: IntBlock) -> None:
+    """Let a block gather rounded features: absent ones, exactly zero, become the block's zeros."""
+    gather = body.node[1]  # after that of the table
+    features = gather.input[0]
+    writer = Writer(f"{body.name}_features_")
+    scaled = writer.op("Mul", features, writer.constant(1 / block.steps, "rates"))
     moved = writer.op("Add", scaled, writer.constant(block.zeros.astype(np.float32), "zeros"))
-    absent = writer.constant(block.zeros[None], "absent")
-    float_zeros = next(array for array in graph.initializer if array.name == concat.input[1])
-    graph.initializer.remove(float_zeros)
-    del concat.input[:]
-    concat.input.extend([writer.quantize(moved), absent])
+    gather.input[0] = writer.quantize(moved)
+    number = next(n for n, node in enumerate(graph.node) if features in node.output)
     for node in reversed(writer.nodes):
-        graph.node.insert(number, node)
+        graph.node.insert(number + 1, node)
     graph.initializer.extend(writer.constants)
 
 
-def replace_body(body: onnx.GraphProto, block: IntBlock) -> None:
-    """Keep how neighbours are gathered, and do the rest in whole numbers."""
-    gather, reshape = body.node[:2]
+def replace_layers(body: onnx.GraphProto, block: IntBlock) -> None:
+    """Keep how a block gathers neighbours and adds its change; make the change in whole numbers."""
+    table, gather, reshape, *layers, kept, added = body.node
     shape = next(array for array in body.initializer if array.name == reshape.input[1])
     writer = Writer(f"{body.name}_int8_")
     value = reshape.output[0]
     for label, layer in (("conv", block.conv), ("expand", block.expand)):
         value = writer.quantize(writer.op("Relu", writer.layer(value, layer, label)))
     writer.layer(value, block.reduce, "reduce")
-    writer.nodes[-1].output[0] = body.output[0].name
-    kept = [gather, reshape, *writer.nodes]
+    writer.nodes[-1].output[0] = layers[-1].output[0]
+    nodes = [table, gather, reshape, *writer.nodes, kept, added]
     constants = [shape, *writer.constants]
     del body.node[:], body.initializer[:]
-    body.node.extend(kept)
+    body.node.extend(nodes)
     body.initializer.extend(constants)

@@ -6,10 +6,12 @@
 The second writes a file's weights and card anew in the graph of today, and keeps it only if it
 gives the same values, bit for bit.
 
-The graph is written by hand because of one thing an exporter would not do: each neighbour
-convolution runs as a Scan over chunks of the neighbour table. Gathered rows are 27 times as large
-as the features; chunk by chunk they stay in cache and need no memory to speak of. Standard
-operators only.
+The graph is written by hand because of one thing an exporter would not do: every layer runs as a
+Scan over chunks of the voxels. Gathered rows are 27 times as large as the features; chunk by chunk
+they stay in cache and need no memory to speak of. The voxels are filled up to whole chunks, and by
+one at least, with absent ones, whose features are kept 0: the last of them is what the index -1 of
+the neighbour table means. So a block reads one array of features and writes the next, and there is
+nothing else of that size. Standard operators only.
 
 A chunk that suits a processor's cache keeps a GPU waiting for the next one. So its size is an
 initializer that is an input as well: who runs the file may override it.
@@ -89,15 +91,14 @@ class Graph:
 def build_graph(net: SuperSdfNet) -> onnx.GraphProto:
     """Write the network as a graph."""
     graph = Graph(net)
-    features = graph.layer(graph.relu(graph.layer("patches", net.stem[0])), net.stem[2])
     rows = graph.op("Shape", "patches", start=0, end=1)
-    chunks = chunked_table(graph, rows)
+    numbers, there = chunked_voxels(graph, rows)
+    features, excess = scan_stem(graph, net, numbers, there)
     for number in range(len(net.blocks)):
-        change = scan_block(graph, net, number, features, chunks, rows)
-        features = graph.op("Add", features, change)
+        features = scan_block(graph, net, number, features, numbers, there)
     per_offset = graph.op("Concat", trunk(graph, net), interpolation(graph), axis=1)
     transposed = graph.op("Transpose", per_offset, perm=[1, 0])
-    scan_head(graph, net, features, transposed)
+    scan_head(graph, net, flat(graph, features, net.config.channels), excess, transposed)
     graph.constants.append(numpy_helper.from_array(np.array([CHUNK], np.int64), CHUNK_INPUT))
     return helper.make_graph(graph.nodes, "super_sdf", inputs(), [output()], graph.constants)
 
@@ -118,43 +119,89 @@ def output() -> onnx.ValueInfoProto:
     return helper.make_tensor_value_info("values", TensorProto.FLOAT, ["D", "Q"])
 
 
-def chunked_table(graph: Graph, rows: str) -> str:
-    """Fill the neighbour table up with absent rows and cut it into (n, chunk, 27)."""
-    partial = graph.op("Mod", rows, CHUNK_INPUT)
-    missing = graph.op("Sub", CHUNK_INPUT, partial)  # 1 to a chunk: one row is spare
-    pads = graph.op("Concat", graph.integers(0, 0), missing, graph.integers(0), axis=0)
-    absent = graph.constant(np.array(-1, np.int32))
-    filled = graph.op("Pad", "neighbours", pads, absent)
-    shape = graph.op("Concat", graph.integers(-1), CHUNK_INPUT, graph.integers(27), axis=0)
-    return graph.op("Reshape", filled, shape)
+def fill_up(graph: Graph, count: str, size: str) -> str:
+    """Return how many rows are wanting to whole chunks, 1 to a chunk."""
+    return graph.op("Sub", size, graph.op("Mod", count, size))
+
+
+def chunked_voxels(graph: Graph, rows: str) -> tuple[str, str]:
+    """Return the voxels' numbers (n, chunk), and 1 where there is one, else 0, (n, chunk, 1).
+
+    Absent ones have the number of the last.
+    """
+    zero, one = (graph.constant(np.array(number, np.int64)) for number in (0, 1))
+    count = graph.op("Squeeze", rows)
+    end = graph.op("Squeeze", graph.op("Add", rows, fill_up(graph, rows, CHUNK_INPUT)))
+    numbers = graph.op("Range", zero, end, one)
+    there = graph.op("Cast", graph.op("Less", numbers, count), to=TensorProto.FLOAT)
+    present = graph.op("Min", numbers, graph.op("Sub", count, one))
+    shape = graph.op("Concat", graph.integers(-1), CHUNK_INPUT, axis=0)
+    column = graph.op("Concat", shape, graph.integers(1), axis=0)
+    return graph.op("Reshape", present, shape), graph.op("Reshape", there, column)
+
+
+def flat(graph: Graph, chunks: str, *width: int) -> str:
+    """Return chunks as one array, the absent rows at its end."""
+    return graph.op("Reshape", chunks, graph.integers(-1, *width))
+
+
+def rows_of(name: str, kind: int, *width: int | str) -> onnx.ValueInfoProto:
+    """Declare a chunk of rows, in the body of a Scan."""
+    return helper.make_tensor_value_info(name, kind, ["rows", *width])
+
+
+def scan_stem(graph: Graph, net: SuperSdfNet, numbers: str, there: str) -> tuple[str, str]:
+    """Add the stem; return features (n, chunk, C), and by how much samples are no distances.
+
+    The latter, (n chunk,), is for ``noisy_voxels``.
+    """
+    body, channels = Graph(net, "stem_"), net.config.channels
+    patch = body.op("Gather", "patches", "some", axis=0)
+    made = body.layer(body.relu(body.layer(patch, net.stem[0])), net.stem[2])
+    features = body.op("Mul", made, "there")
+    centre = body.op("Gather", patch, body.integers(CENTRE), axis=1)
+    apart = body.op("Abs", body.op("Sub", patch, centre))
+    beyond = body.op("Sub", apart, body.constant(REACH))
+    most = body.op("ReduceMax", beyond, body.integers(1), keepdims=1)
+    excess = body.op("Mul", most, "there")
+    given = [rows_of("some", TensorProto.INT64), rows_of("there", TensorProto.FLOAT, 1)]
+    results = [
+        rows_of(features, TensorProto.FLOAT, channels),
+        rows_of(excess, TensorProto.FLOAT, 1),
+    ]
+    subgraph = helper.make_graph(body.nodes, "stem", given, results, body.constants)
+    names = ["stem_features", "stem_excess"]
+    graph.nodes.append(
+        helper.make_node("Scan", [numbers, there], names, body=subgraph, num_scan_inputs=2)
+    )
+    return names[0], flat(graph, names[1])
 
 
 def scan_block(
-    graph: Graph, net: SuperSdfNet, number: int, features: str, chunks: str, rows: str
+    graph: Graph, net: SuperSdfNet, number: int, features: str, numbers: str, there: str
 ) -> str:
-    """Add a residual block without its sum, chunk by chunk; return (V, C)."""
+    """Add a residual block; return its features (n, chunk, C)."""
     block, channels = net.blocks[number], net.config.channels
-    zeros = graph.constant(np.zeros((1, channels), np.float32))
-    padded = graph.op("Concat", features, zeros, axis=0)  # index -1 is the row of zeros
+    everywhere = flat(graph, features, channels)
     body = Graph(net, f"block{number}_")
-    gathered = body.op("Gather", padded, "chunk", axis=0)
+    table = body.op("Gather", "neighbours", "some", axis=0)
+    gathered = body.op("Gather", everywhere, table, axis=0)
     columns = body.op("Reshape", gathered, body.integers(-1, 27 * channels))
     product = body.op("MatMul", columns, body.parameter(block.conv.weight))
     mixed = body.relu(body.op("Add", product, body.parameter(block.conv.bias)))
-    reduced = body.layer(body.relu(body.layer(mixed, block.expand)), block.reduce)
-    subgraph = helper.make_graph(
-        body.nodes,
-        f"block{number}",
-        [helper.make_tensor_value_info("chunk", TensorProto.INT32, ["rows", 27])],
-        [helper.make_tensor_value_info(reduced, TensorProto.FLOAT, ["rows", channels])],
-        body.constants,
-    )
-    stacked = graph.op("Scan", chunks, body=subgraph, num_scan_inputs=1)
-    flat = graph.op("Reshape", stacked, graph.integers(-1, channels))
-    return graph.op("Slice", flat, graph.integers(0), rows, graph.integers(0))
+    change = body.layer(body.relu(body.layer(mixed, block.expand)), block.reduce)
+    result = body.op("Add", "features_of_some", body.op("Mul", change, "there"))
+    given = [
+        rows_of("some", TensorProto.INT64),
+        rows_of("features_of_some", TensorProto.FLOAT, channels),
+        rows_of("there", TensorProto.FLOAT, 1),
+    ]
+    results = [rows_of(result, TensorProto.FLOAT, channels)]
+    subgraph = helper.make_graph(body.nodes, f"block{number}", given, results, body.constants)
+    return graph.op("Scan", numbers, features, there, body=subgraph, num_scan_inputs=3)
 
 
-def scan_head(graph: Graph, net: SuperSdfNet, features: str, per_offset: str) -> None:
+def scan_head(graph: Graph, net: SuperSdfNet, features: str, excess: str, per_offset: str) -> None:
     """Add the head, chunk by chunk of the voxels; its result is the output.
 
     What it makes for each voxel is five times as large as the features. A chunk has at least as
@@ -162,20 +209,17 @@ def scan_head(graph: Graph, net: SuperSdfNet, features: str, per_offset: str) ->
     """
     count, offsets = (graph.op("Shape", name, start=0, end=1) for name in ("voxels", "offsets"))
     size = graph.op("Max", CHUNK_INPUT, offsets)
-    missing = graph.op("Sub", size, graph.op("Mod", count, size))
-    first = graph.constant(np.array(0, np.int32))
-    filled = graph.op(
-        "Pad", "voxels", graph.op("Concat", graph.integers(0), missing, axis=0), first
-    )
+    pads = graph.op("Concat", graph.integers(0), fill_up(graph, count, size), axis=0)
+    filled = graph.op("Pad", "voxels", pads, graph.constant(np.array(0, np.int32)))
     chunks = graph.op("Reshape", filled, graph.op("Concat", graph.integers(-1), size, axis=0))
-    subgraph = head_body(net, features, per_offset, noisy_voxels(graph))
+    subgraph = head_body(net, features, excess, per_offset)
     stacked = graph.op("Scan", chunks, body=subgraph, num_scan_inputs=1)
-    flat = graph.op("Reshape", stacked, graph.op("Concat", graph.integers(-1), offsets, axis=0))
-    ends = [flat, graph.integers(0), count, graph.integers(0)]
+    whole = graph.op("Reshape", stacked, graph.op("Concat", graph.integers(-1), offsets, axis=0))
+    ends = [whole, graph.integers(0), count, graph.integers(0)]
     graph.nodes.append(helper.make_node("Slice", ends, ["values"]))
 
 
-def head_body(net: SuperSdfNet, features: str, per_offset: str, noisy: str) -> onnx.GraphProto:
+def head_body(net: SuperSdfNet, features: str, excess: str, per_offset: str) -> onnx.GraphProto:
     """Return the head of some voxels: coefficients times functions, and the correction."""
     body = Graph(net, "head_")
     chosen = body.op("Gather", features, "some", axis=0)
@@ -183,25 +227,19 @@ def head_body(net: SuperSdfNet, features: str, per_offset: str, noisy: str) -> o
     patches = body.op("Gather", "patches", "some", axis=0)
     per_voxel = body.op("Concat", chosen, branch, patches, axis=1)
     kept = body.op("MatMul", per_voxel, per_offset)
-    where = body.op("Gather", noisy, "some", axis=0)
-    correction = body.op("Mul", body.layer(chosen, net.correction), where)
+    correction = body.op("Mul", body.layer(chosen, net.correction), noisy_voxels(body, excess))
     values = body.op("Add", kept, correction)
-    given = helper.make_tensor_value_info("some", TensorProto.INT32, ["chunk"])
-    made = helper.make_tensor_value_info(values, TensorProto.FLOAT, ["chunk", "Q"])
+    given, made = rows_of("some", TensorProto.INT32), rows_of(values, TensorProto.FLOAT, "Q")
     return helper.make_graph(body.nodes, "head", [given], [made], body.constants)
 
 
-def noisy_voxels(graph: Graph) -> str:
-    """Add which voxels are noisy, (V, 1) of 0 and 1: see network.is_noisy."""
-    centre = graph.op("Gather", "patches", graph.integers(CENTRE), axis=1)
-    apart = graph.op("Abs", graph.op("Sub", "patches", centre))
-    excess = graph.op("Sub", apart, graph.constant(REACH))
-    most = graph.op("ReduceMax", excess, graph.integers(1), keepdims=0)
-    ended = graph.op("Concat", most, graph.constant(np.zeros(1, np.float32)), axis=0)
-    around = graph.op("Gather", ended, "neighbours", axis=0)
-    worst = graph.op("ReduceMax", around, graph.integers(1), keepdims=1)
-    above = graph.op("Greater", worst, graph.constant(np.float32(0)))
-    return graph.op("Cast", above, to=TensorProto.FLOAT)
+def noisy_voxels(body: Graph, excess: str) -> str:
+    """Add which of some voxels are noisy, (n, 1) of 0 and 1: see network.is_noisy."""
+    table = body.op("Gather", "neighbours", "some", axis=0)
+    around = body.op("Gather", excess, table, axis=0)
+    worst = body.op("ReduceMax", around, body.integers(1), keepdims=1)
+    above = body.op("Greater", worst, body.constant(np.float32(0)))
+    return body.op("Cast", above, to=TensorProto.FLOAT)
 
 
 def trunk(graph: Graph, net: SuperSdfNet) -> str:
