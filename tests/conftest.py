@@ -8,7 +8,7 @@ import numpy as np
 import onnxruntime as ort
 import pytest
 
-from super_sdf import SdfGrid
+from super_sdf import SdfGrid, plan
 from super_sdf.band import NEIGHBOURHOOD
 
 
@@ -72,6 +72,15 @@ def command(
         return code, out, err
 
     return run
+
+
+@pytest.fixture
+def bare_plan(monkeypatch):
+    """Let the plan count what grows with the surface, over 100 MB, and nothing else."""
+    stages = {name: (*row[:3], 0) for name, row in plan.STAGES.items()}
+    for name, value in (("STAGES", stages), ("CODE_BYTES", 0), ("MESH_BYTES", 0)):
+        monkeypatch.setattr(plan, name, value)
+    monkeypatch.setattr(plan, "held_memory", lambda: 10**8)
 
 
 @pytest.fixture

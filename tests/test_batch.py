@@ -461,21 +461,20 @@ def test_killed_on_the_way_it_goes_on(command):
 def test_a_dead_worker_costs_its_file_alone(run):
     larger_grids(6)
     folder, options = Path("out"), ConvertOptions(4, (1.0,), (0.0,))
-    jobs, dead = find_jobs(["in/more*.npy"], ".ply", options), []
+    jobs, victims = find_jobs(["in/more*.npy"], ".ply", options), []
     pool = Pool(iter(jobs), folder, Loading("fast", "float32", "cpu", 1), lambda job: None)
     results = []
     for result in pool.results(2):
         results.append(result)
-        if not dead:
-            dead = [worker.job for worker in pool.busy.values() if worker.job is not result.job][:1]
-            victim = next(w for w in pool.busy.values() if w.job is dead[0])
-            os.kill(victim.process.pid, signal.SIGKILL)
+        if not victims:
+            victims = list(pool.busy.values())[:1]
+            os.kill(victims[0].process.pid, signal.SIGKILL)
     assert sorted(r.job.target for r in results) == sorted(j.target for j in jobs)
     failed = [result for result in results if result.row["status"] != "ok"]
-    assert [result.job for result in failed] == dead and failed[0].row["retry"]
+    (job,) = [victim.job for victim in victims]  # what it was at in the end
+    assert [result.job for result in failed] == [job] and failed[0].row["retry"]
     assert failed[0].failure() == (
-        f"{dead[0].source}: the process that converted it died of SIGKILL (for want of memory, "
-        "mostly)"
+        f"{job.source}: the process that converted it died of SIGKILL (for want of memory, mostly)"
     )
     assert not list(folder.rglob(".*.part"))
 

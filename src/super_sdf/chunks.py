@@ -14,7 +14,7 @@ from typing import TypeVar
 
 Result = TypeVar("Result")
 
-CHUNK = 1 << 13  # rows
+CHUNK = 1 << 19  # numbers
 
 _threads: ContextVar[int] = ContextVar("threads", default=1)
 
@@ -34,9 +34,15 @@ def working_threads(number: int) -> Iterator[None]:
         _threads.reset(token)
 
 
-def in_chunks(count: int, work: Callable[[slice], Result], chunk: int = CHUNK) -> list[Result]:
-    """Return what ``work`` makes of ``count`` rows, chunk by chunk."""
-    return side_by_side([slice(n, min(n + chunk, count)) for n in range(0, count, chunk)], work)
+def rows_in_chunk(width: int) -> int:
+    """Return how many rows go at a time if so many numbers are made of each on the way."""
+    return max(CHUNK // width, 1)
+
+
+def in_chunks(count: int, width: int, work: Callable[[slice], Result]) -> list[Result]:
+    """Return what ``work`` makes of ``count`` rows, chunk by chunk; of each it makes ``width``."""
+    step = rows_in_chunk(width)
+    return side_by_side([slice(n, min(n + step, count)) for n in range(0, count, step)], work)
 
 
 def side_by_side(pieces: list[slice], work: Callable[[slice], Result]) -> list[Result]:

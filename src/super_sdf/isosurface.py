@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from .band import NEIGHBOURHOOD, STRIDES
 from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, triangle_table
-from .chunks import CHUNK, in_chunks, side_by_side
+from .chunks import in_chunks, rows_in_chunk, side_by_side
 from .compiling import compiled_twin
 from .field import FineField
 from .grid import BoolArray, FloatArray, IntArray, SdfGrid
@@ -60,7 +60,8 @@ def extract_pieces(field: FineField, grid: SdfGrid, first_vertex: int = 0) -> li
 def count_vertices(field: FineField) -> IntArray:
     """Return how many vertices belong to each voxel, (D,): those on crossed edges that it owns."""
     count = compiled_twin(_count_chunk)
-    return np.concatenate(in_chunks(len(field.voxel_ijk), lambda rows: count(field, rows)))
+    width = len(edges_of_block(field.factor).axis)
+    return np.concatenate(in_chunks(len(field.voxel_ijk), width, lambda rows: count(field, rows)))
 
 
 def _count_chunk(field: FineField, rows: slice) -> IntArray:
@@ -70,11 +71,12 @@ def _count_chunk(field: FineField, rows: slice) -> IntArray:
 
 
 def _groups(field: FineField) -> list[slice]:
-    """Cut a field's planes into runs of whole planes with about ``CHUNK`` voxels or one plane."""
+    """Cut a field's planes into runs of whole planes: one, or with about a chunk of voxels."""
     core = field.rows(*field.planes)
     plane = field.voxel_ijk[core, 0]
     starts = core.start + np.flatnonzero(np.diff(plane, prepend=plane[:1] - 1))
-    chosen = np.unique(np.searchsorted(starts, np.arange(core.start, core.stop, CHUNK)))
+    step = rows_in_chunk((field.factor + 1) ** 3)
+    chosen = np.unique(np.searchsorted(starts, np.arange(core.start, core.stop, step)))
     bounds = [*starts[chosen[chosen < len(starts)]].tolist(), core.stop]
     return [slice(a, b) for a, b in pairwise(bounds)]
 

@@ -126,7 +126,8 @@ def carry(
     """
     onto = np.zeros(finer.count, np.float32) if onto is None else onto
     carry_some = compiled_twin(_carry_chunk)
-    in_chunks(len(nodes.table), lambda rows: carry_some(values, nodes, finer, rows, onto))
+    width = (finer.factor + 1) ** 3
+    in_chunks(len(nodes.table), width, lambda rows: carry_some(values, nodes, finer, rows, onto))
     return onto
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import mmap
 from contextlib import suppress
 from pathlib import Path
@@ -13,6 +14,7 @@ from .errors import OutOfMemoryError
 
 # Of the memory that is free, what is taken unless told otherwise.
 SHARE = 0.6
+LARGE = 1_000_000  # bytes of an array that is given back at once, where memory is short
 
 
 def free_memory() -> int | None:
@@ -73,17 +75,35 @@ def held_memory(peak: bool = False) -> int | None:
     return int(sizes["VmHWM" if peak else "VmRSS"].split()[0]) * 1024
 
 
+def hold_less() -> None:
+    """Let this process hold what it uses and no more, from now on, at some cost in time.
+
+    The C library keeps what is freed, up to 32 MB in a piece, for later. Told how large a piece is
+    to come from the system and go back to it, it no longer learns to keep larger ones. What it
+    keeps already is given back. Nothing happens where the library has no such calls (not glibc).
+    """
+    trim_threshold, mmap_threshold = -1, -3  # glibc's malloc.h
+    with suppress(OSError, AttributeError, TypeError):  # the last: Windows knows no CDLL(None)
+        library = ctypes.CDLL(None)
+        library.mallopt(mmap_threshold, LARGE)
+        library.mallopt(trim_threshold, 2 * LARGE)
+        library.malloc_trim(0)
+
+
 def forget_peak() -> None:
     """Count the peak of memory from now on; where the system cannot, it stays the process's.
 
     What was freed is given back first, for else it would be used again unseen.
     """
-    import ctypes
-
-    with suppress(OSError, AttributeError):
+    with suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
+
+
+def in_words(size: int) -> str:
+    """Return a number of bytes as users read it, and as ``--max-memory`` takes it."""
+    return f"{size / 1e9:,.2f} GB" if size >= 1e9 else f"{size / 1e6:,.0f} MB"
 
 
 def check_fits(need: int, what: str, way_out: str) -> None:
@@ -91,5 +111,5 @@ def check_fits(need: int, what: str, way_out: str) -> None:
     free = free_memory()
     if free is not None and need > free:
         raise OutOfMemoryError(
-            f"{what} needs {need / 1e9:,.2f} GB of memory, {free / 1e9:,.2f} GB are free; {way_out}"
+            f"{what} needs {in_words(need)} of memory, {in_words(free)} are free; {way_out}"
         )

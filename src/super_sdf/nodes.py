@@ -146,7 +146,8 @@ def average_shared(blocks: FloatArray, nodes: SharedNodes) -> FloatArray:
     """
     values = np.empty(nodes.count, np.float32)
     average = compiled_twin(_average_chunk)
-    in_chunks(len(blocks), lambda rows: average(blocks, nodes, rows, values))
+    count, width = blocks.shape
+    in_chunks(count, width, lambda rows: average(blocks, nodes, rows, values))
     return values
 
 
@@ -200,7 +201,7 @@ def signs_of_skipped(
         skipped = (table[rows] < 0) & ((beside >= 0) & (beside < shape)).all(2)
         signs[rows] = np.where(patches[voxels[rows]] > 0, skipped, -skipped.astype(np.int8))
 
-    in_chunks(len(table), fill)
+    in_chunks(len(table), 3 * 27, fill)
     return signs
 
 

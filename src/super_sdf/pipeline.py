@@ -25,7 +25,7 @@ from .errors import GridError
 from .field import FineField, border_is_crossed
 from .grid import FloatArray, IntArray, SdfGrid
 from .isosurface import extract_pieces
-from .memory import memory_bound
+from .memory import hold_less, memory_bound
 from .mesh import Mesh, join_meshes
 from .nodes import (
     average_shared,
@@ -188,6 +188,8 @@ def reconstruct_slabs(
     vertices = 0
     seen: set[bool] = set()
     for slab in slabs:
+        if len(slabs) > 1:
+            hold_less()
         with working_threads(threads):
             field = refine(band, network, factor, slab, steps)
             whole = close_at_border(field, grid, offset) if cap else field

@@ -18,27 +18,24 @@ import numpy as np
 
 from .compiling import is_loaded
 from .errors import OutOfMemoryError
-from .memory import held_memory
+from .memory import held_memory, hold_less, in_words
 from .spheres import REACH_IN_VOXELS
 from .survey import Band
 
 FINAL_BESIDE = 1
 DECODED_BESIDE = FINAL_BESIDE + REACH_IN_VOXELS
 # What a process takes at the most in each stage, measured (``benchmarks.large``), in bytes: for
-# each voxel that the network sees, for each that is decoded, for each node of a decoded block.
+# each voxel that the network sees, for each that is decoded, for each node of a decoded block, and
+# for chunks in work, whatever the grid.
 STAGES = {
-    "network": (1450, 0, 8.0),
-    "average": (108, 800, 7.5),
-    "fit and mesh": (108, 1110, 2.6),
+    "network": (680, 0, 8.0, 5e6),
+    "average": (108, 375, 7.2, 2e7),
+    "fit and mesh": (108, 850, 4.7, 2e7),
 }
 # The mesh of the slab before, which may still be in use, for each cell of a face of a block.
 MESH_BYTES = 19
-# What is freed after a slab is not all given back: with several, a process holds a little more.
-FRAGMENTS = 1.06
-# Chunks in work, whatever the grid.
-WORK_BYTES = 35_000_000
 # Compiled functions, which come from the disk as they are called.
-CODE_BYTES = 30_000_000
+CODE_BYTES = 60_000_000
 
 
 @dataclass(frozen=True)
@@ -92,20 +89,24 @@ def plan_slabs(
         if bound is not None and need > bound:
             raise _does_not_fit(band, factor, "at once", need, bound)
         return [whole(band)]
+    if bound is None or peak_bytes(band, [whole(band)], factor) <= bound:
+        return [whole(band)]
+    hold_less()
     for slabs in ways_to_cut(band, receptive_field):
         need = peak_bytes(band, slabs, factor)
-        if bound is None or need <= bound:
+        if need <= bound:
             return slabs
-    assert bound is not None
     raise _does_not_fit(band, factor, "even plane by plane", need, bound)
 
 
 def peak_bytes(band: Band, slabs: list[Slab], factor: int) -> int:
     """Return what the process will hold at the most: now, and for the largest slab."""
-    held = held_memory() or band.patches.nbytes + WORK_BYTES
-    mesh_before = max(band.count_decoded(slab.decoded) for slab in slabs) * MESH_BYTES * factor**2
+    held = held_memory() or band.patches.nbytes
     need = held + max(slab_bytes(band, slab, factor) for slab in slabs)
-    return need if len(slabs) == 1 else int(FRAGMENTS * (need + mesh_before))
+    if len(slabs) == 1:
+        return need
+    largest = max(band.count_decoded(slab.decoded) for slab in slabs)
+    return need + largest * MESH_BYTES * factor**2
 
 
 def cut(band: Band, pieces: int, receptive_field: int) -> list[Slab]:
@@ -136,15 +137,14 @@ def slab_bytes(band: Band, slab: Slab, factor: int) -> int:
     """Return what a process takes for a slab beside what it holds already, at the most."""
     seen = slab.seen.stop - slab.seen.start
     decoded = band.count_decoded(slab.decoded)
-    sizes = np.array([seen, decoded, decoded * (factor + 1) ** 3])
-    work = WORK_BYTES + CODE_BYTES * is_loaded()
-    return work + int((np.array(list(STAGES.values())) @ sizes).max())
+    sizes = np.array([seen, decoded, decoded * (factor + 1) ** 3, 1])
+    return CODE_BYTES * is_loaded() + int((np.array(list(STAGES.values())) @ sizes).max())
 
 
 def _does_not_fit(band: Band, factor: int, how: str, need: int, bound: int) -> OutOfMemoryError:
     """Return the error for work that is too large."""
     return OutOfMemoryError(
-        f"factor {factor} on {int(band.decoded_before[-1]):,} voxels needs {need / 1e9:,.2f} GB of "
-        f"memory {how}, {bound / 1e9:,.2f} GB may be taken; use a smaller factor, or allow more "
+        f"factor {factor} on {int(band.decoded_before[-1]):,} voxels needs {in_words(need)} of "
+        f"memory {how}, {in_words(bound)} may be taken; use a smaller factor, or allow more "
         "(--max-memory)"
     )

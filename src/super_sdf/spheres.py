@@ -37,6 +37,8 @@ DISAGREEMENT = 0.5  # how much the variance of what foot points say speaks again
 FLAT = 0.7  # the largest slope towards a neighbour; that of a distance is near 1
 MOST_NOISY = 0.02  # share of samples that are no distances: beyond, none is taken for exact
 
+MADE = 128  # numbers for each sample, on the way to its foot point
+
 # Planes of voxels to both sides that a block's fitted values depend on: what is said round it, by
 # samples one voxel on, given what was said one voxel further, whose tries read blocks as far again.
 REACH_IN_VOXELS = 5
@@ -92,7 +94,7 @@ def exact_samples(patches: FloatArray, lipschitz: BoolArray) -> BoolArray:
     sample = patches[:, CENTRE]
     limits = np.float32(sample.min()), np.float32(sample.max())
     near = np.abs(sample) < FARTHEST
-    cut_off = in_chunks(len(patches), lambda rows: is_cut_off(patches[rows], limits))
+    cut_off = in_chunks(len(patches), 27, lambda rows: is_cut_off(patches[rows], limits))
     exact: BoolArray = lipschitz & near & ~np.concatenate(cut_off)
     return exact
 
@@ -115,7 +117,7 @@ def find_foot_points(values: FloatArray, nodes: SharedNodes, samples: Samples) -
     sphere that touches is outside everywhere else.
     """
     find = compiled_twin(_find_chunk)
-    parts = in_chunks(len(samples.exact), lambda chunk: find(values, nodes, samples, chunk))
+    parts = in_chunks(len(samples.exact), MADE, lambda chunk: find(values, nodes, samples, chunk))
     rows, place, value, cosine = (np.concatenate(arrays, -1) for arrays in zip(*parts))
     return weighted_feet(rows, place, value, cosine)
 
@@ -170,7 +172,7 @@ def weighted_feet(
 def mean_at_nodes(feet: Said, nodes: SharedNodes) -> FloatArray:
     """Return for each node, (count,), what the foot points in the cells round it say."""
     sums = sums_at_nodes(feet, nodes)
-    return np.concatenate(in_chunks(nodes.count, lambda some: agreed_mean(*sums[:, some])))
+    return np.concatenate(in_chunks(nodes.count, 3, lambda some: agreed_mean(*sums[:, some])))
 
 
 def agreed_mean(

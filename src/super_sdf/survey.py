@@ -23,7 +23,7 @@ from .band import (
 from .chunks import side_by_side
 from .errors import OutOfMemoryError
 from .grid import BoolArray, FloatArray, IntArray, SdfGrid
-from .memory import release_pages
+from .memory import in_words, release_pages
 from .spheres import exact_samples
 
 BYTES_PER_VOXEL = 123  # of a band
@@ -132,7 +132,7 @@ def _check_bound(voxels: int, planes: int, bound: int | None) -> None:
     if bound is not None and voxels * BYTES_PER_VOXEL > bound:
         raise OutOfMemoryError(
             f"the band of the first {planes:,} planes has {voxels:,} voxels already, which alone "
-            f"take {voxels * BYTES_PER_VOXEL / 1e9:,.2f} GB of memory, {bound / 1e9:,.2f} GB may "
+            f"take {in_words(voxels * BYTES_PER_VOXEL)} of memory, {in_words(bound)} may "
             "be taken; is this a distance field? If so, allow more (--max-memory)"
         )
 
