@@ -1,10 +1,11 @@
 """What people do today, beside us: dense upsampling and marching cubes, in the same run.
 
-    python -m benchmarks.against MESH.ply --sizes 64 128 [--rfta 32]
+    python -m benchmarks.against MESH.ply --sizes 64 128 [--rfta 32] [-- --max-memory 145M]
 
 Whole processes, one after the other: read an .npy file, refine it four times, write a PLY file.
 SciPy's ``zoom`` of the whole grid, cubic or trilinear, to the same fine nodes, and scikit-image's
 marching cubes; Reach for the Arcs (extra ``peers``) at sizes given apart, for it takes minutes.
+What follows ``--`` goes to ``super-sdf``, in a row of its own.
 """
 
 from __future__ import annotations
@@ -60,17 +61,16 @@ def convert_by_peer(source: str, target: str, factor: str, order: str) -> None:
         convert_densely(source, target, int(factor), int(order))
 
 
-def commands(grid: Path, factor: int) -> dict[str, list[str]]:
-    """Return the arguments of Python for each method."""
+def commands(grid: Path, factor: int, options: list[str]) -> dict[str, list[str]]:
+    """Return the arguments of Python for each method, ours with further options among them."""
     target = str(grid.with_suffix(".ply"))
     words = ["upsample", str(grid), target, "--force", "--quiet", "--inside", "negative"]
     words += ["--spacing", str(1 / int(grid.stem)), "--origin", "0", "--factor", str(factor)]
     ours = ["-m", "super_sdf.cli", *words]
     dense = ["-m", "benchmarks.against", "--worker", str(grid), target, str(factor)]
+    variants = [[], ["--precision", "int8"], ["--quality", "fast"], options]
     return {
-        "super-sdf": ours,
-        "super-sdf --precision int8": [*ours, "--precision", "int8"],
-        "super-sdf --quality fast": [*ours, "--quality", "fast"],
+        **{" ".join(["super-sdf", *more]): [*ours, *more] for more in variants},
         **{name: [*dense, str(order)] for name, order in ORDERS.items()},
     }
 
@@ -108,14 +108,15 @@ def main() -> None:
     parser.add_argument("--rfta", type=int, nargs="*", default=[], help="sizes for that method")
     parser.add_argument("--factor", type=int, default=4)
     parser.add_argument("--runs", type=int, default=3)
-    asked = parser.parse_args()
+    asked, options = parser.parse_known_args()
+    options = [word for word in options if word != "--"]
     print(f"{describe_machine()}; {asked.mesh.stem}, factor {asked.factor}\n")
     print("| grid | method | s | peak MB | time over ours | memory over ours |")
     print("| --- | --- | ---: | ---: | ---: | ---: |")
     with tempfile.TemporaryDirectory() as name:
         for size in sorted({*asked.sizes, *asked.rfta}):
             grid = sample(asked.mesh, size, Path(name))
-            methods = commands(grid, asked.factor)
+            methods = commands(grid, asked.factor, options)
             found = {method: median_of(words, asked.runs) for method, words in methods.items()}
             if size in asked.rfta:
                 found[RFTA] = median_of([*methods["SciPy zoom, cubic"][:-1], "rfta"], 1)

@@ -11,7 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import onnx
-from onnx import helper, numpy_helper
+from onnx import numpy_helper
+
+from export.writer import Writer
 
 ONE = "int8_one"
 NONE = "int8_none"
@@ -37,25 +39,8 @@ class IntBlock:
     reduce: IntLayer
 
 
-class Writer:
-    """Nodes and constants in the making, with a prefix; every method returns a value's name."""
-
-    def __init__(self, prefix: str) -> None:
-        self.prefix = prefix
-        self.nodes: list[onnx.NodeProto] = []
-        self.constants: list[onnx.TensorProto] = []
-
-    def op(self, kind: str, *inputs: str, **attributes: int) -> str:
-        """Add a node with one output."""
-        name = f"{self.prefix}{kind.lower()}_{len(self.nodes)}"
-        self.nodes.append(helper.make_node(kind, inputs, [name], name=name, **attributes))
-        return name
-
-    def constant(self, array: np.ndarray, label: str) -> str:
-        """Add a constant."""
-        name = f"{self.prefix}{label}"
-        self.constants.append(numpy_helper.from_array(np.asarray(array), name))
-        return name
+class IntWriter(Writer):
+    """A part of the graph, with layers on whole numbers."""
 
     def quantize(self, value: str) -> str:
         """Round to 0 to 255; what is below or above is cut off."""
@@ -88,7 +73,7 @@ def round_features(graph: onnx.GraphProto, body: onnx.GraphProto, block: IntBloc
     """Let a block gather rounded features: absent ones, exactly zero, become the block's zeros."""
     gather = body.node[1]  # after that of the table
     features = gather.input[0]
-    writer = Writer(f"{body.name}_features_")
+    writer = IntWriter(f"{body.name}_features_")
     scaled = writer.op("Mul", features, writer.constant(1 / block.steps, "rates"))
     moved = writer.op("Add", scaled, writer.constant(block.zeros.astype(np.float32), "zeros"))
     gather.input[0] = writer.quantize(moved)
@@ -102,7 +87,7 @@ def replace_layers(body: onnx.GraphProto, block: IntBlock) -> None:
     """Keep how a block gathers neighbours and adds its change; make the change in whole numbers."""
     table, gather, reshape, *layers, kept, added = body.node
     shape = next(array for array in body.initializer if array.name == reshape.input[1])
-    writer = Writer(f"{body.name}_int8_")
+    writer = IntWriter(f"{body.name}_int8_")
     value = reshape.output[0]
     for label, layer in (("conv", block.conv), ("expand", block.expand)):
         value = writer.quantize(writer.op("Relu", writer.layer(value, layer, label)))

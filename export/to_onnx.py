@@ -30,6 +30,7 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 
 from export.network import NetworkConfig, SuperSdfNet
+from export.writer import Writer
 from super_sdf.band import CENTRE, REACH, find_band, gather_patches, neighbour_table
 from super_sdf.device import CHUNK_INPUT
 from super_sdf.network import FORMAT_VERSION, load_network
@@ -40,26 +41,12 @@ CHUNK = 512  # rows of the neighbour table at a time; 256 to 2048 differ by a fe
 PARITY = 2e-4  # half voxels: 1e-4 of a voxel
 
 
-class Graph:
-    """Nodes and constants of an ONNX graph in the making; every method returns a value's name."""
+class Graph(Writer):
+    """A part of the graph, with the network's parameters and layers."""
 
     def __init__(self, net: SuperSdfNet, prefix: str = "") -> None:
-        self.prefix = prefix
+        super().__init__(prefix)
         self.names = {id(tensor): name for name, tensor in net.named_parameters()}
-        self.nodes: list[onnx.NodeProto] = []
-        self.constants: list[onnx.TensorProto] = []
-
-    def op(self, kind: str, *inputs: str, **attributes: Any) -> str:
-        """Add a node with one output."""
-        name = f"{self.prefix}{kind.lower()}_{len(self.nodes)}"
-        self.nodes.append(helper.make_node(kind, inputs, [name], name=name, **attributes))
-        return name
-
-    def constant(self, array: Any) -> str:
-        """Add a constant."""
-        name = f"{self.prefix}constant_{len(self.constants)}"
-        self.constants.append(numpy_helper.from_array(np.asarray(array), name))
-        return name
 
     def integers(self, *numbers: int) -> str:
         """Add a constant of int64."""

@@ -169,6 +169,7 @@ class Total:
             self.counts.update(piece.counts)
             self.counts |= Counter(piece.whole)
             yield from piece.meshes
+            del piece  # before the next is made
             watch.lap("write")
 
 

@@ -200,6 +200,7 @@ def reconstruct_slabs(
         vertices += piece.counts["vertices"]
         seen |= piece.signs
         yield piece
+        del piece  # before the next is made
     if len(seen) < 2:
         raise no_surface(grid, offset)
 

@@ -30,10 +30,9 @@ DECODED_BESIDE = FINAL_BESIDE + REACH_IN_VOXELS
 STAGES = {
     "network": (680, 0, 8.0, 5e6),
     "average": (108, 375, 7.2, 2e7),
-    "fit and mesh": (108, 850, 4.7, 2e7),
+    "fit": (108, 850, 3.3, 2e7),
+    "isosurface": (108, 140, 5.7, 2e7),
 }
-# The mesh of the slab before, which may still be in use, for each cell of a face of a block.
-MESH_BYTES = 19
 # Compiled functions, which come from the disk as they are called.
 CODE_BYTES = 60_000_000
 
@@ -102,11 +101,7 @@ def plan_slabs(
 def peak_bytes(band: Band, slabs: list[Slab], factor: int) -> int:
     """Return what the process will hold at the most: now, and for the largest slab."""
     held = held_memory() or band.patches.nbytes
-    need = held + max(slab_bytes(band, slab, factor) for slab in slabs)
-    if len(slabs) == 1:
-        return need
-    largest = max(band.count_decoded(slab.decoded) for slab in slabs)
-    return need + largest * MESH_BYTES * factor**2
+    return held + max(slab_bytes(band, slab, factor) for slab in slabs)
 
 
 def cut(band: Band, pieces: int, receptive_field: int) -> list[Slab]:

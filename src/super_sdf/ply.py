@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from .mesh import Mesh
 
 CHUNK = 1 << 18  # vertices or faces written at a time
-SPOOL_BYTES = 16_000_000  # triangles that wait in memory before they go to a file beside
+SPOOL_BYTES = 4_000_000  # triangles that wait in memory before they go to a file beside
 HEADER_BYTES = 320
 
 
@@ -35,7 +35,7 @@ def write_ply(pieces: Iterable[Mesh], path: Path) -> None:
             number = "double" if piece.vertices.dtype == np.float64 else "float"
             vertices, faces = vertices + len(piece.vertices), faces + len(piece.faces)
         waiting.seek(0)
-        shutil.copyfileobj(waiting, file, SPOOL_BYTES // 4)
+        shutil.copyfileobj(waiting, file, SPOOL_BYTES)
         file.seek(0)
         file.write(_ply_header(number, vertices, faces))
 
