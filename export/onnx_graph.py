@@ -1,0 +1,253 @@
+"""The network as an ONNX graph.
+
+It is written by hand because of one thing an exporter would not do: every layer runs as a Scan over
+chunks of the voxels. Gathered rows are 27 times as large as the features; chunk by chunk they stay
+in cache and need no memory to speak of. The voxels are filled up to whole chunks, and by one at
+least, with absent ones, whose features are kept 0: the last of them is what the index -1 of the
+neighbour table means. So a block reads one array of features and writes the next, and there is
+nothing else of that size. Standard operators only.
+
+A chunk that suits a processor's cache keeps a GPU waiting for the next one. So its size is an
+initializer that is an input as well: who runs the file may override it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import onnx
+import torch
+from onnx import TensorProto, helper, numpy_helper
+
+from export.network import SuperSdfNet
+from export.writer import Writer
+from super_sdf.band import CENTRE, REACH
+from super_sdf.device import CHUNK_INPUT
+
+CHUNK = 512  # voxels at a time; 256 to 2048 differ by a few percent on a CPU
+
+
+class Graph(Writer):
+    """A part of the graph, with the network's parameters and layers."""
+
+    def __init__(self, net: SuperSdfNet, prefix: str = "") -> None:
+        super().__init__(prefix)
+        self.names = {id(tensor): name for name, tensor in net.named_parameters()}
+
+    def integers(self, *numbers: int) -> str:
+        """Add a constant of int64."""
+        return self.constant(np.array(numbers, np.int64))
+
+    def parameter(self, tensor: torch.Tensor, *, transposed: bool = False) -> str:
+        """Add a parameter of the network, under its name there: ``read_weights`` finds it so."""
+        array = tensor.detach().numpy()
+        name = self.names[id(tensor)]
+        self.constants.append(
+            numpy_helper.from_array(array.T.copy() if transposed else array, name)
+        )
+        return name
+
+    def layer(self, value: str, layer: torch.nn.Linear) -> str:
+        """Add a linear layer (torch keeps its weight transposed)."""
+        product = self.op("MatMul", value, self.parameter(layer.weight, transposed=True))
+        return self.op("Add", product, self.parameter(layer.bias))
+
+    def relu(self, value: str) -> str:
+        """Add a rectifier."""
+        return self.op("Relu", value)
+
+    def silu(self, value: str) -> str:
+        """Add ``x sigmoid(x)``."""
+        return self.op("Mul", value, self.op("Sigmoid", value))
+
+
+def build_graph(net: SuperSdfNet) -> onnx.GraphProto:
+    """Write the network as a graph."""
+    graph = Graph(net)
+    rows = graph.op("Shape", "patches", start=0, end=1)
+    numbers, there = chunked_voxels(graph, rows)
+    features, excess = scan_stem(graph, net, numbers, there)
+    for number in range(len(net.blocks)):
+        features = scan_block(graph, net, number, features, numbers, there)
+    per_offset = graph.op("Concat", trunk(graph, net), interpolation(graph), axis=1)
+    transposed = graph.op("Transpose", per_offset, perm=[1, 0])
+    scan_head(graph, net, flat(graph, features, net.config.channels), excess, transposed)
+    graph.constants.append(numpy_helper.from_array(np.array([CHUNK], np.int64), CHUNK_INPUT))
+    return helper.make_graph(graph.nodes, "super_sdf", inputs(), [output()], graph.constants)
+
+
+def inputs() -> list[onnx.ValueInfoProto]:
+    """Return the declared inputs; the last has a default."""
+    return [
+        helper.make_tensor_value_info("patches", TensorProto.FLOAT, ["V", 27]),
+        helper.make_tensor_value_info("neighbours", TensorProto.INT32, ["V", 27]),
+        helper.make_tensor_value_info("voxels", TensorProto.INT32, ["D"]),
+        helper.make_tensor_value_info("offsets", TensorProto.FLOAT, ["Q", 3]),
+        helper.make_tensor_value_info(CHUNK_INPUT, TensorProto.INT64, [1]),
+    ]
+
+
+def output() -> onnx.ValueInfoProto:
+    """Return the declared output."""
+    return helper.make_tensor_value_info("values", TensorProto.FLOAT, ["D", "Q"])
+
+
+def fill_up(graph: Graph, count: str, size: str) -> str:
+    """Return how many rows are wanting to whole chunks, 1 to a chunk."""
+    return graph.op("Sub", size, graph.op("Mod", count, size))
+
+
+def chunked_voxels(graph: Graph, rows: str) -> tuple[str, str]:
+    """Return the voxels' numbers (n, chunk), and 1 where there is one, else 0, (n, chunk, 1).
+
+    Absent ones have the number of the last.
+    """
+    zero, one = (graph.constant(np.array(number, np.int64)) for number in (0, 1))
+    count = graph.op("Squeeze", rows)
+    end = graph.op("Squeeze", graph.op("Add", rows, fill_up(graph, rows, CHUNK_INPUT)))
+    numbers = graph.op("Range", zero, end, one)
+    there = graph.op("Cast", graph.op("Less", numbers, count), to=TensorProto.FLOAT)
+    present = graph.op("Min", numbers, graph.op("Sub", count, one))
+    shape = graph.op("Concat", graph.integers(-1), CHUNK_INPUT, axis=0)
+    column = graph.op("Concat", shape, graph.integers(1), axis=0)
+    return graph.op("Reshape", present, shape), graph.op("Reshape", there, column)
+
+
+def flat(graph: Graph, chunks: str, *width: int) -> str:
+    """Return chunks as one array, the absent rows at its end."""
+    return graph.op("Reshape", chunks, graph.integers(-1, *width))
+
+
+def rows_of(name: str, kind: int, *width: int | str) -> onnx.ValueInfoProto:
+    """Declare a chunk of rows, in the body of a Scan."""
+    return helper.make_tensor_value_info(name, kind, ["rows", *width])
+
+
+def scan_stem(graph: Graph, net: SuperSdfNet, numbers: str, there: str) -> tuple[str, str]:
+    """Add the stem; return features (n, chunk, C), and by how much samples are no distances.
+
+    The latter, (n chunk,), is for ``noisy_voxels``.
+    """
+    body, channels = Graph(net, "stem_"), net.config.channels
+    patch = body.op("Gather", "patches", "some", axis=0)
+    made = body.layer(body.relu(body.layer(patch, net.stem[0])), net.stem[2])
+    features = body.op("Mul", made, "there")
+    centre = body.op("Gather", patch, body.integers(CENTRE), axis=1)
+    apart = body.op("Abs", body.op("Sub", patch, centre))
+    beyond = body.op("Sub", apart, body.constant(REACH))
+    most = body.op("ReduceMax", beyond, body.integers(1), keepdims=1)
+    excess = body.op("Mul", most, "there")
+    given = [rows_of("some", TensorProto.INT64), rows_of("there", TensorProto.FLOAT, 1)]
+    results = [
+        rows_of(features, TensorProto.FLOAT, channels),
+        rows_of(excess, TensorProto.FLOAT, 1),
+    ]
+    subgraph = helper.make_graph(body.nodes, "stem", given, results, body.constants)
+    names = ["stem_features", "stem_excess"]
+    graph.nodes.append(
+        helper.make_node("Scan", [numbers, there], names, body=subgraph, num_scan_inputs=2)
+    )
+    return names[0], flat(graph, names[1])
+
+
+def scan_block(
+    graph: Graph, net: SuperSdfNet, number: int, features: str, numbers: str, there: str
+) -> str:
+    """Add a residual block; return its features (n, chunk, C)."""
+    block, channels = net.blocks[number], net.config.channels
+    everywhere = flat(graph, features, channels)
+    body = Graph(net, f"block{number}_")
+    table = body.op("Gather", "neighbours", "some", axis=0)
+    gathered = body.op("Gather", everywhere, table, axis=0)
+    columns = body.op("Reshape", gathered, body.integers(-1, 27 * channels))
+    product = body.op("MatMul", columns, body.parameter(block.conv.weight))
+    mixed = body.relu(body.op("Add", product, body.parameter(block.conv.bias)))
+    change = body.layer(body.relu(body.layer(mixed, block.expand)), block.reduce)
+    result = body.op("Add", "features_of_some", body.op("Mul", change, "there"))
+    given = [
+        rows_of("some", TensorProto.INT64),
+        rows_of("features_of_some", TensorProto.FLOAT, channels),
+        rows_of("there", TensorProto.FLOAT, 1),
+    ]
+    results = [rows_of(result, TensorProto.FLOAT, channels)]
+    subgraph = helper.make_graph(body.nodes, f"block{number}", given, results, body.constants)
+    return graph.op("Scan", numbers, features, there, body=subgraph, num_scan_inputs=3)
+
+
+def scan_head(graph: Graph, net: SuperSdfNet, features: str, excess: str, per_offset: str) -> None:
+    """Add the head, chunk by chunk of the voxels; its result is the output.
+
+    What it makes for each voxel is five times as large as the features. A chunk has at least as
+    many rows as there are offsets: of fewer, sums would depend on the number of threads.
+    """
+    count, offsets = (graph.op("Shape", name, start=0, end=1) for name in ("voxels", "offsets"))
+    size = graph.op("Max", CHUNK_INPUT, offsets)
+    pads = graph.op("Concat", graph.integers(0), fill_up(graph, count, size), axis=0)
+    filled = graph.op("Pad", "voxels", pads, graph.constant(np.array(0, np.int32)))
+    chunks = graph.op("Reshape", filled, graph.op("Concat", graph.integers(-1), size, axis=0))
+    subgraph = head_body(net, features, excess, per_offset)
+    stacked = graph.op("Scan", chunks, body=subgraph, num_scan_inputs=1)
+    whole = graph.op("Reshape", stacked, graph.op("Concat", graph.integers(-1), offsets, axis=0))
+    ends = [whole, graph.integers(0), count, graph.integers(0)]
+    graph.nodes.append(helper.make_node("Slice", ends, ["values"]))
+
+
+def head_body(net: SuperSdfNet, features: str, excess: str, per_offset: str) -> onnx.GraphProto:
+    """Return the head of some voxels: coefficients times functions, and the correction."""
+    body = Graph(net, "head_")
+    chosen = body.op("Gather", features, "some", axis=0)
+    branch = body.relu(body.layer(chosen, net.branch))
+    patches = body.op("Gather", "patches", "some", axis=0)
+    per_voxel = body.op("Concat", chosen, branch, patches, axis=1)
+    kept = body.op("MatMul", per_voxel, per_offset)
+    correction = body.op("Mul", body.layer(chosen, net.correction), noisy_voxels(body, excess))
+    values = body.op("Add", kept, correction)
+    given, made = rows_of("some", TensorProto.INT32), rows_of(values, TensorProto.FLOAT, "Q")
+    return helper.make_graph(body.nodes, "head", [given], [made], body.constants)
+
+
+def noisy_voxels(body: Graph, excess: str) -> str:
+    """Add which of some voxels are noisy, (n, 1) of 0 and 1: see network.is_noisy."""
+    table = body.op("Gather", "neighbours", "some", axis=0)
+    around = body.op("Gather", excess, table, axis=0)
+    worst = body.op("ReduceMax", around, body.integers(1), keepdims=1)
+    above = body.op("Greater", worst, body.constant(np.float32(0)))
+    return body.op("Cast", above, to=TensorProto.FLOAT)
+
+
+def trunk(graph: Graph, net: SuperSdfNet) -> str:
+    """Add the functions of the offset, (Q, functions)."""
+    origin = torch.zeros(1, 3)
+    at_sample = graph.constant(net.trunk.raw(origin).detach().numpy())
+    waves = graph.constant(net.trunk.waves.numpy())
+    angles = graph.op("Mul", graph.op("Unsqueeze", "offsets", graph.integers(2)), waves)
+    flat = graph.op("Flatten", angles, axis=1)
+    value = graph.op("Concat", "offsets", graph.op("Sin", flat), graph.op("Cos", flat), axis=1)
+    first, _, second, _, last = net.trunk.layers
+    value = graph.silu(graph.layer(value, first))
+    value = graph.silu(graph.layer(value, second))
+    functions = graph.op("Sub", graph.layer(value, last), at_sample)
+    # Exactly 0 at the sample, however that was rounded: samples that are 0 must stay 0.
+    length = graph.op("ReduceMax", graph.op("Abs", "offsets"), graph.integers(1), keepdims=1)
+    elsewhere = graph.op("Greater", length, graph.constant(np.float32(0)))
+    return graph.op("Mul", functions, graph.op("Cast", elsewhere, to=TensorProto.FLOAT))
+
+
+def interpolation(graph: Graph) -> str:
+    """Add the weights (Q, 27) of quadratic interpolation: see network.interpolation_weights."""
+    at = graph.op("Mul", "offsets", graph.constant(np.float32(0.5)))
+    half = graph.op("Mul", at, graph.constant(np.float32(0.5)))
+    square = graph.op("Mul", at, at)
+    half_square = graph.op("Mul", square, graph.constant(np.float32(0.5)))
+    below = graph.op("Sub", half_square, half)
+    middle = graph.op("Sub", graph.constant(np.float32(1)), square)
+    above = graph.op("Add", half_square, half)
+    axis = graph.integers(2)
+    parts = [graph.op("Unsqueeze", part, axis) for part in (below, middle, above)]
+    weights = graph.op("Concat", *parts, axis=2)  # (Q, 3, 3)
+    x, y, z = (
+        graph.op("Gather", weights, graph.constant(np.array(n, np.int64)), axis=1) for n in range(3)
+    )
+    x = graph.op("Unsqueeze", x, graph.integers(2, 3))
+    y = graph.op("Unsqueeze", y, graph.integers(1, 3))
+    z = graph.op("Unsqueeze", z, graph.integers(1, 2))
+    return graph.op("Flatten", graph.op("Mul", graph.op("Mul", x, y), z), axis=1)
