@@ -40,6 +40,7 @@ def files(tmp_path_factory, samples):
 
 def test_a_rounded_layer_is_near_and_zero_is_exact():
     rng = np.random.default_rng(0)
+    torch.manual_seed(0)
     weight, bias = torch.randn(27 * 4, 5), torch.randn(5)
     steps, zeros = rng.uniform(0.01, 0.02, 4), rng.integers(0, 255, 4)
     layer = whole_layer(weight, bias, np.tile(steps, 27), np.full(5, 0.5), zeros)
