@@ -90,7 +90,7 @@ def plan_slabs(
         return [whole(band)]
     if bound is None or peak_bytes(band, [whole(band)], factor) <= bound:
         return [whole(band)]
-    hold_less()
+    hold_less()  # else what was freed counts as held
     for slabs in ways_to_cut(band, receptive_field):
         need = peak_bytes(band, slabs, factor)
         if need <= bound:
