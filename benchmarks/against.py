@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.options import parse
 from benchmarks.stages import sample
 from super_sdf.errors import SuperSdfError
 from super_sdf.evaluation.timing import describe_machine, run_python
@@ -108,8 +109,7 @@ def main() -> None:
     parser.add_argument("--rfta", type=int, nargs="*", default=[], help="sizes for that method")
     parser.add_argument("--factor", type=int, default=4)
     parser.add_argument("--runs", type=int, default=3)
-    asked, options = parser.parse_known_args()
-    options = [word for word in options if word != "--"]
+    asked, options = parse(parser)
     print(f"{describe_machine()}; {asked.mesh.stem}, factor {asked.factor}\n")
     print("| grid | method | s | peak MB | time over ours | memory over ours |")
     print("| --- | --- | ---: | ---: | ---: | ---: |")

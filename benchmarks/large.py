@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.options import parse
 from super_sdf.errors import SuperSdfError
 from super_sdf.evaluation.timing import describe_machine, run_python
 
@@ -64,8 +65,7 @@ def main() -> None:
     parser.add_argument("grids", type=Path, nargs="*", help=".npy files")
     parser.add_argument("--analytic", type=int, nargs="*", default=[], help="sizes of a torus")
     parser.add_argument("--max-memory", nargs="+", default=["4G"], help="bounds to try")
-    asked, options = parser.parse_known_args()
-    options = [word for word in options if word != "--"]
+    asked, options = parse(parser)
     print(f"{describe_machine()}\n")
     print(
         "| grid | bound | slabs | band voxels | triangles | s | after the network | peak MB | "

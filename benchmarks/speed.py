@@ -16,6 +16,7 @@ import statistics
 import time
 from pathlib import Path
 
+from benchmarks.options import parse
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.evaluation.cases import Setting, Shape
 from super_sdf.evaluation.measuring import Row
@@ -46,8 +47,9 @@ def main() -> None:
     parser.add_argument("--shapes", type=int, default=10, help="how many, spread over them")
     parser.add_argument("--factor", type=int, default=4)
     parser.add_argument("--warm", action="store_true", help="in this process")
-    parser.add_argument("options", nargs="*", help="further options of the command, after --")
-    asked = parser.parse_args()
+    asked, options = parse(parser)
+    if asked.warm and options:
+        parser.error("with --warm the command is not run: leave its options away")
     paths = spread(find_meshes(asked.meshes), asked.shapes)
     network = load_network() if asked.warm else None
 
@@ -55,7 +57,7 @@ def main() -> None:
         shape = Shape.read(path)
         if network:
             return time_warm(shape, setting, network)
-        return time_shape(shape, setting, asked.options)
+        return time_shape(shape, setting, options)
 
     print(f"{describe_machine()}; {len(paths)} shapes, factor {asked.factor}, median of {RUNS}\n")
     print("| grid | mean s | slowest s | peak MB |\n| --- | ---: | ---: | ---: |")

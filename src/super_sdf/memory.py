@@ -87,7 +87,13 @@ def hold_less() -> None:
         library = ctypes.CDLL(None)
         library.mallopt(mmap_threshold, LARGE)
         library.mallopt(trim_threshold, 2 * LARGE)
-        library.malloc_trim(0)
+    _give_back()
+
+
+def _give_back() -> None:
+    """Give the system back what was freed, where the C library has such a call."""
+    with suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def forget_peak() -> None:
@@ -95,8 +101,7 @@ def forget_peak() -> None:
 
     What was freed is given back first, for else it would be used again unseen.
     """
-    with suppress(OSError, AttributeError, TypeError):
-        ctypes.CDLL(None).malloc_trim(0)
+    _give_back()
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
 
