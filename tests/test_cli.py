@@ -266,12 +266,12 @@ def test_targets_are_checked_before_the_work(here, command, target):
 
 
 def test_a_folder_without_permission_is_named(here, command, monkeypatch):
-    monkeypatch.setattr("super_sdf.io.os.access", lambda path, mode: False)
+    monkeypatch.setattr("super_sdf.files.output.os.access", lambda path, mode: False)
     want = "Error: out.ply cannot be written: no permission in .\n"
     assert command("upsample", "in.npy", "out.ply") == (1, "", want)
 
 
-@pytest.mark.parametrize("stage", ["pipeline.refine", "pipeline.extract_pieces", "io.write_ply"])
+@pytest.mark.parametrize("stage", ["pipeline.refine", "pipeline.extract_pieces", "files.meshes.write_ply"])
 def test_an_interrupt_at_any_stage_leaves_nothing(here, command, monkeypatch, stage):
     def interrupt(*_, **__):
         raise KeyboardInterrupt

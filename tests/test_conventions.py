@@ -5,8 +5,8 @@ import pytest
 from conftest import ball
 
 from super_sdf.band import rescale
-from super_sdf.conventions import make_grid, surface_gradients, typical_length
 from super_sdf.errors import GridError, OptionError
+from super_sdf.files.conventions import make_grid, surface_gradients, typical_length
 from super_sdf.grid import SdfGrid
 
 

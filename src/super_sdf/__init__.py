@@ -16,9 +16,9 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from .errors import SuperSdfError as SuperSdfError
     from .field import FineField as FineField
+    from .files.grids import read_grid as read_grid
+    from .files.meshes import write_mesh as write_mesh
     from .grid import SdfGrid as SdfGrid
-    from .io import read_grid as read_grid
-    from .io import write_mesh as write_mesh
     from .isosurface import extract_mesh as extract_mesh
     from .mesh import Mesh as Mesh
     from .network import load_network as load_network
@@ -32,10 +32,10 @@ _HOME = {
     "SuperSdfError": "errors",
     "extract_mesh": "isosurface",
     "load_network": "network",
-    "read_grid": "io",
+    "read_grid": "files.grids",
     "reconstruct": "pipeline",
     "upsample": "pipeline",
-    "write_mesh": "io",
+    "write_mesh": "files.meshes",
 }
 __all__ = sorted([*_HOME, "__version__"])
 

@@ -73,7 +73,7 @@ class Upsampling:
     def work(self) -> None:
         """Check what is asked, load the network, convert."""
         from .convert import Stopwatch, convert
-        from .io import check_target
+        from .files.meshes import check_target
         from .network import load_network
         from .nodes import check_factor
 

@@ -74,7 +74,7 @@ def render(sources: tuple[Path, ...], target: Path, **options: Any) -> None:
     MESH is any file that trimesh reads; a single .npy or .npz grid is drawn as a cross-section in
     false colours with its zero line, as it is and as super-sdf refines it. No display is needed.
     """
-    from .io import GRID_SUFFIXES
+    from .files.grids import GRID_SUFFIXES
 
     with one_line_errors():
         check_extra("render")
@@ -87,7 +87,7 @@ def render(sources: tuple[Path, ...], target: Path, **options: Any) -> None:
 
 def check_picture(target: Path, *, force: bool) -> None:
     """Raise if a picture cannot be written there; asked before the work starts."""
-    from .io import check_free
+    from .files.output import check_free
 
     if target.suffix.lower() != ".png":
         raise OptionError(f"{target} is no picture file: give .png")
@@ -114,7 +114,7 @@ def render_meshes(sources: tuple[Path, ...], target: Path, options: dict[str, An
 def render_grid(sources: tuple[Path, ...], target: Path, options: dict[str, Any]) -> None:
     """Draw a grid's section before and after upsampling."""
     from .evaluation.sections import render_section
-    from .io import read_grid
+    from .files.grids import read_grid
     from .network import load_network
     from .pipeline import upsample
 

@@ -68,7 +68,7 @@ def run_sample(source: Path, target: Path, options: dict[str, Any]) -> None:
     from .evaluation.metrics import normalise
     from .evaluation.sampling import fitted_layout, sample_solid, unit_layout
     from .evaluation.solid import Solid, load_solid
-    from .io import check_grid_target, write_grid
+    from .files.grids import check_grid_target, write_grid
 
     start = time.perf_counter()
     check_grid_target(target, force=options["force"])

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from .files.grids import read_grid
+from .files.meshes import write_pieces
 from .grid import SdfGrid, Triple
-from .io import read_grid, write_pieces
 from .mesh import Mesh
 from .pipeline import Decoder, Piece, Progress, reconstruct_slabs, step_name
 

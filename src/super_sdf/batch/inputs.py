@@ -13,7 +13,8 @@ from pathlib import Path, PurePath
 
 from ..convert import ConvertOptions
 from ..errors import OptionError
-from ..io import GRID_SUFFIXES, check_mesh_suffix
+from ..files.grids import GRID_SUFFIXES
+from ..files.meshes import check_mesh_suffix
 from .job import Job
 from .manifest import read_manifest
 

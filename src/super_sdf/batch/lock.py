@@ -90,7 +90,7 @@ def read_begun(folder: Path) -> set[str]:
 def remove_parts(targets: Iterable[Path], pid: int | None = None) -> None:
     """Remove what ended processes, or the one given, left of unfinished files.
 
-    The names are those of ``io.replacing``.
+    The names are those of ``files.output.replacing``.
     """
     names_in: dict[Path, set[str]] = {}
     for target in targets:

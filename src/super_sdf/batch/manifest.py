@@ -14,10 +14,10 @@ from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any
 
-from ..conventions import INSIDE
 from ..convert import ConvertOptions
 from ..errors import FileError, OptionError
-from ..io import MESH_SUFFIXES
+from ..files.conventions import INSIDE
+from ..files.meshes import MESH_SUFFIXES
 from ..nodes import check_factor
 from .job import Job
 

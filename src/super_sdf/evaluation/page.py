@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, MaxNLocator
 from numpy.typing import NDArray
 
-from ..io import replacing
+from ..files.output import replacing
 
 Image = NDArray[np.uint8]
 

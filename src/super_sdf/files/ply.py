@@ -12,7 +12,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .mesh import Mesh
+from ..mesh import Mesh
 
 CHUNK = 1 << 18  # vertices or faces written at a time
 SPOOL_BYTES = 4_000_000  # triangles that wait in memory before they go to a file beside

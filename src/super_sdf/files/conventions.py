@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import GridError, OptionError
-from .grid import SdfGrid, Triple, check_spacing, check_values
-from .memory import release_pages
+from ..errors import GridError, OptionError
+from ..grid import SdfGrid, Triple, check_spacing, check_values
+from ..memory import release_pages
 
 INSIDE = ("auto", "negative", "positive")
 SNAP = 0.02  # an estimate this near to a usual spacing is taken for it

@@ -1,18 +1,13 @@
-"""Grids from files, meshes to files. Files are checked before they are read, and appear whole.
+"""Grids from files, and to them: ``.npy`` (an array) and ``.npz``.
 
-Grids: ``.npy`` (an array) and ``.npz`` (keys ``values``, and optionally ``spacing``, ``origin``).
-Meshes: ``.ply`` by our own ``ply``; ``.stl .obj .off .glb .3mf`` by trimesh, which wants two
-more packages for the last (extra ``3mf``).
+The keys of the latter are ``values`` and, optionally, ``spacing`` and ``origin``. Files are checked
+before they are read.
 """
 
 from __future__ import annotations
 
-import os
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
-from importlib.util import find_spec
 from math import prod
 from pathlib import Path
 from typing import IO, Any
@@ -21,16 +16,13 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from ..errors import FileError, GridError, OptionError, SuperSdfError
+from ..grid import SdfGrid
+from ..memory import check_fits
 from .conventions import make_grid
-from .errors import FileError, GridError, OptionError, SuperSdfError, WriteError
-from .grid import SdfGrid
-from .memory import check_fits
-from .mesh import Mesh, join_meshes
-from .ply import write_ply
+from .output import check_free, replacing
 
 GRID_SUFFIXES = (".npy", ".npz")
-MESH_SUFFIXES = (".ply", ".stl", ".obj", ".off", ".glb", ".3mf")
-NEEDED_FOR_3MF = ("lxml", "networkx")
 NPZ_KEYS = ("values", "spacing", "origin")
 
 
@@ -134,67 +126,12 @@ def _check_promise(
         check_fits(size, f"{name}, {said},", "save it as .npy, which is read piece by piece")
 
 
-def check_target(path: str | Path, *, force: bool = False) -> Path:
-    """Return the path of a mesh file to be if it can be written; asked before the work starts."""
-    check_mesh_suffix(Path(path))
-    return check_free(Path(path), force=force)
-
-
-def check_mesh_suffix(path: Path) -> None:
-    """Raise if the suffix is no mesh file's, or if what writes such files is not installed."""
-    if path.suffix.lower() not in MESH_SUFFIXES:
-        raise OptionError(f"{path} is no mesh file: give one of {', '.join(MESH_SUFFIXES)}")
-    if path.suffix.lower() == ".3mf" and not all(map(find_spec, NEEDED_FOR_3MF)):
-        needed = " and ".join(NEEDED_FOR_3MF)
-        raise FileError(f"writing .3mf needs {needed}: pip install 'super-sdf[3mf]'")
-
-
 def check_grid_target(path: str | Path, *, force: bool = False) -> Path:
     """Return the path of a grid file to be if it can be written; asked before the work starts."""
     path = Path(path)
     if path.suffix.lower() != ".npz":
         raise OptionError(f"{path} is no grid file that keeps spacing and origin: give .npz")
     return check_free(path, force=force)
-
-
-def check_free(path: Path, *, force: bool = False) -> Path:
-    """Return the path if a file can be made there."""
-    if path.is_dir():
-        raise WriteError(f"{path} is a folder: give a file")
-    if path.exists() and not force:
-        raise WriteError(f"{path} exists: remove it or use --force")
-    if not path.parent.is_dir():
-        raise WriteError(f"{path.parent} is no folder: make it first")
-    if not os.access(path.parent, os.W_OK):
-        raise WriteError(f"{path} cannot be written: no permission in {path.parent}")
-    return path
-
-
-def write_mesh(mesh: Mesh, path: str | Path, *, force: bool = False) -> None:
-    """Write a mesh; the suffix tells the format.
-
-    Raises
-    ------
-    OptionError
-        If the suffix is unknown.
-    FileError
-        If the file exists and ``force`` is not set, or cannot be written.
-    """
-    write_pieces([mesh], path, force=force)
-
-
-def write_pieces(pieces: Iterable[Mesh], path: str | Path, *, force: bool = False) -> None:
-    """Write a mesh that comes in pieces, whose triangles use the vertices of all pieces so far.
-
-    To a ``.ply`` file each piece is written as it comes; for other formats all are kept until the
-    last. Otherwise as ``write_mesh``.
-    """
-    path = check_target(path, force=force)
-    with replacing(path) as part:
-        if path.suffix.lower() == ".ply":
-            write_ply(pieces, part)
-        else:
-            _write_by_trimesh(join_meshes(list(pieces)), part, path.suffix.lower()[1:])
 
 
 def write_grid(grid: SdfGrid, path: str | Path, *, force: bool = False) -> None:
@@ -210,27 +147,3 @@ def write_grid(grid: SdfGrid, path: str | Path, *, force: bool = False) -> None:
     path = check_grid_target(path, force=force)
     with replacing(path) as part, part.open("wb") as file:
         np.savez(file, values=grid.values, spacing=grid.spacing, origin=grid.origin)
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Yield a path beside the target; it takes the target's place only if all goes well.
-
-    What the system has against it is raised as WriteError.
-    """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        yield part
-        os.replace(part, path)
-    except OSError as error:
-        raise WriteError(f"{path} cannot be written: {error.strerror or error}") from error
-    finally:
-        part.unlink(missing_ok=True)
-
-
-def _write_by_trimesh(mesh: Mesh, path: Path, file_type: str) -> None:
-    """Write one of trimesh's formats."""
-    import trimesh
-
-    copy = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    copy.export(path, file_type=file_type)

@@ -1,0 +1,1 @@
+"""Grids from files, meshes to files, and what an array says of where it lies."""
