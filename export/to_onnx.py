@@ -19,6 +19,8 @@ import onnx
 import torch
 from onnx import helper, numpy_helper
 
+from export.calibration import draw_samples
+from export.dormant import dormant_share
 from export.network import NetworkConfig, SuperSdfNet
 from export.onnx_graph import build_graph
 from super_sdf.band import find_band, gather_patches, neighbour_table
@@ -27,6 +29,7 @@ from super_sdf.nodes import block_offsets
 
 OPSET = 18
 PARITY = 2e-4  # half voxels: 1e-4 of a voxel
+DORMANT = 0.01  # share of the rectified units that may react to nothing
 
 
 def read_weights(path: Path) -> dict[str, torch.Tensor]:
@@ -120,6 +123,22 @@ def read_network(path: Path) -> SuperSdfNet:
     return net.eval()
 
 
+def check_awake(net: SuperSdfNet) -> None:
+    """Refuse a network whose units have died: what it has learnt would fit into a smaller one.
+
+    Raises
+    ------
+    SystemExit
+        If more than ``DORMANT`` of the rectified units react to no voxel of procedural shapes.
+    """
+    share = dormant_share(net, [[sample] for sample in draw_samples()])
+    if share > DORMANT:
+        raise SystemExit(
+            f"{100 * share:.1f} % of the rectified units react to nothing, "
+            f"{100 * DORMANT:g} % may: train on, with --start and --rate; nothing was written"
+        )
+
+
 def make_card(net: SuperSdfNet, name: str, data: str, accuracy: str) -> dict[str, Any]:
     """Return the metadata that the runtime shows."""
     commit = subprocess.run(
@@ -154,6 +173,7 @@ def main() -> None:
         rewrite(options.source, options.out)
         return
     net = load_run(options.run)
+    check_awake(net)
     write_model(net, options.out, make_card(net, options.out.stem, options.data, options.accuracy))
     difference = parity(net, options.out)
     if difference > PARITY:

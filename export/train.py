@@ -4,11 +4,12 @@
     python -m export.train --store training/store --run training/run --minutes 90     # goes on
     python -m export.train --store training/store --run training/run --device cuda    # a GPU
     python -m export.train ... --start models/base.onnx --rate 0.7      # on from there
+    python -m export.train ... --start models/base.onnx --blocks 9      # and three blocks more
 
 A run folder holds ``checkpoint.pt`` (weights, averaged weights, optimisers, time spent),
-``log.csv`` and ``loss.png``. The learning rate follows the share of ``--minutes`` that is spent, so
-a run always ends annealed, however fast the machine. New shards in the store are picked up as they
-appear.
+``log.csv`` and ``loss.png``. Units that react to nothing are started again (``dormant``). The
+learning rate follows the share of ``--minutes`` that is spent, so a run always ends annealed,
+however fast the machine. New shards in the store are picked up as they appear.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import argparse
 import copy
 import csv
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,16 +28,20 @@ from torch import Tensor
 
 from export.augment import USUAL, Prepared, augment, prepare
 from export.dataset import CORNERS, Sample, read_shard
+from export.dormant import dormant_share, revive
 from export.network import SIZES, SuperSdfNet
 from export.recipe import RECIPE, Recipe, differences, loss_of, make_optimisers, rate_factor
 from export.to_onnx import read_weights
 
 CHECKPOINT_SECONDS = 180
 LOG_STEPS = 100
+REVIVE_STEPS = 300
+REVIVE_UNTIL = 0.8  # of the budget: what is started again has to learn
+WATCHED = 4  # batches that a unit must react to, to count as awake
 HELD_OUT = 2  # shards, the first by name: the loss on them is logged
 NEAR = 0.5  # half voxels from the surface, where normals are measured; values within half of it
 
-LOG_COLUMNS = ("step", "seconds", "samples", "loss", "held-out", "near", "normal")
+LOG_COLUMNS = ("step", "seconds", "samples", "loss", "held-out", "near", "normal", "dormant")
 
 
 def predict(net: SuperSdfNet, batch: list[Prepared]) -> list[tuple[Tensor, Tensor]]:
@@ -120,9 +125,13 @@ class Run:
             self.step, self.seconds = state["step"], state["seconds"]
 
     def start_from(self, weights: dict[str, Tensor]) -> None:
-        """Begin with the weights of another network of the same sizes."""
-        self.net.load_state_dict(weights)
-        self.average.load_state_dict(weights)
+        """Begin with the values of another network, of the same sizes or with fewer blocks."""
+        new = self.net.load_state_dict(weights, strict=False).missing_keys
+        with torch.no_grad():
+            for name, parameter in self.net.named_parameters():
+                if name in new and ".reduce." in name:  # a block that changes nothing yet
+                    parameter.zero_()
+        self.average.load_state_dict(self.net.state_dict())
 
     def advance(self, batch: list[Prepared], spent: float) -> float:
         """Take one step at the rate for this share of the budget; return the loss."""
@@ -183,6 +192,9 @@ def train(run: Run, store: Store, minutes: float, seed: int) -> None:
         start = time.monotonic()
         losses.append(run.advance(store.draw_batch(rng, run.recipe), run.seconds / (60 * minutes)))
         run.seconds += time.monotonic() - start
+        if run.step % REVIVE_STEPS == 1 and run.seconds < REVIVE_UNTIL * 60 * minutes:
+            batches = [store.draw_batch(rng, run.recipe) for _ in range(WATCHED)]
+            revive(run.net, run.optimisers, batches)
         if run.step % LOG_STEPS == 0:
             log(run, store, float(np.mean(losses)))
             losses.clear()
@@ -199,6 +211,7 @@ def log(run: Run, store: Store, loss: float) -> None:
     if run.step % (10 * LOG_STEPS) == 0:
         errors = measure(run.average, store.held_out)
         row += [f"{errors.everywhere:.5f}", f"{errors.near:.5f}", f"{errors.normal:.5f}"]
+        row += [f"{dormant_share(run.net, [[sample] for sample in store.held_out]):.4f}"]
         plot_log(run.path.parent)
     with (run.path.parent / "log.csv").open("a", newline="") as file:
         csv.writer(file).writerow(row)
@@ -215,12 +228,13 @@ def read_log(folder: Path) -> np.ndarray:
 def plot_log(folder: Path) -> None:
     """Draw loss and held-out errors against minutes as ``loss.png``."""
     columns = dict(zip(LOG_COLUMNS, read_log(folder).T))
-    figure = Figure(figsize=(9, 4), layout="constrained")
-    for ax, names in zip(figure.subplots(1, 2), (["loss"], ["held-out", "near", "normal"])):
+    figure = Figure(figsize=(12, 4), layout="constrained")
+    panels = (["loss"], ["held-out", "near", "normal"], ["dormant"])
+    for ax, names in zip(figure.subplots(1, 3), panels):
         for name in names:
             measured = np.isfinite(columns[name])
             ax.plot(columns["seconds"][measured] / 60, columns[name][measured], label=name)
-        ax.set(xlabel="minutes", yscale="log")
+        ax.set(xlabel="minutes", yscale="linear" if "dormant" in names else "log")
         ax.legend()
     figure.savefig(folder / "loss.png", dpi=100)
 
@@ -232,6 +246,7 @@ def main() -> None:
     parser.add_argument("--run", type=Path, required=True, help="folder of the run")
     parser.add_argument("--size", choices=SIZES, default="base", help="of the network")
     parser.add_argument("--start", type=Path, help="an .onnx file of that size to start from")
+    parser.add_argument("--blocks", type=int, help="of the network, if not as many as its size has")
     parser.add_argument("--minutes", type=float, default=90.0, help="of training, in all")
     parser.add_argument("--rate", type=float, default=1.0, help="times the usual learning rates")
     parser.add_argument("--noisy", type=float, default=USUAL.noisy, help="share of the samples")
@@ -241,7 +256,9 @@ def main() -> None:
     options.run.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(options.seed)
     recipe = RECIPE.at(options.rate, options.noisy)
-    run = Run(options.run, SuperSdfNet(SIZES[options.size]), recipe, options.device)
+    config = SIZES[options.size]
+    config = replace(config, blocks=options.blocks or config.blocks)
+    run = Run(options.run, SuperSdfNet(config), recipe, options.device)
     if options.start:
         run.start_from(read_weights(options.start))
     run.resume()

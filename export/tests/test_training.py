@@ -30,6 +30,7 @@ from export.dataset import (
     signed_distance,
     write_shard,
 )
+from export.dormant import dormant_share, moments, rectified_layers, revive
 from export.latency import ball, microseconds
 from export.network import (
     GatherMatMul,
@@ -38,9 +39,10 @@ from export.network import (
     interpolation_weights,
     is_noisy,
 )
-from export.recipe import RECIPE, differences, rate_factor
+from export.recipe import RECIPE, differences, make_optimisers, rate_factor
 from export.shapes import random_solid
 from export.to_onnx import (
+    check_awake,
     make_card,
     noisy_ball,
     parity,
@@ -373,3 +375,61 @@ def test_training_can_start_from_an_onnx_file(tmp_path):
     run.start_from(read_weights(tmp_path / "small.onnx"))
     for one, other in zip(net.parameters(), run.average.parameters()):
         torch.testing.assert_close(one, other)
+
+
+def test_a_deeper_network_starts_with_the_values_of_the_file(tmp_path):
+    net = small_net()
+    write_model(net, tmp_path / "small.onnx", make_card(net, "small", "nothing", "none"))
+    run = Run(tmp_path, SuperSdfNet(replace(SMALL, blocks=SMALL.blocks + 2)))
+    run.start_from(read_weights(tmp_path / "small.onnx"))
+    arrays = [torch.from_numpy(array) for array in noisy_ball()]
+    with torch.no_grad():
+        torch.testing.assert_close(run.net(*arrays), net(*arrays))
+        torch.testing.assert_close(run.average(*arrays), net(*arrays))
+
+
+def put_to_sleep(net, units=3):
+    """Let some units of every rectified layer react to nothing."""
+    with torch.no_grad():
+        for entry in rectified_layers(net):
+            entry.bias[:units] = -1e4
+
+
+def test_dormant_units_are_counted_and_start_again_without_a_change(samples):
+    net, batch = small_net(), [prepare(samples[0])]
+    layers = rectified_layers(net)
+    units = sum(len(entry.bias) for entry in layers)
+    put_to_sleep(net)
+    assert dormant_share(net, [batch]) >= 3 * len(layers) / units
+    with torch.no_grad():
+        before = net.encode_batch(batch)
+        offsets = torch.from_numpy(batch[0].offsets)
+        values = net.decode(before, offsets)
+        optimisers = make_optimisers(net, RECIPE)
+        assert revive(net, optimisers, [batch]) >= 3 * len(layers)
+        torch.testing.assert_close(net.decode(net.encode_batch(batch), offsets), values)
+    assert dormant_share(net, [batch]) == 0
+
+
+def test_a_unit_that_starts_again_forgets_what_moved_it(samples):
+    net, batch = small_net(), [prepare(samples[0])]
+    optimisers = make_optimisers(net, RECIPE)
+    values = net.decode(net.encode_batch(batch), torch.from_numpy(batch[0].offsets))
+    values.square().mean().backward()
+    for optimiser in optimisers:
+        optimiser.step()
+    put_to_sleep(net)
+    revive(net, optimisers, [batch])
+    for entry in rectified_layers(net):
+        kept = [m for optimiser in optimisers for m in moments(optimiser, entry.weight)]
+        assert kept and all((entry.incoming(array)[:3] == 0).all() for array in kept)
+
+
+def test_a_network_with_dead_units_is_not_exported(samples, monkeypatch):
+    net = small_net()
+    monkeypatch.setattr("export.to_onnx.draw_samples", lambda: [prepare(samples[0])])
+    revive(net, [], [[prepare(samples[0])]])
+    check_awake(net)
+    put_to_sleep(net)
+    with pytest.raises(SystemExit, match=r"% of the rectified units react to nothing, 1 % may"):
+        check_awake(net)
