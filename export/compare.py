@@ -21,6 +21,7 @@ import torch
 
 from export import variants
 from export.augment import CLEAN, USUAL
+from export.dormant import dormant_share
 from export.latency import ball, microseconds
 from export.network import NetworkConfig, SuperSdfNet
 from export.recipe import RECIPE, Recipe
@@ -29,6 +30,7 @@ from export.train import Errors, Run, Store, measure
 HELD_OUT = 2  # shards
 SHARDS = 20  # of training
 OURS = NetworkConfig(blocks=5)
+DEEP = NetworkConfig(blocks=8)  # where units die
 HIGH = replace(RECIPE, hidden_rate=5e-3, shares=CLEAN)  # a short run bears a higher rate
 
 Entry = tuple[Callable[[NetworkConfig], SuperSdfNet], NetworkConfig, Recipe]
@@ -67,6 +69,12 @@ ENTRIES: dict[str, Entry] = {
     "batches of 6,000": (SuperSdfNet, OURS, replace(HIGH, batch_voxels=6000)),
     "batches of 30,000": (SuperSdfNet, OURS, replace(HIGH, batch_voxels=30_000)),
     "half inside out": (SuperSdfNet, OURS, replace(HIGH, shares=replace(CLEAN, inverted=0.5))),
+    "8 blocks, rectifiers": (SuperSdfNet, DEEP, replace(HIGH, revive_steps=0)),
+    "8 blocks, dormant units started again": (SuperSdfNet, DEEP, HIGH),
+    "8 blocks, one rectifier each": (blocks_of(variants.LinearMixBlock), DEEP, HIGH),
+    "8 blocks, leaky rectifiers": (blocks_of(variants.LeakyBlock), DEEP, HIGH),
+    "8 blocks, smooth rectifiers": (blocks_of(variants.SiluBlock), DEEP, HIGH),
+    "8 blocks, normalised features": (blocks_of(variants.NormBlock), DEEP, HIGH),
     "noise, offsets, truncation": (SuperSdfNet, OURS, replace(HIGH, shares=USUAL)),
 }  # fmt: skip
 
@@ -102,15 +110,16 @@ def main() -> None:
         if name not in done and (options.only or "") in name:
             run = train_entry(entry, store, options.out, options.minutes)
             errors = measure(run.average, store.held_out)
-            append_row(rows, name, run, errors)
+            append_row(rows, name, run, errors, dormant_share(run.net, [store.held_out]))
             print(name, errors, flush=True)
     print(format_table(with_times(read_rows(rows))))
 
 
-def append_row(path: Path, name: str, run: Run, errors: Errors) -> None:
+def append_row(path: Path, name: str, run: Run, errors: Errors, dormant: float) -> None:
     """Write what came of an entry as a line."""
     parameters = sum(p.numel() for p in run.net.parameters())
     row = {"name": name, "parameters": parameters, "steps": run.step, **asdict(errors)}
+    row["dormant"] = dormant
     with path.open("a") as file:
         file.write(json.dumps(row) + "\n")
 
@@ -134,13 +143,15 @@ def with_times(rows: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]
 def format_table(rows: dict[str, dict[str, float]]) -> str:
     """Return the table in Markdown."""
     lines = [
-        "| network | parameters | us a voxel | steps | error | near the surface | normal |",
-        "| --- | ---: | ---: | ---: | ---: | ---: | ---: |",
+        "| network | parameters | us a voxel | steps | error | near the surface | normal "
+        "| dormant |",
+        "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]
     for name, row in rows.items():
         lines.append(
             f"| {name} | {row['parameters'] / 1e3:.0f} k | {row['us']:.1f} | {row['steps']} | "
-            f"{100 * row['everywhere']:.2f} | {100 * row['near']:.2f} | {100 * row['normal']:.2f} |"
+            f"{100 * row['everywhere']:.2f} | {100 * row['near']:.2f} | {100 * row['normal']:.2f} "
+            f"| {100 * row['dormant']:.1f} % |"
         )
     return "\n".join(lines)
 

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from export.augment import Prepared
-from export.network import NeighbourConv, SuperSdfNet
+from export.network import Block, NeighbourConv, SuperSdfNet
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,15 +55,17 @@ class Rectified:
 
 
 def rectified_layers(net: SuperSdfNet) -> list[Rectified]:
-    """Return all layers of a network that a rectifier follows."""
+    """Return the layers of a network that a rectifier follows; of variants, those as in ours."""
     first, _, second = net.stem
     layers = [Rectified(first, first.weight, second.weight, False)]
-    for block in net.blocks:
-        layers.append(Rectified(block.conv, block.conv.weight, block.expand.weight, False))
-        layers.append(Rectified(block.expand, block.expand.weight, block.reduce.weight, False))
-    functions = net.trunk.layers[-1].weight
-    channels = net.config.channels
-    return [*layers, Rectified(net.branch, net.branch.weight, functions, True, channels)]
+    for block in net.modules():
+        if type(block) is Block:  # others may have rectifiers of another kind, or elsewhere
+            layers.append(Rectified(block.conv, block.conv.weight, block.expand.weight, False))
+            layers.append(Rectified(block.expand, block.expand.weight, block.reduce.weight, False))
+    if type(net).residual is SuperSdfNet.residual:
+        functions, channels = net.trunk.layers[-1].weight, net.config.channels
+        layers.append(Rectified(net.branch, net.branch.weight, functions, True, channels))
+    return layers
 
 
 @contextmanager

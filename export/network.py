@@ -118,11 +118,15 @@ class Block(nn.Module):
 
     def forward(self, features: Tensor, table: Tensor) -> Tensor:
         """Map (V, C) to (V, C)."""
-        return features + self.reduce(torch.relu(self.expand(self.mix(features, table))))
+        return features + self.reduce(self.activate(self.expand(self.mix(features, table))))
 
     def mix(self, features: Tensor, table: Tensor) -> Tensor:
         """Look at the neighbours."""
-        return torch.relu(self.conv(features, table))
+        return self.activate(self.conv(features, table))
+
+    def activate(self, values: Tensor) -> Tensor:
+        """Apply the rectifier that follows both layers."""
+        return torch.relu(values)
 
 
 class Trunk(nn.Module):

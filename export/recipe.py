@@ -31,6 +31,8 @@ class Recipe:
     far_weight: float = 0.25  # ... towards this
     gradient_weight: float = 0.5
     eikonal_weight: float = 0.0
+    revive_steps: int = 300  # between two looks for dormant units; 0 for never
+    revive_until: float = 0.8  # share of the budget: what is started again has to learn
     shares: Shares = USUAL
 
     def at(self, rate: float, noisy: float) -> Recipe:

@@ -18,6 +18,7 @@ import argparse
 import copy
 import csv
 import time
+from collections import deque
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -35,9 +36,7 @@ from export.to_onnx import read_weights
 
 CHECKPOINT_SECONDS = 180
 LOG_STEPS = 100
-REVIVE_STEPS = 300
-REVIVE_UNTIL = 0.8  # of the budget: what is started again has to learn
-WATCHED = 4  # batches that a unit must react to, to count as awake
+WATCHED = 4  # batches: a unit that reacted to none of the last is dormant
 HELD_OUT = 2  # shards, the first by name: the loss on them is logged
 NEAR = 0.5  # half voxels from the surface, where normals are measured; values within half of it
 
@@ -99,6 +98,7 @@ class Run:
         self.optimisers = make_optimisers(self.net, recipe)
         self.peaks = [optimiser.param_groups[0]["lr"] for optimiser in self.optimisers]
         self.step, self.seconds = 0, 0.0
+        self.recent: deque[list[Prepared]] = deque(maxlen=WATCHED)
 
     def save(self) -> None:
         """Write the checkpoint, whole or not at all."""
@@ -147,7 +147,20 @@ class Run:
             optimiser.step()
         self.step += 1
         self.update_average()
+        self.recent.append(batch)
+        if self.is_time_to_revive(spent):
+            revive(self.net, self.optimisers, self.recent)
         return float(loss.detach())
+
+    def is_time_to_revive(self, spent: float) -> bool:
+        """Say whether dormant units are to be started again after this step."""
+        every, full = self.recipe.revive_steps, len(self.recent) == WATCHED
+        return (
+            bool(every)
+            and full
+            and self.step % every == WATCHED
+            and spent < self.recipe.revive_until
+        )
 
     def update_average(self) -> None:
         """Move the averaged weights towards the present ones."""
@@ -192,9 +205,6 @@ def train(run: Run, store: Store, minutes: float, seed: int) -> None:
         start = time.monotonic()
         losses.append(run.advance(store.draw_batch(rng, run.recipe), run.seconds / (60 * minutes)))
         run.seconds += time.monotonic() - start
-        if run.step % REVIVE_STEPS == 1 and run.seconds < REVIVE_UNTIL * 60 * minutes:
-            batches = [store.draw_batch(rng, run.recipe) for _ in range(WATCHED)]
-            revive(run.net, run.optimisers, batches)
         if run.step % LOG_STEPS == 0:
             log(run, store, float(np.mean(losses)))
             losses.clear()

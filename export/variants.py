@@ -57,6 +57,42 @@ class BottleneckBlock(Block):
         return torch.relu(self.conv(torch.relu(self.down(features)), table))
 
 
+class LinearMixBlock(Block):
+    """Has one rectifier instead of two: none between the convolution and the pointwise layer."""
+
+    def mix(self, features: Tensor, table: Tensor) -> Tensor:
+        """Look at the neighbours."""
+        return self.conv(features, table)
+
+
+class LeakyBlock(Block):
+    """Lets a tenth of what is negative through, so that no unit is without a gradient."""
+
+    def activate(self, values: Tensor) -> Tensor:
+        """Apply the leaky rectifier."""
+        return torch.nn.functional.leaky_relu(values, 0.1)
+
+
+class SiluBlock(Block):
+    """Bends smoothly: ``x sigmoid(x)``."""
+
+    def activate(self, values: Tensor) -> Tensor:
+        """Apply the smooth rectifier."""
+        return torch.nn.functional.silu(values)
+
+
+class NormBlock(Block):
+    """Divides the features by their root mean square over the channels before it mixes them."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__(config)
+        self.norm = nn.RMSNorm(config.channels)
+
+    def mix(self, features: Tensor, table: Tensor) -> Tensor:
+        """Look at the neighbours' normalised features."""
+        return super().mix(self.norm(features.float()), table)
+
+
 class PointBlock(Block):
     """Does not look at the neighbours: the patch alone counts."""
 

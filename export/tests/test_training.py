@@ -312,10 +312,10 @@ def test_noisy_are_the_voxels_whose_neighbours_are_no_distance(samples):
 
 def test_a_row_is_kept_and_shown(tmp_path):
     run = Run(tmp_path, SuperSdfNet(SMALL))
-    append_row(tmp_path / "rows.jsonl", "ours", run, Errors(0.01, 0.02, 0.03))
+    append_row(tmp_path / "rows.jsonl", "ours", run, Errors(0.01, 0.02, 0.03), 0.285)
     (row,) = read_rows(tmp_path / "rows.jsonl").values()
     table = format_table({"ours": {**row, "us": 7.03}})
-    assert table.endswith("| ours | 6 k | 7.0 | 0 | 1.00 | 2.00 | 3.00 |")
+    assert table.endswith("| ours | 6 k | 7.0 | 0 | 1.00 | 2.00 | 3.00 | 28.5 % |")
 
 
 @pytest.mark.parametrize("make", [SuperSdfNet, UNet])
@@ -424,6 +424,16 @@ def test_a_unit_that_starts_again_forgets_what_moved_it(samples):
     for entry in rectified_layers(net):
         kept = [m for optimiser in optimisers for m in moments(optimiser, entry.weight)]
         assert kept and all((entry.incoming(array)[:3] == 0).all() for array in kept)
+
+
+def test_a_run_starts_dormant_units_again_until_its_last_fifth(tmp_path, samples):
+    recipe = replace(RECIPE, batch_voxels=1, shares=CLEAN, revive_steps=10)
+    run, batch = Run(tmp_path, SuperSdfNet(SMALL), recipe), [prepare(samples[0])]
+    for spent, asleep in ((0.5, False), (0.9, True)):
+        put_to_sleep(run.net)
+        for _ in range(10):
+            run.advance(batch, spent)
+        assert (dormant_share(run.net, [batch]) > 0.05) == asleep
 
 
 def test_a_network_with_dead_units_is_not_exported(samples, monkeypatch):
