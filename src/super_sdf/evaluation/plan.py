@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ..errors import FileError, OptionError
+from ..files.regular import check_regular_file
 from .cases import Setting
 from .measuring import FLOOR, NO_SETTING, OURS, Task, digest_of_file, digest_of_ours
 from .methods import METHODS
@@ -142,18 +144,17 @@ def find_meshes(sources: Sequence[Path]) -> tuple[Path, ...]:
     Raises
     ------
     FileError
-        If a source is missing or holds no mesh, or two shapes have one name.
+        If a source is missing or holds no mesh, if a mesh is no regular file, or two shapes have
+        one name.
     """
     found: list[Path] = []
     for source in sources:
-        if not source.exists():
-            raise FileError(f"{source} does not exist")
         inside = [source]
-        if source.is_dir():
+        if os.path.isdir(source):
             inside = sorted(p for p in source.iterdir() if p.suffix.lower() in MESH_SUFFIXES)
         if not inside:
             raise FileError(f"{source} holds no mesh: give {', '.join(MESH_SUFFIXES)}")
-        found += inside
+        found += map(check_regular_file, inside)
     names = [path.stem for path in found]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice:
