@@ -5,6 +5,7 @@ import pytest
 from conftest import ball, trilinear
 
 from super_sdf import SdfGrid, read_grid, reconstruct
+from super_sdf.planes import PlaneFile
 
 
 @pytest.mark.parametrize("dtype", ["<f4", ">f4", "<f8", ">f8", "f2", "i2", ">i4", "i8", "i1"])
@@ -27,18 +28,30 @@ def test_npz_keys_and_options_that_go_before_them(tmp_path):
     assert other.origin == (4.0, 5.0, 6.0) and other.spacing == (1.01,) * 3
 
 
-def test_npy_is_mapped_not_loaded(tmp_path):
+def test_an_npy_is_read_plane_by_plane_not_loaded(tmp_path):
     np.save(tmp_path / "in.npy", ball().values)
-    assert isinstance(read_grid(tmp_path / "in.npy").values, np.memmap)
+    grid = read_grid(tmp_path / "in.npy")
+    assert isinstance(grid.samples, PlaneFile)
+    np.testing.assert_array_equal(grid.planes(3, 7), ball().values[3:7])
+    assert "loaded" not in vars(grid.samples)
 
 
 @pytest.mark.parametrize("order", ["C", "F"])
 @pytest.mark.parametrize("dtype", ["<f4", ">f8", "<i2"])
-def test_a_mapped_file_is_read_as_the_array_is(tmp_path, dtype, order):
-    values = np.asarray(np.round(100 * ball(14, 4.0).values), dtype, order=order)
-    np.save(tmp_path / "in.npy", values)
-    grid = read_grid(tmp_path / "in.npy", spacing=100)
-    assert isinstance(grid.samples, np.memmap)
-    mapped, loaded = (reconstruct(g, trilinear) for g in (grid, SdfGrid(values, 100)))
-    np.testing.assert_array_equal(mapped.vertices, loaded.vertices)
-    np.testing.assert_array_equal(mapped.faces, loaded.faces)
+@pytest.mark.parametrize("save", [np.save, np.savez, np.savez_compressed])
+@pytest.mark.parametrize("room", [0.0, 0.25])
+def test_a_file_is_read_as_the_array_is(tmp_path, monkeypatch, dtype, order, save, room):
+    """In place, unpacked in memory, and unpacked into a temporary file."""
+    values = np.asarray(np.round(100 * ball(shape=(14, 12, 17), radius=4.0).values), dtype, order)
+    path = tmp_path / ("in.npy" if save is np.save else "in.npz")
+    save(path, **{"arr" if save is np.save else "values": values})
+    monkeypatch.setattr("super_sdf.files.grids.ROOM_SHARE", room)
+    monkeypatch.setattr("super_sdf.files.unpacking.PIECE", 3000)
+    grid = read_grid(path, spacing=100)
+    in_place = save is np.save and order == "C"
+    assert isinstance(grid.samples, PlaneFile) == (in_place or not room)
+    np.testing.assert_array_equal(grid.planes(2, 5), values[2:5])
+    read, given = (reconstruct(g, trilinear) for g in (grid, SdfGrid(values, 100)))
+    np.testing.assert_array_equal(read.vertices, given.vertices)
+    np.testing.assert_array_equal(read.faces, given.faces)
+    np.testing.assert_array_equal(grid.values, values)

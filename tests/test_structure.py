@@ -11,6 +11,7 @@ EVALUATION = sorted((ROOT / "src" / "super_sdf" / "evaluation").glob("*.py"))
 FLOORS = [
     {"errors", "chunks", "compiling"},
     {"memory", "cuda"},
+    {"planes"},
     {"grid"},
     {"band", "mesh", "cell_cases", "device"},
     {"nodes", "symmetry", "files"},
@@ -29,8 +30,9 @@ FLOORS = [
 BATCH = sorted((ROOT / "src" / "super_sdf" / "batch").glob("*.py"))
 FILES = sorted((ROOT / "src" / "super_sdf" / "files").glob("*.py"))
 FILES_FLOORS = [
-    {"conventions", "output", "ply", "regular", "__init__"},
-    {"grids", "meshes"},
+    {"archives", "conventions", "headers", "output", "ply", "regular", "__init__"},
+    {"meshes", "unpacking"},
+    {"grids"},
 ]
 BATCH_FLOORS = [
     {"fingerprint", "lock", "__init__"},

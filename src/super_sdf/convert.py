@@ -138,8 +138,14 @@ def convert(
         As ``read_grid``, ``upsample`` and ``write_mesh`` raise it; nothing was written then.
     """
     watch = Stopwatch(progress)
-    given = {"spacing": options.spacing, "origin": options.origin}
-    grid = read_grid(source, inside=options.inside, level=options.offset, **given)
+    grid = read_grid(
+        source,
+        spacing=options.spacing,
+        origin=options.origin,
+        inside=options.inside,
+        level=options.offset,
+        max_memory=options.max_memory,
+    )
     watch.lap("read")
     pieces = reconstruct_slabs(
         grid,

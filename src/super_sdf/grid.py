@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import GridError
-from .memory import release_pages
+from .planes import PlaneFile, Samples
 
 FloatArray: TypeAlias = NDArray[np.float32]
 IntArray: TypeAlias = NDArray[np.int32]
@@ -30,7 +30,7 @@ class SdfGrid:
     ----------
     values : (nx, ny, nz) array_like
         Signed distances in world units, negative inside; i runs along x, j along y, k along z. A
-        mapped file stays one: it is read plane by plane.
+        mapped file stays one, and a ``PlaneFile``, too.
     spacing : float or three floats
         World distance between neighbouring samples; equal on all axes.
     origin : float or three floats
@@ -43,7 +43,8 @@ class SdfGrid:
     Attributes
     ----------
     values : (nx, ny, nz) array
-        All samples, negative inside.
+        All samples, negative inside. If they are in a file it is loaded when they are asked for,
+        and they stay in memory; ``planes`` reads some.
     low, high : float
         The smallest and the largest of them.
 
@@ -54,7 +55,7 @@ class SdfGrid:
         or if the spacing is not positive and equal on all axes.
     """
 
-    samples: NDArray[Any]
+    samples: Samples
     spacing: Triple
     origin: Triple
     notes: tuple[str, ...]
@@ -64,7 +65,7 @@ class SdfGrid:
 
     def __init__(
         self,
-        values: ArrayLike,
+        values: ArrayLike | PlaneFile,
         spacing: ArrayLike,
         origin: ArrayLike = 0.0,
         notes: tuple[str, ...] = (),
@@ -72,7 +73,7 @@ class SdfGrid:
         positive_inside: bool = False,
         extremes: tuple[float, float] | None = None,
     ) -> None:
-        samples = np.asanyarray(values)
+        samples = values if isinstance(values, PlaneFile) else np.asanyarray(values)
         low, high = extremes or check_values(samples)  # given: they were checked before
         set_ = partial(object.__setattr__, self)
         set_("samples", samples)
@@ -86,7 +87,9 @@ class SdfGrid:
     @property
     def values(self) -> NDArray[Any]:
         """All samples, negative inside."""
-        return negated(self.samples) if self.positive_inside else self.samples
+        samples = self.samples
+        whole = samples.loaded if isinstance(samples, PlaneFile) else samples
+        return negated(whole) if self.positive_inside else whole
 
     def planes(self, first: int, last: int) -> NDArray[Any]:
         """Return the samples with i from ``first`` to before ``last``, negative inside."""
@@ -134,26 +137,31 @@ def check_spacing(spacing: ArrayLike) -> Triple:
     return triple
 
 
-def check_values(values: NDArray[Any]) -> tuple[float, float]:
+def check_values(values: Samples) -> tuple[float, float]:
     """Return the smallest and largest sample of a finite, numeric, three-dimensional array."""
-    if values.dtype == np.bool_:
+    check_kind(values.dtype, values.shape)
+    return _find_extremes(values)
+
+
+def check_kind(dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
+    """Raise if an array of this type and shape holds no grid, whatever its values."""
+    if dtype == np.bool_:
         raise GridError(
             "values are true or false: an occupancy grid holds no distances; "
             "make them with scipy.ndimage.distance_transform_edt"
         )
-    if values.dtype.kind not in "fiu":
-        raise GridError(f"values have dtype {values.dtype}: give floating-point or integer numbers")
-    if values.ndim != 3:
-        raise GridError(f"values have shape {values.shape}: give three axes (x, y, z)")
-    if min(values.shape) < 2:
-        raise GridError(f"values have shape {values.shape}: give at least 2 samples on each axis")
-    return _find_extremes(values)
+    if dtype.kind not in "fiu":
+        raise GridError(f"values have dtype {dtype}: give floating-point or integer numbers")
+    if len(shape) != 3:
+        raise GridError(f"values have shape {shape}: give three axes (x, y, z)")
+    if min(shape) < 2:
+        raise GridError(f"values have shape {shape}: give at least 2 samples on each axis")
 
 
-def _find_extremes(values: NDArray[Any]) -> tuple[float, float]:
+def _find_extremes(values: Samples) -> tuple[float, float]:
     """Return the smallest and the largest sample, or raise on the first NaN or infinity.
 
-    Plane by plane, for the grid may be a mapped file. Extremes tell of bad samples, too: the
+    Plane by plane, for the grid may be in a file. Extremes tell of bad samples, too: the
     smallest of numbers and a NaN is NaN.
     """
     extremes = []
@@ -166,7 +174,6 @@ def _find_extremes(values: NDArray[Any]) -> tuple[float, float]:
                 "replace unknown far samples by a large distance of the right sign"
             )
         extremes.append((low, high))
-        release_pages(values)
     lows, highs = zip(*extremes)
     return min(lows), max(highs)
 

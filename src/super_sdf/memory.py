@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import ctypes
-import mmap
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
-
-from numpy.typing import NDArray
 
 from .errors import OutOfMemoryError
 
@@ -53,16 +49,6 @@ def memory_bound(max_memory: int | None = None) -> int | None:
     if max_memory is not None or free is None:
         return max_memory
     return (held_memory() or 0) + int(SHARE * free)
-
-
-def release_pages(array: NDArray[Any]) -> None:
-    """Let go of the pages of a mapped file that were read: they count as this process's memory.
-
-    Nothing happens to other arrays, nor where the system has no such call; to read on is safe.
-    """
-    file = getattr(array, "_mmap", None)
-    if file is not None and hasattr(mmap, "MADV_DONTNEED"):
-        file.madvise(mmap.MADV_DONTNEED)
 
 
 def held_memory(peak: bool = False) -> int | None:

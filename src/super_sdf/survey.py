@@ -23,7 +23,7 @@ from .band import (
 from .chunks import side_by_side
 from .errors import OutOfMemoryError
 from .grid import BoolArray, FloatArray, IntArray, SdfGrid
-from .memory import in_words, release_pages
+from .memory import in_words
 from .spheres import exact_samples
 
 BYTES_PER_VOXEL = 123  # of a band
@@ -150,7 +150,6 @@ def _band_of_planes(
     """Return the voxels of some planes, and their patches: they see one plane further."""
     low, high = max(first - 1, 0), min(last + 1, grid.shape[0])
     rescaled = rescale(grid, offset, low, high)
-    release_pages(grid.samples)
     ijk = find_band(rescaled)
     own = ijk[(ijk[:, 0] >= first - low) & (ijk[:, 0] < last - low)]
     return own + np.array([low, 0, 0], np.int32), gather_patches(rescaled, own)

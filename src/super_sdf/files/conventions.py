@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..errors import GridError, OptionError
 from ..grid import SdfGrid, Triple, check_spacing, check_values
-from ..memory import release_pages
+from ..planes import Samples
 
 INSIDE = ("auto", "negative", "positive")
 SNAP = 0.02  # an estimate this near to a usual spacing is taken for it
@@ -24,7 +24,7 @@ STRAIGHT = 0.3  # bend (see surface_gradients) below which a field is linear eno
 
 
 def make_grid(
-    values: NDArray[Any],
+    values: Samples,
     *,
     spacing: Any = None,
     origin: Any = None,
@@ -61,14 +61,13 @@ def make_grid(
     notes: list[str] = []
     flipped = _is_positive_inside(values, inside, level, extremes, notes)
     chosen = _choose_spacing(values, -level if flipped else level, spacing, notes)
-    release_pages(values)
     if origin is None:
         notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
     at = 0.0 if origin is None else origin
     return SdfGrid(values, chosen, at, tuple(notes), positive_inside=flipped, extremes=extremes)
 
 
-def check_not_flat(values: NDArray[Any], extremes: tuple[float, float]) -> None:
+def check_not_flat(values: Samples, extremes: tuple[float, float]) -> None:
     """Raise if the values are constant or an occupancy grid."""
     low, high = extremes
     if low == high:
@@ -96,7 +95,7 @@ def check_both_sides(extremes: tuple[float, float], level: float) -> None:
 
 
 def _is_positive_inside(
-    values: NDArray[Any],
+    values: Samples,
     inside: str,
     level: float,
     extremes: tuple[float, float],
@@ -120,7 +119,7 @@ def _is_positive_inside(
     return positive
 
 
-def _count_border(values: NDArray[Any], level: float) -> tuple[int, int]:
+def _count_border(values: Samples, level: float) -> tuple[int, int]:
     """Return how many samples of the grid's six faces are below the level, and how many there are.
 
     A sample on an edge counts for each of its faces.
@@ -128,13 +127,12 @@ def _count_border(values: NDArray[Any], level: float) -> tuple[int, int]:
     below = sum(int((values[end] < level).sum()) for end in (0, -1))
     for plane in values:
         below += sum(int((edge < level).sum()) for edge in (plane[0], plane[-1], *plane.T[[0, -1]]))
-        release_pages(values)
     nx, ny, nz = values.shape
     return below, 2 * (nx * ny + ny * nz + nz * nx)
 
 
 def surface_gradients(
-    values: NDArray[Any], level: float = 0.0
+    values: Samples, level: float = 0.0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return index-space gradients at samples next to the surface, and how bent the field is there.
 
@@ -151,7 +149,7 @@ def surface_gradients(
 
 
 def _plane_gradients(
-    values: NDArray[Any], i: int, level: float
+    values: Samples, i: int, level: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return gradients (n, 3) and their relative change (n,) next to the surface in plane i."""
     first = max(i - 1, 0)
@@ -166,7 +164,6 @@ def _plane_gradients(
         n[:-1] |= crossed
         b[1:-1] += np.abs(d[2:] - 2 * d[1:-1] + d[:-2])
     chosen = near[i - first]
-    release_pages(values)
     gradient = np.asarray(np.gradient(slab))[:, i - first][:, chosen].T
     length = np.sqrt((gradient**2).sum(1))
     return gradient, bend[i - first][chosen] / np.maximum(length, np.finfo(float).tiny)
@@ -210,7 +207,7 @@ def _check_equal_axes(gradients: NDArray[np.float64], bend: NDArray[np.float64])
         )
 
 
-def _choose_spacing(values: NDArray[Any], level: float, spacing: Any, notes: list[str]) -> Triple:
+def _choose_spacing(values: Samples, level: float, spacing: Any, notes: list[str]) -> Triple:
     """Return the spacing that is given, or else measured; they must not contradict each other."""
     given = None if spacing is None else check_spacing(spacing)
     gradients, bend = surface_gradients(values, level)

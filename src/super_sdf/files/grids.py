@@ -7,23 +7,31 @@ before they are read.
 from __future__ import annotations
 
 import zipfile
-import zlib
 from math import prod
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
-from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from ..errors import FileError, GridError, OptionError, SuperSdfError
-from ..grid import SdfGrid
-from ..memory import check_fits
+from ..errors import FileError, GridError, OptionError, OutOfMemoryError
+from ..grid import SdfGrid, check_kind
+from ..memory import held_memory, memory_bound
+from ..planes import InputFile, PlaneFile, Samples
+from .archives import Member
 from .conventions import make_grid
+from .headers import ArrayHeader, Read, read_array_header
 from .output import check_free, replacing
+from .regular import check_regular_file
+from .unpacking import unpack
 
 GRID_SUFFIXES = (".npy", ".npz")
 NPZ_KEYS = ("values", "spacing", "origin")
+MOST_NAMED = 10  # members of an archive
+# Of the memory that is left, what an unpacked array may take, and bytes where nobody can say.
+ROOM_SHARE, UNKNOWN_ROOM = 0.25, 1 << 28
+# A grid with a surface is not packed further than this; deflate comes to 1,030 on zeros.
+BOMB_RATIO = 500
 
 
 def read_grid(
@@ -33,97 +41,141 @@ def read_grid(
     origin: Any = None,
     inside: str = "auto",
     level: float = 0.0,
+    max_memory: int | None = None,
 ) -> SdfGrid:
     """Read a grid; ``spacing`` and ``origin`` go before those in the file. See ``make_grid``.
 
-    An ``.npy`` file is mapped, not loaded.
+    An ``.npy`` file is not loaded but read plane by plane, now and when the grid is refined. What
+    ``.npz`` holds, and an array whose first axis is the fastest (Fortran's order), is unpacked
+    first: into memory if that takes a quarter at most of what is left of ``max_memory`` (bytes
+    that this process may hold in all), else into a temporary file.
 
     Raises
     ------
     FileError
-        If the file is missing, damaged, truncated or of another kind.
+        If the file is missing, damaged, truncated, of another kind, or written to meanwhile.
     OutOfMemoryError
-        If it is larger than memory.
+        If there is no room to unpack it.
     GridError
         If its values are no signed distance grid.
     """
     path = Path(path)
     if path.suffix.lower() not in GRID_SUFFIXES:
         raise OptionError(f"{path} is no grid file: give {' or '.join(GRID_SUFFIXES)}")
-    try:
-        found = _read_npy(path) if path.suffix.lower() == ".npy" else _read_npz(path)
-    except FileNotFoundError:
-        raise FileError(f"{path} does not exist") from None
-    except IsADirectoryError:
-        raise FileError(f"{path} is a folder: give a file") from None
-    except PermissionError:
-        raise FileError(f"{path} cannot be read: permission denied") from None
+    check_regular_file(path)
+    read = _read_npy if path.suffix.lower() == ".npy" else _read_npz
+    found = read(path, _room(max_memory))
     given = {"spacing": spacing, "origin": origin}
     chosen = {key: found.get(key) if own is None else own for key, own in given.items()}
     return make_grid(found["values"], inside=inside, level=level, **chosen)
 
 
-def _read_npy(path: Path) -> dict[str, NDArray[Any]]:
-    """Map the array of an .npy file."""
-    with path.open("rb") as file:
-        shape, dtype = _read_header(file, str(path))
-        follow = path.stat().st_size - file.tell()
-    _check_promise(shape, dtype, follow, str(path))
-    return {"values": np.load(path, mmap_mode="r", allow_pickle=False)}
+def _room(max_memory: int | None) -> int:
+    """Return how many bytes an array may take that must be unpacked."""
+    bound = memory_bound(max_memory)
+    if bound is None:
+        return UNKNOWN_ROOM
+    return int(ROOM_SHARE * max(bound - (held_memory() or 0), 0))
 
 
-def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
+def _read_npy(path: Path, room: int) -> dict[str, Any]:
+    """Return the array of an .npy file; it is read where it is unless its first axis is fastest."""
+    file = InputFile.open(path)
+    read = _reader(file)
+    header = read_array_header(read, str(path))
+    _check_promise(header, file.size - header.length, str(path))
+    check_kind(header.dtype, header.shape)
+    if header.fortran_order:
+        return {"values": unpack(read, header, str(path), room)}
+    return {"values": PlaneFile(file, header.length, header.shape, header.dtype)}
+
+
+def _reader(file: InputFile) -> Read:
+    """Return what reads a file from the beginning on."""
+    place = 0
+
+    def read(count: int) -> bytes:
+        nonlocal place
+        data = file.read(place, count)
+        place += len(data)
+        return data.tobytes()
+
+    return read
+
+
+def _read_npz(path: Path, room: int) -> dict[str, Any]:
     """Read the known arrays of an .npz file."""
+    file = InputFile.open(path)
     try:
-        with zipfile.ZipFile(path) as archive:
-            names = [name.removesuffix(".npy") for name in archive.namelist()]
-            if "values" not in names:
-                held = ", ".join(names) or "nothing"
-                raise FileError(f"{path} has no key 'values' (it holds {held})")
-            return {key: _read_member(archive, key, path) for key in NPZ_KEYS if key in names}
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
-        # The last two are zipfile's for an unknown compression and for an encrypted member.
-        if isinstance(error, SuperSdfError):
-            raise
-        raise FileError(f"{path} is no readable .npz archive: {error}") from None
+        with _open_archive(file) as archive:
+            members = _find_members(archive, path)
+            found = {
+                key: _read_small(archive, members[key], f"{path}[{key}]")
+                for key in NPZ_KEYS[1:]
+                if key in members
+            }
+            return found | {"values": _read_values(archive, members["values"], path, room)}
+    finally:
+        file.check_unchanged()  # that, rather than what else went wrong, is what to tell
 
 
-def _read_member(archive: zipfile.ZipFile, key: str, path: Path) -> NDArray[Any]:
-    """Read one array of an archive, after its size was checked."""
-    name = f"{path}[{key}]"
-    member = archive.getinfo(f"{key}.npy")
-    with archive.open(member) as file:
-        shape, dtype = _read_header(file, name)
-        if key != "values" and prod(shape) > 3:
-            raise GridError(f"{name} has shape {shape}: give one number or three")
-        _check_promise(shape, dtype, member.file_size - file.tell(), name, loaded=True)
-    with archive.open(member) as file:
-        array: NDArray[Any] = npy.read_array(file, allow_pickle=False)
-    return array
-
-
-def _read_header(file: IO[bytes], name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Return shape and dtype that an .npy header declares."""
-    readers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+def _open_archive(file: InputFile) -> zipfile.ZipFile:
+    """Open a zip archive."""
     try:
-        shape, _, dtype = readers[npy.read_magic(file)](file)
-    except (ValueError, KeyError, EOFError):
-        raise FileError(f"{name} is no .npy array: its header cannot be read") from None
-    if dtype.hasobject:
-        raise FileError(f"{name} holds Python objects: save the numbers alone")
-    return shape, dtype
+        return zipfile.ZipFile(file.file)
+    except Exception as error:  # zipfile raises what a wrong field leads to: ten kinds and more
+        raise FileError(f"{file.name} is no readable .npz archive: {error}") from None
 
 
-def _check_promise(
-    shape: tuple[int, ...], dtype: np.dtype[Any], follow: int, name: str, loaded: bool = False
-) -> None:
-    """Raise if an array is longer than its file or, to be loaded, than memory."""
-    size = prod(shape) * dtype.itemsize
-    said = f"{' x '.join(map(str, shape))} {dtype}, {size:,} bytes"
-    if size > follow:
-        raise FileError(f"{name} is truncated: its header promises {said}, but {follow:,} follow")
-    if loaded:
-        check_fits(size, f"{name}, {said},", "save it as .npy, which is read piece by piece")
+def _find_members(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.ZipInfo]:
+    """Return the known members by their keys."""
+    infos = archive.infolist()
+    names = [info.filename.removesuffix(".npy") for info in infos]
+    if "values" not in names:
+        held = ", ".join(names[:MOST_NAMED]) or "nothing"
+        more = f" and {len(names) - MOST_NAMED:,} more" if len(names) > MOST_NAMED else ""
+        raise FileError(f"{path} has no key 'values' (it holds {held}{more})")
+    twice = next((key for key in NPZ_KEYS if names.count(key) > 1), None)
+    if twice:
+        raise FileError(f"{path} holds {twice!r} {names.count(twice)} times: save it once")
+    return {name: info for name, info in zip(names, infos) if name in NPZ_KEYS}
+
+
+def _read_small(archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str) -> NDArray[Any]:
+    """Read one number or three."""
+    member = Member(archive, info, name)
+    header = read_array_header(member.read, name)
+    if prod(header.shape) > 3:
+        raise GridError(f"{name} has shape {header.shape}: give one number or three")
+    if header.dtype.kind not in "fiu":
+        raise GridError(f"{name} has dtype {header.dtype}: give one number or three")
+    _check_promise(header, member.left, name)
+    return np.frombuffer(member.read(header.size), header.dtype).reshape(header.shape)
+
+
+def _read_values(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path, room: int) -> Samples:
+    """Unpack the values."""
+    name = f"{path}[values]"
+    member = Member(archive, info, name)
+    header = read_array_header(member.read, name)
+    _check_promise(header, member.left, name)
+    check_kind(header.dtype, header.shape)
+    if header.size > room and header.size > BOMB_RATIO * info.compress_size:
+        raise OutOfMemoryError(
+            f"{name}, {header}, unpacks from {info.compress_size:,} bytes as a zip bomb does, and "
+            "does not fit in memory; if it is a grid, save it as .npy"
+        )
+    return unpack(member.read, header, name, room)
+
+
+def _check_promise(header: ArrayHeader, follow: int, name: str) -> None:
+    """Raise unless the array is as long as what follows its header."""
+    if header.size > follow:
+        said = f"its header promises {header}, but {follow:,} follow"
+        raise FileError(f"{name} is truncated: {said}")
+    if header.size < follow:
+        said = f"its header promises {header}, but {follow:,} follow"
+        raise FileError(f"{name} holds more than one array, or its header is damaged: {said}")
 
 
 def check_grid_target(path: str | Path, *, force: bool = False) -> Path:
