@@ -19,7 +19,7 @@ FLOORS = [
     {"isosurface", "border", "spheres"},
     {"survey", "kernels"},
     {"compiled"},
-    {"plan"},
+    {"plan", "precision"},
     {"pipeline"},
     {"convert"},
     {"cli_common", "cli_conversion", "cli_batch_report", "__init__"},
@@ -30,9 +30,10 @@ FLOORS = [
 BATCH = sorted((ROOT / "src" / "super_sdf" / "batch").glob("*.py"))
 FILES = sorted((ROOT / "src" / "super_sdf" / "files").glob("*.py"))
 FILES_FLOORS = [
-    {"archives", "conventions", "headers", "output", "ply", "regular", "__init__"},
-    {"meshes", "unpacking"},
-    {"grids"},
+    {"archives", "conventions", "headers", "parts", "regular", "spool", "__init__"},
+    {"output", "ply", "stl", "text_meshes", "glb", "unpacking"},
+    {"threemf"},
+    {"grids", "meshes"},
 ]
 BATCH_FLOORS = [
     {"fingerprint", "lock", "__init__"},
