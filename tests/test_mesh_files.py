@@ -51,10 +51,10 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, mesh, monkeypatch):
 
 
 def test_3mf_without_its_packages_is_refused_before_the_work(tmp_path, monkeypatch):
-    monkeypatch.setattr("super_sdf.files.meshes.find_spec", lambda name: None)
+    monkeypatch.setattr("super_sdf.extras.find_spec", lambda name: None)
     with pytest.raises(FileError) as caught:
         check_target(tmp_path / "out.3mf")
-    want = "writing .3mf needs lxml and networkx: pip install 'super-sdf[3mf]'"
+    want = "writing .3mf needs lxml, networkx: pip install -e '.[3mf]' in a clone of super-sdf"
     assert str(caught.value) == want
 
 

@@ -7,16 +7,15 @@ for the last (extra ``3mf``).
 from __future__ import annotations
 
 from collections.abc import Iterable
-from importlib.util import find_spec
 from pathlib import Path
 
-from ..errors import FileError, OptionError
+from ..errors import OptionError
+from ..extras import check_modules
 from ..mesh import Mesh, join_meshes
 from .output import check_free, replacing
 from .ply import write_ply
 
 MESH_SUFFIXES = (".ply", ".stl", ".obj", ".off", ".glb", ".3mf")
-NEEDED_FOR_3MF = ("lxml", "networkx")
 
 
 def check_target(path: str | Path, *, force: bool = False) -> Path:
@@ -29,9 +28,8 @@ def check_mesh_suffix(path: Path) -> None:
     """Raise if the suffix is no mesh file's, or if what writes such files is not installed."""
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise OptionError(f"{path} is no mesh file: give one of {', '.join(MESH_SUFFIXES)}")
-    if path.suffix.lower() == ".3mf" and not all(map(find_spec, NEEDED_FOR_3MF)):
-        needed = " and ".join(NEEDED_FOR_3MF)
-        raise FileError(f"writing .3mf needs {needed}: pip install 'super-sdf[3mf]'")
+    if path.suffix.lower() == ".3mf":
+        check_modules("writing .3mf", "3mf")
 
 
 def write_mesh(mesh: Mesh, path: str | Path, *, force: bool = False) -> None:
