@@ -10,7 +10,7 @@ SOURCES = sorted((ROOT / "src" / "super_sdf").glob("*.py"))
 EVALUATION = sorted((ROOT / "src" / "super_sdf" / "evaluation").glob("*.py"))
 FLOORS = [
     {"errors", "chunks", "compiling", "interrupts", "streams"},
-    {"memory", "cuda"},
+    {"memory", "cuda", "extras"},
     {"planes"},
     {"grid"},
     {"band", "mesh", "cell_cases", "device"},
@@ -45,13 +45,15 @@ BATCH_FLOORS = [
     {"run"},
 ]
 EVALUATION_FLOORS = [
-    {"solid", "published", "page", "__init__"},
+    {"mesh_files", "published", "page", "folder", "__init__"},
+    {"solid"},
     {"sampling", "metrics", "rendering", "sections"},
     {"cases"},
     {"methods"},
     {"peers"},
     {"measuring"},
-    {"plan", "runner", "tables", "timing"},
+    {"plan", "store", "tables", "timing"},
+    {"runner"},
     {"results", "plots"},
     {"experiment_tables"},
     {"report"},

@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
-from .cli_common import CONTEXT, check_extra, one_line_errors
+from .cli_common import CONTEXT, one_line_errors
 from .errors import OptionError
+from .extras import check_modules
 from .interrupts import raising_interrupts
 
 EXAMPLES = """\b
@@ -60,14 +62,14 @@ def sample(source: Path, target: Path, **options: Any) -> None:
     units, negative inside.
     """
     with one_line_errors():
-        check_extra("sample")
+        check_modules("sample", "eval")
         run_sample(source, target, options)
 
 
 def run_sample(source: Path, target: Path, options: dict[str, Any]) -> None:
     """Read the mesh, lay out the grid, sample it, write it, say what was found."""
     from .evaluation.metrics import normalise
-    from .evaluation.sampling import fitted_layout, sample_solid, unit_layout
+    from .evaluation.sampling import check_numbers, fitted_layout, sample_solid, unit_layout
     from .evaluation.solid import Solid, load_solid
     from .files.grids import check_grid_target, write_grid
 
@@ -78,6 +80,11 @@ def run_sample(source: Path, target: Path, options: dict[str, Any]) -> None:
         raise OptionError("give either -n (samples along the longest axis) or --spacing")
     if options["frame"] == "unit" and samples is None:
         raise OptionError("--frame unit has a side of 1: give -n, not --spacing")
+    chosen = {"n": samples, "spacing": spacing, "band": options["band"]}
+    check_numbers(**chosen, padding=0 if options["frame"] == "unit" else options["padding"])
+    padded = click.get_current_context().get_parameter_source("padding")
+    if options["frame"] == "unit" and padded is not ParameterSource.DEFAULT:
+        raise OptionError("--frame unit has a side of 1: it takes no --padding")
     solid, notes = load_solid(source, allow_open=options["allow_open"])
     if options["frame"] == "unit":
         solid, layout = Solid(normalise(solid.mesh)), unit_layout(samples)

@@ -59,6 +59,9 @@ class Plan:
             Setting(size, self.factor).check()
         if not self.paths or not self.sizes:
             raise OptionError("nothing to measure: give meshes and sizes")
+        Setting(self.peer_size).check("peer size")
+        if not self.peer_limit > 0:
+            raise OptionError(f"peer limit is {self.peer_limit:g}: give more than 0 seconds")
 
     def settings(self) -> list[Setting]:
         """Return the settings of the main table."""
@@ -138,23 +141,29 @@ def spread(paths: tuple[Path, ...], count: int) -> tuple[Path, ...]:
     return tuple(paths[i * len(paths) // count] for i in range(count))
 
 
+def meshes_in(folder: Path) -> list[Path]:
+    """Return the mesh files of a folder, by name."""
+    try:
+        found = sorted(p for p in folder.iterdir() if p.suffix.lower() in MESH_SUFFIXES)
+    except OSError as error:
+        raise FileError(f"{folder} cannot be read: {error.strerror}") from error
+    if not found:
+        raise FileError(f"{folder} holds no mesh: give {', '.join(MESH_SUFFIXES)}")
+    return found
+
+
 def find_meshes(sources: Sequence[Path]) -> tuple[Path, ...]:
     """Return mesh files, and those in folders, by name.
 
     Raises
     ------
     FileError
-        If a source is missing or holds no mesh, if a mesh is no regular file, or two shapes have
-        one name.
+        If a source is missing, no regular file or holds no mesh, or two shapes have one name.
     """
     found: list[Path] = []
     for source in sources:
-        inside = [source]
-        if os.path.isdir(source):
-            inside = sorted(p for p in source.iterdir() if p.suffix.lower() in MESH_SUFFIXES)
-        if not inside:
-            raise FileError(f"{source} holds no mesh: give {', '.join(MESH_SUFFIXES)}")
-        found += map(check_regular_file, inside)
+        inside = meshes_in(source) if os.path.isdir(source) else [source]
+        found += [check_regular_file(path) for path in inside]
     names = [path.stem for path in found]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice:
