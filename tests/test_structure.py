@@ -13,8 +13,8 @@ FLOORS = [
     {"memory", "cuda"},
     {"grid"},
     {"band", "mesh", "cell_cases", "device"},
-    {"nodes", "symmetry"},
-    {"field", "files", "network", "lattice"},
+    {"nodes", "symmetry", "files"},
+    {"field", "network", "lattice"},
     {"isosurface", "border", "spheres"},
     {"survey", "kernels"},
     {"compiled"},
@@ -29,7 +29,7 @@ FLOORS = [
 BATCH = sorted((ROOT / "src" / "super_sdf" / "batch").glob("*.py"))
 FILES = sorted((ROOT / "src" / "super_sdf" / "files").glob("*.py"))
 FILES_FLOORS = [
-    {"conventions", "output", "ply", "__init__"},
+    {"conventions", "output", "ply", "regular", "__init__"},
     {"grids", "meshes"},
 ]
 BATCH_FLOORS = [
