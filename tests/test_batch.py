@@ -4,7 +4,6 @@ import json
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -19,14 +18,13 @@ from conftest import ball
 
 from super_sdf.batch import job as batch_job
 from super_sdf.batch.fingerprint import fingerprint, is_unchanged
-from super_sdf.batch.inputs import find_jobs
 from super_sdf.batch.job import Result
 from super_sdf.batch.lock import FolderLock
 from super_sdf.batch.plan import Batch, Settings
-from super_sdf.batch.workers import Loading, choose_workers
+from super_sdf.batch.workers import choose_workers
 from super_sdf.chunks import count_cores
 from super_sdf.cli_batch_report import describe_progress, duration
-from super_sdf.convert import ConvertOptions, convert
+from super_sdf.convert import convert
 from super_sdf.errors import FileError
 
 LONE = ("--jobs", 1, "--factor", 2, "--quality", "fast", "--spacing", 1, "--origin", 0)
