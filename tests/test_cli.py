@@ -280,7 +280,7 @@ def test_an_interrupt_at_any_stage_leaves_nothing(here, command, monkeypatch, st
 
     monkeypatch.setattr(f"super_sdf.{stage}", interrupt)
     code, out, err = command("upsample", "in.npy", "out.ply", "--quiet")
-    assert (code, out, err.strip()) == (1, "", "Error: interrupted; nothing was written")
+    assert (code, out, err.strip()) == (130, "", "Error: interrupted; nothing was written")
     assert os.listdir() == ["in.npy"]
 
 
