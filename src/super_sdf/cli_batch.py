@@ -112,11 +112,11 @@ def complete(jobs: list[Job], settings: Settings, quiet: bool) -> Batch:
     from .batch.lock import FolderLock
     from .batch.run import Run
 
-    with FolderLock(settings.folder) as lock:
+    with raising_interrupts(), FolderLock(settings.folder) as lock:
         run = Run(jobs, settings, lock)
         total = len(run.batch.waiting)
         try:
-            with progress_line(total, quiet) as progress, raising_interrupts():
+            with progress_line(total, quiet) as progress:
                 run.complete(progress)
         except KeyboardInterrupt as error:
             done = f": {len(run.batch.done)} of {total} are done and kept"

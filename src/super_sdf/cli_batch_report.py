@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from .cli_common import print_result, tell
+
 if TYPE_CHECKING:
     from .batch.job import Job
     from .batch.plan import Batch
@@ -62,15 +64,15 @@ def duration(seconds: float) -> str:
 def tell_plan(plan: Batch, as_json: bool) -> None:
     """Print what would be done with each file, and how many there are of each kind."""
     if as_json:
-        click.echo(json.dumps(plan_report(plan), indent=2))
+        print_result(json.dumps(plan_report(plan), indent=2), "nothing was written")
     else:
         for line in plan_lines(plan):
-            click.echo(line)
+            print_result(line, "nothing was written")
     kinds = {kind: len(found) for kind, found in plan_report(plan).items()}
     if not kinds["unread"]:
         del kinds["unread"]
     counts = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in kinds.items())
-    click.echo(counts, err=True)
+    tell(counts)
 
 
 def plan_lines(plan: Batch) -> Iterator[str]:
@@ -119,17 +121,18 @@ def kind_of(row: dict[str, Any]) -> str:
 def tell_summary(batch: Batch, options: dict[str, Any]) -> None:
     """Print counts and failures: sentences on stderr, JSON on stdout."""
     if options["as_json"]:
-        click.echo(json.dumps(summary(batch), indent=2))
+        report = batch.settings.folder / "report.jsonl"
+        print_result(json.dumps(summary(batch), indent=2), f"all is in {report}")
     failed = [result.failure() for result in batch.failures()]
     failed += [f"{path} {reason}" for path, reason in batch.unread]
     for line in failed[:SHOWN]:
-        click.echo(f"Failed: {line}", err=True)
+        tell(f"Failed: {line}")
     more = len(failed) - SHOWN
     if more > 0:
-        click.echo(f"and {more} more, see {batch.settings.folder / 'report.jsonl'}", err=True)
+        tell(f"and {more} more, see {batch.settings.folder / 'report.jsonl'}")
     if not options["quiet"]:
         for remark in (*remarks(batch), sentence(batch)):
-            click.echo(remark, err=True)
+            tell(remark)
 
 
 def remarks(batch: Batch) -> list[str]:

@@ -48,14 +48,14 @@ def choose_workers(device: str, jobs: int, max_memory: int | None = None) -> int
 def useful_workers(asked: int, jobs: int, max_memory: int | None = None) -> tuple[int, str | None]:
     """Return how many of the processes asked for can be of use, and why no more can."""
     cores = count_cores()
-    limits = [(jobs, f"{jobs} to do"), (cores, f"{cores} cores that it may use")]
+    limits = [
+        (jobs, "there is no more to do"),
+        (cores, "this process may use no more cores"),
+    ]
     if max_memory is not None:
-        room = max(1, max_memory // LEAST_BYTES)
-        limits.append((room, f"room for {room} in --max-memory"))
+        limits.append((max(1, max_memory // LEAST_BYTES), "--max-memory has no room for more"))
     most, cause = min(limits)
-    if asked <= most:
-        return asked, None
-    return most, f"--jobs {asked} is cut to {most}: there is {cause}"
+    return min(asked, most), None if asked <= most else f"--jobs {asked} is cut to {most}: {cause}"
 
 
 def make_worker(loading: Loading, folder: Path) -> Callable[[Job], Row]:
