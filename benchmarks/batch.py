@@ -2,9 +2,12 @@
 
     python -m benchmarks.batch                                # 500 grids, 16^3 to 128^3
     python -m benchmarks.batch --count 20 --sizes 12 16 24    # in half a minute
+    python -m benchmarks.batch --count 8 --sizes 8 12 16 --faults 200 --full 50
 
 Writes the grids, runs ``super-sdf batch``, kills it with SIGKILL as often as asked, goes on, runs
 it once more, and prints what came of it, beside what each file costs over the warm pipeline.
+With --faults the batch, or one of its workers, is instead killed or ended at random moments, a
+fault each time; with --full there is no more room (a disk in memory, which only root may mount).
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +39,7 @@ from super_sdf.evaluation.timing import describe_machine
 from super_sdf.mesh import Mesh
 from super_sdf.network import load_network
 
+from .batch_faults import KILLS, LIMITS, count_faults, make_setting
 from .mixed_grids import BROKEN, Placed, write_broken, write_mixed
 
 COMMAND = [sys.executable, "-m", "super_sdf.cli"]
@@ -123,7 +128,7 @@ def measure_overhead(place: Place, names: list[str], repeats: int = 3) -> tuple[
 
     The first file is left out: with it the batch loads the network.
     """
-    jobs = find_jobs([str(place.grids / name) for name in names], ".ply", ConvertOptions())
+    jobs = find_jobs([str(place.grids / name) for name in names], ".ply", ConvertOptions()).jobs
     rounds = []
     for _ in range(repeats):
         with tempfile.TemporaryDirectory() as folder:
@@ -176,6 +181,8 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--count", type=int, default=500, help="grids, broken ones not counted")
     parser.add_argument("--sizes", type=int, nargs="+", default=[16, 24, 32, 48, 64, 96, 128])
     parser.add_argument("--kills", type=int, default=3)
+    parser.add_argument("--faults", type=int, default=0, help="kills at random moments instead")
+    parser.add_argument("--full", type=int, default=0, help="full disks instead")
     parser.add_argument("--jobs", type=int, default=count_cores(), help="processes")
     parser.add_argument("--equal", type=int, default=40, help="meshes held against single runs")
     parser.add_argument("--overhead", type=int, default=40, help="files timed, each three times")
@@ -187,6 +194,9 @@ def main() -> None:
     """Print the machine and a Markdown table."""
     asked = parse()
     with working_folder(asked.folder) as folder:
+        if asked.faults or asked.full:
+            report_faults(folder, asked)
+            return
         place = Place(folder / "grids", folder / "meshes", asked.jobs)
         solids = write_mixed(place.grids, asked.count, asked.sizes)
         write_broken(place.grids / "broken")
@@ -196,6 +206,16 @@ def main() -> None:
             place.run_and_kill(total * kill // (asked.kills + 1))
             print(f"| killed after | {len(place.lines())} files |", flush=True)
         report(place, solids, asked, total)
+
+
+def report_faults(folder: Path, asked: argparse.Namespace) -> None:
+    """Print what came of each kind of fault."""
+    kinds = [kind for kind, _ in zip(cycle(KILLS), range(asked.faults))]
+    kinds += [kind for kind, _ in zip(cycle(LIMITS), range(asked.full))]
+    counts = count_faults(make_setting(folder, asked.count, asked.sizes), kinds)
+    print(f"{describe_machine()}; {asked.count} files\n\n| | | |\n| --- | --- | --- |")
+    for (kind, came), count in sorted(counts.items()):
+        print(f"| {kind} | {count} | {came} |")
 
 
 def report(place: Place, solids: dict[str, Placed], asked: argparse.Namespace, total: int) -> None:

@@ -10,7 +10,7 @@ SOURCES = sorted((ROOT / "src" / "super_sdf").glob("*.py"))
 EVALUATION = sorted((ROOT / "src" / "super_sdf" / "evaluation").glob("*.py"))
 FLOORS = [
     {"errors", "chunks", "compiling", "interrupts", "streams"},
-    {"memory", "cuda", "extras"},
+    {"memory", "cuda", "extras", "machine"},
     {"planes"},
     {"grid"},
     {"band", "mesh", "cell_cases", "device"},
@@ -22,8 +22,8 @@ FLOORS = [
     {"plan", "precision"},
     {"pipeline"},
     {"convert"},
-    {"cli_common", "cli_conversion", "cli_batch_report", "__init__"},
-    {"selftest"},
+    {"cli_common", "cli_conversion", "__init__"},
+    {"selftest", "cli_batch_report"},
     {"cli_batch", "cli_sample", "cli_evaluate", "cli_render", "cli_info"},
     {"cli"},
     {"entry"},
@@ -37,11 +37,16 @@ FILES_FLOORS = [
     {"threemf"},
     {"grids", "meshes"},
 ]
+MACHINE = sorted((ROOT / "src" / "super_sdf" / "machine").glob("*.py"))
+MACHINE_FLOORS = [
+    {"records", "serving", "__init__"},
+    {"pool"},
+]
 BATCH_FLOORS = [
-    {"fingerprint", "lock", "__init__"},
-    {"job"},
+    {"fingerprint", "journal", "walking", "__init__"},
+    {"job", "lock"},
     {"manifest", "workers", "ledger"},
-    {"inputs", "plan", "pool"},
+    {"inputs", "plan"},
     {"run"},
 ]
 EVALUATION_FLOORS = [
@@ -78,7 +83,7 @@ def imported(path: Path) -> set[str]:
 def check_floors(sources: list[Path], floors: list[set[str]]) -> None:
     """Every module stands on one floor and imports from floors below, within its package."""
     floor = {name: level for level, names in enumerate(floors) for name in names}
-    assert set(floor) - {"files"} == {path.stem for path in sources}
+    assert set(floor) - {"files", "machine"} == {path.stem for path in sources}
     for path in sources:
         for name in imported(path) & {f".{other}" for other in floor}:
             assert floor[name[1:]] < floor[path.stem], f"{path.stem} imports {name}"
@@ -87,13 +92,14 @@ def check_floors(sources: list[Path], floors: list[set[str]]) -> None:
 def test_every_module_imports_only_from_floors_below():
     check_floors(SOURCES, FLOORS)
     check_floors(FILES, FILES_FLOORS)
+    check_floors(MACHINE, MACHINE_FLOORS)
     check_floors(BATCH, BATCH_FLOORS)
     check_floors(EVALUATION, EVALUATION_FLOORS)
 
 
 def test_the_runtime_needs_four_packages():
     allowed = {"click", "numpy", "onnxruntime", "trimesh"} | set(sys.stdlib_module_names)
-    for path in SOURCES + FILES + BATCH:
+    for path in SOURCES + FILES + MACHINE + BATCH:
         foreign = {name for name in imported(path) if not name.startswith(".")} - allowed
         if path.stem == "kernels":  # loaded only where numba is
             foreign -= {"numba"}
@@ -103,7 +109,7 @@ def test_the_runtime_needs_four_packages():
 
 
 def test_the_runtime_does_not_know_the_evaluation():
-    for path in SOURCES + FILES + BATCH:
+    for path in SOURCES + FILES + MACHINE + BATCH:
         assert path.stem.startswith("cli_") or ".evaluation" not in imported(path)
 
 

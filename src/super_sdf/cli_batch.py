@@ -56,7 +56,7 @@ Examples:
 @click.option("--retry", is_flag=True, help="Try unchanged inputs again that failed before.")
 @click.option("--force", is_flag=True, help="Do all again; replace meshes of another origin.")
 @click.option("--dry-run", is_flag=True, help="Say what would be done; write nothing.")
-@click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
+@click.option("--json", "as_json", is_flag=True, help="Print the summary, or the plan, as JSON.")
 @click.option("-q", "--quiet", is_flag=True, help="Print failures only.")
 def batch(sources: tuple[str, ...], folder: Path, **options: Any) -> None:
     """Convert every grid that IN names to a mesh in DIR, as upsample would.
@@ -81,7 +81,7 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
 
     start = time.perf_counter()
     check_factor(options["factor"])
-    jobs = find_jobs(sources, f".{options['kind']}", make_options(options))
+    jobs, unread = find_jobs(sources, f".{options['kind']}", make_options(options))
     model = chosen_model(options)
     find_model(model, options["precision"])
     flags = {name: options[name] for name in ("force", "retry", "fail_fast")}
@@ -95,12 +95,15 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
         **flags,
     )
     if options["dry_run"]:
-        tell_plan(preview(jobs, settings))
+        plan = preview(jobs, settings)
+        plan.unread = unread
+        tell_plan(plan, options["as_json"])
         return
     done = complete(jobs, settings, options["quiet"])
+    done.unread = unread
     done.seconds = time.perf_counter() - start
     tell_summary(done, options)
-    if done.failures():
+    if done.failures() or done.unread:
         sys.exit(1)
 
 
@@ -109,7 +112,7 @@ def complete(jobs: list[Job], settings: Settings, quiet: bool) -> Batch:
     from .batch.lock import FolderLock
     from .batch.run import Run
 
-    with FolderLock(settings.folder) as lock:
+    with raising_interrupts(), FolderLock(settings.folder) as lock:
         run = Run(jobs, settings, lock)
         total = len(run.batch.waiting)
         try:

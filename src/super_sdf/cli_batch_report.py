@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
 from collections.abc import Iterator
@@ -11,7 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from .cli_common import print_result, tell
+
 if TYPE_CHECKING:
+    from .batch.job import Job
     from .batch.plan import Batch
     from .batch.run import Progress
 
@@ -22,7 +26,7 @@ REDRAW = 0.1  # seconds between two drawings of the progress line
 @contextmanager
 def progress_line(total: int, quiet: bool) -> Iterator[Progress | None]:
     """Keep a line on stderr up to date, if somebody is there to see it."""
-    if quiet or not total or not sys.stderr.isatty():
+    if quiet or not total or sys.stderr is None or not sys.stderr.isatty():
         yield None
         return
     shown = 0.0
@@ -57,46 +61,90 @@ def duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
 
 
-def tell_plan(plan: Batch) -> None:
+def tell_plan(plan: Batch, as_json: bool) -> None:
     """Print what would be done with each file, and how many there are of each kind."""
+    if as_json:
+        print_result(json.dumps(plan_report(plan), indent=2), "nothing was written")
+    else:
+        for line in plan_lines(plan):
+            print_result(line, "nothing was written")
+    kinds = {kind: len(found) for kind, found in plan_report(plan).items()}
+    if not kinds["unread"]:
+        del kinds["unread"]
+    counts = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in kinds.items())
+    tell(counts)
+
+
+def plan_lines(plan: Batch) -> Iterator[str]:
+    """Yield what would be done with each file, a line each."""
+    from .batch.job import in_a_line
+
+    folder = plan.settings.folder
     for job in plan.waiting:
-        click.echo(f"to do: {job.source} -> {plan.settings.folder / job.target}")
+        yield in_a_line(f"to do: {job.source} -> {folder / job.target}")
     for job, _ in plan.done_before:
-        click.echo(f"done before: {job.source} -> {plan.settings.folder / job.target}")
+        yield in_a_line(f"done before: {job.source} -> {folder / job.target}")
     for result in plan.failed_before:
-        click.echo(f"{kind_of(result.row)}: {result.failure()}")
-    refused = sum(bool(result.row["retry"]) for result in plan.failed_before)
-    counts = f"{len(plan.waiting)} to do, {len(plan.done_before)} done before, "
-    counts += f"{len(plan.failed_before) - refused} failed before, {refused} refused"
-    click.echo(counts, err=True)
+        yield f"{kind_of(result.row).replace('_', ' ')}: {result.failure()}"
+    for path, reason in plan.unread:
+        yield in_a_line(f"unread: {path} {reason}")
+
+
+def plan_report(plan: Batch) -> dict[str, Any]:
+    """Return what would be done with each file, by kind, as it stands in JSON."""
+    failed: dict[str, list[dict[str, Any]]] = {"failed_before": [], "refused": []}
+    for _, row in plan.failed_before:
+        failed[kind_of(row)].append(failure_entry(row))
+    return {
+        "to_do": [entry(job) for job in plan.waiting],
+        "done_before": [entry(job) for job, _ in plan.done_before],
+        **failed,
+        "unread": [{"in": path, "reason": reason} for path, reason in plan.unread],
+    }
+
+
+def entry(job: Job) -> dict[str, str]:
+    """Return what JSON tells of a file that has a mesh, or may have one."""
+    return {"in": os.path.abspath(job.source), "out": job.target}
+
+
+def failure_entry(row: dict[str, Any]) -> dict[str, Any]:
+    """Return what JSON tells of a file that has no mesh."""
+    return {"in": row["in"], "out": row["out"], "reason": row["reason"]}
 
 
 def kind_of(row: dict[str, Any]) -> str:
     """Say why nothing is to be done with a file that has no mesh."""
-    return "refused" if row["retry"] else "failed before"
+    return "refused" if row["retry"] else "failed_before"
 
 
 def tell_summary(batch: Batch, options: dict[str, Any]) -> None:
     """Print counts and failures: sentences on stderr, JSON on stdout."""
     if options["as_json"]:
-        click.echo(json.dumps(summary(batch), indent=2))
-    for result in batch.failures()[:SHOWN]:
-        click.echo(f"Failed: {result.failure()}", err=True)
-    more = len(batch.failures()) - SHOWN
+        report = batch.settings.folder / "report.jsonl"
+        print_result(json.dumps(summary(batch), indent=2), f"all is in {report}")
+    failed = [result.failure() for result in batch.failures()]
+    failed += [f"{path} {reason}" for path, reason in batch.unread]
+    for line in failed[:SHOWN]:
+        tell(f"Failed: {line}")
+    more = len(failed) - SHOWN
     if more > 0:
-        click.echo(f"and {more} more, see {batch.settings.folder / 'report.jsonl'}", err=True)
+        tell(f"and {more} more, see {batch.settings.folder / 'report.jsonl'}")
     if not options["quiet"]:
         for remark in (*remarks(batch), sentence(batch)):
-            click.echo(remark, err=True)
+            tell(remark)
 
 
 def remarks(batch: Batch) -> list[str]:
-    """Say of how many new meshes the report tells more; that one is open is counted anyhow."""
+    """Say how it was run, and of how many new meshes the report tells more.
+
+    That one is open is counted anyhow.
+    """
     rows = [result.row for result in batch.done]
     inferred = sum(bool(row["inferred"]) for row in rows)
     warned = sum(len(row["warnings"]) > (not row["closed"]) for row in rows)
     report = batch.settings.folder / "report.jsonl"
-    said = []
+    said = [f"Note: {note}" for note in batch.notes]
     if inferred:
         said.append(f"Note: spacing, origin or sign of {inferred} was inferred: see {report}")
     if warned:
@@ -113,6 +161,7 @@ def sentence(batch: Batch) -> str:
         failed = len(batch.failed_before) - refused
         words += f", {failed} failed before (--retry tries again)" if failed else ""
         words += f", {refused} refused" if refused else ""
+        words += f", {len(batch.unread)} folders unread" if batch.unread else ""
     else:
         words = f"{facts['done']} done, {facts['failed']} failed"
         words += f", {facts['done_before']} done before" if facts["done_before"] else ""
@@ -127,14 +176,14 @@ def summary(batch: Batch) -> dict[str, Any]:
     return {
         "done": len(batch.done),
         "done_before": len(batch.done_before),
-        "failed": len(batch.failures()),
+        "failed": len(batch.failures()) + len(batch.unread),
         "not_begun": len(batch.waiting),
         "closed": closed,
         "open": len(batch.results()) - closed,
         "seconds": round(batch.seconds, 3),
         "failures": [
-            {"in": row["in"], "out": row["out"], "reason": row["reason"]}
-            for _, row in batch.failures()
+            *(failure_entry(row) for _, row in batch.failures()),
+            *({"in": path, "out": None, "reason": reason} for path, reason in batch.unread),
         ],
         "report": str(batch.settings.folder / "report.jsonl"),
     }

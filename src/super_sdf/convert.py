@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -118,6 +118,7 @@ def convert(
     *,
     force: bool = False,
     progress: Progress | None = None,
+    before_rename: Callable[[Path], None] | None = None,
 ) -> Conversion:
     """Convert a grid file to a mesh file.
 
@@ -133,6 +134,8 @@ def convert(
         Replace the target if it exists.
     progress : callable, optional
         Called with (steps done, steps in all).
+    before_rename : callable, optional
+        Called with the path of the finished mesh, before it takes the target's name.
 
     Raises
     ------
@@ -162,7 +165,8 @@ def convert(
         progress=watch.step,
     )
     total = Total()
-    write_pieces(total.count(pieces, watch), target, force=force, about=about)
+    meshes = total.count(pieces, watch)
+    write_pieces(meshes, target, force=force, about=about, before_rename=before_rename)
     watch.lap("write")
     return describe(grid, total, options, watch.seconds, notes)
 

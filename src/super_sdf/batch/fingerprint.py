@@ -18,8 +18,10 @@ Fingerprint = dict[str, Any]
 
 
 def fingerprint(path: Path) -> Fingerprint | None:
-    """Return what a file is now, None if it cannot be read."""
+    """Return what a file is now, None if it cannot be read or is no regular file."""
     try:
+        if not path.is_file():  # to open a pipe would wait for ever
+            return None
         with path.open("rb", buffering=0) as file:
             state = os.fstat(file.fileno())  # before it is read: a change while it is shows later
             digest = hashlib.sha256()
@@ -36,7 +38,7 @@ def is_unchanged(path: Path, known: Fingerprint | None, *, same_path: bool = Tru
     It is read only if its time is another, or if it was known by another path.
     """
     if known is None:
-        return not (path.is_file() and os.access(path, os.R_OK))
+        return not (os.path.isfile(path) and os.access(path, os.R_OK))
     state = None
     with suppress(OSError):
         state = path.stat()
@@ -46,3 +48,9 @@ def is_unchanged(path: Path, known: Fingerprint | None, *, same_path: bool = Tru
         return True
     now = fingerprint(path)
     return now is not None and bool(now["sha256"] == known["sha256"])
+
+
+def is_fingerprint(found: Any) -> bool:
+    """Say whether something read from JSON is what ``fingerprint`` returns."""
+    types = {"sha256": str, "size": int, "mtime_ns": int}
+    return isinstance(found, dict) and all(type(found.get(k)) is t for k, t in types.items())

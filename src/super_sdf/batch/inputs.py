@@ -10,18 +10,30 @@ import glob
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePath
+from typing import NamedTuple
 
 from ..convert import ConvertOptions
-from ..errors import OptionError
+from ..errors import FileError, OptionError
 from ..files.grids import GRID_SUFFIXES
 from ..files.meshes import check_mesh_suffix
+from ..files.regular import reason_of
 from .job import Job
+from .journal import NAME as JOURNAL
+from .ledger import NAME as LEDGER
 from .manifest import read_manifest
+from .walking import files_below, fixed_part, matches
 
 MANIFEST_SUFFIXES = (".txt", ".jsonl")
 
 
-def find_jobs(arguments: Sequence[str], suffix: str, options: ConvertOptions) -> list[Job]:
+class Inputs(NamedTuple):
+    """What there is to do; and which folders could not be looked into, each with the reason."""
+
+    jobs: list[Job]
+    unread: list[tuple[str, str]]
+
+
+def find_jobs(arguments: Sequence[str], suffix: str, options: ConvertOptions) -> Inputs:
     """Return what the arguments name, each once.
 
     Parameters
@@ -38,49 +50,68 @@ def find_jobs(arguments: Sequence[str], suffix: str, options: ConvertOptions) ->
     OptionError
         If an argument names no grid, or if two inputs would become one output.
     FileError
-        If a manifest cannot be read.
+        If a manifest, or the only folder, cannot be read.
     """
-    found = [job for argument in arguments for job in _expand(argument, suffix, options)]
-    for kind in {PurePath(job.target).suffix for job in found}:
+    search = Search(suffix, options)
+    jobs = _each_once([job for argument in arguments for job in search.expand(argument)])
+    for kind in {PurePath(job.target).suffix for job in jobs}:
         check_mesh_suffix(Path(f"*{kind}"))
-    return _each_once(found)
+    for job in jobs:
+        if PurePath(job.target).parts[0].casefold() in (JOURNAL, LEDGER):
+            raise OptionError(
+                f"{job.source} would become {job.target}, but the first of these names is the "
+                "batch's own: rename it"
+            )
+    return Inputs(jobs, list(dict.fromkeys(search.unread)))
 
 
-def _expand(argument: str, suffix: str, options: ConvertOptions) -> list[Job]:
-    """Return the jobs that one argument stands for."""
-    path = Path(argument)
-    if path.is_dir():
-        return _below(path, path.rglob("*"), suffix, options, argument)
-    if path.suffix.lower() in MANIFEST_SUFFIXES and path.is_file():
-        return read_manifest(path, suffix, options)
-    if path.suffix.lower() in GRID_SUFFIXES and path.exists():
-        return _below(path.parent, [path], suffix, options, argument)
-    if glob.has_magic(argument):
-        matches = map(Path, glob.iglob(argument, recursive=True))
-        return _below(_fixed_part(path), matches, suffix, options, argument)
-    if not path.exists():
-        raise OptionError(f"{argument} does not exist: give grids, folders, patterns or a manifest")
-    raise OptionError(
-        f"{argument} is neither a grid ({', '.join(GRID_SUFFIXES)}) nor a manifest "
-        f"({', '.join(MANIFEST_SUFFIXES)})"
-    )
+class Search:
+    """Finds what arguments stand for; ``unread`` says which folders could not be read."""
 
+    def __init__(self, suffix: str, options: ConvertOptions) -> None:
+        self.suffix, self.options = suffix, options
+        self.unread: list[tuple[str, str]] = []
 
-def _below(
-    root: Path, paths: Iterable[Path], suffix: str, options: ConvertOptions, argument: str
-) -> list[Job]:
-    """Return a job for every grid among the paths; the outputs mirror the folders below root."""
-    grids = sorted(p for p in paths if p.suffix.lower() in GRID_SUFFIXES and not p.is_dir())
-    if not grids:
-        raise OptionError(f"{argument} holds no {' or '.join(GRID_SUFFIXES)} file")
-    return [Job(p, p.relative_to(root).with_suffix(suffix).as_posix(), options) for p in grids]
+    def expand(self, argument: str) -> list[Job]:
+        """Return the jobs that one argument stands for."""
+        path, suffix = Path(argument), Path(argument).suffix.lower()
+        if argument and os.path.isdir(path):
+            return self._below(path, files_below(path, self._note), argument)
+        if suffix in MANIFEST_SUFFIXES and os.path.isfile(path):
+            return read_manifest(path, self.suffix, self.options)
+        if suffix in GRID_SUFFIXES and os.path.lexists(path):
+            return self._below(path.parent, [path], argument)
+        if glob.has_magic(argument):
+            return self._below(fixed_part(path), matches(path, self._note), argument)
+        if not argument or not os.path.lexists(path):
+            raise OptionError(
+                f"{argument or repr(argument)} does not exist: give grids, folders, patterns or a "
+                "manifest"
+            )
+        raise OptionError(
+            f"{argument} is neither a grid ({', '.join(GRID_SUFFIXES)}) nor a manifest "
+            f"({', '.join(MANIFEST_SUFFIXES)})"
+        )
 
+    def _below(self, root: Path, paths: Iterable[Path], argument: str) -> list[Job]:
+        """Return a job for every grid among the paths; outputs mirror the folders below root.
 
-def _fixed_part(pattern: Path) -> Path:
-    """Return the folder above the first part of a pattern that is one."""
-    parts = pattern.parts
-    first = next(i for i, part in enumerate(parts) if glob.has_magic(part))
-    return Path(*parts[:first])
+        What has a grid's name and is no regular file is one, too: it fails by its name.
+        """
+        grids = sorted(
+            path for path in paths if path.suffix.lower() in GRID_SUFFIXES and not path.is_dir()
+        )
+        if not grids:
+            if self.unread:
+                raise FileError(" ".join(self.unread[-1]))
+            raise OptionError(f"{argument} holds no {' or '.join(GRID_SUFFIXES)} file")
+        return [Job(p, self._target(p.relative_to(root)), self.options) for p in grids]
+
+    def _target(self, path: Path) -> str:
+        return path.with_suffix(self.suffix).as_posix()
+
+    def _note(self, error: OSError) -> None:
+        self.unread.append((str(error.filename), reason_of(error)))
 
 
 def _each_once(jobs: Iterable[Job]) -> list[Job]:

@@ -3,12 +3,15 @@
     {"in": "a.npy", "out": "parts/a.stl", "spacing": 0.5, "inside": "negative"}
 
 Inputs are relative to the manifest, outputs to the output folder. Blank lines, and in ``.txt``
-those that start with ``#``, are passed over. Options are those of ``ConvertOptions``.
+those that start with ``#``, are passed over. Options are those of ``ConvertOptions``. The text is
+UTF-8; a byte order mark before it, and CRLF at the lines' ends, change nothing.
 """
 
 from __future__ import annotations
 
 import json
+import math
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path, PurePath
@@ -22,6 +25,8 @@ from ..nodes import check_factor
 from .job import Job
 
 Entry = dict[str, Any]
+USAGE = 'give an object, {"in": "a.npy"}'
+LONGEST = 240  # characters of a line, or of what is wrong with it, that are shown
 
 
 def read_manifest(path: Path, suffix: str, options: ConvertOptions) -> list[Job]:
@@ -39,7 +44,7 @@ def read_manifest(path: Path, suffix: str, options: ConvertOptions) -> list[Job]
         try:
             jobs.append(_job(entry, path.parent, suffix, options))
         except OptionError as error:
-            raise OptionError(f"{path}, line {number}: {error}") from None
+            raise OptionError(f"{path}, line {number}: {shorten(str(error))}") from None
     if not jobs:
         raise OptionError(f"{path} names no file: give a path a line")
     return jobs
@@ -48,7 +53,7 @@ def read_manifest(path: Path, suffix: str, options: ConvertOptions) -> list[Job]
 def _entries(path: Path) -> Iterator[tuple[int, Entry]]:
     """Yield the number and the content of each line that has one."""
     try:
-        lines = path.read_text("utf-8").splitlines()
+        lines = path.read_text("utf-8-sig").split("\n")
     except (OSError, UnicodeDecodeError) as error:
         raise FileError(f"{path} cannot be read: {getattr(error, 'strerror', error)}") from None
     for number, line in enumerate(map(str.strip, lines), 1):
@@ -61,12 +66,37 @@ def _entries(path: Path) -> Iterator[tuple[int, Entry]]:
 def _parse(line: str, where: str) -> Entry:
     """Return a line's JSON object."""
     try:
-        entry = json.loads(line)
+        entry = json.loads(line, object_pairs_hook=_without_doubles, parse_constant=_no_constant)
+    except OptionError as error:
+        raise OptionError(f"{where}: {shorten(str(error))}") from None
     except ValueError as error:
         raise OptionError(f"{where} is no JSON: {error}") from None
+    except RecursionError:
+        raise OptionError(f"{where} is nested too deeply: {USAGE}") from None
     if not isinstance(entry, dict):
-        raise OptionError(f'{where} is {line}: give an object, {{"in": "a.npy"}}')
+        raise OptionError(f"{where} is {shorten(line)}: {USAGE}")
     return entry
+
+
+def _without_doubles(pairs: list[tuple[str, Any]]) -> Entry:
+    """Return an object of JSON, unless it says something twice."""
+    entry = dict(pairs)
+    if len(entry) < len(pairs):
+        names = [name for name, _ in pairs]
+        double = next(name for name in names if names.count(name) > 1)
+        raise OptionError(f"{double!r} is there twice: give it once")
+    return entry
+
+
+def _no_constant(name: str) -> float:
+    """Refuse NaN and the infinities, which Python's parser takes and JSON has not."""
+    raise OptionError(f"{name} is no number: give a finite one")
+
+
+def shorten(text: str) -> str:
+    """Return a text that fits into a message, without its middle where it is long."""
+    half = LONGEST // 2
+    return text if len(text) <= LONGEST else f"{text[:half]}...{text[-half:]}"
 
 
 def _job(entry: Entry, home: Path, suffix: str, options: ConvertOptions) -> Job:
@@ -74,6 +104,7 @@ def _job(entry: Entry, home: Path, suffix: str, options: ConvertOptions) -> Job:
     source, target = entry.pop("in", None), entry.pop("out", None)
     if not isinstance(source, str) or not source:
         raise OptionError(f"'in' is {source!r}: give the path of a grid")
+    _check_name("in", source)
     unknown = sorted(entry.keys() - CHECKS.keys())
     if unknown:
         raise OptionError(f"{unknown[0]!r} is unknown: give in, out, {', '.join(CHECKS)}")
@@ -84,6 +115,8 @@ def _job(entry: Entry, home: Path, suffix: str, options: ConvertOptions) -> Job:
 
 def _default_target(source: str, suffix: str) -> PurePath:
     """Return where a mesh goes: below the output folder as the grid is below the manifest."""
+    if PurePath(source).name in ("", ".."):
+        raise OptionError(f"'in' is {source!r}: give the path of a grid")
     path = PurePath(source).with_suffix(suffix)
     return PurePath(path.name) if path.is_absolute() or ".." in path.parts else path
 
@@ -95,7 +128,18 @@ def _check_target(target: Any) -> PurePath:
         raise OptionError(f"'out' is {target!r}: give a file, one of {', '.join(MESH_SUFFIXES)}")
     if path.is_absolute() or ".." in path.parts:
         raise OptionError(f"'out' is {target!r}: give a path within the output folder")
+    _check_name("out", target)
     return path
+
+
+def _check_name(name: str, path: str) -> None:
+    """Raise if no file can be called so: a NUL in it, or half a pair of UTF-16."""
+    try:
+        is_impossible = b"\0" in os.fsencode(path)
+    except UnicodeEncodeError:
+        is_impossible = True
+    if is_impossible:
+        raise OptionError(f"{name!r} is {path!r}: no file can have this name")
 
 
 def _factor(name: str, value: Any) -> int:
@@ -108,7 +152,13 @@ def _factor(name: str, value: Any) -> int:
 def _number(name: str, value: Any) -> float:
     if type(value) not in (int, float):
         raise OptionError(f"{name!r} is {value!r}: give a number")
-    return float(value)
+    try:
+        number = float(value)
+    except OverflowError:  # a whole number beyond 1.8e308
+        number = math.inf
+    if not math.isfinite(number):
+        raise OptionError(f"{name!r} is {value!r}: give a finite number")
+    return number
 
 
 def _numbers(name: str, value: Any) -> tuple[float, ...]:

@@ -13,8 +13,8 @@ from .. import __version__
 from ..network import find_model
 from .fingerprint import fingerprint, is_unchanged
 from .job import Job, Result, Row, failed_row
+from .journal import Journal, read_journal
 from .ledger import Ledger
-from .lock import read_begun
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,10 @@ class Batch:
         What this run did.
     work, work_done : float
         How long it all takes about, in no unit.
+    unread : list of (str, str)
+        Folders that could not be looked into, and why.
+    notes : list of str
+        What a user should know of how it is run.
     """
 
     settings: Settings
@@ -57,6 +61,8 @@ class Batch:
     work: float = 0.0
     work_done: float = 0.0
     seconds: float = 0.0
+    unread: list[tuple[str, str]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
     def failures(self) -> list[Result]:
         """Return all that failed, now or before."""
@@ -70,8 +76,8 @@ class Batch:
 class Planner:
     """Tells what is to be done from what was done before with the same content and options."""
 
-    def __init__(self, settings: Settings, ledger: Ledger, begun: set[str]) -> None:
-        self.settings, self.ledger, self.begun = settings, ledger, begun
+    def __init__(self, settings: Settings, ledger: Ledger, journal: Journal) -> None:
+        self.settings, self.ledger, self.journal = settings, ledger, journal
         path, symmetries = find_model(settings.model, settings.precision)
         network = fingerprint(path)
         self.network = network and network["sha256"], symmetries
@@ -90,7 +96,8 @@ class Planner:
             else:
                 before = batch.done_before if row["status"] == "ok" else batch.failed_before
                 before.append(Result(job, row))
-        batch.waiting.sort(key=lambda job: (job.target in self.begun, -expected_work(job)))
+        last = self.journal.begun - self.ledger.written
+        batch.waiting.sort(key=lambda job: (job.target in last, -expected_work(job)))
         batch.work = sum(map(expected_work, batch.waiting))
         return batch
 
@@ -118,11 +125,22 @@ class Planner:
 
     def _refused(self, job: Job) -> Row | None:
         """Return why an output may not be written: something is there that no batch made."""
-        ours = job.target in self.ledger.written or job.target in self.begun
-        if self.settings.force or ours or not self._path(job).exists():
+        if not os.path.lexists(self._path(job)) or self.may_replace(job):
             return None
-        reason = f"{self._path(job)} exists and is of no batch: remove it or use --force"
+        reason = f"{self._path(job)} exists and was not made by a batch: remove it or use --force"
         return {**failed_row(job, reason), "options": self.digest(job)}
+
+    def may_replace(self, job: Job) -> bool:
+        """Say whether a job may replace the file that is there.
+
+        Its content tells: a mesh that took its name, and whose process was killed before its row
+        was written, is in the journal.
+        """
+        if self.settings.force or job.target in self.ledger.written:
+            return True
+        digests = self.journal.made.get(job.target)
+        now = fingerprint(self._path(job)) if digests else None
+        return digests is not None and now is not None and now["sha256"] in digests
 
     def _path(self, job: Job) -> Path:
         return self.settings.folder / job.target
@@ -131,7 +149,7 @@ class Planner:
 def preview(jobs: Sequence[Job], settings: Settings) -> Batch:
     """Return what would be done; write nothing."""
     folder = settings.folder
-    return Planner(settings, Ledger(folder), read_begun(folder)).plan(jobs)
+    return Planner(settings, Ledger(folder), read_journal(folder)).plan(jobs)
 
 
 def expected_work(job: Job) -> float:

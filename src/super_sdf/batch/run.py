@@ -7,20 +7,24 @@ until it changes; others, a killed process or a full disk, are tried again.
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from ..chunks import count_cores
-from ..memory import memory_bound
-from .job import Job, Result
+from ..files.parts import remove_abandoned_parts
+from ..machine.pool import Death, Pool
+from ..memory import held_memory, memory_bound
+from .job import Job, Result, Row, failed_row
+from .journal import read_journal
 from .ledger import Ledger
 from .lock import FolderLock
 from .plan import Batch, Planner, Settings, expected_work
-from .pool import Pool
-from .workers import Loading, choose_workers, convert_here
+from .workers import Loading, choose_workers, convert_here, make_worker, useful_workers
 
 # Of what ``expected_work`` counts: done in the time that several processes would take to start.
 LITTLE = 30_000
@@ -37,57 +41,83 @@ class Run:
         self.ledger = Ledger(settings.folder)
         self.ledger.cut_torn_line()
         lock.begun -= self.ledger.written
-        self.planner = Planner(settings, self.ledger, set(lock.begun))
+        self.planner = Planner(settings, self.ledger, read_journal(settings.folder))
         self.batch = self.planner.plan(jobs)
+        self.died: set[str] = set()  # outputs at which a process ended
 
     def complete(self, progress: Progress | None = None) -> None:
         """Do what is to be done; each file is in the ledger before the next is told of."""
         start = time.perf_counter()
         self._note_refused()
-        with closing(self._convert()) as results:
-            for result in results:
-                self._take(result)
+        with closing(self._convert()) as answers:
+            for job, answer in answers:
+                self._take(job, answer)
                 self.batch.seconds = time.perf_counter() - start
                 if progress:
                     progress(self.batch)
 
-    def _convert(self) -> Generator[Result, None, None]:
+    def _convert(self) -> Generator[tuple[Job, Row | Death], None, None]:
         """Convert in this process or in several."""
-        asked = self.settings
-        if not self.batch.waiting or self._is_over():
+        asked, folder = self.settings, self.settings.folder
+        if not self.batch.waiting or self.is_over():
             return
-        jobs = len(self.batch.waiting) if self.batch.work > LITTLE else 1
-        workers = asked.workers or choose_workers(asked.device, jobs)
+        workers = self._count_workers()
         threads = asked.threads or (max(1, count_cores() // workers) if workers > 1 else 0)
         loading = Loading(asked.model, asked.precision, asked.device, threads)
-        queue = self._queue(workers)
+        queue = Queue(self, workers)
         if workers == 1:
-            yield from convert_here(queue, asked.folder, loading, self._begin)
+            yield from convert_here(queue, folder, loading)
         else:
-            yield from Pool(queue, asked.folder, loading, self._begin).results(workers)
+            prepare = partial(make_worker, loading, folder)
+            yield from Pool(queue, prepare, self._clean).results(workers)
 
-    def _queue(self, workers: int) -> Iterator[Job]:
-        """Yield jobs as long as there are, and as they should be begun; memory is shared out."""
-        while self.batch.waiting and not self._is_over():
-            job = self.batch.waiting.pop(0)
-            bound = memory_bound(job.options.max_memory)
-            if workers > 1 and bound is not None:
-                job = replace(job, options=replace(job.options, max_memory=bound // workers))
-            yield job
+    def _count_workers(self) -> int:
+        """Return how many processes are to convert."""
+        asked, jobs = self.settings, len(self.batch.waiting)
+        memory = self.batch.waiting[0].options.max_memory
+        if not asked.workers:
+            return choose_workers(asked.device, jobs if self.batch.work > LITTLE else 1, memory)
+        workers, note = useful_workers(asked.workers, jobs, memory)
+        self.batch.notes += [note] if note else []
+        return workers
 
-    def _is_over(self) -> bool:
+    def _clean(self, job: Job, pid: int) -> None:
+        remove_abandoned_parts([self.settings.folder / job.target], pid)
+
+    def is_over(self) -> bool:
+        """Say whether nothing more is to be begun."""
         return self.settings.fail_fast and bool(self.batch.failures())
 
-    def _begin(self, job: Job) -> None:
-        self.lock.begin(job.target)
+    def begin(self, job: Job) -> Job:
+        """Return a job as it is to be done now, after it was noted that it is.
 
-    def _take(self, result: Result) -> None:
-        """Keep what came of a job."""
-        job, row = result
+        Whether it may replace what is there is asked now: what a process that died was at, or an
+        orphan of a killed batch, may have taken its name meanwhile.
+        """
+        self.lock.begin(job.target)
+        if not os.path.lexists(self.settings.folder / job.target):
+            return job
+        self.planner.journal = read_journal(self.settings.folder)
+        return replace(job, replace=self.planner.may_replace(job))
+
+    def _take(self, job: Job, answer: Row | Death) -> None:
+        """Keep what came of a job; one at which a process ended is tried once more, at the end."""
+        if not isinstance(answer, Death):
+            self._keep(job, answer)
+        elif job.target in self.died:
+            reason = f"the process that converted it {answer.cause}, twice"
+            self._keep(job, failed_row(job, reason))
+        else:
+            self.died.add(job.target)
+            self.batch.waiting.append(job)
+
+    def _keep(self, job: Job, row: Row) -> None:
         row["options"] = self.planner.digest(job)
         self.ledger.add(row)
-        self.lock.finish(job.target)
-        (self.batch.done if row["status"] == "ok" else self.batch.failed).append(result)
+        is_ok = row["status"] == "ok"
+        if is_ok or not os.path.lexists(self.settings.folder / job.target):
+            self.lock.finish(job.target)  # else the journal may be all that knows what is there
+        (self.batch.done if is_ok else self.batch.failed).append(Result(job, row))
         self.batch.work_done += expected_work(job)
 
     def _note_refused(self) -> None:
@@ -96,3 +126,26 @@ class Run:
             known: dict[str, Any] = self.ledger.rows.get(job.target, {})
             if row is not known and row["reason"] != known.get("reason"):
                 self.ledger.add(row)
+
+
+class Queue:
+    """The jobs of a run that are still to be begun, each with its share of the memory.
+
+    The bound is read once, before processes fill it, and shared by those that convert.
+    """
+
+    def __init__(self, run: Run, workers: int) -> None:
+        self.run, self.workers = run, workers
+        self.bound = memory_bound(run.batch.waiting[0].options.max_memory)
+        if self.bound is not None and workers > 1:
+            self.bound = max(1, self.bound - (held_memory() or 0)) // workers
+
+    def __len__(self) -> int:
+        return 0 if self.run.is_over() else len(self.run.batch.waiting)
+
+    def popleft(self) -> Job:
+        """Begin the next job."""
+        job = self.run.begin(self.run.batch.waiting.pop(0))
+        if self.workers == 1:
+            return job
+        return replace(job, options=replace(job.options, max_memory=self.bound))

@@ -1,29 +1,23 @@
-"""Who converts: this process, or one that a pool started; each loads its network once."""
+"""Who converts: this process, or several that a pool supervises; each loads its network once."""
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
-import threading
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass
-from multiprocessing.connection import Connection, wait
+from functools import partial
 from pathlib import Path
 
 from ..chunks import count_cores
 from ..cuda import available_devices
-from ..errors import SuperSdfError
+from ..machine.pool import Tasks
 from ..memory import free_memory
 from ..network import Network, load_network
-from .job import Job, Result, attempt
+from .job import Job, Row, attempt
 
-# Of memory, for each process that is started unasked: the network, and a grid of 128^3.
+# Of memory, for each process that is started unasked: the network, and a grid of 128^3; and the
+# least with which a process can do anything.
 BYTES_PER_WORKER = 10**9
-
-Begin = Callable[[Job], None]
-"""Called with a job before it begins."""
+LEAST_BYTES = 3 * 10**8
 
 
 @dataclass(frozen=True)
@@ -42,43 +36,36 @@ class Loading:
         )
 
 
-def choose_workers(device: str, jobs: int) -> int:
+def choose_workers(device: str, jobs: int, max_memory: int | None = None) -> int:
     """Return how many processes are best: one a core, as far as memory goes; one on a GPU."""
     if device == "cuda" or (device == "auto" and "cuda" in available_devices()):
         return 1
-    free = free_memory()
+    free = max_memory or free_memory()
     room = count_cores() if free is None else free // BYTES_PER_WORKER
     return max(1, min(count_cores(), room, jobs))
 
 
-def convert_here(
-    jobs: Iterator[Job], folder: Path, loading: Loading, begin: Begin
-) -> Iterator[Result]:
+def useful_workers(asked: int, jobs: int, max_memory: int | None = None) -> tuple[int, str | None]:
+    """Return how many of the processes asked for can be of use, and why no more can."""
+    cores = count_cores()
+    limits = [
+        (jobs, "there is no more to do"),
+        (cores, "this process may use no more cores"),
+    ]
+    if max_memory is not None:
+        limits.append((max(1, max_memory // LEAST_BYTES), "--max-memory has no room for more"))
+    most, cause = min(limits)
+    return min(asked, most), None if asked <= most else f"--jobs {asked} is cut to {most}: {cause}"
+
+
+def make_worker(loading: Loading, folder: Path) -> Callable[[Job], Row]:
+    """Load the network, and return what converts a job with it."""
+    return partial(attempt, folder=folder, network=loading.load())
+
+
+def convert_here(jobs: Tasks[Job], folder: Path, loading: Loading) -> Iterator[tuple[Job, Row]]:
     """Convert one file after another in this process; yield each as it is done."""
-    network = loading.load()
-    for job in jobs:
-        begin(job)
-        yield Result(job, attempt(job, folder, network))
-
-
-def serve(pipe: Connection, folder: Path, loading: Loading) -> None:
-    """Convert what comes by the pipe, until nobody is at its other end."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=end_with_parent, daemon=True).start()
-    try:
-        network = loading.load()
-    except SuperSdfError as error:
-        pipe.send(error)
-        return
-    with suppress(EOFError, OSError):
-        pipe.send(None)
-        while True:
-            pipe.send(attempt(pipe.recv(), folder, network))
-
-
-def end_with_parent() -> None:
-    """End this process when its parent does, however that does: an orphan would write on."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        wait([parent.sentinel])
-        os._exit(1)
+    convert_job = make_worker(loading, folder)
+    while len(jobs):
+        job = jobs.popleft()
+        yield job, convert_job(job)

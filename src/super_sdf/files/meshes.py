@@ -68,12 +68,18 @@ def write_mesh(mesh: Mesh, path: str | Path, *, force: bool = False) -> None:
 
 
 def write_pieces(
-    pieces: Iterable[Mesh], path: str | Path, *, force: bool = False, about: Triple = WORLD_ORIGIN
+    pieces: Iterable[Mesh],
+    path: str | Path,
+    *,
+    force: bool = False,
+    about: Triple = WORLD_ORIGIN,
+    before_rename: Callable[[Path], None] | None = None,
 ) -> None:
     """Write a mesh that comes in pieces, whose triangles use the vertices of all pieces so far.
 
     ``about`` is the point that a format with a local origin counts from. Whether the format can
-    hold the mesh is not asked: see ``precision.check_format_holds``. Otherwise as ``write_mesh``.
+    hold the mesh is not asked: see ``precision.check_format_holds``. ``before_rename`` is called
+    with the path of the finished file, before it takes its name. Otherwise as ``write_mesh``.
     """
     path = check_target(path, force=force)
     writers: dict[str, Writer] = {
@@ -84,7 +90,7 @@ def write_pieces(
         ".glb": partial(write_glb, about=about),
         ".3mf": write_3mf,
     }
-    with replacing(path, force=force) as part:
+    with replacing(path, force=force, before_rename=before_rename) as part:
         writers[path.suffix.lower()](pieces, part)
 
 

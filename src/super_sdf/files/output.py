@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -52,7 +52,9 @@ class _NameTakenError(Exception):
 
 
 @contextmanager
-def replacing(path: Path, *, force: bool = True) -> Iterator[Path]:
+def replacing(
+    path: Path, *, force: bool = True, before_rename: Callable[[Path], None] | None = None
+) -> Iterator[Path]:
     """Yield a path beside the target; it takes the target's place only if all goes well.
 
     The place of a link is kept: the file that it leads to is replaced. What killed processes left
@@ -64,11 +66,15 @@ def replacing(path: Path, *, force: bool = True) -> Iterator[Path]:
         The target.
     force : bool
         Replace a file that is there in the end; else that is an error, and the file stays.
+    before_rename : callable, optional
+        Called with the path of the finished file, before it takes the target's name.
     """
     target = _behind_links(path) if force else path
     try:
         with reserved_part(target) as part:
             yield part
+            if before_rename:
+                before_rename(part)
             (os.replace if force else _rename_if_free)(part, target)
     except _NameTakenError:
         raise WriteError(

@@ -1,0 +1,185 @@
+"""What goes wrong while a batch runs, at random moments, and whether all is right afterwards.
+
+Each trial starts ``super-sdf batch`` in an empty folder, lets one fault happen, looks at what is
+there, and runs the batch again, which must end complete.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from shutil import rmtree
+
+import numpy as np
+import psutil
+
+from .mixed_grids import write_mixed
+
+COMMAND = [sys.executable, "-m", "super_sdf.cli", "batch"]
+KILLS = {
+    "batch killed": signal.SIGKILL,
+    "batch ended": signal.SIGTERM,
+    "batch hung up": signal.SIGHUP,
+    "worker killed": signal.SIGKILL,
+    "worker ended": signal.SIGTERM,
+}
+LIMITS = ("file limit", "full disk")
+OWN_FILES = {"report.jsonl", ".super-sdf-batch"}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Where the grids are, what their meshes must be, and how long the batch takes alone."""
+
+    grids: Path
+    meshes: Path
+    right: dict[str, bytes]
+    seconds: float
+
+    def start(self, limit: int | None = None) -> subprocess.Popen[bytes]:
+        """Start the batch, where no file may grow beyond a limit."""
+        words = [*COMMAND, str(self.grids), "--out", str(self.meshes), "--jobs", "2"]
+        words += ["--quality", "fast", "--factor", "2", "--quiet"]
+        lower = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (limit, limit))
+        return subprocess.Popen(
+            words, stderr=subprocess.PIPE, preexec_fn=None if limit is None else lower
+        )
+
+    def found(self) -> dict[str, bytes]:
+        """Return what is in the output folder, by name."""
+        paths = (path for path in self.meshes.rglob("*") if path.is_file())
+        return {path.relative_to(self.meshes).as_posix(): path.read_bytes() for path in paths}
+
+
+def make_setting(folder: Path, count: int, sizes: list[int]) -> Setting:
+    """Write grids, and convert them undisturbed."""
+    write_mixed(folder / "grids", count, sizes)
+    setting = Setting(folder / "grids", folder / "meshes", {}, 0.0)
+    start = time.perf_counter()
+    _, said = setting.start().communicate()
+    if said:
+        raise SystemExit(said.decode())
+    right = {name: data for name, data in setting.found().items() if name not in OWN_FILES}
+    return Setting(setting.grids, setting.meshes, right, time.perf_counter() - start)
+
+
+def count_faults(setting: Setting, kinds: list[str], seed: int = 0) -> Counter[tuple[str, str]]:
+    """Run a trial a kind; count what came of each: "right", or what was wrong."""
+    rng, counts = np.random.default_rng(seed), Counter[tuple[str, str]]()
+    for kind in kinds:
+        rmtree(setting.meshes, ignore_errors=True)
+        setting.meshes.mkdir()
+        with small_disk(setting.meshes) if kind == "full disk" else nullcontext():
+            wrong = try_once(setting, kind, rng) or "right"
+            counts[kind, wrong] += 1
+        if wrong != "right":
+            print(f"{kind}: {wrong}", file=sys.stderr, flush=True)
+    return counts
+
+
+def try_once(setting: Setting, kind: str, rng: np.random.Generator) -> str | None:
+    """Let a fault happen, and run the batch again; return what is wrong, if anything is."""
+    said = FAULTS[kind](setting, kind, rng)
+    if b"Traceback" in said:
+        return f"a traceback: {said.decode()}"
+    wrong = half_written(setting)
+    if wrong:
+        return wrong
+    process = setting.start()
+    _, said = process.communicate()
+    if process.returncode or said:
+        return f"exit code {process.returncode} when run again: {said.decode()}"
+    return incomplete(setting)
+
+
+def half_written(setting: Setting) -> str | None:
+    """Return what has its final name and is not whole."""
+    found = setting.found()
+    for name in found.keys() & setting.right.keys():
+        if found[name] != setting.right[name]:
+            return f"{name} is half written, or wrong"
+    *lines, _ = found.get("report.jsonl", b"").split(b"\n")
+    for row in map(json.loads, lines):
+        if row["status"] == "ok" and row["out"] not in found:
+            return f"{row['out']} is in the report alone"
+    return None
+
+
+def incomplete(setting: Setting) -> str | None:
+    """Return what is there and should not be, or the other way round."""
+    found = setting.found()
+    if found.pop(".super-sdf-batch", b"") != b"":
+        return "the journal is not empty"
+    rows = {row["out"]: row for row in map(json.loads, found.pop("report.jsonl").splitlines())}
+    if {name for name, row in rows.items() if row["status"] == "ok"} != setting.right.keys():
+        return "the report lacks a row"
+    names = found.keys() ^ setting.right.keys()
+    return f"left over or missing: {', '.join(names)}" if names else half_written(setting)
+
+
+def kill(setting: Setting, kind: str, rng: np.random.Generator) -> bytes:
+    """Send a signal to the batch, or to one of its workers, at a random moment."""
+    process = setting.start()
+    time.sleep(rng.uniform(0, setting.seconds))
+    victims = [process.pid]
+    if kind.startswith("worker"):
+        victims = [child.pid for child in children_of(process.pid)]
+    if victims and process.poll() is None:
+        with suppress(psutil.NoSuchProcess):  # it was through
+            psutil.Process(victims[rng.integers(len(victims))]).send_signal(KILLS[kind])
+    return process.communicate()[1]
+
+
+def children_of(pid: int) -> list[psutil.Process]:
+    """Return a batch's workers."""
+    try:
+        children = psutil.Process(pid).children()
+        return [child for child in children if "spawn_main" in " ".join(child.cmdline())]
+    except psutil.Error:  # it has ended, or one of them has
+        return []
+
+
+def limit_files(setting: Setting, kind: str, rng: np.random.Generator) -> bytes:
+    """Let no file grow beyond a random size: what is over it is written in part."""
+    largest = max(map(len, setting.right.values()))
+    return setting.start(int(rng.integers(0, largest))).communicate()[1]
+
+
+def fill_disk(setting: Setting, kind: str, rng: np.random.Generator) -> bytes:
+    """Leave a random room on the disk, and make more when the batch has ended."""
+    ballast = setting.meshes / "ballast"
+    need = sum(map(len, setting.right.values()))
+    with ballast.open("wb") as file:
+        file.write(bytes(max(0, DISK_BYTES - int(rng.integers(0, 1.2 * need)))))
+    said = setting.start().communicate()[1]
+    ballast.unlink()
+    return said
+
+
+DISK_BYTES = 4 << 20
+FAULTS: dict[str, Callable[[Setting, str, np.random.Generator], bytes]] = {
+    **dict.fromkeys(KILLS, kill),
+    "file limit": limit_files,
+    "full disk": fill_disk,
+}
+
+
+@contextmanager
+def small_disk(folder: Path) -> Iterator[None]:
+    """Mount a small disk in memory on a folder, which only root may."""
+    words = ["mount", "-t", "tmpfs", "-o", f"size={DISK_BYTES}", "tmpfs", str(folder)]
+    subprocess.run(words, check=True)
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", str(folder)], check=True)

@@ -1,0 +1,73 @@
+"""Which files lie below a folder or match a pattern, however its links lead.
+
+Links to folders are followed where a pattern names them, not below a folder or by ``**``: so a
+circle of links has an end. Folders that cannot be read are named.
+"""
+
+from __future__ import annotations
+
+import glob
+import os
+from collections.abc import Callable, Iterator
+from fnmatch import fnmatch
+from pathlib import Path
+
+OnError = Callable[[OSError], None]
+"""Called with the error of a folder that cannot be read."""
+
+
+def files_below(folder: Path, on_error: OnError) -> Iterator[Path]:
+    """Yield what lies below a folder and is no folder."""
+    for path, _, names in os.walk(folder, onerror=on_error):
+        yield from (Path(path, name) for name in names)
+
+
+def matches(pattern: Path, on_error: OnError) -> list[Path]:
+    """Return what a glob pattern matches, each once; ``**`` stands for any folders."""
+    root = fixed_part(pattern)
+    paths = [root]
+    for part in pattern.parts[len(root.parts) :]:
+        found = [path for start in paths for path in _step(start, part, on_error)]
+        paths = list(dict.fromkeys(found))
+    return paths
+
+
+def fixed_part(pattern: Path) -> Path:
+    """Return the folder above the first part of a pattern that is one."""
+    parts = pattern.parts
+    first = next(i for i, part in enumerate(parts) if glob.has_magic(part))
+    return Path(*parts[:first])
+
+
+def _step(path: Path, part: str, on_error: OnError) -> Iterator[Path]:
+    """Yield where one part of a pattern leads."""
+    if part == "**":
+        yield from _visible_below(path, on_error)
+    elif glob.has_magic(part):
+        yield from (path / name for name in _names(path, on_error) if _fits(name, part))
+    elif os.path.lexists(path / part):
+        yield path / part
+
+
+def _visible_below(path: Path, on_error: OnError) -> Iterator[Path]:
+    """Yield a path, and all below it that is not hidden."""
+    yield path
+    for folder, folders, names in os.walk(path, onerror=on_error):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        yield from (Path(folder, n) for n in (*folders, *names) if not n.startswith("."))
+
+
+def _names(path: Path, on_error: OnError) -> list[str]:
+    """Return what is in a folder; nothing is in a file."""
+    try:
+        return os.listdir(path)
+    except (NotADirectoryError, FileNotFoundError):
+        return []
+    except OSError as error:
+        on_error(error)
+        return []
+
+
+def _fits(name: str, part: str) -> bool:
+    """Say whether a name matches; hidden ones only where the pattern says the dot."""
+    return fnmatch(name, part) and (part.startswith(".") or not name.startswith("."))
