@@ -191,8 +191,7 @@ CASES = {
     ),
     ("in.npy", "--offset", "99"): (
         1,
-        "no value is above 99 (the largest is 10.6796): the grid lies within the solid; if "
-        "that is outside and the solid thin, say --inside positive",
+        "no surface at 99: the values go from -5.63846 to 10.6796",
     ),
     ("in.npy", "--factor", "5"): (
         2,
@@ -271,7 +270,9 @@ def test_a_folder_without_permission_is_named(here, command, monkeypatch):
     assert command("upsample", "in.npy", "out.ply") == (1, "", want)
 
 
-@pytest.mark.parametrize("stage", ["pipeline.refine", "pipeline.extract_pieces", "files.meshes.write_ply"])
+@pytest.mark.parametrize(
+    "stage", ["pipeline.refine", "pipeline.extract_pieces", "files.meshes.write_ply"]
+)
 def test_an_interrupt_at_any_stage_leaves_nothing(here, command, monkeypatch, stage):
     def interrupt(*_, **__):
         raise KeyboardInterrupt

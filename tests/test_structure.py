@@ -11,9 +11,11 @@ EVALUATION = sorted((ROOT / "src" / "super_sdf" / "evaluation").glob("*.py"))
 FLOORS = [
     {"errors", "chunks", "compiling"},
     {"memory", "cuda"},
+    {"samples", "gradients"},
+    {"sides", "spacing"},
     {"grid"},
     {"band", "mesh", "cell_cases", "device"},
-    {"nodes", "symmetry"},
+    {"nodes", "symmetry", "offsets", "options"},
     {"field", "files", "network", "lattice"},
     {"isosurface", "border", "spheres"},
     {"survey", "kernels"},
@@ -29,7 +31,7 @@ FLOORS = [
 BATCH = sorted((ROOT / "src" / "super_sdf" / "batch").glob("*.py"))
 FILES = sorted((ROOT / "src" / "super_sdf" / "files").glob("*.py"))
 FILES_FLOORS = [
-    {"conventions", "output", "ply", "__init__"},
+    {"output", "ply", "__init__"},
     {"grids", "meshes"},
 ]
 BATCH_FLOORS = [

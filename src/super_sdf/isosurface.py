@@ -22,6 +22,7 @@ from .band import NEIGHBOURHOOD, STRIDES
 from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, triangle_table
 from .chunks import in_chunks, rows_in_chunk, side_by_side
 from .compiling import compiled_twin
+from .errors import GridError
 from .field import FineField
 from .grid import BoolArray, FloatArray, IntArray, SdfGrid
 from .mesh import Mesh, join_meshes
@@ -238,7 +239,24 @@ def _to_world(
     """Turn fine lattice positions into world ones: fine index K i + K/2 is sample i."""
     sample = position / field.factor - 0.5
     world: NDArray[np.float64] = sample * np.array(grid.spacing) + np.array(grid.origin)
-    reach = np.abs(grid.origin) + np.array(grid.spacing) * field.shape
-    fine_spacing = grid.voxel_size / field.factor
-    single = np.finfo(np.float32).eps * reach.max() < CLEARANCE / 2 * fine_spacing
-    return world.astype(np.float32) if single else world
+    return world if vertex_type(grid, field.factor) is np.float64 else world.astype(np.float32)
+
+
+def vertex_type(grid: SdfGrid, factor: int) -> type[np.float32] | type[np.float64]:
+    """Return the numbers that tell neighbouring vertices apart: single, else double.
+
+    Raises
+    ------
+    GridError
+        If neither does.
+    """
+    least = CLEARANCE / 2 * grid.voxel_size / factor
+    reach = max(abs(x) + h * n for x, h, n in zip(grid.origin, grid.spacing, grid.shape))
+    for kind in (np.float32, np.float64):
+        finfo = np.finfo(kind)
+        if float(finfo.tiny) < least and float(finfo.eps) * reach < least:
+            return kind
+    raise GridError(
+        f"the grid reaches to {reach:.6g}, too far from the origin for its spacing, "
+        f"{grid.voxel_size:.6g}: vertices could not be told apart; give a nearer origin"
+    )

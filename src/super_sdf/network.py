@@ -37,7 +37,7 @@ INPUTS = {
 OUTPUT = "values"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Network:
     """A loaded network; safe to call from several threads.
 
@@ -61,6 +61,13 @@ class Network:
     symmetries: int = 1
     threads: int = 0
     notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        threads = self.threads or "all"
+        return (
+            f"Network({self.card.get('name', 'unnamed')}, receptive field {self.receptive_field}, "
+            f"symmetries {self.symmetries}, device {self.device}, threads {threads})"
+        )
 
     @property
     def receptive_field(self) -> int | None:

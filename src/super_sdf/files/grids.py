@@ -17,9 +17,8 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from ..errors import FileError, GridError, OptionError, SuperSdfError
-from ..grid import SdfGrid
+from ..grid import SdfGrid, make_grid
 from ..memory import check_fits
-from .conventions import make_grid
 from .output import check_free, replacing
 
 GRID_SUFFIXES = (".npy", ".npz")
@@ -32,7 +31,6 @@ def read_grid(
     spacing: Any = None,
     origin: Any = None,
     inside: str = "auto",
-    level: float = 0.0,
 ) -> SdfGrid:
     """Read a grid; ``spacing`` and ``origin`` go before those in the file. See ``make_grid``.
 
@@ -60,7 +58,7 @@ def read_grid(
         raise FileError(f"{path} cannot be read: permission denied") from None
     given = {"spacing": spacing, "origin": origin}
     chosen = {key: found.get(key) if own is None else own for key, own in given.items()}
-    return make_grid(found["values"], inside=inside, level=level, **chosen)
+    return make_grid(found["values"], inside=inside, **chosen)
 
 
 def _read_npy(path: Path) -> dict[str, NDArray[Any]]:
