@@ -1,5 +1,7 @@
 """The library says what the command says: what it refuses, in one line, and what it takes."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from conftest import ball, trilinear
@@ -9,6 +11,7 @@ from super_sdf import SdfGrid, SuperSdfError, extract_mesh, make_grid, reconstru
 from super_sdf.convert import in_percent
 from super_sdf.errors import GridError, OptionError, OptionTypeError
 
+ROOT = Path(__file__).parent.parent
 VALUES = ball(20, 6.0).values
 
 
@@ -182,6 +185,14 @@ def test_mesh_and_field_say_what_they_are_in_a_line():
 def test_dir_lists_the_public_names():
     assert dir(super_sdf) == super_sdf.__all__
     assert {"make_grid", "reconstruct", "write_mesh"} <= set(dir(super_sdf))
+
+
+def test_an_editable_install_is_a_path_that_type_checkers_follow():
+    """Setuptools makes it one where all packages lie below one folder."""
+    settings = (ROOT / "pyproject.toml").read_text()
+    assert 'package-dir = { "" = "src" }' in settings and 'where = ["src"]' in settings
+    assert Path(super_sdf.__path__[0], "models", "base.onnx").is_file()
+    assert Path(super_sdf.__path__[0], "py.typed").is_file()
 
 
 @pytest.mark.parametrize(
