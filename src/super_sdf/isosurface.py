@@ -253,8 +253,8 @@ def vertex_type(grid: SdfGrid, factor: int) -> type[np.float32] | type[np.float6
     least = CLEARANCE / 2 * grid.voxel_size / factor
     reach = max(abs(x) + h * n for x, h, n in zip(grid.origin, grid.spacing, grid.shape))
     for kind in (np.float32, np.float64):
-        finfo = np.finfo(kind)
-        if float(finfo.tiny) < least and float(finfo.eps) * reach < least:
+        tiny, eps, most = (float(getattr(np.finfo(kind), name)) for name in ("tiny", "eps", "max"))
+        if tiny < least and eps * reach < least and reach < most:
             return kind
     raise GridError(
         f"the grid reaches to {reach:.6g}, too far from the origin for its spacing, "
