@@ -7,7 +7,17 @@ import pytest
 from conftest import ball, trilinear
 
 import super_sdf
-from super_sdf import SdfGrid, SuperSdfError, extract_mesh, make_grid, reconstruct, upsample
+from super_sdf import (
+    SdfGrid,
+    SuperSdfError,
+    extract_mesh,
+    load_network,
+    make_grid,
+    read_grid,
+    reconstruct,
+    upsample,
+    write_mesh,
+)
 from super_sdf.convert import in_percent
 from super_sdf.errors import GridError, OptionError, OptionTypeError
 
@@ -155,6 +165,27 @@ def test_wrong_arguments_are_named_with_the_value_seen(message):
         assert str(caught.value) == message
 
 
+OTHERS = {
+    "threads is '2': give a whole number, 0 for one a core": lambda: load_network(threads="2"),
+    "threads is -1: give 1 or more, or 0 for one a core": lambda: load_network(threads=-1),
+    "model is None: give the path of a file": lambda: load_network(None),
+    "path is 3: give the path of a file": lambda: read_grid(3),
+    "path is None: give the path of a file": lambda: write_mesh(reconstruct(GRID, trilinear), None),
+    "mesh is None: give one from reconstruct(grid)": lambda: write_mesh(None, "a.ply"),
+    f"field is {GRID!r:.57}...: give one from upsample(grid, network)": lambda: extract_mesh(
+        GRID, GRID
+    ),
+    "inside is 1: give one of auto, negative, positive": lambda: make_grid(VALUES, inside=1),
+}
+
+
+@pytest.mark.parametrize("message", OTHERS)
+def test_so_are_those_of_the_other_functions(message):
+    with pytest.raises(OptionError) as caught:
+        OTHERS[message]()
+    assert str(caught.value) == message
+
+
 def test_numbers_of_numpy_are_numbers():
     plain = reconstruct(GRID, trilinear, 2, offset=0.5, cap=True)
     numpy = reconstruct(GRID, trilinear, np.int8(2), offset=np.float32(0.5), cap=np.True_)
@@ -175,7 +206,7 @@ def test_mesh_and_field_say_what_they_are_in_a_line():
     assert repr(mesh).startswith(
         f"Mesh({len(mesh.vertices):,} vertices float32, {len(mesh.faces):,}"
     )
-    network = super_sdf.load_network("fast", threads=1)
+    network = load_network("fast", threads=1)
     said = "Network(fast, receptive field 5, symmetries 1, device cpu, threads 1)"
     assert repr(network) == said.replace("field 5", f"field {network.receptive_field}")
     for thing in (GRID, field, mesh, network):

@@ -21,6 +21,7 @@ from .cuda import first_line
 from .device import open_session, run_bound, run_on_cpu
 from .errors import DeviceError, FileError, ModelError, OptionError
 from .grid import FloatArray, IntArray
+from .options import check_path, check_threads
 from .symmetry import cube_symmetries, turn
 
 FORMAT_VERSION = 1
@@ -170,12 +171,14 @@ def load_network(
     FileError
         If there is no such file.
     OptionError
-        If there is none of this precision.
+        If there is none of this precision, or another argument is not what it should be.
     ModelError
         If it is not a network of this format.
     DeviceError
         If CUDA was asked for and cannot run.
     """
+    threads = check_threads(threads)
+    check_path(model, "model")
     path, symmetries = find_model(model, precision)
     if precision == "int8":
         device = _cpu_for_int8(device)

@@ -1,9 +1,11 @@
-"""What the pipeline is asked, checked before any work: the same for library and command line."""
+"""What the library is asked, checked before any work: the same for the command line."""
 
 from __future__ import annotations
 
 from math import isfinite
 from numbers import Integral, Real
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,22 @@ def check_grid(grid: Any) -> None:
         raise OptionTypeError(
             f"grid is {what}: make one with make_grid(values, spacing=...) or read_grid(path)"
         )
+
+
+def check_path(path: Any, name: str) -> Path:
+    """Return a path."""
+    if not isinstance(path, (str, PathLike)):
+        raise OptionTypeError(f"{name} is {seen(path)}: give the path of a file")
+    return Path(path)
+
+
+def check_threads(threads: Any) -> int:
+    """Return a number of threads; 0 is for one a core."""
+    if not isinstance(threads, Integral) or isinstance(threads, bool):
+        raise OptionTypeError(f"threads is {seen(threads)}: give a whole number, 0 for one a core")
+    if int(threads) < 0:
+        raise OptionError(f"threads is {threads}: give 1 or more, or 0 for one a core")
+    return int(threads)
 
 
 def check_network(network: Any) -> None:

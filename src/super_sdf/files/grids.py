@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ..errors import FileError, GridError, OptionError, SuperSdfError
 from ..grid import SdfGrid, make_grid
 from ..memory import check_fits
+from ..options import check_path
 from .output import check_free, replacing
 
 GRID_SUFFIXES = (".npy", ".npz")
@@ -45,7 +46,7 @@ def read_grid(
     GridError
         If its values are no signed distance grid.
     """
-    path = Path(path)
+    path = check_path(path, "path")
     if path.suffix.lower() not in GRID_SUFFIXES:
         raise OptionError(f"{path} is no grid file: give {' or '.join(GRID_SUFFIXES)}")
     try:

@@ -10,8 +10,9 @@ from collections.abc import Iterable
 from importlib.util import find_spec
 from pathlib import Path
 
-from ..errors import FileError, OptionError
+from ..errors import FileError, OptionError, OptionTypeError, seen
 from ..mesh import Mesh, join_meshes
+from ..options import check_path
 from .output import check_free, replacing
 from .ply import write_ply
 
@@ -44,6 +45,9 @@ def write_mesh(mesh: Mesh, path: str | Path, *, force: bool = False) -> None:
     FileError
         If the file exists and ``force`` is not set, or cannot be written.
     """
+    if not isinstance(mesh, Mesh):
+        raise OptionTypeError(f"mesh is {seen(mesh)}: give one from reconstruct(grid)")
+    check_path(path, "path")
     write_pieces([mesh], path, force=force)
 
 
