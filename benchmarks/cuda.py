@@ -37,7 +37,7 @@ def noisy_ball(size: int) -> SdfGrid:
     ijk = np.indices((size,) * 3, np.float32)
     values = np.linalg.norm(ijk - (size / 2 - 0.37), axis=0) - 0.38 * size
     values[: size // 4] += rng.uniform(-0.2, 0.2, values[: size // 4].shape)
-    return SdfGrid(values.astype(np.float32), (1.0, 1.0, 1.0))
+    return SdfGrid.trusted(values.astype(np.float32), (1.0, 1.0, 1.0))
 
 
 def network_inputs(size: int) -> tuple[np.ndarray, ...]:

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from super_sdf import SdfGrid, reconstruct, write_mesh
+from super_sdf import make_grid, reconstruct, write_mesh
 
 part = np.load(Path(__file__).parent / "part.npz")
 
-grid = SdfGrid(part["values"], spacing=part["spacing"], origin=part["origin"])
+grid = make_grid(part["values"], spacing=part["spacing"], origin=part["origin"])
 mesh = reconstruct(grid)
 write_mesh(mesh, sys.argv[1] if len(sys.argv) > 1 else "part.ply", force=True)
 

@@ -98,7 +98,7 @@ def make_sample(
     values = sample_grid(solid, (shape, 1.0, first))
     if not lowest[0] < values.min() < lowest[1]:
         return None
-    window = rescale(SdfGrid(values, (1.0, 1.0, 1.0)))
+    window = rescale(SdfGrid.trusted(values, (1.0, 1.0, 1.0)))
     band = find_band(window)
     voxel_ijk = band[np.abs(window[tuple(band.T)]) <= DECODE_LIMIT]
     if not len(voxel_ijk) or (values < 0).all():

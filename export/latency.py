@@ -1,6 +1,6 @@
 """How long networks of any make take in onnxruntime, all exported alike.
 
-    python -m export.latency models/base.onnx
+    python -m export.latency src/super_sdf/models/base.onnx
 
 The graphs are those of PyTorch's exporter, which gathers all rows of a convolution at once; what is
 shipped goes chunk by chunk (``to_onnx``) and takes less.
@@ -34,7 +34,7 @@ def ball(radius: float = 35.0) -> Prepared:
     """Return the band of a ball; the targets are empty."""
     shape = (int(2 * radius + 8),) * 3
     distance = np.linalg.norm(np.indices(shape) - (shape[0] - 1) / 2, axis=0) - radius
-    band = survey(SdfGrid(distance.astype(np.float32), 1.0))
+    band = survey(SdfGrid.trusted(distance.astype(np.float32), 1.0))
     patches, table, voxels = band.network_inputs()
     targets = np.zeros((len(voxels), 0), np.float32)
     return Prepared(band.voxel_ijk, patches, table, voxels, block_offsets(4), targets)

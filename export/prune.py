@@ -1,6 +1,6 @@
 """Leave out the blocks of a network that never react: they add the same to every voxel.
 
-    python -m export.prune models/base.onnx --out pruned.onnx
+    python -m export.prune src/super_sdf/models/base.onnx --out pruned.onnx
 
 A block whose first rectifier lets nothing through, whatever the neighbours are, adds a constant.
 That goes into the bias of the layer before it, and the values stay what they were.

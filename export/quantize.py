@@ -1,6 +1,7 @@
-"""Write the int8 variant of an exported network, and check how far it is from it.
+r"""Write the int8 variant of an exported network, and check how far it is from it.
 
-    python -m export.quantize models/base.onnx --out models/base-int8.onnx
+    python -m export.quantize src/super_sdf/models/base.onnx \
+        --out src/super_sdf/models/base-int8.onnx
 
 Only the blocks change, and those that never react are left out (``prune``); stem, head and the
 stream of features between the blocks stay float32. Weights are whole numbers with a scale for each

@@ -1,7 +1,9 @@
-"""Write a trained network as the ONNX file that the runtime loads, and check that they agree.
+r"""Write a trained network as the ONNX file that the runtime loads, and check that they agree.
 
-    python -m export.to_onnx --run training/run --out models/base.onnx --data "..." --accuracy "..."
-    python -m export.to_onnx --from models/base.onnx --out models/base.onnx
+    python -m export.to_onnx --run training/run --out src/super_sdf/models/base.onnx \
+        --data "..." --accuracy "..."
+    python -m export.to_onnx --from src/super_sdf/models/base.onnx \
+        --out src/super_sdf/models/base.onnx
 
 The second writes a file's weights and card anew in the graph of today, and keeps it only if it
 gives the same values, bit for bit.

@@ -3,8 +3,8 @@
     python -m export.train --store training/store --run training/run --minutes 90
     python -m export.train --store training/store --run training/run --minutes 90     # goes on
     python -m export.train --store training/store --run training/run --device cuda    # a GPU
-    python -m export.train ... --start models/base.onnx --rate 0.7      # on from there
-    python -m export.train ... --start models/base.onnx --blocks 9      # and three blocks more
+    python -m export.train ... --start src/super_sdf/models/base.onnx --rate 0.7   # from there
+    python -m export.train ... --start src/super_sdf/models/base.onnx --blocks 9   # and deeper
 
 A run folder holds ``checkpoint.pt`` (weights, averaged weights, optimisers, time spent),
 ``log.csv`` and ``loss.png``. Units that react to nothing are started again (``dormant``). The

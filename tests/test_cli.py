@@ -191,8 +191,7 @@ CASES = {
     ),
     ("in.npy", "--offset", "99"): (
         1,
-        "no value is above 99 (the largest is 10.6796): the grid lies within the solid; if "
-        "that is outside and the solid thin, say --inside positive",
+        "no surface at 99: the values go from -5.35914 to 10.6796",
     ),
     ("in.npy", "--factor", "5"): (
         2,

@@ -6,8 +6,8 @@ from conftest import ball
 
 from super_sdf.band import rescale
 from super_sdf.errors import GridError, OptionError
-from super_sdf.files.conventions import make_grid, surface_gradients, typical_length
-from super_sdf.grid import SdfGrid
+from super_sdf.gradients import surface_gradients, typical_length
+from super_sdf.grid import SdfGrid, make_grid
 
 
 def torus(n: int, unit: float = 1.0) -> np.ndarray:
@@ -56,7 +56,7 @@ def test_what_is_given_is_taken_silently():
 
 def test_planes_are_negative_inside_whatever_was_stored():
     values = np.arange(24, dtype=np.uint8).reshape(4, 3, 2)
-    grid = SdfGrid(values, 1.0, positive_inside=True)
+    grid = SdfGrid.trusted(values, 1.0, positive_inside=True)
     np.testing.assert_array_equal(grid.planes(1, 3), -values[1:3].astype(float))
     assert (grid.low, grid.high) == (-23, 0)
     np.testing.assert_array_equal(rescale(grid, -10, 1, 3), 2 * (10 - values[1:3].astype(float)))
@@ -114,7 +114,7 @@ def test_a_wrong_unit_is_refused_with_the_way_out():
 
 
 def test_values_that_are_not_quite_distances_are_noted():
-    grid = make_grid(torus(64) * 1.3, spacing=1 / 64, origin=0)
+    grid = make_grid(torus(64) * 1.2, spacing=1 / 64, origin=0)
     assert len(grid.notes) == 1 and "they are no exact distances" in grid.notes[0]
 
 

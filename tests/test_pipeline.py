@@ -24,7 +24,7 @@ def plane(shape=(9, 11, 10)):
     normal = np.array([0.48, -0.6, 0.64])
     ijk = np.indices(shape).reshape(3, -1).T
     middle = np.array(shape) / 2 - 0.3
-    return SdfGrid(((ijk - middle) @ normal).reshape(shape), (1.0,) * 3), normal, middle
+    return SdfGrid.trusted(((ijk - middle) @ normal).reshape(shape), (1.0,) * 3), normal, middle
 
 
 @pytest.mark.parametrize("factor", FACTORS)
@@ -66,7 +66,7 @@ def test_coarse_samples_are_kept(network):
 def test_noisy_samples_are_corrected(network):
     clean = ball(24, 8.0)
     noise = np.random.default_rng(0).uniform(-0.4, 0.4, clean.shape)
-    field = upsample(SdfGrid(clean.values + noise, clean.spacing), network)
+    field = upsample(SdfGrid.trusted(clean.values + noise, clean.spacing), network)
     assert field.noisy_voxels > 0.5 * field.band_voxels
     before, after = noise[tuple(field.voxel_ijk.T)], values_at_samples(field)
     wanted = clean.values[tuple(field.voxel_ijk.T)]
@@ -135,7 +135,7 @@ def test_decoding_only_what_can_hold_the_surface_loses_nothing(noise, monkeypatc
     """Also on values that are no distances: uniform noise of up to half a voxel."""
     grid = ball()
     values = grid.values + np.random.default_rng(0).uniform(-noise, noise, grid.shape)
-    noisy = SdfGrid(values, grid.spacing)
+    noisy = SdfGrid.trusted(values, grid.spacing)
     some = upsample(noisy, trilinear)
     part = reconstruct(noisy, trilinear)
     monkeypatch.setattr(survey, "can_hold_surface", lambda patches, _: np.ones(len(patches), bool))

@@ -252,7 +252,7 @@ def slope(axis: int) -> SdfGrid:
     ijk = np.indices((10, 12, 14)).astype(float)
     normal = np.roll([0.2, 0.5, np.sqrt(1 - 0.29)], axis)
     values = 0.5 * (np.tensordot(normal, ijk, 1) - normal @ [4.6, 5.7, 6.8])
-    return SdfGrid(values.astype(np.float32), 0.5, (10.0, -20.0, 30.0))
+    return SdfGrid.trusted(values.astype(np.float32), 0.5, (10.0, -20.0, 30.0))
 
 
 def distance_to_slope(grid: SdfGrid, axis: int, points: list[np.ndarray]) -> np.ndarray:
@@ -301,7 +301,7 @@ def test_a_field_closed_at_the_border_has_the_same_section():
 
 
 def test_the_plane_is_the_nearest_one():
-    grid = SdfGrid(ball(20).values, 0.5, (0.0, 0.0, 10.0))
+    grid = SdfGrid.trusted(ball(20).values, 0.5, (0.0, 0.0, 10.0))
     assert find_plane(grid, "z", 12.0) == 4
     assert find_plane(grid, "z", 12.2) == 4
     assert find_plane(grid, "z", 12.3) == 5

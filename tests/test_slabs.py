@@ -57,7 +57,7 @@ def in_pieces(grid, network, monkeypatch, pieces, **options):
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize("factor, cap", [(2, True), (4, False), (4, True)])
 def test_slabs_change_nothing(network, monkeypatch, field, factor, cap):
-    grid = SdfGrid(FIELDS[field], (1.0,) * 3)
+    grid = SdfGrid.trusted(FIELDS[field], (1.0,) * 3)
     (whole,) = in_pieces(grid, network, monkeypatch, 1, factor=factor, cap=cap)
     one = join_meshes(whole.meshes)
     for pieces in (2, 3, 7, 56):
@@ -75,7 +75,7 @@ def test_slabs_change_nothing(network, monkeypatch, field, factor, cap):
 @given(st.integers(0, 10**6), st.integers(2, 30))
 def test_slabs_change_nothing_on_anything(network, seed, pieces):
     values = np.random.default_rng(seed).uniform(-3, 3, (36, 5, 6))
-    grid = SdfGrid(values, (1.0,) * 3)
+    grid = SdfGrid.trusted(values, (1.0,) * 3)
     with pytest.MonkeyPatch.context() as patch:
         (whole,) = in_pieces(grid, network, patch, 1, factor=2, cap=True)
         parts = in_pieces(grid, network, patch, pieces, factor=2, cap=True)
@@ -87,7 +87,7 @@ def test_slabs_change_nothing_on_anything(network, seed, pieces):
 
 def test_what_a_slab_depends_on_is_needed(network, monkeypatch):
     """With less round it the mesh would be another: the test above can fail."""
-    grid = SdfGrid(FIELDS["clean"], (1.0,) * 3)
+    grid = SdfGrid.trusted(FIELDS["clean"], (1.0,) * 3)
     one = reconstruct(grid, network)
     monkeypatch.setattr(plan, "DECODED_BESIDE", 2)
     parts = in_pieces(grid, network, monkeypatch, 4)
@@ -98,7 +98,7 @@ def test_what_a_slab_depends_on_is_needed(network, monkeypatch):
 @pytest.mark.parametrize("field", ["clean", "bad samples", "noisy"])
 @pytest.mark.parametrize("factor", [2, 4, 8])
 def test_compiled_and_threads_change_nothing(monkeypatch, field, factor):
-    grid = SdfGrid(FIELDS[field], (1.0,) * 3, (1.0, 2.0, 3.0))
+    grid = SdfGrid.trusted(FIELDS[field], (1.0,) * 3, (1.0, 2.0, 3.0))
     monkeypatch.setattr("super_sdf.chunks.CHUNK", 5000)
     meshes = []
     for compiled, threads in (("0", 1), ("0", 2), ("1", 1), ("1", 3)):
@@ -111,7 +111,7 @@ def test_compiled_and_threads_change_nothing(monkeypatch, field, factor):
 
 def test_compiled_changes_nothing_where_signs_are_pinned_and_nothing_is_near(monkeypatch):
     """A field that is none: pinned nodes, foot points beyond the blocks, a cap."""
-    grid = SdfGrid(np.random.default_rng(2).uniform(-3, 3, (9, 10, 11)), (1.0,) * 3)
+    grid = SdfGrid.trusted(np.random.default_rng(2).uniform(-3, 3, (9, 10, 11)), (1.0,) * 3)
     meshes = []
     for compiled in "01":
         monkeypatch.setenv("SUPER_SDF_COMPILED", compiled)
@@ -138,7 +138,7 @@ def test_a_function_that_does_not_say_how_far_it_sees_is_asked_once():
 
 @pytest.mark.parametrize("pieces", [1, 2, 5, 1000])
 def test_slabs_cover_the_grid_once(pieces):
-    band = survey(SdfGrid(rod(), (1.0,) * 3))
+    band = survey(SdfGrid.trusted(rod(), (1.0,) * 3))
     slabs = cut(band, pieces, receptive_field=4)
     assert slabs[0].planes[0] == 0 and slabs[-1].planes[1] == 56
     assert all(a.planes[1] == b.planes[0] for a, b in pairwise(slabs))
@@ -152,14 +152,14 @@ def test_slabs_cover_the_grid_once(pieces):
 def test_the_thinnest_slabs_all_decode_something():
     values = np.full((60, 14, 15), 9.0)
     values[40:] = rod()[:20]
-    band = survey(SdfGrid(values, (1.0,) * 3))
+    band = survey(SdfGrid.trusted(values, (1.0,) * 3))
     *_, thinnest = plan.ways_to_cut(band, receptive_field=2)
     assert thinnest[0].planes[0] == 0 and thinnest[-1].planes[1] == 60
     assert all(band.count_decoded(band.rows(*slab.planes)) for slab in thinnest)
 
 
 def test_less_memory_makes_more_slabs_and_too_little_is_refused(bare_plan):
-    band = survey(SdfGrid(rod(), (1.0,) * 3))
+    band = survey(SdfGrid.trusted(rod(), (1.0,) * 3))
     need = 10**8 + slab_bytes(band, plan.whole(band), 4)
     assert len(plan_slabs(band, 4, 2, need)) == 1
     counts = [

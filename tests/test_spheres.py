@@ -93,7 +93,7 @@ def test_exact_samples_are_kept():
 def test_noisy_samples_move_nothing():
     grid = ball()
     noise = np.random.default_rng(0).uniform(-0.3, 0.3, grid.shape)
-    samples, nodes, position = blocks_of(SdfGrid(grid.values + noise, grid.spacing))
+    samples, nodes, position = blocks_of(SdfGrid.trusted(grid.values + noise, grid.spacing))
     assert not len(samples.exact)
     values = distance_to_ball(position)
     np.testing.assert_array_equal(fit_to_spheres(values.copy(), nodes, samples), values)
@@ -110,7 +110,7 @@ def test_one_bad_sample_costs_only_its_neighbours_their_word():
 
 def test_samples_that_were_cut_off_say_nothing():
     grid = ball()
-    band = survey(SdfGrid(np.clip(grid.values, -0.25, 0.25), grid.spacing))
+    band = survey(SdfGrid.trusted(np.clip(grid.values, -0.25, 0.25), grid.spacing))
     np.testing.assert_array_equal(band.exact, np.abs(band.patches[:, 13]) < 0.5)
     assert band.exact.any()
 
@@ -163,7 +163,7 @@ def test_a_wall_between_the_samples_is_found():
     beyond = np.abs(ijk) - np.array([4.6, 0.17, 4.6])[:, None, None, None]
     outer = np.linalg.norm(np.maximum(beyond, 0), axis=0) + np.minimum(beyond.max(0), 0)
     assert outer.min() > 0
-    mesh = reconstruct(SdfGrid(outer, (1.0,) * 3, (-7.5,) * 3), load_network())
+    mesh = reconstruct(SdfGrid.trusted(outer, (1.0,) * 3, (-7.5,) * 3), load_network())
     assert mesh.is_closed()
     thickness = np.ptp(mesh.vertices, axis=0)
     assert thickness == pytest.approx([9.2, 0.34, 9.2], abs=0.25)

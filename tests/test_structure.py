@@ -12,9 +12,12 @@ FLOORS = [
     {"errors", "chunks", "compiling", "interrupts", "streams"},
     {"memory", "cuda", "extras", "machine"},
     {"planes"},
+    {"samples", "gradients"},
+    {"sides", "spacing"},
     {"grid"},
     {"band", "mesh", "cell_cases", "device"},
-    {"nodes", "symmetry", "files"},
+    {"nodes", "symmetry", "options", "offsets"},
+    {"files"},
     {"field", "network", "lattice"},
     {"isosurface", "border", "spheres"},
     {"survey", "kernels"},
@@ -32,7 +35,7 @@ FLOORS = [
 BATCH = sorted((ROOT / "src" / "super_sdf" / "batch").glob("*.py"))
 FILES = sorted((ROOT / "src" / "super_sdf" / "files").glob("*.py"))
 FILES_FLOORS = [
-    {"archives", "conventions", "headers", "parts", "regular", "spool", "__init__"},
+    {"archives", "headers", "parts", "regular", "spool", "__init__"},
     {"output", "ply", "stl", "text_meshes", "glb", "unpacking"},
     {"threemf"},
     {"grids", "meshes"},

@@ -1,7 +1,7 @@
 """Sparse super-resolution of signed distance grids: a coarse grid in, a fine mesh out.
 
->>> from super_sdf import SdfGrid, reconstruct
->>> mesh = reconstruct(SdfGrid(values, spacing=0.1))            # doctest: +SKIP
+>>> from super_sdf import make_grid, reconstruct
+>>> mesh = reconstruct(make_grid(values, spacing=0.1))            # doctest: +SKIP
 
 Names are imported when they are first used, so that ``super-sdf --help`` need not load NumPy.
 """
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from .files.grids import read_grid as read_grid
     from .files.meshes import write_mesh as write_mesh
     from .grid import SdfGrid as SdfGrid
+    from .grid import make_grid as make_grid
     from .isosurface import extract_mesh as extract_mesh
     from .mesh import Mesh as Mesh
     from .network import load_network as load_network
@@ -32,6 +33,7 @@ _HOME = {
     "SuperSdfError": "errors",
     "extract_mesh": "isosurface",
     "load_network": "network",
+    "make_grid": "grid",
     "read_grid": "files.grids",
     "reconstruct": "pipeline",
     "upsample": "pipeline",
@@ -45,3 +47,8 @@ def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f".{_HOME[name]}", __name__), name)
+
+
+def __dir__() -> list[str]:
+    """List the public names, imported already or not."""
+    return __all__

@@ -40,18 +40,19 @@ def rescale(
 ) -> FloatArray:
     """Return the samples in half voxels, ``(values - offset) * 2 / h`` (Eq. 4).
 
-    ``offset`` (world units) shifts the field, so that the level ``values == offset`` becomes the
-    zero level (Sec. 5.3). The band's values then lie in [-3, 3] whatever the unit. Of planes
-    ``first`` to before ``last`` only, if these are given.
+    ``offset`` (world units) shifts the field, so that the surface at that distance, positive
+    outwards, becomes the zero level (Sec. 5.3). The band's values then lie in [-3, 3] whatever the
+    unit. Of planes ``first`` to before ``last`` only, if these are given.
     """
     planes = grid.planes(first, grid.shape[0] if last is None else last)
     rescaled = np.empty(planes.shape, np.float32)
     scale = 2.0 / grid.voxel_size
-    limit = float(np.finfo(np.float32).max) / 4
+    limit = float(np.finfo(np.float32).max) / 4 / scale
     for plane, out in zip(planes, rescaled):  # plane by plane: in cache, and no second copy
-        shifted = plane.astype(np.float64) - offset
-        shifted *= scale
-        np.clip(shifted, -limit, limit, out=out, casting="same_kind")
+        shifted = plane.astype(np.float64)
+        np.clip(shifted, offset - limit, offset + limit, out=shifted)
+        shifted -= offset
+        np.multiply(shifted, scale, out=out, casting="same_kind")
     return rescaled
 
 

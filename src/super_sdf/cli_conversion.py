@@ -81,7 +81,8 @@ OPTIONS = (
         default=0.0,
         show_default=True,
         metavar="D",
-        help="Mesh the surface at distance D (world units, positive outwards).",
+        help="Mesh the surface at distance D, in world units: a positive one grows the solid, "
+        "whichever sign is inside.",
     ),
     click.option("--cap", is_flag=True, help="Close a surface that runs out of the grid."),
     click.option(

@@ -148,7 +148,6 @@ def convert(
         spacing=options.spacing,
         origin=options.origin,
         inside=options.inside,
-        level=options.offset,
         max_memory=options.max_memory,
     )
     check_factor(options.factor)
@@ -210,9 +209,9 @@ def find_warnings(counts: dict[str, int], closed: bool) -> tuple[str, ...]:
     if not closed:
         warnings.append("the surface runs out of the grid and is open there (close it with --cap)")
     if counts["noisy_voxels"]:
-        share = 100 * counts["noisy_voxels"] / counts["band_voxels"]
+        share = in_percent(counts["noisy_voxels"], counts["band_voxels"])
         warnings.append(
-            f"in {share:.2g} % of the band the values differ by more than distances can: they "
+            f"in {share} of the band the values differ by more than distances can: they "
             "are taken for noisy there, and corrected"
         )
     if counts["pinned_nodes"]:
@@ -221,3 +220,11 @@ def find_warnings(counts: dict[str, int], closed: bool) -> tuple[str, ...]:
             "given their sign: the input is no distance field there"
         )
     return tuple(warnings)
+
+
+def in_percent(part: int, whole: int) -> str:
+    """Return a share that is not 0 in two digits, as one says it."""
+    share = 100 * part / whole
+    if share < 0.01:
+        return "less than 0.01 %"
+    return f"{share:.0f} %" if share >= 9.95 else f"{share:.2g} %"

@@ -8,6 +8,9 @@
 
   - ``MeshError`` (also ``ValueError``): a reference mesh bounds no solid.
   - ``OptionError`` (also ``ValueError``): an argument has no meaning (an odd factor, say).
+
+    - ``OptionTypeError`` (also ``TypeError``): it is not even of the right type.
+
   - ``FileError`` (also ``OSError``): a file cannot be read or written.
 
     - ``WriteError``: it cannot be made where it was asked for, which is not the input's fault.
@@ -38,6 +41,10 @@ class OptionError(SuperSdfError, ValueError):
     """An argument has no meaning."""
 
 
+class OptionTypeError(OptionError, TypeError):
+    """An argument is of the wrong type."""
+
+
 class FileError(SuperSdfError, OSError):
     """A file cannot be read or written."""
 
@@ -56,3 +63,9 @@ class DeviceError(SuperSdfError, RuntimeError):
 
 class OutOfMemoryError(SuperSdfError, MemoryError):
     """The work would not fit in memory; it was not begun."""
+
+
+def seen(value: object) -> str:
+    """Return a value as errors show it: on one line, and not longer than that takes."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -10,7 +10,7 @@ from .grid import BoolArray, FloatArray, IntArray
 from .nodes import SharedNodes
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FineField:
     """Values on the nodes of some voxels' blocks: those of a whole grid, or of a slab of it.
 
@@ -47,6 +47,14 @@ class FineField:
     band_voxels: int = 0
     noisy_voxels: int = 0
     pinned: int = 0
+
+    def __repr__(self) -> str:
+        shape = " x ".join(map(str, self.shape))
+        first, last = self.planes
+        return (
+            f"FineField(factor {self.factor}, {len(self.values):,} nodes of "
+            f"{len(self.voxel_ijk):,} voxels in planes {first} to {last - 1} of {shape})"
+        )
 
     @property
     def numbers(self) -> IntArray:

@@ -4,27 +4,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from math import isfinite
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import GridError
 from .planes import PlaneFile, Samples
+from .samples import Extremes, as_samples, check_not_flat, check_values
+from .sides import check_negative_inside, is_positive_inside
+from .spacing import Triple as Triple
+from .spacing import as_triple, check_spacing, choose_spacing
 
 FloatArray: TypeAlias = NDArray[np.float32]
 IntArray: TypeAlias = NDArray[np.int32]
 BoolArray: TypeAlias = NDArray[np.bool_]
-Triple: TypeAlias = tuple[float, float, float]
-
-# The method works on cubes: axes whose spacing differs by less than this are taken as equal.
-EQUAL_SPACING = 1e-3
 
 
-@dataclass(frozen=True, eq=False, init=False)
+@dataclass(frozen=True, eq=False, init=False, repr=False)
 class SdfGrid:
     """Signed distances at the points ``world = origin + spacing * (i, j, k)``.
+
+    Made so, it says that the values are negative inside and how far apart they are, and the values
+    must not contradict it. ``make_grid`` finds out what is not known.
 
     Parameters
     ----------
@@ -35,10 +36,6 @@ class SdfGrid:
         World distance between neighbouring samples; equal on all axes.
     origin : float or three floats
         World position of sample (0, 0, 0); the world's origin unless given.
-    notes : tuple of str
-        What was inferred rather than given, a sentence each.
-    positive_inside : bool
-        The values given are positive inside: read them with the other sign.
 
     Attributes
     ----------
@@ -47,12 +44,15 @@ class SdfGrid:
         and they stay in memory; ``planes`` reads some.
     low, high : float
         The smallest and the largest of them.
+    notes : tuple of str
+        What was inferred rather than given, a sentence each.
 
     Raises
     ------
     GridError
-        If the array is not three-dimensional, finite, and at least 2 samples long on each axis,
-        or if the spacing is not positive and equal on all axes.
+        If the array is not three-dimensional, finite, and at least 2 samples long on each axis; if
+        most of its border is negative; if the spacing is not positive and equal on all axes, or the
+        values change by more from sample to sample, or by much less.
     """
 
     samples: Samples
@@ -64,25 +64,63 @@ class SdfGrid:
     high: float
 
     def __init__(
-        self,
+        self, values: ArrayLike | PlaneFile, spacing: ArrayLike, origin: ArrayLike = 0.0
+    ) -> None:
+        samples, extremes = _checked(values)
+        check_negative_inside(samples)
+        notes: list[str] = []
+        chosen = choose_spacing(samples, check_spacing(spacing), notes)
+        self._set(samples, chosen, origin, tuple(notes), False, extremes)
+
+    @classmethod
+    def trusted(
+        cls,
         values: ArrayLike | PlaneFile,
         spacing: ArrayLike,
         origin: ArrayLike = 0.0,
         notes: tuple[str, ...] = (),
         *,
         positive_inside: bool = False,
-        extremes: tuple[float, float] | None = None,
+        extremes: Extremes | None = None,
+    ) -> SdfGrid:
+        """Return a grid of values whose sign and spacing are known, and not checked.
+
+        ``positive_inside`` says that they are to be read with the other sign; their smallest and
+        largest, if they are given, that they were found finite and three-dimensional before.
+        """
+        samples = as_samples(values)
+        grid = object.__new__(cls)
+        found = extremes or check_values(samples)
+        grid._set(samples, check_spacing(spacing), origin, notes, positive_inside, found)
+        return grid
+
+    def _set(
+        self,
+        samples: Samples,
+        spacing: Triple,
+        origin: ArrayLike,
+        notes: tuple[str, ...],
+        positive_inside: bool,
+        extremes: Extremes,
     ) -> None:
-        samples = values if isinstance(values, PlaneFile) else np.asanyarray(values)
-        low, high = extremes or check_values(samples)  # given: they were checked before
+        """Set all fields."""
         set_ = partial(object.__setattr__, self)
+        low, high = extremes
         set_("samples", samples)
-        set_("spacing", check_spacing(spacing))
+        set_("spacing", spacing)
         set_("origin", as_triple(origin, "origin"))
         set_("notes", notes)
         set_("positive_inside", positive_inside)
         set_("low", -high if positive_inside else low)
         set_("high", -low if positive_inside else high)
+
+    def __repr__(self) -> str:
+        shape = " x ".join(map(str, self.shape))
+        spacing, origin = (", ".join(f"{x:.6g}" for x in at) for at in (self.spacing, self.origin))
+        return (
+            f"SdfGrid({shape} {self.samples.dtype}, spacing {spacing}, origin {origin}, "
+            f"values {self.low:.6g} to {self.high:.6g})"
+        )
 
     @property
     def values(self) -> NDArray[Any]:
@@ -108,75 +146,58 @@ class SdfGrid:
         return sum(self.spacing) / 3
 
 
+def make_grid(
+    values: ArrayLike | PlaneFile,
+    *,
+    spacing: ArrayLike | None = None,
+    origin: ArrayLike | None = None,
+    inside: str = "auto",
+) -> SdfGrid:
+    """Make a grid from an array of signed distances, inferring what is not given.
+
+    Parameters
+    ----------
+    values : (nx, ny, nz) array_like
+        Signed distances; i runs along x, j along y, k along z.
+    spacing : number or three, optional
+        World distance between samples; estimated from the gradient if not given.
+    origin : three numbers, optional
+        World position of sample (0, 0, 0); the world's origin if not given.
+    inside : {"auto", "negative", "positive"}
+        The sign of samples inside the solid; "auto" takes the border of the grid for outside.
+
+    Returns
+    -------
+    SdfGrid
+        Negative inside; ``notes`` says what was inferred.
+
+    Raises
+    ------
+    GridError
+        If the values are no signed distances, or contradict the spacing.
+    OptionError
+        If ``inside`` is another word.
+    """
+    samples, extremes = _checked(values)
+    notes: list[str] = []
+    flipped = is_positive_inside(samples, inside, extremes, notes)
+    chosen = choose_spacing(samples, spacing, notes)
+    if origin is None:
+        notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
+    at = 0.0 if origin is None else origin
+    return SdfGrid.trusted(
+        samples, chosen, at, tuple(notes), positive_inside=flipped, extremes=extremes
+    )
+
+
+def _checked(values: ArrayLike | PlaneFile) -> tuple[Samples, Extremes]:
+    """Return samples that can be those of a solid, with the smallest and the largest."""
+    samples = as_samples(values)
+    extremes = check_values(samples)
+    check_not_flat(samples, extremes)
+    return samples, extremes
+
+
 def negated(values: NDArray[Any]) -> NDArray[Any]:
     """Return the values with the other sign, unsigned integers among them."""
     return -values.astype(np.promote_types(values.dtype, np.float32))
-
-
-def as_triple(number: ArrayLike, name: str) -> Triple:
-    """Return one number or three as three finite floats."""
-    try:
-        triple = np.broadcast_to(np.asarray(number, np.float64).ravel(), (3,))
-    except (TypeError, ValueError):
-        raise GridError(f"{name} is {number!r}: give one number or three") from None
-    if not np.isfinite(triple).all():
-        raise GridError(f"{name} is {number!r}: it must be finite")
-    return float(triple[0]), float(triple[1]), float(triple[2])
-
-
-def check_spacing(spacing: ArrayLike) -> Triple:
-    """Return the spacing as three floats; they must be positive and equal (within 0.1 %)."""
-    triple = as_triple(spacing, "spacing")
-    if min(triple) <= 0:
-        raise GridError(f"spacing is {_join(triple)}: it must be greater than 0")
-    if max(triple) > min(triple) * (1 + EQUAL_SPACING):
-        raise GridError(
-            f"spacing is {_join(triple)}: the method needs cubic voxels; "
-            "resample the grid to one spacing on all axes"
-        )
-    return triple
-
-
-def check_values(values: Samples) -> tuple[float, float]:
-    """Return the smallest and largest sample of a finite, numeric, three-dimensional array."""
-    check_kind(values.dtype, values.shape)
-    return _find_extremes(values)
-
-
-def check_kind(dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
-    """Raise if an array of this type and shape holds no grid, whatever its values."""
-    if dtype == np.bool_:
-        raise GridError(
-            "values are true or false: an occupancy grid holds no distances; "
-            "make them with scipy.ndimage.distance_transform_edt"
-        )
-    if dtype.kind not in "fiu":
-        raise GridError(f"values have dtype {dtype}: give floating-point or integer numbers")
-    if len(shape) != 3:
-        raise GridError(f"values have shape {shape}: give three axes (x, y, z)")
-    if min(shape) < 2:
-        raise GridError(f"values have shape {shape}: give at least 2 samples on each axis")
-
-
-def _find_extremes(values: Samples) -> tuple[float, float]:
-    """Return the smallest and the largest sample, or raise on the first NaN or infinity.
-
-    Plane by plane, for the grid may be in a file. Extremes tell of bad samples, too: the
-    smallest of numbers and a NaN is NaN.
-    """
-    extremes = []
-    for i, plane in enumerate(values):
-        low, high = float(plane.min()), float(plane.max())
-        if not (isfinite(low) and isfinite(high)):
-            j, k = np.argwhere(~np.isfinite(plane))[0]
-            raise GridError(
-                f"values[{i}, {j}, {k}] is {plane[j, k]}: every sample must be finite; "
-                "replace unknown far samples by a large distance of the right sign"
-            )
-        extremes.append((low, high))
-    lows, highs = zip(*extremes)
-    return min(lows), max(highs)
-
-
-def _join(triple: Triple) -> str:
-    return ", ".join(f"{number:g}" for number in triple)

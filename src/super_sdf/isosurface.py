@@ -22,11 +22,12 @@ from .band import NEIGHBOURHOOD, STRIDES
 from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, triangle_table
 from .chunks import in_chunks, rows_in_chunk, side_by_side
 from .compiling import compiled_twin
-from .errors import GridError
+from .errors import GridError, OptionTypeError, seen
 from .field import FineField
 from .grid import BoolArray, FloatArray, IntArray, SdfGrid
 from .mesh import Mesh, join_meshes
 from .nodes import block_ijk, part_of_node
+from .options import check_grid
 
 # A vertex keeps this share of its lattice edge from either end: where a node's value is 0 several
 # vertices would otherwise fall together, and programs that merge such points would tear the mesh.
@@ -44,6 +45,9 @@ def extract_mesh(field: FineField, grid: SdfGrid, first_vertex: int = 0) -> Mesh
     faces may use both.
     References: Lorensen and Cline, "Marching Cubes", 1987.
     """
+    if not isinstance(field, FineField):
+        raise OptionTypeError(f"field is {seen(field)}: give one from upsample(grid, network)")
+    check_grid(grid)
     return join_meshes(extract_pieces(field, grid, first_vertex))
 
 

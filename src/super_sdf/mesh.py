@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from .grid import IntArray
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Mesh:
     """Triangles of a surface, outward: seen from outside, counter-clockwise.
 
@@ -25,6 +25,14 @@ class Mesh:
 
     vertices: NDArray[Any]
     faces: IntArray
+
+    def __repr__(self) -> str:
+        says = f"{len(self.vertices):,} vertices {self.vertices.dtype}, {len(self.faces):,} faces"
+        if len(self.vertices):
+            low, high = self.vertices.min(0), self.vertices.max(0)
+            box = ", ".join(f"{a:.6g} to {b:.6g}" for a, b in zip(low, high))
+            says += f", x, y, z from {box}"
+        return f"Mesh({says})"
 
     def transformed(self, linear: NDArray[Any], shift: NDArray[Any]) -> Mesh:
         """Return the mesh with ``vertices @ linear.T + shift`` (``linear`` keeps orientation)."""

@@ -23,6 +23,7 @@ from .device import open_session, run_bound, run_on_cpu
 from .errors import DeviceError, FileError, ModelError, OptionError
 from .files.regular import check_regular_file
 from .grid import FloatArray, IntArray
+from .options import check_path, check_threads
 from .symmetry import cube_symmetries, turn
 
 FORMAT_VERSION = 1
@@ -39,7 +40,7 @@ INPUTS = {
 OUTPUT = "values"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Network:
     """A loaded network; safe to call from several threads.
 
@@ -63,6 +64,13 @@ class Network:
     symmetries: int = 1
     threads: int = 0
     notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        threads = self.threads or "all"
+        return (
+            f"Network({self.card.get('name', 'unnamed')}, receptive field {self.receptive_field}, "
+            f"symmetries {self.symmetries}, device {self.device}, threads {threads})"
+        )
 
     @property
     def receptive_field(self) -> int | None:
@@ -165,12 +173,14 @@ def load_network(
     FileError
         If there is no such file.
     OptionError
-        If there is none of this precision.
+        If there is none of this precision, or another argument is not what it should be.
     ModelError
         If it is not a network of this format.
     DeviceError
         If CUDA was asked for and cannot run.
     """
+    threads = check_threads(threads)
+    check_path(model, "model")
     path, symmetries = find_model(model, precision)
     if precision == "int8":
         device = _cpu_for_int8(device)

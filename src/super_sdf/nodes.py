@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from .band import CENTRE, NEIGHBOURHOOD, STRIDES
 from .chunks import in_chunks
 from .compiling import compiled_twin
-from .errors import OptionError
+from .errors import OptionError, OptionTypeError, seen
 from .grid import BoolArray, FloatArray, IntArray
 
 Signs = NDArray[np.int8]
@@ -37,14 +38,17 @@ SHARING = [
 ]
 
 
-def check_factor(factor: int) -> int:
+def check_factor(factor: Any) -> int:
     """Return the factor if it is even and 2 to 16: an odd one has no node on the sample."""
-    if not 2 <= factor <= MAX_FACTOR or factor % 2:
+    if not isinstance(factor, Integral) or isinstance(factor, bool):
+        raise OptionTypeError(f"factor is {seen(factor)}: give a whole number")
+    whole = int(factor)
+    if not 2 <= whole <= MAX_FACTOR or whole % 2:
         raise OptionError(
-            f"factor is {factor}: give an even number from 2 to {MAX_FACTOR} "
+            f"factor is {seen(whole)}: give an even number from 2 to {MAX_FACTOR} "
             "(an odd one has no node on the samples)"
         )
-    return factor
+    return whole
 
 
 def block_ijk(factor: int) -> IntArray:

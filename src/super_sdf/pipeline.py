@@ -6,8 +6,8 @@
 A grid that is too large to be refined at once is refined slab by slab (see ``plan``); the mesh is
 the same.
 
->>> from super_sdf import SdfGrid, reconstruct
->>> mesh = reconstruct(SdfGrid(values, spacing=0.1))            # doctest: +SKIP
+>>> from super_sdf import make_grid, reconstruct
+>>> mesh = reconstruct(make_grid(values, spacing=0.1))            # doctest: +SKIP
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ import numpy as np
 from .border import close_at_border
 from .chunks import working_threads
 from .compiling import use_compiled
-from .errors import NoSurfaceError
 from .field import FineField, border_is_crossed
 from .grid import FloatArray, IntArray, SdfGrid
 from .isosurface import extract_pieces, vertex_type
@@ -35,9 +34,17 @@ from .nodes import (
     pin_to_skipped,
     signs_of_skipped,
 )
+from .options import (
+    check_cap,
+    check_distance,
+    check_grid,
+    check_max_memory,
+    check_network,
+    check_progress,
+)
 from .plan import Slab, peak_bytes, plan_slabs
 from .spheres import Samples, fit_to_spheres
-from .survey import Band, survey
+from .survey import Band, no_surface, survey
 
 Progress = Callable[[int, int], None]
 """Called with (steps done, steps in all)."""
@@ -83,7 +90,10 @@ def upsample(
     factor : int
         How many times finer, K: 2, 4, 8, 16 (any even number up to 16).
     offset : float
-        Refine round the level ``values == offset`` (world units) instead of 0 (Sec. 5.3).
+        Refine round the surface at this distance (world units) from the solid's own, instead of
+        that (Sec. 5.3). Positive is outwards, whichever sign the given values have inside:
+        ``grid.values``, which equal the offset there, are always negative inside. The distances
+        must go 1.5 spacings further.
     progress : callable, optional
         Called with (steps done, steps in all).
 
@@ -95,13 +105,18 @@ def upsample(
     Raises
     ------
     OptionError
-        If the factor is odd or out of range.
+        If the factor is odd or out of range, or another argument is not what it should be.
     OutOfMemoryError
         If the fine values would not fit in memory.
     GridError
-        If no surface is found: thin parts may pass between samples that are all outside, so this
-        is known only in the end.
+        If the distances end within 1.5 spacings of the offset; if it is too far from the origin for
+        vertices to be told apart; if no surface is found: thin parts may pass between samples that
+        are all outside, so this is known only in the end.
     """
+    check_grid(grid)
+    check_network(network)
+    check_progress(progress)
+    factor, offset = check_factor(factor), check_distance(offset)
     with working_threads(getattr(network, "threads", 0)):
         band = find_surface(grid, factor, offset, memory_bound())
         (slab,) = plan_slabs(band, factor, None, memory_bound())
@@ -128,6 +143,7 @@ def reconstruct(
     there, or closed along the border with ``cap``. ``max_memory`` bounds what the process may hold,
     in bytes, beside the mesh; a share of what is free unless given. Otherwise as ``upsample``.
     """
+    check_grid(grid)
     if network is None:
         from .network import load_network
 
@@ -178,6 +194,25 @@ def reconstruct_slabs(
 
     Joined, the pieces are the same mesh, bit for bit, whatever the slabs and threads.
     """
+    check_grid(grid)
+    check_network(network)
+    check_progress(progress)
+    factor, offset = check_factor(factor), check_distance(offset)
+    return _slabs(
+        grid, network, factor, offset, check_cap(cap), check_max_memory(max_memory), progress
+    )
+
+
+def _slabs(
+    grid: SdfGrid,
+    network: Decoder,
+    factor: int,
+    offset: float,
+    cap: bool,
+    max_memory: int | None,
+    progress: Progress | None,
+) -> Iterator[Piece]:
+    """Yield the pieces of ``reconstruct_slabs``, whose arguments were checked."""
     threads = getattr(network, "threads", 0)
     bound = memory_bound(max_memory)
     with working_threads(threads):
@@ -221,7 +256,6 @@ class Steps:
 
 def find_surface(grid: SdfGrid, factor: int, offset: float, bound: int | None) -> Band:
     """Return the band of a grid, if a surface can be in it."""
-    check_factor(factor)
     vertex_type(grid, factor)  # raises if there is none
     band = survey(grid, offset, bound)  # Eqs. 2 and 4
     if not band.decoded.any():
@@ -270,13 +304,6 @@ def describe_piece(field: FineField, meshes: list[Mesh], planned: dict[str, int]
     }
     whole = {"band_voxels": field.band_voxels, "noisy_voxels": field.noisy_voxels, **planned}
     return Piece(meshes, counts, whole, border_is_crossed(field), field.signs())
-
-
-def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:
-    """Return the error for a grid in which nothing is to be found."""
-    return NoSurfaceError(
-        f"no surface at {offset:g}: the values go from {grid.low:.6g} to {grid.high:.6g}"
-    )
 
 
 def rows_among(voxels: IntArray, count: int) -> IntArray:

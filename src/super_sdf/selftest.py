@@ -113,7 +113,7 @@ def make_ball() -> Ball:
     """Sample a ball and return its voxels that can hold the surface."""
     ijk = np.indices((BALL_SAMPLES,) * 3)
     values = np.linalg.norm(ijk - BALL_CENTRE, axis=0) - BALL_RADIUS
-    band = survey(SdfGrid(values.astype(np.float32), (1.0, 1.0, 1.0)))
+    band = survey(SdfGrid.trusted(values.astype(np.float32), (1.0, 1.0, 1.0)))
     patches, table, voxels = band.network_inputs()
     offsets = block_offsets(4)
     nodes = band.voxel_ijk[voxels, None] + offsets / 2  # offsets are in half voxels

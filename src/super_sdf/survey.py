@@ -21,9 +21,10 @@ from .band import (
     rescale,
 )
 from .chunks import side_by_side
-from .errors import OutOfMemoryError
+from .errors import NoSurfaceError, OutOfMemoryError
 from .grid import BoolArray, FloatArray, IntArray, SdfGrid
 from .memory import in_words
+from .offsets import Jumps, check_not_cut_off, check_not_filled, find_jumps
 from .spheres import exact_samples
 
 BYTES_PER_VOXEL = 123  # of a band
@@ -104,18 +105,21 @@ def _cropped(voxel_ijk: IntArray, shape: tuple[int, int, int]) -> tuple[IntArray
 def survey(grid: SdfGrid, offset: float = 0.0, bound: int | None = None) -> Band:
     """Read a grid once and return its band.
 
-    ``offset`` (world units) moves the surface to the level ``values == offset``. ``bound`` is how
-    many bytes the process may hold.
+    ``offset`` (world units, positive outwards) is the distance at which the surface is looked for.
+    ``bound`` is how many bytes the process may hold.
 
     Raises
     ------
+    GridError
+        If the distances end too near to the offset.
     OutOfMemoryError
         As soon as the band alone is larger than the bound: it is not worth reading on.
     """
     sizes: list[int] = []
+    jumps: list[tuple[Jumps, Jumps]] = []
 
     def read(planes: slice) -> tuple[IntArray, FloatArray]:
-        found = _band_of_planes(grid, offset, planes.start, planes.stop)
+        found = _band_of_planes(grid, offset, planes.start, planes.stop, jumps)
         sizes.append(len(found[0]))
         _check_bound(sum(sizes), planes.stop, bound)
         return found
@@ -124,6 +128,10 @@ def survey(grid: SdfGrid, offset: float = 0.0, bound: int | None = None) -> Band
     voxel_ijk = np.concatenate([ijk for ijk, _ in parts])
     patches = [part for _, part in parts]
     del parts
+    if offset:
+        if not any(up.near for up, _ in jumps):
+            raise no_surface(grid, offset)
+        check_not_filled(jumps, offset, grid.voxel_size)
     return describe(grid.shape, voxel_ijk, _joined(patches))
 
 
@@ -145,14 +153,28 @@ def describe(shape: tuple[int, int, int], voxel_ijk: IntArray, patches: FloatArr
 
 
 def _band_of_planes(
-    grid: SdfGrid, offset: float, first: int, last: int
+    grid: SdfGrid, offset: float, first: int, last: int, jumps: list[tuple[Jumps, Jumps]]
 ) -> tuple[IntArray, FloatArray]:
-    """Return the voxels of some planes, and their patches: they see one plane further."""
+    """Return the voxels of some planes, and their patches: they see one plane further.
+
+    With an offset, how far the distances go is looked at too, and ``jumps`` added to.
+    """
     low, high = max(first - 1, 0), min(last + 1, grid.shape[0])
     rescaled = rescale(grid, offset, low, high)
     ijk = find_band(rescaled)
     own = ijk[(ijk[:, 0] >= first - low) & (ijk[:, 0] < last - low)]
-    return own + np.array([low, 0, 0], np.int32), gather_patches(rescaled, own)
+    patches = gather_patches(rescaled, own)
+    if offset:  # at 0 there is no nearer surface to be had
+        check_not_cut_off(patches, offset, grid.voxel_size)
+        jumps.append(find_jumps(rescaled))
+    return own + np.array([low, 0, 0], np.int32), patches
+
+
+def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:
+    """Return the error for a grid in which nothing is to be found."""
+    return NoSurfaceError(
+        f"no surface at {offset:g}: the values go from {grid.low:.6g} to {grid.high:.6g}"
+    )
 
 
 def _joined(parts: list[FloatArray]) -> FloatArray:

@@ -19,9 +19,9 @@ from typing import Any
 
 from ..convert import ConvertOptions
 from ..errors import FileError, OptionError
-from ..files.conventions import INSIDE
 from ..files.meshes import MESH_SUFFIXES
 from ..nodes import check_factor
+from ..sides import INSIDE
 from .job import Job
 
 Entry = dict[str, Any]

@@ -137,12 +137,13 @@ class Case:
         random = np.random.default_rng(shape.seed(NOISE))
         reach = setting.noise * self.spacing / 2
         noise = random.uniform(-1, 1, self.coarse.shape) * reach if reach else 0
-        self.grid = SdfGrid((self.coarse + noise).astype(np.float32), self.spacing, origin)
+        values = (self.coarse + noise).astype(np.float32)
+        self.grid = SdfGrid.trusted(values, self.spacing, origin)
 
     @cached_property
     def voxels(self) -> IntArray:
         """The band of the exact distances (Eq. 2), (V, 3)."""
-        return find_band(rescale(SdfGrid(self.coarse, self.spacing)))
+        return find_band(rescale(SdfGrid.trusted(self.coarse, self.spacing)))
 
     @cached_property
     def band(self) -> BoolArray:

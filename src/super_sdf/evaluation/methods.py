@@ -84,7 +84,8 @@ def refined_grid(grid: SdfGrid, network: Decoder, factor: int) -> SdfGrid:
     field = band_field(grid, network, factor)
     rest = spread_samples(np.asarray(grid.values, np.float32), factor)
     first = np.array(grid.origin) - grid.voxel_size / 2
-    return SdfGrid(np.where(np.isnan(field), rest, field), grid.voxel_size / factor, first)
+    values = np.where(np.isnan(field), rest, field)
+    return SdfGrid.trusted(values, grid.voxel_size / factor, first)
 
 
 def band_field(grid: SdfGrid, network: Decoder, factor: int) -> FloatArray:

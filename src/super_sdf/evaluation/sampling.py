@@ -115,7 +115,7 @@ def sample_solid(
     if band is not None and band < np.inf:
         notes.append(f"distances are exact up to {band:g} voxels and cut off there")
     values = sample_grid(solid, layout, band=np.inf if band is None else band, progress=progress)
-    return SdfGrid(values, spacing, origin, tuple(notes))
+    return SdfGrid.trusted(values, spacing, origin, tuple(notes))
 
 
 def sample_grid(

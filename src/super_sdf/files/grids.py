@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, GridError, OptionError, OutOfMemoryError
-from ..grid import SdfGrid, check_kind
+from ..grid import SdfGrid, make_grid
 from ..memory import held_memory, memory_bound
+from ..options import check_path
 from ..planes import InputFile, PlaneFile, Samples
+from ..samples import check_kind
 from .archives import Member
-from .conventions import make_grid
 from .headers import ArrayHeader, Read, read_array_header
 from .output import check_free, replacing
 from .regular import check_regular_file
@@ -40,7 +41,6 @@ def read_grid(
     spacing: Any = None,
     origin: Any = None,
     inside: str = "auto",
-    level: float = 0.0,
     max_memory: int | None = None,
 ) -> SdfGrid:
     """Read a grid; ``spacing`` and ``origin`` go before those in the file. See ``make_grid``.
@@ -59,7 +59,7 @@ def read_grid(
     GridError
         If its values are no signed distance grid.
     """
-    path = Path(path)
+    path = check_path(path, "path")
     if path.suffix.lower() not in GRID_SUFFIXES:
         raise OptionError(f"{path} is no grid file: give {' or '.join(GRID_SUFFIXES)}")
     check_regular_file(path)
@@ -67,7 +67,7 @@ def read_grid(
     found = read(path, _room(max_memory))
     given = {"spacing": spacing, "origin": origin}
     chosen = {key: found.get(key) if own is None else own for key, own in given.items()}
-    return make_grid(found["values"], inside=inside, level=level, **chosen)
+    return make_grid(found["values"], inside=inside, **chosen)
 
 
 def _room(max_memory: int | None) -> int:

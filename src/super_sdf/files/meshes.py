@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, OptionError
+from ..errors import FileError, OptionError, OptionTypeError, seen
 from ..grid import Triple
 from ..mesh import Mesh
+from ..options import check_path
 from .glb import write_glb
 from .output import check_free, replacing
 from .ply import write_ply
@@ -61,7 +62,9 @@ def write_mesh(mesh: Mesh, path: str | Path, *, force: bool = False) -> None:
         If the file exists and ``force`` is not set, or cannot be written; or if the format cannot
         hold the mesh: a coordinate is not finite, or corners of a triangle would fall together.
     """
-    path = check_target(path, force=force)
+    if not isinstance(mesh, Mesh):
+        raise OptionTypeError(f"mesh is {seen(mesh)}: give one from reconstruct(grid)")
+    path = check_target(check_path(path, "path"), force=force)
     about = _local_origin(mesh, path)
     _check_mesh_holds(mesh, path, about)
     write_pieces([mesh], path, force=force, about=about)

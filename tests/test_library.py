@@ -1,0 +1,241 @@
+"""The library says what the command says: what it refuses, in one line, and what it takes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ball, trilinear
+
+import super_sdf
+from super_sdf import (
+    SdfGrid,
+    SuperSdfError,
+    extract_mesh,
+    load_network,
+    make_grid,
+    read_grid,
+    reconstruct,
+    upsample,
+    write_mesh,
+)
+from super_sdf.convert import in_percent
+from super_sdf.errors import GridError, OptionError, OptionTypeError
+
+ROOT = Path(__file__).parent.parent
+VALUES = ball(20, 6.0).values
+
+
+def test_values_of_the_other_sign_are_refused():
+    with pytest.raises(GridError) as caught:
+        SdfGrid(-VALUES, 1.0)
+    assert str(caught.value) == (
+        "100% of the grid's border is negative, which is inside: make the grid with "
+        "make_grid(values, spacing=..., inside='positive'), or inside='negative' if the solid does "
+        "run out of the grid there"
+    )
+    assert reconstruct(make_grid(-VALUES, spacing=1), trilinear, 2).volume() > 0
+
+
+@pytest.mark.parametrize("make", [SdfGrid, lambda v, h: make_grid(v, spacing=h)])
+@pytest.mark.parametrize("unit, spacing", [(1.5, 1.0), (1.0, 1.5 / 2), (1.0, 2.5), (1.0, 1000)])
+def test_a_spacing_that_the_values_contradict_is_refused(make, unit, spacing):
+    for values in (VALUES, np.abs(np.indices((20, 20, 20)) - 9.3).max(0) - 5.1):
+        with pytest.raises(GridError, match="distances and spacing must be in one unit; scale the"):
+            make(values * unit, spacing)
+
+
+def test_grid_and_make_grid_are_the_same_grid():
+    one, other = SdfGrid(VALUES, 1.0), make_grid(VALUES, spacing=1.0, origin=0)
+    assert repr(one) == repr(other) and one.notes == other.notes == ()
+
+
+def test_thin_parts_may_change_by_less_than_the_spacing():
+    walls = np.abs(np.indices((12, 12, 12))[2] % 4 - 2) - 0.3  # in each fourth sample
+    grid = make_grid(walls, spacing=1.0, origin=0, inside="negative")
+    assert grid.spacing == (1.0, 1.0, 1.0)
+
+
+def test_what_does_not_change_is_no_unit():
+    board = np.where(np.indices((3, 3, 64))[2] % 2, 1.0, -1.0)  # opposite neighbours are equal
+    board[2, 2, 2] = -1.5
+    with pytest.raises(GridError, match="change by 0 from sample to sample, but spacing is 1: dis"):
+        make_grid(board, spacing=1.0, inside="negative")
+    with pytest.raises(GridError, match="change by 0 from sample to sample; give --spacing"):
+        make_grid(board, inside="negative")
+
+
+MASKED = np.ma.masked_greater(VALUES, 9)
+
+
+@pytest.mark.parametrize(
+    "values, message",
+    [
+        (
+            MASKED,
+            r"^\d+ values are masked, values\[0, 0, 0\] the first: every sample must be known",
+        ),
+        (
+            [[1.0], [1.0, 2.0]],
+            r"^values are \[\[1.0\], \[1.0, 2.0\]\]: give an array of three axes",
+        ),
+        (None, "^values have dtype object: give floating-point or integer numbers"),
+        ("part.npy", "^values have dtype <U8: give floating-point or integer numbers"),
+        (
+            np.full((3, 3, 3), np.longdouble("1e400")),
+            r"^values\[0, 0, 0\] is 1e\+400: every sample",
+        ),
+    ],
+)
+def test_what_is_no_array_of_samples_is_refused(values, message):
+    for make in (make_grid, lambda v: SdfGrid(v, 1.0)):
+        with pytest.raises(GridError, match=message):
+            make(values)
+
+
+def test_a_mask_that_hides_nothing_is_let_go_of():
+    grid = make_grid(np.ma.masked_invalid(VALUES), spacing=1)
+    assert type(grid.samples) is np.ndarray
+
+
+@pytest.mark.parametrize(
+    "spacing, message",
+    [
+        ("1.5", "spacing is '1.5': give one number or three"),
+        (True, "spacing is True: give one number or three"),
+        ([1.0, None, 1.0], r"spacing is \[1.0, None, 1.0\]: give one number or three"),
+        (np.ones(2000), r"spacing is array\(\[1., 1., 1., ..., 1., 1., 1.\].*: give one number or"),
+        (
+            1e-300,
+            "spacing is 1e-300, 1e-300, 1e-300: give lengths in a unit in which it is between",
+        ),
+        (1e300, r"spacing is 1e\+300, .*: give lengths in a unit in which it is between"),
+    ],
+)
+def test_a_spacing_is_one_number_or_three(spacing, message):
+    with pytest.raises(GridError, match=message) as caught:
+        make_grid(VALUES, spacing=spacing)
+    assert "\n" not in str(caught.value)
+
+
+GRID = ball(12, 3.0)
+WRONG = {
+    "grid is an array of shape (20, 20, 20): make one with make_grid(values, spacing=...) or "
+    "read_grid(path)": (OptionTypeError, {"grid": VALUES}),
+    "grid is 'part.npz': make one with make_grid(values, spacing=...) or read_grid(path)": (
+        OptionTypeError,
+        {"grid": "part.npz"},
+    ),
+    "network is 'fast': give one from load_network()": (OptionTypeError, {"network": "fast"}),
+    "factor is '4': give a whole number": (OptionTypeError, {"factor": "4"}),
+    "factor is 4.0: give a whole number": (OptionTypeError, {"factor": 4.0}),
+    "factor is True: give a whole number": (OptionTypeError, {"factor": True}),
+    "factor is None: give a whole number": (OptionTypeError, {"factor": None}),
+    "factor is 0: give an even number from 2 to 16 (an odd one has no node on the samples)": (
+        OptionError,
+        {"factor": np.int64(0)},
+    ),
+    "offset is '1': give a number, in world units": (OptionTypeError, {"offset": "1"}),
+    "offset is None: give a number, in world units": (OptionTypeError, {"offset": None}),
+    "offset is False: give a number, in world units": (OptionTypeError, {"offset": False}),
+    "offset is nan: give a finite number, in world units": (OptionError, {"offset": np.nan}),
+    "offset is -inf: give a finite number, in world units": (OptionError, {"offset": -np.inf}),
+    "cap is 'no': give True or False": (OptionTypeError, {"cap": "no"}),
+    "cap is 1: give True or False": (OptionTypeError, {"cap": 1}),
+    "max_memory is '4G': give a whole number of bytes": (OptionTypeError, {"max_memory": "4G"}),
+    "max_memory is 1.5: give a whole number of bytes": (OptionTypeError, {"max_memory": 1.5}),
+    "max_memory is -5: give a number of bytes greater than 0": (OptionError, {"max_memory": -5}),
+    "progress is True: give a function of (steps done, steps in all)": (
+        OptionTypeError,
+        {"progress": True},
+    ),
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_wrong_arguments_are_named_with_the_value_seen(message):
+    kind, wrong = WRONG[message]
+    arguments = {"grid": GRID, "network": trilinear} | wrong
+    with pytest.raises(kind) as caught:
+        reconstruct(**arguments)
+    assert str(caught.value) == message and isinstance(caught.value, SuperSdfError)
+    assert isinstance(caught.value, TypeError) == (kind is OptionTypeError)
+    if not {"cap", "max_memory"} & set(wrong):
+        with pytest.raises(kind) as caught:
+            upsample(**arguments)
+        assert str(caught.value) == message
+
+
+OTHERS = {
+    "threads is '2': give a whole number, 0 for one a core": lambda: load_network(threads="2"),
+    "threads is -1: give 1 or more, or 0 for one a core": lambda: load_network(threads=-1),
+    "model is None: give the path of a file": lambda: load_network(None),
+    "path is 3: give the path of a file": lambda: read_grid(3),
+    "path is None: give the path of a file": lambda: write_mesh(reconstruct(GRID, trilinear), None),
+    "mesh is None: give one from reconstruct(grid)": lambda: write_mesh(None, "a.ply"),
+    f"field is {GRID!r:.57}...: give one from upsample(grid, network)": lambda: extract_mesh(
+        GRID, GRID
+    ),
+    "inside is 1: give one of auto, negative, positive": lambda: make_grid(VALUES, inside=1),
+}
+
+
+@pytest.mark.parametrize("message", OTHERS)
+def test_so_are_those_of_the_other_functions(message):
+    with pytest.raises(OptionError) as caught:
+        OTHERS[message]()
+    assert str(caught.value) == message
+
+
+def test_numbers_of_numpy_are_numbers():
+    plain = reconstruct(GRID, trilinear, 2, offset=0.5, cap=True)
+    numpy = reconstruct(GRID, trilinear, np.int8(2), offset=np.float32(0.5), cap=np.True_)
+    np.testing.assert_array_equal(plain.vertices, numpy.vertices)
+
+
+def test_mesh_and_field_say_what_they_are_in_a_line():
+    field = upsample(GRID, trilinear, 2)
+    mesh = extract_mesh(field, GRID)
+    assert repr(GRID) == (
+        "SdfGrid(12 x 12 x 12 float32, spacing 1, 1, 1, origin 0, 0, 0, "
+        f"values {GRID.low:.6g} to {GRID.high:.6g})"
+    )
+    assert repr(field) == (
+        f"FineField(factor 2, {len(field.values):,} nodes of {len(field.voxel_ijk):,} voxels in "
+        "planes 0 to 11 of 12 x 12 x 12)"
+    )
+    assert repr(mesh).startswith(
+        f"Mesh({len(mesh.vertices):,} vertices float32, {len(mesh.faces):,}"
+    )
+    network = load_network("fast", threads=1)
+    said = "Network(fast, receptive field 5, symmetries 1, device cpu, threads 1)"
+    assert repr(network) == said.replace("field 5", f"field {network.receptive_field}")
+    for thing in (GRID, field, mesh, network):
+        assert "\n" not in repr(thing) and len(repr(thing)) < 160
+
+
+def test_dir_lists_the_public_names():
+    assert dir(super_sdf) == super_sdf.__all__
+    assert {"make_grid", "reconstruct", "write_mesh"} <= set(dir(super_sdf))
+
+
+def test_an_editable_install_is_a_path_that_type_checkers_follow():
+    """Setuptools makes it one where all packages lie below one folder."""
+    settings = (ROOT / "pyproject.toml").read_text()
+    assert 'package-dir = { "" = "src" }' in settings and 'where = ["src"]' in settings
+    assert Path(super_sdf.__path__[0], "models", "base.onnx").is_file()
+    assert Path(super_sdf.__path__[0], "py.typed").is_file()
+
+
+@pytest.mark.parametrize(
+    "part, whole, said",
+    [
+        (997, 1000, "100 %"),
+        (12, 100, "12 %"),
+        (9_960, 100_000, "10 %"),
+        (99, 1000, "9.9 %"),
+        (31, 10_000, "0.31 %"),
+        (1, 10**7, "less than 0.01 %"),
+    ],
+)
+def test_shares_are_plain_percentages(part, whole, said):
+    assert in_percent(part, whole) == said

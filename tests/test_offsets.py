@@ -1,0 +1,116 @@
+"""Surfaces at a distance: closed forms, the sign of the solid, and where the distances end."""
+
+import numpy as np
+import pytest
+from conftest import ball
+
+from super_sdf import load_network, make_grid, reconstruct
+from super_sdf.errors import GridError
+
+SIDE = 8.6
+
+
+@pytest.fixture(scope="module")
+def network():
+    return load_network("fast", threads=1)
+
+
+def cube(unit: float = 1.0) -> np.ndarray:
+    """Exact distances to a cube of side 8.6 units in a grid of spacing 1 unit."""
+    beyond = np.abs(np.indices((22, 22, 22)) - 10.37) - SIDE / 2
+    outside = np.linalg.norm(np.maximum(beyond, 0), axis=0)
+    return (outside + np.minimum(beyond.max(0), 0)) * unit
+
+
+def cube_volume(offset: float) -> float:
+    """Steiner's formula outwards: faces, edges, corners; inwards a smaller cube."""
+    if offset < 0:
+        return (SIDE + 2 * offset) ** 3
+    ball = 4 / 3 * np.pi * offset**3
+    return SIDE**3 + 6 * SIDE**2 * offset + 3 * np.pi * SIDE * offset**2 + ball
+
+
+@pytest.mark.parametrize("offset", [-2.0, -1.0, 0.5, 1.7, 3.0])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_an_offset_grows_the_solid_whichever_sign_its_inside_has(network, offset, sign):
+    grid = make_grid(sign * cube(0.5), spacing=0.5, origin=0)
+    mesh = reconstruct(grid, network, 2, offset=0.5 * offset)
+    assert mesh.is_closed()
+    assert mesh.volume() == pytest.approx(cube_volume(offset) / 8, rel=0.02)
+
+
+@pytest.mark.parametrize("offset", [-2.0, -0.7, 1.3, 3.0])
+def test_balls_have_the_volume_of_balls(network, offset):
+    mesh = reconstruct(ball(20, 5.0), network, 2, offset=offset)
+    assert mesh.is_closed()
+    assert mesh.volume() == pytest.approx(4 / 3 * np.pi * (5 + offset) ** 3, rel=0.02)
+
+
+def test_both_signs_give_the_same_mesh(network):
+    one, other = (
+        reconstruct(make_grid(sign * cube(), spacing=1), network, 2, offset=0.8) for sign in (1, -1)
+    )
+    np.testing.assert_array_equal(one.vertices, other.vertices)
+    np.testing.assert_array_equal(one.faces, other.faces)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(
+    "offset, says",
+    [
+        (2.9, "they end at 3: the largest that works is 1.5"),
+        (1.51, "they end at 3: the largest that works is 1.5"),
+        (4.0, "they end at 3: the largest that works is 1.5"),
+        (-2.9, "they end at -3: the smallest that works is -1.5"),
+    ],
+)
+def test_an_offset_near_the_cut_is_refused_with_the_one_that_works(network, sign, offset, says):
+    grid = make_grid(sign * np.clip(cube() - 1.5, -3, 3), spacing=1)  # cut off on both sides
+    with pytest.raises(GridError) as caught:
+        reconstruct(grid, network, 2, offset=offset)
+    want = f"offset {offset:g} needs distances 1.5 spacings (1.5) to either side of it, but {says}"
+    assert str(caught.value) == want
+
+
+def test_the_offset_that_works_does(network):
+    for scale in (1.0, 0.1, 1 / 3, 1e-5):
+        grid = make_grid(np.clip(cube(scale), -3 * scale, 3 * scale), spacing=scale)
+        with pytest.raises(GridError) as caught:
+            reconstruct(grid, network, 2, offset=2.2 * scale)
+        largest = float(str(caught.value).split()[-1])
+        mesh = reconstruct(grid, network, 2, offset=largest)
+        assert mesh.volume() == pytest.approx(cube_volume(1.5) * scale**3, rel=0.02)
+
+
+@pytest.mark.parametrize("fill", [1000, 3e38, 1e300])
+def test_fill_values_end_the_distances_too(network, fill):
+    values = np.where(np.abs(cube()) > 3, np.copysign(fill, cube()), cube())
+    grid = make_grid(values, spacing=1)
+    with pytest.raises(GridError) as caught:
+        reconstruct(grid, network, 2, offset=1.5)
+    assert "needs distances 2.5 spacings (2.5) to either side of it, but they end at 2.99" in str(
+        caught.value
+    )
+    mesh = reconstruct(grid, network, 2, offset=0.49)
+    assert mesh.volume() == pytest.approx(cube_volume(0.49), rel=0.02)
+
+
+def test_fields_cut_off_at_once_have_one_surface(network):
+    grid = make_grid(np.clip(cube(), -1, 1), spacing=1)
+    with pytest.raises(GridError, match=r"but they end at 1: only 0 works$"):
+        reconstruct(grid, network, 2, offset=0.2)
+    assert reconstruct(grid, network, 2).is_closed()
+
+
+@pytest.mark.parametrize("fill", [3, 1000])
+def test_beyond_all_values_there_is_no_surface(network, fill):
+    values = np.where(np.abs(cube()) > 3, np.copysign(fill, cube()), cube())
+    with pytest.raises(GridError) as caught:
+        reconstruct(make_grid(values, spacing=1), network, 2, offset=99)
+    assert str(caught.value) == f"no surface at 99: the values go from -{fill} to {fill}"
+
+
+def test_noisy_distances_may_be_moved(network):
+    noise = np.random.default_rng(0).uniform(-0.4, 0.4, (22, 22, 22))
+    mesh = reconstruct(make_grid(cube() + noise, spacing=1), network, 2, offset=1.0)
+    assert mesh.volume() == pytest.approx(cube_volume(1.0), rel=0.1)
