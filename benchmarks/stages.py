@@ -22,9 +22,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, ScalarFormatter
 
-from super_sdf import convert, load_network, pipeline, ply
+from super_sdf import convert, load_network, pipeline
 from super_sdf.compiling import is_loaded
 from super_sdf.evaluation.timing import describe_machine, run_command
+from super_sdf.files import spool
 from super_sdf.memory import forget_peak, held_memory
 from super_sdf.network import Network
 from super_sdf.survey import Band
@@ -39,7 +40,7 @@ STAGES = {
     "average": [(pipeline, "average_shared")],
     "fit": [(pipeline, "fit_to_spheres"), (pipeline, "pin_to_skipped")],
     "isosurface": [(pipeline, "extract_pieces")],
-    "write": [(ply, "write_in_chunks")],
+    "write": [(spool, "write_in_chunks")],
 }
 AFTER = ("number", "average", "fit", "isosurface", "write")
 

@@ -1,16 +1,20 @@
 """Meshes to files: every format, nothing half-written."""
 
 import os
+import re
+import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from conftest import ball, trilinear
 
-from super_sdf import Mesh, reconstruct, write_mesh
+from super_sdf import Mesh, SdfGrid, reconstruct, write_mesh
+from super_sdf.convert import ConvertOptions, convert
 from super_sdf.errors import FileError, GridError, OptionError
-from super_sdf.files import ply
-from super_sdf.files.meshes import check_target, write_pieces
+from super_sdf.files import spool, stl
+from super_sdf.files.meshes import MESH_SUFFIXES, write_pieces
 
 
 @pytest.fixture
@@ -18,7 +22,7 @@ def mesh():
     return reconstruct(ball(14, 4.0), trilinear, 2)
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj", ".off", ".glb", ".3mf"])
+@pytest.mark.parametrize("suffix", MESH_SUFFIXES)
 def test_formats_come_back_the_same(tmp_path, mesh, suffix):
     write_mesh(mesh, tmp_path / f"out{suffix}")
     back = trimesh.load(tmp_path / f"out{suffix}", force="mesh")
@@ -28,7 +32,7 @@ def test_formats_come_back_the_same(tmp_path, mesh, suffix):
 
 
 def test_ply_holds_the_very_numbers(tmp_path, mesh, monkeypatch):
-    monkeypatch.setattr("super_sdf.files.ply.CHUNK", 1000)
+    monkeypatch.setattr(spool, "CHUNK", 1000)
     for dtype in (np.float32, np.float64):
         exact = Mesh(mesh.vertices.astype(dtype), mesh.faces)
         write_mesh(exact, tmp_path / "out.ply", force=True)
@@ -50,14 +54,6 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, mesh, monkeypatch):
     assert target.read_text() == "before" and os.listdir(tmp_path) == ["out.ply"]
 
 
-def test_3mf_without_its_packages_is_refused_before_the_work(tmp_path, monkeypatch):
-    monkeypatch.setattr("super_sdf.files.meshes.find_spec", lambda name: None)
-    with pytest.raises(FileError) as caught:
-        check_target(tmp_path / "out.3mf")
-    want = "writing .3mf needs lxml and networkx: pip install 'super-sdf[3mf]'"
-    assert str(caught.value) == want
-
-
 def test_only_known_formats_and_free_places_are_written(tmp_path, mesh):
     with pytest.raises(OptionError, match=r"give one of \.ply, \.stl, \.obj, \.off, \.glb, \.3mf"):
         write_mesh(mesh, tmp_path / "out.xyz")
@@ -66,20 +62,176 @@ def test_only_known_formats_and_free_places_are_written(tmp_path, mesh):
         write_mesh(mesh, tmp_path / "out.ply")
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".stl"])
-def test_a_mesh_in_pieces_makes_the_same_file(mesh, tmp_path, monkeypatch, suffix):
-    monkeypatch.setattr(ply, "SPOOL_BYTES", 1000)  # triangles go to a file beside
+def in_pieces(mesh):
+    """Cut a mesh as slabs do: triangles come later than their vertices, never before."""
     half, some = len(mesh.vertices) // 2, len(mesh.faces) // 3
-    pieces = [
-        Mesh(mesh.vertices[:half], mesh.faces[:0]),
-        Mesh(mesh.vertices[half:], mesh.faces[:some]),
-        Mesh(mesh.vertices[:0], mesh.faces[some:]),
-    ]
+    yield Mesh(mesh.vertices[:half], mesh.faces[:0])
+    yield Mesh(mesh.vertices[half:], mesh.faces[:some])
+    yield Mesh(mesh.vertices[:0], mesh.faces[some:])
+
+
+@pytest.mark.parametrize("suffix", MESH_SUFFIXES)
+def test_a_mesh_in_pieces_makes_the_same_file(mesh, tmp_path, monkeypatch, suffix):
     one, other = tmp_path / f"one{suffix}", tmp_path / f"other{suffix}"
     write_mesh(mesh, one)
-    write_pieces(iter(pieces), other)
+    monkeypatch.setattr(spool, "SPOOL_BYTES", 1000)  # triangles go to a file beside
+    monkeypatch.setattr(stl, "CHUNK", 100)
+    write_pieces(in_pieces(mesh), other)
     assert one.read_bytes() == other.read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == [one.name, other.name]
+
+
+def grown(mesh, times):
+    """Yield a mesh many times, each a piece of one."""
+    for turn in range(times):
+        shift = np.float32(20 * turn)
+        yield Mesh(mesh.vertices + shift, mesh.faces + np.int32(turn * len(mesh.vertices)))
+
+
+@pytest.mark.parametrize("suffix", MESH_SUFFIXES)
+def test_memory_does_not_grow_with_the_mesh(mesh, tmp_path, monkeypatch, suffix):
+    monkeypatch.setattr(spool, "SPOOL_BYTES", 1000)
+    peaks = []
+    for times in (1, 8, 24):
+        tracemalloc.start()
+        write_pieces(grown(mesh, times), tmp_path / f"{times}{suffix}")
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[2] < 1.02 * peaks[1] + 10_000  # the first loads and caches what is needed
+
+
+def read(path):
+    """Read a mesh; corners at one very point are one vertex."""
+    back = trimesh.load(path, force="mesh", process=False)
+    points, rows = np.unique(back.vertices, axis=0, return_inverse=True)
+    return Mesh(points, rows.ravel()[back.faces].astype(np.int32))
+
+
+def check_holds(path, done):
+    """Say that what a program reads is the mesh that was made: closed, no two vertices the same."""
+    back = read(path)
+    assert np.isfinite(back.vertices).all() and back.is_closed() and back.volume() > 0
+    assert len(back.vertices) == done.counts["vertices"]
+    assert len(back.faces) == done.counts["triangles"]
+
+
+def place(spacing, origin):
+    """Write a ball with vertices next to nodes: three samples are all but 0."""
+    values = ball(12, 3.0).values.astype(np.float64)
+    values[np.abs(values) < 0.1] *= 1e-6
+    np.savez("in.npz", values=values * spacing, spacing=spacing, origin=origin)
+
+
+PLACES = {
+    "near": (1.0, 0.0),
+    "parcel": (0.1, 5.4e6),
+    "machine": (0.01, 1e3),
+    "microns": (5e-6, 0.0),
+    "nanometres": (1e-9, 1.0),
+    "beyond single": (1e39, 0.0),
+    "below single": (1e-44, 0.0),
+    "below single, far": (1e-47, 0.0),
+}
+REFUSED = {".stl": set(PLACES) - {"near", "microns"}}
+REFUSED[".glb"] = {"beyond single", "below single", "below single, far"}
+
+
+@pytest.mark.parametrize("suffix", MESH_SUFFIXES)
+@pytest.mark.parametrize("name", PLACES)
+def test_a_format_holds_the_mesh_or_refuses_it(tmp_path, monkeypatch, name, suffix):
+    monkeypatch.chdir(tmp_path)
+    place(*PLACES[name])
+    target = Path(f"out{suffix}")
+    try:
+        done = convert("in.npz", target, trilinear, ConvertOptions(4, inside="negative"))
+    except FileError as error:
+        assert name in REFUSED.get(suffix, set())
+        assert f"out{suffix} cannot hold the mesh: {suffix} has single precision" in str(error)
+        assert os.listdir() == ["in.npz"]
+    else:
+        assert name not in REFUSED.get(suffix, set())
+        check_holds(target, done)
+
+
+def test_what_cannot_be_held_is_named_with_the_figures(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    place(0.1, 5.4e6)
+    want = (
+        "out.stl cannot hold the mesh: .stl has single precision, in steps of 0.5 at 5.4e+06, and "
+        "vertices are down to 2.5e-05 apart; write .ply or .obj"
+    )
+    with pytest.raises(FileError, match=f"^{re.escape(want)}$"):
+        convert("in.npz", "out.stl", trilinear, ConvertOptions(4, inside="negative"))
+    place(1e39, 0.0)
+    with pytest.raises(FileError, match=r"numbers up to 3.4e\+38, the mesh reaches 6e\+39, and"):
+        convert("in.npz", "out.glb", trilinear, ConvertOptions(4, inside="negative"))
+    place(1.0, 1e17)
+    want = (
+        "spacing 1 and coordinates up to 1e+17 are too far apart: double precision has steps of 16 "
+        "there, vertices are down to 0.00025 apart; give another --origin or --spacing"
+    )
+    for suffix in MESH_SUFFIXES:
+        with pytest.raises((GridError, FileError)) as caught:
+            convert("in.npz", f"out{suffix}", trilinear, ConvertOptions(4, inside="negative"))
+        assert str(caught.value) == want or suffix in (".stl", ".glb")
+    with pytest.raises(GridError, match=f"^{re.escape(want)}$"):
+        reconstruct(SdfGrid(ball().values, 1.0, 1e17), trilinear)
+    assert os.listdir() == ["in.npz"]
+
+
+def test_glb_says_from_where_it_counts(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    place(0.1, 5.4e6)
+    done = convert("in.npz", "out.glb", trilinear, ConvertOptions(4, inside="negative"))
+    assert done.notes[-1] == (
+        "out.glb has single precision: its vertices count from 5400000.55, 5400000.55, 5400000.55, "
+        "which the translation of its node adds"
+    )
+    convert("in.npz", "out.ply", trilinear, ConvertOptions(4, inside="negative"))
+    np.testing.assert_allclose(read("out.glb").volume(), read("out.ply").volume(), rtol=1e-5)
+    np.testing.assert_allclose(
+        *[trimesh.load(f"out{s}").bounds for s in (".glb", ".ply")], rtol=1e-12
+    )
+
+
+def test_a_mesh_that_its_format_would_flatten_is_refused(tmp_path, mesh):
+    far = Mesh(mesh.vertices.astype(np.float64) * 1e-3 + 1e5, mesh.faces)
+    want = (
+        "out.stl cannot be written: .stl holds single precision, in which vertices of this mesh "
+        "fall together; write .ply or .obj"
+    )
+    with pytest.raises(FileError, match=re.escape(want)):
+        write_mesh(far, tmp_path / "out.stl")
+    write_mesh(far, tmp_path / "out.glb")
+    assert len(read(tmp_path / "out.glb").vertices) == len(mesh.vertices)
+    bad = Mesh(np.where(mesh.vertices > 5, np.nan, mesh.vertices), mesh.faces)
+    for suffix in MESH_SUFFIXES:
+        with pytest.raises(FileError, match=r"a vertex of the mesh is not finite$"):
+            write_mesh(bad, tmp_path / f"bad{suffix}")
+    assert os.listdir(tmp_path) == ["out.glb"]
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".off", ".3mf"])
+def test_text_holds_the_very_numbers(tmp_path, suffix):
+    numbers = np.random.default_rng(0).standard_normal((999, 3)) ** 9 * 1e-3
+    faces = np.arange(999, dtype=np.int32).reshape(-1, 3)
+    for dtype in (np.float32, np.float64):
+        write_mesh(Mesh(numbers.astype(dtype), faces), tmp_path / f"out{suffix}", force=True)
+        back = trimesh.load(tmp_path / f"out{suffix}", force="mesh", process=False)
+        corners = back.vertices[back.faces].astype(dtype)  # readers may order vertices anew
+        np.testing.assert_array_equal(corners, numbers.astype(dtype)[faces])
+
+
+def test_normals_of_stl_look_out_at_every_scale(tmp_path, mesh):
+    for scale in (1e-30, 1.0, 1e30):
+        write_mesh(
+            Mesh(mesh.vertices * np.float32(scale), mesh.faces), tmp_path / "out.stl", force=True
+        )
+        rows = np.fromfile(tmp_path / "out.stl", stl.ROW, offset=84)
+        a, b, c = (rows["corners"] / np.float32(scale)).astype(np.float64).transpose(1, 0, 2)
+        normal = np.cross(b - a, c - a)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        np.testing.assert_allclose(rows["normal"], normal, atol=2e-3)
 
 
 def test_pieces_that_end_in_an_error_leave_nothing(mesh, tmp_path):

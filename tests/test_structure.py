@@ -18,7 +18,7 @@ FLOORS = [
     {"isosurface", "border", "spheres"},
     {"survey", "kernels"},
     {"compiled"},
-    {"plan"},
+    {"plan", "precision"},
     {"pipeline"},
     {"convert"},
     {"cli_common", "cli_conversion", "cli_batch_report", "__init__"},
@@ -29,7 +29,9 @@ FLOORS = [
 BATCH = sorted((ROOT / "src" / "super_sdf" / "batch").glob("*.py"))
 FILES = sorted((ROOT / "src" / "super_sdf" / "files").glob("*.py"))
 FILES_FLOORS = [
-    {"conventions", "output", "ply", "__init__"},
+    {"conventions", "parts", "spool", "__init__"},
+    {"output", "ply", "stl", "text_meshes", "glb"},
+    {"threemf"},
     {"grids", "meshes"},
 ]
 BATCH_FLOORS = [

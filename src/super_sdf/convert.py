@@ -17,7 +17,9 @@ from .files.grids import read_grid
 from .files.meshes import write_pieces
 from .grid import SdfGrid, Triple
 from .mesh import Mesh
+from .nodes import check_factor
 from .pipeline import Decoder, Piece, Progress, reconstruct_slabs, step_name
+from .precision import check_format_holds, local_origin_note
 
 
 @dataclass(frozen=True)
@@ -140,6 +142,9 @@ def convert(
     watch = Stopwatch(progress)
     given = {"spacing": options.spacing, "origin": options.origin}
     grid = read_grid(source, inside=options.inside, level=options.offset, **given)
+    check_factor(options.factor)
+    about = check_format_holds(target, grid, options.factor)
+    notes = (*grid.notes, *local_origin_note(target, about))
     watch.lap("read")
     pieces = reconstruct_slabs(
         grid,
@@ -151,9 +156,9 @@ def convert(
         progress=watch.step,
     )
     total = Total()
-    write_pieces(total.count(pieces, watch), target, force=force)
+    write_pieces(total.count(pieces, watch), target, force=force, about=about)
     watch.lap("write")
-    return describe(grid, total, options, watch.seconds)
+    return describe(grid, total, options, watch.seconds, notes)
 
 
 class Total:
@@ -175,14 +180,18 @@ class Total:
 
 
 def describe(
-    grid: SdfGrid, total: Total, options: ConvertOptions, seconds: dict[str, float]
+    grid: SdfGrid,
+    total: Total,
+    options: ConvertOptions,
+    seconds: dict[str, float],
+    notes: tuple[str, ...],
 ) -> Conversion:
     """Say what was made."""
     closed = options.cap or not total.is_cut
     counts = {name: total.counts[name] for name in COUNTS}
     warnings = find_warnings(counts, closed)
     where = grid.shape, grid.spacing, grid.origin
-    return Conversion(*where, counts, closed, grid.notes, warnings, seconds)
+    return Conversion(*where, counts, closed, notes, warnings, seconds)
 
 
 def find_warnings(counts: dict[str, int], closed: bool) -> tuple[str, ...]:

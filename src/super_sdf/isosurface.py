@@ -11,9 +11,11 @@ as one made at once.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +24,7 @@ from .band import NEIGHBOURHOOD, STRIDES
 from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, triangle_table
 from .chunks import in_chunks, rows_in_chunk, side_by_side
 from .compiling import compiled_twin
+from .errors import GridError
 from .field import FineField
 from .grid import BoolArray, FloatArray, IntArray, SdfGrid
 from .mesh import Mesh, join_meshes
@@ -238,7 +241,41 @@ def _to_world(
     """Turn fine lattice positions into world ones: fine index K i + K/2 is sample i."""
     sample = position / field.factor - 0.5
     world: NDArray[np.float64] = sample * np.array(grid.spacing) + np.array(grid.origin)
-    reach = np.abs(grid.origin) + np.array(grid.spacing) * field.shape
-    fine_spacing = grid.voxel_size / field.factor
-    single = np.finfo(np.float32).eps * reach.max() < CLEARANCE / 2 * fine_spacing
+    single = tells_vertices_apart(np.float32, farthest_coordinate(grid), grid, field.factor)
     return world.astype(np.float32) if single else world
+
+
+def farthest_coordinate(grid: SdfGrid) -> float:
+    """Return a bound of the coordinates of vertices, up to their sign."""
+    axes = zip(grid.origin, grid.spacing, grid.shape)
+    return max(abs(origin) + spacing * samples for origin, spacing, samples in axes)
+
+
+def tells_vertices_apart(dtype: type[Any], reach: float, grid: SdfGrid, factor: int) -> bool:
+    """Say whether coordinates up to ``reach`` tell neighbouring vertices apart in a dtype."""
+    limits = np.finfo(dtype)
+    step = max(float(limits.eps) * reach, float(limits.smallest_subnormal))
+    return reach <= float(limits.max) and step < closest_vertices(grid, factor) / 2
+
+
+def closest_vertices(grid: SdfGrid, factor: int) -> float:
+    """Return how near to each other two vertices can lie: the clearance from a node."""
+    return CLEARANCE * grid.voxel_size / factor
+
+
+def check_vertices_fit(grid: SdfGrid, factor: int) -> None:
+    """Raise if not even double precision tells the vertices of a fine mesh apart.
+
+    Raises
+    ------
+    GridError
+        With what it tells apart so far from the world's origin.
+    """
+    reach = farthest_coordinate(grid)
+    if not tells_vertices_apart(np.float64, reach, grid, factor):
+        raise GridError(
+            f"spacing {grid.voxel_size:g} and coordinates up to {reach:g} are too far apart: "
+            f"double precision has steps of {math.ulp(reach):.2g} there, vertices "
+            f"are down to {closest_vertices(grid, factor):.2g} apart; "
+            "give another --origin or --spacing"
+        )

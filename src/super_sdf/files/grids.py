@@ -145,5 +145,5 @@ def write_grid(grid: SdfGrid, path: str | Path, *, force: bool = False) -> None:
         If the file exists and ``force`` is not set, or cannot be written.
     """
     path = check_grid_target(path, force=force)
-    with replacing(path) as part, part.open("wb") as file:
+    with replacing(path, force=force) as part, part.open("wb") as file:
         np.savez(file, values=grid.values, spacing=grid.spacing, origin=grid.origin)

@@ -2,42 +2,32 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
-from collections.abc import Callable, Iterable
-from functools import partial
+from collections.abc import Iterable
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import Mesh
+from .spool import append_spool, little_endian, spool_beside, write_split
 
-CHUNK = 1 << 18  # vertices or faces written at a time
-SPOOL_BYTES = 4_000_000  # triangles that wait in memory before they go to a file beside
 HEADER_BYTES = 320
 
 
 def write_ply(pieces: Iterable[Mesh], path: Path) -> None:
     """Write binary little-endian PLY.
 
-    All vertices come before all triangles, and their numbers before both: triangles wait beside,
-    and the header, which is padded to one length, is written last.
+    All vertices come before all triangles, and their numbers before both: the header, which is
+    padded to one length, is written last.
     """
-    vertices, faces, number = 0, 0, "float"
-    spool = partial(tempfile.SpooledTemporaryFile, SPOOL_BYTES, dir=path.parent)
-    with path.open("wb") as file, spool() as waiting:
-        file.write(_ply_header(number, 0, 0))
-        for piece in pieces:
-            write_in_chunks(file, piece.vertices, _little_endian)
-            write_in_chunks(waiting, piece.faces, _ply_rows)
-            number = "double" if piece.vertices.dtype == np.float64 else "float"
-            vertices, faces = vertices + len(piece.vertices), faces + len(piece.faces)
-        waiting.seek(0)
-        shutil.copyfileobj(waiting, file, SPOOL_BYTES)
+    with path.open("wb") as file, spool_beside(path) as waiting:
+        file.write(_ply_header("float", 0, 0))
+        written = write_split(pieces, (file, waiting), (little_endian, _ply_rows))
+        append_spool(waiting, file)
         file.seek(0)
-        file.write(_ply_header(number, vertices, faces))
+        number = "double" if written.dtype == np.float64 else "float"
+        file.write(_ply_header(number, written.vertices, written.faces))
 
 
 def _ply_header(number: str, vertices: int, faces: int) -> bytes:
@@ -53,19 +43,6 @@ def _ply_header(number: str, vertices: int, faces: int) -> bytes:
     ]
     rest = "\n".join(lines)
     return (first + " " * (HEADER_BYTES - len(first) - len(rest)) + rest).encode("ascii")
-
-
-def write_in_chunks(
-    file: IO[bytes], array: NDArray[Any], to_bytes: Callable[[NDArray[Any]], bytes]
-) -> None:
-    """Write rows of an array, some at a time: the bytes are a copy."""
-    for start in range(0, len(array), CHUNK):
-        file.write(to_bytes(array[start : start + CHUNK]))
-
-
-def _little_endian(array: NDArray[Any]) -> bytes:
-    """Return the bytes of numbers, least significant first."""
-    return array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()
 
 
 def _ply_rows(faces: NDArray[Any]) -> bytes:
