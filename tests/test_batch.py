@@ -384,7 +384,7 @@ def test_an_interrupt_is_one_line_and_keeps_what_is_done(run, monkeypatch):
 
     monkeypatch.setattr(batch_job, "convert", interrupt)
     want = "Error: interrupted: 1 of 4 are done and kept; run it again to go on\n"
-    assert run("in") == (1, "", want)
+    assert run("in") == (130, "", want)
     assert len(files()) == 2 and len(rows()) == 1
 
 

@@ -271,14 +271,16 @@ def test_a_folder_without_permission_is_named(here, command, monkeypatch):
     assert command("upsample", "in.npy", "out.ply") == (1, "", want)
 
 
-@pytest.mark.parametrize("stage", ["pipeline.refine", "pipeline.extract_pieces", "files.meshes.write_ply"])
+@pytest.mark.parametrize(
+    "stage", ["pipeline.refine", "pipeline.extract_pieces", "files.meshes.write_ply"]
+)
 def test_an_interrupt_at_any_stage_leaves_nothing(here, command, monkeypatch, stage):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(f"super_sdf.{stage}", interrupt)
     code, out, err = command("upsample", "in.npy", "out.ply", "--quiet")
-    assert (code, out, err.strip()) == (1, "", "Error: interrupted; nothing was written")
+    assert (code, out, err.strip()) == (130, "", "Error: interrupted; nothing was written")
     assert os.listdir() == ["in.npy"]
 
 

@@ -9,7 +9,7 @@ ROOT = Path(__file__).parent.parent
 SOURCES = sorted((ROOT / "src" / "super_sdf").glob("*.py"))
 EVALUATION = sorted((ROOT / "src" / "super_sdf" / "evaluation").glob("*.py"))
 FLOORS = [
-    {"errors", "chunks", "compiling"},
+    {"errors", "chunks", "compiling", "interrupts", "streams"},
     {"memory", "cuda"},
     {"grid"},
     {"band", "mesh", "cell_cases", "device"},
@@ -25,6 +25,8 @@ FLOORS = [
     {"selftest"},
     {"cli_batch", "cli_sample", "cli_evaluate", "cli_render", "cli_info"},
     {"cli"},
+    {"entry"},
+    {"__main__"},
 ]
 BATCH = sorted((ROOT / "src" / "super_sdf" / "batch").glob("*.py"))
 FILES = sorted((ROOT / "src" / "super_sdf" / "files").glob("*.py"))

@@ -15,12 +15,14 @@ import click
 
 from . import __version__
 from .cli_batch import batch
-from .cli_common import CONTEXT, one_line_errors
+from .cli_common import CONTEXT, InterruptedCommand, one_line_errors, print_result, tell
 from .cli_conversion import conversion_options, make_options
 from .cli_evaluate import evaluate
 from .cli_info import info
 from .cli_render import render
 from .cli_sample import sample
+from .interrupts import ending_at_once, raising_interrupts
+from .streams import settle_streams
 
 if TYPE_CHECKING:
     from .convert import Conversion
@@ -88,7 +90,7 @@ class Upsampling:
             precision=asked["precision"],
         )
         watch.lap("load network")
-        with self.progress_bar() as progress:
+        with raising_interrupts(), self.progress_bar() as progress:
             self.done = convert(
                 self.source,
                 self.target,
@@ -132,23 +134,22 @@ class Upsampling:
         """Print the findings: sentences on stderr, JSON on stdout."""
         report = self.report()
         if self.options["as_json"]:
-            click.echo(json.dumps(report, indent=2))
+            print_result(json.dumps(report, indent=2), f"{self.target} is written")
         if self.options["quiet"]:
             return
         for note in (*self.done.notes, *self.network.notes):
-            click.echo(f"Note: {note}", err=True)
+            tell(f"Note: {note}")
         for warning in self.done.warnings:
-            click.echo(f"Warning: {warning}", err=True)
+            tell(f"Warning: {warning}")
         if self.options["verbose"]:
             for key in ("shape", "spacing", "origin", "device", "band_voxels", "nodes"):
-                click.echo(f"{key.replace('_', ' ')}: {report[key]}", err=True)
+                tell(f"{key.replace('_', ' ')}: {report[key]}")
             for stage, spent in self.seconds.items():
-                click.echo(f"{stage}: {spent:.3f} s", err=True)
+                tell(f"{stage}: {spent:.3f} s")
         total = sum(self.seconds.values())
-        click.echo(
+        tell(
             f"{self.target}: {report['vertices']:,} vertices, {report['triangles']:,} triangles, "
             f"{total:.1f} s",
-            err=True,
         )
 
 
@@ -157,18 +158,33 @@ for command in (batch, sample, evaluate, render, info):
 
 
 def main() -> None:
-    """Run the command line; an interrupt ends it with one line, too."""
+    """Run the command line; whatever ends it is told in one line."""
+    with ending_at_once():
+        try:
+            code = run()
+        finally:
+            settle_streams()
+    if code:
+        sys.exit(code)
+
+
+def run() -> int:
+    """Run a command; return the exit code."""
     try:
         cli.main(standalone_mode=False)
-    except click.UsageError as error:
-        click.echo(f"Error: {error.format_message()}", err=True)
-        sys.exit(error.exit_code)
     except click.ClickException as error:
-        error.show()
-        sys.exit(error.exit_code)
-    except (click.Abort, KeyboardInterrupt):
-        click.echo("Error: interrupted; nothing was written", err=True)
-        sys.exit(1)
+        tell(f"Error: {error.format_message()}")
+        return error.exit_code
+    except InterruptedCommand as error:
+        tell(f"Error: {error}")
+        return error.exit_code
+    except click.Abort:  # outside of a command's work
+        tell("Error: interrupted; nothing was written")
+        return 130
+    except OSError as error:  # outside of a command's work: help
+        tell(f"Error: stdout cannot be written: {error.strerror or error}")
+        return 1
+    return 0
 
 
 if __name__ == "__main__":

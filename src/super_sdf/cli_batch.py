@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .cli_batch_report import progress_line, tell_plan, tell_summary
-from .cli_common import CONTEXT, one_line_errors
+from .cli_common import CONTEXT, InterruptedCommand, one_line_errors
 from .cli_conversion import conversion_options, make_options
+from .interrupts import raising_interrupts
 
 if TYPE_CHECKING:
     from .batch.job import Job
@@ -112,11 +113,9 @@ def complete(jobs: list[Job], settings: Settings, quiet: bool) -> Batch:
         run = Run(jobs, settings, lock)
         total = len(run.batch.waiting)
         try:
-            with progress_line(total, quiet) as progress:
+            with progress_line(total, quiet) as progress, raising_interrupts():
                 run.complete(progress)
-        except KeyboardInterrupt:
-            raise click.ClickException(
-                f"interrupted: {len(run.batch.done)} of {total} are done and kept; run it again "
-                "to go on"
-            ) from None
+        except KeyboardInterrupt as error:
+            done = f": {len(run.batch.done)} of {total} are done and kept"
+            raise InterruptedCommand(f"{done}; run it again to go on", error) from None
     return run.batch

@@ -12,6 +12,7 @@ import click
 
 from .cli_common import CONTEXT, check_extra, one_line_errors
 from .errors import FileError
+from .interrupts import raising_interrupts
 
 EXAMPLES = """\b
 Examples:
@@ -139,7 +140,8 @@ def evaluate(sources: tuple[Path, ...], **options: Any) -> None:
     """
     with one_line_errors():
         check_extra("evaluate")
-        left_out = run_evaluate(sources, options)
+        with raising_interrupts():  # there are processes to end, and results to keep
+            left_out = run_evaluate(sources, options)
     if left_out:
         sys.exit(1)
 

@@ -9,6 +9,7 @@ import click
 
 from .cli_common import CONTEXT, check_extra, one_line_errors
 from .errors import OptionError
+from .interrupts import raising_interrupts
 
 EXAMPLES = """\b
 Examples:
@@ -108,7 +109,8 @@ def render_meshes(sources: tuple[Path, ...], target: Path, options: dict[str, An
         reference = Solid(read_mesh(options["reference"]))
         panels = [Panel(mesh, name, vertex_errors(mesh, reference)) for name, mesh in meshes]
     chosen = {name: options[name] for name in ("colour", "up", "zoom", "size", "top")}
-    render_panels(panels, target, **chosen)
+    with raising_interrupts():
+        render_panels(panels, target, **chosen)
 
 
 def render_grid(sources: tuple[Path, ...], target: Path, options: dict[str, Any]) -> None:
@@ -121,4 +123,5 @@ def render_grid(sources: tuple[Path, ...], target: Path, options: dict[str, Any]
     grid = read_grid(sources[0])
     field = upsample(grid, load_network(), options["factor"])
     chosen = {name: options[name] for name in ("axis", "at", "size")}
-    render_section(grid, target, field=field, **chosen)
+    with raising_interrupts():
+        render_section(grid, target, field=field, **chosen)

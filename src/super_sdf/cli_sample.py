@@ -13,6 +13,7 @@ import click
 
 from .cli_common import CONTEXT, check_extra, one_line_errors
 from .errors import OptionError
+from .interrupts import raising_interrupts
 
 EXAMPLES = """\b
 Examples:
@@ -84,7 +85,8 @@ def run_sample(source: Path, target: Path, options: dict[str, Any]) -> None:
         layout = fitted_layout(solid.mesh, n=samples, spacing=spacing, padding=options["padding"])
     with bar("sampling", options["quiet"]) as progress:
         grid = sample_solid(solid, layout, band=options["band"], progress=progress)
-    write_grid(grid, target, force=options["force"])
+    with raising_interrupts():
+        write_grid(grid, target, force=options["force"])
     if not options["quiet"]:
         for note in (*notes, *grid.notes):
             click.echo(f"Note: {note}", err=True)

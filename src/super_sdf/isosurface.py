@@ -11,11 +11,9 @@ as one made at once.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -241,41 +239,32 @@ def _to_world(
     """Turn fine lattice positions into world ones: fine index K i + K/2 is sample i."""
     sample = position / field.factor - 0.5
     world: NDArray[np.float64] = sample * np.array(grid.spacing) + np.array(grid.origin)
-    single = tells_vertices_apart(np.float32, farthest_coordinate(grid), grid, field.factor)
-    return world.astype(np.float32) if single else world
+    return world if vertex_type(grid, field.factor) is np.float64 else world.astype(np.float32)
 
 
-def farthest_coordinate(grid: SdfGrid) -> float:
-    """Return a bound of the coordinates of vertices, up to their sign."""
-    axes = zip(grid.origin, grid.spacing, grid.shape)
-    return max(abs(origin) + spacing * samples for origin, spacing, samples in axes)
-
-
-def tells_vertices_apart(dtype: type[Any], reach: float, grid: SdfGrid, factor: int) -> bool:
-    """Say whether coordinates up to ``reach`` tell neighbouring vertices apart in a dtype."""
-    limits = np.finfo(dtype)
-    step = max(float(limits.eps) * reach, float(limits.smallest_subnormal))
-    return reach <= float(limits.max) and step < closest_vertices(grid, factor) / 2
-
-
-def closest_vertices(grid: SdfGrid, factor: int) -> float:
-    """Return how near to each other two vertices can lie: the clearance from a node."""
-    return CLEARANCE * grid.voxel_size / factor
-
-
-def check_vertices_fit(grid: SdfGrid, factor: int) -> None:
-    """Raise if not even double precision tells the vertices of a fine mesh apart.
+def vertex_type(grid: SdfGrid, factor: int) -> type[np.float32] | type[np.float64]:
+    """Return the numbers that tell neighbouring vertices apart: single, else double.
 
     Raises
     ------
     GridError
-        With what it tells apart so far from the world's origin.
+        If neither does.
     """
-    reach = farthest_coordinate(grid)
-    if not tells_vertices_apart(np.float64, reach, grid, factor):
-        raise GridError(
-            f"spacing {grid.voxel_size:g} and coordinates up to {reach:g} are too far apart: "
-            f"double precision has steps of {math.ulp(reach):.2g} there, vertices "
-            f"are down to {closest_vertices(grid, factor):.2g} apart; "
-            "give another --origin or --spacing"
-        )
+    reach = max(abs(x) + h * n for x, h, n in zip(grid.origin, grid.spacing, grid.shape))
+    for kind in (np.float32, np.float64):
+        if tells_vertices_apart(kind, reach, grid, factor):
+            return kind
+    raise GridError(
+        f"the grid reaches to {reach:.6g}, too far from the origin for its spacing, "
+        f"{grid.voxel_size:.6g}: vertices could not be told apart; give a nearer origin"
+    )
+
+
+def tells_vertices_apart(
+    kind: type[np.float32] | type[np.float64], reach: float, grid: SdfGrid, factor: int
+) -> bool:
+    """Say whether numbers of a kind, up to ``reach``, tell neighbouring vertices apart."""
+    least = CLEARANCE / 2 * grid.voxel_size / factor
+    finfo = np.finfo(kind)
+    fine = float(finfo.tiny) < least and float(finfo.eps) * reach < least
+    return fine and reach < float(finfo.max)

@@ -24,7 +24,7 @@ from .compiling import use_compiled
 from .errors import GridError
 from .field import FineField, border_is_crossed
 from .grid import FloatArray, IntArray, SdfGrid
-from .isosurface import check_vertices_fit, extract_pieces
+from .isosurface import extract_pieces, vertex_type
 from .memory import hold_less, memory_bound
 from .mesh import Mesh, join_meshes
 from .nodes import (
@@ -178,8 +178,6 @@ def reconstruct_slabs(
 
     Joined, the pieces are the same mesh, bit for bit, whatever the slabs and threads.
     """
-    check_factor(factor)
-    check_vertices_fit(grid, factor)
     threads = getattr(network, "threads", 0)
     bound = memory_bound(max_memory)
     with working_threads(threads):
@@ -224,6 +222,7 @@ class Steps:
 def find_surface(grid: SdfGrid, factor: int, offset: float, bound: int | None) -> Band:
     """Return the band of a grid, if a surface can be in it."""
     check_factor(factor)
+    vertex_type(grid, factor)  # raises if there is none
     band = survey(grid, offset, bound)  # Eqs. 2 and 4
     if not band.decoded.any():
         raise no_surface(grid, offset)

@@ -15,7 +15,7 @@ import numpy as np
 from .errors import FileError
 from .files.meshes import SINGLE_PRECISION, WITH_LOCAL_ORIGIN, WORLD_ORIGIN
 from .grid import SdfGrid, Triple
-from .isosurface import closest_vertices, farthest_coordinate, tells_vertices_apart
+from .isosurface import CLEARANCE, tells_vertices_apart, vertex_type
 
 
 def check_format_holds(path: str | Path, grid: SdfGrid, factor: int) -> Triple:
@@ -23,24 +23,27 @@ def check_format_holds(path: str | Path, grid: SdfGrid, factor: int) -> Triple:
 
     That is the world's origin, or the grid's middle where single precision tells vertices apart
     only there and the format has a place for it. A format with double precision or text holds what
-    ``isosurface.check_vertices_fit`` lets pass.
+    ``isosurface.vertex_type`` lets pass.
 
     Raises
     ------
+    GridError
+        If no numbers tell neighbouring vertices apart.
     FileError
         If the format cannot tell neighbouring vertices apart wherever they count from.
     """
     suffix = Path(path).suffix.lower()
-    reach = farthest_coordinate(grid)
-    if suffix not in SINGLE_PRECISION or tells_vertices_apart(np.float32, reach, grid, factor):
+    if vertex_type(grid, factor) is np.float32 or suffix not in SINGLE_PRECISION:
         return WORLD_ORIGIN
+    reach = max(abs(x) + h * n for x, h, n in zip(grid.origin, grid.spacing, grid.shape))
     if suffix in WITH_LOCAL_ORIGIN:
         reach = max(spacing * samples / 2 for spacing, samples in zip(grid.spacing, grid.shape))
         if tells_vertices_apart(np.float32, reach, grid, factor):
             return _middle(grid)
+    apart = CLEARANCE * grid.voxel_size / factor
     raise FileError(
         f"{path} cannot hold the mesh: {suffix} has single precision, {_limit_at(reach)}, and "
-        f"vertices are down to {closest_vertices(grid, factor):.2g} apart; write .ply or .obj"
+        f"vertices are down to {apart:.2g} apart; write .ply or .obj"
     )
 
 

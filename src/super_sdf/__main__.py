@@ -1,0 +1,5 @@
+"""``python -m super_sdf``."""
+
+from .entry import main
+
+main()
