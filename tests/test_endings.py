@@ -1,0 +1,131 @@
+"""How a process of the command line ends: by signals, without streams, with little of anything."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from conftest import ball
+
+COMMAND = [sys.executable, "-m", "super_sdf"]
+QUICK = ["upsample", "in.npy", "out.ply", "--quality", "fast", "--spacing", "1", "--origin", "0"]
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    np.save("in.npy", ball().values)
+
+
+def run(*arguments, shell="", **options):
+    """Run the command line, with redirections of the shell; return exit code, stdout, stderr."""
+    words = ["sh", "-c", f'"$@" {shell}', "sh", *COMMAND, *arguments]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, **options)
+    return done.returncode, done.stdout, done.stderr
+
+
+# What stands in for a long step: it says where it is, and waits for the signal.
+STAGE = """
+import sys, time
+from super_sdf import entry, pipeline
+def wait(*_):
+    print(sorted(__import__("os").listdir()), flush=True)
+    time.sleep(30)
+pipeline.refine = wait
+entry.main()
+"""
+# The same in the midst of an import.
+IMPORT = """
+import sys, time
+class Finder:
+    def find_spec(self, name, *_):
+        if name == "numpy":
+            print("importing", flush=True)
+            try:
+                time.sleep(30)
+            except BaseException as error:
+                raise ImportError("something else") from error
+sys.meta_path.insert(0, Finder())
+from super_sdf.entry import main
+main()
+"""
+LINES = {
+    signal.SIGINT: "Error: interrupted; nothing was written\n",
+    signal.SIGTERM: "Error: ended by SIGTERM; nothing was written\n",
+    signal.SIGHUP: "Error: ended by SIGHUP; nothing was written\n",
+}
+
+
+@pytest.mark.parametrize("script", [STAGE, IMPORT])
+@pytest.mark.parametrize("number", LINES)
+def test_a_signal_leaves_a_line_its_exit_code_and_no_file(number, script):
+    words = [sys.executable, "-c", script, *QUICK]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(words, **pipes) as process:
+        begun = process.stdout.readline()
+        assert (".part" in begun) == (script == STAGE)
+        process.send_signal(number)
+        _, err = process.communicate(timeout=30)
+    assert (process.returncode, err) == (128 + number, LINES[number])
+    assert os.listdir() == ["in.npy"]
+
+
+def test_an_ignored_hangup_stays_ignored():
+    script = STAGE.replace("time.sleep(30)", "raise MemoryError").replace(
+        "    print", "    __import__('os').kill(__import__('os').getpid(), 1); print"
+    )
+    words = [sys.executable, "-c", script, *QUICK]
+    before = lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN)  # noqa: E731
+    done = subprocess.run(words, capture_output=True, text=True, preexec_fn=before)
+    assert (done.returncode, done.stderr.count("out of memory")) == (1, 1)
+
+
+def test_closed_streams_cost_no_mesh():
+    assert run(*QUICK, shell="2>&-") == (0, "", "")
+    mesh = Path("out.ply").read_bytes()
+    assert run(*QUICK, "--force", shell="<&- >&- 2>&-")[0] == 0
+    assert run(*QUICK, "--force", shell="2>/dev/full") == (0, "", "")
+    assert Path("out.ply").read_bytes() == mesh and trimesh.load("out.ply").is_watertight
+
+
+@pytest.mark.parametrize(
+    "shell, reason", [(">/dev/full", "No space left on device"), (">&-", "Bad file descriptor")]
+)
+def test_a_report_that_cannot_be_printed_is_one_line_and_the_mesh_stays(shell, reason):
+    want = f"Error: stdout cannot be written: {reason}; out.ply is written\n"
+    assert run(*QUICK, "--json", "--quiet", shell=shell) == (1, "", want)
+    assert trimesh.load("out.ply").is_watertight
+    want = f"Error: stdout cannot be written: {reason}\n"
+    assert run("--help", shell=shell) == (1, "", want)
+
+
+@pytest.mark.parametrize("handles", [6, 7, 8, 10, 20])
+def test_few_file_handles_end_in_a_line_or_a_mesh(handles):
+    def limit():
+        resource.setrlimit(resource.RLIMIT_NOFILE, (handles, handles))
+
+    code, _, err = run(*QUICK, "--quiet", preexec_fn=limit)
+    ours = [line for line in err.splitlines() if "onnxruntime" not in line or line[:5] == "Error"]
+    if code == 0:
+        assert trimesh.load("out.ply").is_watertight and ours == []
+    else:
+        assert code == 1 and len(ours) == 1 and "Too many open files" in ours[0]
+        assert os.listdir() == ["in.npy"]
+
+
+@pytest.mark.parametrize("size", [1, 1000, 100_000])
+@pytest.mark.parametrize("suffix", ["ply", "stl", "obj", "glb", "3mf"])
+def test_a_disk_that_fills_leaves_nothing(size, suffix, command):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        code, _, err = command(*QUICK[:2], f"out.{suffix}", *QUICK[3:])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert (code, err) == (1, f"Error: out.{suffix} cannot be written: File too large\n")
+    assert os.listdir() == ["in.npy"]

@@ -1,0 +1,166 @@
+"""Files that appear whole or not at all, and what is left of those that did not."""
+
+import errno
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from super_sdf.errors import FileError, GridError, SuperSdfError, WriteError
+from super_sdf.files import output, parts
+from super_sdf.files.output import check_free, replacing
+from super_sdf.files.parts import part_path, remove_abandoned_parts
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def make(path, *, force=False, meanwhile=lambda: None):
+    """Write a file as all are written; something happens meanwhile."""
+    with replacing(Path(path), force=force) as part:
+        part.write_text("mine")
+        meanwhile()
+
+
+def refusal(path, *, force=False):
+    """Return why a file cannot be made there, before the work."""
+    with pytest.raises(WriteError) as caught:
+        check_free(Path(path), force=force)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("has_links", [True, False])
+def test_a_file_that_appears_meanwhile_is_kept_unless_forced(monkeypatch, has_links):
+    def no_links(*_):
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    if not has_links:
+        monkeypatch.setattr(output.os, "link", no_links)
+    make("one.ply")
+    assert Path("one.ply").read_text() == "mine"
+    want = r"^out.ply was made by somebody else meanwhile: remove it or use --force$"
+    with pytest.raises(WriteError, match=want):
+        make("out.ply", meanwhile=lambda: Path("out.ply").write_text("theirs"))
+    assert Path("out.ply").read_text() == "theirs"
+    make("out.ply", force=True, meanwhile=lambda: Path("out.ply").write_text("theirs"))
+    assert Path("out.ply").read_text() == "mine"
+    assert sorted(os.listdir()) == ["one.ply", "out.ply"]
+
+
+def test_a_link_to_nothing_is_a_file_that_exists_and_by_force_its_target_is_made():
+    os.symlink("there.ply", "out.ply")
+    assert refusal("out.ply") == "out.ply exists: remove it or use --force"
+    check_free(Path("out.ply"), force=True)
+    make("out.ply", force=True)
+    assert os.readlink("out.ply") == "there.ply" and Path("there.ply").read_text() == "mine"
+
+
+def test_by_force_a_link_stays_one_and_what_it_leads_to_is_replaced():
+    os.mkdir("disk")
+    Path("disk/there.ply").write_text("old")
+    os.symlink("disk/there.ply", "out.ply")
+    make("out.ply", force=True)
+    assert os.readlink("out.ply") == "disk/there.ply"
+    assert Path("disk/there.ply").read_text() == "mine" and os.listdir("disk") == ["there.ply"]
+
+
+def test_a_link_that_appears_meanwhile_is_not_followed():
+    Path("theirs").write_text("theirs")
+    with pytest.raises(WriteError, match="made by somebody else meanwhile"):
+        make("out.ply", meanwhile=lambda: os.symlink("gone.ply", "out.ply"))
+    assert sorted(os.listdir()) == ["out.ply", "theirs"]
+
+
+def test_places_where_no_file_can_be_are_named():
+    os.symlink("round.ply", "round.ply")
+    os.symlink("no/there.ply", "out.ply")
+    os.mkfifo("pipe.ply")
+    assert refusal("round.ply", force=True).startswith("round.ply cannot be written: Too many le")
+    assert refusal("out.ply", force=True).endswith("/no is no folder: make it first")
+    assert refusal("pipe.ply", force=True) == "pipe.ply is no regular file: give another name"
+    assert refusal("x" * 300) == f"{'x' * 300} cannot be written: File name too long"
+    assert refusal("a\0b").endswith(" cannot be written: embedded null byte")
+
+
+@pytest.mark.parametrize("name", ["x" * 251 + ".ply", "ä" * 125 + ".ply"])
+def test_the_longest_names_are_written(name):
+    make(name)
+    assert os.listdir() == [name]
+
+
+def leave_part(target, pid):
+    """Make what a killed process leaves, and a spool; return their names."""
+    part = part_path(Path(target))
+    names = [part.name.replace(f".{os.getpid()}.", f".{pid}.")]
+    names.append(f"{names[0]}.abc_1234")
+    for name in names:
+        Path(name).write_text("half")
+    return names
+
+
+@pytest.mark.parametrize("target", ["out.ply", "x" * 250 + ".ply"])
+@pytest.mark.parametrize("has_locks", [True, False])
+def test_what_a_killed_process_left_goes_with_the_next_run(monkeypatch, target, has_locks):
+    if not has_locks:
+        monkeypatch.setattr(parts, "_take_lock", lambda file: None)
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    leave_part(target, gone.pid)
+    foreign = [*leave_part("other.ply", gone.pid), ".out.ply.part", "out.ply.1.part", ".out.ply.1"]
+    for name in foreign[2:]:
+        Path(name).write_text("theirs")
+    make(target)
+    assert sorted(os.listdir()) == sorted([target, *foreign])
+
+
+def test_what_is_being_written_is_not_touched():
+    with replacing(Path("out.ply")) as part:
+        part.write_text("mine")
+        script = "import sys; from pathlib import Path; from super_sdf.files import parts; "
+        script += "parts.remove_abandoned_parts([Path('out.ply')])"
+        subprocess.run([sys.executable, "-c", script], check=True)
+        remove_abandoned_parts([Path("out.ply")])
+        assert part.read_text() == "mine"
+        with pytest.raises(WriteError, match=r"^out.ply is being written already: wait for it$"):
+            make("out.ply", force=True)
+    assert os.listdir() == ["out.ply"]
+
+
+def test_parts_of_a_process_that_is_known_to_have_ended_go():
+    left = leave_part("out.ply", 1)
+    remove_abandoned_parts([Path("out.ply")], pid=1)
+    assert not set(left) & set(os.listdir())
+
+
+def test_errors_keep_their_words():
+    full = OSError(errno.ENOSPC, "No space left on device")
+    errors = {
+        "no surface": GridError("no surface"),
+        "in.npy is damaged": FileError("in.npy is damaged"),
+        "out.ply cannot be written: No space left on device": full,
+    }
+    for want, error in errors.items():
+        with pytest.raises(SuperSdfError) as caught, replacing(Path("out.ply")):
+            raise error
+        assert str(caught.value) == want
+    assert os.listdir() == []
+
+
+def test_grids_and_meshes_ask_once_more_in_the_end(monkeypatch):
+    from super_sdf import Mesh, SdfGrid, write_mesh
+    from super_sdf.files import grids, meshes
+
+    for module in (grids, meshes):  # the first look finds nothing
+        monkeypatch.setattr(module, "check_free", lambda path, force: path)
+    Path("out.ply").write_text("theirs")
+    Path("out.npz").write_text("theirs")
+    with pytest.raises(WriteError, match="made by somebody else"):
+        write_mesh(Mesh(np.eye(3), np.array([[0, 1, 2]])), "out.ply")
+    with pytest.raises(WriteError, match="made by somebody else"):
+        grids.write_grid(SdfGrid(np.arange(8.0).reshape(2, 2, 2) - 1, 4.0), "out.npz")
+    assert Path("out.ply").read_text() == Path("out.npz").read_text() == "theirs"
