@@ -18,7 +18,7 @@ FLOORS = [
     {"isosurface", "border", "spheres"},
     {"survey", "kernels"},
     {"compiled"},
-    {"plan", "precision"},
+    {"plan", "precision", "expectation"},
     {"pipeline"},
     {"convert"},
     {"cli_common", "cli_conversion", "cli_batch_report", "__init__"},
