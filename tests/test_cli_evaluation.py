@@ -1,7 +1,7 @@
 """The commands sample and render, and lists of values on the command line."""
 
-import subprocess
-import sys
+import re
+from pathlib import Path
 
 import click
 import numpy as np
@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from conftest import ball
 from solids import cube, inverted, joined, saved, torus
 
-from super_sdf import Mesh, read_grid
+from super_sdf import Mesh, extras, read_grid
 from super_sdf.cli_evaluate import ListCommand
 
 
@@ -149,14 +149,41 @@ def test_an_option_takes_several_values(line):
     assert result.output == "words=('m', 'n') sizes=(32, 64, 128) names=('a', 'b') out=a\n"
 
 
-def test_a_missing_extra_is_named(here):
-    """As in an environment without SciPy."""
-    script = (
-        "import sys, importlib.util as u; real = u.find_spec;"
-        "u.find_spec = lambda name, *rest: None if name == 'scipy' else real(name, *rest);"
-        "from super_sdf.cli import main; sys.argv = ['super-sdf', 'sample', 'box.ply', 'a.npz'];"
-        "main()"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.returncode == 1
-    assert done.stderr == "Error: sample needs scipy: pip install 'super-sdf[eval]'\n"
+@pytest.mark.parametrize(
+    ("gone", "words", "want"),
+    [
+        (["scipy"], "sample box.ply a.npz", "sample needs scipy: pip install -e '.[eval]'"),
+        (["scipy"], "evaluate . --out a", "evaluate needs scipy: pip install -e '.[eval]'"),
+        (
+            ["igl", "scipy", "pyvista"],
+            "render box.ply a.png",
+            "render needs igl, scipy, pyvista: pip install -e '.[view]'",
+        ),
+        (["pyvista"], "render box.ply a.png", "render needs pyvista: pip install -e '.[view]'"),
+        (
+            ["igl", "pyvista"],
+            "render in.npz a.png",
+            "render needs igl: pip install -e '.[view]'",
+        ),
+        (
+            ["gpytoolbox"],
+            "evaluate . --out a --peers rfta",
+            "--peers needs gpytoolbox: pip install -e '.[peers]'",
+        ),
+    ],
+)
+def test_what_is_missing_is_named_with_the_extra_that_brings_it_all(
+    here, command, monkeypatch, gone, words, want
+):
+    real = extras.find_spec
+    monkeypatch.setattr(extras, "find_spec", lambda name: None if name in gone else real(name))
+    assert command(*words.split()) == (1, "", f"Error: {want} in a clone of super-sdf\n")
+
+
+def test_nobody_is_told_to_install_from_an_index_that_has_no_such_package():
+    root = Path(__file__).parent.parent
+    folders = ("docs", "examples", "export", "models", "src")
+    inside = [path for folder in folders for path in (root / folder).rglob("*")]
+    sources = [path for path in [*root.glob("*.md"), *inside] if path.suffix in (".md", ".py")]
+    assert len(sources) > 50
+    assert not [path for path in sources if re.search(r"install '?super-sdf", path.read_text())]

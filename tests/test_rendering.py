@@ -13,7 +13,7 @@ from conftest import ball, trilinear
 from matplotlib.image import imread
 from solids import cube, sphere
 
-from super_sdf import Mesh, SdfGrid, upsample
+from super_sdf import Mesh, SdfGrid, extras, upsample
 from super_sdf.border import close_at_border
 from super_sdf.errors import FileError, OptionError
 from super_sdf.evaluation import rendering
@@ -218,8 +218,8 @@ def test_pictures_of_nothing_and_values_of_another_mesh_are_refused(tmp_path: Pa
 
 
 def test_without_pyvista_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(rendering, "find_spec", lambda name: None)
-    with pytest.raises(FileError, match=r"super-sdf\[view\]"):
+    monkeypatch.setattr(extras, "find_spec", lambda name: None)
+    with pytest.raises(FileError, match=r"pip install -e '\.\[view\]' in a clone"):
         picture(tmp_path, Panel(cube()))
 
 

@@ -6,9 +6,10 @@ import re
 import numpy as np
 import pytest
 
-from super_sdf import cli_common, selftest
+from super_sdf import extras, selftest
 from super_sdf.errors import DeviceError
-from super_sdf.selftest import EXTRAS, Finding, run_checks
+from super_sdf.extras import EXTRAS
+from super_sdf.selftest import Finding, run_checks
 
 pytestmark = pytest.mark.usefixtures("cpu_build")
 
@@ -87,7 +88,7 @@ def test_a_network_that_cannot_run_is_a_finding_and_the_checks_go_on(monkeypatch
     monkeypatch.setattr(selftest, "ask", broken)
     findings = list(run_checks("cpu"))
     assert find(findings, "network base on cpu").says == "the network failed on cpu: no"
-    assert findings[-1].what == "extra view"
+    assert findings[-1].what == "extra peers"
 
 
 def test_both_kinds_of_onnxruntime_at_once_fail(monkeypatch):
@@ -99,11 +100,10 @@ def test_both_kinds_of_onnxruntime_at_once_fail(monkeypatch):
 
 
 def test_a_missing_extra_is_named_with_its_way_out(monkeypatch):
-    monkeypatch.setattr(selftest, "find_spec", lambda module: None)
+    monkeypatch.setattr(extras, "find_spec", lambda module: None)
     assert selftest.check_extra("3mf", EXTRAS["3mf"]) == Finding(
-        "missing", "extra 3mf", "no lxml, networkx: pip install 'super-sdf[3mf]'"
+        "missing", "extra 3mf", "no lxml, networkx: pip install -e '.[3mf]' in a clone of super-sdf"
     )
-    assert EXTRAS["eval"] == cli_common.NEEDED
 
 
 def test_a_system_that_does_not_tell_its_memory(monkeypatch):
@@ -118,7 +118,7 @@ def test_the_command_prints_a_line_a_check_and_its_exit_code_tells(command):
     assert lines[0].startswith("ok       versions: super-sdf ")
     assert all(re.match(r"(ok      |missing ) \w+", line) for line in lines[:-1])
     code, out, _ = command("info", "--check", "--device", "cuda")
-    assert code == 1 and out.splitlines()[-1] == "1 of 10 checks failed"
+    assert code == 1 and out.splitlines()[-1] == "1 of 11 checks failed"
     assert "\nfailed   cuda: onnxruntime " in out
 
 

@@ -10,7 +10,7 @@ SOURCES = sorted((ROOT / "src" / "super_sdf").glob("*.py"))
 EVALUATION = sorted((ROOT / "src" / "super_sdf" / "evaluation").glob("*.py"))
 FLOORS = [
     {"errors", "chunks", "compiling", "interrupts", "streams"},
-    {"memory", "cuda"},
+    {"memory", "cuda", "extras"},
     {"grid"},
     {"band", "mesh", "cell_cases", "device"},
     {"nodes", "symmetry"},

@@ -9,8 +9,6 @@ import click
 
 from .interrupts import describe_interrupt, exit_code
 
-# Modules of the extra ``eval``.
-NEEDED = ("igl", "matplotlib", "scipy", "skimage")
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
 
@@ -64,14 +62,3 @@ def print_result(text: str, kept: str) -> None:
         raise click.ClickException(
             f"stdout cannot be written: {error.strerror or error}; {kept}"
         ) from error
-
-
-def check_extra(command: str) -> None:
-    """Raise if the packages of the extra are not there."""
-    from importlib.util import find_spec
-
-    from .errors import FileError
-
-    missing = [name for name in NEEDED if find_spec(name) is None]
-    if missing:
-        raise FileError(f"{command} needs {', '.join(missing)}: pip install 'super-sdf[eval]'")

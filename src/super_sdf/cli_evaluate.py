@@ -10,8 +10,8 @@ from typing import Any
 
 import click
 
-from .cli_common import CONTEXT, check_extra, one_line_errors
-from .errors import FileError
+from .cli_common import CONTEXT, one_line_errors
+from .extras import check_modules
 from .interrupts import raising_interrupts
 
 EXAMPLES = """\b
@@ -139,7 +139,7 @@ def evaluate(sources: tuple[Path, ...], **options: Any) -> None:
     again, it goes on where it was. OUT/report.md has the tables, plots and pictures.
     """
     with one_line_errors():
-        check_extra("evaluate")
+        check_modules("evaluate", "eval")
         with raising_interrupts():  # there are processes to end, and results to keep
             left_out = run_evaluate(sources, options)
     if left_out:
@@ -151,11 +151,10 @@ def run_evaluate(sources: tuple[Path, ...], options: dict[str, Any]) -> bool:
     from .chunks import count_cores
     from .evaluation.evaluate import evaluate
     from .evaluation.methods import METHODS
-    from .evaluation.peers import peers_are_installed
     from .evaluation.plan import Plan, find_meshes, spread
 
-    if options["peers"] and not peers_are_installed():
-        raise FileError("peers need gpytoolbox: pip install 'super-sdf[peers]'")
+    if options["peers"]:
+        check_modules("--peers", "peers")
     paths = find_meshes(sources)
     jobs = options["jobs"] or count_cores()
     plan = Plan(

@@ -7,8 +7,9 @@ from typing import Any
 
 import click
 
-from .cli_common import CONTEXT, check_extra, one_line_errors
+from .cli_common import CONTEXT, one_line_errors
 from .errors import OptionError
+from .extras import EXTRAS, check_modules
 from .interrupts import raising_interrupts
 
 EXAMPLES = """\b
@@ -78,9 +79,9 @@ def render(sources: tuple[Path, ...], target: Path, **options: Any) -> None:
     from .files.grids import GRID_SUFFIXES
 
     with one_line_errors():
-        check_extra("render")
-        check_picture(target, force=options["force"])
         grids = [source for source in sources if source.suffix.lower() in GRID_SUFFIXES]
+        check_modules("render", "view", EXTRAS["eval"] if grids else None)
+        check_picture(target, force=options["force"])
         if grids and len(sources) > 1:
             raise OptionError(f"{grids[0]} is a grid: give it alone, or meshes only")
         (render_grid if grids else render_meshes)(sources, target, options)

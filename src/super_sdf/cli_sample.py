@@ -11,8 +11,9 @@ from typing import Any
 
 import click
 
-from .cli_common import CONTEXT, check_extra, one_line_errors
+from .cli_common import CONTEXT, one_line_errors
 from .errors import OptionError
+from .extras import check_modules
 from .interrupts import raising_interrupts
 
 EXAMPLES = """\b
@@ -60,7 +61,7 @@ def sample(source: Path, target: Path, **options: Any) -> None:
     units, negative inside.
     """
     with one_line_errors():
-        check_extra("sample")
+        check_modules("sample", "eval")
         run_sample(source, target, options)
 
 

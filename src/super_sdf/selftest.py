@@ -10,13 +10,13 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
-from importlib.util import find_spec
 
 import numpy as np
 
 from . import __version__
 from .cuda import available_devices, check_cuda, describe_gpu, onnxruntime_version
 from .errors import DeviceError, SuperSdfError
+from .extras import EXTRAS, how_to_install, missing_modules
 from .grid import FloatArray, IntArray, SdfGrid
 from .memory import free_memory
 from .network import load_network, shipped_models
@@ -24,13 +24,6 @@ from .nodes import block_offsets
 from .survey import survey
 
 OK, MISSING, FAILED = "ok", "missing", "failed"
-# Modules that the extras bring.
-EXTRAS = {
-    "fast": ("numba",),
-    "3mf": ("lxml", "networkx"),
-    "eval": ("igl", "matplotlib", "scipy", "skimage"),
-    "view": ("pyvista",),
-}
 BALL_SAMPLES, BALL_CENTRE, BALL_RADIUS = 32, 15.63, 12.0  # off the samples
 WORST = 0.05  # voxels; the shipped networks stay under 0.025, a broken one is off by whole voxels
 CUDA_APART = 1e-4  # voxels between the CPU's values and CUDA's
@@ -172,8 +165,8 @@ def judge(
 
 def check_extra(name: str, modules: tuple[str, ...]) -> Finding:
     """Say whether an extra's modules are there."""
-    missing = [module for module in modules if find_spec(module) is None]
+    missing = missing_modules(modules)
     if missing:
-        way_out = f"pip install 'super-sdf[{name}]'"
-        return Finding(MISSING, f"extra {name}", f"no {', '.join(missing)}: {way_out}")
+        says = f"no {', '.join(missing)}: {how_to_install(name)}"
+        return Finding(MISSING, f"extra {name}", says)
     return Finding(OK, f"extra {name}", ", ".join(modules))

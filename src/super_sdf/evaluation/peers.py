@@ -5,8 +5,6 @@ They take minutes a shape and no factor: each makes what surface it likes from t
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-
 import numpy as np
 
 from ..grid import IntArray, SdfGrid
@@ -16,8 +14,6 @@ from .cases import Case
 from .methods import Method, Surface
 from .sampling import grid_points
 from .solid import Points
-
-PACKAGE = "gpytoolbox"
 
 
 def samples_of(grid: SdfGrid) -> Points:
@@ -54,8 +50,3 @@ def split_quads(quads: IntArray) -> IntArray:
 
 
 PEERS: dict[str, Method] = {"rfta": reach_for_the_arcs, "dual-contouring": dual_contouring}
-
-
-def peers_are_installed() -> bool:
-    """Say whether the package that has them is there."""
-    return find_spec(PACKAGE) is not None

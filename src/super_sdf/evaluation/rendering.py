@@ -9,14 +9,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, OptionError
+from ..errors import OptionError
+from ..extras import EXTRAS, check_modules, missing_modules
 from ..mesh import Mesh
 from .page import COLOUR_MAP, Image, Page, write_picture
 from .solid import Distances, Points, Solid
@@ -89,7 +89,7 @@ class Frame:
 
 def can_render() -> bool:
     """Say whether PyVista is installed."""
-    return find_spec("pyvista") is not None
+    return not missing_modules(EXTRAS["view"])
 
 
 def vertex_errors(mesh: Mesh, reference: Solid) -> Distances:
@@ -237,8 +237,7 @@ def _top_of(values: NDArray[Any]) -> float:
 
 def _pyvista() -> Any:
     """Import PyVista, which takes a second."""
-    if not can_render():
-        raise FileError("pictures of meshes need PyVista: pip install 'super-sdf[view]'")
+    check_modules("drawing meshes", "view")
     return import_module("pyvista")
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from ..extras import how_to_install
 from ..mesh import Mesh
 from ..network import load_network
 from . import experiment_tables
@@ -166,7 +167,7 @@ def picture_section(results: Results, out: Path, up: str) -> str:
     title = f"## The {count} best and the {count} worst shapes at {setting.size}^3, by F1 over the "
     title += "floor's"
     if not can_render():
-        return f"{title}\n\nNot drawn: PyVista is not installed (extra `view`)."
+        return f"{title}\n\nNot drawn: PyVista is not installed ({how_to_install('view')})."
     paths = {path.stem: path for path in results.plan.paths}
     lines = [title]
     for row in ranked[:count] + ranked[len(ranked) - count :]:
