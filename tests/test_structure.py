@@ -13,8 +13,8 @@ FLOORS = [
     {"memory", "cuda", "extras"},
     {"grid"},
     {"band", "mesh", "cell_cases", "device"},
-    {"nodes", "symmetry"},
-    {"field", "files", "network", "lattice"},
+    {"nodes", "symmetry", "files"},
+    {"field", "network", "lattice"},
     {"isosurface", "border", "spheres"},
     {"survey", "kernels"},
     {"compiled"},
@@ -31,7 +31,7 @@ FLOORS = [
 BATCH = sorted((ROOT / "src" / "super_sdf" / "batch").glob("*.py"))
 FILES = sorted((ROOT / "src" / "super_sdf" / "files").glob("*.py"))
 FILES_FLOORS = [
-    {"conventions", "parts", "spool", "__init__"},
+    {"conventions", "parts", "regular", "spool", "__init__"},
     {"output", "ply", "stl", "text_meshes", "glb"},
     {"threemf"},
     {"grids", "meshes"},

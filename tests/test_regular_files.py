@@ -1,0 +1,67 @@
+"""Only regular files are read: what stands in the way is said, and nothing is waited for."""
+
+import os
+import re
+import socket
+from pathlib import Path
+
+import pytest
+
+from super_sdf.errors import FileError
+from super_sdf.files.regular import check_regular_file
+
+
+@pytest.fixture(autouse=True)
+def _in_empty_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def make_every_kind() -> None:
+    """Make what is no regular file, a name each."""
+    Path("folder.npy").mkdir()
+    os.mkfifo("pipe.npy")
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind("socket.npy")
+    Path("zero.npy").symlink_to("/dev/zero")
+    Path("loop.npy").symlink_to("loop.npy")
+    Path("dangling.npy").symlink_to("nothing.npy")
+    Path("file").touch()
+
+
+WHAT_IS_WRONG = {
+    "folder.npy": "is a folder: give a file",
+    "pipe.npy": "is a named pipe: give a file",
+    "socket.npy": "is a socket: give a file",
+    "zero.npy": "is a device: give a file",
+    "loop.npy": "cannot be read: its links lead in a circle",
+    "dangling.npy": "does not exist",
+    "missing.npy": "does not exist",
+    "file/in.npy": "does not exist: what stands before its last / is no folder",
+    "n" * 300: "does not exist: the name is longer than the system allows",
+}
+
+
+@pytest.mark.parametrize("name", WHAT_IS_WRONG)
+def test_what_is_no_regular_file_is_named(name):
+    make_every_kind()
+    with pytest.raises(FileError, match=f"^{re.escape(name)} {re.escape(WHAT_IS_WRONG[name])}$"):
+        check_regular_file(name)
+
+
+@pytest.mark.parametrize("name", ["a\0.npy", "a\ud800.npy"])
+def test_a_name_that_no_file_can_have(name):
+    with pytest.raises(FileError, match="^" + re.escape(f"{name!r} is no name that a file can")):
+        check_regular_file(name)
+
+
+def test_a_file_that_may_not_be_read(monkeypatch):
+    Path("file").touch()
+    monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may read everything
+    with pytest.raises(FileError, match=r"^file cannot be read: permission denied$"):
+        check_regular_file("file")
+
+
+def test_files_and_links_to_them_pass():
+    Path("file").touch()
+    Path("link").symlink_to("file")
+    assert check_regular_file("link") == Path("link")
