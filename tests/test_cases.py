@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from conftest import trilinear
@@ -9,6 +11,7 @@ from scipy import ndimage
 from solids import cube, saved, sphere, torus
 
 from super_sdf import Mesh, load_network, pipeline
+from super_sdf.errors import NoSurfaceError
 from super_sdf.evaluation import methods
 from super_sdf.evaluation.cases import Case, Setting, Shape
 from super_sdf.evaluation.measuring import Task, measure_method, measure_task
@@ -117,14 +120,28 @@ def test_a_scale_is_the_longest_side_over_that_of_the_grid():
     assert (case.coarse[:, 16, 16] < 0).sum() == 8
 
 
-def test_a_method_that_raises_counts_as_a_dot_and_is_named(monkeypatch):
+def test_a_method_that_raises_has_no_figures_and_is_named(monkeypatch):
     def broken(case, network):
-        raise ValueError("no luck")
+        raise ValueError("no luck\nat all")
 
     monkeypatch.setitem(methods.METHODS, "mc", broken)
     row = measure_method(*shape_and_case(cube(), Setting(8)), "mc", trilinear)
-    assert row["error"] == "ValueError: no luck"
-    assert row["f1"] == 0 and row["faces"] == 0 and not row["closed"]
+    assert row.keys() == {"error"}
+    assert re.fullmatch(r"ValueError: no luck \(test_cases\.py:\d+\)", row["error"])
+
+
+def test_a_surface_that_is_not_found_counts_as_a_dot():
+    thin = Mesh(cube().vertices * [1, 1, 1e-4], cube().faces)  # no sample lies in it
+    row = measure_method(*shape_and_case(thin, Setting(8)), "mc", trilinear)
+    assert row["error"] is None and row["f1"] < 1e-4 and row["faces"] == 0 and not row["closed"]
+
+    def nothing(*_, **__):
+        raise NoSurfaceError("no surface at 0")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(methods, "reconstruct", nothing)
+        row = measure_method(*shape_and_case(cube(), Setting(8)), "ours", trilinear)
+    assert row["error"] is None and row["f1"] == 0 and row["faces"] == 0
 
 
 def test_a_lattice_beyond_memory_fails_its_methods_and_not_the_shape(tmp_path):
@@ -133,7 +150,7 @@ def test_a_lattice_beyond_memory_fails_its_methods_and_not_the_shape(tmp_path):
     rows = list(measure_task(task, Shape.read(path)))
     assert [row["method"] for row in rows] == ["mc", "bound"]
     assert all("measuring 8000^3 refined to " in row["error"] for row in rows)
-    assert all(row["f1"] == 0 for row in rows)
+    assert all("f1" not in row for row in rows)  # that is no score
 
 
 def shape_and_case(mesh: Mesh, setting: Setting) -> tuple[Shape, Case]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,12 +19,14 @@ from solids import cube, saved, sphere, torus
 
 from super_sdf import Mesh, SuperSdfError
 from super_sdf.cli import cli
-from super_sdf.evaluation import measuring, plan, published, runner, tables, timing
+from super_sdf.errors import WriteError
+from super_sdf.evaluation import measuring, plan, published, report, runner, tables, timing
 from super_sdf.evaluation.cases import Setting, Shape
 from super_sdf.evaluation.measuring import Task
 from super_sdf.evaluation.plan import Plan
 from super_sdf.evaluation.results import Results
-from super_sdf.evaluation.runner import LeftOut, Runner, Store, complete
+from super_sdf.evaluation.runner import LeftOut, Runner, complete
+from super_sdf.evaluation.store import KEY_TYPES, Store, is_row
 
 QUALITY = ("cd", "f1", "nc", "signed_nc", "p2s", "ecd", "ef1", "field_mse", "faces", "closed")
 
@@ -51,8 +55,7 @@ def quality_of(out: Path) -> dict[tuple, tuple]:
     """Return the figures of quality of each row."""
     rows = [json.loads(line) for line in (out / "results.jsonl").read_text().splitlines()]
     return {
-        tuple(row[name] for name in runner.KEY_NAMES): tuple(row[name] for name in QUALITY)
-        for row in rows
+        tuple(row[name] for name in KEY_TYPES): tuple(row[name] for name in QUALITY) for row in rows
     }
 
 
@@ -108,8 +111,9 @@ def test_pictures_of_the_best_and_worst(meshes, tmp_path):
     out = tmp_path / "out"
     done = evaluate(meshes, "--sizes", 8, "--methods", "mc", "ours", "--out", out)
     assert done.returncode == 0, done.stderr
-    shown = [line for line in (out / "report.md").read_text().splitlines() if "](pictures/" in line]
-    assert len(shown) == 2
+    report = (out / "report.md").read_text()
+    shown = [line for line in report.splitlines() if "](pictures/" in line]
+    assert len(shown) == 3 and "## All 3 shapes at 8^3, best F1 over" in report
     assert all((out / line.split("(")[1][:-1]).exists() for line in shown)
 
 
@@ -117,14 +121,14 @@ def test_a_store_keeps_rows_and_forgets_other_protocols(tmp_path):
     path = tmp_path / "rows.jsonl"
     task = task_of(tmp_path / "box.ply")
     store = Store(path)
-    store.add({**task.key("mc"), "f1": 0.5, "error": None})
-    store.add({**task.key("ours"), "protocol": measuring.PROTOCOL - 1, "f1": 0.5, "error": None})
+    store.add({**row("box", 0.5), **task.key("mc")})
+    store.add({**row("box", 0.5), **task.key("ours"), "protocol": measuring.PROTOCOL - 1})
     with path.open("a") as file:
         file.write('{"shape": "to')
     again = Store(path)
-    assert again.get(task, "mc") == {**task.key("mc"), "f1": 0.5, "error": None}
+    assert again.get(task, "mc") == {**row("box", 0.5), **task.key("mc")}
     assert again.get(task, "ours") is None
-    again.add({**task.key("bound"), "f1": 1.0, "error": None})
+    again.add({**row("box", 1.0), **task.key("bound")})
     assert Store(path).get(task, "bound")["f1"] == 1.0
 
 
@@ -181,11 +185,11 @@ def test_a_process_that_dies_fails_one_method_and_the_rest_go_on(tmp_path, monke
     errors = {name: store.get(task, name)["error"] for name in task.methods}
     assert errors == {
         "mc": None,
-        "ours": "its process ended with -9",
+        "ours": "its process died of SIGKILL (mostly for want of memory)",
         "bspline": None,
         "bound": None,
     }
-    assert store.get(task, "ours")["f1"] == 0  # a dot stands in
+    assert "f1" not in store.get(task, "ours")  # a failure is no score
     assert seen == [(1, 1)]
 
 
@@ -206,7 +210,52 @@ def test_a_mesh_that_crashes_its_reader_is_left_out(tmp_path, monkeypatch):
     monkeypatch.setattr(runner, "work", crash)
     tasks = [task_of(tmp_path / "box.ply"), task_of(tmp_path / "box.ply", ("ours", "bound"))]
     left_out = complete(tasks, Store(tmp_path / "rows.jsonl"), 1)
-    assert left_out == [LeftOut("box", "while it was read its process ended with -9")]
+    reason = "while it was read its process died of SIGKILL (mostly for want of memory)"
+    assert left_out == [LeftOut("box", reason)]
+
+
+def test_a_process_killed_before_it_had_its_shape_is_tried_once_more(tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "work", crash_once)
+    path = saved(cube(), tmp_path / "box.ply")
+    tasks = [task_of(path), task_of(path, ("ours", "bound"))]
+    store = Store(tmp_path / "rows.jsonl")
+    assert complete(tasks, store, 2) == []
+    assert all(store.get(task, name)["error"] is None for task in tasks for name in task.methods)
+
+
+def crash_once(task: Task, rows) -> None:
+    """Stand in for a process that somebody kills, in the middle of what it sends."""
+    marker = task.path.with_suffix(f".{task.methods[0]}")
+    if not marker.exists():
+        marker.touch()
+        os.write(rows.fileno(), b"\0\0\1\0half of a message")
+        os.kill(os.getpid(), signal.SIGKILL)
+    rows.send(runner.READ)
+    for method in task.methods:
+        rows.send({**task.key(method), "error": None})
+
+
+def test_a_process_that_does_not_start_leaves_its_shape_out(tmp_path, monkeypatch):
+    one = Runner([task_of(tmp_path / "box.ply")], 1)
+    monkeypatch.setattr(one.context.Process, "start", no_process)
+    reason = "its process did not start: Too many open files"
+    assert [found for _, found in one.results()] == [LeftOut("box", reason), None]
+
+
+def no_process(self) -> None:
+    raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+
+def test_a_bug_in_the_reading_names_the_shape(tmp_path, monkeypatch):
+    def broken(path):
+        raise ValueError("no luck")
+
+    monkeypatch.setattr(Shape, "read", broken)
+    sent = []
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    runner.work(task_of(tmp_path / "box.ply"), SimpleNamespace(send=sent.append))
+    ((name, reason),) = [(found.shape, found.reason) for found in sent]
+    assert name == "box" and reason.startswith("ValueError: no luck (test_evaluation.py:")
 
 
 def refuse(task: Task, rows) -> None:
@@ -251,11 +300,20 @@ def test_two_shapes_of_one_name_are_refused(meshes, tmp_path):
         ([".", "--factor", "3"], "Error: factor is 3"),
         ([".", "--model", "none"], "Error: no model 'none': give an ONNX file"),
         (["empty"], "Error: empty holds no mesh: give .ply"),
+        (["pipe"], "Error: pipe/a.ply is a named pipe: give a file"),
+        (["/dev/zero"], "Error: /dev/zero is a device: give a file"),
+        (["pipe/a.ply"], "Error: pipe/a.ply is a named pipe: give a file"),
+        (["x" * 300], f"Error: {'x' * 300} does not exist: the name is longer"),
+        ([".", "--peer-size", "0"], "Error: peer size is 0: give at least 4 samples"),
+        ([".", "--peer-limit", "nan"], "Error: peer limit is nan: give more than 0 seconds"),
+        ([".", "--peer-limit", "-1"], "Error: peer limit is -1: give more than 0 seconds"),
     ],
 )
 def test_what_makes_no_sense_is_said_in_one_line(words, message, meshes, monkeypatch):
     monkeypatch.chdir(meshes)
     (meshes / "empty").mkdir()
+    (meshes / "pipe").mkdir()
+    os.mkfifo(meshes / "pipe" / "a.ply")
     result = CliRunner().invoke(cli, ["evaluate", *words, "--out", "out", "--quiet"])
     assert result.exit_code != 0
     assert result.output.splitlines()[-1].startswith(message)
@@ -263,9 +321,132 @@ def test_what_makes_no_sense_is_said_in_one_line(words, message, meshes, monkeyp
 
 
 def row(name: str, f1: float, **figures: object) -> measuring.Row:
-    known = dict.fromkeys((column.key for column in tables.SURFACE), 0.001)
+    known = dict.fromkeys((*measuring.NUMBERS, *measuring.OPTIONAL_NUMBERS, "excess_cd"), 0.001)
     said = {"shape": name, "f1": f1, "closed": True, "outward": True, "faces": 4, "error": None}
-    return {**known, **said, **figures}
+    return {**known, **said, "notes": [], **figures}
+
+
+DAMAGED = [
+    b"no json",
+    b"[1, 2]",
+    b"3",
+    b"null",
+    b'{"shape": "to',
+    b'{"a":' * 100_000,
+    b"[" * 100_000,
+    b'{"protocol": 2}',
+    b"\xff\xfe\x00",
+    b"9" * 6000,
+]
+
+
+def test_what_is_no_row_is_passed_over(tmp_path):
+    path, task = tmp_path / "rows.jsonl", task_of(tmp_path / "box.ply")
+    good = {**row("box", 0.5), **task.key("mc")}
+    assert is_row(good)
+    changes = [
+        {name: value} for name in good for value in ([], {"a": 1}, "9", 10**400, float("nan"))
+    ]
+    odd = [{**good, **change} for change in changes]
+    odd = [found for found in odd if not is_row(found)]
+    assert len(odd) > 0.7 * len(changes)
+    lines = [*DAMAGED, *(json.dumps(found).encode() for found in odd)]
+    path.write_bytes(b"\n".join([*lines, json.dumps(good).encode(), b'{"shape": "torn']))
+    store = Store(path)
+    assert list(store.rows.values()) == [good]
+    assert path.read_bytes().endswith(b"torn\n")
+
+
+def test_rows_that_cannot_be_kept_end_it_in_one_line():
+    store = Store(Path("/dev/null"))
+    store.path = Path("/dev/full")
+    with pytest.raises(WriteError, match=r"^/dev/full cannot be written: No space left on"):
+        store.add(row("box", 0.5, **task_of(Path("box.ply")).key("mc")))
+
+
+def test_a_failure_is_left_out_of_its_table_and_named(meshes, tmp_path):
+    results = made_up(meshes, tmp_path, methods=("mc", "ours"), peers=("rfta",))
+    task = next(task for task in results.tasks if task.path.stem == "ring" and task.setting.size)
+    results.store.add({**task.key("ours"), "error": "out of memory"})
+    again = Results(results.plan, results.tasks, results.store, [LeftOut("lost", "it is")])
+    assert again.left_out == [
+        LeftOut("lost", "it is"),
+        LeftOut("ring", "ours (32^3, factor 4): out of memory"),
+    ]
+    by_method = again.by_method(Setting(32))
+    shapes = {name: [found["shape"] for found in rows] for name, rows in by_method.items()}
+    assert shapes == {name: ["ball", "box"] for name in ("mc", "ours", "floor")}
+    assert len(again.rows(Setting(0, 0), "floor")) == 3
+
+
+def test_a_size_that_does_not_fit_is_no_score(meshes, tmp_path):
+    out = tmp_path / "out"
+    words = ("--sizes", 8, 20000, "--methods", "mc", "--out", out, "--no-pictures", "--limit", 1)
+    done = evaluate(meshes, *words)
+    assert done.returncode == 1
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("Left out: ")]
+    assert line.startswith("Left out: ball: mc (20000^3, factor 4): measuring 20000^3 refined to ")
+    text = (out / "report.md").read_text()
+    assert f"Left out, {line.removeprefix('Left out: ')}." in text
+    large = text.split("## 20000^3")[1]
+    assert "| MC | - | - |" in large and "0.000" not in large.split("##")[0]
+
+
+@pytest.mark.parametrize(
+    ("count", "title"),
+    [
+        (1, "## The shape at 8^3"),
+        (3, "## All 3 shapes at 8^3, best F1 over the floor's first"),
+        (10, "## The 5 best and the 5 worst shapes at 8^3, by F1 over the floor's"),
+    ],
+)
+def test_the_pictures_are_called_what_they_show(count, title):
+    assert report.extremes_title(count, Setting(8)) == title
+
+
+def test_a_folder_that_no_evaluation_made_is_refused(meshes, tmp_path):
+    out = tmp_path / "out"
+    words = [meshes, "--sizes", 8, "--methods", "mc", "--out", out, "--quiet", "--limit", 1]
+    arguments = ["evaluate", *map(str, words), "--no-pictures"]
+    out.mkdir()
+    (out / "report.md").write_text("mine")
+    refused = CliRunner().invoke(cli, arguments)
+    assert refused.exit_code == 1
+    assert refused.output == (
+        f"Error: {out} holds 'report.md' and no results.jsonl, so no evaluation made it: give a "
+        "new or an empty folder\n"
+    )
+    assert [path.name for path in out.iterdir()] == ["report.md"]
+    (out / "report.md").unlink()
+    done = evaluate(*arguments[1:])
+    assert done.returncode == 0, done.stderr
+    (out / "notes.md").write_text("mine")
+    (out / "plots" / "mine.png").write_text("mine")
+    assert CliRunner().invoke(cli, arguments).exit_code == 0  # nothing is left to measure
+    assert (out / "notes.md").read_text() == (out / "plots" / "mine.png").read_text() == "mine"
+    for name in ("report.md", "shapes.md", "results.jsonl"):
+        ours = (out / name).read_bytes()
+        (out / name).write_text("mine")
+        refused = CliRunner().invoke(cli, arguments)
+        message = f"Error: {out / name} was not written by an evaluation: move it or use another"
+        assert refused.exit_code == 1 and refused.output.startswith(message)
+        assert (out / name).read_text() == "mine"
+        (out / name).write_bytes(ours)
+
+
+def test_an_interrupt_says_what_is_kept(meshes, tmp_path, monkeypatch):
+    def interrupt(tasks, store, *_):
+        store.add(row("box", 0.5, **tasks[0].key("mc")))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("super_sdf.evaluation.evaluate.complete", interrupt)
+    out = tmp_path / "out"
+    result = CliRunner().invoke(cli, ["evaluate", str(meshes), "--out", str(out)])
+    assert result.exit_code == 1
+    assert result.output == (
+        f"Error: interrupted: what was measured is kept in {out / 'results.jsonl'}; the same "
+        "command goes on from there\n"
+    )
 
 
 def made_up(meshes: Path, out: Path, **options: object) -> Results:
@@ -277,8 +458,9 @@ def made_up(meshes: Path, out: Path, **options: object) -> Results:
         for method in task.methods:
             f1 = 0.5 + task.setting.factor / 100 - task.setting.noise / 10
             cost = {"seconds": 1.0, "peak_mb": 10.0, "notes": []}
-            late = {"error": "over the limit of 1 s"} if method == "rfta" else {}
-            store.add({**row(task.path.stem, f1), **cost, **task.key(method), **late})
+            late = {"error": "over the limit of 1 s", "limit": 1.0} if method == "rfta" else {}
+            key = task.key(method)
+            store.add({**key, **row(task.path.stem, f1), **cost, **key, **late})
     return Results(asked, tasks, store, [])
 
 
@@ -330,14 +512,13 @@ def test_gaps_and_wins_are_what_they_are_called():
     )
 
 
-def test_tables_show_means_and_name_failures():
-    rows = [row("a", 0.5), row("b", 0.0, faces=0, closed=False, error="ValueError: no")]
+def test_tables_show_means_and_name_what_has_no_surface():
+    rows = [row("a", 0.5), row("b", 0.0, faces=0, closed=False)]
     table = tables.surface_table({"mc": rows}, 32)
     mine = next(line for line in table.splitlines() if line.startswith("| MC |"))
     assert "| 0.250 |" in mine and mine.endswith("| 1 of 2 | 2 of 2 |")
     assert "*PoNQ, published, Thingi30*" in table
-    lines = tables.failure_lines({"mc": rows})
-    assert lines == ["No surface (a dot stands in), MC: b (ValueError: no)."]
+    assert tables.empty_lines({"mc": rows}) == ["No surface (a dot stands in), MC: b."]
 
 
 def test_published_figures_are_in_their_tables_order():

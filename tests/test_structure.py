@@ -44,13 +44,14 @@ BATCH_FLOORS = [
     {"run"},
 ]
 EVALUATION_FLOORS = [
-    {"solid", "published", "page", "__init__"},
+    {"solid", "published", "page", "folder", "__init__"},
     {"sampling", "metrics", "rendering", "sections"},
     {"cases"},
     {"methods"},
     {"peers"},
     {"measuring"},
-    {"plan", "runner", "tables", "timing"},
+    {"plan", "store", "tables", "timing"},
+    {"runner"},
     {"results", "plots"},
     {"experiment_tables"},
     {"report"},

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,9 @@ Examples:
   super-sdf evaluate meshes/ --sizes 32 64 --experiments noise factors --out report/
   super-sdf evaluate a.ply b.ply --sizes 32 --peers rfta --out report/
 """
+# Options that the plan takes as they are; of a list, each entry once.
+NUMBERS = ("factor", "model", "experiment_shapes", "peer_shapes", "peer_size", "peer_limit")
+LISTS = ("sizes", "experiments", "peers")
 
 
 class ListCommand(click.Command):
@@ -121,7 +125,7 @@ def takes(option: click.Option, word: str, ctx: click.Context) -> bool:
 @click.option(
     "--model", default="base", show_default=True, help="fast, base, best, or an ONNX file."
 )
-@click.option("--jobs", type=click.IntRange(1), help="Processes; one a core unless given.")
+@click.option("--jobs", type=click.IntRange(1), help="Processes, one a core at most.")
 @click.option(
     "--up",
     type=click.Choice(["x", "y", "z"]),
@@ -136,7 +140,8 @@ def evaluate(sources: tuple[Path, ...], **options: Any) -> None:
 
     MESHES are files or folders. Each is scaled to a box diagonal of 1 and sampled at every size;
     what each method makes of the samples is compared with the mesh itself. Killed and started
-    again, it goes on where it was. OUT/report.md has the tables, plots and pictures.
+    again, it goes on where it was. OUT/report.md has the tables, plots and pictures; OUT is a new
+    folder, an empty one, or that of an earlier evaluation.
     """
     with one_line_errors():
         check_modules("evaluate", "eval")
@@ -156,33 +161,46 @@ def run_evaluate(sources: tuple[Path, ...], options: dict[str, Any]) -> bool:
     if options["peers"]:
         check_modules("--peers", "peers")
     paths = find_meshes(sources)
-    jobs = options["jobs"] or count_cores()
+    jobs = min(options["jobs"] or count_cores(), count_cores())
+    once: dict[str, Any] = {name: tuple(dict.fromkeys(options[name])) for name in LISTS}
     plan = Plan(
         spread(paths, options["limit"] or len(paths)),
         methods=tuple(name for name in METHODS if name in (options["methods"] or METHODS)),
         jobs=jobs,
         threads=max(1, count_cores() // jobs),
-        **{
-            name: options[name]
-            for name in (
-                *("sizes", "factor", "model", "experiments", "experiment_shapes"),
-                *("peers", "peer_shapes", "peer_size", "peer_limit"),
-            )
-        },
+        **{name: options[name] for name in NUMBERS},
+        **once,
     )
-    outcome = evaluate(
-        plan,
-        options["out"],
-        up=options["up"],
-        pictures=not options["no_pictures"],
-        progress=None if options["quiet"] else progress_lines(),
-    )
+    with interrupts_explained(options["out"]):
+        outcome = evaluate(
+            plan,
+            options["out"],
+            up=options["up"],
+            pictures=not options["no_pictures"],
+            progress=None if options["quiet"] else progress_lines(),
+        )
     for entry in outcome.left_out:
         click.echo(f"Left out: {entry.shape}: {entry.reason}", err=True)
     if not options["quiet"]:
-        click.echo(outcome.report.read_text())
+        click.echo(outcome.report.read_text(encoding="utf-8"))
         click.echo(f"{outcome.report}", err=True)
     return bool(outcome.left_out)
+
+
+@contextmanager
+def interrupts_explained(out: Path) -> Iterator[None]:
+    """Say of an interrupt what is kept, if anything is."""
+    from .evaluation.folder import ROWS
+
+    rows = out / ROWS
+    try:
+        yield
+    except KeyboardInterrupt:
+        if not rows.exists():
+            raise
+        raise click.ClickException(
+            f"interrupted: what was measured is kept in {rows}; the same command goes on from there"
+        ) from None
 
 
 def progress_lines() -> Callable[[int, int, str, float], None]:

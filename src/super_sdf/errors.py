@@ -3,6 +3,9 @@
 - ``SuperSdfError``: the base; its text is one line: what was wrong, the value seen, the way out.
 
   - ``GridError`` (also ``ValueError``): the samples are not a usable signed distance grid.
+
+    - ``NoSurfaceError``: they are, but no surface is to be found in them.
+
   - ``MeshError`` (also ``ValueError``): a reference mesh bounds no solid.
   - ``OptionError`` (also ``ValueError``): an argument has no meaning (an odd factor, say).
   - ``FileError`` (also ``OSError``): a file cannot be read or written.
@@ -21,6 +24,10 @@ class SuperSdfError(Exception):
 
 class GridError(SuperSdfError, ValueError):
     """The samples are not a usable signed distance grid."""
+
+
+class NoSurfaceError(GridError):
+    """No surface is to be found in the samples."""
 
 
 class MeshError(SuperSdfError, ValueError):

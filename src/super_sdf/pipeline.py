@@ -21,7 +21,7 @@ import numpy as np
 from .border import close_at_border
 from .chunks import working_threads
 from .compiling import use_compiled
-from .errors import GridError
+from .errors import NoSurfaceError
 from .field import FineField, border_is_crossed
 from .grid import FloatArray, IntArray, SdfGrid
 from .isosurface import extract_pieces, vertex_type
@@ -272,9 +272,9 @@ def describe_piece(field: FineField, meshes: list[Mesh], planned: dict[str, int]
     return Piece(meshes, counts, whole, border_is_crossed(field), field.signs())
 
 
-def no_surface(grid: SdfGrid, offset: float) -> GridError:
+def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:
     """Return the error for a grid in which nothing is to be found."""
-    return GridError(
+    return NoSurfaceError(
         f"no surface at {offset:g}: the values go from {grid.low:.6g} to {grid.high:.6g}"
     )
 

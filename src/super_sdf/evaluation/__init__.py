@@ -3,5 +3,6 @@
 It needs the extra ``eval`` (libigl, SciPy, scikit-image, matplotlib), pictures of meshes the extra
 ``view`` (PyVista); the runtime imports nothing from here.
 
-    solid -> sampling -> cases -> methods, peers -> measuring -> runner -> tables, plots, report
+    solid -> sampling -> cases -> methods, peers -> measuring -> store, runner -> tables, plots
+    -> report
 """

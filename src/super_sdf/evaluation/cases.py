@@ -57,11 +57,20 @@ class Setting:
     scale: float = 0.0
     passes: int = 1
 
-    def check(self) -> None:
-        """Raise OptionError if a number is out of range."""
+    def check(self, name: str = "size") -> None:
+        """Raise OptionError if a number is out of range; ``name`` is what the size is called."""
         check_factor(self.factor)
         if self.size < 4:
-            raise OptionError(f"size is {self.size}: give at least 4 samples along an axis")
+            raise OptionError(f"{name} is {self.size}: give at least 4 samples along an axis")
+
+    def __str__(self) -> str:
+        if not self.size:
+            return "reference"
+        noted = [f"{self.size}^3", f"factor {self.factor}"]
+        noted += [f"noise {self.noise:g}"] if self.noise else []
+        noted += [f"scale {self.scale:g}"] if self.scale else []
+        noted += [f"{self.passes} passes"] if self.passes > 1 else []
+        return ", ".join(noted)
 
 
 class Shape:
@@ -94,7 +103,7 @@ class Shape:
 
     def seed(self, stream: int) -> tuple[int, int]:
         """Return the seed of a stream of random numbers."""
-        return zlib.crc32(self.name.encode()), stream
+        return zlib.crc32(self.name.encode(errors="surrogateescape")), stream
 
 
 class Case:

@@ -9,13 +9,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import FileError
+from ..errors import FileError, SuperSdfError
 from .cases import Shape
-from .measuring import PROCESS, Row, Task
+from .folder import ROWS, check_folder, make_folder
+from .measuring import PROCESS, Row, Task, failed_row, reason_of
 from .plan import Plan
 from .report import write_report
 from .results import Results
-from .runner import LeftOut, Store, complete
+from .runner import LeftOut, complete
+from .store import Store
 from .timing import time_shape
 
 Progress = Callable[[int, int, str, float], None]
@@ -24,7 +26,7 @@ Progress = Callable[[int, int, str, float], None]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Where the report is, and which shapes are not in it."""
+    """Where the report is, and which shapes are not in it, or not in all of its tables."""
 
     report: Path
     left_out: Sequence[LeftOut]
@@ -49,7 +51,7 @@ def evaluate(
     plan : Plan
         What is asked for.
     out : Path
-        Folder of the report; made if need be.
+        Folder of the report: a new one, an empty one, or that of an earlier evaluation.
     up : {"x", "y", "z"}
         The axis that points up in the pictures.
     pictures : bool
@@ -62,17 +64,15 @@ def evaluate(
     OptionError
         If the plan makes no sense.
     FileError
-        If the folder cannot be made, or no shape could be measured.
+        If the folder cannot be made or holds what no evaluation wrote, or no shape could be
+        measured.
     ModelError
         If the network cannot be loaded.
     """
     plan.check()
+    check_folder(out)
     tasks = plan.tasks()
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileError(f"{out} cannot be made: {error.strerror}") from error
-    store = Store(out / "results.jsonl")
+    store = Store(make_folder(out) / ROWS)
     tell = progress or (lambda done, total, what, share: None)
     left_out = complete(
         tasks,
@@ -82,23 +82,24 @@ def evaluate(
     )
     results = Results(plan, tasks, store, left_out)
     if not results.floors:
-        raise FileError(f"no shape could be measured; {left_out[0].shape}: {left_out[0].reason}")
+        first = results.left_out[0]
+        raise FileError(f"no shape could be measured; {first.shape}: {first.reason}")
     timings = time_processes(results, tell) if "timings" in plan.experiments else {}
-    return Outcome(write_report(results, out, timings, up=up, pictures=pictures), left_out)
+    report = write_report(results, out, timings, up=up, pictures=pictures)
+    return Outcome(report, results.left_out)
 
 
 def name_of(task: Task) -> str:
     """Return what a task is called while it goes on."""
-    setting = task.setting
-    noted = [f"{setting.size}^3, factor {setting.factor}"] if setting.size else ["reference"]
-    noted += [f"noise {setting.noise:g}"] if setting.noise else []
-    noted += [f"scale {setting.scale:g}"] if setting.scale else []
-    noted += [f"{setting.passes} passes"] if setting.passes > 1 else []
-    return f"{task.path.stem} ({', '.join([*noted, *(task.methods if task.limit else [])])})"
+    named = [str(task.setting), *(task.methods if task.limit else [])]
+    return f"{task.path.stem} ({', '.join(named)})"
 
 
 def time_processes(results: Results, tell: Progress) -> dict[int, list[Row]]:
-    """Return the times of the command by size, each shape's kept; nothing else runs meanwhile."""
+    """Return the times of the command by size, each shape's kept; nothing else runs meanwhile.
+
+    What fails is added to what the results leave out.
+    """
     plan, timings = results.plan, dict[int, list[Row]]()
     names = results.names(plan.experiment_paths())
     settings = plan.settings()
@@ -106,8 +107,21 @@ def time_processes(results: Results, tell: Progress) -> dict[int, list[Row]]:
     tasks = [task for task in tasks if task.limit is None]
     for done, task in enumerate(tasks, 1):
         if not results.store.is_final(task, PROCESS):
-            row = time_shape(Shape.read(task.path), task.setting, ["--model", plan.model])
-            results.store.add({**task.key(PROCESS), **row})
-        timings.setdefault(task.setting.size, []).append(results.store.get(task, PROCESS) or {})
+            results.store.add(time_task(task, plan.model))
+        row = results.store.get(task, PROCESS) or {}
+        if row["error"] is None:
+            timings.setdefault(task.setting.size, []).append(row)
+        else:
+            said = f"timing ({task.setting}): {row['error']}"
+            results.left_out.append(LeftOut(task.path.stem, said))
         tell(done, len(tasks), f"timing {name_of(task)}", done / len(tasks))
     return timings
+
+
+def time_task(task: Task, model: str) -> Row:
+    """Return the row of the command's time on a task's grid, or why there is none."""
+    try:
+        row = time_shape(Shape.read(task.path), task.setting, ["--model", model])
+    except SuperSdfError as problem:
+        return failed_row(task, PROCESS, reason_of(problem))
+    return {**task.key(PROCESS), **row}

@@ -100,7 +100,7 @@ def timing_section(timings: Mapping[int, Sequence[Row]]) -> str:
             cells = [f"{s:.2f}" for s in theirs]
             rows.append([f"{size}^3", f"*{name}, published, Thingi30*", *cells, "-"])
     titles = ["grid", "method", "mean s", "least", "most", "highest peak MB"]
-    count = len(next(iter(timings.values())))
+    count = max(map(len, timings.values()))
     return "\n\n".join(
         [
             f"## Timings, {count} shapes",

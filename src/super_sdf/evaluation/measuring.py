@@ -12,14 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import OutOfMemoryError
+from ..errors import FileError, SuperSdfError
+from ..files.regular import check_regular_file
 from ..memory import forget_peak, held_memory
 from ..mesh import Mesh
 from ..network import find_model, load_network
 from ..pipeline import Decoder
 from . import metrics
 from .cases import RESULT_POINTS, Case, Setting, Shape
-from .methods import EMPTY, METHODS, Surface
+from .methods import METHODS, Surface
 from .peers import PEERS
 
 Row = dict[str, Any]
@@ -28,9 +29,17 @@ PROTOCOL = 2  # count up when a figure changes its meaning: the rows kept so far
 FLOOR = "floor"
 NO_SETTING = Setting(0, 0)  # the floor's: the reference against itself
 OURS = "ours"
+BLOCK = 1 << 20  # bytes of a file that are held at a time
 PROCESS = "process"  # ours, as a whole process (see ``timing``)
+# The figures of a row, and those of them that may be None: what was not measured or is not known.
+NUMBERS = (
+    *("cd", "f1", "recall", "precision", "nc", "signed_nc"),
+    *("p2s", "p2s_there", "p2s_back", "p99", "p99_there", "p99_back"),
+    *("max", "max_there", "max_back", "closed", "outward", "faces", "seconds"),
+)
+OPTIONAL_NUMBERS = ("ecd", "ef1", "field_mse", "field_mae", "peak_mb")
 # Modules by the start of their names that no surface depends on.
-NOT_THE_METHOD = ("cli", "io", "errors")
+NOT_THE_METHOD = ("cli", "errors", "extras")
 
 
 @dataclass(frozen=True)
@@ -64,12 +73,12 @@ class Task:
 
 def measure_task(task: Task, shape: Shape) -> Iterator[Row]:
     """Yield a row for each method of a task, which is of that shape."""
-    # On the CPU, so that every machine agrees.
-    network = load_network(task.model, device="cpu", threads=task.threads)
     try:
+        # On the CPU, so that every machine agrees.
+        network = load_network(task.model, device="cpu", threads=task.threads)
         case = None if task.setting == NO_SETTING else Case(shape, task.setting)
-    except OutOfMemoryError as error:
-        yield from (failed_row(task, shape, method, str(error)) for method in task.methods)
+    except Exception as problem:  # every method of the task fails by it; the others still count
+        yield from (failed_row(task, method, reason_of(problem)) for method in task.methods)
         return
     for method in task.methods:
         figures = measure_method(shape, case, method, network)
@@ -77,21 +86,20 @@ def measure_task(task: Task, shape: Shape) -> Iterator[Row]:
 
 
 def measure_method(shape: Shape, case: Case | None, method: str, network: Decoder) -> Row:
-    """Return a method's figures; if it raises, those of a dot, with the reason in "error".
+    """Return a method's figures; if it raises, none, with the reason in "error".
 
+    A failure is no score: it says something of the machine or of a bug, not of the method.
     ``seconds`` and ``peak_mb`` are those of making the mesh: from the grid in memory to the mesh
     in memory, and what was held at most beyond what was held before.
     """
-    error = None
     held, clock = start_memory(), time.perf_counter()
     try:
         surface = make_surface(shape, case, method, network)
+        seconds, peak = time.perf_counter() - clock, peak_since(held)
+        figures = {**measure_surface(shape, surface.mesh), **measure_field(case, surface)}
     except Exception as problem:  # named in the report; the other shapes still count
-        traceback.print_exc()
-        surface, error = Surface(EMPTY), f"{type(problem).__name__}: {problem}"
-    seconds, peak = time.perf_counter() - clock, peak_since(held)
-    figures = {**measure_surface(shape, surface.mesh), **measure_field(case, surface)}
-    return {**figures, "seconds": seconds, "peak_mb": peak, "error": error}
+        return {"error": reason_of(problem)}
+    return {**figures, "seconds": seconds, "peak_mb": peak, "error": None}
 
 
 def make_surface(shape: Shape, case: Case | None, method: str, network: Decoder) -> Surface:
@@ -101,11 +109,21 @@ def make_surface(shape: Shape, case: Case | None, method: str, network: Decoder)
     return {**METHODS, **PEERS}[method](case, network)
 
 
-def failed_row(task: Task, shape: Shape, method: str, error: str) -> Row:
-    """Return the row of a method that made nothing: a dot's figures."""
-    none = {"field_mse": None, "field_mae": None, "seconds": None, "peak_mb": None}
-    figures = {**measure_surface(shape, EMPTY), **none}
-    return {**task.key(method), **figures, "error": error, "notes": list(shape.notes)}
+def failed_row(task: Task, method: str, error: str) -> Row:
+    """Return the row of a method that could not be measured: no figures, and why."""
+    return {**task.key(method), "error": error}
+
+
+def reason_of(problem: Exception) -> str:
+    """Return what went wrong in a line; of a bug also where."""
+    said = (str(problem).splitlines() or [""])[0]
+    if isinstance(problem, SuperSdfError):
+        return said
+    if isinstance(problem, MemoryError):
+        return "out of memory"
+    last = traceback.extract_tb(problem.__traceback__)[-1:]
+    place = "".join(f" ({Path(frame.filename).name}:{frame.lineno})" for frame in last)
+    return f"{type(problem).__name__}: {said}{place}"
 
 
 def measure_surface(shape: Shape, mesh: Mesh) -> Row:
@@ -143,8 +161,21 @@ def peak_since(held: int | None) -> float | None:
 
 
 def digest_of_file(path: Path) -> str:
-    """Return the sum of a file that tells it from others."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+    """Return the sum of a file that tells it from others.
+
+    Raises
+    ------
+    FileError
+        If it cannot be read.
+    """
+    digest = hashlib.sha256()
+    try:
+        with check_regular_file(path).open("rb") as file:
+            while block := file.read(BLOCK):
+                digest.update(block)
+    except OSError as error:
+        raise FileError(f"{path} cannot be read: {error.strerror}") from error
+    return digest.hexdigest()[:16]
 
 
 def digest_of_ours(model: str) -> str:

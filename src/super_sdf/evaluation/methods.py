@@ -13,6 +13,7 @@ import numpy as np
 from scipy import ndimage
 from skimage.measure import marching_cubes
 
+from ..errors import NoSurfaceError
 from ..grid import FloatArray, SdfGrid
 from ..mesh import Mesh
 from ..nodes import block_ijk
@@ -61,12 +62,15 @@ def our_surface(case: Case, network: Decoder) -> Surface:
     """Mesh the coarse grid with super-sdf, as often as the setting says.
 
     Capped, as one would ask who wants solids: where no surface leaves the grid that changes
-    nothing.
+    nothing. Where no surface is found, the mesh is empty.
     """
     grid = case.grid
-    for _ in range(case.setting.passes - 1):
-        grid = refined_grid(grid, network, case.factor)
-    mesh = reconstruct(grid, network, factor=case.factor, cap=True)
+    try:
+        for _ in range(case.setting.passes - 1):
+            grid = refined_grid(grid, network, case.factor)
+        mesh = reconstruct(grid, network, factor=case.factor, cap=True)
+    except NoSurfaceError:
+        return Surface(EMPTY)
     if case.setting.passes > 1 or case.setting.noise:
         return Surface(mesh)  # no field of the very nodes and voxels that the protocol compares
     return Surface(mesh, lambda: band_field(case.grid, network, case.factor))

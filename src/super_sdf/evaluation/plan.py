@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ..errors import FileError, OptionError
+from ..files.regular import check_regular_file
 from .cases import Setting
 from .measuring import FLOOR, NO_SETTING, OURS, Task, digest_of_file, digest_of_ours
 from .methods import METHODS
@@ -57,6 +59,9 @@ class Plan:
             Setting(size, self.factor).check()
         if not self.paths or not self.sizes:
             raise OptionError("nothing to measure: give meshes and sizes")
+        Setting(self.peer_size).check("peer size")
+        if not self.peer_limit > 0:
+            raise OptionError(f"peer limit is {self.peer_limit:g}: give more than 0 seconds")
 
     def settings(self) -> list[Setting]:
         """Return the settings of the main table."""
@@ -136,24 +141,29 @@ def spread(paths: tuple[Path, ...], count: int) -> tuple[Path, ...]:
     return tuple(paths[i * len(paths) // count] for i in range(count))
 
 
+def meshes_in(folder: Path) -> list[Path]:
+    """Return the mesh files of a folder, by name."""
+    try:
+        found = sorted(p for p in folder.iterdir() if p.suffix.lower() in MESH_SUFFIXES)
+    except OSError as error:
+        raise FileError(f"{folder} cannot be read: {error.strerror}") from error
+    if not found:
+        raise FileError(f"{folder} holds no mesh: give {', '.join(MESH_SUFFIXES)}")
+    return found
+
+
 def find_meshes(sources: Sequence[Path]) -> tuple[Path, ...]:
     """Return mesh files, and those in folders, by name.
 
     Raises
     ------
     FileError
-        If a source is missing or holds no mesh, or two shapes have one name.
+        If a source is missing, no regular file or holds no mesh, or two shapes have one name.
     """
     found: list[Path] = []
     for source in sources:
-        if not source.exists():
-            raise FileError(f"{source} does not exist")
-        inside = [source]
-        if source.is_dir():
-            inside = sorted(p for p in source.iterdir() if p.suffix.lower() in MESH_SUFFIXES)
-        if not inside:
-            raise FileError(f"{source} holds no mesh: give {', '.join(MESH_SUFFIXES)}")
-        found += inside
+        inside = meshes_in(source) if os.path.isdir(source) else [source]
+        found += [check_regular_file(path) for path in inside]
     names = [path.stem for path in found]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice:

@@ -9,6 +9,8 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from ..files.output import replacing
+from .folder import make_folder
 from .measuring import FLOOR, OURS, Row
 from .tables import LABELS, mean_of
 
@@ -33,14 +35,15 @@ MEASURES = (
 
 def draw_plots(by_size: Results, folder: Path) -> dict[str, str]:
     """Draw all plots into a folder; return their titles by file name."""
-    folder.mkdir(exist_ok=True)
+    make_folder(folder)
     plots = {
         "resolution.png": ("Quality against resolution", draw_resolution),
         "distribution.png": ("F1 of every shape, sorted", draw_distribution),
         "time.png": ("Quality against time", draw_time),
     }
     for name, (_, draw) in plots.items():
-        draw(by_size).savefig(folder / name, dpi=110)
+        with replacing(folder / name) as part:
+            draw(by_size).savefig(part, format="png", dpi=110)
     return {name: title for name, (title, _) in plots.items()}
 
 

@@ -11,11 +11,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from ..errors import SuperSdfError
 from ..extras import how_to_install
 from ..mesh import Mesh
 from ..network import load_network
 from . import experiment_tables
 from .cases import Case, Setting, Shape
+from .folder import REPORT, SHAPES, make_folder, write_page
 from .measuring import OURS, Row
 from .methods import METHODS
 from .plots import draw_plots
@@ -27,7 +29,7 @@ from .tables import (
     LABELS,
     SHORT,
     cost_table,
-    failure_lines,
+    empty_lines,
     gap_line,
     markdown,
     mean_row,
@@ -45,8 +47,9 @@ is the sum of the mean squared distances both ways, F1 at 0.003, NC the normal c
 the mean exact distance from point to triangle, of both directions ("ref to res", "res to ref");
 ECD and EF1 (at 0.005) compare sharp edges. Field errors are those at the fine nodes of the band.
 The bound is marching cubes of the true distance at the same nodes; the floor is what two perfect
-samplings of the reference score. A result without a surface counts as a dot at the origin.
-Published rows are of other shapes (Thingi30)."""
+samplings of the reference score. A result without a surface counts as a dot at the origin; a shape
+that a method failed on is left out of that table for all methods, and named. Published rows are of
+other shapes (Thingi30)."""
 
 
 def write_report(
@@ -76,11 +79,10 @@ def write_report(
     sections += [experiment_tables.timing_section(timings)] if timings else []
     sections += [cost_section(results), plot_section(results, out)]
     sections += [picture_section(results, out, up)] if pictures and OURS in plan.methods else []
-    report = out / "report.md"
-    report.write_text("\n\n".join(filter(None, [*sections, note_section(results)])) + "\n")
     shapes = [f"## {s.size}^3\n\n{shape_table(results.by_method(s))}" for s in plan.settings()]
-    (out / "shapes.md").write_text("\n\n".join(shapes) + "\n")
-    return report
+    write_page(out / SHAPES, "\n\n".join(shapes) + "\n")
+    text = "\n\n".join(filter(None, [*sections, note_section(results)])) + "\n"
+    return write_page(out / REPORT, text)
 
 
 def title_section(results: Results) -> str:
@@ -103,7 +105,7 @@ def note_section(results: Results) -> str:
 def size_section(results: Results, setting: Setting) -> str:
     """Return all that is said of the quality at one size."""
     by_method = results.by_method(setting)
-    lines = [win_line(by_method), gap_line(by_method), *failure_lines(by_method)]
+    lines = [win_line(by_method), gap_line(by_method), *empty_lines(by_method)]
     title = f"## {setting.size}^3, factor {setting.factor}"
     return "\n\n".join([title, surface_table(by_method, setting.size), *filter(None, lines)])
 
@@ -114,18 +116,15 @@ def peer_section(results: Results) -> str:
     setting, paths = Setting(plan.peer_size), plan.peer_paths()
     columns = (*SHORT, EF1, *COST)
     for name in ("mc", "bspline", OURS, *plan.peers):
-        found = results.rows(setting, name, paths)
-        done = [row for row in found if not row["error"]]
+        done = results.rows(setting, name, paths)
         closed = f"{sum(row['closed'] for row in done)} of {len(done)}"
-        rows.append(
-            [*mean_row(LABELS[name], done, columns), closed, f"{len(done)} of {len(found)}"]
-        )
+        finished = f"{len(done)} of {len(results.names(paths))}"
+        rows.append([*mean_row(LABELS[name], done, columns), closed, finished])
     titles = ["method", *(column.title for column in columns), "closed", "finished"]
     failed = [
         f"{LABELS[name]}, {row['shape']}: {row['error']}."
         for name in plan.peers
-        for row in results.rows(setting, name, paths)
-        if row["error"]
+        for row in results.out_of_time(setting, name, paths)
     ]
     title = f"## Peers, {plan.peer_size}^3, {len(results.names(paths))} shapes"
     return "\n\n".join([title, markdown(titles, rows), *failed])
@@ -163,22 +162,38 @@ def picture_section(results: Results, out: Path, up: str) -> str:
     setting, floors = results.plan.settings()[0], results.floors
     ranked = results.rows(setting, OURS)
     ranked.sort(key=lambda row: row["f1"] / floors[row["shape"]]["f1"], reverse=True)
-    count = min(EXTREMES, len(ranked) // 2)
-    title = f"## The {count} best and the {count} worst shapes at {setting.size}^3, by F1 over the "
-    title += "floor's"
+    if not ranked:
+        return ""
+    shown = ranked if len(ranked) < 2 * EXTREMES else [*ranked[:EXTREMES], *ranked[-EXTREMES:]]
+    title = extremes_title(len(ranked), setting)
     if not can_render():
         return f"{title}\n\nNot drawn: PyVista is not installed ({how_to_install('view')})."
     paths = {path.stem: path for path in results.plan.paths}
-    lines = [title]
-    for row in ranked[:count] + ranked[len(ranked) - count :]:
-        picture = out / "pictures" / f"{row['shape']}.png"
-        draw_shape(paths[row["shape"]], setting, results.plan.model, picture, up)
+    lines, folder = [title], make_folder(out / "pictures")
+    for row in shown:
+        picture = folder / f"{row['shape']}.png"
         floor = floors[row["shape"]]["f1"]
         lines.append(
             f"**{row['shape']}**, F1 {row['f1']:.3f} (floor {floor:.3f}), NC {row['nc']:.3f}"
         )
-        lines.append(f"![{row['shape']}](pictures/{picture.name})")
+        try:
+            draw_shape(paths[row["shape"]], setting, results.plan.model, picture, up)
+            lines.append(f"![{row['shape']}](pictures/{picture.name})")
+        except SuperSdfError as problem:  # the tables are worth more than a picture
+            lines.append(f"Not drawn: {problem}.")
     return "\n\n".join(lines)
+
+
+def extremes_title(count: int, setting: Setting) -> str:
+    """Return the heading of the pictures: all shapes if there are few, best first."""
+    if count == 1:
+        return f"## The shape at {setting.size}^3"
+    if count < 2 * EXTREMES:
+        return f"## All {count} shapes at {setting.size}^3, best F1 over the floor's first"
+    return (
+        f"## The {EXTREMES} best and the {EXTREMES} worst shapes at {setting.size}^3, by F1 over "
+        "the floor's"
+    )
 
 
 def draw_shape(path: Path, setting: Setting, model: str, target: Path, up: str) -> None:
@@ -193,7 +208,6 @@ def draw_shape(path: Path, setting: Setting, model: str, target: Path, up: str) 
         Panel(shape.mesh, "reference"),
         Panel(ours, "error of super-sdf", vertex_errors(ours, shape.solid)),
     ]
-    target.parent.mkdir(exist_ok=True)
     render_panels(
         panels,
         target,

@@ -1,32 +1,27 @@
-"""Processes that measure, and the file that remembers: killed at any moment, it goes on.
+"""Processes that measure.
 
 Each task runs in a process of its own, so that one that crashes, runs out of memory or out of time
-takes nothing with it. Rows are appended to a file of JSON lines as they come.
+takes nothing with it.
 """
 
 from __future__ import annotations
 
-import json
 import multiprocessing
+import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
 
-from ..errors import SuperSdfError
 from .cases import Shape
-from .measuring import PROTOCOL, Row, Task, failed_row, measure_task
+from .measuring import Row, Task, failed_row, measure_task, reason_of
+from .store import Store
 
-# What a row is known by; the rest of it are figures.
-KEY_NAMES = (
-    *("shape", "mesh", "size", "factor", "noise", "scale", "passes"),
-    *("method", "digest", "protocol"),
-)
 READ = "read"  # what a process sends once it has its shape
+GRACE = 10.0  # seconds that a process has to end after its last row
 POLL = 0.5  # seconds between looks at the clock where there is a limit
 # Modules that every task wants, loaded once: processes are then forked in milliseconds.
 PRELOAD = ["super_sdf.evaluation.measuring"]
@@ -37,53 +32,14 @@ Progress = Callable[[int, int, Task, float], None]
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A shape that could not be measured at all, and why."""
+    """A shape that could not be measured, or not everywhere, and why."""
 
     shape: str
     reason: str
 
 
-class Store:
-    """The rows of a file of JSON lines, by key."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.rows: dict[tuple[Any, ...], Row] = {}
-        text = path.read_text() if path.exists() else ""
-        for line in text.splitlines():
-            with suppress(ValueError):  # a line that was being written when the writer was killed
-                self._take(json.loads(line))
-        if text and not text.endswith("\n"):
-            self._write("\n")
-
-    def add(self, row: Row) -> None:
-        """Keep a row, in memory and in the file."""
-        self._take(row)
-        self._write(json.dumps(row) + "\n")
-
-    def get(self, task: Task, method: str) -> Row | None:
-        """Return a method's row, if it was measured."""
-        key = task.key(method)
-        return self.rows.get(tuple(key[name] for name in KEY_NAMES))
-
-    def is_final(self, task: Task, method: str) -> bool:
-        """Say whether a row is there that another run would not better.
-
-        A failure may have had a passing cause; one by the limit has not, unless given more time.
-        """
-        row = self.get(task, method)
-        if row is None or row["error"] is None:
-            return row is not None
-        limit = row.get("limit")
-        return limit is not None and task.limit is not None and limit >= task.limit
-
-    def _take(self, row: Row) -> None:
-        if row.get("protocol") == PROTOCOL:
-            self.rows[tuple(row[name] for name in KEY_NAMES)] = row
-
-    def _write(self, text: str) -> None:
-        with self.path.open("a") as out:
-            out.write(text)
+Found = tuple[Task, Row | LeftOut | None]
+"""A row of a task, why its shape is left out, or None after the last of a task."""
 
 
 @dataclass(eq=False)
@@ -105,26 +61,29 @@ class Running:
             return False
         return time.monotonic() - self.began > self.task.limit
 
+    def end(self) -> None:
+        """End the process, if it has not ended."""
+        self.process.kill()
+        self.process.join()
+        self.rows.close()
+
 
 class Runner:
-    """Measures tasks, so many at a time; iterate over ``results``."""
+    """Measures tasks, several at a time; iterate over ``results``."""
 
     def __init__(self, tasks: Sequence[Task], jobs: int) -> None:
         self.waiting, self.jobs = list(reversed(tasks)), jobs
         self.running: dict[Connection, Running] = {}
         self.left_out: set[Path] = set()
+        self.tried: set[Task] = set()
         self.context = make_context()
 
-    def results(self) -> Iterator[tuple[Task, Row | LeftOut | None]]:
+    def results(self) -> Generator[Found, None, None]:
         """Yield each row as it comes, with None after the last one of a task."""
         try:
             while self.waiting or self.running:
                 while self.waiting and len(self.running) < self.jobs:
-                    task = self.waiting.pop()
-                    if task.path in self.left_out:
-                        yield task, None
-                    else:
-                        self._start(task)
+                    yield from self._start(self.waiting.pop())
                 for source in wait(list(self.running), POLL):
                     yield from self._receive(self.running[source])  # type: ignore[index]
                 for late in [entry for entry in self.running.values() if entry.is_late()]:
@@ -133,52 +92,82 @@ class Runner:
             for entry in self.running.values():
                 entry.process.kill()
 
-    def _start(self, task: Task) -> None:
+    def _start(self, task: Task) -> Iterator[Found]:
+        """Start a process for a task, unless its shape is left out by now."""
+        if task.path in self.left_out:
+            yield task, None
+            return
         ours, theirs = self.context.Pipe(duplex=False)
         process = self.context.Process(target=work, args=(task, theirs), daemon=True)  # type: ignore[attr-defined]
-        process.start()
-        theirs.close()
-        self.running[ours] = Running(task, process, ours, list(task.methods))
+        try:
+            process.start()
+        except OSError as error:  # no more processes or files, or it was killed in between
+            ours.close()
+            yield from self._try_again(task, f"its process did not start: {error.strerror}")
+        else:
+            self.running[ours] = Running(task, process, ours, list(task.methods))
+        finally:
+            theirs.close()
 
-    def _receive(self, entry: Running) -> Iterator[tuple[Task, Row | LeftOut | None]]:
+    def _receive(self, entry: Running) -> Iterator[Found]:
         """Take what a process has sent; if it ended owing rows, the first of them has failed."""
         try:
             found: Row | LeftOut | str = entry.rows.recv()
-        except EOFError:
-            entry.process.join()
-            yield from self._give_up(entry, f"its process ended with {entry.process.exitcode}")
+        except (EOFError, OSError):  # the latter if it was killed while it sent
+            entry.process.join(GRACE)
+            yield from self._give_up(entry, how_it_ended(entry.process.exitcode))
             return
         if isinstance(found, LeftOut):
-            yield from self._leave_out(entry, found.reason)
+            yield from self._leave_out(entry.task, found.reason)
+            entry.owed = []
         elif isinstance(found, str):
             entry.began = time.monotonic()
         else:
             entry.owed.remove(found["method"])
             yield entry.task, found
 
-    def _leave_out(self, entry: Running, reason: str) -> Iterator[tuple[Task, LeftOut]]:
-        """Drop what a task owes; name its shape, once."""
-        entry.owed = []
-        if entry.task.path not in self.left_out:
-            self.left_out.add(entry.task.path)
-            yield entry.task, LeftOut(entry.task.path.stem, reason)
+    def _leave_out(self, task: Task, reason: str) -> Iterator[Found]:
+        """Name the shape of a task as left out, once."""
+        if task.path not in self.left_out:
+            self.left_out.add(task.path)
+            yield task, LeftOut(task.path.stem, reason)
 
-    def _give_up(self, entry: Running, error: str) -> Iterator[tuple[Task, Row | LeftOut | None]]:
-        """End a task; what it owes after the method under way is put back in the queue."""
-        entry.process.kill()
-        entry.process.join()
+    def _try_again(self, task: Task, reason: str) -> Iterator[Found]:
+        """Put a task that did not come to its shape back in the queue; the second time, end it.
+
+        Once may be somebody's kill. Twice, it is the shape that no process survives.
+        """
+        if task not in self.tried:
+            self.tried.add(task)
+            self.waiting.append(task)
+            return
+        yield from self._leave_out(task, reason)
+        yield task, None
+
+    def _give_up(self, entry: Running, reason: str) -> Iterator[Found]:
+        """End a task's process; what it owes after the method under way goes back in the queue."""
+        late, task = entry.is_late(), entry.task
         del self.running[entry.rows]
-        entry.rows.close()
+        entry.end()
         if entry.owed and entry.began is None:
-            yield from self._leave_out(entry, f"while it was read {error}")
+            yield from self._try_again(task, f"while it was read {reason}")
+            return
         if entry.owed:
-            task, limit = entry.task, entry.task.limit if entry.is_late() else None
-            row = failed_row(task, Shape.read(task.path), entry.owed[0], error)
-            yield task, {**row, "limit": limit}
+            row = failed_row(task, entry.owed[0], reason)
+            yield task, {**row, "limit": task.limit if late else None}
         if entry.owed[1:]:
-            self.waiting.append(replace(entry.task, methods=tuple(entry.owed[1:])))
+            self.waiting.append(replace(task, methods=tuple(entry.owed[1:])))
         else:
-            yield entry.task, None
+            yield task, None
+
+
+def how_it_ended(code: int | None) -> str:
+    """Say how a process ended that still had to send something."""
+    if code is None or code >= 0:
+        return f"its process ended with exit code {code}"
+    name = signal.Signals(-code).name
+    hint = " (mostly for want of memory)" if name == "SIGKILL" else ""
+    return f"its process died of {name}{hint}"
 
 
 def make_context() -> multiprocessing.context.BaseContext:
@@ -192,14 +181,16 @@ def make_context() -> multiprocessing.context.BaseContext:
 
 def work(task: Task, rows: Connection) -> None:
     """Measure a task in a process of its own; send ``READ`` and rows, or why there are none."""
-    try:
-        shape = Shape.read(task.path)
-    except SuperSdfError as error:
-        rows.send(LeftOut(task.path.stem, str(error)))
-        return
-    rows.send(READ)
-    for row in measure_task(task, shape):
-        rows.send(row)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent to handle
+    with suppress(BrokenPipeError):  # nobody listens any more
+        try:
+            shape = Shape.read(task.path)
+        except Exception as problem:  # the other shapes still count
+            rows.send(LeftOut(task.path.stem, reason_of(problem)))
+            return
+        rows.send(READ)
+        for row in measure_task(task, shape):
+            rows.send(row)
 
 
 def missing_tasks(tasks: Sequence[Task], store: Store) -> list[Task]:
@@ -223,14 +214,15 @@ def complete(
     missing = missing_tasks(tasks, store)
     left_out: list[LeftOut] = []
     done, work_done, work = 0, 0.0, sum(map(expected_work, missing))
-    for task, found in Runner(missing, jobs).results():
-        if isinstance(found, LeftOut):
-            left_out.append(found)
-        elif found is not None:
-            store.add(found)
-        else:
-            done += 1
-            work_done += expected_work(task)
-            if progress:
-                progress(done, len(missing), task, work_done / work)
+    with closing(Runner(missing, jobs).results()) as results:  # ends the processes, come what may
+        for task, found in results:
+            if isinstance(found, LeftOut):
+                left_out.append(found)
+            elif found is not None:
+                store.add(found)
+            else:
+                done += 1
+                work_done += expected_work(task)
+                if progress:
+                    progress(done, len(missing), task, work_done / work)
     return left_out

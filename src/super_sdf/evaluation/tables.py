@@ -167,15 +167,11 @@ def win_line(by_method: Mapping[str, Sequence[Row]]) -> str:
     return f"{line} Not on: {', '.join(lost)}." if lost else line
 
 
-def failure_lines(by_method: Mapping[str, Sequence[Row]]) -> list[str]:
-    """Return a line for each method that left shapes without a surface, with their names."""
+def empty_lines(by_method: Mapping[str, Sequence[Row]]) -> list[str]:
+    """Return a line for each method that found no surface in some shapes, with their names."""
     lines = []
     for method, rows in by_method.items():
-        names = [
-            row["shape"] + (f" ({row['error']})" if row["error"] else "")
-            for row in rows
-            if not row["faces"]
-        ]
+        names = [row["shape"] for row in rows if not row["faces"]]
         if names:
             lines.append(f"No surface (a dot stands in), {LABELS[method]}: {', '.join(names)}.")
     return lines
