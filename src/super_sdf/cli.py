@@ -16,7 +16,7 @@ import click
 from . import __version__
 from .cli_batch import batch
 from .cli_common import CONTEXT, InterruptedCommand, one_line_errors, print_result, tell
-from .cli_conversion import conversion_options, make_options
+from .cli_conversion import chosen_model, conversion_options, make_options
 from .cli_evaluate import evaluate
 from .cli_info import info
 from .cli_render import render
@@ -68,6 +68,7 @@ class Upsampling:
 
     def __init__(self, source: str, target: str, options: dict[str, Any]) -> None:
         self.source, self.target, self.options = source, target, options
+        self.model = chosen_model(options)
         self.seconds: dict[str, float] = {}
         self.network: Network
         self.done: Conversion
@@ -84,7 +85,7 @@ class Upsampling:
         check_target(self.target, force=asked["force"])
         watch.lap("start")
         self.network = load_network(
-            asked["model"] or asked["quality"],
+            self.model,
             device=asked["device"],
             threads=asked["threads"],
             precision=asked["precision"],
@@ -123,7 +124,7 @@ class Upsampling:
             "output": self.target,
             "factor": self.options["factor"],
             "offset": self.options["offset"],
-            "model": self.options["model"] or self.options["quality"],
+            "model": self.model,
             "precision": self.options["precision"],
             "device": self.network.device,
             "device_notes": list(self.network.notes),

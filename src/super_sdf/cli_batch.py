@@ -11,7 +11,7 @@ import click
 
 from .cli_batch_report import progress_line, tell_plan, tell_summary
 from .cli_common import CONTEXT, InterruptedCommand, one_line_errors
-from .cli_conversion import conversion_options, make_options
+from .cli_conversion import chosen_model, conversion_options, make_options
 from .interrupts import raising_interrupts
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
     start = time.perf_counter()
     check_factor(options["factor"])
     jobs = find_jobs(sources, f".{options['kind']}", make_options(options))
-    model = options["model"] or options["quality"]
+    model = chosen_model(options)
     find_model(model, options["precision"])
     flags = {name: options[name] for name in ("force", "retry", "fail_fast")}
     settings = Settings(

@@ -6,6 +6,9 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
+
+from .errors import OptionError
 
 if TYPE_CHECKING:
     from .convert import ConvertOptions
@@ -123,6 +126,19 @@ def conversion_options(command: Callable[..., Any]) -> Callable[..., Any]:
     for option in reversed(OPTIONS):
         command = option(command)
     return command
+
+
+def chosen_model(asked: dict[str, Any]) -> str:
+    """Return the network that is asked for, a quality or a file; not both at once."""
+    if asked["model"] is None:
+        return str(asked["quality"])
+    given = click.get_current_context().get_parameter_source("quality")
+    if given is not ParameterSource.DEFAULT:
+        raise OptionError(
+            f"--model {asked['model']} takes the place of --quality {asked['quality']}: give one "
+            "of them"
+        )
+    return str(asked["model"])
 
 
 def make_options(asked: dict[str, Any]) -> ConvertOptions:
