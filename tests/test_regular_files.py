@@ -5,9 +5,13 @@ import re
 import socket
 from pathlib import Path
 
+import numpy as np
 import pytest
+import trimesh
+from conftest import ball
 
 from super_sdf.errors import FileError
+from super_sdf.evaluation.solid import read_mesh
 from super_sdf.files.regular import check_regular_file
 
 
@@ -65,3 +69,43 @@ def test_files_and_links_to_them_pass():
     Path("file").touch()
     Path("link").symlink_to("file")
     assert check_regular_file("link") == Path("link")
+
+
+def commands_that_read(name: str) -> list[tuple[str, ...]]:
+    """Return the commands that are given a file of this name, as mesh or as model."""
+    return [
+        ("sample", f"{name}.ply", "out.npz", "-n", "8"),
+        ("render", f"{name}.ply", "out.png"),
+        ("render", "cube.ply", "out.png", "--reference", f"{name}.ply", "--colour", "error"),
+        ("evaluate", f"{name}.ply", "--sizes", "8", "--out", "results"),
+        ("upsample", "in.npy", "out.ply", "--model", f"{name}.ply"),
+    ]
+
+
+@pytest.mark.parametrize("which", range(5))
+@pytest.mark.parametrize("name", ["pipe", "zero", "loop"])
+def test_every_command_reads_regular_files_alone(command, name, which):
+    os.mkfifo("pipe.ply")
+    Path("zero.ply").symlink_to("/dev/zero")
+    Path("loop.ply").symlink_to("loop.ply")
+    trimesh.creation.box().export("cube.ply")
+    np.save("in.npy", ball(12, 3.0).values)
+    wrong = WHAT_IS_WRONG[f"{name}.npy"]
+    code, _, err = command(*commands_that_read(name)[which])
+    assert (code, err) == (1, f"Error: {name}.ply {wrong}\n")
+
+
+def test_a_pipe_in_a_folder_of_meshes_is_named(command):
+    Path("meshes").mkdir()
+    trimesh.creation.box().export("meshes/cube.ply")
+    os.mkfifo("meshes/pipe.ply")
+    code, _, err = command("evaluate", "meshes", "--sizes", "8", "--out", "results")
+    assert (code, err) == (1, "Error: meshes/pipe.ply is a named pipe: give a file\n")
+
+
+def test_a_mesh_that_names_a_pipe_is_read_without_it():
+    os.mkfifo("pipe.mtl")
+    trimesh.creation.box().export("cube.obj")
+    mesh = Path("cube.obj").read_text()
+    Path("cube.obj").write_text(f"mtllib pipe.mtl\nusemtl red\n{mesh}")
+    assert len(read_mesh("cube.obj").faces) == 12

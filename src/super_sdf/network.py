@@ -8,6 +8,7 @@ Inputs ``patches`` (V, 27), ``neighbours`` (V, 27), ``voxels`` (D,), ``offsets``
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
@@ -20,6 +21,7 @@ from onnxruntime import InferenceSession
 from .cuda import first_line
 from .device import open_session, run_bound, run_on_cpu
 from .errors import DeviceError, FileError, ModelError, OptionError
+from .files.regular import check_regular_file
 from .grid import FloatArray, IntArray
 from .symmetry import cube_symmetries, turn
 
@@ -118,7 +120,7 @@ def find_model(model: str | Path, precision: str = "float32") -> tuple[Path, int
     Raises
     ------
     FileError
-        If there is no such file.
+        If there is no such file, or what has its name is no regular file.
     OptionError
         If there is none of this precision.
     """
@@ -128,14 +130,14 @@ def find_model(model: str | Path, precision: str = "float32") -> tuple[Path, int
     path = shipped_models().get(name, Path(model))
     if precision == "int8":
         path = path.with_name(f"{path.stem}-int8.onnx")  # beside that of float32
-        if not path.is_file():
+        if not os.path.lexists(path):
             raise OptionError(
                 f"{model} has no int8 variant, {path}: write one with export.quantize"
             )
-    if not path.is_file():
+    if not os.path.lexists(path):
         names = ", ".join(QUALITIES)
         raise FileError(f"no model {str(model)!r}: give an ONNX file or one of: {names}")
-    return path, symmetries
+    return check_regular_file(path), symmetries
 
 
 def load_network(

@@ -7,15 +7,18 @@ pseudonormal is wrong on meshes that intersect themselves, as real ones do.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import igl
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, MeshError
+from ..files.regular import check_regular_file
 from ..mesh import Mesh
 
 Points = NDArray[np.float64]
@@ -108,10 +111,9 @@ def read_mesh(path: str | Path) -> Mesh:
     """
     import trimesh
 
-    if not Path(path).is_file():
-        raise FileError(f"{path} does not exist" if not Path(path).exists() else f"{path}: no file")
+    path = check_regular_file(path)
     try:
-        found = trimesh.load_mesh(path)
+        found = trimesh.load_mesh(path, resolver=_file_resolver(path))
         vertices, faces = np.array(found.vertices, np.float64), np.array(found.faces, np.int32)
     except Exception as error:  # trimesh's readers raise whatever their format makes them
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -121,6 +123,24 @@ def read_mesh(path: str | Path) -> Mesh:
     if not np.isfinite(vertices).all():
         raise MeshError(f"{path} holds coordinates that are not finite: repair it first")
     return Mesh(vertices, faces)
+
+
+def _file_resolver(path: Path) -> Any:
+    """Return what finds the files that a mesh file names, materials and buffers, for trimesh."""
+    from trimesh.resolvers import FilePathResolver
+
+    class RegularFileResolver(FilePathResolver):
+        """Opens regular files alone: a mesh may name a pipe, which never ends."""
+
+        def get(self, name: str) -> Any:
+            """Return a file's content."""
+            for candidate in (name.strip(), name.strip().lstrip("/"), os.path.split(name)[-1]):
+                named = os.path.join(self.parent, candidate)
+                if os.path.exists(named):
+                    check_regular_file(named)
+            return super().get(name)
+
+    return RegularFileResolver(str(path))
 
 
 def examine(solid: Solid) -> Findings:
