@@ -32,8 +32,9 @@ from export.shapes import random_solid
 from export.shapes.draws import draw_sway
 from super_sdf import Mesh, SdfGrid
 from super_sdf.band import DECODE_LIMIT, find_band, rescale
+from super_sdf.evaluation.mesh_files import read_mesh
 from super_sdf.evaluation.sampling import sample_grid
-from super_sdf.evaluation.solid import Solid, read_mesh
+from super_sdf.evaluation.solid import Solid
 from super_sdf.nodes import block_offsets
 
 CORNERS, FINE_NODES, ANYWHERE = 5, 4, 4  # queries: 4 a corner, 28 in all

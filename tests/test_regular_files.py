@@ -11,7 +11,7 @@ import trimesh
 from conftest import ball
 
 from super_sdf.errors import FileError
-from super_sdf.evaluation.solid import read_mesh
+from super_sdf.evaluation.mesh_files import read_mesh
 from super_sdf.files.regular import check_regular_file
 
 

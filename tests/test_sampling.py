@@ -8,6 +8,7 @@ from solids import TORUS, cube, inverted, joined, saved, sphere, torus
 
 from super_sdf import Mesh, SuperSdfError, load_network, reconstruct
 from super_sdf.evaluation import sampling
+from super_sdf.evaluation.mesh_files import read_mesh
 from super_sdf.evaluation.sampling import (
     fitted_layout,
     grid_points,
@@ -15,7 +16,7 @@ from super_sdf.evaluation.sampling import (
     sample_solid,
     unit_layout,
 )
-from super_sdf.evaluation.solid import Solid, examine, load_solid, read_mesh
+from super_sdf.evaluation.solid import Solid, examine, load_solid
 
 
 def cube_distance(points: np.ndarray) -> np.ndarray:

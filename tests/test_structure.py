@@ -44,7 +44,8 @@ BATCH_FLOORS = [
     {"run"},
 ]
 EVALUATION_FLOORS = [
-    {"solid", "published", "page", "folder", "__init__"},
+    {"mesh_files", "published", "page", "folder", "__init__"},
+    {"solid"},
     {"sampling", "metrics", "rendering", "sections"},
     {"cases"},
     {"methods"},

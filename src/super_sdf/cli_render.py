@@ -98,8 +98,9 @@ def check_picture(target: Path, *, force: bool) -> None:
 
 def render_meshes(sources: tuple[Path, ...], target: Path, options: dict[str, Any]) -> None:
     """Draw meshes; by their errors, if there is a reference to compare with."""
+    from .evaluation.mesh_files import read_mesh
     from .evaluation.rendering import Panel, render_panels, vertex_errors
-    from .evaluation.solid import Solid, read_mesh
+    from .evaluation.solid import Solid
 
     if (options["colour"] == "error") != (options["reference"] is not None):
         raise OptionError("--colour error and --reference MESH go together: give both or neither")

@@ -7,19 +7,17 @@ pseudonormal is wrong on meshes that intersect themselves, as real ones do.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import igl
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, MeshError
-from ..files.regular import check_regular_file
+from ..errors import MeshError
 from ..mesh import Mesh
+from .mesh_files import read_mesh
 
 Points = NDArray[np.float64]
 Distances = NDArray[np.float64]
@@ -97,50 +95,6 @@ class Findings:
     open_edges: int
     inverted: bool
     overlapping: int
-
-
-def read_mesh(path: str | Path) -> Mesh:
-    """Read any mesh file that trimesh reads, vertices merged, float64.
-
-    Raises
-    ------
-    FileError
-        If the file is missing or no mesh can be read from it.
-    MeshError
-        If it holds no triangle, or coordinates that are not finite.
-    """
-    import trimesh
-
-    path = check_regular_file(path)
-    try:
-        found = trimesh.load_mesh(path, resolver=_file_resolver(path))
-        vertices, faces = np.array(found.vertices, np.float64), np.array(found.faces, np.int32)
-    except Exception as error:  # trimesh's readers raise whatever their format makes them
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise FileError(f"{path} cannot be read as a mesh: {reason}") from error
-    if not len(faces):
-        raise MeshError(f"{path} holds no triangle: give a surface mesh")
-    if not np.isfinite(vertices).all():
-        raise MeshError(f"{path} holds coordinates that are not finite: repair it first")
-    return Mesh(vertices, faces)
-
-
-def _file_resolver(path: Path) -> Any:
-    """Return what finds the files that a mesh file names, materials and buffers, for trimesh."""
-    from trimesh.resolvers import FilePathResolver
-
-    class RegularFileResolver(FilePathResolver):
-        """Opens regular files alone: a mesh may name a pipe, which never ends."""
-
-        def get(self, name: str) -> Any:
-            """Return a file's content."""
-            for candidate in (name.strip(), name.strip().lstrip("/"), os.path.split(name)[-1]):
-                named = os.path.join(self.parent, candidate)
-                if os.path.exists(named):
-                    check_regular_file(named)
-            return super().get(name)
-
-    return RegularFileResolver(str(path))
 
 
 def examine(solid: Solid) -> Findings:
