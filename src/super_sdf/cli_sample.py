@@ -68,7 +68,7 @@ def sample(source: Path, target: Path, **options: Any) -> None:
 def run_sample(source: Path, target: Path, options: dict[str, Any]) -> None:
     """Read the mesh, lay out the grid, sample it, write it, say what was found."""
     from .evaluation.metrics import normalise
-    from .evaluation.sampling import fitted_layout, sample_solid, unit_layout
+    from .evaluation.sampling import check_numbers, fitted_layout, sample_solid, unit_layout
     from .evaluation.solid import Solid, load_solid
     from .files.grids import check_grid_target, write_grid
 
@@ -79,6 +79,8 @@ def run_sample(source: Path, target: Path, options: dict[str, Any]) -> None:
         raise OptionError("give either -n (samples along the longest axis) or --spacing")
     if options["frame"] == "unit" and samples is None:
         raise OptionError("--frame unit has a side of 1: give -n, not --spacing")
+    chosen = {"n": samples, "spacing": spacing, "band": options["band"]}
+    check_numbers(**chosen, padding=0 if options["frame"] == "unit" else options["padding"])
     solid, notes = load_solid(source, allow_open=options["allow_open"])
     if options["frame"] == "unit":
         solid, layout = Solid(normalise(solid.mesh)), unit_layout(samples)

@@ -9,12 +9,13 @@ so every sample is asked.
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import prod
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ..errors import OptionError
+from ..errors import MeshError, OptionError
 from ..grid import FloatArray, SdfGrid
 from ..memory import check_fits
 from ..mesh import Mesh
@@ -24,6 +25,10 @@ EDGE = 8  # samples along a cube
 CHUNK = 512  # cubes at a time: 2^18 points, 20 MB
 EXACT_SAMPLES = 1 << 24  # up to 256^3 every sample is exact unless a band is asked for
 BIG_GRID_BAND = 4.0  # voxels; the upsampling looks no farther than 1.5 + sqrt(3)
+LEAST_BAND = 1.5  # voxels; the pipeline's band
+MOST_ALONG_AXIS = 1e9  # samples; beyond, only a wrong number was given
+SMALLEST, LARGEST = 1e-30, 1e30  # spacing and extent that float32 holds with all its digits
+POSITION_ERROR = 1e-4  # of the spacing, that a sample may be off its place
 WORK_BYTES = 500_000_000  # beside the values: search trees and chunks
 
 Progress = Callable[[int, int], None]
@@ -31,8 +36,29 @@ Layout = tuple[tuple[int, int, int], float, NDArray[np.float64]]
 """Samples along the axes, spacing, and the position of sample (0, 0, 0)."""
 
 
+def check_numbers(
+    *,
+    n: int | None = None,
+    spacing: float | None = None,
+    padding: float = 2.0,
+    band: float | None = None,
+) -> None:
+    """Raise OptionError if a number makes no grid, whatever the mesh; those not given are fine."""
+    if n is not None and n < 2:
+        raise OptionError(f"n is {n}: give at least 2 samples along the longest axis")
+    if spacing is not None and not 0 < spacing < np.inf:
+        raise OptionError(f"spacing is {spacing:g}: it must be greater than 0")
+    if not 0 <= padding < np.inf:
+        raise OptionError(f"padding is {padding:g}: give 0 voxels or more")
+    if n is not None and n - 1 - 2 * padding < 1:
+        raise OptionError(f"{n} samples leave no room within a padding of {padding:g} voxels")
+    if band is not None and not band >= LEAST_BAND:
+        raise OptionError(f"band is {band:g}: give at least {LEAST_BAND:g} voxels")
+
+
 def unit_layout(n: int, side: float = 1.0) -> Layout:
     """Return the layout of the test grids: voxel centres (i + 1/2)/n - 1/2, times ``side``."""
+    check_numbers(n=n, padding=0)
     return (n, n, n), side / n, np.full(3, (0.5 / n - 0.5) * side)
 
 
@@ -55,21 +81,21 @@ def fitted_layout(
     Raises
     ------
     OptionError
-        If not exactly one of n and spacing is given, or one is out of range.
+        If not exactly one of n and spacing is given, or a number is out of range.
     """
     if (n is None) == (spacing is None):
         raise OptionError("give either the number of samples or the spacing")
-    if not 0 <= padding < np.inf:
-        raise OptionError(f"padding is {padding:g}: give 0 voxels or more")
+    check_numbers(n=n, spacing=spacing, padding=padding)
     low, high = mesh.vertices.min(0).astype(np.float64), mesh.vertices.max(0).astype(np.float64)
     if spacing is None:
-        room = (n or 0) - 1 - 2 * padding
-        if room < 1:
-            raise OptionError(f"{n} samples leave no room within a padding of {padding:g} voxels")
-        spacing = float((high - low).max() / room)
-    if not 0 < spacing < np.inf:
-        raise OptionError(f"spacing is {spacing:g}: it must be greater than 0")
-    steps = np.ceil((high - low) / spacing + 2 * padding - 1e-6).astype(int)
+        spacing = float((high - low).max() / ((n or 0) - 1 - 2 * padding))
+    with np.errstate(over="ignore"):
+        steps = np.ceil((high - low) / spacing + 2 * padding - 1e-6)
+    if steps.max() >= MOST_ALONG_AXIS:
+        raise OptionError(
+            f"a spacing of {spacing:g} and a padding of {padding:g} voxels make {steps.max():.3g} "
+            f"samples along an axis of a mesh {(high - low).max():g} long: give fewer"
+        )
     nx, ny, nz = (int(count) + 1 for count in steps)
     return (nx, ny, nz), spacing, (low + high - steps * spacing) / 2
 
@@ -84,7 +110,7 @@ def sample_solid(
     """
     shape, spacing, origin = layout
     notes = []
-    if band is None and np.prod(shape) > EXACT_SAMPLES:
+    if band is None and prod(shape) > EXACT_SAMPLES:
         band = BIG_GRID_BAND
     if band is not None and band < np.inf:
         notes.append(f"distances are exact up to {band:g} voxels and cut off there")
@@ -112,14 +138,17 @@ def sample_grid(
     ------
     OptionError
         If the band is under 1.5 voxels, which the pipeline needs.
+    MeshError
+        If the distances would be too small or too large for float32, or the grid lies so far
+        from the origin that neighbouring samples cannot be told apart.
     OutOfMemoryError
         If the grid would not fit in memory.
     """
     shape, spacing, _ = layout
-    if not band >= 1.5:
-        raise OptionError(f"band is {band:g}: give at least 1.5 voxels")
+    check_numbers(band=band)
+    check_scale(layout)
     size = " x ".join(map(str, shape))
-    check_fits(int(np.prod(shape)) * 4 + WORK_BYTES, f"a grid of {size}", "take fewer samples")
+    check_fits(prod(shape) * 4 + WORK_BYTES, f"a grid of {size}", "take fewer samples")
     values = np.empty(shape, np.float32)
     corners = np.argwhere(np.ones([-(-n // EDGE) for n in shape], bool)) * EDGE
     for start in range(0, len(corners), CHUNK):
@@ -128,6 +157,23 @@ def sample_grid(
         if progress:
             progress(min(start + CHUNK, len(corners)), len(corners))
     return values
+
+
+def check_scale(layout: Layout) -> None:
+    """Raise MeshError if float32 does not hold the distances, or double the positions."""
+    shape, spacing, origin = layout
+    reach = spacing * max(shape)
+    if not (spacing > SMALLEST and reach < LARGEST):
+        raise MeshError(
+            f"a spacing of {spacing:g} and an extent of {reach:g} are beyond what float32 holds: "
+            "scale the mesh"
+        )
+    away = float(np.abs(origin).max()) + reach
+    if np.spacing(away) > POSITION_ERROR * spacing:
+        raise MeshError(
+            f"the grid reaches to {away:g}, where numbers are {np.spacing(away):.2g} apart: too "
+            f"coarse for a spacing of {spacing:g}; move the mesh to the origin"
+        )
 
 
 def grid_points(layout: Layout) -> Points:
