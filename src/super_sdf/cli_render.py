@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from .cli_common import CONTEXT, one_line_errors
 from .errors import OptionError
@@ -18,6 +19,9 @@ Examples:
   super-sdf render fine.ply error.png --colour error --reference true.ply
   super-sdf render part.npz section.png --axis z
 """
+# Options that have a meaning for one kind of source only.
+FOR_GRIDS = ("axis", "at", "factor")
+FOR_MESHES = ("colour", "reference", "top", "up", "zoom")
 
 
 @click.command(
@@ -84,7 +88,16 @@ def render(sources: tuple[Path, ...], target: Path, **options: Any) -> None:
         check_picture(target, force=options["force"])
         if grids and len(sources) > 1:
             raise OptionError(f"{grids[0]} is a grid: give it alone, or meshes only")
+        check_given(FOR_MESHES if grids else FOR_GRIDS, "a grid" if grids else "meshes")
         (render_grid if grids else render_meshes)(sources, target, options)
+
+
+def check_given(others: tuple[str, ...], drawn: str) -> None:
+    """Raise if an option was given that has no meaning for what is drawn."""
+    context = click.get_current_context()
+    for name in others:
+        if context.get_parameter_source(name) is not ParameterSource.DEFAULT:
+            raise OptionError(f"--{name} has no meaning for {drawn}: leave it out")
 
 
 def check_picture(target: Path, *, force: bool) -> None:
@@ -99,9 +112,14 @@ def check_picture(target: Path, *, force: bool) -> None:
 def render_meshes(sources: tuple[Path, ...], target: Path, options: dict[str, Any]) -> None:
     """Draw meshes; by their errors, if there is a reference to compare with."""
     from .evaluation.mesh_files import read_mesh
-    from .evaluation.rendering import Panel, render_panels, vertex_errors
+    from .evaluation.page import check_page
+    from .evaluation.rendering import Panel, check_numbers, render_panels, vertex_errors
     from .evaluation.solid import Solid
 
+    check_numbers(zoom=options["zoom"], top=options["top"])
+    check_page(options["size"], len(sources))
+    if options["top"] is not None and options["colour"] != "error":
+        raise OptionError("--top is the end of the colour bar: give it with --colour error")
     if (options["colour"] == "error") != (options["reference"] is not None):
         raise OptionError("--colour error and --reference MESH go together: give both or neither")
     meshes = [(source.name, read_mesh(source)) for source in sources]
@@ -117,12 +135,16 @@ def render_meshes(sources: tuple[Path, ...], target: Path, options: dict[str, An
 
 def render_grid(sources: tuple[Path, ...], target: Path, options: dict[str, Any]) -> None:
     """Draw a grid's section before and after upsampling."""
-    from .evaluation.sections import render_section
+    from .evaluation.sections import check_section, find_plane, render_section
     from .files.grids import read_grid
     from .network import load_network
+    from .nodes import check_factor
     from .pipeline import upsample
 
+    check_factor(options["factor"])
+    check_section(options["size"])
     grid = read_grid(sources[0])
+    find_plane(grid, options["axis"], options["at"])  # raises if there is none
     field = upsample(grid, load_network(), options["factor"])
     chosen = {name: options[name] for name in ("axis", "at", "size")}
     with raising_interrupts():

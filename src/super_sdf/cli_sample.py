@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from .cli_common import CONTEXT, one_line_errors
 from .errors import OptionError
@@ -81,6 +82,9 @@ def run_sample(source: Path, target: Path, options: dict[str, Any]) -> None:
         raise OptionError("--frame unit has a side of 1: give -n, not --spacing")
     chosen = {"n": samples, "spacing": spacing, "band": options["band"]}
     check_numbers(**chosen, padding=0 if options["frame"] == "unit" else options["padding"])
+    padded = click.get_current_context().get_parameter_source("padding")
+    if options["frame"] == "unit" and padded is not ParameterSource.DEFAULT:
+        raise OptionError("--frame unit has a side of 1: it takes no --padding")
     solid, notes = load_solid(source, allow_open=options["allow_open"])
     if options["frame"] == "unit":
         solid, layout = Solid(normalise(solid.mesh)), unit_layout(samples)

@@ -14,14 +14,41 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, MaxNLocator
 from numpy.typing import NDArray
 
+from ..errors import OptionError
 from ..files.output import replacing
+from ..memory import check_fits
 
 Image = NDArray[np.uint8]
 
 ACROSS = 4  # panels in a row unless told
 # Light where the error is small, for there the shading has to show the shape.
 COLOUR_MAP = "magma_r"
+LARGEST_SIZE = 8000  # pixels along a panel: drawn at twice that, which renderers still can
+LARGEST_SIDE = 60_000  # pixels along a page: matplotlib ends at 2^16, and there are margins
+BYTES_PER_DRAWN_PIXEL = 180  # while one panel is drawn, measured
+BYTES_PER_PIXEL = 24  # of the page
 DPI = 72  # so that a point of type is a pixel
+
+
+def check_page(size: int, count: int, columns: int | None = None) -> None:
+    """Raise if ``count`` pictures of that size are too large to be drawn on a page.
+
+    Raises
+    ------
+    OptionError
+        If there are more pixels along an axis than can be drawn.
+    OutOfMemoryError
+        If they would not fit in memory.
+    """
+    if not 0 < size <= LARGEST_SIZE:
+        raise OptionError(f"size is {size:g}: give 1 to {LARGEST_SIZE} pixels")
+    across = min(count, columns or ACROSS)
+    wide, tall = across * size, -(-count // across) * size
+    what = f"a picture of {wide:,} x {tall:,} pixels"
+    if max(wide, tall) > LARGEST_SIDE:
+        raise OptionError(f"{what} cannot be written: give fewer meshes or a smaller size")
+    need = BYTES_PER_DRAWN_PIXEL * size**2 + BYTES_PER_PIXEL * wide * tall
+    check_fits(need, what, "give a smaller size")
 
 
 def write_picture(figure: Figure, target: Path) -> None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..errors import OptionError
 from ..extras import EXTRAS, check_modules, missing_modules
 from ..mesh import Mesh
-from .page import COLOUR_MAP, Image, Page, write_picture
+from .page import COLOUR_MAP, Image, Page, check_page, write_picture
 from .solid import Distances, Points, Solid
 
 COLOURS = ("shaded", "normal", "error")
@@ -32,6 +32,8 @@ THREE_QUARTER = 0.6, 1.0, 0.5  # right, front and up of the default view
 BASE = "#b9c7df"
 TOP_PERCENTILE = 99.0  # so that a single stray vertex does not stretch the colours
 NORMALS_SAY = "colour: direction of the face; red, green, blue are (1 + normal)/2 along x, y, z"
+ZOOMS = 0.01, 1000.0  # beyond, a mesh is a dot or a flat colour
+LARGEST_TOP = 1e30  # of the colour bar, and one over the smallest: VTK's numbers are float32
 MARGIN = 1.06  # of the frame over what it holds
 NARROWEST = 0.5  # a panel's short side over its long one, at least: titles need room
 SUPERSAMPLING = 2  # pixels drawn for each pixel of the picture, along an axis
@@ -213,15 +215,27 @@ def _check(
         raise OptionError("nothing to draw: give a mesh")
     if colour not in COLOURS:
         raise OptionError(f"colour is {colour!r}: give one of {', '.join(COLOURS)}")
-    numbers = {"zoom": zoom, "size": size, "top": top, "columns": columns}
-    for name, number in numbers.items():
-        if number is not None and not 0 < number < np.inf:
-            raise OptionError(f"{name} is {number:g}: give a number greater than 0")
+    check_numbers(zoom=zoom, top=top, columns=columns)
+    check_page(size, len(panels), columns)
     for panel in panels:
         count = len(panel.mesh.vertices)
         if panel.values is not None and panel.values.shape != (count,):
             shape = panel.values.shape
             raise OptionError(f"values have shape {shape}: give one for each of {count} vertices")
+
+
+def check_numbers(
+    *, zoom: float = 1.0, top: float | None = None, columns: int | None = None
+) -> None:
+    """Raise OptionError if a number has no meaning, whatever is drawn."""
+    for name, number in {"zoom": zoom, "top": top, "columns": columns}.items():
+        if number is not None and not 0 < number < np.inf:
+            raise OptionError(f"{name} is {number:g}: give a number greater than 0")
+    least, most = ZOOMS
+    if not least <= zoom <= most:
+        raise OptionError(f"zoom is {zoom:g}: give a number from {least:g} to {most:g}")
+    if top is not None and not 1 / LARGEST_TOP <= top <= LARGEST_TOP:
+        raise OptionError(f"top is {top:g}: no colour bar can be drawn to that")
 
 
 def _values_of(panels: Sequence[Panel]) -> NDArray[Any]:

@@ -18,13 +18,15 @@ from numpy.typing import NDArray
 from ..errors import OptionError
 from ..field import FineField
 from ..grid import SdfGrid
-from .page import write_picture
+from .page import check_page, write_picture
 
 AXES = "xyz"
 COLOUR_MAP = "RdBu_r"  # blue inside, red outside, white at the surface
 LIMIT = 3.0  # colours end so many voxels from the surface
 UNKNOWN = "#c4c4c4"
 INCHES = 7.0  # a panel's width; the pixels an inch follow from the size asked for
+SECTIONS = 2  # beside each other, at most
+TALLEST = 3  # a panel's height over its width, at most
 STRIP = 1.35  # inches for titles, labels and the colour bar
 
 
@@ -92,8 +94,7 @@ def render_section(
     FileError
         If the file cannot be written.
     """
-    if not 0 < size < np.inf:
-        raise OptionError(f"size is {size}: give a number of pixels greater than 0")
+    check_section(size)
     index = find_plane(grid, axis, at)
     sections = {f"{' x '.join(map(str, grid.shape))} samples": coarse_section(grid, axis, index)}
     if field is not None:
@@ -104,6 +105,11 @@ def render_section(
     figure = _draw(sections, axis, grid.voxel_size, size)
     figure.suptitle(f"section at {axis} = {place:.4g}")
     write_picture(figure, target)
+
+
+def check_section(size: int) -> None:
+    """Raise if a section of that many pixels along a panel is too large; see ``check_page``."""
+    check_page(size, SECTIONS * TALLEST, columns=SECTIONS)
 
 
 def find_plane(grid: SdfGrid, axis: str = "z", at: float | None = None) -> int:
@@ -179,7 +185,7 @@ def _draw(sections: dict[str, Section], axis: str, voxel: float, size: int) -> F
     """Draw sections by their titles, side by side, with one colour bar."""
     boxes = [section.box() for section in sections.values()]
     left, right, bottom, top = boxes[0]
-    tall = float(np.clip((top - bottom) / (right - left), 0.3, 3))
+    tall = float(np.clip((top - bottom) / (right - left), 0.3, TALLEST))
     inches = INCHES * len(sections), INCHES * tall + STRIP
     figure = Figure(figsize=inches, dpi=size / INCHES, layout="constrained")
     plots = figure.subplots(1, len(sections), squeeze=False, sharex=True, sharey=True)[0]
