@@ -1,5 +1,6 @@
 """The commands sample and render, and lists of values on the command line."""
 
+import os
 import re
 from pathlib import Path
 
@@ -77,11 +78,31 @@ def test_what_is_wrong_with_a_mesh_is_said(here, command):
         ("lidless.ply box.npz -n 9", 1, "lidless.ply is open: 4 edges have no partner"),
         ("box.ply box.npz -n 9 --band 1", 2, "band is 1: give at least 1.5 voxels"),
         ("box.ply box.npz -n 90000", 1, "a grid of 90000 x 30004 x 30004 needs "),
+        ("box.ply box.npz -n 99999999999999", 2, "a spacing of 3e-14 and a padding of 2 voxels"),
+        ("box.ply box.npz -n 0", 2, "n is 0: give at least 2 samples"),
+        ("none.ply box.npz -n -5", 2, "n is -5: give at least 2 samples"),
+        ("box.ply box.npz -n 1 --frame unit", 2, "n is 1: give at least 2 samples"),
+        ("box.ply box.npz -n 9999999 --frame unit", 1, "a grid of 9999999 x 9999999 x 9999999"),
+        ("box.ply box.npz -n 9 --frame unit --padding 3", 2, "--frame unit has a side of 1: it"),
+        ("box.ply box.npz --spacing 1e-300", 2, "a spacing of 1e-300 and a padding of 2 voxels"),
+        ("box.ply box.npz --spacing 1e-320", 2, "a spacing of 9.99989e-321 and a padding of"),
+        ("box.ply box.npz --spacing 1e300", 1, "a spacing of 1e+300 and an extent of 5e+300 are"),
+        ("box.ply box.npz --spacing nan", 2, "spacing is nan: it must be greater than 0"),
+        ("box.ply box.npz --spacing inf", 2, "spacing is inf: it must be greater than 0"),
+        ("box.ply box.npz --spacing .1 --padding 1e300", 2, "a spacing of 0.1 and a padding of"),
+        ("box.ply box.npz -n 9 --padding -1e9", 2, "padding is -1e+09: give 0 voxels or more"),
+        ("box.ply box.npz -n 9 --padding nan", 2, "padding is nan: give 0 voxels or more"),
+        ("box.ply box.npz -n 9 --band nan", 2, "band is nan: give at least 1.5 voxels"),
+        ("far.off box.npz -n 9", 1, "the grid reaches to 1e+14, where numbers are 0.016 apart"),
+        ("pipe.ply box.npz -n 9", 1, "pipe.ply is a named pipe: give a file"),
     ],
 )
 def test_bad_samples_are_one_line(here, command, words, code, message):
     (here / "old.npz").touch()
     saved(Mesh(cube().vertices, cube().faces[2:]), here / "lidless.ply")
+    far = trimesh.Trimesh(cube().vertices + 1e14, cube().faces, process=False)
+    (here / "far.off").write_text(trimesh.exchange.off.export_off(far, digits=1))
+    os.mkfifo(here / "pipe.ply")
     found, out, err = command("sample", *words.split())
     assert (found, out) == (code, "")
     assert len(err.splitlines()) == 1 and err.startswith(f"Error: {message}"), err
@@ -112,10 +133,26 @@ def test_a_grid_becomes_a_section(here, command):
         ("box.ply out.png --reference box.ply", 2, "--colour error and --reference MESH go"),
         ("box.ply in.npy out.png", 2, "in.npy is a grid: give it alone, or meshes only"),
         ("in.npy out.png --at 900", 2, "at is 900"),
+        ("in.npy out.png --at nan", 2, "at is nan"),
+        ("in.npy out.png --factor 3", 2, "factor is 3"),
+        ("in.npy out.png --size 100000", 2, "size is 100000: give 1 to 8000 pixels"),
+        ("box.ply out.png --size 100000", 2, "size is 100000: give 1 to 8000 pixels"),
+        ("none.ply out.png --zoom 0", 2, "zoom is 0: give a number greater than 0"),
+        ("none.ply out.png --zoom nan", 2, "zoom is nan: give a number greater than 0"),
+        ("none.ply out.png --zoom -1", 2, "zoom is -1: give a number greater than 0"),
+        ("none.ply out.png --zoom 1e300", 2, "zoom is 1e+300: give a number from 0.01 to 1000"),
+        ("none.ply out.png --colour error --top 0", 2, "top is 0: give a number greater than 0"),
+        ("none.ply out.png --colour error --top 1e99", 2, "top is 1e+99: no colour bar can be"),
+        ("box.ply out.png --top 1", 2, "--top is the end of the colour bar: give it with"),
+        ("box.ply out.png --at 1", 2, "--at has no meaning for meshes: leave it out"),
+        ("in.npy out.png --colour normal", 2, "--colour has no meaning for a grid: leave it out"),
+        (" ".join(["box.ply"] * 40 + ["out.png --size 8000"]), 2, "a picture of 32,000 x 80,000"),
+        ("pipe.ply out.png", 1, "pipe.ply is a named pipe: give a file"),
     ],
 )
 def test_bad_pictures_are_one_line(here, command, words, code, message):
     np.save("in.npy", ball().values)
+    os.mkfifo("pipe.ply")
     found, out, err = command("render", *words.split())
     assert (found, out) == (code, "")
     assert len(err.splitlines()) == 1 and err.startswith(f"Error: {message}"), err

@@ -19,6 +19,8 @@ from ..mesh import Mesh
 
 # Coordinates beyond have products and squares that no number holds.
 FARTHEST = 1e30
+SAME_PLACE = 1e-8  # vertices nearer than that are one
+SMALLEST_STEP = 1e-18  # of the farthest coordinate, so that whole numbers of it fit in 64 bits
 
 
 def read_mesh(path: str | Path) -> Mesh:
@@ -39,12 +41,29 @@ def read_mesh(path: str | Path) -> Mesh:
     if faces.min() < 0 or faces.max() >= len(vertices):
         wrong = faces.min() if faces.min() < 0 else faces.max()
         raise MeshError(f"{path} has a face of vertex {wrong}, of {len(vertices):,}: repair it")
-    if not np.isfinite(vertices).all():
+    drawn = vertices[faces.ravel()]
+    if not np.isfinite(drawn).all():
         raise MeshError(f"{path} holds coordinates that are not finite: repair it first")
-    farthest = np.abs(vertices).max()
+    farthest = np.abs(drawn).max()
     if farthest > FARTHEST:
         raise MeshError(f"{path} reaches to {farthest:.3g}: scale it to coordinates under 1e30")
-    return Mesh(vertices, faces.astype(np.int32))
+    return merged(Mesh(vertices, faces.astype(np.int32)))
+
+
+def merged(mesh: Mesh) -> Mesh:
+    """Return a mesh whose vertices at one place are one, without those of no face.
+
+    One place is ``SAME_PLACE`` wide, of small meshes that share of their size. Normals and textures
+    do not keep vertices apart, as they do in trimesh: a mesh is not open along its seams.
+    """
+    from trimesh.grouping import unique_rows
+
+    used, faces = np.unique(mesh.faces, return_inverse=True)
+    vertices = mesh.vertices[used]
+    step = SAME_PLACE * min(1.0, float(np.ptp(vertices, axis=0).max()))
+    step = max(step, float(np.abs(vertices).max()) * SMALLEST_STEP) or 1.0
+    first, place = unique_rows(np.round(vertices / step).astype(np.int64), keep_order=True)
+    return Mesh(vertices[first], place[faces].reshape(-1, 3).astype(np.int32))
 
 
 def _load(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -53,11 +72,12 @@ def _load(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
     try:
         with _quiet():
-            found = trimesh.load_mesh(path, resolver=_file_resolver(path))
+            # as it is: else faces of vertices that are not finite would be dropped unsaid
+            found = trimesh.load_mesh(path, process=False, resolver=_file_resolver(path))
             vertices = np.array(getattr(found, "vertices", ()), np.float64).reshape(-1, 3)
             faces = np.array(getattr(found, "faces", ()), np.int64).reshape(-1, 3)
-    except SuperSdfError:
-        raise
+    except SuperSdfError as error:  # of a file that this one names
+        raise FileError(f"{path} names another file: {error}") from error
     except Exception as error:  # trimesh's readers raise whatever their format makes them
         reason = str(error).strip().splitlines()
         said = reason[0][:200] if reason else type(error).__name__

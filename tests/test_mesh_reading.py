@@ -1,0 +1,144 @@
+"""Mesh files as they come: what is wrong with one is said in a line that names it."""
+
+from __future__ import annotations
+
+import random
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from solids import cube, sphere
+
+from super_sdf import Mesh
+from super_sdf.errors import FileError, MeshError, SuperSdfError
+from super_sdf.evaluation.mesh_files import merged, read_mesh
+from super_sdf.evaluation.solid import load_solid
+
+FORMATS = ("ply", "stl", "stl_ascii", "obj", "off", "glb")
+PIECES = (b"nan", b"-1", b"99999999", b"\xff" * 8, b"1e400", b"\n\n", b"{" * 50, b"")
+
+
+def off_file(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
+    """Write an .off file with all digits."""
+    rows = [" ".join(map(repr, vertex)) for vertex in vertices.tolist()]
+    rows += ["3 " + " ".join(map(str, face)) for face in faces.tolist()]
+    path.write_text(f"OFF\n{len(vertices)} {len(faces)} 0\n" + "\n".join(rows) + "\n")
+    return path
+
+
+def damaged(rng: random.Random, content: bytes) -> bytes:
+    """Cut a file short, change bytes of it, or put something else in a place."""
+    changed = bytearray(content)
+    kind = rng.randrange(3)
+    if kind == 0:
+        return content[: rng.randrange(len(content))]
+    if kind == 1:
+        for _ in range(rng.randrange(1, 20)):
+            changed[rng.randrange(min(len(changed), 10 ** rng.randrange(2, 6)))] = rng.randrange(
+                256
+            )
+        return bytes(changed)
+    start = rng.randrange(min(len(changed), 10 ** rng.randrange(2, 6)))
+    changed[start : start + rng.randrange(50)] = rng.choice(PIECES)
+    return bytes(changed)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_damaged_files_are_read_or_named_in_a_line(tmp_path, capfd, kind):
+    ball = trimesh.Trimesh(*vars(sphere(size=6)).values())
+    content = ball.export(file_type=kind)
+    content = content if isinstance(content, bytes) else content.encode()
+    path = tmp_path / f"ball.{kind.removesuffix('_ascii')}"
+    rng, refused = random.Random(kind), 0
+    for _ in range(40):
+        path.write_bytes(damaged(rng, content))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            try:
+                mesh = read_mesh(path)
+                assert np.isfinite(mesh.vertices).all() and mesh.faces.max() < len(mesh.vertices)
+            except SuperSdfError as error:
+                refused += 1
+                assert str(error).startswith(str(path)) and "\n" not in str(error)
+    assert refused > 5
+    assert capfd.readouterr() == ("", "")
+
+
+def changed_cube(index: int, coordinate: float) -> np.ndarray:
+    """Return the cube's vertices with one that is elsewhere."""
+    vertices = cube().vertices.copy()
+    vertices[index, 0] = coordinate
+    return vertices
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces", "message"),
+    [
+        (changed_cube(3, np.nan), cube().faces, "holds coordinates that are not finite"),
+        (changed_cube(3, np.inf), cube().faces, "holds coordinates that are not finite"),
+        (changed_cube(3, 1e31), cube().faces, "reaches to 1e+31: scale it to coordinates"),
+        (cube().vertices, np.zeros((0, 3), int), "holds no triangle: give a surface mesh"),
+        (cube().vertices, cube().faces + 3, "cannot be read as a mesh: OFF file has a face"),
+    ],
+)
+def test_meshes_that_are_none(tmp_path, vertices, faces, message):
+    path = off_file(tmp_path / "box.off", vertices, faces)
+    with pytest.raises(SuperSdfError) as caught:
+        read_mesh(path)
+    assert str(caught.value).startswith(f"{path} {message}")
+
+
+def test_faces_of_vertices_that_are_not_there(tmp_path):
+    path = tmp_path / "box.ply"
+    trimesh.Trimesh(cube().vertices, cube().faces + 3, process=False).export(path)
+    with pytest.raises(MeshError, match=r"box\.ply has a face of vertex 10, of 8: repair it"):
+        read_mesh(path)
+
+
+@pytest.mark.parametrize("name", ["cloud.ply", "lines.obj", "empty.stl", "deep.gltf", "x.json"])
+def test_files_without_a_mesh(tmp_path, name):
+    path = tmp_path / name
+    if name == "cloud.ply":
+        trimesh.PointCloud(np.eye(3)).export(path)
+    else:
+        path.write_text(
+            {"lines.obj": "v 0 0 0\nv 1 0 0\nl 1 2\n", "deep.gltf": "[" * 99999}.get(name, "")
+        )
+    with pytest.raises((FileError, MeshError), match=rf"{name} (holds no triangle|cannot be read)"):
+        read_mesh(path)
+
+
+def test_a_scene_is_one_mesh(tmp_path):
+    away = Mesh(cube().vertices + 3, cube().faces)
+    scene = trimesh.Scene([trimesh.Trimesh(mesh.vertices, mesh.faces) for mesh in (cube(), away)])
+    scene.export(tmp_path / "two.glb")
+    solid, notes = load_solid(tmp_path / "two.glb")
+    assert notes == [] and solid.mesh.volume() == pytest.approx(2)
+    assert solid.is_inside(np.array([[0.0, 0, 0], [3, 3, 3], [1.5, 1.5, 1.5]])).tolist() == [
+        1,
+        1,
+        0,
+    ]
+
+
+@pytest.mark.parametrize("size", [1e-9, 1e-3, 1.0, 1e6, 1e25])
+def test_vertices_at_one_place_are_one_at_every_scale(size):
+    ball = sphere(size=12)
+    corners = ball.vertices[ball.faces].reshape(-1, 3) * size
+    soup = Mesh(corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3))
+    whole = merged(soup)
+    assert len(whole.vertices) == len(ball.vertices) and whole.is_closed()
+    assert np.array_equal(whole.vertices[whole.faces], soup.vertices[soup.faces])
+
+
+def test_a_mesh_is_not_open_along_the_seams_of_its_texture(tmp_path):
+    """Each face of the box has texture coordinates of its own."""
+    corners = cube().vertices[cube().faces].reshape(-1, 3)
+    rows = [f"v {x} {y} {z}" for x, y, z in corners]
+    rows += [f"vt {n / 40} 0" for n in range(len(corners))]
+    rows += ["f " + " ".join(f"{n}/{n}" for n in range(m, m + 3)) for m in range(1, 37, 3)]
+    (tmp_path / "box.obj").write_text("\n".join(rows))
+    solid, notes = load_solid(tmp_path / "box.obj")
+    assert notes == [] and solid.is_closed and len(solid.mesh.vertices) == 8
