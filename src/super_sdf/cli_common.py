@@ -1,4 +1,4 @@
-"""What commands share: how help looks, errors in one line, extras that must be there."""
+"""What commands share: how help looks, errors in one line."""
 
 from __future__ import annotations
 
