@@ -20,6 +20,8 @@ of solids so thin that hardly a sample lies inside.
 from __future__ import annotations
 
 import argparse
+import zipfile
+import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,13 +30,16 @@ import igl
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from export.arguments import Parser, at_least, share
 from export.shapes import random_solid
 from export.shapes.draws import draw_sway
 from super_sdf import Mesh, SdfGrid
 from super_sdf.band import DECODE_LIMIT, find_band, rescale
+from super_sdf.errors import FileError
 from super_sdf.evaluation.mesh_files import read_mesh
 from super_sdf.evaluation.sampling import sample_grid
 from super_sdf.evaluation.solid import Solid
+from super_sdf.files.regular import check_regular_file
 from super_sdf.nodes import block_offsets
 
 CORNERS, FINE_NODES, ANYWHERE = 5, 4, 4  # queries: 4 a corner, 28 in all
@@ -142,9 +147,18 @@ def write_shard(path: Path, samples: list[Sample]) -> None:
 
 
 def read_shard(path: Path) -> Iterator[Sample]:
-    """Yield the samples of a shard."""
-    with np.load(path) as file:
-        shard = dict(file)
+    """Yield the samples of a shard.
+
+    Raises
+    ------
+    FileError
+        If it is damaged, or none.
+    """
+    try:
+        with np.load(check_regular_file(path)) as file:
+            shard = dict(file)
+    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise FileError(f"{path} is no shard: {error}; remove it and make it again") from error
     window_ends = np.cumsum(shard["window_shape"].prod(1))
     voxel_ends = np.cumsum(shard["voxel_count"])
     windows = np.split(shard["windows"], window_ends[:-1])
@@ -155,15 +169,31 @@ def read_shard(path: Path) -> Iterator[Sample]:
 
 
 def find_meshes(folder: Path | None) -> tuple[list[Path], list[Path]]:
-    """Return the files of simple prisms (under 128 faces, by file size) and all others."""
-    files = sorted(folder.glob("*.ply")) if folder else []
+    """Return the files of simple prisms (under 128 faces, by file size) and all others.
+
+    Raises
+    ------
+    FileError
+        If the folder is none or holds no .ply file, or one of them is no regular file.
+    """
+    if folder is None:
+        return [], []
+    if not folder.is_dir():
+        raise FileError(f"--meshes {folder} is no folder: give one of closed .ply meshes")
+    files = [check_regular_file(file) for file in sorted(folder.glob("*.ply"))]
+    if not files:
+        raise FileError(f"--meshes {folder} holds no .ply file: other formats are not read here")
     prisms = [file for file in files if file.stat().st_size < 3000]
     return prisms, sorted(set(files) - set(prisms))
 
 
 def mesh_order(seed: int, prisms: list[Path], others: list[Path], count: int) -> list[Path]:
-    """Return ``count`` files, all others once before any again, a sixth of them prisms."""
+    """Return ``count`` files, all others once before any again, a sixth of them prisms.
+
+    Where there are none but prisms, they are all.
+    """
     rng = np.random.default_rng(seed)
+    others, prisms = (others, prisms) if others else (prisms, [])
     order: list[Path] = []
     while others and len(order) < count:
         few = rng.permutation(prisms)[: len(others) // 5].tolist()
@@ -213,16 +243,22 @@ def fill_shard(
 
 def main() -> None:
     """Fill a store; a shard that is there already is kept."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = Parser(description=__doc__.split("\n")[0])
     parser.add_argument("--meshes", type=Path, help="folder of closed .ply meshes")
-    parser.add_argument("--procedural", type=float, default=0.3, help="share beside --meshes")
-    parser.add_argument("--thin", type=float, default=0.05, help="share of thin solids")
+    parser.add_argument("--procedural", type=share, default=0.3, help="share beside --meshes")
+    parser.add_argument("--thin", type=share, default=0.05, help="share of thin solids")
     parser.add_argument("--out", type=Path, required=True, help="folder for the shards")
-    parser.add_argument("--count", type=int, default=5000, help="samples to make")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--count", type=at_least(1), default=5000, help="samples to make")
+    parser.add_argument("--seed", type=at_least(0), default=0)
     options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
+    with parser.one_line_errors():
+        fill_store(options)
+
+
+def fill_store(options: argparse.Namespace) -> None:
+    """Make the shards that are not there."""
     files = mesh_order(options.seed, *find_meshes(options.meshes), options.count + SHARD)
+    options.out.mkdir(parents=True, exist_ok=True)
     for number in range(-(-options.count // SHARD)):
         path = options.out / f"shard-{options.seed}-{number:04d}.npz"
         if not path.exists():

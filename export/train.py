@@ -27,12 +27,15 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from export.arguments import Parser, at_least, positive, share
 from export.augment import USUAL, Prepared, augment, prepare
 from export.dataset import CORNERS, Sample, read_shard
 from export.dormant import dormant_share, revive
 from export.network import SIZES, SuperSdfNet
 from export.recipe import RECIPE, Recipe, differences, loss_of, make_optimisers, rate_factor
 from export.to_onnx import read_weights
+from super_sdf.errors import FileError
+from super_sdf.files.regular import check_regular_file
 
 CHECKPOINT_SECONDS = 180
 LOG_STEPS = 100
@@ -57,9 +60,16 @@ def predict(net: SuperSdfNet, batch: list[Prepared]) -> list[tuple[Tensor, Tenso
 
 
 class Store:
-    """The samples of the shards in a folder; the first are held out, by name, and only measured."""
+    """The samples of the shards in a folder; the first are held out, by name, and only measured.
+
+    Raises
+    ------
+    FileError
+        If no shard is left to train on, or one is damaged.
+    """
 
     def __init__(self, folder: Path, held_out: int, most: int | None = None) -> None:
+        check_store(folder, held_out)
         self.folder, self.most = folder, most
         self.seen = sorted(folder.glob("shard-*.npz"))[:held_out]
         self.held_out = [prepare(s) for path in self.seen for s in read_shard(path)]
@@ -83,6 +93,18 @@ class Store:
             sample = augment(rng, self.samples[self.order.pop()], recipe.shares)
             batch += [sample] if len(sample.voxels) else []
         return batch
+
+
+def check_store(folder: Path, held_out: int) -> None:
+    """Raise FileError if a folder does not hold more shards than are held out."""
+    if not folder.is_dir():
+        raise FileError(f"--store {folder} is no folder: fill one with export.dataset")
+    count = len(list(folder.glob("shard-*.npz")))
+    if count <= held_out:
+        raise FileError(
+            f"--store {folder} holds {count} of at least {held_out + 1} shards, for the first "
+            f"{held_out} are held out: make more with export.dataset"
+        )
 
 
 class Run:
@@ -251,18 +273,27 @@ def plot_log(folder: Path) -> None:
 
 def main() -> None:
     """Train or go on training."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = Parser(description=__doc__.split("\n")[0])
     parser.add_argument("--store", type=Path, required=True, help="folder of shards")
     parser.add_argument("--run", type=Path, required=True, help="folder of the run")
     parser.add_argument("--size", choices=SIZES, default="base", help="of the network")
     parser.add_argument("--start", type=Path, help="an .onnx file of that size to start from")
-    parser.add_argument("--blocks", type=int, help="of the network, if not as many as its size has")
-    parser.add_argument("--minutes", type=float, default=90.0, help="of training, in all")
-    parser.add_argument("--rate", type=float, default=1.0, help="times the usual learning rates")
-    parser.add_argument("--noisy", type=float, default=USUAL.noisy, help="share of the samples")
+    parser.add_argument("--blocks", type=at_least(1), help="of the network, if others")
+    parser.add_argument("--minutes", type=positive, default=90.0, help="of training, in all")
+    parser.add_argument("--rate", type=positive, default=1.0, help="times the usual learning rates")
+    parser.add_argument("--noisy", type=share, default=USUAL.noisy, help="share of the samples")
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=at_least(0), default=0)
     options = parser.parse_args()
+    with parser.one_line_errors():
+        run_training(options)
+
+
+def run_training(options: argparse.Namespace) -> None:
+    """Check the store before anything is made, then train."""
+    check_store(options.store, HELD_OUT)
+    if options.start:
+        check_regular_file(options.start)
     options.run.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(options.seed)
     recipe = RECIPE.at(options.rate, options.noisy)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import zipfile
 from pathlib import Path
 
@@ -30,6 +31,8 @@ def test_the_main_job(here, command):
     assert spacing.startswith("Note: spacing not given: taken as 1, the values show ")
     assert origin == "Note: origin not given: sample (0, 0, 0) is at 0, 0, 0"
     assert done.startswith("out.ply: ") and done.endswith(" s")
+    box = r"from \(3\.6\d*, .*\) to \(15\.6\d*, .*\), \d+\.\d s"
+    assert re.fullmatch(rf"out\.ply: [\d,]+ vertices, [\d,]+ triangles, closed, {box}", done)
     mesh = trimesh.load("out.ply")
     assert mesh.is_watertight and mesh.volume == pytest.approx(4 / 3 * np.pi * 216, rel=0.01)
 
@@ -64,7 +67,7 @@ def test_a_surface_that_leaves_the_grid_is_reported_and_capped(here, command):
     _, _, err = command("upsample", "cut.npy", "open.ply")
     want = "Warning: the surface runs out of the grid and is open there (close it with --cap)"
     assert want in err
-    assert not trimesh.load("open.ply").is_watertight
+    assert " triangles, open, from (" in err and not trimesh.load("open.ply").is_watertight
     _, _, err = command("upsample", "cut.npy", "closed.ply", "--cap")
     assert "Warning" not in err
     assert trimesh.load("closed.ply").is_watertight
@@ -329,3 +332,12 @@ def test_every_option_has_help():
         for parameter in subcommand.params:
             if isinstance(parameter, click.Option):
                 assert parameter.help, parameter.name
+
+
+def test_a_large_file_is_announced_unless_quiet(here, command, monkeypatch):
+    monkeypatch.setattr("super_sdf.expectation.LARGE", 1000)
+    _, _, err = command("upsample", "in.npy", "out.ply", "--quality", "fast")
+    assert err.startswith("out.ply will have about 22,000 triangles, 423,168 bytes\nNote: ")
+    options = "--quality", "fast", "--quiet", "--json"
+    code, out, err = command("upsample", "in.npy", "new.ply", *options)
+    assert (code, err) == (0, "") and json.loads(out)["expected_bytes"] > 400_000

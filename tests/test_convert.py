@@ -1,14 +1,17 @@
 """One file to another: what is written, what is told, and nothing where it fails."""
 
 import os
+import re
 
 import numpy as np
 import pytest
 import trimesh
 from conftest import ball, trilinear
 
+from super_sdf import expectation
 from super_sdf.convert import ConvertOptions, convert
-from super_sdf.errors import FileError, GridError
+from super_sdf.errors import FileError, GridError, WriteError
+from super_sdf.files.meshes import MESH_SUFFIXES
 
 
 @pytest.fixture(autouse=True)
@@ -56,3 +59,48 @@ def test_a_failure_writes_nothing_and_a_file_is_replaced_only_by_force():
     with pytest.raises(FileError, match=r"^out.ply exists: remove it or use --force$"):
         convert("in.npy", "out.ply", trilinear, ConvertOptions(2))
     convert("in.npy", "out.ply", trilinear, ConvertOptions(4), force=True)
+
+
+@pytest.mark.parametrize("factor", [2, 4])
+@pytest.mark.parametrize("suffix", MESH_SUFFIXES)
+def test_the_size_of_the_file_is_known_before(factor, suffix):
+    x, y, z = np.indices((24,) * 3) * 0.5
+    gyroid = np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)
+    np.save("gyroid.npy", gyroid.astype(np.float32))
+    done = convert("gyroid.npy", f"out{suffix}", trilinear, ConvertOptions(factor, (1.0,)))
+    report, size = done.report(), os.path.getsize(f"out{suffix}")
+    assert report["expected_triangles"] == pytest.approx(report["triangles"], rel=0.08)
+    assert report["expected_bytes"] == pytest.approx(size, rel=0.35)
+
+
+def test_a_large_file_is_announced_before_the_work(monkeypatch):
+    said = []
+    options = ConvertOptions(2)
+    convert("in.npy", "out.ply", trilinear, options, announce=said.append)
+    assert said == []
+    monkeypatch.setattr(expectation, "LARGE", 40_000)
+
+    def work(*_):
+        assert said == ["new.ply will have about 2,500 triangles, 47,424 bytes"]
+        raise MemoryError
+
+    with pytest.raises(MemoryError):
+        convert("in.npy", "new.ply", work, options, announce=said.append)
+
+
+def test_a_file_that_its_disk_cannot_hold_is_refused_before_the_work(monkeypatch):
+    monkeypatch.setattr(expectation, "free_space", lambda path: 2e6)
+    convert("in.npy", "out.ply", trilinear, ConvertOptions(4))
+    monkeypatch.setattr(expectation, "free_space", lambda path: 1000)
+    want = (
+        "big.ply cannot be written: about 10,000 triangles take 189,696 bytes, 1,000 bytes are "
+        "free there; use a smaller factor, or another folder"
+    )
+    with pytest.raises(WriteError, match=re.escape(want)):
+        convert("in.npy", "big.ply", None, ConvertOptions(4))
+    assert sorted(os.listdir()) == ["in.npy", "out.ply"]
+
+
+def test_the_box_is_that_of_the_vertices():
+    done = convert("in.npy", "out.ply", trilinear, ConvertOptions(2, (1.0,), (5.0, -5.0, 0.0)))
+    np.testing.assert_allclose(done.report()["bounds"], trimesh.load("out.ply").bounds)

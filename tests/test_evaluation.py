@@ -434,18 +434,18 @@ def test_a_folder_that_no_evaluation_made_is_refused(meshes, tmp_path):
         (out / name).write_bytes(ours)
 
 
-def test_an_interrupt_says_what_is_kept(meshes, tmp_path, monkeypatch):
+def test_an_interrupt_says_what_is_kept(meshes, tmp_path, monkeypatch, command):
     def interrupt(tasks, store, *_):
         store.add(row("box", 0.5, **tasks[0].key("mc")))
         raise KeyboardInterrupt
 
     monkeypatch.setattr("super_sdf.evaluation.evaluate.complete", interrupt)
     out = tmp_path / "out"
-    result = CliRunner().invoke(cli, ["evaluate", str(meshes), "--out", str(out)])
-    assert result.exit_code == 1
-    assert result.output == (
+    code, _, err = command("evaluate", meshes, "--out", out)
+    assert (code, err) == (
+        130,
         f"Error: interrupted: what was measured is kept in {out / 'results.jsonl'}; the same "
-        "command goes on from there\n"
+        "command goes on from there\n",
     )
 
 

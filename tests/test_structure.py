@@ -22,7 +22,7 @@ FLOORS = [
     {"isosurface", "border", "spheres"},
     {"survey", "kernels"},
     {"compiled"},
-    {"plan", "precision"},
+    {"plan", "precision", "expectation"},
     {"pipeline"},
     {"convert"},
     {"cli_common", "cli_conversion", "__init__"},

@@ -273,6 +273,7 @@ def test_the_held_out_errors_of_the_truth_are_zero(samples):
 
 def test_a_log_is_drawn(tmp_path, samples):
     write_shard(tmp_path / "shard-0-0000.npz", samples)
+    write_shard(tmp_path / "shard-0-0001.npz", samples[:1])
     run = Run(tmp_path, SuperSdfNet(SMALL))
     store = Store(tmp_path, 1)
     for run.step in (900, 1000):

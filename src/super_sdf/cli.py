@@ -99,6 +99,7 @@ class Upsampling:
                 make_options(asked),
                 force=asked["force"],
                 progress=progress,
+                announce=self.announce,
             )
         self.seconds = watch.seconds | self.done.seconds
 
@@ -147,11 +148,24 @@ class Upsampling:
                 tell(f"{key.replace('_', ' ')}: {report[key]}")
             for stage, spent in self.seconds.items():
                 tell(f"{stage}: {spent:.3f} s")
-        total = sum(self.seconds.values())
-        tell(
-            f"{self.target}: {report['vertices']:,} vertices, {report['triangles']:,} triangles, "
-            f"{total:.1f} s",
+        tell(f"{self.target}: {self.summary()}")
+
+    def summary(self) -> str:
+        """Return the mesh in a line."""
+        counts = self.done.counts
+        low, high = (
+            "(" + ", ".join(f"{x:.6g}" for x in corner) + ")" for corner in self.done.bounds
         )
+        return (
+            f"{counts['vertices']:,} vertices, {counts['triangles']:,} triangles, "
+            f"{'closed' if self.done.closed else 'open'}, from {low} to {high}, "
+            f"{sum(self.seconds.values()):.1f} s"
+        )
+
+    def announce(self, line: str) -> None:
+        """Say before the work what a user may want to stop; the bar is drawn anew below."""
+        if not self.options["quiet"]:
+            tell(f"\r{line}\x1b[K" if sys.stderr.isatty() else line)
 
 
 for command in (batch, sample, evaluate, render, info):

@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from .cli_common import CONTEXT, one_line_errors
+from .cli_common import CONTEXT, InterruptedCommand, one_line_errors, print_result, tell
 from .extras import check_modules
 from .interrupts import raising_interrupts
 
@@ -180,10 +180,10 @@ def run_evaluate(sources: tuple[Path, ...], options: dict[str, Any]) -> bool:
             progress=None if options["quiet"] else progress_lines(),
         )
     for entry in outcome.left_out:
-        click.echo(f"Left out: {entry.shape}: {entry.reason}", err=True)
+        tell(f"Left out: {entry.shape}: {entry.reason}")
     if not options["quiet"]:
-        click.echo(outcome.report.read_text(encoding="utf-8"))
-        click.echo(f"{outcome.report}", err=True)
+        print_result(outcome.report.read_text(encoding="utf-8"), f"{outcome.report} is written")
+        tell(f"{outcome.report}")
     return bool(outcome.left_out)
 
 
@@ -195,21 +195,20 @@ def interrupts_explained(out: Path) -> Iterator[None]:
     rows = out / ROWS
     try:
         yield
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
         if not rows.exists():
             raise
-        raise click.ClickException(
-            f"interrupted: what was measured is kept in {rows}; the same command goes on from there"
-        ) from None
+        kept = f": what was measured is kept in {rows}; the same command goes on from there"
+        raise InterruptedCommand(kept, interrupt) from None
 
 
 def progress_lines() -> Callable[[int, int, str, float], None]:
     """Return a function that prints a line a task, with the time that the rest will take."""
     start = time.monotonic()
 
-    def tell(done: int, total: int, what: str, share: float) -> None:
+    def show(done: int, total: int, what: str, share: float) -> None:
         spent = time.monotonic() - start
         left = spent / share * (1 - share)
-        click.echo(f"{done} of {total}: {what}, {spent:.0f} s, {left:.0f} s left", err=True)
+        tell(f"{done} of {total}: {what}, {spent:.0f} s, {left:.0f} s left")
 
-    return tell
+    return show

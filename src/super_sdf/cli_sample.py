@@ -12,7 +12,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from .cli_common import CONTEXT, one_line_errors
+from .cli_common import CONTEXT, one_line_errors, tell
 from .errors import OptionError
 from .extras import check_modules
 from .interrupts import raising_interrupts
@@ -96,12 +96,10 @@ def run_sample(source: Path, target: Path, options: dict[str, Any]) -> None:
         write_grid(grid, target, force=options["force"])
     if not options["quiet"]:
         for note in (*notes, *grid.notes):
-            click.echo(f"Note: {note}", err=True)
+            tell(f"Note: {note}")
         size = " x ".join(map(str, grid.shape))
         seconds = time.perf_counter() - start
-        click.echo(
-            f"{target}: {size} samples, spacing {grid.voxel_size:g}, {seconds:.1f} s", err=True
-        )
+        tell(f"{target}: {size} samples, spacing {grid.voxel_size:g}, {seconds:.1f} s")
 
 
 @contextmanager

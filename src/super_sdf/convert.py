@@ -13,6 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from .expectation import Expectation, expect
 from .files.grids import read_grid
 from .files.meshes import write_pieces
 from .grid import SdfGrid, Triple
@@ -20,6 +23,7 @@ from .mesh import Mesh
 from .nodes import check_factor
 from .pipeline import Decoder, Piece, Progress, reconstruct_slabs, step_name
 from .precision import check_format_holds, local_origin_note
+from .spacing import as_triple
 
 
 @dataclass(frozen=True)
@@ -57,7 +61,9 @@ class Conversion:
     shape, spacing, origin
         The grid's.
     counts : dict
-        Voxels, nodes, vertices and triangles, by name.
+        Voxels, nodes, vertices and triangles, by name; what was expected of the file before.
+    bounds : two Triples
+        The lowest and the highest coordinates of vertices.
     closed : bool
         Whether the mesh has no open edge. Not counted: the mesh is a closed manifold by
         construction unless the surface runs out of the grid, and then too if it is capped.
@@ -71,6 +77,7 @@ class Conversion:
     spacing: Triple
     origin: Triple
     counts: dict[str, int]
+    bounds: tuple[Triple, Triple]
     closed: bool
     notes: tuple[str, ...]
     warnings: tuple[str, ...]
@@ -83,6 +90,7 @@ class Conversion:
             "spacing": list(self.spacing),
             "origin": list(self.origin),
             **self.counts,
+            "bounds": [list(corner) for corner in self.bounds],
             "closed": self.closed,
             "inferred": list(self.notes),
             "warnings": list(self.warnings),
@@ -119,6 +127,7 @@ def convert(
     force: bool = False,
     progress: Progress | None = None,
     before_rename: Callable[[Path], None] | None = None,
+    announce: Callable[[str], None] | None = None,
 ) -> Conversion:
     """Convert a grid file to a mesh file.
 
@@ -136,6 +145,8 @@ def convert(
         Called with (steps done, steps in all).
     before_rename : callable, optional
         Called with the path of the finished mesh, before it takes the target's name.
+    announce : callable, optional
+        Called before the work with a sentence on the size of the file, if that will be large.
 
     Raises
     ------
@@ -153,6 +164,9 @@ def convert(
     check_factor(options.factor)
     about = check_format_holds(target, grid, options.factor)
     notes = (*grid.notes, *local_origin_note(target, about))
+    expected = expect(grid, options.factor, options.offset, target)
+    if announce and (said := expected.said(target)):
+        announce(said)
     watch.lap("read")
     pieces = reconstruct_slabs(
         grid,
@@ -163,7 +177,7 @@ def convert(
         max_memory=options.max_memory,
         progress=watch.step,
     )
-    total = Total()
+    total = Total(expected)
     meshes = total.count(pieces, watch)
     write_pieces(meshes, target, force=force, about=about, before_rename=before_rename)
     watch.lap("write")
@@ -173,8 +187,10 @@ def convert(
 class Total:
     """What there is to say of all pieces of a mesh."""
 
-    def __init__(self) -> None:
+    def __init__(self, expected: Expectation) -> None:
+        self.expected = expected
         self.counts: Counter[str] = Counter()
+        self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)
         self.is_cut = False
 
     def count(self, pieces: Iterable[Piece], watch: Stopwatch) -> Iterator[Mesh]:
@@ -183,9 +199,17 @@ class Total:
             self.is_cut |= piece.is_cut
             self.counts.update(piece.counts)
             self.counts |= Counter(piece.whole)
+            for mesh in piece.meshes:
+                self.reach(mesh)
             yield from piece.meshes
             del piece  # before the next is made
             watch.lap("write")
+
+    def reach(self, mesh: Mesh) -> None:
+        """Take a mesh into the box."""
+        if len(mesh.vertices):
+            self.low = np.minimum(self.low, mesh.vertices.min(0))
+            self.high = np.maximum(self.high, mesh.vertices.max(0))
 
 
 def describe(
@@ -198,9 +222,12 @@ def describe(
     """Say what was made."""
     closed = options.cap or not total.is_cut
     counts = {name: total.counts[name] for name in COUNTS}
+    counts["expected_triangles"] = total.expected.triangles
+    counts["expected_bytes"] = total.expected.size
     warnings = find_warnings(counts, closed)
     where = grid.shape, grid.spacing, grid.origin
-    return Conversion(*where, counts, closed, notes, warnings, seconds)
+    bounds = as_triple(total.low, "low"), as_triple(total.high, "high")
+    return Conversion(*where, counts, bounds, closed, notes, warnings, seconds)
 
 
 def find_warnings(counts: dict[str, int], closed: bool) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -49,6 +50,11 @@ def _behind_links(path: Path) -> Path:
 
 class _NameTakenError(Exception):
     """The target has appeared since it was asked for."""
+
+
+def free_space(path: Path) -> int:
+    """Return the bytes that are free where a file is to be."""
+    return shutil.disk_usage(_behind_links(path).parent).free
 
 
 @contextmanager

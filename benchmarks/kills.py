@@ -1,0 +1,148 @@
+"""Processes that are ended at random moments, and disks that fill: what is left of them.
+
+    python -m benchmarks.kills                                  # 100 SIGTERM, 100 SIGKILL, 50 full
+    python -m benchmarks.kills --kills 5 --full 5 --size 24     # in a minute
+
+Runs ``super-sdf upsample`` and ends it after a random part of the time that it takes, or lets no
+file grow beyond a random size. The target must be absent or whole, a terminated run must leave
+nothing beside it, and the next run must leave nothing but the mesh.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from super_sdf.evaluation.timing import describe_machine
+
+COMMAND = [sys.executable, "-m", "super_sdf"]
+SUFFIXES = (".ply", ".stl", ".obj", ".glb", ".3mf")
+LONG_ENOUGH = 120.0  # seconds that no run takes
+
+
+def write_ball(path: Path, size: int) -> None:
+    """Write the grid of a ball, with so many samples along each axis."""
+    ijk = np.indices((size,) * 3, dtype=np.float32)
+    distance = np.linalg.norm(ijk - np.float32(size / 2 - 0.4), axis=0) - size / 3
+    np.save(path, distance.astype(np.float32))
+
+
+class Bench:
+    """A folder with a grid, and what a run that nobody disturbs makes of it, in every format."""
+
+    def __init__(self, folder: Path, size: int) -> None:
+        self.folder, self.grid = folder / "out", folder / "grid.npy"
+        self.folder.mkdir()
+        write_ball(self.grid, size)
+        self.whole: dict[str, bytes] = {}
+        self.seconds: dict[str, float] = {}
+        for suffix in SUFFIXES:
+            start = time.perf_counter()
+            self.start(suffix).wait(LONG_ENOUGH)
+            self.seconds[suffix] = time.perf_counter() - start
+            self.whole[suffix] = self.target(suffix).read_bytes()
+            self.target(suffix).unlink()
+
+    def target(self, suffix: str) -> Path:
+        """Return the mesh's path."""
+        return self.folder / f"ball{suffix}"
+
+    def start(
+        self, suffix: str, before: Callable[[], None] | None = None
+    ) -> subprocess.Popen[bytes]:
+        """Start a run."""
+        options = ["--quality", "fast", "--quiet", "--force"]
+        words = [*COMMAND, "upsample", str(self.grid), str(self.target(suffix)), *options]
+        return subprocess.Popen(words, stderr=subprocess.PIPE, preexec_fn=before)
+
+    def faults(self, suffix: str) -> Counter[str]:
+        """Count what a disturbed run has left that it should not, then let one run to its end."""
+        target, found = self.target(suffix), Counter[str]()
+        if target.exists():
+            found["whole"] += 1
+            found["HALF-WRITTEN"] += target.read_bytes() != self.whole[suffix]
+        found["left beside"] += bool(set(os.listdir(self.folder)) - {target.name})
+        self.start(suffix).wait(LONG_ENOUGH)
+        found["LEFT AFTER THE NEXT RUN"] += os.listdir(self.folder) != [target.name]
+        found["WRONG AFTER THE NEXT RUN"] += target.read_bytes() != self.whole[suffix]
+        target.unlink()
+        return found
+
+    def kill(self, number: signal.Signals, suffix: str) -> Counter[str]:
+        """End a run by a signal at a random moment."""
+        process = self.start(suffix)
+        time.sleep(random.uniform(0, 1.05) * self.seconds[suffix])
+        process.send_signal(number)
+        _, said = process.communicate(timeout=LONG_ENOUGH)
+        codes = (0, 128 + number, -number)  # the last: before Python, or it, could do anything
+        return self.faults(suffix) + Counter(
+            {
+                "exit codes of others": process.returncode not in codes,
+                "more than a line said": said.count(b"\n") > 1,
+            }
+        )
+
+    def fill(self, suffix: str) -> Counter[str]:
+        """Let no file grow beyond a random size."""
+        most = random.randrange(len(self.whole[suffix]) + 1)
+        limit = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (most, most))
+        process = self.start(suffix, limit)
+        _, said = process.communicate(timeout=LONG_ENOUGH)
+        return self.faults(suffix) + Counter(
+            {
+                "exit codes of others": process.returncode not in (0, 1),
+                "more than a line said": said.count(b"\n") > 1,
+            }
+        )
+
+
+def tally(name: str, runs: int, once: Callable[[str], Counter[str]]) -> bool:
+    """Disturb runs of all formats in turn; print what came of it, and say if all is well."""
+    found = Counter[str]()
+    for turn in range(runs):
+        found.update(once(SUFFIXES[turn % len(SUFFIXES)]))
+    counts = ", ".join(f"{what}: {found[what]}" for what in sorted(found))
+    print(f"{name}: {runs} runs; {counts}", flush=True)
+    bad = [what for what in found if what not in ("whole", "left beside") and found[what]]
+    return not bad and not (name == "SIGTERM" and found["left beside"])
+
+
+def main() -> None:
+    """Run it all; exit code 1 if anything was half-written or left over."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--kills", type=int, default=100, help="Runs ended by each signal.")
+    parser.add_argument("--full", type=int, default=50, help="Runs on a disk that fills.")
+    parser.add_argument("--size", type=int, default=48, help="Samples along each axis.")
+    parser.add_argument("--seed", type=int, default=0, help="Of the random moments.")
+    asked = parser.parse_args()
+    random.seed(asked.seed)
+    print(describe_machine())
+    folder = Path(tempfile.mkdtemp())
+    try:
+        bench = Bench(folder, asked.size)
+        good = [
+            tally("SIGTERM", asked.kills, partial(bench.kill, signal.SIGTERM)),
+            tally("SIGKILL", asked.kills, partial(bench.kill, signal.SIGKILL)),
+            tally("full disk", asked.full, bench.fill),
+        ]
+    finally:
+        shutil.rmtree(folder)
+    sys.exit(0 if all(good) else 1)
+
+
+if __name__ == "__main__":
+    main()
