@@ -24,15 +24,15 @@ COLOUR_MAP = "magma_r"
 DPI = 72  # so that a point of type is a pixel
 
 
-def write_picture(figure: Figure, target: Path) -> None:
-    """Write a figure as PNG; the file appears whole.
+def write_picture(figure: Figure, target: Path, *, force: bool = True) -> None:
+    """Write a figure as PNG; the file appears whole, in place of an old one only by ``force``.
 
     Raises
     ------
     FileError
         If it cannot be written.
     """
-    with replacing(target) as part:
+    with replacing(target, force=force) as part:
         figure.savefig(part, format="png", dpi=figure.dpi)
 
 

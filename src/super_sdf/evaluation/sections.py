@@ -66,6 +66,7 @@ def render_section(
     axis: str = "z",
     at: float | None = None,
     size: int = 700,
+    force: bool = True,
 ) -> None:
     """Draw a cross-section of a grid, and beside it of its refinement, as a PNG file.
 
@@ -74,7 +75,7 @@ def render_section(
     grid : SdfGrid
         The samples.
     target : path
-        The file; an old one is replaced.
+        The file.
     field : FineField, optional
         What ``upsample`` made of the grid.
     axis : str
@@ -84,6 +85,8 @@ def render_section(
         nearest plane of samples.
     size : int
         Width of a panel in pixels.
+    force : bool
+        Replace a file that is there.
 
     Raises
     ------
@@ -103,7 +106,7 @@ def render_section(
     place = grid.origin[number] + grid.spacing[number] * index
     figure = _draw(sections, axis, grid.voxel_size, size)
     figure.suptitle(f"section at {axis} = {place:.4g}")
-    write_picture(figure, target)
+    write_picture(figure, target, force=force)
 
 
 def find_plane(grid: SdfGrid, axis: str = "z", at: float | None = None) -> int:
