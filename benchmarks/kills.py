@@ -1,7 +1,7 @@
 """Processes that are ended at random moments, and disks that fill: what is left of them.
 
     python -m benchmarks.kills                                  # 100 SIGTERM, 100 SIGKILL, 50 full
-    python -m benchmarks.kills --kills 5 --full 5 --size 24     # in a minute
+    python -m benchmarks.kills --terms 5 --kills 5 --full 5    # in a minute
 
 Runs ``super-sdf upsample`` and ends it after a random part of the time that it takes, or lets no
 file grow beyond a random size. The target must be absent or whole, a terminated run must leave
@@ -124,9 +124,10 @@ def tally(name: str, runs: int, once: Callable[[str], Counter[str]]) -> bool:
 def main() -> None:
     """Run it all; exit code 1 if anything was half-written or left over."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--kills", type=int, default=100, help="Runs ended by each signal.")
+    parser.add_argument("--terms", type=int, default=100, help="Runs ended by SIGTERM.")
+    parser.add_argument("--kills", type=int, default=100, help="Runs ended by SIGKILL.")
     parser.add_argument("--full", type=int, default=50, help="Runs on a disk that fills.")
-    parser.add_argument("--size", type=int, default=48, help="Samples along each axis.")
+    parser.add_argument("--size", type=int, default=24, help="Samples along each axis.")
     parser.add_argument("--seed", type=int, default=0, help="Of the random moments.")
     asked = parser.parse_args()
     random.seed(asked.seed)
@@ -135,7 +136,7 @@ def main() -> None:
     try:
         bench = Bench(folder, asked.size)
         good = [
-            tally("SIGTERM", asked.kills, partial(bench.kill, signal.SIGTERM)),
+            tally("SIGTERM", asked.terms, partial(bench.kill, signal.SIGTERM)),
             tally("SIGKILL", asked.kills, partial(bench.kill, signal.SIGKILL)),
             tally("full disk", asked.full, bench.fill),
         ]
