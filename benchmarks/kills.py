@@ -1,10 +1,11 @@
 """Processes that are ended at random moments, and disks that fill: what is left of them.
 
     python -m benchmarks.kills                                  # 100 SIGTERM, 100 SIGKILL, 50 full
-    python -m benchmarks.kills --kills 5 --full 5 --size 24     # in a minute
+    python -m benchmarks.kills --terms 5 --kills 5 --full 5    # in a minute
 
-Runs ``super-sdf upsample`` and ends it after a random part of the time that it takes, or lets no
-file grow beyond a random size. The target must be absent or whole, a terminated run must leave
+Runs ``super-sdf upsample`` and ends it after a random part of the time that it takes, every second
+run after a random part of the time from its first file on, or lets no file grow beyond a random
+size. The target must be absent or whole, a terminated run must leave
 nothing beside it, and the next run must leave nothing but the mesh.
 """
 
@@ -50,10 +51,16 @@ class Bench:
         write_ball(self.grid, size)
         self.whole: dict[str, bytes] = {}
         self.seconds: dict[str, float] = {}
+        self.writing: dict[str, float] = {}  # the seconds of these from the first file on
+        self.turn = 0
         for suffix in SUFFIXES:
             start = time.perf_counter()
-            self.start(suffix).wait(LONG_ENOUGH)
+            process = self.start(suffix)
+            self.wait_for_file(process)
+            begun = time.perf_counter()
+            process.wait(LONG_ENOUGH)
             self.seconds[suffix] = time.perf_counter() - start
+            self.writing[suffix] = time.perf_counter() - begun
             self.whole[suffix] = self.target(suffix).read_bytes()
             self.target(suffix).unlink()
 
@@ -68,6 +75,11 @@ class Bench:
         options = ["--quality", "fast", "--quiet", "--force"]
         words = [*COMMAND, "upsample", str(self.grid), str(self.target(suffix)), *options]
         return subprocess.Popen(words, stderr=subprocess.PIPE, preexec_fn=before)
+
+    def wait_for_file(self, process: subprocess.Popen[bytes]) -> None:
+        """Wait until a run has made a file, or ended."""
+        while process.poll() is None and not os.listdir(self.folder):
+            time.sleep(0.001)
 
     def faults(self, suffix: str) -> Counter[str]:
         """Count what a disturbed run has left that it should not, then let one run to its end."""
@@ -85,7 +97,11 @@ class Bench:
     def kill(self, number: signal.Signals, suffix: str) -> Counter[str]:
         """End a run by a signal at a random moment."""
         process = self.start(suffix)
-        time.sleep(random.uniform(0, 1.05) * self.seconds[suffix])
+        self.turn += 1
+        if self.turn % 2:
+            self.wait_for_file(process)
+        seconds = self.writing if self.turn % 2 else self.seconds
+        time.sleep(random.uniform(0, 1.05) * seconds[suffix])
         process.send_signal(number)
         _, said = process.communicate(timeout=LONG_ENOUGH)
         codes = (0, 128 + number, -number)  # the last: before Python, or it, could do anything
@@ -124,9 +140,10 @@ def tally(name: str, runs: int, once: Callable[[str], Counter[str]]) -> bool:
 def main() -> None:
     """Run it all; exit code 1 if anything was half-written or left over."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--kills", type=int, default=100, help="Runs ended by each signal.")
+    parser.add_argument("--terms", type=int, default=100, help="Runs ended by SIGTERM.")
+    parser.add_argument("--kills", type=int, default=100, help="Runs ended by SIGKILL.")
     parser.add_argument("--full", type=int, default=50, help="Runs on a disk that fills.")
-    parser.add_argument("--size", type=int, default=48, help="Samples along each axis.")
+    parser.add_argument("--size", type=int, default=24, help="Samples along each axis.")
     parser.add_argument("--seed", type=int, default=0, help="Of the random moments.")
     asked = parser.parse_args()
     random.seed(asked.seed)
@@ -135,7 +152,7 @@ def main() -> None:
     try:
         bench = Bench(folder, asked.size)
         good = [
-            tally("SIGTERM", asked.kills, partial(bench.kill, signal.SIGTERM)),
+            tally("SIGTERM", asked.terms, partial(bench.kill, signal.SIGTERM)),
             tally("SIGKILL", asked.kills, partial(bench.kill, signal.SIGKILL)),
             tally("full disk", asked.full, bench.fill),
         ]

@@ -128,7 +128,7 @@ def render_meshes(sources: tuple[Path, ...], target: Path, options: dict[str, An
     else:
         reference = Solid(read_mesh(options["reference"]))
         panels = [Panel(mesh, name, vertex_errors(mesh, reference)) for name, mesh in meshes]
-    chosen = {name: options[name] for name in ("colour", "up", "zoom", "size", "top")}
+    chosen = {name: options[name] for name in ("colour", "up", "zoom", "size", "top", "force")}
     with raising_interrupts():
         render_panels(panels, target, **chosen)
 
@@ -146,6 +146,6 @@ def render_grid(sources: tuple[Path, ...], target: Path, options: dict[str, Any]
     grid = read_grid(sources[0])
     find_plane(grid, options["axis"], options["at"])  # raises if there is none
     field = upsample(grid, load_network(), options["factor"])
-    chosen = {name: options[name] for name in ("axis", "at", "size")}
+    chosen = {name: options[name] for name in ("axis", "at", "size", "force")}
     with raising_interrupts():
         render_section(grid, target, field=field, **chosen)

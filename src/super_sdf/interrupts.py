@@ -82,7 +82,7 @@ def _raise(number: int, frame: FrameType | None) -> None:
 
 
 def _end(number: int, frame: FrameType | None) -> None:
-    line = f"Error: {_describe(number)}; nothing was written\n"
+    line = f"Error: {_describe(number)}\n"
     with suppress(OSError):
         os.write(2, line.encode("ascii"))
     os._exit(128 + number)

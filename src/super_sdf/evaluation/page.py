@@ -51,15 +51,15 @@ def check_page(size: int, count: int, columns: int | None = None) -> None:
     check_fits(need, what, "give a smaller size")
 
 
-def write_picture(figure: Figure, target: Path) -> None:
-    """Write a figure as PNG; the file appears whole.
+def write_picture(figure: Figure, target: Path, *, force: bool = True) -> None:
+    """Write a figure as PNG; the file appears whole, in place of an old one only by ``force``.
 
     Raises
     ------
     FileError
         If it cannot be written.
     """
-    with replacing(target) as part:
+    with replacing(target, force=force) as part:
         figure.savefig(part, format="png", dpi=figure.dpi)
 
 

@@ -111,8 +111,9 @@ def render_panels(
     top: float | None = None,
     unit: str = "",
     columns: int | None = None,
+    force: bool = True,
 ) -> None:
-    """Draw meshes side by side from one camera, as a PNG file; an old one is replaced.
+    """Draw meshes side by side from one camera, as a PNG file.
 
     Parameters
     ----------
@@ -138,6 +139,8 @@ def render_panels(
         Of the values, for the bar's title.
     columns : int, optional
         Panels in a row, at most.
+    force : bool
+        Replace a file that is there.
 
     Raises
     ------
@@ -159,7 +162,7 @@ def render_panels(
     elif colour == "error" and top is not None and len(values):
         title = f"distance to the reference ({unit})" if unit else "distance to the reference"
         page.add_bar(title, top, clipped=bool(values.max() > top))
-    write_picture(page.figure, target)
+    write_picture(page.figure, target, force=force)
 
 
 def view_axes(up: str = "z", view: tuple[float, float, float] | None = None) -> NDArray[np.float64]:

@@ -68,6 +68,7 @@ def render_section(
     axis: str = "z",
     at: float | None = None,
     size: int = 700,
+    force: bool = True,
 ) -> None:
     """Draw a cross-section of a grid, and beside it of its refinement, as a PNG file.
 
@@ -76,7 +77,7 @@ def render_section(
     grid : SdfGrid
         The samples.
     target : path
-        The file; an old one is replaced.
+        The file.
     field : FineField, optional
         What ``upsample`` made of the grid.
     axis : str
@@ -86,6 +87,8 @@ def render_section(
         nearest plane of samples.
     size : int
         Width of a panel in pixels.
+    force : bool
+        Replace a file that is there.
 
     Raises
     ------
@@ -104,7 +107,7 @@ def render_section(
     place = grid.origin[number] + grid.spacing[number] * index
     figure = _draw(sections, axis, grid.voxel_size, size)
     figure.suptitle(f"section at {axis} = {place:.4g}")
-    write_picture(figure, target)
+    write_picture(figure, target, force=force)
 
 
 def check_section(size: int) -> None:

@@ -110,4 +110,6 @@ def _lives(pid: int) -> bool:
         return False
     except OSError:
         return True  # somebody else's
+    with suppress(OSError):  # ended, though nobody has asked how yet
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     return True
