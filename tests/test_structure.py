@@ -9,15 +9,15 @@ ROOT = Path(__file__).parent.parent
 SOURCES = sorted((ROOT / "src" / "super_sdf").glob("*.py"))
 EVALUATION = sorted((ROOT / "src" / "super_sdf" / "evaluation").glob("*.py"))
 FLOORS = [
-    {"errors", "chunks", "compiling"},
-    {"memory", "cuda"},
+    {"errors", "containers", "compiling"},
+    {"memory", "cuda", "index_width", "chunks"},
     {"grid"},
     {"band", "mesh", "cell_cases", "device"},
     {"nodes", "symmetry"},
     {"field", "files", "network", "lattice"},
     {"isosurface", "border", "spheres"},
     {"survey", "kernels"},
-    {"compiled"},
+    {"compiled", "footprint"},
     {"plan"},
     {"pipeline"},
     {"convert"},

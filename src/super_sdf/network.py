@@ -35,6 +35,10 @@ INPUTS = {
     "offsets": "tensor(float)",
 }
 OUTPUT = "values"
+# What a run takes, measured, for each voxel that it sees, its row of the neighbour table included,
+# and for each value; and what it takes to average over symmetries: turned copies, and the mean.
+BYTES = {"float32": (680.0, 8.0), "int8": (950.0, 8.0)}
+TURNED_BYTES = (240.0, 4.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +71,14 @@ class Network:
         """Voxels to each side that a prediction depends on, None if the file does not say."""
         field = self.card.get("receptive_field")
         return field if isinstance(field, int) else None
+
+    @property
+    def memory_bytes(self) -> tuple[float, float]:
+        """What a run takes at most: bytes for each voxel that it sees, and for each value."""
+        voxel, value = BYTES["int8" if self.card.get("precision") == "int8" else "float32"]
+        if self.symmetries == 1:
+            return voxel, value
+        return voxel + TURNED_BYTES[0], value + TURNED_BYTES[1]
 
     def __call__(
         self, patches: FloatArray, table: IntArray, voxels: IntArray, offsets: FloatArray
