@@ -24,10 +24,12 @@ _threads: ContextVar[int] = ContextVar("threads", default=1)
 
 def count_cores() -> int:
     """Return how many cores this process may use: in a container, its share of them, rounded up."""
-    cores = (
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    )
-    return max(ceil(min(cores, bound_of_cores())), 1)
+    return max(ceil(min(cores_of_system(), bound_of_cores())), 1)
+
+
+def cores_of_system() -> int:
+    """Return how many cores the system lets this process run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def useful_threads(requested: int) -> int:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from onnxruntime import InferenceSession
 
+from .chunks import cores_of_system, useful_threads
 from .cuda import first_line
 from .device import open_session, run_bound, run_on_cpu
 from .errors import DeviceError, FileError, ModelError, OptionError
@@ -166,7 +167,7 @@ def load_network(
     device : str
         "cuda", "cpu", or "auto": CUDA where it runs, else the CPU.
     threads : int
-        CPU threads; 0 for one a core.
+        CPU threads; 0 for one a core, and never more.
     precision : str
         "float32", or "int8" for the variant in whole numbers, quicker on the CPU, where it runs.
 
@@ -184,9 +185,20 @@ def load_network(
     path, symmetries = find_model(model, precision)
     if precision == "int8":
         device = _cpu_for_int8(device)
-    opened = open_session(path, device, threads, one_voxel())
+    useful = useful_threads(threads)
+    if not threads and useful == cores_of_system():
+        useful = 0  # onnxruntime's own choice, one a physical core
+    opened = open_session(path, device, useful, one_voxel())
     card = _read_card(opened.session, path)
-    return Network(opened.session, card, opened.device, symmetries, threads, opened.notes)
+    notes = (*opened.notes, *_note_threads(threads, useful))
+    return Network(opened.session, card, opened.device, symmetries, useful, notes)
+
+
+def _note_threads(requested: int, useful: int) -> tuple[str, ...]:
+    """Return a note if fewer threads work than were asked for."""
+    if not requested or requested <= useful:
+        return ()
+    return (f"--threads {requested} is cut to {useful}, the cores that this process may use",)
 
 
 def _cpu_for_int8(device: str) -> str:
