@@ -193,7 +193,8 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--quick", action="store_true", help="a few small grids, for a check")
     asked = parser.parse_args()
     if asked.quick:
-        asked.sizes, asked.factors, asked.suffixes = [32], [2, 16], [".ply"]
+        asked.fields, asked.sizes = ["ball", "wall across x"], [24]
+        asked.factors, asked.suffixes = [2, 16], [".ply"]
         asked.sources, asked.bounds = [".npy"], ["least"]
     return asked
 
