@@ -8,7 +8,7 @@ import numpy as np
 import onnxruntime as ort
 import pytest
 
-from super_sdf import SdfGrid, plan
+from super_sdf import SdfGrid, footprint, plan
 from super_sdf.band import NEIGHBOURHOOD
 
 
@@ -77,9 +77,10 @@ def command(
 @pytest.fixture
 def bare_plan(monkeypatch):
     """Let the plan count what grows with the surface, over 100 MB, and nothing else."""
-    stages = {name: (*row[:3], 0) for name, row in plan.STAGES.items()}
-    monkeypatch.setattr(plan, "STAGES", stages)
-    monkeypatch.setattr(plan, "CODE_BYTES", 0)
+    stages = {name: (*row[:3], 0, 0) for name, row in footprint.STAGES.items()}
+    monkeypatch.setattr(footprint, "STAGES", stages)
+    monkeypatch.setattr(footprint, "NETWORK_FIXED", 0)
+    monkeypatch.setattr(footprint, "CODE_BYTES", 0)
     monkeypatch.setattr(plan, "held_memory", lambda: 10**8)
 
 

@@ -12,7 +12,7 @@ from super_sdf import SdfGrid, load_network, pipeline, plan, reconstruct
 from super_sdf.errors import OutOfMemoryError
 from super_sdf.mesh import join_meshes
 from super_sdf.pipeline import reconstruct_slabs
-from super_sdf.plan import cut, plan_slabs, slab_bytes
+from super_sdf.plan import cut, peak_bytes, plan_slabs
 from super_sdf.survey import survey
 
 
@@ -49,7 +49,7 @@ FIELDS = {
 def in_pieces(grid, network, monkeypatch, pieces, **options):
     """Reconstruct in so many slabs."""
     monkeypatch.setattr(
-        pipeline, "plan_slabs", lambda band, factor, field, bound: cut(band, pieces, field)
+        pipeline, "plan_slabs", lambda band, factor, field, *bounds: cut(band, pieces, field)
     )
     return list(reconstruct_slabs(grid, network, **options))
 
@@ -160,7 +160,7 @@ def test_the_thinnest_slabs_all_decode_something():
 
 def test_less_memory_makes_more_slabs_and_too_little_is_refused(bare_plan):
     band = survey(SdfGrid.trusted(rod(), (1.0,) * 3))
-    need = 10**8 + slab_bytes(band, plan.whole(band), 4)
+    need = peak_bytes(band, [plan.whole(band)], 4)
     assert len(plan_slabs(band, 4, 2, need)) == 1
     counts = [
         len(plan_slabs(band, 4, 2, 10**8 + int(share * (need - 10**8)))) for share in (0.9, 0.7)

@@ -9,8 +9,8 @@ ROOT = Path(__file__).parent.parent
 SOURCES = sorted((ROOT / "src" / "super_sdf").glob("*.py"))
 EVALUATION = sorted((ROOT / "src" / "super_sdf" / "evaluation").glob("*.py"))
 FLOORS = [
-    {"errors", "chunks", "compiling", "interrupts", "streams"},
-    {"memory", "cuda", "extras", "machine"},
+    {"errors", "containers", "compiling", "interrupts", "streams"},
+    {"memory", "cuda", "extras", "machine", "index_width", "chunks"},
     {"planes"},
     {"samples", "gradients"},
     {"sides", "spacing"},
@@ -21,7 +21,7 @@ FLOORS = [
     {"field", "network", "lattice"},
     {"isosurface", "border", "spheres"},
     {"survey", "kernels"},
-    {"compiled"},
+    {"compiled", "footprint"},
     {"plan", "precision", "expectation"},
     {"pipeline"},
     {"convert"},

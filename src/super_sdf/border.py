@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from .band import NEIGHBOURHOOD, neighbour_table, plane_blocks, rescale
+from .chunks import in_chunks
 from .field import FineField
 from .grid import IntArray, SdfGrid
 from .nodes import BARELY_INSIDE, BARELY_OUTSIDE, number_shared_nodes
@@ -34,8 +35,17 @@ def close_at_border(field: FineField, grid: SdfGrid, offset: float = 0.0) -> Fin
     place = np.argsort(order)
     decoded, solid = np.split(place[: len(border)], [len(known)])
     values = np.full(nodes.count, BARELY_OUTSIDE, np.float32)
-    values[nodes.numbers(solid)] = BARELY_INSIDE
-    values[nodes.numbers(decoded)] = field.values[field.nodes.numbers(rows)]
+
+    def fill(some: slice) -> None:
+        values[nodes.numbers(solid[some])] = BARELY_INSIDE
+
+    def copy(some: slice) -> None:
+        own = slice(rows.start + some.start, rows.start + some.stop)
+        values[nodes.numbers(decoded[some])] = field.values[field.nodes.numbers(own)]
+
+    width = (field.factor + 1) ** 3
+    in_chunks(len(solid), width, fill)
+    in_chunks(len(decoded), width, copy)  # after: the field's own values stay
     ends = (-1, field.shape[0] + 1)  # the outer layers go with the first slab and the last
     planes = [ends[n] if at in (0, field.shape[0]) else at for n, at in enumerate(field.planes)]
     return replace(

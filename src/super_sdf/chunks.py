@@ -10,7 +10,10 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
+from math import ceil
 from typing import TypeVar
+
+from .containers import bound_of_cores
 
 Result = TypeVar("Result")
 
@@ -20,14 +23,33 @@ _threads: ContextVar[int] = ContextVar("threads", default=1)
 
 
 def count_cores() -> int:
-    """Return how many cores this process may use."""
+    """Return how many cores this process may use: in a container, its share of them, rounded up."""
+    return max(ceil(min(cores_of_system(), bound_of_cores())), 1)
+
+
+def cores_of_system() -> int:
+    """Return how many cores the system lets this process run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def useful_threads(requested: int) -> int:
+    """Return how many threads to work with if so many are asked for, 0 for one a core.
+
+    More than there are cores would wait for each other.
+    """
+    cores = count_cores()
+    return min(requested or cores, cores)
+
+
+def threads_at_work() -> int:
+    """Return how many chunks are worked on at a time."""
+    return _threads.get()
 
 
 @contextmanager
 def working_threads(number: int) -> Iterator[None]:
     """Work on so many chunks at a time within; 0 for one a core."""
-    token = _threads.set(number or count_cores())
+    token = _threads.set(useful_threads(number))
     try:
         yield
     finally:
@@ -45,9 +67,11 @@ def in_chunks(count: int, width: int, work: Callable[[slice], Result]) -> list[R
     return side_by_side([slice(n, min(n + step, count)) for n in range(0, count, step)], work)
 
 
-def side_by_side(pieces: list[slice], work: Callable[[slice], Result]) -> list[Result]:
-    """Return what ``work`` makes of each piece."""
-    threads = min(_threads.get(), len(pieces))
+def side_by_side(
+    pieces: list[slice], work: Callable[[slice], Result], at_once: int | None = None
+) -> list[Result]:
+    """Return what ``work`` makes of each piece; of no more pieces ``at_once``, if that is given."""
+    threads = min(at_once or threads_at_work(), threads_at_work(), len(pieces))
     if threads < 2:
         return [work(piece) for piece in pieces]
     with ThreadPoolExecutor(threads) as pool:

@@ -126,7 +126,7 @@ def extract_rows(
     """See ``isosurface._extract_rows``."""
     nodes, edges = field.nodes, edges_of_block(field.factor)
     first_node = nodes.owned_before(before.start)
-    vertex_at = np.full(3 * (nodes.owned_before(rows.stop) - first_node), -1, np.int32)
+    vertex_at = np.empty(3 * (nodes.owned_before(rows.stop) - first_node), np.int32)
     shared = field.values, nodes.starts, nodes.owned, *part_of_node(field.factor)
     own = edges.axis, edges.start, edges.end, edges.part
     position = np.empty((firsts[rows.stop] - firsts[rows.start], 3))

@@ -33,7 +33,8 @@ CUDA_OPTIONS = {
 # zeroed by the system, which takes a third of the time of the network itself. After a run the arena
 # gives back what it took, for the next grid has another size; after a small one there is no need.
 SHRINK = "memory.enable_memory_arena_shrinkage"
-SMALL = 20_000  # voxels
+SMALL = 20_000  # voxels ...
+SMALL_OUTPUT = 5_000_000  # ... and values
 # An input that networks may have besides the four: how many rows of the neighbour table at a time.
 # The file's own suits a CPU's cache; a GPU waits between chunks, so that they should be large: the
 # gathered rows of this one are 27 * 64 floats each, 113 MB.
@@ -133,7 +134,7 @@ def run_on_cpu(session: ort.InferenceSession, feeds: Mapping[str, Any]) -> Float
     output = session.get_outputs()[0].name
     binding.bind_output(output, "cpu", 0, np.float32, values.shape, values.ctypes.data)
     options = ort.RunOptions()
-    if len(feeds["patches"]) > SMALL:
+    if len(feeds["patches"]) > SMALL or values.size > SMALL_OUTPUT:
         options.add_run_config_entry(SHRINK, "cpu:0")
     session.run_with_iobinding(binding, options)
     return values

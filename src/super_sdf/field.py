@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from .chunks import in_chunks
 from .grid import BoolArray, FloatArray, IntArray
-from .nodes import SharedNodes
+from .nodes import SharedNodes, part_of_node
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -66,6 +68,16 @@ class FineField:
         start, stop = np.searchsorted(self.voxel_ijk[:, 0], [first, last])
         return slice(int(start), int(stop))
 
+    def plane_before(self, rows: slice) -> slice:
+        """Return the rows of the voxels in the plane before that of a row."""
+        plane = int(self.voxel_ijk[rows.start, 0])
+        return self.rows(plane - 1, plane)
+
+    def nodes_seen_from(self, rows: slice) -> int:
+        """Return how many nodes belong to the voxels of some planes and of the plane before."""
+        first = self.nodes.owned_before(self.plane_before(rows).start)
+        return self.nodes.owned_before(rows.stop) - first
+
     def own_nodes(self) -> slice:
         """Return the nodes, rows of ``values``, that belong to voxels in ``planes``."""
         rows = self.rows(*self.planes)
@@ -87,10 +99,23 @@ class FineField:
 def border_is_crossed(field: FineField) -> bool:
     """Say whether the surface runs through the outer faces of the grid, in the field's planes."""
     core = np.arange(len(field.voxel_ijk))[field.rows(*field.planes)]
+    side = np.indices((field.factor + 1,) * 3).reshape(3, -1)
     for axis, samples in enumerate(field.shape):
         for voxel, node in ((0, 0), (samples - 1, field.factor)):
             at_face = core[field.voxel_ijk[core, axis] == voxel]
-            outer = np.moveaxis(field.inside_blocks(at_face), axis + 1, 0)[node]
-            if (outer.any((1, 2)) & ~outer.all((1, 2))).any():
+            outer = np.flatnonzero(side[axis] == node)
+            if _any_is_crossed(field, at_face, outer):
                 return True
     return False
+
+
+def _any_is_crossed(field: FineField, rows: IntArray, block_nodes: NDArray[np.intp]) -> bool:
+    """Say whether in any of some voxels' blocks some of these nodes are inside, and others not."""
+    part, place = (array[block_nodes] for array in part_of_node(field.factor))
+
+    def crossed(chunk: slice) -> bool:
+        numbers = field.nodes.starts[rows[chunk]][:, part] + place
+        inside = field.values[numbers] <= 0
+        return bool((inside.any(1) & ~inside.all(1)).any())
+
+    return any(in_chunks(len(rows), len(block_nodes), crossed))

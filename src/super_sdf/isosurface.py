@@ -20,11 +20,12 @@ from numpy.typing import NDArray
 
 from .band import NEIGHBOURHOOD, STRIDES
 from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, triangle_table
-from .chunks import in_chunks, rows_in_chunk, side_by_side
+from .chunks import in_chunks, rows_in_chunk, side_by_side, threads_at_work
 from .compiling import compiled_twin
 from .errors import GridError, OptionTypeError, seen
 from .field import FineField
 from .grid import BoolArray, FloatArray, IntArray, SdfGrid
+from .index_width import check_count
 from .mesh import Mesh, join_meshes
 from .nodes import block_ijk, part_of_node
 from .options import check_grid
@@ -32,6 +33,8 @@ from .options import check_grid
 # A vertex keeps this share of its lattice edge from either end: where a node's value is 0 several
 # vertices would otherwise fall together, and programs that merge such points would tear the mesh.
 CLEARANCE = 1e-3
+# Of each node, where the vertices on the edges that begin there are looked up: three numbers.
+LOOKUP_BYTES = 12
 # Nodes beyond the grid's border (a closed surface, see border.close_at_border) lie this far out, in
 # fine spacings: enough for distinct vertices.
 CAP_HEIGHT = 0.02
@@ -52,14 +55,32 @@ def extract_mesh(field: FineField, grid: SdfGrid, first_vertex: int = 0) -> Mesh
 
 
 def extract_pieces(field: FineField, grid: SdfGrid, first_vertex: int = 0) -> list[Mesh]:
-    """Return the mesh of ``extract_mesh`` in pieces, at least one, as they are made."""
+    """Return the mesh of ``extract_mesh`` in pieces, at least one, as they are made.
+
+    Raises
+    ------
+    OptionError
+        If there are more vertices than can be numbered, those before among them.
+    """
     times = count_vertices(field)
     core = field.rows(*field.planes)
     ends = np.cumsum(times, dtype=np.int64)
     before = int(ends[core.start - 1]) if core.start else 0
     firsts = np.append(0, ends) + (first_vertex - before)
-    parts = side_by_side(_groups(field), lambda rows: _extract_group(field, grid, firsts, rows))
+    check_count(int(firsts[core.stop]), "vertices", field.factor)
+    groups = _groups(field)
+    at_once = lookups_at_once(field.nodes.count, max(map(field.nodes_seen_from, groups), default=0))
+    parts = side_by_side(groups, lambda rows: _extract_group(field, grid, firsts, rows), at_once)
     return parts or [Mesh(_to_world(np.empty((0, 3)), field, grid), np.empty((0, 3), np.int32))]
+
+
+def lookups_at_once(nodes: int, widest: int) -> int:
+    """Return for how many groups of planes at a time vertices are looked up, if so many threads.
+
+    A plane may hold the whole surface. Tables of ``widest`` nodes, one a thread, take at most twice
+    what the values of all nodes take, or one thread does all.
+    """
+    return max(min(8 * nodes // max(LOOKUP_BYTES * widest, 1), threads_at_work()), 1)
 
 
 def count_vertices(field: FineField) -> IntArray:
@@ -132,8 +153,7 @@ def _own_edges(field: FineField, rows: slice | IntArray) -> BoolArray:
 def _extract_group(field: FineField, grid: SdfGrid, firsts: NDArray[np.int64], rows: slice) -> Mesh:
     """Return the vertices and triangles of some whole planes of voxels."""
     extract = compiled_twin(_extract_rows)
-    plane = int(field.voxel_ijk[rows.start, 0])
-    position, faces = extract(field, firsts, field.rows(plane - 1, plane), rows)
+    position, faces = extract(field, firsts, field.plane_before(rows), rows)
     return Mesh(_to_world(position, field, grid), faces)
 
 
@@ -148,18 +168,28 @@ def _extract_rows(
     """
     first_node = field.nodes.owned_before(before.start)
     nodes = field.nodes.owned_before(rows.stop) - first_node
-    vertex_at = np.full(3 * nodes, -1, np.int32)
-    for some in (before, rows):
+    vertex_at = np.empty(3 * nodes, np.int32)  # what is not set is not read
+    positions = []
+    for some in (*_chunks(field, before), *_chunks(field, rows)):
         voxel, edge = np.nonzero(_own_edges(field, some))
         voxel += some.start
         own = np.arange(len(voxel)) - np.searchsorted(voxel, voxel)  # the voxel's first is 0
         start, end = _ends(field, voxel, edge)
         axis = edges_of_block(field.factor).axis[edge]
         near = start >= first_node  # not on the far side of the plane before
-        at = 3 * (start - first_node) + axis
+        at = _lattice_edges(start, first_node) + axis
         vertex_at[at[near]] = (firsts[voxel] + own)[near]
-    position = _positions(field, voxel, edge, field.values[start], field.values[end])
-    return position, _triangles(field, rows, vertex_at, first_node)
+        if some.start >= rows.start:
+            values = field.values[start], field.values[end]
+            positions.append(_positions(field, voxel, edge, *values))
+    faces = [_triangles(field, some, vertex_at, first_node) for some in _chunks(field, rows)]
+    return np.concatenate(positions), np.concatenate(faces)
+
+
+def _chunks(field: FineField, rows: slice) -> list[slice]:
+    """Cut rows so that what is made of each chunk stays small, where a plane has many voxels."""
+    step = rows_in_chunk(4 * (field.factor + 1) ** 3)
+    return [slice(n, min(n + step, rows.stop)) for n in range(rows.start, rows.stop, step)]
 
 
 def _ends(
@@ -224,9 +254,15 @@ def _triangles(field: FineField, rows: slice, vertex_at: IntArray, first_node: i
     block_node = low_node[of_triangle, None] + start[edges]
     part, place = part_of_node(factor)
     starts = field.nodes.starts[rows]
-    node = starts[voxel[of_triangle, None], part[block_node]] + place[block_node] - first_node
-    faces: IntArray = vertex_at[3 * node + np.array(EDGE_AXIS)[edges]]
+    node = starts[voxel[of_triangle, None], part[block_node]] + place[block_node]
+    faces: IntArray = vertex_at[_lattice_edges(node, first_node) + np.array(EDGE_AXIS)[edges]]
     return faces
+
+
+def _lattice_edges(node: IntArray, first_node: int) -> NDArray[np.int64]:
+    """Return where the edges that begin at nodes are looked up: 32 bits are too few for that."""
+    at: NDArray[np.int64] = 3 * (node.astype(np.int64) - first_node)
+    return at
 
 
 def _low_nodes(cell: NDArray[np.int64], factor: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -24,7 +24,7 @@ def wake():
 @compiled
 def number_parts(table, sizes, sharers, seen, first_sharer, starts, owned):
     """Number the parts of blocks; return how many nodes there are."""
-    count = np.int32(0)
+    count = np.int64(0)
     for voxel in range(len(table)):
         for part in range(27):
             for at in range(first_sharer[part], first_sharer[part + 1]):

@@ -6,6 +6,7 @@ import ctypes
 from contextlib import suppress
 from pathlib import Path
 
+from .containers import left_memory
 from .errors import OutOfMemoryError
 
 # Of the memory that is free, what is taken unless told otherwise.
@@ -26,18 +27,8 @@ def free_memory() -> int | None:
     if "MemAvailable" not in sizes:
         return None
     free = int(sizes["MemAvailable"].split()[0]) * 1024
-    left = _left_in_container()
+    left = left_memory()
     return free if left is None else min(free, left)
-
-
-def _left_in_container() -> int | None:
-    """Return what a Linux control group lets this process still take, None without a bound."""
-    group = Path("/sys/fs/cgroup")
-    try:
-        bound, used = ((group / f"memory.{name}").read_text() for name in ("max", "current"))
-        return max(int(bound) - int(used), 0)
-    except (OSError, ValueError):  # no such group, or its bound is the word "max"
-        return None
 
 
 def memory_bound(max_memory: int | None = None) -> int | None:

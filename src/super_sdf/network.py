@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from onnxruntime import InferenceSession
 
+from .chunks import cores_of_system, useful_threads
 from .cuda import first_line
 from .device import open_session, run_bound, run_on_cpu
 from .errors import DeviceError, FileError, ModelError, OptionError
@@ -38,6 +39,10 @@ INPUTS = {
     "offsets": "tensor(float)",
 }
 OUTPUT = "values"
+# What a run takes, measured, for each voxel that it sees, its row of the neighbour table included,
+# and for each value; and what it takes to average over symmetries: turned copies, and the mean.
+BYTES = {"float32": (680.0, 8.0), "int8": (950.0, 8.0)}
+TURNED_BYTES = (240.0, 4.0)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -77,6 +82,14 @@ class Network:
         """Voxels to each side that a prediction depends on, None if the file does not say."""
         field = self.card.get("receptive_field")
         return field if isinstance(field, int) else None
+
+    @property
+    def memory_bytes(self) -> tuple[float, float]:
+        """What a run takes at most: bytes for each voxel that it sees, and for each value."""
+        voxel, value = BYTES["int8" if self.card.get("precision") == "int8" else "float32"]
+        if self.symmetries == 1:
+            return voxel, value
+        return voxel + TURNED_BYTES[0], value + TURNED_BYTES[1]
 
     def __call__(
         self, patches: FloatArray, table: IntArray, voxels: IntArray, offsets: FloatArray
@@ -164,7 +177,7 @@ def load_network(
     device : str
         "cuda", "cpu", or "auto": CUDA where it runs, else the CPU.
     threads : int
-        CPU threads; 0 for one a core.
+        CPU threads; 0 for one a core, and never more.
     precision : str
         "float32", or "int8" for the variant in whole numbers, quicker on the CPU, where it runs.
 
@@ -184,9 +197,20 @@ def load_network(
     path, symmetries = find_model(model, precision)
     if precision == "int8":
         device = _cpu_for_int8(device)
-    opened = open_session(path, device, threads, one_voxel())
+    useful = useful_threads(threads)
+    if not threads and useful == cores_of_system():
+        useful = 0  # onnxruntime's own choice, one a physical core
+    opened = open_session(path, device, useful, one_voxel())
     card = _read_card(opened.session, path)
-    return Network(opened.session, card, opened.device, symmetries, threads, opened.notes)
+    notes = (*opened.notes, *_note_threads(threads, useful))
+    return Network(opened.session, card, opened.device, symmetries, useful, notes)
+
+
+def _note_threads(requested: int, useful: int) -> tuple[str, ...]:
+    """Return a note if fewer threads work than were asked for."""
+    if not requested or requested <= useful:
+        return ()
+    return (f"--threads {requested} is cut to {useful}, the cores that this process may use",)
 
 
 def _cpu_for_int8(device: str) -> str:

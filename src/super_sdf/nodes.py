@@ -24,6 +24,7 @@ from .chunks import in_chunks
 from .compiling import compiled_twin
 from .errors import OptionError, OptionTypeError, seen
 from .grid import BoolArray, FloatArray, IntArray
+from .index_width import check_count
 
 Signs = NDArray[np.int8]
 
@@ -122,24 +123,36 @@ class SharedNodes:
 
 
 def number_shared_nodes(table: IntArray, factor: int) -> SharedNodes:
-    """Number the nodes of all blocks of voxels whose neighbours among themselves are given."""
+    """Number the nodes of all blocks of voxels whose neighbours among themselves are given.
+
+    Raises
+    ------
+    OptionError
+        If there are more than can be numbered.
+    """
     sizes = np.array([len(nodes) for nodes in nodes_of_part(factor)], np.int32)
     starts, owned, count = compiled_twin(_number_parts)(table, sizes)
+    check_count(count, "nodes in a slab", factor)
     return SharedNodes(factor, table, starts, owned, count)
 
 
 def _number_parts(table: IntArray, sizes: IntArray) -> tuple[IntArray, BoolArray, int]:
-    """Return ``starts``, ``owned`` and ``count`` for parts of so many nodes each."""
+    """Return ``starts``, ``owned`` and ``count`` for parts of so many nodes each.
+
+    If ``count`` is more than 32 bits hold, ``starts`` is of no use.
+    """
     owned = np.stack([(table[:, sharing[sharing < CENTRE]] < 0).all(1) for sharing in SHARING], 1)
-    ends = np.cumsum((owned * sizes).ravel(), dtype=np.int32).reshape(table.shape)
-    own_starts = ends - owned * sizes
+    own_sizes = owned * sizes
+    own_starts = np.cumsum(own_sizes.ravel(), dtype=np.int32).reshape(table.shape)
+    own_starts -= own_sizes
+    del own_sizes
     starts = np.empty_like(own_starts)
     for part, sharing in enumerate(SHARING):
         first = sharing[(table[:, sharing] >= 0).argmax(1)]
         as_part = np.array([seen_from(part, neighbour) for neighbour in range(27)])[first]
         owner = np.take_along_axis(table, first[:, None], 1)[:, 0]
         starts[:, part] = own_starts[owner, as_part]
-    return starts, owned, int(ends.flat[-1]) if ends.size else 0
+    return starts, owned, int(owned.sum(0, dtype=np.int64) @ sizes)
 
 
 def average_shared(blocks: FloatArray, nodes: SharedNodes) -> FloatArray:

@@ -22,6 +22,7 @@ from .border import close_at_border
 from .chunks import working_threads
 from .compiling import use_compiled
 from .field import FineField, border_is_crossed
+from .footprint import NETWORK_BYTES
 from .grid import FloatArray, IntArray, SdfGrid
 from .isosurface import extract_pieces, vertex_type
 from .memory import hold_less, memory_bound
@@ -62,6 +63,7 @@ class Decoder(Protocol):
     """What the pipeline asks of a network: see ``network.Network``.
 
     If it has a ``receptive_field`` (voxels to each side), it need not see the whole band at once.
+    Its ``memory_bytes`` say what it takes: see ``footprint.slab_bytes``.
     """
 
     def __call__(
@@ -119,7 +121,7 @@ def upsample(
     factor, offset = check_factor(factor), check_distance(offset)
     with working_threads(getattr(network, "threads", 0)):
         band = find_surface(grid, factor, offset, memory_bound())
-        (slab,) = plan_slabs(band, factor, None, memory_bound())
+        (slab,) = plan_slabs(band, factor, None, memory_bound(), bytes_of(network))
         steps = Steps(progress, slabs=1)
         field = refine(band, network, factor, slab, steps)
     if len(field.signs()) < 2:
@@ -217,8 +219,9 @@ def _slabs(
     bound = memory_bound(max_memory)
     with working_threads(threads):
         band = find_surface(grid, factor, offset, bound)
-        slabs = plan_slabs(band, factor, getattr(network, "receptive_field", None), bound)
-        planned = {"slabs": len(slabs), "planned_bytes": peak_bytes(band, slabs, factor)}
+        field, taken = getattr(network, "receptive_field", None), bytes_of(network)
+        slabs = plan_slabs(band, factor, field, bound, taken)
+        planned = {"slabs": len(slabs), "planned_bytes": peak_bytes(band, slabs, factor, taken)}
     steps = Steps(progress, len(slabs))
     vertices = 0
     seen: set[bool] = set()
@@ -238,6 +241,12 @@ def _slabs(
         del piece  # before the next is made
     if len(seen) < 2:
         raise no_surface(grid, offset)
+
+
+def bytes_of(network: Decoder) -> tuple[float, float]:
+    """Return what a network takes for each voxel that it sees, and for each value."""
+    taken: tuple[float, float] = getattr(network, "memory_bytes", NETWORK_BYTES)
+    return taken
 
 
 class Steps:

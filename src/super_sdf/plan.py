@@ -16,25 +16,15 @@ from itertools import pairwise
 
 import numpy as np
 
-from .compiling import is_loaded
+from . import index_width
 from .errors import OutOfMemoryError
+from .footprint import NETWORK_BYTES, slab_bytes
 from .memory import held_memory, hold_less, in_words
 from .spheres import REACH_IN_VOXELS
 from .survey import Band
 
 FINAL_BESIDE = 1
 DECODED_BESIDE = FINAL_BESIDE + REACH_IN_VOXELS
-# What a process takes at the most in each stage, measured (``benchmarks.large``), in bytes: for
-# each voxel that the network sees, for each that is decoded, for each node of a decoded block, and
-# for chunks in work, whatever the grid.
-STAGES = {
-    "network": (680, 0, 8.0, 5e6),
-    "average": (108, 375, 7.2, 2e7),
-    "fit": (108, 850, 3.3, 2e7),
-    "isosurface": (108, 140, 5.7, 2e7),
-}
-# Compiled functions, which come from the disk as they are called.
-CODE_BYTES = 60_000_000
 
 
 @dataclass(frozen=True)
@@ -62,9 +52,13 @@ def whole(band: Band) -> Slab:
 
 
 def plan_slabs(
-    band: Band, factor: int, receptive_field: int | None, bound: int | None
+    band: Band,
+    factor: int,
+    receptive_field: int | None,
+    bound: int | None,
+    network_bytes: tuple[float, float] = NETWORK_BYTES,
 ) -> list[Slab]:
-    """Return the fewest slabs that fit, in order.
+    """Return the fewest slabs that fit, in order, and whose nodes can be numbered.
 
     Parameters
     ----------
@@ -77,31 +71,67 @@ def plan_slabs(
         must see the whole band at once.
     bound : int, optional
         Bytes that the process may hold in all: see ``memory.memory_bound``.
+    network_bytes : two floats
+        What the network takes: see ``footprint.slab_bytes``.
 
     Raises
     ------
     OutOfMemoryError
         If the thinnest slabs do not fit.
+    OptionError
+        If they have more nodes than can be numbered, or the mesh more vertices, as far as that can
+        be said.
     """
-    if receptive_field is None:
-        need = peak_bytes(band, [whole(band)], factor)
-        if bound is not None and need > bound:
-            raise _does_not_fit(band, factor, "at once", need, bound)
-        return [whole(band)]
-    if bound is None or peak_bytes(band, [whole(band)], factor) <= bound:
-        return [whole(band)]
-    hold_less()  # else what was freed counts as held
-    for slabs in ways_to_cut(band, receptive_field):
-        need = peak_bytes(band, slabs, factor)
-        if need <= bound:
+    check_vertices(band, factor)
+    how = "at once" if receptive_field is None else "even plane by plane"
+    for nth, slabs in enumerate(_ways(band, receptive_field)):
+        if nth == 1:
+            hold_less()  # else what was freed counts as held
+        need = peak_bytes(band, slabs, factor, network_bytes)
+        nodes = most_nodes(band, slabs, factor)
+        fits = bound is None or need <= bound
+        if fits and nodes <= index_width.LARGEST:
             return slabs
-    raise _does_not_fit(band, factor, "even plane by plane", need, bound)
+    index_width.check_count(nodes, f"nodes {how}", factor)
+    raise _does_not_fit(band, factor, how, need, bound or 0)
 
 
-def peak_bytes(band: Band, slabs: list[Slab], factor: int) -> int:
+def _ways(band: Band, receptive_field: int | None) -> Iterator[list[Slab]]:
+    """Yield the whole band, and if the network need not see it at once, more and more slabs."""
+    yield [whole(band)]
+    if receptive_field is not None:
+        yield from ways_to_cut(band, receptive_field)
+
+
+def check_vertices(band: Band, factor: int) -> None:
+    """Raise if the mesh will surely have more vertices than can be numbered.
+
+    The surface crosses K^2 times as many edges of the fine lattice as between samples, about; only
+    far more than can be numbered are refused before they are counted.
+    """
+    if int(band.decoded_before[-1]) * 3 * factor**3 > index_width.LARGEST:
+        check_count = index_width.check_count
+        check_count(band.count_crossings() * factor**2 // 2, "vertices, at the least", factor)
+
+
+def most_nodes(band: Band, slabs: list[Slab], factor: int) -> int:
+    """Return how many nodes the blocks of a slab have at the most, shared ones as often."""
+    return max(band.count_decoded(slab.decoded) for slab in slabs) * (factor + 1) ** 3
+
+
+def peak_bytes(
+    band: Band,
+    slabs: list[Slab],
+    factor: int,
+    network_bytes: tuple[float, float] = NETWORK_BYTES,
+) -> int:
     """Return what the process will hold at the most: now, and for the largest slab."""
     held = held_memory() or band.patches.nbytes
-    return held + max(slab_bytes(band, slab, factor) for slab in slabs)
+    needs = (
+        slab_bytes(band, slab.seen, slab.decoded, slab.planes, factor, network_bytes)
+        for slab in slabs
+    )
+    return held + max(needs)
 
 
 def cut(band: Band, pieces: int, receptive_field: int) -> list[Slab]:
@@ -126,14 +156,6 @@ def _slab(band: Band, first: int, last: int, receptive_field: int) -> Slab:
     decoded = band.rows(first - DECODED_BESIDE, last + DECODED_BESIDE)
     beside = DECODED_BESIDE + receptive_field
     return Slab((first, last), decoded, band.rows(first - beside, last + beside))
-
-
-def slab_bytes(band: Band, slab: Slab, factor: int) -> int:
-    """Return what a process takes for a slab beside what it holds already, at the most."""
-    seen = slab.seen.stop - slab.seen.start
-    decoded = band.count_decoded(slab.decoded)
-    sizes = np.array([seen, decoded, decoded * (factor + 1) ** 3, 1])
-    return CODE_BYTES * is_loaded() + int((np.array(list(STAGES.values())) @ sizes).max())
 
 
 def _does_not_fit(band: Band, factor: int, how: str, need: int, bound: int) -> OutOfMemoryError:

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .band import (
+    CENTRE,
+    STRIDES,
     can_hold_surface,
     find_band,
     gather_patches,
@@ -23,7 +25,7 @@ from .band import (
 from .chunks import side_by_side
 from .errors import NoSurfaceError, OutOfMemoryError
 from .grid import BoolArray, FloatArray, IntArray, SdfGrid
-from .memory import in_words
+from .memory import held_memory, in_words
 from .offsets import Jumps, check_not_cut_off, check_not_filled, find_jumps
 from .spheres import exact_samples
 
@@ -82,6 +84,14 @@ class Band:
         first, last = np.searchsorted(self.seen_before, [rows.start, rows.stop])
         return int(self.decoded_before[last] - self.decoded_before[first])
 
+    def count_crossings(self) -> int:
+        """Return between how many samples and their next along an axis the surface passes."""
+        inside = self.patches[:, CENTRE] <= 0
+        return sum(
+            int(np.count_nonzero(inside != (self.patches[:, CENTRE + step] <= 0)))
+            for step in STRIDES
+        )
+
     def network_inputs(
         self, seen: slice | None = None, decoded: slice | None = None
     ) -> tuple[FloatArray, IntArray, IntArray]:
@@ -117,11 +127,12 @@ def survey(grid: SdfGrid, offset: float = 0.0, bound: int | None = None) -> Band
     """
     sizes: list[int] = []
     jumps: list[tuple[Jumps, Jumps]] = []
+    held = held_memory() or 0
 
     def read(planes: slice) -> tuple[IntArray, FloatArray]:
         found = _band_of_planes(grid, offset, planes.start, planes.stop, jumps)
         sizes.append(len(found[0]))
-        _check_bound(sum(sizes), planes.stop, bound)
+        _check_bound(sum(sizes), planes.stop, held, bound)
         return found
 
     parts = side_by_side([slice(*block) for block in plane_blocks(grid.shape)], read)
@@ -135,13 +146,17 @@ def survey(grid: SdfGrid, offset: float = 0.0, bound: int | None = None) -> Band
     return describe(grid.shape, voxel_ijk, _joined(patches))
 
 
-def _check_bound(voxels: int, planes: int, bound: int | None) -> None:
-    """Raise if so many voxels of the band do not fit in the bound."""
-    if bound is not None and voxels * BYTES_PER_VOXEL > bound:
+def _check_bound(voxels: int, planes: int, held: int, bound: int | None) -> None:
+    """Raise if so many voxels of the band do not fit in what of the bound is not held already.
+
+    If that is nothing, the band is not at fault unless it is larger than the bound by itself.
+    """
+    need = voxels * BYTES_PER_VOXEL
+    if bound is not None and need > (bound - held if held < bound else bound):
         raise OutOfMemoryError(
             f"the band of the first {planes:,} planes has {voxels:,} voxels already, which alone "
-            f"take {in_words(voxels * BYTES_PER_VOXEL)} of memory, {in_words(bound)} may "
-            "be taken; is this a distance field? If so, allow more (--max-memory)"
+            f"take {in_words(need)} of memory, {in_words(bound)} may be taken in all; is this a "
+            "distance field? If so, allow more (--max-memory)"
         )
 
 

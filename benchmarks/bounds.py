@@ -1,0 +1,245 @@
+"""Whether a conversion keeps within ``--max-memory``: peak of the process against the bound.
+
+    python -m benchmarks.bounds --sizes 128 --factors 2 4
+    python -m benchmarks.bounds --fields gyroid "wall across x" --precisions int8 --code numpy
+    python -m benchmarks.bounds --quick
+    python -m benchmarks.bounds --mesh fandisk.ply
+
+Every conversion is a process of its own, start, files and libraries included, and its peak is what
+the system says when it has ended. Two bounds are tried: a share of what the plan says without one,
+and the least that the plan accepts. Ends with 1 if a peak is more than 1.05 of its bound.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from super_sdf.evaluation.timing import LAUNCHER, describe_machine, run_command
+
+FIELDS = ("ball", "gyroid", "wall across x", "wall across z")
+SUFFIXES = (".ply", ".stl", ".obj")
+CODE = {"numpy": "0", "numba": "1"}
+SHARE = 0.6
+ALLOWED = 1.05
+LARGEST = 4_000_000_000  # bytes planned: what needs more in the least is left out
+
+# What the plan says of the whole grid at once and of its thinnest slabs, asked in a process that
+# holds what the command would hold.
+PLAN = """
+import sys
+from super_sdf import load_network
+from super_sdf.files.grids import read_grid
+from super_sdf.pipeline import find_surface
+from super_sdf.plan import peak_bytes, ways_to_cut, whole
+
+path, factor, precision = sys.argv[1:]
+network = load_network(precision=precision, device="cpu")
+grid = read_grid(path, spacing=1.0)
+band = find_surface(grid, int(factor), 0.0, None)
+*_, thinnest = ways_to_cut(band, network.receptive_field)
+for slabs in ([whole(band)], thinnest):
+    print(peak_bytes(band, slabs, int(factor), network.memory_bytes))
+"""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A conversion: what of, and how."""
+
+    field: str
+    size: int
+    factor: int
+    precision: str
+    code: str
+    suffix: str
+    source: str
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a conversion took: seconds and bytes, or why it was refused."""
+
+    seconds: float
+    peak: int
+    said: dict[str, int]
+    refusal: str = ""
+
+
+def values_of(field: str, n: int) -> Iterator[NDArray[np.float32]]:
+    """Yield the planes of a field of n samples along each axis, spacing 1."""
+    at = np.arange(n) - n / 2 + 0.63
+    y, z = at[:, None], at[None, :]
+    for x in at:
+        if field == "ball":
+            plane = np.sqrt(x**2 + y**2 + z**2) - 0.4 * n
+        elif field == "gyroid":
+            plane = gyroid(x, y, z, 8 * np.pi / n)
+        elif field == "wall across x":
+            plane = np.full((n, n), abs(x) - 1.7)
+        else:
+            plane = np.broadcast_to(np.abs(z) - 1.7, (n, n))
+        yield plane.astype(np.float32)
+
+
+def gyroid(
+    x: float, y: NDArray[np.float64], z: NDArray[np.float64], turn: float
+) -> NDArray[np.float64]:
+    """Return about the distance to a gyroid, cut off at 3 samples; ``turn`` is radians a sample."""
+    sines, cosines = zip(*((np.sin(turn * axis), np.cos(turn * axis)) for axis in (x, y, z)))
+    value = sum(sines[a] * cosines[(a + 1) % 3] for a in range(3))
+    slopes = [cosines[a] * cosines[(a + 1) % 3] - sines[a - 1] * sines[a] for a in range(3)]
+    slope = np.sqrt(sum(slope**2 for slope in slopes))
+    distance: NDArray[np.float64] = np.clip(value / (turn * np.maximum(slope, 0.5)), -3, 3)
+    return distance
+
+
+def write_grids(field: str, n: int, folder: Path) -> None:
+    """Write a field as ``.npy`` and ``.npz``."""
+    array = np.lib.format.open_memmap(folder / "grid.npy", "w+", np.float32, (n, n, n))
+    for plane, values in zip(array, values_of(field, n)):
+        plane[:] = values
+    array.flush()
+    np.savez(folder / "grid.npz", values=array)
+
+
+def sample_mesh(mesh: Path, n: int, folder: Path) -> None:
+    """Write the grids of a mesh, box diagonal 1 in the unit cube, in units of a sample."""
+    words = ["sample", str(mesh), str(folder / "cube.npz"), "-n", str(n), "--frame", "unit"]
+    run_command([*words, "--force", "--quiet"])
+    values = (np.load(folder / "cube.npz")["values"] * n).astype(np.float32)
+    np.save(folder / "grid.npy", values)
+    np.savez(folder / "grid.npz", values=values)
+
+
+def run_python(words: list[str], code: str) -> tuple[str, str]:
+    """Run Python with or without numba; return what it printed, stdout and stderr."""
+    command = [sys.executable, "-c", LAUNCHER, *words]
+    environment = os.environ | {"SUPER_SDF_COMPILED": CODE[code]}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    return done.stdout.rstrip("\n"), done.stderr
+
+
+def plan(case: Case, folder: Path) -> tuple[int, int]:
+    """Return the planned bytes of the whole grid, and of its thinnest slabs."""
+    path = folder / f"grid{case.source}"
+    words = ["-c", PLAN, str(path), str(case.factor), case.precision]
+    printed, errors = run_python(words, case.code)
+    whole, thinnest, *_ = printed.splitlines()
+    if not whole:
+        raise SystemExit(errors)
+    return int(whole), int(thinnest)
+
+
+def convert(case: Case, folder: Path, bound: int) -> Run:
+    """Convert under a bound, in bytes."""
+    target = folder / f"mesh{case.suffix}"
+    words = ["-m", "super_sdf.cli", "upsample", str(folder / f"grid{case.source}"), str(target)]
+    words += ["--spacing", "1", "--force", "--json", "--quiet", "--device", "cpu"]
+    words += ["--factor", str(case.factor), "--precision", case.precision]
+    printed, errors = run_python([*words, "--max-memory", str(bound)], case.code)
+    printed, _, last = printed.rpartition("\n")
+    status, seconds, peak = last.split()
+    peak_bytes = int(peak) * (1 if sys.platform == "darwin" else 1024)
+    if int(status):
+        return Run(float(seconds), peak_bytes, {}, errors.strip().rpartition("\n")[2])
+    return Run(float(seconds), peak_bytes, json.loads(printed))
+
+
+def row(case: Case, name: str, bound: int, run: Run) -> str:
+    """Return a row of the table."""
+    what = [case.field, f"{case.size}^3", case.factor, case.precision, case.code]
+    cells = [*what, f"{case.source} to {case.suffix}", name, f"{bound / 1e6:,.0f}"]
+    if run.refusal:
+        cells += ["refused", "", f"{run.peak / 1e6:,.0f}", "", f"{run.seconds:.1f}"]
+    else:
+        planned = f"{run.said['planned_bytes'] / 1e6:,.0f}"
+        share = f"{run.peak / bound:.2f}"
+        cells += [run.said["slabs"], planned, f"{run.peak / 1e6:,.0f}", share, f"{run.seconds:.1f}"]
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def bounds_of(whole: int, thinnest: int, share: float, names: list[str]) -> dict[str, int]:
+    """Return the bounds to try, in bytes, by name; plans differ a little from run to run."""
+    least = int(1.02 * thinnest) + 1_000_000
+    bounds = {"share": max(int(share * whole), least), "least": least}
+    return {name: bounds[name] for name in names}
+
+
+def parse() -> argparse.Namespace:
+    """Return what was asked."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--fields", nargs="*", choices=FIELDS, default=FIELDS)
+    parser.add_argument("--mesh", type=Path, nargs="*", default=[], help="files to sample")
+    parser.add_argument("--sizes", type=int, nargs="+", default=[128, 256])
+    parser.add_argument("--factors", type=int, nargs="+", default=[2, 4, 16])
+    parser.add_argument("--precisions", nargs="+", default=["float32", "int8"])
+    parser.add_argument("--code", nargs="+", choices=CODE, default=list(CODE))
+    parser.add_argument("--suffixes", nargs="+", default=SUFFIXES)
+    parser.add_argument("--sources", nargs="+", choices=[".npy", ".npz"], default=[".npy", ".npz"])
+    parser.add_argument("--bounds", nargs="+", choices=["share", "least"], default=["share"])
+    parser.add_argument("--share", type=float, default=SHARE)
+    parser.add_argument("--quick", action="store_true", help="a few small grids, for a check")
+    asked = parser.parse_args()
+    if asked.quick:
+        asked.fields, asked.sizes = ["ball", "wall across x"], [24]
+        asked.factors, asked.suffixes = [2, 16], [".ply"]
+        asked.sources, asked.bounds = [".npy"], ["least"]
+    return asked
+
+
+def cases(asked: argparse.Namespace, field: str, size: int) -> Iterator[Case]:
+    """Yield what is to be tried on a grid."""
+    for choice in product(
+        asked.factors, asked.precisions, asked.code, asked.suffixes, asked.sources
+    ):
+        yield Case(field, size, *choice)
+
+
+def main() -> None:
+    """Print the machine and a Markdown table."""
+    asked, over = parse(), []
+    print(f"{describe_machine()}; MB\n")
+    print(
+        "| grid | size | factor | precision | code | files | bound | MB | slabs | planned | peak | "
+        "of the bound | s |\n| --- | ---: | ---: |" + " --- |" * 4 + " ---: |" * 6
+    )
+    fields = [(name, None) for name in asked.fields] + [(mesh.stem, mesh) for mesh in asked.mesh]
+    for (field, mesh), size in product(fields, asked.sizes):
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            sample_mesh(mesh, size, folder) if mesh else write_grids(field, size, folder)
+            for case in cases(asked, field, size):
+                over += try_bounds(case, folder, asked)
+    if over:
+        raise SystemExit("over the bound:\n" + "\n".join(over))
+
+
+def try_bounds(case: Case, folder: Path, asked: argparse.Namespace) -> list[str]:
+    """Print a row for each bound; return those that are over it."""
+    whole, thinnest = plan(case, folder)
+    if thinnest > LARGEST:
+        return []
+    over = []
+    for name, bound in bounds_of(whole, thinnest, asked.share, asked.bounds).items():
+        run = convert(case, folder, bound)
+        line = row(case, name, bound, run)
+        print(line, flush=True)
+        if run.peak > ALLOWED * bound or (run.refusal and "memory" not in run.refusal):
+            over.append(f"{line} {run.refusal}")
+    return over
+
+
+if __name__ == "__main__":
+    main()

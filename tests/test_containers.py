@@ -1,0 +1,88 @@
+"""What control groups leave: files that stand in for those of the system."""
+
+import pytest
+
+from super_sdf import chunks, containers, memory
+from super_sdf.containers import bound_of_cores, left_memory
+
+MB = 10**6
+
+
+@pytest.fixture
+def system(tmp_path, monkeypatch):
+    """Write the files of control groups, by their paths below /sys/fs/cgroup."""
+
+    def write(own, files):
+        (tmp_path / "own").write_text(own)
+        for name, text in files.items():
+            path = tmp_path / "fs" / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(f"{text}\n")
+        monkeypatch.setattr(containers, "GROUPS", tmp_path / "fs")
+        monkeypatch.setattr(containers, "OWN", tmp_path / "own")
+
+    return write
+
+
+def group(name, most, taken, kept=0):
+    """Return a group's files, version 2."""
+    names = "memory.max", "memory.current", "memory.stat"
+    texts = most, taken, f"anon 5\ninactive_file {kept}\nactive_file 7"
+    return {f"{name}{file}": text for file, text in zip(names, texts)}
+
+
+def old_group(name, most, taken, kept):
+    """Return a group's files, version 1."""
+    names = "limit_in_bytes", "usage_in_bytes", "stat"
+    texts = most, taken, f"inactive_file 1\ntotal_inactive_file {kept}"
+    return {f"memory/{name}memory.{file}": text for file, text in zip(names, texts)}
+
+
+@pytest.mark.parametrize(
+    "own, files, want",
+    [
+        ("0::/", {}, None),
+        ("0::/", group("", "max", 5), None),
+        ("0::/", group("", 500 * MB, 450 * MB, 400 * MB), 450 * MB),
+        ("0::/", group("", 500 * MB, 600 * MB), 0),
+        ("0::/a/b", group("a/b/", "max", 9) | group("a/", 100, 30) | group("", 300, 250), 50),
+        ("0::/a/b", group("a/b/", 90, 30, 10) | group("a/", "max", 30), 70),
+        ("0::/a/b", group("a/b/", 90, "what?") | group("a/", 100, 30), 70),
+        ("0::/not/mounted/here", group("", 100, 40), 60),
+        ("4:memory:/a\n1:cpu:/", old_group("a/", 100, 80, 70) | old_group("", 2**63, 90, 0), 90),
+        ("3:cpu,cpuacct:/\n4:memory:/gone\n0::/", old_group("", 100, 80, 0), 20),
+    ],
+)
+def test_memory_that_is_left(system, own, files, want):
+    system(own, files)
+    assert left_memory() == want
+
+
+def test_free_memory_is_what_the_group_leaves(system):
+    system("0::/", group("", 80 * MB, 70 * MB, 65 * MB))
+    assert memory.free_memory() == 75 * MB
+
+
+def test_without_control_groups_nothing_is_bounded(monkeypatch, tmp_path):
+    monkeypatch.setattr(containers, "OWN", tmp_path / "none")
+    assert left_memory() is None and bound_of_cores() == float("inf")
+
+
+@pytest.mark.parametrize(
+    "own, files, want",
+    [
+        ("0::/", {"cpu.max": "max 100000"}, 8),
+        ("0::/", {"cpu.max": "150000 100000"}, 2),
+        ("0::/a", {"cpu.max": "300000 100000", "a/cpu.max": "10000 100000"}, 1),
+        ("2:cpu,cpuacct:/", {"cpu/cpu.cfs_quota_us": -1, "cpu/cpu.cfs_period_us": 100000}, 8),
+        ("2:cpu,cpuacct:/", {"cpu/cpu.cfs_quota_us": 300000, "cpu/cpu.cfs_period_us": 100000}, 3),
+    ],
+)
+def test_threads_are_cut_to_the_cores_that_are_left(system, monkeypatch, own, files, want):
+    system(own, files)
+    monkeypatch.setattr(chunks, "cores_of_system", lambda: 8)
+    assert chunks.count_cores() == want
+    assert chunks.useful_threads(200) == chunks.useful_threads(0) == want
+    assert chunks.useful_threads(1) == 1
+    with chunks.working_threads(200):
+        assert chunks.threads_at_work() == want
