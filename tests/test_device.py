@@ -11,7 +11,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-import onnxruntime as ort
 import pytest
 from conftest import ball
 from test_network import network_inputs
@@ -22,6 +21,7 @@ from super_sdf.device import CHUNK_INPUT, CPU, CUDA_CHUNK, CUDA_OPTIONS, run_bou
 from super_sdf.errors import DeviceError, ModelError
 from super_sdf.network import INPUTS, one_voxel, shipped_models
 from super_sdf.nodes import block_offsets
+from super_sdf.onnx import ort
 
 pytestmark = pytest.mark.usefixtures("cpu_build")
 ROOT = Path(__file__).parent.parent

@@ -83,15 +83,14 @@ def gather_facts() -> dict[str, Any]:
     """Return versions, devices and cards."""
     import platform
 
-    import onnxruntime
-
     from .cuda import available_devices
     from .network import load_network, shipped_models
+    from .onnx import ort
 
     return {
         "super-sdf": __version__,
         "python": platform.python_version(),
-        "onnxruntime": onnxruntime.__version__,
+        "onnxruntime": ort.__version__,
         "devices": available_devices(),
         "models": {name: dict(load_network(name, device="cpu").card) for name in shipped_models()},
     }

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime as ort
 
 from .cuda import CUDA, check_cuda, first_line, has_gpu, onnxruntime_version
 from .errors import DeviceError, ModelError
 from .grid import FloatArray
+from .onnx import ort
 
 DEVICES = ("auto", "cpu", "cuda")
 CPU = "CPUExecutionProvider"

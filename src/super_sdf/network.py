@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from onnxruntime import InferenceSession
 
 from .cuda import first_line
 from .device import open_session, run_bound, run_on_cpu
 from .errors import DeviceError, FileError, ModelError, OptionError
 from .grid import FloatArray, IntArray
+from .onnx import ort
 from .symmetry import cube_symmetries, turn
 
 FORMAT_VERSION = 1
@@ -55,7 +55,7 @@ class Network:
         What the user should know of the device.
     """
 
-    session: InferenceSession
+    session: ort.InferenceSession
     card: Mapping[str, Any]
     device: str
     symmetries: int = 1
@@ -194,7 +194,7 @@ def one_voxel() -> dict[str, Any]:
     }
 
 
-def _read_card(session: InferenceSession, path: Path) -> dict[str, Any]:
+def _read_card(session: ort.InferenceSession, path: Path) -> dict[str, Any]:
     """Return a file's metadata after checking that it keeps the contract."""
     inputs = {given.name: given.type for given in session.get_inputs()}
     outputs = [given.name for given in session.get_outputs()]
