@@ -9,11 +9,11 @@ ROOT = Path(__file__).parent.parent
 SOURCES = sorted((ROOT / "src" / "super_sdf").glob("*.py"))
 EVALUATION = sorted((ROOT / "src" / "super_sdf" / "evaluation").glob("*.py"))
 FLOORS = [
-    {"errors", "chunks", "compiling"},
-    {"memory", "onnx"},
+    {"errors", "chunks", "compiling", "pace"},
+    {"memory", "onnx", "progress"},
     {"grid", "cuda"},
-    {"band", "mesh", "cell_cases", "device"},
-    {"nodes", "symmetry"},
+    {"band", "mesh", "cell_cases", "running", "contract"},
+    {"nodes", "symmetry", "device", "decoder"},
     {"field", "files", "network", "lattice"},
     {"isosurface", "border", "spheres"},
     {"survey", "kernels"},

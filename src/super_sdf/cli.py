@@ -7,15 +7,13 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from . import __version__
 from .cli_batch import batch
-from .cli_common import CONTEXT, one_line_errors
+from .cli_common import CONTEXT, one_line_errors, progress_bar
 from .cli_conversion import conversion_options, make_options
 from .cli_evaluate import evaluate
 from .cli_info import info
@@ -72,10 +70,11 @@ class Upsampling:
 
     def work(self) -> None:
         """Check what is asked, load the network, convert."""
-        from .convert import Stopwatch, convert
+        from .convert import convert
         from .files.meshes import check_target
         from .network import load_network
         from .nodes import check_factor
+        from .progress import Stopwatch
 
         asked, watch = self.options, Stopwatch()
         check_factor(asked["factor"])
@@ -88,7 +87,7 @@ class Upsampling:
             precision=asked["precision"],
         )
         watch.lap("load network")
-        with self.progress_bar() as progress:
+        with progress_bar("upsampling", asked["quiet"]) as progress:
             self.done = convert(
                 self.source,
                 self.target,
@@ -98,20 +97,6 @@ class Upsampling:
                 progress=progress,
             )
         self.seconds = watch.seconds | self.done.seconds
-
-    @contextmanager
-    def progress_bar(self) -> Iterator[Any]:
-        """Draw a bar on stderr if somebody is there to see it."""
-        if self.options["quiet"] or not sys.stderr.isatty():
-            yield None
-            return
-        with click.progressbar(length=1, label="upsampling", file=sys.stderr) as bar:
-
-            def show(done: int, total: int) -> None:
-                bar.length = total
-                bar.update(1)
-
-            yield show
 
     def report(self) -> dict[str, Any]:
         """Return counts, times and findings."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import click
@@ -25,6 +26,16 @@ def one_line_errors() -> Iterator[None]:
         raise click.ClickException(str(error)) from error
     except MemoryError:
         raise click.ClickException("out of memory: use a smaller --factor or grid") from None
+
+
+@contextmanager
+def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
+    """Draw a bar on stderr, with the time that is left; None if nobody is there to see it."""
+    if quiet or not sys.stderr.isatty():
+        yield None
+        return
+    with click.progressbar(length=1000, label=label, file=sys.stderr) as shown:
+        yield lambda done, total: shown.update(1000 * done // total - shown.pos)
 
 
 def check_extra(command: str) -> None:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import click
 
-from .cli_common import CONTEXT, check_extra, one_line_errors
+from .cli_common import CONTEXT, check_extra, one_line_errors, progress_bar
 from .errors import OptionError
 
 EXAMPLES = """\b
@@ -82,7 +79,7 @@ def run_sample(source: Path, target: Path, options: dict[str, Any]) -> None:
         solid, layout = Solid(normalise(solid.mesh)), unit_layout(samples)
     else:
         layout = fitted_layout(solid.mesh, n=samples, spacing=spacing, padding=options["padding"])
-    with bar("sampling", options["quiet"]) as progress:
+    with progress_bar("sampling", options["quiet"]) as progress:
         grid = sample_solid(solid, layout, band=options["band"], progress=progress)
     write_grid(grid, target, force=options["force"])
     if not options["quiet"]:
@@ -93,13 +90,3 @@ def run_sample(source: Path, target: Path, options: dict[str, Any]) -> None:
         click.echo(
             f"{target}: {size} samples, spacing {grid.voxel_size:g}, {seconds:.1f} s", err=True
         )
-
-
-@contextmanager
-def bar(label: str, quiet: bool) -> Iterator[Callable[[int, int], None]]:
-    """Draw a bar on stderr, if somebody is there to see it."""
-    if quiet or not sys.stderr.isatty():
-        yield lambda done, total: None
-        return
-    with click.progressbar(length=1000, label=label, file=sys.stderr) as shown:
-        yield lambda done, total: shown.update(1000 * done // total - shown.pos)

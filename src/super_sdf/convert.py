@@ -6,18 +6,19 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from .decoder import Decoder
 from .files.grids import read_grid
 from .files.meshes import write_pieces
 from .grid import SdfGrid, Triple
 from .mesh import Mesh
-from .pipeline import Decoder, Piece, Progress, reconstruct_slabs, step_name
+from .pipeline import Piece, reconstruct_slabs
+from .progress import Progress, Stopwatch
 
 
 @dataclass(frozen=True)
@@ -87,27 +88,6 @@ class Conversion:
         }
 
 
-class Stopwatch:
-    """The time between laps, by the name of the lap."""
-
-    def __init__(self, progress: Progress | None = None) -> None:
-        self.seconds: dict[str, float] = {}
-        self.clock = time.perf_counter()
-        self.progress = progress
-
-    def lap(self, stage: str) -> None:
-        """Book the time since the last lap under a stage."""
-        now = time.perf_counter()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.clock
-        self.clock = now
-
-    def step(self, done: int, total: int) -> None:
-        """Book a step of the pipeline, and pass it on."""
-        self.lap(step_name(done))
-        if self.progress:
-            self.progress(done, total)
-
-
 def convert(
     source: str | Path,
     target: str | Path,
@@ -130,14 +110,14 @@ def convert(
     force : bool
         Replace the target if it exists.
     progress : callable, optional
-        Called with (steps done, steps in all).
+        Called with (done, total), see ``progress.Progress``; what it raises ends the work.
 
     Raises
     ------
     SuperSdfError
         As ``read_grid``, ``upsample`` and ``write_mesh`` raise it; nothing was written then.
     """
-    watch = Stopwatch(progress)
+    watch = Stopwatch()
     given = {"spacing": options.spacing, "origin": options.origin}
     grid = read_grid(source, inside=options.inside, level=options.offset, **given)
     watch.lap("read")
@@ -148,7 +128,7 @@ def convert(
         offset=options.offset,
         cap=options.cap,
         max_memory=options.max_memory,
-        progress=watch.step,
+        progress=progress,
     )
     total = Total()
     write_pieces(total.count(pieces, watch), target, force=force)
@@ -166,6 +146,7 @@ class Total:
     def count(self, pieces: Iterable[Piece], watch: Stopwatch) -> Iterator[Mesh]:
         """Pass the meshes on, and count; the time until the next is asked for is for writing."""
         for piece in pieces:
+            watch.take(piece.seconds)
             self.is_cut |= piece.is_cut
             self.counts.update(piece.counts)
             self.counts |= Counter(piece.whole)

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..convert import ConvertOptions, convert
+from ..decoder import Decoder
 from ..errors import FileError, GridError, OptionError, WriteError
-from ..pipeline import Decoder
 from .fingerprint import fingerprint
 
 Row = dict[str, Any]
