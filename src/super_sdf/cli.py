@@ -98,6 +98,12 @@ class Upsampling:
             )
         self.seconds = watch.seconds | self.done.seconds
 
+    def device_notes(self) -> list[str]:
+        """Return what to know of where the network and compiled functions run."""
+        from .compiling import why_not
+
+        return [*self.network.notes, *why_not()]
+
     def report(self) -> dict[str, Any]:
         """Return counts, times and findings."""
         return {
@@ -108,7 +114,7 @@ class Upsampling:
             "model": self.options["model"] or self.options["quality"],
             "precision": self.options["precision"],
             "device": self.network.device,
-            "device_notes": list(self.network.notes),
+            "device_notes": self.device_notes(),
             **self.done.report(),
             "seconds": {stage: round(spent, 4) for stage, spent in self.seconds.items()},
         }
@@ -120,7 +126,7 @@ class Upsampling:
             click.echo(json.dumps(report, indent=2))
         if self.options["quiet"]:
             return
-        for note in (*self.done.notes, *self.network.notes):
+        for note in (*self.done.notes, *self.device_notes()):
             click.echo(f"Note: {note}", err=True)
         for warning in self.done.warnings:
             click.echo(f"Warning: {warning}", err=True)

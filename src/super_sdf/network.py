@@ -25,6 +25,7 @@ DEFAULT_QUALITY = "base"
 # A shipped file, and over how many symmetries of the cube its answers are averaged.
 QUALITIES = {"fast": ("fast", 1), "base": ("base", 1), "best": ("base", 8)}
 PRECISIONS = ("float32", "int8")
+NO_NETWORKS = "super-sdf was installed without its networks: install it again"
 PART = 1024  # rows of a run from which its time is told: two chunks
 
 
@@ -149,8 +150,11 @@ def first_rows(feeds: Mapping[str, Any], rows: int) -> dict[str, Any]:
 
 
 def shipped_models() -> dict[str, Path]:
-    """Return the networks that come with the package, by name."""
-    folder = Path(str(resources.files("super_sdf.models")))
+    """Return the networks that come with the package, by name; none if it lost their folder."""
+    try:
+        folder = Path(str(resources.files("super_sdf.models")))
+    except ImportError:
+        return {}
     return {path.stem: path for path in sorted(folder.glob("*.onnx"))}
 
 
@@ -167,10 +171,12 @@ def find_model(model: str | Path, precision: str = "float32") -> tuple[Path, int
     if precision not in PRECISIONS:
         raise OptionError(f"precision is {precision!r}: give one of {', '.join(PRECISIONS)}")
     name, symmetries = QUALITIES.get(str(model), (str(model), 1))
+    if str(model) in QUALITIES and name not in shipped_models():
+        raise FileError(f"the network {name!r} is missing: {NO_NETWORKS}")
     path = shipped_models().get(name, Path(model))
     if precision == "int8":
         path = path.with_name(f"{path.stem}-int8.onnx")  # beside that of float32
-        if not os.path.isfile(path):  # False also of names that no system takes
+        if not os.path.isfile(path):
             raise OptionError(
                 f"{model} has no int8 variant, {path}: write one with export.quantize"
             )
