@@ -68,6 +68,17 @@ def test_a_run_leaves_nothing_at_home_and_calls_nobody(tmp_path, monkeypatch, ho
     assert sorted(os.listdir()) == ["fresh", "in.npy", "out.ply", "unwritable"]
 
 
+@pytest.mark.parametrize("words", [["info"], ["info", "--check", "--device", "cpu"]])
+def test_info_needs_no_home(tmp_path, words):
+    (tmp_path / "unwritable").write_text("")
+    script = (
+        f"import sys; from super_sdf.cli import main; sys.argv = {['super-sdf', *words]}; main()"
+    )
+    run = run_at_home(tmp_path / "unwritable", NO_SOCKETS + script)
+    assert (run.returncode, run.stderr) == (0, "") and "base" in run.stdout
+    assert os.listdir(tmp_path) == ["unwritable"]
+
+
 def test_a_socket_would_have_been_seen(tmp_path):
     run = run_at_home(tmp_path, NO_SOCKETS + "import socket; socket.socket()")
     assert run.returncode == -31  # SIGSYS
