@@ -84,6 +84,17 @@ def test_watched_runs_give_the_same_bits(monkeypatch):
     np.testing.assert_array_equal(fast(*asked, progress=lambda share: None), plain)
 
 
+def test_a_bound_run_is_watched_and_stopped_as_well(monkeypatch):
+    monkeypatch.setattr(running, "LOOK", 1e-4)
+    feeds = dict(zip(network.INPUTS, (*network_inputs(ball()), block_offsets(4))))
+    session, looks = load_network("fast", device="cpu").session, []
+    watched = running.run_bound(session, feeds, "cpu", look=lambda: looks.append(1))
+    np.testing.assert_array_equal(watched, running.run_bound(session, feeds, "cpu"))
+    assert looks
+    with pytest.raises(ZeroDivisionError):
+        running.run_bound(session, feeds, "cpu", look=lambda: 1 / 0)
+
+
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError("enough")])
 def test_what_the_callback_raises_ends_the_run_and_the_next_is_right(watched, error):
     grid, fast = ball(), load_network("fast", device="cpu")

@@ -45,6 +45,10 @@ class Network:
         CPU threads; 0 for one a core.
     notes : tuple of str
         What the user should know of the device.
+    pace : Pace
+        How long runs take, learnt from them.
+    tells_progress : bool
+        That a call takes ``progress``: see ``decoder.Decoder``.
     """
 
     session: ort.InferenceSession
@@ -128,7 +132,8 @@ class Network:
         part = first_rows(feeds, rows - 1)  # one more is added to fill the last chunk
         begun = time.perf_counter()
         self._ask(part)
-        work = work_of(rows, len(part["voxels"]), len(part["offsets"]))
+        offsets = len(part["offsets"])  # no fewer voxels than these are decoded at a time
+        work = work_of(rows, max(len(part["voxels"]), offsets), offsets)
         self.pace.learn(work, time.perf_counter() - begun)
 
 
