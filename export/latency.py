@@ -15,7 +15,6 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-import onnxruntime as ort
 import torch
 
 from export.augment import Prepared
@@ -24,6 +23,7 @@ from export.variants import UNet
 from super_sdf.grid import SdfGrid
 from super_sdf.network import load_network
 from super_sdf.nodes import block_offsets
+from super_sdf.onnx import ort
 from super_sdf.survey import survey
 
 NAMES = ["patches", "neighbours", "voxels", "offsets"]

@@ -26,7 +26,8 @@ from export.dormant import dormant_share
 from export.network import NetworkConfig, SuperSdfNet
 from export.onnx_graph import build_graph
 from super_sdf.band import find_band, gather_patches, neighbour_table
-from super_sdf.network import FORMAT_VERSION, load_network
+from super_sdf.contract import FORMAT_VERSION
+from super_sdf.network import load_network
 from super_sdf.nodes import block_offsets
 
 OPSET = 18

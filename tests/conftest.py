@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import onnxruntime as ort
 import pytest
 
 from super_sdf import SdfGrid, footprint, plan
 from super_sdf.band import NEIGHBOURHOOD
+from super_sdf.onnx import ort
 
 
 def trilinear(

@@ -39,7 +39,7 @@ def test_stages_are_timed_and_steps_told():
         "in.npy", "out.ply", trilinear, ConvertOptions(2), progress=lambda *s: steps.append(s)
     )
     assert list(done.seconds) == ["read", "band", "network", "nodes", "isosurface", "write"]
-    assert steps == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert steps == [(20, 1000), (800, 1000), (900, 1000), (1000, 1000)]
 
 
 @pytest.mark.parametrize("cap", [False, True])

@@ -11,17 +11,19 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-import onnxruntime as ort
 import pytest
 from conftest import ball
 from test_network import network_inputs
 
 from super_sdf import cuda, device, load_network
+from super_sdf.contract import INPUTS, one_voxel
 from super_sdf.cuda import CUDA, first_line
-from super_sdf.device import CHUNK_INPUT, CPU, CUDA_CHUNK, CUDA_OPTIONS, run_bound
+from super_sdf.device import CPU, CUDA_OPTIONS
 from super_sdf.errors import DeviceError, ModelError
-from super_sdf.network import INPUTS, one_voxel, shipped_models
+from super_sdf.network import shipped_models
 from super_sdf.nodes import block_offsets
+from super_sdf.onnx import ort
+from super_sdf.running import CHUNK_INPUT, CUDA_CHUNK, run_bound
 
 pytestmark = pytest.mark.usefixtures("cpu_build")
 ROOT = Path(__file__).parent.parent
@@ -72,7 +74,7 @@ class FakeSession:
         self.bindings, self.fails = [], ""
         self.get_providers = lambda: [CUDA, CPU]
         self.get_inputs = lambda: [SimpleNamespace(name=n, type=t) for n, t in INPUTS.items()]
-        self.get_outputs = lambda: [SimpleNamespace(name="values")]
+        self.get_outputs = lambda: [SimpleNamespace(name="values", type="tensor(float)")]
         self.get_overridable_initializers = lambda: [SimpleNamespace(name=CHUNK_INPUT)]
         metadata = SimpleNamespace(custom_metadata_map={"format_version": "1"})
         self.get_modelmeta = lambda: metadata

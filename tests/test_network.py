@@ -1,13 +1,18 @@
-"""The ONNX file's contract, and devices asked for."""
+"""The ONNX file's contract, what a network gives, and devices asked for."""
+
+import os
+import warnings
 
 import numpy as np
 import pytest
-from conftest import ball
+from conftest import ball, trilinear
+from onnx_files import DOUBLE, FLOAT, INPUTS, metadata, write_network
 
-from super_sdf import load_network
+from super_sdf import load_network, reconstruct, upsample
 from super_sdf.band import find_band, gather_patches, neighbour_table, rescale
+from super_sdf.decoder import check_values
 from super_sdf.errors import DeviceError, FileError, ModelError, OptionError
-from super_sdf.network import QUALITIES, shipped_models
+from super_sdf.network import QUALITIES, Network, shipped_models
 from super_sdf.nodes import block_offsets
 
 
@@ -131,3 +136,168 @@ def test_what_is_no_network_is_refused(tmp_path):
         load_network(tmp_path / "bad.onnx")
     with pytest.raises(DeviceError, match="device is 'tpu': give one of auto, cpu, cuda"):
         load_network(device="tpu")
+
+
+@pytest.fixture
+def no_warnings():
+    """Let nothing be said on the way."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+
+
+def test_any_file_of_the_contract_runs(tmp_path):
+    assert len(reconstruct(ball(), load_network(write_network(tmp_path / "own.onnx"))).faces)
+
+
+# The last step of a network, how its output is declared, and how it is refused.
+TRANSPOSED = [("Transpose", ("sum",), "values", {})]
+ONE_COLUMN = [("Identity", ("mean",), "values", {})]
+WRONG = {
+    "axes swapped": (TRANSPOSED, (FLOAT, "D", "Q"), " does not run with its own inputs: the "),
+    "one value a voxel": (ONE_COLUMN, (FLOAT, "D", 1), " does not run with its own inputs: the "),
+    "double": (
+        [("Cast", ("sum",), "values", {"to": DOUBLE})],
+        (DOUBLE, "D", "Q"),
+        r" is no super-sdf network of format 1 \(format 1, .*outputs values tensor\(double\)\);",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_network_whose_output_is_another_is_refused(tmp_path, name):
+    last, output, said = WRONG[name]
+    path = write_network(tmp_path / "own.onnx", last, output=output)
+    with pytest.raises(ModelError, match=f"^{path}{said}") as caught:
+        load_network(path, device="cpu")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_network_with_other_inputs_is_refused(tmp_path):
+    inputs = {**INPUTS, "more\nlines": (FLOAT, "V")}
+    path = write_network(tmp_path / "own.onnx", inputs=inputs)
+    with pytest.raises(ModelError, match=r"is no super-sdf network of format 1 \(format 1, inp"):
+        load_network(path, device="cpu")
+
+
+INFINITE = [("Sub", ("sum", "sum"), "zero", {}), ("Div", ("sum", "zero"), "values", {})]
+NAN = [
+    ("Abs", ("sum",), "above", {}),
+    ("Neg", ("above",), "below", {}),
+    ("Log", ("below",), "values", {}),
+]
+
+
+@pytest.mark.parametrize("last", [INFINITE, NAN], ids=["infinite", "NaN"])
+@pytest.mark.parametrize("symmetries", [1, 8])
+@pytest.mark.parametrize("compiled", "01")
+def test_values_that_are_not_finite_are_refused_with_their_count(
+    tmp_path, monkeypatch, no_warnings, last, symmetries, compiled
+):
+    monkeypatch.setenv("SUPER_SDF_COMPILED", compiled)
+    loaded = load_network(write_network(tmp_path / "own.onnx", last), device="cpu")
+    network = Network(loaded.session, loaded.card, "cpu", symmetries)
+    for work in (upsample, reconstruct):
+        with pytest.raises(ModelError) as caught:
+            work(ball(), network, 2)
+        bad, said = str(caught.value).split(" values that the network gave are ")
+        count, _, whole = bad.replace(",", "").split(" ", 2)
+        assert int(count) == int(whole.split()[-1]) > 0
+        assert said == (
+            "NaN, infinite or beyond 1e15: it cannot be used for this grid; use another --model"
+        )
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e16, -3e38])
+def test_one_bad_value_among_many_is_found(no_warnings, value):
+    values = np.zeros((5000, 125), np.float32)
+    assert check_values(values, (5000, 125)) is values
+    values[4800, 7] = value
+    with pytest.raises(ModelError, match=r"^1 of the 625,000 values that the network gave are NaN"):
+        check_values(values, (5000, 125))
+    values[:2] = value
+    with pytest.raises(ModelError, match=r"^251 of the 625,000 values"):
+        check_values(values, (5000, 125))
+
+
+@pytest.mark.parametrize(
+    ("given", "what"),
+    [
+        (np.zeros((3, 4), np.float32), r"float32 of shape \(3, 4\)"),
+        (np.zeros((4, 3), np.int64), r"int64 of shape \(4, 3\)"),
+        ([[1.0] * 3] * 4, r"list of shape \(4, 3\)"),
+        (None, r"NoneType of shape \(\)"),
+    ],
+)
+def test_a_function_in_place_of_a_network_is_checked_too(given, what):
+    wanted = r" in place of float32 of shape \(4, 3\), \(voxels, offsets\)$"
+    with pytest.raises(ModelError, match=f"^the network gave {what}{wanted}"):
+        check_values(given, (4, 3))
+
+
+def test_a_function_may_give_double_precision_in_any_order():
+    def doubled(*asked):
+        return np.asfortranarray(trilinear(*asked), np.float64)
+
+    one, two = reconstruct(ball(), trilinear), reconstruct(ball(), doubled)
+    np.testing.assert_array_equal(one.vertices, two.vertices)
+
+
+DEEP, LONG = "[" * 100_000, "7" * 5000
+CARDS = {
+    "negative field": ({"receptive_field": "-5"}, "its receptive field is -5; it must be a whole"),
+    "no field": ({"receptive_field": "0"}, "its receptive field is 0; it must be a whole number"),
+    "huge field": ({"receptive_field": "9" * 400}, "its receptive field is 9999999999"),
+    "broken field": ({"receptive_field": "6.5"}, "its receptive field is 6.5; it must be a whole"),
+    "truth": ({"receptive_field": "true"}, "its receptive field is True; it must be a whole"),
+    "words": ({"receptive_field": "six"}, "its receptive field is 'six'; it must be a whole"),
+    "list": ({"receptive_field": "[6]"}, r"its receptive field is \[6\]; it must be a whole"),
+    "digits": ({"receptive_field": LONG}, "its metadata 'receptive_field' is no value that can be"),
+    "deep": ({"data": DEEP}, r"its metadata 'data' is no value that can be read, '\[\[\[\[\[\["),
+    "no version": (None, r"is no super-sdf network of format 1 \(format none, inputs patches ten"),
+    "version": (
+        {"format_version": "1\n" * 900},
+        r"is no super-sdf network of format 1 \(format 1 1",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CARDS)
+def test_metadata_that_cannot_be_used_is_one_line(tmp_path, name):
+    changed, said = CARDS[name]
+    path = tmp_path / "own.onnx"
+    if changed is None:
+        write_network(path, card={})
+    else:
+        path.write_bytes(shipped_models()["fast"].read_bytes() + metadata(changed))
+    with pytest.raises(ModelError, match=said) as caught:
+        load_network(path, device="cpu")
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 400 + len(str(path))
+
+
+def test_a_card_need_not_say_the_receptive_field(tmp_path):
+    card = {"format_version": "1", "note": "not JSON"}
+    network = load_network(write_network(tmp_path / "own.onnx", card=card), device="cpu")
+    assert network.receptive_field is None and network.card["note"] == "not JSON"
+
+
+@pytest.mark.parametrize(
+    "kind", ["folder", "FIFO", "empty", "half", "text", "absent", "long", "NUL"]
+)
+def test_what_is_no_model_file_is_one_line(tmp_path, command, kind):
+    path = tmp_path / "own.onnx"
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "FIFO":
+        os.mkfifo(path)
+    elif kind in ("empty", "half", "text"):
+        whole = shipped_models()["fast"].read_bytes()
+        path.write_bytes({"empty": b"", "half": whole[: len(whole) // 2], "text": b"me\n"}[kind])
+    elif kind in ("long", "NUL"):
+        path = {"long": "n" * 300 + ".onnx", "NUL": "a\0b.onnx"}[kind]
+    np.save(tmp_path / "in.npy", ball().values)
+    words = tmp_path / "in.npy", tmp_path / "out.ply", "--model", path, "--spacing", "1"
+    code, out, err = command("upsample", *words, "--device", "cpu")
+    assert (code, out, err.count("\n")) == (1, "", 1) and err.startswith("Error: ")
+    assert "own.onnx" in err or kind in ("long", "NUL")
+    assert not (tmp_path / "out.ply").exists()

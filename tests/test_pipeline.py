@@ -163,12 +163,6 @@ def test_threads_give_the_same_mesh(network):
         np.testing.assert_array_equal(one, other)
 
 
-def test_progress_is_told_step_by_step():
-    told = []
-    reconstruct(ball(), trilinear, progress=lambda done, total: told.append((done, total)))
-    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
-
-
 def test_a_field_without_a_surface_is_refused():
     for low in (0.5, 5.0):
         grid = SdfGrid(np.linspace(low, 9, 27).reshape(3, 3, 3), (1.0,) * 3)

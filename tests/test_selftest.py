@@ -2,11 +2,12 @@
 
 import json
 import re
+from importlib import resources
 
 import numpy as np
 import pytest
 
-from super_sdf import extras, selftest
+from super_sdf import compiling, extras, network, selftest
 from super_sdf.errors import DeviceError
 from super_sdf.extras import EXTRAS
 from super_sdf.selftest import Finding, run_checks
@@ -129,3 +130,57 @@ def test_the_command_prints_json(command):
     found = next(f for f in report["findings"] if f["what"] == "network fast on cpu")
     assert found["state"] == "ok" and found["figures"]["off_voxels"] < 0.05
     assert command("info", "--check", "--device", "cuda", "--json")[0] == 1
+
+
+def test_a_numba_that_does_not_work_is_a_failure(monkeypatch):
+    monkeypatch.setattr(compiling, "_compiled", compiling.Compiled())
+    monkeypatch.setattr(compiling, "import_module", lambda name: 1 / 0)
+    found = selftest.check_extra("fast", ("numba",))
+    assert found.state == "failed" and found.says.startswith(
+        "numba is installed but cannot be used, and NumPy takes longer (division by zero); mend"
+    )
+
+
+@pytest.fixture
+def models(tmp_path, monkeypatch):
+    """A folder of networks that replaces the shipped ones; without it the package has none."""
+    folder, files = tmp_path / "models", resources.files
+
+    def find(package):
+        if package != "super_sdf.models":
+            return files(package)
+        if not folder.exists():
+            raise ModuleNotFoundError(f"No module named {package!r}")
+        return folder
+
+    monkeypatch.setattr(resources, "files", find)
+    return folder
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_a_package_without_networks_says_so(models, command, tmp_path, there):
+    if there:
+        models.mkdir()
+    said = "super-sdf was installed without its networks: install it again"
+    code, out, err = command("info")
+    assert (code, out.splitlines()[-1], err) == (1, f"models: {said}", "")
+    code, out, err = command("info", "--json")
+    assert (code, json.loads(out)["fault"], json.loads(out)["models"], err) == (1, said, {}, "")
+    code, out, err = command("info", "--check", "--device", "cpu")
+    assert (code, err) == (1, "") and f"failed   networks: {said}\n" in out
+    code, out, err = command("upsample", "in.npy", tmp_path / "out.ply")
+    assert (code, out, err) == (1, "", f"Error: the network 'base' is missing: {said}\n")
+
+
+def test_a_network_file_that_cannot_be_read_is_a_line_and_the_others_are_shown(models, command):
+    shipped = network.Path(network.__file__).parents[2] / "models"
+    models.mkdir()
+    (models / "fast.onnx").write_bytes((shipped / "fast.onnx").read_bytes())
+    (models / "base.onnx").write_bytes(b"text")
+    fault = f"{models / 'base.onnx'} is no ONNX file that onnxruntime can run: "
+    code, out, err = command("info")
+    assert (code, err) == (1, "") and f"model base\n  fault: {fault}" in out
+    assert "model fast\n  accuracy: " in out
+    code, out, err = command("info", "--check", "--device", "cpu")
+    assert (code, err) == (1, "") and f"\nfailed   network base on cpu: {fault}" in out
+    assert "\nok       network fast on cpu: " in out and "\n1 of 9 checks failed\n" in out

@@ -9,14 +9,14 @@ ROOT = Path(__file__).parent.parent
 SOURCES = sorted((ROOT / "src" / "super_sdf").glob("*.py"))
 EVALUATION = sorted((ROOT / "src" / "super_sdf" / "evaluation").glob("*.py"))
 FLOORS = [
-    {"errors", "containers", "compiling", "interrupts", "streams"},
-    {"memory", "cuda", "extras", "machine", "index_width", "chunks"},
-    {"planes"},
+    {"errors", "containers", "compiling", "interrupts", "streams", "pace"},
+    {"memory", "onnx", "progress", "extras", "machine", "index_width", "chunks"},
+    {"planes", "cuda"},
     {"samples", "gradients"},
     {"sides", "spacing"},
     {"grid"},
-    {"band", "mesh", "cell_cases", "device"},
-    {"nodes", "symmetry", "options", "offsets"},
+    {"band", "mesh", "cell_cases", "running", "contract", "decoder"},
+    {"nodes", "symmetry", "options", "offsets", "device"},
     {"files"},
     {"field", "network", "lattice"},
     {"isosurface", "border", "spheres"},
@@ -107,8 +107,18 @@ def test_the_runtime_needs_four_packages():
         if path.stem == "kernels":  # loaded only where numba is
             foreign -= {"numba"}
         assert not foreign, f"{path.stem} imports {foreign}"
-        if path.stem not in ("cuda", "device", "network", "cli_info"):
-            assert "onnxruntime" not in imported(path)
+
+
+def test_onnxruntime_is_imported_in_one_place():
+    """There its telemetry is switched off before."""
+    rooms = [ROOT / room for room in ("src", "tests", "export", "benchmarks", "examples")]
+    importing = {
+        path.name
+        for room in rooms
+        for path in room.rglob("*.py")
+        if "onnxruntime" in imported(path)
+    }
+    assert importing == {"onnx.py"}
 
 
 def test_the_runtime_does_not_know_the_evaluation():

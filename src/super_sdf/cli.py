@@ -7,15 +7,20 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from . import __version__
 from .cli_batch import batch
-from .cli_common import CONTEXT, InterruptedCommand, one_line_errors, print_result, tell
+from .cli_common import (
+    CONTEXT,
+    InterruptedCommand,
+    one_line_errors,
+    print_result,
+    progress_bar,
+    tell,
+)
 from .cli_conversion import chosen_model, conversion_options, make_options
 from .cli_evaluate import evaluate
 from .cli_info import info
@@ -75,10 +80,11 @@ class Upsampling:
 
     def work(self) -> None:
         """Check what is asked, load the network, convert."""
-        from .convert import Stopwatch, convert
+        from .convert import convert
         from .files.meshes import check_target
         from .network import load_network
         from .nodes import check_factor
+        from .progress import Stopwatch
 
         asked, watch = self.options, Stopwatch()
         check_factor(asked["factor"])
@@ -91,7 +97,7 @@ class Upsampling:
             precision=asked["precision"],
         )
         watch.lap("load network")
-        with raising_interrupts(), self.progress_bar() as progress:
+        with raising_interrupts(), progress_bar("upsampling", asked["quiet"]) as progress:
             self.done = convert(
                 self.source,
                 self.target,
@@ -103,19 +109,11 @@ class Upsampling:
             )
         self.seconds = watch.seconds | self.done.seconds
 
-    @contextmanager
-    def progress_bar(self) -> Iterator[Any]:
-        """Draw a bar on stderr if somebody is there to see it."""
-        if self.options["quiet"] or not sys.stderr.isatty():
-            yield None
-            return
-        with click.progressbar(length=1, label="upsampling", file=sys.stderr) as bar:
+    def device_notes(self) -> list[str]:
+        """Return what to know of where the network and compiled functions run."""
+        from .compiling import why_not
 
-            def show(done: int, total: int) -> None:
-                bar.length = total
-                bar.update(1)
-
-            yield show
+        return [*self.network.notes, *why_not()]
 
     def report(self) -> dict[str, Any]:
         """Return counts, times and findings."""
@@ -127,7 +125,7 @@ class Upsampling:
             "model": self.model,
             "precision": self.options["precision"],
             "device": self.network.device,
-            "device_notes": list(self.network.notes),
+            "device_notes": self.device_notes(),
             **self.done.report(),
             "seconds": {stage: round(spent, 4) for stage, spent in self.seconds.items()},
         }
@@ -139,7 +137,7 @@ class Upsampling:
             print_result(json.dumps(report, indent=2), f"{self.target} is written")
         if self.options["quiet"]:
             return
-        for note in (*self.done.notes, *self.network.notes):
+        for note in (*self.done.notes, *self.device_notes()):
             tell(f"Note: {note}")
         for warning in self.done.warnings:
             tell(f"Warning: {warning}")

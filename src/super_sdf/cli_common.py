@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
 import click
@@ -46,6 +47,16 @@ def describe_os_error(error: OSError) -> str:
     """Say in a line what the system refused, and of which file if it tells."""
     reason = error.strerror or str(error)
     return f"{error.filename}: {reason}" if error.filename else reason
+
+
+@contextmanager
+def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
+    """Draw a bar on stderr, with the time that is left; None if nobody is there to see it."""
+    if quiet or not sys.stderr.isatty():
+        yield None
+        return
+    with click.progressbar(length=1000, label=label, file=sys.stderr) as shown:
+        yield lambda done, total: shown.update(1000 * done // total - shown.pos)
 
 
 def tell(line: str) -> None:

@@ -39,7 +39,7 @@ def info(check: bool, device: str, as_json: bool) -> None:
     with one_line_errors():
         if check:
             sys.exit(0 if tell_checks(device, as_json) else 1)
-        tell_facts(as_json)
+        sys.exit(0 if tell_facts(as_json) else 1)
 
 
 def tell_checks(device: str, as_json: bool) -> bool:
@@ -64,12 +64,13 @@ def tell_checks(device: str, as_json: bool) -> bool:
     return not failed
 
 
-def tell_facts(as_json: bool) -> None:
-    """Print versions, devices and cards."""
+def tell_facts(as_json: bool) -> bool:
+    """Print versions, devices and cards; return whether all networks could be loaded."""
     facts = gather_facts()
+    works = bool(facts["models"]) and not any("fault" in card for card in facts["models"].values())
     if as_json:
         click.echo(json.dumps(facts, indent=2))
-        return
+        return works
     for key in ("super-sdf", "python", "onnxruntime"):
         click.echo(f"{key} {facts[key]}")
     click.echo(f"devices: {', '.join(facts['devices'])}")
@@ -77,21 +78,36 @@ def tell_facts(as_json: bool) -> None:
         click.echo(f"model {name}")
         for key, value in sorted(card.items()):
             click.echo(f"  {key.replace('_', ' ')}: {value}")
+    if not facts["models"]:
+        click.echo(f"models: {facts['fault']}")
+    return works
 
 
 def gather_facts() -> dict[str, Any]:
     """Return versions, devices and cards."""
     import platform
 
-    import onnxruntime
-
     from .cuda import available_devices
-    from .network import load_network, shipped_models
+    from .network import NO_NETWORKS, shipped_models
+    from .onnx import ort
 
-    return {
+    models = {name: find_card(name) for name in shipped_models()}
+    facts = {
         "super-sdf": __version__,
         "python": platform.python_version(),
-        "onnxruntime": onnxruntime.__version__,
+        "onnxruntime": ort.__version__,
         "devices": available_devices(),
-        "models": {name: dict(load_network(name, device="cpu").card) for name in shipped_models()},
+        "models": models,
     }
+    return facts if models else {**facts, "fault": NO_NETWORKS}
+
+
+def find_card(name: str) -> dict[str, Any]:
+    """Return a shipped network's card, or why it cannot be loaded as its ``fault``."""
+    from .errors import SuperSdfError
+    from .network import load_network
+
+    try:
+        return dict(load_network(name, device="cpu").card)
+    except SuperSdfError as error:
+        return {"fault": str(error)}

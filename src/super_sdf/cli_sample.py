@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import click
 from click.core import ParameterSource
 
-from .cli_common import CONTEXT, one_line_errors, tell
+from .cli_common import CONTEXT, one_line_errors, progress_bar, tell
 from .errors import OptionError
 from .extras import check_modules
 from .interrupts import raising_interrupts
@@ -90,7 +87,7 @@ def run_sample(source: Path, target: Path, options: dict[str, Any]) -> None:
         solid, layout = Solid(normalise(solid.mesh)), unit_layout(samples)
     else:
         layout = fitted_layout(solid.mesh, n=samples, spacing=spacing, padding=options["padding"])
-    with bar("sampling", options["quiet"]) as progress:
+    with progress_bar("sampling", options["quiet"]) as progress:
         grid = sample_solid(solid, layout, band=options["band"], progress=progress)
     with raising_interrupts():
         write_grid(grid, target, force=options["force"])
@@ -100,13 +97,3 @@ def run_sample(source: Path, target: Path, options: dict[str, Any]) -> None:
         size = " x ".join(map(str, grid.shape))
         seconds = time.perf_counter() - start
         tell(f"{target}: {size} samples, spacing {grid.voxel_size:g}, {seconds:.1f} s")
-
-
-@contextmanager
-def bar(label: str, quiet: bool) -> Iterator[Callable[[int, int], None]]:
-    """Draw a bar on stderr, if somebody is there to see it."""
-    if quiet or not sys.stderr.isatty():
-        yield lambda done, total: None
-        return
-    with click.progressbar(length=1000, label=label, file=sys.stderr) as shown:
-        yield lambda done, total: shown.update(1000 * done // total - shown.pos)

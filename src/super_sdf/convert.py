@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -15,14 +14,16 @@ from typing import Any
 
 import numpy as np
 
+from .decoder import Decoder
 from .expectation import Expectation, expect
 from .files.grids import read_grid
 from .files.meshes import write_pieces
 from .grid import SdfGrid, Triple
 from .mesh import Mesh
 from .nodes import check_factor
-from .pipeline import Decoder, Piece, Progress, reconstruct_slabs, step_name
+from .pipeline import Piece, reconstruct_slabs
 from .precision import check_format_holds, local_origin_note
+from .progress import Progress, Stopwatch
 from .spacing import as_triple
 
 
@@ -97,27 +98,6 @@ class Conversion:
         }
 
 
-class Stopwatch:
-    """The time between laps, by the name of the lap."""
-
-    def __init__(self, progress: Progress | None = None) -> None:
-        self.seconds: dict[str, float] = {}
-        self.clock = time.perf_counter()
-        self.progress = progress
-
-    def lap(self, stage: str) -> None:
-        """Book the time since the last lap under a stage."""
-        now = time.perf_counter()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.clock
-        self.clock = now
-
-    def step(self, done: int, total: int) -> None:
-        """Book a step of the pipeline, and pass it on."""
-        self.lap(step_name(done))
-        if self.progress:
-            self.progress(done, total)
-
-
 def convert(
     source: str | Path,
     target: str | Path,
@@ -142,7 +122,7 @@ def convert(
     force : bool
         Replace the target if it exists.
     progress : callable, optional
-        Called with (steps done, steps in all).
+        Called with (done, total), see ``progress.Progress``; what it raises ends the work.
     before_rename : callable, optional
         Called with the path of the finished mesh, before it takes the target's name.
     announce : callable, optional
@@ -153,7 +133,7 @@ def convert(
     SuperSdfError
         As ``read_grid``, ``upsample`` and ``write_mesh`` raise it; nothing was written then.
     """
-    watch = Stopwatch(progress)
+    watch = Stopwatch()
     grid = read_grid(
         source,
         spacing=options.spacing,
@@ -175,7 +155,7 @@ def convert(
         offset=options.offset,
         cap=options.cap,
         max_memory=options.max_memory,
-        progress=watch.step,
+        progress=progress,
     )
     total = Total(expected)
     meshes = total.count(pieces, watch)
@@ -196,6 +176,7 @@ class Total:
     def count(self, pieces: Iterable[Piece], watch: Stopwatch) -> Iterator[Mesh]:
         """Pass the meshes on, and count; the time until the next is asked for is for writing."""
         for piece in pieces:
+            watch.take(piece.seconds)
             self.is_cut |= piece.is_cut
             self.counts.update(piece.counts)
             self.counts |= Counter(piece.whole)

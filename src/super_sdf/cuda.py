@@ -13,9 +13,8 @@ import sys
 from contextlib import redirect_stdout
 from pathlib import Path
 
-import onnxruntime as ort
-
 from .errors import DeviceError
+from .onnx import ort
 
 CUDA = "CUDAExecutionProvider"
 DRIVER = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"

@@ -1,48 +1,39 @@
-"""The network: an ONNX file that keeps a contract.
-
-Inputs ``patches`` (V, 27), ``neighbours`` (V, 27), ``voxels`` (D,), ``offsets`` (Q, 3); output
-``values`` (D, Q). All lengths are in half voxels. The file's metadata says what it was made for.
-``device`` runs it.
-"""
+"""The network: an ONNX file that keeps the ``contract``, opened on a ``device``."""
 
 from __future__ import annotations
 
-import json
 import os
+import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
-from onnxruntime import InferenceSession
 
 from .chunks import cores_of_system, useful_threads
-from .cuda import first_line
-from .device import open_session, run_bound, run_on_cpu
+from .contract import INPUTS, one_voxel, read_card
+from .device import open_session
 from .errors import DeviceError, FileError, ModelError, OptionError
 from .files.regular import check_regular_file
 from .grid import FloatArray, IntArray
+from .onnx import ort
 from .options import check_path, check_threads
+from .pace import LONG, Pace, Tell, work_of
+from .running import CUDA_CHUNK, Look, run_bound, run_on_cpu
 from .symmetry import cube_symmetries, turn
 
-FORMAT_VERSION = 1
 DEFAULT_QUALITY = "base"
 # A shipped file, and over how many symmetries of the cube its answers are averaged.
 QUALITIES = {"fast": ("fast", 1), "base": ("base", 1), "best": ("base", 8)}
 PRECISIONS = ("float32", "int8")
-INPUTS = {
-    "patches": "tensor(float)",
-    "neighbours": "tensor(int32)",
-    "voxels": "tensor(int32)",
-    "offsets": "tensor(float)",
-}
-OUTPUT = "values"
 # What a run takes, measured, for each voxel that it sees, its row of the neighbour table included,
 # and for each value; and what it takes to average over symmetries: turned copies, and the mean.
 BYTES = {"float32": (680.0, 8.0), "int8": (950.0, 8.0)}
 TURNED_BYTES = (240.0, 4.0)
+NO_NETWORKS = "super-sdf was installed without its networks: install it again"
+PART = 1024  # rows of a run from which its time is told: two chunks
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -61,14 +52,20 @@ class Network:
         CPU threads; 0 for one a core.
     notes : tuple of str
         What the user should know of the device.
+    pace : Pace
+        How long runs take, learnt from them.
+    tells_progress : bool
+        That a call takes ``progress``: see ``decoder.Decoder``.
     """
 
-    session: InferenceSession
+    session: ort.InferenceSession
     card: Mapping[str, Any]
     device: str
     symmetries: int = 1
     threads: int = 0
     notes: tuple[str, ...] = ()
+    pace: Pace = field(default_factory=Pace, repr=False)
+    tells_progress: ClassVar[bool] = True
 
     def __repr__(self) -> str:
         threads = self.threads or "all"
@@ -80,8 +77,7 @@ class Network:
     @property
     def receptive_field(self) -> int | None:
         """Voxels to each side that a prediction depends on, None if the file does not say."""
-        field = self.card.get("receptive_field")
-        return field if isinstance(field, int) else None
+        return self.card.get("receptive_field")
 
     @property
     def memory_bytes(self) -> tuple[float, float]:
@@ -92,9 +88,17 @@ class Network:
         return voxel + TURNED_BYTES[0], value + TURNED_BYTES[1]
 
     def __call__(
-        self, patches: FloatArray, table: IntArray, voxels: IntArray, offsets: FloatArray
+        self,
+        patches: FloatArray,
+        table: IntArray,
+        voxels: IntArray,
+        offsets: FloatArray,
+        progress: Tell | None = None,
     ) -> FloatArray:
         """Return the values (D, Q) of voxels (D,) at offsets (Q, 3), in half voxels.
+
+        ``progress`` is called several times a second with the share that is done, 0 to 1, an
+        estimate by the clock. An interrupt, or what it raises, ends the call in milliseconds.
 
         Raises
         ------
@@ -102,17 +106,25 @@ class Network:
             If onnxruntime fails, for want of memory on a GPU, say.
         """
         if self.symmetries == 1:
-            return self._run(patches, table, voxels, offsets)
+            return self._run(patches, table, voxels, offsets, progress)
         mean = np.zeros((len(voxels), len(offsets)), np.float32)
-        for symmetry in cube_symmetries()[: self.symmetries]:
+        for number, symmetry in enumerate(cube_symmetries()[: self.symmetries]):
             turned, turned_table, moved = turn(symmetry, patches, table, offsets)
-            mean += self._run(turned, turned_table, voxels, moved) / self.symmetries
+            tell = progress and part_of(progress, number, self.symmetries)
+            values = self._run(turned, turned_table, voxels, moved, tell)
+            with np.errstate(invalid="ignore"):  # infinities are the caller's to refuse
+                mean += values / self.symmetries
         return mean
 
     def _run(
-        self, patches: FloatArray, table: IntArray, voxels: IntArray, offsets: FloatArray
+        self,
+        patches: FloatArray,
+        table: IntArray,
+        voxels: IntArray,
+        offsets: FloatArray,
+        progress: Tell | None,
     ) -> FloatArray:
-        """Run the session.
+        """Run the session; watched if that takes long, for a thread takes a tenth of a millisecond.
 
         Of fewer voxels than offsets onnxruntime would make the sums in an order that depends on how
         many threads there are, so voxels are repeated until there are as many.
@@ -120,18 +132,56 @@ class Network:
         count = len(voxels)
         voxels = np.resize(voxels, max(count, len(offsets)))
         feeds = dict(zip(INPUTS, (patches, table, voxels, offsets)))
-        try:
-            run = run_bound if self.device == "cuda" else run_on_cpu
-            return run(self.session, feeds)[:count]
-        except Exception as error:  # onnxruntime's errors have no common base but this
-            raise DeviceError(
-                f"the network failed on {self.device}: {first_line(error)}"
-            ) from error
+        work = work_of(len(patches), len(voxels), len(offsets))
+        if work < LONG:
+            return self._ask(feeds)[:count]
+        if progress and self.pace.seconds is None:
+            self._try_part(feeds)
+        watch = self.pace.watch(work, progress or (lambda share: None))
+        begun = time.perf_counter()
+        values = self._ask(feeds, watch)
+        self.pace.learn(work, time.perf_counter() - begun)
+        return values[:count]
+
+    def _ask(self, feeds: Mapping[str, Any], look: Look | None = None) -> FloatArray:
+        """Run the session where it is."""
+        run = run_bound if self.device == "cuda" else run_on_cpu
+        return run(self.session, feeds, look=look)
+
+    def _try_part(self, feeds: Mapping[str, Any]) -> None:
+        """Learn the pace from a small part of a run: the first chunks."""
+        rows = CUDA_CHUNK if self.device == "cuda" else PART
+        part = first_rows(feeds, rows - 1)  # one more is added to fill the last chunk
+        begun = time.perf_counter()
+        self._ask(part)
+        offsets = len(part["offsets"])  # no fewer voxels than these are decoded at a time
+        work = work_of(rows, max(len(part["voxels"]), offsets), offsets)
+        self.pace.learn(work, time.perf_counter() - begun)
+
+
+def part_of(progress: Tell, number: int, count: int) -> Tell:
+    """Return what tells of the whole when it is told how far one part of ``count`` is."""
+    return lambda share: progress((number + share) / count)
+
+
+def first_rows(feeds: Mapping[str, Any], rows: int) -> dict[str, Any]:
+    """Return the inputs of the first rows of a band, cut off from the others."""
+    table, voxels = feeds["neighbours"][:rows], feeds["voxels"]
+    decoded = voxels[voxels < rows]
+    return {
+        "patches": feeds["patches"][:rows],
+        "neighbours": np.where(table < rows, table, np.int32(-1)),
+        "voxels": decoded if len(decoded) else np.zeros(1, np.int32),
+        "offsets": feeds["offsets"],
+    }
 
 
 def shipped_models() -> dict[str, Path]:
-    """Return the networks that come with the package, by name."""
-    folder = Path(str(resources.files("super_sdf.models")))
+    """Return the networks that come with the package, by name; none if it lost their folder."""
+    try:
+        folder = Path(str(resources.files("super_sdf.models")))
+    except ImportError:
+        return {}
     return {path.stem: path for path in sorted(folder.glob("*.onnx"))}
 
 
@@ -148,6 +198,8 @@ def find_model(model: str | Path, precision: str = "float32") -> tuple[Path, int
     if precision not in PRECISIONS:
         raise OptionError(f"precision is {precision!r}: give one of {', '.join(PRECISIONS)}")
     name, symmetries = QUALITIES.get(str(model), (str(model), 1))
+    if str(model) in QUALITIES and name not in shipped_models():
+        raise FileError(f"the network {name!r} is missing: {NO_NETWORKS}")
     path = shipped_models().get(name, Path(model))
     if precision == "int8":
         path = path.with_name(f"{path.stem}-int8.onnx")  # beside that of float32
@@ -201,7 +253,9 @@ def load_network(
     if not threads and useful == cores_of_system():
         useful = 0  # onnxruntime's own choice, one a physical core
     opened = open_session(path, device, useful, one_voxel())
-    card = _read_card(opened.session, path)
+    card = read_card(opened.session, path)
+    if opened.failure:
+        raise ModelError(f"{path} does not run with its own inputs: {opened.failure}")
     notes = (*opened.notes, *_note_threads(threads, useful))
     return Network(opened.session, card, opened.device, symmetries, useful, notes)
 
@@ -218,35 +272,3 @@ def _cpu_for_int8(device: str) -> str:
     if device == "cuda":
         raise DeviceError("int8 is for the CPU: use --precision float32 with --device cuda")
     return "cpu" if device == "auto" else device
-
-
-def one_voxel() -> dict[str, Any]:
-    """Return the least that a network can be asked: one voxel, without neighbours, one offset."""
-    return {
-        "patches": np.zeros((1, 27), np.float32),
-        "neighbours": np.full((1, 27), -1, np.int32),
-        "voxels": np.zeros(1, np.int32),
-        "offsets": np.zeros((1, 3), np.float32),
-    }
-
-
-def _read_card(session: InferenceSession, path: Path) -> dict[str, Any]:
-    """Return a file's metadata after checking that it keeps the contract."""
-    inputs = {given.name: given.type for given in session.get_inputs()}
-    outputs = [given.name for given in session.get_outputs()]
-    metadata = session.get_modelmeta().custom_metadata_map
-    version = metadata.get("format_version", "none")
-    if inputs != INPUTS or outputs != [OUTPUT] or version != str(FORMAT_VERSION):
-        raise ModelError(
-            f"{path} is no super-sdf network of format {FORMAT_VERSION} (format {version}, inputs "
-            f"{', '.join(inputs)}); export one with export/to_onnx.py"
-        )
-    return {key: _parse(text) for key, text in metadata.items()}
-
-
-def _parse(text: str) -> Any:
-    """Read a metadata value: JSON where it is JSON, else text."""
-    try:
-        return json.loads(text)
-    except json.JSONDecodeError:
-        return text

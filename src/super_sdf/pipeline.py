@@ -12,18 +12,19 @@ the same.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
 from .border import close_at_border
 from .chunks import working_threads
 from .compiling import use_compiled
+from .decoder import Decoder, decode
 from .field import FineField, border_is_crossed
 from .footprint import NETWORK_BYTES
-from .grid import FloatArray, IntArray, SdfGrid
+from .grid import IntArray, SdfGrid
 from .isosurface import extract_pieces, vertex_type
 from .memory import hold_less, memory_bound
 from .mesh import Mesh, join_meshes
@@ -44,33 +45,9 @@ from .options import (
     check_progress,
 )
 from .plan import Slab, peak_bytes, plan_slabs
+from .progress import STEPS, Progress, Steps
 from .spheres import Samples, fit_to_spheres
 from .survey import Band, no_surface, survey
-
-Progress = Callable[[int, int], None]
-"""Called with (steps done, steps in all)."""
-
-# The first once, the others for each slab.
-STEPS = ("band", "network", "nodes", "isosurface")
-
-
-def step_name(done: int) -> str:
-    """Return what was done when a progress callback is told of so many steps."""
-    return STEPS[0] if done == 1 else STEPS[1 + (done - 2) % (len(STEPS) - 1)]
-
-
-class Decoder(Protocol):
-    """What the pipeline asks of a network: see ``network.Network``.
-
-    If it has a ``receptive_field`` (voxels to each side), it need not see the whole band at once.
-    Its ``memory_bytes`` say what it takes: see ``footprint.slab_bytes``.
-    """
-
-    def __call__(
-        self, patches: FloatArray, table: IntArray, voxels: IntArray, offsets: FloatArray
-    ) -> FloatArray:
-        """Map patches (V, 27), neighbours (V, 27), voxels (D,), offsets (Q, 3) to (D, Q)."""
-        ...
 
 
 def upsample(
@@ -97,7 +74,7 @@ def upsample(
         ``grid.values``, which equal the offset there, are always negative inside. The distances
         must go 1.5 spacings further.
     progress : callable, optional
-        Called with (steps done, steps in all).
+        Called with (done, total), see ``progress.Progress``; what it raises ends the work.
 
     Returns
     -------
@@ -110,6 +87,8 @@ def upsample(
         If the factor is odd or out of range, or another argument is not what it should be.
     OutOfMemoryError
         If the fine values would not fit in memory.
+    ModelError
+        If the network gives values that are not finite.
     GridError
         If the distances end within 1.5 spacings of the offset; if it is too far from the origin for
         vertices to be told apart; if no surface is found: thin parts may pass between samples that
@@ -119,10 +98,11 @@ def upsample(
     check_network(network)
     check_progress(progress)
     factor, offset = check_factor(factor), check_distance(offset)
+    steps = Steps(progress, [name for name in STEPS if name != "isosurface"])
     with working_threads(getattr(network, "threads", 0)):
         band = find_surface(grid, factor, offset, memory_bound())
         (slab,) = plan_slabs(band, factor, None, memory_bound(), bytes_of(network))
-        steps = Steps(progress, slabs=1)
+        steps.finish("band")
         field = refine(band, network, factor, slab, steps)
     if len(field.signs()) < 2:
         raise no_surface(grid, offset)
@@ -173,6 +153,8 @@ class Piece:
         Whether the surface runs out of the grid here.
     signs : set of bool
         Whether there are outer nodes (True), and others (False).
+    seconds : dict
+        What each step took, by its name in ``progress.STEPS``; the first piece's has the band's.
     """
 
     meshes: list[Mesh]
@@ -180,6 +162,7 @@ class Piece:
     whole: dict[str, int]
     is_cut: bool
     signs: set[bool]
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
 
 
 def reconstruct_slabs(
@@ -216,13 +199,15 @@ def _slabs(
 ) -> Iterator[Piece]:
     """Yield the pieces of ``reconstruct_slabs``, whose arguments were checked."""
     threads = getattr(network, "threads", 0)
+    steps = Steps(progress)
     bound = memory_bound(max_memory)
     with working_threads(threads):
         band = find_surface(grid, factor, offset, bound)
         field, taken = getattr(network, "receptive_field", None), bytes_of(network)
         slabs = plan_slabs(band, factor, field, bound, taken)
         planned = {"slabs": len(slabs), "planned_bytes": peak_bytes(band, slabs, factor, taken)}
-    steps = Steps(progress, len(slabs))
+    steps.divide(len(slabs))
+    steps.finish("band")
     vertices = 0
     seen: set[bool] = set()
     for slab in slabs:
@@ -234,11 +219,13 @@ def _slabs(
             meshes = extract_pieces(whole, grid, first_vertex=vertices)
             piece = describe_piece(field, meshes, planned)
             del field, whole, meshes  # no more of them than one at a time
-        steps.finish_one()
+        steps.finish("isosurface")
+        piece.seconds.update(steps.take_seconds())
         vertices += piece.counts["vertices"]
         seen |= piece.signs
         yield piece
         del piece  # before the next is made
+        steps.watch.start()  # what passed meanwhile is the caller's
     if len(seen) < 2:
         raise no_surface(grid, offset)
 
@@ -247,20 +234,6 @@ def bytes_of(network: Decoder) -> tuple[float, float]:
     """Return what a network takes for each voxel that it sees, and for each value."""
     taken: tuple[float, float] = getattr(network, "memory_bytes", NETWORK_BYTES)
     return taken
-
-
-class Steps:
-    """Counts the steps that are done and tells of each."""
-
-    def __init__(self, progress: Progress | None, slabs: int) -> None:
-        self.progress = progress or (lambda done, total: None)
-        self.done, self.total = 0, 1 + (len(STEPS) - 1) * slabs
-        self.finish_one()  # the band
-
-    def finish_one(self) -> None:
-        """Count one more."""
-        self.done += 1
-        self.progress(self.done, self.total)
 
 
 def find_surface(grid: SdfGrid, factor: int, offset: float, bound: int | None) -> Band:
@@ -277,10 +250,10 @@ def refine(
     band: Band, network: Decoder, factor: int, slab: Slab, steps: Steps | None = None
 ) -> FineField:
     """Return the fine field of a slab, or of the whole band."""
-    steps = steps or Steps(None, slabs=1)
-    patches, table, voxels = band.network_inputs(slab.seen, slab.decoded)
-    blocks = network(patches, table, voxels, block_offsets(factor))  # Eqs. 3 and 5
-    steps.finish_one()
+    steps = steps or Steps()
+    inputs = patches, table, voxels = band.network_inputs(slab.seen, slab.decoded)
+    blocks = decode(network, inputs, block_offsets(factor), steps.within("network"))  # Eqs. 3, 5
+    steps.finish("network")
 
     row_of = rows_among(voxels, len(table))
     nodes = number_shared_nodes(row_of[table[voxels]], factor)
@@ -291,7 +264,7 @@ def refine(
     own_ijk = band.voxel_ijk[slab.seen][voxels]
     skipped = signs_of_skipped(nodes.table, own_ijk, patches, voxels, band.shape)
     pinned = pin_to_skipped(values, nodes, skipped)
-    steps.finish_one()
+    steps.finish("nodes")
     field = FineField(band.shape, factor, own_ijk, nodes, values, slab.planes)
     return replace(
         field,

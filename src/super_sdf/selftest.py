@@ -14,12 +14,13 @@ from importlib.metadata import PackageNotFoundError, version
 import numpy as np
 
 from . import __version__
+from .compiling import try_compiled
 from .cuda import available_devices, check_cuda, describe_gpu, onnxruntime_version
 from .errors import DeviceError, SuperSdfError
 from .extras import EXTRAS, how_to_install, missing_modules
 from .grid import FloatArray, IntArray, SdfGrid
 from .memory import free_memory
-from .network import load_network, shipped_models
+from .network import NO_NETWORKS, load_network, shipped_models
 from .nodes import block_offsets
 from .survey import survey
 
@@ -63,6 +64,8 @@ def run_checks(device: str = "auto") -> Iterator[Finding]:
         found = find_cuda(needed=device == "cuda" or "cuda" in available_devices())
         devices += ["cuda"] * (found.state == OK)
         yield found
+    if not shipped_models():
+        yield Finding(FAILED, "networks", NO_NETWORKS)
     ball = make_ball()
     for name in sorted(shipped_models(), key=lambda name: "int8" in name):  # made from the others
         yield from check_network(name, ["cpu"] if "int8" in name else devices, ball)
@@ -164,9 +167,12 @@ def judge(
 
 
 def check_extra(name: str, modules: tuple[str, ...]) -> Finding:
-    """Say whether an extra's modules are there."""
+    """Say whether an extra's modules are there, and whether numba works."""
     missing = missing_modules(modules)
     if missing:
         says = f"no {', '.join(missing)}: {how_to_install(name)}"
         return Finding(MISSING, f"extra {name}", says)
+    fault = try_compiled() if "numba" in modules else ""  # the one that upsample takes unasked
+    if fault:
+        return Finding(FAILED, f"extra {name}", fault)
     return Finding(OK, f"extra {name}", ", ".join(modules))

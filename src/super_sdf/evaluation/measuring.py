@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from ..decoder import Decoder
 from ..errors import FileError, SuperSdfError
 from ..files.regular import check_regular_file
 from ..memory import forget_peak, held_memory
 from ..mesh import Mesh
 from ..network import find_model, load_network
-from ..pipeline import Decoder
 from . import metrics
 from .cases import RESULT_POINTS, Case, Setting, Shape
 from .methods import METHODS, Surface

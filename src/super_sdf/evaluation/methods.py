@@ -13,11 +13,12 @@ import numpy as np
 from scipy import ndimage
 from skimage.measure import marching_cubes
 
+from ..decoder import Decoder
 from ..errors import NoSurfaceError
 from ..grid import FloatArray, SdfGrid
 from ..mesh import Mesh
 from ..nodes import block_ijk
-from ..pipeline import Decoder, reconstruct, refine
+from ..pipeline import reconstruct, refine
 from ..plan import whole
 from ..survey import survey
 from .cases import Case, spread_samples

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..decoder import Decoder
 from ..grid import IntArray, SdfGrid
 from ..mesh import Mesh
-from ..pipeline import Decoder
 from .cases import Case
 from .methods import Method, Surface
 from .sampling import grid_points

@@ -1,0 +1,127 @@
+"""A run leaves no file in the user's home, opens no socket and prints no line of onnxruntime."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ball
+
+import super_sdf
+from super_sdf import onnx
+from super_sdf.errors import DeviceError
+
+# The kernel ends the process at its first socket, whichever thread or library asks for it.
+NO_SOCKETS = """
+import ctypes, platform, struct
+def forbid_sockets():
+    number = {"x86_64": 41, "aarch64": 198}[platform.machine()]
+    load_number, return_if_other = (0x20, 0, 0, 0), (0x15, 0, 1, number)
+    kill, allow = (0x06, 0, 0, 0x80000000), (0x06, 0, 0, 0x7FFF0000)
+    steps = b"".join(struct.pack("HBBI", *s) for s in (load_number, return_if_other, kill, allow))
+    kept = ctypes.create_string_buffer(steps)
+    class Program(ctypes.Structure):
+        _fields_ = [("count", ctypes.c_ushort), ("steps", ctypes.c_void_p)]
+    library = ctypes.CDLL(None, use_errno=True)
+    assert library.prctl(38, 1, 0, 0, 0) == 0  # PR_SET_NO_NEW_PRIVS
+    program = Program(4, ctypes.addressof(kept))
+    assert library.prctl(22, 2, ctypes.byref(program)) == 0  # PR_SET_SECCOMP, by a filter
+forbid_sockets()
+"""
+UPSAMPLE = """
+import os, sys
+from super_sdf.cli import main
+sys.argv = ["super-sdf", "upsample", "in.npy", "out.ply", "--device", "cpu"]
+main()
+assert "ORT_DISABLE_TELEMETRY" not in os.environ
+print(sum(os.readlink(e.path).startswith("socket") for e in os.scandir("/proc/self/fd")
+          if os.path.islink(e.path)))
+"""
+
+
+def run_at_home(home, script, **variables):
+    """Run a script in a process of its own, whose user has this home and no settings."""
+    kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH") if name in os.environ}
+    sources = str(Path(super_sdf.__file__).parent.parent)
+    given = {"HOME": str(home), "PYTHONPATH": sources, "PYTHONDONTWRITEBYTECODE": "1"}
+    return subprocess.run(
+        [sys.executable, "-c", script],
+        env={**kept, **given, **variables},
+        capture_output=True,
+        text=True,
+    )
+
+
+@pytest.mark.parametrize("home", ["fresh", "unwritable"])
+def test_a_run_leaves_nothing_at_home_and_calls_nobody(tmp_path, monkeypatch, home):
+    monkeypatch.chdir(tmp_path)
+    np.save("in.npy", ball(16, 4.0).values)
+    Path("fresh").mkdir()
+    Path("unwritable").write_text("")  # nothing can be made below a file, not even by root
+    run = run_at_home(tmp_path / home, NO_SOCKETS + UPSAMPLE)
+    assert (run.returncode, run.stdout) == (0, "0\n"), run.stderr
+    notes, (last,) = run.stderr.splitlines()[:-1], run.stderr.splitlines()[-1:]
+    assert last.startswith("out.ply: ") and all(note.startswith("Note: ") for note in notes)
+    assert list(Path("fresh").iterdir()) == []
+    assert sorted(os.listdir()) == ["fresh", "in.npy", "out.ply", "unwritable"]
+
+
+@pytest.mark.parametrize("words", [["info"], ["info", "--check", "--device", "cpu"]])
+def test_info_needs_no_home(tmp_path, words):
+    (tmp_path / "unwritable").write_text("")
+    script = (
+        f"import sys; from super_sdf.cli import main; sys.argv = {['super-sdf', *words]}; main()"
+    )
+    run = run_at_home(tmp_path / "unwritable", NO_SOCKETS + script)
+    assert (run.returncode, run.stderr) == (0, "") and "base" in run.stdout
+    assert os.listdir(tmp_path) == ["unwritable"]
+
+
+def test_a_socket_would_have_been_seen(tmp_path):
+    run = run_at_home(tmp_path, NO_SOCKETS + "import socket; socket.socket()")
+    assert run.returncode == -31  # SIGSYS
+
+
+def test_telemetry_is_off_for_the_import_alone(monkeypatch):
+    monkeypatch.delenv(onnx.SWITCH, raising=False)
+    with onnx.without_telemetry():
+        assert os.environ[onnx.SWITCH] == "1"
+    assert onnx.SWITCH not in os.environ
+    with pytest.raises(KeyError), onnx.without_telemetry():
+        raise KeyError
+    assert onnx.SWITCH not in os.environ
+
+
+def test_what_the_user_decided_stays(monkeypatch):
+    monkeypatch.setenv(onnx.SWITCH, "0")
+    with onnx.without_telemetry():
+        assert os.environ[onnx.SWITCH] == "0"
+    assert os.environ[onnx.SWITCH] == "0"
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [
+        ("raise ImportError('no libonnxruntime.so\\nmore')", "no libonnxruntime.so"),
+        ("x = 1 / 0", "division by zero"),
+    ],
+)
+def test_an_onnxruntime_that_does_not_load_is_one_line(tmp_path, fault, reason):
+    (tmp_path / "onnxruntime.py").write_text(fault)
+    np.save(tmp_path / "in.npy", ball(16, 4.0).values)
+    script = f"import sys; sys.path.insert(0, {str(tmp_path)!r})" + UPSAMPLE.replace(
+        "in.npy", str(tmp_path / "in.npy")
+    )
+    run = run_at_home(tmp_path, script)
+    way_out = "pip install --force-reinstall onnxruntime"
+    said = f"Error: onnxruntime cannot be imported ({reason}): {way_out}\n"
+    assert (run.returncode, run.stderr) == (1, said)
+
+
+def test_an_onnxruntime_that_does_not_load_is_an_error_of_ours(monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    monkeypatch.delitem(sys.modules, "super_sdf.onnx")
+    with pytest.raises(DeviceError, match=r"^onnxruntime cannot be imported"):
+        __import__("super_sdf.onnx")
