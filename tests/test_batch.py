@@ -179,6 +179,20 @@ def test_fail_fast_begins_nothing_after_a_failure(run_batch):
     assert len(rows()) == 1
 
 
+def test_a_dry_run_in_json_is_the_plan(run_batch):
+    run_batch("in/bad.npy", "in/deep")
+    Path("out/a.ply").write_text("mine")
+    np.save("in/new.npy", ball(12, 3.0).values)
+    code, out, err = run_batch("in", "--dry-run", "--json")
+    plan = json.loads(out)
+    assert code == 0 and err == "1 to do, 2 done before, 1 failed before, 1 refused\n"
+    assert plan["to_do"] == [{"in": os.path.abspath("in/new.npy"), "out": "new.ply"}]
+    assert plan["failed_before"] == [
+        {"in": os.path.abspath("in/bad.npy"), "out": "bad.ply", "reason": CONSTANT}
+    ]
+    assert [entry["out"] for entry in plan["refused"]] == ["a.ply"] and plan["unread"] == []
+
+
 def test_json_is_the_summary(run_batch):
     code, out, err = run_batch("in", "--json", "--quiet")
     facts = json.loads(out)
