@@ -180,7 +180,8 @@ def test_fail_fast_begins_nothing_after_a_failure(run_batch):
 
 
 def test_a_dry_run_in_json_is_the_plan(run_batch):
-    run_batch("in/bad.npy", "in/deep")
+    Path("in/list.txt").write_text("bad.npy\ndeep/b.npz\ndeep/er/c.d.npy")
+    run_batch("in/list.txt")
     Path("out/a.ply").write_text("mine")
     np.save("in/new.npy", ball(12, 3.0).values)
     code, out, err = run_batch("in", "--dry-run", "--json")

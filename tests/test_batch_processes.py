@@ -157,7 +157,7 @@ def test_a_worker_that_dies_once_costs_nothing(command):
     assert len(rows()) == 10 and not list(Path("out").rglob(".*.part"))
 
 
-def test_a_file_at_which_two_processes_die_is_named(run_batch, monkeypatch):
+def test_a_file_at_which_two_processes_die_is_named(command, monkeypatch):
     seen = []
 
     def deaths(self, count):
@@ -169,7 +169,7 @@ def test_a_file_at_which_two_processes_die_is_named(run_batch, monkeypatch):
 
     monkeypatch.setattr(Pool, "results", deaths)
     monkeypatch.setattr("super_sdf.batch.workers.count_cores", lambda: 2)
-    code, _, err = run_batch("in", "--jobs", 2)
+    code, _, err = command("batch", "in", "--out", "out", "--quality", "fast", "--jobs", 2)
     reason = "the process that converted it died of SIGKILL, twice"
     assert code == 1 and err.startswith(f"Failed: in/a.npy: {reason}\n3 done, 1 failed")
     assert [job.source.name for job in seen].count("a.npy") == 2
