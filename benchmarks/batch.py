@@ -183,6 +183,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--kills", type=int, default=3)
     parser.add_argument("--faults", type=int, default=0, help="kills at random moments instead")
     parser.add_argument("--full", type=int, default=0, help="full disks instead")
+    parser.add_argument("--seed", type=int, default=0, help="of the moments of faults")
     parser.add_argument("--jobs", type=int, default=count_cores(), help="processes")
     parser.add_argument("--equal", type=int, default=40, help="meshes held against single runs")
     parser.add_argument("--overhead", type=int, default=40, help="files timed, each three times")
@@ -212,10 +213,13 @@ def report_faults(folder: Path, asked: argparse.Namespace) -> None:
     """Print what came of each kind of fault."""
     kinds = [kind for kind, _ in zip(cycle(KILLS), range(asked.faults))]
     kinds += [kind for kind, _ in zip(cycle(LIMITS), range(asked.full))]
-    counts = count_faults(make_setting(folder, asked.count, asked.sizes), kinds)
-    print(f"{describe_machine()}; {asked.count} files\n\n| | | |\n| --- | --- | --- |")
-    for (kind, came), count in sorted(counts.items()):
-        print(f"| {kind} | {count} | {came} |")
+    counts = count_faults(make_setting(folder, asked.count, asked.sizes), kinds, asked.seed)
+    print(f"{describe_machine()}; {asked.count} files\n")
+    print(
+        "| fault | exit code | times | found then, and after another run |\n" + "| --- " * 4 + "|"
+    )
+    for (kind, code, found), count in sorted(counts.items()):
+        print(f"| {kind} | {code} | {count} | {found} |")
 
 
 def report(place: Place, solids: dict[str, Placed], asked: argparse.Namespace, total: int) -> None:

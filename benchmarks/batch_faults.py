@@ -34,6 +34,8 @@ KILLS = {
     "worker ended": signal.SIGTERM,
 }
 LIMITS = ("file limit", "full disk")
+BALLAST = "ballast"  # a file that fills the disk until the first run is over
+Process = subprocess.Popen[bytes]
 OWN_FILES = {"report.jsonl", ".super-sdf-batch"}
 
 
@@ -46,7 +48,7 @@ class Setting:
     right: dict[str, bytes]
     seconds: float
 
-    def start(self, limit: int | None = None) -> subprocess.Popen[bytes]:
+    def start(self, limit: int | None = None) -> Process:
         """Start the batch, where no file may grow beyond a limit."""
         words = [*COMMAND, str(self.grids), "--out", str(self.meshes), "--jobs", "2"]
         words += ["--quality", "fast", "--factor", "2", "--quiet"]
@@ -73,33 +75,38 @@ def make_setting(folder: Path, count: int, sizes: list[int]) -> Setting:
     return Setting(setting.grids, setting.meshes, right, time.perf_counter() - start)
 
 
-def count_faults(setting: Setting, kinds: list[str], seed: int = 0) -> Counter[tuple[str, str]]:
-    """Run a trial a kind; count what came of each: "right", or what was wrong."""
-    rng, counts = np.random.default_rng(seed), Counter[tuple[str, str]]()
+def count_faults(setting: Setting, kinds: list[str], seed: int) -> Counter[tuple[str, int, str]]:
+    """Run a trial a kind; count exit codes, and what was found: "right", or what was wrong."""
+    rng, counts = np.random.default_rng(seed), Counter[tuple[str, int, str]]()
     for kind in kinds:
         rmtree(setting.meshes, ignore_errors=True)
         setting.meshes.mkdir()
         with small_disk(setting.meshes) if kind == "full disk" else nullcontext():
-            wrong = try_once(setting, kind, rng) or "right"
-            counts[kind, wrong] += 1
-        if wrong != "right":
+            code, wrong = try_once(setting, kind, rng)
+        counts[kind, code, wrong or "right"] += 1
+        if wrong:
             print(f"{kind}: {wrong}", file=sys.stderr, flush=True)
     return counts
 
 
-def try_once(setting: Setting, kind: str, rng: np.random.Generator) -> str | None:
-    """Let a fault happen, and run the batch again; return what is wrong, if anything is."""
-    said = FAULTS[kind](setting, kind, rng)
+def try_once(setting: Setting, kind: str, rng: np.random.Generator) -> tuple[int, str | None]:
+    """Let a fault happen, and run the batch again.
+
+    Return the exit code of the first run, and what is wrong, if anything is.
+    """
+    process = FAULTS[kind](setting, kind, rng)
+    said, code = process.communicate()[1], process.returncode
+    (setting.meshes / BALLAST).unlink(missing_ok=True)
     if b"Traceback" in said:
-        return f"a traceback: {said.decode()}"
+        return code, f"a traceback: {said.decode()}"
     wrong = half_written(setting)
     if wrong:
-        return wrong
+        return code, wrong
     process = setting.start()
-    _, said = process.communicate()
+    said = process.communicate()[1]
     if process.returncode or said:
-        return f"exit code {process.returncode} when run again: {said.decode()}"
-    return incomplete(setting)
+        return code, f"exit code {process.returncode} when run again: {said.decode()}"
+    return code, incomplete(setting)
 
 
 def half_written(setting: Setting) -> str | None:
@@ -127,7 +134,7 @@ def incomplete(setting: Setting) -> str | None:
     return f"left over or missing: {', '.join(names)}" if names else half_written(setting)
 
 
-def kill(setting: Setting, kind: str, rng: np.random.Generator) -> bytes:
+def kill(setting: Setting, kind: str, rng: np.random.Generator) -> Process:
     """Send a signal to the batch, or to one of its workers, at a random moment."""
     process = setting.start()
     time.sleep(rng.uniform(0, setting.seconds))
@@ -137,7 +144,7 @@ def kill(setting: Setting, kind: str, rng: np.random.Generator) -> bytes:
     if victims and process.poll() is None:
         with suppress(psutil.NoSuchProcess):  # it was through
             psutil.Process(victims[rng.integers(len(victims))]).send_signal(KILLS[kind])
-    return process.communicate()[1]
+    return process
 
 
 def children_of(pid: int) -> list[psutil.Process]:
@@ -149,25 +156,21 @@ def children_of(pid: int) -> list[psutil.Process]:
         return []
 
 
-def limit_files(setting: Setting, kind: str, rng: np.random.Generator) -> bytes:
+def limit_files(setting: Setting, kind: str, rng: np.random.Generator) -> Process:
     """Let no file grow beyond a random size: what is over it is written in part."""
     largest = max(map(len, setting.right.values()))
-    return setting.start(int(rng.integers(0, largest))).communicate()[1]
+    return setting.start(int(rng.integers(0, largest)))
 
 
-def fill_disk(setting: Setting, kind: str, rng: np.random.Generator) -> bytes:
-    """Leave a random room on the disk, and make more when the batch has ended."""
-    ballast = setting.meshes / "ballast"
-    need = sum(map(len, setting.right.values()))
-    with ballast.open("wb") as file:
-        file.write(bytes(max(0, DISK_BYTES - int(rng.integers(0, 1.2 * need)))))
-    said = setting.start().communicate()[1]
-    ballast.unlink()
-    return said
+def fill_disk(setting: Setting, kind: str, rng: np.random.Generator) -> Process:
+    """Leave a random room on the disk."""
+    room = int(rng.integers(0, sum(map(len, setting.right.values()))))
+    (setting.meshes / BALLAST).write_bytes(bytes(max(0, DISK_BYTES - room)))
+    return setting.start()
 
 
 DISK_BYTES = 4 << 20
-FAULTS: dict[str, Callable[[Setting, str, np.random.Generator], bytes]] = {
+FAULTS: dict[str, Callable[[Setting, str, np.random.Generator], Process]] = {
     **dict.fromkeys(KILLS, kill),
     "file limit": limit_files,
     "full disk": fill_disk,

@@ -21,9 +21,15 @@ out = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 grid = read_grid(Path(__file__).parent / "part.npz")
 network = load_network(threads=2)  # loaded once; may be shared by threads
 
+
+def show(done: int, total: int) -> None:
+    """Say how far it is, on a line that is written over."""
+    print(f"step {done} of {total}", end="\r", file=sys.stderr)
+
+
 for offset in (0, 1, 2, 3, 99):
     try:
-        field = upsample(grid, network, factor=2, offset=offset)
+        field = upsample(grid, network, factor=2, offset=offset, progress=show)
     except SuperSdfError as error:
         print(f"offset {offset}: {error}")
         continue

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
+from batches import FAST, PLAIN
 
 from super_sdf import SdfGrid, footprint, plan
 from super_sdf.band import NEIGHBOURHOOD
@@ -72,6 +75,29 @@ def command(
         return code, out, err
 
     return run
+
+
+@pytest.fixture
+def grid_folder(tmp_path, monkeypatch):
+    """Work in a folder of its own with three good grids and a bad one below ``in``."""
+    monkeypatch.chdir(tmp_path)
+    Path("in/deep/er").mkdir(parents=True)
+    np.save("in/a.npy", ball(12, 3.0).values)
+    np.savez("in/deep/b.npz", values=ball(12, 3.5).values)
+    np.save("in/deep/er/c.d.npy", ball(12, 4.0).values[:7])
+    np.save("in/bad.npy", np.ones((4, 4, 4)))
+
+
+@pytest.fixture
+def run_batch(command):
+    """Run the batch; return exit code and what it says, without the time."""
+
+    def go(*arguments, out="out"):
+        network = () if "--model" in arguments else FAST
+        code, said, err = command("batch", *arguments, "--out", out, *PLAIN, *network)
+        return code, said, re.sub(r"; [\d.]+ s\n$", "\n", err)
+
+    return go
 
 
 @pytest.fixture

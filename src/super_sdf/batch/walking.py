@@ -53,8 +53,11 @@ def _visible_below(path: Path, on_error: OnError) -> Iterator[Path]:
     """Yield a path, and all below it that is not hidden."""
     yield path
     for folder, folders, names in os.walk(path, onerror=on_error):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        yield from (Path(folder, n) for n in (*folders, *names) if not n.startswith("."))
+        below = (Path(folder, name) for name in folders if not name.startswith("."))
+        kept = [path for path in below if not path.is_symlink()]
+        folders[:] = [path.name for path in kept]
+        yield from kept
+        yield from (Path(folder, name) for name in names if not name.startswith("."))
 
 
 def _names(path: Path, on_error: OnError) -> list[str]:

@@ -54,7 +54,10 @@ class _NameTakenError(Exception):
 
 def free_space(path: Path) -> int:
     """Return the bytes that are free where a file is to be."""
-    return shutil.disk_usage(_behind_links(path).parent).free
+    try:
+        return shutil.disk_usage(_behind_links(path).parent).free
+    except OSError as error:
+        raise _cannot_be_written(path, error) from error
 
 
 @contextmanager

@@ -1,0 +1,212 @@
+"""What a batch finds: files, folders, patterns and lists, whatever is in them."""
+
+import errno
+import glob
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from batches import files
+from conftest import ball
+
+from super_sdf.batch.inputs import find_jobs
+from super_sdf.convert import ConvertOptions
+
+pytestmark = pytest.mark.usefixtures("grid_folder")
+
+
+def test_patterns_keep_the_folders_below_their_fixed_part(run_batch):
+    assert run_batch("in/**/*.np?", "--cap", "--dry-run")[2].startswith("4 to do")
+    run_batch("in/de*/**/*.npy")
+    assert files().keys() == {"deep/er/c.d.ply", "report.jsonl"}
+    Path("in/x[1].npy").write_bytes(Path("in/a.npy").read_bytes())
+    assert (
+        run_batch("in/x[1].npy", out="other")[0] == 0
+    )  # a file of that name goes before a pattern
+
+
+def test_a_list_names_files_from_where_it_lies(run_batch):
+    Path("in/list.txt").write_text("# two of them\n\n deep/b.npz\n../in/a.npy\nnone.npy\n")
+    code, _, err = run_batch("in/list.txt")
+    assert code == 1 and files().keys() == {"deep/b.ply", "a.ply", "report.jsonl"}
+    assert f"Failed: {Path('in/none.npy')} does not exist\n" in err
+    assert (
+        run_batch("in/list.txt")[2]
+        .splitlines()[-1]
+        .startswith("nothing to do: 2 done before, 1 fail")
+    )
+    np.save("in/none.npy", ball(12, 3.0).values)
+    assert run_batch("in/list.txt")[0] == 0
+
+
+def test_a_list_of_objects_has_options_of_its_own(run_batch, command):
+    np.save("in/a.npy", -2 * ball(12, 3.0).values)
+    line = {"in": "in/a.npy", "out": "x/y.stl", "spacing": 2, "origin": [1, 2, 3], "factor": 4}
+    other = {"in": "in/deep/er/c.d.npy", "cap": True, "inside": "negative"}
+    lines = [{**line, "inside": "positive", "offset": 1}, other]
+    Path("list.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    assert run_batch("list.jsonl") == (0, "", "2 done, 0 failed; 2 meshes closed, 0 open\n")
+    options = ("--spacing", 2, "--origin", "1,2,3", "--inside", "positive", "--offset", 1)
+    command("upsample", "in/a.npy", "single.stl", *options, "--quality", "fast")
+    assert Path("single.stl").read_bytes() == Path("out/x/y.stl").read_bytes()
+
+
+LISTS = {
+    "{": "list.jsonl, line 1 is no JSON: Expecting property name enclosed in double quotes: "
+    "line 1 column 2 (char 1)",
+    "[1]": 'list.jsonl, line 1 is [1]: give an object, {"in": "a.npy"}',
+    "": "list.jsonl names no file: give a path a line",
+    '{"out": "a.ply"}': "list.jsonl, line 1: 'in' is None: give the path of a grid",
+    '{"in": "a.npy", "Factor": 2}': "list.jsonl, line 1: 'Factor' is unknown: give in, out, "
+    "factor, spacing, origin, inside, offset, cap",
+    '\n{"in": "a.npy", "factor": 3}': "list.jsonl, line 2: factor is 3: give an even number from "
+    "2 to 16 (an odd one has no node on the samples)",
+    '{"in": "a.npy", "factor": true}': "list.jsonl, line 1: 'factor' is True: give a whole number",
+    '{"in": "a.npy", "spacing": [1, 2]}': "list.jsonl, line 1: 'spacing' is [1, 2]: give one "
+    "number, or a list of three",
+    '{"in": "a.npy", "offset": "1"}': "list.jsonl, line 1: 'offset' is '1': give a number",
+    '{"in": "a.npy", "inside": "out"}': "list.jsonl, line 1: 'inside' is 'out': give one of auto, "
+    "negative, positive",
+    '{"in": "a.npy", "cap": 1}': "list.jsonl, line 1: 'cap' is 1: give true or false",
+    '{"in": "a.npy", "out": "a.xyz"}': "list.jsonl, line 1: 'out' is 'a.xyz': give a file, one of "
+    ".ply, .stl, .obj, .off, .glb, .3mf",
+    '{"in": "."}': "list.jsonl, line 1: 'in' is '.': give the path of a grid",
+    '{"in": "../.."}': "list.jsonl, line 1: 'in' is '../..': give the path of a grid",
+    '{"in": "a\\u0000.npy"}': "list.jsonl, line 1: 'in' is 'a\\x00.npy': no file can have this "
+    "name",
+    '{"in": "a\\ud800.npy"}': "list.jsonl, line 1: 'in' is 'a\\ud800.npy': no file can have this "
+    "name",
+    '{"in": "a.npy", "out": "\\udfff.ply"}': "list.jsonl, line 1: 'out' is '\\udfff.ply': no file "
+    "can have this name",
+    '{"in": "a.npy", "offset": 1' + 400 * "0" + "}": "list.jsonl, line 1: 'offset' is 1"
+    + 107 * "0"
+    + "..."
+    + 98 * "0"
+    + ": give a finite number",
+    '{"in": "a.npy", "factor": 1' + 5000 * "0" + "}": "list.jsonl, line 1 is no JSON: Exceeds the "
+    "limit (4300 digits) for integer string conversion: value has 5001 digits; use "
+    "sys.set_int_max_str_digits() to increase the limit",
+    '{"in": "a.npy", "offset": 1e999}': "list.jsonl, line 1: 'offset' is inf: give a finite number",
+    '{"in": "a.npy", "offset": NaN}': "list.jsonl, line 1: NaN is no number: give a finite one",
+    '{"in": "a.npy", "in": "b.npy"}': "list.jsonl, line 1: 'in' is there twice: give it once",
+    100_000 * "[": 'list.jsonl, line 1 is nested too deeply: give an object, {"in": "a.npy"}',
+    f'"{10_000_000 * "x"}"': 'list.jsonl, line 1 is "'
+    + 119 * "x"
+    + "..."
+    + 119 * "x"
+    + '": give an object, {"in": "a.npy"}',
+    '{"in": "a.npy", "out": "report.jsonl/x.ply"}': "a.npy would become report.jsonl/x.ply, but "
+    "the first of these names is the batch's own: rename it",
+    '{"in": "a.npy", "out": "a/../../b.ply"}': "list.jsonl, line 1: 'out' is 'a/../../b.ply': give "
+    "a path within the output folder",
+    '{"in": "a.npy", "out": "../a.ply"}': "list.jsonl, line 1: 'out' is '../a.ply': give a path "
+    "within the output folder",
+}
+
+
+@pytest.mark.parametrize("text", LISTS, ids=range(len(LISTS)))
+def test_a_list_without_meaning_is_refused_before_the_work(run_batch, text):
+    Path("list.jsonl").write_text(text)
+    assert run_batch("list.jsonl") == (2, "", f"Error: {LISTS[text]}\n")
+    assert not Path("out").exists()
+
+
+ARGUMENTS = {
+    "nothing": "nothing does not exist: give grids, folders, patterns or a manifest",
+    "none.npy": "none.npy does not exist: give grids, folders, patterns or a manifest",
+    "in/*.vdb": "in/*.vdb holds no .npy or .npz file",
+    "empty": "empty holds no .npy or .npz file",
+    "odd.vdb": "odd.vdb is neither a grid (.npy, .npz) nor a manifest (.txt, .jsonl)",
+}
+
+
+@pytest.mark.parametrize("argument", ARGUMENTS)
+def test_arguments_that_name_no_grid_are_refused(run_batch, argument):
+    Path("empty").mkdir()
+    Path("odd.vdb").write_text("")
+    assert run_batch("in", argument) == (2, "", f"Error: {ARGUMENTS[argument]}\n")
+
+
+def test_byte_order_marks_and_line_ends_of_windows_change_nothing(run_batch):
+    Path("in/list.txt").write_bytes(b"\xef\xbb\xbfa.npy\r\ndeep/b.npz\r\n")
+    Path("list.jsonl").write_bytes(b'\xef\xbb\xbf{"in": "in/a.npy", "out": "c.ply"}\r\n\r\n')
+    assert run_batch("in/list.txt", "list.jsonl")[0] == 0
+    assert files().keys() == {"a.ply", "deep/b.ply", "c.ply", "report.jsonl"}
+
+
+def test_a_name_too_long_fails_by_its_name(run_batch):
+    long = 300 * "n"
+    Path("list.jsonl").write_text(f'{{"in": "{long}.npy"}}\n{{"in": "in/a.npy"}}')
+    code, _, err = run_batch("list.jsonl")
+    assert code == 1 and files().keys() == {"in/a.ply", "report.jsonl"}
+    reason = "does not exist: the name is longer than the system allows"
+    assert err.startswith(f"Failed: {long}.npy {reason}\n1 done, 1 failed")
+    Path("list.jsonl").write_text(f'{{"in": "in/a.npy", "out": "{long}.ply"}}')
+    code, _, err = run_batch("list.jsonl")
+    reason = f"{Path('out', long)}.ply cannot be written: File name too long"
+    assert code == 1 and err.startswith(f"Failed: in/a.npy: {reason}\n")
+
+
+def test_names_that_no_terminal_shows_take_one_line(run_batch):
+    os.link("in/bad.npy", b"in/bad\n\xff.npy")
+    _, _, err = run_batch("in")
+    assert "Failed: in/bad\\n\\udcff.npy: every value is 1" in err
+    assert "in/bad\\n\\udcff.npy" in run_batch("in", "--dry-run")[1]
+
+
+def test_what_is_no_regular_file_fails_by_its_name(run_batch):
+    os.mkfifo("in/pipe.npy")
+    Path("in/loop.npz").symlink_to("loop.npz")
+    Path("in/zero.npy").symlink_to("/dev/zero")
+    for _ in range(2):
+        code, _, err = run_batch("in")
+        assert code == 1 and "3 done" in err
+        assert "Failed: in/pipe.npy is a named pipe: give a file\n" in err
+        assert "Failed: in/zero.npy is a device: give a file\n" in err
+        assert "Failed: in/loop.npz cannot be read: its links lead in a circle\n" in err
+    os.mkfifo("list.txt")
+    want = "Error: list.txt is neither a grid (.npy, .npz) nor a manifest (.txt, .jsonl)\n"
+    assert run_batch("list.txt") == (2, "", want)
+
+
+def test_links_in_a_circle_end(run_batch):
+    for name in "abc":
+        Path("in", name).symlink_to(Path("in").absolute())
+        Path("in/deep", name).symlink_to("..")
+    assert run_batch("in/**/*.np?", "--dry-run")[2].startswith("4 to do")
+    assert run_batch("in", "--dry-run")[2].startswith("4 to do")
+    assert run_batch("in/a/*.npy", "--dry-run")[2].startswith("2 to do")  # named: followed
+
+
+def test_patterns_find_what_the_shell_would(run_batch):
+    Path("in/.hidden").mkdir()
+    shutil.copy("in/a.npy", "in/.hidden/a.npy")
+    patterns = "in/*", "in/**", "in/**/**/*.npz", "in/*/b.*", "in/deep/[a-f]*/*", "in/.h*/*.npy"
+    for pattern in patterns:
+        want = {Path(p) for p in glob.glob(pattern, recursive=True)}
+        want = {path for path in want if path.suffix in (".npy", ".npz")}
+        assert {job.source for job in find_jobs([pattern], ".ply", ConvertOptions()).jobs} == want
+    below = find_jobs(["in"], ".ply", ConvertOptions()).jobs
+    assert Path("in/.hidden/a.npy") in {job.source for job in below}
+
+
+def test_folders_that_cannot_be_read_are_named(run_batch, monkeypatch):
+    scan = os.scandir
+
+    def refuse(path):
+        if str(path).endswith("deep"):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return scan(path)
+
+    monkeypatch.setattr(os, "scandir", refuse)
+    os.remove("in/bad.npy")
+    reason = f"{Path('in/deep')} cannot be read: permission denied"
+    want = f"Failed: {reason}\n1 done, 1 failed; 1 meshes closed, 0 open\n"
+    assert run_batch("in") == (1, "", want)
+    _, out, err = run_batch("in", "--dry-run")
+    assert f"unread: {reason}\n" in out and err.endswith(", 1 unread\n")
+    assert run_batch("in/deep") == (1, "", f"Error: {reason}\n")
+    assert ", 1 folders unread; " in run_batch("in")[2]

@@ -1,0 +1,219 @@
+"""Batches and their processes, killed, ended, short of memory: nothing is lost or left over."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+import trimesh
+from batches import CONSTANT, files, rows
+from conftest import ball
+
+from super_sdf.batch import job as batch_job
+from super_sdf.batch.fingerprint import fingerprint
+from super_sdf.batch.inputs import find_jobs
+from super_sdf.batch.lock import FolderLock
+from super_sdf.batch.plan import Settings
+from super_sdf.batch.run import Queue, Run
+from super_sdf.batch.workers import choose_workers, useful_workers
+from super_sdf.chunks import count_cores
+from super_sdf.convert import ConvertOptions
+from super_sdf.errors import FileError
+from super_sdf.machine.pool import Death, Pool
+
+pytestmark = pytest.mark.usefixtures("grid_folder")
+
+
+def test_an_interrupt_is_one_line_and_keeps_what_is_done(run_batch, monkeypatch):
+    right, done = batch_job.convert, []
+
+    def interrupt(*arguments, **options):
+        if done:
+            raise KeyboardInterrupt
+        done.append(right(*arguments, **options))
+        return done[0]
+
+    monkeypatch.setattr(batch_job, "convert", interrupt)
+    want = "Error: interrupted: 1 of 4 are done and kept; run it again to go on\n"
+    assert run_batch("in") == (130, "", want)
+    assert len(files()) == 2 and len(rows()) == 1
+
+
+def test_a_folder_belongs_to_one_batch_at_a_time(run_batch):
+    with FolderLock(Path("out")):
+        want = "Error: out is in use by another batch: wait for it, or give another\n"
+        assert run_batch("in") == (1, "", want)
+        assert run_batch("in", "--dry-run")[0] == 0
+    assert run_batch("in")[0] == 1 and rows()
+
+
+def test_what_a_killed_batch_left_is_removed_and_nothing_else(run_batch):
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    Path("out/deep").mkdir(parents=True)
+    stale = Path(f"out/deep/.b.ply.{ended.pid}.part")
+    kept = [f"out/.x.ply.{ended.pid}.part", "out/b.part"]
+    for path in (stale, *map(Path, kept)):
+        path.write_text("half")
+    Path("out/deep/b.ply").write_text("was moved into place, and not yet in the report")
+    made = {"out": "deep/b.ply", "sha256": fingerprint(Path("out/deep/b.ply"))["sha256"]}
+    Path("out/.super-sdf-batch").write_text(f'\n"deep/b.ply"\n\n{json.dumps(made)}\n"to')
+    assert run_batch("in/", "--dry-run")[2].startswith("4 to do") and stale.exists()
+    assert run_batch("in")[2].endswith("3 done, 1 failed; 2 meshes closed, 1 open\n")
+    assert not stale.exists() and all(map(os.path.exists, kept))
+    assert rows()[-1]["out"] == "deep/b.ply"  # last: it may be what ended the run
+    assert Path("out/.super-sdf-batch").read_text() == ""
+
+
+def start_batch(*options):
+    """Start a batch as a process, and return it when its report has some lines."""
+    arguments = ["batch", "in", "--out", "out", "--jobs", 2, "--threads", 1, *options]
+    words = [sys.executable, "-m", "super_sdf.cli", *map(str, arguments)]
+    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
+    report = Path("out/report.jsonl")
+    while not report.exists() or report.read_bytes().count(b"\n") < 2:
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.01)
+    return process
+
+
+def is_over(process):
+    """Say whether a process has ended, if only its parent has still to hear of it."""
+    with suppress(psutil.NoSuchProcess):
+        return process.status() == psutil.STATUS_ZOMBIE
+    return True
+
+
+def larger_grids(count):
+    """Write grids that take a moment."""
+    for i in range(count):
+        np.save(f"in/more{i}.npy", ball(32, 10 + i / 8).values)
+
+
+def test_killed_on_the_way_it_goes_on(command):
+    larger_grids(8)
+    process = start_batch("--quality", "fast")
+    workers = psutil.Process(process.pid).children()
+    assert len(workers) >= 2
+    process.kill()
+    process.communicate()
+    limit = time.monotonic() + 10
+    while not all(map(is_over, workers)) and time.monotonic() < limit:
+        time.sleep(0.01)
+    assert all(map(is_over, workers))  # no orphans
+    for mesh in Path("out").rglob("[!.]*.ply"):
+        assert len(trimesh.load(mesh).faces) > 0
+    finished = Path("out/report.jsonl").read_text().count("\n")
+    code, _, err = command("batch", "in", "--out", "out", "--quality", "fast")
+    assert code == 1 and f", {finished} done before" in err
+    assert len(rows()) == 12 == len({row["out"] for row in rows()})
+    assert not list(Path("out").rglob(".*.part"))
+
+
+def test_as_many_processes_as_cores_and_memory_allow(monkeypatch):
+    monkeypatch.setattr("super_sdf.batch.workers.count_cores", lambda: 8)
+    monkeypatch.setattr("super_sdf.batch.workers.free_memory", lambda: 3_500_000_000)
+    assert choose_workers("cpu", 100) == 3
+    monkeypatch.setattr("super_sdf.batch.workers.free_memory", lambda: None)
+    assert [choose_workers("cpu", jobs) for jobs in (0, 5, 100)] == [1, 5, 8]
+    assert choose_workers("cuda", 100) == 1 and count_cores() >= 1
+
+
+def test_a_lock_refused_is_a_file_error():
+    with FolderLock(Path("out")), pytest.raises(FileError, match="in use by another batch"):
+        FolderLock(Path("out"))
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
+def test_a_signal_ends_batch_and_workers_in_a_line(name):
+    larger_grids(8)
+    process = start_batch("--quality", "fast")
+    workers = psutil.Process(process.pid).children()
+    process.send_signal(getattr(signal, name))
+    _, err = process.communicate(timeout=60)
+    said = "interrupted" if name == "SIGINT" else f"ended by {name}"
+    assert process.returncode == 128 + getattr(signal, name)
+    assert err.startswith(f"Error: {said}: ") and err.count("\n") == 1
+    assert err.endswith("of 12 are done and kept; run it again to go on\n")
+    psutil.wait_procs(workers, timeout=10)
+    assert all(map(is_over, workers)) and not list(Path("out").rglob(".*.part"))
+
+
+def test_a_worker_that_dies_once_costs_nothing(command):
+    larger_grids(6)
+    process = start_batch("--quality", "fast", "--quiet")
+    children = psutil.Process(process.pid).children()
+    worker = next(child for child in children if "spawn_main" in " ".join(child.cmdline()))
+    worker.kill()
+    _, err = process.communicate(timeout=120)
+    assert err == f"Failed: {Path('in/bad.npy')}: {CONSTANT}\n"
+    assert len(rows()) == 10 and not list(Path("out").rglob(".*.part"))
+
+
+def test_a_file_at_which_two_processes_die_is_named(command, monkeypatch):
+    seen = []
+
+    def deaths(self, count):
+        while len(self.tasks):
+            seen.append(job := self.tasks.popleft())
+            made = {"content": None, "output": None, "closed": True, "inferred": [], "warnings": []}
+            row = {**batch_job.failed_row(job, None), **made, "status": "ok", "retry": False}
+            yield job, Death("died of SIGKILL") if job.source.name == "a.npy" else row
+
+    monkeypatch.setattr(Pool, "results", deaths)
+    monkeypatch.setattr("super_sdf.batch.workers.count_cores", lambda: 2)
+    code, _, err = command("batch", "in", "--out", "out", "--quality", "fast", "--jobs", 2)
+    reason = "the process that converted it died of SIGKILL, twice"
+    assert code == 1 and err.startswith(f"Failed: in/a.npy: {reason}\n3 done, 1 failed")
+    assert [job.source.name for job in seen].count("a.npy") == 2
+    assert seen[-1].source.name == "a.npy"  # the others first
+    assert {job.options.max_memory for job in seen} != {None}
+
+
+def test_fail_fast_begins_nothing_more_in_several_processes(monkeypatch):
+    batch = Run(find_jobs(["in"], ".ply", ConvertOptions()).jobs, *settings(fail_fast=True))
+    queue = Queue(batch, 2)
+    assert len(queue) == 4
+    first = queue.popleft()
+    batch._take(first, batch_job.failed_row(first, "why"))
+    assert len(queue) == 0 and len(batch.batch.waiting) == 3
+
+
+def settings(**options):
+    """Return how a batch is run, and its lock."""
+    return Settings(Path("out"), **options), FolderLock(Path("out"))
+
+
+def test_the_bound_is_read_once_and_shared_by_those_that_run(monkeypatch):
+    bounds = iter([10**9])
+    monkeypatch.setattr("super_sdf.batch.run.memory_bound", lambda asked: next(bounds))
+    monkeypatch.setattr("super_sdf.batch.run.held_memory", lambda: 10**8)
+    run = Run(find_jobs(["in"], ".ply", ConvertOptions()).jobs, *settings())
+    queue = Queue(run, 3)
+    assert [queue.popleft().options.max_memory for _ in range(4)] == 4 * [3 * 10**8]
+
+
+def test_no_more_processes_than_are_of_use(monkeypatch):
+    monkeypatch.setattr("super_sdf.batch.workers.count_cores", lambda: 4)
+    assert useful_workers(4, 10) == (4, None)
+    assert useful_workers(8, 2) == (2, "--jobs 8 is cut to 2: there is no more to do")
+    note = "--jobs 200 is cut to 4: this process may use no more cores"
+    assert useful_workers(200, 10, 10**10) == (4, note)
+    note = "--jobs 3 is cut to 2: --max-memory has no room for more"
+    assert useful_workers(3, 10, 700_000_000) == (2, note)
+    assert choose_workers("cpu", 10, 700_000_000) == 1
+
+
+def test_many_jobs_of_two_files_share_a_small_bound(command):
+    larger_grids(2)
+    arguments = "batch", "in/more0.npy", "in/more1.npy", "--out", "out", "--quality", "fast"
+    code, _, err = command(*arguments, "--jobs", 8, "--max-memory", "700M")
+    assert code == 0 and err.startswith("Note: --jobs 8 is cut to ")
+    assert {row["slabs"] for row in rows()} == {1}
