@@ -116,8 +116,8 @@ def test_exact_zeros_survive_merging_by_position():
     import trimesh
 
     ijk = np.indices((14, 14, 14)) - 6
-    values = ((np.abs(ijk).max(0) - 3.0) * 0.1).astype(np.float32)
-    mesh = reconstruct(SdfGrid(values, (0.1, 0.1, 0.1)), trilinear)
+    values = (np.abs(ijk).max(0) - 3.0).astype(np.float32)
+    mesh = reconstruct(SdfGrid.trusted(values, (0.1, 0.1, 0.1)), trilinear)
     merged = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
     assert len(merged.vertices) == len(mesh.vertices)
     assert merged.is_watertight and merged.is_winding_consistent

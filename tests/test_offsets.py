@@ -1,12 +1,16 @@
 """Surfaces at a distance: closed forms, the sign of the solid, and where the distances end."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+import trimesh
 from conftest import ball
 
 from super_sdf import load_network, make_grid, reconstruct
 from super_sdf.errors import GridError
 
+PART = Path(__file__).parent.parent / "examples" / "part.npz"
 SIDE = 8.6
 
 
@@ -114,3 +118,28 @@ def test_noisy_distances_may_be_moved(network):
     noise = np.random.default_rng(0).uniform(-0.4, 0.4, (22, 22, 22))
     mesh = reconstruct(make_grid(cube() + noise, spacing=1), network, 2, offset=1.0)
     assert mesh.volume() == pytest.approx(cube_volume(1.0), rel=0.1)
+
+
+def test_the_command_reads_the_sign_from_the_solid(command, tmp_path, monkeypatch):
+    """At the level of the offset most of the border is inside."""
+    monkeypatch.chdir(tmp_path)
+    np.save("cube.npy", cube()[4:-4, 4:-4, 4:-4].astype(np.float32))
+    code, _, err = command("upsample", "cube.npy", "a.ply", "--offset", 3, "--cap", "--factor", 2)
+    assert code == 0 and "taken as inside" not in err
+    mesh = trimesh.load("a.ply")
+    low, high = 4 - 0.5 - 4, 17 + 0.5 - 4  # capped at the faces of the outer voxels
+    assert mesh.is_watertight and mesh.volume > 0.9 * (high - low) ** 3 > cube_volume(0)
+
+
+def test_the_command_refuses_an_offset_near_the_cut(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    says = (
+        "Error: offset 5.5 needs distances 1.5 spacings (2.25) to either side of it, but they end "
+        "at 6: the largest that works is 3.75\n"
+    )
+    assert command("upsample", PART, "a.ply", "--offset", 5.5) == (1, "", says)
+    code, _, err = command("upsample", PART, "a.ply", "--offset", "nan")
+    assert code == 2 and err.endswith("offset is nan: give a finite number, in world units\n")
+    assert not list(tmp_path.iterdir())
+    assert command("upsample", PART, "a.ply", "--offset", 3.75, "--factor", 2)[0] == 0
+    assert trimesh.load("a.ply").is_watertight

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from .errors import GridError
 from .planes import Samples
 
-# Values are cut off here, so that squares of their differences are numbers.
+# Values are clipped here, so that squares of their differences do not overflow.
 FARTHEST = 1e150
 ENOUGH = 30  # samples for a statement
 STRAIGHT = 0.3  # bend (see surface_gradients) below which a field is linear enough to measure
 BENT = 0.6  # bend beyond which lengths may agree by chance, as those of a distance to a mask do
-# Gradients are consistent if so many of the straighter ones agree, within a share of the length.
+# Gradients are consistent if nine in ten of the straighter ones agree within 5 %.
 AGREEING, AGREEMENT = 0.9, 0.05
 UNEQUAL = 1.3  # ratio of the spacings along two axes that the values themselves show
 

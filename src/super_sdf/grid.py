@@ -24,8 +24,8 @@ BoolArray: TypeAlias = NDArray[np.bool_]
 class SdfGrid:
     """Signed distances at the points ``world = origin + spacing * (i, j, k)``.
 
-    Made so, it says that the values are negative inside and how far apart they are, and the values
-    must not contradict it. ``make_grid`` finds out what is not known.
+    The constructor takes the values as negative inside and the spacing as known, and refuses values
+    that contradict either. ``make_grid`` infers the sign, and the spacing where it is not given.
 
     Parameters
     ----------
@@ -51,8 +51,8 @@ class SdfGrid:
     ------
     GridError
         If the array is not three-dimensional, finite, and at least 2 samples long on each axis; if
-        most of its border is negative; if the spacing is not positive and equal on all axes, or the
-        values change by more from sample to sample, or by much less.
+        most of its border is negative; if the spacing is not positive and equal on all axes; or if
+        the values change from sample to sample by more than the spacing, or by much less.
     """
 
     samples: Samples
@@ -83,10 +83,10 @@ class SdfGrid:
         positive_inside: bool = False,
         extremes: Extremes | None = None,
     ) -> SdfGrid:
-        """Return a grid of values whose sign and spacing are known, and not checked.
+        """Return a grid whose sign and spacing are known and therefore not checked.
 
-        ``positive_inside`` says that they are to be read with the other sign; their smallest and
-        largest, if they are given, that they were found finite and three-dimensional before.
+        With ``positive_inside`` the values are read with the other sign. With ``extremes``, their
+        smallest and largest, they are not searched for NaN and infinity again.
         """
         samples = as_samples(values)
         grid = object.__new__(cls)

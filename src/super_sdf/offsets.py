@@ -1,7 +1,7 @@
 """Whether the distances go far enough round an offset.
 
-From some distance on a field may be cut off, at one value, or be filled with another. A surface
-that needs what is not there would come out in pieces, or elsewhere.
+A field may be cut off at some distance, or hold a fill value from there on. A surface too near to
+that distance would come out in loose pieces, or in the wrong place.
 """
 
 from __future__ import annotations
@@ -14,13 +14,14 @@ from .band import CENTRE, HALF_BAND, PATCH_LIMIT
 from .errors import GridError
 from .grid import BoolArray, FloatArray
 
-# Noisy distances next to each other may differ by twice the spacing; a fill value does by more.
-# A few such jumps are errors, for which nothing is refused.
+# Neighbouring samples of noisy distances differ by up to twice the spacing (4 half voxels), from a
+# fill value they differ by more. A small share of such jumps is tolerated: wrong samples.
 JUMP, MOST_JUMPS = 4.2, 0.05
-# How far distances must go, in half voxels, until they are cut off, or filled with values that the
-# network would take for noise.
+# How far distances must go beyond the offset, in half voxels, before they are cut off at one value;
+# and before fill values begin, which would be taken for noise.
 CUT_OFF_ROOM, FILL_ROOM = HALF_BAND, 5.0
-# What is said to work does, by so much: for rounding, and where no sample is at the very end.
+# Tolerances in half voxels, so that the offset that the message names works: for rounding, and
+# because no sample lies exactly where fill values begin.
 ROUNDING, UNSAMPLED = 1e-3, 0.1
 
 

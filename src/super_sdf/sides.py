@@ -1,4 +1,4 @@
-"""Which sign is inside: that which the border of the grid has not. It is read at level 0."""
+"""Which sign is inside: the border of the grid is taken for outside, whatever the offset."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def is_positive_inside(values: Samples, inside: str, extremes: Extremes, notes: 
         return inside == "positive"
     check_both_sides(extremes)
     below, total = _count_border(values)
-    positive = _lies_inside(below, total)
+    positive = _is_mostly_negative(below, total)
     share = max(below, total - below) / total
     if positive or share < 1:
         sign = "positive" if positive else "negative"
@@ -29,9 +29,9 @@ def is_positive_inside(values: Samples, inside: str, extremes: Extremes, notes: 
 
 
 def check_negative_inside(values: Samples) -> None:
-    """Raise if values that should be negative inside would be taken for positive inside."""
+    """Raise if most of the border is negative: such values seem to be positive inside."""
     below, total = _count_border(values)
-    if _lies_inside(below, total):
+    if _is_mostly_negative(below, total):
         raise GridError(
             f"{below / total:.0%} of the grid's border is negative, which is inside: make the grid "
             "with make_grid(values, spacing=..., inside='positive'), or inside='negative' if the "
@@ -54,8 +54,8 @@ def check_both_sides(extremes: Extremes) -> None:
         )
 
 
-def _lies_inside(below: int, total: int) -> bool:
-    """Say whether most of the border is on the inner side if negative is inside."""
+def _is_mostly_negative(below: int, total: int) -> bool:
+    """Say whether most of the border is negative."""
     return 2 * below > total
 
 

@@ -24,10 +24,13 @@ EQUAL_SPACING = 1e-3
 # Spacings in which areas, volumes and squares of areas are numbers, with room to either side.
 LEAST_SPACING, MOST_SPACING = 1e-60, 1e60
 SNAP = 0.02  # an estimate this near to a usual spacing is taken for it
-# Ratio of measured to given spacing: noted beyond the first. A distance cannot change by more than
-# the samples are apart: refused beyond the second if the values are consistent, else the third.
-TOLERATED, REFUSED, REFUSED_IF_UNSURE = 1.1, 1.25, 2.0
-# It can change by less, at thin parts and where it is cut off, but not at so many samples.
+# Ratio of measured to given spacing, or its inverse, from which on there is a note.
+TOLERATED = 1.1
+# Distances cannot change by more than the samples are apart. Larger ratios are refused: the first
+# limit is for gradients that agree with each other, the second for noisy or bent fields.
+REFUSED, REFUSED_IF_UNSURE = 1.25, 2.0
+# Distances change by less at thin parts and where they are cut off. If nine in ten samples change
+# by less than half the spacing, the unit is wrong.
 SLOW, SLOW_SHARE = 0.5, 0.9
 
 
