@@ -1,0 +1,192 @@
+"""Run a command line in this process, as a terminal would see it, within a time limit."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+LIMIT = 20.0  # seconds; none of these inputs takes one
+# Python shows these to nobody who does not ask.
+HIDDEN = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
+
+
+class HangError(BaseException):
+    """The command did not end in time."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """How a command ended.
+
+    Attributes
+    ----------
+    code : int
+        The exit code; negative if a signal ended the process.
+    out, err : str
+        What stood on the terminal, what compiled code wrote there too.
+    trace : str
+        Where an exception came out of the program, its type and text; empty if none did.
+    warned : tuple of str
+        Warnings that Python would have shown.
+    grown : int
+        Bytes that the process took more at its height than before.
+    """
+
+    code: int
+    out: str
+    err: str
+    trace: str = ""
+    warned: tuple[str, ...] = ()
+    seconds: float = 0.0
+    grown: int = 0
+
+
+class Terminal:
+    """Files in place of standard output and error, for compiled code and children too.
+
+    One for the life of the process: what it starts may keep them.
+    """
+
+    def __init__(self) -> None:
+        # Appending, so that others who hold them go on at the end after they were emptied.
+        self.folder = tempfile.TemporaryDirectory(prefix="corpus-terminal-")
+        paths = [Path(self.folder.name, name) for name in ("out", "err")]
+        self.files = [path.open("a+b", buffering=0) for path in paths]
+
+    @contextmanager
+    def taken(self) -> Iterator[None]:
+        """Let standard output and error go to the files."""
+        before, streams = [os.dup(1), os.dup(2)], (sys.stdout, sys.stderr)
+        for number, file in enumerate(self.files, 1):
+            file.truncate(0)
+            os.dup2(file.fileno(), number)
+        errors = ("strict", "backslashreplace")
+        sys.stdout, sys.stderr = (
+            open(number, "w", encoding="utf-8", errors=error, closefd=False)  # noqa: SIM115
+            for number, error in enumerate(errors, 1)
+        )
+        try:
+            yield
+        finally:
+            with suppress(OSError, ValueError):
+                sys.stdout.flush()
+                sys.stderr.flush()
+            sys.stdout, sys.stderr = streams
+            for number, kept in enumerate(before, 1):
+                os.dup2(kept, number)
+                os.close(kept)
+
+    def read(self) -> tuple[str, str]:
+        """Return what was written to each."""
+        texts = []
+        for file in self.files:
+            file.seek(0)
+            texts.append(file.read().decode("utf-8", "replace"))
+        return texts[0], texts[1]
+
+
+_terminals: list[Terminal] = []
+
+
+def run_here(words: Sequence[str], folder: Path) -> Run:
+    """Run the command line in a folder, in this process; only in its main thread."""
+    from super_sdf import cli
+
+    if not _terminals:
+        _terminals.append(Terminal())
+    terminal, start, code, trace = _terminals[0], time.perf_counter(), 0, ""
+    before = _begin_memory()
+    with (
+        warnings.catch_warnings(record=True) as caught,
+        terminal.taken(),
+        _called(words, folder),
+        time_limit(LIMIT),
+    ):
+        warnings.simplefilter("always")
+        try:
+            cli.main()
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else int(end.code is not None)
+        except BaseException as error:  # whatever comes out is what is looked for
+            code, trace = 1, describe(error)
+    out, err = terminal.read()
+    warned = tuple(_say(entry) for entry in caught if not issubclass(entry.category, HIDDEN))
+    spent = time.perf_counter() - start
+    return Run(code, out, err, trace, warned, spent, _peak_memory() - before)
+
+
+@contextmanager
+def _called(words: Sequence[str], folder: Path) -> Iterator[None]:
+    """Be called with these words in this folder."""
+    before, home = sys.argv, os.getcwd()
+    sys.argv = ["super-sdf", *words]
+    os.chdir(folder)
+    try:
+        yield
+    finally:
+        sys.argv = before
+        os.chdir(home)
+
+
+@contextmanager
+def time_limit(seconds: float) -> Iterator[None]:
+    """Raise HangError after so long."""
+
+    def ring(*_: Any) -> None:
+        raise HangError
+
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def describe(error: BaseException) -> str:
+    """Return where an exception came from, the last of our own lines first, and what it says."""
+    frames = traceback.extract_tb(error.__traceback__)
+    ours = [frame for frame in frames if f"{os.sep}super_sdf{os.sep}" in frame.filename]
+    places = []
+    for frame in [ours[-1] if ours else frames[-1], frames[-1]]:
+        path = Path(frame.filename)
+        places.append(f"{path.parent.name}/{path.name}:{frame.name}")
+    text = str(error).splitlines()[0][:200] if str(error) else ""
+    return f"{' < '.join(dict.fromkeys(places))}: {type(error).__name__}: {text}"
+
+
+def _say(entry: warnings.WarningMessage) -> str:
+    path = Path(entry.filename)
+    first = str(entry.message).splitlines()[0] if str(entry.message) else ""
+    return f"{path.parent.name}/{path.name}:{entry.lineno}: {entry.category.__name__}: {first}"
+
+
+def _begin_memory() -> int:
+    """Set the high-water mark back, where the system can, and return what is held now."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+    return _status("VmRSS")
+
+
+def _peak_memory() -> int:
+    return _status("VmHWM")
+
+
+def _status(key: str) -> int:
+    """Return a line of the process's status in bytes; 0 where the system keeps none."""
+    with suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith(f"{key}:"):
+                return int(line.split()[1]) * 1024
+    return 0
