@@ -72,7 +72,7 @@ def upsample(
     alone: bool = False,
 ) -> Case:
     """Return a case of ``upsample`` with the small network."""
-    words = ("upsample", source, target, "--quality", "fast", *options)
+    words = ("upsample", source, target, *small_network(options), *options)
     return Case(name, words, files, made(target), alone)
 
 
@@ -80,7 +80,7 @@ def batch(
     name: str, files: Files, *options: str, source: str = "in.npy", alone: bool = False
 ) -> Case:
     """Return a case of ``batch`` in one process, into the folder ``out``."""
-    words = ("batch", source, "--out", "out", "--quality", "fast", "--jobs", "1", *options)
+    words = ("batch", source, "--out", "out", *small_network(options), "--jobs", "1", *options)
     return Case(name, words, files, ("out", "out/*"), alone)
 
 
@@ -114,6 +114,11 @@ def evaluate(name: str, files: Files, *options: str, source: str) -> Case:
     small = ("--sizes", "8", "--methods", "mc", "--model", "fast", "--jobs", "1", "--no-pictures")
     words = ("evaluate", source, "--out", "report", *small, *options)
     return Case(name, words, files, ("report", "report/*"), alone=True)
+
+
+def small_network(options: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the words for the small network, unless another is given."""
+    return () if "--model" in options or "--quality" in options else ("--quality", "fast")
 
 
 def made(target: str) -> tuple[str, ...]:

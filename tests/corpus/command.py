@@ -9,6 +9,7 @@ python -m benchmarks.corpus --fields 10000        # random fields: closed manifo
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
 from collections import Counter
@@ -31,8 +32,6 @@ def main() -> int:
     lines = try_fields(asked.fields, asked.seed) if asked.fields else try_cases(asked)
     for line in lines[:SHOWN]:
         print(line)
-    if asked.faults:
-        asked.faults.write_text("".join(f"{line}\n" for line in lines), "utf-8", "replace")
     print(f"{len(lines)} faults, {time.perf_counter() - start:.0f} s")
     return int(bool(lines))
 
@@ -54,9 +53,9 @@ def try_cases(asked: argparse.Namespace) -> list[str]:
     cases = [case for case in make_cases(asked.seed) if asked.only in case.name]
     if not (asked.whole or asked.only):
         cases = spread(cases, asked.count, asked.seed)
-    outcomes = list(watched(run_all(cases), len(cases)))
+    outcomes = list(watched(run_all(cases), len(cases), asked.faults))
     print(table(outcomes))
-    return [f"{o.case.name}\t{f.kind}\t{f.what}" for o in outcomes for f in o.faults]
+    return [line for outcome in outcomes for line in outcome.lines()]
 
 
 def try_fields(count: int, seed: int) -> list[str]:
@@ -83,12 +82,15 @@ def run_all(cases: Iterable[Case]) -> Iterator[Outcome]:
         child.stop()
 
 
-def watched(outcomes: Iterable[Outcome], count: int) -> Iterator[Outcome]:
-    """Pass outcomes on, and say now and then how far it is."""
-    for number, outcome in enumerate(outcomes, 1):
-        if number % TELL == 0:
-            print(f"{number} of {count}: {outcome.case.name}", file=sys.stderr, flush=True)
-        yield outcome
+def watched(outcomes: Iterable[Outcome], count: int, faults: Path | None) -> Iterator[Outcome]:
+    """Pass outcomes on; write their faults as they come, and say now and then how far it is."""
+    with open(faults or os.devnull, "w", encoding="utf-8", errors="replace") as file:
+        for number, outcome in enumerate(outcomes, 1):
+            file.writelines(f"{line}\n" for line in outcome.lines())
+            file.flush()
+            if number % TELL == 0:
+                print(f"{number} of {count}: {outcome.case.name}", file=sys.stderr, flush=True)
+            yield outcome
 
 
 def table(outcomes: Iterable[Outcome]) -> str:

@@ -2,10 +2,25 @@
 
 from __future__ import annotations
 
-from . import archives, fields, grids, ledgers, manifests, meshes, models, options, scales, special
+from . import (
+    archives,
+    fields,
+    grids,
+    ledgers,
+    manifests,
+    meshes,
+    models,
+    options,
+    reports,
+    scales,
+    special,
+)
 from .case import Case
 
-THEMES = (grids, archives, fields, scales, options, manifests, ledgers, models, meshes, special)
+THEMES = (
+    *(grids, archives, fields, scales, options, manifests, ledgers),
+    *(models, meshes, special, reports),
+)
 
 
 def make_cases(seed: int = 0) -> list[Case]:

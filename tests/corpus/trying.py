@@ -21,6 +21,10 @@ class Outcome:
     run: Run
     faults: list[Fault]
 
+    def lines(self) -> list[str]:
+        """Return the faults, a line each."""
+        return [f"{self.case.name}\t{fault.kind}\t{fault.what}" for fault in self.faults]
+
 
 def try_case(case: Case, run_words: Callable[[Sequence[str], Path], Run]) -> Outcome:
     """Build a case in an empty folder, run it and judge it."""
