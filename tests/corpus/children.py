@@ -13,7 +13,7 @@ from typing import Any
 
 import onnxruntime
 
-from .running import LIMIT, Run, run_here
+from .running import Run, limit, run_here
 
 MEMORY = 8 << 30  # bytes of address space: most of it is libraries and never used
 FILE = 1 << 30  # bytes of a file
@@ -39,7 +39,7 @@ class Child:
         """Run a command line in a folder."""
         try:
             self.pipe.send((tuple(words), folder))
-            if self.pipe.poll(LIMIT + GRACE):
+            if self.pipe.poll(limit() + GRACE):
                 found: Run = self.pipe.recv()
                 return found
             return self._replace("hangs where no alarm wakes it")

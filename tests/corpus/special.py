@@ -121,7 +121,9 @@ def _elsewhere(kind: str, content: Content) -> Iterator[Case]:
         for option in ([], ["--force"]):
             at = {**GRID, target: content}
             name = f"special/{kind}-target-{target[4:]}{''.join(option)}"
-            yield upsample(name, at, *option, source="good.npy", target=target, alone=True)
+            words = ("upsample", "good.npy", target, "--quality", "fast", *option)
+            made = (target, "nowhere")  # the latter where it is a link to there
+            yield Case(name, words, at, made, alone=True)
     words = ("upsample", "good.npy", "to/out.ply", "--quality", "fast")
     made = ("to/out.ply", "out.ply")  # the latter where it is a link to the folder itself
     yield Case(f"special/{kind}-target-above", words, {**GRID, "to": content}, made, alone=True)
