@@ -8,6 +8,7 @@ from . import (
     grids,
     ledgers,
     manifests,
+    members,
     meshes,
     models,
     options,
@@ -18,7 +19,7 @@ from . import (
 from .case import Case
 
 THEMES = (
-    *(grids, archives, fields, scales, options, manifests, ledgers),
+    *(grids, archives, members, fields, scales, options, manifests, ledgers),
     *(models, meshes, special, reports),
 )
 
