@@ -64,7 +64,8 @@ KINDS = {
 
 def faults_of_field(field: RandomField, network: Decoder) -> list[str]:
     """Return what is wrong with a field's mesh: holes, vertices of two surfaces, no numbers."""
-    mesh = reconstruct(SdfGrid(field.values, 1.0), network, field.factor, cap=field.cap)
+    grid = SdfGrid.trusted(field.values, 1.0)  # they are no distances, and need not be
+    mesh = reconstruct(grid, network, field.factor, cap=field.cap)
     faults = []
     if not np.isfinite(mesh.vertices).all():
         faults.append("vertices are not finite")
