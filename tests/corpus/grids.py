@@ -1,0 +1,158 @@
+"""``.npy`` files: odd and damaged headers, every dtype in every order, odd shapes."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+
+import numpy as np
+
+from .case import Case, ball, batch, npy, npz, render, rng_of, upsample
+from .mutation import mutate
+
+DTYPES = "?bBhHiIlLqQefdgFDGSUOMmV"
+SHAPES = [
+    *("()", "(12,)", "(12, 12)", "(12, 12, 12, 1)", "(1728,)", "12", "[12, 12, 12]", "None"),
+    *("(-1, 12, 12)", "(12, -12, -12)", "(-12, -12, -12)", "(0, 12, 12)", "(12, 12, 0)"),
+    *("(True, 12, 12)", "(12, True, True)", "(False, 2, 2)", "(12L, 12L, 12L)", "(12.0, 12, 12)"),
+    *("(9999999999999999999999, 12, 12)", "(4294967296, 4294967296, 1)", "(2**62, 4, 4)"),
+    *("(4611686018427387904, 4, 4)", "(9223372036854775807, 9223372036854775807, 1)"),
+    *("(1000000, 1000000, 1000000)", "(100000, 2, 2)", "(2, 2, 100000)", "('12', 12, 12)"),
+    *("(12, 12, 12", "12, 12, 12)", "((12, 12), 12)", "(12, 12, 12j)", "(0x0c, 0o14, 12)"),
+    *("(1" + "0" * 5000 + ", 2, 2)", "(" * 300 + "12" + ")" * 300, "(12, 12, 12,)", "{12}"),
+    "(" * 9000 + "12" + ")" * 9000,
+]
+DESCRS = [
+    *("'<f4 '", "'f4'", "'|f4'", "'=f4'", "'>f4'", "'<f16'", "'<f0'", "'<f3'", "'f'", "''"),
+    *("'<f99999999999999999999'", "'|O'", "'object'", "'|b1'", "'<U12'", "'|S4'", "'|V4'"),
+    *("'|V0'", "'|S0'", "'<M8[s]'", "'<M8'", "'<m8[ns]'", "'<M8[zz]'", "'<c8'", "'<c16'"),
+    *("[('a', '<f4')]", "[('a', '<f4'), ('a', '<f4')]", "[]", "[('', '|V0')]", "None", "4"),
+    *("('<f4', (2,))", "('<f4', (99999999,))", "{'names': ['a']}", "[['a', '<f4']]", "'<f4,<f4'"),
+    *("'(2,)<f4'", "'(99999999999,)f4'", "[('a', 'O')]", "'a'*99999", "'\\x00'", "'<é4'"),
+    "[('a'," * 200 + "'<f4'" + ")]" * 200,
+]
+WHOLE = [
+    *("", " ", "{", "}", "{}", "[]", "()", "1", "None", "{'descr': '<f4'}", "'" * 3, "\\", "#"),
+    *("{'descr': '<f4', 'fortran_order': False}", "\x00", "\x00" * 64, "\xff" * 64, "\x0c{}"),
+    "{'descr': '<f4', 'fortran_order': 0, 'shape': (12, 12, 12), }",
+    "{'descr': '<f4', 'fortran_order': 'no', 'shape': (12, 12, 12), }",
+    "{'descr': '<f4', 'fortran_order': None, 'shape': (12, 12, 12), }",
+    "{'descr': '<f4', 'fortran_order': False, 'shape': (12, 12, 12), 'more': 1}",
+    "{'descr': '<f4', 'fortran_order': False, 'shape': (12, 12, 12), 'shape': (2, 2, 2)}",
+    "{'descr': '<f4', 'fortran_order': False, 'shape': (12, 12, 12)} {}",
+    "  {'descr': '<f4', 'fortran_order': False, 'shape': (12, 12, 12)}",
+    "\n    {'descr': '<f4',\n 'fortran_order': False, 'shape': (12, 12, 12)}",
+    "{'descr': '<f4', 'fortran_order': False, 'shape': (12, 12, 12)}\n\t x",
+    "{'descr': '<f4', 'fortran_order': False, 'shape': (12, 12, 12)",
+    "{'descr': '<f4', 'fortran_order': False, 'shape': (12, 12, 12)}" + " " * 20000,
+    "{'descr': '<f4', 'fortran_order': False, 'shape': (12, 12, 12), 'a': " + "[" * 9999 + "}",
+    *("-" * 5000 + "1", "{" * 200 + "}" * 200, "__import__('os').system('touch made')"),
+    "{'descr': '<f4', 'fortran_order': False, 'shape': (" + "1+" * 4000 + "1, 12, 12)}",
+]
+SIZES = [
+    *((2, 2, 2), (1, 12, 12), (12, 1, 12), (12, 12, 1), (1, 1, 1), (0, 0, 0), (0, 2, 2)),
+    *((2, 2, 64), (64, 2, 2), (2, 64, 2), (3, 3, 3), (3, 2, 3), (2, 12, 12), (12, 2, 12)),
+    *((12, 12, 2), (3, 3, 400), (400, 3, 3), (3, 400, 3), (2, 2, 3000), (5, 7, 90), (4, 4, 4)),
+    *((1, 9, 9, 9), (9, 9, 9, 1), (9, 9), (81,), (), (2,) * 8, (1, 1, 1, 9, 9, 9), (6, 5, 4)),
+]
+
+
+def header(text: str, version: tuple[int, int] = (1, 0), data: bytes | None = None) -> bytes:
+    """Return an .npy file with a header as given, and the data of a ball."""
+    raw = text.encode("utf-8" if version == (3, 0) else "latin-1", "replace")
+    length = struct.pack("<H", min(len(raw), 65535)) if version[0] == 1 else None
+    length = length or struct.pack("<I", len(raw))
+    body = ball().tobytes() if data is None else data
+    return b"\x93NUMPY" + bytes(version) + length + raw + body
+
+
+def said(descr: str = "'<f4'", order: str = "False", shape: str = "(12, 12, 12)") -> str:
+    """Return the text of a header."""
+    return f"{{'descr': {descr}, 'fortran_order': {order}, 'shape': {shape}, }}\n"
+
+
+def cases(seed: int) -> Iterator[Case]:
+    """Yield the cases of this theme."""
+    texts = [said(shape=shape) for shape in SHAPES] + [said(descr) for descr in DESCRS] + WHOLE
+    for number, text in enumerate(texts):
+        for version in [(1, 0), (2, 0), (3, 0), (9, 9)][: 4 if number % 5 == 0 else 2]:
+            name = f"grids/header-{number}-v{version[0]}"
+            yield upsample(name, {"in.npy": header(text, version)}, alone=len(text) > 8000)
+        if number % 3 == 0:
+            yield batch(f"grids/batch-header-{number}", {"in.npy": header(text)})
+        if number % 6 == 0:
+            yield render(f"grids/render-{number}", {"in.npy": header(text)}, source="in.npy")
+    yield from _damaged(seed)
+    yield from _dtypes()
+    yield from _shapes()
+
+
+def _damaged(seed: int) -> Iterator[Case]:
+    """Yield files with a few bytes changed in the header, or anywhere, and truncated ones."""
+    whole = npy(ball())
+    for number in range(420):
+        name = f"grids/damaged-{number}"
+        last = 140 if number % 3 else None
+        data = mutate(whole, rng_of(name, seed), 0, last)
+        yield (batch if number % 7 == 0 else upsample)(name, {"in.npy": data})
+    for number in range(80):
+        name = f"grids/truncated-{number}"
+        end = int(rng_of(name, seed).integers(0, 200 if number % 2 else len(whole)))
+        yield upsample(name, {"in.npy": whole[:end]})
+    for number, length in enumerate([0, 1, 117, 119, 65535]):
+        data = whole[:8] + struct.pack("<H", length) + whole[10:]
+        yield upsample(f"grids/header-length-{number}", {"in.npy": data})
+    for number, data in enumerate([b"", b"\x93NUMPY", b"\x93NUMPY\x01\x00", b"PK\x03\x04", b"\n"]):
+        yield upsample(f"grids/start-{number}", {"in.npy": data})
+    yield upsample("grids/long-tail", {"in.npy": whole + b"x" * 100_000})
+
+
+def _dtypes() -> Iterator[Case]:
+    """Yield every dtype in both byte orders and both axis orders, in both kinds of file."""
+    for letter in DTYPES:
+        for order in "<>":
+            dtype = np.dtype(
+                {"S": "S5", "U": "U5", "V": "V4", "M": "M8[s]", "m": "m8[s]"}.get(letter, letter)
+            )
+            dtype = dtype.newbyteorder(order)
+            try:
+                values = (ball() * 10).astype(dtype)
+            except (TypeError, ValueError):
+                values = np.zeros((12, 12, 12), dtype)
+            for fortran in (False, True):
+                array = np.asfortranarray(values) if fortran else values
+                name = f"grids/dtype-{letter}-{'le' if order == '<' else 'be'}-{'fc'[not fortran]}"
+                spaced = ("--spacing", "10")
+                yield upsample(name, {"in.npy": npy(array)}, *spaced)
+                yield upsample(f"{name}-inferred", {"in.npy": npy(array)}, "--factor", "2")
+                yield upsample(f"{name}-npz", {"in.npz": npz(values=array)}, source="in.npz")
+            yield batch(f"grids/batch-{letter}-{ord(order)}", {"in.npy": npy(values)}, *spaced)
+    yield from _wide_integers()
+
+
+def _wide_integers() -> Iterator[Case]:
+    """Yield integers that no float holds, and the ends of each type."""
+    for letter in "bBhHiIqQ":
+        limits = np.iinfo(letter)
+        for number, (low, high) in enumerate(
+            [(limits.min, limits.max), (limits.max - 3, limits.max)]
+        ):
+            values = np.where(ball() < 0, low, high).astype(letter)
+            values[0, 0, 0] = (int(low) + int(high)) // 2
+            yield upsample(f"grids/limits-{letter}-{number}", {"in.npy": npy(values)})
+            yield upsample(
+                f"grids/limits-{letter}-{number}-1", {"in.npy": npy(values)}, "--spacing", "1"
+            )
+
+
+def _shapes() -> Iterator[Case]:
+    """Yield odd shapes, with each factor."""
+    for number, shape in enumerate(SIZES):
+        values = ball(shape) if len(shape) == 3 else np.linspace(-1, 1, int(np.prod(shape)))
+        files = {"in.npy": npy(values.reshape(shape))}
+        for factor in ("2", "4", "8"):
+            words = ("--spacing", "1", "--factor", factor, "--inside", "negative")
+            yield upsample(f"grids/shape-{number}-{factor}", files, *words)
+            yield upsample(f"grids/shape-{number}-{factor}-cap", files, "--cap", "--factor", factor)
+        yield batch(f"grids/shape-{number}-batch", files)
+        yield render(f"grids/shape-{number}-render", files, source="in.npy")

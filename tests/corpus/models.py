@@ -1,0 +1,147 @@
+"""Networks: damaged files, other inputs and outputs, odd metadata, answers that are no numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from .case import Case, ball, npy, rng_of
+from .mutation import mutate
+from .onnx_bytes import DOUBLE, FLOAT, INPUTS, INT32, INT64, METADATA, NODES, OUTPUTS, Net
+
+GRID = {"in.npy": npy(ball())}
+TEXTS: list[str | bytes] = [
+    *(
+        "",
+        " ",
+        "0",
+        "-1",
+        "1",
+        "2",
+        "1 ",
+        "01",
+        "1.0",
+        "1e9",
+        "1e999",
+        "true",
+        "null",
+        "NaN",
+        "one",
+    ),
+    *(
+        "[]",
+        "{}",
+        "[1]",
+        '"1"',
+        "9" * 5000,
+        "-" + "9" * 5000,
+        "[" * 99999,
+        '{"a":' * 9999,
+        "1000000",
+    ),
+    *(b"\xff\xfe", b"\x00", "\n", "4294967297", "9223372036854775808", "0.5", "Infinity", "é"),
+]
+KEYS = ["format_version", "receptive_field", "training_factors", "value_scaling", "other"]
+
+
+def odd_nets() -> dict[str, Net]:
+    """Return networks that are not what is wanted, or answer what nothing can be made of."""
+    numbers = {
+        text: float(text) for text in ("nan", "inf", "-inf", "3e38", "-3e38", "1e-45", "1", "-5")
+    }
+    nets = {f"adds-{text}": Net(extra=number) for text, number in numbers.items()}
+    for operator in ("Sqrt", "Log", "Reciprocal", "Exp", "Neg", "Floor", "Sign", "Acos", "Nothing"):
+        nodes = (*NODES[:-1], (operator, ("sum",), ("values",)))
+        nets[f"ends-with-{operator}"] = Net(nodes)
+    for number in range(4):
+        others = [value for k, value in enumerate(INPUTS) if k != number]
+        name, kind, shape = INPUTS[number]
+        wrong = DOUBLE if kind == FLOAT else INT64
+        changed = {
+            "missing": others,
+            "renamed": [*others, (f"{name}s", kind, shape)],
+            "other-type": [*others, (name, wrong, shape)],
+            "flat": [*others, (name, kind, ("N",))],
+            "deep": [*others, (name, kind, ("V", 27, 1, 1))],
+            "fixed": [*others, (name, kind, (1, *shape[1:]))],
+            "narrow": [*others, (name, kind, ("V", 26))],
+            "negative": [*others, (name, kind, (-1, 27))],
+            "twice": [*INPUTS, INPUTS[number]],
+        }
+        nets |= {f"{name}-{what}": Net(inputs=inputs) for what, inputs in changed.items()}
+    outputs = {
+        "none": (),
+        "renamed": (("result", FLOAT, ("D", "Q")),),
+        "double": (("values", DOUBLE, ("D", "Q")),),
+        "integer": (("values", INT32, ("D", "Q")),),
+        "two": (*OUTPUTS, ("sum", FLOAT, ("D", "Q"))),
+        "flat": (("values", FLOAT, ("D",)),),
+        "fixed": (("values", FLOAT, (1, 1)),),
+    }
+    nets |= {f"output-{what}": Net(outputs=values) for what, values in outputs.items()}
+    for name, last in {
+        "one-column": ("Identity", ("column",), ("values",)),
+        "one-row": ("Identity", ("row",), ("values",)),
+        "too-many": ("Identity", ("chosen",), ("values",)),
+        "turned": ("Transpose", ("sum",), ("values",)),
+        "scalar": ("ReduceSum", ("sum",), ("values",)),
+        "shape": ("Shape", ("sum",), ("values",)),
+        "itself": ("Add", ("values", "sum"), ("values",)),
+        "unknown": ("Identity", ("nobody",), ("values",)),
+        "nothing": ("Identity", (), ("values",)),
+    }.items():
+        nets[f"gives-{name}"] = Net((*NODES[:-1], last))
+    nets |= {f"opset-{n}": Net(opset=n) for n in (0, 1, 6, 9999, -1, 2**63)}
+    nets |= {f"ir-{n}": Net(ir_version=n) for n in (0, 1, 99, -1)}
+    return nets | {"empty": Net(()), "domain": Net(domain="some.where"), "bare": Net(metadata={})}
+
+
+def cases(seed: int) -> Iterator[Case]:
+    """Yield the cases of this theme."""
+    yield from _both("right", Net().to_bytes())
+    for name, net in odd_nets().items():
+        yield from _both(name, net.to_bytes())
+        yield _upsample(f"{name}-cap", net.to_bytes(), "--cap", "--factor", "2")
+    for key in KEYS:
+        for number, text in enumerate(TEXTS):
+            data = Net(metadata={**METADATA, key: text}).to_bytes()
+            yield _upsample(f"{key}-{number}", data, "--max-memory", "400M")
+    for number, data in enumerate((b"", b"x", b"\x00" * 999, b"\x08", npy(ball()), b"PK\x03\x04")):
+        yield from _both(f"none-{number}", data)
+    whole = Net().to_bytes()
+    for number in range(260):
+        name = f"damaged-{number}"
+        yield _upsample(name, mutate(whole, rng_of(name, seed)))
+    for number in range(40):
+        name = f"cut-{number}"
+        yield _upsample(name, whole[: int(rng_of(name, seed).integers(len(whole)))])
+    yield from _shipped(seed)
+
+
+def _shipped(seed: int) -> Iterator[Case]:
+    """Yield the smallest network of the package, damaged."""
+    from super_sdf.network import shipped_models
+
+    whole = shipped_models()["base-int8"].read_bytes()
+    for number in range(60):
+        name = f"shipped-{number}"
+        rng = rng_of(name, seed)
+        first, last = ((0, 3000), (len(whole) - 9000, None), (0, None))[number % 3]
+        yield _upsample(name, mutate(whole, rng, first, last))
+    weights = bytearray(whole)
+    for number in range(20):
+        name = f"shipped-weights-{number}"
+        at = int(rng_of(name, seed).integers(5000, len(whole) - 20000))
+        yield _upsample(name, bytes(weights[:at] + b"\xff" * 64 + weights[at + 64 :]))
+
+
+def _upsample(name: str, data: bytes, *options: str) -> Case:
+    words = ("upsample", "in.npy", "out.ply", "--model", "net.onnx", *options)
+    return Case(f"models/{name}", words, {**GRID, "net.onnx": data}, ("out.ply",), alone=True)
+
+
+def _both(name: str, data: bytes) -> Iterator[Case]:
+    """Yield a network for ``upsample`` and for ``batch``."""
+    yield _upsample(name, data)
+    words = ("batch", "in.npy", "--out", "out", "--jobs", "1", "--model", "net.onnx")
+    made = ("out", "out/*")
+    yield Case(f"models/{name}-batch", words, {**GRID, "net.onnx": data}, made, alone=True)

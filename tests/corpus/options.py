@@ -1,0 +1,153 @@
+"""Odd options and arguments of every command."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from .case import Case, ball, batch, npy, render, sample, upsample
+from .meshes import CUBE
+
+GRID = {"in.npy": npy(ball())}
+NUMBERS = [
+    *("", " ", "x", "nan", "NaN", "inf", "-inf", "1e999", "-1", "0", "-0", "1e-400", "5e-324"),
+    *("1e308", "1" + "0" * 400, "-1" + "0" * 400, "1_0", "1,5", "1,1,1", "1,1", ",,", "1,,1"),
+    *(
+        "1,1,1,1",
+        "1 1 1",
+        "0x10",
+        "1.",
+        ".5",
+        "+1",
+        "\uff11",
+        "٣",
+        "1e",
+        "--1",
+        "1\n",
+        "½",
+        "1,nan,1",
+    ),
+    *("1,2,3", "true", "4", "2", "3", "5", "7", "32", "64", "-4", "16", "2.0", "2147483648"),
+    *("9223372036854775808", "99999999999999"),
+]
+WORDS = [
+    *("", " ", "x", "AUTO", "neg", "é", "a\nb", "\udcff", "-", "--", "n" * 5000, "0", "None"),
+    "\x1b[31m",
+]
+SIZES = [
+    *("", "0", "-1", "1", "1K", "1k", "1M", "100M", "1G", "1T", "1e9", "1e400", "nan", "inf"),
+    *("G", "1GB", "1 G", ".5G", "-1G", "1" + "0" * 400, "1" + "0" * 400 + "G", "\uff15M", "²"),
+    *("1_000M", "0x1", "1e-9G", "\n"),
+]
+TARGETS = [
+    *("", ".", "..", "/", "out", "out.", ".ply", "out.PLY", "out.xyz", "out.npy", "none/out.ply"),
+    *("out.ply/", "in.npy", "in.npy/out.ply", "n" * 251 + ".ply", "n" * 300 + ".ply"),
+    *("n" * 245 + ".ply", "~/no/out.ply", "d/" * 2100 + "out.ply", "a\nb.ply", "\udcff.ply"),
+    *("-out.ply", "é.ply", "*.ply", " .ply", "out.ply.gz", "folder.ply", "there.ply"),
+    *("folder.ply/x.ply", "n" * 250 + ".stl", "n" * 240 + ".obj", "CON.stl", "a:b.ply"),
+]
+NUMBER_OPTIONS = {
+    "upsample": ["--factor", "--spacing", "--origin", "--offset", "--threads"],
+    "batch": ["--factor", "--spacing", "--origin", "--offset", "--threads"],
+    "sample": ["-n", "--spacing", "--padding", "--band"],
+    "render": ["--top", "--zoom", "--size"],
+    "section": ["--at", "--size", "--factor"],
+}
+WORD_OPTIONS = {
+    "upsample": ["--inside", "--quality", "--precision", "--model", "--device", "--none"],
+    "batch": ["--format", "--inside", "--quality", "--model", "--none"],
+    "sample": ["--frame", "--none"],
+    "render": ["--colour", "--reference", "--up", "--none"],
+    "info": ["--device", "--none"],
+}
+
+
+def cases(seed: int) -> Iterator[Case]:
+    """Yield the cases of this theme."""
+    del seed
+    for command, options in NUMBER_OPTIONS.items():
+        for option in options:
+            for number, text in enumerate(NUMBERS):
+                yield _case(f"{command}{option}-{number}", command, option, text)
+    for command, options in WORD_OPTIONS.items():
+        for option in options:
+            for number, text in enumerate(WORDS):
+                yield _case(f"{command}{option}-{number}", command, option, text)
+    for number, text in enumerate(SIZES):
+        yield _case(f"upsample-max-memory-{number}", "upsample", "--max-memory", text)
+        yield _case(f"batch-max-memory-{number}", "batch", "--max-memory", text)
+    yield from _targets()
+    yield from _lines()
+
+
+def _case(name: str, command: str, *options: str) -> Case:
+    """Return a case of a command that works but for these options."""
+    name = f"options/{name}"
+    huge = any(len(text) > 6 and text.isdigit() for text in options)
+    if command == "upsample":
+        return upsample(name, GRID, *options, alone=huge)
+    if command == "batch":
+        return batch(name, GRID, *options, alone=huge)
+    if command == "sample":
+        count = () if options[0] in ("-n", "--spacing") else ("-n", "8")
+        return sample(name, CUBE, *count, *options, source="cube.ply", alone=True)
+    if command == "render":
+        return render(name, CUBE, *options, source="cube.ply", alone=True)
+    if command == "section":
+        return render(name, GRID, *options, source="in.npy", alone=True)
+    return Case(name, (command, *options))
+
+
+def _targets() -> Iterator[Case]:
+    """Yield targets that cannot be, or are taken."""
+    taken = {"folder.ply/x": b"", "there.ply": b"somebody's", **GRID, **CUBE}
+    for number, target in enumerate(TARGETS):
+        for option in ([], ["--force"]):
+            suffix = "".join(option)
+            yield upsample(f"options/target-{number}{suffix}", taken, *option, target=target)
+        image, grid = target.replace(".ply", ".png"), target.replace(".ply", ".npz")
+        name = f"options/render-target-{number}"
+        yield render(name, taken, source="in.npy", target=image, alone=True)
+        name = f"options/sample-target-{number}"
+        yield sample(name, taken, "-n", "8", source="cube.ply", target=grid, alone=True)
+        words = ("batch", "in.npy", "--out", target.removesuffix(".ply"), "--quality", "fast")
+        if target not in ("/", "..", "", ".", "~/no/out.ply", "in.npy"):
+            yield Case(f"options/batch-out-{number}", (*words, "--jobs", "1"), taken, ("*",))
+
+
+def _lines() -> Iterator[Case]:
+    """Yield command lines that are odd as a whole."""
+    lines = [
+        *([], [""], ["x"], ["--x"], ["-h"], ["--version"], ["upsample"], ["upsample", "in.npy"]),
+        *(["upsample", "a", "b", "c"], ["batch"], ["batch", "in.npy"], ["batch", "--out", "out"]),
+        *(["sample"], ["sample", "cube.ply"], ["sample", "cube.ply", "out.npz"], ["render"]),
+        *(["render", "cube.ply"], ["render", "in.npy", "cube.ply", "out.png"], ["evaluate"]),
+        *(["evaluate", "cube.ply"], ["evaluate", "--out", "report"], ["info", "x"], ["info"]),
+        *(["info", "--json"], ["info", "--device", "cuda"], ["info", "-h"], ["sample", "-h"]),
+        *(["sample", "cube.ply", "out.npz", "-n", "8", "--spacing", "1"],),
+        *(["sample", "cube.ply", "out.npz", "--frame", "unit", "--spacing", "1"],),
+        *(["render", "cube.ply", "out.png", "--colour", "error"],),
+        *(["render", "cube.ply", "out.png", "--reference", "cube.ply"],),
+        *(["upsample", "in.npy", "out.ply", "--quality", "best", "--model", "none.onnx"],),
+        *(["upsample", "in.npy", "out.ply", "--device", "cuda"], ["\udcff"]),
+        *(["upsample", "\udcff.npy", "out.ply"], ["upsample", "a\nb.npy", "out.ply"]),
+        *(["batch", "in.npy", "in.npy", "--out", "out", "--quality", "fast", "--jobs", "1"],),
+        *(
+            [
+                "batch",
+                "in.npy",
+                "./in.npy",
+                "--out",
+                "out",
+                "--quality",
+                "fast",
+                "--json",
+                "--dry-run",
+            ],
+        ),
+        *(["batch", "n" * 5000, "--out", "out"], ["upsample", "n" * 5000 + ".npy", "out.ply"]),
+        *(["upsample", "n" * 300 + ".npy", "out.ply"], ["batch", "n" * 300 + ".npy", "--out", "o"]),
+        *(["sample", "n" * 300 + ".ply", "out.npz", "-n", "8"], ["render", "n" * 300, "out.png"]),
+    ]
+    for number, words in enumerate(lines):
+        made = ("out.*", "out", "out/*", "o", "o/*")
+        yield Case(f"options/line-{number}", tuple(words), {**GRID, **CUBE}, made, alone=True)

@@ -1,0 +1,93 @@
+"""Random fields of 2 to 16 samples a side, and whether their meshes are closed manifolds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from conftest import count_fans
+
+from super_sdf import Mesh, SdfGrid, reconstruct
+from super_sdf.pipeline import Decoder
+
+from .case import ball, rng_of
+
+MOST_SAMPLES = 300
+
+
+@dataclass(frozen=True)
+class RandomField:
+    """A field, and how its surface is asked for."""
+
+    name: str
+    values: np.ndarray
+    factor: int
+    cap: bool
+
+
+def make_fields(count: int, seed: int = 0) -> Iterator[RandomField]:
+    """Yield so many fields; the same for the same seed."""
+    for number in range(count):
+        rng = rng_of(f"field-{number}", seed)
+        shape = _draw_shape(rng)
+        kind = list(KINDS)[number % len(KINDS)]
+        values = KINDS[kind](rng, shape).astype(np.float32)
+        values.flat[0], values.flat[-1] = 1, -1  # both sides, whatever the rest
+        factor, cap = (2, 4)[number // 2 % 2], bool(number % 2)
+        name = f"{number}: {kind} {shape}, factor {factor}{', cap' * cap}"
+        yield RandomField(name, values, factor, cap)
+
+
+def _draw_shape(rng: np.random.Generator) -> tuple[int, ...]:
+    """Return 2 to 16 samples a side, some hundreds in all: small ones meet all cases, and soon."""
+    shape = rng.integers(2, 17, 3)
+    while shape.prod() > MOST_SAMPLES:
+        shape[shape.argmax()] = rng.integers(2, shape.max())
+    return tuple(map(int, rng.permutation(shape)))
+
+
+KINDS = {
+    "normal": lambda rng, shape: rng.normal(size=shape),
+    "large": lambda rng, shape: rng.normal(size=shape) * 10,
+    "clamped": lambda rng, shape: np.clip(rng.normal(size=shape), -0.4, 0.4),
+    "half-integer": lambda rng, shape: rng.integers(-3, 4, shape) / 2,
+    "exact zeros": lambda rng, shape: rng.normal(size=shape) * (rng.random(shape) < 0.5),
+    "mostly zeros": lambda rng, shape: rng.choice([-1, 0, 0, 0, 0, 1], shape),
+    "signs": lambda rng, shape: rng.choice([-1.0, 1.0], shape),
+    "clamped ball": lambda rng, shape: np.clip(ball(shape, rng.uniform(0.2, 0.6)), -0.5, 0.5),
+    "rounded ball": lambda rng, shape: np.round(ball(shape, rng.uniform(0.2, 0.6)) * 2) / 2,
+    "noisy ball": lambda rng, shape: ball(shape) + rng.uniform(-0.5, 0.5, shape),
+    "denormal": lambda rng, shape: rng.normal(size=shape) * rng.choice([1, 1e-44], shape),
+}
+
+
+def faults_of_field(field: RandomField, network: Decoder) -> list[str]:
+    """Return what is wrong with a field's mesh: holes, vertices of two surfaces, no numbers."""
+    grid = SdfGrid.trusted(field.values, 1.0)  # they are no distances, and need not be
+    mesh = reconstruct(grid, network, field.factor, cap=field.cap)
+    faults = []
+    if not np.isfinite(mesh.vertices).all():
+        faults.append("vertices are not finite")
+    if len(np.unique(mesh.vertices, axis=0)) < len(mesh.vertices):
+        faults.append("vertices at the same position")
+    inner, border = open_edges(mesh, field.values.shape)
+    if inner or (field.cap and border):
+        faults.append(f"{inner} open edges within the grid, {border} at its border")
+    elif not border and (count_fans(mesh.faces) != 1).any():
+        faults.append("surfaces share a vertex")
+    return [f"{field.name}: {fault}" for fault in faults]
+
+
+def open_edges(mesh: Mesh, shape: tuple[int, ...]) -> tuple[int, int]:
+    """Count edges without a partner: within the grid's box, and in its faces.
+
+    The fine lattice ends half a voxel beyond the outer samples; there a surface may run out.
+    """
+    size = len(mesh.vertices)
+    start, end = mesh.faces.ravel().astype(np.int64), np.roll(mesh.faces, -1, axis=1).ravel()
+    lonely = np.setxor1d(start * size + end, end * size + start)
+    ends = mesh.vertices[np.stack([lonely // size, lonely % size])]
+    in_face = (np.abs(ends + 0.5) < 1e-3) | (np.abs(ends - np.array(shape) + 0.5) < 1e-3)
+    at_border = in_face.all(0).any(1)
+    return int((~at_border).sum()), int(at_border.sum())

@@ -1,0 +1,146 @@
+"""What is no plain file: as input, as output, as a list, a network, or in a folder of inputs."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from .case import Case, Content, ball, batch, evaluate, npy, npz, render, sample, upsample
+
+
+def _socket(path: Path) -> None:
+    """Leave a socket at a path."""
+    home = os.getcwd()
+    os.chdir(path.parent)  # a socket's path may be 100 characters long and no more
+    try:
+        with socket.socket(socket.AF_UNIX) as bound:
+            bound.bind(path.name)
+    finally:
+        os.chdir(home)
+
+
+def _closed(path: Path) -> None:
+    """Leave a file that only root can read."""
+    path.write_bytes(npy(ball()))
+    path.chmod(0)
+
+
+def _closed_folder(path: Path) -> None:
+    path.mkdir()
+    path.chmod(0)
+
+
+def _circle(path: Path) -> None:
+    """Leave a folder that holds links to itself and to what is above."""
+    path.mkdir()
+    (path / "in.npy").write_bytes(npy(ball()))
+    (path / "me").symlink_to(".")
+    (path / "up").symlink_to("..")
+
+
+def _long_line(path: Path) -> None:
+    path.write_bytes(b"x" * 30_000_000)
+
+
+def _link(to: str) -> Callable[[Path], None]:
+    return lambda path: path.symlink_to(to)
+
+
+KINDS: dict[str, Content] = {
+    "fifo": os.mkfifo,
+    "socket": _socket,
+    "zero": _link("/dev/zero"),
+    "null": _link("/dev/null"),
+    "full": _link("/dev/full"),
+    "random": _link("/dev/urandom"),
+    "tty": _link("/dev/tty"),
+    "stdin": _link("/dev/stdin"),
+    "loop": lambda path: path.symlink_to(path.name),
+    "dangling": _link("nowhere"),
+    "link-to-folder": _link("."),
+    "folder": lambda path: path.mkdir(),
+    "closed": _closed,
+    "closed-folder": _closed_folder,
+    "circle": _circle,
+    "memory": _link("/proc/self/mem"),
+    "pages": _link("/proc/self/pagemap"),
+    "status": _link("/proc/self/status"),
+    "environ": _link("/proc/self/environ"),
+    "empty": b"",
+    "long-line": _long_line,
+}
+DEVICES = {"null", "full", "zero", "random", "tty", "stdin", "memory", "pages", "status", "environ"}
+GRID = {"good.npy": npy(ball()), "good.npz": npz(values=ball())}
+
+
+def cases(seed: int) -> Iterator[Case]:
+    """Yield the cases of this theme."""
+    del seed
+    for kind, content in KINDS.items():
+        for suffix in ("npy", "npz"):
+            at = {f"in.{suffix}": content}
+            name = f"special/{kind}-{suffix}"
+            yield upsample(name, at, source=f"in.{suffix}", alone=True)
+            yield batch(f"{name}-batch", at, source=f"in.{suffix}", alone=True)
+            yield render(f"{name}-render", at, source=f"in.{suffix}", alone=True)
+            inside = {f"grids/in.{suffix}": content, "grids/good.npy": GRID["good.npy"]}
+            yield batch(f"{name}-within", inside, source="grids", alone=True)
+            pattern = batch(f"{name}-pattern", inside, source=f"grids/*.{suffix}", alone=True)
+            yield pattern
+        yield from _meshes(kind, content)
+        yield from _elsewhere(kind, content)
+    yield from _roots()
+
+
+def _meshes(kind: str, content: Content) -> Iterator[Case]:
+    """Yield it as a mesh."""
+    for suffix in ("ply", "stl", "obj"):
+        at, source = {f"in.{suffix}": content}, f"in.{suffix}"
+        yield sample(f"special/{kind}-{suffix}-sample", at, "-n", "8", source=source, alone=True)
+        yield render(f"special/{kind}-{suffix}-render", at, source=source, alone=True)
+    yield evaluate(f"special/{kind}-evaluate", {"in.ply": content}, source="in.ply")
+    yield evaluate(f"special/{kind}-evaluate-within", {"in/in.ply": content}, source="in")
+
+
+def _elsewhere(kind: str, content: Content) -> Iterator[Case]:
+    """Yield it as a list, as a network, as the reference, and where the output goes."""
+    for suffix in ("txt", "jsonl"):
+        at = {f"list.{suffix}": content}
+        yield batch(f"special/{kind}-{suffix}", {**GRID, **at}, source=f"list.{suffix}", alone=True)
+    listed = {"list.jsonl": b'{"in": "in.npy"}\n{"in": "good.npy"}\n', "in.npy": content, **GRID}
+    yield batch(f"special/{kind}-listed", listed, source="list.jsonl", alone=True)
+    model = ("upsample", "good.npy", "out.ply", "--model", "net.onnx")
+    yield Case(
+        f"special/{kind}-model", model, {**GRID, "net.onnx": content}, ("out.ply",), alone=True
+    )
+    if kind in DEVICES:
+        return  # as a target: what follows links would write there
+    for target in ("out.ply", "out.stl"):
+        for option in ([], ["--force"]):
+            at = {**GRID, target: content}
+            name = f"special/{kind}-target-{target[4:]}{''.join(option)}"
+            words = ("upsample", "good.npy", target, "--quality", "fast", *option)
+            made = (target, "nowhere")  # the latter where it is a link to there
+            yield Case(name, words, at, made, alone=True)
+    words = ("upsample", "good.npy", "to/out.ply", "--quality", "fast")
+    made = ("to/out.ply", "out.ply")  # the latter where it is a link to the folder itself
+    yield Case(f"special/{kind}-target-above", words, {**GRID, "to": content}, made, alone=True)
+
+
+def _roots() -> Iterator[Case]:
+    """Yield folders and patterns that never end, and paths of the system."""
+    circle = {"c": _circle}
+    for source in ("c", "c/**/*.npy", "**/*.npy", "c/**", "c/*/*.npy", "**", "[", "c/[!a]n.npy"):
+        yield batch(f"special/circle-{source.replace('/', '-')}", circle, source=source, alone=True)
+    for number, target in enumerate(
+        ("/proc/out.ply", "/sys/out.ply", "/proc/self/out.ply", "/none/out.ply")
+    ):
+        yield upsample(
+            f"special/system-{number}", GRID, source="good.npy", target=target, alone=True
+        )
+    for number, source in enumerate(("/dev/zero", "/dev/stdin", "/proc/self/maps", "~", "-", ".")):
+        yield upsample(f"special/source-{number}", {}, source=source, alone=True)
+        yield batch(f"special/source-{number}-batch", {}, source=source, alone=True)
+    yield upsample("special/root", {}, source="/", alone=True)
