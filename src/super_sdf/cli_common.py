@@ -32,15 +32,20 @@ def one_line_errors(kept: str = "nothing was written") -> Iterator[None]:
     try:
         yield
     except OptionError as error:
-        raise click.UsageError(str(error)) from error
+        raise click.UsageError(in_a_line(error)) from error
     except SuperSdfError as error:
-        raise click.ClickException(str(error)) from error
+        raise click.ClickException(in_a_line(error)) from error
     except MemoryError:
         raise click.ClickException("out of memory: use a smaller --factor or grid") from None
     except OSError as error:  # what the system refuses is no bug: too few file handles, say
         raise click.ClickException(describe_os_error(error)) from error
     except KeyboardInterrupt as error:
         raise InterruptedCommand(f"; {kept}", error) from None
+
+
+def in_a_line(error: Exception) -> str:
+    """Return what an error says in one line, whatever names of files or keys it repeats."""
+    return " ".join(str(error).splitlines())
 
 
 def describe_os_error(error: OSError) -> str:

@@ -46,9 +46,12 @@ def one_voxel() -> dict[str, Any]:
 
 def read_card(session: ort.InferenceSession, path: Path) -> dict[str, Any]:
     """Return a file's metadata after checking that it keeps the contract, or raise ModelError."""
-    inputs = {given.name: given.type for given in session.get_inputs()}
-    outputs = {made.name: made.type for made in session.get_outputs()}
-    metadata = session.get_modelmeta().custom_metadata_map
+    try:
+        inputs = {given.name: given.type for given in session.get_inputs()}
+        outputs = {made.name: made.type for made in session.get_outputs()}
+        metadata = session.get_modelmeta().custom_metadata_map
+    except UnicodeDecodeError as error:
+        raise ModelError(f"{path} holds names that are no UTF-8 text: it is damaged") from error
     version = metadata.get("format_version", "none")
     if inputs != INPUTS or outputs != {OUTPUT: OUTPUT_TYPE} or version != str(FORMAT_VERSION):
         raise ModelError(

@@ -25,8 +25,10 @@ def fingerprint(path: Path) -> Fingerprint | None:
         with path.open("rb", buffering=0) as file:
             state = os.fstat(file.fileno())  # before it is read: a change while it is shows later
             digest = hashlib.sha256()
-            while chunk := file.read(CHUNK):
+            left = state.st_size  # of what the system makes up as it is read there is no end
+            while left > 0 and (chunk := file.read(min(CHUNK, left))):
                 digest.update(chunk)
+                left -= len(chunk)
     except OSError:
         return None
     return {"sha256": digest.hexdigest(), "size": state.st_size, "mtime_ns": state.st_mtime_ns}

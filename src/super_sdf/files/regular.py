@@ -36,19 +36,22 @@ def check_regular_file(path: str | Path) -> Path:
     Raises
     ------
     FileError
-        If it does not exist, may not be read, or is a folder, a pipe, a socket or a device.
+        If it does not exist, may not be read, is empty, or is a folder, a pipe, a socket or a
+        device.
     """
     try:
-        mode = os.stat(path).st_mode
+        found = os.stat(path)
     except OSError as error:
         raise FileError(f"{path} {reason_of(error)}") from None
     except ValueError:  # a NUL, or a character that the system's encoding lacks
         raise FileError(f"{str(path)!r} is no name that a file can have") from None
-    if not stat.S_ISREG(mode):
-        kind = KINDS.get(stat.S_IFMT(mode), "special file")
+    if not stat.S_ISREG(found.st_mode):
+        kind = KINDS.get(stat.S_IFMT(found.st_mode), "special file")
         raise FileError(f"{path} is a {kind}: give a file")
     if not os.access(path, os.R_OK):
         raise FileError(f"{path} {REASONS[errno.EACCES]}")
+    if not found.st_size:  # nor is what the system calls so and makes up as it is read
+        raise FileError(f"{path} is empty: give a file with something in it")
     return Path(path)
 
 
