@@ -41,7 +41,7 @@ OPTIONS = [
         ("--up", "w"),
     ),
     *(("--peer-limit", "nan"), ("--peer-limit", "-1"), ("--experiments", "x"), ("--out", "")),
-    *(("--experiment-shapes", "0"), ("--peers", "x"), ("--out", "cube.ply"), ("--out", "no/no/no")),
+    *(("--experiment-shapes", "0"), ("--peers", "x"), ("--out", "cube.ply")),
 ]
 
 
