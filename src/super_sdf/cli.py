@@ -35,7 +35,7 @@ Examples:
 """
 
 
-@click.group(context_settings=CONTEXT)
+@click.group(context_settings=CONTEXT, no_args_is_help=False)
 @click.version_option(__version__, prog_name="super-sdf")
 def cli() -> None:
     """Turn coarse signed distance grids into fine meshes."""

@@ -37,7 +37,8 @@ def as_triple(number: ArrayLike, name: str) -> Triple:
         array = np.asarray(number)
         if array.dtype.kind not in "fiu":  # truth values and words are none
             raise TypeError
-        triple = np.broadcast_to(array.astype(np.float64).ravel(), (3,))
+        with np.errstate(over="ignore"):  # beyond a double: not finite, as it is said below
+            triple = np.broadcast_to(array.astype(np.float64).ravel(), (3,))
     except (TypeError, ValueError, RuntimeError):
         raise GridError(f"{name} is {seen(number)}: give one number or three") from None
     if not np.isfinite(triple).all():

@@ -24,9 +24,10 @@ def fingerprint(path: Path) -> Fingerprint | None:
             return None
         with path.open("rb", buffering=0) as file:
             state = os.fstat(file.fileno())  # before it is read: a change while it is shows later
-            digest = hashlib.sha256()
-            while chunk := file.read(CHUNK):
+            digest, left = hashlib.sha256(), state.st_size  # what the system makes up has no end
+            while chunk := file.read(min(CHUNK, left)):
                 digest.update(chunk)
+                left -= len(chunk)
     except OSError:
         return None
     return {"sha256": digest.hexdigest(), "size": state.st_size, "mtime_ns": state.st_mtime_ns}

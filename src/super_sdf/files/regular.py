@@ -39,16 +39,18 @@ def check_regular_file(path: str | Path) -> Path:
         If it does not exist, may not be read, or is a folder, a pipe, a socket or a device.
     """
     try:
-        mode = os.stat(path).st_mode
+        state = os.stat(path)
     except OSError as error:
         raise FileError(f"{path} {reason_of(error)}") from None
     except ValueError:  # a NUL, or a character that the system's encoding lacks
         raise FileError(f"{str(path)!r} is no name that a file can have") from None
-    if not stat.S_ISREG(mode):
-        kind = KINDS.get(stat.S_IFMT(mode), "special file")
+    if not stat.S_ISREG(state.st_mode):
+        kind = KINDS.get(stat.S_IFMT(state.st_mode), "special file")
         raise FileError(f"{path} is a {kind}: give a file")
     if not os.access(path, os.R_OK):
         raise FileError(f"{path} {REASONS[errno.EACCES]}")
+    if not state.st_size:  # or the system makes it up as it is read, without end
+        raise FileError(f"{path} is empty")
     return Path(path)
 
 
