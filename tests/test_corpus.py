@@ -9,7 +9,6 @@ import os
 from pathlib import Path
 
 import numpy as np
-import onnxruntime
 import pytest
 from conftest import trilinear
 from corpus.case import Case, upsample
@@ -23,6 +22,7 @@ from corpus.running import Run, run_here
 from corpus.trying import try_case
 
 from super_sdf import load_network
+from super_sdf.onnx import ort
 
 EACH = 45  # cases of a theme
 ALONE = 40  # of all that may hang or crash
@@ -37,7 +37,7 @@ def cases() -> list[Case]:
 @pytest.fixture
 def kept(monkeypatch):
     """Load each network once."""
-    monkeypatch.setattr(onnxruntime, "InferenceSession", kept_sessions())
+    monkeypatch.setattr(ort, "InferenceSession", kept_sessions())
 
 
 @pytest.mark.usefixtures("kept")

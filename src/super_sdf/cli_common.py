@@ -65,9 +65,12 @@ def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[int, int], None]
 
 
 def tell(line: str) -> None:
-    """Print a line to stderr; where that cannot be written there is nobody to tell."""
+    """Print a line to stderr; where that cannot be written there is nobody to tell.
+
+    It stays one line, whatever the names of files and of what is in them hold.
+    """
     with suppress(OSError):
-        click.echo(line, err=True)
+        click.echo(line.replace("\n", " "), err=True)
 
 
 def print_result(text: str, kept: str) -> None:

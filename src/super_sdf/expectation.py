@@ -74,7 +74,9 @@ def count_crossings(grid: SdfGrid, offset: float) -> int:
 def _planes(grid: SdfGrid, offset: float) -> Iterator[BoolArray]:
     """Yield which samples are inside, plane by plane: the grid may be in a file."""
     for i in range(grid.shape[0]):
-        yield grid.planes(i, i + 1)[0] <= offset
+        with np.errstate(over="ignore"):  # an offset beyond single precision is beyond all values
+            inside = grid.planes(i, i + 1)[0] <= offset
+        yield inside
 
 
 def _rounded(count: int) -> int:

@@ -11,7 +11,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-import onnxruntime
+from super_sdf.onnx import ort
 
 from .running import Run, limit, run_here
 
@@ -73,7 +73,7 @@ def serve(pipe: Connection, crash_log: str) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     with open(crash_log, "w") as log:
         faulthandler.enable(log)
-        onnxruntime.InferenceSession = kept_sessions()
+        ort.InferenceSession = kept_sessions()
         while True:
             try:
                 words, folder = pipe.recv()
@@ -91,7 +91,7 @@ def kept_sessions() -> Callable[..., Any]:
     from super_sdf.network import shipped_models
 
     shipped = {str(path) for path in shipped_models().values()}
-    load, kept = onnxruntime.InferenceSession, {}
+    load, kept = ort.InferenceSession, {}
 
     def open_once(path: Any, options: Any, **others: Any) -> Any:
         if str(path) not in shipped:

@@ -117,7 +117,7 @@ def _targets() -> Iterator[Case]:
 def _lines() -> Iterator[Case]:
     """Yield command lines that are odd as a whole."""
     lines = [
-        *([], [""], ["x"], ["--x"], ["-h"], ["--version"], ["upsample"], ["upsample", "in.npy"]),
+        *([""], ["x"], ["--x"], ["-h"], ["--version"], ["upsample"], ["upsample", "in.npy"]),
         *(["upsample", "a", "b", "c"], ["batch"], ["batch", "in.npy"], ["batch", "--out", "out"]),
         *(["sample"], ["sample", "cube.ply"], ["sample", "cube.ply", "out.npz"], ["render"]),
         *(["render", "cube.ply"], ["render", "in.npy", "cube.ply", "out.png"], ["evaluate"]),

@@ -96,6 +96,8 @@ def _make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise WriteError(f"{folder} cannot be made: {error.strerror}") from error
+    except RecursionError:
+        raise WriteError(f"{folder} cannot be made: too many folders within each other") from None
 
 
 def failed_row(job: Job, reason: str, *, retry: bool = True, content: Any = None) -> Row:
@@ -122,6 +124,8 @@ def _reason(error: Exception) -> str:
     """Return what went wrong, in a line."""
     if isinstance(error, MemoryError) and not _is_ours(error):
         return "out of memory: use a smaller --factor or grid"
+    if isinstance(error, OSError) and not _is_ours(error):  # no bug: a name too long, say
+        return f"the system refuses it: {error.strerror or error}"
     first = in_a_line(next(iter(str(error).splitlines()), ""))
     return first if _is_ours(error) else f"{type(error).__name__}: {first}"
 

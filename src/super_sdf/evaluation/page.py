@@ -41,7 +41,7 @@ def check_page(size: int, count: int, columns: int | None = None) -> None:
         If they would not fit in memory.
     """
     if not 0 < size <= LARGEST_SIZE:
-        raise OptionError(f"size is {size:g}: give 1 to {LARGEST_SIZE} pixels")
+        raise OptionError(f"size is {size}: give 1 to {LARGEST_SIZE} pixels")
     across = min(count, columns or ACROSS)
     wide, tall = across * size, -(-count // across) * size
     what = f"a picture of {wide:,} x {tall:,} pixels"

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ..errors import MeshError, OptionError
+from ..errors import MeshError, OptionError, seen
 from ..grid import FloatArray, SdfGrid
 from ..memory import check_fits
 from ..mesh import Mesh
@@ -46,6 +46,8 @@ def check_numbers(
     """Raise OptionError if a number makes no grid, whatever the mesh; those not given are fine."""
     if n is not None and n < 2:
         raise OptionError(f"n is {n}: give at least 2 samples along the longest axis")
+    if n is not None and n >= MOST_ALONG_AXIS:
+        raise OptionError(f"n is {seen(n)}: give fewer than {MOST_ALONG_AXIS:g} samples")
     if spacing is not None and not 0 < spacing < np.inf:
         raise OptionError(f"spacing is {spacing:g}: it must be greater than 0")
     if not 0 <= padding < np.inf:
@@ -91,13 +93,14 @@ def fitted_layout(
         spacing = float((high - low).max() / ((n or 0) - 1 - 2 * padding))
     with np.errstate(over="ignore"):
         steps = np.ceil((high - low) / spacing + 2 * padding - 1e-6)
+        origin = (low + high - steps * spacing) / 2  # not finite: refused by the grid
     if steps.max() >= MOST_ALONG_AXIS:
         raise OptionError(
             f"a spacing of {spacing:g} and a padding of {padding:g} voxels make {steps.max():.3g} "
             f"samples along an axis of a mesh {(high - low).max():g} long: give fewer"
         )
     nx, ny, nz = (int(count) + 1 for count in steps)
-    return (nx, ny, nz), spacing, (low + high - steps * spacing) / 2
+    return (nx, ny, nz), spacing, origin
 
 
 def sample_solid(

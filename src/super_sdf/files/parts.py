@@ -27,7 +27,7 @@ def part_path(target: Path) -> Path:
 
 def _stem(name: str) -> str:
     """Return what the names of a target's parts begin with; a digest stands for a long name."""
-    raw = os.fsencode(name)
+    raw = name.encode("utf-8", "surrogatepass")  # a ledger may name what no file can be called
     return f".{name}." if len(raw) <= LONGEST else f".{hashlib.sha256(raw).hexdigest()[:32]}."
 
 
