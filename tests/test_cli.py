@@ -161,7 +161,7 @@ CASES = {
     ("folder.npy",): (1, "folder.npy is a folder: give a file"),
     ("in.vdb",): (2, "in.vdb is no grid file: give .npy or .npz"),
     ("text.npy",): (1, "text.npy is no .npy array: its header cannot be read"),
-    ("empty.npy",): (1, "empty.npy is no .npy array: its header cannot be read"),
+    ("empty.npy",): (1, "empty.npy is empty: give a file with something in it"),
     ("text.npz",): (1, "text.npz is no readable .npz archive: File is not a zip file"),
     ("objects.npy",): (1, "objects.npy holds Python objects: save the numbers alone"),
     ("other.npz",): (1, "other.npz has no key 'values' (it holds field, more)"),

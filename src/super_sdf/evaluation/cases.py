@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..band import find_band, rescale
-from ..errors import OptionError
+from ..errors import OptionError, seen
 from ..grid import BoolArray, FloatArray, IntArray, SdfGrid
 from ..memory import check_fits
 from ..mesh import Mesh
@@ -30,6 +30,9 @@ BYTES_PER_NODE = 20
 
 # Streams of random numbers, each seeded by the shape's name and its own number.
 REFERENCE_POINTS, REFERENCE_EDGES, RESULT_POINTS, NOISE = range(4)
+
+
+LARGEST_SIZE = 100_000  # samples along an axis: a grid of more is beyond any memory
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,8 @@ class Setting:
         check_factor(self.factor)
         if self.size < 4:
             raise OptionError(f"{name} is {self.size}: give at least 4 samples along an axis")
+        if self.size > LARGEST_SIZE:
+            raise OptionError(f"{name} is {seen(self.size)}: give at most {LARGEST_SIZE:,} samples")
 
     def __str__(self) -> str:
         if not self.size:
