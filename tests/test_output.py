@@ -107,7 +107,7 @@ def leave_part(target, pid):
 @pytest.mark.parametrize("has_locks", [True, False])
 def test_what_a_killed_process_left_goes_with_the_next_run(monkeypatch, target, has_locks):
     if not has_locks:
-        monkeypatch.setattr(parts, "_take_lock", lambda file: None)
+        monkeypatch.setattr(parts, "take_lock", lambda file: None)
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
     leave_part(target, gone.pid)

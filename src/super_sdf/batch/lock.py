@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import BinaryIO
 
 from ..errors import FileError, WriteError
-from ..files.parts import remove_abandoned_parts
+from ..files.parts import remove_abandoned_parts, take_lock
 from .journal import NAME, note_begun, read_journal
 
 
@@ -38,7 +38,7 @@ class FolderLock:
             raise
         except OSError as error:
             raise WriteError(f"{folder} cannot be written: {error.strerror}") from error
-        if not _take_lock(self.file):
+        if take_lock(self.file.fileno()) is False:  # None: there are no locks here
             self.file.close()
             raise FileError(f"{folder} is in use by another batch: wait for it, or give another")
         self.begun = read_journal(folder).begun
@@ -70,18 +70,3 @@ class FolderLock:
     def finish(self, target: str) -> None:
         """Forget an output: the ledger has it."""
         self.begun.discard(target)
-
-
-def _take_lock(file: BinaryIO) -> bool:
-    """Lock an open file if nobody else has; where the system has no such lock, do without."""
-    try:
-        import fcntl
-    except ImportError:
-        return True
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # a file system without locks
-        return True
-    return True

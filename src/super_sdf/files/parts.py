@@ -46,7 +46,7 @@ def reserved_part(target: Path) -> Iterator[Path]:
         file = os.open(part, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
     except FileExistsError:
         raise WriteError(f"{target} is being written already: wait for it") from None
-    has_lock = _take_lock(file) is not None
+    has_lock = take_lock(file) is not None
     if not has_lock:
         os.close(file)
     try:
@@ -79,14 +79,14 @@ def _is_abandoned(path: Path, pid: int) -> bool:
     except OSError:  # somebody else's, or gone
         return False
     try:
-        taken = _take_lock(file)
+        taken = take_lock(file)
     finally:
         os.close(file)
     return taken if taken is not None else not _lives(pid)
 
 
-def _take_lock(file: int) -> bool | None:
-    """Lock an open file if nobody else has; None where there are no locks."""
+def take_lock(file: int) -> bool | None:
+    """Lock an open file, until it is closed, if nobody else has; None where there are no locks."""
     try:
         import fcntl
     except ImportError:  # Windows
