@@ -72,7 +72,7 @@ def _find_extremes(values: Samples) -> Extremes:
     for i, plane in enumerate(values):
         low, high = float(plane.min()), float(plane.max())
         if not (isfinite(low) and isfinite(high)):
-            with np.errstate(over="ignore"):  # of long doubles
+            with np.errstate(over="ignore", invalid="ignore"):  # of long doubles
                 j, k = np.argwhere(~np.isfinite(plane.astype(np.float64)))[0]
             raise GridError(
                 f"values[{i}, {j}, {k}] is {plane[j, k]!s}: every sample must be finite; "
