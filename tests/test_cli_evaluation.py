@@ -78,7 +78,11 @@ def test_what_is_wrong_with_a_mesh_is_said(here, command):
         ("lidless.ply box.npz -n 9", 1, "lidless.ply is open: 4 edges have no partner"),
         ("box.ply box.npz -n 9 --band 1", 2, "band is 1: give at least 1.5 voxels"),
         ("box.ply box.npz -n 90000", 1, "a grid of 90000 x 30004 x 30004 needs "),
-        ("box.ply box.npz -n 99999999999999", 2, "n is 99999999999999: give fewer than 1e+09 samples"),
+        (
+            "box.ply box.npz -n 99999999999999",
+            2,
+            "n is 99999999999999: give fewer than 1e+09",
+        ),
         ("box.ply box.npz -n 0", 2, "n is 0: give at least 2 samples"),
         ("none.ply box.npz -n -5", 2, "n is -5: give at least 2 samples"),
         ("box.ply box.npz -n 1 --frame unit", 2, "n is 1: give at least 2 samples"),

@@ -13,6 +13,9 @@ from test_privacy import run_at_home
 
 from super_sdf import compiling, reconstruct
 from super_sdf.compiling import Compiled, compiled_twin, is_loaded, try_compiled, use_compiled
+from super_sdf.footprint import CODE_BYTES, COMPILER_BYTES, slab_bytes
+from super_sdf.plan import whole
+from super_sdf.survey import survey
 
 INSTEAD = "numba is installed but cannot be used, and NumPy takes longer"
 MEND = "; mend it, or set SUPER_SDF_COMPILED=0"
@@ -34,7 +37,7 @@ def double(value):
 def made_module(double=lambda value: [2 * value, "compiled"], wake=lambda: None):
     """Stand in for the compiled functions."""
     module = ModuleType(compiling.MODULE)
-    module.double, module.wake = double, wake
+    module.double, module.wake, module.is_on_disk = double, wake, lambda: True
     return module
 
 
@@ -177,3 +180,16 @@ def test_the_command_says_it_once_and_writes_the_same_mesh(tmp_path, monkeypatch
     (note,) = [line for line in runs[1].stderr.splitlines() if "numba" in line]
     assert note.startswith(f"Note: {INSTEAD} ({reason}") and "numba" not in runs[0].stderr
     assert Path("0.ply").read_bytes() == Path("1.ply").read_bytes()
+
+
+def test_the_plan_counts_the_compiler_where_nothing_is_on_disk(monkeypatch):
+    module = made_module()
+    monkeypatch.setattr(compiling, "import_module", lambda name: module)
+    band = survey(ball())
+    slab = whole(band)
+    bare = slab_bytes(band, slab.seen, slab.decoded, slab.planes, 4)
+    assert try_compiled() == ""
+    kept = slab_bytes(band, slab.seen, slab.decoded, slab.planes, 4)
+    module.is_on_disk = lambda: False
+    anew = slab_bytes(band, slab.seen, slab.decoded, slab.planes, 4)
+    assert (kept - bare, anew - kept) == (CODE_BYTES, COMPILER_BYTES)

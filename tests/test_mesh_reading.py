@@ -106,7 +106,9 @@ def test_files_without_a_mesh(tmp_path, name):
         path.write_text(
             {"lines.obj": "v 0 0 0\nv 1 0 0\nl 1 2\n", "deep.gltf": "[" * 99999}.get(name, "")
         )
-    with pytest.raises((FileError, MeshError), match=rf"{name} (holds no triangle|cannot be read|is empty)"):
+    with pytest.raises(
+        (FileError, MeshError), match=rf"{name} (holds no triangle|cannot be read|is empty)"
+    ):
         read_mesh(path)
 
 

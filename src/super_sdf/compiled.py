@@ -8,6 +8,7 @@ Python's lock, so chunks run side by side.
 from __future__ import annotations
 
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,12 @@ from .nodes import (
 from .spheres import Samples
 
 Arrays = tuple[NDArray[Any], ...]
+
+
+def is_on_disk() -> bool:
+    """Say whether machine code was kept by an earlier process: else all is compiled anew."""
+    folder, last = Path(kernels.make_triangles.stats.cache_path), kernels.make_triangles.__name__
+    return any(folder.glob(f"kernels.{last}-*.nbi"))
 
 
 def wake() -> None:

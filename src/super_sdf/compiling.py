@@ -94,6 +94,12 @@ def is_loaded() -> bool:
     return _compiled.module is not None and os.environ.get(SWITCH) != "0"
 
 
+def must_compile() -> bool:
+    """Say whether the functions in use have to be compiled first, which takes memory of its own."""
+    module = _compiled.module
+    return module is not None and is_loaded() and not module.is_on_disk()
+
+
 def why_not() -> tuple[str, ...]:
     """Return a sentence on why numba is not used though it is installed; none if all is well."""
     return (_compiled.fault,) * bool(_compiled.fault)

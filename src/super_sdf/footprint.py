@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from .chunks import CHUNK, rows_in_chunk, threads_at_work
-from .compiling import is_loaded
+from .compiling import is_loaded, must_compile
 from .isosurface import LOOKUP_BYTES, lookups_at_once
 from .survey import Band
 
@@ -25,6 +25,8 @@ BYTES_PER_OFFSET = 27_000
 NETWORK_FIXED = 5_000_000
 # Compiled functions, which come from the disk as they are called.
 CODE_BYTES = 60_000_000
+# The first process that uses them compiles them.
+COMPILER_BYTES = 60_000_000
 
 Range = tuple[int, int]
 
@@ -48,7 +50,8 @@ def slab_bytes(
     needs = dict(zip(STAGES, np.array(list(STAGES.values())) @ sizes))
     needs["isosurface"] += _lookup_bytes(band, planes, own, factor)
     needs["network"] = _bytes_for_network(voxels, own, factor, network_bytes)
-    return CODE_BYTES * is_loaded() + int(max(needs.values()))
+    code = CODE_BYTES * is_loaded() + COMPILER_BYTES * must_compile()
+    return code + int(max(needs.values()))
 
 
 def _bytes_for_network(
