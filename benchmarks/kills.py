@@ -36,7 +36,7 @@ LONG_ENOUGH = 120.0  # seconds that no run takes
 
 
 def write_ball(path: Path, size: int) -> None:
-    """Write the grid of a ball, with so many samples along each axis."""
+    """Write the grid of a ball, with ``size`` samples along each axis."""
     ijk = np.indices((size,) * 3, dtype=np.float32)
     distance = np.linalg.norm(ijk - np.float32(size / 2 - 0.4), axis=0) - size / 3
     np.save(path, distance.astype(np.float32))

@@ -33,7 +33,7 @@ def cores_of_system() -> int:
 
 
 def useful_threads(requested: int) -> int:
-    """Return how many threads to work with if so many are asked for, 0 for one a core.
+    """Return the number of threads to use for a requested number, 0 meaning one per core.
 
     More than there are cores would wait for each other.
     """
@@ -70,7 +70,7 @@ def in_chunks(count: int, width: int, work: Callable[[slice], Result]) -> list[R
 def side_by_side(
     pieces: list[slice], work: Callable[[slice], Result], at_once: int | None = None
 ) -> list[Result]:
-    """Return what ``work`` makes of each piece; of no more pieces ``at_once``, if that is given."""
+    """Return ``work(piece)`` for each piece, at most ``at_once`` of them at a time if given."""
     threads = min(at_once or threads_at_work(), threads_at_work(), len(pieces))
     if threads < 2:
         return [work(piece) for piece in pieces]

@@ -130,7 +130,7 @@ def conversion_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def chosen_model(asked: dict[str, Any]) -> str:
-    """Return the network that is asked for, a quality or a file; not both at once."""
+    """Return the network of ``--quality`` or ``--model``; both together are an error."""
     if asked["model"] is None:
         return str(asked["quality"])
     given = click.get_current_context().get_parameter_source("quality")

@@ -24,7 +24,7 @@ PATHS = [
     *("//a.npy", "a", "a.NPY", "b\0.npy", "a.npy\0", "\ud800.npy", "\udcff.npy", "é.npy"),
     *("n" * 300 + ".npy", "d/" * 3000 + "a.npy", "a\nb.npy", "a\rb.npy", "a\u2028b.npy", "*.npy"),
     *("**/*.npy", "CON.npy", ".npy", "..npy", "-", "--help.npy", "list.jsonl", "/dev/null"),
-    *("/proc/self/mem", "a.npy:x", "\ufeffa.npy", "file:///a.npy", "/proc/1/root/none.npy"),
+    *("/proc/self/mem", "a.npy:x", "\ufeffa.npy", "file:///a.npy", "/proc/1/cwd/none.npy"),
     *("a.npy/../a.npy", "none.npz"),
 ]
 TARGETS = [

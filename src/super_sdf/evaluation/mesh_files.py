@@ -51,7 +51,7 @@ def read_mesh(path: str | Path) -> Mesh:
 
 
 def merged(mesh: Mesh) -> Mesh:
-    """Return a mesh whose vertices at one place are one, without those of no face.
+    """Merge vertices at the same place and drop those that no face uses.
 
     One place is ``SAME_PLACE`` wide, of small meshes that share of their size. Normals and textures
     do not keep vertices apart, as they do in trimesh: a mesh is not open along its seams.

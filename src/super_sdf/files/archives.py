@@ -29,7 +29,7 @@ class Codec(Protocol):
         ...
 
     def decompress(self, data: bytes, max_length: int) -> bytes:
-        """Take packed bytes and return at most so many unpacked ones."""
+        """Take packed bytes and return at most ``max_length`` unpacked ones."""
         ...
 
 
@@ -55,7 +55,7 @@ class Deflate:
         return not self._inner.unconsumed_tail
 
     def decompress(self, data: bytes, max_length: int) -> bytes:
-        """Take packed bytes and return at most so many unpacked ones."""
+        """Take packed bytes and return at most ``max_length`` unpacked ones."""
         return self._inner.decompress(self._inner.unconsumed_tail + data, max_length)
 
 
