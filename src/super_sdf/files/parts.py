@@ -6,7 +6,6 @@ a file without its lock, or without its process where locks are not known, was l
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 from collections.abc import Iterable, Iterator
@@ -28,7 +27,11 @@ def part_path(target: Path) -> Path:
 def _stem(name: str) -> str:
     """Return what the names of a target's parts begin with; a digest stands for a long name."""
     raw = name.encode("utf-8", "surrogatepass")  # a ledger may name what no file can be called
-    return f".{name}." if len(raw) <= LONGEST else f".{hashlib.sha256(raw).hexdigest()[:32]}."
+    if len(raw) <= LONGEST:
+        return f".{name}."
+    from hashlib import sha256  # it loads OpenSSL, and long names are rare
+
+    return f".{sha256(raw).hexdigest()[:32]}."
 
 
 @contextmanager
