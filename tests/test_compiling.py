@@ -12,7 +12,14 @@ from conftest import ball, trilinear
 from test_privacy import run_at_home
 
 from super_sdf import compiling, reconstruct
-from super_sdf.compiling import Compiled, compiled_twin, is_loaded, try_compiled, use_compiled
+from super_sdf.compiling import (
+    Compiled,
+    compiled_twin,
+    is_loaded,
+    must_compile,
+    try_compiled,
+    use_compiled,
+)
 from super_sdf.footprint import CODE_BYTES, COMPILER_BYTES, slab_bytes
 from super_sdf.plan import whole
 from super_sdf.survey import survey
@@ -189,7 +196,10 @@ def test_the_plan_counts_the_compiler_where_nothing_is_on_disk(monkeypatch):
     slab = whole(band)
     bare = slab_bytes(band, slab.seen, slab.decoded, slab.planes, 4)
     assert try_compiled() == ""
+    assert not must_compile()
     kept = slab_bytes(band, slab.seen, slab.decoded, slab.planes, 4)
     module.is_on_disk = lambda: False
+    monkeypatch.setattr(compiling, "_compiled", Compiled())
+    assert try_compiled() == "" and must_compile()
     anew = slab_bytes(band, slab.seen, slab.decoded, slab.planes, 4)
     assert (kept - bare, anew - kept) == (CODE_BYTES, COMPILER_BYTES)

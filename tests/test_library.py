@@ -144,7 +144,7 @@ WRONG = {
     "max_memory is '4G': give a whole number of bytes": (OptionTypeError, {"max_memory": "4G"}),
     "max_memory is 1.5: give a whole number of bytes": (OptionTypeError, {"max_memory": 1.5}),
     "max_memory is -5: give a number of bytes greater than 0": (OptionError, {"max_memory": -5}),
-    "progress is True: give a function of (steps done, steps in all)": (
+    "progress is True: give a function of (done, total), in thousandths": (
         OptionTypeError,
         {"progress": True},
     ),

@@ -35,6 +35,7 @@ class Compiled:
     def __init__(self) -> None:
         self.module: ModuleType | None = None
         self.fault = ""
+        self.must_compile = False
         self.lock = Lock()
         self.awake = Event()
 
@@ -48,6 +49,7 @@ class Compiled:
             except Exception as error:  # numba does not fit NumPy, LLVM is missing, no cache ...
                 self.give_up(error)
                 return
+            self.must_compile = not self.module.is_on_disk()  # before the first call writes it
             # The first call takes a quarter of a second: let that pass while the network runs.
             Thread(target=self.wake, args=(self.module,)).start()
 
@@ -96,8 +98,7 @@ def is_loaded() -> bool:
 
 def must_compile() -> bool:
     """Say whether the functions in use have to be compiled first, which takes memory of its own."""
-    module = _compiled.module
-    return module is not None and is_loaded() and not module.is_on_disk()
+    return is_loaded() and _compiled.must_compile
 
 
 def why_not() -> tuple[str, ...]:

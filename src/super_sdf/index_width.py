@@ -12,7 +12,7 @@ LARGEST = 2**31 - 1
 
 
 def check_count(count: int, what: str, factor: int) -> int:
-    """Return a count if so many can be numbered; ``what`` they are."""
+    """Return ``count``, the number of ``what``, or raise if it exceeds 32-bit indices."""
     if count > LARGEST:
         raise OptionError(
             f"factor {factor} makes {count:,} {what}, and {LARGEST:,} can be numbered; use a "

@@ -55,7 +55,7 @@ def extract_mesh(field: FineField, grid: SdfGrid, first_vertex: int = 0) -> Mesh
 
 
 def extract_pieces(field: FineField, grid: SdfGrid, first_vertex: int = 0) -> list[Mesh]:
-    """Return the mesh of ``extract_mesh`` in pieces, at least one, as they are made.
+    """Return the mesh of ``extract_mesh`` as a list of one or more pieces, in order.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def extract_pieces(field: FineField, grid: SdfGrid, first_vertex: int = 0) -> li
 
 
 def lookups_at_once(nodes: int, widest: int) -> int:
-    """Return for how many groups of planes at a time vertices are looked up, if so many threads.
+    """Return how many threads may hold a vertex lookup table at the same time.
 
     A plane may hold the whole surface. Tables of ``widest`` nodes, one a thread, take at most twice
     what the values of all nodes take, or one thread does all.

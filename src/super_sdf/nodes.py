@@ -137,9 +137,9 @@ def number_shared_nodes(table: IntArray, factor: int) -> SharedNodes:
 
 
 def _number_parts(table: IntArray, sizes: IntArray) -> tuple[IntArray, BoolArray, int]:
-    """Return ``starts``, ``owned`` and ``count`` for parts of so many nodes each.
+    """Return ``starts``, ``owned`` and ``count`` for parts of ``sizes`` nodes each.
 
-    If ``count`` is more than 32 bits hold, ``starts`` is of no use.
+    ``starts`` is meaningless if ``count`` exceeds 32 bits: the caller checks ``count`` first.
     """
     owned = np.stack([(table[:, sharing[sharing < CENTRE]] < 0).all(1) for sharing in SHARING], 1)
     own_sizes = owned * sizes

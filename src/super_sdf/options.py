@@ -76,5 +76,5 @@ def check_progress(progress: Any) -> None:
     """Raise if there is something to be told of progress that cannot be called."""
     if progress is not None and not callable(progress):
         raise OptionTypeError(
-            f"progress is {seen(progress)}: give a function of (steps done, steps in all)"
+            f"progress is {seen(progress)}: give a function of (done, total), in thousandths"
         )

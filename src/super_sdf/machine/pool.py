@@ -72,7 +72,7 @@ class Pool(Generic[Task]):
         self.false_starts = 0
 
     def results(self, count: int) -> Iterator[tuple[Task, Any]]:
-        """Work with so many processes; yield each task as it is done, with its answer or a Death.
+        """Run the tasks in ``count`` processes; yield each when done, with its answer or a Death.
 
         Raises
         ------
