@@ -67,7 +67,7 @@ def commands(grid: Path, factor: int, options: list[str]) -> dict[str, list[str]
     target = str(grid.with_suffix(".ply"))
     words = ["upsample", str(grid), target, "--force", "--quiet", "--inside", "negative"]
     words += ["--spacing", str(1 / int(grid.stem)), "--origin", "0", "--factor", str(factor)]
-    ours = ["-m", "super_sdf.cli", *words]
+    ours = ["-m", "super_sdf", *words]
     dense = ["-m", "benchmarks.against", "--worker", str(grid), target, str(factor)]
     variants = [[], ["--precision", "int8"], ["--quality", "fast"], options]
     return {

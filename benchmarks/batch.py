@@ -33,16 +33,16 @@ from super_sdf.batch.job import Job
 from super_sdf.batch.lock import FolderLock
 from super_sdf.batch.plan import Batch, Settings
 from super_sdf.batch.run import Run
-from super_sdf.chunks import count_cores
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.evaluation.timing import describe_machine
+from super_sdf.machine.threads import count_cores
 from super_sdf.mesh import Mesh
-from super_sdf.network import load_network
+from super_sdf.network.network import load_network
 
 from .batch_faults import KILLS, LIMITS, count_faults, make_setting
 from .mixed_grids import BROKEN, Placed, write_broken, write_mixed
 
-COMMAND = [sys.executable, "-m", "super_sdf.cli"]
+COMMAND = [sys.executable, "-m", "super_sdf"]
 FAR, MEAN = 1.0, 0.05  # voxels that vertices may be from the truth: any, and in the mean
 
 

@@ -25,7 +25,7 @@ import psutil
 
 from .mixed_grids import write_mixed
 
-COMMAND = [sys.executable, "-m", "super_sdf.cli", "batch"]
+COMMAND = [sys.executable, "-m", "super_sdf", "batch"]
 KILLS = {
     "batch killed": signal.SIGKILL,
     "batch ended": signal.SIGTERM,

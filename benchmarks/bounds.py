@@ -42,7 +42,7 @@ import sys
 from super_sdf import load_network
 from super_sdf.files.grids import read_grid
 from super_sdf.pipeline import find_surface
-from super_sdf.plan import peak_bytes, ways_to_cut, whole
+from super_sdf.slabs.cutting import peak_bytes, ways_to_cut, whole
 
 path, factor, precision = sys.argv[1:]
 network = load_network(precision=precision, device="cpu")
@@ -145,7 +145,7 @@ def plan(case: Case, folder: Path) -> tuple[int, int]:
 def convert(case: Case, folder: Path, bound: int) -> Run:
     """Convert under a bound, in bytes."""
     target = folder / f"mesh{case.suffix}"
-    words = ["-m", "super_sdf.cli", "upsample", str(folder / f"grid{case.source}"), str(target)]
+    words = ["-m", "super_sdf", "upsample", str(folder / f"grid{case.source}"), str(target)]
     words += ["--spacing", "1", "--force", "--json", "--quiet", "--device", "cpu"]
     words += ["--factor", str(case.factor), "--precision", case.precision]
     printed, errors = run_python([*words, "--max-memory", str(bound)], case.code)

@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 
 from super_sdf import SdfGrid, load_network, reconstruct
-from super_sdf.contract import INPUTS
-from super_sdf.cuda import describe_gpu, onnxruntime_version, query_gpu
 from super_sdf.errors import DeviceError
-from super_sdf.network import QUALITIES, Network
-from super_sdf.nodes import block_offsets
-from super_sdf.running import CUDA_CHUNK, run_bound
-from super_sdf.survey import survey
+from super_sdf.network.contract import INPUTS
+from super_sdf.network.cuda import describe_gpu, onnxruntime_version, query_gpu
+from super_sdf.network.network import QUALITIES, Network
+from super_sdf.network.running import CUDA_CHUNK, run_bound
+from super_sdf.steps.nodes import block_offsets
+from super_sdf.steps.survey import survey
 
 RUNS = 3
 CHUNKS = (512, 2048, 8192, CUDA_CHUNK, 65536)

@@ -39,7 +39,7 @@ def write_torus(path: Path, n: int) -> Path:
 def run(grid: Path, folder: Path, bound: str, options: list[str]) -> str:
     """Convert a grid; return a row of the table."""
     target = folder / "mesh.ply"
-    words = ["-m", "super_sdf.cli", "upsample", str(grid), str(target), "--force", "--json", "-q"]
+    words = ["-m", "super_sdf", "upsample", str(grid), str(target), "--force", "--json", "-q"]
     try:
         seconds, peak, printed = run_python([*words, "--max-memory", bound, *options])
     except SuperSdfError:  # the command has said why

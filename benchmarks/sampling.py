@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from super_sdf import Mesh
-from super_sdf.evaluation.mesh_files import read_mesh
-from super_sdf.evaluation.sampling import grid_points, sample_grid, unit_layout
-from super_sdf.evaluation.solid import Solid
 from super_sdf.evaluation.timing import describe_machine, run_command
+from super_sdf.truth.mesh_files import read_mesh
+from super_sdf.truth.sampling import grid_points, sample_grid, unit_layout
+from super_sdf.truth.solid import Solid
 
 RADIUS = 0.4  # of the sphere
 RING, TUBE = 0.27, 0.18  # radii of the torus

@@ -22,8 +22,8 @@ from super_sdf.evaluation.cases import Setting, Shape
 from super_sdf.evaluation.measuring import Row
 from super_sdf.evaluation.plan import find_meshes, spread
 from super_sdf.evaluation.timing import RUNS, describe_machine, grid_file, time_shape
-from super_sdf.memory import forget_peak, held_memory
-from super_sdf.network import Network, load_network
+from super_sdf.machine.memory import forget_peak, held_memory
+from super_sdf.network.network import Network, load_network
 
 
 def time_warm(shape: Shape, setting: Setting, network: Network) -> Row:

@@ -23,12 +23,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, ScalarFormatter
 
 from super_sdf import convert, load_network, pipeline
-from super_sdf.compiling import is_loaded
 from super_sdf.evaluation.timing import describe_machine, run_command
 from super_sdf.files import spool
-from super_sdf.memory import forget_peak, held_memory
-from super_sdf.network import Network
-from super_sdf.survey import Band
+from super_sdf.machine.compiling import is_loaded
+from super_sdf.machine.memory import forget_peak, held_memory
+from super_sdf.network.network import Network
+from super_sdf.steps.survey import Band
 
 # The functions that are a stage, where they are looked up.
 STAGES = {

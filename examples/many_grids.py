@@ -8,14 +8,7 @@ Writes the part and its surface moved outwards by 1, 2 and 3 mm, at factor 2.
 import sys
 from pathlib import Path
 
-from super_sdf import (
-    SuperSdfError,
-    extract_mesh,
-    load_network,
-    read_grid,
-    upsample,
-    write_mesh,
-)
+from super_sdf import SuperSdfError, extract_mesh, load_network, read_grid, upsample, write_mesh
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 grid = read_grid(Path(__file__).parent / "part.npz")

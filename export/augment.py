@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from export.dataset import Sample
-from super_sdf.band import find_band, gather_patches, neighbour_table
-from super_sdf.symmetry import cube_symmetries, turn
+from super_sdf.network.symmetry import cube_symmetries, turn
+from super_sdf.steps.band import find_band, gather_patches, neighbour_table
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from export.augment import USUAL, Prepared, augment, batch_table
 from export.dataset import fill_shard
 from export.latency import ball
 from export.network import Block, SuperSdfNet
-from super_sdf.network import load_network
+from super_sdf.network.network import load_network
 
 THIN = 0.05  # share of thin solids, as in training
 SAMPLES = 200

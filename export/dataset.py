@@ -34,13 +34,13 @@ from export.arguments import Parser, at_least, share
 from export.shapes import random_solid
 from export.shapes.draws import draw_sway
 from super_sdf import Mesh, SdfGrid
-from super_sdf.band import DECODE_LIMIT, find_band, rescale
 from super_sdf.errors import FileError
-from super_sdf.evaluation.mesh_files import read_mesh
-from super_sdf.evaluation.sampling import sample_grid
-from super_sdf.evaluation.solid import Solid
 from super_sdf.files.regular import check_regular_file
-from super_sdf.nodes import block_offsets
+from super_sdf.steps.band import DECODE_LIMIT, find_band, rescale
+from super_sdf.steps.nodes import block_offsets
+from super_sdf.truth.mesh_files import read_mesh
+from super_sdf.truth.sampling import sample_grid
+from super_sdf.truth.solid import Solid
 
 CORNERS, FINE_NODES, ANYWHERE = 5, 4, 4  # queries: 4 a corner, 28 in all
 SMALLEST, LARGEST = 7, 100  # voxels along a shape's diagonal

@@ -20,11 +20,11 @@ import torch
 from export.augment import Prepared
 from export.network import SuperSdfNet
 from export.variants import UNet
-from super_sdf.grid import SdfGrid
-from super_sdf.network import load_network
-from super_sdf.nodes import block_offsets
-from super_sdf.onnx import ort
-from super_sdf.survey import survey
+from super_sdf.grid.sdf_grid import SdfGrid
+from super_sdf.network.network import load_network
+from super_sdf.network.onnx import ort
+from super_sdf.steps.nodes import block_offsets
+from super_sdf.steps.survey import survey
 
 NAMES = ["patches", "neighbours", "voxels", "offsets"]
 RUNS = 5

@@ -23,7 +23,8 @@ import torch
 from torch import Tensor, nn
 
 from export.augment import Prepared, batch_table
-from super_sdf.band import CENTRE, REACH
+from super_sdf.neighbourhood import CENTRE
+from super_sdf.steps.band import REACH
 
 
 @dataclass(frozen=True)
@@ -171,7 +172,7 @@ class Encoded:
 def is_noisy(patches: Tensor, table: Tensor) -> Tensor:
     """Say of each voxel, (V, 1), by 1 or 0 whether its or a neighbour's patch is of no distance.
 
-    That is: two samples differ by more than they are apart, as ``super_sdf.band.is_lipschitz``.
+    That is: two samples differ by more than they are apart, as in ``steps.band.is_lipschitz``.
     """
     excess = (patches - patches[:, CENTRE, None]).abs() - patches.new_tensor(REACH)
     most = torch.cat([excess.amax(1), patches.new_zeros(1)])

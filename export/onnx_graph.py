@@ -20,8 +20,9 @@ from onnx import TensorProto, helper, numpy_helper
 
 from export.network import SuperSdfNet
 from export.writer import Writer
-from super_sdf.band import CENTRE, REACH
-from super_sdf.running import CHUNK_INPUT
+from super_sdf.neighbourhood import CENTRE
+from super_sdf.network.running import CHUNK_INPUT
+from super_sdf.steps.band import REACH
 
 CHUNK = 512  # voxels at a time; 256 to 2048 differ by a few percent on a CPU
 

@@ -25,10 +25,10 @@ from export.calibration import draw_samples
 from export.dormant import dormant_share
 from export.network import NetworkConfig, SuperSdfNet
 from export.onnx_graph import build_graph
-from super_sdf.band import find_band, gather_patches, neighbour_table
-from super_sdf.contract import FORMAT_VERSION
-from super_sdf.network import load_network
-from super_sdf.nodes import block_offsets
+from super_sdf.network.contract import FORMAT_VERSION
+from super_sdf.network.network import load_network
+from super_sdf.steps.band import find_band, gather_patches, neighbour_table
+from super_sdf.steps.nodes import block_offsets
 
 OPSET = 18
 PARITY = 2e-4  # half voxels: 1e-4 of a voxel

@@ -20,7 +20,8 @@ from export.network import (
     interpolation_weights,
     is_noisy,
 )
-from super_sdf.band import NEIGHBOURHOOD, neighbour_table
+from super_sdf.neighbourhood import NEIGHBOURHOOD
+from super_sdf.steps.band import neighbour_table
 
 AXES = tuple(np.flatnonzero((np.delete(NEIGHBOURHOOD, axis, 1) == 0).all(1)) for axis in range(3))
 

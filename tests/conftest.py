@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from batches import FAST, PLAIN
 
-from super_sdf import SdfGrid, footprint, plan
-from super_sdf.band import NEIGHBOURHOOD
-from super_sdf.onnx import ort
+from super_sdf import SdfGrid
+from super_sdf.neighbourhood import NEIGHBOURHOOD
+from super_sdf.network.onnx import ort
+from super_sdf.slabs import cutting, footprint
 
 
 def trilinear(
@@ -62,7 +63,7 @@ def command(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., tuple[int, str, str]]:
     """Run the command line in this process; return exit code, stdout and stderr."""
-    from super_sdf.cli import main
+    from super_sdf.cli.main import main
 
     def run(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr("sys.argv", ["super-sdf", *map(str, arguments)])
@@ -107,7 +108,7 @@ def bare_plan(monkeypatch):
     monkeypatch.setattr(footprint, "STAGES", stages)
     monkeypatch.setattr(footprint, "NETWORK_FIXED", 0)
     monkeypatch.setattr(footprint, "CODE_BYTES", 0)
-    monkeypatch.setattr(plan, "held_memory", lambda: 10**8)
+    monkeypatch.setattr(cutting, "held_memory", lambda: 10**8)
 
 
 @pytest.fixture

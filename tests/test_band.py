@@ -5,9 +5,8 @@ import pytest
 from conftest import ball
 
 from super_sdf import SdfGrid
-from super_sdf.band import (
-    CENTRE,
-    NEIGHBOURHOOD,
+from super_sdf.neighbourhood import CENTRE, NEIGHBOURHOOD
+from super_sdf.steps.band import (
     can_hold_surface,
     find_band,
     gather_patches,

@@ -15,7 +15,7 @@ from super_sdf.batch import job as batch_job
 from super_sdf.batch.fingerprint import fingerprint, is_unchanged
 from super_sdf.batch.job import Result
 from super_sdf.batch.plan import Batch, Settings
-from super_sdf.cli_batch_report import describe_progress, duration
+from super_sdf.cli.batch_report import describe_progress, duration
 from super_sdf.convert import convert
 
 pytestmark = pytest.mark.usefixtures("grid_folder")
@@ -103,7 +103,7 @@ def test_what_has_changed_is_done_again(run_batch, monkeypatch):
 
 
 def test_another_network_file_is_another_option(run_batch, command):
-    from super_sdf.network import shipped_models
+    from super_sdf.network.network import shipped_models
 
     shutil.copy(shipped_models()["fast"], "own.onnx")
     run_batch("in", "--model", "own.onnx")
@@ -255,6 +255,6 @@ def test_progress_has_rate_and_time_left(run_batch, monkeypatch):
     batch.work, batch.work_done = 400.0, 100.0
     assert describe_progress(batch, 30) == "10/30, 2 files/s, 15 s left, 1 failed"
     assert [duration(s) for s in (0.04, 59, 200, 7300)] == ["0.0 s", "59 s", "3 min", "2 h 2 min"]
-    monkeypatch.setattr("super_sdf.cli_batch_report.sys.stderr.isatty", lambda: True)
+    monkeypatch.setattr("super_sdf.cli.batch_report.sys.stderr.isatty", lambda: True)
     _, _, err = run_batch("in")
     assert err.startswith("0/4\r") and "\r1/4, " in err and "\r\x1b[KFailed: in/bad" in err

@@ -23,10 +23,10 @@ from super_sdf.batch.lock import FolderLock
 from super_sdf.batch.plan import Settings
 from super_sdf.batch.run import Queue, Run
 from super_sdf.batch.workers import choose_workers, useful_workers
-from super_sdf.chunks import count_cores
 from super_sdf.convert import ConvertOptions
 from super_sdf.errors import FileError
 from super_sdf.machine.pool import Death, Pool
+from super_sdf.machine.threads import count_cores
 
 pytestmark = pytest.mark.usefixtures("grid_folder")
 
@@ -75,7 +75,7 @@ def test_what_a_killed_batch_left_is_removed_and_nothing_else(run_batch):
 def start_batch(*options):
     """Start a batch as a process, and return it when its report has some lines."""
     arguments = ["batch", "in", "--out", "out", "--jobs", 2, "--threads", 1, *options]
-    words = [sys.executable, "-m", "super_sdf.cli", *map(str, arguments)]
+    words = [sys.executable, "-m", "super_sdf", *map(str, arguments)]
     process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
     report = Path("out/report.jsonl")
     while not report.exists() or report.read_bytes().count(b"\n") < 2:

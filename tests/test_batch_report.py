@@ -112,7 +112,7 @@ def test_a_carriage_return_ends_no_line_and_deep_lines_are_passed_over(run_batch
 
 def limited(size):
     """Convert in a process whose files have so many bytes at most; return code and stderr."""
-    words = [sys.executable, "-m", "super_sdf.cli", "batch", "in/a.npy", "in/deep", "--out", "out"]
+    words = [sys.executable, "-m", "super_sdf", "batch", "in/a.npy", "in/deep", "--out", "out"]
     done = subprocess.run(
         [*words, *map(str, LONE)],
         stderr=subprocess.PIPE,

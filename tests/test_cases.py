@@ -16,7 +16,7 @@ from super_sdf.evaluation import methods
 from super_sdf.evaluation.cases import Case, Setting, Shape
 from super_sdf.evaluation.measuring import Task, measure_method, measure_task
 from super_sdf.evaluation.metrics import distance_or_dot
-from super_sdf.evaluation.solid import Solid
+from super_sdf.truth.solid import Solid
 
 
 def case_of(mesh: Mesh, setting: Setting) -> Case:

@@ -13,7 +13,7 @@ import trimesh
 from conftest import ball
 
 import super_sdf
-from super_sdf import cli
+from super_sdf.cli import main as cli
 
 
 @pytest.fixture
@@ -99,7 +99,7 @@ def test_the_precision_may_be_chosen(here, command):
 
 
 def test_fine_values_that_contradict_the_coarse_ones_are_warned_of(here, command, monkeypatch):
-    from super_sdf.network import Network
+    from super_sdf.network.network import Network
 
     def all_inside(self, patches, table, voxels, offsets):
         return np.full((len(voxels), len(offsets)), -1, np.float32)
@@ -234,7 +234,7 @@ def test_bad_input_is_one_line_and_no_file(here, command, arguments):
 def test_a_zip_bomb_is_refused_unread(here, command, monkeypatch):
     np.savez_compressed("bomb.npz", values=np.zeros((200, 200, 200), np.float32))
     packed = zipfile.ZipFile("bomb.npz").getinfo("values.npy").compress_size
-    monkeypatch.setattr("super_sdf.memory.free_memory", lambda: 10**7)
+    monkeypatch.setattr("super_sdf.machine.memory.free_memory", lambda: 10**7)
     monkeypatch.setattr("super_sdf.files.grids.unpack", None)
     want = (
         "bomb.npz[values], 200 x 200 x 200 float32, 32,000,000 bytes, unpacks from "
@@ -245,8 +245,8 @@ def test_a_zip_bomb_is_refused_unread(here, command, monkeypatch):
 
 
 def test_a_factor_beyond_memory_is_refused_before_the_work(here, command, monkeypatch):
-    monkeypatch.setattr("super_sdf.memory.free_memory", lambda: 10**7)
-    monkeypatch.setattr("super_sdf.plan.hold_less", lambda: None)
+    monkeypatch.setattr("super_sdf.machine.memory.free_memory", lambda: 10**7)
+    monkeypatch.setattr("super_sdf.slabs.cutting.hold_less", lambda: None)
     code, _, err = command("upsample", "in.npy", "out.ply", "--factor", 16)
     assert code == 1 and err.startswith("Error: factor 16 on ")
     assert " MB of memory even plane by plane, " in err and err.endswith("(--max-memory)\n")
@@ -317,7 +317,7 @@ def test_a_size_that_is_none_is_named(here, command, size):
 
 @pytest.mark.parametrize("size, want", [("1500M", 1_500_000_000), ("4g", 4 * 10**9), ("123", 123)])
 def test_sizes_are_numbers_with_a_unit(size, want):
-    from super_sdf.cli_conversion import parse_size
+    from super_sdf.cli.conversion import parse_size
 
     assert parse_size(None, None, size) == want
 
@@ -335,7 +335,7 @@ def test_every_option_has_help():
 
 
 def test_a_large_file_is_announced_unless_quiet(here, command, monkeypatch):
-    monkeypatch.setattr("super_sdf.expectation.LARGE", 1000)
+    monkeypatch.setattr("super_sdf.files.expectation.LARGE", 1000)
     _, _, err = command("upsample", "in.npy", "out.ply", "--quality", "fast")
     assert err.startswith("out.ply will have about 22,000 triangles, 423,168 bytes\nNote: ")
     options = "--quality", "fast", "--quiet", "--json"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from conftest import ball
 
-from super_sdf.network import shipped_models
+from super_sdf.network.network import shipped_models
 
 
 @pytest.mark.parametrize("quality", ["fast", "base", "best"])

@@ -12,8 +12,9 @@ from click.testing import CliRunner
 from conftest import ball
 from solids import cube, inverted, joined, saved, torus
 
-from super_sdf import Mesh, extras, read_grid
-from super_sdf.cli_evaluate import ListCommand
+from super_sdf import Mesh, read_grid
+from super_sdf.cli.evaluate import ListCommand
+from super_sdf.machine import extras
 
 
 @pytest.fixture

@@ -11,8 +11,9 @@ import pytest
 from conftest import ball, trilinear
 from test_privacy import run_at_home
 
-from super_sdf import compiling, reconstruct
-from super_sdf.compiling import (
+from super_sdf import reconstruct
+from super_sdf.machine import compiling
+from super_sdf.machine.compiling import (
     Compiled,
     compiled_twin,
     is_loaded,
@@ -20,9 +21,9 @@ from super_sdf.compiling import (
     try_compiled,
     use_compiled,
 )
-from super_sdf.footprint import CODE_BYTES, COMPILER_BYTES, slab_bytes
-from super_sdf.plan import whole
-from super_sdf.survey import survey
+from super_sdf.slabs.cutting import whole
+from super_sdf.slabs.footprint import CODE_BYTES, COMPILER_BYTES, slab_bytes
+from super_sdf.steps.survey import survey
 
 INSTEAD = "numba is installed but cannot be used, and NumPy takes longer"
 MEND = "; mend it, or set SUPER_SDF_COMPILED=0"
@@ -156,7 +157,7 @@ def test_without_numba_nothing_is_tried_and_nothing_said(monkeypatch):
 UPSAMPLE = """
 import sys
 sys.path.insert(0, {folder!r})
-from super_sdf.cli import main
+from super_sdf.cli.main import main
 sys.argv = ["super-sdf", "upsample", "in.npy", "out.ply", "--device", "cpu", "--spacing", "1"]
 main()
 """

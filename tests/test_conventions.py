@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from conftest import ball
 
-from super_sdf.band import rescale
 from super_sdf.errors import GridError, OptionError
-from super_sdf.gradients import surface_gradients, typical_length
-from super_sdf.grid import SdfGrid, make_grid
+from super_sdf.grid.gradients import surface_gradients, typical_length
+from super_sdf.grid.sdf_grid import SdfGrid, make_grid
+from super_sdf.steps.band import rescale
 
 
 def torus(n: int, unit: float = 1.0) -> np.ndarray:

@@ -8,9 +8,9 @@ import pytest
 import trimesh
 from conftest import ball, trilinear
 
-from super_sdf import expectation
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.errors import FileError, GridError, WriteError
+from super_sdf.files import expectation
 from super_sdf.files.meshes import MESH_SUFFIXES
 
 

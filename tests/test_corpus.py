@@ -22,7 +22,7 @@ from corpus.running import Run, run_here
 from corpus.trying import try_case
 
 from super_sdf import load_network
-from super_sdf.onnx import ort
+from super_sdf.network.onnx import ort
 
 EACH = 45  # cases of a theme
 ALONE = 40  # of all that may hang or crash

@@ -15,15 +15,16 @@ import pytest
 from conftest import ball
 from test_network import network_inputs
 
-from super_sdf import cuda, device, load_network
-from super_sdf.contract import INPUTS, one_voxel
-from super_sdf.cuda import CUDA, first_line
-from super_sdf.device import CPU, CUDA_OPTIONS
+from super_sdf import load_network
 from super_sdf.errors import DeviceError, ModelError
-from super_sdf.network import shipped_models
-from super_sdf.nodes import block_offsets
-from super_sdf.onnx import ort
-from super_sdf.running import CHUNK_INPUT, CUDA_CHUNK, run_bound
+from super_sdf.network import cuda, device
+from super_sdf.network.contract import INPUTS, one_voxel
+from super_sdf.network.cuda import CUDA, first_line
+from super_sdf.network.device import CPU, CUDA_OPTIONS
+from super_sdf.network.network import shipped_models
+from super_sdf.network.onnx import ort
+from super_sdf.network.running import CHUNK_INPUT, CUDA_CHUNK, run_bound
+from super_sdf.steps.nodes import block_offsets
 
 pytestmark = pytest.mark.usefixtures("cpu_build")
 ROOT = Path(__file__).parent.parent

@@ -13,7 +13,7 @@ import pytest
 import trimesh
 from click.testing import CliRunner
 
-from super_sdf.cli import cli
+from super_sdf.cli.main import cli
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()

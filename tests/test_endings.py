@@ -32,7 +32,8 @@ def run(*arguments, shell="", **options):
 # What stands in for a long step: it says where it is, and waits for the signal.
 STAGE = """
 import sys, time
-from super_sdf import entry, pipeline
+from super_sdf import pipeline
+from super_sdf.cli import entry
 def wait(*_):
     print(sorted(__import__("os").listdir()), flush=True)
     time.sleep(30)
@@ -51,7 +52,7 @@ class Finder:
             except BaseException as error:
                 raise ImportError("something else") from error
 sys.meta_path.insert(0, Finder())
-from super_sdf.entry import main
+from super_sdf.cli.entry import main
 main()
 """
 LINES = {

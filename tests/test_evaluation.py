@@ -18,7 +18,7 @@ from click.testing import CliRunner
 from solids import cube, saved, sphere, torus
 
 from super_sdf import Mesh, SuperSdfError
-from super_sdf.cli import cli
+from super_sdf.cli.main import cli
 from super_sdf.errors import WriteError
 from super_sdf.evaluation import measuring, plan, published, report, runner, tables, timing
 from super_sdf.evaluation.cases import Setting, Shape
@@ -47,7 +47,7 @@ def task_of(path: Path, methods: tuple[str, ...] = ("mc",), **options) -> Task:
 
 def evaluate(*words: object) -> subprocess.CompletedProcess[str]:
     """Run the command as a user does: its processes need a program that can be imported."""
-    command = [sys.executable, "-m", "super_sdf.cli", "evaluate", *map(str, words)]
+    command = [sys.executable, "-m", "super_sdf", "evaluate", *map(str, words)]
     return subprocess.run(command, capture_output=True, text=True)
 
 
@@ -70,7 +70,7 @@ def test_killed_and_started_again_it_ends_with_the_same_tables(meshes, tmp_path)
     done = evaluate(*words, "--out", whole)
     assert done.returncode == 0, done.stderr
 
-    command = [sys.executable, "-m", "super_sdf.cli", "evaluate", *map(str, words)]
+    command = [sys.executable, "-m", "super_sdf", "evaluate", *map(str, words)]
     child = subprocess.Popen([*command, "--out", str(cut)], stderr=subprocess.DEVNULL)
     store = cut / "results.jsonl"
     while not (store.exists() and len(store.read_text().splitlines()) > 3):
@@ -494,9 +494,7 @@ def test_the_command_is_timed_as_a_process(monkeypatch):
     monkeypatch.setattr(timing, "RUNS", 1)
     figures = timing.time_shape(Shape("ring", torus()), Setting(12))
     assert 0.05 < figures["seconds"] < 60 and 20 < figures["peak_mb"] < 2000
-    with pytest.raises(
-        SuperSdfError, match=r"super_sdf\.cli upsample none\.npz x\.ply ended with 1"
-    ):
+    with pytest.raises(SuperSdfError, match=r"super_sdf upsample none\.npz x\.ply ended with 1"):
         timing.run_command(["upsample", "none.npz", "x.ply"])
 
 

@@ -5,7 +5,7 @@ import pytest
 from conftest import ball, trilinear
 
 from super_sdf import SdfGrid, read_grid, reconstruct
-from super_sdf.planes import PlaneFile
+from super_sdf.grid.planes import PlaneFile
 
 
 @pytest.mark.parametrize("dtype", ["<f4", ">f4", "<f8", ">f8", "f2", "i2", ">i4", "i8", "i1"])

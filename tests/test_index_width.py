@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from conftest import ball, trilinear
 
-from super_sdf import SdfGrid, index_width, load_network, reconstruct, upsample
+from super_sdf import SdfGrid, load_network, reconstruct, upsample
 from super_sdf.errors import OptionError
-from super_sdf.isosurface import _lattice_edges, extract_mesh
-from super_sdf.nodes import number_shared_nodes
-from super_sdf.plan import check_vertices, most_nodes, plan_slabs
-from super_sdf.survey import Band, survey
+from super_sdf.machine import index_width
+from super_sdf.slabs.cutting import check_vertices, most_nodes, plan_slabs
+from super_sdf.steps.marching import _lattice_edges, extract_mesh
+from super_sdf.steps.nodes import number_shared_nodes
+from super_sdf.steps.survey import Band, survey
 
 
 def wall(side):
@@ -53,7 +54,7 @@ def test_nodes_are_counted_beyond_32_bits(monkeypatch, compiled):
     reconstruct(ball(), trilinear, 2)  # so that the compiled functions are loaded
     table = np.full((5, 27), -1, np.int32)
     table[:, 13] = np.arange(5)
-    monkeypatch.setattr("super_sdf.nodes.nodes_of_part", lambda factor: [range(10**8)] * 27)
+    monkeypatch.setattr("super_sdf.steps.nodes.nodes_of_part", lambda factor: [range(10**8)] * 27)
     with pytest.raises(OptionError, match=r"^factor 16 makes 13,500,000,000 nodes in a slab, and "):
         number_shared_nodes(table, 16)
 
@@ -94,7 +95,7 @@ def test_a_plane_that_holds_everything_is_meshed_in_chunks_to_the_same_mesh(
     grid = SdfGrid(np.abs(i - 3.6) - 1.3 + 0.01 * np.sin(j + k), 1.0)
     meshes = []
     for chunk in (1 << 19, 2000):
-        monkeypatch.setattr("super_sdf.chunks.CHUNK", chunk)
+        monkeypatch.setattr("super_sdf.machine.threads.CHUNK", chunk)
         meshes.append(reconstruct(grid, trilinear, factor, cap=True))
     np.testing.assert_array_equal(meshes[0].faces, meshes[1].faces)
     np.testing.assert_array_equal(meshes[0].vertices, meshes[1].vertices)

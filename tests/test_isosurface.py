@@ -10,11 +10,11 @@ from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
 from super_sdf import SdfGrid, extract_mesh, load_network, reconstruct, upsample
-from super_sdf.band import neighbour_table
-from super_sdf.cell_cases import CORNERS, EDGE_AXIS, EDGE_START, triangle_table
-from super_sdf.field import FineField
-from super_sdf.isosurface import CLEARANCE
-from super_sdf.nodes import block_ijk, number_shared_nodes
+from super_sdf.mesh import CLEARANCE
+from super_sdf.steps.band import neighbour_table
+from super_sdf.steps.cell_cases import CORNERS, EDGE_AXIS, EDGE_START, triangle_table
+from super_sdf.steps.field import FineField
+from super_sdf.steps.nodes import block_ijk, number_shared_nodes
 
 
 def dense_field(lattice: np.ndarray, factor: int = 2) -> tuple[FineField, SdfGrid]:

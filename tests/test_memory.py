@@ -5,12 +5,12 @@ import sys
 
 import pytest
 
-from super_sdf import memory
+from super_sdf.machine import memory
 
 # Arrays of 4 MB in a row, of which the last stays: the C library keeps what is freed before it.
 FREED = """
 import numpy as np
-from super_sdf.memory import held_memory, hold_less
+from super_sdf.machine.memory import held_memory, hold_less
 
 def free_all_but_one():
     np.ones(3_900_000)  # 31 MB: from now on the library keeps pieces of this size

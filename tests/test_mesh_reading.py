@@ -13,8 +13,8 @@ from solids import cube, sphere
 
 from super_sdf import Mesh
 from super_sdf.errors import FileError, MeshError, SuperSdfError
-from super_sdf.evaluation.mesh_files import merged, read_mesh
-from super_sdf.evaluation.solid import load_solid
+from super_sdf.truth.mesh_files import merged, read_mesh
+from super_sdf.truth.solid import load_solid
 
 FORMATS = ("ply", "stl", "stl_ascii", "obj", "off", "glb")
 PIECES = (b"nan", b"-1", b"99999999", b"\xff" * 8, b"1e400", b"\n\n", b"{" * 50, b"")

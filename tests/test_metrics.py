@@ -9,7 +9,7 @@ from solids import CUBE_FACES, cube, inverted, sphere, square
 from super_sdf import Mesh
 from super_sdf.evaluation import metrics
 from super_sdf.evaluation.methods import EMPTY
-from super_sdf.evaluation.solid import Solid
+from super_sdf.truth.solid import Solid
 
 N = metrics.SAMPLE_COUNT
 

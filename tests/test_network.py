@@ -9,11 +9,11 @@ from conftest import ball, trilinear
 from onnx_files import DOUBLE, FLOAT, INPUTS, metadata, write_network
 
 from super_sdf import load_network, reconstruct, upsample
-from super_sdf.band import find_band, gather_patches, neighbour_table, rescale
-from super_sdf.decoder import check_values
 from super_sdf.errors import DeviceError, FileError, ModelError, OptionError
-from super_sdf.network import QUALITIES, Network, shipped_models
-from super_sdf.nodes import block_offsets
+from super_sdf.network.decoder import check_values
+from super_sdf.network.network import QUALITIES, Network, shipped_models
+from super_sdf.steps.band import find_band, gather_patches, neighbour_table, rescale
+from super_sdf.steps.nodes import block_offsets
 
 
 def network_inputs(grid):

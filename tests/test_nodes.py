@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from super_sdf.band import neighbour_table
 from super_sdf.errors import OptionError
-from super_sdf.nodes import (
+from super_sdf.steps.band import neighbour_table
+from super_sdf.steps.nodes import (
     average_shared,
     block_ijk,
     block_offsets,

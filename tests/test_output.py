@@ -153,8 +153,8 @@ def test_errors_keep_their_words():
 
 def test_grids_meshes_and_pictures_ask_once_more_in_the_end(monkeypatch):
     from super_sdf import Mesh, SdfGrid, write_mesh
-    from super_sdf.evaluation.sections import render_section
     from super_sdf.files import grids, meshes
+    from super_sdf.pictures.sections import render_section
 
     grid = SdfGrid(np.arange(8.0).reshape(2, 2, 2) - 1, 4.0)
     for module in (grids, meshes):  # the first look finds nothing

@@ -7,10 +7,11 @@ import pytest
 from conftest import ball, trilinear
 from scipy.spatial import cKDTree
 
-from super_sdf import SdfGrid, load_network, pipeline, reconstruct, survey, upsample
+from super_sdf import SdfGrid, load_network, pipeline, reconstruct, upsample
 from super_sdf.errors import GridError
-from super_sdf.isosurface import CLEARANCE
-from super_sdf.nodes import block_ijk
+from super_sdf.mesh import CLEARANCE
+from super_sdf.steps import survey
+from super_sdf.steps.nodes import block_ijk
 
 FACTORS = [2, 4, 8, 16]
 

@@ -10,8 +10,8 @@ import pytest
 from conftest import ball
 
 import super_sdf
-from super_sdf import onnx
 from super_sdf.errors import DeviceError
+from super_sdf.network import onnx
 
 # The kernel ends the process at its first socket, whichever thread or library asks for it.
 NO_SOCKETS = """
@@ -32,7 +32,7 @@ forbid_sockets()
 """
 UPSAMPLE = """
 import os, sys
-from super_sdf.cli import main
+from super_sdf.cli.main import main
 sys.argv = ["super-sdf", "upsample", "in.npy", "out.ply", "--device", "cpu"]
 main()
 assert "ORT_DISABLE_TELEMETRY" not in os.environ
@@ -71,9 +71,8 @@ def test_a_run_leaves_nothing_at_home_and_calls_nobody(tmp_path, monkeypatch, ho
 @pytest.mark.parametrize("words", [["info"], ["info", "--check", "--device", "cpu"]])
 def test_info_needs_no_home(tmp_path, words):
     (tmp_path / "unwritable").write_text("")
-    script = (
-        f"import sys; from super_sdf.cli import main; sys.argv = {['super-sdf', *words]}; main()"
-    )
+    script = "import sys; from super_sdf.cli.main import main;"
+    script += f"sys.argv = {['super-sdf', *words]}; main()"
     run = run_at_home(tmp_path / "unwritable", NO_SOCKETS + script)
     assert (run.returncode, run.stderr) == (0, "") and "base" in run.stdout
     assert os.listdir(tmp_path) == ["unwritable"]
@@ -122,6 +121,6 @@ def test_an_onnxruntime_that_does_not_load_is_one_line(tmp_path, fault, reason):
 
 def test_an_onnxruntime_that_does_not_load_is_an_error_of_ours(monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    monkeypatch.delitem(sys.modules, "super_sdf.onnx")
+    monkeypatch.delitem(sys.modules, "super_sdf.network.onnx")
     with pytest.raises(DeviceError, match=r"^onnxruntime cannot be imported"):
-        __import__("super_sdf.onnx")
+        __import__("super_sdf.network.onnx")

@@ -13,10 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_network import network_inputs
 
-from super_sdf import load_network, network, reconstruct, running, upsample
-from super_sdf.nodes import block_offsets
-from super_sdf.pace import TRUSTED, Pace, share_of_time, work_of
+from super_sdf import load_network, reconstruct, upsample
+from super_sdf.network import network, running
+from super_sdf.network.pace import TRUSTED, Pace, share_of_time, work_of
 from super_sdf.progress import Steps
+from super_sdf.steps.nodes import block_offsets
 
 
 @pytest.fixture

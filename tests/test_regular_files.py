@@ -11,8 +11,8 @@ import trimesh
 from conftest import ball
 
 from super_sdf.errors import FileError
-from super_sdf.evaluation.mesh_files import read_mesh
 from super_sdf.files.regular import check_regular_file
+from super_sdf.truth.mesh_files import read_mesh
 
 
 @pytest.fixture(autouse=True)

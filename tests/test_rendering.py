@@ -13,18 +13,14 @@ from conftest import ball, trilinear
 from matplotlib.image import imread
 from solids import cube, sphere
 
-from super_sdf import Mesh, SdfGrid, extras, upsample
-from super_sdf.border import close_at_border
+from super_sdf import Mesh, SdfGrid, upsample
 from super_sdf.errors import FileError, OptionError
-from super_sdf.evaluation import rendering
-from super_sdf.evaluation.rendering import Panel, render_panels, vertex_errors, view_axes
-from super_sdf.evaluation.sections import (
-    coarse_section,
-    find_plane,
-    fine_section,
-    render_section,
-)
-from super_sdf.evaluation.solid import Solid
+from super_sdf.machine import extras
+from super_sdf.pictures import rendering
+from super_sdf.pictures.rendering import Panel, render_panels, vertex_errors, view_axes
+from super_sdf.pictures.sections import coarse_section, find_plane, fine_section, render_section
+from super_sdf.steps.cap import close_at_border
+from super_sdf.truth.solid import Solid
 
 WHITE = np.full(3, 255)
 # Of the faces of a cube that the default view shows, z up: to +x, -y and +z.
@@ -233,7 +229,7 @@ def test_a_picture_that_cannot_be_written_leaves_nothing(tmp_path: Path):
 def test_no_display_is_needed_and_nothing_is_said(tmp_path: Path):
     script = (
         "import numpy as np, sys; from pathlib import Path; from super_sdf import Mesh;"
-        "from super_sdf.evaluation.rendering import Panel, render_panels;"
+        "from super_sdf.pictures.rendering import Panel, render_panels;"
         "mesh = Mesh(np.eye(3), np.array([[0, 1, 2]], np.int32));"
         "render_panels([Panel(mesh)], Path(sys.argv[1]), size=50)"
     )

@@ -7,16 +7,16 @@ import pytest
 from solids import TORUS, cube, inverted, joined, saved, sphere, torus
 
 from super_sdf import Mesh, SuperSdfError, load_network, reconstruct
-from super_sdf.evaluation import sampling
-from super_sdf.evaluation.mesh_files import read_mesh
-from super_sdf.evaluation.sampling import (
+from super_sdf.truth import sampling
+from super_sdf.truth.mesh_files import read_mesh
+from super_sdf.truth.sampling import (
     fitted_layout,
     grid_points,
     sample_grid,
     sample_solid,
     unit_layout,
 )
-from super_sdf.evaluation.solid import Solid, examine, load_solid
+from super_sdf.truth.solid import Solid, examine, load_solid
 
 
 def cube_distance(points: np.ndarray) -> np.ndarray:

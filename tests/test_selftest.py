@@ -2,14 +2,15 @@
 
 import json
 import re
-from importlib import resources
 
 import numpy as np
 import pytest
 
-from super_sdf import compiling, extras, network, selftest
+from super_sdf import selftest
 from super_sdf.errors import DeviceError
-from super_sdf.extras import EXTRAS
+from super_sdf.machine import compiling, extras
+from super_sdf.machine.extras import EXTRAS
+from super_sdf.network import network
 from super_sdf.selftest import Finding, run_checks
 
 pytestmark = pytest.mark.usefixtures("cpu_build")
@@ -141,19 +142,14 @@ def test_a_numba_that_does_not_work_is_a_failure(monkeypatch):
     )
 
 
+SHIPPED = network.shipped_models()
+
+
 @pytest.fixture
 def models(tmp_path, monkeypatch):
     """A folder of networks that replaces the shipped ones; without it the package has none."""
-    folder, files = tmp_path / "models", resources.files
-
-    def find(package):
-        if package != "super_sdf.models":
-            return files(package)
-        if not folder.exists():
-            raise ModuleNotFoundError(f"No module named {package!r}")
-        return folder
-
-    monkeypatch.setattr(resources, "files", find)
+    folder = tmp_path / "models"
+    monkeypatch.setattr(network, "MODELS", folder)
     return folder
 
 
@@ -173,9 +169,8 @@ def test_a_package_without_networks_says_so(models, command, tmp_path, there):
 
 
 def test_a_network_file_that_cannot_be_read_is_a_line_and_the_others_are_shown(models, command):
-    shipped = network.Path(network.__file__).parents[2] / "models"
     models.mkdir()
-    (models / "fast.onnx").write_bytes((shipped / "fast.onnx").read_bytes())
+    (models / "fast.onnx").write_bytes(SHIPPED["fast"].read_bytes())
     (models / "base.onnx").write_bytes(b"text")
     fault = f"{models / 'base.onnx'} is no ONNX file that onnxruntime can run: "
     code, out, err = command("info")

@@ -8,12 +8,13 @@ from conftest import ball, trilinear
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from super_sdf import SdfGrid, load_network, pipeline, plan, reconstruct
+from super_sdf import SdfGrid, load_network, pipeline, reconstruct
 from super_sdf.errors import OutOfMemoryError
 from super_sdf.mesh import join_meshes
 from super_sdf.pipeline import reconstruct_slabs
-from super_sdf.plan import cut, peak_bytes, plan_slabs
-from super_sdf.survey import survey
+from super_sdf.slabs import cutting
+from super_sdf.slabs.cutting import cut, peak_bytes, plan_slabs
+from super_sdf.steps.survey import survey
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +90,7 @@ def test_what_a_slab_depends_on_is_needed(network, monkeypatch):
     """With less round it the mesh would be another: the test above can fail."""
     grid = SdfGrid.trusted(FIELDS["clean"], (1.0,) * 3)
     one = reconstruct(grid, network)
-    monkeypatch.setattr(plan, "DECODED_BESIDE", 2)
+    monkeypatch.setattr(cutting, "DECODED_BESIDE", 2)
     parts = in_pieces(grid, network, monkeypatch, 4)
     mesh = join_meshes([mesh for part in parts for mesh in part.meshes])
     assert not np.array_equal(mesh.vertices, one.vertices)
@@ -99,7 +100,7 @@ def test_what_a_slab_depends_on_is_needed(network, monkeypatch):
 @pytest.mark.parametrize("factor", [2, 4, 8])
 def test_compiled_and_threads_change_nothing(monkeypatch, field, factor):
     grid = SdfGrid.trusted(FIELDS[field], (1.0,) * 3, (1.0, 2.0, 3.0))
-    monkeypatch.setattr("super_sdf.chunks.CHUNK", 5000)
+    monkeypatch.setattr("super_sdf.machine.threads.CHUNK", 5000)
     meshes = []
     for compiled, threads in (("0", 1), ("0", 2), ("1", 1), ("1", 3)):
         monkeypatch.setenv("SUPER_SDF_COMPILED", compiled)
@@ -153,14 +154,14 @@ def test_the_thinnest_slabs_all_decode_something():
     values = np.full((60, 14, 15), 9.0)
     values[40:] = rod()[:20]
     band = survey(SdfGrid.trusted(values, (1.0,) * 3))
-    *_, thinnest = plan.ways_to_cut(band, receptive_field=2)
+    *_, thinnest = cutting.ways_to_cut(band, receptive_field=2)
     assert thinnest[0].planes[0] == 0 and thinnest[-1].planes[1] == 60
     assert all(band.count_decoded(band.rows(*slab.planes)) for slab in thinnest)
 
 
 def test_less_memory_makes_more_slabs_and_too_little_is_refused(bare_plan):
     band = survey(SdfGrid.trusted(rod(), (1.0,) * 3))
-    need = peak_bytes(band, [plan.whole(band)], 4)
+    need = peak_bytes(band, [cutting.whole(band)], 4)
     assert len(plan_slabs(band, 4, 2, need)) == 1
     counts = [
         len(plan_slabs(band, 4, 2, 10**8 + int(share * (need - 10**8)))) for share in (0.9, 0.7)

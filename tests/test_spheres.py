@@ -7,10 +7,10 @@ import pytest
 from conftest import ball, trilinear
 
 from super_sdf import SdfGrid, load_network, pipeline, reconstruct
-from super_sdf.band import neighbour_table
-from super_sdf.lattice import carry, read
-from super_sdf.nodes import block_ijk, number_shared_nodes
-from super_sdf.spheres import (
+from super_sdf.steps.band import neighbour_table
+from super_sdf.steps.interpolation import carry, read
+from super_sdf.steps.nodes import block_ijk, number_shared_nodes
+from super_sdf.steps.spheres import (
     PRIOR,
     Samples,
     agreed_mean,
@@ -19,7 +19,7 @@ from super_sdf.spheres import (
     fit_to_spheres,
     mean_at_nodes,
 )
-from super_sdf.survey import survey
+from super_sdf.steps.survey import survey
 
 CENTRE_OF_BALL = 10 - 0.37
 

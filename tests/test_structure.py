@@ -1,112 +1,92 @@
-"""Imports point one way, and the runtime is light."""
+"""Imports point down the list of rooms in docs/tour.md, and the runtime is light."""
 
 import ast
+import re
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parent.parent
-SOURCES = sorted((ROOT / "src" / "super_sdf").glob("*.py"))
-EVALUATION = sorted((ROOT / "src" / "super_sdf" / "evaluation").glob("*.py"))
-FLOORS = [
-    {"errors", "containers", "compiling", "interrupts", "streams", "pace"},
-    {"memory", "onnx", "progress", "extras", "machine", "index_width", "chunks"},
-    {"planes", "cuda"},
-    {"samples", "gradients"},
-    {"sides", "spacing"},
-    {"grid"},
-    {"band", "mesh", "cell_cases", "running", "contract", "decoder"},
-    {"nodes", "symmetry", "options", "offsets", "device"},
-    {"files"},
-    {"field", "network", "lattice"},
-    {"isosurface", "border", "spheres"},
-    {"survey", "kernels"},
-    {"compiled", "footprint"},
-    {"plan", "precision", "expectation"},
-    {"pipeline"},
-    {"convert"},
-    {"cli_common", "cli_conversion", "__init__"},
-    {"selftest", "cli_batch_report"},
-    {"cli_batch", "cli_sample", "cli_evaluate", "cli_render", "cli_info"},
-    {"cli"},
-    {"entry"},
-    {"__main__"},
-]
-BATCH = sorted((ROOT / "src" / "super_sdf" / "batch").glob("*.py"))
-FILES = sorted((ROOT / "src" / "super_sdf" / "files").glob("*.py"))
-FILES_FLOORS = [
-    {"archives", "headers", "parts", "regular", "spool", "__init__"},
-    {"output", "ply", "stl", "text_meshes", "glb", "unpacking"},
-    {"threemf"},
-    {"grids", "meshes"},
-]
-MACHINE = sorted((ROOT / "src" / "super_sdf" / "machine").glob("*.py"))
-MACHINE_FLOORS = [
-    {"records", "serving", "__init__"},
-    {"pool"},
-]
-BATCH_FLOORS = [
-    {"fingerprint", "journal", "walking", "__init__"},
-    {"job", "lock"},
-    {"manifest", "workers", "ledger"},
-    {"inputs", "plan"},
-    {"run"},
-]
-EVALUATION_FLOORS = [
-    {"mesh_files", "published", "page", "folder", "__init__"},
-    {"solid"},
-    {"sampling", "metrics", "rendering", "sections"},
-    {"cases"},
-    {"methods"},
-    {"peers"},
-    {"measuring"},
-    {"plan", "store", "tables", "timing"},
-    {"runner"},
-    {"results", "plots"},
-    {"experiment_tables"},
-    {"report"},
-    {"evaluate"},
-]
+PACKAGE = ROOT / "src" / "super_sdf"
+MODULES = {
+    ".".join(path.relative_to(PACKAGE).with_suffix("").parts): path
+    for path in PACKAGE.rglob("*.py")
+}
+# Rooms that need more than the four packages that are always installed.
+WITH_EXTRAS = {"evaluation", "pictures", "truth", "compiled"}
+
+
+def room_of(module: str) -> str:
+    """Return the folder of a module within the package, or the module itself."""
+    return module.split(".")[0]
+
+
+def rooms() -> list[set[str]]:
+    """Return the rooms of the tour, those on a line together."""
+    lines = (ROOT / "docs" / "tour.md").read_text().splitlines()
+    cells = [line.split("|")[1] for line in lines if line.startswith("| `")]
+    return [set(re.findall(r"`(\w+)/?`", cell)) for cell in cells]
 
 
 def imported(path: Path) -> set[str]:
-    """Return the modules that a file imports anywhere, relative ones with their dots before."""
-    names = set()
+    """Return the modules that a file imports anywhere, of this package without its name."""
+    names: set[str] = set()
+    inside = path.is_relative_to(PACKAGE)
+    here = path.relative_to(PACKAGE).with_suffix("").parts if inside else ()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            names |= {alias.name.split(".")[0] for alias in node.names}
+            names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            module = (node.module or "").split(".")[0]
-            names.add("." * node.level + module)
-            if not module:  # from . import metrics
-                names |= {"." * node.level + alias.name for alias in node.names}
+            before = here[: len(here) - node.level] if node.level else ()
+            module = ".".join([*before, *([node.module] if node.module else [])])
+            below = {f"{module}.{alias.name}".lstrip(".") for alias in node.names}
+            names |= (below & set(MODULES)) or {module or "__init__"}
     return names
 
 
-def check_floors(sources: list[Path], floors: list[set[str]]) -> None:
-    """Every module stands on one floor and imports from floors below, within its package."""
-    floor = {name: level for level, names in enumerate(floors) for name in names}
-    assert set(floor) - {"files", "machine"} == {path.stem for path in sources}
-    for path in sources:
-        for name in imported(path) & {f".{other}" for other in floor}:
-            assert floor[name[1:]] < floor[path.stem], f"{path.stem} imports {name}"
+def own(path: Path) -> set[str]:
+    """Return the modules of the package that one of its files imports."""
+    packages = {name.removesuffix(".__init__"): name for name in MODULES}
+    return {packages.get(name, name) for name in imported(path)} & set(MODULES)
 
 
-def test_every_module_imports_only_from_floors_below():
-    check_floors(SOURCES, FLOORS)
-    check_floors(FILES, FILES_FLOORS)
-    check_floors(MACHINE, MACHINE_FLOORS)
-    check_floors(BATCH, BATCH_FLOORS)
-    check_floors(EVALUATION, EVALUATION_FLOORS)
+def test_the_tour_names_every_room_once():
+    named = [name for line in rooms() for name in line]
+    assert sorted(named) == sorted({room_of(module) for module in MODULES})
 
 
-def test_the_runtime_needs_four_packages():
+@pytest.mark.parametrize("module", MODULES)
+def test_a_module_imports_from_its_own_room_or_one_below(module):
+    level = {name: number for number, line in enumerate(rooms()) for name in line}
+    for name in own(MODULES[module]) - {"__init__"}:  # that is the version
+        room = room_of(name)
+        assert room == room_of(module) or level[room] > level[room_of(module)], f"imports {name}"
+
+
+def test_no_room_has_a_circle():
+    TopologicalSorter({module: own(path) - {module} for module, path in MODULES.items()}).prepare()
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_no_string_names_a_module(module):
+    strings = [node.value for node in ast.walk(ast.parse(MODULES[module].read_text()))
+               if isinstance(node, ast.Constant) and isinstance(node.value, str)]  # fmt: skip
+    assert not [text for text in strings if re.fullmatch(r"super_sdf(\.\w+)+", text)]
+
+
+@pytest.mark.parametrize("module", [m for m in MODULES if room_of(m) not in WITH_EXTRAS])
+def test_the_runtime_needs_four_packages(module):
     allowed = {"click", "numpy", "onnxruntime", "trimesh"} | set(sys.stdlib_module_names)
-    for path in SOURCES + FILES + MACHINE + BATCH:
-        foreign = {name for name in imported(path) if not name.startswith(".")} - allowed
-        if path.stem == "kernels":  # loaded only where numba is
-            foreign -= {"numba"}
-        assert not foreign, f"{path.stem} imports {foreign}"
+    foreign = imported(MODULES[module]) - set(MODULES) - {"", "__init__"}
+    assert {name.split(".")[0] for name in foreign} <= allowed
+
+
+@pytest.mark.parametrize("room", sorted({room_of(m) for m in MODULES if "." in m}))
+def test_every_room_says_what_lives_there(room):
+    assert ast.get_docstring(ast.parse((PACKAGE / room / "__init__.py").read_text()))
 
 
 def test_onnxruntime_is_imported_in_one_place():
@@ -121,19 +101,10 @@ def test_onnxruntime_is_imported_in_one_place():
     assert importing == {"onnx.py"}
 
 
-def test_the_runtime_does_not_know_the_evaluation():
-    for path in SOURCES + FILES + MACHINE + BATCH:
-        assert path.stem.startswith("cli_") or ".evaluation" not in imported(path)
-
-
-def test_the_evaluation_does_not_know_the_command_line():
-    for path in EVALUATION:
-        assert not any(name.startswith(("..cli", "torch")) for name in imported(path))
-
-
 def test_help_loads_click_and_nothing_heavier():
     script = (
-        "import sys; from super_sdf.cli import cli; cli.main(['--help'], standalone_mode=False);"
+        "import sys; from super_sdf.cli.main import cli;"
+        "cli.main(['--help'], standalone_mode=False);"
         "heavy = {'numpy', 'onnxruntime', 'trimesh', 'torch'} & set(sys.modules); assert not heavy"
     )
     subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)

@@ -4,9 +4,10 @@ import numpy as np
 from conftest import ball
 
 from super_sdf import load_network
-from super_sdf.band import NEIGHBOURHOOD, find_band, gather_patches, neighbour_table, rescale
-from super_sdf.nodes import block_offsets
-from super_sdf.symmetry import cube_symmetries, turn
+from super_sdf.neighbourhood import NEIGHBOURHOOD
+from super_sdf.network.symmetry import cube_symmetries, turn
+from super_sdf.steps.band import find_band, gather_patches, neighbour_table, rescale
+from super_sdf.steps.nodes import block_offsets
 
 
 def test_the_symmetries_are_a_group_of_48_with_the_reflections_first():

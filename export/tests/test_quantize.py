@@ -12,8 +12,8 @@ from export.network import NetworkConfig, SuperSdfNet
 from export.prune import without_idle_blocks
 from export.quantize import LEVELS, MOST, quantize, steps_of, whole_block, whole_layer
 from export.to_onnx import make_card, read_network, write_model
-from super_sdf.network import load_network
-from super_sdf.onnx import ort
+from super_sdf.network.network import load_network
+from super_sdf.network.onnx import ort
 
 SMALL = NetworkConfig(channels=16, blocks=3, hidden=32, functions=24, trunk=16, frequencies=2)
 

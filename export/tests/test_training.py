@@ -54,13 +54,14 @@ from export.to_onnx import (
 from export.train import Errors, Run, Store, log, read_log, sample_errors, train
 from export.variants import UNet
 from super_sdf import Mesh, load_network
-from super_sdf.band import CENTRE, NEIGHBOURHOOD, find_band, is_lipschitz, neighbour_table
-from super_sdf.contract import INPUTS
-from super_sdf.evaluation.sampling import sample_grid
-from super_sdf.evaluation.solid import Solid
-from super_sdf.network import shipped_models
-from super_sdf.nodes import block_offsets
-from super_sdf.running import CHUNK_INPUT
+from super_sdf.neighbourhood import CENTRE, NEIGHBOURHOOD
+from super_sdf.network.contract import INPUTS
+from super_sdf.network.network import shipped_models
+from super_sdf.network.running import CHUNK_INPUT
+from super_sdf.steps.band import find_band, is_lipschitz, neighbour_table
+from super_sdf.steps.nodes import block_offsets
+from super_sdf.truth.sampling import sample_grid
+from super_sdf.truth.solid import Solid
 
 SMALL = NetworkConfig(channels=8, blocks=2, hidden=16, functions=24, trunk=16, frequencies=2)
 

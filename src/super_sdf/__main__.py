@@ -1,5 +1,5 @@
 """``python -m super_sdf``."""
 
-from .entry import main
+from .cli.entry import main
 
 main()

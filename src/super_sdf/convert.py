@@ -14,17 +14,18 @@ from typing import Any
 
 import numpy as np
 
-from .decoder import Decoder
-from .expectation import Expectation, expect
+from .arrays import Triple
+from .files.expectation import Expectation, expect
 from .files.grids import read_grid
 from .files.meshes import write_pieces
-from .grid import SdfGrid, Triple
+from .files.precision import check_format_holds, local_origin_note
+from .grid.sdf_grid import SdfGrid
+from .grid.spacing import as_triple
 from .mesh import Mesh
-from .nodes import check_factor
+from .network.decoder import Decoder
 from .pipeline import Piece, reconstruct_slabs
-from .precision import check_format_holds, local_origin_note
 from .progress import Progress, Stopwatch
-from .spacing import as_triple
+from .steps.nodes import check_factor
 
 
 @dataclass(frozen=True)

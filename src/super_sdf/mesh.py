@@ -8,7 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .grid import IntArray
+from .arrays import IntArray
+from .errors import GridError
+from .grid.sdf_grid import SdfGrid
+
+# A vertex keeps this share of its lattice edge from either end: where a node's value is 0 several
+# vertices would otherwise fall together, and programs that merge such points would tear the mesh.
+CLEARANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -69,3 +75,31 @@ def join_meshes(pieces: list[Mesh]) -> Mesh:
         np.concatenate([piece.vertices for piece in pieces]),
         np.concatenate([piece.faces for piece in pieces]),
     )
+
+
+def vertex_type(grid: SdfGrid, factor: int) -> type[np.float32] | type[np.float64]:
+    """Return the numbers that tell neighbouring vertices apart: single, else double.
+
+    Raises
+    ------
+    GridError
+        If neither does.
+    """
+    reach = max(abs(x) + h * n for x, h, n in zip(grid.origin, grid.spacing, grid.shape))
+    for kind in (np.float32, np.float64):
+        if tells_vertices_apart(kind, reach, grid, factor):
+            return kind
+    raise GridError(
+        f"the grid reaches to {reach:.6g}, too far from the origin for its spacing, "
+        f"{grid.voxel_size:.6g}: vertices could not be told apart; give a nearer origin"
+    )
+
+
+def tells_vertices_apart(
+    kind: type[np.float32] | type[np.float64], reach: float, grid: SdfGrid, factor: int
+) -> bool:
+    """Say whether numbers of a kind, up to ``reach``, tell neighbouring vertices apart."""
+    least = CLEARANCE / 2 * grid.voxel_size / factor
+    finfo = np.finfo(kind)
+    fine = float(finfo.tiny) < least and float(finfo.eps) * reach < least
+    return fine and reach < float(finfo.max)

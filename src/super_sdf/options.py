@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .errors import OptionError, OptionTypeError, seen
-from .grid import SdfGrid
+from .grid.sdf_grid import SdfGrid
 
 
 def check_grid(grid: Any) -> None:

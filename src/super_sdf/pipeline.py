@@ -18,24 +18,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .border import close_at_border
-from .chunks import working_threads
-from .compiling import use_compiled
-from .decoder import Decoder, decode
-from .field import FineField, border_is_crossed
-from .footprint import NETWORK_BYTES
-from .grid import IntArray, SdfGrid
-from .isosurface import extract_pieces, vertex_type
-from .memory import hold_less, memory_bound
-from .mesh import Mesh, join_meshes
-from .nodes import (
-    average_shared,
-    block_offsets,
-    check_factor,
-    number_shared_nodes,
-    pin_to_skipped,
-    signs_of_skipped,
-)
+from .arrays import IntArray
+from .grid.sdf_grid import SdfGrid
+from .machine.compiling import use_compiled
+from .machine.memory import hold_less, memory_bound
+from .machine.threads import working_threads
+from .mesh import Mesh, join_meshes, vertex_type
+from .network.decoder import Decoder, decode
 from .options import (
     check_cap,
     check_distance,
@@ -44,10 +33,22 @@ from .options import (
     check_network,
     check_progress,
 )
-from .plan import Slab, peak_bytes, plan_slabs
 from .progress import STEPS, Progress, Steps
-from .spheres import Samples, fit_to_spheres
-from .survey import Band, no_surface, survey
+from .slabs.cutting import Slab, peak_bytes, plan_slabs
+from .slabs.footprint import NETWORK_BYTES
+from .steps.cap import close_at_border
+from .steps.field import FineField, border_is_crossed
+from .steps.marching import extract_pieces
+from .steps.nodes import (
+    average_shared,
+    block_offsets,
+    check_factor,
+    number_shared_nodes,
+    pin_to_skipped,
+    signs_of_skipped,
+)
+from .steps.spheres import Samples, fit_to_spheres
+from .steps.survey import Band, no_surface, survey
 
 
 def upsample(
@@ -127,7 +128,7 @@ def reconstruct(
     """
     check_grid(grid)
     if network is None:
-        from .network import load_network
+        from .network.network import load_network
 
         network = load_network()
     pieces = reconstruct_slabs(

@@ -5,14 +5,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping
 
-from .pace import Tell
-
 Progress = Callable[[int, int], None]
 """Called with (done, total), in thousandths of the work; ``done`` never falls and ends at total.
 
 While the network runs it is called several times a second, with an estimate by the clock. If it
 raises, the work ends there with that error.
 """
+
+Tell = Callable[[float], None]
+"""Called with the share of a step that is done, from 0 to 1."""
 
 TOTAL = 1000
 # The parts of the time that the steps take, with a network on a CPU: the first once, the others for

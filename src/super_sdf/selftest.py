@@ -14,15 +14,16 @@ from importlib.metadata import PackageNotFoundError, version
 import numpy as np
 
 from . import __version__
-from .compiling import try_compiled
-from .cuda import available_devices, check_cuda, describe_gpu, onnxruntime_version
+from .arrays import FloatArray, IntArray
 from .errors import DeviceError, SuperSdfError
-from .extras import EXTRAS, how_to_install, missing_modules
-from .grid import FloatArray, IntArray, SdfGrid
-from .memory import free_memory
-from .network import NO_NETWORKS, load_network, shipped_models
-from .nodes import block_offsets
-from .survey import survey
+from .grid.sdf_grid import SdfGrid
+from .machine.compiling import try_compiled
+from .machine.extras import EXTRAS, how_to_install, missing_modules
+from .machine.memory import free_memory
+from .network.cuda import available_devices, check_cuda, describe_gpu, onnxruntime_version
+from .network.network import NO_NETWORKS, load_network, shipped_models
+from .steps.nodes import block_offsets
+from .steps.survey import survey
 
 OK, MISSING, FAILED = "ok", "missing", "failed"
 BALL_SAMPLES, BALL_CENTRE, BALL_RADIUS = 32, 15.63, 12.0  # off the samples

@@ -11,7 +11,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from super_sdf.onnx import ort
+from super_sdf.network.onnx import ort
 
 from .running import Run, limit, run_here
 
@@ -88,7 +88,7 @@ def kept_sessions() -> Callable[..., Any]:
 
     Threads that wait for each other's cores cost more than such small grids.
     """
-    from super_sdf.network import shipped_models
+    from super_sdf.network.network import shipped_models
 
     shipped = {str(path) for path in shipped_models().values()}
     load, kept = ort.InferenceSession, {}

@@ -119,7 +119,7 @@ def cases(seed: int) -> Iterator[Case]:
 
 def _shipped(seed: int) -> Iterator[Case]:
     """Yield the smallest network of the package, damaged."""
-    from super_sdf.network import shipped_models
+    from super_sdf.network.network import shipped_models
 
     whole = shipped_models()["base-int8"].read_bytes()
     for number in range(60):

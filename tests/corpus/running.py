@@ -62,7 +62,7 @@ _terminals: list[Terminal] = []
 
 def run_here(words: Sequence[str], folder: Path) -> Run:
     """Run the command line in a folder, in this process; only in its main thread."""
-    from super_sdf import cli
+    from super_sdf.cli import main as cli
 
     if not _terminals:
         _terminals.append(Terminal())

@@ -1,1 +1,4 @@
-"""Many grids to meshes: found, planned, shared out, resumed. The command is ``super-sdf batch``."""
+"""Many grids to meshes: found, planned, shared out, resumed. The command is ``super-sdf batch``.
+
+It may import ``convert`` and what lies below.
+"""

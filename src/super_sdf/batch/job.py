@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..convert import ConvertOptions, convert
-from ..decoder import Decoder
 from ..errors import FileError, GridError, OptionError, WriteError
 from ..files.regular import check_regular_file
+from ..network.decoder import Decoder
 from .fingerprint import Fingerprint, fingerprint
 from .journal import note_made
 

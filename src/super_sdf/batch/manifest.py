@@ -20,8 +20,8 @@ from typing import Any
 from ..convert import ConvertOptions
 from ..errors import FileError, OptionError
 from ..files.meshes import MESH_SUFFIXES
-from ..nodes import check_factor
-from ..sides import INSIDE
+from ..grid.sides import INSIDE
+from ..steps.nodes import check_factor
 from .job import Job
 
 Entry = dict[str, Any]

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from .. import __version__
-from ..network import find_model
+from ..network.network import find_model
 from .fingerprint import fingerprint, is_unchanged
 from .job import Job, Result, Row, failed_row
 from .journal import Journal, read_journal

@@ -15,10 +15,10 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from ..chunks import count_cores
 from ..files.parts import remove_abandoned_parts
+from ..machine.memory import held_memory, memory_bound
 from ..machine.pool import Death, Pool
-from ..memory import held_memory, memory_bound
+from ..machine.threads import count_cores
 from .job import Job, Result, Row, failed_row
 from .journal import read_journal
 from .ledger import Ledger

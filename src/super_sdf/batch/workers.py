@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from ..chunks import count_cores
-from ..cuda import available_devices
+from ..machine.memory import free_memory
 from ..machine.pool import Tasks
-from ..memory import free_memory
-from ..network import Network, load_network
+from ..machine.threads import count_cores
+from ..network.cuda import available_devices
+from ..network.network import Network, load_network
 from .job import Job, Row, attempt
 
 # Of memory, for each process that is started unasked: the network, and a grid of 128^3; and the

@@ -15,15 +15,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..band import find_band, rescale
+from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import OptionError, seen
-from ..grid import BoolArray, FloatArray, IntArray, SdfGrid
-from ..memory import check_fits
+from ..evaluation import metrics
+from ..grid.sdf_grid import SdfGrid
+from ..machine.memory import check_fits
 from ..mesh import Mesh
-from ..nodes import check_factor
-from . import metrics
-from .sampling import sample_grid, unit_layout
-from .solid import Distances, Solid, load_solid
+from ..steps.band import find_band, rescale
+from ..steps.nodes import check_factor
+from ..truth.sampling import sample_grid, unit_layout
+from ..truth.solid import Distances, Solid, load_solid
 
 # At most, of the dense fields, their masks, and the meshing of one of them.
 BYTES_PER_NODE = 20

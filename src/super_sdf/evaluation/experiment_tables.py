@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from . import published
+from ..evaluation import published
 from .cases import Setting
 from .measuring import OURS, Row
 from .plan import BASE_SIZE, FACTORS, NOISES, PASSES, SCALES

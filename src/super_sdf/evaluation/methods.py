@@ -13,14 +13,15 @@ import numpy as np
 from scipy import ndimage
 from skimage.measure import marching_cubes
 
-from ..decoder import Decoder
+from ..arrays import FloatArray
 from ..errors import NoSurfaceError
-from ..grid import FloatArray, SdfGrid
+from ..grid.sdf_grid import SdfGrid
 from ..mesh import Mesh
-from ..nodes import block_ijk
+from ..network.decoder import Decoder
 from ..pipeline import reconstruct, refine
-from ..plan import whole
-from ..survey import survey
+from ..slabs.cutting import whole
+from ..steps.nodes import block_ijk
+from ..steps.survey import survey
 from .cases import Case, spread_samples
 
 NUDGE = np.float32(1e-9)  # what an exact zero becomes: a vertex on a node can open the surface

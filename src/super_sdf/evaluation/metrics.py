@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..grid import IntArray
+from ..arrays import IntArray
 from ..mesh import Mesh
-from .solid import Distances, Points, Solid
+from ..truth.solid import Distances, Points, Solid
 
 SAMPLE_COUNT = 100_000
 F1_DISTANCE = 0.003

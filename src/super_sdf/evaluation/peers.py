@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..decoder import Decoder
-from ..grid import IntArray, SdfGrid
+from ..arrays import IntArray
+from ..grid.sdf_grid import SdfGrid
 from ..mesh import Mesh
+from ..network.decoder import Decoder
+from ..truth.sampling import grid_points
+from ..truth.solid import Points
 from .cases import Case
 from .methods import Method, Surface
-from .sampling import grid_points
-from .solid import Points
 
 
 def samples_of(grid: SdfGrid) -> Points:

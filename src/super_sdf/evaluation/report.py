@@ -12,16 +12,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ..errors import SuperSdfError
-from ..extras import how_to_install
+from ..evaluation import experiment_tables
+from ..machine.extras import how_to_install
 from ..mesh import Mesh
-from ..network import load_network
-from . import experiment_tables
+from ..network.network import load_network
+from ..pictures.rendering import Panel, can_render, render_panels, vertex_errors
 from .cases import Case, Setting, Shape
 from .folder import REPORT, SHAPES, make_folder, write_page
 from .measuring import OURS, Row
 from .methods import METHODS
 from .plots import draw_plots
-from .rendering import Panel, can_render, render_panels, vertex_errors
 from .results import Results
 from .tables import (
     COST,

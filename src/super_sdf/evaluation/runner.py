@@ -16,6 +16,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
+from . import measuring
 from .cases import Shape
 from .measuring import Row, Task, failed_row, measure_task, reason_of
 from .store import Store
@@ -24,7 +25,7 @@ READ = "read"  # what a process sends once it has its shape
 GRACE = 10.0  # seconds that a process has to end after its last row
 POLL = 0.5  # seconds between looks at the clock where there is a limit
 # Modules that every task wants, loaded once: processes are then forked in milliseconds.
-PRELOAD = ["super_sdf.evaluation.measuring"]
+PRELOAD = [measuring.__name__]
 
 Progress = Callable[[int, int, Task, float], None]
 """Called with (tasks done, tasks in all, the task just done, the share of the work done)."""

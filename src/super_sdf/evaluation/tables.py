@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from . import published
+from ..evaluation import published
 from .measuring import FLOOR, OURS, Row
 
 LABELS = {

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..chunks import count_cores
 from ..errors import SuperSdfError
+from ..machine.threads import count_cores
 from .cases import Case, Setting, Shape
 from .measuring import Row
 
@@ -58,7 +58,7 @@ def run_command(words: Sequence[str]) -> tuple[float, float]:
     SuperSdfError
         If the command fails.
     """
-    seconds, peak, _ = run_python(["-m", "super_sdf.cli", *words])
+    seconds, peak, _ = run_python(["-m", "super_sdf", *words])
     return seconds, peak
 
 

@@ -1,1 +1,1 @@
-"""Grids from files, meshes to files, and what an array says of where it lies."""
+"""Grids from files, meshes to files. It may import ``grid``, ``mesh`` and ``machine``."""

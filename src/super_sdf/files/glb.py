@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Triple
 from ..errors import FileError
-from ..grid import Triple
 from ..mesh import Mesh
 from .spool import append_spool, little_endian, spool_beside, write_split
 

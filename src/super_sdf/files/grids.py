@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, GridError, OptionError, OutOfMemoryError
-from ..grid import SdfGrid, make_grid
-from ..memory import held_memory, memory_bound
+from ..grid.planes import InputFile, PlaneFile, Samples
+from ..grid.samples import check_kind
+from ..grid.sdf_grid import SdfGrid, make_grid
+from ..machine.memory import held_memory, memory_bound
 from ..options import check_path
-from ..planes import InputFile, PlaneFile, Samples
-from ..samples import check_kind
 from .archives import Member
 from .headers import ArrayHeader, Read, read_array_header
 from .output import check_free, replacing

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Triple
 from ..errors import FileError, OptionError, OptionTypeError, seen
-from ..grid import Triple
 from ..mesh import Mesh
 from ..options import check_path
 from .glb import write_glb

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, OutOfMemoryError
-from ..memory import in_words
-from ..planes import InputFile, PlaneFile, Samples
+from ..grid.planes import InputFile, PlaneFile, Samples
+from ..machine.memory import in_words
 from .headers import ArrayHeader, Read
 
 PIECE = 1 << 23  # bytes at a time

@@ -1,1 +1,4 @@
-"""What runs have in common: supervised worker processes, files of lines that are only appended."""
+"""What a run may use: threads, memory, packages, worker processes, append-only records.
+
+It may import ``errors`` alone.
+"""

@@ -1,0 +1,1 @@
+"""The command line: a module a command, no numerics. It may import every other room."""

@@ -1,0 +1,113 @@
+"""The command ``info``: versions, devices and networks, and with --check whether they work."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+import click
+
+from .. import __version__
+from .common import CONTEXT, one_line_errors
+
+EXAMPLES = """\b
+Examples:
+  super-sdf info --check
+  super-sdf info --check --device cuda
+"""
+
+
+@click.command(
+    context_settings=CONTEXT, epilog=EXAMPLES, short_help="Show versions, devices and networks."
+)
+@click.option("--check", is_flag=True, help="Try everything; exit code 1 if something fails.")
+@click.option(
+    "--device",
+    type=click.Choice(["auto", "cpu", "cuda"]),
+    default="auto",
+    show_default=True,
+    help="With --check: cpu leaves CUDA out, cuda insists on it.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+def info(check: bool, device: str, as_json: bool) -> None:
+    """Show versions, devices, and the shipped networks with their cards.
+
+    With --check also whether they work here: each network is run on a ball, whose distances are
+    known, on the CPU and on CUDA, and what is missing is named with the way to install it.
+    """
+    with one_line_errors():
+        if check:
+            sys.exit(0 if tell_checks(device, as_json) else 1)
+        sys.exit(0 if tell_facts(as_json) else 1)
+
+
+def tell_checks(device: str, as_json: bool) -> bool:
+    """Run the checks and print each as it ends; return whether none failed."""
+    from dataclasses import asdict
+
+    from ..selftest import FAILED, run_checks
+
+    findings = []
+    for finding in run_checks(device):
+        findings.append(finding)
+        if not as_json:
+            click.echo(f"{finding.state:<8} {finding.what}: {finding.says}")
+    failed = [finding for finding in findings if finding.state == FAILED]
+    if as_json:
+        report = {"works": not failed, "findings": [asdict(finding) for finding in findings]}
+        click.echo(json.dumps(report, indent=2))
+    elif failed:
+        click.echo(f"{len(failed)} of {len(findings)} checks failed")
+    else:
+        click.echo("What is installed works.")
+    return not failed
+
+
+def tell_facts(as_json: bool) -> bool:
+    """Print versions, devices and cards; return whether all networks could be loaded."""
+    facts = gather_facts()
+    works = bool(facts["models"]) and not any("fault" in card for card in facts["models"].values())
+    if as_json:
+        click.echo(json.dumps(facts, indent=2))
+        return works
+    for key in ("super-sdf", "python", "onnxruntime"):
+        click.echo(f"{key} {facts[key]}")
+    click.echo(f"devices: {', '.join(facts['devices'])}")
+    for name, card in facts["models"].items():
+        click.echo(f"model {name}")
+        for key, value in sorted(card.items()):
+            click.echo(f"  {key.replace('_', ' ')}: {value}")
+    if not facts["models"]:
+        click.echo(f"models: {facts['fault']}")
+    return works
+
+
+def gather_facts() -> dict[str, Any]:
+    """Return versions, devices and cards."""
+    import platform
+
+    from ..network.cuda import available_devices
+    from ..network.network import NO_NETWORKS, shipped_models
+    from ..network.onnx import ort
+
+    models = {name: find_card(name) for name in shipped_models()}
+    facts = {
+        "super-sdf": __version__,
+        "python": platform.python_version(),
+        "onnxruntime": ort.__version__,
+        "devices": available_devices(),
+        "models": models,
+    }
+    return facts if models else {**facts, "fault": NO_NETWORKS}
+
+
+def find_card(name: str) -> dict[str, Any]:
+    """Return a shipped network's card, or why it cannot be loaded as its ``fault``."""
+    from ..errors import SuperSdfError
+    from ..network.network import load_network
+
+    try:
+        return dict(load_network(name, device="cpu").card)
+    except SuperSdfError as error:
+        return {"fault": str(error)}

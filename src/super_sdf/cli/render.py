@@ -1,0 +1,151 @@
+"""The command ``render``: parse, call the library. No numerics here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+from click.core import ParameterSource
+
+from ..errors import OptionError
+from ..machine.extras import EXTRAS, check_modules
+from .common import CONTEXT, one_line_errors
+from .interrupts import raising_interrupts
+
+EXAMPLES = """\b
+Examples:
+  super-sdf render coarse.ply fine.ply pair.png --colour normal --up y
+  super-sdf render fine.ply error.png --colour error --reference true.ply
+  super-sdf render part.npz section.png --axis z
+"""
+# Options that have a meaning for one kind of source only.
+FOR_GRIDS = ("axis", "at", "factor")
+FOR_MESHES = ("colour", "reference", "top", "up", "zoom")
+
+
+@click.command(
+    context_settings=CONTEXT,
+    epilog=EXAMPLES,
+    short_help="Draw meshes, or a cross-section of a grid.",
+)
+@click.argument(
+    "sources", metavar="MESH...", nargs=-1, required=True, type=click.Path(path_type=Path)
+)
+@click.argument("target", metavar="OUT.png", type=click.Path(path_type=Path))
+@click.option(
+    "--colour",
+    type=click.Choice(["shaded", "normal", "error"]),
+    default="shaded",
+    show_default=True,
+    help="By light, by the direction of the face, or by the distance to the reference.",
+)
+@click.option(
+    "--reference", type=click.Path(path_type=Path), help="The mesh that errors are measured to."
+)
+@click.option(
+    "--top",
+    type=float,
+    metavar="D",
+    help="Distance at the end of the colour bar.",
+)
+@click.option(
+    "--up",
+    type=click.Choice(["x", "y", "z"]),
+    default="z",
+    show_default=True,
+    help="The axis that points up.",
+)
+@click.option("--zoom", type=float, default=1.0, show_default=True, help="Closer in.")
+@click.option(
+    "--size", type=click.IntRange(100), default=700, show_default=True, help="Pixels a panel."
+)
+@click.option(
+    "--axis",
+    type=click.Choice(["x", "y", "z"]),
+    default="z",
+    show_default=True,
+    help="Of a grid: the axis that the section cuts across.",
+)
+@click.option(
+    "--at", type=float, metavar="D", help="Of a grid: where on that axis; else the middle."
+)
+@click.option(
+    "--factor", type=int, default=4, show_default=True, help="Of a grid: how many times finer."
+)
+@click.option("--force", is_flag=True, help="Replace OUT if it exists.")
+def render(sources: tuple[Path, ...], target: Path, **options: Any) -> None:
+    """Draw meshes side by side from one camera, or a section of a grid before and after.
+
+    MESH is any file that trimesh reads; a single .npy or .npz grid is drawn as a cross-section in
+    false colours with its zero line, as it is and as super-sdf refines it. No display is needed.
+    """
+    from ..files.grids import GRID_SUFFIXES
+
+    with one_line_errors():
+        grids = [source for source in sources if source.suffix.lower() in GRID_SUFFIXES]
+        check_modules("render", "view", EXTRAS["eval"] if grids else None)
+        check_picture(target, force=options["force"])
+        if grids and len(sources) > 1:
+            raise OptionError(f"{grids[0]} is a grid: give it alone, or meshes only")
+        check_given(FOR_MESHES if grids else FOR_GRIDS, "a grid" if grids else "meshes")
+        (render_grid if grids else render_meshes)(sources, target, options)
+
+
+def check_given(others: tuple[str, ...], drawn: str) -> None:
+    """Raise if an option was given that has no meaning for what is drawn."""
+    context = click.get_current_context()
+    for name in others:
+        if context.get_parameter_source(name) is not ParameterSource.DEFAULT:
+            raise OptionError(f"--{name} has no meaning for {drawn}: leave it out")
+
+
+def check_picture(target: Path, *, force: bool) -> None:
+    """Raise if a picture cannot be written there; asked before the work starts."""
+    from ..files.output import check_free
+
+    if target.suffix.lower() != ".png":
+        raise OptionError(f"{target} is no picture file: give .png")
+    check_free(target, force=force)
+
+
+def render_meshes(sources: tuple[Path, ...], target: Path, options: dict[str, Any]) -> None:
+    """Draw meshes; by their errors, if there is a reference to compare with."""
+    from ..pictures.page import check_page
+    from ..pictures.rendering import Panel, check_numbers, render_panels, vertex_errors
+    from ..truth.mesh_files import read_mesh
+    from ..truth.solid import Solid
+
+    check_numbers(zoom=options["zoom"], top=options["top"])
+    check_page(options["size"], len(sources))
+    if options["top"] is not None and options["colour"] != "error":
+        raise OptionError("--top is the end of the colour bar: give it with --colour error")
+    if (options["colour"] == "error") != (options["reference"] is not None):
+        raise OptionError("--colour error and --reference MESH go together: give both or neither")
+    meshes = [(source.name, read_mesh(source)) for source in sources]
+    if options["reference"] is None:
+        panels = [Panel(mesh, name) for name, mesh in meshes]
+    else:
+        reference = Solid(read_mesh(options["reference"]))
+        panels = [Panel(mesh, name, vertex_errors(mesh, reference)) for name, mesh in meshes]
+    chosen = {name: options[name] for name in ("colour", "up", "zoom", "size", "top", "force")}
+    with raising_interrupts():
+        render_panels(panels, target, **chosen)
+
+
+def render_grid(sources: tuple[Path, ...], target: Path, options: dict[str, Any]) -> None:
+    """Draw a grid's section before and after upsampling."""
+    from ..files.grids import read_grid
+    from ..network.network import load_network
+    from ..pictures.sections import check_section, find_plane, render_section
+    from ..pipeline import upsample
+    from ..steps.nodes import check_factor
+
+    check_factor(options["factor"])
+    check_section(options["size"])
+    grid = read_grid(sources[0])
+    find_plane(grid, options["axis"], options["at"])  # raises if there is none
+    field = upsample(grid, load_network(), options["factor"])
+    chosen = {name: options[name] for name in ("axis", "at", "size", "force")}
+    with raising_interrupts():
+        render_section(grid, target, field=field, **chosen)

@@ -1,0 +1,1 @@
+"""The optional machine code of a few steps (extra ``fast``)."""

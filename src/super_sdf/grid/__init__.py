@@ -1,0 +1,4 @@
+"""The coarse input: its samples, and what they say of sign and spacing.
+
+It may import ``machine`` and ``errors``.
+"""

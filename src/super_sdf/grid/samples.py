@@ -1,0 +1,95 @@
+"""What an array must be to hold the samples of a grid: numeric, three-dimensional, finite."""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import GridError, seen
+from .planes import PlaneFile, Samples
+
+Extremes = tuple[float, float]
+"""The smallest and the largest sample."""
+
+MADE_FROM_MASKS = "make them with scipy.ndimage.distance_transform_edt"
+
+
+def as_samples(values: ArrayLike | PlaneFile) -> Samples:
+    """Return an array of samples; a file that is read by planes stays one. None may be masked."""
+    if isinstance(values, PlaneFile):
+        return values
+    try:
+        samples = np.asanyarray(values)
+    except (TypeError, ValueError, RuntimeError):  # ragged lists, tensors on a GPU
+        raise GridError(f"values are {seen(values)}: give an array of three axes") from None
+    if isinstance(samples, np.ma.MaskedArray):
+        return _unmasked(samples)
+    return samples
+
+
+def _unmasked(samples: np.ma.MaskedArray[Any, Any]) -> NDArray[Any]:
+    """Return the data of a masked array, if nothing in it is masked."""
+    masked = np.argwhere(np.ma.getmaskarray(samples))
+    if len(masked):
+        first = ", ".join(map(str, masked[0]))
+        raise GridError(
+            f"{len(masked):,} values are masked, values[{first}] the first: every sample must be "
+            "known; fill unknown far ones with a large distance of the right sign (filled())"
+        )
+    return np.asarray(samples.data)
+
+
+def check_values(values: Samples) -> Extremes:
+    """Return the smallest and largest sample of a finite, numeric, three-dimensional array."""
+    check_kind(values.dtype, values.shape)
+    return _find_extremes(values)
+
+
+def check_kind(dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
+    """Raise if an array of this type and shape holds no grid, whatever its values."""
+    if dtype == np.bool_:
+        raise GridError(
+            f"values are true or false: an occupancy grid holds no distances; {MADE_FROM_MASKS}"
+        )
+    if dtype.kind not in "fiu":
+        raise GridError(f"values have dtype {dtype}: give floating-point or integer numbers")
+    if len(shape) != 3:
+        raise GridError(f"values have shape {shape}: give three axes (x, y, z)")
+    if min(shape) < 2:
+        raise GridError(f"values have shape {shape}: give at least 2 samples on each axis")
+
+
+def _find_extremes(values: Samples) -> Extremes:
+    """Return the smallest and the largest sample, or raise on the first NaN or infinity.
+
+    Plane by plane, for the grid may be in a file. Extremes tell of bad samples, too: the
+    smallest of numbers and a NaN is NaN.
+    """
+    extremes = []
+    for i, plane in enumerate(values):
+        low, high = float(plane.min()), float(plane.max())
+        if not (isfinite(low) and isfinite(high)):
+            with np.errstate(over="ignore", invalid="ignore"):  # of long doubles
+                j, k = np.argwhere(~np.isfinite(plane.astype(np.float64)))[0]
+            raise GridError(
+                f"values[{i}, {j}, {k}] is {plane[j, k]!s}: every sample must be finite; "
+                "replace unknown far samples by a large distance of the right sign"
+            )
+        extremes.append((low, high))
+    lows, highs = zip(*extremes)
+    return min(lows), max(highs)
+
+
+def check_not_flat(values: Samples, extremes: Extremes) -> None:
+    """Raise if the values are constant or an occupancy grid."""
+    low, high = extremes
+    if low == high:
+        raise GridError(f"every value is {low:.6g}: a constant field has no surface")
+    if min(values.shape) > 2 and all(((p == low) | (p == high)).all() for p in values):
+        raise GridError(
+            f"the only values are {low:.6g} and {high:.6g}: an occupancy grid holds no distances; "
+            f"{MADE_FROM_MASKS}"
+        )

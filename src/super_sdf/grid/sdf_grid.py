@@ -1,0 +1,199 @@
+"""The coarse input: a regular grid of signed distances and where it lies in the world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..arrays import Triple
+from .planes import PlaneFile, Samples
+from .samples import Extremes, as_samples, check_not_flat, check_values
+from .sides import check_negative_inside, is_positive_inside
+from .spacing import as_triple, check_spacing, choose_spacing
+
+
+@dataclass(frozen=True, eq=False, init=False, repr=False)
+class SdfGrid:
+    """Signed distances at the points ``world = origin + spacing * (i, j, k)``.
+
+    The constructor takes the values as negative inside and the spacing as known, and refuses values
+    that contradict either. ``make_grid`` infers the sign, and the spacing where it is not given.
+
+    Parameters
+    ----------
+    values : (nx, ny, nz) array_like
+        Signed distances in world units, negative inside; i runs along x, j along y, k along z. A
+        mapped file stays one, and a ``PlaneFile``, too.
+    spacing : float or three floats
+        World distance between neighbouring samples; equal on all axes.
+    origin : float or three floats
+        World position of sample (0, 0, 0); the world's origin unless given.
+
+    Attributes
+    ----------
+    values : (nx, ny, nz) array
+        All samples, negative inside. If they are in a file it is loaded when they are asked for,
+        and they stay in memory; ``planes`` reads some.
+    low, high : float
+        The smallest and the largest of them.
+    notes : tuple of str
+        What was inferred rather than given, a sentence each.
+
+    Raises
+    ------
+    GridError
+        If the array is not three-dimensional, finite, and at least 2 samples long on each axis; if
+        most of its border is negative; if the spacing is not positive and equal on all axes; or if
+        the values change from sample to sample by more than the spacing, or by much less.
+    """
+
+    samples: Samples
+    spacing: Triple
+    origin: Triple
+    notes: tuple[str, ...]
+    positive_inside: bool
+    low: float
+    high: float
+
+    def __init__(
+        self, values: ArrayLike | PlaneFile, spacing: ArrayLike, origin: ArrayLike = 0.0
+    ) -> None:
+        samples, extremes = _checked(values)
+        check_negative_inside(samples)
+        notes: list[str] = []
+        chosen = choose_spacing(samples, check_spacing(spacing), notes)
+        self._set(samples, chosen, origin, tuple(notes), False, extremes)
+
+    @classmethod
+    def trusted(
+        cls,
+        values: ArrayLike | PlaneFile,
+        spacing: ArrayLike,
+        origin: ArrayLike = 0.0,
+        notes: tuple[str, ...] = (),
+        *,
+        positive_inside: bool = False,
+        extremes: Extremes | None = None,
+    ) -> SdfGrid:
+        """Return a grid whose sign and spacing are known and therefore not checked.
+
+        With ``positive_inside`` the values are read with the other sign. With ``extremes``, their
+        smallest and largest, they are not searched for NaN and infinity again.
+        """
+        samples = as_samples(values)
+        grid = object.__new__(cls)
+        found = extremes or check_values(samples)
+        grid._set(samples, check_spacing(spacing), origin, notes, positive_inside, found)
+        return grid
+
+    def _set(
+        self,
+        samples: Samples,
+        spacing: Triple,
+        origin: ArrayLike,
+        notes: tuple[str, ...],
+        positive_inside: bool,
+        extremes: Extremes,
+    ) -> None:
+        """Set all fields."""
+        set_ = partial(object.__setattr__, self)
+        low, high = extremes
+        set_("samples", samples)
+        set_("spacing", spacing)
+        set_("origin", as_triple(origin, "origin"))
+        set_("notes", notes)
+        set_("positive_inside", positive_inside)
+        set_("low", -high if positive_inside else low)
+        set_("high", -low if positive_inside else high)
+
+    def __repr__(self) -> str:
+        shape = " x ".join(map(str, self.shape))
+        spacing, origin = (", ".join(f"{x:.6g}" for x in at) for at in (self.spacing, self.origin))
+        return (
+            f"SdfGrid({shape} {self.samples.dtype}, spacing {spacing}, origin {origin}, "
+            f"values {self.low:.6g} to {self.high:.6g})"
+        )
+
+    @property
+    def values(self) -> NDArray[Any]:
+        """All samples, negative inside."""
+        samples = self.samples
+        whole = samples.loaded if isinstance(samples, PlaneFile) else samples
+        return negated(whole) if self.positive_inside else whole
+
+    def planes(self, first: int, last: int) -> NDArray[Any]:
+        """Return the samples with i from ``first`` to before ``last``, negative inside."""
+        samples = self.samples[first:last]
+        return negated(samples) if self.positive_inside else samples
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Samples along x, y and z."""
+        nx, ny, nz = self.samples.shape
+        return nx, ny, nz
+
+    @property
+    def voxel_size(self) -> float:
+        """The spacing h, in world units."""
+        return sum(self.spacing) / 3
+
+
+def make_grid(
+    values: ArrayLike | PlaneFile,
+    *,
+    spacing: ArrayLike | None = None,
+    origin: ArrayLike | None = None,
+    inside: str = "auto",
+) -> SdfGrid:
+    """Make a grid from an array of signed distances, inferring what is not given.
+
+    Parameters
+    ----------
+    values : (nx, ny, nz) array_like
+        Signed distances; i runs along x, j along y, k along z.
+    spacing : number or three, optional
+        World distance between samples; estimated from the gradient if not given.
+    origin : three numbers, optional
+        World position of sample (0, 0, 0); the world's origin if not given.
+    inside : {"auto", "negative", "positive"}
+        The sign of samples inside the solid; "auto" takes the border of the grid for outside.
+
+    Returns
+    -------
+    SdfGrid
+        Negative inside; ``notes`` says what was inferred.
+
+    Raises
+    ------
+    GridError
+        If the values are no signed distances, or contradict the spacing.
+    OptionError
+        If ``inside`` is another word.
+    """
+    samples, extremes = _checked(values)
+    notes: list[str] = []
+    flipped = is_positive_inside(samples, inside, extremes, notes)
+    chosen = choose_spacing(samples, spacing, notes)
+    if origin is None:
+        notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
+    at = 0.0 if origin is None else origin
+    return SdfGrid.trusted(
+        samples, chosen, at, tuple(notes), positive_inside=flipped, extremes=extremes
+    )
+
+
+def _checked(values: ArrayLike | PlaneFile) -> tuple[Samples, Extremes]:
+    """Return samples that can be those of a solid, with the smallest and the largest."""
+    samples = as_samples(values)
+    extremes = check_values(samples)
+    check_not_flat(samples, extremes)
+    return samples, extremes
+
+
+def negated(values: NDArray[Any]) -> NDArray[Any]:
+    """Return the values with the other sign, unsigned integers among them."""
+    return -values.astype(np.promote_types(values.dtype, np.float32))

@@ -1,0 +1,43 @@
+"""Optional packages: which extra brings which, and how an extra is installed."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+from ..errors import FileError
+
+# Modules that the extras bring, beside those of the extra that they build on.
+EXTRAS = {
+    "fast": ("numba",),
+    "3mf": ("lxml", "networkx"),
+    "eval": ("igl", "matplotlib", "scipy", "skimage"),
+    "view": ("pyvista",),
+    "peers": ("gpytoolbox",),
+}
+BUILT_ON = {"view": "eval", "peers": "eval"}
+
+
+def all_modules(extra: str) -> tuple[str, ...]:
+    """Return the modules of an extra and of the one that it builds on."""
+    below = EXTRAS[BUILT_ON[extra]] if extra in BUILT_ON else ()
+    return (*below, *EXTRAS[extra])
+
+
+def missing_modules(modules: tuple[str, ...]) -> list[str]:
+    """Return those of the modules that are not installed."""
+    return [name for name in modules if find_spec(name) is None]
+
+
+def how_to_install(extra: str) -> str:
+    """Return the command that installs an extra: the package is installed from its sources."""
+    return f"pip install -e '.[{extra}]' in a clone of super-sdf"
+
+
+def check_modules(what: str, extra: str, modules: tuple[str, ...] | None = None) -> None:
+    """Raise FileError if modules that ``what`` needs are missing, with the extra that brings them.
+
+    ``modules`` are those needed, all of the extra unless given.
+    """
+    missing = missing_modules(all_modules(extra) if modules is None else modules)
+    if missing:
+        raise FileError(f"{what} needs {', '.join(missing)}: {how_to_install(extra)}")

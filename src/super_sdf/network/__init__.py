@@ -1,0 +1,4 @@
+"""The network: an ONNX file, its contract, and the device that it runs on.
+
+It may import ``machine`` and what lies below.
+"""

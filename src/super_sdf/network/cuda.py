@@ -1,0 +1,113 @@
+"""What CUDA needs of this machine, and what of it is missing, in plain words.
+
+onnxruntime itself falls back to the CPU without a word: see ``device``.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import io
+import re
+import subprocess
+import sys
+from contextlib import redirect_stdout
+from pathlib import Path
+
+from ..errors import DeviceError
+from .onnx import ort
+
+CUDA = "CUDAExecutionProvider"
+DRIVER = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
+
+
+def available_devices() -> list[str]:
+    """Return the devices that this onnxruntime was built for."""
+    return ["cpu"] + ["cuda"] * (CUDA in ort.get_available_providers())
+
+
+def onnxruntime_version() -> str:
+    """Return the version of onnxruntime with that of the CUDA it was built for."""
+    cuda = getattr(ort, "cuda_version", "")
+    return f"onnxruntime {ort.__version__}" + (f" for CUDA {cuda}" if cuda else "")
+
+
+def check_cuda() -> None:
+    """Raise DeviceError if onnxruntime has no CUDA or does not find its libraries."""
+    if CUDA not in ort.get_available_providers():
+        raise DeviceError(
+            f"{onnxruntime_version()} here has no CUDA provider: install onnxruntime-gpu in place "
+            "of onnxruntime"
+        )
+    if not has_driver():
+        raise DeviceError(f"there is no {DRIVER}: install the NVIDIA driver")
+    library = missing_library()
+    if library:
+        raise DeviceError(
+            f"{onnxruntime_version()} does not find {library}: pip install "
+            "'onnxruntime-gpu[cuda,cudnn]' brings CUDA's libraries"
+        )
+
+
+def missing_library() -> str | None:
+    """Return the first library that onnxruntime's CUDA provider wants and that is not there.
+
+    The loader is asked, with the very file that onnxruntime would load, for its list of libraries
+    is another in each version. None where the loader does not name files (Windows).
+    """
+    if hasattr(ort, "preload_dlls"):  # since 1.21; finds what pip installed
+        with redirect_stdout(io.StringIO()):  # it prints
+            ort.preload_dlls()
+    provider = Path(ort.__file__).parent / "capi" / "libonnxruntime_providers_cuda.so"
+    try:
+        ctypes.CDLL(str(provider))
+    except OSError as error:
+        library, _, reason = str(error).partition(": ")
+        return library if "cannot open shared object file" in reason else None
+    return None
+
+
+def has_gpu() -> bool:
+    """Say whether this machine seems to have an NVIDIA GPU: its device file or its driver."""
+    return Path("/dev/nvidia0").exists() or has_driver()
+
+
+def has_driver() -> bool:
+    """Say whether the NVIDIA driver's library is there."""
+    try:
+        ctypes.CDLL(DRIVER)
+    except OSError:
+        return False
+    return True
+
+
+def describe_gpu() -> str | None:
+    """Return the first GPU's name, driver and memory, None where nvidia-smi does not say."""
+    values = query_gpu("name", "driver_version", "memory.total", "memory.used")
+    if values is None:
+        return None
+    name, driver, total, used = values
+    free = (int(total) - int(used)) * 2**20 / 1e9
+    return f"{name}, driver {driver}, {free:.1f} GB free"
+
+
+def query_gpu(*fields: str) -> list[str] | None:
+    """Ask nvidia-smi for fields of the first GPU; memory comes in MiB."""
+    words = ["nvidia-smi", "-i", "0", f"--query-gpu={','.join(fields)}"]
+    try:
+        run = subprocess.run(
+            [*words, "--format=csv,noheader,nounits"], capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return run.stdout.strip().split(", ")
+
+
+def first_line(error: Exception) -> str:
+    """Return what an error of onnxruntime says, in one line.
+
+    Where CUDA failed that is inside a long line of source files and template arguments.
+    """
+    failure = re.search(r"CUDA failure \d+: [^;\n]*", str(error))
+    if failure:
+        return failure[0].strip()
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)

@@ -1,0 +1,167 @@
+"""How a grid is cut into slabs so that the work fits in memory: decided before it begins.
+
+The result is the same for every cut. What a block's values depend on ends some planes away:
+
+    planes of the slab                   its vertices and triangles are made
+    + FINAL_BESIDE                       values must be final: which vertices are whose
+    + spheres.REACH_IN_VOXELS            blocks are decoded
+    + the network's receptive field      voxels are shown to the network
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from ..errors import OutOfMemoryError
+from ..machine import index_width
+from ..machine.memory import held_memory, hold_less, in_words
+from ..steps.spheres import REACH_IN_VOXELS
+from ..steps.survey import Band
+from .footprint import NETWORK_BYTES, slab_bytes
+
+FINAL_BESIDE = 1
+DECODED_BESIDE = FINAL_BESIDE + REACH_IN_VOXELS
+
+
+@dataclass(frozen=True)
+class Slab:
+    """Planes of voxels to be meshed, from the first to before the last, and rows of the band.
+
+    Attributes
+    ----------
+    planes : two ints
+        The slab's own planes.
+    decoded : slice
+        Voxels among which are those to decode.
+    seen : slice
+        Voxels that the network sees.
+    """
+
+    planes: tuple[int, int]
+    decoded: slice
+    seen: slice
+
+
+def whole(band: Band) -> Slab:
+    """Return the whole band as one slab."""
+    return Slab((0, band.shape[0]), band.all_rows, band.all_rows)
+
+
+def plan_slabs(
+    band: Band,
+    factor: int,
+    receptive_field: int | None,
+    bound: int | None,
+    network_bytes: tuple[float, float] = NETWORK_BYTES,
+) -> list[Slab]:
+    """Return the fewest slabs that fit, in order, and whose nodes can be numbered.
+
+    Parameters
+    ----------
+    band : Band
+        Of the whole grid.
+    factor : int
+        K.
+    receptive_field : int, optional
+        Voxels to each side that the network's answer depends on; if it is not known, the network
+        must see the whole band at once.
+    bound : int, optional
+        Bytes that the process may hold in all: see ``memory.memory_bound``.
+    network_bytes : two floats
+        What the network takes: see ``footprint.slab_bytes``.
+
+    Raises
+    ------
+    OutOfMemoryError
+        If the thinnest slabs do not fit.
+    OptionError
+        If they have more nodes than can be numbered, or the mesh more vertices, as far as that can
+        be said.
+    """
+    check_vertices(band, factor)
+    how = "at once" if receptive_field is None else "even plane by plane"
+    for nth, slabs in enumerate(_ways(band, receptive_field)):
+        if nth == 1:
+            hold_less()  # else what was freed counts as held
+        need = peak_bytes(band, slabs, factor, network_bytes)
+        nodes = most_nodes(band, slabs, factor)
+        fits = bound is None or need <= bound
+        if fits and nodes <= index_width.LARGEST:
+            return slabs
+    index_width.check_count(nodes, f"nodes {how}", factor)
+    raise _does_not_fit(band, factor, how, need, bound or 0)
+
+
+def _ways(band: Band, receptive_field: int | None) -> Iterator[list[Slab]]:
+    """Yield the whole band, and if the network need not see it at once, more and more slabs."""
+    yield [whole(band)]
+    if receptive_field is not None:
+        yield from ways_to_cut(band, receptive_field)
+
+
+def check_vertices(band: Band, factor: int) -> None:
+    """Raise if the mesh will surely have more vertices than can be numbered.
+
+    The surface crosses K^2 times as many edges of the fine lattice as between samples, about; only
+    far more than can be numbered are refused before they are counted.
+    """
+    if int(band.decoded_before[-1]) * 3 * factor**3 > index_width.LARGEST:
+        check_count = index_width.check_count
+        check_count(band.count_crossings() * factor**2 // 2, "vertices, at the least", factor)
+
+
+def most_nodes(band: Band, slabs: list[Slab], factor: int) -> int:
+    """Return how many nodes the blocks of a slab have at the most, shared ones as often."""
+    return max(band.count_decoded(slab.decoded) for slab in slabs) * (factor + 1) ** 3
+
+
+def peak_bytes(
+    band: Band,
+    slabs: list[Slab],
+    factor: int,
+    network_bytes: tuple[float, float] = NETWORK_BYTES,
+) -> int:
+    """Return what the process will hold at the most: now, and for the largest slab."""
+    held = held_memory() or band.patches.nbytes
+    needs = (
+        slab_bytes(band, slab.seen, slab.decoded, slab.planes, factor, network_bytes)
+        for slab in slabs
+    )
+    return held + max(needs)
+
+
+def cut(band: Band, pieces: int, receptive_field: int) -> list[Slab]:
+    """Cut a band into slabs with about the same number of decoded voxels, at most so many."""
+    share = band.decoded_before / max(int(band.decoded_before[-1]), 1)
+    inner = np.searchsorted(share, np.arange(1, pieces) / pieces)
+    bounds = np.unique(np.clip([0, *inner, band.shape[0]], 0, band.shape[0])).tolist()
+    return [_slab(band, first, last, receptive_field) for first, last in pairwise(bounds)]
+
+
+def ways_to_cut(band: Band, receptive_field: int) -> Iterator[list[Slab]]:
+    """Yield cuts into more and more slabs, down to slabs of one plane."""
+    for pieces in range(1, band.shape[0]):
+        yield cut(band, pieces, receptive_field)
+    planes = np.flatnonzero(np.diff(band.decoded_before)).tolist()  # each slab decodes something
+    bounds = [0, *planes[1:], band.shape[0]]
+    yield [_slab(band, first, last, receptive_field) for first, last in pairwise(bounds)]
+
+
+def _slab(band: Band, first: int, last: int, receptive_field: int) -> Slab:
+    """Return a slab with what it depends on."""
+    decoded = band.rows(first - DECODED_BESIDE, last + DECODED_BESIDE)
+    beside = DECODED_BESIDE + receptive_field
+    return Slab((first, last), decoded, band.rows(first - beside, last + beside))
+
+
+def _does_not_fit(band: Band, factor: int, how: str, need: int, bound: int) -> OutOfMemoryError:
+    """Return the error for work that is too large."""
+    return OutOfMemoryError(
+        f"factor {factor} on {int(band.decoded_before[-1]):,} voxels needs {in_words(need)} of "
+        f"memory {how}, {in_words(bound)} may be taken; use a smaller factor, or allow more "
+        "(--max-memory)"
+    )

@@ -1,0 +1,72 @@
+"""What a slab takes in memory, stage by stage, at the most."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..machine.compiling import is_loaded, must_compile
+from ..machine.threads import CHUNK, rows_in_chunk, threads_at_work
+from ..steps.marching import LOOKUP_BYTES, lookups_at_once
+from ..steps.survey import Band
+
+# What a process takes at the most in each stage after the network, measured (``benchmarks.large``,
+# ``benchmarks.bounds``), in bytes: for each voxel that the network sees, for each that is decoded,
+# for each node of a decoded block, for each thread's chunk, and whatever the grid.
+STAGES = {
+    "average": (108, 375, 7.2, 1e7, 5e6),
+    "fit": (108, 850, 3.3, 1e7, 1e7),
+    "isosurface": (108, 140, 5.7, 1e7, 5e6),
+}
+# A network's own, unless it says otherwise: bytes for each voxel that it sees, its neighbours among
+# them, and for each value.
+NETWORK_BYTES = (680.0, 8.0)
+# The head of a network works on a chunk of voxels at all offsets at a time.
+BYTES_PER_OFFSET = 27_000
+NETWORK_FIXED = 5_000_000
+# Compiled functions, which come from the disk as they are called.
+CODE_BYTES = 60_000_000
+# The first process that uses them compiles them.
+COMPILER_BYTES = 60_000_000
+
+Range = tuple[int, int]
+
+
+def slab_bytes(
+    band: Band,
+    seen: slice,
+    decoded: slice,
+    planes: Range,
+    factor: int,
+    network_bytes: tuple[float, float] = NETWORK_BYTES,
+) -> int:
+    """Return what a process takes for a slab beside what it holds already, at the most.
+
+    ``network_bytes`` is for each voxel that the network sees, and for each value.
+    """
+    voxels, own = seen.stop - seen.start, band.count_decoded(decoded)
+    values = own * (factor + 1) ** 3
+    threads = min(threads_at_work(), values // CHUNK + 1)
+    sizes = np.array([voxels, own, values, threads, 1])
+    needs = dict(zip(STAGES, np.array(list(STAGES.values())) @ sizes))
+    needs["isosurface"] += _lookup_bytes(band, planes, own, factor)
+    needs["network"] = _bytes_for_network(voxels, own, factor, network_bytes)
+    code = CODE_BYTES * is_loaded() + COMPILER_BYTES * must_compile()
+    return code + int(max(needs.values()))
+
+
+def _bytes_for_network(
+    voxels: int, decoded: int, factor: int, network_bytes: tuple[float, float]
+) -> float:
+    """Return what the network takes: it is asked for as many voxels as offsets, at least."""
+    offsets = (factor + 1) ** 3
+    fixed = BYTES_PER_OFFSET * offsets + NETWORK_FIXED
+    return float(np.dot(network_bytes, [voxels, max(decoded, offsets) * offsets])) + fixed
+
+
+def _lookup_bytes(band: Band, planes: Range, decoded: int, factor: int) -> int:
+    """Return what the tables take in which the vertices of whole planes are looked up."""
+    nodes_of_voxel = factor**2 * (factor + 1)  # of a flat sheet of voxels; a solid has fewer
+    before = band.decoded_before[max(planes[0] - 1, 0) : planes[1] + 1]
+    two_planes = int((before[2:] - before[:-2]).max()) if len(before) > 2 else decoded
+    widest = min(two_planes + rows_in_chunk((factor + 1) ** 3), decoded) * nodes_of_voxel
+    return LOOKUP_BYTES * widest * lookups_at_once(decoded * nodes_of_voxel, widest)

@@ -1,0 +1,103 @@
+"""The 256 cases of marching cubes, made from one rule instead of copied.
+
+A cell has 8 corners, numbered ``4 x + 2 y + z``, and 12 edges. A case has a bit for each corner
+that is inside. On every face of the cell the surface is cut in segments, so that inside corners
+at opposite ends of a diagonal stay apart: the rule sees only that face, so the cells on its two
+sides agree (Lorensen and Cline 1987, with a face-consistent choice in the ambiguous cases; Montani
+et al. 1994). The segments close to loops, and each loop is cut into triangles by diagonals that
+do not lie on a face, so that no edge can belong to more than two triangles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+
+import numpy as np
+
+from ..arrays import IntArray
+
+CORNERS: IntArray = np.indices((2, 2, 2)).reshape(3, 8).T.astype(np.int32)
+# Edge e runs from corner EDGE_START[e] one step along EDGE_AXIS[e].
+EDGE_START = (0, 1, 2, 3, 0, 1, 4, 5, 0, 2, 4, 6)
+EDGE_AXIS = (0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2)
+# The corners of each face in counter-clockwise order, seen from outside the cell.
+FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+
+_STEP = (4, 2, 1)
+_EDGE_BETWEEN = {
+    frozenset((start, start + _STEP[axis])): edge
+    for edge, (start, axis) in enumerate(zip(EDGE_START, EDGE_AXIS))
+}
+
+
+@lru_cache(maxsize=1)
+def triangle_table() -> tuple[IntArray, IntArray]:
+    """Return the triangles of every case.
+
+    Returns
+    -------
+    (256,) int32 and (256, T, 3) int32
+        How many triangles a case has, and the cell edges that carry their vertices, in an order
+        that makes them look from inside to outside; unused rows are 0.
+    """
+    cases = [[t for loop in _loops(case) for t in _triangulate(loop)] for case in range(256)]
+    counts = np.array([len(triangles) for triangles in cases], np.int32)
+    table = np.zeros((256, counts.max(), 3), np.int32)
+    for case, triangles in enumerate(cases):
+        if triangles:
+            table[case, : len(triangles)] = triangles
+    return counts, table
+
+
+def _loops(case: int) -> Iterator[list[int]]:
+    """Yield the closed loops of cell edges that the surface crosses."""
+    after = dict(segment for face in FACES for segment in _segments(case, face))
+    while after:
+        first, edge = after.popitem()
+        loop = [first]
+        while edge != first:
+            loop.append(edge)
+            edge = after.pop(edge)
+        yield loop
+
+
+def _segments(case: int, face: tuple[int, ...]) -> Iterator[tuple[int, int]]:
+    """Yield the segments on a face: one for each run of inside corners, from its start to its end.
+
+    Going round counter-clockwise, a run starts where outside turns to inside.
+    """
+    inside = [bool(case >> corner & 1) for corner in face]
+    for at in range(4):
+        if inside[at] and not inside[at - 1]:
+            end = next(n for n in range(at, at + 4) if not inside[(n + 1) % 4])
+            leaving = frozenset((face[end % 4], face[(end + 1) % 4]))
+            entering = frozenset((face[at - 1], face[at]))
+            yield _EDGE_BETWEEN[entering], _EDGE_BETWEEN[leaving]
+
+
+def _triangulate(loop: list[int]) -> list[tuple[int, int, int]]:
+    """Cut a loop into triangles without a diagonal on a face of the cell."""
+    if len(loop) < 3:
+        return []
+    first, last = loop[0], loop[-1]
+    for middle in range(1, len(loop) - 1):
+        left, right = loop[: middle + 1], loop[middle:]
+        if all(len(part) == 2 or not _share_face(part[0], part[-1]) for part in (left, right)):
+            try:
+                parts = _triangulate(left) + _triangulate(right)
+            except _CannotCutError:
+                continue
+            return [(first, loop[middle], last), *parts]
+    raise _CannotCutError
+
+
+class _CannotCutError(Exception):
+    """Raised for a part of a loop that cannot be cut; another middle may do."""
+
+
+def _share_face(a: int, b: int) -> bool:
+    """Say whether two cell edges lie on one face."""
+    ends = {EDGE_START[a], EDGE_START[a] + _STEP[EDGE_AXIS[a]]}
+    ends |= {EDGE_START[b], EDGE_START[b] + _STEP[EDGE_AXIS[b]]}
+    return any(ends <= set(face) for face in FACES)

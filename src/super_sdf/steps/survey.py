@@ -1,0 +1,203 @@
+"""The band of a whole grid, found plane by plane: all that is kept of the input.
+
+It grows with the surface, 123 bytes a voxel, not with the grid, and the grid is read once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import BoolArray, FloatArray, IntArray
+from ..errors import NoSurfaceError, OutOfMemoryError
+from ..grid.sdf_grid import SdfGrid
+from ..machine.memory import held_memory, in_words
+from ..machine.threads import side_by_side
+from ..neighbourhood import CENTRE, STRIDES
+from .band import (
+    can_hold_surface,
+    find_band,
+    gather_patches,
+    is_lipschitz,
+    neighbour_table,
+    plane_blocks,
+    rescale,
+)
+from .offsets import Jumps, check_not_cut_off, check_not_filled, find_jumps
+from .spheres import exact_samples
+
+BYTES_PER_VOXEL = 123  # of a band
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """The active voxels of a grid (Eq. 2) and what their samples say.
+
+    Attributes
+    ----------
+    shape : three ints
+        Samples of the grid along each axis.
+    voxel_ijk : (V, 3) int32
+        The voxels, in C order.
+    patches : (V, 27) float32
+        The samples round each, in half voxels.
+    lipschitz : (V,) bool
+        Where they can be distances.
+    decoded : (V,) bool
+        Which voxels can hold the surface.
+    exact : (V,) bool
+        Which samples can be taken for exact distances.
+    """
+
+    shape: tuple[int, int, int]
+    voxel_ijk: IntArray
+    patches: FloatArray
+    lipschitz: BoolArray
+    decoded: BoolArray
+    exact: BoolArray
+
+    @property
+    def all_rows(self) -> slice:
+        """The rows of all voxels."""
+        return slice(0, len(self.voxel_ijk))
+
+    def rows(self, first: int, last: int) -> slice:
+        """Return the rows of the voxels in planes ``first`` to before ``last``."""
+        low, high = max(first, 0), min(last, self.shape[0])
+        return slice(int(self.seen_before[low]), int(self.seen_before[high]))
+
+    @cached_property
+    def seen_before(self) -> NDArray[np.int64]:
+        """How many voxels there are before each plane, and in all, (nx + 1,)."""
+        return np.searchsorted(self.voxel_ijk[:, 0], np.arange(self.shape[0] + 1))
+
+    @cached_property
+    def decoded_before(self) -> NDArray[np.int64]:
+        """How many voxels to decode there are before each plane, and in all, (nx + 1,)."""
+        return np.append(0, np.cumsum(self.decoded))[self.seen_before]
+
+    def count_decoded(self, rows: slice) -> int:
+        """Return how many voxels are to be decoded in rows of whole planes."""
+        first, last = np.searchsorted(self.seen_before, [rows.start, rows.stop])
+        return int(self.decoded_before[last] - self.decoded_before[first])
+
+    def count_crossings(self) -> int:
+        """Return between how many samples and their next along an axis the surface passes."""
+        inside = self.patches[:, CENTRE] <= 0
+        return sum(
+            int(np.count_nonzero(inside != (self.patches[:, CENTRE + step] <= 0)))
+            for step in STRIDES
+        )
+
+    def network_inputs(
+        self, seen: slice | None = None, decoded: slice | None = None
+    ) -> tuple[FloatArray, IntArray, IntArray]:
+        """Return what the network is asked: patches, neighbours, and which voxels to decode.
+
+        It sees the voxels in rows ``seen``, and decodes of those in rows ``decoded`` what can hold
+        the surface; all unless given.
+        """
+        seen, decoded = seen or self.all_rows, decoded or self.all_rows
+        table = neighbour_table(*_cropped(self.voxel_ijk[seen], self.shape))
+        voxels = np.flatnonzero(self.decoded[decoded]) + decoded.start - seen.start
+        return self.patches[seen], table, voxels.astype(np.int32)
+
+
+def _cropped(voxel_ijk: IntArray, shape: tuple[int, int, int]) -> tuple[IntArray, tuple[int, ...]]:
+    """Return voxels counted from the first plane in which there is one, and so many planes."""
+    first, last = int(voxel_ijk[0, 0]), int(voxel_ijk[-1, 0])
+    return voxel_ijk - np.array([first, 0, 0], np.int32), (last - first + 1, *shape[1:])
+
+
+def survey(grid: SdfGrid, offset: float = 0.0, bound: int | None = None) -> Band:
+    """Read a grid once and return its band.
+
+    ``offset`` (world units, positive outwards) is the distance at which the surface is looked for.
+    ``bound`` is how many bytes the process may hold.
+
+    Raises
+    ------
+    GridError
+        If the distances end too near to the offset.
+    OutOfMemoryError
+        As soon as the band alone is larger than the bound: it is not worth reading on.
+    """
+    sizes: list[int] = []
+    jumps: list[tuple[Jumps, Jumps]] = []
+    held = held_memory() or 0
+
+    def read(planes: slice) -> tuple[IntArray, FloatArray]:
+        found = _band_of_planes(grid, offset, planes.start, planes.stop, jumps)
+        sizes.append(len(found[0]))
+        _check_bound(sum(sizes), planes.stop, held, bound)
+        return found
+
+    parts = side_by_side([slice(*block) for block in plane_blocks(grid.shape)], read)
+    voxel_ijk = np.concatenate([ijk for ijk, _ in parts])
+    patches = [part for _, part in parts]
+    del parts
+    if offset:
+        if not any(up.near for up, _ in jumps):
+            raise no_surface(grid, offset)
+        check_not_filled(jumps, offset, grid.voxel_size)
+    return describe(grid.shape, voxel_ijk, _joined(patches))
+
+
+def _check_bound(voxels: int, planes: int, held: int, bound: int | None) -> None:
+    """Raise if so many voxels of the band do not fit in what of the bound is not held already.
+
+    If that is nothing, the band is not at fault unless it is larger than the bound by itself.
+    """
+    need = voxels * BYTES_PER_VOXEL
+    if bound is not None and need > (bound - held if held < bound else bound):
+        raise OutOfMemoryError(
+            f"the band of the first {planes:,} planes has {voxels:,} voxels already, which alone "
+            f"take {in_words(need)} of memory, {in_words(bound)} may be taken in all; is this a "
+            "distance field? If so, allow more (--max-memory)"
+        )
+
+
+def describe(shape: tuple[int, int, int], voxel_ijk: IntArray, patches: FloatArray) -> Band:
+    """Return a band with all that its patches say."""
+    lipschitz = is_lipschitz(patches)
+    decoded = can_hold_surface(patches, lipschitz)
+    return Band(shape, voxel_ijk, patches, lipschitz, decoded, exact_samples(patches, lipschitz))
+
+
+def _band_of_planes(
+    grid: SdfGrid, offset: float, first: int, last: int, jumps: list[tuple[Jumps, Jumps]]
+) -> tuple[IntArray, FloatArray]:
+    """Return the voxels of some planes, and their patches: they see one plane further.
+
+    With an offset, how far the distances go is looked at too, and ``jumps`` added to.
+    """
+    low, high = max(first - 1, 0), min(last + 1, grid.shape[0])
+    rescaled = rescale(grid, offset, low, high)
+    ijk = find_band(rescaled)
+    own = ijk[(ijk[:, 0] >= first - low) & (ijk[:, 0] < last - low)]
+    patches = gather_patches(rescaled, own)
+    if offset:  # at 0 there is no nearer surface to be had
+        check_not_cut_off(patches, offset, grid.voxel_size)
+        jumps.append(find_jumps(rescaled))
+    return own + np.array([low, 0, 0], np.int32), patches
+
+
+def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:
+    """Return the error for a grid in which nothing is to be found."""
+    return NoSurfaceError(
+        f"no surface at {offset:g}: the values go from {grid.low:.6g} to {grid.high:.6g}"
+    )
+
+
+def _joined(parts: list[FloatArray]) -> FloatArray:
+    """Return the arrays in one and empty the list, so that there is hardly a second copy."""
+    joined = np.empty((sum(map(len, parts)), 27), np.float32)
+    start = len(joined)
+    while parts:
+        part = parts.pop()
+        start -= len(part)
+        joined[start : start + len(part)] = part
+    return joined

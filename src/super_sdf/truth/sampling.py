@@ -1,0 +1,236 @@
+"""Signed distance grids of solids: every sample exact, or every sample near the surface.
+
+The grid is worked through in cubes of 8^3 samples. The distance at a cube's centre tells whether
+any of its samples can lie in the band; only those cubes are evaluated. The sign is asked once for
+each connected region away from the surface, since it cannot change there; of an open mesh it can,
+so every sample is asked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import prod
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from ..arrays import FloatArray
+from ..errors import MeshError, OptionError, seen
+from ..grid.sdf_grid import SdfGrid
+from ..machine.memory import check_fits
+from ..mesh import Mesh
+from .solid import Points, Solid
+
+EDGE = 8  # samples along a cube
+CHUNK = 512  # cubes at a time: 2^18 points, 20 MB
+EXACT_SAMPLES = 1 << 24  # up to 256^3 every sample is exact unless a band is asked for
+BIG_GRID_BAND = 4.0  # voxels; the upsampling looks no farther than 1.5 + sqrt(3)
+LEAST_BAND = 1.5  # voxels; the pipeline's band
+MOST_ALONG_AXIS = 1e9  # samples; beyond, only a wrong number was given
+SMALLEST, LARGEST = 1e-30, 1e30  # spacing and extent that float32 holds with all its digits
+POSITION_ERROR = 1e-4  # of the spacing, that a sample may be off its place
+WORK_BYTES = 500_000_000  # beside the values: search trees and chunks
+
+Progress = Callable[[int, int], None]
+Layout = tuple[tuple[int, int, int], float, NDArray[np.float64]]
+"""Samples along the axes, spacing, and the position of sample (0, 0, 0)."""
+
+
+def check_numbers(
+    *,
+    n: int | None = None,
+    spacing: float | None = None,
+    padding: float = 2.0,
+    band: float | None = None,
+) -> None:
+    """Raise OptionError if a number makes no grid, whatever the mesh; those not given are fine."""
+    if n is not None and n < 2:
+        raise OptionError(f"n is {n}: give at least 2 samples along the longest axis")
+    if n is not None and n >= MOST_ALONG_AXIS:
+        raise OptionError(f"n is {seen(n)}: give fewer than {MOST_ALONG_AXIS:g} samples")
+    if spacing is not None and not 0 < spacing < np.inf:
+        raise OptionError(f"spacing is {spacing:g}: it must be greater than 0")
+    if not 0 <= padding < np.inf:
+        raise OptionError(f"padding is {padding:g}: give 0 voxels or more")
+    if n is not None and n - 1 - 2 * padding < 1:
+        raise OptionError(f"{n} samples leave no room within a padding of {padding:g} voxels")
+    if band is not None and not band >= LEAST_BAND:
+        raise OptionError(f"band is {band:g}: give at least {LEAST_BAND:g} voxels")
+
+
+def unit_layout(n: int, side: float = 1.0) -> Layout:
+    """Return the layout of the test grids: voxel centres (i + 1/2)/n - 1/2, times ``side``."""
+    check_numbers(n=n, padding=0)
+    return (n, n, n), side / n, np.full(3, (0.5 / n - 0.5) * side)
+
+
+def fitted_layout(
+    mesh: Mesh, *, n: int | None = None, spacing: float | None = None, padding: float = 2.0
+) -> Layout:
+    """Return the layout of a grid round a mesh, in the mesh's units.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        What is to be sampled.
+    n : int
+        Samples along the longest axis of its box; or else
+    spacing : float
+        world distance between samples.
+    padding : float
+        Voxels between the box and the outer samples, at least.
+
+    Raises
+    ------
+    OptionError
+        If not exactly one of n and spacing is given, or a number is out of range.
+    """
+    if (n is None) == (spacing is None):
+        raise OptionError("give either the number of samples or the spacing")
+    check_numbers(n=n, spacing=spacing, padding=padding)
+    low, high = mesh.vertices.min(0).astype(np.float64), mesh.vertices.max(0).astype(np.float64)
+    if spacing is None:
+        spacing = float((high - low).max() / ((n or 0) - 1 - 2 * padding))
+    with np.errstate(over="ignore"):
+        steps = np.ceil((high - low) / spacing + 2 * padding - 1e-6)
+        origin = (low + high - steps * spacing) / 2  # not finite: refused by the grid
+    if steps.max() >= MOST_ALONG_AXIS:
+        raise OptionError(
+            f"a spacing of {spacing:g} and a padding of {padding:g} voxels make {steps.max():.3g} "
+            f"samples along an axis of a mesh {(high - low).max():g} long: give fewer"
+        )
+    nx, ny, nz = (int(count) + 1 for count in steps)
+    return (nx, ny, nz), spacing, origin
+
+
+def sample_solid(
+    solid: Solid, layout: Layout, *, band: float | None = None, progress: Progress | None = None
+) -> SdfGrid:
+    """Sample a solid as a grid that the pipeline takes.
+
+    Unless a band is given, grids over 256^3 samples are cut off ``BIG_GRID_BAND`` voxels from the
+    surface, and a note says so. See ``sample_grid``.
+    """
+    shape, spacing, origin = layout
+    notes = []
+    if band is None and prod(shape) > EXACT_SAMPLES:
+        band = BIG_GRID_BAND
+    if band is not None and band < np.inf:
+        notes.append(f"distances are exact up to {band:g} voxels and cut off there")
+    values = sample_grid(solid, layout, band=np.inf if band is None else band, progress=progress)
+    return SdfGrid.trusted(values, spacing, origin, tuple(notes))
+
+
+def sample_grid(
+    solid: Solid, layout: Layout, *, band: float = np.inf, progress: Progress | None = None
+) -> FloatArray:
+    """Return the signed distance at every sample of a grid, (nx, ny, nz) float32.
+
+    Parameters
+    ----------
+    solid : Solid
+        What is sampled.
+    layout : shape, spacing and origin
+        ``world = origin + spacing * ijk``.
+    band : float
+        In voxels: distances are exact (to float32) up to so far, and cut off there.
+    progress : callable, optional
+        Called with (cubes done, cubes in all).
+
+    Raises
+    ------
+    OptionError
+        If the band is under 1.5 voxels, which the pipeline needs.
+    MeshError
+        If the distances would be too small or too large for float32, or the grid lies so far
+        from the origin that neighbouring samples cannot be told apart.
+    OutOfMemoryError
+        If the grid would not fit in memory.
+    """
+    shape, spacing, _ = layout
+    check_numbers(band=band)
+    check_scale(layout)
+    size = " x ".join(map(str, shape))
+    check_fits(prod(shape) * 4 + WORK_BYTES, f"a grid of {size}", "take fewer samples")
+    values = np.empty(shape, np.float32)
+    corners = np.argwhere(np.ones([-(-n // EDGE) for n in shape], bool)) * EDGE
+    for start in range(0, len(corners), CHUNK):
+        chunk = corners[start : start + CHUNK]
+        _write_cubes(values, chunk, _sample_cubes(solid, chunk, layout, band * spacing))
+        if progress:
+            progress(min(start + CHUNK, len(corners)), len(corners))
+    return values
+
+
+def check_scale(layout: Layout) -> None:
+    """Raise MeshError if float32 does not hold the distances, or double the positions."""
+    shape, spacing, origin = layout
+    reach = spacing * max(shape)
+    if not (spacing > SMALLEST and reach < LARGEST):
+        raise MeshError(
+            f"a spacing of {spacing:g} and an extent of {reach:g} are beyond what float32 holds: "
+            "scale the mesh"
+        )
+    away = float(np.abs(origin).max()) + reach
+    if np.spacing(away) > POSITION_ERROR * spacing:
+        raise MeshError(
+            f"the grid reaches to {away:g}, where numbers are {np.spacing(away):.2g} apart: too "
+            f"coarse for a spacing of {spacing:g}; move the mesh to the origin"
+        )
+
+
+def grid_points(layout: Layout) -> Points:
+    """Return the position of every sample of a grid, (n, 3), C order."""
+    shape, spacing, origin = layout
+    return np.indices(shape).reshape(3, -1).T * spacing + origin
+
+
+def _sample_cubes(
+    solid: Solid, corners: NDArray[np.int64], layout: Layout, limit: float
+) -> FloatArray:
+    """Return the distances in cubes of samples, (c, 8, 8, 8), cut off at the limit."""
+    _, spacing, origin = layout
+    centres = (corners + (EDGE - 1) / 2) * spacing + origin
+    reach = limit + 3**0.5 * (EDGE - 1) / 2 * spacing
+    near = np.ones(len(corners), bool)
+    if np.isfinite(limit) and solid.is_closed:
+        near = solid.distance(centres) <= reach
+    values = np.empty((len(corners), EDGE, EDGE, EDGE), np.float32)
+    outside = np.where(solid.is_inside(centres[~near]), -1, 1)
+    values[~near] = (outside * limit)[:, None, None, None]
+    offsets = np.moveaxis(np.indices((EDGE,) * 3), 0, -1)
+    points = (corners[near][:, None, None, None] + offsets) * spacing + origin
+    if len(points):
+        values[near] = np.clip(_signed(solid, points, spacing), -limit, limit)
+    return values
+
+
+def _signed(solid: Solid, points: Points, spacing: float) -> NDArray[np.float64]:
+    """Return the signed distance in cubes of neighbouring points, (c, 8, 8, 8).
+
+    Two neighbours that are both more than half a spacing from the surface are on one side of it,
+    so one point tells the sign of a connected region of such; the others are asked one by one.
+    """
+    shape = points.shape[:-1]
+    points = points.reshape(-1, 3)
+    found = solid.distance(points).reshape(shape)
+    away = (found > 0.5 * spacing * (1 + 1e-9)) & solid.is_closed
+    within_cube = np.zeros((3, 3, 3, 3), bool)
+    within_cube[1] = ndimage.generate_binary_structure(3, 1)
+    regions, count = ndimage.label(away, within_cube)
+    inside = np.zeros(shape, bool)
+    inside[~away] = solid.is_inside(points[~away.ravel()])
+    if count:
+        _, first = np.unique(regions.ravel(), return_index=True)
+        first = first[-count:]  # the first of all is of region 0, which is no region
+        side = np.concatenate([[False], solid.is_inside(points[first])])
+        inside |= side[regions]
+    return np.where(inside, -found, found)
+
+
+def _write_cubes(values: FloatArray, corners: NDArray[np.int64], cubes: FloatArray) -> None:
+    """Put cubes into the grid; what reaches over its end is dropped."""
+    for (i, j, k), cube in zip(corners, cubes):
+        part = values[i : i + EDGE, j : j + EDGE, k : k + EDGE]
+        part[...] = cube[tuple(map(slice, part.shape))]
