@@ -103,10 +103,8 @@ class Upsampling:
         self.seconds = watch.seconds | self.done.seconds
 
     def device_notes(self) -> list[str]:
-        """Return what to know of where the network and compiled functions run."""
-        from ..machine.compiling import why_not
-
-        return [*self.network.notes, *why_not()]
+        """Return what to know of where the network runs."""
+        return list(self.network.notes)
 
     def report(self) -> dict[str, Any]:
         """Return counts, times and findings."""
