@@ -206,7 +206,7 @@ CASES = {
     ),
     ("in.npy", "--spacing", "1,2"): (
         2,
-        "Invalid value for '--spacing': '1,2': give one number, or three with commas between",
+        "Invalid value for '--spacing': '1,2': give one number, or three separated by commas",
     ),
     ("in.npy", "--spacing", "1,1,2"): (
         1,
@@ -332,6 +332,29 @@ def test_every_option_has_help():
         for parameter in subcommand.params:
             if isinstance(parameter, click.Option):
                 assert parameter.help, parameter.name
+
+
+def test_the_help_names_every_mesh_format():
+    printed = cli.upsample_command.help
+    from super_sdf.files.meshes import MESH_SUFFIXES
+
+    assert all(f" {suffix}" in printed for suffix in MESH_SUFFIXES)
+
+
+def test_defaults_are_those_of_the_library(command):
+    from super_sdf.convert import ConvertOptions
+
+    defaults = {
+        parameter.name: parameter.get_default(click.Context(cli.upsample_command))
+        for parameter in cli.upsample_command.params
+    }
+    for name in ("factor", "inside", "offset", "cap"):
+        assert defaults[name] == getattr(ConvertOptions, name)
+    assert (defaults["quality"], defaults["precision"], defaults["device"]) == (
+        "base",
+        "float32",
+        "auto",
+    )
 
 
 def test_a_large_file_is_announced_unless_quiet(here, command, monkeypatch):

@@ -13,7 +13,11 @@ from conftest import ball
 from solids import cube, inverted, joined, saved, torus
 
 from super_sdf import Mesh, read_grid
+from super_sdf.cli import evaluate
 from super_sdf.cli.evaluate import ListCommand
+from super_sdf.evaluation.methods import METHODS
+from super_sdf.evaluation.peers import PEERS
+from super_sdf.evaluation.plan import EXPERIMENTS
 from super_sdf.machine import extras
 
 
@@ -23,6 +27,12 @@ def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     saved(Mesh(cube().vertices * [3, 1, 1], cube().faces), tmp_path / "box.ply")
     return tmp_path
+
+
+def test_the_help_of_evaluate_has_the_names_that_evaluation_knows():
+    assert sorted(evaluate.METHODS) == sorted(METHODS)
+    assert evaluate.EXPERIMENTS == EXPERIMENTS
+    assert sorted(evaluate.PEERS) == sorted(PEERS)
 
 
 def test_a_mesh_becomes_a_grid_and_a_mesh_again(here, command):
@@ -132,7 +142,7 @@ def test_a_grid_becomes_a_section(here, command):
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
-        ("box.ply out.jpg", 2, "out.jpg is no picture file: give .png"),
+        ("box.ply out.jpg", 2, "out.jpg is not a picture file: give .png"),
         ("none.ply out.png", 1, "none.ply does not exist"),
         ("box.ply out.png --colour error", 2, "--colour error and --reference MESH go together"),
         ("box.ply out.png --reference box.ply", 2, "--colour error and --reference MESH go"),
@@ -149,8 +159,8 @@ def test_a_grid_becomes_a_section(here, command):
         ("none.ply out.png --colour error --top 0", 2, "top is 0: give a number greater than 0"),
         ("none.ply out.png --colour error --top 1e99", 2, "top is 1e+99: no colour bar can be"),
         ("box.ply out.png --top 1", 2, "--top is the end of the colour bar: give it with"),
-        ("box.ply out.png --at 1", 2, "--at has no meaning for meshes: leave it out"),
-        ("in.npy out.png --colour normal", 2, "--colour has no meaning for a grid: leave it out"),
+        ("box.ply out.png --at 1", 2, "--at does not apply to meshes: leave it out"),
+        ("in.npy out.png --colour normal", 2, "--colour does not apply to a grid: leave it out"),
         (" ".join(["box.ply"] * 40 + ["out.png --size 8000"]), 2, "a picture of 32,000 x 80,000"),
         ("pipe.ply out.png", 1, "pipe.ply is a named pipe: give a file"),
     ],
