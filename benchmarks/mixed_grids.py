@@ -108,7 +108,7 @@ BROKEN = {
     "constant.npy": "a constant field has no surface",
     "unsigned.npy": "an unsigned field has no inside",
     "anisotropic.npz": "the method needs cubic voxels",
-    "corrupt.npz": "is no readable .npz archive",
+    "corrupt.npz": "is not a readable .npz archive",
 }
 
 

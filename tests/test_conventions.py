@@ -109,13 +109,15 @@ def test_a_wrong_unit_is_refused_with_the_way_out():
     with pytest.raises(GridError) as caught:
         make_grid(ball(24, 8.0).values, spacing=0.1)
     assert str(caught.value).startswith("the values change by ")
-    want = "from sample to sample, but spacing is 0.1: distances and spacing must be in one unit"
+    want = (
+        "from sample to sample, but spacing is 0.1: distances and spacing must be in the same unit"
+    )
     assert want in str(caught.value)
 
 
 def test_values_that_are_not_quite_distances_are_noted():
     grid = make_grid(torus(64) * 1.2, spacing=1 / 64, origin=0)
-    assert len(grid.notes) == 1 and "they are no exact distances" in grid.notes[0]
+    assert len(grid.notes) == 1 and "they are not exact distances" in grid.notes[0]
 
 
 def test_spacing_must_be_equal_positive_and_finite():

@@ -40,7 +40,9 @@ def test_values_of_the_other_sign_are_refused():
 @pytest.mark.parametrize("unit, spacing", [(1.5, 1.0), (1.0, 1.5 / 2), (1.0, 2.5), (1.0, 1000)])
 def test_a_spacing_that_the_values_contradict_is_refused(make, unit, spacing):
     for values in (VALUES, np.abs(np.indices((20, 20, 20)) - 9.3).max(0) - 5.1):
-        with pytest.raises(GridError, match="distances and spacing must be in one unit; scale the"):
+        with pytest.raises(
+            GridError, match="distances and spacing must be in the same unit; scale the"
+        ):
             make(values * unit, spacing)
 
 

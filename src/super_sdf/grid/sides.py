@@ -1,16 +1,37 @@
-"""Which sign is inside: the border of the grid is taken for outside, whatever the offset."""
+"""Which sign is inside: the border of the grid counts as outside, whatever the offset."""
 
 from __future__ import annotations
 
 from ..errors import GridError, OptionError, seen
-from .planes import Samples
+from .planes import SampleArray
 from .samples import Extremes
 
 INSIDE = ("auto", "negative", "positive")
 
 
-def is_positive_inside(values: Samples, inside: str, extremes: Extremes, notes: list[str]) -> bool:
-    """Say whether the values are positive inside, by word or, if that is "auto", by the border."""
+def is_positive_inside(
+    values: SampleArray, inside: str, extremes: Extremes, notes: list[str]
+) -> bool:
+    """Return whether the values are positive inside: as given, or for "auto" from the border.
+
+    Parameters
+    ----------
+    values : (nx, ny, nz) array or PlaneFile
+        Samples.
+    inside : str
+        One of ``INSIDE``.
+    extremes : two floats
+        The smallest and the largest sample.
+    notes : list of str
+        A sentence is added if the sign was inferred and may be wrong.
+
+    Raises
+    ------
+    OptionError
+        If ``inside`` is unknown.
+    GridError
+        If all values are on one side of the surface.
+    """
     if not isinstance(inside, str) or inside not in INSIDE:
         raise OptionError(f"inside is {seen(inside)}: give one of {', '.join(INSIDE)}")
     if inside != "auto":
@@ -28,8 +49,8 @@ def is_positive_inside(values: Samples, inside: str, extremes: Extremes, notes: 
     return positive
 
 
-def check_negative_inside(values: Samples) -> None:
-    """Raise if most of the border is negative: such values seem to be positive inside."""
+def check_negative_inside(values: SampleArray) -> None:
+    """Raise GridError if most of the border is negative: the sign seems to be reversed."""
     below, total = _count_border(values)
     if _is_mostly_negative(below, total):
         raise GridError(
@@ -40,7 +61,7 @@ def check_negative_inside(values: Samples) -> None:
 
 
 def check_both_sides(extremes: Extremes) -> None:
-    """Raise if all values are on one side of the surface."""
+    """Raise GridError if all values are on one side of the surface."""
     low, high = extremes
     if low >= 0:
         raise GridError(
@@ -55,12 +76,12 @@ def check_both_sides(extremes: Extremes) -> None:
 
 
 def _is_mostly_negative(below: int, total: int) -> bool:
-    """Say whether most of the border is negative."""
+    """Return whether most samples of the border are negative."""
     return 2 * below > total
 
 
-def _count_border(values: Samples) -> tuple[int, int]:
-    """Return how many samples of the grid's six faces are negative, and how many there are.
+def _count_border(values: SampleArray) -> tuple[int, int]:
+    """Return the number of negative samples on the six faces of the grid, and of all there.
 
     A sample on an edge counts for each of its faces.
     """
