@@ -168,8 +168,8 @@ def test_wrong_arguments_are_named_with_the_value_seen(message):
 
 
 OTHERS = {
-    "threads is '2': give a whole number, 0 for one a core": lambda: load_network(threads="2"),
-    "threads is -1: give 1 or more, or 0 for one a core": lambda: load_network(threads=-1),
+    "threads is '2': give a whole number, 0 for one per core": lambda: load_network(threads="2"),
+    "threads is -1: give 1 or more, or 0 for one per core": lambda: load_network(threads=-1),
     "model is None: give the path of a file": lambda: load_network(None),
     "path is 3: give the path of a file": lambda: read_grid(3),
     "path is None: give the path of a file": lambda: write_mesh(reconstruct(GRID, trilinear), None),

@@ -99,7 +99,7 @@ def test_big_grids_are_cut_off_and_make_the_same_mesh(monkeypatch):
     exact = sample_solid(solid, layout)
     monkeypatch.setattr(sampling, "EXACT_SAMPLES", 1000)
     cut = sample_solid(solid, layout)
-    assert not exact.notes and "cut off" in cut.notes[0]
+    assert not exact.notes and "clamped" in cut.notes[0]
     assert cut.values.max() == pytest.approx(4 / 24)
     network = load_network()
     one, other = reconstruct(exact, network), reconstruct(cut, network)
