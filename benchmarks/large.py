@@ -1,11 +1,11 @@
-"""Large grids: time, and peak of memory against what was planned, for several bounds.
+"""Large grids: time, and peak memory compared with the plan, for several limits.
 
     python -m benchmarks.large GRID.npy --max-memory 3G 1500M 900M [-- --spacing 0.002]
     python -m benchmarks.large --analytic 512 1024 --max-memory 4G
 
-Whole processes, start and files included. The mesh of a grid must be the same file whatever the
-bound: compare its digests. An analytic grid is a torus of area 1.2 in the unit cube, written plane
-by plane. What follows ``--`` goes to the command.
+Whole processes, start and files included. The mesh of a grid must be the same file for every limit:
+compare its digests. An analytic grid is a torus of area 1.2 in the unit cube, written plane by
+plane. Options after ``--`` are passed to the command.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def run(grid: Path, folder: Path, bound: str, options: list[str]) -> str:
     words = ["-m", "super_sdf", "upsample", str(grid), str(target), "--force", "--json", "-q"]
     try:
         seconds, peak, printed = run_python([*words, "--max-memory", bound, *options])
-    except SuperSdfError:  # the command has said why
+    except SuperSdfError:  # the command has printed why
         return f"| {grid.stem} | {bound} | refused |" + " |" * 9
     said = json.loads(printed)
     planned = said["planned_bytes"] / 1e6
