@@ -109,16 +109,16 @@ def main() -> None:
     parser.add_argument("--rfta", type=int, nargs="*", default=[], help="sizes for that method")
     parser.add_argument("--factor", type=int, default=4)
     parser.add_argument("--runs", type=int, default=3)
-    asked, options = parse(parser)
-    print(f"{describe_machine()}; {asked.mesh.stem}, factor {asked.factor}\n")
+    arguments, options = parse(parser)
+    print(f"{describe_machine()}; {arguments.mesh.stem}, factor {arguments.factor}\n")
     print("| grid | method | s | peak MB | time over ours | memory over ours |")
     print("| --- | --- | ---: | ---: | ---: | ---: |")
     with tempfile.TemporaryDirectory() as name:
-        for size in sorted({*asked.sizes, *asked.rfta}):
-            grid = sample(asked.mesh, size, Path(name))
-            methods = commands(grid, asked.factor, options)
-            found = {method: median_of(words, asked.runs) for method, words in methods.items()}
-            if size in asked.rfta:
+        for size in sorted({*arguments.sizes, *arguments.rfta}):
+            grid = sample(arguments.mesh, size, Path(name))
+            methods = commands(grid, arguments.factor, options)
+            found = {method: median_of(words, arguments.runs) for method, words in methods.items()}
+            if size in arguments.rfta:
                 found[RFTA] = median_of([*methods["SciPy zoom, cubic"][:-1], "rfta"], 1)
             print_rows(size, found)
 

@@ -70,8 +70,8 @@ class Place:
         """Run the batch to its end; return the exit code, the last line and the seconds."""
         start = time.perf_counter()
         process = self.start()
-        _, said = process.communicate()
-        return process.returncode, said.strip().splitlines()[-1], time.perf_counter() - start
+        _, output = process.communicate()
+        return process.returncode, output.strip().splitlines()[-1], time.perf_counter() - start
 
     def run_and_kill(self, lines: int) -> None:
         """Kill the batch when the report has this many lines."""
@@ -193,28 +193,30 @@ def parse() -> argparse.Namespace:
 
 def main() -> None:
     """Print the machine and a Markdown table."""
-    asked = parse()
-    with working_folder(asked.folder) as folder:
-        if asked.faults or asked.full:
-            report_faults(folder, asked)
+    arguments = parse()
+    with working_folder(arguments.folder) as folder:
+        if arguments.faults or arguments.full:
+            report_faults(folder, arguments)
             return
-        place = Place(folder / "grids", folder / "meshes", asked.jobs)
-        solids = write_mixed(place.grids, asked.count, asked.sizes)
+        place = Place(folder / "grids", folder / "meshes", arguments.jobs)
+        solids = write_mixed(place.grids, arguments.count, arguments.sizes)
         write_broken(place.grids / "broken")
-        total = asked.count + len(BROKEN)
+        total = arguments.count + len(BROKEN)
         print(f"{describe_machine()}; {total} files\n\n| | |\n| --- | --- |", flush=True)
-        for kill in range(1, asked.kills + 1):
-            place.run_and_kill(total * kill // (asked.kills + 1))
+        for kill in range(1, arguments.kills + 1):
+            place.run_and_kill(total * kill // (arguments.kills + 1))
             print(f"| killed after | {len(place.lines())} files |", flush=True)
-        report(place, solids, asked, total)
+        report(place, solids, arguments, total)
 
 
-def report_faults(folder: Path, asked: argparse.Namespace) -> None:
+def report_faults(folder: Path, arguments: argparse.Namespace) -> None:
     """Print the results for each kind of fault."""
-    kinds = [kind for kind, _ in zip(cycle(KILLS), range(asked.faults))]
-    kinds += [kind for kind, _ in zip(cycle(LIMITS), range(asked.full))]
-    counts = count_faults(make_setting(folder, asked.count, asked.sizes), kinds, asked.seed)
-    print(f"{describe_machine()}; {asked.count} files\n")
+    kinds = [kind for kind, _ in zip(cycle(KILLS), range(arguments.faults))]
+    kinds += [kind for kind, _ in zip(cycle(LIMITS), range(arguments.full))]
+    counts = count_faults(
+        make_setting(folder, arguments.count, arguments.sizes), kinds, arguments.seed
+    )
+    print(f"{describe_machine()}; {arguments.count} files\n")
     print(
         "| fault | exit code | times | found then, and after another run |\n" + "| --- " * 4 + "|"
     )
@@ -222,24 +224,26 @@ def report_faults(folder: Path, asked: argparse.Namespace) -> None:
         print(f"| {kind} | {code} | {count} | {found} |")
 
 
-def report(place: Place, solids: dict[str, Placed], asked: argparse.Namespace, total: int) -> None:
+def report(
+    place: Place, solids: dict[str, Placed], arguments: argparse.Namespace, total: int
+) -> None:
     """Print the results, row by row as they come."""
 
     def row(name: str, value: object) -> None:
         print(f"| {name} | {value} |", flush=True)
 
-    code, said, seconds = place.run()
-    row("the last run", f"exit code {code}, {seconds:.1f} s: {said}")
+    code, output, seconds = place.run()
+    row("the last run", f"exit code {code}, {seconds:.1f} s: {output}")
     row("lines in the report", f"{len(place.lines())} of {total}")
-    row("right meshes", f"{count_right(place, solids)} of {asked.count}")
+    row("right meshes", f"{count_right(place, solids)} of {arguments.count}")
     row("failures that name the fault", f"{count_named(place)} of {len(BROKEN)}")
     parts = [p for p in place.meshes.rglob("*") if p.suffix == ".part"]
     row("unfinished files left", len(parts))
-    code, said, seconds = place.run()
-    row("run again", f"exit code {code}, {seconds:.2f} s: {said}")
-    names = spread(sorted(solids), asked.equal)
+    code, output, seconds = place.run()
+    row("run again", f"exit code {code}, {seconds:.2f} s: {output}")
+    names = spread(sorted(solids), arguments.equal)
     row("equal to single runs", f"{count_equal(place, names)} of {len(names)}")
-    names = spread(sorted(solids), asked.overhead)
+    names = spread(sorted(solids), arguments.overhead)
     alone, batched = measure_overhead(place, names)
     share = 100 * (batched / alone - 1)
     row("over the warm pipeline", f"{batched:.2f} s for {alone:.2f} s: {share:+.1f} %")

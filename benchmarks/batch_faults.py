@@ -68,9 +68,9 @@ def make_setting(folder: Path, count: int, sizes: list[int]) -> Setting:
     write_mixed(folder / "grids", count, sizes)
     setting = Setting(folder / "grids", folder / "meshes", {}, 0.0)
     start = time.perf_counter()
-    _, said = setting.start().communicate()
-    if said:
-        raise SystemExit(said.decode())
+    _, output = setting.start().communicate()
+    if output:
+        raise SystemExit(output.decode())
     right = {name: data for name, data in setting.found().items() if name not in OWN_FILES}
     return Setting(setting.grids, setting.meshes, right, time.perf_counter() - start)
 
@@ -95,17 +95,17 @@ def try_once(setting: Setting, kind: str, rng: np.random.Generator) -> tuple[int
     Return the exit code of the first run, and what is wrong, if anything is.
     """
     process = FAULTS[kind](setting, kind, rng)
-    said, code = process.communicate()[1], process.returncode
+    output, code = process.communicate()[1], process.returncode
     (setting.meshes / BALLAST).unlink(missing_ok=True)
-    if b"Traceback" in said:
-        return code, f"a traceback: {said.decode()}"
+    if b"Traceback" in output:
+        return code, f"a traceback: {output.decode()}"
     wrong = half_written(setting)
     if wrong:
         return code, wrong
     process = setting.start()
-    said = process.communicate()[1]
-    if process.returncode or said:
-        return code, f"exit code {process.returncode} when run again: {said.decode()}"
+    output = process.communicate()[1]
+    if process.returncode or output:
+        return code, f"exit code {process.returncode} when run again: {output.decode()}"
     return code, incomplete(setting)
 
 

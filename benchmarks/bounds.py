@@ -73,7 +73,7 @@ class Run:
 
     seconds: float
     peak: int
-    said: dict[str, int]
+    report: dict[str, int]
     refusal: str = ""
 
 
@@ -164,9 +164,10 @@ def row(case: Case, name: str, bound: int, run: Run) -> str:
     if run.refusal:
         cells += ["refused", "", f"{run.peak / 1e6:,.0f}", "", f"{run.seconds:.1f}"]
     else:
-        planned = f"{run.said['planned_bytes'] / 1e6:,.0f}"
+        planned = f"{run.report['planned_bytes'] / 1e6:,.0f}"
         share = f"{run.peak / bound:.2f}"
-        cells += [run.said["slabs"], planned, f"{run.peak / 1e6:,.0f}", share, f"{run.seconds:.1f}"]
+        peak = f"{run.peak / 1e6:,.0f}"
+        cells += [run.report["slabs"], planned, peak, share, f"{run.seconds:.1f}"]
     return f"| {' | '.join(map(str, cells))} |"
 
 
@@ -191,48 +192,54 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--bounds", nargs="+", choices=["share", "least"], default=["share"])
     parser.add_argument("--share", type=float, default=SHARE)
     parser.add_argument("--quick", action="store_true", help="a few small grids, for a check")
-    asked = parser.parse_args()
-    if asked.quick:
-        asked.fields, asked.sizes = ["ball", "wall across x"], [24]
-        asked.factors, asked.suffixes = [2, 16], [".ply"]
-        asked.sources, asked.bounds = [".npy"], ["least"]
-    return asked
+    arguments = parser.parse_args()
+    if arguments.quick:
+        arguments.fields, arguments.sizes = ["ball", "wall across x"], [24]
+        arguments.factors, arguments.suffixes = [2, 16], [".ply"]
+        arguments.sources, arguments.bounds = [".npy"], ["least"]
+    return arguments
 
 
-def cases(asked: argparse.Namespace, field: str, size: int) -> Iterator[Case]:
+def cases(arguments: argparse.Namespace, field: str, size: int) -> Iterator[Case]:
     """Yield the conversions to try on a grid."""
     for choice in product(
-        asked.factors, asked.precisions, asked.code, asked.suffixes, asked.sources
+        arguments.factors,
+        arguments.precisions,
+        arguments.code,
+        arguments.suffixes,
+        arguments.sources,
     ):
         yield Case(field, size, *choice)
 
 
 def main() -> None:
     """Print the machine and a Markdown table."""
-    asked, over = parse(), []
+    arguments, over = parse(), []
     print(f"{describe_machine()}; MB\n")
     print(
         "| grid | size | factor | precision | code | files | bound | MB | slabs | planned | peak | "
         "of the bound | s |\n| --- | ---: | ---: |" + " --- |" * 4 + " ---: |" * 6
     )
-    fields = [(name, None) for name in asked.fields] + [(mesh.stem, mesh) for mesh in asked.mesh]
-    for (field, mesh), size in product(fields, asked.sizes):
+    fields = [(name, None) for name in arguments.fields] + [
+        (mesh.stem, mesh) for mesh in arguments.mesh
+    ]
+    for (field, mesh), size in product(fields, arguments.sizes):
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
             sample_mesh(mesh, size, folder) if mesh else write_grids(field, size, folder)
-            for case in cases(asked, field, size):
-                over += try_bounds(case, folder, asked)
+            for case in cases(arguments, field, size):
+                over += try_bounds(case, folder, arguments)
     if over:
         raise SystemExit("over the bound:\n" + "\n".join(over))
 
 
-def try_bounds(case: Case, folder: Path, asked: argparse.Namespace) -> list[str]:
+def try_bounds(case: Case, folder: Path, arguments: argparse.Namespace) -> list[str]:
     """Print a row per limit; return the ones that were exceeded."""
     whole, thinnest = plan(case, folder)
     if thinnest > LARGEST:
         return []
     over = []
-    for name, bound in bounds_of(whole, thinnest, asked.share, asked.bounds).items():
+    for name, bound in bounds_of(whole, thinnest, arguments.share, arguments.bounds).items():
         run = convert(case, folder, bound)
         line = row(case, name, bound, run)
         print(line, flush=True)

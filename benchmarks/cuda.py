@@ -70,11 +70,11 @@ def compare_values(device: str, sizes: Sequence[int]) -> None:
     for quality in QUALITIES:
         here, there = load_network(quality, device="cpu"), load_network(quality, device=device)
         for size in sizes:
-            asked = network_inputs(size)
-            apart = np.abs(here(*asked) - there(*asked)).max() / 2
-            seconds = [best_seconds(network, *asked) for network in (here, there)]
-            shown = [f"{1e6 * value / len(asked[0]):.2f}" for value in seconds]
-            rows.append([quality, f"{size}^3", f"{len(asked[0]):,}", *shown, f"{apart:.1e}"])
+            inputs = network_inputs(size)
+            apart = np.abs(here(*inputs) - there(*inputs)).max() / 2
+            seconds = [best_seconds(network, *inputs) for network in (here, there)]
+            shown = [f"{1e6 * value / len(inputs[0]):.2f}" for value in seconds]
+            rows.append([quality, f"{size}^3", f"{len(inputs[0]):,}", *shown, f"{apart:.1e}"])
     head = [
         "network",
         "grid",
@@ -104,17 +104,17 @@ def watch_memory(device: str, size: int) -> None:
     rows.append(["loaded", used_memory()])
     whole = network_inputs(size)
     for count, share in enumerate(np.linspace(0.2, 1, SHAPES), 1):
-        ask_part(network, whole, share)
+        run_part(network, whole, share)
         if count in (1, 2, 5, 10, 20, SHAPES):
             rows.append([f"{count} shapes", used_memory()])
-    ask_part(network, whole, 0.2)
+    run_part(network, whole, 0.2)
     rows.append(["a small one", used_memory()])
     print_table(f"Memory of the GPU in MiB, shapes up to {size}^3", ["after", "used"], rows)
 
 
-def ask_part(network: Network, asked: Sequence[np.ndarray], share: float) -> None:
+def run_part(network: Network, inputs: Sequence[np.ndarray], share: float) -> None:
     """Run the network on the first part of a band, without the rest."""
-    patches, table, voxels, offsets = asked
+    patches, table, voxels, offsets = inputs
     count = int(share * len(patches))
     table = np.where(table[:count] < count, table[:count], -1).astype(np.int32)
     network(patches[:count], table, voxels[voxels < count], offsets)
@@ -142,18 +142,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128, 256])
     parser.add_argument("--device", default="cuda", help="cpu tries this command itself")
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     try:
-        load_network("fast", device=asked.device)
+        load_network("fast", device=arguments.device)
     except DeviceError as error:
         print(f"nothing to measure: {error}")
         return
     gpu = describe_gpu() or "no GPU"
     print(f"{gpu}; {os.cpu_count()} cores; {onnxruntime_version()}; least of {RUNS} runs each")
-    compare_values(asked.device, asked.sizes)
-    compare_chunks(asked.device, max(asked.sizes))
-    watch_memory(asked.device, max(asked.sizes))
-    compare_pipeline(asked.device, asked.sizes)
+    compare_values(arguments.device, arguments.sizes)
+    compare_chunks(arguments.device, max(arguments.sizes))
+    watch_memory(arguments.device, max(arguments.sizes))
+    compare_pipeline(arguments.device, arguments.sizes)
 
 
 if __name__ == "__main__":

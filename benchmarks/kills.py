@@ -103,12 +103,12 @@ class Bench:
         seconds = self.writing if self.turn % 2 else self.seconds
         time.sleep(random.uniform(0, 1.05) * seconds[suffix])
         process.send_signal(number)
-        _, said = process.communicate(timeout=LONG_ENOUGH)
+        _, output = process.communicate(timeout=LONG_ENOUGH)
         codes = (0, 128 + number, -number)  # the last: before Python, or it, could do anything
         return self.faults(suffix) + Counter(
             {
                 "exit codes of others": process.returncode not in codes,
-                "more than a line said": said.count(b"\n") > 1,
+                "more than one line printed": output.count(b"\n") > 1,
             }
         )
 
@@ -117,11 +117,11 @@ class Bench:
         most = random.randrange(len(self.whole[suffix]) + 1)
         limit = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (most, most))
         process = self.start(suffix, limit)
-        _, said = process.communicate(timeout=LONG_ENOUGH)
+        _, output = process.communicate(timeout=LONG_ENOUGH)
         return self.faults(suffix) + Counter(
             {
                 "exit codes of others": process.returncode not in (0, 1),
-                "more than a line said": said.count(b"\n") > 1,
+                "more than one line printed": output.count(b"\n") > 1,
             }
         )
 
@@ -145,16 +145,16 @@ def main() -> None:
     parser.add_argument("--full", type=int, default=50, help="Runs on a disk that fills.")
     parser.add_argument("--size", type=int, default=24, help="Samples along each axis.")
     parser.add_argument("--seed", type=int, default=0, help="Of the random moments.")
-    asked = parser.parse_args()
-    random.seed(asked.seed)
+    arguments = parser.parse_args()
+    random.seed(arguments.seed)
     print(describe_machine())
     folder = Path(tempfile.mkdtemp())
     try:
-        bench = Bench(folder, asked.size)
+        bench = Bench(folder, arguments.size)
         good = [
-            tally("SIGTERM", asked.terms, partial(bench.kill, signal.SIGTERM)),
-            tally("SIGKILL", asked.kills, partial(bench.kill, signal.SIGKILL)),
-            tally("full disk", asked.full, bench.fill),
+            tally("SIGTERM", arguments.terms, partial(bench.kill, signal.SIGTERM)),
+            tally("SIGKILL", arguments.kills, partial(bench.kill, signal.SIGKILL)),
+            tally("full disk", arguments.full, bench.fill),
         ]
     finally:
         shutil.rmtree(folder)

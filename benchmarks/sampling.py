@@ -94,7 +94,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("mesh", type=Path)
     parser.add_argument("--size", type=int, default=512)
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     print(f"{describe_machine()}\n\n| solid | triangles | largest error, {SIZE}^3 samples |")
     print("| --- | ---: | ---: |")
     layout = unit_layout(SIZE)
@@ -103,10 +103,17 @@ def main() -> None:
         error = sample_grid(Solid(mesh), layout).ravel() - closed_form(grid_points(layout))
         print(f"| {name} | {len(mesh.faces):,} | {np.abs(error).max():.1e} |", flush=True)
     with tempfile.TemporaryDirectory() as folder:
-        words = ["sample", str(asked.mesh), f"{folder}/grid.npz", "-n", str(asked.size), "--quiet"]
+        words = [
+            "sample",
+            str(arguments.mesh),
+            f"{folder}/grid.npz",
+            "-n",
+            str(arguments.size),
+            "--quiet",
+        ]
         seconds, peak = run_command(words)
-    faces = len(read_mesh(asked.mesh).faces)
-    print(f"\n{asked.mesh.stem}, {faces:,} faces, {asked.size}^3: {seconds:.1f} s, {peak:.0f} MB")
+    faces, size = len(read_mesh(arguments.mesh).faces), f"{arguments.size}^3"
+    print(f"\n{arguments.mesh.stem}, {faces:,} faces, {size}: {seconds:.1f} s, {peak:.0f} MB")
 
 
 if __name__ == "__main__":

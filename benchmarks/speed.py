@@ -49,11 +49,11 @@ def main() -> None:
     )
     parser.add_argument("--factor", type=int, default=4)
     parser.add_argument("--warm", action="store_true", help="convert in this process")
-    asked, options = parse(parser)
-    if asked.warm and options:
+    arguments, options = parse(parser)
+    if arguments.warm and options:
         parser.error("with --warm the command is not run: leave its options away")
-    paths = spread(find_meshes(asked.meshes), asked.shapes)
-    network = load_network() if asked.warm else None
+    paths = spread(find_meshes(arguments.meshes), arguments.shapes)
+    network = load_network() if arguments.warm else None
 
     def measure(path: Path, setting: Setting) -> Row:
         shape = Shape.read(path)
@@ -61,10 +61,12 @@ def main() -> None:
             return time_warm(shape, setting, network)
         return time_shape(shape, setting, options)
 
-    print(f"{describe_machine()}; {len(paths)} shapes, factor {asked.factor}, median of {RUNS}\n")
+    print(
+        f"{describe_machine()}; {len(paths)} shapes, factor {arguments.factor}, median of {RUNS}\n"
+    )
     print("| grid | mean s | slowest s | peak MB |\n| --- | ---: | ---: | ---: |")
-    for size in asked.sizes:
-        rows = [measure(path, Setting(size, asked.factor)) for path in paths]
+    for size in arguments.sizes:
+        rows = [measure(path, Setting(size, arguments.factor)) for path in paths]
         seconds, peak = [row["seconds"] for row in rows], max(row["peak_mb"] for row in rows)
         mean = statistics.mean(seconds)
         print(f"| {size}^3 | {mean:.3f} | {max(seconds):.3f} | {peak:.0f} |", flush=True)

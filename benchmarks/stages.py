@@ -190,19 +190,20 @@ def main() -> None:
     parser.add_argument("--precision", default="float32")
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--out", type=Path, help="folder for the plot")
-    asked = parser.parse_args()
-    network = load_network(asked.model, precision=asked.precision)
+    arguments = parser.parse_args()
+    network = load_network(arguments.model, precision=arguments.precision)
     peak, rows = matrix_product_peak(), {}
     with tempfile.TemporaryDirectory() as name:
-        for size in asked.sizes:
-            grid = sample(asked.mesh, size, Path(name))
-            rows[size] = measure(grid, network, asked.factor, asked.runs)
+        for size in arguments.sizes:
+            grid = sample(arguments.mesh, size, Path(name))
+            rows[size] = measure(grid, network, arguments.factor, arguments.runs)
     code = "compiled" if is_loaded() else "NumPy"
-    print(f"{describe_machine()}; {asked.mesh.stem}, factor {asked.factor}, {asked.model}, {code};")
+    what = f"{arguments.mesh.stem}, factor {arguments.factor}, {arguments.model}, {code}"
+    print(f"{describe_machine()}; {what};")
     print(f"float32 matrix product: {peak / 1e9:.0f} GFLOP/s\n\n{tables(rows, network, peak)}")
-    if asked.out:
-        asked.out.mkdir(parents=True, exist_ok=True)
-        draw(rows).savefig(asked.out / "stages.png", dpi=110)
+    if arguments.out:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        draw(rows).savefig(arguments.out / "stages.png", dpi=110)
 
 
 if __name__ == "__main__":

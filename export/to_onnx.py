@@ -169,7 +169,7 @@ def main() -> None:
     source.add_argument("--run", type=Path, help="folder of the run")
     source.add_argument("--from", type=Path, dest="source", help="an .onnx file to rewrite")
     parser.add_argument("--out", type=Path, required=True, help="the .onnx file")
-    parser.add_argument("--data", default="not said", help="what it was trained on")
+    parser.add_argument("--data", default="not given", help="what it was trained on")
     parser.add_argument("--accuracy", default="not measured", help="measured figures, in words")
     options = parser.parse_args()
     if options.source:

@@ -190,7 +190,7 @@ CASES = {
     ("unsigned.npy",): (
         1,
         "no value is below 0 (the smallest is 0.255889): an unsigned field has no inside; if the "
-        "solid is thinner than the spacing, say --inside negative",
+        "solid is thinner than the spacing, use --inside negative",
     ),
     ("in.npy", "--offset", "99"): (
         1,

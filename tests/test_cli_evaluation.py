@@ -66,7 +66,7 @@ def test_what_is_wrong_with_a_mesh_is_said(here, command):
     saved(inverted(cube()), here / "in.ply")
     code, _, err = command("sample", "in.ply", "in.npz", "-n", 12)
     assert code == 0
-    assert err.splitlines()[0] == "Note: inverted, its faces look inward: turned round"
+    assert err.splitlines()[0] == "Note: inverted: its faces point inward; they were reversed"
     twice = joined(cube(), Mesh(cube().vertices + np.array([0.4, 0, 0]), cube().faces))
     saved(twice, here / "two.ply")
     code, _, err = command("sample", "two.ply", "two.npz", "-n", 12)

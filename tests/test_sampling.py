@@ -130,7 +130,7 @@ def test_a_cavity_is_no_overlap():
 
 def test_an_inverted_mesh_is_turned_round_and_named(tmp_path):
     solid, notes = load_solid(saved(inverted(cube()), tmp_path / "in.ply"))
-    assert notes == ["inverted, its faces look inward: turned round"]
+    assert notes == ["inverted: its faces point inward; they were reversed"]
     assert solid.signed_distance(np.zeros((1, 3)))[0] == -0.5
 
 

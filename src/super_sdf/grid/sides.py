@@ -44,7 +44,7 @@ def is_positive_inside(
         sign = "positive" if positive else "negative"
         notes.append(
             f"{sign} values are taken as inside: {share:.0%} of the grid's border has the other "
-            "sign (say otherwise with --inside)"
+            "sign (if that is wrong, use --inside)"
         )
     return positive
 
@@ -66,12 +66,12 @@ def check_both_sides(extremes: Extremes) -> None:
     if low >= 0:
         raise GridError(
             f"no value is below 0 (the smallest is {low:.6g}): an unsigned field has no "
-            "inside; if the solid is thinner than the spacing, say --inside negative"
+            "inside; if the solid is thinner than the spacing, use --inside negative"
         )
     if high <= 0:
         raise GridError(
             f"no value is above 0 (the largest is {high:.6g}): the grid lies within the "
-            "solid; if that is outside and the solid thin, say --inside positive"
+            "solid; if that is outside and the solid thin, use --inside positive"
         )
 
 

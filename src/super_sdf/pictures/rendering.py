@@ -146,15 +146,13 @@ def render_panels(
         The PNG file.
     colour : str
         ``shaded``; ``normal``: (n + 1)/2 of each face normal n as red, green, blue; or ``error``:
-        the values of the vertices with a colour bar. A panel without values is shaded then.
+        the values of the vertices with a colour bar (panels without values are shaded).
     up : str
         The axis that points up: x, y or z.
     layout : Layout
-        The camera's direction and the size of the panels.
-    top : float, optional
-        The value at the end of the colour bar. Default: the 99th percentile of all values.
-    unit : str
-        The unit of the values, for the title of the colour bar.
+        Direction of the camera, zoom, and size of the panels.
+    top, unit : float and str, optional
+        Value at the end of the colour bar (default: the 99th percentile) and unit of the values.
     force : bool
         Replace an existing file.
 
@@ -176,9 +174,13 @@ def render_panels(
     if colour == "normal":
         page.add_line(NORMALS_LEGEND)
     elif colour == "error" and top is not None and len(values):
-        title = f"distance to the reference ({unit})" if unit else "distance to the reference"
-        page.add_bar(title, top, clipped=bool(values.max() > top))
+        page.add_bar(_bar_title(unit), top, clipped=bool(values.max() > top))
     write_picture(page.figure, target, force=force)
+
+
+def _bar_title(unit: str) -> str:
+    """Return the title of the colour bar of errors."""
+    return f"distance to the reference ({unit})" if unit else "distance to the reference"
 
 
 def view_axes(up: str = "z", view: tuple[float, float, float] | None = None) -> NDArray[np.float64]:

@@ -144,7 +144,7 @@ def load_solid(path: str | Path, *, allow_open: bool = False) -> tuple[Solid, li
     if found.open_edges:
         notes.append(f"open at {found.open_edges:,} edges: inside is guessed across the holes")
     if found.inverted:
-        notes.append("inverted, its faces look inward: turned round")
+        notes.append("inverted: its faces point inward; they were reversed")
         solid = Solid(Mesh(solid.mesh.vertices, np.ascontiguousarray(solid.mesh.faces[:, ::-1])))
     if found.overlapping:
         notes.append(
