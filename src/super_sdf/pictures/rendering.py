@@ -166,8 +166,7 @@ def render_panels(
     _check(panels, colour, layout, top)
     frame = fit_frame(panels, view_axes(up, layout.view), layout.zoom)
     values = _values_of(panels)
-    if colour == "error" and top is None:
-        top = _top_of(values)
+    top = _top_of(values) if colour == "error" and top is None else top
     images = [_draw(panel, frame, colour, frame.pixels(layout.size), top) for panel in panels]
     titles = [panel.title for panel in panels]
     page = Page(layout.size, images, titles, columns=layout.columns, foot=FOOT[colour])
