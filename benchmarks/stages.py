@@ -25,7 +25,6 @@ from matplotlib.ticker import LogLocator, ScalarFormatter
 from super_sdf import convert, load_network, pipeline
 from super_sdf.evaluation.timing import describe_machine, run_command
 from super_sdf.files import spool
-from super_sdf.machine.compiling import is_loaded
 from super_sdf.machine.memory import forget_peak, held_memory
 from super_sdf.network.network import Network
 from super_sdf.steps.survey import Band
@@ -36,7 +35,7 @@ STAGES = {
     "band": [(pipeline, "survey")],
     "gather": [(Band, "network_inputs")],
     "network": [(Network, "__call__")],
-    "number": [(pipeline, "number_shared_nodes")],
+    "number": [(pipeline, "share_parts")],
     "average": [(pipeline, "average_shared")],
     "fit": [(pipeline, "fit_to_spheres"), (pipeline, "pin_to_skipped")],
     "isosurface": [(pipeline, "extract_pieces")],
@@ -197,8 +196,7 @@ def main() -> None:
         for size in arguments.sizes:
             grid = sample(arguments.mesh, size, Path(name))
             rows[size] = measure(grid, network, arguments.factor, arguments.runs)
-    code = "compiled" if is_loaded() else "NumPy"
-    what = f"{arguments.mesh.stem}, factor {arguments.factor}, {arguments.model}, {code}"
+    what = f"{arguments.mesh.stem}, factor {arguments.factor}, {arguments.model}"
     print(f"{describe_machine()}; {what};")
     print(f"float32 matrix product: {peak / 1e9:.0f} GFLOP/s\n\n{tables(rows, network, peak)}")
     if arguments.out:

@@ -107,7 +107,6 @@ def bare_plan(monkeypatch):
     stages = {name: (*row[:3], 0, 0) for name, row in footprint.STAGES.items()}
     monkeypatch.setattr(footprint, "STAGES", stages)
     monkeypatch.setattr(footprint, "NETWORK_FIXED", 0)
-    monkeypatch.setattr(footprint, "CODE_BYTES", 0)
     monkeypatch.setattr(cutting, "held_memory", lambda: 10**8)
 
 

@@ -246,7 +246,7 @@ def test_a_zip_bomb_is_refused_unread(here, command, monkeypatch):
 
 def test_a_factor_beyond_memory_is_refused_before_the_work(here, command, monkeypatch):
     monkeypatch.setattr("super_sdf.machine.memory.free_memory", lambda: 10**7)
-    monkeypatch.setattr("super_sdf.slabs.cutting.hold_less", lambda: None)
+    monkeypatch.setattr("super_sdf.slabs.cutting.give_back", lambda: None)
     code, _, err = command("upsample", "in.npy", "out.ply", "--factor", 16)
     assert code == 1 and err.startswith("Error: factor 16 on ")
     assert " MB of memory even plane by plane, " in err and err.endswith("(--max-memory)\n")

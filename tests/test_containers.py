@@ -85,5 +85,3 @@ def test_threads_are_cut_to_the_cores_that_are_left(system, monkeypatch, own, fi
     assert chunks.count_cores() == want
     assert chunks.useful_threads(200) == chunks.useful_threads(0) == want
     assert chunks.useful_threads(1) == 1
-    with chunks.working_threads(200):
-        assert chunks.threads_at_work() == want

@@ -14,22 +14,21 @@ from super_sdf.mesh import CLEARANCE
 from super_sdf.steps.band import neighbour_table
 from super_sdf.steps.cell_cases import CORNERS, EDGE_AXIS, EDGE_START, triangle_table
 from super_sdf.steps.field import FineField
-from super_sdf.steps.nodes import block_ijk, number_shared_nodes
+from super_sdf.steps.nodes import block_ijk, share_parts
 
 
 def dense_field(lattice: np.ndarray, factor: int = 2) -> tuple[FineField, SdfGrid]:
     """Wrap a dense fine lattice as a field in which every voxel is decoded."""
     shape = tuple((n - 1) // factor for n in lattice.shape)
     voxels = np.argwhere(np.ones(shape)).astype(np.int32)
-    nodes = number_shared_nodes(neighbour_table(voxels, shape), factor)
-    position = voxels[:, None] * factor + block_ijk(factor)
-    values = np.empty(nodes.count, np.float32)
-    values[nodes.numbers()] = lattice[tuple(np.moveaxis(position, 2, 0))]
+    parts = share_parts(neighbour_table(voxels, shape))
+    position = voxels * factor + block_ijk(factor)[:, None]
+    blocks = lattice[tuple(np.moveaxis(position, 2, 0))].astype(np.float32)
     half = 0.5 - 0.5 / factor  # so that vertices come out in fine lattice indices
     grid = SdfGrid.trusted(
         np.zeros(shape, np.float32), (float(factor),) * 3, (half * factor + 0.5,) * 3
     )
-    return FineField(shape, factor, voxels, nodes, values, (0, shape[0])), grid
+    return FineField(shape, factor, voxels, blocks, parts, (0, shape[0])), grid
 
 
 def test_every_case_uses_exactly_its_crossed_edges():

@@ -5,13 +5,14 @@ import pytest
 
 from super_sdf.errors import OptionError
 from super_sdf.steps.band import neighbour_table
+from super_sdf.steps.field import FineField
 from super_sdf.steps.nodes import (
     average_shared,
     block_ijk,
     block_offsets,
     check_factor,
-    number_shared_nodes,
     pin_to_skipped,
+    share_parts,
     signs_of_skipped,
 )
 
@@ -41,47 +42,71 @@ def test_odd_and_absurd_factors_are_refused(factor):
         check_factor(factor)
 
 
+def field_of(voxels, table, factor, blocks=None):
+    """Return a field of these voxels: it numbers the nodes."""
+    blocks = np.empty(((factor + 1) ** 3, len(voxels)), np.float32) if blocks is None else blocks
+    return FineField((6, 5, 7), factor, voxels, blocks, share_parts(table), (0, 6))
+
+
 @pytest.mark.parametrize("factor", [2, 4])
 @pytest.mark.parametrize("seed", range(4))
 def test_nodes_have_one_number_for_each_position(seed, factor):
     voxels, table = some_voxels(seed)
-    nodes = number_shared_nodes(table, factor)
+    field = field_of(voxels, table, factor)
     position = (voxels[:, None] * factor + block_ijk(factor)).reshape(-1, 3)
     different, inverse = np.unique(position, axis=0, return_inverse=True)
-    assert nodes.count == len(different)
-    pairs = np.unique(np.stack([inverse.ravel(), nodes.numbers().ravel()]), axis=1)
-    assert pairs.shape[1] == nodes.count
+    assert field.parts.count_nodes(factor) == len(different)
+    pairs = np.unique(np.stack([inverse.ravel(), field.numbers.ravel()]), axis=1)
+    assert pairs.shape[1] == len(different)
 
 
 def test_nodes_belong_to_the_first_voxel_that_has_them_and_come_in_its_order():
     voxels, table = some_voxels(3)
-    nodes = number_shared_nodes(table, 4)
-    owner = np.full(nodes.count, len(voxels))
-    np.minimum.at(owner, nodes.numbers(), np.arange(len(voxels))[:, None])
+    field = field_of(voxels, table, 4)
+    owner = np.full(field.parts.count_nodes(4), len(voxels))
+    np.minimum.at(owner, field.numbers, np.arange(len(voxels))[:, None])
     assert (np.diff(owner) >= 0).all()
     for row in range(len(voxels) + 1):
-        assert nodes.owned_before(row) == (owner < row).sum()
+        assert field.parts.count_nodes(4, slice(0, row)) == (owner < row).sum()
 
 
-def test_shared_nodes_are_plain_means():
-    _, table = some_voxels(7)
-    nodes = number_shared_nodes(table, 4)
-    numbers = nodes.numbers()
-    blocks = np.random.default_rng(0).normal(size=numbers.shape).astype(np.float32)
-    values = average_shared(blocks, nodes)
-    total = np.bincount(numbers.ravel(), blocks.ravel())
-    np.testing.assert_array_equal(values, (total / np.bincount(numbers.ravel())).astype(np.float32))
+@pytest.mark.parametrize("factor", [2, 4])
+@pytest.mark.parametrize("threads", [1, 3])
+def test_shared_nodes_are_plain_means_in_every_block(monkeypatch, factor, threads):
+    monkeypatch.setattr("super_sdf.machine.threads.WORTH", 1)
+    voxels, table = some_voxels(7)
+    blocks = np.random.default_rng(0).normal(size=((factor + 1) ** 3, len(voxels) + 1))
+    blocks = blocks.astype(np.float32)
+    blocks[:, -1] = 0
+    field = field_of(voxels, table, factor, blocks[:, :-1])
+    numbers = field.numbers.ravel()
+    total = np.bincount(numbers, blocks[:, :-1].T.ravel())
+    average_shared(blocks, field.parts, factor, threads)
+    want = (total / np.bincount(numbers)).astype(np.float32)
+    np.testing.assert_array_equal(blocks[:, :-1].T, want[field.numbers])
+    np.testing.assert_array_equal(field.values, want)
+    assert not blocks[:, -1].any()
 
 
 def test_pinned_nodes_take_the_sign_of_the_skipped_voxel():
-    nodes = number_shared_nodes(np.where(np.arange(27) == 13, 0, -1)[None].astype(np.int32), 2)
-    values = np.ones(27, np.float32)
+    parts = share_parts(np.where(np.arange(27) == 13, 0, -1)[None].astype(np.int32))
+    blocks = np.ones((27, 1), np.float32)
     patches = np.ones((1, 27), np.float32)
     patches[0, 22] = -1  # the neighbour at +x is inside; others are beyond the grid, but that at -x
     ijk, voxels = np.array([[1, 0, 0]], np.int32), np.zeros(1, np.int32)
-    changed = pin_to_skipped(
-        values, nodes, signs_of_skipped(nodes.table, ijk, patches, voxels, (3, 1, 1))
-    )
-    on_face = nodes.numbers()[0, block_ijk(2)[:, 0] == 2]
-    assert changed.sum() == 9 and changed[on_face].all()
-    np.testing.assert_array_equal(values < 0, changed)
+    skipped = signs_of_skipped(parts, ijk, patches, voxels, (3, 1, 1))
+    assert pin_to_skipped(blocks, parts, 2, skipped).tolist() == [9]
+    np.testing.assert_array_equal(blocks[:, 0] < 0, block_ijk(2)[:, 0] == 2)
+
+
+def test_a_pinned_node_of_two_voxels_is_pinned_in_both_and_counted_once():
+    voxels = np.array([[1, 1, 1], [1, 1, 2]], np.int32)
+    parts = share_parts(neighbour_table(voxels, (3, 3, 4)))
+    patches = -np.ones((2, 27), np.float32)
+    skipped = signs_of_skipped(parts, voxels, patches, np.arange(2, dtype=np.int32), (3, 3, 4))
+    blocks = np.ones((27, 2), np.float32)
+    changed = pin_to_skipped(blocks, parts, 2, skipped)
+    left = (block_ijk(2) == 1).all(1)  # all nodes but those in the middle touch a skipped voxel
+    between = (block_ijk(2) == [1, 1, 2]).all(1)  # and that in the middle of the common face
+    assert (blocks[~left & ~between, 0] < 0).all() and (blocks[left | between, 0] > 0).all()
+    assert changed.tolist() == [25, 17]

@@ -1,4 +1,4 @@
-"""Cut in slabs, by any threads, compiled or not: the same mesh, to the last bit."""
+"""Cut in slabs, by any threads: the same mesh, to the last bit."""
 
 from itertools import pairwise
 
@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 
 from super_sdf import SdfGrid, load_network, pipeline, reconstruct
 from super_sdf.errors import OutOfMemoryError
+from super_sdf.machine import threads
+from super_sdf.machine.resources import Resources
 from super_sdf.mesh import join_meshes
 from super_sdf.pipeline import reconstruct_slabs
 from super_sdf.slabs import cutting
@@ -98,29 +100,27 @@ def test_what_a_slab_depends_on_is_needed(network, monkeypatch):
 
 @pytest.mark.parametrize("field", ["clean", "bad samples", "noisy"])
 @pytest.mark.parametrize("factor", [2, 4, 8])
-def test_compiled_and_threads_change_nothing(monkeypatch, field, factor):
+def test_threads_change_nothing(monkeypatch, field, factor):
     grid = SdfGrid.trusted(FIELDS[field], (1.0,) * 3, (1.0, 2.0, 3.0))
-    monkeypatch.setattr("super_sdf.machine.threads.CHUNK", 5000)
-    meshes = []
-    for compiled, threads in (("0", 1), ("0", 2), ("1", 1), ("1", 3)):
-        monkeypatch.setenv("SUPER_SDF_COMPILED", compiled)
-        meshes.append(reconstruct(grid, load_network("fast", threads=threads), factor))
+    monkeypatch.setattr(threads, "CHUNK", 5000)
+    monkeypatch.setattr(threads, "WORTH", 1000)
+    monkeypatch.setattr(threads, "count_cores", lambda: 3)
+    meshes = [reconstruct(grid, answering(number), factor) for number in (1, 2, 3)]
     for mesh in meshes[1:]:
         np.testing.assert_array_equal(mesh.faces, meshes[0].faces)
         np.testing.assert_array_equal(mesh.vertices, meshes[0].vertices)
 
 
-def test_compiled_changes_nothing_where_signs_are_pinned_and_nothing_is_near(monkeypatch):
-    """A field that is none: pinned nodes, foot points beyond the blocks, a cap."""
-    grid = SdfGrid.trusted(np.random.default_rng(2).uniform(-3, 3, (9, 10, 11)), (1.0,) * 3)
-    meshes = []
-    for compiled in "01":
-        monkeypatch.setenv("SUPER_SDF_COMPILED", compiled)
-        for answer in (trilinear, lambda patches, *rest: trilinear(patches, *rest) - 1):
-            meshes.append(reconstruct(grid, answer, 2, cap=True))
-    for plain, compiled in zip(meshes[:2], meshes[2:]):
-        np.testing.assert_array_equal(plain.faces, compiled.faces)
-        np.testing.assert_array_equal(plain.vertices, compiled.vertices)
+def answering(number):
+    """Return a stand-in for a network that is given some threads."""
+
+    class Threaded:
+        threads = number
+
+        def __call__(self, *inputs):
+            return trilinear(*inputs)
+
+    return Threaded()
 
 
 def test_a_function_that_does_not_say_how_far_it_sees_is_asked_once():
@@ -162,18 +162,17 @@ def test_the_thinnest_slabs_all_decode_something():
 def test_less_memory_makes_more_slabs_and_too_little_is_refused(bare_plan):
     band = survey(SdfGrid.trusted(rod(), (1.0,) * 3))
     need = peak_bytes(band, [cutting.whole(band)], 4)
-    assert len(plan_slabs(band, 4, 2, need)) == 1
-    counts = [
-        len(plan_slabs(band, 4, 2, 10**8 + int(share * (need - 10**8)))) for share in (0.9, 0.7)
-    ]
+    assert len(plan_slabs(band, 4, 2, Resources(memory=need))) == 1
+    less = [Resources(memory=10**8 + int(share * (need - 10**8))) for share in (0.9, 0.7)]
+    counts = [len(plan_slabs(band, 4, 2, resources)) for resources in less]
     assert 1 < counts[0] <= counts[1]
     with pytest.raises(OutOfMemoryError, match=r"^factor 4 on [\d,]+ voxels needs 1\d\d MB of "):
-        plan_slabs(band, 4, 2, 10**8 + 1)
-    assert len(plan_slabs(band, 4, 2, None)) == 1
+        plan_slabs(band, 4, 2, Resources(memory=10**8 + 1))
+    assert len(plan_slabs(band, 4, 2, Resources(memory=None))) == 1
 
 
 def test_a_band_larger_than_memory_is_refused_while_it_is_read():
     with pytest.raises(
         OutOfMemoryError, match=r"the band of the first \d+ planes has [\d,]+ voxels"
     ):
-        survey(ball(), bound=1000)
+        survey(ball(), resources=Resources(memory=1000))

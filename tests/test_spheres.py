@@ -8,11 +8,12 @@ from conftest import ball, trilinear
 
 from super_sdf import SdfGrid, load_network, pipeline, reconstruct
 from super_sdf.steps.band import neighbour_table
-from super_sdf.steps.interpolation import carry, read
-from super_sdf.steps.nodes import block_ijk, number_shared_nodes
+from super_sdf.steps.field import FineField
+from super_sdf.steps.interpolation import prolong, sample_trilinear
+from super_sdf.steps.nodes import block_ijk, number_parts, share_parts
 from super_sdf.steps.spheres import (
     PRIOR,
-    Samples,
+    ExactSamples,
     agreed_mean,
     exact_samples,
     find_foot_points,
@@ -25,78 +26,97 @@ CENTRE_OF_BALL = 10 - 0.37
 
 
 def blocks_of(grid, factor=4):
-    """Return samples, nodes and the nodes' positions, in half voxels from sample 0."""
+    """Return samples, parts and the positions of the nodes, (Q, D, 3), in half voxels."""
     band = survey(grid)
     table = neighbour_table(band.voxel_ijk, grid.shape)
     voxels = np.flatnonzero(band.decoded).astype(np.int32)
     row_of = pipeline.rows_among(voxels, len(table))
-    nodes = number_shared_nodes(row_of[table[voxels]], factor)
-    position = np.empty((nodes.count, 3))
-    position[nodes.numbers()] = (
-        2 * band.voxel_ijk[voxels][:, None] + block_ijk(factor) * (2 / factor) - 1
-    )
+    position = 2 * band.voxel_ijk[voxels] + block_ijk(factor)[:, None] * (2 / factor) - 1
     exact = np.flatnonzero(band.exact).astype(np.int32)
-    return Samples(band.patches, exact, table, row_of), nodes, position
+    return (
+        ExactSamples(band.patches, exact, table, row_of),
+        share_parts(row_of[table[voxels]]),
+        position,
+    )
 
 
 def distance_to_ball(nodes, radius=6.0):
-    exact = np.linalg.norm(nodes - 2 * CENTRE_OF_BALL, axis=1) - 2 * radius
-    return exact.astype(np.float32)
+    """Return blocks of distances, with the column of zeros."""
+    exact = np.linalg.norm(nodes - 2 * CENTRE_OF_BALL, axis=2) - 2 * radius
+    return with_zeros(exact.astype(np.float32))
+
+
+def with_zeros(blocks):
+    return np.pad(blocks, ((0, 0), (0, 1)))
+
+
+def fitted(blocks, parts, samples, factor=4):
+    moved = blocks.copy()
+    fit_to_spheres(moved, parts, factor, samples)
+    return moved
 
 
 @pytest.mark.parametrize("factor", [2, 4, 8])
 def test_foot_points_lie_on_the_surface(factor):
-    samples, nodes, position = blocks_of(ball(), factor)
-    feet = find_foot_points(distance_to_ball(position), nodes, samples)
+    samples, _, position = blocks_of(ball(), factor)
+    feet = find_foot_points(distance_to_ball(position), factor, samples)
     assert len(feet.rows) == len(samples.exact)
     assert np.abs(feet.values).max() < 0.12 / factor  # linear interpolation of a curved field
     assert feet.weights.min() > 0.95
 
 
-def test_a_linear_field_is_read_exactly():
-    _, nodes, position = blocks_of(ball())
+def test_a_linear_field_is_sampled_exactly():
+    _, _, position = blocks_of(ball())
     slope = np.array([0.48, -0.6, 0.64])
-    values = (position @ slope).astype(np.float32)
     rng = np.random.default_rng(0)
-    rows = rng.integers(len(nodes.table), size=100).astype(np.int32)
+    rows = rng.integers(position.shape[1], size=100).astype(np.int32)
     place = rng.random((3, 100)).astype(np.float32)
-    value, gradient = read(values, nodes, rows, place)
-    low = position[nodes.numbers(rows)[:, 0]]
+    blocks = with_zeros((position @ slope).astype(np.float32))
+    value, gradient = sample_trilinear(blocks, rows, place, 4)
+    low = position[0, rows]
     np.testing.assert_allclose(value, (low + 2 * place.T) @ slope, atol=1e-4)
     np.testing.assert_allclose(gradient.T * 4 / 2, np.tile(slope, (100, 1)), atol=1e-3)
 
 
 @pytest.mark.parametrize("bias", [-0.2, 0.1, 0.2])
 def test_a_surface_that_is_off_everywhere_is_brought_back(bias):
-    samples, nodes, position = blocks_of(ball())
+    samples, parts, position = blocks_of(ball())
     exact = distance_to_ball(position)
-    fitted = fit_to_spheres(exact + np.float32(bias), nodes, samples)
-    near = np.abs(exact) < 0.3
-    assert np.abs(fitted - exact)[near].max() < 0.4 * abs(bias)
-    assert np.abs(fitted - exact)[near].mean() < 0.2 * abs(bias)
+    biased = exact + np.float32(bias)
+    biased[:, -1] = 0
+    off = np.abs(fitted(biased, parts, samples) - exact)[np.abs(exact) < 0.3]
+    assert off.max() < 0.4 * abs(bias)
+    assert off.mean() < 0.2 * abs(bias)
 
 
 def test_an_exact_field_stays():
-    samples, nodes, position = blocks_of(ball())
+    samples, parts, position = blocks_of(ball())
     exact = distance_to_ball(position)
-    assert np.abs(fit_to_spheres(exact.copy(), nodes, samples) - exact).max() < 0.03
+    assert np.abs(fitted(exact, parts, samples) - exact).max() < 0.03
+
+
+@pytest.mark.parametrize("factor", [2, 4, 8])
+def test_copies_of_a_shared_node_stay_equal(factor):
+    samples, parts, position = blocks_of(ball(), factor)
+    moved = fitted(distance_to_ball(position), parts, samples, factor)[:, :-1]
+    field = FineField((20,) * 3, factor, samples.exact, moved, parts, (0, 20))
+    np.testing.assert_array_equal(field.values[field.numbers], moved.T)
 
 
 def test_exact_samples_are_kept():
-    samples, nodes, position = blocks_of(ball())
-    fitted = fit_to_spheres(distance_to_ball(position) + np.float32(0.1), nodes, samples)
+    samples, parts, position = blocks_of(ball())
+    moved = fitted(distance_to_ball(position + 0.05), parts, samples)
     decoded = np.flatnonzero(samples.row_of[:-1] >= 0)
-    middle = nodes.numbers()[samples.row_of[decoded], 62]
-    np.testing.assert_array_equal(fitted[middle], samples.patches[decoded, 13])
+    np.testing.assert_array_equal(moved[62, samples.row_of[decoded]], samples.patches[decoded, 13])
 
 
 def test_noisy_samples_move_nothing():
     grid = ball()
     noise = np.random.default_rng(0).uniform(-0.3, 0.3, grid.shape)
-    samples, nodes, position = blocks_of(SdfGrid.trusted(grid.values + noise, grid.spacing))
+    samples, parts, position = blocks_of(SdfGrid.trusted(grid.values + noise, grid.spacing))
     assert not len(samples.exact)
-    values = distance_to_ball(position)
-    np.testing.assert_array_equal(fit_to_spheres(values.copy(), nodes, samples), values)
+    blocks = distance_to_ball(position)
+    np.testing.assert_array_equal(fitted(blocks, parts, samples), blocks)
 
 
 def test_one_bad_sample_costs_only_its_neighbours_their_word():
@@ -128,33 +148,37 @@ def test_means_are_drawn_to_nothing_by_little_weight_and_by_disagreement():
 
 
 @pytest.mark.parametrize("cells", [1, 2])
-def test_nodes_that_no_foot_point_is_near_hear_nothing(cells):
-    samples, nodes, position = blocks_of(ball())
-    values = distance_to_ball(position) + np.float32(0.2)
+def test_nodes_that_no_foot_point_is_near_are_not_moved(cells):
+    samples, parts, position = blocks_of(ball())
+    blocks = distance_to_ball(position + 0.1)
     above = replace(samples, exact=samples.exact[:40])  # on one side: samples come in C order
-    feet = find_foot_points(values, nodes, above)
-    lattice = number_shared_nodes(nodes.table, cells)
-    heard = carry(mean_at_nodes(feet, lattice), lattice, nodes) != 0
-    assert heard.any() and position[heard, 0].max() < 2 * 8
+    feet = find_foot_points(blocks, 4, above)
+    numbers, count = number_parts(parts, np.ones(27, np.int64))
+    mean, *_ = mean_at_nodes(feet, feet.values, numbers, count, cells)
+    moved = prolong(mean[numbers], 2, 4) != 0
+    assert moved.any() and position[moved, 0].max() < 2 * 8
 
 
 @pytest.mark.parametrize("factor", [2, 4, 16])
-def test_a_linear_function_is_carried_exactly(factor):
-    _, nodes, fine = blocks_of(ball(), factor)
+def test_a_linear_function_is_prolonged_exactly(factor):
+    _, _, fine = blocks_of(ball(), factor)
     _, _, coarse = blocks_of(ball(), 2)
     slope = np.array([0.48, -0.6, 0.64])
-    lattice = number_shared_nodes(nodes.table, 2)
-    carried = carry((coarse @ slope).astype(np.float32), lattice, nodes)
-    np.testing.assert_allclose(carried, fine @ slope, atol=1e-4)
+    prolonged = prolong((coarse @ slope).astype(np.float32), 2, factor)
+    np.testing.assert_allclose(prolonged, fine @ slope, atol=1e-4)
+    ends = [0, factor]  # nodes of the coarse lattice keep their bits
+    whole = prolonged.reshape(*(factor + 1,) * 3, -1)[np.ix_(ends, ends, ends)]
+    corners = (coarse @ slope).astype(np.float32).reshape(3, 3, 3, -1)[::2, ::2, ::2]
+    np.testing.assert_array_equal(whole, corners)
 
 
 def test_a_ball_by_interpolation_gets_better(monkeypatch):
     def error(mesh):
         return np.abs(np.linalg.norm(mesh.vertices - CENTRE_OF_BALL, axis=1) - 6).mean()
 
-    fitted = error(reconstruct(ball(), trilinear))
-    monkeypatch.setattr(pipeline, "fit_to_spheres", lambda values, *_: values)
-    assert fitted < 0.35 * error(reconstruct(ball(), trilinear))
+    with_fit = error(reconstruct(ball(), trilinear))
+    monkeypatch.setattr(pipeline, "fit_to_spheres", lambda *_: None)
+    assert with_fit < 0.35 * error(reconstruct(ball(), trilinear))
 
 
 def test_a_wall_between_the_samples_is_found():

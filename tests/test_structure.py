@@ -16,7 +16,7 @@ MODULES = {
     for path in PACKAGE.rglob("*.py")
 }
 # Rooms that need more than the four packages that are always installed.
-WITH_EXTRAS = {"evaluation", "pictures", "truth", "compiled"}
+WITH_EXTRAS = {"evaluation", "pictures", "truth"}
 
 
 def room_of(module: str) -> str:

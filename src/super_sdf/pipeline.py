@@ -20,9 +20,8 @@ import numpy as np
 
 from .arrays import IntArray
 from .grid.sdf_grid import SdfGrid
-from .machine.compiling import use_compiled
-from .machine.memory import hold_less, memory_bound
-from .machine.threads import working_threads
+from .machine.memory import give_back
+from .machine.resources import Resources, allot
 from .mesh import Mesh, join_meshes, vertex_type
 from .network.decoder import Decoder, decode
 from .options import (
@@ -43,11 +42,11 @@ from .steps.nodes import (
     average_shared,
     block_offsets,
     check_factor,
-    number_shared_nodes,
     pin_to_skipped,
+    share_parts,
     signs_of_skipped,
 )
-from .steps.spheres import Samples, fit_to_spheres
+from .steps.spheres import ExactSamples, fit_to_spheres
 from .steps.survey import Band, no_surface, survey
 
 
@@ -57,6 +56,7 @@ def upsample(
     factor: int = 4,
     *,
     offset: float = 0.0,
+    max_memory: int | None = None,
     progress: Progress | None = None,
 ) -> FineField:
     """Refine a coarse grid near its surface, all at once.
@@ -74,6 +74,8 @@ def upsample(
         that (Sec. 5.3). Positive is outwards, whichever sign the given values have inside:
         ``grid.values``, which equal the offset there, are always negative inside. The distances
         must go 1.5 spacings further.
+    max_memory : int, optional
+        Bytes that the process may hold in all; a share of what is free unless given.
     progress : callable, optional
         Called with (done, total), see ``progress.Progress``; what it raises ends the work.
 
@@ -99,12 +101,12 @@ def upsample(
     check_network(network)
     check_progress(progress)
     factor, offset = check_factor(factor), check_distance(offset)
+    resources = allot(getattr(network, "threads", 0), check_max_memory(max_memory))
     steps = Steps(progress, [name for name in STEPS if name != "isosurface"])
-    with working_threads(getattr(network, "threads", 0)):
-        band = find_surface(grid, factor, offset, memory_bound())
-        (slab,) = plan_slabs(band, factor, None, memory_bound(), bytes_of(network))
-        steps.finish("band")
-        field = refine(band, network, factor, slab, steps)
+    band = find_surface(grid, factor, offset, resources)
+    (slab,) = plan_slabs(band, factor, None, resources, bytes_of(network))
+    steps.finish("band")
+    field = refine(band, network, factor, slab, resources.threads, steps)
     if len(field.signs()) < 2:
         raise no_surface(grid, offset)
     return field
@@ -199,27 +201,24 @@ def _slabs(
     progress: Progress | None,
 ) -> Iterator[Piece]:
     """Yield the pieces of ``reconstruct_slabs``, whose arguments were checked."""
-    threads = getattr(network, "threads", 0)
+    resources = allot(getattr(network, "threads", 0), max_memory)
     steps = Steps(progress)
-    bound = memory_bound(max_memory)
-    with working_threads(threads):
-        band = find_surface(grid, factor, offset, bound)
-        field, taken = getattr(network, "receptive_field", None), bytes_of(network)
-        slabs = plan_slabs(band, factor, field, bound, taken)
-        planned = {"slabs": len(slabs), "planned_bytes": peak_bytes(band, slabs, factor, taken)}
+    band = find_surface(grid, factor, offset, resources)
+    reach, taken = getattr(network, "receptive_field", None), bytes_of(network)
+    slabs = plan_slabs(band, factor, reach, resources, taken)
+    planned = peak_bytes(band, slabs, factor, taken, resources.threads)
     steps.divide(len(slabs))
     steps.finish("band")
     vertices = 0
     seen: set[bool] = set()
     for slab in slabs:
         if len(slabs) > 1:
-            hold_less()
-        with working_threads(threads):
-            field = refine(band, network, factor, slab, steps)
-            whole = close_at_border(field, grid, offset) if cap else field
-            meshes = extract_pieces(whole, grid, first_vertex=vertices)
-            piece = describe_piece(field, meshes, planned)
-            del field, whole, meshes  # no more of them than one at a time
+            give_back()
+        field = refine(band, network, factor, slab, resources.threads, steps)
+        whole = close_at_border(field, grid, offset) if cap else field
+        meshes = extract_pieces(whole, grid, vertices, resources.threads)
+        piece = describe_piece(field, meshes, {"slabs": len(slabs), "planned_bytes": planned})
+        del field, whole, meshes  # no more of them than one at a time
         steps.finish("isosurface")
         piece.seconds.update(steps.take_seconds())
         vertices += piece.counts["vertices"]
@@ -237,50 +236,54 @@ def bytes_of(network: Decoder) -> tuple[float, float]:
     return taken
 
 
-def find_surface(grid: SdfGrid, factor: int, offset: float, bound: int | None) -> Band:
+def find_surface(grid: SdfGrid, factor: int, offset: float, resources: Resources) -> Band:
     """Return the band of a grid, if a surface can be in it."""
     vertex_type(grid, factor)  # raises if there is none
-    band = survey(grid, offset, bound)  # Eqs. 2 and 4
+    band = survey(grid, offset, resources)  # Eqs. 2 and 4
     if not band.decoded.any():
         raise no_surface(grid, offset)
-    use_compiled(int(band.decoded.sum()))
     return band
 
 
 def refine(
-    band: Band, network: Decoder, factor: int, slab: Slab, steps: Steps | None = None
+    band: Band,
+    network: Decoder,
+    factor: int,
+    slab: Slab,
+    threads: int = 1,
+    steps: Steps | None = None,
 ) -> FineField:
     """Return the fine field of a slab, or of the whole band."""
     steps = steps or Steps()
-    inputs = patches, table, voxels = band.network_inputs(slab.seen, slab.decoded)
-    blocks = decode(network, inputs, block_offsets(factor), steps.within("network"))  # Eqs. 3, 5
+    patches, table, voxels = inputs = band.network_inputs(slab.seen, slab.decoded)
+    listen = steps.within("network")
+    blocks = decode(network, inputs, block_offsets(factor), listen, threads)  # Eqs. 3, 5
     steps.finish("network")
 
     row_of = rows_among(voxels, len(table))
-    nodes = number_shared_nodes(row_of[table[voxels]], factor)
-    values = average_shared(blocks, nodes)  # Eq. 7
-    del blocks
+    parts = share_parts(row_of[table[voxels]])
+    average_shared(blocks, parts, factor, threads)  # Eq. 7
     exact = np.flatnonzero(band.exact[slab.seen]).astype(np.int32)
-    values = fit_to_spheres(values, nodes, Samples(patches, exact, table, row_of))
+    fit_to_spheres(blocks, parts, factor, ExactSamples(patches, exact, table, row_of), threads)
     own_ijk = band.voxel_ijk[slab.seen][voxels]
-    skipped = signs_of_skipped(nodes.table, own_ijk, patches, voxels, band.shape)
-    pinned = pin_to_skipped(values, nodes, skipped)
+    skipped = signs_of_skipped(parts, own_ijk, patches, voxels, band.shape)
+    pinned = pin_to_skipped(blocks, parts, factor, skipped)
     steps.finish("nodes")
-    field = FineField(band.shape, factor, own_ijk, nodes, values, slab.planes)
+    field = FineField(band.shape, factor, own_ijk, blocks[:, :-1], parts, slab.planes)
     return replace(
         field,
         band_voxels=len(band.voxel_ijk),
         noisy_voxels=int(np.count_nonzero(~band.lipschitz)),
-        pinned=int(np.count_nonzero(pinned[field.own_nodes()])),
+        pinned=int(pinned[field.own_rows].sum()),
     )
 
 
 def describe_piece(field: FineField, meshes: list[Mesh], planned: dict[str, int]) -> Piece:
     """Return the meshes of a slab with what there is to say of them."""
-    own, nodes = field.rows(*field.planes), field.own_nodes()
+    own = field.own_rows
     counts = {
         "decoded_voxels": own.stop - own.start,
-        "nodes": nodes.stop - nodes.start,
+        "nodes": field.parts.count_nodes(field.factor, own),
         "pinned_nodes": field.pinned,
         "vertices": sum(len(mesh.vertices) for mesh in meshes),
         "triangles": sum(len(mesh.faces) for mesh in meshes),

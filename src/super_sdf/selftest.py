@@ -17,7 +17,6 @@ from . import __version__
 from .arrays import FloatArray, IntArray
 from .errors import DeviceError, SuperSdfError
 from .grid.sdf_grid import SdfGrid
-from .machine.compiling import try_compiled
 from .machine.extras import EXTRAS, how_to_install, missing_modules
 from .machine.memory import free_memory
 from .network.cuda import available_devices, check_cuda, describe_gpu, onnxruntime_version
@@ -174,12 +173,9 @@ def judge(
 
 
 def check_extra(name: str, modules: tuple[str, ...]) -> Finding:
-    """Report whether the modules of an extra are installed, and whether numba works."""
+    """Report whether the modules of an extra are installed."""
     missing = missing_modules(modules)
     if missing:
         says = f"no {', '.join(missing)}: {how_to_install(name)}"
         return Finding(MISSING, f"extra {name}", says)
-    fault = try_compiled() if "numba" in modules else ""  # upsample uses it by default
-    if fault:
-        return Finding(FAILED, f"extra {name}", fault)
     return Finding(OK, f"extra {name}", ", ".join(modules))

@@ -128,10 +128,8 @@ class Upsampling:
         }
 
     def device_notes(self) -> list[str]:
-        """Return notes on the device of the network and on compiled code that is not used."""
-        from ..machine.compiling import why_not
-
-        return [*self.network.notes, *why_not()]
+        """Return notes on the device of the network."""
+        return list(self.network.notes)
 
     def summary(self) -> str:
         """Describe the mesh in one line."""

@@ -8,7 +8,6 @@ from ..errors import FileError
 
 # Modules that the extras bring, beside those of the extra that they build on.
 EXTRAS = {
-    "fast": ("numba",),
     "3mf": ("lxml", "networkx"),
     "eval": ("igl", "matplotlib", "scipy", "skimage"),
     "view": ("pyvista",),

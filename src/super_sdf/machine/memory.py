@@ -11,7 +11,6 @@ from .containers import left_memory
 
 # Of the memory that is free, what is taken unless told otherwise.
 SHARE = 0.6
-LARGE = 1_000_000  # bytes of an array that is given back at once, where memory is short
 
 
 def free_memory() -> int | None:
@@ -52,24 +51,9 @@ def held_memory(peak: bool = False) -> int | None:
     return int(sizes["VmHWM" if peak else "VmRSS"].split()[0]) * 1024
 
 
-def hold_less() -> None:
-    """Let this process hold what it uses and no more, from now on, at some cost in time.
-
-    The C library keeps what is freed, up to 32 MB in a piece, for later. Told how large a piece is
-    to come from the system and go back to it, it no longer learns to keep larger ones. What it
-    keeps already is given back. Nothing happens where the library has no such calls (not glibc).
-    """
-    trim_threshold, mmap_threshold = -1, -3  # glibc's malloc.h
+def give_back() -> None:
+    """Give the system back what was freed, where the C library has such a call (glibc)."""
     with suppress(OSError, AttributeError, TypeError):  # the last: Windows knows no CDLL(None)
-        library = ctypes.CDLL(None)
-        library.mallopt(mmap_threshold, LARGE)
-        library.mallopt(trim_threshold, 2 * LARGE)
-    _give_back()
-
-
-def _give_back() -> None:
-    """Give the system back what was freed, where the C library has such a call."""
-    with suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
@@ -78,7 +62,7 @@ def forget_peak() -> None:
 
     What was freed is given back first, for else it would be used again unseen.
     """
-    _give_back()
+    give_back()
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
 

@@ -1,25 +1,23 @@
-"""Rows worked on a chunk at a time, so that what is made on the way stays small and in cache.
+"""Threads, and work that is cut into pieces for them.
 
-Chunks do not depend on each other, so they may run side by side; results come in their order.
+Pieces do not depend on each other, so they may run at the same time; results come in their order.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from contextvars import ContextVar
 from math import ceil
 from typing import TypeVar
 
 from .containers import bound_of_cores
 
+Piece = TypeVar("Piece")
 Result = TypeVar("Result")
 
-CHUNK = 1 << 19  # numbers
-
-_threads: ContextVar[int] = ContextVar("threads", default=1)
+CHUNK = 1 << 19  # numbers that are worked on at a time, so that temporaries stay in cache
+WORTH = 1 << 21  # numbers for each thread, or threads cost more than they save
 
 
 def count_cores() -> int:
@@ -41,37 +39,34 @@ def useful_threads(requested: int) -> int:
     return min(requested or cores, cores)
 
 
-def threads_at_work() -> int:
-    """Return how many chunks are worked on at a time."""
-    return _threads.get()
-
-
-@contextmanager
-def working_threads(number: int) -> Iterator[None]:
-    """Work on so many chunks at a time within; 0 for one a core."""
-    token = _threads.set(useful_threads(number))
-    try:
-        yield
-    finally:
-        _threads.reset(token)
+def worthwhile(numbers: int, threads: int) -> int:
+    """Return how many of the threads are worth starting for work on ``numbers`` numbers."""
+    return max(min(threads, numbers // WORTH), 1)
 
 
 def rows_in_chunk(width: int) -> int:
-    """Return how many rows go at a time if so many numbers are made of each on the way."""
+    """Return the rows per chunk when each row needs ``width`` temporaries."""
     return max(CHUNK // width, 1)
 
 
-def in_chunks(count: int, width: int, work: Callable[[slice], Result]) -> list[Result]:
-    """Return what ``work`` makes of ``count`` rows, chunk by chunk; of each it makes ``width``."""
+def chunks_of(count: int, width: int) -> list[slice]:
+    """Cut ``count`` rows into chunks, when each row needs ``width`` temporaries."""
     step = rows_in_chunk(width)
-    return side_by_side([slice(n, min(n + step, count)) for n in range(0, count, step)], work)
+    return [slice(first, min(first + step, count)) for first in range(0, count, step)]
 
 
-def side_by_side(
-    pieces: list[slice], work: Callable[[slice], Result], at_once: int | None = None
+def map_chunks(
+    work: Callable[[slice], Result], count: int, width: int, threads: int = 1
 ) -> list[Result]:
-    """Return ``work(piece)`` for each piece, at most ``at_once`` of them at a time if given."""
-    threads = min(at_once or threads_at_work(), threads_at_work(), len(pieces))
+    """Return ``work(rows)`` for chunks of ``count`` rows that need ``width`` temporaries each."""
+    return map_threads(work, chunks_of(count, width), worthwhile(count * width, threads))
+
+
+def map_threads(
+    work: Callable[[Piece], Result], pieces: Sequence[Piece], threads: int = 1
+) -> list[Result]:
+    """Return ``work(piece)`` for each piece, by as many threads."""
+    threads = min(threads, len(pieces))
     if threads < 2:
         return [work(piece) for piece in pieces]
     with ThreadPoolExecutor(threads) as pool:

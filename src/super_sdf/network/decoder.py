@@ -8,7 +8,7 @@ import numpy as np
 
 from ..arrays import FloatArray, IntArray
 from ..errors import ModelError
-from ..machine.threads import in_chunks
+from ..machine.threads import map_chunks
 from ..progress import Tell
 
 # Half voxels: the squares of sums of such values are still numbers in single precision.
@@ -35,8 +35,9 @@ def decode(
     inputs: tuple[FloatArray, IntArray, IntArray],
     offsets: FloatArray,
     progress: Tell | None = None,
+    threads: int = 1,
 ) -> FloatArray:
-    """Return a network's values, (D, Q) float32 in half voxels, of which all are usable.
+    """Return a network's values in half voxels, of which all are usable.
 
     Parameters
     ----------
@@ -48,6 +49,13 @@ def decode(
         In half voxels.
     progress : callable, optional
         Told the share that is done, if the network tells it.
+    threads : int
+        How many work at a time, after the network.
+
+    Returns
+    -------
+    (Q, D + 1) float32
+        A row for each offset, a column for each voxel, and one of zeros: see ``steps.nodes``.
 
     Raises
     ------
@@ -57,26 +65,39 @@ def decode(
     tells = progress is not None and getattr(network, "tells_progress", False)
     told: dict[str, Any] = {"progress": progress} if tells else {}
     values = network(*inputs, offsets, **told)
-    return check_values(values, (len(inputs[2]), len(offsets)))
+    check_kind(values, (len(inputs[2]), len(offsets)))
+    return to_blocks(values, threads)
 
 
-def check_values(values: Any, shape: tuple[int, int]) -> FloatArray:
-    """Return a network's values as float32 if they are numbers of this shape, else raise."""
+def check_kind(values: Any, shape: tuple[int, int]) -> None:
+    """Raise if a network's values are not floating-point numbers of this shape."""
     kind = getattr(values, "dtype", type(values).__name__)
     if not isinstance(values, np.ndarray) or values.shape != shape or values.dtype.kind != "f":
         raise ModelError(
             f"the network gave {kind} of shape {np.shape(values)} in place of float32 of shape "
             f"{shape}, (voxels, offsets)"
         )
-    with np.errstate(over="ignore"):  # what is too large is refused next
-        single: FloatArray = np.ascontiguousarray(values, np.float32)
-    bad = sum(in_chunks(*shape, lambda rows: count_unusable(single[rows])))
+
+
+def to_blocks(values: FloatArray, threads: int = 1) -> FloatArray:
+    """Return values (D, Q) as blocks (Q, D + 1), if all of them can be used."""
+    count, offsets = values.shape
+    blocks = np.empty((offsets, count + 1), np.float32)
+    blocks[:, count] = 0
+
+    def check_and_turn(rows: slice) -> int:
+        with np.errstate(over="ignore"):  # what is too large is refused
+            some = values[rows].astype(np.float32, copy=False)
+        blocks[:, rows] = some.T
+        return count_unusable(some)
+
+    bad = sum(map_chunks(check_and_turn, count, 4 * offsets, threads))
     if bad:
         raise ModelError(
-            f"{bad:,} of the {single.size:,} values that the network gave are NaN, infinite or "
+            f"{bad:,} of the {values.size:,} values that the network gave are NaN, infinite or "
             "beyond 1e15: it cannot be used for this grid; use another --model"
         )
-    return single
+    return blocks
 
 
 def count_unusable(values: FloatArray) -> int:

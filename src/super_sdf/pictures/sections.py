@@ -182,11 +182,11 @@ def _node_plane(field: FineField, number: int, index: int) -> NDArray[np.float64
     across, along = _others(number)
     in_grid = ((field.voxel_ijk >= 0) & (field.voxel_ijk < np.array(field.shape))).all(1)
     rows = np.flatnonzero(in_grid & (field.voxel_ijk[:, number] == index))
-    blocks = field.nodes.numbers(rows).reshape(-1, *(factor + 1,) * 3)
-    nodes = np.take(blocks, factor // 2, axis=number + 1)
+    blocks = field.blocks[:, rows].T.reshape(-1, *(factor + 1,) * 3)
+    values = np.take(blocks, factor // 2, axis=number + 1)
     place = factor * field.voxel_ijk[rows, :, None] + np.arange(factor + 1)
     plane = np.full((factor * field.shape[across] + 1, factor * field.shape[along] + 1), np.nan)
-    plane[place[:, across, :, None], place[:, along, None, :]] = field.values[nodes]
+    plane[place[:, across, :, None], place[:, along, None, :]] = values
     return plane
 
 

@@ -18,7 +18,8 @@ import numpy as np
 
 from ..errors import OutOfMemoryError
 from ..machine import index_width
-from ..machine.memory import held_memory, hold_less, in_words
+from ..machine.memory import give_back, held_memory, in_words
+from ..machine.resources import Resources
 from ..steps.spheres import REACH_IN_VOXELS
 from ..steps.survey import Band
 from .footprint import NETWORK_BYTES, slab_bytes
@@ -55,10 +56,10 @@ def plan_slabs(
     band: Band,
     factor: int,
     receptive_field: int | None,
-    bound: int | None,
+    resources: Resources,
     network_bytes: tuple[float, float] = NETWORK_BYTES,
 ) -> list[Slab]:
-    """Return the fewest slabs that fit, in order, and whose nodes can be numbered.
+    """Return the fewest slabs that fit in memory, in order.
 
     Parameters
     ----------
@@ -69,8 +70,8 @@ def plan_slabs(
     receptive_field : int, optional
         Voxels to each side that the network's answer depends on; if it is not known, the network
         must see the whole band at once.
-    bound : int, optional
-        Bytes that the process may hold in all: see ``memory.memory_bound``.
+    resources : Resources
+        What the run may use.
     network_bytes : two floats
         What the network takes: see ``footprint.slab_bytes``.
 
@@ -79,20 +80,17 @@ def plan_slabs(
     OutOfMemoryError
         If the thinnest slabs do not fit.
     OptionError
-        If they have more nodes than can be numbered, or the mesh more vertices, as far as that can
-        be said.
+        If the mesh has more vertices than can be numbered, as far as that can be said.
     """
     check_vertices(band, factor)
     how = "at once" if receptive_field is None else "even plane by plane"
+    bound, need = resources.memory, 0
     for nth, slabs in enumerate(_ways(band, receptive_field)):
         if nth == 1:
-            hold_less()  # else what was freed counts as held
-        need = peak_bytes(band, slabs, factor, network_bytes)
-        nodes = most_nodes(band, slabs, factor)
-        fits = bound is None or need <= bound
-        if fits and nodes <= index_width.LARGEST:
+            give_back()  # else what was freed counts as held
+        need = peak_bytes(band, slabs, factor, network_bytes, resources.threads)
+        if bound is None or need <= bound:
             return slabs
-    index_width.check_count(nodes, f"nodes {how}", factor)
     raise _does_not_fit(band, factor, how, need, bound or 0)
 
 
@@ -110,13 +108,8 @@ def check_vertices(band: Band, factor: int) -> None:
     far more than can be numbered are refused before they are counted.
     """
     if int(band.decoded_before[-1]) * 3 * factor**3 > index_width.LARGEST:
-        check_count = index_width.check_count
-        check_count(band.count_crossings() * factor**2 // 2, "vertices, at the least", factor)
-
-
-def most_nodes(band: Band, slabs: list[Slab], factor: int) -> int:
-    """Return how many nodes the blocks of a slab have at the most, shared ones as often."""
-    return max(band.count_decoded(slab.decoded) for slab in slabs) * (factor + 1) ** 3
+        least = band.count_crossings() * factor**2 // 2
+        index_width.check_count(least, "vertices, at the least")
 
 
 def peak_bytes(
@@ -124,11 +117,12 @@ def peak_bytes(
     slabs: list[Slab],
     factor: int,
     network_bytes: tuple[float, float] = NETWORK_BYTES,
+    threads: int = 1,
 ) -> int:
     """Return what the process will hold at the most: now, and for the largest slab."""
     held = held_memory() or band.patches.nbytes
     needs = (
-        slab_bytes(band, slab.seen, slab.decoded, slab.planes, factor, network_bytes)
+        slab_bytes(band, slab.seen, slab.decoded, slab.planes, factor, network_bytes, threads)
         for slab in slabs
     )
     return held + max(needs)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..machine.compiling import is_loaded, must_compile
-from ..machine.threads import CHUNK, rows_in_chunk, threads_at_work
+from ..machine.threads import CHUNK, rows_in_chunk
 from ..steps.marching import LOOKUP_BYTES, lookups_at_once
 from ..steps.survey import Band
 
@@ -23,10 +22,6 @@ NETWORK_BYTES = (680.0, 8.0)
 # The head of a network works on a chunk of voxels at all offsets at a time.
 BYTES_PER_OFFSET = 27_000
 NETWORK_FIXED = 5_000_000
-# Compiled functions, which come from the disk as they are called.
-CODE_BYTES = 60_000_000
-# The first process that uses them compiles them.
-COMPILER_BYTES = 60_000_000
 
 Range = tuple[int, int]
 
@@ -38,6 +33,7 @@ def slab_bytes(
     planes: Range,
     factor: int,
     network_bytes: tuple[float, float] = NETWORK_BYTES,
+    threads: int = 1,
 ) -> int:
     """Return what a process takes for a slab beside what it holds already, at the most.
 
@@ -45,13 +41,11 @@ def slab_bytes(
     """
     voxels, own = seen.stop - seen.start, band.count_decoded(decoded)
     values = own * (factor + 1) ** 3
-    threads = min(threads_at_work(), values // CHUNK + 1)
-    sizes = np.array([voxels, own, values, threads, 1])
+    sizes = np.array([voxels, own, values, min(threads, values // CHUNK + 1), 1])
     needs = dict(zip(STAGES, np.array(list(STAGES.values())) @ sizes))
-    needs["isosurface"] += _lookup_bytes(band, planes, own, factor)
+    needs["isosurface"] += _lookup_bytes(band, planes, own, factor, threads)
     needs["network"] = _bytes_for_network(voxels, own, factor, network_bytes)
-    code = CODE_BYTES * is_loaded() + COMPILER_BYTES * must_compile()
-    return code + int(max(needs.values()))
+    return int(max(needs.values()))
 
 
 def _bytes_for_network(
@@ -63,10 +57,10 @@ def _bytes_for_network(
     return float(np.dot(network_bytes, [voxels, max(decoded, offsets) * offsets])) + fixed
 
 
-def _lookup_bytes(band: Band, planes: Range, decoded: int, factor: int) -> int:
+def _lookup_bytes(band: Band, planes: Range, decoded: int, factor: int, threads: int) -> int:
     """Return what the tables take in which the vertices of whole planes are looked up."""
-    nodes_of_voxel = factor**2 * (factor + 1)  # of a flat sheet of voxels; a solid has fewer
+    nodes = (factor + 1) ** 3
     before = band.decoded_before[max(planes[0] - 1, 0) : planes[1] + 1]
     two_planes = int((before[2:] - before[:-2]).max()) if len(before) > 2 else decoded
-    widest = min(two_planes + rows_in_chunk((factor + 1) ** 3), decoded) * nodes_of_voxel
-    return LOOKUP_BYTES * widest * lookups_at_once(decoded * nodes_of_voxel, widest)
+    widest = min(two_planes + rows_in_chunk(nodes), decoded)
+    return LOOKUP_BYTES * nodes * widest * lookups_at_once(decoded, widest, threads)

@@ -6,20 +6,27 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import IntArray
+from ..arrays import FloatArray, IntArray
 from ..grid.sdf_grid import SdfGrid
-from ..machine.threads import in_chunks
 from ..neighbourhood import NEIGHBOURHOOD
 from .band import neighbour_table, plane_blocks, rescale
 from .field import FineField
-from .nodes import BARELY_INSIDE, BARELY_OUTSIDE, number_shared_nodes
+from .nodes import (
+    BARELY_INSIDE,
+    BARELY_OUTSIDE,
+    SHARING,
+    SharedParts,
+    nodes_of_part,
+    seen_from,
+    share_parts,
+)
 
 
 def close_at_border(field: FineField, grid: SdfGrid, offset: float = 0.0) -> FineField:
     """Surround the grid by voxels that are outside, so that the surface is closed at its border.
 
     Added are the border voxels inside the solid that were not decoded, and next to all border
-    voxels a layer of outer ones. The nodes beyond the border lie on it (see ``isosurface``), so
+    voxels a layer of outer ones. The nodes beyond the border lie on it (see ``marching``), so
     what is added is flat. Of a slab its planes are closed, and those beside them that say whose
     vertex is whose.
     """
@@ -33,26 +40,50 @@ def close_at_border(field: FineField, grid: SdfGrid, offset: float = 0.0) -> Fin
     voxel_ijk = voxel_ijk[order]
 
     padded = tuple(n + 2 for n in field.shape)
-    nodes = number_shared_nodes(neighbour_table(voxel_ijk + 1, padded), field.factor)
-    place = np.argsort(order)
-    decoded, solid = np.split(place[: len(border)], [len(known)])
-    values = np.full(nodes.count, BARELY_OUTSIDE, np.float32)
-
-    def fill(some: slice) -> None:
-        values[nodes.numbers(solid[some])] = BARELY_INSIDE
-
-    def copy(some: slice) -> None:
-        own = slice(rows.start + some.start, rows.start + some.stop)
-        values[nodes.numbers(decoded[some])] = field.values[field.nodes.numbers(own)]
-
-    width = (field.factor + 1) ** 3
-    in_chunks(len(solid), width, fill)
-    in_chunks(len(decoded), width, copy)  # after: the field's own values stay
+    parts = share_parts(neighbour_table(voxel_ijk + 1, padded))
+    column_of = np.empty(len(order), np.int32)  # of each voxel of the border
+    column_of[order] = np.arange(len(order))
+    known_at, solid_at, _ = np.split(column_of, [len(known), len(border)])
+    blocks = np.full((len(field.blocks), len(voxel_ijk)), BARELY_OUTSIDE, np.float32)
+    spread(BARELY_INSIDE, solid_at, blocks, parts, field.factor)
+    spread(field.blocks[:, rows], known_at, blocks, parts, field.factor)  # after: values stay
     ends = (-1, field.shape[0] + 1)  # the outer layers go with the first slab and the last
     planes = [ends[n] if at in (0, field.shape[0]) else at for n, at in enumerate(field.planes)]
     return replace(
-        field, voxel_ijk=voxel_ijk, nodes=nodes, values=values, planes=(planes[0], planes[1])
+        field, voxel_ijk=voxel_ijk, blocks=blocks, parts=parts, planes=(planes[0], planes[1])
     )
+
+
+def spread(
+    values: FloatArray | np.float32,
+    columns: IntArray,
+    blocks: FloatArray,
+    parts: SharedParts,
+    factor: int,
+) -> None:
+    """Set the blocks of some voxels, and what other blocks share with them.
+
+    Parameters
+    ----------
+    values : (Q, n) float32, or one number
+        The blocks' values.
+    columns : (n,) int32
+        The voxels.
+    blocks : (Q, D) float32
+        Changed in place.
+    parts : SharedParts
+        Of all D voxels.
+    factor : int
+        K.
+    """
+    values = np.broadcast_to(values, (len(blocks), len(columns)))
+    nodes = nodes_of_part(factor)
+    for part, sharing in enumerate(SHARING):
+        for place in sharing:
+            neighbour = parts.table[place, columns]
+            there = np.flatnonzero(neighbour >= 0)
+            seen = nodes[seen_from(part, place)]
+            blocks[seen[:, None], neighbour[there]] = values[nodes[part][:, None], there]
 
 
 def _filled_border(

@@ -7,6 +7,9 @@ Two cells see the same edges on their common face, hence the mesh is a closed, o
 
 Vertices and triangles come in the order of the voxels, so a surface made slab by slab is the same
 as one made at once.
+
+The edge that runs from node q of a block along axis a has the number ``a Q + q`` in that block. So
+seen from another block of the neighbourhood, or from a cell, its number differs by a constant.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,21 +25,21 @@ from numpy.typing import NDArray
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import OptionTypeError, seen
 from ..grid.sdf_grid import SdfGrid
-from ..machine.compiling import compiled_twin
 from ..machine.index_width import check_count
-from ..machine.threads import in_chunks, rows_in_chunk, side_by_side, threads_at_work
+from ..machine.threads import map_chunks, map_threads, rows_in_chunk
 from ..mesh import CLEARANCE, Mesh, join_meshes, vertex_type
-from ..neighbourhood import NEIGHBOURHOOD, STRIDES
+from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 from ..options import check_grid
 from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, triangle_table
 from .field import FineField
 from .nodes import block_ijk, part_of_node
 
-# Of each node, where the vertices on the edges that begin there are looked up: three numbers.
+# Bytes for each node of a block, in the table in which the vertices on its edges are looked up.
 LOOKUP_BYTES = 12
-# Nodes beyond the grid's border (a closed surface, see border.close_at_border) lie this far out, in
+# Nodes beyond the grid's border (a closed surface, see cap.close_at_border) lie this far out, in
 # fine spacings: enough for distinct vertices.
 CAP_HEIGHT = 0.02
+NO_FACES = np.empty((0, 3), np.int32)
 
 
 def extract_mesh(field: FineField, grid: SdfGrid, first_vertex: int = 0) -> Mesh:
@@ -52,7 +56,9 @@ def extract_mesh(field: FineField, grid: SdfGrid, first_vertex: int = 0) -> Mesh
     return join_meshes(extract_pieces(field, grid, first_vertex))
 
 
-def extract_pieces(field: FineField, grid: SdfGrid, first_vertex: int = 0) -> list[Mesh]:
+def extract_pieces(
+    field: FineField, grid: SdfGrid, first_vertex: int = 0, threads: int = 1
+) -> list[Mesh]:
     """Return the mesh of ``extract_mesh`` as a list of one or more pieces, in order.
 
     Raises
@@ -60,164 +66,155 @@ def extract_pieces(field: FineField, grid: SdfGrid, first_vertex: int = 0) -> li
     OptionError
         If there are more vertices than can be numbered, those before among them.
     """
-    times = count_vertices(field)
-    core = field.rows(*field.planes)
-    ends = np.cumsum(times, dtype=np.int64)
-    before = int(ends[core.start - 1]) if core.start else 0
-    firsts = np.append(0, ends) + (first_vertex - before)
-    check_count(int(firsts[core.stop]), "vertices", field.factor)
-    groups = _groups(field)
-    at_once = lookups_at_once(field.nodes.count, max(map(field.nodes_seen_from, groups), default=0))
-    parts = side_by_side(groups, lambda rows: _extract_group(field, grid, firsts, rows), at_once)
-    return parts or [Mesh(_to_world(np.empty((0, 3)), field, grid), np.empty((0, 3), np.int32))]
+    core = field.own_rows
+    before = field.plane_before(core).start if core.start < core.stop else core.start
+    rows = slice(before, core.stop)
+    crossings = find_crossings(field, rows, threads)
+    first = first_vertex - int(np.searchsorted(crossings.own_row, core.start))
+    check_count(first + len(crossings.own_row), "vertices")
+    groups = groups_of_planes(field)
+    widest = max((rows.stop - field.plane_before(rows).start for rows in groups), default=0)
+    at_once = lookups_at_once(len(field.voxel_ijk), widest, threads)
+
+    def mesh_of(group: slice) -> Mesh:
+        vertices = place_vertices(field, grid, crossings, group)
+        return Mesh(vertices, connect(field, crossings, group, first))
+
+    meshes = map_threads(mesh_of, groups, at_once)
+    return meshes or [Mesh(np.empty((0, 3), vertex_type(grid, field.factor)), NO_FACES)]
 
 
-def lookups_at_once(nodes: int, widest: int) -> int:
-    """Return how many threads may hold a vertex lookup table at the same time.
+@dataclass(frozen=True, eq=False)
+class Crossings:
+    """Where the surface crosses the blocks of some voxels, in the order of the voxels.
 
-    A plane may hold the whole surface. Tables of ``widest`` nodes, one a thread, take at most twice
-    what the values of all nodes take, or one thread does all.
+    Attributes
+    ----------
+    own_row, own_edge : (n,) int32, int16
+        Voxels, and crossed edges of their blocks that belong to the voxel: each has a vertex.
+    other_row, other_edge : (m,) int32, int16
+        Crossed edges that belong to another of the voxels that share them.
+    cell_row, cell, case : (c,) int32, int16, uint8
+        Voxels, crossed cells of their blocks, and the cells' cases.
     """
-    return max(min(8 * nodes // max(LOOKUP_BYTES * widest, 1), threads_at_work()), 1)
+
+    own_row: IntArray
+    own_edge: NDArray[np.int16]
+    other_row: IntArray
+    other_edge: NDArray[np.int16]
+    cell_row: IntArray
+    cell: NDArray[np.int16]
+    case: NDArray[np.uint8]
 
 
-def count_vertices(field: FineField) -> IntArray:
-    """Return how many vertices belong to each voxel, (D,): those on crossed edges that it owns."""
-    count = compiled_twin(_count_chunk)
-    width = len(edges_of_block(field.factor).axis)
-    return np.concatenate(in_chunks(len(field.voxel_ijk), width, lambda rows: count(field, rows)))
+def find_crossings(field: FineField, rows: slice, threads: int = 1) -> Crossings:
+    """Return where the surface crosses the blocks of some voxels."""
+    chunks = map_chunks(
+        lambda some: _crossings_of_chunk(field, rows.start + some.start, rows.start + some.stop),
+        rows.stop - rows.start,
+        4 * len(field.blocks),
+        threads,
+    )
+    empty = _crossings_of_chunk(field, rows.start, rows.start)
+    return Crossings(*(np.concatenate(arrays) for arrays in zip(empty, *chunks)))
 
 
-def _count_chunk(field: FineField, rows: slice) -> IntArray:
-    """Count the vertices of some voxels."""
-    times: IntArray = _own_edges(field, rows).sum(1, dtype=np.int32)
-    return times
+def _crossings_of_chunk(field: FineField, start: int, stop: int) -> tuple[NDArray[Any], ...]:
+    """Return the arrays of ``Crossings`` for some voxels."""
+    inside = field.blocks[:, start:stop] <= 0
+    crossed = np.flatnonzero(inside.any(0) & ~inside.all(0))
+    rows = (start + crossed).astype(np.int32)
+    inside = inside.take(crossed, 1).reshape(*(field.factor + 1,) * 3, -1)
+    slot, edge = _split(_crossed_edges(inside), rows, 3 * len(field.blocks))
+    owner = field.parts.owner[part_of_edge(field.factor)[edge], slot]
+    own = owner == CENTRE
+    case = _cases(inside)
+    active = np.flatnonzero(case - np.uint8(1) < 254)  # 0 and 255 are not crossed
+    cell_row, cell = _split(active, rows, field.factor**3)
+    return slot[own], edge[own], slot[~own], edge[~own], cell_row, cell, case[active]
 
 
-def _groups(field: FineField) -> list[slice]:
+def _split(
+    places: NDArray[np.intp], rows: IntArray, width: int
+) -> tuple[IntArray, NDArray[np.int16]]:
+    """Return the voxel and the place in its block of places in a table of ``width`` columns."""
+    line = places // width
+    return rows[line], (places - line * width).astype(np.int16)
+
+
+def _crossed_edges(inside: BoolArray) -> NDArray[np.intp]:
+    """Return the crossed edges of blocks (K+1, K+1, K+1, n), in a table of 3 Q columns."""
+    crossed = np.zeros((3, *inside.shape), bool)
+    np.not_equal(inside[1:], inside[:-1], out=crossed[0, :-1])
+    np.not_equal(inside[:, 1:], inside[:, :-1], out=crossed[1, :, :-1])
+    np.not_equal(inside[:, :, 1:], inside[:, :, :-1], out=crossed[2, :, :, :-1])
+    return np.flatnonzero(np.moveaxis(crossed, -1, 0))
+
+
+def _cases(inside: BoolArray) -> NDArray[np.uint8]:
+    """Return the cases of the cells of blocks (K+1, K+1, K+1, n), flat, voxel by voxel."""
+    bits: NDArray[Any] = inside.view(np.uint8)
+    bits = bits[:, :, :-1] | bits[:, :, 1:] << 1
+    bits = bits[:, :-1] | bits[:, 1:] << 2
+    bits = bits[:-1] | bits[1:] << 4
+    return np.moveaxis(bits, -1, 0).ravel()
+
+
+@lru_cache
+def part_of_edge(factor: int) -> IntArray:
+    """Return the part of the block in which each edge lies, (3 Q,): its part's owner owns it."""
+    side = np.tile(NEIGHBOURHOOD[part_of_node(factor)[0]], (3, 1, 1))
+    side[np.arange(3), :, np.arange(3)] = 0  # not at either end of its axis
+    part: IntArray = ((side.reshape(-1, 3) + 1) @ STRIDES).astype(np.int32)
+    return part
+
+
+def groups_of_planes(field: FineField) -> list[slice]:
     """Cut a field's planes into runs of whole planes: one, or with about a chunk of voxels."""
-    core = field.rows(*field.planes)
+    core = field.own_rows
     plane = field.voxel_ijk[core, 0]
     starts = core.start + np.flatnonzero(np.diff(plane, prepend=plane[:1] - 1))
-    step = rows_in_chunk((field.factor + 1) ** 3)
+    step = rows_in_chunk(len(field.blocks))
     chosen = np.unique(np.searchsorted(starts, np.arange(core.start, core.stop, step)))
     bounds = [*starts[chosen[chosen < len(starts)]].tolist(), core.stop]
     return [slice(a, b) for a, b in pairwise(bounds)]
 
 
-@dataclass(frozen=True, eq=False)
-class BlockEdges:
-    """The lattice edges in a block, axis by axis in the order of their first nodes: 3 K (K+1)^2.
+def lookups_at_once(voxels: int, widest: int, threads: int) -> int:
+    """Return how many threads may hold a vertex lookup table at the same time.
 
-    Attributes
-    ----------
-    axis : (E,) int32
-        Along which axis each runs.
-    start, end : (E,) int32
-        Its block nodes.
-    part : (E,) int32
-        The part of the block that it lies in: an edge belongs to the voxel that owns its part.
+    A plane may hold the whole surface. Tables of ``widest`` voxels, one a thread, take at most
+    twice what the values of all voxels take, or one thread does all.
     """
+    return max(min(8 * voxels // max(LOOKUP_BYTES * widest, 1), threads), 1)
 
-    axis: IntArray
-    start: IntArray
-    end: IntArray
-    part: IntArray
+
+def place_vertices(
+    field: FineField, grid: SdfGrid, crossings: Crossings, rows: slice
+) -> NDArray[Any]:
+    """Return the vertices on the edges that some voxels own, (n, 3), in world coordinates."""
+    own = slice(*np.searchsorted(crossings.own_row, [rows.start, rows.stop]))
+    row, edge = crossings.own_row[own], crossings.own_edge[own]
+    axis, node = np.divmod(edge, np.int16(len(field.blocks)))
+    share = _crossing(field.blocks[node, row], field.blocks[_ends(field.factor)[edge], row])
+    vertices: NDArray[Any] = np.empty((len(row), 3), vertex_type(grid, field.factor))
+    for along in range(3):
+        voxel = field.voxel_ijk[row, along]
+        start = field.factor * voxel + block_ijk(field.factor)[node, along]
+        runs, last = axis == along, field.shape[along] * field.factor
+        lattice: NDArray[np.float64] = start + np.where(runs, share, 0.0)
+        if ((voxel < 0) | (voxel >= field.shape[along])).any():  # a cap
+            lattice = _onto_border(start, runs, share, last)
+        # The fine index K i + K/2 is sample i.
+        sample = lattice / field.factor - 0.5
+        vertices[:, along] = sample * grid.spacing[along] + grid.origin[along]
+    return vertices
 
 
 @lru_cache
-def edges_of_block(factor: int) -> BlockEdges:
-    """Return the edges of a block."""
-    block = block_ijk(factor)
-    starts = [np.flatnonzero(block[:, axis] < factor) for axis in range(3)]
-    axis = np.repeat(np.arange(3), [len(start) for start in starts])
-    start = np.concatenate(starts)
-    end = start + np.array([(factor + 1) ** 2, factor + 1, 1])[axis]
-    side = NEIGHBOURHOOD[part_of_node(factor)[0][start]].copy()
-    side[np.arange(len(side)), axis] = 0  # not at either end of its axis
-    arrays = axis, start, end, (side + 1) @ STRIDES
-    return BlockEdges(*(array.astype(np.int32) for array in arrays))
-
-
-def _own_edges(field: FineField, rows: slice | IntArray) -> BoolArray:
-    """Say which edges of some voxels' blocks are crossed and belong to the voxel, (n, E)."""
-    edges = edges_of_block(field.factor)
-    inside = field.inside_blocks(rows).reshape(-1, (field.factor + 1) ** 3)
-    crossed = inside[:, edges.start] != inside[:, edges.end]
-    own: BoolArray = crossed & field.nodes.owned[rows][:, edges.part]
-    return own
-
-
-def _extract_group(field: FineField, grid: SdfGrid, firsts: NDArray[np.int64], rows: slice) -> Mesh:
-    """Return the vertices and triangles of some whole planes of voxels."""
-    extract = compiled_twin(_extract_rows)
-    position, faces = extract(field, firsts, field.plane_before(rows), rows)
-    return Mesh(_to_world(position, field, grid), faces)
-
-
-def _extract_rows(
-    field: FineField, firsts: NDArray[np.int64], before: slice, rows: slice
-) -> tuple[NDArray[np.float64], IntArray]:
-    """Return positions, in fine spacings, and triangles of some planes, given the plane before.
-
-    ``firsts`` is the number of each voxel's first vertex, (D + 1,).
-    An edge belongs to a voxel of its own plane or the one before. The vertex on the edge that runs
-    from node v along axis a is looked up at ``3 v + a``.
-    """
-    first_node = field.nodes.owned_before(before.start)
-    nodes = field.nodes.owned_before(rows.stop) - first_node
-    vertex_at = np.empty(3 * nodes, np.int32)  # what is not set is not read
-    positions = []
-    for some in (*_chunks(field, before), *_chunks(field, rows)):
-        voxel, edge = np.nonzero(_own_edges(field, some))
-        voxel += some.start
-        own = np.arange(len(voxel)) - np.searchsorted(voxel, voxel)  # the voxel's first is 0
-        start, end = _ends(field, voxel, edge)
-        axis = edges_of_block(field.factor).axis[edge]
-        near = start >= first_node  # not on the far side of the plane before
-        at = _lattice_edges(start, first_node) + axis
-        vertex_at[at[near]] = (firsts[voxel] + own)[near]
-        if some.start >= rows.start:
-            values = field.values[start], field.values[end]
-            positions.append(_positions(field, voxel, edge, *values))
-    faces = [_triangles(field, some, vertex_at, first_node) for some in _chunks(field, rows)]
-    return np.concatenate(positions), np.concatenate(faces)
-
-
-def _chunks(field: FineField, rows: slice) -> list[slice]:
-    """Cut rows so that what is made of each chunk stays small, where a plane has many voxels."""
-    step = rows_in_chunk(4 * (field.factor + 1) ** 3)
-    return [slice(n, min(n + step, rows.stop)) for n in range(rows.start, rows.stop, step)]
-
-
-def _ends(
-    field: FineField, voxel: NDArray[np.intp], edge: NDArray[np.intp]
-) -> tuple[IntArray, IntArray]:
-    """Return the nodes at both ends of edges of blocks."""
-    edges = edges_of_block(field.factor)
-    part, place = part_of_node(field.factor)
-    low, high = (
-        field.nodes.starts[voxel, part[node]] + place[node]
-        for node in (edges.start[edge], edges.end[edge])
-    )
-    return low, high
-
-
-def _positions(
-    field: FineField,
-    voxel: NDArray[np.intp],
-    edge: NDArray[np.intp],
-    low: FloatArray,
-    high: FloatArray,
-) -> NDArray[np.float64]:
-    """Return the vertices on edges with values at both ends, from the fine lattice's first node."""
-    edges = edges_of_block(field.factor)
-    start = field.factor * field.voxel_ijk[voxel] + block_ijk(field.factor)[edges.start[edge]]
-    lattice = np.array(field.shape) * field.factor
-    share = _crossing(low, high)
-    first = _onto_border(start.astype(np.float64), lattice)
-    last = _onto_border(start + np.eye(3)[edges.axis[edge]], lattice)
-    return first + share[:, None] * (last - first)
+def _ends(factor: int) -> NDArray[np.intp]:
+    """Return the node at the far end of each edge of a block, (3 Q,); past it if there is none."""
+    return (np.arange((factor + 1) ** 3) + _strides(factor)[:, None]).ravel()
 
 
 def _crossing(low: FloatArray, high: FloatArray) -> NDArray[np.float64]:
@@ -226,55 +223,89 @@ def _crossing(low: FloatArray, high: FloatArray) -> NDArray[np.float64]:
     return np.clip(low64 / (low64 - high64), CLEARANCE, 1 - CLEARANCE)
 
 
-def _onto_border(position: NDArray[np.float64], lattice: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Bring nodes from beyond the border of the fine lattice back to it."""
-    return np.clip(position, -CAP_HEIGHT, lattice + CAP_HEIGHT)
+def _onto_border(
+    start: IntArray, runs: BoolArray, share: NDArray[np.float64], last: int
+) -> NDArray[np.float64]:
+    """Return coordinates on edges whose nodes beyond the border are brought back to it.
+
+    ``runs`` says which edges run along the axis of the coordinates.
+    """
+    low = np.clip(start.astype(np.float64), -CAP_HEIGHT, last + CAP_HEIGHT)
+    high = np.clip(start + runs.astype(np.float64), -CAP_HEIGHT, last + CAP_HEIGHT)
+    return low + share * (high - low)
 
 
-def _triangles(field: FineField, rows: slice, vertex_at: IntArray, first_node: int) -> IntArray:
-    """Return the triangles of some voxels' cells, in the order of voxels and cells."""
-    factor = field.factor
-    inside = field.inside_blocks(rows)
-    case = np.zeros((len(inside),) + (factor,) * 3, np.uint8)
-    for bit, (x, y, z) in enumerate(CORNERS):
-        corner = inside[:, x : x + factor, y : y + factor, z : z + factor]
-        case |= corner.astype(np.uint8) << np.uint8(bit)
-    counts, table = triangle_table()
-    cell = np.flatnonzero((case != 0) & (case != 255))
-    case_of_cell = case.ravel()[cell]
-    times = counts[case_of_cell]
-    of_triangle = np.repeat(np.arange(len(cell)), times)
-    nth = np.arange(len(of_triangle)) - np.repeat(np.cumsum(times) - times, times)
-    edges = table[case_of_cell[of_triangle], nth]
-    voxel, low_node = _low_nodes(cell, factor)
-    step = np.array([(factor + 1) ** 2, factor + 1, 1])
-    start = (CORNERS @ step)[np.array(EDGE_START)]
-    block_node = low_node[of_triangle, None] + start[edges]
-    part, place = part_of_node(factor)
-    starts = field.nodes.starts[rows]
-    node = starts[voxel[of_triangle, None], part[block_node]] + place[block_node]
-    faces: IntArray = vertex_at[_lattice_edges(node, first_node) + np.array(EDGE_AXIS)[edges]]
+def connect(field: FineField, crossings: Crossings, rows: slice, first: int) -> IntArray:
+    """Return the triangles in some whole planes of voxels, in the order of voxels and cells.
+
+    ``first`` is the number of the first vertex of ``crossings``.
+    """
+    before = field.plane_before(rows).start
+    edges = 3 * len(field.blocks)
+    vertex_at = _number_vertices(field, crossings, slice(before, rows.stop), first)
+    some = slice(*np.searchsorted(crossings.cell_row, [rows.start, rows.stop]))
+    case = crossings.case[some]
+    counts, starts, table = _flat_triangles(field.factor)
+    low = (crossings.cell_row[some] - before) * np.int64(edges)
+    low += _low_nodes(field.factor)[crossings.cell[some]]
+    times = counts[case]
+    nth = np.arange(times.sum()) + np.repeat(starts[case] - (np.cumsum(times) - times), times)
+    faces: IntArray = vertex_at.take(table[nth] + np.repeat(low, times)[:, None])
     return faces
 
 
-def _lattice_edges(node: IntArray, first_node: int) -> NDArray[np.int64]:
-    """Return where the edges that begin at nodes are looked up: 32 bits are too few for that."""
-    at: NDArray[np.int64] = 3 * (node.astype(np.int64) - first_node)
-    return at
+def _number_vertices(field: FineField, crossings: Crossings, rows: slice, first: int) -> IntArray:
+    """Return for the edges of some voxels' blocks, flat, the vertex if there is one.
+
+    All but the vertices on edges of the first plane that voxels before it own.
+    """
+    edges = 3 * len(field.blocks)
+    vertex_at = np.empty((rows.stop - rows.start) * edges, np.int32)  # what is not set is not read
+    own = slice(*np.searchsorted(crossings.own_row, [rows.start, rows.stop]))
+    row = crossings.own_row[own] - np.int64(rows.start)
+    vertex_at[row * edges + crossings.own_edge[own]] = np.arange(
+        first + own.start, first + own.stop
+    )
+    other = slice(*np.searchsorted(crossings.other_row, [rows.start, rows.stop]))
+    row, edge = crossings.other_row[other], crossings.other_edge[other].astype(np.int64)
+    place = field.parts.owner[part_of_edge(field.factor)[edge], row]
+    owner = field.parts.table[place, row] - np.int64(rows.start)
+    there = owner >= 0
+    at = owner * edges + edge - _shifts(field.factor)[place]
+    vertex_at[((row - np.int64(rows.start)) * edges + edge)[there]] = vertex_at[at[there]]
+    return vertex_at
 
 
-def _low_nodes(cell: NDArray[np.int64], factor: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the voxel of each cell, and the block node at the cell's low corner."""
-    voxel, within = np.divmod(cell, factor**3)
-    x, rest = np.divmod(within, factor**2)
-    y, z = np.divmod(rest, factor)
-    return voxel, (x * (factor + 1) + y) * (factor + 1) + z
+@lru_cache
+def _shifts(factor: int) -> NDArray[np.int64]:
+    """Return how far an edge's number is from that which the voxel at each place gives it."""
+    shifts: NDArray[np.int64] = factor * NEIGHBOURHOOD.astype(np.int64) @ _strides(factor)
+    return shifts
 
 
-def _to_world(
-    position: NDArray[np.float64], field: FineField, grid: SdfGrid
-) -> NDArray[np.float64] | FloatArray:
-    """Turn fine lattice positions into world ones: fine index K i + K/2 is sample i."""
-    sample = position / field.factor - 0.5
-    world: NDArray[np.float64] = sample * np.array(grid.spacing) + np.array(grid.origin)
-    return world if vertex_type(grid, field.factor) is np.float64 else world.astype(np.float32)
+def _strides(factor: int) -> NDArray[np.int64]:
+    """Return from a node of a block to the next along each axis."""
+    return np.array([(factor + 1) ** 2, factor + 1, 1])
+
+
+@lru_cache
+def _low_nodes(factor: int) -> NDArray[np.intp]:
+    """Return the node at the low corner of each cell of a block, (K^3,)."""
+    return np.flatnonzero((block_ijk(factor) < factor).all(1))
+
+
+@lru_cache
+def _flat_triangles(factor: int) -> tuple[IntArray, IntArray, NDArray[np.int64]]:
+    """Return the triangles of all cases in a row.
+
+    Returns
+    -------
+    (256,) int32, (256,) int32, (n, 3) int64
+        How many each case has, which is its first, and the edges that carry their vertices, from
+        the number of the cell's low node.
+    """
+    counts, table = triangle_table()
+    start = (CORNERS @ _strides(factor))[np.array(EDGE_START)]
+    edge = start + np.array(EDGE_AXIS) * (factor + 1) ** 3
+    used = np.arange(table.shape[1]) < counts[:, None]
+    return counts, (np.cumsum(counts) - counts).astype(np.int32), edge[table[used]]

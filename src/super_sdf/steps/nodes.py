@@ -1,18 +1,23 @@
-"""The fine lattice: the nodes of each voxel's block, and one value for each shared node.
+"""The fine lattice: the nodes of each voxel's block, and the mean of those that blocks share.
 
 Nodes are points of spacing h/K. A voxel's block is its (K+1)^3 nodes, faces included (Eq. 3), in
 C order. The fine index of coarse sample i is ``K*i + K/2``.
 
+Values are kept block by block, (Q, D): a row for each of the block's Q nodes, a column for each
+voxel. What is done to a node is so done to all voxels in one pass over contiguous memory. Blocks
+that share a node have a copy of it each, and from ``average_shared`` on the copies are equal, bit
+for bit. One column more, always 0, stands for voxels that are not there: index -1 reads it.
+
 A block has 27 parts: 8 corners, 12 edges, 6 faces and the inside, in the order of
-``NEIGHBOURHOOD``. A part is shared as a whole; it belongs to the first of the voxels that share it,
-and its nodes have consecutive numbers. So numbering 27 parts a voxel numbers all nodes, and nothing
-is sorted or searched.
+``NEIGHBOURHOOD``. A part is shared as a whole, and belongs to the first of the voxels that share
+it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 from numbers import Integral
 from typing import Any
 
@@ -21,9 +26,8 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray, Signs
 from ..errors import OptionError, OptionTypeError, seen
-from ..machine.compiling import compiled_twin
 from ..machine.index_width import check_count
-from ..machine.threads import in_chunks
+from ..machine.threads import map_threads, worthwhile
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 
 MAX_FACTOR = 16
@@ -79,111 +83,151 @@ def nodes_of_part(factor: int) -> list[NDArray[np.intp]]:
     return [np.flatnonzero(part == number) for number in range(27)]
 
 
+@lru_cache
+def part_sizes(factor: int) -> NDArray[np.int64]:
+    """Return how many nodes each part has, (27,)."""
+    return np.array([len(nodes) for nodes in nodes_of_part(factor)])
+
+
 def seen_from(part: int, neighbour: int | np.integer[Any]) -> int:
     """Return which part of a neighbour that shares it a part is: it is on the other side there."""
     return int((NEIGHBOURHOOD[part] - 2 * NEIGHBOURHOOD[neighbour] + 1) @ STRIDES)
 
 
 @dataclass(frozen=True, eq=False)
-class SharedNodes:
-    """Numbers for the nodes of some blocks: a node that blocks share has one number.
+class SharedParts:
+    """Which voxels share the parts of their blocks.
 
     Attributes
     ----------
-    factor : int
-        K.
-    table : (D, 27) int32
+    table : (27, D) int32
         Neighbours among the D voxels themselves, -1 where there is none.
-    starts : (D, 27) int32
-        The number of the first node of each part.
-    owned : (D, 27) bool
-        Which parts belong to the voxel itself.
-    count : int
-        How many different nodes there are.
+    owner : (27, D) int8
+        Where the voxel that owns a part stands, as a place in the neighbourhood: ``CENTRE`` for
+        the voxel itself.
     """
 
-    factor: int
     table: IntArray
-    starts: IntArray
-    owned: BoolArray
-    count: int
+    owner: Signs
 
-    def numbers(self, rows: slice | NDArray[np.integer[Any]] = slice(None)) -> IntArray:
-        """Return the nodes of some blocks, (n, Q)."""
-        part, place = part_of_node(self.factor)
-        return self.starts[rows][:, part] + place
+    def owned(self, rows: slice = slice(None)) -> BoolArray:
+        """Say which parts some voxels own, (27, n)."""
+        own: BoolArray = self.owner[:, rows] == CENTRE
+        return own
 
-    def owned_before(self, row: int) -> int:
-        """Return how many nodes belong to the voxels before a row: theirs come first."""
-        if row == len(self.starts):
-            return self.count
-        return int(self.starts[row][self.owned[row]].min())
+    def count_nodes(self, factor: int, rows: slice = slice(None)) -> int:
+        """Return how many nodes belong to some voxels."""
+        parts = np.count_nonzero(self.owned(rows), axis=1)
+        return int(parts @ part_sizes(factor))
 
 
-def number_shared_nodes(table: IntArray, factor: int) -> SharedNodes:
-    """Number the nodes of all blocks of voxels whose neighbours among themselves are given.
+def share_parts(table: IntArray) -> SharedParts:
+    """Find the owner of each part, given the voxels' neighbours among themselves, (D, 27)."""
+    by_place = np.ascontiguousarray(table.T)
+    there = by_place >= 0
+    owner = np.full(by_place.shape, CENTRE, np.int8)
+    for part, sharing in enumerate(SHARING):
+        for place in sharing[sharing < CENTRE][::-1]:  # the first comes last, and stays
+            owner[part][there[place]] = place
+    return SharedParts(by_place, owner)
+
+
+def number_parts(parts: SharedParts, sizes: NDArray[np.int64]) -> tuple[IntArray, int]:
+    """Number the nodes of all parts, in the order of the voxels that own them.
+
+    Parameters
+    ----------
+    parts : SharedParts
+        Of D voxels.
+    sizes : (27,) int64
+        How many nodes a part has.
+
+    Returns
+    -------
+    (27, D) int32 and int
+        The number of the first node of each part, and how many nodes there are.
 
     Raises
     ------
     OptionError
-        If there are more than can be numbered.
+        If there are more than 32-bit numbers.
     """
-    sizes = np.array([len(nodes) for nodes in nodes_of_part(factor)], np.int32)
-    starts, owned, count = compiled_twin(_number_parts)(table, sizes)
-    check_count(count, "nodes in a slab", factor)
-    return SharedNodes(factor, table, starts, owned, count)
-
-
-def _number_parts(table: IntArray, sizes: IntArray) -> tuple[IntArray, BoolArray, int]:
-    """Return ``starts``, ``owned`` and ``count`` for parts of ``sizes`` nodes each.
-
-    ``starts`` is meaningless if ``count`` exceeds 32 bits: the caller checks ``count`` first.
-    """
-    owned = np.stack([(table[:, sharing[sharing < CENTRE]] < 0).all(1) for sharing in SHARING], 1)
-    own_sizes = owned * sizes
-    own_starts = np.cumsum(own_sizes.ravel(), dtype=np.int32).reshape(table.shape)
-    own_starts -= own_sizes
-    del own_sizes
-    starts = np.empty_like(own_starts)
+    owned = parts.owned()
+    count = check_count(int(np.count_nonzero(owned, axis=1) @ sizes), "nodes")
+    ends = np.cumsum((owned.T * sizes.astype(np.int32)).ravel(), dtype=np.int32)
+    starts = np.ascontiguousarray(ends.reshape(-1, 27).T) - sizes[:, None].astype(np.int32)
     for part, sharing in enumerate(SHARING):
-        first = sharing[(table[:, sharing] >= 0).argmax(1)]
-        as_part = np.array([seen_from(part, neighbour) for neighbour in range(27)])[first]
-        owner = np.take_along_axis(table, first[:, None], 1)[:, 0]
-        starts[:, part] = own_starts[owner, as_part]
-    return starts, owned, int(owned.sum(0, dtype=np.int64) @ sizes)
+        for place in sharing[sharing < CENTRE]:
+            rows = np.flatnonzero(parts.owner[part] == place)
+            starts[part, rows] = starts[seen_from(part, place), parts.table[place, rows]]
+    return starts, count
 
 
-def average_shared(blocks: FloatArray, nodes: SharedNodes) -> FloatArray:
-    """Return one value a node: the mean over the blocks that predict it (Eq. 7).
+def average_shared(blocks: FloatArray, parts: SharedParts, factor: int, threads: int = 1) -> None:
+    """Set each copy of a shared node to the mean of the copies (Eq. 7).
 
-    ``blocks`` is (D, Q); the result is (count,). The sum runs in the order of the voxels, in double
-    precision, so it does not depend on how the work was divided.
+    Parameters
+    ----------
+    blocks : (Q, D + 1) float32
+        A prediction for each node of each block, changed in place; the last column is 0.
+    parts : SharedParts
+        Of the D voxels.
+    factor : int
+        K.
+    threads : int
+        How many work at a time.
+
+    Notes
+    -----
+    Sums run in the order of the voxels, in double precision (two numbers need none), so that all
+    copies get the same bits and the result does not depend on how the work was divided.
     """
-    values = np.empty(nodes.count, np.float32)
-    average = compiled_twin(_average_chunk)
-    count, width = blocks.shape
-    in_chunks(count, width, lambda rows: average(blocks, nodes, rows, values))
-    return values
+    groups = [axes for axes in product((False, True), repeat=3) if any(axes)]
+    threads = worthwhile(blocks.size, threads)
+    map_threads(lambda axes: _average_group(blocks, parts.table, factor, axes), groups, threads)
 
 
-def _average_chunk(blocks: FloatArray, nodes: SharedNodes, rows: slice, values: FloatArray) -> None:
-    """Set the values of the nodes that some voxels own."""
-    columns = nodes_of_part(nodes.factor)
-    for part, sharing in enumerate(SHARING):
-        own = rows.start + np.flatnonzero(nodes.owned[rows, part])
-        total = np.zeros((len(own), len(columns[part])))
-        times = np.zeros((len(own), 1))
-        for neighbour in sharing:
-            other = nodes.table[own, neighbour]
-            there = other >= 0
-            seen = columns[seen_from(part, neighbour)]
-            total[there] += blocks[other[there, None], seen]
-            times += there[:, None]
-        values[nodes.starts[own, part, None] + np.arange(total.shape[1])] = total / times
+def _average_group(
+    blocks: FloatArray, table: IntArray, factor: int, axes: tuple[bool, ...]
+) -> None:
+    """Average the nodes that are shared across some axes and inside along the others."""
+    sides, columns = columns_of_group(factor, axes)
+    kind = np.float32 if len(sides) == 2 else np.float64
+    means = []
+    for own in sides:
+        total: NDArray[Any] = np.zeros((len(columns[0]), table.shape[1]), kind)
+        times: NDArray[Any] = np.zeros(table.shape[1], kind)
+        for other, nodes in zip(sides, columns):
+            voxel = table[CENTRE + int((own - other) @ STRIDES)].astype(np.intp)
+            times += voxel >= 0
+            for row, node in enumerate(nodes):
+                total[row] += blocks[node].take(voxel)
+        means.append((total / times).astype(np.float32))
+    for nodes, mean in zip(columns, means):
+        blocks[nodes, :-1] = mean
+
+
+@lru_cache
+def columns_of_group(
+    factor: int, axes: tuple[bool, ...]
+) -> tuple[list[IntArray], list[NDArray[np.intp]]]:
+    """Return the sides at which voxels can meet, in their order, and the nodes seen from each.
+
+    Sides are (3,), 1 for a node at the voxel's high end of an axis, 0 at its low end and along the
+    other axes.
+    """
+    block = block_ijk(factor)
+    ends = [(1, 0) if shared else (0,) for shared in axes]
+    sides = [np.array(side, np.int32) for side in product(*ends)]
+    inner = (block > 0) & (block < factor)
+    columns = [
+        np.flatnonzero(np.where(axes, block == factor * side, inner).all(1)) for side in sides
+    ]
+    return sides, columns
 
 
 def signs_of_skipped(
-    table: IntArray,
+    parts: SharedParts,
     voxel_ijk: IntArray,
     patches: FloatArray,
     voxels: IntArray,
@@ -193,8 +237,8 @@ def signs_of_skipped(
 
     Parameters
     ----------
-    table : (D, 27) int32
-        Neighbours among the decoded voxels, -1 where there is none.
+    parts : SharedParts
+        Of the decoded voxels.
     voxel_ijk : (D, 3) int32
         The decoded voxels.
     patches : (V, 27) float32
@@ -206,21 +250,23 @@ def signs_of_skipped(
 
     Returns
     -------
-    (D, 27) int8
+    (27, D) int8
         1 outside, -1 inside; 0 where nothing was skipped.
     """
-    signs = np.empty(table.shape, np.int8)
-
-    def fill(rows: slice) -> None:
-        beside = voxel_ijk[rows, None] + NEIGHBOURHOOD
-        skipped = (table[rows] < 0) & ((beside >= 0) & (beside < shape)).all(2)
-        signs[rows] = np.where(patches[voxels[rows]] > 0, skipped, -skipped.astype(np.int8))
-
-    in_chunks(len(table), 3 * 27, fill)
+    signs = np.zeros(parts.table.shape, np.int8)
+    last = np.array(shape) - 1
+    for place, step in enumerate(NEIGHBOURHOOD):
+        skipped = parts.table[place] < 0
+        for axis in np.flatnonzero(step):  # beyond the grid nothing was skipped
+            skipped &= voxel_ijk[:, axis] != (last[axis] if step[axis] > 0 else 0)
+        rows = np.flatnonzero(skipped)
+        signs[place, rows] = np.where(patches[voxels[rows], place] > 0, 1, -1)
     return signs
 
 
-def pin_to_skipped(values: FloatArray, nodes: SharedNodes, skipped: Signs) -> BoolArray:
+def pin_to_skipped(
+    blocks: FloatArray, parts: SharedParts, factor: int, skipped: Signs
+) -> NDArray[np.int64]:
     """Give nodes shared with a voxel that was not decoded that voxel's sign.
 
     Such a voxel holds no surface, so all its nodes have its sign; with this no sign change can
@@ -228,32 +274,31 @@ def pin_to_skipped(values: FloatArray, nodes: SharedNodes, skipped: Signs) -> Bo
 
     Parameters
     ----------
-    values : (count,) float32
+    blocks : (Q, D) float32
         Node values, changed in place.
-    nodes : SharedNodes
-        The nodes of the decoded voxels.
-    skipped : (D, 27) int8
-        From ``signs_of_skipped``.
+    parts : SharedParts
+        Of the decoded voxels.
+    factor : int
+        K.
+    skipped : (27, D) int8
+        From ``signs_of_skipped``. No two skipped voxels round a node differ in sign.
 
     Returns
     -------
-    (count,) bool
-        Which nodes had the other sign.
+    (D,) int64
+        How many nodes of each voxel's own had the other sign.
     """
-    changed = np.zeros(len(values), bool)
-    compiled_twin(_pin)(values, nodes, skipped, changed)
+    changed = np.zeros(skipped.shape[1], np.int64)
+    for part, nodes in enumerate(nodes_of_part(factor)):
+        sign = np.zeros(skipped.shape[1], np.int8)
+        for place in SHARING[part]:
+            np.copyto(sign, skipped[place], where=skipped[place] != 0)
+        rows = np.flatnonzero(sign)
+        outside = sign[rows] > 0
+        for node in nodes:
+            wrong = (blocks[node, rows] > 0) != outside
+            if wrong.any():
+                at = rows[wrong]
+                blocks[node, at] = np.where(outside[wrong], BARELY_OUTSIDE, BARELY_INSIDE)
+                changed[at] += parts.owner[part, at] == CENTRE
     return changed
-
-
-def _pin(values: FloatArray, nodes: SharedNodes, skipped: Signs, changed: BoolArray) -> None:
-    """Change the values, and say which. No two skipped voxels round a node differ in sign."""
-    parts = nodes_of_part(nodes.factor)
-    for place in range(27):
-        rows = np.flatnonzero(skipped[:, place])
-        outside = skipped[rows, place] > 0
-        for part in np.flatnonzero([place in sharing for sharing in SHARING]):
-            number = nodes.starts[rows, part, None] + np.arange(len(parts[part]))
-            wrong = (values[number] > 0) != outside[:, None]
-            changed[number[wrong]] = True
-            signed = np.where(outside, BARELY_OUTSIDE, BARELY_INSIDE)[:, None]
-            values[number[wrong]] = np.broadcast_to(signed, wrong.shape)[wrong]

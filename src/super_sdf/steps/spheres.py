@@ -14,31 +14,32 @@ Lengths are in half voxels, as in ``band``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
-from ..machine.compiling import compiled_twin
-from ..machine.threads import in_chunks
-from ..neighbourhood import CENTRE, STRIDES
+from ..machine.threads import map_chunks
+from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 from .band import REACH
-from .interpolation import Said, carry, read, sums_at_nodes
-from .nodes import SharedNodes, nodes_of_part, number_shared_nodes
+from .interpolation import CELL, find_cell, prolong, sample_trilinear
+from .nodes import SharedParts, nodes_of_part, number_parts
 
 DIRECTIONS = 5  # tried for each sample: see find_foot_points
 FARTHEST = 2.8  # samples near the band's edge, 3, may have been cut off there
 USUAL = 0.2  # a value at a foot point that is larger is less likely a matter of position ...
 LARGEST = 0.6  # ... and counts as no more than this
 ALIGNMENT = 3  # squarings of the cosine between a sample's direction and the normal it meets
-LEAST = 1e-3  # a weight below is none
+LEAST_WEIGHT = 1e-3  # a weight below is none
 PRIOR = 0.2  # foot points that speak for no correction at all
 DISAGREEMENT = 0.5  # how much the variance of what foot points say speaks against it
 FLAT = 0.7  # the largest slope towards a neighbour; that of a distance is near 1
+CORNER_PARTS = np.flatnonzero(np.abs(NEIGHBOURHOOD).all(1))
 MOST_NOISY = 0.02  # share of samples that are no distances: beyond, none is taken for exact
 
-MADE = 128  # numbers for each sample, on the way to its foot point
+TEMPORARIES = 128  # numbers for each sample, on the way to its foot point
 
 # Planes of voxels to both sides that a block's fitted values depend on: what is said round it, by
 # samples one voxel on, given what was said one voxel further, whose tries read blocks as far again.
@@ -46,7 +47,7 @@ REACH_IN_VOXELS = 5
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class ExactSamples:
     """Samples that can be taken for exact distances, and where they find the blocks round them.
 
     Attributes
@@ -67,25 +68,70 @@ class Samples:
     row_of: IntArray
 
 
-def fit_to_spheres(values: FloatArray, nodes: SharedNodes, samples: Samples) -> FloatArray:
-    """Return the node values, (count,), moved so that the surface touches the samples' spheres.
+@dataclass(frozen=True, eq=False)
+class FootPoints:
+    """Foot points of samples, and what the field is there.
 
-    They are changed in place. Nodes at exact samples keep the sample; without such samples nothing
-    is moved.
+    Attributes
+    ----------
+    rows : (n,) int32
+        The block each lies in.
+    place : (3, n) float32
+        Where in the block, from 0 to 1.
+    values : (n,) float32
+        The field there, which should be 0.
+    weights : (n,) float32
+        How far to trust that.
+    """
+
+    rows: IntArray
+    place: FloatArray
+    values: FloatArray
+    weights: FloatArray
+
+
+def fit_to_spheres(
+    blocks: FloatArray, parts: SharedParts, factor: int, samples: ExactSamples, threads: int = 1
+) -> None:
+    """Move the surface so that it touches the samples' spheres.
+
+    Nodes at exact samples keep the sample; without such samples nothing is moved.
+
+    Parameters
+    ----------
+    blocks : (Q, D + 1) float32
+        Node values in half voxels, changed in place; the last column is 0.
+    parts : SharedParts
+        Of the D voxels.
+    factor : int
+        K.
+    samples : ExactSamples
+        Whose spheres.
+    threads : int
+        How many work at a time.
     """
     if not len(samples.exact):  # a noisy field, say
-        return values
-    feet = find_foot_points(values, nodes, samples)
-    coarse, fine = (number_shared_nodes(nodes.table, cells) for cells in (1, 2))
-    first = mean_at_nodes(feet, coarse)
-    left = replace(feet, values=feet.values - read(first, coarse, feet.rows, feet.place)[0])
-    correction = carry(first, coarse, fine) + mean_at_nodes(left, fine)
-    carry(-correction, fine, nodes, onto=values)
-    keep_samples(values, nodes, samples)
-    return values
+        return
+    feet = find_foot_points(blocks, factor, samples, threads)
+    correction = correction_of(feet, parts)
+
+    def subtract(rows: slice) -> None:
+        blocks[:, rows] -= prolong(correction[:, rows], 2, factor)
+
+    map_chunks(subtract, correction.shape[1], len(blocks), threads)
+    keep_samples(blocks, factor, samples)
 
 
-def exact_samples(patches: FloatArray, lipschitz: BoolArray) -> BoolArray:
+def correction_of(feet: FootPoints, parts: SharedParts) -> FloatArray:
+    """Return what foot points say in the mean at the parts of each block, (27, D)."""
+    numbers, count = number_parts(parts, np.ones(27, np.int64))
+    coarse, at, shares = mean_at_nodes(feet, feet.values, numbers, count, 1)
+    left = feet.values - (coarse[at] * shares).sum(0)
+    fine, *_ = mean_at_nodes(feet, left, numbers, count, 2)
+    return prolong(coarse[numbers[CORNER_PARTS]], 1, 2) + fine[numbers]
+
+
+def exact_samples(patches: FloatArray, lipschitz: BoolArray, threads: int = 1) -> BoolArray:
     """Say which samples of a whole band, (V,), can be taken for exact distances.
 
     Where more than a few of all are none (``lipschitz``, from ``is_lipschitz``), no sample is.
@@ -95,7 +141,7 @@ def exact_samples(patches: FloatArray, lipschitz: BoolArray) -> BoolArray:
     sample = patches[:, CENTRE]
     limits = np.float32(sample.min()), np.float32(sample.max())
     near = np.abs(sample) < FARTHEST
-    cut_off = in_chunks(len(patches), 27, lambda rows: is_cut_off(patches[rows], limits))
+    cut_off = map_chunks(lambda rows: is_cut_off(patches[rows], limits), len(patches), 27, threads)
     exact: BoolArray = lipschitz & near & ~np.concatenate(cut_off)
     return exact
 
@@ -109,22 +155,28 @@ def is_cut_off(patches: FloatArray, limits: tuple[np.float32, np.float32]) -> Bo
     return cut_off
 
 
-def find_foot_points(values: FloatArray, nodes: SharedNodes, samples: Samples) -> Said:
-    """Return what the field says at foot points of samples; those beyond the blocks are left out.
+def find_foot_points(
+    blocks: FloatArray, factor: int, samples: ExactSamples, threads: int = 1
+) -> FootPoints:
+    """Return the foot points of samples, without those beyond the blocks.
 
     The direction to the surface is the field's gradient where it is reached, hence found by
     turns: first the patch's gradient, then half-way towards the field's where that led. Of all
     points at the right distance the nearest to the surface, or deepest beyond, is the best: a
     sphere that touches is outside everywhere else.
     """
-    find = compiled_twin(_find_chunk)
-    parts = in_chunks(len(samples.exact), MADE, lambda chunk: find(values, nodes, samples, chunk))
-    rows, place, value, cosine = (np.concatenate(arrays, -1) for arrays in zip(*parts))
+    chunks = map_chunks(
+        lambda some: best_tries(blocks, factor, samples, some),
+        len(samples.exact),
+        TEMPORARIES,
+        threads,
+    )
+    rows, place, value, cosine = (np.concatenate(arrays, -1) for arrays in zip(*chunks))
     return weighted_feet(rows, place, value, cosine)
 
 
-def _find_chunk(
-    values: FloatArray, nodes: SharedNodes, samples: Samples, chunk: slice
+def best_tries(
+    blocks: FloatArray, factor: int, samples: ExactSamples, chunk: slice
 ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
     """Return block, place, value and cosine of the best foot point of some samples."""
     exact = samples.exact[chunk]
@@ -134,17 +186,19 @@ def _find_chunk(
     tries = []
     for _ in range(DIRECTIONS):
         rows, place = locate(-distance * direction, exact, samples)
-        value, gradient = read(values, nodes, rows, place)
+        value, gradient = sample_trilinear(blocks, rows, place, factor)
         normal = _unit(gradient)
         tries.append((rows, place, value, _dot(direction, normal)))
         direction = np.where(rows >= 0, _unit(direction + normal), direction)
-    rows, place, value, cosine = (np.stack(parts) for parts in zip(*tries))
+    rows, place, value, cosine = (np.stack(arrays) for arrays in zip(*tries))
     clearance = np.where(rows >= 0, np.copysign(np.float32(1), distance) * value, np.inf)
     best = clearance.argmin(0), np.arange(len(exact))
     return rows[best], place[best[0], :, best[1]].T, value[best], cosine[best]
 
 
-def locate(steps: FloatArray, exact: IntArray, samples: Samples) -> tuple[IntArray, FloatArray]:
+def locate(
+    steps: FloatArray, exact: IntArray, samples: ExactSamples
+) -> tuple[IntArray, FloatArray]:
     """Return the blocks, (n,), that points at ``steps`` (3, n) from samples lie in, and where.
 
     No step is longer than 3 along an axis, so a point lies in the sample's voxel or a neighbour's.
@@ -158,22 +212,61 @@ def locate(steps: FloatArray, exact: IntArray, samples: Samples) -> tuple[IntArr
 
 def weighted_feet(
     rows: IntArray, place: FloatArray, values: FloatArray, cosine: FloatArray
-) -> Said:
+) -> FootPoints:
     """Return the foot points that count, by the angle at which they are met and what is there."""
     unusual = values / np.float32(USUAL)
     aligned = np.clip(cosine, 0, 1)
     for _ in range(ALIGNMENT):  # not a power: its last bit depends on the place in the array
         aligned *= aligned
     weights = aligned / (1 + unusual * unusual)
-    kept = (rows >= 0) & (weights > LEAST)
+    kept = (rows >= 0) & (weights > LEAST_WEIGHT)
     values = np.clip(values[kept], -LARGEST, LARGEST)
-    return Said(rows[kept], np.ascontiguousarray(place[:, kept]), values, weights[kept])
+    return FootPoints(rows[kept], np.ascontiguousarray(place[:, kept]), values, weights[kept])
 
 
-def mean_at_nodes(feet: Said, nodes: SharedNodes) -> FloatArray:
-    """Return for each node, (count,), what the foot points in the cells round it say."""
-    sums = sums_at_nodes(feet, nodes)
-    return np.concatenate(in_chunks(nodes.count, 3, lambda some: agreed_mean(*sums[:, some])))
+def mean_at_nodes(
+    feet: FootPoints, values: FloatArray, numbers: IntArray, count: int, cells: int
+) -> tuple[FloatArray, NDArray[np.intp], FloatArray]:
+    """Return the mean at each node of what is at the foot points in the cells round it.
+
+    Parameters
+    ----------
+    feet : FootPoints
+        Where, and how far to trust it.
+    values : (n,) float32
+        What is there.
+    numbers : (27, D) int32
+        The nodes: a number below ``count`` for each part of each block.
+    count : int
+        How many numbers there are.
+    cells : {1, 2}
+        Along a block: of 1 the corners are the nodes, of 2 all parts.
+
+    Returns
+    -------
+    (count,) float32, (8, n) int64, (8, n) float32
+        The mean; the nodes round each foot point, and its trilinear weights for them.
+    """
+    part, shares = parts_round(feet.place, cells)
+    at = numbers[part, feet.rows].astype(np.intp)
+    weight = (shares * feet.weights).astype(np.float64)
+    sums: list[NDArray[np.float64]] = []
+    for _ in range(3):  # of weights, values and squares
+        total: NDArray[Any] = np.bincount(at.ravel(), weight.ravel(), count)
+        sums.append(total)
+        weight *= values
+    means = map_chunks(lambda some: agreed_mean(*(s[some] for s in sums)), count, 8)
+    return np.concatenate(means), at, shares
+
+
+def parts_round(place: FloatArray, cells: int) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return the parts that are the nodes round places (3, n), (8, n), and trilinear weights."""
+    low, within = find_cell(place, cells)
+    step = STRIDES * (2 // cells)
+    part = step @ low + (CELL @ step)[:, None]
+    upper = np.stack([1 - within, within])  # (2, 3, n)
+    shares: FloatArray = upper[CELL[:, 0], 0] * upper[CELL[:, 1], 1] * upper[CELL[:, 2], 2]
+    return part, shares
 
 
 def agreed_mean(
@@ -186,12 +279,12 @@ def agreed_mean(
     return (agreement * total / (weight + PRIOR)).astype(np.float32)
 
 
-def keep_samples(values: FloatArray, nodes: SharedNodes, samples: Samples) -> None:
+def keep_samples(blocks: FloatArray, factor: int, samples: ExactSamples) -> None:
     """Put exact samples back where they are nodes: in the middle of blocks."""
     decoded = samples.exact[samples.row_of[samples.exact] >= 0]
-    middle = len(nodes_of_part(nodes.factor)[CENTRE]) // 2
-    number = nodes.starts[samples.row_of[decoded], CENTRE] + middle
-    values[number] = samples.patches[decoded, CENTRE]
+    inside = nodes_of_part(factor)[CENTRE]
+    middle = inside[len(inside) // 2]
+    blocks[middle, samples.row_of[decoded]] = samples.patches[decoded, CENTRE]
 
 
 def _unit(vectors: FloatArray) -> FloatArray:

@@ -15,7 +15,8 @@ from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import NoSurfaceError, OutOfMemoryError
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import held_memory, in_words
-from ..machine.threads import side_by_side
+from ..machine.resources import ALONE, Resources
+from ..machine.threads import map_threads
 from ..neighbourhood import CENTRE, STRIDES
 from .band import (
     can_hold_surface,
@@ -112,11 +113,11 @@ def _cropped(voxel_ijk: IntArray, shape: tuple[int, int, int]) -> tuple[IntArray
     return voxel_ijk - np.array([first, 0, 0], np.int32), (last - first + 1, *shape[1:])
 
 
-def survey(grid: SdfGrid, offset: float = 0.0, bound: int | None = None) -> Band:
+def survey(grid: SdfGrid, offset: float = 0.0, resources: Resources = ALONE) -> Band:
     """Read a grid once and return its band.
 
     ``offset`` (world units, positive outwards) is the distance at which the surface is looked for.
-    ``bound`` is how many bytes the process may hold.
+    ``resources`` is what the run may use.
 
     Raises
     ------
@@ -132,10 +133,11 @@ def survey(grid: SdfGrid, offset: float = 0.0, bound: int | None = None) -> Band
     def read(planes: slice) -> tuple[IntArray, FloatArray]:
         found = _band_of_planes(grid, offset, planes.start, planes.stop, jumps)
         sizes.append(len(found[0]))
-        _check_bound(sum(sizes), planes.stop, held, bound)
+        _check_bound(sum(sizes), planes.stop, held, resources.memory)
         return found
 
-    parts = side_by_side([slice(*block) for block in plane_blocks(grid.shape)], read)
+    blocks = [slice(*block) for block in plane_blocks(grid.shape)]
+    parts = map_threads(read, blocks, resources.threads)
     voxel_ijk = np.concatenate([ijk for ijk, _ in parts])
     patches = [part for _, part in parts]
     del parts
@@ -143,7 +145,7 @@ def survey(grid: SdfGrid, offset: float = 0.0, bound: int | None = None) -> Band
         if not any(up.near for up, _ in jumps):
             raise no_surface(grid, offset)
         check_not_filled(jumps, offset, grid.voxel_size)
-    return describe(grid.shape, voxel_ijk, _joined(patches))
+    return describe(grid.shape, voxel_ijk, _joined(patches), resources.threads)
 
 
 def _check_bound(voxels: int, planes: int, held: int, bound: int | None) -> None:
@@ -160,11 +162,14 @@ def _check_bound(voxels: int, planes: int, held: int, bound: int | None) -> None
         )
 
 
-def describe(shape: tuple[int, int, int], voxel_ijk: IntArray, patches: FloatArray) -> Band:
+def describe(
+    shape: tuple[int, int, int], voxel_ijk: IntArray, patches: FloatArray, threads: int = 1
+) -> Band:
     """Return a band with all that its patches say."""
     lipschitz = is_lipschitz(patches)
     decoded = can_hold_surface(patches, lipschitz)
-    return Band(shape, voxel_ijk, patches, lipschitz, decoded, exact_samples(patches, lipschitz))
+    exact = exact_samples(patches, lipschitz, threads)
+    return Band(shape, voxel_ijk, patches, lipschitz, decoded, exact)
 
 
 def _band_of_planes(

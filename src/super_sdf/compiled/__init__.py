@@ -1,1 +1,0 @@
-"""The optional machine code of a few steps (extra ``fast``)."""
