@@ -1,1 +1,1 @@
-"""Quality and speed of super-sdf, measured beside its peers by commands that print tables."""
+"""Commands that measure quality, speed and robustness of super-sdf and print tables."""

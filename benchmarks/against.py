@@ -1,11 +1,11 @@
-"""What people do today, beside us: dense upsampling and marching cubes, in the same run.
+"""Compare super-sdf with dense upsampling and marching cubes, in the same run.
 
     python -m benchmarks.against MESH.ply --sizes 64 128 [--rfta 32] [-- --max-memory 145M]
 
 Whole processes, one after the other: read an .npy file, refine it four times, write a PLY file.
-SciPy's ``zoom`` of the whole grid, cubic or trilinear, to the same fine nodes, and scikit-image's
-marching cubes; Reach for the Arcs (extra ``peers``) at sizes given apart, for it takes minutes.
-What follows ``--`` goes to ``super-sdf``, in a row of its own.
+Baselines: SciPy's ``zoom`` of the whole grid, cubic or trilinear, to the same fine nodes with
+scikit-image's marching cubes, and Reach for the Arcs (extra ``peers``) at the sizes of ``--rfta``,
+since it takes minutes. Options after ``--`` are passed to ``super-sdf`` for an additional row.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ RFTA = "Reach for the Arcs"
 
 
 def convert_densely(source: str, target: str, factor: int, order: int) -> None:
-    """Refine a grid by SciPy and mesh it by scikit-image, as a script of ten lines would."""
+    """Refine a grid with SciPy and mesh it with scikit-image, as a short script would."""
     from scipy.ndimage import zoom
     from skimage.measure import marching_cubes
 
@@ -43,7 +43,7 @@ def convert_densely(source: str, target: str, factor: int, order: int) -> None:
 
 
 def convert_by_rfta(source: str, target: str) -> None:
-    """Mesh a grid by Reach for the Arcs, its defaults."""
+    """Mesh a grid with Reach for the Arcs and its defaults."""
     from gpytoolbox import reach_for_the_arcs
 
     from super_sdf import Mesh, write_mesh
@@ -55,7 +55,7 @@ def convert_by_rfta(source: str, target: str) -> None:
 
 
 def convert_by_peer(source: str, target: str, factor: str, order: str) -> None:
-    """Do a method's work, in a process of its own."""
+    """Convert a grid with a baseline method, in a worker process."""
     if order == "rfta":
         convert_by_rfta(source, target)
     else:
@@ -63,7 +63,7 @@ def convert_by_peer(source: str, target: str, factor: str, order: str) -> None:
 
 
 def commands(grid: Path, factor: int, options: list[str]) -> dict[str, list[str]]:
-    """Return the arguments of Python for each method, ours with further options among them."""
+    """Return the arguments of Python for each method; ours also with ``options``."""
     target = str(grid.with_suffix(".ply"))
     words = ["upsample", str(grid), target, "--force", "--quiet", "--inside", "negative"]
     words += ["--spacing", str(1 / int(grid.stem)), "--origin", "0", "--factor", str(factor)]
@@ -77,7 +77,7 @@ def commands(grid: Path, factor: int, options: list[str]) -> dict[str, list[str]
 
 
 def median_of(words: list[str], runs: int) -> tuple[float, float] | None:
-    """Return the median of the seconds and the highest peak in MB; None if it fails."""
+    """Return the median of the seconds and the largest peak in MB; None if the command fails."""
     try:
         done = [run_python(words)[:2] for _ in range(runs)]
     except SuperSdfError:
@@ -87,7 +87,7 @@ def median_of(words: list[str], runs: int) -> tuple[float, float] | None:
 
 
 def print_rows(size: int, found: dict[str, tuple[float, float] | None]) -> None:
-    """Print a size's rows: seconds and memory, and both over ours."""
+    """Print the rows of a size: seconds and memory, also relative to ours."""
     ours = found["super-sdf"]
     for name, figures in found.items():
         if figures is None or ours is None:
@@ -99,7 +99,7 @@ def print_rows(size: int, found: dict[str, tuple[float, float] | None]) -> None:
 
 
 def main() -> None:
-    """Print the machine and a Markdown table; or do a method's work, asked so by the former."""
+    """Print the machine and a Markdown table; with ``--worker``, run one method."""
     if sys.argv[1:2] == ["--worker"]:
         convert_by_peer(*sys.argv[2:])
         return
@@ -109,16 +109,16 @@ def main() -> None:
     parser.add_argument("--rfta", type=int, nargs="*", default=[], help="sizes for that method")
     parser.add_argument("--factor", type=int, default=4)
     parser.add_argument("--runs", type=int, default=3)
-    asked, options = parse(parser)
-    print(f"{describe_machine()}; {asked.mesh.stem}, factor {asked.factor}\n")
+    arguments, options = parse(parser)
+    print(f"{describe_machine()}; {arguments.mesh.stem}, factor {arguments.factor}\n")
     print("| grid | method | s | peak MB | time over ours | memory over ours |")
     print("| --- | --- | ---: | ---: | ---: | ---: |")
     with tempfile.TemporaryDirectory() as name:
-        for size in sorted({*asked.sizes, *asked.rfta}):
-            grid = sample(asked.mesh, size, Path(name))
-            methods = commands(grid, asked.factor, options)
-            found = {method: median_of(words, asked.runs) for method, words in methods.items()}
-            if size in asked.rfta:
+        for size in sorted({*arguments.sizes, *arguments.rfta}):
+            grid = sample(arguments.mesh, size, Path(name))
+            methods = commands(grid, arguments.factor, options)
+            found = {method: median_of(words, arguments.runs) for method, words in methods.items()}
+            if size in arguments.rfta:
                 found[RFTA] = median_of([*methods["SciPy zoom, cubic"][:-1], "rfta"], 1)
             print_rows(size, found)
 

@@ -1,13 +1,13 @@
-"""Many grids, some broken, killed on the way: whether the batch keeps what it promises.
+"""Test ``super-sdf batch`` on many grids, some of them broken, with kills in between.
 
     python -m benchmarks.batch                                # 500 grids, 16^3 to 128^3
-    python -m benchmarks.batch --count 20 --sizes 12 16 24    # in half a minute
+    python -m benchmarks.batch --count 20 --sizes 12 16 24    # half a minute
     python -m benchmarks.batch --count 8 --sizes 8 12 16 --faults 200 --full 50
 
-Writes the grids, runs ``super-sdf batch``, kills it with SIGKILL as often as asked, goes on, runs
-it once more, and prints what came of it, beside what each file costs over the warm pipeline.
-With --faults the batch, or one of its workers, is instead killed or ended at random moments, a
-fault each time; with --full there is no more room (a disk in memory, which only root may mount).
+Writes the grids, runs ``super-sdf batch``, kills it with SIGKILL ``--kills`` times, resumes it,
+runs it once more, and prints the results and the overhead per file over the warm pipeline. With
+``--faults`` the batch or one of its workers is instead killed or terminated at random moments, one
+fault per trial; with ``--full`` the disk fills up (a RAM disk, which only root may mount).
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ from .batch_faults import KILLS, LIMITS, count_faults, make_setting
 from .mixed_grids import BROKEN, Placed, write_broken, write_mixed
 
 COMMAND = [sys.executable, "-m", "super_sdf"]
-FAR, MEAN = 1.0, 0.05  # voxels that vertices may be from the truth: any, and in the mean
+FAR, MEAN = 1.0, 0.05  # voxels: largest accepted error of a vertex, and mean
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where the grids are, and where the meshes go."""
+    """A folder of grids, and the batch that converts them."""
 
     grids: Path
     meshes: Path
@@ -62,19 +62,19 @@ class Place:
         )
 
     def lines(self) -> list[str]:
-        """Return the whole lines of the report."""
+        """Return the complete lines of the report."""
         report = self.meshes / "report.jsonl"
         return report.read_text().split("\n")[:-1] if report.exists() else []
 
     def run(self) -> tuple[int, str, float]:
-        """Run the batch to its end; return exit code, last line and seconds."""
+        """Run the batch to its end; return the exit code, the last line and the seconds."""
         start = time.perf_counter()
         process = self.start()
-        _, said = process.communicate()
-        return process.returncode, said.strip().splitlines()[-1], time.perf_counter() - start
+        _, output = process.communicate()
+        return process.returncode, output.strip().splitlines()[-1], time.perf_counter() - start
 
     def run_and_kill(self, lines: int) -> None:
-        """Kill the batch when the report has so many lines."""
+        """Kill the batch when the report has this many lines."""
         process = self.start()
         while len(self.lines()) < lines and process.poll() is None:
             time.sleep(0.02)
@@ -83,7 +83,7 @@ class Place:
 
 
 def is_right(path: Path, solid: Placed, spacing: float, n: int) -> bool:
-    """Say whether a mesh is closed and lies where the solid's surface is, among the samples.
+    """Return whether a mesh is closed and its vertices are on the surface of the solid.
 
     The spacing of an .npy is inferred: of a coarse grid approximately, as the report says.
     """
@@ -95,7 +95,7 @@ def is_right(path: Path, solid: Placed, spacing: float, n: int) -> bool:
 
 
 def count_right(place: Place, solids: dict[str, Placed]) -> int:
-    """Count the meshes that are there and right."""
+    """Count the meshes that exist and are correct."""
     rows, right = {row["out"]: row for row in map(json.loads, place.lines())}, 0
     for name, solid in solids.items():
         target = Path(name).with_suffix(".ply")
@@ -106,14 +106,14 @@ def count_right(place: Place, solids: dict[str, Placed]) -> int:
 
 
 def count_named(place: Place) -> int:
-    """Count the broken files whose failure says what is wrong with them."""
+    """Count the broken files whose error message names the fault."""
     rows = {row["in"]: row for row in map(json.loads, place.lines())}
     reasons = {Path(name).name: row["reason"] for name, row in rows.items() if row["reason"]}
     return sum(text in reasons.get(name, "") for name, text in BROKEN.items())
 
 
 def count_equal(place: Place, names: list[str]) -> int:
-    """Count the meshes that are, byte for byte, those of ``super-sdf upsample``."""
+    """Count the meshes that are byte for byte those of ``super-sdf upsample``."""
     single, equal = place.meshes.parent / "single.ply", 0
     for name in names:
         words = ["upsample", str(place.grids / name), str(single), "--force", "--quiet"]
@@ -160,7 +160,7 @@ def time_pairs(jobs: list[Job], folder: Path) -> list[tuple[float, float]]:
 
 @contextmanager
 def working_folder(given: Path | None) -> Iterator[Path]:
-    """Yield the folder asked for, or one that is removed afterwards."""
+    """Yield the given folder, or a temporary one."""
     if given:
         given.mkdir(parents=True, exist_ok=True)
         yield given
@@ -170,13 +170,13 @@ def working_folder(given: Path | None) -> Iterator[Path]:
 
 
 def spread(names: list[str], count: int) -> list[str]:
-    """Return so many of the names, evenly."""
+    """Return this many of the names, evenly spread."""
     chosen = np.linspace(0, len(names) - 1, min(count, len(names))).round().astype(int)
     return [names[i] for i in chosen]
 
 
 def parse() -> argparse.Namespace:
-    """Read the command line."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--count", type=int, default=500, help="grids, broken ones not counted")
     parser.add_argument("--sizes", type=int, nargs="+", default=[16, 24, 32, 48, 64, 96, 128])
@@ -193,28 +193,30 @@ def parse() -> argparse.Namespace:
 
 def main() -> None:
     """Print the machine and a Markdown table."""
-    asked = parse()
-    with working_folder(asked.folder) as folder:
-        if asked.faults or asked.full:
-            report_faults(folder, asked)
+    arguments = parse()
+    with working_folder(arguments.folder) as folder:
+        if arguments.faults or arguments.full:
+            report_faults(folder, arguments)
             return
-        place = Place(folder / "grids", folder / "meshes", asked.jobs)
-        solids = write_mixed(place.grids, asked.count, asked.sizes)
+        place = Place(folder / "grids", folder / "meshes", arguments.jobs)
+        solids = write_mixed(place.grids, arguments.count, arguments.sizes)
         write_broken(place.grids / "broken")
-        total = asked.count + len(BROKEN)
+        total = arguments.count + len(BROKEN)
         print(f"{describe_machine()}; {total} files\n\n| | |\n| --- | --- |", flush=True)
-        for kill in range(1, asked.kills + 1):
-            place.run_and_kill(total * kill // (asked.kills + 1))
+        for kill in range(1, arguments.kills + 1):
+            place.run_and_kill(total * kill // (arguments.kills + 1))
             print(f"| killed after | {len(place.lines())} files |", flush=True)
-        report(place, solids, asked, total)
+        report(place, solids, arguments, total)
 
 
-def report_faults(folder: Path, asked: argparse.Namespace) -> None:
-    """Print what came of each kind of fault."""
-    kinds = [kind for kind, _ in zip(cycle(KILLS), range(asked.faults))]
-    kinds += [kind for kind, _ in zip(cycle(LIMITS), range(asked.full))]
-    counts = count_faults(make_setting(folder, asked.count, asked.sizes), kinds, asked.seed)
-    print(f"{describe_machine()}; {asked.count} files\n")
+def report_faults(folder: Path, arguments: argparse.Namespace) -> None:
+    """Print the results for each kind of fault."""
+    kinds = [kind for kind, _ in zip(cycle(KILLS), range(arguments.faults))]
+    kinds += [kind for kind, _ in zip(cycle(LIMITS), range(arguments.full))]
+    counts = count_faults(
+        make_setting(folder, arguments.count, arguments.sizes), kinds, arguments.seed
+    )
+    print(f"{describe_machine()}; {arguments.count} files\n")
     print(
         "| fault | exit code | times | found then, and after another run |\n" + "| --- " * 4 + "|"
     )
@@ -222,24 +224,26 @@ def report_faults(folder: Path, asked: argparse.Namespace) -> None:
         print(f"| {kind} | {code} | {count} | {found} |")
 
 
-def report(place: Place, solids: dict[str, Placed], asked: argparse.Namespace, total: int) -> None:
-    """Print what came of it, row by row as it is known."""
+def report(
+    place: Place, solids: dict[str, Placed], arguments: argparse.Namespace, total: int
+) -> None:
+    """Print the results, row by row as they come."""
 
     def row(name: str, value: object) -> None:
         print(f"| {name} | {value} |", flush=True)
 
-    code, said, seconds = place.run()
-    row("the last run", f"exit code {code}, {seconds:.1f} s: {said}")
+    code, output, seconds = place.run()
+    row("the last run", f"exit code {code}, {seconds:.1f} s: {output}")
     row("lines in the report", f"{len(place.lines())} of {total}")
-    row("right meshes", f"{count_right(place, solids)} of {asked.count}")
+    row("right meshes", f"{count_right(place, solids)} of {arguments.count}")
     row("failures that name the fault", f"{count_named(place)} of {len(BROKEN)}")
     parts = [p for p in place.meshes.rglob("*") if p.suffix == ".part"]
     row("unfinished files left", len(parts))
-    code, said, seconds = place.run()
-    row("run again", f"exit code {code}, {seconds:.2f} s: {said}")
-    names = spread(sorted(solids), asked.equal)
+    code, output, seconds = place.run()
+    row("run again", f"exit code {code}, {seconds:.2f} s: {output}")
+    names = spread(sorted(solids), arguments.equal)
     row("equal to single runs", f"{count_equal(place, names)} of {len(names)}")
-    names = spread(sorted(solids), asked.overhead)
+    names = spread(sorted(solids), arguments.overhead)
     alone, batched = measure_overhead(place, names)
     share = 100 * (batched / alone - 1)
     row("over the warm pipeline", f"{batched:.2f} s for {alone:.2f} s: {share:+.1f} %")

@@ -1,7 +1,7 @@
-"""What goes wrong while a batch runs, at random moments, and whether all is right afterwards.
+"""Faults at random moments while a batch runs, and whether the output is correct afterwards.
 
-Each trial starts ``super-sdf batch`` in an empty folder, lets one fault happen, looks at what is
-there, and runs the batch again, which must end complete.
+Each trial starts ``super-sdf batch`` in an empty folder, causes one fault, checks the output, and
+runs the batch again, which must then be complete.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ OWN_FILES = {"report.jsonl", ".super-sdf-batch"}
 
 @dataclass(frozen=True)
 class Setting:
-    """Where the grids are, what their meshes must be, and how long the batch takes alone."""
+    """The grids, their expected meshes, and the undisturbed duration of the batch."""
 
     grids: Path
     meshes: Path
@@ -49,7 +49,7 @@ class Setting:
     seconds: float
 
     def start(self, limit: int | None = None) -> Process:
-        """Start the batch, where no file may grow beyond a limit."""
+        """Start the batch with a limit on the size of files."""
         words = [*COMMAND, str(self.grids), "--out", str(self.meshes), "--jobs", "2"]
         words += ["--quality", "fast", "--factor", "2", "--quiet"]
         lower = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (limit, limit))
@@ -64,19 +64,19 @@ class Setting:
 
 
 def make_setting(folder: Path, count: int, sizes: list[int]) -> Setting:
-    """Write grids, and convert them undisturbed."""
+    """Write the grids, and convert them without a fault."""
     write_mixed(folder / "grids", count, sizes)
     setting = Setting(folder / "grids", folder / "meshes", {}, 0.0)
     start = time.perf_counter()
-    _, said = setting.start().communicate()
-    if said:
-        raise SystemExit(said.decode())
+    _, output = setting.start().communicate()
+    if output:
+        raise SystemExit(output.decode())
     right = {name: data for name, data in setting.found().items() if name not in OWN_FILES}
     return Setting(setting.grids, setting.meshes, right, time.perf_counter() - start)
 
 
 def count_faults(setting: Setting, kinds: list[str], seed: int) -> Counter[tuple[str, int, str]]:
-    """Run a trial a kind; count exit codes, and what was found: "right", or what was wrong."""
+    """Run one trial per kind; count the exit codes and the verdicts, "right" or what was wrong."""
     rng, counts = np.random.default_rng(seed), Counter[tuple[str, int, str]]()
     for kind in kinds:
         rmtree(setting.meshes, ignore_errors=True)
@@ -90,27 +90,27 @@ def count_faults(setting: Setting, kinds: list[str], seed: int) -> Counter[tuple
 
 
 def try_once(setting: Setting, kind: str, rng: np.random.Generator) -> tuple[int, str | None]:
-    """Let a fault happen, and run the batch again.
+    """Cause a fault, and run the batch again.
 
     Return the exit code of the first run, and what is wrong, if anything is.
     """
     process = FAULTS[kind](setting, kind, rng)
-    said, code = process.communicate()[1], process.returncode
+    output, code = process.communicate()[1], process.returncode
     (setting.meshes / BALLAST).unlink(missing_ok=True)
-    if b"Traceback" in said:
-        return code, f"a traceback: {said.decode()}"
+    if b"Traceback" in output:
+        return code, f"a traceback: {output.decode()}"
     wrong = half_written(setting)
     if wrong:
         return code, wrong
     process = setting.start()
-    said = process.communicate()[1]
-    if process.returncode or said:
-        return code, f"exit code {process.returncode} when run again: {said.decode()}"
+    output = process.communicate()[1]
+    if process.returncode or output:
+        return code, f"exit code {process.returncode} when run again: {output.decode()}"
     return code, incomplete(setting)
 
 
 def half_written(setting: Setting) -> str | None:
-    """Return what has its final name and is not whole."""
+    """Return the files with a final name that are not complete."""
     found = setting.found()
     for name in found.keys() & setting.right.keys():
         if found[name] != setting.right[name]:
@@ -123,7 +123,7 @@ def half_written(setting: Setting) -> str | None:
 
 
 def incomplete(setting: Setting) -> str | None:
-    """Return what is there and should not be, or the other way round."""
+    """Return the names of unexpected and missing files."""
     found = setting.found()
     if found.pop(".super-sdf-batch", b"") != b"":
         return "the journal is not empty"
@@ -148,7 +148,7 @@ def kill(setting: Setting, kind: str, rng: np.random.Generator) -> Process:
 
 
 def children_of(pid: int) -> list[psutil.Process]:
-    """Return a batch's workers."""
+    """Return the worker processes of a batch."""
     try:
         children = psutil.Process(pid).children()
         return [child for child in children if "spawn_main" in " ".join(child.cmdline())]
@@ -157,13 +157,13 @@ def children_of(pid: int) -> list[psutil.Process]:
 
 
 def limit_files(setting: Setting, kind: str, rng: np.random.Generator) -> Process:
-    """Let no file grow beyond a random size: what is over it is written in part."""
+    """Limit the size of files at random: larger ones are written in part."""
     largest = max(map(len, setting.right.values()))
     return setting.start(int(rng.integers(0, largest)))
 
 
 def fill_disk(setting: Setting, kind: str, rng: np.random.Generator) -> Process:
-    """Leave a random room on the disk."""
+    """Leave a random amount of free space on the disk."""
     room = int(rng.integers(0, sum(map(len, setting.right.values()))))
     (setting.meshes / BALLAST).write_bytes(bytes(max(0, DISK_BYTES - room)))
     return setting.start()
@@ -179,7 +179,7 @@ FAULTS: dict[str, Callable[[Setting, str, np.random.Generator], Process]] = {
 
 @contextmanager
 def small_disk(folder: Path) -> Iterator[None]:
-    """Mount a small disk in memory on a folder, which only root may."""
+    """Mount a small RAM disk on a folder, which only root may do."""
     words = ["mount", "-t", "tmpfs", "-o", f"size={DISK_BYTES}", "tmpfs", str(folder)]
     subprocess.run(words, check=True)
     try:

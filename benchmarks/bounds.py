@@ -1,13 +1,13 @@
-"""Whether a conversion keeps within ``--max-memory``: peak of the process against the bound.
+"""Whether a conversion stays within ``--max-memory``: peak memory of the process over the limit.
 
     python -m benchmarks.bounds --sizes 128 --factors 2 4
     python -m benchmarks.bounds --fields gyroid "wall across x" --precisions int8
     python -m benchmarks.bounds --quick
     python -m benchmarks.bounds --mesh fandisk.ply
 
-Every conversion is a process of its own, start, files and libraries included, and its peak is what
-the system says when it has ended. Two bounds are tried: a share of what the plan says without one,
-and the least that the plan accepts. Ends with 1 if a peak is more than 1.05 of its bound.
+Every conversion runs in its own process, start, files and libraries included; the system reports
+its peak when it has ended. Two limits are tried: a share of what the plan needs without a limit,
+and the smallest that the plan accepts. The exit code is 1 if a peak exceeds 1.05 times its limit.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ FIELDS = ("ball", "gyroid", "wall across x", "wall across z")
 SUFFIXES = (".ply", ".stl", ".obj")
 SHARE = 0.6
 ALLOWED = 1.05
-LARGEST = 4_000_000_000  # bytes planned: what needs more in the least is left out
+LARGEST = 4_000_000_000  # bytes; grids whose smallest plan is larger are skipped
 
-# What the plan says of the whole grid at once and of its thinnest slabs, asked in a process that
-# holds what the command would hold.
+# Prints the planned bytes of the whole grid and of its thinnest slabs, in a process that has loaded
+# what the command would load.
 PLAN = """
 import sys
 from super_sdf import load_network
@@ -56,7 +56,7 @@ for slabs in ([whole(band)], thinnest):
 
 @dataclass(frozen=True)
 class Case:
-    """A conversion: what of, and how."""
+    """A conversion: the grid and the options."""
 
     field: str
     size: int
@@ -68,11 +68,11 @@ class Case:
 
 @dataclass(frozen=True)
 class Run:
-    """What a conversion took: seconds and bytes, or why it was refused."""
+    """The result of a conversion: seconds and bytes, or why it was refused."""
 
     seconds: float
     peak: int
-    said: dict[str, int]
+    report: dict[str, int]
     refusal: str = ""
 
 
@@ -95,7 +95,7 @@ def values_of(field: str, n: int) -> Iterator[NDArray[np.float32]]:
 def gyroid(
     x: float, y: NDArray[np.float64], z: NDArray[np.float64], turn: float
 ) -> NDArray[np.float64]:
-    """Return about the distance to a gyroid, cut off at 3 samples; ``turn`` is radians a sample."""
+    """Return roughly the distance to a gyroid, truncated at 3; ``turn``: radians per sample."""
     sines, cosines = zip(*((np.sin(turn * axis), np.cos(turn * axis)) for axis in (x, y, z)))
     value = sum(sines[a] * cosines[(a + 1) % 3] for a in range(3))
     slopes = [cosines[a] * cosines[(a + 1) % 3] - sines[a - 1] * sines[a] for a in range(3)]
@@ -114,7 +114,7 @@ def write_grids(field: str, n: int, folder: Path) -> None:
 
 
 def sample_mesh(mesh: Path, n: int, folder: Path) -> None:
-    """Write the grids of a mesh, box diagonal 1 in the unit cube, in units of a sample."""
+    """Write the grids of a mesh, box diagonal 1 in the unit cube, in index units."""
     words = ["sample", str(mesh), str(folder / "cube.npz"), "-n", str(n), "--frame", "unit"]
     run_command([*words, "--force", "--quiet"])
     values = (np.load(folder / "cube.npz")["values"] * n).astype(np.float32)
@@ -123,7 +123,7 @@ def sample_mesh(mesh: Path, n: int, folder: Path) -> None:
 
 
 def run_python(words: list[str]) -> tuple[str, str]:
-    """Run Python; return what it printed, stdout and stderr."""
+    """Run Python; return its stdout and stderr."""
     command = [sys.executable, "-c", LAUNCHER, *words]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return done.stdout.rstrip("\n"), done.stderr
@@ -141,7 +141,7 @@ def plan(case: Case, folder: Path) -> tuple[int, int]:
 
 
 def convert(case: Case, folder: Path, bound: int) -> Run:
-    """Convert under a bound, in bytes."""
+    """Convert with a memory limit in bytes."""
     target = folder / f"mesh{case.suffix}"
     words = ["-m", "super_sdf", "upsample", str(folder / f"grid{case.source}"), str(target)]
     words += ["--spacing", "1", "--force", "--json", "--quiet", "--device", "cpu"]
@@ -162,21 +162,22 @@ def row(case: Case, name: str, bound: int, run: Run) -> str:
     if run.refusal:
         cells += ["refused", "", f"{run.peak / 1e6:,.0f}", "", f"{run.seconds:.1f}"]
     else:
-        planned = f"{run.said['planned_bytes'] / 1e6:,.0f}"
+        planned = f"{run.report['planned_bytes'] / 1e6:,.0f}"
         share = f"{run.peak / bound:.2f}"
-        cells += [run.said["slabs"], planned, f"{run.peak / 1e6:,.0f}", share, f"{run.seconds:.1f}"]
+        peak = f"{run.peak / 1e6:,.0f}"
+        cells += [run.report["slabs"], planned, peak, share, f"{run.seconds:.1f}"]
     return f"| {' | '.join(map(str, cells))} |"
 
 
 def bounds_of(whole: int, thinnest: int, share: float, names: list[str]) -> dict[str, int]:
-    """Return the bounds to try, in bytes, by name; plans differ a little from run to run."""
+    """Return the limits to try, in bytes, by name; plans vary slightly from run to run."""
     least = int(1.02 * thinnest) + 1_000_000
     bounds = {"share": max(int(share * whole), least), "least": least}
     return {name: bounds[name] for name in names}
 
 
 def parse() -> argparse.Namespace:
-    """Return what was asked."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--fields", nargs="*", choices=FIELDS, default=FIELDS)
     parser.add_argument("--mesh", type=Path, nargs="*", default=[], help="files to sample")
@@ -188,46 +189,50 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--bounds", nargs="+", choices=["share", "least"], default=["share"])
     parser.add_argument("--share", type=float, default=SHARE)
     parser.add_argument("--quick", action="store_true", help="a few small grids, for a check")
-    asked = parser.parse_args()
-    if asked.quick:
-        asked.fields, asked.sizes = ["ball", "wall across x"], [24]
-        asked.factors, asked.suffixes = [2, 16], [".ply"]
-        asked.sources, asked.bounds = [".npy"], ["least"]
-    return asked
+    arguments = parser.parse_args()
+    if arguments.quick:
+        arguments.fields, arguments.sizes = ["ball", "wall across x"], [24]
+        arguments.factors, arguments.suffixes = [2, 16], [".ply"]
+        arguments.sources, arguments.bounds = [".npy"], ["least"]
+    return arguments
 
 
-def cases(asked: argparse.Namespace, field: str, size: int) -> Iterator[Case]:
-    """Yield what is to be tried on a grid."""
-    for choice in product(asked.factors, asked.precisions, asked.suffixes, asked.sources):
+def cases(arguments: argparse.Namespace, field: str, size: int) -> Iterator[Case]:
+    """Yield the conversions to try on a grid."""
+    for choice in product(
+        arguments.factors, arguments.precisions, arguments.suffixes, arguments.sources
+    ):
         yield Case(field, size, *choice)
 
 
 def main() -> None:
     """Print the machine and a Markdown table."""
-    asked, over = parse(), []
+    arguments, over = parse(), []
     print(f"{describe_machine()}; MB\n")
     print(
         "| grid | size | factor | precision | files | bound | MB | slabs | planned | peak | "
         "of the bound | s |\n| --- | ---: | ---: |" + " --- |" * 3 + " ---: |" * 6
     )
-    fields = [(name, None) for name in asked.fields] + [(mesh.stem, mesh) for mesh in asked.mesh]
-    for (field, mesh), size in product(fields, asked.sizes):
+    fields = [(name, None) for name in arguments.fields] + [
+        (mesh.stem, mesh) for mesh in arguments.mesh
+    ]
+    for (field, mesh), size in product(fields, arguments.sizes):
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
             sample_mesh(mesh, size, folder) if mesh else write_grids(field, size, folder)
-            for case in cases(asked, field, size):
-                over += try_bounds(case, folder, asked)
+            for case in cases(arguments, field, size):
+                over += try_bounds(case, folder, arguments)
     if over:
         raise SystemExit("over the bound:\n" + "\n".join(over))
 
 
-def try_bounds(case: Case, folder: Path, asked: argparse.Namespace) -> list[str]:
-    """Print a row for each bound; return those that are over it."""
+def try_bounds(case: Case, folder: Path, arguments: argparse.Namespace) -> list[str]:
+    """Print a row per limit; return the ones that were exceeded."""
     whole, thinnest = plan(case, folder)
     if thinnest > LARGEST:
         return []
     over = []
-    for name, bound in bounds_of(whole, thinnest, asked.share, asked.bounds).items():
+    for name, bound in bounds_of(whole, thinnest, arguments.share, arguments.bounds).items():
         run = convert(case, folder, bound)
         line = row(case, name, bound, run)
         print(line, flush=True)

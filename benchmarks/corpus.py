@@ -1,11 +1,11 @@
-"""Thousands of bad and odd inputs, all commands: none may end in a traceback, a hang or a bad mesh.
+"""Run all commands on thousands of bad and odd inputs: no traceback, no hang, no bad mesh.
 
     python -m benchmarks.corpus                       # a seeded sample
     python -m benchmarks.corpus --whole               # all
-    python -m benchmarks.corpus --only grids/header   # those with this in their names
-    python -m benchmarks.corpus --fields 10000        # random fields: closed manifolds?
+    python -m benchmarks.corpus --only grids/header   # names that contain this
+    python -m benchmarks.corpus --fields 10000        # random fields: manifolds?
 
-The cases are those of ``tests/corpus``, of which the tests run a sample.
+The cases are in ``tests/corpus``; the tests run a sample of them.
 """
 
 import sys

@@ -1,11 +1,11 @@
-"""CUDA against the CPU: values, speed, memory over many shapes, whole runs. Needs a GPU.
+"""Compare CUDA with the CPU: values, speed, memory over many shapes, whole runs. Needs a GPU.
 
     python -m benchmarks.cuda --sizes 64 128 256
 
 Prints Markdown: the machine; for each network and size the largest difference and the microseconds
-a voxel, copies to and from the GPU included; the microseconds for several chunks of the neighbour
-table; the GPU's memory after ever larger shapes; and the seconds from a grid to its mesh. All grids
-are noisy balls. Where CUDA does not run, one line says why.
+per voxel, copies to and from the GPU included; the time for several chunk sizes of the neighbour
+table; GPU memory after ever larger shapes; and the seconds from a grid to its mesh. All grids are
+noisy balls. If CUDA does not run, one line says why.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ def noisy_ball(size: int) -> SdfGrid:
 
 
 def network_inputs(size: int) -> tuple[np.ndarray, ...]:
-    """Return what the pipeline asks the network for a ball at factor 4."""
+    """Return the inputs of the network for a ball at factor 4."""
     return *survey(noisy_ball(size)).network_inputs(), block_offsets(4)
 
 
 def best_seconds(work: Callable[..., Any], *arguments: Any) -> float:
-    """Return the least seconds of several runs, after one that does not count."""
+    """Return the seconds of the fastest of several runs, after a warm-up run."""
     work(*arguments)
     seconds = []
     for _ in range(RUNS):
@@ -65,62 +65,69 @@ def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[Any]]) 
 
 
 def compare_values(device: str, sizes: Sequence[int]) -> None:
-    """Print how far CUDA's values are from the CPU's and how long both take."""
+    """Print the difference between the values of CUDA and of the CPU, and both times."""
     rows = []
     for quality in QUALITIES:
         here, there = load_network(quality, device="cpu"), load_network(quality, device=device)
         for size in sizes:
-            asked = network_inputs(size)
-            apart = np.abs(here(*asked) - there(*asked)).max() / 2
-            seconds = [best_seconds(network, *asked) for network in (here, there)]
-            shown = [f"{1e6 * value / len(asked[0]):.2f}" for value in seconds]
-            rows.append([quality, f"{size}^3", f"{len(asked[0]):,}", *shown, f"{apart:.1e}"])
-    head = ["network", "grid", "voxels", "CPU us a voxel", f"{device} us a voxel", "apart, voxels"]
+            inputs = network_inputs(size)
+            apart = np.abs(here(*inputs) - there(*inputs)).max() / 2
+            seconds = [best_seconds(network, *inputs) for network in (here, there)]
+            shown = [f"{1e6 * value / len(inputs[0]):.2f}" for value in seconds]
+            rows.append([quality, f"{size}^3", f"{len(inputs[0]):,}", *shown, f"{apart:.1e}"])
+    head = [
+        "network",
+        "grid",
+        "voxels",
+        "CPU us per voxel",
+        f"{device} us per voxel",
+        "difference, voxels",
+    ]
     print_table("Values and speed of the network", head, rows)
 
 
 def compare_chunks(device: str, size: int) -> None:
-    """Print how long the network takes with other chunks of the neighbour table."""
+    """Print the time of the network for several chunk sizes of the neighbour table."""
     network = load_network("base", device=device)
     feeds = dict(zip(INPUTS, network_inputs(size)))
     rows = []
     for chunk in CHUNKS:
         seconds = best_seconds(run_bound, network.session, feeds, device, chunk)
         rows.append([chunk, f"{1e6 * seconds / len(feeds['patches']):.2f}"])
-    print_table(f"Chunks of the neighbour table at {size}^3", ["rows", "us a voxel"], rows)
+    print_table(f"Chunks of the neighbour table at {size}^3", ["rows", "us per voxel"], rows)
 
 
 def watch_memory(device: str, size: int) -> None:
-    """Print the GPU's memory after many shapes, each with more voxels than the last."""
+    """Print GPU memory after many shapes, each with more voxels than the last."""
     rows = [["nothing", used_memory()]]
     network = load_network("base", device=device)
     rows.append(["loaded", used_memory()])
     whole = network_inputs(size)
     for count, share in enumerate(np.linspace(0.2, 1, SHAPES), 1):
-        ask_part(network, whole, share)
+        run_part(network, whole, share)
         if count in (1, 2, 5, 10, 20, SHAPES):
             rows.append([f"{count} shapes", used_memory()])
-    ask_part(network, whole, 0.2)
+    run_part(network, whole, 0.2)
     rows.append(["a small one", used_memory()])
     print_table(f"Memory of the GPU in MiB, shapes up to {size}^3", ["after", "used"], rows)
 
 
-def ask_part(network: Network, asked: Sequence[np.ndarray], share: float) -> None:
-    """Ask for the first part of a band, cut off from the rest."""
-    patches, table, voxels, offsets = asked
+def run_part(network: Network, inputs: Sequence[np.ndarray], share: float) -> None:
+    """Run the network on the first part of a band, without the rest."""
+    patches, table, voxels, offsets = inputs
     count = int(share * len(patches))
     table = np.where(table[:count] < count, table[:count], -1).astype(np.int32)
     network(patches[:count], table, voxels[voxels < count], offsets)
 
 
 def used_memory() -> str:
-    """Return the GPU's memory in use, by nvidia-smi."""
+    """Return the GPU memory in use, according to nvidia-smi."""
     answer = query_gpu("memory.used")
     return answer[0] if answer else "unknown"
 
 
 def compare_pipeline(device: str, sizes: Sequence[int]) -> None:
-    """Print the seconds from a grid to its mesh, the network loaded already."""
+    """Print the seconds from a grid to its mesh, without loading the network."""
     rows = []
     for size in sizes:
         grid = noisy_ball(size)
@@ -131,22 +138,22 @@ def compare_pipeline(device: str, sizes: Sequence[int]) -> None:
 
 
 def main() -> None:
-    """Print everything, or in one line why there is nothing to measure."""
+    """Print all tables, or one line that says why CUDA does not run."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128, 256])
     parser.add_argument("--device", default="cuda", help="cpu tries this command itself")
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     try:
-        load_network("fast", device=asked.device)
+        load_network("fast", device=arguments.device)
     except DeviceError as error:
         print(f"nothing to measure: {error}")
         return
     gpu = describe_gpu() or "no GPU"
     print(f"{gpu}; {os.cpu_count()} cores; {onnxruntime_version()}; least of {RUNS} runs each")
-    compare_values(asked.device, asked.sizes)
-    compare_chunks(asked.device, max(asked.sizes))
-    watch_memory(asked.device, max(asked.sizes))
-    compare_pipeline(asked.device, asked.sizes)
+    compare_values(arguments.device, arguments.sizes)
+    compare_chunks(arguments.device, max(arguments.sizes))
+    watch_memory(arguments.device, max(arguments.sizes))
+    compare_pipeline(arguments.device, arguments.sizes)
 
 
 if __name__ == "__main__":

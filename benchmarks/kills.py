@@ -1,12 +1,12 @@
-"""Processes that are ended at random moments, and disks that fill: what is left of them.
+"""Kill conversions at random moments, or fill the disk, and check the files that are left.
 
     python -m benchmarks.kills                                  # 100 SIGTERM, 100 SIGKILL, 50 full
-    python -m benchmarks.kills --terms 5 --kills 5 --full 5    # in a minute
+    python -m benchmarks.kills --terms 5 --kills 5 --full 5    # a minute
 
-Runs ``super-sdf upsample`` and ends it after a random part of the time that it takes, every second
-run after a random part of the time from its first file on, or lets no file grow beyond a random
-size. The target must be absent or whole, a terminated run must leave
-nothing beside it, and the next run must leave nothing but the mesh.
+Runs ``super-sdf upsample`` and ends it after a random share of its duration, or in every second run
+after a random share of the time from its first file on; or limits the size of files at random. The
+target must be absent or complete, a terminated run must leave no other file, and the next run must
+leave nothing but the mesh.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from super_sdf.evaluation.timing import describe_machine
 
 COMMAND = [sys.executable, "-m", "super_sdf"]
 SUFFIXES = (".ply", ".stl", ".obj", ".glb", ".3mf")
-LONG_ENOUGH = 120.0  # seconds that no run takes
+LONG_ENOUGH = 120.0  # seconds; every run is shorter
 
 
 def write_ball(path: Path, size: int) -> None:
@@ -43,7 +43,7 @@ def write_ball(path: Path, size: int) -> None:
 
 
 class Bench:
-    """A folder with a grid, and what a run that nobody disturbs makes of it, in every format."""
+    """A folder with a grid, and the meshes of undisturbed runs in every format."""
 
     def __init__(self, folder: Path, size: int) -> None:
         self.folder, self.grid = folder / "out", folder / "grid.npy"
@@ -65,7 +65,7 @@ class Bench:
             self.target(suffix).unlink()
 
     def target(self, suffix: str) -> Path:
-        """Return the mesh's path."""
+        """Return the path of the mesh."""
         return self.folder / f"ball{suffix}"
 
     def start(
@@ -77,12 +77,12 @@ class Bench:
         return subprocess.Popen(words, stderr=subprocess.PIPE, preexec_fn=before)
 
     def wait_for_file(self, process: subprocess.Popen[bytes]) -> None:
-        """Wait until a run has made a file, or ended."""
+        """Wait until a run has created a file, or ended."""
         while process.poll() is None and not os.listdir(self.folder):
             time.sleep(0.001)
 
     def faults(self, suffix: str) -> Counter[str]:
-        """Count what a disturbed run has left that it should not, then let one run to its end."""
+        """Count the files that a disturbed run should not have left, then complete another run."""
         target, found = self.target(suffix), Counter[str]()
         if target.exists():
             found["whole"] += 1
@@ -103,31 +103,31 @@ class Bench:
         seconds = self.writing if self.turn % 2 else self.seconds
         time.sleep(random.uniform(0, 1.05) * seconds[suffix])
         process.send_signal(number)
-        _, said = process.communicate(timeout=LONG_ENOUGH)
+        _, output = process.communicate(timeout=LONG_ENOUGH)
         codes = (0, 128 + number, -number)  # the last: before Python, or it, could do anything
         return self.faults(suffix) + Counter(
             {
                 "exit codes of others": process.returncode not in codes,
-                "more than a line said": said.count(b"\n") > 1,
+                "more than one line printed": output.count(b"\n") > 1,
             }
         )
 
     def fill(self, suffix: str) -> Counter[str]:
-        """Let no file grow beyond a random size."""
+        """Limit the size of files at random."""
         most = random.randrange(len(self.whole[suffix]) + 1)
         limit = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (most, most))
         process = self.start(suffix, limit)
-        _, said = process.communicate(timeout=LONG_ENOUGH)
+        _, output = process.communicate(timeout=LONG_ENOUGH)
         return self.faults(suffix) + Counter(
             {
                 "exit codes of others": process.returncode not in (0, 1),
-                "more than a line said": said.count(b"\n") > 1,
+                "more than one line printed": output.count(b"\n") > 1,
             }
         )
 
 
 def tally(name: str, runs: int, once: Callable[[str], Counter[str]]) -> bool:
-    """Disturb runs of all formats in turn; print what came of it, and say if all is well."""
+    """Disturb runs of all formats in turn; print the results, return whether all were correct."""
     found = Counter[str]()
     for turn in range(runs):
         found.update(once(SUFFIXES[turn % len(SUFFIXES)]))
@@ -138,23 +138,23 @@ def tally(name: str, runs: int, once: Callable[[str], Counter[str]]) -> bool:
 
 
 def main() -> None:
-    """Run it all; exit code 1 if anything was half-written or left over."""
+    """Run all trials; exit code 1 if any file was incomplete or left over."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--terms", type=int, default=100, help="Runs ended by SIGTERM.")
     parser.add_argument("--kills", type=int, default=100, help="Runs ended by SIGKILL.")
     parser.add_argument("--full", type=int, default=50, help="Runs on a disk that fills.")
     parser.add_argument("--size", type=int, default=24, help="Samples along each axis.")
     parser.add_argument("--seed", type=int, default=0, help="Of the random moments.")
-    asked = parser.parse_args()
-    random.seed(asked.seed)
+    arguments = parser.parse_args()
+    random.seed(arguments.seed)
     print(describe_machine())
     folder = Path(tempfile.mkdtemp())
     try:
-        bench = Bench(folder, asked.size)
+        bench = Bench(folder, arguments.size)
         good = [
-            tally("SIGTERM", asked.terms, partial(bench.kill, signal.SIGTERM)),
-            tally("SIGKILL", asked.kills, partial(bench.kill, signal.SIGKILL)),
-            tally("full disk", asked.full, bench.fill),
+            tally("SIGTERM", arguments.terms, partial(bench.kill, signal.SIGTERM)),
+            tally("SIGKILL", arguments.kills, partial(bench.kill, signal.SIGKILL)),
+            tally("full disk", arguments.full, bench.fill),
         ]
     finally:
         shutil.rmtree(folder)

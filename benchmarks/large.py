@@ -1,11 +1,11 @@
-"""Large grids: time, and peak of memory against what was planned, for several bounds.
+"""Large grids: time, and peak memory compared with the plan, for several limits.
 
     python -m benchmarks.large GRID.npy --max-memory 3G 1500M 900M [-- --spacing 0.002]
     python -m benchmarks.large --analytic 512 1024 --max-memory 4G
 
-Whole processes, start and files included. The mesh of a grid must be the same file whatever the
-bound: compare its digests. An analytic grid is a torus of area 1.2 in the unit cube, written plane
-by plane. What follows ``--`` goes to the command.
+Whole processes, start and files included. The mesh of a grid must be the same file for every limit:
+compare its digests. An analytic grid is a torus of area 1.2 in the unit cube, written plane by
+plane. Options after ``--`` are passed to the command.
 """
 
 from __future__ import annotations
@@ -42,20 +42,20 @@ def run(grid: Path, folder: Path, bound: str, options: list[str]) -> str:
     words = ["-m", "super_sdf", "upsample", str(grid), str(target), "--force", "--json", "-q"]
     try:
         seconds, peak, printed = run_python([*words, "--max-memory", bound, *options])
-    except SuperSdfError:  # the command has said why
+    except SuperSdfError:  # the command has printed why
         return f"| {grid.stem} | {bound} | refused |" + " |" * 9
-    said = json.loads(printed)
-    planned = said["planned_bytes"] / 1e6
+    report = json.loads(printed)
+    planned = report["planned_bytes"] / 1e6
     digest = hashlib.sha256()
     with target.open("rb") as file:
         while block := file.read(1 << 24):
             digest.update(block)
-    after = sum(said["seconds"][stage] for stage in ("nodes", "isosurface", "write"))
+    after = sum(report["seconds"][stage] for stage in ("nodes", "isosurface", "write"))
     file = digest.hexdigest()[:8]
     return (
-        f"| {said['shape'][0]}^3 | {bound} | {said['slabs']} | {said['band_voxels']:,} | "
-        f"{said['triangles']:,} | {seconds:.1f} | {after / seconds:.0%} | {peak:,.0f} | "
-        f"{planned:,.0f} | {planned / peak - 1:+.0%} | {said['closed']} | {file} |"
+        f"| {report['shape'][0]}^3 | {bound} | {report['slabs']} | {report['band_voxels']:,} | "
+        f"{report['triangles']:,} | {seconds:.1f} | {after / seconds:.0%} | {peak:,.0f} | "
+        f"{planned:,.0f} | {planned / peak - 1:+.0%} | {report['closed']} | {file} |"
     )
 
 
@@ -65,7 +65,7 @@ def main() -> None:
     parser.add_argument("grids", type=Path, nargs="*", help=".npy files")
     parser.add_argument("--analytic", type=int, nargs="*", default=[], help="sizes of a torus")
     parser.add_argument("--max-memory", nargs="+", default=["4G"], help="bounds to try")
-    asked, options = parse(parser)
+    arguments, options = parse(parser)
     print(f"{describe_machine()}\n")
     print(
         "| grid | bound | slabs | band voxels | triangles | s | after the network | peak MB | "
@@ -73,12 +73,12 @@ def main() -> None:
     )
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        for grid in asked.grids:
-            for bound in asked.max_memory:
+        for grid in arguments.grids:
+            for bound in arguments.max_memory:
                 print(run(grid, folder, bound, options), flush=True)
-        for n in asked.analytic:
+        for n in arguments.analytic:
             grid = write_torus(folder / "torus.npy", n)
-            for bound in asked.max_memory:
+            for bound in arguments.max_memory:
                 print(run(grid, folder, bound, ["--spacing", str(1 / n), *options]), flush=True)
 
 

@@ -1,13 +1,13 @@
-"""Whether a change of the code changes a mesh: the SHA-256 of the file made of every grid.
+"""Whether a change of the code changes a mesh: the SHA-256 of the mesh file of every grid.
 
     python -m benchmarks.meshes MESHES --sizes 32 64 --out before.json
     python -m benchmarks.meshes MESHES --sizes 32 64 --against before.json
     python -m benchmarks.meshes MESHES --sizes 32 64 --against benchmarks/meshes.json
 
 Samples every shape at every size, converts it with the network ``base`` to ``.ply``, and prints
-which files are others. ``meshes.json`` is of the 63 validation shapes, with the network whose own
-SHA-256 stands in it; another network gives other meshes, and is refused. Sums of floats may differ
-between kinds of processor, so on another machine write a file of the earlier commit first.
+which files differ. ``meshes.json`` has the digests of the 63 validation shapes and of the network;
+another network gives other meshes, and is refused. Sums of floats may differ between processors, so
+on another machine write a file with the earlier commit first.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def digest(path: Path) -> str:
 
 
 def mesh_digests(path: Path, sizes: list[int], network: Network) -> Iterator[tuple[str, str]]:
-    """Yield ``name size`` and the digest of the mesh file, of a shape at each size."""
+    """Yield ``name size`` and the digest of the mesh file for a shape at each size."""
     shape, options = Shape.read(path), ConvertOptions(inside="negative")
     for size in sizes:
         with grid_file(shape, Setting(size, options.factor)) as grid:
@@ -41,7 +41,7 @@ def mesh_digests(path: Path, sizes: list[int], network: Network) -> Iterator[tup
 
 
 def main() -> None:
-    """Write the digests, or compare them with a file of such; exit code 1 if any differs."""
+    """Write the digests, or compare them with those in a file; exit code 1 if any differs."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("meshes", nargs="+", type=Path, help="closed meshes, or folders of them")
     parser.add_argument("--sizes", nargs="+", type=int, default=[32, 64])

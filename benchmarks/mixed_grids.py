@@ -1,7 +1,7 @@
-"""A folder as users have it: grids of solids in all sizes, and some that are broken.
+"""A folder like those of users: grids of solids in all sizes, and some broken files.
 
-The solids' distances are closed forms, so what is made of them can be held against the truth at
-every vertex. Of what is broken, each kind says what the failure should be called.
+The distances to the solids have closed forms, so meshes can be compared with the truth at every
+vertex. For each kind of broken file there is the message that the failure should contain.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Points = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Placed:
-    """A solid in a grid: sizes, place and turn as shares of a grid of side 1."""
+    """A solid in a grid of side 1: its kind, position, rotation and size."""
 
     kind: str
     middle: Points
@@ -70,7 +70,7 @@ SOLIDS: dict[str, Callable[[Points], Points]] = {
 
 
 def random_solid(kind: str, rng: np.random.Generator) -> Placed:
-    """Return a solid that keeps off the grid's border."""
+    """Return a solid that stays away from the border of the grid."""
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     return Placed(kind, rng.uniform(0.48, 0.52, 3), turn, rng.uniform(0.25, 0.34))
 
@@ -86,7 +86,7 @@ def write_solid(solid: Placed, n: int, path: Path) -> None:
 
 
 def write_mixed(folder: Path, count: int, sizes: list[int], seed: int = 0) -> dict[str, Placed]:
-    """Write so many grids of all sizes and solids; return which solid each file holds."""
+    """Write grids of all sizes and solids; return the solid that each file holds."""
     rng, solids = np.random.default_rng(seed), {}
     for i in range(count):
         n, kind = sizes[i % len(sizes)], list(SOLIDS)[i // len(sizes) % len(SOLIDS)]
@@ -97,7 +97,7 @@ def write_mixed(folder: Path, count: int, sizes: list[int], seed: int = 0) -> di
     return solids
 
 
-# What is broken, and what the failure has to name.
+# Broken files, and words that the error message must contain.
 BROKEN = {
     "truncated.npy": "is truncated",
     "empty.npy": "its header cannot be read",
@@ -108,12 +108,12 @@ BROKEN = {
     "constant.npy": "a constant field has no surface",
     "unsigned.npy": "an unsigned field has no inside",
     "anisotropic.npz": "the method needs cubic voxels",
-    "corrupt.npz": "is no readable .npz archive",
+    "corrupt.npz": "is not a readable .npz archive",
 }
 
 
 def write_broken(folder: Path) -> None:
-    """Write a file of each broken kind."""
+    """Write one file of each broken kind."""
     folder.mkdir(parents=True, exist_ok=True)
     good = folder / "good.npy"
     write_solid(random_solid("ball", np.random.default_rng(0)), 24, good)

@@ -1,8 +1,8 @@
-"""The picture in README: coarse marching cubes beside our result, whole and close up.
+"""The picture in README: coarse marching cubes beside super-sdf, whole and close up.
 
-    python -m benchmarks.picture [GRID.npz] [OUT.png]          # wants the extra view
+    python -m benchmarks.picture [GRID.npz] [OUT.png]          # needs the extra view
 
-Rendered off screen by PyVista from the very meshes that the command line writes.
+Rendered off screen by PyVista from the same meshes that the command line writes.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def coarse_mesh(grid: SdfGrid) -> Mesh:
 
 
 def draw(plotter: pv.Plotter, mesh: Mesh, title: str, close: bool) -> None:
-    """Draw a mesh, flat shaded, as a whole or round its upper front corner."""
+    """Draw a mesh, flat shaded, as a whole or around its upper front corner."""
     rows = np.insert(mesh.faces, 0, 3, axis=1)
     plotter.add_mesh(pv.PolyData(mesh.vertices, rows), color=LIGHT_BLUE, specular=0.2)
     plotter.add_text(title, font_size=10, color="black", position="upper_left")

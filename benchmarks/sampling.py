@@ -1,9 +1,9 @@
-"""How exact sampled grids are, and what a large one takes.
+"""Errors of sampled grids, and time and memory of a large one.
 
     python -m benchmarks.sampling MESH --size 512
 
-Samples a box, and a sphere and a torus of so many triangles that chords stray from the surface by
-under 1e-6, and prints the largest difference from the closed form over all samples. Then runs
+Samples a box, and a sphere and a torus with so many triangles that they deviate from the surface by
+less than 1e-6, and prints the largest difference from the closed form over all samples. Then runs
 ``super-sdf sample MESH -n SIZE`` and prints its time and peak of memory.
 """
 
@@ -30,7 +30,7 @@ SIZE = 64
 
 
 def wrapped(points: np.ndarray) -> Mesh:
-    """Return the mesh of points (u, v, 3) of a surface that closes on itself along u and v."""
+    """Return the mesh of points (u, v, 3) on a surface that is periodic along u and v."""
     corner = np.arange(points.shape[0] * points.shape[1]).reshape(points.shape[:2])
     right, up = np.roll(corner, -1, 0), np.roll(corner, -1, 1)
     faces = np.stack([corner, right, np.roll(right, -1, 1), corner, np.roll(right, -1, 1), up], -1)
@@ -38,12 +38,12 @@ def wrapped(points: np.ndarray) -> Mesh:
 
 
 def steps_for(radius: float) -> int:
-    """Return into how many chords a circle is cut that stray by half of what they may."""
+    """Return the number of chords of a circle that deviate by half of the tolerance."""
     return int(np.ceil(np.pi / np.arccos(1 - STRAY / 2 / radius)))
 
 
 def torus() -> Mesh:
-    """Return a torus round the z axis."""
+    """Return a torus around the z axis."""
     u = np.linspace(0, 2 * np.pi, steps_for(RING + TUBE), endpoint=False)[:, None]
     v = np.linspace(0, 2 * np.pi, steps_for(TUBE), endpoint=False)[None]
     ring = RING + TUBE * np.cos(v)
@@ -51,7 +51,7 @@ def torus() -> Mesh:
 
 
 def sphere() -> Mesh:
-    """Return a sphere, its vertices outside by as much as its faces are inside."""
+    """Return a sphere, its vertices as far outside as its faces are inside."""
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=9, radius=RADIUS + STRAY / 4)
@@ -59,7 +59,7 @@ def sphere() -> Mesh:
 
 
 def box() -> Mesh:
-    """Return a box round the origin."""
+    """Return a box around the origin."""
     import trimesh
 
     made = trimesh.creation.box(extents=2 * HALF)
@@ -94,7 +94,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("mesh", type=Path)
     parser.add_argument("--size", type=int, default=512)
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     print(f"{describe_machine()}\n\n| solid | triangles | largest error, {SIZE}^3 samples |")
     print("| --- | ---: | ---: |")
     layout = unit_layout(SIZE)
@@ -103,10 +103,17 @@ def main() -> None:
         error = sample_grid(Solid(mesh), layout).ravel() - closed_form(grid_points(layout))
         print(f"| {name} | {len(mesh.faces):,} | {np.abs(error).max():.1e} |", flush=True)
     with tempfile.TemporaryDirectory() as folder:
-        words = ["sample", str(asked.mesh), f"{folder}/grid.npz", "-n", str(asked.size), "--quiet"]
+        words = [
+            "sample",
+            str(arguments.mesh),
+            f"{folder}/grid.npz",
+            "-n",
+            str(arguments.size),
+            "--quiet",
+        ]
         seconds, peak = run_command(words)
-    faces = len(read_mesh(asked.mesh).faces)
-    print(f"\n{asked.mesh.stem}, {faces:,} faces, {asked.size}^3: {seconds:.1f} s, {peak:.0f} MB")
+    faces, size = len(read_mesh(arguments.mesh).faces), f"{arguments.size}^3"
+    print(f"\n{arguments.mesh.stem}, {faces:,} faces, {size}: {seconds:.1f} s, {peak:.0f} MB")
 
 
 if __name__ == "__main__":

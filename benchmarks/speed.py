@@ -1,12 +1,12 @@
-"""How long a conversion takes and how much memory.
+"""Time and memory of a conversion.
 
     python -m benchmarks.speed MESHES --sizes 32 64 128 --shapes 10 [-- --precision int8]
     python -m benchmarks.speed MESHES --sizes 32 64 128 --shapes 10 --warm
 
 Samples every shape at every size, converts it several times, and prints the machine and, for each
-size, the mean over shapes of the median time, the slowest shape, and the highest peak of memory.
-Whole processes, start included, and what follows ``--`` goes to the command; or, with ``--warm``,
-from file to file in this process, which has its network already.
+size, the mean over shapes of the median time, the slowest shape, and the highest peak memory. Whole
+processes are measured, start included, and options after ``--`` are passed to the command; with
+``--warm``, from file to file in this process, which has loaded the network.
 """
 
 from __future__ import annotations
@@ -44,14 +44,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("meshes", type=Path, nargs="+", help="files or folders")
     parser.add_argument("--sizes", type=int, nargs="+", default=[32, 64, 128])
-    parser.add_argument("--shapes", type=int, default=10, help="how many, spread over them")
+    parser.add_argument(
+        "--shapes", type=int, default=10, help="number of shapes, spread over the list"
+    )
     parser.add_argument("--factor", type=int, default=4)
-    parser.add_argument("--warm", action="store_true", help="in this process")
-    asked, options = parse(parser)
-    if asked.warm and options:
+    parser.add_argument("--warm", action="store_true", help="convert in this process")
+    arguments, options = parse(parser)
+    if arguments.warm and options:
         parser.error("with --warm the command is not run: leave its options away")
-    paths = spread(find_meshes(asked.meshes), asked.shapes)
-    network = load_network() if asked.warm else None
+    paths = spread(find_meshes(arguments.meshes), arguments.shapes)
+    network = load_network() if arguments.warm else None
 
     def measure(path: Path, setting: Setting) -> Row:
         shape = Shape.read(path)
@@ -59,10 +61,12 @@ def main() -> None:
             return time_warm(shape, setting, network)
         return time_shape(shape, setting, options)
 
-    print(f"{describe_machine()}; {len(paths)} shapes, factor {asked.factor}, median of {RUNS}\n")
+    print(
+        f"{describe_machine()}; {len(paths)} shapes, factor {arguments.factor}, median of {RUNS}\n"
+    )
     print("| grid | mean s | slowest s | peak MB |\n| --- | ---: | ---: | ---: |")
-    for size in asked.sizes:
-        rows = [measure(path, Setting(size, asked.factor)) for path in paths]
+    for size in arguments.sizes:
+        rows = [measure(path, Setting(size, arguments.factor)) for path in paths]
         seconds, peak = [row["seconds"] for row in rows], max(row["peak_mb"] for row in rows)
         mean = statistics.mean(seconds)
         print(f"| {size}^3 | {mean:.3f} | {max(seconds):.3f} | {peak:.0f} |", flush=True)

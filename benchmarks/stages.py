@@ -1,10 +1,10 @@
-"""Where time and memory go, stage by stage, from small grids to large ones.
+"""Time and memory of each stage, from small grids to large ones.
 
     python -m benchmarks.stages MESH.ply --sizes 32 64 128 256 512 --out report/
 
 Samples the mesh at each size (box diagonal 1 in the unit cube) and converts the grid in this
-process, warm: the median of some runs. The network's operations are two for each of its weights and
-voxel; what the machine can do is measured in the same run, a float32 matrix product in NumPy.
+process, warm: the median of several runs. Two operations of the network are counted per weight and
+voxel; the peak of the machine is measured in the same run, by a float32 matrix product in NumPy.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from super_sdf.machine.memory import forget_peak, held_memory
 from super_sdf.network.network import Network
 from super_sdf.steps.survey import Band
 
-# The functions that are a stage, where they are looked up.
+# The function of each stage, in the module where it is looked up.
 STAGES = {
     "read": [(convert, "read_grid")],
     "band": [(pipeline, "survey")],
@@ -45,14 +45,14 @@ AFTER = ("number", "average", "fit", "isosurface", "write")
 
 
 class Probe:
-    """Seconds and peaks of memory of each stage, while it is in place."""
+    """Measures seconds and peak memory of each stage within a ``with`` block."""
 
     def __init__(self) -> None:
         self.seconds = dict.fromkeys(STAGES, 0.0)
         self.peak = dict.fromkeys(STAGES, 0)
 
     def watch(self, stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Return the function, with a clock."""
+        """Return the function with time and memory measured."""
 
         def watched(*args: Any, **options: Any) -> Any:
             forget_peak()
@@ -65,7 +65,7 @@ class Probe:
         return watched
 
     def run(self, work: Callable[[], Any]) -> Any:
-        """Do some work under the probe."""
+        """Run a function under the probe."""
         patches = [
             mock.patch.object(place, name, self.watch(stage, getattr(place, name)))
             for stage, places in STAGES.items()
@@ -80,7 +80,7 @@ class Probe:
 
 
 def matrix_product_peak(side: int = 2048, runs: int = 10) -> float:
-    """Return the operations a second of a float32 matrix product, the best of some runs."""
+    """Return the operations per second of a float32 matrix product, the best of several runs."""
     a, b = np.random.default_rng(0).random((2, side, side), np.float32)
     best = np.inf
     for _ in range(runs):
@@ -101,7 +101,7 @@ def sample(mesh: Path, size: int, folder: Path) -> Path:
 
 
 def measure(grid: Path, network: Network, factor: int, runs: int) -> dict[str, Any]:
-    """Return seconds and peaks of the stages, and counts."""
+    """Return seconds and peak memory of the stages, and counts."""
     options = convert.ConvertOptions(factor, (1 / int(grid.stem),), (0.0,), "negative")
 
     def work() -> convert.Conversion:
@@ -132,7 +132,7 @@ def tables(rows: dict[int, dict[str, Any]], network: Network, peak: float) -> st
 
 
 def summary(network: Network, peak: float) -> dict[str, Callable[[dict[str, Any]], str]]:
-    """Return what else stands in the table: a cell of each kind for a size."""
+    """Return the other rows of the table: for each, a function from a size's figures to a cell."""
     operations = 2 * network.card["parameters"]
 
     def rate(row: dict[str, Any]) -> float:
@@ -146,8 +146,10 @@ def summary(network: Network, peak: float) -> dict[str, Callable[[dict[str, Any]
         "after the network": lambda row: f"{after(row) / row['total']:.0%}",
         "band voxels": lambda row: f"{row['band_voxels']:,}",
         "triangles": lambda row: f"{row['triangles']:,}",
-        "peak bytes a voxel": lambda row: f"{max(row['peak'].values()) / row['band_voxels']:,.0f}",
-        "network: us a voxel": lambda row: (
+        "peak bytes per voxel": lambda row: (
+            f"{max(row['peak'].values()) / row['band_voxels']:,.0f}"
+        ),
+        "network: us per voxel": lambda row: (
             f"{1e6 * row['seconds']['network'] / row['band_voxels']:.1f}"
         ),
         "network: GFLOP/s": lambda row: f"{rate(row) / 1e9:.0f}",
@@ -156,7 +158,7 @@ def summary(network: Network, peak: float) -> dict[str, Callable[[dict[str, Any]
 
 
 def draw(rows: dict[int, dict[str, Any]]) -> Figure:
-    """Draw seconds and memory of the stages against the size of the grid."""
+    """Plot seconds and memory of the stages against the size of the grid."""
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     seconds, memory = figure.subplots(1, 2)
     sizes = list(rows)
@@ -187,19 +189,19 @@ def main() -> None:
     parser.add_argument("--precision", default="float32")
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--out", type=Path, help="folder for the plot")
-    asked = parser.parse_args()
-    network = load_network(asked.model, precision=asked.precision)
+    arguments = parser.parse_args()
+    network = load_network(arguments.model, precision=arguments.precision)
     peak, rows = matrix_product_peak(), {}
     with tempfile.TemporaryDirectory() as name:
-        for size in asked.sizes:
-            grid = sample(asked.mesh, size, Path(name))
-            rows[size] = measure(grid, network, asked.factor, asked.runs)
-    code = "NumPy"
-    print(f"{describe_machine()}; {asked.mesh.stem}, factor {asked.factor}, {asked.model}, {code};")
+        for size in arguments.sizes:
+            grid = sample(arguments.mesh, size, Path(name))
+            rows[size] = measure(grid, network, arguments.factor, arguments.runs)
+    what = f"{arguments.mesh.stem}, factor {arguments.factor}, {arguments.model}"
+    print(f"{describe_machine()}; {what};")
     print(f"float32 matrix product: {peak / 1e9:.0f} GFLOP/s\n\n{tables(rows, network, peak)}")
-    if asked.out:
-        asked.out.mkdir(parents=True, exist_ok=True)
-        draw(rows).savefig(asked.out / "stages.png", dpi=110)
+    if arguments.out:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        draw(rows).savefig(arguments.out / "stages.png", dpi=110)
 
 
 if __name__ == "__main__":

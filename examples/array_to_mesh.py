@@ -1,4 +1,4 @@
-"""From an array to a mesh: three lines. Here the array is that of a real part.
+"""From an array to a mesh in three lines, with the array of a real part.
 
 python examples/array_to_mesh.py [OUT.ply]
 """

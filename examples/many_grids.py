@@ -12,12 +12,12 @@ from super_sdf import SuperSdfError, extract_mesh, load_network, read_grid, upsa
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 grid = read_grid(Path(__file__).parent / "part.npz")
-network = load_network(threads=2)  # loaded once; may be shared by threads
+network = load_network(threads=2)  # loaded once; threads may share it
 
 
 def show(done: int, total: int) -> None:
-    """Say how far it is, on a line that is written over."""
-    print(f"step {done} of {total}", end="\r", file=sys.stderr)
+    """Print the progress on one line, over and over."""
+    print(f"{100 * done // total} %", end="\r", file=sys.stderr)
 
 
 for offset in (0, 1, 2, 3, 99):

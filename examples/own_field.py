@@ -1,4 +1,4 @@
-"""A grid from a formula: any function of position that is a distance, sampled where you like.
+"""A grid from a formula: sample any distance function on your own lattice.
 
     python examples/own_field.py [OUT.stl]
 

@@ -1,1 +1,1 @@
-"""From meshes to a shipped network: shapes, sampling, data, training, ONNX export."""
+"""From meshes to a shipped network: shapes, sampling, training data, training, ONNX export."""

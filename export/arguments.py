@@ -1,4 +1,4 @@
-"""What the scripts are asked on the command line: wrong numbers and files end them in one line."""
+"""Command line arguments of the scripts: invalid numbers and files end them with one line."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from super_sdf.errors import SuperSdfError
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser of arguments that says what is wrong in a line, without the usage before it."""
+    """An argument parser that reports an error in one line, without the usage."""
 
     def error(self, message: str) -> NoReturn:
-        """End with exit code 2."""
+        """Print the error and exit with code 2."""
         self.exit(2, f"Error: {message}\n")
 
     @contextmanager
     def one_line_errors(self) -> Iterator[None]:
-        """End with exit code 1 and a line where a file or what it holds is at fault."""
+        """Exit with code 1 and one line if a file or its content is invalid."""
         try:
             yield
         except SuperSdfError as error:
@@ -38,7 +38,7 @@ def share(text: str) -> float:
 
 
 def positive(text: str) -> float:
-    """Parse a finite number over 0."""
+    """Parse a finite number greater than 0."""
     number = float(text)
     if not 0 < number < math.inf:
         raise argparse.ArgumentTypeError(f"{text}: give a number greater than 0")
@@ -46,7 +46,7 @@ def positive(text: str) -> float:
 
 
 def at_least(least: int) -> Callable[[str], int]:
-    """Return what parses a whole number that is not under ``least``."""
+    """Return a parser for whole numbers of at least ``least``."""
 
     def whole(text: str) -> int:
         number = int(text)

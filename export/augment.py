@@ -1,8 +1,8 @@
-"""What is done to a sample each time it is shown: no network sees the same one twice.
+"""Random changes to a sample each time it is shown, so that no network sees the same one twice.
 
-A distance field stays one when the cube it is sampled in is turned and (near the surface) when
-another level is called zero. What users bring besides is cut off at some distance, or noisy: the
-targets stay clean, so the network learns to undo it.
+A distance field stays one when its cube is turned or mirrored and, near the surface, when another
+level is called zero. Grids of users may also be truncated or noisy: the targets stay clean, so the
+network learns to undo that.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from super_sdf.steps.band import find_band, gather_patches, neighbour_table
 
 @dataclass(frozen=True)
 class Shares:
-    """How many of the samples each change is made to, from 0 to 1."""
+    """The share of samples that each change is applied to, from 0 to 1."""
 
-    inverted: float = 0.0  # worse: solids are oftener convex than not, and networks learn that
+    inverted: float = 0.0  # more is worse: solids are mostly convex, and networks learn that
     shifted: float = 1 / 6
     noisy: float = 1 / 4
     truncated: float = 1 / 6
@@ -33,9 +33,9 @@ CLEAN = Shares(0, 0, 0, 0)
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A sample as the network takes it: band patches and neighbours, and where its targets are."""
+    """A sample as the network's inputs, with the targets."""
 
-    ijk: np.ndarray  # (V, 3) the voxels, in the window or turned with it
+    ijk: np.ndarray  # (V, 3) voxels in the window, turned with it
     patches: np.ndarray  # (V, 27) float32
     table: np.ndarray  # (V, 27) int32, -1 where absent
     voxels: np.ndarray  # (D,) rows of the band that have targets
@@ -50,7 +50,7 @@ def augment(rng: np.random.Generator, sample: Sample, shares: Shares) -> Prepare
 
 
 def prepare(sample: Sample) -> Prepared:
-    """Gather a sample with the runtime's own functions; targets outside its band are dropped."""
+    """Gather a sample with the functions of the runtime; targets outside the band are dropped."""
     band = find_band(sample.window)
     strides = np.array([sample.window.shape[1] * sample.window.shape[2], sample.window.shape[2], 1])
     keys, wanted = band @ strides, sample.voxel_ijk.astype(np.int64) @ strides
@@ -67,14 +67,14 @@ def prepare(sample: Sample) -> Prepared:
 
 
 def inverted(rng: np.random.Generator, sample: Sample, shares: Shares) -> Sample:
-    """Let inside and outside change places."""
+    """Swap inside and outside."""
     if rng.random() >= shares.inverted:
         return sample
     return replace(sample, window=-sample.window, targets=-sample.targets)
 
 
 def shifted(rng: np.random.Generator, sample: Sample, shares: Shares) -> Sample:
-    """Call a level within half a voxel the surface (Sec. 5.3)."""
+    """Move the zero level by up to half a voxel (Sec. 5.3)."""
     if rng.random() >= shares.shifted:
         return sample
     level = np.float32(rng.uniform(-1, 1))
@@ -83,7 +83,7 @@ def shifted(rng: np.random.Generator, sample: Sample, shares: Shares) -> Sample:
 
 
 def noisy(rng: np.random.Generator, sample: Sample, shares: Shares) -> Sample:
-    """Add uniform noise of up to half a voxel, oftener little than much."""
+    """Add uniform noise of up to half a voxel; small amplitudes are more frequent."""
     if rng.random() >= shares.noisy:
         return sample
     noise = rng.uniform(-1, 1, sample.window.shape) * rng.random() ** 1.5
@@ -91,7 +91,7 @@ def noisy(rng: np.random.Generator, sample: Sample, shares: Shares) -> Sample:
 
 
 def truncated(rng: np.random.Generator, sample: Prepared, shares: Shares) -> Prepared:
-    """Cut the values off at 1.5 to 3 voxels."""
+    """Truncate the values at 1.5 to 3 voxels."""
     if rng.random() >= shares.truncated:
         return sample
     limit = rng.uniform(3, 6)
@@ -99,7 +99,7 @@ def truncated(rng: np.random.Generator, sample: Prepared, shares: Shares) -> Pre
 
 
 def batch_table(tables: Sequence[np.ndarray]) -> np.ndarray:
-    """Lay neighbour tables end to end; absent is then the number of all rows, not -1."""
+    """Concatenate neighbour tables; the index of an absent neighbour becomes the number of rows."""
     starts = np.cumsum([0] + [len(table) for table in tables])
     moved = [np.where(t < 0, starts[-1], t + at) for t, at in zip(tables, starts[:-1])]
     return np.concatenate(moved).astype(np.int32)

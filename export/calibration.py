@@ -1,6 +1,6 @@
-"""What the layers of a network read, on samples as in training: their ranges.
+"""The ranges of the inputs of a network's layers, on samples as in training.
 
-``quantize`` makes steps of them, and ``prune`` finds what never reacts.
+``quantize`` derives quantization steps from them, and ``prune`` finds blocks that never react.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ SAMPLES = 200
 
 @dataclass
 class Ranges:
-    """What a block reads: the least and the most of each channel at its three layers."""
+    """Minimum and maximum of each channel at the inputs of the three layers of a block."""
 
     low: Tensor  # (C,) features
     high: Tensor  # (C,)
-    mixed: Tensor  # (C,) the most; after a rectifier the least is 0
-    expanded: Tensor  # (hidden,) alike
+    mixed: Tensor  # (C,) maximum; after a rectifier the minimum is 0
+    expanded: Tensor  # (hidden,) likewise
 
     @classmethod
     def of_zeros(cls, block: Block) -> Ranges:
-        """Return ranges that hold nothing but 0."""
+        """Return ranges that contain only 0."""
         zeros = torch.zeros(block.expand.in_features)
         return cls(zeros, zeros, zeros, torch.zeros(block.expand.out_features))
 
     def widen(self, features: Tensor, mixed: Tensor, expanded: Tensor) -> None:
-        """Take in what was read."""
+        """Extend the ranges by the inputs of one sample."""
         self.low = torch.minimum(self.low, features.amin(0))
         self.high = torch.maximum(self.high, features.amax(0))
         self.mixed = torch.maximum(self.mixed, mixed.amax(0))
@@ -46,7 +46,7 @@ class Ranges:
 
 
 def draw_samples(count: int = SAMPLES, seed: int = 0) -> list[Prepared]:
-    """Return samples of procedural shapes; some noisy, some cut off."""
+    """Return samples of procedural shapes, some noisy, some truncated."""
     rng = np.random.default_rng(seed)
     samples = fill_shard(rng, [], 1.0, THIN, count)
     return [augment(rng, sample, USUAL) for sample in samples]
@@ -54,21 +54,21 @@ def draw_samples(count: int = SAMPLES, seed: int = 0) -> list[Prepared]:
 
 @torch.no_grad()
 def find_ranges(net: SuperSdfNet, samples: list[Prepared]) -> list[Ranges]:
-    """Return what each block reads on these samples."""
+    """Return the ranges of each block on these samples."""
     ranges = [Ranges.of_zeros(block) for block in net.blocks]
     for sample in samples:
         table = torch.from_numpy(batch_table([sample.table]))
         features = net.stem(torch.from_numpy(sample.patches))
-        for block, seen in zip(net.blocks, ranges):
+        for block, block_ranges in zip(net.blocks, ranges):
             mixed = block.mix(features, table)
             expanded = torch.relu(block.expand(mixed))
-            seen.widen(features, mixed, expanded)
+            block_ranges.widen(features, mixed, expanded)
             features = features + block.reduce(expanded)
     return ranges
 
 
 def distance_apart(one: Path, other: Path) -> np.ndarray:
-    """Return how far the values of two files are apart on a ball, in voxels."""
+    """Return the differences between the values of two files on a ball, in voxels."""
     sample = ball(15.0)
     arrays = (sample.patches, sample.table, sample.voxels, sample.offsets)
     first, second = (load_network(path, device="cpu")(*arrays) for path in (one, other))

@@ -1,11 +1,11 @@
-"""Which validation shapes a network is chosen on, and which are measured once, at the end.
+"""Split the validation shapes: one half to choose a network on, one to measure once at the end.
 
     super-sdf evaluate $(python -m export.choice FOLDER choose) --sizes 32 --model new.onnx ...
     super-sdf evaluate $(python -m export.choice FOLDER final) --sizes 32 64 128 --out report/
 
-Whatever is tuned on a shape says too much of itself there. So the shapes of a folder are drawn, by
-a seed, in two halves: candidates are compared on the first alone, and the card gives the figures
-of both.
+Figures on shapes that were used to choose a network are too good. So the shapes of a folder are
+split by a seed into two halves: candidates are compared on the first only, and the model card gives
+the figures of both.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ SEED = 0
 
 
 def draw_halves(paths: Sequence[Path], seed: int = SEED) -> dict[str, list[Path]]:
-    """Return the shapes to choose on and those measured once; of an odd count the latter has more.
+    """Return the two halves of the shapes; of an odd number the second gets one more.
 
-    The draw depends on the files' names alone, not on their order or folder.
+    The split depends on the names of the files only, not on their order or folder.
     """
     names = sorted(path.stem for path in paths)
     chosen = set(np.random.default_rng(seed).permutation(names)[: len(names) // 2].tolist())
@@ -36,7 +36,7 @@ def draw_halves(paths: Sequence[Path], seed: int = SEED) -> dict[str, list[Path]
 
 
 def main() -> None:
-    """Print the paths of a half, a line each."""
+    """Print the paths of one half, one per line."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("meshes", nargs="+", type=Path, help="files or folders")
     parser.add_argument("half", choices=HALVES)

@@ -1,10 +1,10 @@
-"""Train many networks under one budget and print a table: what pays, and what does not.
+"""Train many networks with the same budget and print a table of their errors.
 
     python -m export.compare --store training/store --out training/compare --minutes 2.5
 
 Every entry has the same seed, samples and minutes of processor time on one thread, and is measured
-on samples of meshes that none was trained on. An entry that has a row in the table is left as it
-is, so the command can be stopped and called again.
+on samples of meshes that none was trained on. Entries that have a row in the table are skipped, so
+the command can be stopped and resumed.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from export.train import Errors, Run, Store, measure
 HELD_OUT = 2  # shards
 SHARDS = 20  # of training
 OURS = NetworkConfig(blocks=5)
-DEEP = NetworkConfig(blocks=8)  # where units die
-HIGH = replace(RECIPE, hidden_rate=5e-3, shares=CLEAN)  # a short run bears a higher rate
+DEEP = NetworkConfig(blocks=8)  # deep enough for units to become dormant
+HIGH = replace(RECIPE, hidden_rate=5e-3, shares=CLEAN)  # short runs tolerate a higher rate
 
 Entry = tuple[Callable[[NetworkConfig], SuperSdfNet], NetworkConfig, Recipe]
 
 
 def blocks_of(kind: type) -> Callable[[NetworkConfig], SuperSdfNet]:
-    """Return a maker of networks with such blocks."""
+    """Return a function that makes networks with blocks of this kind."""
     return lambda config: variants.BlockNet(config, kind)
 
 
@@ -94,12 +94,12 @@ def train_entry(entry: Entry, store: Store, folder: Path, minutes: float) -> Run
 
 
 def main() -> None:
-    """Train what has no row yet, then print the table."""
+    """Train the entries without a row, then print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--store", type=Path, required=True, help="folder of shards")
     parser.add_argument("--out", type=Path, required=True, help="folder for the rows")
-    parser.add_argument("--minutes", type=float, default=2.5, help="an entry")
-    parser.add_argument("--only", help="entries whose name has this in it")
+    parser.add_argument("--minutes", type=float, default=2.5, help="processor time per entry")
+    parser.add_argument("--only", help="train only entries whose name contains this")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
@@ -116,7 +116,7 @@ def main() -> None:
 
 
 def append_row(path: Path, name: str, run: Run, errors: Errors, dormant: float) -> None:
-    """Write what came of an entry as a line."""
+    """Append the results of an entry as one line of JSON."""
     parameters = sum(p.numel() for p in run.net.parameters())
     row = {"name": name, "parameters": parameters, "steps": run.step, **asdict(errors)}
     row["dormant"] = dormant
@@ -131,7 +131,7 @@ def read_rows(path: Path) -> dict[str, dict[str, float]]:
 
 
 def with_times(rows: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
-    """Add to each row how long the network takes on one thread."""
+    """Add to each row the microseconds per voxel of the network on one thread."""
     sample = ball(20.0)
     makers = {name: ENTRIES[name][:2] for name in rows}
     return {
@@ -143,7 +143,7 @@ def with_times(rows: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]
 def format_table(rows: dict[str, dict[str, float]]) -> str:
     """Return the table in Markdown."""
     lines = [
-        "| network | parameters | us a voxel | steps | error | near the surface | normal "
+        "| network | parameters | us per voxel | steps | error | near the surface | normal "
         "| dormant |",
         "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]

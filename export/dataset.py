@@ -4,17 +4,17 @@
 
 A sample is one shape in one pose at one resolution. It holds a window of the coarse grid and, for
 each voxel that can hold the surface, the exact distance at a set of query offsets that is drawn
-anew for every sample: ``CORNERS`` nodes of the K = 4 lattice, each followed by its next nodes along
-x, y and z (the differences are what the loss knows of the gradient), then some nodes of the K = 16
-lattice (which has those of 2 and 8), then some points anywhere in the voxel. Values are rescaled
-(half voxels, Eqs. 4 and 5).
+anew for every sample: ``CORNERS`` nodes of the K = 4 lattice, each followed by the next node along
+x, y and z (the loss takes the gradient from their differences), then some nodes of the K = 16
+lattice (which includes those of 2 and 8), then some points anywhere in the voxel. Values are
+rescaled (half voxels, Eqs. 4 and 5).
 
-Samples are stored in shards, ``shard-<seed>-<number>.npz``, of flat arrays laid end to end:
+Samples are stored in shards, ``shard-<seed>-<number>.npz``, as concatenated flat arrays:
 ``windows`` (float32) with ``window_shape``, ``offsets`` (n, Q, 3), ``voxel_ijk`` (D, 3) and
-``targets`` (D, Q) float16 with ``voxel_count``. Without ``--meshes`` all shapes are procedural;
-with it, each mesh comes once before any comes again, but only as many of the simple prisms as make
-a sixth, and ``--procedural`` says what share is procedural besides. ``--thin`` of the samples are
-of solids so thin that hardly a sample lies inside.
+``targets`` (D, Q) float16 with ``voxel_count``. Without ``--meshes`` all shapes are procedural.
+With it, each mesh is used once before any is repeated, except that simple prisms are limited to a
+sixth, and ``--procedural`` is the share of procedural shapes among them. A share ``--thin`` of the
+samples are of solids so thin that hardly any sample lies inside.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ from super_sdf.truth.mesh_files import read_mesh
 from super_sdf.truth.sampling import sample_grid
 from super_sdf.truth.solid import Solid
 
-CORNERS, FINE_NODES, ANYWHERE = 5, 4, 4  # queries: 4 a corner, 28 in all
+CORNERS, FINE_NODES, ANYWHERE = 5, 4, 4  # queries: 4 per corner, 28 in all
 SMALLEST, LARGEST = 7, 100  # voxels along a shape's diagonal
-SWAYED = 0.3  # of the meshes
-THIN = -0.2, 0.6  # between them, in spacings, is the lowest sample of a thin solid
+SWAYED = 0.3  # share of the meshes that are bent
+THIN = -0.2, 0.6  # range of the lowest sample of a thin solid, in spacings
 WINDOW = 32  # samples along each axis: a whole shape at 32^3, a piece of it at 64^3
-SHARD = 50  # samples a file
+SHARD = 50  # samples per file
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ def draw_pose(rng: np.random.Generator, mesh: Mesh) -> Mesh:
 
 
 def draw_window(rng: np.random.Generator, mesh: Mesh) -> tuple[tuple[int, int, int], np.ndarray]:
-    """Return shape and first sample of a window: the whole shape, or a piece round a vertex."""
+    """Return shape and first sample of a window: the whole shape, or a piece around a vertex."""
     whole = np.ceil(mesh.vertices.max(0)).astype(int) + 3
     shape = np.minimum(whole, WINDOW)
     middle = mesh.vertices[rng.integers(len(mesh.vertices))]
@@ -80,7 +80,7 @@ def draw_window(rng: np.random.Generator, mesh: Mesh) -> tuple[tuple[int, int, i
 
 
 def draw_offsets(rng: np.random.Generator) -> np.ndarray:
-    """Return the sample's query offsets, (Q, 3) in [-1, 1]: see the module."""
+    """Return the query offsets of a sample, (Q, 3) in [-1, 1]: see the module's docstring."""
     corners = rng.integers(0, 4, (CORNERS, 3)) / 2 - 1
     steps = np.concatenate([np.zeros((1, 3)), np.eye(3)]) / 2
     quadruples = (corners[:, None] + steps).reshape(-1, 3)
@@ -92,10 +92,10 @@ def draw_offsets(rng: np.random.Generator) -> np.ndarray:
 def make_sample(
     rng: np.random.Generator, mesh: Mesh, lowest: tuple[float, float] = (-np.inf, np.inf)
 ) -> Sample | None:
-    """Sample a shape; None where it is not seen: no sample is near it, or all are inside.
+    """Sample a shape; return None if no sample is near the surface, or all are inside.
 
-    What is so thin that no sample lies inside is kept: it can be told from its distances. None
-    also where the lowest sample is not between two bounds (spacings).
+    A shape so thin that no sample lies inside is kept: its distances reveal it. Also None if the
+    lowest sample is not between the two bounds ``lowest`` (in spacings).
     """
     posed = draw_pose(rng, mesh)
     shape, first = draw_window(rng, posed)
@@ -115,15 +115,16 @@ def make_sample(
 
 
 def signed_distance(rng: np.random.Generator, solid: Solid, points: np.ndarray) -> np.ndarray:
-    """Return the signed distance of points (n, 3).
+    """Return the signed distance, (n,), of points (n, 3).
 
     The nearest triangle gives the sign quickly, but wrongly on meshes that intersect themselves.
-    So it is checked at 2,000 points by winding number; where any differs, all are asked for it.
+    So it is checked at 2,000 points by winding number; if any differs, the winding number is used
+    for all points.
     """
     kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
     distances = igl.signed_distance(points, solid.mesh.vertices, solid.mesh.faces, kind)[0]
     some = rng.integers(len(points), size=min(len(points), 2000))
-    clear = np.abs(distances[some]) > 1e-4  # on the surface either sign is right
+    clear = np.abs(distances[some]) > 1e-4  # on the surface either sign is correct
     inside = solid.is_inside(points[some])
     if (inside == (distances[some] < 0))[clear].all():
         return distances
@@ -131,7 +132,7 @@ def signed_distance(rng: np.random.Generator, solid: Solid, points: np.ndarray) 
 
 
 def write_shard(path: Path, samples: list[Sample]) -> None:
-    """Write samples end to end; the file appears whole or not at all."""
+    """Write a shard; the file is complete or absent."""
     part = path.with_suffix(".part")
     with part.open("wb") as file:
         np.savez(
@@ -152,13 +153,13 @@ def read_shard(path: Path) -> Iterator[Sample]:
     Raises
     ------
     FileError
-        If it is damaged, or none.
+        If it is damaged or not a shard.
     """
     try:
         with np.load(check_regular_file(path)) as file:
             shard = dict(file)
     except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise FileError(f"{path} is no shard: {error}; remove it and make it again") from error
+        raise FileError(f"{path} is not a shard: {error}; remove it and make it again") from error
     window_ends = np.cumsum(shard["window_shape"].prod(1))
     voxel_ends = np.cumsum(shard["voxel_count"])
     windows = np.split(shard["windows"], window_ends[:-1])
@@ -174,23 +175,23 @@ def find_meshes(folder: Path | None) -> tuple[list[Path], list[Path]]:
     Raises
     ------
     FileError
-        If the folder is none or holds no .ply file, or one of them is no regular file.
+        If the folder does not exist or has no .ply file, or one of them is not a regular file.
     """
     if folder is None:
         return [], []
     if not folder.is_dir():
-        raise FileError(f"--meshes {folder} is no folder: give one of closed .ply meshes")
+        raise FileError(f"--meshes {folder} is not a folder: give one with closed .ply meshes")
     files = [check_regular_file(file) for file in sorted(folder.glob("*.ply"))]
     if not files:
-        raise FileError(f"--meshes {folder} holds no .ply file: other formats are not read here")
+        raise FileError(f"--meshes {folder} has no .ply file: other formats are not read here")
     prisms = [file for file in files if file.stat().st_size < 3000]
     return prisms, sorted(set(files) - set(prisms))
 
 
 def mesh_order(seed: int, prisms: list[Path], others: list[Path], count: int) -> list[Path]:
-    """Return ``count`` files, all others once before any again, a sixth of them prisms.
+    """Return ``count`` files: each mesh once before any is repeated, a sixth of them prisms.
 
-    Where there are none but prisms, they are all.
+    If there are only prisms, all files are.
     """
     rng = np.random.default_rng(seed)
     others, prisms = (others, prisms) if others else (prisms, [])
@@ -202,7 +203,7 @@ def mesh_order(seed: int, prisms: list[Path], others: list[Path], count: int) ->
 
 
 def draw_mesh(rng: np.random.Generator, path: Path) -> Mesh:
-    """Read a mesh; some are bent by smooth waves, so that few faces stay flat or in line."""
+    """Read a mesh; some are bent by smooth waves, so that few faces stay flat or parallel."""
     mesh = read_mesh(path)
     if rng.random() >= SWAYED:
         return mesh
@@ -211,7 +212,7 @@ def draw_mesh(rng: np.random.Generator, path: Path) -> Mesh:
 
 
 def make_thin_sample(rng: np.random.Generator) -> Sample:
-    """Squeeze procedural shapes along their axes until one is thin where it is seen."""
+    """Squeeze random procedural shapes along their axes until one is thin in its window."""
     sample = None
     while sample is None:
         solid = random_solid(rng)
@@ -227,7 +228,7 @@ def fill_shard(
     thin: float,
     count: int = SHARD,
 ) -> list[Sample]:
-    """Make a shard's samples; a procedural shape stands in for a mesh that shows nothing."""
+    """Make the samples of a shard; a procedural shape replaces a mesh without a usable sample."""
     samples: list[Sample] = []
     for number in range(count):
         if rng.random() < thin:
@@ -242,10 +243,15 @@ def fill_shard(
 
 
 def main() -> None:
-    """Fill a store; a shard that is there already is kept."""
+    """Fill a store; existing shards are kept."""
     parser = Parser(description=__doc__.split("\n")[0])
     parser.add_argument("--meshes", type=Path, help="folder of closed .ply meshes")
-    parser.add_argument("--procedural", type=share, default=0.3, help="share beside --meshes")
+    parser.add_argument(
+        "--procedural",
+        type=share,
+        default=0.3,
+        help="share of procedural shapes when --meshes is given",
+    )
     parser.add_argument("--thin", type=share, default=0.05, help="share of thin solids")
     parser.add_argument("--out", type=Path, required=True, help="folder for the shards")
     parser.add_argument("--count", type=at_least(1), default=5000, help="samples to make")
@@ -256,7 +262,7 @@ def main() -> None:
 
 
 def fill_store(options: argparse.Namespace) -> None:
-    """Make the shards that are not there."""
+    """Make the missing shards."""
     files = mesh_order(options.seed, *find_meshes(options.meshes), options.count + SHARD)
     options.out.mkdir(parents=True, exist_ok=True)
     for number in range(-(-options.count // SHARD)):

@@ -1,10 +1,10 @@
-"""Units that never react: found, counted, and started again while a network is trained.
+"""Dormant units, which never react: finding, counting and restarting them during training.
 
-A rectified unit whose input is negative for every voxel gives 0 and has no gradient: it is lost for
-good. Neighbours' features have nearly the same mean, 27 times over, so that a step of the optimiser
-moves a unit's input much farther up or down than its spread. Such dormant units are given new
-incoming weights, centred on a batch so that they react to half of it, and outgoing weights of 0, so
-that the network's values stay what they were.
+A rectified unit whose input is negative for every voxel returns 0 and has no gradient: it never
+recovers. The features of all 27 neighbours have nearly the same mean, so a step of the optimiser
+may shift the input of a unit by much more than its spread. Dormant units get new incoming weights,
+centred on a batch so that they react to half of it, and outgoing weights of 0, so that the values
+of the network do not change.
 
 References
 ----------
@@ -27,16 +27,16 @@ from export.network import Block, NeighbourConv, SuperSdfNet
 
 @dataclass(frozen=True, eq=False)
 class Rectified:
-    """A layer before a rectifier, and where its units' weights are.
+    """A layer followed by a rectifier, and the weights into and out of its units.
 
-    ``incoming`` is (units, inputs), ``outgoing`` (units, outputs): views of the parameters, which
-    are ``weight`` and ``reader``; ``first`` is the row of ``reader`` that belongs to unit 0.
+    ``incoming`` (units, inputs) and ``outgoing`` (units, outputs) are views of the parameters
+    ``weight`` and ``reader``; row ``first`` of ``reader`` belongs to unit 0.
     """
 
     layer: nn.Module
     weight: nn.Parameter
     reader: nn.Parameter
-    units_first: bool  # in ``reader``: rows are units; else columns are
+    units_first: bool  # whether rows of ``reader`` are units; else columns are
     first: int = 0
 
     @property
@@ -45,21 +45,21 @@ class Rectified:
         return self.layer.bias
 
     def incoming(self, array: Tensor) -> Tensor:
-        """Return ``weight``, or what an optimiser keeps of it, as (units, inputs)."""
+        """Return ``weight``, or an optimiser's state for it, as (units, inputs)."""
         return array.T if isinstance(self.layer, NeighbourConv) else array
 
     def outgoing(self, array: Tensor) -> Tensor:
-        """Return the units' part of ``reader``, or of what an optimiser keeps of it."""
+        """Return the units' part of ``reader``, or of an optimiser's state for it."""
         rows = array if self.units_first else array.T
         return rows[self.first : self.first + len(self.bias)]
 
 
 def rectified_layers(net: SuperSdfNet) -> list[Rectified]:
-    """Return the layers of a network that a rectifier follows; of variants, those as in ours."""
+    """Return the layers that a rectifier follows; of variants, only those that are as in ours."""
     first, _, second = net.stem
     layers = [Rectified(first, first.weight, second.weight, False)]
     for block in net.modules():
-        if type(block) is Block:  # others may have rectifiers of another kind, or elsewhere
+        if type(block) is Block:  # other kinds may have other rectifiers, or none
             layers.append(Rectified(block.conv, block.conv.weight, block.expand.weight, False))
             layers.append(Rectified(block.expand, block.expand.weight, block.reduce.weight, False))
     if type(net).residual is SuperSdfNet.residual:
@@ -70,7 +70,7 @@ def rectified_layers(net: SuperSdfNet) -> list[Rectified]:
 
 @contextmanager
 def watching(layers: Sequence[Rectified]) -> Iterator[list[Tensor]]:
-    """Yield a list that holds, for each layer, the inputs of its rectifier in the last pass."""
+    """Yield a list with the inputs of each layer's rectifier in the last forward pass."""
     seen: list[Tensor] = [torch.empty(0) for _ in layers]
 
     def keep(number: int) -> Any:
@@ -108,9 +108,10 @@ def revive(
     optimisers: Sequence[torch.optim.Optimizer],
     batches: Sequence[Sequence[Prepared]],
 ) -> int:
-    """Start the units that react to no voxel of these samples again; return how many.
+    """Restart the units that react to no voxel of these samples; return their number.
 
-    Their values on other samples change by what they gave there, which is little: they are rare.
+    On other samples the network's values change by the contribution of these units, which is small
+    because they react rarely.
     """
     layers, known = rectified_layers(net), reacting(net, batches)
     asleep = [torch.nonzero(~units)[:, 0] for units in known]
@@ -124,7 +125,7 @@ def revive(
 
 
 def restart(entry: Rectified, units: Tensor, optimisers: Sequence[torch.optim.Optimizer]) -> None:
-    """Give units of a layer weights as those of the others are, read by nobody yet."""
+    """Give units of a layer random incoming weights and outgoing weights of 0."""
     incoming, outgoing = entry.incoming(entry.weight), entry.outgoing(entry.reader)
     incoming[units] = torch.randn_like(incoming[units]) * incoming.std()
     entry.bias[units] = 0
@@ -138,6 +139,6 @@ def restart(entry: Rectified, units: Tensor, optimisers: Sequence[torch.optim.Op
 
 
 def moments(optimiser: torch.optim.Optimizer, parameter: nn.Parameter) -> list[Tensor]:
-    """Return the running means of the gradient that an optimiser keeps of a parameter."""
+    """Return the running means of the gradient that an optimiser keeps for a parameter."""
     kept = optimiser.state.get(parameter, {})
     return [array for array in kept.values() if getattr(array, "shape", ()) == parameter.shape]

@@ -1,8 +1,8 @@
-"""Blocks in whole numbers, in place of those of an exported graph.
+"""Replace the blocks of an exported graph by blocks in integer arithmetic.
 
-Standard operators only, in the pairs that onnxruntime turns into one: dequantize, multiply,
-rectify, quantize. What is gathered is bytes, a quarter of the memory. Sums of whole numbers are
-exact in any order, so a voxel's values depend on nothing but its neighbours.
+Only standard operators are used, in the sequence that onnxruntime fuses: dequantize, multiply,
+rectify, quantize. The gathered features are bytes, a quarter of the memory. Integer sums are exact
+in any order, so the values of a voxel depend only on its neighbours.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ NONE = "int8_none"
 
 @dataclass(frozen=True, eq=False)
 class IntLayer:
-    """A linear layer: ``(values @ weight + bias) * scales``, values whole from 0 to 255."""
+    """A linear layer: ``(values @ weight + bias) * scales``, with integer values from 0 to 255."""
 
     weight: np.ndarray  # (K, n) int8
     scales: np.ndarray  # (n,) float32
@@ -30,7 +30,7 @@ class IntLayer:
 
 @dataclass(frozen=True, eq=False)
 class IntBlock:
-    """A residual block. Features f are read as ``f / steps + zeros``, rounded, from 0 to 255."""
+    """A residual block. Its features f are quantized as ``f / steps + zeros``, from 0 to 255."""
 
     steps: np.ndarray  # (C,) float32
     zeros: np.ndarray  # (C,) uint8
@@ -40,17 +40,17 @@ class IntBlock:
 
 
 class IntWriter(Writer):
-    """A part of the graph, with layers on whole numbers."""
+    """A part of the graph, with integer layers."""
 
     def quantize(self, value: str) -> str:
-        """Round to 0 to 255; what is below or above is cut off."""
+        """Round to 0..255, saturating."""
         return self.op("QuantizeLinear", value, ONE, NONE)
 
     def layer(self, value: str, layer: IntLayer, label: str) -> str:
-        """Add a linear layer on whole numbers."""
+        """Add an integer linear layer."""
         scales = self.constant(layer.scales, f"{label}.scales")
         operands = [self.op("DequantizeLinear", value, ONE, NONE)]
-        # onnxruntime joins the four only where the zeros, all 0, are written out
+        # onnxruntime fuses the operators only if the zero points, all 0, are explicit
         for name, array, axis in (("weight", layer.weight, 1), ("bias", layer.bias, 0)):
             zeros = self.constant(np.zeros(len(layer.scales), array.dtype), f"{label}.{name}_zeros")
             whole = self.constant(array, f"{label}.{name}")
@@ -59,7 +59,7 @@ class IntWriter(Writer):
 
 
 def replace_blocks(graph: onnx.GraphProto, blocks: list[IntBlock]) -> None:
-    """Put the blocks in the place of a graph's own, the Scan nodes in their order."""
+    """Replace the blocks of a graph, its Scan nodes in order."""
     scans = [node for node in graph.node if node.op_type == "Scan"]
     graph.initializer.append(numpy_helper.from_array(np.float32(1), ONE))
     graph.initializer.append(numpy_helper.from_array(np.uint8(0), NONE))
@@ -70,8 +70,8 @@ def replace_blocks(graph: onnx.GraphProto, blocks: list[IntBlock]) -> None:
 
 
 def round_features(graph: onnx.GraphProto, body: onnx.GraphProto, block: IntBlock) -> None:
-    """Let a block gather rounded features: absent ones, exactly zero, become the block's zeros."""
-    gather = body.node[1]  # after that of the table
+    """Let a block gather quantized features; absent ones, exactly 0, become its zero points."""
+    gather = body.node[1]  # body.node[0] gathers the table
     features = gather.input[0]
     writer = IntWriter(f"{body.name}_features_")
     scaled = writer.op("Mul", features, writer.constant(1 / block.steps, "rates"))
@@ -84,7 +84,7 @@ def round_features(graph: onnx.GraphProto, body: onnx.GraphProto, block: IntBloc
 
 
 def replace_layers(body: onnx.GraphProto, block: IntBlock) -> None:
-    """Keep how a block gathers neighbours and adds its change; make the change in whole numbers."""
+    """Replace the layers of a block by integer ones; gathering and the residual sum stay."""
     table, gather, reshape, *layers, kept, added = body.node
     shape = next(array for array in body.initializer if array.name == reshape.input[1])
     writer = IntWriter(f"{body.name}_int8_")

@@ -1,9 +1,9 @@
-"""How long networks of any make take in onnxruntime, all exported alike.
+"""Time networks of any architecture in onnxruntime, all exported in the same way.
 
     python -m export.latency src/super_sdf/models/base.onnx
 
-The graphs are those of PyTorch's exporter, which gathers all rows of a convolution at once; what is
-shipped goes chunk by chunk (``to_onnx``) and takes less.
+PyTorch's exporter gathers all rows of a convolution at once; the shipped graph works chunk by chunk
+(``to_onnx``) and is faster.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def ball(radius: float = 35.0) -> Prepared:
 
 
 def microseconds(net: SuperSdfNet, sample: Prepared, threads: int) -> float:
-    """Return the time of a network for each voxel of a band, decoding what can hold the surface."""
+    """Return a network's microseconds per voxel of a band, decoding what can hold the surface."""
     arrays = (sample.patches, sample.table, sample.voxels, sample.offsets)
     tensors = [torch.from_numpy(array) for array in arrays]
     if isinstance(net, UNet):
@@ -49,7 +49,7 @@ def microseconds(net: SuperSdfNet, sample: Prepared, threads: int) -> float:
         tensors += [*tables[1:], *parents]
     names = NAMES + [f"level_{n}" for n in range(len(tensors) - len(NAMES))]
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(), torch.no_grad():
-        warnings.simplefilter("ignore")  # the exporter's, about shapes that stay as they are
+        warnings.simplefilter("ignore")  # warnings of the exporter about fixed shapes
         path = Path(folder) / "net.onnx"
         torch.onnx.export(
             net.eval(), tuple(tensors), path, input_names=names, output_names=["values"],
@@ -64,14 +64,14 @@ def microseconds(net: SuperSdfNet, sample: Prepared, threads: int) -> float:
 
 
 def time_file(path: Path, threads: int) -> float:
-    """Return the microseconds of a shipped file for each voxel of a band."""
+    """Return the microseconds per voxel of a band that a shipped file takes."""
     sample, network = ball(), load_network(path, device="cpu", threads=threads)
     arrays = (sample.patches, sample.table, sample.voxels, sample.offsets)
     return least_seconds(lambda: network(*arrays), threads) / len(sample.patches) * 1e6
 
 
 def least_seconds(run, threads: int) -> float:
-    """Return the least of some runs; on one thread the processor's time, on more the clock's."""
+    """Return the fastest of ``RUNS`` runs: processor time on one thread, else elapsed time."""
     clock = time.process_time if threads == 1 else time.perf_counter
     spent = []
     for _ in range(RUNS):
@@ -82,13 +82,13 @@ def least_seconds(run, threads: int) -> float:
 
 
 def main() -> None:
-    """Time ONNX files as they are shipped."""
+    """Time shipped ONNX files."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("models", nargs="+", type=Path, help="ONNX files")
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args()
     for path in options.models:
-        print(f"{path.name}: {time_file(path, options.threads):.1f} us a voxel of the band")
+        print(f"{path.name}: {time_file(path, options.threads):.1f} us per voxel of the band")
 
 
 if __name__ == "__main__":

@@ -8,9 +8,9 @@ the 27 neighbours (a gather and a matrix product) and a pointwise layer. The hea
 a trunk: coefficients per voxel times functions of the offset. It adds a residual to the quadratic
 interpolation of the patch. All lengths are in half voxels (Eqs. 4 and 5).
 
-Interpolation and functions leave the sample as it is (Sec. 4.1). A noisy sample should not stay, so
-there is a correction of the whole voxel besides. It is 0 where the samples can be distances, as far
-as the voxel's neighbours see: there they are kept.
+Interpolation and functions keep the value of the sample (Sec. 4.1). A noisy sample should not be
+kept, so there is also a correction of the whole voxel. It is 0 where all samples around the voxel
+can be distances.
 """
 
 from __future__ import annotations
@@ -58,20 +58,20 @@ SIZES = {
 class GatherMatMul(torch.autograd.Function):
     """``gather(features, table) @ weight``, differentiated without a scatter.
 
-    If u is v's neighbour at place k, then v is u's at place 26 - k. So the gradient is a
-    convolution too, with the places reversed, and nothing is added up at random addresses.
+    If u is v's neighbour at place k, then v is u's neighbour at place 26 - k. So the gradient is a
+    convolution, too, with the places reversed, and no scatter-add is needed.
     """
 
     @staticmethod
     def forward(ctx, features: Tensor, weight: Tensor, table: Tensor) -> Tensor:
-        """Take features (V, C), weight (27 C, C_out), table (V, 27); return (V, C_out)."""
+        """Map features (V, C), weight (27 C, C_out) and table (V, 27) to (V, C_out)."""
         columns = gather(features, table)
         ctx.save_for_backward(columns, weight, table)
         return columns @ weight
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, None]:
-        """Take the gradient (V, C_out); return those of features and weight."""
+        """Map the gradient (V, C_out) to the gradients of features and weight."""
         columns, weight, table = ctx.saved_tensors
         grad = grad.contiguous()
         places, channels_out = table.shape[1], weight.shape[1]
@@ -122,7 +122,7 @@ class Block(nn.Module):
         return features + self.reduce(self.activate(self.expand(self.mix(features, table))))
 
     def mix(self, features: Tensor, table: Tensor) -> Tensor:
-        """Look at the neighbours."""
+        """Apply the neighbour convolution and its rectifier."""
         return self.activate(self.conv(features, table))
 
     def activate(self, values: Tensor) -> Tensor:
@@ -158,7 +158,7 @@ class Trunk(nn.Module):
 
 @dataclass(frozen=True)
 class Encoded:
-    """Voxels as the head takes them."""
+    """The inputs of the head for each voxel."""
 
     features: Tensor  # (V, C)
     patches: Tensor  # (V, 27)
@@ -170,9 +170,10 @@ class Encoded:
 
 
 def is_noisy(patches: Tensor, table: Tensor) -> Tensor:
-    """Say of each voxel, (V, 1), by 1 or 0 whether its or a neighbour's patch is of no distance.
+    """Return 1 for voxels whose own or a neighbour's patch cannot be distances, else 0, (V, 1).
 
-    That is: two samples differ by more than they are apart, as in ``steps.band.is_lipschitz``.
+    In such a patch two samples differ by more than their distance, as in
+    ``steps.band.is_lipschitz``.
     """
     excess = (patches - patches[:, CENTRE, None]).abs() - patches.new_tensor(REACH)
     most = torch.cat([excess.amax(1), patches.new_zeros(1)])
@@ -201,14 +202,14 @@ class SuperSdfNet(nn.Module):
         return features
 
     def encode_batch(self, batch: Sequence[Prepared]) -> Encoded:
-        """Encode samples laid end to end."""
+        """Encode a batch of samples, concatenated."""
         device = next(self.parameters()).device
         patches = torch.from_numpy(np.concatenate([sample.patches for sample in batch])).to(device)
         table = torch.from_numpy(batch_table([sample.table for sample in batch])).to(device)
         return self.encode_all(patches, table)
 
     def encode_all(self, patches: Tensor, table: Tensor) -> Encoded:
-        """Return the voxels of ``encode`` with all that the head takes."""
+        """Encode voxels; return all inputs of the head."""
         return Encoded(self.encode(patches, table), patches, is_noisy(patches, table))
 
     def decode(self, voxels: Encoded, offsets: Tensor) -> Tensor:
@@ -218,7 +219,7 @@ class SuperSdfNet(nn.Module):
         return values + correction
 
     def residual(self, features: Tensor, offsets: Tensor) -> Tensor:
-        """Return what the network adds to the interpolation, (D, Q); 0 at the sample."""
+        """Return the residual over the interpolation, (D, Q); 0 at the sample."""
         coefficients = torch.cat([features, torch.relu(self.branch(features))], 1)
         return coefficients.float() @ self.trunk(offsets).float().T
 
@@ -228,15 +229,15 @@ class SuperSdfNet(nn.Module):
 
     def forward(self, patches: Tensor, table: Tensor, voxels: Tensor, offsets: Tensor) -> Tensor:
         """Return the values (D, Q) of the voxels (D,) at the offsets (Q, 3)."""
-        table = torch.where(table < 0, len(patches), table)  # the row of zeros
+        table = torch.where(table < 0, len(patches), table)  # index of the row of zeros
         return self.decode(self.encode_all(patches, table).some(voxels), offsets)
 
 
 def interpolation_weights(offsets: Tensor) -> Tensor:
     """Return the weights (Q, 27) of quadratic interpolation in the patch, in its (C) order.
 
-    Through the three samples of an axis, at -1, 0 and 1 voxels, runs one parabola; the product
-    over the axes keeps the sample and reproduces linear functions exactly.
+    Along each axis a parabola passes through the three samples at -1, 0 and 1 voxels; the product
+    over the axes keeps the value of the sample and reproduces linear functions exactly.
     """
     at = offsets / 2
     axis = torch.stack([at * (at - 1) / 2, 1 - at * at, at * (at + 1) / 2], 2)

@@ -1,14 +1,14 @@
 """The network as an ONNX graph.
 
-It is written by hand because of one thing an exporter would not do: every layer runs as a Scan over
-chunks of the voxels. Gathered rows are 27 times as large as the features; chunk by chunk they stay
-in cache and need no memory to speak of. The voxels are filled up to whole chunks, and by one at
-least, with absent ones, whose features are kept 0: the last of them is what the index -1 of the
-neighbour table means. So a block reads one array of features and writes the next, and there is
-nothing else of that size. Standard operators only.
+It is built by hand because no exporter does this: every layer runs as a Scan over chunks of voxels.
+Gathered rows are 27 times as large as the features; in chunks they stay in cache and need hardly
+any memory. The voxels are padded to whole chunks, by at least one absent voxel, whose features are
+kept at 0: index -1 of the neighbour table refers to the last of them. So a block reads one array of
+features and writes the next, and there is no other array of that size. Only standard operators are
+used.
 
-A chunk that suits a processor's cache keeps a GPU waiting for the next one. So its size is an
-initializer that is an input as well: who runs the file may override it.
+A chunk that fits a processor's cache is too small for a GPU. So its size is an initializer that is
+also an input, which the runtime may override.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from super_sdf.neighbourhood import CENTRE
 from super_sdf.network.running import CHUNK_INPUT
 from super_sdf.steps.band import REACH
 
-CHUNK = 512  # voxels at a time; 256 to 2048 differ by a few percent on a CPU
+CHUNK = 512  # voxels at a time; on a CPU 256 to 2048 differ by a few percent
 
 
 class Graph(Writer):
-    """A part of the graph, with the network's parameters and layers."""
+    """A part of the graph, with parameters and layers of the network."""
 
     def __init__(self, net: SuperSdfNet, prefix: str = "") -> None:
         super().__init__(prefix)
         self.names = {id(tensor): name for name, tensor in net.named_parameters()}
 
     def integers(self, *numbers: int) -> str:
-        """Add a constant of int64."""
+        """Add an int64 constant."""
         return self.constant(np.array(numbers, np.int64))
 
     def parameter(self, tensor: torch.Tensor, *, transposed: bool = False) -> str:
-        """Add a parameter of the network, under its name there: ``read_weights`` finds it so."""
+        """Add a parameter under its name in the network, by which ``read_weights`` finds it."""
         array = tensor.detach().numpy()
         name = self.names[id(tensor)]
         self.constants.append(
@@ -62,7 +62,7 @@ class Graph(Writer):
 
 
 def build_graph(net: SuperSdfNet) -> onnx.GraphProto:
-    """Write the network as a graph."""
+    """Build the graph of the network."""
     graph = Graph(net)
     rows = graph.op("Shape", "patches", start=0, end=1)
     numbers, there = chunked_voxels(graph, rows)
@@ -93,14 +93,14 @@ def output() -> onnx.ValueInfoProto:
 
 
 def fill_up(graph: Graph, count: str, size: str) -> str:
-    """Return how many rows are wanting to whole chunks, 1 to a chunk."""
+    """Return the number of rows to pad to whole chunks, from 1 to a chunk."""
     return graph.op("Sub", size, graph.op("Mod", count, size))
 
 
 def chunked_voxels(graph: Graph, rows: str) -> tuple[str, str]:
-    """Return the voxels' numbers (n, chunk), and 1 where there is one, else 0, (n, chunk, 1).
+    """Return the indices of the voxels, (n, chunk), and a mask of 1 and 0, (n, chunk, 1).
 
-    Absent ones have the number of the last.
+    Padding has the index of the last voxel and mask 0.
     """
     zero, one = (graph.constant(np.array(number, np.int64)) for number in (0, 1))
     count = graph.op("Squeeze", rows)
@@ -114,7 +114,7 @@ def chunked_voxels(graph: Graph, rows: str) -> tuple[str, str]:
 
 
 def flat(graph: Graph, chunks: str, *width: int) -> str:
-    """Return chunks as one array, the absent rows at its end."""
+    """Return chunks as one array, with the padding at its end."""
     return graph.op("Reshape", chunks, graph.integers(-1, *width))
 
 
@@ -124,9 +124,9 @@ def rows_of(name: str, kind: int, *width: int | str) -> onnx.ValueInfoProto:
 
 
 def scan_stem(graph: Graph, net: SuperSdfNet, numbers: str, there: str) -> tuple[str, str]:
-    """Add the stem; return features (n, chunk, C), and by how much samples are no distances.
+    """Add the stem; return features (n, chunk, C) and excess (n chunk, 1).
 
-    The latter, (n chunk,), is for ``noisy_voxels``.
+    The excess, by which samples differ by more than distances can, is for ``noisy_voxels``.
     """
     body, channels = Graph(net, "stem_"), net.config.channels
     patch = body.op("Gather", "patches", "some", axis=0)
@@ -175,10 +175,10 @@ def scan_block(
 
 
 def scan_head(graph: Graph, net: SuperSdfNet, features: str, excess: str, per_offset: str) -> None:
-    """Add the head, chunk by chunk of the voxels; its result is the output.
+    """Add the head, in chunks of voxels; its result is the output.
 
-    What it makes for each voxel is five times as large as the features. A chunk has at least as
-    many rows as there are offsets: of fewer, sums would depend on the number of threads.
+    The intermediate array of a voxel is five times as large as its features. A chunk has at least
+    as many rows as there are offsets: with fewer, sums would depend on the number of threads.
     """
     count, offsets = (graph.op("Shape", name, start=0, end=1) for name in ("voxels", "offsets"))
     size = graph.op("Max", CHUNK_INPUT, offsets)
@@ -193,7 +193,7 @@ def scan_head(graph: Graph, net: SuperSdfNet, features: str, excess: str, per_of
 
 
 def head_body(net: SuperSdfNet, features: str, excess: str, per_offset: str) -> onnx.GraphProto:
-    """Return the head of some voxels: coefficients times functions, and the correction."""
+    """Return the head for a chunk of voxels: coefficients times functions, plus correction."""
     body = Graph(net, "head_")
     chosen = body.op("Gather", features, "some", axis=0)
     branch = body.relu(body.layer(chosen, net.branch))
@@ -207,7 +207,7 @@ def head_body(net: SuperSdfNet, features: str, excess: str, per_offset: str) -> 
 
 
 def noisy_voxels(body: Graph, excess: str) -> str:
-    """Add which of some voxels are noisy, (n, 1) of 0 and 1: see network.is_noisy."""
+    """Add a mask, (n, 1) of 0 and 1, of the noisy voxels of a chunk: see ``network.is_noisy``."""
     table = body.op("Gather", "neighbours", "some", axis=0)
     around = body.op("Gather", excess, table, axis=0)
     worst = body.op("ReduceMax", around, body.integers(1), keepdims=1)

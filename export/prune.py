@@ -1,9 +1,9 @@
-"""Leave out the blocks of a network that never react: they add the same to every voxel.
+"""Remove the blocks of a network that never react: they add a constant to every voxel.
 
     python -m export.prune src/super_sdf/models/base.onnx --out pruned.onnx
 
-A block whose first rectifier lets nothing through, whatever the neighbours are, adds a constant.
-That goes into the bias of the layer before it, and the values stay what they were.
+A block whose first rectifier is always 0, whatever the neighbours are, adds a constant. This is
+moved to the bias of the layer before it, and the values stay the same.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from export.to_onnx import PARITY, read_network, write_model
 
 @torch.no_grad()
 def without_idle_blocks(net: SuperSdfNet, ranges: list[Ranges]) -> SuperSdfNet:
-    """Return the network without the blocks in which nothing got through the first rectifier."""
+    """Return the network without the blocks whose first rectifier is always 0."""
     pruned = copy.deepcopy(net)
     before, kept = pruned.stem[2], []
-    for block, seen in zip(pruned.blocks, ranges):
-        if seen.mixed.any():
+    for block, block_ranges in zip(pruned.blocks, ranges):
+        if block_ranges.mixed.any():
             before = block.reduce
             kept.append(block)
         else:
@@ -45,7 +45,7 @@ def without_idle_blocks(net: SuperSdfNet, ranges: list[Ranges]) -> SuperSdfNet:
 
 
 def card_of(source: Path, net: SuperSdfNet, **changed: str) -> dict[str, Any]:
-    """Return the card of a file for what a network made from it is."""
+    """Return the metadata of a file, updated for a network that was made from it."""
     card = {prop.key: prop.value for prop in onnx.load(source).metadata_props}
     size = sum(parameter.numel() for parameter in net.parameters())
     field = net.config.receptive_field
@@ -53,10 +53,10 @@ def card_of(source: Path, net: SuperSdfNet, **changed: str) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Write the file and refuse to keep one that gives other values."""
+    """Write the file; keep it only if its values are the same."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("source", type=Path, help="an .onnx file of export.to_onnx")
-    parser.add_argument("--out", type=Path, required=True, help="the .onnx file, another one")
+    parser.add_argument("--out", type=Path, required=True, help="the new .onnx file")
     options = parser.parse_args()
     whole = read_network(options.source)
     net = without_idle_blocks(whole, find_ranges(whole, draw_samples()))

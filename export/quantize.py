@@ -1,13 +1,13 @@
-r"""Write the int8 variant of an exported network, and check how far it is from it.
+r"""Write the int8 variant of an exported network, and check its error.
 
     python -m export.quantize src/super_sdf/models/base.onnx \
         --out src/super_sdf/models/base-int8.onnx
 
-Only the blocks change, and those that never react are left out (``prune``); stem, head and the
-stream of features between the blocks stay float32. Weights are whole numbers with a scale for each
-output channel; what a layer reads is whole numbers with a step for each input channel. The steps
-are fixed beforehand, from what the network computes on procedural shapes: steps found in each call
-would make a voxel's values depend on all others in it.
+Only the blocks change, and those that never react are removed (``prune``); stem, head and the
+features between the blocks stay float32. Weights are integers with one scale per output channel;
+the inputs of a layer are integers with one step per input channel. The steps are static, calibrated
+on procedural shapes: dynamic steps would make the values of a voxel depend on all others in the
+call.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from export.network import Block
 from export.prune import card_of, without_idle_blocks
 from export.to_onnx import read_network, write_model
 
-LEVELS = 255  # of what a layer reads: uint8
-# Two products must fit into 16 bits: processors without VNNI add them up there, and cut them off.
-MOST = 64  # of a weight; 2 * 255 * 64 < 2^15
+LEVELS = 255  # of the inputs of a layer: uint8
+# Two products must fit into 16 bits, in which processors without VNNI add them with saturation.
+MOST = 64  # largest weight; 2 * 255 * 64 < 2^15
 MOST_BIAS = 2**30
-LEAST_STEP = 1e-3  # over the largest step: for channels that hardly ever differ from 0
-FARTHEST = 0.01  # voxels, on average: farther from float32 a file is not kept
+LEAST_STEP = 1e-3  # over the largest step, for channels that are almost always 0
+LARGEST_ERROR = 0.01  # voxels, mean difference from float32 at which a file is still kept
 Array = np.ndarray
 
 
 def quantize(
     source: Path, target: Path, samples: list[Prepared], accuracy: str = "not measured"
 ) -> None:
-    """Write the int8 variant of a file, with its card."""
+    """Write the int8 variant of a file, with its metadata."""
     net = read_network(source)
     net = without_idle_blocks(net, find_ranges(net, samples))
     changed = {"name": target.stem, "precision": "int8", "accuracy": accuracy}
@@ -56,7 +56,7 @@ def quantize(
 
 
 def whole_block(block: Block, ranges: Ranges) -> IntBlock:
-    """Round a block's three layers."""
+    """Quantize the three layers of a block."""
     steps = steps_of(ranges.high - ranges.low)
     zeros = np.rint(-ranges.low.numpy() / steps).clip(0, LEVELS)
     mixed, expanded = steps_of(ranges.mixed), steps_of(ranges.expanded)
@@ -71,7 +71,7 @@ def whole_block(block: Block, ranges: Ranges) -> IntBlock:
 
 
 def steps_of(width: Tensor) -> Array:
-    """Return how much one is worth in each channel, (n,)."""
+    """Return the quantization step of each channel, (n,)."""
     steps = width.numpy() / LEVELS
     return np.maximum(steps, LEAST_STEP * (steps.max() or 1)).astype(np.float32)
 
@@ -79,16 +79,16 @@ def steps_of(width: Tensor) -> Array:
 def whole_layer(
     weight: Tensor, bias: Tensor, steps: Array, out: Array, zeros: Array | None = None
 ) -> IntLayer:
-    """Round a layer.
+    """Quantize a layer.
 
     Parameters
     ----------
     weight, bias : (K, n), (n,)
         The layer, ``values @ weight + bias``.
     steps, out : (K,), (n,)
-        What one is worth in what the layer reads and in what it gives.
+        Quantization steps of its inputs and of its outputs.
     zeros : (C,), optional
-        Which whole numbers stand for 0 in what it reads, repeated if K > C; else 0 does.
+        Zero points of the inputs, repeated if K > C. Default: 0.
     """
     scaled = weight.detach().double().numpy() * steps[:, None] / out
     start = bias.detach().double().numpy() / out
@@ -101,7 +101,7 @@ def whole_layer(
 
 
 def main() -> None:
-    """Write the file and refuse to keep one that is far from its source."""
+    """Write the file; keep it only if it is close to its source."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("source", type=Path, help="an .onnx file of export.to_onnx")
     parser.add_argument("--out", type=Path, required=True, help="the int8 .onnx file")
@@ -109,7 +109,7 @@ def main() -> None:
     options = parser.parse_args()
     quantize(options.source, options.out, draw_samples(), options.accuracy)
     apart = distance_apart(options.source, options.out).mean()
-    if apart > FARTHEST:
+    if apart > LARGEST_ERROR:
         options.out.unlink()
         raise SystemExit(f"{apart:.4f} voxels from {options.source} on average: not kept")
     print(f"{options.out}: {options.out.stat().st_size / 1e6:.1f} MB, {apart:.5f} voxels away")

@@ -1,6 +1,6 @@
-"""How a network is trained: what counts as an error, what moves the weights, and how fast.
+"""How a network is trained: loss, optimisers, learning rates.
 
-What else was tried is in README's table; ``compare`` tried it.
+README's table has the alternatives that were tried, with ``compare``.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from export.network import SuperSdfNet
 
 @dataclass(frozen=True)
 class Recipe:
-    """The choices of a run."""
+    """The hyperparameters of a run."""
 
-    muon: bool = True  # for the matrices of the blocks; AdamW for all else
+    muon: bool = True  # for the matrices of the blocks; AdamW for all other parameters
     hidden_rate: float = 4e-3  # of the blocks; 2e-3 and 1e-2 are worse
     outer_rate: float = 2e-3
     warm_up: float = 0.03  # share of the budget
-    batch_voxels: int = 12_000  # a step's arrays stay in cache
-    average_decay: float = 0.998  # of the weights, a step
+    batch_voxels: int = 12_000  # small enough for the arrays of a step to stay in cache
+    average_decay: float = 0.998  # of the averaged weights, per step
     power: int = 1  # of the error: 1 or 2
-    reach: float = 0.5  # half voxels: so far from the surface the weight has fallen by 1/e ...
-    far_weight: float = 0.25  # ... towards this
+    reach: float = 0.5  # half voxels: decay length of the weight away from the surface ...
+    far_weight: float = 0.25  # ... to this
     gradient_weight: float = 0.5
     eikonal_weight: float = 0.0
-    revive_steps: int = 300  # between two looks for dormant units; 0 for never
-    revive_until: float = 0.8  # share of the budget: what is started again has to learn
+    revive_steps: int = 300  # between restarts of dormant units; 0 for never
+    revive_until: float = 0.8  # share of the budget: restarted units need time to learn
     shares: Shares = USUAL
 
     def at(self, rate: float, noisy: float) -> Recipe:
-        """Return the recipe with so many times its rates, and so many samples noisy."""
+        """Return the recipe with rates multiplied by ``rate`` and this share of noisy samples."""
         return replace(
             self,
             hidden_rate=rate * self.hidden_rate,
@@ -49,18 +49,18 @@ RECIPE = Recipe()
 
 
 def differences(values: Tensor) -> Tensor:
-    """Return the gradients (D, CORNERS, 3) of values (D, Q) at the corners: see ``dataset``."""
+    """Return the gradients, (D, CORNERS, 3), of values (D, Q) at the corners: see ``dataset``."""
     quadruples = values[:, : 4 * CORNERS].view(len(values), CORNERS, 4)
     return 2 * (quadruples[:, :, 1:] - quadruples[:, :, :1])
 
 
 def nearness(target: Tensor, recipe: Recipe) -> Tensor:
-    """Return how much an error counts: more near the surface, for there it moves the mesh."""
+    """Return the weight of an error: larger near the surface, where it moves the mesh."""
     return recipe.far_weight + torch.exp(-target.abs() / recipe.reach)
 
 
 def loss_of(prediction: Tensor, target: Tensor, recipe: Recipe) -> Tensor:
-    """Return the weighted error of the values and of their gradient."""
+    """Return the loss: the weighted error of the values and of their gradient."""
     error = (prediction - target).abs() ** recipe.power
     loss = (nearness(target, recipe) * error).mean()
     corners = nearness(target[:, : 4 * CORNERS : 4], recipe)

@@ -1,12 +1,12 @@
-r"""Write a trained network as the ONNX file that the runtime loads, and check that they agree.
+r"""Export a trained network as the ONNX file that the runtime loads, and check that they agree.
 
     python -m export.to_onnx --run training/run --out src/super_sdf/models/base.onnx \
         --data "..." --accuracy "..."
     python -m export.to_onnx --from src/super_sdf/models/base.onnx \
         --out src/super_sdf/models/base.onnx
 
-The second writes a file's weights and card anew in the graph of today, and keeps it only if it
-gives the same values, bit for bit.
+The second command rewrites a file with the same weights and metadata in the current graph, and
+keeps the result only if its values are the same, bit for bit.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from super_sdf.steps.nodes import block_offsets
 
 OPSET = 18
 PARITY = 2e-4  # half voxels: 1e-4 of a voxel
-DORMANT = 0.01  # share of the rectified units that may react to nothing
+DORMANT = 0.01  # largest accepted share of dormant units
 
 
 def read_weights(path: Path) -> dict[str, torch.Tensor]:
-    """Return the parameters and buffers in an exported file, to train on from there."""
+    """Return the parameters and buffers of an exported file, to continue training from."""
     graphs = [onnx.load(path).graph]
     graphs += [a.g for node in graphs[0].node for a in node.attribute if a.name == "body"]
     arrays = {i.name: numpy_helper.to_array(i).copy() for g in graphs for i in g.initializer}
@@ -49,7 +49,7 @@ def read_weights(path: Path) -> dict[str, torch.Tensor]:
 
 
 def write_model(net: SuperSdfNet, path: Path, card: dict[str, Any]) -> None:
-    """Write graph and metadata."""
+    """Write the graph and the metadata."""
     imports = [helper.make_opsetid("", OPSET)]
     model = helper.make_model(build_graph(net), opset_imports=imports, ir_version=9)
     model.producer_name = "super-sdf"
@@ -59,7 +59,7 @@ def write_model(net: SuperSdfNet, path: Path, card: dict[str, Any]) -> None:
 
 
 def noisy_ball(seed: int = 0) -> tuple[np.ndarray, ...]:
-    """Return inputs to compare networks on, with noise and some voxels that are not decoded."""
+    """Return inputs to compare networks on: noisy, and with voxels that are not decoded."""
     rng = np.random.default_rng(seed)
     ijk = np.indices((24, 20, 22))
     radius = np.linalg.norm(ijk - np.array([11, 9, 10])[:, None, None, None], axis=0)
@@ -80,7 +80,7 @@ def parity(net: SuperSdfNet, path: Path, seed: int = 0) -> float:
 
 
 def load_run(folder: Path) -> SuperSdfNet:
-    """Return the averaged network of a run."""
+    """Return the network of a run, with averaged weights."""
     state = torch.load(folder / "checkpoint.pt", weights_only=True)
     net = SuperSdfNet(NetworkConfig(**state["config"]))
     net.load_state_dict(state["average"])
@@ -88,7 +88,7 @@ def load_run(folder: Path) -> SuperSdfNet:
 
 
 def rewrite(source: Path, target: Path) -> None:
-    """Write the weights and the card of an exported file in the graph of today.
+    """Write the weights and the metadata of an exported file with the current graph.
 
     Raises
     ------
@@ -127,7 +127,7 @@ def read_network(path: Path) -> SuperSdfNet:
 
 
 def check_awake(net: SuperSdfNet) -> None:
-    """Refuse a network whose units have died: what it has learnt would fit into a smaller one.
+    """Refuse a network with dormant units: a smaller one would do as well.
 
     Raises
     ------
@@ -143,7 +143,7 @@ def check_awake(net: SuperSdfNet) -> None:
 
 
 def make_card(net: SuperSdfNet, name: str, data: str, accuracy: str) -> dict[str, Any]:
-    """Return the metadata that the runtime shows."""
+    """Return the metadata of the file, which the runtime shows."""
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
     ).stdout.strip()
@@ -163,13 +163,13 @@ def make_card(net: SuperSdfNet, name: str, data: str, accuracy: str) -> dict[str
 
 
 def main() -> None:
-    """Export a run, or a file anew, and refuse to keep a file that does not agree with it."""
+    """Export a run, or rewrite a file; keep the result only if it agrees with the source."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--run", type=Path, help="folder of the run")
-    source.add_argument("--from", type=Path, dest="source", help="an .onnx file to write anew")
+    source.add_argument("--from", type=Path, dest="source", help="an .onnx file to rewrite")
     parser.add_argument("--out", type=Path, required=True, help="the .onnx file")
-    parser.add_argument("--data", default="not said", help="what it was trained on")
+    parser.add_argument("--data", default="not given", help="what it was trained on")
     parser.add_argument("--accuracy", default="not measured", help="measured figures, in words")
     options = parser.parse_args()
     if options.source:

@@ -1,15 +1,15 @@
-"""Train the network; resumable, one log line an interval, a plot of the loss.
+"""Train the network; resumable, with a log and a plot of the loss.
 
     python -m export.train --store training/store --run training/run --minutes 90
-    python -m export.train --store training/store --run training/run --minutes 90     # goes on
+    python -m export.train --store training/store --run training/run --minutes 90     # resumes
     python -m export.train --store training/store --run training/run --device cuda    # a GPU
-    python -m export.train ... --start src/super_sdf/models/base.onnx --rate 0.7   # from there
-    python -m export.train ... --start src/super_sdf/models/base.onnx --blocks 9   # and deeper
+    python -m export.train ... --start src/super_sdf/models/base.onnx --rate 0.7   # its weights
+    python -m export.train ... --start src/super_sdf/models/base.onnx --blocks 9   # more blocks
 
 A run folder holds ``checkpoint.pt`` (weights, averaged weights, optimisers, time spent),
-``log.csv`` and ``loss.png``. Units that react to nothing are started again (``dormant``). The
-learning rate follows the share of ``--minutes`` that is spent, so a run always ends annealed,
-however fast the machine. New shards in the store are picked up as they appear.
+``log.csv`` and ``loss.png``. Dormant units are restarted (``dormant``). The learning rate depends
+on the share of ``--minutes`` that is spent, so a run always ends annealed, however fast the
+machine. New shards in the store are picked up as they appear.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ from super_sdf.files.regular import check_regular_file
 
 CHECKPOINT_SECONDS = 180
 LOG_STEPS = 100
-WATCHED = 4  # batches: a unit that reacted to none of the last is dormant
-HELD_OUT = 2  # shards, the first by name: the loss on them is logged
-NEAR = 0.5  # half voxels from the surface, where normals are measured; values within half of it
+WATCHED = 4  # last batches: a unit that reacted to none of them is dormant
+HELD_OUT = 2  # shards, the first by name, whose errors are logged
+NEAR = 0.5  # half voxels from the surface: limit for normals; half of it for values
 
 LOG_COLUMNS = ("step", "seconds", "samples", "loss", "held-out", "near", "normal", "dormant")
 
@@ -60,12 +60,12 @@ def predict(net: SuperSdfNet, batch: list[Prepared]) -> list[tuple[Tensor, Tenso
 
 
 class Store:
-    """The samples of the shards in a folder; the first are held out, by name, and only measured.
+    """The samples of the shards in a folder; the first shards, by name, are held out.
 
     Raises
     ------
     FileError
-        If no shard is left to train on, or one is damaged.
+        If no shard is left for training, or one is damaged.
     """
 
     def __init__(self, folder: Path, held_out: int, most: int | None = None) -> None:
@@ -78,14 +78,14 @@ class Store:
         self.refresh()
 
     def refresh(self) -> None:
-        """Read the shards that are new, up to so many at a time."""
+        """Read new shards, at most ``most`` of them."""
         new = sorted(set(self.folder.glob("shard-*.npz")) - set(self.seen))
         for path in new[: self.most]:
             self.seen.append(path)
             self.samples += list(read_shard(path))
 
     def draw_batch(self, rng: np.random.Generator, recipe: Recipe) -> list[Prepared]:
-        """Return samples of about so many voxels together, each once an epoch."""
+        """Return samples with about ``batch_voxels`` voxels together, each once per epoch."""
         batch: list[Prepared] = []
         while sum(len(sample.patches) for sample in batch) < recipe.batch_voxels:
             if not self.order:
@@ -96,19 +96,19 @@ class Store:
 
 
 def check_store(folder: Path, held_out: int) -> None:
-    """Raise FileError if a folder does not hold more shards than are held out."""
+    """Raise FileError if a folder has no more shards than are held out."""
     if not folder.is_dir():
-        raise FileError(f"--store {folder} is no folder: fill one with export.dataset")
+        raise FileError(f"--store {folder} is not a folder: fill one with export.dataset")
     count = len(list(folder.glob("shard-*.npz")))
     if count <= held_out:
         raise FileError(
-            f"--store {folder} holds {count} of at least {held_out + 1} shards, for the first "
+            f"--store {folder} has {count} of at least {held_out + 1} shards, since the first "
             f"{held_out} are held out: make more with export.dataset"
         )
 
 
 class Run:
-    """What a checkpoint holds: weights, their running average, optimisers, steps, seconds spent."""
+    """The state of a run: weights, their running average, optimisers, steps, seconds spent."""
 
     def __init__(
         self, folder: Path, net: SuperSdfNet, recipe: Recipe = RECIPE, device: str = "cpu"
@@ -123,7 +123,7 @@ class Run:
         self.recent: deque[list[Prepared]] = deque(maxlen=WATCHED)
 
     def save(self) -> None:
-        """Write the checkpoint, whole or not at all."""
+        """Write the checkpoint, completely or not at all."""
         part = self.path.with_suffix(".part")
         state = {
             "config": self.net.config.as_dict(),
@@ -137,7 +137,7 @@ class Run:
         part.rename(self.path)
 
     def resume(self) -> None:
-        """Go on from the checkpoint, if there is one."""
+        """Continue from the checkpoint, if there is one."""
         if self.path.exists():
             state = torch.load(self.path, weights_only=True, map_location=self.device)
             self.net.load_state_dict(state["net"])
@@ -147,11 +147,11 @@ class Run:
             self.step, self.seconds = state["step"], state["seconds"]
 
     def start_from(self, weights: dict[str, Tensor]) -> None:
-        """Begin with the values of another network, of the same sizes or with fewer blocks."""
+        """Start with the weights of a network of the same sizes, or with fewer blocks."""
         new = self.net.load_state_dict(weights, strict=False).missing_keys
         with torch.no_grad():
             for name, parameter in self.net.named_parameters():
-                if name in new and ".reduce." in name:  # a block that changes nothing yet
+                if name in new and ".reduce." in name:  # a new block, which changes nothing yet
                     parameter.zero_()
         self.average.load_state_dict(self.net.state_dict())
 
@@ -175,7 +175,7 @@ class Run:
         return float(loss.detach())
 
     def is_time_to_revive(self, spent: float) -> bool:
-        """Say whether dormant units are to be started again after this step."""
+        """Return whether dormant units are restarted after this step."""
         every, full = self.recipe.revive_steps, len(self.recent) == WATCHED
         return (
             bool(every)
@@ -185,7 +185,7 @@ class Run:
         )
 
     def update_average(self) -> None:
-        """Move the averaged weights towards the present ones."""
+        """Move the averaged weights towards the current ones."""
         decay = min(self.recipe.average_decay, self.step / (self.step + 9))
         with torch.no_grad():
             for mean, now in zip(self.average.parameters(), self.net.parameters()):
@@ -194,7 +194,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Errors:
-    """What is measured on held-out samples, in voxels but for the last; means over samples."""
+    """Mean errors on held-out samples; the first two in voxels."""
 
     everywhere: float
     near: float  # within an eighth of a voxel of the surface
@@ -210,7 +210,7 @@ def measure(net: SuperSdfNet, samples: list[Prepared]) -> Errors:
 
 
 def sample_errors(prediction: Tensor, target: Tensor) -> list[float]:
-    """Return the figures of one sample; NaN where nothing is near the surface."""
+    """Return the errors of one sample; NaN where nothing is near the surface."""
     error = (prediction - target).abs() / 2
     corners = target[:, : 4 * CORNERS : 4].abs() < NEAR
     got, wanted = differences(prediction)[corners], differences(target)[corners]
@@ -238,7 +238,7 @@ def train(run: Run, store: Store, minutes: float, seed: int) -> None:
 
 
 def log(run: Run, store: Store, loss: float) -> None:
-    """Append a line to the log, print it, and now and then measure and draw."""
+    """Append a line to the log and print it; every tenth time measure and plot."""
     row = [run.step, round(run.seconds), len(store.samples), f"{loss:.5f}"]
     if run.step % (10 * LOG_STEPS) == 0:
         errors = measure(run.average, store.held_out)
@@ -258,7 +258,7 @@ def read_log(folder: Path) -> np.ndarray:
 
 
 def plot_log(folder: Path) -> None:
-    """Draw loss and held-out errors against minutes as ``loss.png``."""
+    """Plot loss and held-out errors against minutes, as ``loss.png``."""
     columns = dict(zip(LOG_COLUMNS, read_log(folder).T))
     figure = Figure(figsize=(12, 4), layout="constrained")
     panels = (["loss"], ["held-out", "near", "normal"], ["dormant"])
@@ -272,16 +272,20 @@ def plot_log(folder: Path) -> None:
 
 
 def main() -> None:
-    """Train or go on training."""
+    """Start or resume training."""
     parser = Parser(description=__doc__.split("\n")[0])
     parser.add_argument("--store", type=Path, required=True, help="folder of shards")
     parser.add_argument("--run", type=Path, required=True, help="folder of the run")
-    parser.add_argument("--size", choices=SIZES, default="base", help="of the network")
-    parser.add_argument("--start", type=Path, help="an .onnx file of that size to start from")
-    parser.add_argument("--blocks", type=at_least(1), help="of the network, if others")
-    parser.add_argument("--minutes", type=positive, default=90.0, help="of training, in all")
-    parser.add_argument("--rate", type=positive, default=1.0, help="times the usual learning rates")
-    parser.add_argument("--noisy", type=share, default=USUAL.noisy, help="share of the samples")
+    parser.add_argument("--size", choices=SIZES, default="base", help="size of the network")
+    parser.add_argument(
+        "--start", type=Path, help="an .onnx file of that size whose weights to start from"
+    )
+    parser.add_argument(
+        "--blocks", type=at_least(1), help="number of blocks, if not that of the size"
+    )
+    parser.add_argument("--minutes", type=positive, default=90.0, help="training time in all")
+    parser.add_argument("--rate", type=positive, default=1.0, help="factor on the learning rates")
+    parser.add_argument("--noisy", type=share, default=USUAL.noisy, help="share of noisy samples")
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
     parser.add_argument("--seed", type=at_least(0), default=0)
     options = parser.parse_args()
@@ -290,7 +294,7 @@ def main() -> None:
 
 
 def run_training(options: argparse.Namespace) -> None:
-    """Check the store before anything is made, then train."""
+    """Check the store before anything is written, then train."""
     check_store(options.store, HELD_OUT)
     if options.start:
         check_regular_file(options.start)

@@ -1,4 +1,4 @@
-"""Other networks of the same contract, to be compared with ours (``compare``)."""
+"""Other networks with the same contract, for the comparison with ours (``compare``)."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from super_sdf.steps.band import neighbour_table
 AXES = tuple(np.flatnonzero((np.delete(NEIGHBOURHOOD, axis, 1) == 0).all(1)) for axis in range(3))
 
 
-# How voxels look at their neighbours.
+# How a block reads the neighbours.
 
 
 class AxesBlock(Block):
-    """Mixes by three convolutions of three places, along x, y and z."""
+    """Three convolutions of three voxels, along x, y and z."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
         self.conv = nn.ModuleList(NeighbourConv(config.channels, 3) for _ in AXES)
 
     def mix(self, features: Tensor, table: Tensor) -> Tensor:
-        """Look along one axis after the other."""
+        """Convolve along one axis after the other."""
         for conv, places in zip(self.conv, AXES):
             features = torch.relu(conv(features, table[:, places].contiguous()))
         return features
 
 
 class BottleneckBlock(Block):
-    """Mixes half as many channels."""
+    """Convolves half as many channels."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
@@ -54,20 +54,20 @@ class BottleneckBlock(Block):
         self.expand = nn.Linear(half, config.hidden)
 
     def mix(self, features: Tensor, table: Tensor) -> Tensor:
-        """Look at the neighbours' reduced features."""
+        """Convolve the reduced features."""
         return torch.relu(self.conv(torch.relu(self.down(features)), table))
 
 
 class LinearMixBlock(Block):
-    """Has one rectifier instead of two: none between the convolution and the pointwise layer."""
+    """One rectifier instead of two: none between the convolution and the pointwise layer."""
 
     def mix(self, features: Tensor, table: Tensor) -> Tensor:
-        """Look at the neighbours."""
+        """Apply the neighbour convolution without a rectifier."""
         return self.conv(features, table)
 
 
 class LeakyBlock(Block):
-    """Lets a tenth of what is negative through, so that no unit is without a gradient."""
+    """Leaky rectifiers of slope 0.1, so that every unit has a gradient."""
 
     def activate(self, values: Tensor) -> Tensor:
         """Apply the leaky rectifier."""
@@ -75,7 +75,7 @@ class LeakyBlock(Block):
 
 
 class SiluBlock(Block):
-    """Bends smoothly: ``x sigmoid(x)``."""
+    """Smooth rectifiers: ``x sigmoid(x)``."""
 
     def activate(self, values: Tensor) -> Tensor:
         """Apply the smooth rectifier."""
@@ -83,26 +83,26 @@ class SiluBlock(Block):
 
 
 class NormBlock(Block):
-    """Divides the features by their root mean square over the channels before it mixes them."""
+    """Normalises the features by their root mean square over the channels first."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
         self.norm = nn.RMSNorm(config.channels)
 
     def mix(self, features: Tensor, table: Tensor) -> Tensor:
-        """Look at the neighbours' normalised features."""
+        """Convolve the normalised features."""
         return super().mix(self.norm(features.float()), table)
 
 
 class PointBlock(Block):
-    """Does not look at the neighbours: the patch alone counts."""
+    """Uses the patch of the voxel only, not the neighbours."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
         self.conv = nn.Linear(config.channels, config.channels)
 
     def mix(self, features: Tensor, table: Tensor) -> Tensor:
-        """Look at the voxel itself."""
+        """Apply a pointwise layer."""
         return torch.relu(self.conv(features))
 
 
@@ -115,7 +115,7 @@ class BlockNet(SuperSdfNet):
 
 
 class DilatedNet(SuperSdfNet):
-    """Every other block looks two voxels far: at the neighbour's neighbour at the same place."""
+    """Every other block is dilated: it reads the neighbour of the neighbour in each direction."""
 
     def encode(self, patches: Tensor, table: Tensor) -> Tensor:
         """Map patches (V, 27) and neighbours (V, 27; V where absent) to features (V, C)."""
@@ -128,7 +128,7 @@ class DilatedNet(SuperSdfNet):
 
 
 class WidePatchNet(SuperSdfNet):
-    """Is given the patches of all 27 neighbours: 5x5x5 samples, the inner ones several times."""
+    """Reads the patches of all 27 neighbours: 5x5x5 samples, the inner ones repeatedly."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
@@ -156,7 +156,7 @@ class UNet(SuperSdfNet):
         self.coarse = nn.ModuleList(Block(config) for _ in range(4 * self.LEVELS - 2))
 
     def encode_batch(self, batch: Sequence[Prepared]) -> Encoded:
-        """Encode samples laid end to end."""
+        """Encode a batch of samples, concatenated."""
         patches = torch.from_numpy(np.concatenate([sample.patches for sample in batch]))
         tables, parents = self.levels(batch)
         features = self.descend(self.stem(patches), tables, parents, list(self.coarse), 0)
@@ -175,7 +175,7 @@ class UNet(SuperSdfNet):
     def forward(
         self, patches: Tensor, table: Tensor, voxels: Tensor, offsets: Tensor, *coarser: Tensor
     ) -> Tensor:
-        """Return the values (D, Q), given the coarser tables and all parents besides."""
+        """Return the values (D, Q); the coarser tables and all parents are further inputs."""
         table = torch.where(table < 0, len(patches), table)
         tables, parents = [table, *coarser[: self.LEVELS]], list(coarser[self.LEVELS :])
         features = self.descend(self.stem(patches), tables, parents, list(self.coarse), 0)
@@ -185,7 +185,7 @@ class UNet(SuperSdfNet):
     def descend(
         self, features: Tensor, tables: list[Tensor], parents: list[Tensor], blocks: list, at: int
     ) -> Tensor:
-        """Work on a level and, in between, on those below it."""
+        """Process a level and, between its blocks, the coarser levels."""
         own = list(self.blocks) if at == 0 else [blocks.pop() for _ in range(2)]
         half = len(own) // 2 if at == 0 else len(own)
         for block in own[:half]:
@@ -202,7 +202,7 @@ class UNet(SuperSdfNet):
 
 
 def coarsen(ijk: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the coarse voxels of twice the side, each voxel's parent, the coarse neighbours."""
+    """Return the voxels of twice the side, the parent of each voxel, the coarse neighbours."""
     half = (ijk - ijk.min(0)) >> 1
     coarse, rows = np.unique(half, axis=0, return_inverse=True)
     coarse = coarse.astype(np.int32)
@@ -211,13 +211,13 @@ def coarsen(ijk: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def join_parents(rows: Sequence[np.ndarray], tables: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the parents of samples laid end to end."""
+    """Concatenate the parents of samples."""
     starts = np.cumsum([0] + [len(table) for table in tables])
     return np.concatenate([row + start for row, start in zip(rows, starts)])
 
 
 def mean_of_children(features: Tensor, parents: Tensor, count: int) -> Tensor:
-    """Return the mean over the children of each of so many parents, (count, C)."""
+    """Return the mean over the children of each parent, (count, C)."""
     # A column of ones counts the children.
     marked = torch.cat([features.float(), features.new_ones(len(features), 1).float()], 1)
     rows = parents[:, None].expand(-1, marked.shape[1])
@@ -225,11 +225,11 @@ def mean_of_children(features: Tensor, parents: Tensor, count: int) -> Tensor:
     return total[:, :-1] / total[:, -1:]
 
 
-# How values are read from the features.
+# How the head turns features into values.
 
 
 class BlockHead(SuperSdfNet):
-    """Gives the 125 values of K = 4 outright, and at other offsets the nearest node's."""
+    """Predicts the 125 values of K = 4 directly; other offsets get the nearest node's value."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
@@ -240,7 +240,7 @@ class BlockHead(SuperSdfNet):
         )
 
     def residual(self, features: Tensor, offsets: Tensor) -> Tensor:
-        """Return what the network adds to the interpolation, (D, Q); 0 at the sample."""
+        """Return the residual over the interpolation, (D, Q); 0 at the sample."""
         nodes = ((offsets + 1) * 2).round().long()
         block = self.branch(features).float()
         return block[:, nodes @ torch.tensor([25, 5, 1])] - block[:, 62:63]
@@ -260,14 +260,14 @@ class QueryHead(SuperSdfNet):
         )
 
     def residual(self, features: Tensor, offsets: Tensor) -> Tensor:
-        """Return what the network adds to the interpolation, (D, Q); 0 at the sample."""
+        """Return the residual over the interpolation, (D, Q); 0 at the sample."""
         voxels = self.branch(features)[:, None]
         at_offsets = self.last(voxels + self.trunk(offsets)[None])
         return (at_offsets - self.last(voxels)).squeeze(2).float()
 
 
 class DeepBranch(SuperSdfNet):
-    """Has a hidden layer before the coefficients."""
+    """A hidden layer before the coefficients."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
@@ -277,12 +277,12 @@ class DeepBranch(SuperSdfNet):
         )
 
     def residual(self, features: Tensor, offsets: Tensor) -> Tensor:
-        """Return what the network adds to the interpolation, (D, Q); 0 at the sample."""
+        """Return the residual over the interpolation, (D, Q); 0 at the sample."""
         return self.branch(features).float() @ self.trunk(offsets).float().T
 
 
 class PlanesHead(SuperSdfNet):
-    """Adds ramps in the voxel: what bends along planes of its own, as distances do at an edge."""
+    """Adds ramps that bend along learnt planes, as distances do at an edge."""
 
     PLANES = 16
 
@@ -291,18 +291,18 @@ class PlanesHead(SuperSdfNet):
         self.planes = nn.Linear(config.channels, 5 * self.PLANES)
 
     def residual(self, features: Tensor, offsets: Tensor) -> Tensor:
-        """Return what the network adds to the interpolation, (D, Q); 0 at the sample."""
+        """Return the residual over the interpolation, (D, Q); 0 at the sample."""
         planes = self.planes(features).float().view(len(features), self.PLANES, 5)
         normal, shift, height = planes.split([3, 1, 1], 2)
         ramps = torch.relu(normal @ offsets.T + shift) - torch.relu(shift)
         return super().residual(features, offsets) + (height.transpose(1, 2) @ ramps)[:, 0]
 
 
-# What the network adds to.
+# The interpolation that the network adds a residual to.
 
 
 class TrilinearBase(SuperSdfNet):
-    """Adds to trilinear interpolation."""
+    """Residual over trilinear interpolation."""
 
     def base(self, patches: Tensor, offsets: Tensor) -> Tensor:
         """Return the interpolation, (D, Q)."""
@@ -314,7 +314,7 @@ class TrilinearBase(SuperSdfNet):
 
 
 class SampleBase(SuperSdfNet):
-    """Adds to the sample."""
+    """Residual over the sample."""
 
     def base(self, patches: Tensor, offsets: Tensor) -> Tensor:
         """Return the sample at every offset, (D, Q)."""

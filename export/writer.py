@@ -1,4 +1,4 @@
-"""Nodes and constants of an ONNX graph in the making."""
+"""Collects the nodes and constants of an ONNX graph."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from onnx import helper, numpy_helper
 
 
 class Writer:
-    """Nodes and constants, their names with a prefix; every method returns a value's name."""
+    """Nodes and constants with prefixed names; every method returns the name of a value."""
 
     def __init__(self, prefix: str = "") -> None:
         self.prefix = prefix

@@ -159,10 +159,10 @@ def bad_files() -> None:
 CASES = {
     ("none.npy",): (1, "none.npy does not exist"),
     ("folder.npy",): (1, "folder.npy is a folder: give a file"),
-    ("in.vdb",): (2, "in.vdb is no grid file: give .npy or .npz"),
-    ("text.npy",): (1, "text.npy is no .npy array: its header cannot be read"),
+    ("in.vdb",): (2, "in.vdb is not a grid file: give .npy or .npz"),
+    ("text.npy",): (1, "text.npy is not an .npy array: its header cannot be read"),
     ("empty.npy",): (1, "empty.npy is empty: give a file with something in it"),
-    ("text.npz",): (1, "text.npz is no readable .npz archive: File is not a zip file"),
+    ("text.npz",): (1, "text.npz is not a readable .npz archive: File is not a zip file"),
     ("objects.npy",): (1, "objects.npy holds Python objects: save the numbers alone"),
     ("other.npz",): (1, "other.npz has no key 'values' (it holds field, more)"),
     ("spaced.npz",): (1, "spaced.npz[spacing] has shape (7,): give one number or three"),
@@ -178,7 +178,7 @@ CASES = {
     ),
     ("damaged.npz",): (
         1,
-        "damaged.npz[values] is damaged: its check sum differs",
+        "damaged.npz[values] is damaged: its checksum is wrong",
     ),
     ("flat.npy",): (1, "values have shape (5, 5): give three axes (x, y, z)"),
     ("nan.npy",): (
@@ -190,7 +190,7 @@ CASES = {
     ("unsigned.npy",): (
         1,
         "no value is below 0 (the smallest is 0.255889): an unsigned field has no inside; if the "
-        "solid is thinner than the spacing, say --inside negative",
+        "solid is thinner than the spacing, use --inside negative",
     ),
     ("in.npy", "--offset", "99"): (
         1,
@@ -206,7 +206,7 @@ CASES = {
     ),
     ("in.npy", "--spacing", "1,2"): (
         2,
-        "Invalid value for '--spacing': '1,2': give one number, or three with commas between",
+        "Invalid value for '--spacing': '1,2': give one number, or three separated by commas",
     ),
     ("in.npy", "--spacing", "1,1,2"): (
         1,
@@ -237,8 +237,8 @@ def test_a_zip_bomb_is_refused_unread(here, command, monkeypatch):
     monkeypatch.setattr("super_sdf.machine.memory.free_memory", lambda: 10**7)
     monkeypatch.setattr("super_sdf.files.grids.unpack", None)
     want = (
-        "bomb.npz[values], 200 x 200 x 200 float32, 32,000,000 bytes, unpacks from "
-        f"{packed:,} bytes as a zip bomb does, and does not fit in memory; if it is a grid, save "
+        "bomb.npz[values], 200 x 200 x 200 float32, 32,000,000 bytes, is compressed to "
+        f"{packed:,} bytes, like a zip bomb, and does not fit in memory; if it is a grid, save "
         "it as .npy"
     )
     assert command("upsample", "bomb.npz", "out.ply") == (1, "", f"Error: {want}\n")
@@ -253,9 +253,9 @@ def test_a_factor_beyond_memory_is_refused_before_the_work(here, command, monkey
 
 
 TARGETS = {
-    "out.xyz": (2, "out.xyz is no mesh file: give one of .ply, .stl, .obj, .off, .glb, .3mf"),
+    "out.xyz": (2, "out.xyz is not a mesh file: give one of .ply, .stl, .obj, .off, .glb, .3mf"),
     "there.ply": (1, "there.ply exists: remove it or use --force"),
-    "no/out.ply": (1, "no is no folder: make it first"),
+    "no/out.ply": (1, "no is not a folder: make it first"),
     "dir.ply": (1, "dir.ply is a folder: give a file"),
 }
 
@@ -276,7 +276,7 @@ def test_a_folder_without_permission_is_named(here, command, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "stage", ["pipeline.refine", "pipeline.extract_pieces", "files.meshes.write_ply"]
+    "stage", ["pipeline.refine", "pipeline.extract_pieces", "files.ply.write_split"]
 )
 def test_an_interrupt_at_any_stage_leaves_nothing(here, command, monkeypatch, stage):
     def interrupt(*_, **__):
@@ -332,6 +332,29 @@ def test_every_option_has_help():
         for parameter in subcommand.params:
             if isinstance(parameter, click.Option):
                 assert parameter.help, parameter.name
+
+
+def test_the_help_names_every_mesh_format():
+    printed = cli.upsample_command.help
+    from super_sdf.files.meshes import MESH_SUFFIXES
+
+    assert all(f" {suffix}" in printed for suffix in MESH_SUFFIXES)
+
+
+def test_defaults_are_those_of_the_library(command):
+    from super_sdf.convert import ConvertOptions
+
+    defaults = {
+        parameter.name: parameter.get_default(click.Context(cli.upsample_command))
+        for parameter in cli.upsample_command.params
+    }
+    for name in ("factor", "inside", "offset", "cap"):
+        assert defaults[name] == getattr(ConvertOptions, name)
+    assert (defaults["quality"], defaults["precision"], defaults["device"]) == (
+        "base",
+        "float32",
+        "auto",
+    )
 
 
 def test_a_large_file_is_announced_unless_quiet(here, command, monkeypatch):

@@ -17,7 +17,7 @@ def test_a_model_and_a_quality_are_not_given_at_once(
     monkeypatch.chdir(tmp_path)
     np.save("in.npy", ball().values)
     model = str(shipped_models()["fast"])
-    message = f"Error: --model {model} takes the place of --quality {quality}: give one of them\n"
+    message = f"Error: --model {model} replaces --quality {quality}: give only one of them\n"
     refused = command(*words.split(), "--model", model, "--quality", quality)
     assert refused == (2, "", message)
     assert [path.name for path in Path().iterdir()] == ["in.npy"]

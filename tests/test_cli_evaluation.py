@@ -13,7 +13,11 @@ from conftest import ball
 from solids import cube, inverted, joined, saved, torus
 
 from super_sdf import Mesh, read_grid
+from super_sdf.cli import evaluate
 from super_sdf.cli.evaluate import ListCommand
+from super_sdf.evaluation.methods import METHODS
+from super_sdf.evaluation.peers import PEERS
+from super_sdf.evaluation.plan import EXPERIMENTS
 from super_sdf.machine import extras
 
 
@@ -23,6 +27,12 @@ def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     saved(Mesh(cube().vertices * [3, 1, 1], cube().faces), tmp_path / "box.ply")
     return tmp_path
+
+
+def test_the_help_of_evaluate_has_the_names_that_evaluation_knows():
+    assert sorted(evaluate.METHODS) == sorted(METHODS)
+    assert evaluate.EXPERIMENTS == EXPERIMENTS
+    assert sorted(evaluate.PEERS) == sorted(PEERS)
 
 
 def test_a_mesh_becomes_a_grid_and_a_mesh_again(here, command):
@@ -56,7 +66,7 @@ def test_what_is_wrong_with_a_mesh_is_said(here, command):
     saved(inverted(cube()), here / "in.ply")
     code, _, err = command("sample", "in.ply", "in.npz", "-n", 12)
     assert code == 0
-    assert err.splitlines()[0] == "Note: inverted, its faces look inward: turned round"
+    assert err.splitlines()[0] == "Note: inverted: its faces point inward; they were reversed"
     twice = joined(cube(), Mesh(cube().vertices + np.array([0.4, 0, 0]), cube().faces))
     saved(twice, here / "two.ply")
     code, _, err = command("sample", "two.ply", "two.npz", "-n", 12)
@@ -72,9 +82,9 @@ def test_what_is_wrong_with_a_mesh_is_said(here, command):
         ("box.ply box.npz -n 9 --spacing 1", 2, "give either -n"),
         ("box.ply box.npz -n 4", 2, "4 samples leave no room within a padding of 2 voxels"),
         ("box.ply box.npz --spacing 1 --frame unit", 2, "--frame unit has a side of 1: give -n"),
-        ("box.ply box.npy -n 9", 2, "box.npy is no grid file that keeps spacing and origin"),
+        ("box.ply box.npy -n 9", 2, "box.npy is not a grid file with spacing and origin"),
         ("none.ply box.npz -n 9", 1, "none.ply does not exist"),
-        ("box.ply none/box.npz -n 9", 1, "none is no folder: make it first"),
+        ("box.ply none/box.npz -n 9", 1, "none is not a folder: make it first"),
         ("box.ply old.npz -n 9", 1, "old.npz exists: remove it or use --force"),
         ("lidless.ply box.npz -n 9", 1, "lidless.ply is open: 4 edges have no partner"),
         ("box.ply box.npz -n 9 --band 1", 2, "band is 1: give at least 1.5 voxels"),
@@ -132,7 +142,7 @@ def test_a_grid_becomes_a_section(here, command):
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
-        ("box.ply out.jpg", 2, "out.jpg is no picture file: give .png"),
+        ("box.ply out.jpg", 2, "out.jpg is not a picture file: give .png"),
         ("none.ply out.png", 1, "none.ply does not exist"),
         ("box.ply out.png --colour error", 2, "--colour error and --reference MESH go together"),
         ("box.ply out.png --reference box.ply", 2, "--colour error and --reference MESH go"),
@@ -149,8 +159,8 @@ def test_a_grid_becomes_a_section(here, command):
         ("none.ply out.png --colour error --top 0", 2, "top is 0: give a number greater than 0"),
         ("none.ply out.png --colour error --top 1e99", 2, "top is 1e+99: no colour bar can be"),
         ("box.ply out.png --top 1", 2, "--top is the end of the colour bar: give it with"),
-        ("box.ply out.png --at 1", 2, "--at has no meaning for meshes: leave it out"),
-        ("in.npy out.png --colour normal", 2, "--colour has no meaning for a grid: leave it out"),
+        ("box.ply out.png --at 1", 2, "--at does not apply to meshes: leave it out"),
+        ("in.npy out.png --colour normal", 2, "--colour does not apply to a grid: leave it out"),
         (" ".join(["box.ply"] * 40 + ["out.png --size 8000"]), 2, "a picture of 32,000 x 80,000"),
         ("pipe.ply out.png", 1, "pipe.ply is a named pipe: give a file"),
     ],

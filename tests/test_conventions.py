@@ -81,11 +81,11 @@ REFUSED = {
     "values are true or false: an occupancy grid holds no distances; "
     "make them with scipy.ndimage.distance_transform_edt": torus(8) < 0,
     "no value is below 0 (the smallest is 0.5): an unsigned field has no inside; if the solid is "
-    "thinner than the spacing, say --inside negative": np.abs(torus(8))
+    "thinner than the spacing, use --inside negative": np.abs(torus(8))
     + 0.5
     - np.abs(torus(8)).min(),
     "no value is above 0 (the largest is -1): the grid lies within the solid; if that is "
-    "outside and the solid thin, say --inside positive": (-1 - np.indices((3, 3, 3)).sum(0)),
+    "outside and the solid thin, use --inside positive": (-1 - np.indices((3, 3, 3)).sum(0)),
     "values[1, 2, 0] is nan: every sample must be finite; replace unknown far samples by a large "
     "distance of the right sign": np.where(np.arange(27).reshape(3, 3, 3) == 15, np.nan, 1.0),
     "values[0, 0, 2] is -inf: every sample must be finite; replace unknown far samples by a large "
@@ -109,13 +109,15 @@ def test_a_wrong_unit_is_refused_with_the_way_out():
     with pytest.raises(GridError) as caught:
         make_grid(ball(24, 8.0).values, spacing=0.1)
     assert str(caught.value).startswith("the values change by ")
-    want = "from sample to sample, but spacing is 0.1: distances and spacing must be in one unit"
+    want = (
+        "from sample to sample, but spacing is 0.1: distances and spacing must be in the same unit"
+    )
     assert want in str(caught.value)
 
 
 def test_values_that_are_not_quite_distances_are_noted():
     grid = make_grid(torus(64) * 1.2, spacing=1 / 64, origin=0)
-    assert len(grid.notes) == 1 and "they are no exact distances" in grid.notes[0]
+    assert len(grid.notes) == 1 and "they are not exact distances" in grid.notes[0]
 
 
 def test_spacing_must_be_equal_positive_and_finite():
@@ -144,7 +146,7 @@ def test_inside_has_three_words():
 def test_a_solid_between_the_samples_needs_a_word_and_a_spacing():
     x, y = np.indices((12, 12, 12))[:2] - 5.5
     rod = np.hypot(x, y) - 0.6  # nearest samples are 0.7 away
-    with pytest.raises(GridError, match="say --inside negative"):
+    with pytest.raises(GridError, match="use --inside negative"):
         make_grid(rod)
     with pytest.raises(GridError, match=r"all values are on one side .* give --spacing"):
         make_grid(rod, inside="negative")

@@ -1,5 +1,6 @@
 """README and examples say and do what they say and do."""
 
+import importlib
 import os
 import re
 import runpy
@@ -76,6 +77,15 @@ def test_the_example_grid_is_small_and_named():
     assert grid.stat().st_size < 600_000
     text = (ROOT / "examples" / "README.md").read_text()
     assert "trimesh" in text and "MIT" in text
+
+
+def test_the_functions_on_the_tour_are_there():
+    tour = (ROOT / "docs" / "tour.md").read_text()
+    path = tour[tour.index("## Where a grid goes") : tour.index("## The rooms")]
+    named = re.findall(r"`([a-z_.]+)\.(\w+)`", path)
+    assert len(named) == 11
+    for module, function in named:
+        assert callable(getattr(importlib.import_module(f"super_sdf.{module}"), function))
 
 
 def test_the_installed_command_is_there():

@@ -444,8 +444,8 @@ def test_an_interrupt_says_what_is_kept(meshes, tmp_path, monkeypatch, command):
     code, _, err = command("evaluate", meshes, "--out", out)
     assert (code, err) == (
         130,
-        f"Error: interrupted: what was measured is kept in {out / 'results.jsonl'}; the same "
-        "command goes on from there\n",
+        f"Error: interrupted: results so far are kept in {out / 'results.jsonl'}; run the same "
+        "command again to resume\n",
     )
 
 

@@ -40,7 +40,9 @@ def test_values_of_the_other_sign_are_refused():
 @pytest.mark.parametrize("unit, spacing", [(1.5, 1.0), (1.0, 1.5 / 2), (1.0, 2.5), (1.0, 1000)])
 def test_a_spacing_that_the_values_contradict_is_refused(make, unit, spacing):
     for values in (VALUES, np.abs(np.indices((20, 20, 20)) - 9.3).max(0) - 5.1):
-        with pytest.raises(GridError, match="distances and spacing must be in one unit; scale the"):
+        with pytest.raises(
+            GridError, match="distances and spacing must be in the same unit; scale the"
+        ):
             make(values * unit, spacing)
 
 
@@ -166,8 +168,8 @@ def test_wrong_arguments_are_named_with_the_value_seen(message):
 
 
 OTHERS = {
-    "threads is '2': give a whole number, 0 for one a core": lambda: load_network(threads="2"),
-    "threads is -1: give 1 or more, or 0 for one a core": lambda: load_network(threads=-1),
+    "threads is '2': give a whole number, 0 for one per core": lambda: load_network(threads="2"),
+    "threads is -1: give 1 or more, or 0 for one per core": lambda: load_network(threads=-1),
     "model is None: give the path of a file": lambda: load_network(None),
     "path is 3: give the path of a file": lambda: read_grid(3),
     "path is None: give the path of a file": lambda: write_mesh(reconstruct(GRID, trilinear), None),

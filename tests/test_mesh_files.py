@@ -48,7 +48,7 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, mesh, monkeypatch):
     def fail(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("super_sdf.files.meshes.write_ply", fail)
+    monkeypatch.setattr("super_sdf.files.ply.write_split", fail)
     with pytest.raises(FileError, match=r"out\.ply cannot be written: No space left on device"):
         write_mesh(mesh, target, force=True)
     assert target.read_text() == "before" and os.listdir(tmp_path) == ["out.ply"]
@@ -183,8 +183,8 @@ def test_glb_says_from_where_it_counts(tmp_path, monkeypatch):
     place(0.1, 5.4e6)
     done = convert("in.npz", "out.glb", trilinear, ConvertOptions(4, inside="negative"))
     assert done.notes[-1] == (
-        "out.glb has single precision: its vertices count from 5400000.55, 5400000.55, 5400000.55, "
-        "which the translation of its node adds"
+        "out.glb has single precision: its vertices are relative to 5400000.55, 5400000.55, "
+        "5400000.55, the translation of its node"
     )
     convert("in.npz", "out.ply", trilinear, ConvertOptions(4, inside="negative"))
     np.testing.assert_allclose(read("out.glb").volume(), read("out.ply").volume(), rtol=1e-5)
@@ -196,8 +196,8 @@ def test_glb_says_from_where_it_counts(tmp_path, monkeypatch):
 def test_a_mesh_that_its_format_would_flatten_is_refused(tmp_path, mesh):
     far = Mesh(mesh.vertices.astype(np.float64) * 1e-3 + 1e5, mesh.faces)
     want = (
-        "out.stl cannot be written: .stl holds single precision, in which vertices of this mesh "
-        "fall together; write .ply or .obj"
+        "out.stl cannot be written: .stl has single precision, in which vertices of this mesh "
+        "coincide; write .ply or .obj"
     )
     with pytest.raises(FileError, match=re.escape(want)):
         write_mesh(far, tmp_path / "out.stl")

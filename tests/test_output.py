@@ -43,7 +43,7 @@ def test_a_file_that_appears_meanwhile_is_kept_unless_forced(monkeypatch, has_li
         monkeypatch.setattr(output.os, "link", no_links)
     make("one.ply")
     assert Path("one.ply").read_text() == "mine"
-    want = r"^out.ply was made by somebody else meanwhile: remove it or use --force$"
+    want = r"^out.ply was created by another program meanwhile: remove it or use --force$"
     with pytest.raises(WriteError, match=want):
         make("out.ply", meanwhile=lambda: Path("out.ply").write_text("theirs"))
     assert Path("out.ply").read_text() == "theirs"
@@ -71,7 +71,7 @@ def test_by_force_a_link_stays_one_and_what_it_leads_to_is_replaced():
 
 def test_a_link_that_appears_meanwhile_is_not_followed():
     Path("theirs").write_text("theirs")
-    with pytest.raises(WriteError, match="made by somebody else meanwhile"):
+    with pytest.raises(WriteError, match="created by another program meanwhile"):
         make("out.ply", meanwhile=lambda: os.symlink("gone.ply", "out.ply"))
     assert sorted(os.listdir()) == ["out.ply", "theirs"]
 
@@ -81,8 +81,8 @@ def test_places_where_no_file_can_be_are_named():
     os.symlink("no/there.ply", "out.ply")
     os.mkfifo("pipe.ply")
     assert refusal("round.ply", force=True).startswith("round.ply cannot be written: Too many le")
-    assert refusal("out.ply", force=True).endswith("/no is no folder: make it first")
-    assert refusal("pipe.ply", force=True) == "pipe.ply is no regular file: give another name"
+    assert refusal("out.ply", force=True).endswith("/no is not a folder: make it first")
+    assert refusal("pipe.ply", force=True) == "pipe.ply is not a regular file: give another name"
     assert refusal("x" * 300) == f"{'x' * 300} cannot be written: File name too long"
     assert refusal("a\0b").endswith(" cannot be written: embedded null byte")
 
@@ -162,11 +162,11 @@ def test_grids_meshes_and_pictures_ask_once_more_in_the_end(monkeypatch):
     Path("out.ply").write_text("theirs")
     Path("out.npz").write_text("theirs")
     Path("out.png").write_text("theirs")
-    with pytest.raises(WriteError, match="made by somebody else"):
+    with pytest.raises(WriteError, match="created by another program"):
         write_mesh(Mesh(np.eye(3), np.array([[0, 1, 2]])), "out.ply")
-    with pytest.raises(WriteError, match="made by somebody else"):
+    with pytest.raises(WriteError, match="created by another program"):
         grids.write_grid(grid, "out.npz")
-    with pytest.raises(WriteError, match="made by somebody else"):
+    with pytest.raises(WriteError, match="created by another program"):
         render_section(grid, Path("out.png"), force=False)
     assert [path.read_text() for path in Path().iterdir()] == 3 * ["theirs"]
     render_section(grid, Path("out.png"), force=True)

@@ -40,7 +40,7 @@ WHAT_IS_WRONG = {
     "loop.npy": "cannot be read: its links lead in a circle",
     "dangling.npy": "does not exist",
     "missing.npy": "does not exist",
-    "file/in.npy": "does not exist: what stands before its last / is no folder",
+    "file/in.npy": "does not exist: the path before its last / is not a folder",
     "n" * 300: "does not exist: the name is longer than the system allows",
 }
 
@@ -54,7 +54,7 @@ def test_what_is_no_regular_file_is_named(name):
 
 @pytest.mark.parametrize("name", ["a\0.npy", "a\ud800.npy"])
 def test_a_name_that_no_file_can_have(name):
-    with pytest.raises(FileError, match="^" + re.escape(f"{name!r} is no name that a file can")):
+    with pytest.raises(FileError, match="^" + re.escape(f"{name!r} is not a valid file name")):
         check_regular_file(name)
 
 

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import warnings
+from dataclasses import fields
 from pathlib import Path
 
 import matplotlib
@@ -17,12 +18,19 @@ from super_sdf import Mesh, SdfGrid, upsample
 from super_sdf.errors import FileError, OptionError
 from super_sdf.machine import extras
 from super_sdf.pictures import rendering
-from super_sdf.pictures.rendering import Panel, render_panels, vertex_errors, view_axes
+from super_sdf.pictures.rendering import (
+    Layout,
+    Panel,
+    render_panels,
+    vertex_errors,
+    view_axes,
+)
 from super_sdf.pictures.sections import coarse_section, find_plane, fine_section, render_section
 from super_sdf.steps.cap import close_at_border
 from super_sdf.truth.solid import Solid
 
 WHITE = np.full(3, 255)
+LAYOUT = {field.name for field in fields(Layout)}
 # Of the faces of a cube that the default view shows, z up: to +x, -y and +z.
 SHOWN = {"x": (255, 128, 128), "-y": (128, 0, 128), "z": (128, 128, 255)}
 
@@ -37,7 +45,8 @@ def drawn(image: np.ndarray) -> np.ndarray:
 
 def picture(folder: Path, *panels: Panel, **options: object) -> np.ndarray:
     target = folder / "picture.png"
-    render_panels(panels, target, **{"size": 160, **options})
+    layout = {name: options.pop(name) for name in LAYOUT & set(options)}
+    render_panels(panels, target, layout=Layout(**{"size": 160, **layout}), **options)
     return pixels(target)
 
 
@@ -221,7 +230,7 @@ def test_without_pyvista_it_says_what_to_install(tmp_path: Path, monkeypatch: py
 
 def test_a_picture_that_cannot_be_written_leaves_nothing(tmp_path: Path):
     with pytest.raises(FileError, match="cannot be written"):
-        render_panels([Panel(cube())], tmp_path / "none" / "picture.png", size=50)
+        render_panels([Panel(cube())], tmp_path / "none" / "picture.png")
     picture(tmp_path, Panel(cube()))
     assert [path.name for path in tmp_path.iterdir()] == ["picture.png"]
 
@@ -231,7 +240,7 @@ def test_no_display_is_needed_and_nothing_is_said(tmp_path: Path):
         "import numpy as np, sys; from pathlib import Path; from super_sdf import Mesh;"
         "from super_sdf.pictures.rendering import Panel, render_panels;"
         "mesh = Mesh(np.eye(3), np.array([[0, 1, 2]], np.int32));"
-        "render_panels([Panel(mesh)], Path(sys.argv[1]), size=50)"
+        "render_panels([Panel(mesh)], Path(sys.argv[1]))"
     )
     gone = ("DISPLAY", "WAYLAND_DISPLAY", "XDG_RUNTIME_DIR", "XDG_SESSION_TYPE")
     environment = {key: value for key, value in os.environ.items() if key not in gone}

@@ -99,7 +99,7 @@ def test_big_grids_are_cut_off_and_make_the_same_mesh(monkeypatch):
     exact = sample_solid(solid, layout)
     monkeypatch.setattr(sampling, "EXACT_SAMPLES", 1000)
     cut = sample_solid(solid, layout)
-    assert not exact.notes and "cut off" in cut.notes[0]
+    assert not exact.notes and "clamped" in cut.notes[0]
     assert cut.values.max() == pytest.approx(4 / 24)
     network = load_network()
     one, other = reconstruct(exact, network), reconstruct(cut, network)
@@ -130,7 +130,7 @@ def test_a_cavity_is_no_overlap():
 
 def test_an_inverted_mesh_is_turned_round_and_named(tmp_path):
     solid, notes = load_solid(saved(inverted(cube()), tmp_path / "in.ply"))
-    assert notes == ["inverted, its faces look inward: turned round"]
+    assert notes == ["inverted: its faces point inward; they were reversed"]
     assert solid.signed_distance(np.zeros((1, 3)))[0] == -0.5
 
 

@@ -25,15 +25,15 @@ def find(findings, what):
 def gpu(monkeypatch):
     """A GPU as far as the self-test sees: its values are the CPU's, and something besides."""
     besides = {"voxels": 0.0}
-    ask = selftest.ask
+    run_network = selftest.run_network
 
-    def asked(name, device, ball):
-        values, microseconds = ask(name, "cpu", ball)
+    def shifted(name, device, ball):
+        values, microseconds = run_network(name, "cpu", ball)
         return values + besides["voxels"] * (device == "cuda"), microseconds
 
     monkeypatch.setattr(selftest, "check_cuda", lambda: None)
     monkeypatch.setattr(selftest, "describe_gpu", lambda: "NVIDIA H100, driver 580.1, 83.9 GB free")
-    monkeypatch.setattr(selftest, "ask", asked)
+    monkeypatch.setattr(selftest, "run_network", shifted)
     return besides
 
 
@@ -49,7 +49,7 @@ def test_everything_is_checked_on_the_cpu():
     ]
     assert all(finding.state != "failed" for finding in findings)
     said = find(findings, "network base on cpu").says
-    assert re.fullmatch(r"off by 0\.0\d\d voxels at most on a ball, [\d.]+ us a voxel", said)
+    assert re.fullmatch(r"off by 0\.0\d\d voxels at most on a ball, [\d.]+ us per voxel", said)
     assert re.fullmatch(r"[\d.]+ GB free", find(findings, "memory").says)
 
 
@@ -66,28 +66,31 @@ def test_cuda_is_compared_with_the_cpu(gpu):
     assert find(findings, "cuda").says == "NVIDIA H100, driver 580.1, 83.9 GB free"
     found = find(findings, "network fast on cuda")
     assert found.state == "ok" and found.says.endswith(
-        " a voxel, 0e+00 voxels from the CPU's values"
+        " us per voxel, 0e+00 voxels from the values of the CPU"
     )
     gpu["voxels"] = 2e-4
     found = find(run_checks(), "network fast on cuda")
     assert found.state == "failed" and found.figures["from_cpu_voxels"] == pytest.approx(2e-4, 0.1)
     assert found.says.endswith(
-        "2e-04 voxels from the CPU's values; allowed are 0.05 on the ball and 1e-04 from the CPU"
+        "2e-04 voxels from the values of the CPU; "
+        "allowed are 0.05 on the ball and 1e-04 from the CPU"
     )
 
 
 @pytest.mark.parametrize("wrong", [0.1, np.nan])
 def test_wrong_values_fail(monkeypatch, wrong):
-    ask = selftest.ask
-    monkeypatch.setattr(selftest, "ask", lambda *asked: (ask(*asked)[0] + wrong, 1.0))
+    run_network = selftest.run_network
+    monkeypatch.setattr(
+        selftest, "run_network", lambda *inputs: (run_network(*inputs)[0] + wrong, 1.0)
+    )
     assert find(run_checks("cpu"), "network base on cpu").state == "failed"
 
 
 def test_a_network_that_cannot_run_is_a_finding_and_the_checks_go_on(monkeypatch):
-    def broken(*asked):
+    def broken(*inputs):
         raise DeviceError("the network failed on cpu: no")
 
-    monkeypatch.setattr(selftest, "ask", broken)
+    monkeypatch.setattr(selftest, "run_network", broken)
     findings = list(run_checks("cpu"))
     assert find(findings, "network base on cpu").says == "the network failed on cpu: no"
     assert findings[-1].what == "extra peers"
@@ -110,7 +113,7 @@ def test_a_missing_extra_is_named_with_its_way_out(monkeypatch):
 
 def test_a_system_that_does_not_tell_its_memory(monkeypatch):
     monkeypatch.setattr(selftest, "free_memory", lambda: None)
-    assert selftest.check_memory().says == "the system does not say how much is free"
+    assert selftest.check_memory().says == "the system does not report the free memory"
 
 
 def test_the_command_prints_a_line_a_check_and_its_exit_code_tells(command):

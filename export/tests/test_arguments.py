@@ -31,8 +31,8 @@ def here(tmp_path, monkeypatch):
 
 
 DATASET = [
-    ("--meshes none", 1, "--meshes none is no folder: give one of closed .ply meshes"),
-    ("--meshes empty", 1, "--meshes empty holds no .ply file: other formats are not read here"),
+    ("--meshes none", 1, "--meshes none is not a folder: give one with closed .ply meshes"),
+    ("--meshes empty", 1, "--meshes empty has no .ply file: other formats are not read here"),
     ("--meshes pipes", 1, "pipes/a.ply is a named pipe: give a file"),
     ("--count 0", 2, "argument --count: 0: give at least 1"),
     ("--thin nan", 2, "argument --thin: nan: give a number from 0 to 1"),
@@ -40,12 +40,12 @@ DATASET = [
     ("--seed -1", 2, "argument --seed: -1: give at least 0"),
 ]
 TRAIN = [
-    ("--store none", 1, "--store none is no folder: fill one with export.dataset"),
+    ("--store none", 1, "--store none is not a folder: fill one with export.dataset"),
     *(
         (
             f"--store {name}",
             1,
-            f"--store {name} holds {count} of at least 3 shards, for the first 2 are held out: "
+            f"--store {name} has {count} of at least 3 shards, since the first 2 are held out: "
             "make more with export.dataset",
         )
         for name, count in (("empty", 0), ("one", 1), ("two", 2))
@@ -53,7 +53,7 @@ TRAIN = [
     (
         "--store damaged",
         1,
-        "damaged/shard-0-0000.npz is no shard: ",
+        "damaged/shard-0-0000.npz is not a shard: ",
     ),
     ("--store two --minutes nan", 2, "argument --minutes: nan: give a number greater than 0"),
     ("--store two --rate 0", 2, "argument --rate: 0: give a number greater than 0"),
@@ -83,7 +83,7 @@ def test_what_cannot_be_worked_with_is_refused(
 
 
 def test_a_store_of_too_few_shards_is_refused_in_python_too(here):
-    with pytest.raises(FileError, match="holds 2 of at least 3 shards"):
+    with pytest.raises(FileError, match="has 2 of at least 3 shards"):
         Store(Path("two"), 2)
 
 
@@ -91,7 +91,7 @@ def test_a_truncated_shard_is_named(here):
     np.savez("whole.npz", windows=np.zeros(1000))
     path = Path("shard-0-0000.npz")
     path.write_bytes(Path("whole.npz").read_bytes()[:500])
-    with pytest.raises(FileError, match=r"shard-0-0000\.npz is no shard: "):
+    with pytest.raises(FileError, match=r"shard-0-0000\.npz is not a shard: "):
         next(read_shard(path))
 
 

@@ -3,7 +3,7 @@
 >>> from super_sdf import make_grid, reconstruct
 >>> mesh = reconstruct(make_grid(values, spacing=0.1))            # doctest: +SKIP
 
-Names are imported when they are first used, so that ``super-sdf --help`` need not load NumPy.
+Names are imported on first use, so that ``super-sdf --help`` does not load NumPy.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    """Return a public name, from ``public``."""
+    """Import a public name from ``public``."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from . import public
@@ -40,5 +40,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """List the public names, imported already or not."""
+    """List the public names, whether imported yet or not."""
     return __all__

@@ -1,4 +1,4 @@
-"""``python -m super_sdf``."""
+"""The command line, as ``python -m super_sdf``."""
 
 from .cli.entry import main
 

@@ -1,4 +1,4 @@
-"""Types of the arrays that pass from step to step."""
+"""Types of the arrays that the steps exchange."""
 
 from __future__ import annotations
 
@@ -11,6 +11,6 @@ FloatArray: TypeAlias = NDArray[np.float32]
 IntArray: TypeAlias = NDArray[np.int32]
 BoolArray: TypeAlias = NDArray[np.bool_]
 Signs: TypeAlias = NDArray[np.int8]
-"""1 outside, -1 inside, 0 not known."""
+"""1 outside, -1 inside, 0 unknown."""
 Triple: TypeAlias = tuple[float, float, float]
-"""A number for each axis: x, y, z."""
+"""One number per axis: x, y, z."""

@@ -1,28 +1,28 @@
 """Everything that this package raises on purpose.
 
-- ``SuperSdfError``: the base; its text is one line: what was wrong, the value seen, the way out.
+- ``SuperSdfError``: the base class; its message is one line: what is wrong, the value, the remedy.
 
   - ``GridError`` (also ``ValueError``): the samples are not a usable signed distance grid.
 
-    - ``NoSurfaceError``: they are, but no surface is to be found in them.
+    - ``NoSurfaceError``: they are, but contain no surface.
 
-  - ``MeshError`` (also ``ValueError``): a reference mesh bounds no solid.
-  - ``OptionError`` (also ``ValueError``): an argument has no meaning (an odd factor, say).
+  - ``MeshError`` (also ``ValueError``): a reference mesh does not bound a solid.
+  - ``OptionError`` (also ``ValueError``): an argument is invalid, such as an odd factor.
 
-    - ``OptionTypeError`` (also ``TypeError``): it is not even of the right type.
+    - ``OptionTypeError`` (also ``TypeError``): an argument has the wrong type.
 
   - ``FileError`` (also ``OSError``): a file cannot be read or written.
 
-    - ``WriteError``: it cannot be made where it was asked for, which is not the input's fault.
+    - ``WriteError``: an output file cannot be created, which is not the input's fault.
 
-  - ``ModelError`` (also ``ValueError``): an ONNX file that does not keep the network's contract.
-  - ``DeviceError`` (also ``RuntimeError``): a device was asked for that cannot run here.
-  - ``OutOfMemoryError`` (also ``MemoryError``): the work would not fit in memory; it was not begun.
+  - ``ModelError`` (also ``ValueError``): an ONNX file does not fulfil the network's contract.
+  - ``DeviceError`` (also ``RuntimeError``): the requested device cannot run here.
+  - ``OutOfMemoryError`` (also ``MemoryError``): the work would not fit in memory and was not begun.
 """
 
 
 class SuperSdfError(Exception):
-    """Base of this package's errors."""
+    """Base class of all errors of this package."""
 
 
 class GridError(SuperSdfError, ValueError):
@@ -30,19 +30,19 @@ class GridError(SuperSdfError, ValueError):
 
 
 class NoSurfaceError(GridError):
-    """No surface is to be found in the samples."""
+    """The samples contain no surface."""
 
 
 class MeshError(SuperSdfError, ValueError):
-    """A reference mesh bounds no solid."""
+    """A reference mesh does not bound a solid."""
 
 
 class OptionError(SuperSdfError, ValueError):
-    """An argument has no meaning."""
+    """An argument is invalid."""
 
 
 class OptionTypeError(OptionError, TypeError):
-    """An argument is of the wrong type."""
+    """An argument has the wrong type."""
 
 
 class FileError(SuperSdfError, OSError):
@@ -50,22 +50,22 @@ class FileError(SuperSdfError, OSError):
 
 
 class WriteError(FileError):
-    """A file cannot be made where it was asked for: no room, no permission, a name taken."""
+    """An output file cannot be created: disk full, no permission, or the name is taken."""
 
 
 class ModelError(SuperSdfError, ValueError):
-    """A network file does not keep the network's contract."""
+    """An ONNX file does not fulfil the network's contract."""
 
 
 class DeviceError(SuperSdfError, RuntimeError):
-    """A device was asked for that cannot run here."""
+    """The requested device cannot run here."""
 
 
 class OutOfMemoryError(SuperSdfError, MemoryError):
-    """The work would not fit in memory; it was not begun."""
+    """The work would not fit in memory and was not begun."""
 
 
 def seen(value: object) -> str:
-    """Return a value as errors show it: on one line, and not longer than that takes."""
+    """Return the repr of a value for error messages: on one line, at most 60 characters."""
     text = " ".join(repr(value).split())
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,4 +1,4 @@
-"""A triangle mesh and what can be said of it without leaving NumPy."""
+"""A triangle mesh: volume, open edges, and the precision that its vertices need."""
 
 from __future__ import annotations
 
@@ -12,40 +12,40 @@ from .arrays import IntArray
 from .errors import GridError
 from .grid.sdf_grid import SdfGrid
 
-# A vertex keeps this share of its lattice edge from either end: where a node's value is 0 several
-# vertices would otherwise fall together, and programs that merge such points would tear the mesh.
+# A vertex keeps this share of its lattice edge away from both ends: where a node's value is 0
+# several vertices would otherwise coincide, and programs that merge points would tear the mesh.
 CLEARANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Mesh:
-    """Triangles of a surface, outward: seen from outside, counter-clockwise.
+    """Triangles of a surface, counter-clockwise seen from outside.
 
     Attributes
     ----------
     vertices : (n, 3) float32 or float64
-        World positions; double where single could not tell neighbouring vertices apart.
+        World positions; float64 where float32 does not resolve neighbouring vertices.
     faces : (m, 3) int32
-        Rows of ``vertices``.
+        Indices of the corners in ``vertices``.
     """
 
     vertices: NDArray[Any]
     faces: IntArray
 
     def __repr__(self) -> str:
-        says = f"{len(self.vertices):,} vertices {self.vertices.dtype}, {len(self.faces):,} faces"
+        text = f"{len(self.vertices):,} vertices {self.vertices.dtype}, {len(self.faces):,} faces"
         if len(self.vertices):
             low, high = self.vertices.min(0), self.vertices.max(0)
             box = ", ".join(f"{a:.6g} to {b:.6g}" for a, b in zip(low, high))
-            says += f", x, y, z from {box}"
-        return f"Mesh({says})"
+            text += f", x, y, z from {box}"
+        return f"Mesh({text})"
 
     def transformed(self, linear: NDArray[Any], shift: NDArray[Any]) -> Mesh:
         """Return the mesh with ``vertices @ linear.T + shift`` (``linear`` keeps orientation)."""
         return Mesh(self.vertices @ linear.T + shift, self.faces)
 
     def volume(self) -> float:
-        """Return the enclosed volume, in cubic world units; positive if faces look outward."""
+        """Return the enclosed volume, in cubic world units; positive if normals point outward."""
         if not len(self.faces):
             return 0.0
         corners = self.vertices.astype(np.float64)
@@ -63,12 +63,12 @@ class Mesh:
         return points + int((times > 1).sum()) + len(np.setxor1d(forward, backward))
 
     def is_closed(self) -> bool:
-        """Say whether there are faces, and no edge is open."""
+        """Return whether there are faces and no edge is open."""
         return len(self.faces) > 0 and self.open_edges() == 0
 
 
 def join_meshes(pieces: list[Mesh]) -> Mesh:
-    """Return pieces whose triangles use the vertices of all of them as one mesh."""
+    """Join pieces whose triangles index the vertices of all pieces, in order."""
     if len(pieces) == 1:
         return pieces[0]
     return Mesh(
@@ -78,12 +78,12 @@ def join_meshes(pieces: list[Mesh]) -> Mesh:
 
 
 def vertex_type(grid: SdfGrid, factor: int) -> type[np.float32] | type[np.float64]:
-    """Return the numbers that tell neighbouring vertices apart: single, else double.
+    """Return the dtype that resolves neighbouring vertices: float32 if possible, else float64.
 
     Raises
     ------
     GridError
-        If neither does.
+        If neither resolves them.
     """
     reach = max(abs(x) + h * n for x, h, n in zip(grid.origin, grid.spacing, grid.shape))
     for kind in (np.float32, np.float64):
@@ -98,7 +98,7 @@ def vertex_type(grid: SdfGrid, factor: int) -> type[np.float32] | type[np.float6
 def tells_vertices_apart(
     kind: type[np.float32] | type[np.float64], reach: float, grid: SdfGrid, factor: int
 ) -> bool:
-    """Say whether numbers of a kind, up to ``reach``, tell neighbouring vertices apart."""
+    """Return whether floats of this kind resolve neighbouring vertices up to ``reach``."""
     least = CLEARANCE / 2 * grid.voxel_size / factor
     finfo = np.finfo(kind)
     fine = float(finfo.tiny) < least and float(finfo.eps) * reach < least

@@ -7,8 +7,8 @@ import numpy as np
 from .arrays import IntArray
 
 NEIGHBOURHOOD: IntArray = np.indices((3, 3, 3)).reshape(3, 27).T.astype(np.int32) - 1
-"""Steps from the voxel in the middle, (27, 3)."""
+"""Steps from the centre voxel, (27, 3)."""
 CENTRE = 13
-"""The place of the voxel itself."""
+"""Index of the centre voxel itself."""
 STRIDES = np.array([9, 3, 1])
-"""From a place to the next along each axis."""
+"""Difference between neighbouring indices along each axis."""

@@ -1,4 +1,4 @@
-"""What the library is asked, checked before any work: the same for the command line."""
+"""Checks of arguments before any work starts; the command line uses the same ones."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .grid.sdf_grid import SdfGrid
 
 
 def check_grid(grid: Any) -> None:
-    """Raise if what should be a grid is an array, say, or a path."""
+    """Raise OptionTypeError if ``grid`` is not an ``SdfGrid``, but an array or a path, say."""
     if not isinstance(grid, SdfGrid):
         what = f"an array of shape {grid.shape}" if isinstance(grid, np.ndarray) else seen(grid)
         raise OptionTypeError(
@@ -24,29 +24,49 @@ def check_grid(grid: Any) -> None:
 
 
 def check_path(path: Any, name: str) -> Path:
-    """Return a path."""
+    """Return an argument as a path; ``name`` is its name in the message.
+
+    Raises
+    ------
+    OptionTypeError
+        If it is neither a string nor a path.
+    """
     if not isinstance(path, (str, PathLike)):
         raise OptionTypeError(f"{name} is {seen(path)}: give the path of a file")
     return Path(path)
 
 
 def check_threads(threads: Any) -> int:
-    """Return a number of threads; 0 is for one a core."""
+    """Return a number of threads; 0 means one per core.
+
+    Raises
+    ------
+    OptionError
+        If it is negative, or not a whole number (``OptionTypeError``).
+    """
     if not isinstance(threads, Integral) or isinstance(threads, bool):
-        raise OptionTypeError(f"threads is {seen(threads)}: give a whole number, 0 for one a core")
+        raise OptionTypeError(
+            f"threads is {seen(threads)}: give a whole number, 0 for one per core"
+        )
     if int(threads) < 0:
-        raise OptionError(f"threads is {threads}: give 1 or more, or 0 for one a core")
+        raise OptionError(f"threads is {threads}: give 1 or more, or 0 for one per core")
     return int(threads)
 
 
 def check_network(network: Any) -> None:
-    """Raise if what should be a network cannot be called."""
+    """Raise OptionTypeError if ``network`` cannot be called."""
     if not callable(network):
         raise OptionTypeError(f"network is {seen(network)}: give one from load_network()")
 
 
 def check_distance(offset: Any) -> float:
-    """Return an offset as a finite number."""
+    """Return an offset, in world units, as a float.
+
+    Raises
+    ------
+    OptionError
+        If it is not finite, or not a number (``OptionTypeError``).
+    """
     if not isinstance(offset, Real) or isinstance(offset, bool):
         raise OptionTypeError(f"offset is {seen(offset)}: give a number, in world units")
     if not isfinite(offset):
@@ -55,14 +75,20 @@ def check_distance(offset: Any) -> float:
 
 
 def check_cap(cap: Any) -> bool:
-    """Return whether to cap."""
+    """Return ``cap`` as a bool, or raise OptionTypeError if it is not one."""
     if not isinstance(cap, (bool, np.bool_)):
         raise OptionTypeError(f"cap is {seen(cap)}: give True or False")
     return bool(cap)
 
 
 def check_max_memory(size: Any) -> int | None:
-    """Return how many bytes may be held, None if that is not said."""
+    """Return a memory limit in bytes; None means a share of the free memory.
+
+    Raises
+    ------
+    OptionError
+        If it is not positive, or not a whole number (``OptionTypeError``).
+    """
     if size is None:
         return None
     if not isinstance(size, Integral) or isinstance(size, bool):
@@ -73,7 +99,7 @@ def check_max_memory(size: Any) -> int | None:
 
 
 def check_progress(progress: Any) -> None:
-    """Raise if there is something to be told of progress that cannot be called."""
+    """Raise OptionTypeError if ``progress`` is neither None nor callable."""
     if progress is not None and not callable(progress):
         raise OptionTypeError(
             f"progress is {seen(progress)}: give a function of (done, total), in thousandths"

@@ -1,4 +1,4 @@
-"""How far the work on a grid is, and how long its steps take."""
+"""Progress of the work on a grid, and the time that its steps take."""
 
 from __future__ import annotations
 
@@ -8,47 +8,52 @@ from collections.abc import Callable, Iterable, Mapping
 Progress = Callable[[int, int], None]
 """Called with (done, total), in thousandths of the work; ``done`` never falls and ends at total.
 
-While the network runs it is called several times a second, with an estimate by the clock. If it
-raises, the work ends there with that error.
+While the network runs it is called several times a second with an estimate from the elapsed time.
+If it raises an exception, the work stops with that exception.
 """
 
 Tell = Callable[[float], None]
-"""Called with the share of a step that is done, from 0 to 1."""
+"""Called with the finished share of a step, from 0 to 1."""
 
 TOTAL = 1000
-# The parts of the time that the steps take, with a network on a CPU: the first once, the others for
-# each slab.
+# Share of the time that each step takes with a network on a CPU. The first runs once, the others
+# once per slab.
 STEPS = {"band": 0.02, "network": 0.78, "nodes": 0.1, "isosurface": 0.1}
 
 
 class Stopwatch:
-    """The time between laps, by the name of the lap."""
+    """Adds up the seconds spent in each stage, by name."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self.start()
 
     def start(self) -> None:
-        """Begin a lap now."""
+        """Start the clock for the next stage."""
         self.clock = time.perf_counter()
 
     def lap(self, stage: str) -> None:
-        """Book the time since the last lap under a stage."""
+        """Add the time since the last lap to a stage."""
         now = time.perf_counter()
         self.take({stage: now - self.clock})
         self.clock = now
 
     def take(self, seconds: Mapping[str, float]) -> None:
-        """Book what was timed elsewhere; the next lap begins now."""
-        for stage, spent in seconds.items():
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + spent
+        """Add times that were measured elsewhere, and restart the clock."""
+        for stage, more in seconds.items():
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + more
         self.start()
 
 
 class Steps:
-    """Tells how far the work is.
+    """Reports progress and measures time, step by step; ``finish`` ends each step.
 
-    ``finish`` is called at the end of each step.
+    Parameters
+    ----------
+    progress : callable, optional
+        Called as ``Progress`` describes.
+    names : iterable of str
+        The steps that will be done, of ``STEPS``.
     """
 
     def __init__(self, progress: Progress | None = None, names: Iterable[str] = STEPS) -> None:
@@ -59,23 +64,23 @@ class Steps:
         self.watch = Stopwatch()
 
     def divide(self, slabs: int) -> None:
-        """Expect all steps but the first once for each slab."""
+        """Expect every step but the first once per slab."""
         for name in self.lengths.keys() - {"band"}:
             self.lengths[name] /= slabs
 
     def finish(self, name: str) -> None:
-        """Tell that a step is done, and book its time."""
+        """Report that a step is done, and record its time."""
         self.watch.lap(name)
         self.done += self.lengths[name]
         self._show(self.done)
 
     def take_seconds(self) -> dict[str, float]:
-        """Return what the steps took since this was called last."""
+        """Return the seconds per step since the last call."""
         seconds, self.watch.seconds = self.watch.seconds, {}
         return seconds
 
     def within(self, name: str) -> Tell | None:
-        """Return what a step that begins now is to call with its share; None if nobody listens."""
+        """Return a callback for the share of a step that starts now; None without ``progress``."""
         begin, length = self.done, self.lengths[name]
         return (lambda share: self._show(begin + share * length)) if self.progress else None
 

@@ -1,4 +1,4 @@
-"""The library's public names, each from the module where it lives."""
+"""The public names of the library, imported from the modules that define them."""
 
 from .errors import SuperSdfError as SuperSdfError
 from .files.grids import read_grid as read_grid

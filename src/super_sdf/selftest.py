@@ -1,6 +1,6 @@
-"""What works on this machine and what is missing: the checks of ``super-sdf info --check``.
+"""The checks of ``super-sdf info --check``: what works on this machine and what is missing.
 
-The networks are asked for a ball, whose distances are known, on every device there is.
+Each network is run on a ball, whose distances are known, on every device.
 """
 
 from __future__ import annotations
@@ -25,14 +25,18 @@ from .steps.nodes import block_offsets
 from .steps.survey import survey
 
 OK, MISSING, FAILED = "ok", "missing", "failed"
-BALL_SAMPLES, BALL_CENTRE, BALL_RADIUS = 32, 15.63, 12.0  # off the samples
-WORST = 0.05  # voxels; the shipped networks stay under 0.025, a broken one is off by whole voxels
-CUDA_APART = 1e-4  # voxels between the CPU's values and CUDA's
+BALL_SAMPLES, BALL_CENTRE, BALL_RADIUS = (
+    32,
+    15.63,
+    12.0,
+)  # in index units; the centre is not on a sample
+LARGEST_ERROR = 0.05  # voxels; shipped networks stay under 0.025, broken ones are off by voxels
+LARGEST_DIFFERENCE = 1e-4  # voxels, between the values of the CPU and of CUDA
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One check: "ok", "missing" (an option that is not installed) or "failed"."""
+    """The result of a check: "ok", "missing" (an optional part is not installed) or "failed"."""
 
     state: str
     what: str
@@ -42,20 +46,20 @@ class Finding:
 
 @dataclass(frozen=True)
 class Ball:
-    """What a network is asked, in its own terms, and the true distances, (D, Q), in voxels."""
+    """The inputs of a network for a ball, and the exact distances, (D, Q), in voxels."""
 
-    asked: tuple[FloatArray, IntArray, IntArray, FloatArray]
+    inputs: tuple[FloatArray, IntArray, IntArray, FloatArray]
     exact: FloatArray
 
 
 def run_checks(device: str = "auto") -> Iterator[Finding]:
-    """Check everything, a finding at a time.
+    """Run all checks and yield their results.
 
     Parameters
     ----------
     device : str
-        "cpu" leaves CUDA out; "cuda" makes it a failure if it is missing; "auto" does that only
-        where the onnxruntime that is installed was built for it.
+        "cpu" skips CUDA; "cuda" counts missing CUDA as a failure; "auto" does so only if the
+        installed onnxruntime was built for CUDA.
     """
     yield check_versions()
     yield check_memory()
@@ -67,27 +71,27 @@ def run_checks(device: str = "auto") -> Iterator[Finding]:
     if not shipped_models():
         yield Finding(FAILED, "networks", NO_NETWORKS)
     ball = make_ball()
-    for name in sorted(shipped_models(), key=lambda name: "int8" in name):  # made from the others
+    for name in sorted(shipped_models(), key=lambda name: "int8" in name):  # int8 last
         yield from check_network(name, ["cpu"] if "int8" in name else devices, ball)
     for name, modules in EXTRAS.items():
         yield check_extra(name, modules)
 
 
 def check_versions() -> Finding:
-    """Name the versions; both kinds of onnxruntime at once overwrite each other's files."""
+    """List the versions; fail if both packages of onnxruntime, which share files, are installed."""
     says = (
         f"super-sdf {__version__}, Python {platform.python_version()}, NumPy "
         f"{np.__version__}, {onnxruntime_version()}"
     )
     if is_installed("onnxruntime") and is_installed("onnxruntime-gpu"):
-        way_out = "uninstall both, then install one"
-        says += f"; onnxruntime and onnxruntime-gpu are both installed: {way_out}"
+        remedy = "uninstall both, then install one"
+        says += f"; onnxruntime and onnxruntime-gpu are both installed: {remedy}"
         return Finding(FAILED, "versions", says)
     return Finding(OK, "versions", says)
 
 
 def is_installed(package: str) -> bool:
-    """Say whether pip knows of a package."""
+    """Return whether a package is installed, by its metadata."""
     try:
         version(package)
     except PackageNotFoundError:
@@ -96,15 +100,15 @@ def is_installed(package: str) -> bool:
 
 
 def check_memory() -> Finding:
-    """Say how much memory is free."""
+    """Report the free memory."""
     free = free_memory()
     if free is None:
-        return Finding(OK, "memory", "the system does not say how much is free")
+        return Finding(OK, "memory", "the system does not report the free memory")
     return Finding(OK, "memory", f"{free / 1e9:.1f} GB free", {"free_bytes": free})
 
 
 def find_cuda(needed: bool) -> Finding:
-    """Say which GPU there is, or what CUDA lacks here."""
+    """Report the GPU, or what CUDA lacks here."""
     try:
         check_cuda()
     except DeviceError as error:
@@ -113,7 +117,7 @@ def find_cuda(needed: bool) -> Finding:
 
 
 def make_ball() -> Ball:
-    """Sample a ball and return its voxels that can hold the surface."""
+    """Sample a ball; return the network's inputs for it and the exact distances."""
     ijk = np.indices((BALL_SAMPLES,) * 3)
     values = np.linalg.norm(ijk - BALL_CENTRE, axis=0) - BALL_RADIUS
     band = survey(SdfGrid.trusted(values.astype(np.float32), (1.0, 1.0, 1.0)))
@@ -125,12 +129,12 @@ def make_ball() -> Ball:
 
 
 def check_network(name: str, devices: list[str], ball: Ball) -> Iterator[Finding]:
-    """Ask a shipped network for the ball on each device, the CPU first."""
+    """Run a shipped network on the ball on each device, the CPU first."""
     reference: FloatArray | None = None
     for device in devices:
         what = f"network {name} on {device}"
         try:
-            values, microseconds = ask(name, device, ball)
+            values, microseconds = run_network(name, device, ball)
         except SuperSdfError as error:
             yield Finding(FAILED, what, str(error))
             continue
@@ -138,36 +142,38 @@ def check_network(name: str, devices: list[str], ball: Ball) -> Iterator[Finding
         reference = values if device == "cpu" else reference
 
 
-def ask(name: str, device: str, ball: Ball) -> tuple[FloatArray, float]:
-    """Return a network's values, (D, Q) in voxels, and its microseconds a voxel of the band."""
+def run_network(name: str, device: str, ball: Ball) -> tuple[FloatArray, float]:
+    """Return a network's values, (D, Q) in voxels, and microseconds per voxel of the band."""
     network = load_network(name, device=device)
-    network(*ball.asked)  # the first run is slower
+    network(*ball.inputs)  # the first run is slower
     start = time.perf_counter()
-    half_voxels = network(*ball.asked)
+    half_voxels = network(*ball.inputs)
     seconds = time.perf_counter() - start
-    return half_voxels * np.float32(0.5), 1e6 * seconds / len(ball.asked[0])
+    return half_voxels * np.float32(0.5), 1e6 * seconds / len(ball.inputs[0])
 
 
 def judge(
     what: str, values: FloatArray, microseconds: float, ball: Ball, reference: FloatArray | None
 ) -> Finding:
-    """Compare values with the ball's, and with the CPU's if there are any."""
+    """Compare values, (D, Q) in voxels, with the exact ones and with those of the CPU."""
     off = float(np.abs(values - ball.exact).max())
-    works = off <= WORST  # not if they are NaN
-    says = f"off by {off:.3f} voxels at most on a ball, {microseconds:.1f} us a voxel"
+    works = off <= LARGEST_ERROR  # False for NaN
+    says = f"off by {off:.3f} voxels at most on a ball, {microseconds:.1f} us per voxel"
     figures = {"off_voxels": off, "microseconds_a_voxel": microseconds}
     if reference is not None:
         apart = float(np.abs(values - reference).max())
-        works = works and apart <= CUDA_APART
-        says += f", {apart:.0e} voxels from the CPU's values"
+        works = works and apart <= LARGEST_DIFFERENCE
+        says += f", {apart:.0e} voxels from the values of the CPU"
         figures["from_cpu_voxels"] = apart
     if not works:
-        says += f"; allowed are {WORST} on the ball and {CUDA_APART:.0e} from the CPU"
+        says += (
+            f"; allowed are {LARGEST_ERROR} on the ball and {LARGEST_DIFFERENCE:.0e} from the CPU"
+        )
     return Finding(OK if works else FAILED, what, says, figures)
 
 
 def check_extra(name: str, modules: tuple[str, ...]) -> Finding:
-    """Say whether an extra's modules are there."""
+    """Report whether the modules of an extra are installed."""
     missing = missing_modules(modules)
     if missing:
         says = f"no {', '.join(missing)}: {how_to_install(name)}"

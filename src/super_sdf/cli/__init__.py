@@ -1,1 +1,1 @@
-"""The command line: a module a command, no numerics. It may import every other room."""
+"""The command line: one module per command, no numerics. It may import every other room."""

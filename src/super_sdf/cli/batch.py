@@ -1,4 +1,4 @@
-"""The command ``batch``: parse, call the library, say what happened. No numerics here."""
+"""The command ``batch``: many grid files to mesh files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from .batch_report import progress_line, tell_plan, tell_summary
+from .batch_report import print_plan, print_summary, progress_line
+from .choices import LazyChoice, mesh_formats
 from .common import CONTEXT, InterruptedCommand, one_line_errors
 from .conversion import chosen_model, conversion_options, make_options
 from .interrupts import raising_interrupts
@@ -26,7 +27,10 @@ Examples:
 
 
 @click.command(
-    context_settings=CONTEXT, epilog=EXAMPLES, short_help="Convert many grids, and go on later."
+    "batch",
+    context_settings=CONTEXT,
+    epilog=EXAMPLES,
+    short_help="Convert many grids; can be stopped and resumed.",
 )
 @click.argument("sources", metavar="IN...", nargs=-1, required=True)
 @click.option(
@@ -35,45 +39,51 @@ Examples:
     metavar="DIR",
     required=True,
     type=click.Path(path_type=Path),
-    help="Where the meshes go, with report.jsonl; folders below IN are kept.",
+    help="Folder for the meshes and report.jsonl; subfolders of IN are kept.",
 )
 @click.option(
     "--format",
     "kind",
-    type=click.Choice(["ply", "stl", "obj", "off", "glb", "3mf"]),
+    type=LazyChoice(mesh_formats),
     default="ply",
     show_default=True,
-    help="Of the meshes.",
+    help="Mesh file format.",
 )
 @conversion_options
 @click.option(
     "--jobs",
     type=click.IntRange(0),
     default=0,
-    help="Processes; 0: one a core, on CUDA one. They share the cores unless --threads is given.",
+    show_default=True,
+    help="Worker processes; 0 means one per core, or a single one on CUDA. They share the cores "
+    "unless --threads is given.",
 )
-@click.option("--fail-fast", is_flag=True, help="Begin nothing more after the first failure.")
-@click.option("--retry", is_flag=True, help="Try unchanged inputs again that failed before.")
-@click.option("--force", is_flag=True, help="Do all again; replace meshes of another origin.")
-@click.option("--dry-run", is_flag=True, help="Say what would be done; write nothing.")
+@click.option("--fail-fast", is_flag=True, help="Start no further file after the first failure.")
+@click.option("--retry", is_flag=True, help="Retry inputs that failed before and have not changed.")
+@click.option(
+    "--force",
+    is_flag=True,
+    help="Convert everything again; replace files that no batch wrote.",
+)
+@click.option("--dry-run", is_flag=True, help="Show what would be done; write nothing.")
 @click.option("--json", "as_json", is_flag=True, help="Print the summary, or the plan, as JSON.")
 @click.option("-q", "--quiet", is_flag=True, help="Print failures only.")
-def batch(sources: tuple[str, ...], folder: Path, **options: Any) -> None:
-    """Convert every grid that IN names to a mesh in DIR, as upsample would.
+def batch_command(sources: tuple[str, ...], folder: Path, **options: Any) -> None:
+    """Convert many grids to meshes in the folder DIR, each as upsample would.
 
-    IN are .npy and .npz files, folders of them, patterns ('**/*.npy'), and lists: .txt, a path a
-    line, or .jsonl, an object a line: {"in": "a.npy", "out": "a.ply", "spacing": 0.5}, paths
-    relative to the list.
+    Each IN is a .npy or .npz file, a folder (searched with its subfolders), a pattern such as
+    '**/*.npy', or a list of inputs: .txt with one path per line, or .jsonl with one object per
+    line such as {"in": "a.npy", "out": "a.ply", "spacing": 0.5}. Paths are relative to the list.
 
-    What failed is named and stops nothing. Run again, after a kill, with more inputs or other
-    options, it does what is not done yet.
+    A file that fails is reported and does not stop the others. Run the command again to resume
+    after an interruption, or with more inputs or other options: only what is missing is done.
     """
     with one_line_errors():
         run_batch(sources, folder, options)
 
 
 def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -> None:
-    """Find the inputs, do what is to be done, say what came of it."""
+    """Find the inputs, convert what is not done yet, print a summary."""
     from ..batch.inputs import find_jobs
     from ..batch.plan import Settings, preview
     from ..network.network import find_model
@@ -97,18 +107,18 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
     if options["dry_run"]:
         plan = preview(jobs, settings)
         plan.unread = unread
-        tell_plan(plan, options["as_json"])
+        print_plan(plan, options["as_json"])
         return
     done = complete(jobs, settings, options["quiet"])
     done.unread = unread
     done.seconds = time.perf_counter() - start
-    tell_summary(done, options)
+    print_summary(done, options)
     if done.failures() or done.unread:
         sys.exit(1)
 
 
 def complete(jobs: list[Job], settings: Settings, quiet: bool) -> Batch:
-    """Run the batch; if interrupted, say what is kept."""
+    """Run the batch; an interrupt reports how many files are done."""
     from ..batch.lock import FolderLock
     from ..batch.run import Run
 
@@ -119,6 +129,6 @@ def complete(jobs: list[Job], settings: Settings, quiet: bool) -> Batch:
             with progress_line(total, quiet) as progress, raising_interrupts():
                 run.complete(progress)
         except KeyboardInterrupt as error:
-            done = f": {len(run.batch.done)} of {total} are done and kept"
-            raise InterruptedCommand(f"{done}; run it again to go on", error) from None
+            kept = f": {len(run.batch.done)} of {total} are done and kept; run it again to go on"
+            raise InterruptedCommand(kept, error) from None
     return run.batch

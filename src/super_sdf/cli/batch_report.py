@@ -1,4 +1,4 @@
-"""What ``batch`` says: how far it is, what it would do, what it did."""
+"""The output of ``batch``: its progress, its plan (``--dry-run``) and its summary."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from .common import print_result, tell
+from .common import print_stderr, print_stdout
 
 if TYPE_CHECKING:
     from ..batch.job import Job
     from ..batch.plan import Batch
     from ..batch.run import Progress
 
-SHOWN = 20  # failures on the screen; all are in the report
-REDRAW = 0.1  # seconds between two drawings of the progress line
+MOST_FAILURES = 20  # printed; the report has all
+REDRAW_SECONDS = 0.1  # between two drawings of the progress line
 
 
 @contextmanager
 def progress_line(total: int, quiet: bool) -> Iterator[Progress | None]:
-    """Keep a line on stderr up to date, if somebody is there to see it."""
+    """Keep a progress line on stderr up to date; None if stderr is no terminal."""
     if quiet or not total or sys.stderr is None or not sys.stderr.isatty():
         yield None
         return
@@ -33,7 +33,7 @@ def progress_line(total: int, quiet: bool) -> Iterator[Progress | None]:
 
     def draw(batch: Batch) -> None:
         nonlocal shown
-        if time.perf_counter() - shown > REDRAW:
+        if time.perf_counter() - shown > REDRAW_SECONDS:
             shown = time.perf_counter()
             click.echo(f"\r{describe_progress(batch, total)}\x1b[K", err=True, nl=False)
 
@@ -45,7 +45,7 @@ def progress_line(total: int, quiet: bool) -> Iterator[Progress | None]:
 
 
 def describe_progress(batch: Batch, total: int) -> str:
-    """Say how far it is, how fast, and how long it will take."""
+    """Return the files finished, the rate, and the remaining time in one line."""
     finished = len(batch.done) + len(batch.failed)
     rate = finished / batch.seconds
     left = batch.seconds * (batch.work / batch.work_done - 1)
@@ -54,29 +54,29 @@ def describe_progress(batch: Batch, total: int) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Return a time in words."""
+    """Return a time in seconds, or in minutes and hours."""
     if seconds < 60:
         return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
     minutes = round(seconds / 60)
     return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
 
 
-def tell_plan(plan: Batch, as_json: bool) -> None:
-    """Print what would be done with each file, and how many there are of each kind."""
+def print_plan(plan: Batch, as_json: bool) -> None:
+    """Print what would be done with each file, and the counts."""
     if as_json:
-        print_result(json.dumps(plan_report(plan), indent=2), "nothing was written")
+        print_stdout(json.dumps(plan_report(plan), indent=2), "nothing was written")
     else:
         for line in plan_lines(plan):
-            print_result(line, "nothing was written")
+            print_stdout(line, "nothing was written")
     kinds = {kind: len(found) for kind, found in plan_report(plan).items()}
     if not kinds["unread"]:
         del kinds["unread"]
     counts = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in kinds.items())
-    tell(counts)
+    print_stderr(counts)
 
 
 def plan_lines(plan: Batch) -> Iterator[str]:
-    """Yield what would be done with each file, a line each."""
+    """Yield a line per file: what would be done with it."""
     from ..batch.job import in_a_line
 
     folder = plan.settings.folder
@@ -85,16 +85,16 @@ def plan_lines(plan: Batch) -> Iterator[str]:
     for job, _ in plan.done_before:
         yield in_a_line(f"done before: {job.source} -> {folder / job.target}")
     for result in plan.failed_before:
-        yield f"{kind_of(result.row).replace('_', ' ')}: {result.failure()}"
+        yield f"{failure_kind(result.row).replace('_', ' ')}: {result.failure()}"
     for path, reason in plan.unread:
         yield in_a_line(f"unread: {path} {reason}")
 
 
 def plan_report(plan: Batch) -> dict[str, Any]:
-    """Return what would be done with each file, by kind, as it stands in JSON."""
+    """Return what would be done with each file, by kind, as ``--json`` prints it."""
     failed: dict[str, list[dict[str, Any]]] = {"failed_before": [], "refused": []}
     for _, row in plan.failed_before:
-        failed[kind_of(row)].append(failure_entry(row))
+        failed[failure_kind(row)].append(failure_entry(row))
     return {
         "to_do": [entry(job) for job in plan.waiting],
         "done_before": [entry(job) for job, _ in plan.done_before],
@@ -104,56 +104,56 @@ def plan_report(plan: Batch) -> dict[str, Any]:
 
 
 def entry(job: Job) -> dict[str, str]:
-    """Return what JSON tells of a file that has a mesh, or may have one."""
+    """Return the JSON entry of a file that is done or to be done."""
     return {"in": os.path.abspath(job.source), "out": job.target}
 
 
 def failure_entry(row: dict[str, Any]) -> dict[str, Any]:
-    """Return what JSON tells of a file that has no mesh."""
+    """Return the JSON entry of a file that failed."""
     return {"in": row["in"], "out": row["out"], "reason": row["reason"]}
 
 
-def kind_of(row: dict[str, Any]) -> str:
-    """Say why nothing is to be done with a file that has no mesh."""
+def failure_kind(row: dict[str, Any]) -> str:
+    """Return why a failed file is not tried again: its output exists, or it failed before."""
     return "refused" if row["retry"] else "failed_before"
 
 
-def tell_summary(batch: Batch, options: dict[str, Any]) -> None:
-    """Print counts and failures: sentences on stderr, JSON on stdout."""
+def print_summary(batch: Batch, options: dict[str, Any]) -> None:
+    """Print counts and failures to stderr, and with ``--json`` JSON to stdout."""
     if options["as_json"]:
         report = batch.settings.folder / "report.jsonl"
-        print_result(json.dumps(summary(batch), indent=2), f"all is in {report}")
+        print_stdout(json.dumps(summary(batch), indent=2), f"all is in {report}")
     failed = [result.failure() for result in batch.failures()]
     failed += [f"{path} {reason}" for path, reason in batch.unread]
-    for line in failed[:SHOWN]:
-        tell(f"Failed: {line}")
-    more = len(failed) - SHOWN
+    for line in failed[:MOST_FAILURES]:
+        print_stderr(f"Failed: {line}")
+    more = len(failed) - MOST_FAILURES
     if more > 0:
-        tell(f"and {more} more, see {batch.settings.folder / 'report.jsonl'}")
+        print_stderr(f"and {more} more, see {batch.settings.folder / 'report.jsonl'}")
     if not options["quiet"]:
         for remark in (*remarks(batch), sentence(batch)):
-            tell(remark)
+            print_stderr(remark)
 
 
 def remarks(batch: Batch) -> list[str]:
-    """Say how it was run, and of how many new meshes the report tells more.
+    """Return notes on the run, and how many new meshes have notes or warnings in the report.
 
-    That one is open is counted anyhow.
+    Open meshes are left out: the summary counts them.
     """
     rows = [result.row for result in batch.done]
     inferred = sum(bool(row["inferred"]) for row in rows)
     warned = sum(len(row["warnings"]) > (not row["closed"]) for row in rows)
     report = batch.settings.folder / "report.jsonl"
-    said = [f"Note: {note}" for note in batch.notes]
+    lines = [f"Note: {note}" for note in batch.notes]
     if inferred:
-        said.append(f"Note: spacing, origin or sign of {inferred} was inferred: see {report}")
+        lines.append(f"Note: spacing, origin or sign of {inferred} was inferred: see {report}")
     if warned:
-        said.append(f"Warning: {warned} are from noisy or contradictory values: see {report}")
-    return said
+        lines.append(f"Warning: {warned} are from noisy or contradictory values: see {report}")
+    return lines
 
 
 def sentence(batch: Batch) -> str:
-    """Say in a line what was done."""
+    """Return in one line what was done."""
     facts = summary(batch)
     if not batch.done and not batch.failed and not batch.waiting:
         words = f"nothing to do: {facts['done_before']} done before"
@@ -171,7 +171,7 @@ def sentence(batch: Batch) -> str:
 
 
 def summary(batch: Batch) -> dict[str, Any]:
-    """Return the counts, and the failures each with its reason."""
+    """Return the counts, and each failure with its reason, as ``--json`` prints them."""
     closed = sum(bool(result.row["closed"]) for result in batch.results())
     return {
         "done": len(batch.done),

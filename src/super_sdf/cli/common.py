@@ -1,4 +1,4 @@
-"""What commands share: how help looks, errors in one line."""
+"""What all commands share: help layout, one-line errors, output to stdout and stderr."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from .interrupts import describe_interrupt, exit_code
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
 
-class InterruptedCommand(Exception):  # noqa: N818, it is no error
-    """A signal ended the command: says which, and what a user has."""
+class InterruptedCommand(Exception):  # noqa: N818, not an error
+    """A signal ended the command: the message names the signal and what was kept."""
 
     def __init__(self, kept: str, interrupt: KeyboardInterrupt) -> None:
         super().__init__(f"{describe_interrupt(interrupt)}{kept}")
@@ -23,40 +23,41 @@ class InterruptedCommand(Exception):  # noqa: N818, it is no error
 
 @contextmanager
 def one_line_errors(kept: str = "nothing was written") -> Iterator[None]:
-    """Turn errors into click's: one line, exit code 2 for usage, else 1; 128 + n for signal n.
+    """Turn errors into click's, one line each.
 
-    ``kept`` says what a user has if the command is interrupted.
+    The exit code is 2 for usage errors, 128 + n after signal n, and 1 for all others. ``kept`` says
+    which output exists if the command is interrupted.
     """
     from ..errors import OptionError, SuperSdfError
 
     try:
         yield
     except OptionError as error:
-        raise click.UsageError(in_a_line(error)) from error
+        raise click.UsageError(on_one_line(error)) from error
     except SuperSdfError as error:
-        raise click.ClickException(in_a_line(error)) from error
+        raise click.ClickException(on_one_line(error)) from error
     except MemoryError:
         raise click.ClickException("out of memory: use a smaller --factor or grid") from None
-    except OSError as error:  # what the system refuses is no bug: too few file handles, say
+    except OSError as error:  # the system refused something, such as another file handle: no bug
         raise click.ClickException(describe_os_error(error)) from error
     except KeyboardInterrupt as error:
         raise InterruptedCommand(f"; {kept}", error) from None
 
 
-def in_a_line(error: Exception) -> str:
-    """Return what an error says in one line, whatever names of files or keys it repeats."""
+def on_one_line(error: Exception) -> str:
+    """Return an error's message on one line, even if a file name or key in it has line breaks."""
     return " ".join(str(error).splitlines())
 
 
 def describe_os_error(error: OSError) -> str:
-    """Say in a line what the system refused, and of which file if it tells."""
+    """Describe in one line what the system refused, with the file name if it is known."""
     reason = error.strerror or str(error)
     return f"{error.filename}: {reason}" if error.filename else reason
 
 
 @contextmanager
 def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
-    """Draw a bar on stderr, with the time that is left; None if nobody is there to see it."""
+    """Draw a progress bar with the remaining time on stderr; None if stderr is no terminal."""
     if quiet or not sys.stderr.isatty():
         yield None
         return
@@ -64,17 +65,20 @@ def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[int, int], None]
         yield lambda done, total: shown.update(1000 * done // total - shown.pos)
 
 
-def tell(line: str) -> None:
-    """Print a line to stderr; where that cannot be written there is nobody to tell.
+def print_stderr(line: str) -> None:
+    """Print a line to stderr, if that can be written.
 
-    It stays one line, whatever the names of files and of what is in them hold.
+    Line breaks, which file names may hold, become spaces.
     """
     with suppress(OSError):
         click.echo(line.replace("\n", " "), err=True)
 
 
-def print_result(text: str, kept: str) -> None:
-    """Print to stdout what was asked for; ``kept`` says what a user has if that fails."""
+def print_stdout(text: str, kept: str) -> None:
+    """Print the result that the user asked for to stdout.
+
+    ``kept`` says which output exists if that fails.
+    """
     try:
         click.echo(text)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""The options that ``upsample`` and ``batch`` share: one text, one meaning."""
+"""The options that ``upsample`` and ``batch`` share."""
 
 from __future__ import annotations
 
@@ -9,6 +9,17 @@ import click
 from click.core import ParameterSource
 
 from ..errors import OptionError
+from .choices import (
+    LazyChoice,
+    LazyDefault,
+    convert_default,
+    default_quality,
+    device_option,
+    first,
+    precisions,
+    qualities,
+    signs_inside,
+)
 
 if TYPE_CHECKING:
     from ..convert import ConvertOptions
@@ -17,7 +28,7 @@ if TYPE_CHECKING:
 def parse_numbers(
     ctx: click.Context, param: click.Parameter, value: str | None
 ) -> tuple[float, ...] | None:
-    """Parse one number, or three with commas between: "0.5" or "0.5,0.5,0.5"."""
+    """Parse one number or three separated by commas: "0.5" or "0.5,0.5,0.5"."""
     if value is None:
         return None
     try:
@@ -25,7 +36,7 @@ def parse_numbers(
     except ValueError:
         numbers = ()
     if len(numbers) not in (1, 3):
-        raise click.BadParameter(f"{value!r}: give one number, or three with commas between")
+        raise click.BadParameter(f"{value!r}: give one number, or three separated by commas")
     return numbers
 
 
@@ -33,7 +44,7 @@ UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9}
 
 
 def parse_size(ctx: click.Context, param: click.Parameter, value: str | None) -> int | None:
-    """Parse a number of bytes: "1500M" or "4G", powers of ten."""
+    """Parse a number of bytes, such as "1500M" or "4G"; the units are powers of ten."""
     if value is None:
         return None
     number, unit = value[:-1], value[-1:].upper()
@@ -52,100 +63,106 @@ OPTIONS = (
     click.option(
         "--factor",
         type=int,
-        default=4,
+        default=convert_default("factor"),
         show_default=True,
-        help="How many times finer: 2, 4, 8 or 16.",
+        help="Refinement per axis: 2, 4, 8 or 16 times finer than the grid.",
     ),
     click.option(
         "--spacing",
         callback=parse_numbers,
         metavar="H",
-        help="World distance between samples; from the file or the values if not given.",
+        help="World distance between neighbouring samples. Default: from the file, else estimated "
+        "from the values.",
     ),
     click.option(
         "--origin",
         callback=parse_numbers,
         metavar="X,Y,Z",
-        help="World position of sample (0, 0, 0); from the file, else 0.",
+        help="World position of sample (0, 0, 0). Default: from the file, else 0,0,0.",
     ),
     click.option(
         "--inside",
-        type=click.Choice(["negative", "positive", "auto"]),
-        default="auto",
+        type=LazyChoice(signs_inside),
+        default=convert_default("inside"),
         show_default=True,
-        help="The sign of values inside; auto takes the grid's border for outside.",
+        help="Sign of the values inside the solid; auto takes the border of the grid as outside.",
     ),
     click.option(
         "--offset",
         type=float,
-        default=0.0,
+        default=convert_default("offset"),
         show_default=True,
         metavar="D",
-        help="Mesh the surface at distance D, in world units: a positive one grows the solid, "
-        "whichever sign is inside.",
+        help="Mesh the offset surface at distance D, in world units; a positive D grows the "
+        "solid, whichever sign is inside.",
     ),
-    click.option("--cap", is_flag=True, help="Close a surface that runs out of the grid."),
+    click.option("--cap", is_flag=True, help="Close the surface where it runs out of the grid."),
     click.option(
         "--quality",
-        type=click.Choice(["fast", "base", "best"]),
-        default="base",
+        type=LazyChoice(qualities),
+        default=LazyDefault(default_quality),
         show_default=True,
-        help="The network: fast is small, best asks base eight times.",
+        help="Network: fast is smaller and quicker; best averages base over 8 reflections and "
+        "takes 8 times as long.",
     ),
     click.option(
         "--precision",
-        type=click.Choice(["float32", "int8"]),
-        default="float32",
+        type=LazyChoice(precisions),
+        default=first(precisions),
         show_default=True,
-        help="Of the network: int8 is quicker on the CPU, and a little less exact.",
+        help="Arithmetic of the network: int8 is quicker on the CPU and slightly less accurate.",
     ),
     click.option(
-        "--model", metavar="FILE", help="Another network, an ONNX file, in place of these."
+        "--model", metavar="FILE", help="Use the network in this ONNX file instead of --quality."
     ),
-    click.option(
-        "--device",
-        type=click.Choice(["auto", "cpu", "cuda"]),
-        default="auto",
-        show_default=True,
-        help="Where the network runs; auto takes CUDA where it can.",
-    ),
+    device_option,
     click.option(
         "--max-memory",
         callback=parse_size,
         metavar="SIZE",
-        help="What the process may hold, such as 1500M or 4G; 60 % of what is free if not given. "
+        help="Memory limit of the process, such as 1500M or 4G. Default: 60 % of the free memory. "
         "Larger grids are refined slab by slab, to the same mesh.",
     ),
     click.option(
-        "--threads", type=click.IntRange(0), default=0, help="CPU threads; 0: one a core."
+        "--threads",
+        type=click.IntRange(0),
+        default=0,
+        show_default=True,
+        help="CPU threads; 0 means one per core.",
     ),
 )
 
 
 def conversion_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a command these options, in this order."""
+    """Add the options to a command, in the order of ``OPTIONS``."""
     for option in reversed(OPTIONS):
         command = option(command)
     return command
 
 
-def chosen_model(asked: dict[str, Any]) -> str:
-    """Return the network of ``--quality`` or ``--model``; both together are an error."""
-    if asked["model"] is None:
-        return str(asked["quality"])
+def chosen_model(options: dict[str, Any]) -> str:
+    """Return the value of ``--model`` or ``--quality``.
+
+    Raises
+    ------
+    OptionError
+        If both were given.
+    """
+    if options["model"] is None:
+        return str(options["quality"])
     given = click.get_current_context().get_parameter_source("quality")
     if given is not ParameterSource.DEFAULT:
         raise OptionError(
-            f"--model {asked['model']} takes the place of --quality {asked['quality']}: give one "
+            f"--model {options['model']} replaces --quality {options['quality']}: give only one "
             "of them"
         )
-    return str(asked["model"])
+    return str(options["model"])
 
 
-def make_options(asked: dict[str, Any]) -> ConvertOptions:
-    """Return what is asked of a conversion, out of all options of a command."""
+def make_options(options: dict[str, Any]) -> ConvertOptions:
+    """Return the conversion's options, picked from all options of a command."""
     from dataclasses import fields
 
     from ..convert import ConvertOptions
 
-    return ConvertOptions(**{field.name: asked[field.name] for field in fields(ConvertOptions)})
+    return ConvertOptions(**{field.name: options[field.name] for field in fields(ConvertOptions)})

@@ -1,4 +1,4 @@
-"""Where the program starts: signals and streams are seen to before anything large is imported."""
+"""The entry point: handles signals and missing streams before anything large is imported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command ``evaluate``: parse, call the library, say what happened. No numerics here."""
+"""The command ``evaluate``: quality against reference meshes and other methods."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from typing import Any
 import click
 
 from ..machine.extras import check_modules
-from .common import CONTEXT, InterruptedCommand, one_line_errors, print_result, tell
+from ..pictures.choices import AXES
+from .choices import LazyDefault, convert_default, default_quality
+from .common import CONTEXT, InterruptedCommand, one_line_errors, print_stderr, print_stdout
 from .interrupts import raising_interrupts
 
 EXAMPLES = """\b
@@ -21,7 +23,12 @@ Examples:
   super-sdf evaluate meshes/ --sizes 32 64 --experiments noise factors --out report/
   super-sdf evaluate a.ply b.ply --sizes 32 --peers rfta --out report/
 """
-# Options that the plan takes as they are; of a list, each entry once.
+# The names that ``evaluation`` knows: help must show them without the extra ``eval``, which that
+# room needs; a test compares.
+METHODS = ("mc", "mc-lewiner", "trilinear", "bspline", "ours", "bound")
+EXPERIMENTS = ("factors", "noise", "iterated", "scale", "timings")
+PEERS = ("rfta", "dual-contouring")
+# Options that the plan takes as they are, and lists, from which repeated entries are dropped.
 NUMBERS = ("factor", "model", "experiment_shapes", "peer_shapes", "peer_size", "peer_limit")
 LISTS = ("sizes", "experiments", "peers")
 
@@ -29,11 +36,11 @@ LISTS = ("sizes", "experiments", "peers")
 class ListCommand(click.Command):
     """A command whose repeatable options take several values: ``--sizes 32 64 128``.
 
-    An option's values end at the first word that is not one of them.
+    The values of such an option end at the first word that is not a valid value.
     """
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Write each further value of such an option as the option itself once more."""
+        """Repeat the option before each of its further values, as click expects it."""
         lists = {
             name: param
             for param in self.params
@@ -44,7 +51,7 @@ class ListCommand(click.Command):
         current: click.Option | None = None
         for word in args:
             follows = len(spelt) > 1 and spelt[-2] in lists
-            if current and follows and takes(current, word, ctx):
+            if current and follows and accepts(current, word, ctx):
                 spelt += [current.opts[0]]
             elif not (spelt and spelt[-1] in lists):
                 current = lists.get(word)
@@ -52,8 +59,8 @@ class ListCommand(click.Command):
         return super().parse_args(ctx, spelt)
 
 
-def takes(option: click.Option, word: str, ctx: click.Context) -> bool:
-    """Say whether a word is a value of an option."""
+def accepts(option: click.Option, word: str, ctx: click.Context) -> bool:
+    """Return whether a word is a valid value of an option."""
     try:
         option.type.convert(word, option, ctx)
     except click.UsageError:
@@ -62,15 +69,18 @@ def takes(option: click.Option, word: str, ctx: click.Context) -> bool:
 
 
 @click.command(
+    "evaluate",
     cls=ListCommand,
     context_settings=CONTEXT,
     epilog=EXAMPLES,
-    short_help="Measure quality on your own meshes.",
+    short_help="Measure the quality on your own meshes.",
 )
 @click.argument(
     "sources", metavar="MESHES...", nargs=-1, required=True, type=click.Path(path_type=Path)
 )
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the report.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, help="Folder for the report."
+)
 @click.option(
     "--sizes",
     multiple=True,
@@ -78,81 +88,101 @@ def takes(option: click.Option, word: str, ctx: click.Context) -> bool:
     default=(32, 64, 128),
     show_default="32 64 128",
     metavar="N...",
-    help="Samples along each axis.",
+    help="Grid sizes: samples along each axis.",
 )
-@click.option("--factor", type=int, default=4, show_default=True, help="How many times finer.")
+@click.option(
+    "--factor",
+    type=int,
+    default=convert_default("factor"),
+    show_default=True,
+    help="Refinement per axis.",
+)
 @click.option(
     "--methods",
     multiple=True,
-    type=click.Choice(["mc", "mc-lewiner", "trilinear", "bspline", "ours", "bound"]),
+    type=click.Choice(METHODS),
     metavar="NAME...",
-    help="Of mc, mc-lewiner, trilinear, bspline, ours, bound; all unless given.",
+    help=f"Methods to compare: {', '.join(METHODS)}. Default: all.",
 )
 @click.option(
     "--experiments",
     multiple=True,
-    type=click.Choice(["factors", "noise", "iterated", "scale", "timings"]),
+    type=click.Choice(EXPERIMENTS),
     metavar="NAME...",
-    help="The paper's, beside what it printed: factors, noise, iterated, scale, timings.",
+    help=f"Experiments of the paper to repeat, beside its results: {', '.join(EXPERIMENTS)}.",
 )
 @click.option(
     "--experiment-shapes",
     type=click.IntRange(1),
     default=10,
     show_default=True,
-    help="Shapes that the experiments take, spread over the list.",
+    help="Number of shapes for the experiments, spread over the list.",
 )
 @click.option(
     "--peers",
     multiple=True,
-    type=click.Choice(["rfta", "dual-contouring"]),
+    type=click.Choice(PEERS),
     metavar="NAME...",
-    help="Other methods: rfta, dual-contouring. Minutes a shape; wants the extra peers.",
+    help=f"Published methods to run as well: {', '.join(PEERS)}. They take minutes per shape and "
+    "need the extra peers.",
 )
 @click.option(
-    "--peer-shapes", type=click.IntRange(1), default=5, show_default=True, help="Shapes for them."
+    "--peer-shapes",
+    type=click.IntRange(1),
+    default=5,
+    show_default=True,
+    help="Number of shapes for the peers.",
 )
-@click.option("--peer-size", type=int, default=32, show_default=True, help="Size for them.")
+@click.option(
+    "--peer-size", type=int, default=32, show_default=True, help="Grid size for the peers."
+)
 @click.option(
     "--peer-limit",
     type=float,
     default=900,
     show_default=True,
     metavar="SECONDS",
-    help="Time for each of them on each shape.",
+    help="Time limit for each peer on each shape.",
 )
-@click.option("--limit", type=click.IntRange(1), help="Take so many meshes, spread over the list.")
 @click.option(
-    "--model", default="base", show_default=True, help="fast, base, best, or an ONNX file."
+    "--limit", type=click.IntRange(1), help="Use only this many meshes, spread over the list."
 )
-@click.option("--jobs", type=click.IntRange(1), help="Processes, one a core at most.")
+@click.option(
+    "--model",
+    default=LazyDefault(default_quality),
+    show_default=True,
+    help="Shipped network (fast, base or best) or an ONNX file.",
+)
+@click.option(
+    "--jobs", type=click.IntRange(1), help="Processes. Default and maximum: one per core."
+)
 @click.option(
     "--up",
-    type=click.Choice(["x", "y", "z"]),
+    type=click.Choice(AXES),
     default="z",
     show_default=True,
-    help="The axis that points up in pictures.",
+    help="Axis that points up in pictures.",
 )
-@click.option("--no-pictures", is_flag=True, help="Leave out the best and worst shapes.")
+@click.option("--no-pictures", is_flag=True, help="Do not draw the best and worst shapes.")
 @click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
-def evaluate(sources: tuple[Path, ...], **options: Any) -> None:
-    """Measure super-sdf, its baselines and its bound on closed reference meshes.
+def evaluate_command(sources: tuple[Path, ...], **options: Any) -> None:
+    """Measure super-sdf, its baselines and its upper bound on closed reference meshes.
 
-    MESHES are files or folders. Each is scaled to a box diagonal of 1 and sampled at every size;
-    what each method makes of the samples is compared with the mesh itself. Killed and started
-    again, it goes on where it was. OUT/report.md has the tables, plots and pictures; OUT is a new
-    folder, an empty one, or that of an earlier evaluation.
+    MESHES are mesh files or folders of them. Each mesh is scaled to a box diagonal of 1 and sampled
+    at every size; the surface that a method reconstructs from the samples is compared with the
+    mesh. OUT/report.md has the tables, plots and pictures. OUT is a new or empty folder, or that
+    of an earlier evaluation, which is resumed.
     """
     with one_line_errors():
         check_modules("evaluate", "eval")
-        with raising_interrupts():  # there are processes to end, and results to keep
-            left_out = run_evaluate(sources, options)
-    if left_out:
+        with raising_interrupts():  # to end worker processes and keep results
+            is_complete = run_evaluate(sources, options)
+    if not is_complete:
         sys.exit(1)
 
 
 def run_evaluate(sources: tuple[Path, ...], options: dict[str, Any]) -> bool:
-    """Plan, measure, report; say which shapes were left out, and return whether any was."""
+    """Plan, measure, report; return whether every shape was measured."""
     from ..evaluation.evaluate import evaluate
     from ..evaluation.methods import METHODS
     from ..evaluation.plan import Plan, find_meshes, spread
@@ -171,7 +201,7 @@ def run_evaluate(sources: tuple[Path, ...], options: dict[str, Any]) -> bool:
         **{name: options[name] for name in NUMBERS},
         **once,
     )
-    with interrupts_explained(options["out"]):
+    with describing_interrupts(options["out"]):
         outcome = evaluate(
             plan,
             options["out"],
@@ -180,16 +210,16 @@ def run_evaluate(sources: tuple[Path, ...], options: dict[str, Any]) -> bool:
             progress=None if options["quiet"] else progress_lines(),
         )
     for entry in outcome.left_out:
-        tell(f"Left out: {entry.shape}: {entry.reason}")
+        print_stderr(f"Left out: {entry.shape}: {entry.reason}")
     if not options["quiet"]:
-        print_result(outcome.report.read_text(encoding="utf-8"), f"{outcome.report} is written")
-        tell(f"{outcome.report}")
-    return bool(outcome.left_out)
+        print_stdout(outcome.report.read_text(encoding="utf-8"), f"{outcome.report} is written")
+        print_stderr(f"{outcome.report}")
+    return not outcome.left_out
 
 
 @contextmanager
-def interrupts_explained(out: Path) -> Iterator[None]:
-    """Say of an interrupt what is kept, if anything is."""
+def describing_interrupts(out: Path) -> Iterator[None]:
+    """Let an interrupt's message name the results that are kept, if there are any."""
     from ..evaluation.folder import ROWS
 
     rows = out / ROWS
@@ -198,17 +228,17 @@ def interrupts_explained(out: Path) -> Iterator[None]:
     except KeyboardInterrupt as interrupt:
         if not rows.exists():
             raise
-        kept = f": what was measured is kept in {rows}; the same command goes on from there"
+        kept = f": results so far are kept in {rows}; run the same command again to resume"
         raise InterruptedCommand(kept, interrupt) from None
 
 
 def progress_lines() -> Callable[[int, int, str, float], None]:
-    """Return a function that prints a line a task, with the time that the rest will take."""
+    """Return a function that prints one line per task, with the remaining time."""
     start = time.monotonic()
 
     def show(done: int, total: int, what: str, share: float) -> None:
         spent = time.monotonic() - start
         left = spent / share * (1 - share)
-        tell(f"{done} of {total}: {what}, {spent:.0f} s, {left:.0f} s left")
+        print_stderr(f"{done} of {total}: {what}, {spent:.0f} s, {left:.0f} s left")
 
     return show

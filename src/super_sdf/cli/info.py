@@ -1,4 +1,4 @@
-"""The command ``info``: versions, devices and networks, and with --check whether they work."""
+"""The command ``info``: versions, devices and networks; with ``--check``, whether they work."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from .. import __version__
+from .choices import LazyChoice, devices, first
 from .common import CONTEXT, one_line_errors
 
 EXAMPLES = """\b
@@ -19,31 +20,35 @@ Examples:
 
 
 @click.command(
-    context_settings=CONTEXT, epilog=EXAMPLES, short_help="Show versions, devices and networks."
+    "info",
+    context_settings=CONTEXT,
+    epilog=EXAMPLES,
+    short_help="Show versions, devices and networks, or check them.",
 )
-@click.option("--check", is_flag=True, help="Try everything; exit code 1 if something fails.")
+@click.option("--check", is_flag=True, help="Test the installation; exit code 1 if a check fails.")
 @click.option(
     "--device",
-    type=click.Choice(["auto", "cpu", "cuda"]),
-    default="auto",
+    type=LazyChoice(devices),
+    default=first(devices),
     show_default=True,
-    help="With --check: cpu leaves CUDA out, cuda insists on it.",
+    help="With --check: cpu skips CUDA; cuda makes it a failure if CUDA does not work.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
-def info(check: bool, device: str, as_json: bool) -> None:
-    """Show versions, devices, and the shipped networks with their cards.
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def info_command(check: bool, device: str, as_json: bool) -> None:
+    """Show versions, devices, and the shipped networks with their metadata.
 
-    With --check also whether they work here: each network is run on a ball, whose distances are
-    known, on the CPU and on CUDA, and what is missing is named with the way to install it.
+    With --check, test instead whether they work on this machine: each network is run on a ball,
+    whose distances are known, on the CPU and on CUDA. What is missing is listed with the command
+    that installs it.
     """
     with one_line_errors():
         if check:
-            sys.exit(0 if tell_checks(device, as_json) else 1)
-        sys.exit(0 if tell_facts(as_json) else 1)
+            sys.exit(0 if print_checks(device, as_json) else 1)
+        sys.exit(0 if print_facts(as_json) else 1)
 
 
-def tell_checks(device: str, as_json: bool) -> bool:
-    """Run the checks and print each as it ends; return whether none failed."""
+def print_checks(device: str, as_json: bool) -> bool:
+    """Run the checks and print each result as it comes; return whether none failed."""
     from dataclasses import asdict
 
     from ..selftest import FAILED, run_checks
@@ -64,8 +69,8 @@ def tell_checks(device: str, as_json: bool) -> bool:
     return not failed
 
 
-def tell_facts(as_json: bool) -> bool:
-    """Print versions, devices and cards; return whether all networks could be loaded."""
+def print_facts(as_json: bool) -> bool:
+    """Print versions, devices and the networks' cards; return whether all networks load."""
     facts = gather_facts()
     works = bool(facts["models"]) and not any("fault" in card for card in facts["models"].values())
     if as_json:
@@ -84,14 +89,14 @@ def tell_facts(as_json: bool) -> bool:
 
 
 def gather_facts() -> dict[str, Any]:
-    """Return versions, devices and cards."""
+    """Return versions, devices and the networks' cards."""
     import platform
 
     from ..network.cuda import available_devices
     from ..network.network import NO_NETWORKS, shipped_models
     from ..network.onnx import ort
 
-    models = {name: find_card(name) for name in shipped_models()}
+    models = {name: load_card(name) for name in shipped_models()}
     facts = {
         "super-sdf": __version__,
         "python": platform.python_version(),
@@ -102,8 +107,8 @@ def gather_facts() -> dict[str, Any]:
     return facts if models else {**facts, "fault": NO_NETWORKS}
 
 
-def find_card(name: str) -> dict[str, Any]:
-    """Return a shipped network's card, or why it cannot be loaded as its ``fault``."""
+def load_card(name: str) -> dict[str, Any]:
+    """Return the metadata of a shipped network, or under ``fault`` why it cannot be loaded."""
     from ..errors import SuperSdfError
     from ..network.network import load_network
 

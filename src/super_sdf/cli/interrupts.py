@@ -1,7 +1,8 @@
-"""Signals that ask a command to end: it does, in a line, with nothing half-written left behind.
+"""Signals that end a command: it prints one line and leaves no half-written file.
 
-Until a command begins to write it ends at once: an exception in the midst of an import would come
-out as something else. From then on the signal is an exception, which removes what was begun.
+Until a command begins to write, a signal ends the process at once: an exception raised during an
+import may come out as another error. From then on the signal raises an exception, so that files
+that were begun are removed.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ Handler = Callable[[int, FrameType | None], None]
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal has asked this process to end."""
+    """A signal that asks this process to end was received."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
@@ -28,12 +29,12 @@ class Interrupted(KeyboardInterrupt):
 
 
 def exit_code(error: KeyboardInterrupt) -> int:
-    """Return the exit code of a process that a signal ended: 128 and the signal's number."""
+    """Return the exit code of a process that a signal ended: 128 plus the signal's number."""
     return 128 + _number(error)
 
 
 def describe_interrupt(error: KeyboardInterrupt) -> str:
-    """Say what ended the command."""
+    """Describe what ended the command."""
     return _describe(_number(error))
 
 
@@ -48,14 +49,14 @@ def _describe(number: int) -> str:
 
 @contextmanager
 def ending_at_once() -> Iterator[None]:
-    """Let signals end the process within the block, as long as it writes nothing."""
+    """End the process on a signal within the block, which must not write files."""
     with _handling(_end):
         yield
 
 
 @contextmanager
 def raising_interrupts() -> Iterator[None]:
-    """Let signals raise ``Interrupted`` within the block, for it has files to remove."""
+    """Raise ``Interrupted`` on a signal within the block, so that it can remove its files."""
     with _handling(_raise):
         yield
 
@@ -63,17 +64,17 @@ def raising_interrupts() -> Iterator[None]:
 @contextmanager
 def _handling(handler: Handler) -> Iterator[None]:
     """Install a handler for the signals that are not ignored (``nohup`` ignores SIGHUP)."""
-    if threading.current_thread() is not threading.main_thread():  # only that can, and gets them
+    if threading.current_thread() is not threading.main_thread():  # only it may install handlers
         yield
         return
     before = {number: signal.getsignal(number) for number in SIGNALS}
-    heard = [number for number in SIGNALS if before[number] not in (signal.SIG_IGN, None)]
+    handled = [number for number in SIGNALS if before[number] not in (signal.SIG_IGN, None)]
     try:
-        for number in heard:
+        for number in handled:
             signal.signal(number, handler)
         yield
     finally:
-        for number in heard:
+        for number in handled:
             signal.signal(number, before[number])
 
 

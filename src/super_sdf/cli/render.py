@@ -1,4 +1,4 @@
-"""The command ``render``: parse, call the library. No numerics here."""
+"""The command ``render``: pictures of meshes, or a cross-section of a grid."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from click.core import ParameterSource
 
 from ..errors import OptionError
 from ..machine.extras import EXTRAS, check_modules
+from ..pictures.choices import AXES, COLOURS
+from .choices import convert_default
 from .common import CONTEXT, one_line_errors
 from .interrupts import raising_interrupts
 
@@ -19,12 +21,13 @@ Examples:
   super-sdf render fine.ply error.png --colour error --reference true.ply
   super-sdf render part.npz section.png --axis z
 """
-# Options that have a meaning for one kind of source only.
+# Options that apply to one kind of source only.
 FOR_GRIDS = ("axis", "at", "factor")
 FOR_MESHES = ("colour", "reference", "top", "up", "zoom")
 
 
 @click.command(
+    "render",
     context_settings=CONTEXT,
     epilog=EXAMPLES,
     short_help="Draw meshes, or a cross-section of a grid.",
@@ -35,50 +38,68 @@ FOR_MESHES = ("colour", "reference", "top", "up", "zoom")
 @click.argument("target", metavar="OUT.png", type=click.Path(path_type=Path))
 @click.option(
     "--colour",
-    type=click.Choice(["shaded", "normal", "error"]),
-    default="shaded",
+    type=click.Choice(COLOURS),
+    default=COLOURS[0],
     show_default=True,
-    help="By light, by the direction of the face, or by the distance to the reference.",
+    help="shaded: lit; normal: by face normal; error: by distance to the reference.",
 )
 @click.option(
-    "--reference", type=click.Path(path_type=Path), help="The mesh that errors are measured to."
+    "--reference", type=click.Path(path_type=Path), help="Reference mesh for --colour error."
 )
 @click.option(
     "--top",
     type=float,
     metavar="D",
-    help="Distance at the end of the colour bar.",
+    help="Distance at the end of the colour bar. Default: the 99th percentile of the errors.",
 )
 @click.option(
     "--up",
-    type=click.Choice(["x", "y", "z"]),
+    type=click.Choice(AXES),
     default="z",
     show_default=True,
-    help="The axis that points up.",
+    help="Axis that points up.",
 )
-@click.option("--zoom", type=float, default=1.0, show_default=True, help="Closer in.")
 @click.option(
-    "--size", type=click.IntRange(100), default=700, show_default=True, help="Pixels a panel."
+    "--zoom",
+    type=float,
+    default=1.0,
+    show_default=True,
+    help="Magnification; at 1 all meshes fit into the picture.",
+)
+@click.option(
+    "--size",
+    type=click.IntRange(100),
+    default=700,
+    show_default=True,
+    help="Pixels along the long side of each panel.",
 )
 @click.option(
     "--axis",
-    type=click.Choice(["x", "y", "z"]),
+    type=click.Choice(AXES),
     default="z",
     show_default=True,
-    help="Of a grid: the axis that the section cuts across.",
+    help="For a grid: axis normal to the section plane.",
 )
 @click.option(
-    "--at", type=float, metavar="D", help="Of a grid: where on that axis; else the middle."
+    "--at",
+    type=float,
+    metavar="D",
+    help="For a grid: world position of the section on that axis. Default: mid-surface.",
 )
 @click.option(
-    "--factor", type=int, default=4, show_default=True, help="Of a grid: how many times finer."
+    "--factor",
+    type=int,
+    default=convert_default("factor"),
+    show_default=True,
+    help="For a grid: refinement per axis.",
 )
 @click.option("--force", is_flag=True, help="Replace OUT if it exists.")
-def render(sources: tuple[Path, ...], target: Path, **options: Any) -> None:
-    """Draw meshes side by side from one camera, or a section of a grid before and after.
+def render_command(sources: tuple[Path, ...], target: Path, **options: Any) -> None:
+    """Draw meshes side by side from one camera, or a cross-section of a grid.
 
-    MESH is any file that trimesh reads; a single .npy or .npz grid is drawn as a cross-section in
-    false colours with its zero line, as it is and as super-sdf refines it. No display is needed.
+    MESH is any mesh file that trimesh reads. A single .npy or .npz grid is drawn instead as a
+    cross-section in false colours with its zero line, before and after refinement. No display is
+    needed.
     """
     from ..files.grids import GRID_SUFFIXES
 
@@ -93,26 +114,26 @@ def render(sources: tuple[Path, ...], target: Path, **options: Any) -> None:
 
 
 def check_given(others: tuple[str, ...], drawn: str) -> None:
-    """Raise if an option was given that has no meaning for what is drawn."""
+    """Raise OptionError if an option was given that does not apply to what is drawn."""
     context = click.get_current_context()
     for name in others:
         if context.get_parameter_source(name) is not ParameterSource.DEFAULT:
-            raise OptionError(f"--{name} has no meaning for {drawn}: leave it out")
+            raise OptionError(f"--{name} does not apply to {drawn}: leave it out")
 
 
 def check_picture(target: Path, *, force: bool) -> None:
-    """Raise if a picture cannot be written there; asked before the work starts."""
+    """Raise if the picture cannot be written; called before the work starts."""
     from ..files.output import check_free
 
     if target.suffix.lower() != ".png":
-        raise OptionError(f"{target} is no picture file: give .png")
+        raise OptionError(f"{target} is not a picture file: give .png")
     check_free(target, force=force)
 
 
 def render_meshes(sources: tuple[Path, ...], target: Path, options: dict[str, Any]) -> None:
-    """Draw meshes; by their errors, if there is a reference to compare with."""
+    """Draw meshes side by side; with a reference, coloured by their distance to it."""
     from ..pictures.page import check_page
-    from ..pictures.rendering import Panel, check_numbers, render_panels, vertex_errors
+    from ..pictures.rendering import Layout, Panel, check_numbers, render_panels, vertex_errors
     from ..truth.mesh_files import read_mesh
     from ..truth.solid import Solid
 
@@ -128,9 +149,10 @@ def render_meshes(sources: tuple[Path, ...], target: Path, options: dict[str, An
     else:
         reference = Solid(read_mesh(options["reference"]))
         panels = [Panel(mesh, name, vertex_errors(mesh, reference)) for name, mesh in meshes]
-    chosen = {name: options[name] for name in ("colour", "up", "zoom", "size", "top", "force")}
+    layout = Layout(zoom=options["zoom"], size=options["size"])
+    chosen = {name: options[name] for name in ("colour", "up", "top", "force")}
     with raising_interrupts():
-        render_panels(panels, target, **chosen)
+        render_panels(panels, target, layout=layout, **chosen)
 
 
 def render_grid(sources: tuple[Path, ...], target: Path, options: dict[str, Any]) -> None:
@@ -144,7 +166,7 @@ def render_grid(sources: tuple[Path, ...], target: Path, options: dict[str, Any]
     check_factor(options["factor"])
     check_section(options["size"])
     grid = read_grid(sources[0])
-    find_plane(grid, options["axis"], options["at"])  # raises if there is none
+    find_plane(grid, options["axis"], options["at"])  # raises if it is outside the grid
     field = upsample(grid, load_network(), options["factor"])
     chosen = {name: options[name] for name in ("axis", "at", "size", "force")}
     with raising_interrupts():

@@ -1,4 +1,4 @@
-"""The command ``sample``: parse, call the library, say what happened. No numerics here."""
+"""The command ``sample``: a closed mesh to a signed distance grid."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from click.core import ParameterSource
 
 from ..errors import OptionError
 from ..machine.extras import check_modules
-from .common import CONTEXT, one_line_errors, progress_bar, tell
+from .common import CONTEXT, one_line_errors, print_stderr, progress_bar
 from .interrupts import raising_interrupts
 
 EXAMPLES = """\b
@@ -22,41 +22,47 @@ Examples:
 
 
 @click.command(
-    context_settings=CONTEXT, epilog=EXAMPLES, short_help="Make a grid from a closed mesh."
+    "sample",
+    context_settings=CONTEXT,
+    epilog=EXAMPLES,
+    short_help="Sample a closed mesh as a signed distance grid.",
 )
 @click.argument("source", metavar="MESH", type=click.Path(path_type=Path))
 @click.argument("target", metavar="OUT", type=click.Path(path_type=Path))
 @click.option("-n", "samples", type=int, help="Samples along the longest axis.")
-@click.option("--spacing", type=float, metavar="H", help="World distance between samples instead.")
+@click.option(
+    "--spacing", type=float, metavar="H", help="World distance between samples, instead of -n."
+)
 @click.option(
     "--padding",
     type=float,
     default=2.0,
     show_default=True,
-    help="Voxels between the mesh's box and the outer samples.",
+    help="Voxels between the bounding box of the mesh and the outermost samples.",
 )
 @click.option(
     "--frame",
     type=click.Choice(["world", "unit"]),
     default="world",
     show_default=True,
-    help="unit: box diagonal scaled to 1, centred in a cube of side 1 (n^3 voxel centres).",
+    help="world keeps the coordinates of the mesh; unit scales its box diagonal to 1 and centres "
+    "it in a unit cube, sampled at n^3 voxel centres.",
 )
 @click.option(
     "--band",
     type=float,
     metavar="VOXELS",
-    help="Exact only so near to the surface, cut off beyond; else all samples are exact up to "
-    "256^3, and those within 4 voxels in larger grids.",
+    help="Exact distances up to this many voxels from the surface, clamped beyond. Default: exact "
+    "everywhere up to 256^3 samples, within 4 voxels in larger grids.",
 )
-@click.option("--allow-open", is_flag=True, help="Guess what is inside a mesh with holes.")
+@click.option("--allow-open", is_flag=True, help="Accept a mesh with holes; its inside is a guess.")
 @click.option("--force", is_flag=True, help="Replace OUT if it exists.")
 @click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
-def sample(source: Path, target: Path, **options: Any) -> None:
-    """Write the signed distances to the closed mesh MESH on a regular grid, OUT.
+def sample_command(source: Path, target: Path, **options: Any) -> None:
+    """Sample the signed distance to the closed mesh MESH on a regular grid and write it to OUT.
 
-    MESH is any file that trimesh reads. OUT is .npz (keys values, spacing, origin), in the mesh's
-    units, negative inside.
+    MESH is any mesh file that trimesh reads. OUT is a .npz file (keys values, spacing, origin);
+    its values are in the units of the mesh and negative inside.
     """
     with one_line_errors():
         check_modules("sample", "eval")
@@ -64,7 +70,7 @@ def sample(source: Path, target: Path, **options: Any) -> None:
 
 
 def run_sample(source: Path, target: Path, options: dict[str, Any]) -> None:
-    """Read the mesh, lay out the grid, sample it, write it, say what was found."""
+    """Read the mesh, lay out the grid, sample it, write it, print notes and the size."""
     from ..evaluation.metrics import normalise
     from ..files.grids import check_grid_target, write_grid
     from ..truth.sampling import check_numbers, fitted_layout, sample_solid, unit_layout
@@ -93,7 +99,7 @@ def run_sample(source: Path, target: Path, options: dict[str, Any]) -> None:
         write_grid(grid, target, force=options["force"])
     if not options["quiet"]:
         for note in (*notes, *grid.notes):
-            tell(f"Note: {note}")
+            print_stderr(f"Note: {note}")
         size = " x ".join(map(str, grid.shape))
         seconds = time.perf_counter() - start
-        tell(f"{target}: {size} samples, spacing {grid.voxel_size:g}, {seconds:.1f} s")
+        print_stderr(f"{target}: {size} samples, spacing {grid.voxel_size:g}, {seconds:.1f} s")

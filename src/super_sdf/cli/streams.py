@@ -1,4 +1,4 @@
-"""Standard streams that are closed, full or gone: no reason to lose a mesh, or to print into it."""
+"""Standard streams that are closed, full or broken: they must not cost the user the mesh."""
 
 from __future__ import annotations
 
@@ -7,39 +7,40 @@ import sys
 from contextlib import suppress
 from typing import TextIO
 
-# To write to what is open for reading fails as it does where the stream is closed.
+# Writing to a descriptor that is open for reading fails, as writing to a closed one does.
 MODES = (os.O_RDONLY, os.O_RDONLY, os.O_WRONLY)
 
 
 def open_missing_streams() -> None:
-    """Open what was closed before the start: the next file would take its number, and its output.
+    """Open null devices in place of standard streams that were closed before the start.
 
-    What is written to stderr is lost then; to stdout it is an error.
+    Otherwise the next file that is opened would get the stream's number, and its output. Text for
+    a missing stderr is lost; text for a missing stdout is an error.
     """
     for number, mode in enumerate(MODES):
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, mode)  # takes the lowest number that is free: this one
+            os.open(os.devnull, mode)  # takes the lowest free number, which is this one
     if sys.stdout is None:
         sys.stdout = os.fdopen(1, "w", closefd=False)
     if sys.stderr is None:
         sys.stderr = os.fdopen(2, "w", closefd=False, errors="backslashreplace")
 
 
-def settle_streams() -> None:
-    """Drop what cannot be written in the end: Python would complain of it on its way out."""
+def discard_unwritable_output() -> None:
+    """Drop buffered output that cannot be written: Python would complain about it at exit."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
         except (OSError, ValueError):
-            _drop(stream)
+            _redirect_to_null(stream)
 
 
-def _drop(stream: TextIO) -> None:
-    """Lead a stream to nowhere, with what it holds."""
+def _redirect_to_null(stream: TextIO) -> None:
+    """Redirect a stream, with its buffer, to the null device."""
     with suppress(OSError, ValueError):
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, stream.fileno())
-        os.close(nowhere)
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, stream.fileno())
+        os.close(null)
         stream.flush()

@@ -1,1 +1,1 @@
-"""Grids from files, meshes to files. It may import ``grid``, ``mesh`` and ``machine``."""
+"""Reading grid files and writing mesh files. It may import ``grid``, ``mesh`` and ``machine``."""

@@ -1,7 +1,7 @@
-"""Members of ``.npz`` archives, unpacked in small pieces and checked against their sum.
+"""Members of ``.npz`` archives, decompressed in small pieces and checked against their checksum.
 
-Python's zipfile unpacks as much at once as some kilobytes of bzip2 or LZMA give, which can be
-gigabytes. So only the packed bytes are taken from it.
+Python's zipfile decompresses whatever some kilobytes of bzip2 or LZMA hold at once, which can be
+gigabytes. So only the compressed bytes are read with it.
 """
 
 from __future__ import annotations
@@ -16,80 +16,85 @@ from typing import Any, Protocol
 
 from ..errors import FileError
 
-PIECE = 1 << 16  # packed bytes at a time
-LARGEST_DICTIONARY = 1 << 26  # bytes that an LZMA member may make the decoder take
+PIECE = 1 << 16  # compressed bytes at a time
+LARGEST_DICTIONARY = 1 << 26  # bytes that the decoder may allocate for an LZMA member
 
 
 class Codec(Protocol):
-    """A decompressor as those of bz2 and lzma."""
+    """The interface of the decompressors of bz2 and lzma."""
 
     @property
     def needs_input(self) -> bool:
-        """Whether it has given all that it can."""
+        """Whether it needs more compressed bytes before it can return anything."""
         ...
 
     def decompress(self, data: bytes, max_length: int) -> bytes:
-        """Take packed bytes and return at most ``max_length`` unpacked ones."""
+        """Decompress data into at most ``max_length`` bytes."""
         ...
 
 
 class Stored:
-    """What is not compressed."""
+    """A "decompressor" for data that is not compressed."""
 
     needs_input = True
 
     def decompress(self, data: bytes, max_length: int) -> bytes:
-        """Return the data: no more is given than is asked for."""
+        """Return the data, which is never longer than ``max_length``."""
         return data
 
 
 class Deflate:
-    """Raw deflate."""
+    """A decompressor for raw deflate."""
 
     def __init__(self) -> None:
         self._inner = zlib.decompressobj(-zlib.MAX_WBITS)
 
     @property
     def needs_input(self) -> bool:
-        """Whether it has given all that it can."""
+        """Whether it needs more compressed bytes before it can return anything."""
         return not self._inner.unconsumed_tail
 
     def decompress(self, data: bytes, max_length: int) -> bytes:
-        """Take packed bytes and return at most ``max_length`` unpacked ones."""
+        """Decompress data into at most ``max_length`` bytes."""
         return self._inner.decompress(self._inner.unconsumed_tail + data, max_length)
 
 
 class Member:
-    """A member of an archive, unpacked as it is read.
+    """A member of an archive, decompressed as it is read.
 
     Parameters
     ----------
     archive : ZipFile
         The archive.
     info : ZipInfo
-        What its directory says of the member.
+        The member's entry in the directory of the archive.
     name : str
-        What errors call it.
+        The name of the member in error messages.
+
+    Raises
+    ------
+    FileError
+        If it is encrypted, damaged, or compressed by an unknown method.
     """
 
     def __init__(self, archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str) -> None:
         if info.flag_bits & 1:
             raise FileError(f"{name} is encrypted: save it without a password")
         self.name, self.left = name, info.file_size
-        self._wanted_sum, self._sum = info.CRC, 0
+        self._expected_checksum, self._checksum = info.CRC, 0
         packed: Any = copy.copy(info)
         packed.compress_type, packed.file_size = zipfile.ZIP_STORED, info.compress_size
-        packed.CRC = None  # that of the unpacked bytes
+        packed.CRC = None  # the checksum is of the decompressed bytes
         try:
             self._packed = archive.open(packed)
             self._codec = self._make_codec(info.compress_type)
         except FileError:
             raise
-        except Exception as error:  # zipfile raises what a wrong field leads to
+        except Exception as error:  # zipfile raises many kinds of error on damaged fields
             raise self._damaged(str(error)) from None
 
     def _make_codec(self, kind: int) -> Codec:
-        """Return what unpacks the member."""
+        """Return the decompressor of the member."""
         if kind == zipfile.ZIP_STORED:
             return Stored()
         if kind == zipfile.ZIP_DEFLATED:
@@ -99,15 +104,15 @@ class Member:
         if kind == zipfile.ZIP_LZMA:
             return self._make_lzma()
         raise FileError(
-            f"{self.name} is compressed in an unknown way ({kind}): use np.savez_compressed"
+            f"{self.name} is compressed by an unknown method ({kind}): use np.savez_compressed"
         )
 
     def _make_lzma(self) -> Codec:
-        """Return what unpacks LZMA, whose settings stand before the data."""
+        """Return a decompressor for LZMA; its settings precede the data."""
         head = self._packed.read(9)
         size, settings, dictionary = struct.unpack("<2xHBI", head) if len(head) == 9 else (0, 0, 0)
         if size != 5 or settings >= 225 or dictionary > LARGEST_DICTIONARY:
-            raise self._damaged("its LZMA settings make no sense")
+            raise self._damaged("its LZMA settings are invalid")
         options = {
             "id": lzma.FILTER_LZMA1,
             "dict_size": max(dictionary, 4096),
@@ -118,12 +123,12 @@ class Member:
         return lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=[options])
 
     def read(self, count: int) -> bytes:
-        """Return the next bytes, as many as asked for, fewer only at the end.
+        """Return the next ``count`` bytes, or fewer at the end.
 
         Raises
         ------
         FileError
-            If the packed data is damaged, or ends too early.
+            If the compressed data is damaged or ends too early.
         """
         count = min(count, self.left)
         pieces = []
@@ -132,20 +137,20 @@ class Member:
             pieces.append(piece)
             count -= len(piece)
             self.left -= len(piece)
-            self._sum = zlib.crc32(piece, self._sum)
-        if pieces and not self.left and self._sum != self._wanted_sum:
-            raise self._damaged("its check sum differs")
+            self._checksum = zlib.crc32(piece, self._checksum)
+        if pieces and not self.left and self._checksum != self._expected_checksum:
+            raise self._damaged("its checksum is wrong")
         return b"".join(pieces)
 
     def _unpack(self, most: int) -> bytes:
-        """Return some bytes."""
+        """Return at least one and at most ``most`` bytes."""
         while True:
             data = b""
             try:
                 if self._codec.needs_input:
                     data = self._packed.read(min(PIECE, most))
                 piece = self._codec.decompress(data, most)
-            except Exception as error:  # zipfile and each way to compress have errors of their own
+            except Exception as error:  # zipfile and each codec raise their own errors
                 raise self._damaged(str(error)) from None
             if piece:
                 return piece

@@ -1,7 +1,7 @@
-"""Grids from files, and to them: ``.npy`` (an array) and ``.npz``.
+"""Reading and writing grid files: ``.npy`` (one array) and ``.npz``.
 
-The keys of the latter are ``values`` and, optionally, ``spacing`` and ``origin``. Files are checked
-before they are read.
+The keys of an ``.npz`` are ``values`` and, optionally, ``spacing`` and ``origin``. Files are
+checked before they are read.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, GridError, OptionError, OutOfMemoryError
-from ..grid.planes import InputFile, PlaneFile, Samples
+from ..grid.planes import InputFile, PlaneFile, SampleArray
 from ..grid.samples import check_kind
 from ..grid.sdf_grid import SdfGrid, make_grid
 from ..machine.memory import held_memory, memory_bound
@@ -28,10 +28,10 @@ from .unpacking import unpack
 
 GRID_SUFFIXES = (".npy", ".npz")
 NPZ_KEYS = ("values", "spacing", "origin")
-MOST_NAMED = 10  # members of an archive
-# Of the memory that is left, what an unpacked array may take, and bytes where nobody can say.
+MOST_NAMED = 10  # members of an archive that an error lists
+# Share of the memory left that an unpacked array may take; bytes if that is unknown.
 ROOM_SHARE, UNKNOWN_ROOM = 0.25, 1 << 28
-# A grid with a surface is not packed further than this; deflate comes to 1,030 on zeros.
+# No grid with a surface is compressed further than this; deflate reaches 1,030 on zeros.
 BOMB_RATIO = 500
 
 
@@ -43,25 +43,37 @@ def read_grid(
     inside: str = "auto",
     max_memory: int | None = None,
 ) -> SdfGrid:
-    """Read a grid; ``spacing`` and ``origin`` go before those in the file. See ``make_grid``.
+    """Read a grid from an ``.npy`` or ``.npz`` file.
 
-    An ``.npy`` file is not loaded but read plane by plane, now and when the grid is refined. What
-    ``.npz`` holds, and an array whose first axis is the fastest (Fortran's order), is unpacked
-    first: into memory if that takes a quarter at most of what is left of ``max_memory`` (bytes
-    that this process may hold in all), else into a temporary file.
+    An ``.npy`` file is not loaded but read plane by plane, now and when the grid is refined. An
+    ``.npz`` file, and an array in Fortran order, is unpacked first: into memory if that takes at
+    most a quarter of what is left of ``max_memory``, else into a temporary file.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    spacing, origin : number or three, optional
+        Used instead of those in the file; see ``make_grid``.
+    inside : {"auto", "negative", "positive"}
+        Sign of the values inside the solid; see ``make_grid``.
+    max_memory : int, optional
+        Bytes that this process may hold in all. Default: a share of the free memory.
 
     Raises
     ------
     FileError
-        If the file is missing, damaged, truncated, of another kind, or written to meanwhile.
+        If the file is missing, damaged, truncated, of another kind, or changes while it is read.
     OutOfMemoryError
         If there is no room to unpack it.
     GridError
-        If its values are no signed distance grid.
+        If its values are not a signed distance grid.
+    OptionError
+        If the suffix or ``inside`` is unknown.
     """
     path = check_path(path, "path")
     if path.suffix.lower() not in GRID_SUFFIXES:
-        raise OptionError(f"{path} is no grid file: give {' or '.join(GRID_SUFFIXES)}")
+        raise OptionError(f"{path} is not a grid file: give {' or '.join(GRID_SUFFIXES)}")
     check_regular_file(path)
     read = _read_npy if path.suffix.lower() == ".npy" else _read_npz
     found = read(path, _room(max_memory))
@@ -71,7 +83,7 @@ def read_grid(
 
 
 def _room(max_memory: int | None) -> int:
-    """Return how many bytes an array may take that must be unpacked."""
+    """Return how many bytes of memory an unpacked array may take."""
     bound = memory_bound(max_memory)
     if bound is None:
         return UNKNOWN_ROOM
@@ -79,11 +91,11 @@ def _room(max_memory: int | None) -> int:
 
 
 def _read_npy(path: Path, room: int) -> dict[str, Any]:
-    """Return the array of an .npy file; it is read where it is unless its first axis is fastest."""
+    """Return the array of an .npy file: a ``PlaneFile``, or unpacked if in Fortran order."""
     file = InputFile.open(path)
     read = _reader(file)
     header = read_array_header(read, str(path))
-    _check_promise(header, file.size - header.length, str(path))
+    _check_size(header, file.size - header.length, str(path))
     check_kind(header.dtype, header.shape)
     if header.fortran_order:
         return {"values": unpack(read, header, str(path), room)}
@@ -91,7 +103,7 @@ def _read_npy(path: Path, room: int) -> dict[str, Any]:
 
 
 def _reader(file: InputFile) -> Read:
-    """Return what reads a file from the beginning on."""
+    """Return a function that reads a file from its beginning on."""
     place = 0
 
     def read(count: int) -> bytes:
@@ -116,19 +128,19 @@ def _read_npz(path: Path, room: int) -> dict[str, Any]:
             }
             return found | {"values": _read_values(archive, members["values"], path, room)}
     finally:
-        file.check_unchanged()  # that, rather than what else went wrong, is what to tell
+        file.check_unchanged()  # a change explains whatever else went wrong
 
 
 def _open_archive(file: InputFile) -> zipfile.ZipFile:
     """Open a zip archive."""
     try:
         return zipfile.ZipFile(file.file)
-    except Exception as error:  # zipfile raises what a wrong field leads to: ten kinds and more
-        raise FileError(f"{file.name} is no readable .npz archive: {error}") from None
+    except Exception as error:  # zipfile raises over ten kinds of error on damaged fields
+        raise FileError(f"{file.name} is not a readable .npz archive: {error}") from None
 
 
 def _find_members(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.ZipInfo]:
-    """Return the known members by their keys."""
+    """Return the members that belong to a grid, by key."""
     infos = archive.infolist()
     names = [info.filename.removesuffix(".npy") for info in infos]
     if "values" not in names:
@@ -142,57 +154,58 @@ def _find_members(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.Zip
 
 
 def _read_small(archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str) -> NDArray[Any]:
-    """Read one number or three."""
+    """Read an array of one number or three."""
     member = Member(archive, info, name)
     header = read_array_header(member.read, name)
     if prod(header.shape) > 3:
         raise GridError(f"{name} has shape {header.shape}: give one number or three")
     if header.dtype.kind not in "fiu":
         raise GridError(f"{name} has dtype {header.dtype}: give one number or three")
-    _check_promise(header, member.left, name)
+    _check_size(header, member.left, name)
     return np.frombuffer(member.read(header.size), header.dtype).reshape(header.shape)
 
 
-def _read_values(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path, room: int) -> Samples:
-    """Unpack the values."""
+def _read_values(
+    archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path, room: int
+) -> SampleArray:
+    """Unpack the array of samples."""
     name = f"{path}[values]"
     member = Member(archive, info, name)
     header = read_array_header(member.read, name)
-    _check_promise(header, member.left, name)
+    _check_size(header, member.left, name)
     check_kind(header.dtype, header.shape)
     if header.size > room and header.size > BOMB_RATIO * info.compress_size:
         raise OutOfMemoryError(
-            f"{name}, {header}, unpacks from {info.compress_size:,} bytes as a zip bomb does, and "
-            "does not fit in memory; if it is a grid, save it as .npy"
+            f"{name}, {header}, is compressed to {info.compress_size:,} bytes, like a zip bomb, "
+            "and does not fit in memory; if it is a grid, save it as .npy"
         )
     return unpack(member.read, header, name, room)
 
 
-def _check_promise(header: ArrayHeader, follow: int, name: str) -> None:
-    """Raise unless the array is as long as what follows its header."""
+def _check_size(header: ArrayHeader, follow: int, name: str) -> None:
+    """Raise FileError unless ``follow`` bytes, those after the header, are the array."""
+    sizes = f"its header promises {header}, but {follow:,} follow"
     if header.size > follow:
-        said = f"its header promises {header}, but {follow:,} follow"
-        raise FileError(f"{name} is truncated: {said}")
+        raise FileError(f"{name} is truncated: {sizes}")
     if header.size < follow:
-        said = f"its header promises {header}, but {follow:,} follow"
-        raise FileError(f"{name} holds more than one array, or its header is damaged: {said}")
+        raise FileError(f"{name} holds more than one array, or its header is damaged: {sizes}")
 
 
 def check_grid_target(path: str | Path, *, force: bool = False) -> Path:
-    """Return the path of a grid file to be if it can be written; asked before the work starts."""
+    """Return the path if a grid file can be written there; called before the work starts."""
     path = Path(path)
     if path.suffix.lower() != ".npz":
-        raise OptionError(f"{path} is no grid file that keeps spacing and origin: give .npz")
+        raise OptionError(f"{path} is not a grid file with spacing and origin: give .npz")
     return check_free(path, force=force)
 
 
 def write_grid(grid: SdfGrid, path: str | Path, *, force: bool = False) -> None:
-    """Write a grid as ``.npz``: values, spacing and origin, as ``read_grid`` reads them.
+    """Write a grid as ``.npz`` with the keys values, spacing and origin.
 
     Raises
     ------
     OptionError
-        If the suffix is another.
+        If the suffix is not ``.npz``.
     FileError
         If the file exists and ``force`` is not set, or cannot be written.
     """

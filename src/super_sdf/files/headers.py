@@ -1,7 +1,7 @@
-"""The header of an ``.npy`` array: taken apart by hand, for files of all kinds claim to be one.
+"""The header of an ``.npy`` array, parsed here because files of all kinds claim to be one.
 
-NumPy evaluates the header as Python, which fails in about ten ways on damaged ones, and reads as
-many bytes of it as the file says.
+NumPy evaluates the header as Python, which fails in about ten ways on damaged headers, and reads as
+many bytes of it as the file claims.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ..errors import FileError
 
 MAGIC = b"\x93NUMPY"
 LENGTH_FORMATS = {b"\x01\x00": "<H", b"\x02\x00": "<I", b"\x03\x00": "<I"}  # by version
-LONGEST = 10_000  # bytes, as NumPy has it
+LONGEST = 10_000  # bytes, NumPy's limit
 KEYS = {"descr", "fortran_order", "shape"}
 ENTRY = re.compile(
     r"""\s*['"](?P<key>\w+)['"]\s*:\s*
@@ -31,12 +31,12 @@ ENTRY = re.compile(
 DTYPE = re.compile(r"[<>|=]?[?biufcmMOSUV][0-9]{0,9}(\[\w+\])?")
 
 Read = Callable[[int], bytes]
-"""Returns the next bytes, as many as asked for, or fewer at the end."""
+"""Returns the next ``count`` bytes, or fewer at the end."""
 
 
 @dataclass(frozen=True)
 class ArrayHeader:
-    """What a header says, and how many bytes itself has."""
+    """Shape, dtype and order of an array, and the length of the header in bytes."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
@@ -45,7 +45,7 @@ class ArrayHeader:
 
     @property
     def size(self) -> int:
-        """Bytes of the array that follows."""
+        """Size of the array in bytes."""
         return prod(self.shape) * self.dtype.itemsize
 
     def __str__(self) -> str:
@@ -58,7 +58,7 @@ def read_array_header(read: Read, name: str) -> ArrayHeader:
     Raises
     ------
     FileError
-        If it is none, or of an array that holds no plain numbers.
+        If it is not a header, or describes an array of anything but plain numbers.
     """
     start = read(8)
     length_format = LENGTH_FORMATS.get(start[6:])
@@ -77,7 +77,7 @@ def read_array_header(read: Read, name: str) -> ArrayHeader:
 
 
 def _interpret(text: str, name: str) -> tuple[tuple[int, ...], np.dtype[Any], bool]:
-    """Return shape, dtype and order that the text of a header gives."""
+    """Parse the text of a header: shape, dtype, and whether in Fortran order."""
     entries = list(ENTRY.finditer(text, 1))
     values = {entry["key"]: entry["value"] for entry in entries}
     rest = text[:1] + ENTRY.sub("", text[1:]).strip()
@@ -93,7 +93,7 @@ def _interpret(text: str, name: str) -> tuple[tuple[int, ...], np.dtype[Any], bo
 
 
 def _read_dtype(text: str, name: str) -> np.dtype[Any]:
-    """Return the type that a header gives."""
+    """Parse the dtype of a header."""
     if text.startswith("["):
         raise FileError(f"{name} holds records, {_shortened(text)}: save the distances alone")
     if not DTYPE.fullmatch(text[1:-1]):
@@ -108,12 +108,12 @@ def _read_dtype(text: str, name: str) -> np.dtype[Any]:
 
 
 def _no_header(name: str, reason: str = "") -> FileError:
-    """Return the error for what is no header."""
+    """Return the error for an invalid header."""
     ending = f": {reason}" if reason else ""
-    return FileError(f"{name} is no .npy array: its header cannot be read{ending}")
+    return FileError(f"{name} is not an .npy array: its header cannot be read{ending}")
 
 
 def _shortened(text: str) -> str:
-    """Return the beginning of a text, on one line."""
+    """Return the beginning of a text on one line."""
     shown = text.encode("unicode_escape").decode("ascii")
     return shown if len(shown) <= 60 else f"{shown[:60]}..."

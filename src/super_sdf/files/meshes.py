@@ -1,13 +1,13 @@
-"""Meshes to files. A target is checked before the work starts, and its file appears whole.
+"""Writing mesh files. A target is checked before the work starts, and only complete files appear.
 
-A module a format (``ply``, ``stl``, ``text_meshes``, ``glb``, ``threemf``). All take a mesh in
-pieces and hold no more of it in memory than one.
+Each format has its module (``ply``, ``stl``, ``text_meshes``, ``glb``, ``threemf``) and its entry
+in ``FORMATS``. All write a mesh piece by piece and hold no more than one piece in memory.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,34 +25,82 @@ from .stl import write_stl
 from .text_meshes import write_obj, write_off
 from .threemf import write_3mf
 
-MESH_SUFFIXES = (".ply", ".stl", ".obj", ".off", ".glb", ".3mf")
-# Formats with 32 bits a number, and those that can say where the point is that they count from.
-SINGLE_PRECISION = (".stl", ".glb")
-WITH_LOCAL_ORIGIN = (".glb",)
-# What a triangle takes in a file, in bytes, with its half of a vertex; of text and archives about.
-BYTES_PER_TRIANGLE = {".ply": 19, ".stl": 50, ".obj": 40, ".off": 39, ".glb": 18, ".3mf": 13}
-Writer = Callable[[Iterable[Mesh], Path], None]
 WORLD_ORIGIN = (0.0, 0.0, 0.0)
-CHUNK = 1 << 16  # triangles that are looked at at a time
+CHUNK = 1 << 16  # triangles checked at a time
+
+
+@dataclass(frozen=True)
+class MeshFormat:
+    """A mesh file format.
+
+    Attributes
+    ----------
+    write : callable
+        Writes pieces of a mesh to a path.
+    bytes_per_triangle : int
+        Size of a triangle in the file with its half of a vertex; approximate for text and archives.
+    single_precision : bool
+        Whether coordinates are float32.
+    local_origin : bool
+        Whether coordinates may be relative to a point, ``write``'s third argument.
+    """
+
+    write: Callable[..., None]
+    bytes_per_triangle: int
+    single_precision: bool = False
+    local_origin: bool = False
+
+
+FORMATS = {
+    ".ply": MeshFormat(write_ply, 19),
+    ".stl": MeshFormat(write_stl, 50, single_precision=True),
+    ".obj": MeshFormat(write_obj, 40),
+    ".off": MeshFormat(write_off, 39),
+    ".glb": MeshFormat(write_glb, 18, single_precision=True, local_origin=True),
+    ".3mf": MeshFormat(write_3mf, 13),
+}
+MESH_SUFFIXES = tuple(FORMATS)
+
+
+def format_of(path: str | Path) -> MeshFormat:
+    """Return the format of a mesh file, whose suffix must be one of ``MESH_SUFFIXES``."""
+    return FORMATS[Path(path).suffix.lower()]
 
 
 def check_target(path: str | Path, *, force: bool = False) -> Path:
-    """Return the path of a mesh file to be if it can be written; asked before the work starts."""
+    """Return the path if a mesh file can be written there; called before the work starts.
+
+    Raises
+    ------
+    OptionError
+        If the suffix is not that of a mesh format.
+    FileError
+        If the file exists and ``force`` is not set, or the folder cannot be written to.
+    """
     check_mesh_suffix(Path(path))
     return check_free(Path(path), force=force)
 
 
 def check_mesh_suffix(path: Path) -> None:
-    """Raise if the suffix is no mesh file's."""
+    """Raise OptionError if the suffix is not that of a mesh format."""
     if path.suffix.lower() not in MESH_SUFFIXES:
-        raise OptionError(f"{path} is no mesh file: give one of {', '.join(MESH_SUFFIXES)}")
+        raise OptionError(f"{path} is not a mesh file: give one of {', '.join(MESH_SUFFIXES)}")
 
 
 def write_mesh(mesh: Mesh, path: str | Path, *, force: bool = False) -> None:
-    """Write a mesh; the suffix tells the format.
+    """Write a mesh to a file, in the format of its suffix.
 
-    ``.glb`` holds single precision: a mesh in double precision is written about the middle of its
-    box, which the file's node adds.
+    ``.glb`` has float32 coordinates: a float64 mesh is written relative to the middle of its
+    bounding box, which is stored as the translation of the node.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        The mesh, in world units.
+    path : path
+        The file: .ply, .stl, .obj, .off, .glb or .3mf.
+    force : bool
+        Replace an existing file.
 
     Raises
     ------
@@ -60,7 +108,7 @@ def write_mesh(mesh: Mesh, path: str | Path, *, force: bool = False) -> None:
         If the suffix is unknown.
     FileError
         If the file exists and ``force`` is not set, or cannot be written; or if the format cannot
-        hold the mesh: a coordinate is not finite, or corners of a triangle would fall together.
+        hold the mesh: a coordinate is not finite, or corners of a triangle would coincide.
     """
     if not isinstance(mesh, Mesh):
         raise OptionTypeError(f"mesh is {seen(mesh)}: give one from reconstruct(grid)")
@@ -78,39 +126,47 @@ def write_pieces(
     about: Triple = WORLD_ORIGIN,
     before_rename: Callable[[Path], None] | None = None,
 ) -> None:
-    """Write a mesh that comes in pieces, whose triangles use the vertices of all pieces so far.
+    """Write a mesh that comes in pieces; triangles may use the vertices of earlier pieces.
 
-    ``about`` is the point that a format with a local origin counts from. Whether the format can
-    hold the mesh is not asked: see ``precision.check_format_holds``. ``before_rename`` is called
-    with the path of the finished file, before it takes its name. Otherwise as ``write_mesh``.
+    Like ``write_mesh``, without checking that the format can hold the mesh: see
+    ``precision.check_format_holds``.
+
+    Parameters
+    ----------
+    pieces : iterable of Mesh
+        The pieces, in world units.
+    path : path
+        The file.
+    force : bool
+        Replace an existing file.
+    about : three floats
+        The local origin of the vertices, for formats that have one.
+    before_rename : callable, optional
+        Called with the path of the complete file before it is renamed to ``path``.
     """
     path = check_target(path, force=force)
-    writers: dict[str, Writer] = {
-        ".ply": write_ply,
-        ".stl": write_stl,
-        ".obj": write_obj,
-        ".off": write_off,
-        ".glb": partial(write_glb, about=about),
-        ".3mf": write_3mf,
-    }
+    mesh_format = format_of(path)
     with replacing(path, force=force, before_rename=before_rename) as part:
-        writers[path.suffix.lower()](pieces, part)
+        if mesh_format.local_origin:
+            mesh_format.write(pieces, part, about)
+        else:
+            mesh_format.write(pieces, part)
 
 
 def _local_origin(mesh: Mesh, path: Path) -> Triple:
-    """Return the point that a mesh's file is to count from."""
+    """Return the local origin for a mesh in a file: the middle of its bounding box if needed."""
     wide = mesh.vertices.dtype == np.float64 and len(mesh.vertices)
-    if path.suffix.lower() not in WITH_LOCAL_ORIGIN or not wide:
+    if not format_of(path).local_origin or not wide:
         return WORLD_ORIGIN
     x, y, z = mesh.vertices.min(0) / 2 + mesh.vertices.max(0) / 2
     return float(x), float(y), float(z)
 
 
 def _check_mesh_holds(mesh: Mesh, path: Path, about: Triple) -> None:
-    """Raise if a mesh has coordinates that are not finite, or that its format cannot hold."""
+    """Raise FileError if coordinates are not finite, or too close together for the format."""
     if not np.isfinite(mesh.vertices).all():
         raise FileError(f"{path} cannot be written: a vertex of the mesh is not finite")
-    if path.suffix.lower() not in SINGLE_PRECISION or mesh.vertices.dtype == np.float32:
+    if not format_of(path).single_precision or mesh.vertices.dtype == np.float32:
         return
     with np.errstate(over="ignore"):
         rounded = (mesh.vertices - about).astype(np.float32)
@@ -120,12 +176,12 @@ def _check_mesh_holds(mesh: Mesh, path: Path, about: Triple) -> None:
     )
     if lost:
         raise FileError(
-            f"{path} cannot be written: {path.suffix} holds single precision, in which vertices of "
-            "this mesh fall together; write .ply or .obj"
+            f"{path} cannot be written: {path.suffix} has single precision, in which vertices of "
+            "this mesh coincide; write .ply or .obj"
         )
 
 
 def _flat_triangles(corners: NDArray[Any]) -> int:
-    """Count triangles, (n, 3, 3), two of whose corners are the same point."""
+    """Count the triangles, (n, 3, 3), with two equal corners."""
     same = (corners == np.roll(corners, 1, axis=1)).all(2).any(1)
     return int(np.count_nonzero(same))

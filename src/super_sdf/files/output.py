@@ -1,4 +1,4 @@
-"""Output files: asked for before the work starts, and there whole or not at all."""
+"""Output files: checked before the work starts, and either complete or absent afterwards."""
 
 from __future__ import annotations
 
@@ -14,9 +14,14 @@ from .parts import reserved_part
 
 
 def check_free(path: Path, *, force: bool = False) -> Path:
-    """Return the path if a file can be made there.
+    """Return the path if a file can be created there.
 
-    A link counts as what it leads to, and as a file where it leads to none.
+    A link counts as its target; a dangling link counts as an existing file.
+
+    Raises
+    ------
+    WriteError
+        If the file exists and ``force`` is not set, or cannot be created.
     """
     kind = _kind_at(path)
     if kind is not None and stat.S_ISDIR(kind):
@@ -24,36 +29,36 @@ def check_free(path: Path, *, force: bool = False) -> Path:
     if os.path.lexists(path) and not force:
         raise WriteError(f"{path} exists: remove it or use --force")
     if kind is not None and not stat.S_ISREG(kind):
-        raise WriteError(f"{path} is no regular file: give another name")
+        raise WriteError(f"{path} is not a regular file: give another name")
     folder = _behind_links(path).parent
     if not folder.is_dir():
-        raise WriteError(f"{folder} is no folder: make it first")
+        raise WriteError(f"{folder} is not a folder: make it first")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise WriteError(f"{path} cannot be written: no permission in {folder}")
     return path
 
 
 def _kind_at(path: Path) -> int | None:
-    """Return the mode of what is there, None if nothing is."""
+    """Return the mode of the file at a path, None if there is none."""
     try:
         return path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
         return None
-    except (OSError, ValueError) as error:  # the last: a NUL in the name
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise _cannot_be_written(path, error) from error
 
 
 def _behind_links(path: Path) -> Path:
-    """Return the file to be made: where the last link leads, if the path is one."""
+    """Return the file that is written: the target if the path is a link."""
     return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
 class _NameTakenError(Exception):
-    """The target has appeared since it was asked for."""
+    """The target was created by another program meanwhile."""
 
 
 def free_space(path: Path) -> int:
-    """Return the bytes that are free where a file is to be."""
+    """Return the free bytes on the disk of a file."""
     try:
         return shutil.disk_usage(_behind_links(path).parent).free
     except OSError as error:
@@ -64,19 +69,24 @@ def free_space(path: Path) -> int:
 def replacing(
     path: Path, *, force: bool = True, before_rename: Callable[[Path], None] | None = None
 ) -> Iterator[Path]:
-    """Yield a path beside the target; it takes the target's place only if all goes well.
+    """Yield a temporary path beside the target, renamed to the target if the block succeeds.
 
-    The place of a link is kept: the file that it leads to is replaced. What killed processes left
-    of the same target is removed. Whatever the system has against it is raised as WriteError.
+    A link stays, and the file it points to is replaced. Temporary files of the same target that
+    killed processes left are removed.
 
     Parameters
     ----------
     path : Path
         The target.
     force : bool
-        Replace a file that is there in the end; else that is an error, and the file stays.
+        Replace a file that exists at the end; otherwise that is an error, and the file stays.
     before_rename : callable, optional
-        Called with the path of the finished file, before it takes the target's name.
+        Called with the path of the complete file before it is renamed.
+
+    Raises
+    ------
+    WriteError
+        If the file cannot be written, for whatever reason the system gives.
     """
     target = _behind_links(path) if force else path
     try:
@@ -87,26 +97,26 @@ def replacing(
             (os.replace if force else _rename_if_free)(part, target)
     except _NameTakenError:
         raise WriteError(
-            f"{path} was made by somebody else meanwhile: remove it or use --force"
+            f"{path} was created by another program meanwhile: remove it or use --force"
         ) from None
-    except SuperSdfError:  # also an OSError, perhaps, but not the system's
+    except SuperSdfError:  # some are OSErrors, too, but not from the system
         raise
     except OSError as error:
         raise _cannot_be_written(path, error) from error
 
 
 def _rename_if_free(part: Path, target: Path) -> None:
-    """Give a file its name unless that is taken: a second name, unlike a rename, never replaces."""
+    """Rename a file unless the target exists: a hard link, unlike a rename, never replaces."""
     try:
         os.link(part, target)
     except FileExistsError:
         raise _NameTakenError from None
-    except OSError:  # a file system without links: the last look is as near as can be
+    except OSError:  # a file system without hard links: check just before the rename
         if os.path.lexists(target):
             raise _NameTakenError from None
         os.rename(part, target)
 
 
 def _cannot_be_written(path: Path, error: OSError | ValueError) -> WriteError:
-    """Return the error for what the system has against a file."""
+    """Return the error for a file that the system refuses to write."""
     return WriteError(f"{path} cannot be written: {getattr(error, 'strerror', None) or error}")

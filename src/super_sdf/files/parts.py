@@ -1,7 +1,7 @@
-"""Names of files that are not finished, and what is done with those that nobody finishes.
+"""Temporary names of unfinished files, and the removal of those that killed processes left.
 
-Beside ``part.ply`` process 123 writes ``.part.ply.123.part``, and holds a lock on it while it does:
-a file without its lock, or without its process where locks are not known, was left by a kill.
+Process 123 writes ``.part.ply.123.part`` beside ``part.ply`` and holds a lock on it meanwhile. A
+file without a lock was abandoned; where there are no locks, one whose process has ended.
 """
 
 from __future__ import annotations
@@ -14,34 +14,36 @@ from pathlib import Path
 
 from ..errors import WriteError
 
-# File systems allow 255 bytes (some 143), and a spool's name is longer still by 9.
+# File systems allow names of 255 bytes (some 143); the name of a spool file is 9 bytes longer.
 LONGEST = 96
 PART = re.compile(r"(?P<stem>\..+\.)(?P<pid>\d+)\.part(\.\w+)?", re.DOTALL)
 
 
 def part_path(target: Path) -> Path:
-    """Return where this process writes what is to become the target."""
+    """Return the path of the unfinished target that this process writes."""
     return target.with_name(f"{_stem(target.name)}{os.getpid()}.part")
 
 
 def _stem(name: str) -> str:
-    """Return what the names of a target's parts begin with; a digest stands for a long name."""
-    raw = name.encode("utf-8", "surrogatepass")  # a ledger may name what no file can be called
+    """Return the prefix of the names of a target's parts; long names are hashed."""
+    raw = name.encode(
+        "utf-8", "surrogatepass"
+    )  # a batch report may hold names that no file can have
     if len(raw) <= LONGEST:
         return f".{name}."
-    from hashlib import sha256  # it loads OpenSSL, and long names are rare
+    from hashlib import sha256  # loads OpenSSL, and long names are rare
 
     return f".{sha256(raw).hexdigest()[:32]}."
 
 
 @contextmanager
 def reserved_part(target: Path) -> Iterator[Path]:
-    """Make this process's part of a target, locked; in the end it is removed if it is still there.
+    """Create and lock this process's part of a target; remove it at the end if it still exists.
 
     Raises
     ------
     WriteError
-        If this process is writing the target already.
+        If this process is already writing the target.
     """
     remove_abandoned_parts([target])
     part = part_path(target)
@@ -61,7 +63,7 @@ def reserved_part(target: Path) -> Iterator[Path]:
 
 
 def remove_abandoned_parts(targets: Iterable[Path], pid: int | None = None) -> None:
-    """Remove what ended processes, or the one given, left of unfinished targets."""
+    """Remove unfinished parts of the targets that ended processes, or process ``pid``, left."""
     stems_in: dict[Path, set[str]] = {}
     for target in targets:
         stems_in.setdefault(target.parent, set()).add(_stem(target.name))
@@ -76,20 +78,23 @@ def remove_abandoned_parts(targets: Iterable[Path], pid: int | None = None) -> N
 
 
 def _is_abandoned(path: Path, pid: int) -> bool:
-    """Say whether nobody holds a part's lock; without locks, whether its process has ended."""
+    """Return whether no process holds a part's lock; without locks, whether its process ended."""
     try:
         file = os.open(path, os.O_RDWR)
-    except OSError:  # somebody else's, or gone
+    except OSError:  # another user's, or gone
         return False
     try:
         taken = take_lock(file)
     finally:
         os.close(file)
-    return taken if taken is not None else not _lives(pid)
+    return taken if taken is not None else not _is_running(pid)
 
 
 def take_lock(file: int) -> bool | None:
-    """Lock an open file, until it is closed, if nobody else has; None where there are no locks."""
+    """Lock an open file until it is closed.
+
+    Return whether that worked, or None if the system or file system has no locks.
+    """
     try:
         import fcntl
     except ImportError:  # Windows
@@ -103,8 +108,8 @@ def take_lock(file: int) -> bool | None:
     return True
 
 
-def _lives(pid: int) -> bool:
-    """Say whether a process has this number; on Windows no open file can be removed anyhow."""
+def _is_running(pid: int) -> bool:
+    """Return whether a process is running; False on Windows, where open files cannot be removed."""
     if os.name == "nt":
         return False
     try:
@@ -112,7 +117,7 @@ def _lives(pid: int) -> bool:
     except ProcessLookupError:
         return False
     except OSError:
-        return True  # somebody else's
-    with suppress(OSError):  # ended, though nobody has asked how yet
+        return True  # another user's
+    with suppress(OSError):  # a zombie has ended
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     return True

@@ -1,4 +1,4 @@
-"""Binary PLY, written piece by piece as a mesh is made."""
+"""Binary PLY, written piece by piece."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ HEADER_BYTES = 320
 def write_ply(pieces: Iterable[Mesh], path: Path) -> None:
     """Write binary little-endian PLY.
 
-    All vertices come before all triangles, and their numbers before both: the header, which is
-    padded to one length, is written last.
+    The format has all vertices before all triangles, and their counts before both: the header,
+    padded to a fixed length, is written last.
     """
     with path.open("wb") as file, spool_beside(path) as waiting:
         file.write(_ply_header("float", 0, 0))
@@ -31,7 +31,7 @@ def write_ply(pieces: Iterable[Mesh], path: Path) -> None:
 
 
 def _ply_header(number: str, vertices: int, faces: int) -> bytes:
-    """Return the header, of the same length whatever the numbers: its comment is padded."""
+    """Return the header; its comment is padded, so that its length is fixed."""
     first = "ply\nformat binary_little_endian 1.0\ncomment made by super-sdf"
     lines = [
         "",
@@ -46,7 +46,7 @@ def _ply_header(number: str, vertices: int, faces: int) -> bytes:
 
 
 def _ply_rows(faces: NDArray[Any]) -> bytes:
-    """Return triangles as PLY's lists: how many corners, then which."""
+    """Return triangles as PLY lists: the number of corners, then their indices."""
     rows = np.empty(len(faces), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
     rows["count"], rows["corners"] = 3, faces
     return rows.tobytes()

@@ -1,8 +1,8 @@
-"""Whether a mesh file's numbers can hold a grid's fine mesh: asked before the work starts.
+"""Whether the numbers of a mesh file can hold the fine mesh of a grid, checked before the work.
 
-Neighbouring vertices lie down to a thousandth of the fine spacing apart. Far from the world's
-origin single precision has no such steps, and vertices would fall together: triangles without
-area, and a mesh that is not closed any more when a program reads it.
+Neighbouring vertices may be as close as a thousandth of the fine spacing. Far from the world origin
+float32 cannot resolve that and vertices would coincide: degenerate triangles, and a mesh that is no
+longer closed when a program reads it.
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ from ..arrays import Triple
 from ..errors import FileError
 from ..grid.sdf_grid import SdfGrid
 from ..mesh import CLEARANCE, tells_vertices_apart, vertex_type
-from .meshes import SINGLE_PRECISION, WITH_LOCAL_ORIGIN, WORLD_ORIGIN
+from .meshes import WORLD_ORIGIN, format_of
 
 
 def check_format_holds(path: str | Path, grid: SdfGrid, factor: int) -> Triple:
-    """Return the point that the vertices in a mesh file are to count from.
+    """Return the local origin for the vertices of a mesh file.
 
-    That is the world's origin, or the grid's middle where single precision tells vertices apart
-    only there and the format has a place for it. A format with double precision or text holds what
-    ``isosurface.vertex_type`` lets pass.
+    It is the world origin, or the middle of the grid if float32 resolves neighbouring vertices only
+    there and the format can store a local origin. Formats with double precision or text hold all
+    that ``mesh.vertex_type`` accepts.
 
     Raises
     ------
     GridError
-        If no numbers tell neighbouring vertices apart.
+        If not even float64 resolves neighbouring vertices.
     FileError
-        If the format cannot tell neighbouring vertices apart wherever they count from.
+        If the format does not resolve neighbouring vertices, whatever the local origin.
     """
-    suffix = Path(path).suffix.lower()
-    if vertex_type(grid, factor) is np.float32 or suffix not in SINGLE_PRECISION:
+    mesh_format = format_of(path)
+    if vertex_type(grid, factor) is np.float32 or not mesh_format.single_precision:
         return WORLD_ORIGIN
     reach = max(abs(x) + h * n for x, h, n in zip(grid.origin, grid.spacing, grid.shape))
-    if suffix in WITH_LOCAL_ORIGIN:
+    if mesh_format.local_origin:
         reach = max(spacing * samples / 2 for spacing, samples in zip(grid.spacing, grid.shape))
         if tells_vertices_apart(np.float32, reach, grid, factor):
             return _middle(grid)
-    apart = CLEARANCE * grid.voxel_size / factor
+    apart, suffix = CLEARANCE * grid.voxel_size / factor, Path(path).suffix.lower()
     raise FileError(
         f"{path} cannot hold the mesh: {suffix} has single precision, {_limit_at(reach)}, and "
         f"vertices are down to {apart:.2g} apart; write .ply or .obj"
@@ -49,25 +49,25 @@ def check_format_holds(path: str | Path, grid: SdfGrid, factor: int) -> Triple:
 
 
 def local_origin_note(path: str | Path, about: Triple) -> tuple[str, ...]:
-    """Return the sentence that says from which point a file counts, if not the world's origin."""
+    """Return a note that names the local origin of a file, none if it is the world origin."""
     if about == WORLD_ORIGIN:
         return ()
     point = ", ".join(f"{coordinate:.12g}" for coordinate in about)
     return (
-        f"{path} has single precision: its vertices count from {point}, "
-        "which the translation of its node adds",
+        f"{path} has single precision: its vertices are relative to {point}, "
+        "the translation of its node",
     )
 
 
 def _middle(grid: SdfGrid) -> Triple:
-    """Return the middle of a grid."""
+    """Return the middle of a grid, in world units."""
     axes = zip(grid.origin, grid.spacing, grid.shape)
     x, y, z = (origin + spacing * (samples - 1) / 2 for origin, spacing, samples in axes)
     return x, y, z
 
 
 def _limit_at(reach: float) -> str:
-    """Say what numbers of single precision end at, or how far apart they are."""
+    """Describe the limit of float32 at a coordinate: its largest number, or its resolution."""
     limits = np.finfo(np.float32)
     if reach > float(limits.max):
         return f"numbers up to {limits.max:.2g}, the mesh reaches {reach:.2g}"

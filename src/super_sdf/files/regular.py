@@ -1,6 +1,6 @@
 """Only regular files are read as inputs.
 
-To open a named pipe waits for ever, to read a device never ends, and a folder is no input.
+Opening a named pipe may wait forever, reading a device may never end, and a folder is no input.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ KINDS = {
 }
 REASONS = {
     errno.ENOENT: "does not exist",
-    errno.ENOTDIR: "does not exist: what stands before its last / is no folder",
+    errno.ENOTDIR: "does not exist: the path before its last / is not a folder",
     errno.ELOOP: "cannot be read: its links lead in a circle",
     errno.ENAMETOOLONG: "does not exist: the name is longer than the system allows",
     errno.EACCES: "cannot be read: permission denied",
@@ -29,9 +29,9 @@ REASONS = {
 
 
 def check_regular_file(path: str | Path) -> Path:
-    """Return the path if it is a regular file, or a link to one, that may be read.
+    """Return the path if it is a readable regular file, or a link to one.
 
-    Nothing is opened, so this does not wait.
+    The file is not opened, so this never blocks.
 
     Raises
     ------
@@ -43,19 +43,19 @@ def check_regular_file(path: str | Path) -> Path:
         found = os.stat(path)
     except OSError as error:
         raise FileError(f"{path} {reason_of(error)}") from None
-    except ValueError:  # a NUL, or a character that the system's encoding lacks
-        raise FileError(f"{str(path)!r} is no name that a file can have") from None
+    except ValueError:  # a NUL, or a character that the file system's encoding lacks
+        raise FileError(f"{str(path)!r} is not a valid file name") from None
     if not stat.S_ISREG(found.st_mode):
         kind = KINDS.get(stat.S_IFMT(found.st_mode), "special file")
         raise FileError(f"{path} is a {kind}: give a file")
     if not os.access(path, os.R_OK):
         raise FileError(f"{path} {REASONS[errno.EACCES]}")
-    if not found.st_size:  # nor is what the system calls so and makes up as it is read
+    if not found.st_size:  # such as files in /proc, which the system makes up as they are read
         raise FileError(f"{path} is empty: give a file with something in it")
     return Path(path)
 
 
 def reason_of(error: OSError) -> str:
-    """Return what the system has against a file, to be read after the file's name."""
-    said = REASONS.get(error.errno or 0)
-    return said or f"cannot be read: {error.strerror or error}"
+    """Return why the system refuses to read a file, as the words after its name."""
+    reason = REASONS.get(error.errno or 0)
+    return reason or f"cannot be read: {error.strerror or error}"

@@ -1,7 +1,7 @@
-"""Meshes that come in pieces: vertices go to the file, triangles wait in a file beside it.
+"""Writing meshes in pieces: vertices go to the file, triangles wait in a temporary file beside it.
 
-Most formats want all vertices before the first triangle. No more of a mesh is in memory than a
-chunk of rows; the file beside has no name, so it ends with the process however that ends.
+Most formats need all vertices before the first triangle. Only a chunk of rows is in memory at a
+time. The temporary file has no name, so it disappears with the process, however that ends.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from numpy.typing import NDArray
 
 from ..mesh import Mesh
 
-CHUNK = 1 << 18  # rows that are written at a time
-TEXT_CHUNK = 1 << 14  # rows of text: Python's numbers take ten times the memory
-SPOOL_BYTES = 4_000_000  # what waits in memory before it goes to a file
+CHUNK = 1 << 18  # rows written at a time
+TEXT_CHUNK = 1 << 14  # rows of text at a time: Python numbers take ten times the memory
+SPOOL_BYTES = 4_000_000  # kept in memory before a file is made
 
 ToBytes = Callable[[NDArray[Any]], bytes]
-"""What is written of some rows of vertices or triangles."""
+"""Converts rows of vertices or triangles to the bytes that are written."""
 
 
 @dataclass(frozen=True)
 class Written:
-    """How many vertices and triangles were written, and the vertices' dtype."""
+    """The numbers of vertices and triangles written, and the dtype of the vertices."""
 
     vertices: int
     faces: int
@@ -40,8 +40,8 @@ class Written:
 def spool_beside(part: Path) -> Iterator[IO[bytes]]:
     """Open a temporary file beside a file that is being written.
 
-    Where the system cannot make a file without a name, it has for a moment one that
-    ``parts.remove_abandoned_parts`` knows.
+    Where the system cannot create unnamed files, it briefly has a name that
+    ``parts.remove_abandoned_parts`` recognises.
     """
     folder, name = str(part.parent), f"{part.name}."
     with tempfile.SpooledTemporaryFile(SPOOL_BYTES, dir=folder, prefix=name) as spool:
@@ -54,7 +54,19 @@ def write_split(
     to_bytes: tuple[ToBytes, ToBytes],
     chunk: int = CHUNK,
 ) -> Written:
-    """Write the vertices of all pieces to one file and their triangles to another."""
+    """Write the vertices of all pieces to the first file and their triangles to the second.
+
+    Parameters
+    ----------
+    pieces : iterable of Mesh
+        The mesh.
+    files : two binary files
+        For vertices and for triangles.
+    to_bytes : two callables
+        Convert rows of vertices, and of triangles, to bytes.
+    chunk : int
+        Rows converted at a time.
+    """
     vertices, faces, dtype = 0, 0, np.dtype(np.float32)
     for piece in pieces:
         write_in_chunks(files[0], piece.vertices, to_bytes[0], chunk)
@@ -67,17 +79,17 @@ def write_split(
 def write_in_chunks(
     file: IO[bytes], array: NDArray[Any], to_bytes: ToBytes, chunk: int = CHUNK
 ) -> None:
-    """Write rows of an array, some at a time: the bytes are a copy."""
+    """Write the rows of an array ``chunk`` at a time, since ``to_bytes`` copies them."""
     for start in range(0, len(array), chunk):
         file.write(to_bytes(array[start : start + chunk]))
 
 
 def append_spool(waiting: IO[bytes], file: IO[bytes]) -> None:
-    """Copy what waited to the end of the file."""
+    """Copy the temporary file ``waiting`` to the end of ``file``."""
     waiting.seek(0)
     shutil.copyfileobj(waiting, file, SPOOL_BYTES)
 
 
 def little_endian(array: NDArray[Any]) -> bytes:
-    """Return the bytes of numbers, least significant first."""
+    """Return the bytes of an array in little-endian order."""
     return array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()

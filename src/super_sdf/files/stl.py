@@ -1,7 +1,7 @@
-"""Binary STL: triangles without vertex numbers, their corners in single precision.
+"""Binary STL: each triangle stores the positions of its corners, in float32.
 
-A triangle may use vertices of earlier pieces, so all vertices so far wait in a file beside, which
-is read back through a map.
+A triangle may use vertices of earlier pieces, so all vertices so far are kept in a temporary file,
+which is read back through a memory map.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from ..mesh import Mesh
 from .spool import little_endian, write_in_chunks
 
-CHUNK = 1 << 15  # triangles in work
+CHUNK = 1 << 15  # triangles at a time
 ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
 def write_stl(pieces: Iterable[Mesh], path: Path) -> None:
-    """Write binary STL; the number of triangles, at its head, is written last."""
+    """Write binary STL; the header, which has the number of triangles, is written last."""
     vertices = faces = 0
     with (
         path.open("wb") as file,
@@ -50,7 +50,7 @@ def _single(vertices: NDArray[Any]) -> bytes:
 def _write_triangles(
     file: IO[bytes], waiting: IO[bytes], vertices: int, faces: NDArray[Any]
 ) -> None:
-    """Write triangles with the positions of their corners; what was read is let go of."""
+    """Write triangles with the positions of their corners; mapped pages are released again."""
     if not len(faces):
         return
     waiting.flush()
@@ -58,14 +58,14 @@ def _write_triangles(
         for start in range(0, len(faces), CHUNK):
             positions = np.frombuffer(mapped, "<f4").reshape(-1, 3)
             corners = positions[faces[start : start + CHUNK]]
-            del positions  # else the map cannot be closed
+            del positions  # otherwise the map cannot be closed
             file.write(_stl_rows(corners))
             if hasattr(mmap, "MADV_DONTNEED"):
                 mapped.madvise(mmap.MADV_DONTNEED)
 
 
 def _stl_rows(corners: NDArray[Any]) -> bytes:
-    """Return triangles, (n, 3, 3), with their unit normals."""
+    """Return the bytes of triangles, (n, 3, 3), with their unit normals."""
     sides = corners[:, 1:].astype(np.float64) - corners[:, :1]
     sides /= np.maximum(np.abs(sides).max((1, 2), keepdims=True), np.finfo(np.float64).tiny)
     normals = np.cross(sides[:, 0], sides[:, 1])

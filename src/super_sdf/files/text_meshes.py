@@ -1,4 +1,4 @@
-"""OBJ and OFF: meshes as text, with as many digits as tell every number from its neighbours."""
+"""OBJ and OFF: meshes as text, with enough digits to read back the same numbers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ OFF_HEADER_BYTES = 64
 
 
 def write_obj(pieces: Iterable[Mesh], path: Path) -> None:
-    """Write Wavefront OBJ; its triangles count vertices from 1."""
+    """Write Wavefront OBJ, whose vertex indices start at 1."""
     with path.open("wb") as file, spool_beside(path) as waiting:
         file.write(b"# made by super-sdf\n")
         rows = number_lines("v %s %s %s\n"), index_lines("f %d %d %d\n", first=1)
@@ -25,7 +25,7 @@ def write_obj(pieces: Iterable[Mesh], path: Path) -> None:
 
 
 def write_off(pieces: Iterable[Mesh], path: Path) -> None:
-    """Write OFF; the counts at its head, padded to one length, are written last."""
+    """Write OFF; the header with the counts, padded to a fixed length, is written last."""
     with path.open("wb") as file, spool_beside(path) as waiting:
         file.write(_off_header(0, 0))
         rows = number_lines("%s %s %s\n"), index_lines("3 %d %d %d\n")
@@ -36,15 +36,15 @@ def write_off(pieces: Iterable[Mesh], path: Path) -> None:
 
 
 def _off_header(vertices: int, faces: int) -> bytes:
-    """Return the head, of the same length whatever the numbers."""
+    """Return the header, padded to a fixed length."""
     return f"OFF\n{vertices} {faces} 0".ljust(OFF_HEADER_BYTES - 1).encode("ascii") + b"\n"
 
 
 def number_lines(line: str) -> ToBytes:
-    """Return what turns rows of numbers into lines: each ``%s`` stands for one.
+    """Return a function that formats rows of floats as lines; ``line`` has a ``%s`` per column.
 
-    9 digits tell all single-precision numbers apart. For double precision Python writes as few as
-    tell them apart, up to 17.
+    9 digits identify every float32. For float64 Python writes the shortest representation that
+    reads back the same, up to 17 digits.
     """
 
     def to_bytes(rows: NDArray[Any]) -> bytes:
@@ -55,10 +55,10 @@ def number_lines(line: str) -> ToBytes:
 
 
 def index_lines(line: str, first: int = 0) -> ToBytes:
-    """Return what turns triangles into lines, vertices counted from ``first``."""
+    """Return a function that formats triangles as lines; vertex indices start at ``first``."""
 
     def to_bytes(rows: NDArray[Any]) -> bytes:
-        numbers = rows.astype(np.int64) + first  # the last may not fit in 32 bits any more
+        numbers = rows.astype(np.int64) + first  # after the addition the last may exceed 32 bits
         return ((line * len(rows)) % tuple(numbers.ravel().tolist())).encode("ascii")
 
     return to_bytes

@@ -1,4 +1,4 @@
-"""3MF: a zip archive with the mesh as XML, compressed as it comes."""
+"""3MF: a zip archive with the mesh as XML, compressed while it is written."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ RELATIONS = (
     '<Relationship Target="/3D/3dmodel.model" Id="rel0" '
     'Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/></Relationships>\n'
 )
-COMPRESSION = 1  # the quickest: higher ones save a tenth, and take three times as long
+COMPRESSION = 1  # the fastest level: higher ones save a tenth and take three times as long
 BEFORE = (
     '<model unit="millimeter" xml:lang="en-US" '
     'xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">\n'
@@ -38,9 +38,9 @@ AFTER = '</triangles></mesh></object></resources><build><item objectid="1"/></bu
 
 
 def write_3mf(pieces: Iterable[Mesh], path: Path) -> None:
-    """Write 3MF; the unit is the format's default, the millimetre.
+    """Write 3MF in the format's default unit, the millimetre.
 
-    Members that are opened by name have no date: the same mesh makes the same file.
+    Members opened by name have no date, so the same mesh always gives the same file.
     """
     with (
         ZipFile(path, "w", ZIP_DEFLATED, compresslevel=COMPRESSION) as archive,
@@ -54,7 +54,7 @@ def write_3mf(pieces: Iterable[Mesh], path: Path) -> None:
 
 
 def _write_model(pieces: Iterable[Mesh], file: IO[bytes], waiting: IO[bytes]) -> None:
-    """Write the mesh; its triangles wait as numbers, half their text."""
+    """Write the mesh; its triangles wait as binary numbers, which take half as much as text."""
     file.write((HEAD + BEFORE).encode("ascii"))
     vertices = number_lines('<vertex x="%s" y="%s" z="%s"/>\n')
     write_split(pieces, (file, waiting), (vertices, _wide), TEXT_CHUNK)

@@ -1,7 +1,7 @@
-"""Arrays that cannot be read where they are: packed ones, and those of which x runs fastest.
+"""Arrays that cannot be read plane by plane in their file: compressed, or in Fortran order.
 
 Each is copied once, from its first byte to its last: into memory if it is small, else into a
-temporary file, which has no name and is gone with the process, however that ends.
+temporary file without a name, which disappears with the process, however that ends.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, OutOfMemoryError
-from ..grid.planes import InputFile, PlaneFile, Samples
+from ..grid.planes import InputFile, PlaneFile, SampleArray
 from ..machine.memory import in_words
 from .headers import ArrayHeader, Read
 
@@ -25,29 +25,34 @@ PIECE = 1 << 23  # bytes at a time
 ON_DISK = "/var/tmp"  # /tmp is in memory on many systems
 
 Write = Callable[[int, NDArray[np.uint8]], None]
-"""Puts bytes at a place, counted from the beginning."""
+"""Writes bytes at an offset from the beginning."""
 
 
-def unpack(read: Read, header: ArrayHeader, name: str, room: int) -> Samples:
-    """Return the three-dimensional array whose bytes come from ``read``.
+def unpack(read: Read, header: ArrayHeader, name: str, room: int) -> SampleArray:
+    """Return the 3D array (nx, ny, nz) whose bytes come from ``read``.
 
     Parameters
     ----------
     read : callable
-        Gives the bytes behind the header.
+        Returns the next bytes after the header.
     header : ArrayHeader
-        What they are.
+        Shape, dtype and order of the array.
     name : str
-        What errors call the array.
+        The name of the array in error messages.
     room : int
-        The bytes that it may take of memory.
+        Bytes of memory that the array may take.
+
+    Returns
+    -------
+    array or PlaneFile
+        In memory if it fits in ``room``, else in a temporary file.
 
     Raises
     ------
     OutOfMemoryError
-        If it is larger than that, and than what is free where temporary files go.
+        If it fits neither in ``room`` nor in the folder for temporary files.
     """
-    copy_all = _copy_turned if header.fortran_order else _copy
+    copy_all = _copy_swapped if header.fortran_order else _copy
     if header.size <= room:
         held = np.empty(header.size, np.uint8)
         copy_all(read, header, _writer_to(held))
@@ -55,12 +60,12 @@ def unpack(read: Read, header: ArrayHeader, name: str, room: int) -> Samples:
     file = _scratch_file(header, name)
     copy_all(read, header, _writer_to_file(file, name))
     return PlaneFile(
-        InputFile(file, name), 0, header.shape, header.dtype, turned=header.fortran_order
+        InputFile(file, name), 0, header.shape, header.dtype, swapped=header.fortran_order
     )
 
 
 def _as_planes(held: NDArray[np.uint8], header: ArrayHeader) -> NDArray[Any]:
-    """Return bytes as the array that they are."""
+    """Return a view of the bytes as an array (nx, ny, nz)."""
     nx, ny, nz = header.shape
     if header.fortran_order:
         return held.view(header.dtype).reshape(nx, nz, ny).transpose(0, 2, 1)
@@ -68,15 +73,15 @@ def _as_planes(held: NDArray[np.uint8], header: ArrayHeader) -> NDArray[Any]:
 
 
 def _copy(read: Read, header: ArrayHeader, write: Write) -> None:
-    """Copy an array."""
+    """Copy an array in C order."""
     for start in range(0, header.size, PIECE):
         write(start, np.frombuffer(read(min(PIECE, header.size - start)), np.uint8))
 
 
-def _copy_turned(read: Read, header: ArrayHeader, write: Write) -> None:
-    """Copy an array of which x runs fastest, then y, so that x runs slowest, then z.
+def _copy_swapped(read: Read, header: ArrayHeader, write: Write) -> None:
+    """Copy an array in Fortran order (x fastest, then y, then z) to the order x, z, y (y fastest).
 
-    So a plane of x is in one piece, and a few planes of z at a time go in pieces of some kilobytes.
+    Then a plane of x is contiguous, and each chunk of z planes is written in pieces of kilobytes.
     """
     nx, ny, nz = header.shape
     size = header.dtype.itemsize
@@ -84,13 +89,13 @@ def _copy_turned(read: Read, header: ArrayHeader, write: Write) -> None:
     for first in range(0, nz, step):
         count = min(step, nz - first)
         planes = np.frombuffer(read(count * nx * ny * size), header.dtype)
-        turned = np.ascontiguousarray(planes.reshape(count * ny, nx).T).view(np.uint8)
-        for i, piece in enumerate(turned):
+        swapped = np.ascontiguousarray(planes.reshape(count * ny, nx).T).view(np.uint8)
+        for i, piece in enumerate(swapped):
             write((i * nz + first) * ny * size, piece)
 
 
 def _writer_to(held: NDArray[np.uint8]) -> Write:
-    """Return what writes to memory."""
+    """Return a function that writes to memory."""
 
     def write(start: int, piece: NDArray[np.uint8]) -> None:
         held[start : start + len(piece)] = piece
@@ -99,7 +104,7 @@ def _writer_to(held: NDArray[np.uint8]) -> Write:
 
 
 def _writer_to_file(file: FileIO, name: str) -> Write:
-    """Return what writes to a file."""
+    """Return a function that writes to a file."""
 
     def write(start: int, piece: NDArray[np.uint8]) -> None:
         rest = piece.data
@@ -117,21 +122,21 @@ def _writer_to_file(file: FileIO, name: str) -> Write:
 
 
 def scratch_folder() -> str:
-    """Return the folder for temporary files: that of TMPDIR, else one on a disk."""
+    """Return the folder for temporary files: TMPDIR, else one on a disk."""
     if not os.environ.get("TMPDIR") and os.access(ON_DISK, os.W_OK):
         return ON_DISK
     return tempfile.gettempdir()
 
 
 def _scratch_file(header: ArrayHeader, name: str) -> FileIO:
-    """Return an empty file without a name, where there is room for an array."""
+    """Return an empty unnamed file on a disk with room for an array."""
     folder = scratch_folder()
     free = shutil.disk_usage(folder).free
     if header.size > free:
         raise OutOfMemoryError(
             f"{name}, {header}, is too large to unpack into memory, and {folder} has "
-            f"{in_words(free)} free; save it as .npy, its last axis fastest, or set TMPDIR to a "
-            "folder with more room"
+            f"{in_words(free)} free; save it as .npy in C order, or set TMPDIR to a folder "
+            "with more room"
         )
     try:
         return tempfile.TemporaryFile(dir=folder, prefix="super-sdf-", buffering=0)

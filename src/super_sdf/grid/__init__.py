@@ -1,4 +1,4 @@
-"""The coarse input: its samples, and what they say of sign and spacing.
+"""The coarse input: its samples, and the sign and spacing that are inferred from them.
 
 It may import ``machine`` and ``errors``.
 """

@@ -1,7 +1,7 @@
-"""How a field changes from sample to sample next to its surface.
+"""Gradients of a field next to its surface, from which the spacing is estimated.
 
-Wherever a distance field is smooth its gradient has length 1, so in units of samples the length is
-the spacing.
+Where a distance field is smooth its gradient has length 1 in world units, so its length in index
+units is the spacing.
 """
 
 from __future__ import annotations
@@ -10,26 +10,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import GridError
-from .planes import Samples
+from .planes import SampleArray
 
-# Values are clipped here, so that squares of their differences do not overflow.
-FARTHEST = 1e150
-ENOUGH = 30  # samples for a statement
-STRAIGHT = 0.3  # bend (see surface_gradients) below which a field is linear enough to measure
-BENT = 0.6  # bend beyond which lengths may agree by chance, as those of a distance to a mask do
-# Gradients are consistent if nine in ten of the straighter ones agree within 5 %.
+# Values are clamped to this, so that squares of their differences do not overflow.
+LARGEST_VALUE = 1e150
+ENOUGH = 30  # least number of samples for an estimate
+STRAIGHT = 0.3  # largest bend (see surface_gradients) of a field that is nearly linear
+BENT = 0.6  # larger bends: lengths may agree by chance, as for the distance to a mask
+# Gradients are consistent if nine in ten of the straightest ones agree within 5 %.
 AGREEING, AGREEMENT = 0.9, 0.05
-UNEQUAL = 1.3  # ratio of the spacings along two axes that the values themselves show
+UNEQUAL = 1.3  # ratio of the spacings measured along two axes from which they differ
 
 
-def surface_gradients(values: Samples) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return index-space gradients at samples next to the surface, and how bent the field is there.
+def surface_gradients(values: SampleArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return gradients and bends of the field at samples next to the surface.
+
+    At most 64 planes are read, spread evenly along x.
+
+    Parameters
+    ----------
+    values : (nx, ny, nz) array or PlaneFile
+        Samples; positive on one side of the surface.
 
     Returns
     -------
-    (n, 3) and (n,) float64
-        Central differences; and the sum of the second differences over the gradient's length. At
-        most 64 planes are looked at.
+    gradients : (n, 3) float64
+        Central differences, in index units.
+    bend : (n,) float64
+        Sum of the absolute second differences over the length of the gradient: 0 for a linear
+        field.
     """
     planes = np.unique(np.linspace(0, len(values) - 1, 64).astype(int))
     found = [_plane_gradients(values, int(i)) for i in planes]
@@ -37,11 +46,13 @@ def surface_gradients(values: Samples) -> tuple[NDArray[np.float64], NDArray[np.
     return gradients, bend
 
 
-def _plane_gradients(values: Samples, i: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return gradients (n, 3) and their relative change (n,) next to the surface in plane i."""
+def _plane_gradients(
+    values: SampleArray, i: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return gradients (n, 3) and bends (n,) at samples next to the surface in plane i."""
     first = max(i - 1, 0)
     slab = values[first : i + 2].astype(np.float64)
-    np.clip(slab, -FARTHEST, FARTHEST, out=slab)
+    np.clip(slab, -LARGEST_VALUE, LARGEST_VALUE, out=slab)
     inside = slab <= 0
     near = np.zeros(slab.shape, bool)
     bend = np.zeros(slab.shape)
@@ -53,17 +64,23 @@ def _plane_gradients(values: Samples, i: int) -> tuple[NDArray[np.float64], NDAr
         b[1:-1] += np.abs(d[2:] - 2 * d[1:-1] + d[:-2])
     chosen = near[i - first]
     gradient = np.asarray(np.gradient(slab))[:, i - first][:, chosen].T
-    turn, length = bend[i - first][chosen], lengths(gradient)
+    change, length = bend[i - first][chosen], lengths(gradient)
     relative = np.full(len(length), np.inf)  # where opposite neighbours are equal, or nearly
-    np.divide(turn, length, out=relative, where=length > 1e-9 * turn)
+    np.divide(change, length, out=relative, where=length > 1e-9 * change)
     return gradient, relative
 
 
 def typical_length(gradients: NDArray[np.float64], bend: NDArray[np.float64]) -> float:
-    """Return the length round which the gradients (n, 3) cluster: their half-sample mode.
+    """Return the half-sample mode of the lengths of gradients (n, 3), at the straighter samples.
 
-    Only the straighter samples count (``_straighter``).
-    Reference: Bickel and Frühwirth, "On a fast, robust estimator of the mode", 2006.
+    Raises
+    ------
+    GridError
+        If there is no gradient.
+
+    References
+    ----------
+    Bickel and Frühwirth, "On a fast, robust estimator of the mode", 2006.
     """
     if not len(gradients):
         raise GridError("all values are on one side of the surface: give --spacing")
@@ -77,15 +94,16 @@ def typical_length(gradients: NDArray[np.float64], bend: NDArray[np.float64]) ->
 
 
 def lengths(gradients: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the lengths of gradients (n, 3)."""
+    """Return the lengths, (n,), of gradients (n, 3)."""
     length: NDArray[np.float64] = np.sqrt((gradients**2).sum(1))
     return length
 
 
 def _straighter(bend: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Say which samples are in the straighter half, and straight indeed if that are enough.
+    """Return a mask, (n,), of the samples in the less bent half of the field.
 
-    Thin walls, edges and noise bend the field, and make its gradient too small or too large.
+    If enough samples are below ``STRAIGHT``, only those are kept. Thin walls, edges and noise bend
+    the field, and make its gradient too short or too long.
     """
     limit = float(np.median(bend))
     if (bend < STRAIGHT).sum() >= ENOUGH:
@@ -96,7 +114,7 @@ def _straighter(bend: NDArray[np.float64]) -> NDArray[np.bool_]:
 def are_consistent(
     measured: float, gradients: NDArray[np.float64], bend: NDArray[np.float64]
 ) -> bool:
-    """Say whether the straighter samples agree on what is measured: it is no matter of noise."""
+    """Return whether the lengths at the straighter samples agree with the measured spacing."""
     straighter = _straighter(bend) & (bend <= BENT)
     length = lengths(gradients[straighter])
     agreeing = np.abs(length - measured) <= AGREEMENT * measured
@@ -104,7 +122,7 @@ def are_consistent(
 
 
 def check_equal_axes(gradients: NDArray[np.float64], bend: NDArray[np.float64]) -> None:
-    """Raise if the values themselves show different spacings along the axes."""
+    """Raise GridError if the gradients show different spacings along the axes."""
     length = lengths(gradients)
     found: dict[str, float] = {}
     for axis, name in enumerate("xyz"):

@@ -1,8 +1,8 @@
 """Arrays in files, read plane by plane.
 
-Not mapped into memory: a map counts as memory of this process, and if another process cuts the file
-off, the system kills whoever looks behind its new end. What is read here is what the file held when
-it was opened, or an error.
+The files are not memory-mapped: mapped pages count as memory of this process, and if another
+process truncates the file, reading beyond its new end kills this one. Here, data that changed since
+the file was opened is an error.
 """
 
 from __future__ import annotations
@@ -22,34 +22,40 @@ from numpy.typing import DTypeLike, NDArray
 from ..errors import FileError
 from ..machine.memory import check_fits
 
-BLOCK_BYTES = 1 << 20  # read at a time when all planes are
+BLOCK_BYTES = 1 << 20  # read at a time when iterating over all planes
 
 
 class InputFile:
-    """A file that is read at any place, by any thread; it must not change meanwhile.
+    """A file that any thread may read at any offset; it must not change while it is open.
 
     Parameters
     ----------
     file : FileIO
         The open file.
     name : str
-        What errors call it.
+        The name of the file in error messages.
 
     Attributes
     ----------
     size : int
-        Its bytes when it was opened.
+        Size of the file in bytes when it was opened.
     """
 
     def __init__(self, file: FileIO, name: str) -> None:
         self.file, self.name = file, name
-        self.state = self._look()
+        self.state = self._stat()
         self.size = self.state[0]
         self._lock = Lock()
 
     @classmethod
     def open(cls, path: Path) -> InputFile:
-        """Open a file by its path."""
+        """Open a file by its path.
+
+        Raises
+        ------
+        FileError
+            If it cannot be opened.
+        """
         try:
             return cls(FileIO(str(path)), str(path))
         except OSError as error:
@@ -59,18 +65,24 @@ class InputFile:
         if hasattr(self, "file"):
             self.file.close()
 
-    def _look(self) -> tuple[int, int]:
+    def _stat(self) -> tuple[int, int]:
         """Return size and time of the last change."""
-        found = os.fstat(self.file.fileno())
-        return found.st_size, found.st_mtime_ns
+        status = os.fstat(self.file.fileno())
+        return status.st_size, status.st_mtime_ns
 
     def check_unchanged(self) -> None:
         """Raise FileError if the file was written to since it was opened."""
-        if self._look() != self.state:
+        if self._stat() != self.state:
             raise FileError(f"{self.name} changed while it was read: read it when it is complete")
 
     def read_into(self, out: NDArray[Any], offset: int) -> None:
-        """Fill an array, contiguous in memory, with what is in the file from ``offset`` on."""
+        """Fill a contiguous array with the bytes of the file from ``offset`` on.
+
+        Raises
+        ------
+        FileError
+            If the file changed, ends too early, or cannot be read.
+        """
         view = out.view(np.uint8).reshape(-1).data
         while view:
             count = self._read_some(view, offset)
@@ -82,9 +94,9 @@ class InputFile:
             raise FileError(f"{self.name} ends {len(view):,} bytes too early")
 
     def _read_some(self, view: memoryview, offset: int) -> int:
-        """Read at least a byte unless the file ends; return how many."""
+        """Read at least one byte unless the file ends; return the number of bytes read."""
         try:
-            if hasattr(os, "preadv"):  # no place that forked processes would share
+            if hasattr(os, "preadv"):  # needs no file position, which forked processes share
                 return os.preadv(self.file.fileno(), [view], offset)
             with self._lock:
                 self.file.seek(offset)
@@ -93,25 +105,25 @@ class InputFile:
             raise FileError(f"{self.name} cannot be read: {error.strerror or error}") from None
 
     def read(self, offset: int, count: int) -> NDArray[np.uint8]:
-        """Return at most ``count`` bytes from ``offset`` on, fewer only where the file ends."""
+        """Return ``count`` bytes from ``offset`` on, or fewer at the end of the file."""
         out = np.empty(max(min(count, self.size - offset), 0), np.uint8)
         self.read_into(out, offset)
         return out
 
 
 class PlaneFile:
-    """An array in a file, of which planes along the first axis are read when asked for.
+    """A 3D array in a file, whose planes along the first axis are read when they are needed.
 
     Parameters
     ----------
     file : InputFile
-        Where it is.
+        The file.
     offset : int
-        The byte at which it begins.
+        The byte in the file at which the array begins.
     shape, dtype
-        The array's, of three axes (nx, ny, nz).
-    turned : bool
-        In the file the last two axes are swapped: (nx, nz, ny).
+        Shape (nx, ny, nz) and type of the array.
+    swapped : bool
+        Whether the last two axes are swapped in the file: (nx, nz, ny).
     """
 
     ndim = 3
@@ -123,32 +135,32 @@ class PlaneFile:
         shape: tuple[int, ...],
         dtype: np.dtype[Any],
         *,
-        turned: bool = False,
+        swapped: bool = False,
     ) -> None:
         self.file, self.offset = file, offset
-        self.shape, self.dtype, self.turned = shape, dtype, turned
+        self.shape, self.dtype, self.swapped = shape, dtype, swapped
         self.plane_bytes = shape[1] * shape[2] * dtype.itemsize
 
     def __len__(self) -> int:
         return self.shape[0]
 
     def read(self, first: int, last: int) -> NDArray[Any]:
-        """Return planes ``first`` to before ``last``.
+        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz).
 
         Raises
         ------
         FileError
-            If the file was changed since it was opened, or cannot be read any more.
+            If the file changed since it was opened, or cannot be read any more.
         """
         _, ny, nz = self.shape
         planes = np.empty(
-            (max(last - first, 0), *((nz, ny) if self.turned else (ny, nz))), self.dtype
+            (max(last - first, 0), *((nz, ny) if self.swapped else (ny, nz))), self.dtype
         )
         self.file.read_into(planes, self.offset + first * self.plane_bytes)
-        return planes.transpose(0, 2, 1) if self.turned else planes
+        return planes.transpose(0, 2, 1) if self.swapped else planes
 
     def __getitem__(self, which: int | slice) -> NDArray[Any]:
-        """Return one plane, or a run of planes, as of an array."""
+        """Return one plane or a range of planes, as indexing an array would."""
         if isinstance(which, slice):
             first, last, step = which.indices(len(self))
             return self.read(first, last) if step == 1 else self.loaded[which]
@@ -178,9 +190,9 @@ class PlaneFile:
         return np.array(self.loaded, dtype) if copy else np.asarray(self.loaded, dtype)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Give another process the array: it may not have the file."""
+        """Pickle the array itself: another process may not have the file."""
         return np.asarray, (self.loaded,)
 
 
-Samples: TypeAlias = NDArray[Any] | PlaneFile
-"""An array, or a file that is read as one."""
+SampleArray: TypeAlias = NDArray[Any] | PlaneFile
+"""An array of samples in memory, or in a file that is read plane by plane."""

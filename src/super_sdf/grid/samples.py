@@ -1,4 +1,4 @@
-"""What an array must be to hold the samples of a grid: numeric, three-dimensional, finite."""
+"""Checks that an array can hold the samples of a grid: numeric, three-dimensional, finite."""
 
 from __future__ import annotations
 
@@ -9,16 +9,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import GridError, seen
-from .planes import PlaneFile, Samples
+from .planes import PlaneFile, SampleArray
 
 Extremes = tuple[float, float]
 """The smallest and the largest sample."""
 
-MADE_FROM_MASKS = "make them with scipy.ndimage.distance_transform_edt"
+DISTANCES_HINT = "make them with scipy.ndimage.distance_transform_edt"
 
 
-def as_samples(values: ArrayLike | PlaneFile) -> Samples:
-    """Return an array of samples; a file that is read by planes stays one. None may be masked."""
+def as_samples(values: ArrayLike | PlaneFile) -> SampleArray:
+    """Return samples as an array; a ``PlaneFile`` is returned as it is.
+
+    Raises
+    ------
+    GridError
+        If they make no array, or some are masked.
+    """
     if isinstance(values, PlaneFile):
         return values
     try:
@@ -42,17 +48,23 @@ def _unmasked(samples: np.ma.MaskedArray[Any, Any]) -> NDArray[Any]:
     return np.asarray(samples.data)
 
 
-def check_values(values: Samples) -> Extremes:
-    """Return the smallest and largest sample of a finite, numeric, three-dimensional array."""
+def check_values(values: SampleArray) -> Extremes:
+    """Return the smallest and the largest sample.
+
+    Raises
+    ------
+    GridError
+        If the array is not numeric and three-dimensional, or a sample is not finite.
+    """
     check_kind(values.dtype, values.shape)
     return _find_extremes(values)
 
 
 def check_kind(dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
-    """Raise if an array of this type and shape holds no grid, whatever its values."""
+    """Raise GridError if an array of this type and shape cannot be a grid."""
     if dtype == np.bool_:
         raise GridError(
-            f"values are true or false: an occupancy grid holds no distances; {MADE_FROM_MASKS}"
+            f"values are true or false: an occupancy grid holds no distances; {DISTANCES_HINT}"
         )
     if dtype.kind not in "fiu":
         raise GridError(f"values have dtype {dtype}: give floating-point or integer numbers")
@@ -62,11 +74,11 @@ def check_kind(dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
         raise GridError(f"values have shape {shape}: give at least 2 samples on each axis")
 
 
-def _find_extremes(values: Samples) -> Extremes:
+def _find_extremes(values: SampleArray) -> Extremes:
     """Return the smallest and the largest sample, or raise on the first NaN or infinity.
 
-    Plane by plane, for the grid may be in a file. Extremes tell of bad samples, too: the
-    smallest of numbers and a NaN is NaN.
+    It is read plane by plane, since the grid may be in a file. The extremes also reveal bad
+    samples: the minimum of numbers and a NaN is NaN.
     """
     extremes = []
     for i, plane in enumerate(values):
@@ -83,13 +95,13 @@ def _find_extremes(values: Samples) -> Extremes:
     return min(lows), max(highs)
 
 
-def check_not_flat(values: Samples, extremes: Extremes) -> None:
-    """Raise if the values are constant or an occupancy grid."""
+def check_not_flat(values: SampleArray, extremes: Extremes) -> None:
+    """Raise GridError if the values are constant or an occupancy grid."""
     low, high = extremes
     if low == high:
         raise GridError(f"every value is {low:.6g}: a constant field has no surface")
     if min(values.shape) > 2 and all(((p == low) | (p == high)).all() for p in values):
         raise GridError(
             f"the only values are {low:.6g} and {high:.6g}: an occupancy grid holds no distances; "
-            f"{MADE_FROM_MASKS}"
+            f"{DISTANCES_HINT}"
         )

@@ -1,4 +1,4 @@
-"""The coarse input: a regular grid of signed distances and where it lies in the world."""
+"""The coarse input: a regular grid of signed distances and its position in the world."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Triple
-from .planes import PlaneFile, Samples
+from .planes import PlaneFile, SampleArray
 from .samples import Extremes, as_samples, check_not_flat, check_values
 from .sides import check_negative_inside, is_positive_inside
 from .spacing import as_triple, check_spacing, choose_spacing
@@ -20,28 +20,28 @@ from .spacing import as_triple, check_spacing, choose_spacing
 class SdfGrid:
     """Signed distances at the points ``world = origin + spacing * (i, j, k)``.
 
-    The constructor takes the values as negative inside and the spacing as known, and refuses values
-    that contradict either. ``make_grid`` infers the sign, and the spacing where it is not given.
+    The constructor expects values that are negative inside and a known spacing, and refuses values
+    that contradict either. ``make_grid`` infers the sign, and the spacing if it is not given.
 
     Parameters
     ----------
     values : (nx, ny, nz) array_like
         Signed distances in world units, negative inside; i runs along x, j along y, k along z. A
-        mapped file stays one, and a ``PlaneFile``, too.
+        memory-mapped array or a ``PlaneFile`` is not loaded.
     spacing : float or three floats
         World distance between neighbouring samples; equal on all axes.
     origin : float or three floats
-        World position of sample (0, 0, 0); the world's origin unless given.
+        World position of sample (0, 0, 0). Default: 0, 0, 0.
 
     Attributes
     ----------
     values : (nx, ny, nz) array
-        All samples, negative inside. If they are in a file it is loaded when they are asked for,
-        and they stay in memory; ``planes`` reads some.
+        All samples, negative inside. Samples in a file are loaded on first use and stay in memory;
+        ``planes`` reads some of them without that.
     low, high : float
-        The smallest and the largest of them.
+        The smallest and the largest sample, negative inside.
     notes : tuple of str
-        What was inferred rather than given, a sentence each.
+        Sentences that say what was inferred rather than given.
 
     Raises
     ------
@@ -51,7 +51,7 @@ class SdfGrid:
         the values change from sample to sample by more than the spacing, or by much less.
     """
 
-    samples: Samples
+    samples: SampleArray
     spacing: Triple
     origin: Triple
     notes: tuple[str, ...]
@@ -79,10 +79,10 @@ class SdfGrid:
         positive_inside: bool = False,
         extremes: Extremes | None = None,
     ) -> SdfGrid:
-        """Return a grid whose sign and spacing are known and therefore not checked.
+        """Return a grid whose sign and spacing are known and not checked against the values.
 
-        With ``positive_inside`` the values are read with the other sign. With ``extremes``, their
-        smallest and largest, they are not searched for NaN and infinity again.
+        With ``positive_inside`` the sign of the values is flipped. With ``extremes``, their minimum
+        and maximum, they are not searched for NaN and infinity again.
         """
         samples = as_samples(values)
         grid = object.__new__(cls)
@@ -92,7 +92,7 @@ class SdfGrid:
 
     def _set(
         self,
-        samples: Samples,
+        samples: SampleArray,
         spacing: Triple,
         origin: ArrayLike,
         notes: tuple[str, ...],
@@ -126,13 +126,13 @@ class SdfGrid:
         return negated(whole) if self.positive_inside else whole
 
     def planes(self, first: int, last: int) -> NDArray[Any]:
-        """Return the samples with i from ``first`` to before ``last``, negative inside."""
+        """Return the samples with first <= i < last, negative inside, (last - first, ny, nz)."""
         samples = self.samples[first:last]
         return negated(samples) if self.positive_inside else samples
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Samples along x, y and z."""
+        """Number of samples along x, y and z."""
         nx, ny, nz = self.samples.shape
         return nx, ny, nz
 
@@ -149,30 +149,30 @@ def make_grid(
     origin: ArrayLike | None = None,
     inside: str = "auto",
 ) -> SdfGrid:
-    """Make a grid from an array of signed distances, inferring what is not given.
+    """Make a grid from an array of signed distances; what is not given is inferred.
 
     Parameters
     ----------
     values : (nx, ny, nz) array_like
-        Signed distances; i runs along x, j along y, k along z.
+        Signed distances in world units; i runs along x, j along y, k along z.
     spacing : number or three, optional
-        World distance between samples; estimated from the gradient if not given.
-    origin : three numbers, optional
-        World position of sample (0, 0, 0); the world's origin if not given.
+        World distance between neighbouring samples. Default: estimated from the gradient.
+    origin : number or three, optional
+        World position of sample (0, 0, 0). Default: 0, 0, 0.
     inside : {"auto", "negative", "positive"}
-        The sign of samples inside the solid; "auto" takes the border of the grid for outside.
+        Sign of the values inside the solid; "auto" takes the border of the grid as outside.
 
     Returns
     -------
     SdfGrid
-        Negative inside; ``notes`` says what was inferred.
+        The grid, negative inside; its ``notes`` say what was inferred.
 
     Raises
     ------
     GridError
-        If the values are no signed distances, or contradict the spacing.
+        If the values are not signed distances, or contradict the spacing.
     OptionError
-        If ``inside`` is another word.
+        If ``inside`` is not one of these.
     """
     samples, extremes = _checked(values)
     notes: list[str] = []
@@ -180,14 +180,14 @@ def make_grid(
     chosen = choose_spacing(samples, spacing, notes)
     if origin is None:
         notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
-    at = 0.0 if origin is None else origin
+        origin = 0.0
     return SdfGrid.trusted(
-        samples, chosen, at, tuple(notes), positive_inside=flipped, extremes=extremes
+        samples, chosen, origin, tuple(notes), positive_inside=flipped, extremes=extremes
     )
 
 
-def _checked(values: ArrayLike | PlaneFile) -> tuple[Samples, Extremes]:
-    """Return samples that can be those of a solid, with the smallest and the largest."""
+def _checked(values: ArrayLike | PlaneFile) -> tuple[SampleArray, Extremes]:
+    """Return samples as an array, and their extremes; raise GridError if they are no field."""
     samples = as_samples(values)
     extremes = check_values(samples)
     check_not_flat(samples, extremes)
@@ -195,5 +195,5 @@ def _checked(values: ArrayLike | PlaneFile) -> tuple[Samples, Extremes]:
 
 
 def negated(values: NDArray[Any]) -> NDArray[Any]:
-    """Return the values with the other sign, unsigned integers among them."""
+    """Return the negated values, as floats so that unsigned integers work."""
     return -values.astype(np.promote_types(values.dtype, np.float32))

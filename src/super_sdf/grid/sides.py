@@ -1,16 +1,37 @@
-"""Which sign is inside: the border of the grid is taken for outside, whatever the offset."""
+"""Which sign is inside: the border of the grid counts as outside, whatever the offset."""
 
 from __future__ import annotations
 
 from ..errors import GridError, OptionError, seen
-from .planes import Samples
+from .planes import SampleArray
 from .samples import Extremes
 
 INSIDE = ("auto", "negative", "positive")
 
 
-def is_positive_inside(values: Samples, inside: str, extremes: Extremes, notes: list[str]) -> bool:
-    """Say whether the values are positive inside, by word or, if that is "auto", by the border."""
+def is_positive_inside(
+    values: SampleArray, inside: str, extremes: Extremes, notes: list[str]
+) -> bool:
+    """Return whether the values are positive inside: as given, or for "auto" from the border.
+
+    Parameters
+    ----------
+    values : (nx, ny, nz) array or PlaneFile
+        Samples.
+    inside : str
+        One of ``INSIDE``.
+    extremes : two floats
+        The smallest and the largest sample.
+    notes : list of str
+        A sentence is added if the sign was inferred and may be wrong.
+
+    Raises
+    ------
+    OptionError
+        If ``inside`` is unknown.
+    GridError
+        If all values are on one side of the surface.
+    """
     if not isinstance(inside, str) or inside not in INSIDE:
         raise OptionError(f"inside is {seen(inside)}: give one of {', '.join(INSIDE)}")
     if inside != "auto":
@@ -23,13 +44,13 @@ def is_positive_inside(values: Samples, inside: str, extremes: Extremes, notes: 
         sign = "positive" if positive else "negative"
         notes.append(
             f"{sign} values are taken as inside: {share:.0%} of the grid's border has the other "
-            "sign (say otherwise with --inside)"
+            "sign (if that is wrong, use --inside)"
         )
     return positive
 
 
-def check_negative_inside(values: Samples) -> None:
-    """Raise if most of the border is negative: such values seem to be positive inside."""
+def check_negative_inside(values: SampleArray) -> None:
+    """Raise GridError if most of the border is negative: the sign seems to be reversed."""
     below, total = _count_border(values)
     if _is_mostly_negative(below, total):
         raise GridError(
@@ -40,27 +61,27 @@ def check_negative_inside(values: Samples) -> None:
 
 
 def check_both_sides(extremes: Extremes) -> None:
-    """Raise if all values are on one side of the surface."""
+    """Raise GridError if all values are on one side of the surface."""
     low, high = extremes
     if low >= 0:
         raise GridError(
             f"no value is below 0 (the smallest is {low:.6g}): an unsigned field has no "
-            "inside; if the solid is thinner than the spacing, say --inside negative"
+            "inside; if the solid is thinner than the spacing, use --inside negative"
         )
     if high <= 0:
         raise GridError(
             f"no value is above 0 (the largest is {high:.6g}): the grid lies within the "
-            "solid; if that is outside and the solid thin, say --inside positive"
+            "solid; if that is outside and the solid thin, use --inside positive"
         )
 
 
 def _is_mostly_negative(below: int, total: int) -> bool:
-    """Say whether most of the border is negative."""
+    """Return whether most samples of the border are negative."""
     return 2 * below > total
 
 
-def _count_border(values: Samples) -> tuple[int, int]:
-    """Return how many samples of the grid's six faces are negative, and how many there are.
+def _count_border(values: SampleArray) -> tuple[int, int]:
+    """Return the number of negative samples on the six faces of the grid, and of all there.
 
     A sample on an edge counts for each of its faces.
     """

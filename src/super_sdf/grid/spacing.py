@@ -1,4 +1,4 @@
-"""How far apart the samples are: as given, or as the values themselves say."""
+"""The spacing of the samples: as given, or estimated from the values."""
 
 from __future__ import annotations
 
@@ -8,30 +8,36 @@ from numpy.typing import ArrayLike, NDArray
 from ..arrays import Triple
 from ..errors import GridError, seen
 from .gradients import are_consistent, check_equal_axes, lengths, surface_gradients, typical_length
-from .planes import Samples
+from .planes import SampleArray
 
-# The method works on cubes: axes whose spacing differs by less than this are taken as equal.
+# The method needs cubic voxels: spacings that differ by less than this ratio count as equal.
 EQUAL_SPACING = 1e-3
-# Spacings in which areas, volumes and squares of areas are numbers, with room to either side.
+# Within these, areas, volumes and squared areas neither overflow nor underflow.
 LEAST_SPACING, MOST_SPACING = 1e-60, 1e60
-SNAP = 0.02  # an estimate this near to a usual spacing is taken for it
-# Ratio of measured to given spacing, or its inverse, from which on there is a note.
+SNAP = 0.02  # an estimate this close to a usual spacing is replaced by it
+# Ratio of measured to given spacing, or its inverse, above which there is a note.
 TOLERATED = 1.1
 # Distances cannot change by more than the samples are apart. Larger ratios are refused: the first
-# limit is for gradients that agree with each other, the second for noisy or bent fields.
+# limit applies to gradients that agree with each other, the second to noisy or bent fields.
 REFUSED, REFUSED_IF_UNSURE = 1.25, 2.0
-# Distances change by less at thin parts and where they are cut off. If nine in ten samples change
+# Distances change by less at thin parts and where they are truncated. If nine in ten samples change
 # by less than half the spacing, the unit is wrong.
 SLOW, SLOW_SHARE = 0.5, 0.9
 
 
 def as_triple(number: ArrayLike, name: str) -> Triple:
-    """Return one number or three as three finite floats."""
+    """Return one number or three as three floats.
+
+    Raises
+    ------
+    GridError
+        If ``number``, which the message calls ``name``, is neither or not finite.
+    """
     try:
         array = np.asarray(number)
-        if array.dtype.kind not in "fiu":  # truth values and words are none
+        if array.dtype.kind not in "fiu":  # booleans and strings are refused
             raise TypeError
-        with np.errstate(over="ignore"):  # of long doubles: found infinite below
+        with np.errstate(over="ignore"):  # of long doubles, which are found to be infinite below
             triple = np.broadcast_to(array.astype(np.float64).ravel(), (3,))
     except (TypeError, ValueError, RuntimeError):
         raise GridError(f"{name} is {seen(number)}: give one number or three") from None
@@ -41,7 +47,13 @@ def as_triple(number: ArrayLike, name: str) -> Triple:
 
 
 def check_spacing(spacing: ArrayLike) -> Triple:
-    """Return the spacing as three floats; they must be positive and equal (within 0.1 %)."""
+    """Return the spacing as three floats.
+
+    Raises
+    ------
+    GridError
+        If they are not positive, out of range, or not equal within 0.1 %.
+    """
     triple = as_triple(spacing, "spacing")
     if min(triple) <= 0:
         raise GridError(f"spacing is {_join(triple)}: it must be greater than 0")
@@ -58,8 +70,16 @@ def check_spacing(spacing: ArrayLike) -> Triple:
     return triple
 
 
-def choose_spacing(values: Samples, spacing: ArrayLike | None, notes: list[str]) -> Triple:
-    """Return the spacing that is given, or else measured; they must not contradict each other."""
+def choose_spacing(values: SampleArray, spacing: ArrayLike | None, notes: list[str]) -> Triple:
+    """Return the given spacing, or else the one that is measured on the values.
+
+    ``notes`` gets a sentence if the spacing was inferred or is doubtful.
+
+    Raises
+    ------
+    GridError
+        If the values contradict the given spacing, or show none.
+    """
     given = None if spacing is None else check_spacing(spacing)
     gradients, bend = surface_gradients(values)
     if given and not len(gradients):
@@ -73,7 +93,7 @@ def choose_spacing(values: Samples, spacing: ArrayLike | None, notes: list[str])
 
 
 def _infer_spacing(measured: float, shape: tuple[int, ...], notes: list[str]) -> Triple:
-    """Return the measured spacing, or the usual one that it is close to."""
+    """Return the measured spacing, or a usual one close to it."""
     if not LEAST_SPACING <= measured <= MOST_SPACING:
         raise GridError(
             f"spacing not given: the values change by {measured:.6g} from sample to sample; give "
@@ -100,18 +120,20 @@ def _check_unit(
     spacing: Triple,
     notes: list[str],
 ) -> None:
-    """Raise or note if the values contradict the given spacing."""
+    """Raise GridError, or add a note, if the values contradict the given spacing."""
     h = sum(spacing) / 3
-    said = f"the values change by {measured:.6g} from sample to sample, but spacing is "
+    observed = f"the values change by {measured:.6g} from sample to sample, but spacing is "
     allowed = REFUSED if are_consistent(measured, gradients, bend) else REFUSED_IF_UNSURE
     if measured > allowed * h or np.quantile(lengths(gradients), SLOW_SHARE) < SLOW * h:
         scale = f"scale the values by {h / measured:.6g} or " if measured > 0 else ""
         raise GridError(
-            f"{said}{spacing[0]:.6g}: distances and spacing must be in one unit; "
+            f"{observed}{spacing[0]:.6g}: distances and spacing must be in the same unit; "
             f"{scale}give another --spacing"
         )
     if not h / TOLERATED <= measured <= h * TOLERATED:
-        notes.append(f"{said}{spacing[0]:.6g}: they are no exact distances, or the unit is wrong")
+        notes.append(
+            f"{observed}{spacing[0]:.6g}: they are not exact distances, or the unit is wrong"
+        )
 
 
 def _join(triple: Triple) -> str:

@@ -1,4 +1,4 @@
-"""A white page: rows of pictures of one size, each under its title, and what explains them."""
+"""A white page with rows of pictures of one size, each under its title, and a legend."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from ..machine.memory import check_fits
 
 Image = NDArray[np.uint8]
 
-ACROSS = 4  # panels in a row unless told
-# Light where the error is small, for there the shading has to show the shape.
+COLUMNS = 4  # default number of panels in a row
+# Light where the error is small, so that the shading shows the shape there.
 COLOUR_MAP = "magma_r"
-LARGEST_SIZE = 8000  # pixels along a panel: drawn at twice that, which renderers still can
-LARGEST_SIDE = 60_000  # pixels along a page: matplotlib ends at 2^16, and there are margins
-BYTES_PER_DRAWN_PIXEL = 180  # while one panel is drawn, measured
+LARGEST_SIZE = 8000  # pixels along a panel; it is drawn at twice that, which renderers can do
+LARGEST_SIDE = 60_000  # pixels along a page: matplotlib's limit is 2^16, margins included
+BYTES_PER_DRAWN_PIXEL = 180  # of memory while one panel is drawn, measured
 BYTES_PER_PIXEL = 24  # of the page
-DPI = 72  # so that a point of type is a pixel
+DPI = 72  # so that a font size in points is one in pixels
 
 
 def check_page(size: int, count: int, columns: int | None = None) -> None:
-    """Raise if ``count`` pictures of that size are too large to be drawn on a page.
+    """Raise if a page of ``count`` pictures of ``size`` pixels is too large to draw.
 
     Raises
     ------
@@ -42,7 +42,7 @@ def check_page(size: int, count: int, columns: int | None = None) -> None:
     """
     if not 0 < size <= LARGEST_SIZE:
         raise OptionError(f"size is {size}: give 1 to {LARGEST_SIZE} pixels")
-    across = min(count, columns or ACROSS)
+    across = min(count, columns or COLUMNS)
     wide, tall = across * size, -(-count // across) * size
     what = f"a picture of {wide:,} x {tall:,} pixels"
     if max(wide, tall) > LARGEST_SIDE:
@@ -52,7 +52,7 @@ def check_page(size: int, count: int, columns: int | None = None) -> None:
 
 
 def write_picture(figure: Figure, target: Path, *, force: bool = True) -> None:
-    """Write a figure as PNG; the file appears whole, in place of an old one only by ``force``.
+    """Write a figure as a complete PNG file; ``force`` replaces an existing one.
 
     Raises
     ------
@@ -64,7 +64,21 @@ def write_picture(figure: Figure, target: Path, *, force: bool = True) -> None:
 
 
 class Page:
-    """A white page: rows of pictures of one size, each under its title, and what explains them."""
+    """A white page with rows of pictures of one size, each under its title, and a legend.
+
+    Parameters
+    ----------
+    size : int
+        Pixels along the long side of a picture; the font size follows from it.
+    images : sequence of (height, width, 3) uint8
+        The pictures.
+    titles : sequence of str
+        The text above each.
+    columns : int or None
+        Most pictures in a row; ``COLUMNS`` if None.
+    foot : float
+        Height of the legend, in lines of text.
+    """
 
     def __init__(
         self,
@@ -80,11 +94,11 @@ class Page:
         self.strip = round(2 * self.type_size) if any(titles) else 0
         self.foot = round(foot * self.type_size)
         self.tall, self.wide = images[0].shape[:2]
-        across = min(len(images), columns or ACROSS)
+        across = min(len(images), columns or COLUMNS)
         rows = -(-len(images) // across)
         self.width = across * (self.wide + self.gap) + self.gap
         self.height = rows * (self.strip + self.tall + self.gap) + self.gap + self.foot
-        # half a pixel more: the page's size is rounded down
+        # plus half a pixel, since the size of the page is rounded down
         inches = (self.width + 0.5) / DPI, (self.height + 0.5) / DPI
         self.figure = Figure(figsize=inches, dpi=DPI, facecolor="white")
         FigureCanvasAgg(self.figure)
@@ -92,14 +106,14 @@ class Page:
             self._put(image, title, *divmod(number, across))
 
     def _put(self, image: Image, title: str, row: int, column: int) -> None:
-        """Put a picture in its place, under its title."""
+        """Draw a picture at its row and column, under its title."""
         left = self.gap + column * (self.wide + self.gap)
         high = self.height - self.gap - row * (self.strip + self.tall + self.gap)
         self.figure.figimage(image, left, high - self.strip - self.tall, origin="upper")
         self._write(title, left + self.wide / 2, high - self.strip / 2, 1.0, self.wide)
 
     def _write(self, line: str, x: float, y: float, scale: float, room: float) -> None:
-        """Write a line round a point, smaller if it is wider than its room."""
+        """Write a line centred on (x, y), in pixels; smaller if it is wider than ``room``."""
         text = self.figure.text(
             x / self.width,
             y / self.height,
@@ -107,19 +121,19 @@ class Page:
             ha="center",
             va="center",
             size=scale * self.type_size,
-            parse_math=False,  # a file's name may hold dollars
+            parse_math=False,  # file names may hold dollar signs
         )
         wide = text.get_window_extent().width
         if wide > room:
             text.set_fontsize(scale * self.type_size * room / wide)
 
     def add_line(self, line: str, y: float | None = None) -> None:
-        """Add a line at the foot of the page."""
+        """Add a line of text at the foot of the page."""
         y = self.foot / 2 if y is None else y
         self._write(line, self.width / 2, y, 0.9, self.width - 2 * self.gap)
 
     def add_bar(self, title: str, top: float, *, clipped: bool) -> None:
-        """Add the colour bar, 0 to top, with an arrow if values lie beyond."""
+        """Add a colour bar from 0 to ``top``, with an arrow if ``clipped`` values lie beyond."""
         unit = self.type_size
         wide = min(1.2 * max(self.wide, self.tall), 0.8 * self.width)
         left, below = (self.width - wide) / 2, 2.0 * unit

@@ -1,6 +1,6 @@
-"""Pictures of meshes side by side, off screen: PyVista draws each, matplotlib sets the page.
+"""Pictures of meshes side by side, off screen: PyVista draws each, matplotlib lays out the page.
 
-All meshes of a picture are seen by one parallel projection, so lengths can be compared.
+All meshes of a picture share one parallel projection, so lengths can be compared.
 """
 
 from __future__ import annotations
@@ -19,39 +19,39 @@ from ..errors import OptionError
 from ..machine.extras import EXTRAS, check_modules, missing_modules
 from ..mesh import Mesh
 from ..truth.solid import Distances, Points, Solid
+from .choices import AXES, COLOURS
 from .page import COLOUR_MAP, Image, Page, check_page, write_picture
 
-COLOURS = ("shaded", "normal", "error")
-# For each axis that may point up: the direction to the right, and the one towards the viewer.
+# For each axis that may point up: the directions to the right and towards the viewer.
 RIGHT_AND_FRONT = {
     "x": ((0, 1, 0), (0, 0, -1)),
     "y": ((1, 0, 0), (0, 0, 1)),
     "z": ((1, 0, 0), (0, -1, 0)),
 }
 THREE_QUARTER = 0.6, 1.0, 0.5  # right, front and up of the default view
-BASE = "#b9c7df"
+MESH_COLOUR = "#b9c7df"
 TOP_PERCENTILE = 99.0  # so that a single stray vertex does not stretch the colours
-NORMALS_SAY = "colour: direction of the face; red, green, blue are (1 + normal)/2 along x, y, z"
-ZOOMS = 0.01, 1000.0  # beyond, a mesh is a dot or a flat colour
-LARGEST_TOP = 1e30  # of the colour bar, and one over the smallest: VTK's numbers are float32
-MARGIN = 1.06  # of the frame over what it holds
-NARROWEST = 0.5  # a panel's short side over its long one, at least: titles need room
-SUPERSAMPLING = 2  # pixels drawn for each pixel of the picture, along an axis
-FOOT = {"shaded": 0.0, "normal": 2.0, "error": 5.0}  # room for what explains them, in lines
+NORMALS_LEGEND = "colour: direction of the face; red, green, blue are (1 + normal)/2 along x, y, z"
+ZOOMS = 0.01, 1000.0  # smallest and largest: beyond, a mesh is a dot or a flat colour
+LARGEST_TOP = 1e30  # of the colour bar; the smallest is its inverse: VTK computes in float32
+MARGIN = 1.06  # size of the frame over the size of the meshes
+NARROWEST = 0.5  # least ratio of a panel's short side to its long one: titles need room
+SUPERSAMPLING = 2  # pixels drawn per pixel of the picture, along each axis
+FOOT = {"shaded": 0.0, "normal": 2.0, "error": 5.0}  # height of the legend, in lines of text
 
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """A mesh of a picture.
+    """One mesh of a picture.
 
     Attributes
     ----------
     mesh : Mesh
-        What is drawn.
+        The mesh that is drawn.
     title : str
-        Stands above it.
-    values : (n,), optional
-        A number for each vertex, shown where colours tell the error.
+        The text above it.
+    values : (n,) float array, optional
+        One value per vertex, shown with ``colour="error"``.
     """
 
     mesh: Mesh
@@ -59,20 +59,46 @@ class Panel:
     values: NDArray[Any] | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """The one view of all panels: x to the right, y up, z nearer, the long side from -1 to 1.
+@dataclass(frozen=True)
+class Layout:
+    """The camera's direction and the size of the panels.
 
     Attributes
     ----------
-    axes : (3, 3)
-        Those directions in the world, a row each.
-    centre : (3,)
-        What is in the middle, along these.
+    view : three floats, optional
+        Direction from the meshes to the viewer, in world axes. Default: from the front, the right
+        and above.
+    zoom : float
+        Magnification; at 1 every mesh fits into its panel.
+    size : int
+        Pixels along the long side of a panel.
+    columns : int, optional
+        Most panels in a row.
+    """
+
+    view: tuple[float, float, float] | None = None
+    zoom: float = 1.0
+    size: int = 700
+    columns: int | None = None
+
+
+DEFAULT_LAYOUT = Layout()
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """The view that all panels share: x to the right, y up, z to the viewer, long side -1 to 1.
+
+    Attributes
+    ----------
+    axes : (3, 3) float64
+        The directions of x, y and z in the world, one per row.
+    centre : (3,) float64
+        The middle of the frame, in coordinates along ``axes``.
     half : float
-        Of the long side, in world units.
+        Half the long side, in world units.
     sides : two floats
-        Width and height, over the long side.
+        Width and height, each over the long side.
     """
 
     axes: NDArray[np.float64]
@@ -81,21 +107,21 @@ class Frame:
     sides: tuple[float, float]
 
     def place(self, vertices: NDArray[Any]) -> Points:
-        """Return where vertices (n, 3) lie in the frame."""
+        """Return the positions of vertices (n, 3) in the frame, (n, 3) float64."""
         return (vertices.astype(np.float64) @ self.axes.T - self.centre) / self.half
 
     def pixels(self, size: int) -> tuple[int, int]:
-        """Return width and height of the panels if the long side has so many pixels."""
+        """Return width and height of a panel whose long side has ``size`` pixels."""
         return round(size * self.sides[0]), round(size * self.sides[1])
 
 
 def can_render() -> bool:
-    """Say whether PyVista is installed."""
+    """Return whether PyVista is installed."""
     return not missing_modules(EXTRAS["view"])
 
 
 def vertex_errors(mesh: Mesh, reference: Solid) -> Distances:
-    """Return the unsigned distance of each vertex to a reference, (n,), in world units."""
+    """Return the unsigned distance of each vertex to the reference, (n,), in world units."""
     return reference.distance(np.ascontiguousarray(mesh.vertices, np.float64))
 
 
@@ -105,12 +131,9 @@ def render_panels(
     *,
     colour: str = "shaded",
     up: str = "z",
-    view: tuple[float, float, float] | None = None,
-    zoom: float = 1.0,
-    size: int = 700,
+    layout: Layout = DEFAULT_LAYOUT,
     top: float | None = None,
     unit: str = "",
-    columns: int | None = None,
     force: bool = True,
 ) -> None:
     """Draw meshes side by side from one camera, as a PNG file.
@@ -118,59 +141,53 @@ def render_panels(
     Parameters
     ----------
     panels : sequence of Panel
-        From left to right.
+        The meshes, from left to right.
     target : path
-        The file.
+        The PNG file.
     colour : str
-        ``shaded``; ``normal``: of each face, (n + 1)/2 as red, green, blue; or ``error``: the
-        vertices' values with a colour bar. A panel without values is shaded then.
+        ``shaded``; ``normal``: (n + 1)/2 of each face normal n as red, green, blue; or ``error``:
+        the values of the vertices with a colour bar (panels without values are shaded).
     up : str
         The axis that points up: x, y or z.
-    view : three floats, optional
-        The direction from the meshes to the viewer, in world axes; from the front, the right and
-        above unless given.
-    zoom : float
-        Closer in; at 1 everything is seen.
-    size : int
-        Pixels along the long side of a panel.
-    top : float, optional
-        The value at the end of the colour bar; most values lie below it unless given.
-    unit : str
-        Of the values, for the bar's title.
-    columns : int, optional
-        Panels in a row, at most.
+    layout : Layout
+        Direction of the camera, zoom, and size of the panels.
+    top, unit : float and str, optional
+        Value at the end of the colour bar (default: the 99th percentile) and unit of the values.
     force : bool
-        Replace a file that is there.
+        Replace an existing file.
 
     Raises
     ------
     OptionError
-        If an argument has no meaning.
+        If an argument is out of range or unknown.
     FileError
         If PyVista is not installed or the file cannot be written.
     """
-    _check(panels, colour, zoom=zoom, size=size, top=top, columns=columns)
-    frame = fit_frame(panels, view_axes(up, view), zoom)
-    if colour == "error":
-        top = _top_of(_values_of(panels)) if top is None else top
-    images = [_draw(panel, frame, colour, frame.pixels(size), top) for panel in panels]
-    titles = [panel.title for panel in panels]
-    page = Page(size, images, titles, columns=columns, foot=FOOT[colour])
+    _check(panels, colour, layout, top)
+    frame = fit_frame(panels, view_axes(up, layout.view), layout.zoom)
     values = _values_of(panels)
+    top = _top_of(values) if colour == "error" and top is None else top
+    images = [_draw(panel, frame, colour, frame.pixels(layout.size), top) for panel in panels]
+    titles = [panel.title for panel in panels]
+    page = Page(layout.size, images, titles, columns=layout.columns, foot=FOOT[colour])
     if colour == "normal":
-        page.add_line(NORMALS_SAY)
+        page.add_line(NORMALS_LEGEND)
     elif colour == "error" and top is not None and len(values):
-        title = f"distance to the reference ({unit})" if unit else "distance to the reference"
-        page.add_bar(title, top, clipped=bool(values.max() > top))
+        page.add_bar(_bar_title(unit), top, clipped=bool(values.max() > top))
     write_picture(page.figure, target, force=force)
 
 
+def _bar_title(unit: str) -> str:
+    """Return the title of the colour bar of errors."""
+    return f"distance to the reference ({unit})" if unit else "distance to the reference"
+
+
 def view_axes(up: str = "z", view: tuple[float, float, float] | None = None) -> NDArray[np.float64]:
-    """Return the picture's right, up and towards the viewer, (3, 3), a row each."""
+    """Return the directions right, up and towards the viewer, one per row, (3, 3)."""
     if up not in RIGHT_AND_FRONT:
         raise OptionError(f"up is {up!r}: give one of {', '.join(RIGHT_AND_FRONT)}")
     right, front = np.array(RIGHT_AND_FRONT[up], np.float64)
-    upward = np.eye(3)["xyz".index(up)]
+    upward = np.eye(3)[AXES.index(up)]
     towards = np.array(THREE_QUARTER) @ [right, front, upward] if view is None else np.array(view)
     if not (np.isfinite(towards).all() and towards.any()):
         raise OptionError(f"view is {view}: give a direction, three numbers that are not all 0")
@@ -183,12 +200,12 @@ def view_axes(up: str = "z", view: tuple[float, float, float] | None = None) -> 
 
 
 def fit_frame(panels: Sequence[Panel], axes: NDArray[np.float64], zoom: float = 1.0) -> Frame:
-    """Return the frame, seen along the axes, that just holds the faces of all panels."""
+    """Return the smallest frame with these axes that holds the faces of all panels."""
     drawn = [panel.mesh.vertices[np.unique(panel.mesh.faces)] for panel in panels]
-    seen = np.concatenate(drawn).astype(np.float64) @ axes.T
-    if not len(seen):
+    points = np.concatenate(drawn).astype(np.float64) @ axes.T
+    if not len(points):
         raise OptionError("nothing to draw: no mesh has a face")
-    low, high = seen.min(0), seen.max(0)
+    low, high = points.min(0), points.max(0)
     sides = (high - low)[:2]
     longest = float(sides.max()) or 1.0
     wide, tall = (max(float(side) / longest, NARROWEST) for side in sides)
@@ -196,7 +213,7 @@ def fit_frame(panels: Sequence[Panel], axes: NDArray[np.float64], zoom: float = 
 
 
 def face_colours(mesh: Mesh) -> Image:
-    """Return the colour of each face's normal, (m, 3): (n + 1)/2 in world axes."""
+    """Return (n + 1)/2 of each face normal n, in world axes, as a colour, (m, 3) uint8."""
     a, b, c = mesh.vertices.astype(np.float64)[mesh.faces.T]
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -204,22 +221,14 @@ def face_colours(mesh: Mesh) -> Image:
     return np.round((normals + 1) / 2 * 255).astype(np.uint8)
 
 
-def _check(
-    panels: Sequence[Panel],
-    colour: str,
-    *,
-    zoom: float,
-    size: int,
-    top: float | None,
-    columns: int | None,
-) -> None:
-    """Raise OptionError if an argument has no meaning."""
+def _check(panels: Sequence[Panel], colour: str, layout: Layout, top: float | None) -> None:
+    """Raise OptionError if an argument is out of range or unknown."""
     if not panels:
         raise OptionError("nothing to draw: give a mesh")
     if colour not in COLOURS:
         raise OptionError(f"colour is {colour!r}: give one of {', '.join(COLOURS)}")
-    check_numbers(zoom=zoom, top=top, columns=columns)
-    check_page(size, len(panels), columns)
+    check_numbers(zoom=layout.zoom, top=top, columns=layout.columns)
+    check_page(layout.size, len(panels), layout.columns)
     for panel in panels:
         count = len(panel.mesh.vertices)
         if panel.values is not None and panel.values.shape != (count,):
@@ -230,7 +239,7 @@ def _check(
 def check_numbers(
     *, zoom: float = 1.0, top: float | None = None, columns: int | None = None
 ) -> None:
-    """Raise OptionError if a number has no meaning, whatever is drawn."""
+    """Raise OptionError if a number is out of range, whatever is drawn."""
     for name, number in {"zoom": zoom, "top": top, "columns": columns}.items():
         if number is not None and not 0 < number < np.inf:
             raise OptionError(f"{name} is {number:g}: give a number greater than 0")
@@ -242,12 +251,12 @@ def check_numbers(
 
 
 def _values_of(panels: Sequence[Panel]) -> NDArray[Any]:
-    """Return the values of all panels."""
+    """Return the values of all panels, concatenated."""
     return np.concatenate([[], *(panel.values for panel in panels if panel.values is not None)])
 
 
 def _top_of(values: NDArray[Any]) -> float:
-    """Return the value at the end of the colour bar: nearly all values lie below it."""
+    """Return the value for the end of the colour bar: 99 % of the values lie below it."""
     top = float(np.percentile(values, TOP_PERCENTILE)) if len(values) else 0.0
     return top if top > 0 else 1.0
 
@@ -260,7 +269,7 @@ def _pyvista() -> Any:
 
 @contextmanager
 def _quiet_without_display() -> Iterator[None]:
-    """Keep VTK from telling that it found no display before it draws without one."""
+    """Keep VTK from warning that it found no display: it draws without one."""
     log = import_module("vtkmodules.vtkCommonCore").vtkLogger
     log.SetStderrVerbosity(log.VERBOSITY_ERROR)
     try:
@@ -295,7 +304,7 @@ def _draw(
 
 
 def _appearance(panel: Panel, colour: str, top: float | None) -> dict[str, Any]:
-    """Return what tells PyVista how a mesh looks. Faces are flat, so that facets show."""
+    """Return PyVista's arguments for colour and lighting; flat shading shows the facets."""
     if colour == "normal":
         return {"scalars": face_colours(panel.mesh), "rgb": True, "lighting": False}
     if colour == "error" and panel.values is not None:
@@ -305,13 +314,13 @@ def _appearance(panel: Panel, colour: str, top: float | None) -> dict[str, Any]:
             "clim": (0, top),
             "interpolate_before_map": True,
             "smooth_shading": False,
-            # mostly ambient: the colours have to be those of the bar
+            # mostly ambient, so that the colours match the colour bar
             "ambient": 0.5,
             "diffuse": 0.55,
             "specular": 0.0,
         }
     return {
-        "color": BASE,
+        "color": MESH_COLOUR,
         "smooth_shading": False,
         "ambient": 0.25,
         "diffuse": 1.0,

@@ -1,6 +1,6 @@
-"""False-colour cross-sections of a grid, as it is and refined.
+"""False-colour cross-sections of a grid, before and after refinement.
 
-Only the plane that is drawn is made dense, never the fine lattice.
+Only the plane that is drawn is dense, never the fine lattice.
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ from numpy.typing import NDArray
 from ..errors import OptionError
 from ..grid.sdf_grid import SdfGrid
 from ..steps.field import FineField
+from .choices import AXES
 from .page import check_page, write_picture
 
-AXES = "xyz"
 COLOUR_MAP = "RdBu_r"  # blue inside, red outside, white at the surface
-LIMIT = 3.0  # colours end so many voxels from the surface
+LIMIT = 3.0  # distance at both ends of the colour bar, in voxels
 UNKNOWN = "#c4c4c4"
-INCHES = 7.0  # a panel's width; the pixels an inch follow from the size asked for
-SECTIONS = 2  # beside each other, at most
-TALLEST = 3  # a panel's height over its width, at most
+INCHES = 7.0  # width of a panel; the pixels per inch follow from the size in pixels
+SECTIONS = 2  # most sections side by side
+TALLEST = 3  # greatest ratio of a panel's height to its width
 STRIP = 1.35  # inches for titles, labels and the colour bar
 
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """Values on a plane of a lattice, each that of a square cell round its point.
+    """Values on a plane of a lattice; each is drawn as a rectangle around its point.
 
     Attributes
     ----------
-    values : (n, m)
+    values : (n, m) float64
         Signed distances in world units, negative inside, NaN where unknown.
     first : two floats
-        World position of value (0, 0), along the plane's two axes.
+        World position of value (0, 0) along the two axes of the plane.
     step : two floats
-        World distance between values along these.
+        World distance between neighbouring values along these axes.
     """
 
     values: NDArray[np.float64]
@@ -70,57 +70,69 @@ def render_section(
     size: int = 700,
     force: bool = True,
 ) -> None:
-    """Draw a cross-section of a grid, and beside it of its refinement, as a PNG file.
+    """Draw a cross-section of a grid, and beside it the same section refined, as a PNG file.
 
     Parameters
     ----------
     grid : SdfGrid
         The samples.
     target : path
-        The file.
+        The PNG file.
     field : FineField, optional
-        What ``upsample`` made of the grid.
+        The refined field of the grid, from ``upsample``.
     axis : str
-        The axis that the section cuts across: x, y or z.
+        The axis normal to the section: x, y or z.
     at : float, optional
-        Where on that axis, in world units; in the middle of the surface unless given. Drawn is the
-        nearest plane of samples.
+        World position on that axis; the nearest plane of samples is drawn. Default: the middle of
+        the surface.
     size : int
         Width of a panel in pixels.
     force : bool
-        Replace a file that is there.
+        Replace an existing file.
 
     Raises
     ------
     OptionError
-        If the axis is unknown, the place outside the grid, or the field of another grid.
+        If the axis is unknown, the position outside the grid, or the field of another grid.
     FileError
         If the file cannot be written.
     """
     check_section(size)
     index = find_plane(grid, axis, at)
+    figure = _draw(_titled_sections(grid, field, axis, index), axis, grid.voxel_size, size)
+    number = AXES.index(axis)
+    position = grid.origin[number] + grid.spacing[number] * index
+    figure.suptitle(f"section at {axis} = {position:.4g}")
+    write_picture(figure, target, force=force)
+
+
+def _titled_sections(
+    grid: SdfGrid, field: FineField | None, axis: str, index: int
+) -> dict[str, Section]:
+    """Return the sections to draw, by title: the samples, and the refined field if given."""
     sections = {f"{' x '.join(map(str, grid.shape))} samples": coarse_section(grid, axis, index)}
     if field is not None:
         title = f"refined {field.factor} times (grey: far from the surface, not refined)"
         sections[title] = fine_section(field, grid, axis, index)
-    number = AXES.index(axis)
-    place = grid.origin[number] + grid.spacing[number] * index
-    figure = _draw(sections, axis, grid.voxel_size, size)
-    figure.suptitle(f"section at {axis} = {place:.4g}")
-    write_picture(figure, target, force=force)
+    return sections
 
 
 def check_section(size: int) -> None:
-    """Raise if a section of that many pixels along a panel is too large; see ``check_page``."""
+    """Raise if panels of ``size`` pixels are too large to draw; see ``check_page``."""
     check_page(size, SECTIONS * TALLEST, columns=SECTIONS)
 
 
 def find_plane(grid: SdfGrid, axis: str = "z", at: float | None = None) -> int:
-    """Return the number of the plane of samples nearest to a place on an axis.
+    """Return the index of the plane of samples nearest to world position ``at`` on an axis.
 
-    Unless a place is given, of the planes that the surface crosses it is the middle one.
+    Without a position, the middle one of the planes that the surface crosses.
+
+    Raises
+    ------
+    OptionError
+        If the axis is unknown or the position outside the grid.
     """
-    if axis not in AXES or len(axis) != 1:
+    if axis not in AXES:
         raise OptionError(f"axis is {axis!r}: give one of {', '.join(AXES)}")
     number = AXES.index(axis)
     if at is None:
@@ -134,7 +146,7 @@ def find_plane(grid: SdfGrid, axis: str = "z", at: float | None = None) -> int:
 
 
 def coarse_section(grid: SdfGrid, axis: str, index: int) -> Section:
-    """Return the samples of a plane."""
+    """Return the plane of samples with this index along an axis."""
     number = AXES.index(axis)
     values = np.take(grid.values, index, axis=number).astype(np.float64)
     across, along = _others(number)
@@ -145,8 +157,8 @@ def coarse_section(grid: SdfGrid, axis: str, index: int) -> Section:
 def fine_section(field: FineField, grid: SdfGrid, axis: str, index: int) -> Section:
     """Return the fine values on the plane of nodes that coincides with a plane of samples."""
     if field.shape != grid.shape:
-        seen = " x ".join(map(str, field.shape))
-        raise OptionError(f"the field refines a grid of {seen}: give that grid")
+        shape = " x ".join(map(str, field.shape))
+        raise OptionError(f"the field refines a grid of {shape}: give that grid")
     number = AXES.index(axis)
     coarse = coarse_section(grid, axis, index)
     wide, high = coarse.step
@@ -156,7 +168,7 @@ def fine_section(field: FineField, grid: SdfGrid, axis: str, index: int) -> Sect
 
 
 def _middle_plane(grid: SdfGrid, number: int) -> int:
-    """Return the plane that the surface crosses, nearest to the middle of all such."""
+    """Return the plane nearest to the middle of all planes that the surface crosses."""
     planes = np.moveaxis(grid.values, number, 0)
     crossed = np.flatnonzero([plane.min() <= 0 < plane.max() for plane in planes])
     if not len(crossed):  # the surface passes between the samples, if there is one
@@ -165,7 +177,7 @@ def _middle_plane(grid: SdfGrid, number: int) -> int:
 
 
 def _node_plane(field: FineField, number: int, index: int) -> NDArray[np.float64]:
-    """Return the values, in half voxels, on the middle nodes of a plane of voxels, else NaN."""
+    """Return the values, in half voxels, on the middle nodes of a plane of voxels; else NaN."""
     factor = field.factor
     across, along = _others(number)
     in_grid = ((field.voxel_ijk >= 0) & (field.voxel_ijk < np.array(field.shape))).all(1)
@@ -179,13 +191,13 @@ def _node_plane(field: FineField, number: int, index: int) -> NDArray[np.float64
 
 
 def _others(number: int) -> tuple[int, int]:
-    """Return the axes that run to the right and up in a section across an axis."""
+    """Return the two axes of a section's plane: to the right, and up."""
     across, along = (other for other in range(3) if other != number)
     return across, along
 
 
 def _draw(sections: dict[str, Section], axis: str, voxel: float, size: int) -> Figure:
-    """Draw sections by their titles, side by side, with one colour bar."""
+    """Draw sections side by side under their titles, with one colour bar."""
     boxes = [section.box() for section in sections.values()]
     left, right, bottom, top = boxes[0]
     tall = float(np.clip((top - bottom) / (right - left), 0.3, TALLEST))
@@ -202,7 +214,7 @@ def _draw(sections: dict[str, Section], axis: str, voxel: float, size: int) -> F
 
 
 def _draw_section(ax: Axes, section: Section, limit: float) -> AxesImage:
-    """Draw the cells of a section, and its zero line."""
+    """Draw the values of a section, and their zero line."""
     known = np.ma.masked_invalid(section.values.T)
     ax.set_facecolor(UNKNOWN)
     image = ax.imshow(
@@ -222,7 +234,7 @@ def _draw_section(ax: Axes, section: Section, limit: float) -> AxesImage:
 
 
 def _add_bar(figure: Figure, image: AxesImage, plots: list[Any]) -> None:
-    """Add the colour bar under all plots."""
+    """Add a colour bar below all plots."""
     bar = figure.colorbar(
         image, ax=plots, location="bottom", extend="both", shrink=0.5, aspect=35, pad=0.03
     )

@@ -1,9 +1,9 @@
 """Signed distance grids of solids: every sample exact, or every sample near the surface.
 
-The grid is worked through in cubes of 8^3 samples. The distance at a cube's centre tells whether
-any of its samples can lie in the band; only those cubes are evaluated. The sign is asked once for
-each connected region away from the surface, since it cannot change there; of an open mesh it can,
-so every sample is asked.
+The grid is processed in cubes of 8^3 samples. The distance at the centre of a cube decides whether
+any of its samples can lie in the band; only those cubes are evaluated. The sign is evaluated once
+per connected region away from the surface, since it cannot change there. In an open mesh it can, so
+it is evaluated at every sample.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from .solid import Points, Solid
 
 EDGE = 8  # samples along a cube
 CHUNK = 512  # cubes at a time: 2^18 points, 20 MB
-EXACT_SAMPLES = 1 << 24  # up to 256^3 every sample is exact unless a band is asked for
-BIG_GRID_BAND = 4.0  # voxels; the upsampling looks no farther than 1.5 + sqrt(3)
-LEAST_BAND = 1.5  # voxels; the pipeline's band
-MOST_ALONG_AXIS = 1e9  # samples; beyond, only a wrong number was given
-SMALLEST, LARGEST = 1e-30, 1e30  # spacing and extent that float32 holds with all its digits
-POSITION_ERROR = 1e-4  # of the spacing, that a sample may be off its place
-WORK_BYTES = 500_000_000  # beside the values: search trees and chunks
+EXACT_SAMPLES = 1 << 24  # up to 256^3 every sample is exact unless a band is given
+BIG_GRID_BAND = 4.0  # voxels; upsampling uses none beyond 1.5 + sqrt(3)
+LEAST_BAND = 1.5  # voxels; the band of the pipeline
+MOST_ALONG_AXIS = 1e9  # samples; a larger number can only be a mistake
+SMALLEST, LARGEST = 1e-30, 1e30  # spacing and extent that float32 holds at full precision
+POSITION_ERROR = 1e-4  # largest error of a sample's position, over the spacing
+WORK_BYTES = 500_000_000  # for search trees and chunks, besides the values
 
 Progress = Callable[[int, int], None]
 Layout = tuple[tuple[int, int, int], float, NDArray[np.float64]]
@@ -44,7 +44,7 @@ def check_numbers(
     padding: float = 2.0,
     band: float | None = None,
 ) -> None:
-    """Raise OptionError if a number makes no grid, whatever the mesh; those not given are fine."""
+    """Raise OptionError if a number that is given is out of range, whatever the mesh."""
     if n is not None and n < 2:
         raise OptionError(f"n is {n}: give at least 2 samples along the longest axis")
     if n is not None and n >= MOST_ALONG_AXIS:
@@ -68,18 +68,18 @@ def unit_layout(n: int, side: float = 1.0) -> Layout:
 def fitted_layout(
     mesh: Mesh, *, n: int | None = None, spacing: float | None = None, padding: float = 2.0
 ) -> Layout:
-    """Return the layout of a grid round a mesh, in the mesh's units.
+    """Return the layout of a grid around a mesh, in the units of the mesh.
 
     Parameters
     ----------
     mesh : Mesh
-        What is to be sampled.
-    n : int
-        Samples along the longest axis of its box; or else
-    spacing : float
-        world distance between samples.
+        The mesh to sample.
+    n : int, optional
+        Samples along the longest axis of its bounding box. Give this or ``spacing``.
+    spacing : float, optional
+        Distance between samples.
     padding : float
-        Voxels between the box and the outer samples, at least.
+        Least number of voxels between the box and the outermost samples.
 
     Raises
     ------
@@ -107,17 +107,17 @@ def fitted_layout(
 def sample_solid(
     solid: Solid, layout: Layout, *, band: float | None = None, progress: Progress | None = None
 ) -> SdfGrid:
-    """Sample a solid as a grid that the pipeline takes.
+    """Sample the signed distance to a solid as an ``SdfGrid``; see ``sample_grid``.
 
-    Unless a band is given, grids over 256^3 samples are cut off ``BIG_GRID_BAND`` voxels from the
-    surface, and a note says so. See ``sample_grid``.
+    Without a ``band``, distances in grids of over 256^3 samples are clamped ``BIG_GRID_BAND``
+    voxels from the surface, and the grid's notes say so.
     """
     shape, spacing, origin = layout
     notes = []
     if band is None and prod(shape) > EXACT_SAMPLES:
         band = BIG_GRID_BAND
     if band is not None and band < np.inf:
-        notes.append(f"distances are exact up to {band:g} voxels and cut off there")
+        notes.append(f"distances are exact up to {band:g} voxels and clamped there")
     values = sample_grid(solid, layout, band=np.inf if band is None else band, progress=progress)
     return SdfGrid.trusted(values, spacing, origin, tuple(notes))
 
@@ -125,26 +125,26 @@ def sample_solid(
 def sample_grid(
     solid: Solid, layout: Layout, *, band: float = np.inf, progress: Progress | None = None
 ) -> FloatArray:
-    """Return the signed distance at every sample of a grid, (nx, ny, nz) float32.
+    """Return the signed distance at every sample of a grid, (nx, ny, nz) float32, negative inside.
 
     Parameters
     ----------
     solid : Solid
-        What is sampled.
+        The solid to sample.
     layout : shape, spacing and origin
         ``world = origin + spacing * ijk``.
     band : float
-        In voxels: distances are exact (to float32) up to so far, and cut off there.
+        Distance in voxels up to which values are exact (to float32); they are clamped there.
     progress : callable, optional
-        Called with (cubes done, cubes in all).
+        Called with (cubes done, all cubes).
 
     Raises
     ------
     OptionError
         If the band is under 1.5 voxels, which the pipeline needs.
     MeshError
-        If the distances would be too small or too large for float32, or the grid lies so far
-        from the origin that neighbouring samples cannot be told apart.
+        If the distances would be too small or too large for float32, or the grid is so far from
+        the origin that float64 does not resolve neighbouring samples.
     OutOfMemoryError
         If the grid would not fit in memory.
     """
@@ -164,7 +164,7 @@ def sample_grid(
 
 
 def check_scale(layout: Layout) -> None:
-    """Raise MeshError if float32 does not hold the distances, or double the positions."""
+    """Raise MeshError if float32 cannot hold the distances, or float64 the positions."""
     shape, spacing, origin = layout
     reach = spacing * max(shape)
     if not (spacing > SMALLEST and reach < LARGEST):
@@ -181,7 +181,7 @@ def check_scale(layout: Layout) -> None:
 
 
 def grid_points(layout: Layout) -> Points:
-    """Return the position of every sample of a grid, (n, 3), C order."""
+    """Return the position of every sample of a grid, (n, 3) in C order."""
     shape, spacing, origin = layout
     return np.indices(shape).reshape(3, -1).T * spacing + origin
 
@@ -189,7 +189,7 @@ def grid_points(layout: Layout) -> Points:
 def _sample_cubes(
     solid: Solid, corners: NDArray[np.int64], layout: Layout, limit: float
 ) -> FloatArray:
-    """Return the distances in cubes of samples, (c, 8, 8, 8), cut off at the limit."""
+    """Return the signed distances in cubes of samples, (c, 8, 8, 8), clamped at the limit."""
     _, spacing, origin = layout
     centres = (corners + (EDGE - 1) / 2) * spacing + origin
     reach = limit + 3**0.5 * (EDGE - 1) / 2 * spacing
@@ -209,8 +209,9 @@ def _sample_cubes(
 def _signed(solid: Solid, points: Points, spacing: float) -> NDArray[np.float64]:
     """Return the signed distance in cubes of neighbouring points, (c, 8, 8, 8).
 
-    Two neighbours that are both more than half a spacing from the surface are on one side of it,
-    so one point tells the sign of a connected region of such; the others are asked one by one.
+    Two neighbours that are both more than half a spacing from the surface are on the same side of
+    it. So the sign is evaluated at one point of each connected region of such points, and at every
+    other point.
     """
     shape = points.shape[:-1]
     points = points.reshape(-1, 3)
@@ -223,14 +224,14 @@ def _signed(solid: Solid, points: Points, spacing: float) -> NDArray[np.float64]
     inside[~away] = solid.is_inside(points[~away.ravel()])
     if count:
         _, first = np.unique(regions.ravel(), return_index=True)
-        first = first[-count:]  # the first of all is of region 0, which is no region
+        first = first[-count:]  # the first belongs to label 0, which is no region
         side = np.concatenate([[False], solid.is_inside(points[first])])
         inside |= side[regions]
     return np.where(inside, -found, found)
 
 
 def _write_cubes(values: FloatArray, corners: NDArray[np.int64], cubes: FloatArray) -> None:
-    """Put cubes into the grid; what reaches over its end is dropped."""
+    """Copy cubes into the grid; parts beyond its end are dropped."""
     for (i, j, k), cube in zip(corners, cubes):
         part = values[i : i + EDGE, j : j + EDGE, k : k + EDGE]
         part[...] = cube[tuple(map(slice, part.shape))]

@@ -1,8 +1,8 @@
-"""Meshes as ground truth: exact distances to them, and whether they bound a solid at all.
+"""Meshes as ground truth: exact distances to them, and whether they bound a solid.
 
-The distance is that to the nearest triangle. The sign is that of the winding number (Barill et al.,
-Fast Winding Numbers for Soups and Clouds, 2018), because the sign of the nearest triangle's
-pseudonormal is wrong on meshes that intersect themselves, as real ones do.
+The distance is that to the nearest triangle. The sign comes from the winding number (Barill et al.,
+Fast Winding Numbers for Soups and Clouds, 2018), because the pseudonormal of the nearest triangle
+gives the wrong sign on meshes that intersect themselves, as real ones do.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from .mesh_files import read_mesh
 Points = NDArray[np.float64]
 Distances = NDArray[np.float64]
 
-# How far from a face its two sides are asked for their winding number, over the box diagonal.
+# Distance from a face at which the winding number of its sides is evaluated, over the box diagonal.
 SIDE_STEP = 1e-5
 
 
 class Solid:
-    """What a mesh encloses; asks are quick, for its search trees are built once.
+    """The solid that a mesh encloses, with search trees for fast queries.
 
     Parameters
     ----------
     mesh : Mesh
-        Triangles, outward. Where pieces overlap the solid is their union, but distances are to
-        the nearest triangle, be it inside another piece.
+        Triangles, facing outward. Where pieces overlap the solid is their union, but distances are
+        to the nearest triangle even if that is inside another piece.
     """
 
     def __init__(self, mesh: Mesh) -> None:
@@ -53,7 +53,7 @@ class Solid:
 
     @cached_property
     def is_closed(self) -> bool:
-        """Whether the winding number can change at the surface only."""
+        """Whether the mesh is closed, so that the winding number changes at the surface only."""
         return count_unbalanced_edges(self.mesh.faces) == 0
 
     def distance(self, points: Points) -> Distances:
@@ -64,32 +64,32 @@ class Solid:
         return np.sqrt(squared)
 
     def winding_number(self, points: Points) -> Distances:
-        """Return how often the mesh winds round each point, (n,): 1 inside, 0 outside."""
+        """Return the winding number of points (n, 3), (n,): 1 inside, 0 outside."""
         return self._winding.winding_number(points) if len(points) else np.zeros(0)
 
     def is_inside(self, points: Points) -> NDArray[np.bool_]:
-        """Say which points, (n, 3), the mesh winds round."""
+        """Return a mask, (n,), of the points (n, 3) inside the solid."""
         return self.winding_number(points) > 0.5
 
     def signed_distance(self, points: Points) -> Distances:
-        """Return the distance of points (n, 3), negative inside, (n,)."""
+        """Return the signed distance, (n,), of points (n, 3), negative inside."""
         found = self.distance(points)
         return np.where(self.is_inside(points), -found, found)
 
 
 @dataclass(frozen=True)
 class Findings:
-    """What is wrong with a mesh that should bound a solid.
+    """Faults of a mesh that should bound a solid.
 
     Attributes
     ----------
     open_edges : int
         Edges with more faces on one side than on the other.
     inverted : bool
-        The faces look inward: the volume is negative.
+        Whether the faces point inward: the volume is negative.
     overlapping : int
-        Faces with a side that the mesh winds round twice, or the wrong way: pieces overlap or
-        fold over there, or are inverted.
+        Number of faces with a winding number of 2 or more, or below 0, on one side: pieces overlap,
+        fold over or are inverted there.
     """
 
     open_edges: int
@@ -98,7 +98,7 @@ class Findings:
 
 
 def examine(solid: Solid) -> Findings:
-    """Look whether a mesh bounds a solid, faces outward."""
+    """Examine whether a mesh bounds a solid, with its faces pointing outward."""
     winding = solid.winding_number(_both_sides(solid.mesh))
     inverted = solid.mesh.volume() < 0
     if inverted:
@@ -109,9 +109,9 @@ def examine(solid: Solid) -> Findings:
 
 
 def count_unbalanced_edges(faces: NDArray[np.int32]) -> int:
-    """Count edges that are not run through equally often in both directions: 0 if closed.
+    """Count edges that faces do not use equally often in both directions: 0 if closed.
 
-    An edge of four faces is closed: the winding number is whole on all sides of it.
+    An edge of four faces counts as closed: the winding number is an integer on all its sides.
     """
     start, end = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel()
     key = np.minimum(start, end) * (faces.max(initial=0) + 1) + np.maximum(start, end)
@@ -121,15 +121,15 @@ def count_unbalanced_edges(faces: NDArray[np.int32]) -> int:
 
 
 def load_solid(path: str | Path, *, allow_open: bool = False) -> tuple[Solid, list[str]]:
-    """Read a mesh as a solid; return it with what was found, a sentence each.
+    """Read a mesh file as a solid; return it with notes on its faults.
 
-    An inverted mesh is turned round; of overlapping pieces the union is taken.
+    An inverted mesh is reversed; overlapping pieces are united.
 
     Raises
     ------
     FileError, MeshError
-        If it cannot be read, is flat, or is open and ``allow_open`` not set. With it the sign is
-        that of the generalised winding number, which guesses across the holes.
+        If it cannot be read, is flat, or is open and ``allow_open`` is not set. With
+        ``allow_open`` the sign comes from the generalised winding number, a guess near the holes.
     """
     solid, notes = Solid(read_mesh(path)), []
     low, high = solid.mesh.vertices.min(0), solid.mesh.vertices.max(0)
@@ -137,14 +137,14 @@ def load_solid(path: str | Path, *, allow_open: bool = False) -> tuple[Solid, li
     if found.open_edges and not allow_open:
         raise MeshError(
             f"{path} is open: {found.open_edges:,} edges have no partner, so it has no inside; "
-            "close it, or say --allow-open to guess across its holes"
+            "close it, or use --allow-open to guess its inside"
         )
     if not (high > low).all() or solid.mesh.volume() == 0:
         raise MeshError(f"{path} is flat: it encloses no volume")
     if found.open_edges:
         notes.append(f"open at {found.open_edges:,} edges: inside is guessed across the holes")
     if found.inverted:
-        notes.append("inverted, its faces look inward: turned round")
+        notes.append("inverted: its faces point inward; they were reversed")
         solid = Solid(Mesh(solid.mesh.vertices, np.ascontiguousarray(solid.mesh.faces[:, ::-1])))
     if found.overlapping:
         notes.append(
@@ -156,7 +156,7 @@ def load_solid(path: str | Path, *, allow_open: bool = False) -> tuple[Solid, li
 
 
 def _both_sides(mesh: Mesh) -> Points:
-    """Return a point on either side of each face, (2 m, 3), close by; none for flat faces."""
+    """Return a point close to each side of each face, (2 m, 3); none for degenerate faces."""
     a, b, c = mesh.vertices[mesh.faces.T]
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)

@@ -1,0 +1,144 @@
+"""The command ``upsample``: one grid file to one mesh file."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from .common import CONTEXT, one_line_errors, print_stderr, print_stdout, progress_bar
+from .conversion import chosen_model, conversion_options, make_options
+from .interrupts import raising_interrupts
+
+if TYPE_CHECKING:
+    from ..convert import Conversion
+    from ..network.network import Network
+
+EXAMPLES = """\b
+Examples:
+  super-sdf upsample part.npz part.ply
+  super-sdf upsample field.npy part.stl --spacing 0.5 --factor 8
+"""
+
+
+@click.command(
+    "upsample",
+    context_settings=CONTEXT,
+    epilog=EXAMPLES,
+    short_help="Refine a grid and write its surface as a mesh.",
+)
+@click.argument("source", metavar="IN")
+@click.argument("target", metavar="OUT")
+@conversion_options
+@click.option("--force", is_flag=True, help="Replace OUT if it exists.")
+@click.option("--json", "as_json", is_flag=True, help="Print counts, times and notes as JSON.")
+@click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
+@click.option("-v", "--verbose", is_flag=True, help="Also print counts and the time per stage.")
+def upsample_command(source: str, target: str, **options: Any) -> None:
+    """Refine the signed distance grid IN and write its surface as the mesh OUT.
+
+    IN is a .npy file (a 3D array with axes x, y, z) or a .npz file (keys values, spacing, origin).
+    OUT is a .ply, .stl, .obj, .off, .glb or .3mf file.
+    """
+    with one_line_errors():
+        run = Upsampling(source, target, options)
+        run.work()
+        run.print_report()
+
+
+class Upsampling:
+    """One run of the command: its options, its result, and the time of each stage."""
+
+    def __init__(self, source: str, target: str, options: dict[str, Any]) -> None:
+        self.source, self.target, self.options = source, target, options
+        self.model = chosen_model(options)
+        self.seconds: dict[str, float] = {}
+        self.network: Network
+        self.result: Conversion
+
+    def work(self) -> None:
+        """Check the options, load the network, convert."""
+        from ..convert import convert
+        from ..files.meshes import check_target
+        from ..network.network import load_network
+        from ..progress import Stopwatch
+        from ..steps.nodes import check_factor
+
+        options, watch = self.options, Stopwatch()
+        check_factor(options["factor"])
+        check_target(self.target, force=options["force"])
+        watch.lap("start")
+        self.network = load_network(
+            self.model,
+            device=options["device"],
+            threads=options["threads"],
+            precision=options["precision"],
+        )
+        watch.lap("load network")
+        with raising_interrupts(), progress_bar("upsampling", options["quiet"]) as progress:
+            self.result = convert(
+                self.source,
+                self.target,
+                self.network,
+                make_options(options),
+                force=options["force"],
+                progress=progress,
+                announce=self.announce,
+            )
+        self.seconds = watch.seconds | self.result.seconds
+
+    def announce(self, line: str) -> None:
+        """Print, before the work, what may make the user stop it; the bar is redrawn below."""
+        if not self.options["quiet"]:
+            print_stderr(f"\r{line}\x1b[K" if sys.stderr.isatty() else line)
+
+    def print_report(self) -> None:
+        """Print notes, warnings and a summary to stderr, and with ``--json`` JSON to stdout."""
+        report = self.report()
+        if self.options["as_json"]:
+            print_stdout(json.dumps(report, indent=2), f"{self.target} is written")
+        if self.options["quiet"]:
+            return
+        for note in (*self.result.notes, *self.device_notes()):
+            print_stderr(f"Note: {note}")
+        for warning in self.result.warnings:
+            print_stderr(f"Warning: {warning}")
+        if self.options["verbose"]:
+            for key in ("shape", "spacing", "origin", "device", "band_voxels", "nodes"):
+                print_stderr(f"{key.replace('_', ' ')}: {report[key]}")
+            for stage, seconds in self.seconds.items():
+                print_stderr(f"{stage}: {seconds:.3f} s")
+        print_stderr(f"{self.target}: {self.summary()}")
+
+    def report(self) -> dict[str, Any]:
+        """Return counts, times and notes as ``--json`` prints them."""
+        return {
+            "input": self.source,
+            "output": self.target,
+            "factor": self.options["factor"],
+            "offset": self.options["offset"],
+            "model": self.model,
+            "precision": self.options["precision"],
+            "device": self.network.device,
+            "device_notes": self.device_notes(),
+            **self.result.report(),
+            "seconds": {stage: round(seconds, 4) for stage, seconds in self.seconds.items()},
+        }
+
+    def device_notes(self) -> list[str]:
+        """Return notes on the device of the network."""
+        return list(self.network.notes)
+
+    def summary(self) -> str:
+        """Describe the mesh in one line."""
+        counts = self.result.counts
+        low, high = (
+            "(" + ", ".join(f"{x:.6g}" for x in corner) + ")" for corner in self.result.bounds
+        )
+        return (
+            f"{counts['vertices']:,} vertices, {counts['triangles']:,} triangles, "
+            f"{'closed' if self.result.closed else 'open'}, from {low} to {high}, "
+            f"{sum(self.seconds.values()):.1f} s"
+        )
