@@ -165,12 +165,12 @@ def test_a_file_at_which_two_processes_die_is_named(command, monkeypatch):
             seen.append(job := self.tasks.popleft())
             made = {"content": None, "output": None, "closed": True, "inferred": [], "warnings": []}
             row = {**batch_job.failed_row(job, None), **made, "status": "ok", "retry": False}
-            yield job, Death("died of SIGKILL") if job.source.name == "a.npy" else row
+            yield job, Death("was killed by SIGKILL") if job.source.name == "a.npy" else row
 
     monkeypatch.setattr(Pool, "results", deaths)
     monkeypatch.setattr("super_sdf.batch.workers.count_cores", lambda: 2)
     code, _, err = command("batch", "in", "--out", "out", "--quality", "fast", "--jobs", 2)
-    reason = "the process that converted it died of SIGKILL, twice"
+    reason = "the process that converted it was killed by SIGKILL, twice"
     assert code == 1 and err.startswith(f"Failed: in/a.npy: {reason}\n3 done, 1 failed")
     assert [job.source.name for job in seen].count("a.npy") == 2
     assert seen[-1].source.name == "a.npy"  # the others first

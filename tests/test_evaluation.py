@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import errno
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,7 +27,9 @@ from super_sdf.evaluation.plan import Plan
 from super_sdf.evaluation.results import Results
 from super_sdf.evaluation.runner import LeftOut, Runner, complete
 from super_sdf.evaluation.store import KEY_TYPES, Store, is_row
+from super_sdf.machine.serving import ClockStarted
 
+KILLED = "was killed by SIGKILL (most likely out of memory)"
 QUALITY = ("cd", "f1", "nc", "signed_nc", "p2s", "ecd", "ef1", "field_mse", "faces", "closed")
 
 
@@ -159,25 +161,33 @@ def test_failures_are_tried_again_but_not_what_ran_out_of_time(tmp_path):
     assert not store.is_final(task_of(tmp_path / "box.ply", limit=20.0), "mc")
 
 
-def die(task: Task, rows) -> None:
+def prepare_to_die():
+    return die
+
+
+def die(task: Task, tell) -> None:
     """Stand in for a process that is killed after its first row."""
-    rows.send(runner.READ)
+    tell(ClockStarted())
     row = {**task.key(task.methods[0]), "error": None}
-    rows.send(row)
+    tell(row)
     if len(task.methods) > 2:
         os.kill(os.getpid(), signal.SIGKILL)
     for method in task.methods[1:]:
-        rows.send({**row, "method": method})
+        tell({**row, "method": method})
 
 
-def sleep(task: Task, rows) -> None:
+def prepare_to_sleep():
+    return sleep
+
+
+def sleep(task: Task, tell) -> None:
     """Stand in for a process that does not end."""
-    rows.send(runner.READ)
+    tell(ClockStarted())
     time.sleep(60)
 
 
 def test_a_process_that_dies_fails_one_method_and_the_rest_go_on(tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "work", die)
+    monkeypatch.setattr(runner, "prepare", prepare_to_die)
     task = task_of(saved(cube(), tmp_path / "box.ply"), ("mc", "ours", "bspline", "bound"))
     store = Store(tmp_path / "rows.jsonl")
     seen = []
@@ -185,7 +195,7 @@ def test_a_process_that_dies_fails_one_method_and_the_rest_go_on(tmp_path, monke
     errors = {name: store.get(task, name)["error"] for name in task.methods}
     assert errors == {
         "mc": None,
-        "ours": "its process died of SIGKILL (mostly for want of memory)",
+        "ours": f"its process {KILLED}",
         "bspline": None,
         "bound": None,
     }
@@ -194,28 +204,35 @@ def test_a_process_that_dies_fails_one_method_and_the_rest_go_on(tmp_path, monke
 
 
 def test_a_process_over_its_limit_is_ended(tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "work", sleep)
+    monkeypatch.setattr(runner, "prepare", prepare_to_sleep)
     task = task_of(saved(cube(), tmp_path / "box.ply"), limit=0.2)
     (_, row), (_, end) = Runner([task], 1).results()
     assert row["error"] == "over the limit of 0.2 s" and row["limit"] == 0.2
     assert end is None
 
 
-def crash(task: Task, rows) -> None:
+def prepare_to_crash():
+    return crash
+
+
+def crash(task: Task, tell) -> None:
     """Stand in for a reader that takes its process down."""
     os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_a_mesh_that_crashes_its_reader_is_left_out(tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "work", crash)
+    monkeypatch.setattr(runner, "prepare", prepare_to_crash)
     tasks = [task_of(tmp_path / "box.ply"), task_of(tmp_path / "box.ply", ("ours", "bound"))]
-    left_out = complete(tasks, Store(tmp_path / "rows.jsonl"), 1)
-    reason = "while it was read its process died of SIGKILL (mostly for want of memory)"
-    assert left_out == [LeftOut("box", reason)]
+    seen = []
+    left_out = complete(
+        tasks, Store(tmp_path / "rows.jsonl"), 1, lambda *step: seen.append(step[:2])
+    )
+    assert left_out == [LeftOut("box", f"while it was read its process {KILLED}")]
+    assert seen == [(1, 2), (2, 2)]
 
 
 def test_a_process_killed_before_it_had_its_shape_is_tried_once_more(tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "work", crash_once)
+    monkeypatch.setattr(runner, "prepare", prepare_to_crash_once)
     path = saved(cube(), tmp_path / "box.ply")
     tasks = [task_of(path), task_of(path, ("ours", "bound"))]
     store = Store(tmp_path / "rows.jsonl")
@@ -223,27 +240,34 @@ def test_a_process_killed_before_it_had_its_shape_is_tried_once_more(tmp_path, m
     assert all(store.get(task, name)["error"] is None for task in tasks for name in task.methods)
 
 
-def crash_once(task: Task, rows) -> None:
-    """Stand in for a process that somebody kills, in the middle of what it sends."""
+def prepare_to_crash_once():
+    return crash_once
+
+
+def crash_once(task: Task, tell) -> None:
+    """Stand in for a process that somebody kills."""
     marker = task.path.with_suffix(f".{task.methods[0]}")
     if not marker.exists():
         marker.touch()
-        os.write(rows.fileno(), b"\0\0\1\0half of a message")
         os.kill(os.getpid(), signal.SIGKILL)
-    rows.send(runner.READ)
+    tell(ClockStarted())
     for method in task.methods:
-        rows.send({**task.key(method), "error": None})
+        tell({**task.key(method), "error": None})
 
 
-def test_a_process_that_does_not_start_leaves_its_shape_out(tmp_path, monkeypatch):
-    one = Runner([task_of(tmp_path / "box.ply")], 1)
-    monkeypatch.setattr(one.context.Process, "start", no_process)
-    reason = "its process did not start: Too many open files"
-    assert [found for _, found in one.results()] == [LeftOut("box", reason), None]
+def test_without_room_for_a_process_it_ends_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(runner.make_context().Process, "start", no_process)
+    with pytest.raises(SuperSdfError, match="no process can be started: Too many open files"):
+        list(Runner([task_of(tmp_path / "box.ply")], 1).results())
 
 
 def no_process(self) -> None:
     raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+
+def test_where_nothing_can_be_forked_processes_are_spawned(monkeypatch):
+    monkeypatch.setattr(multiprocessing, "get_all_start_methods", lambda: ["spawn"])
+    assert runner.make_context().get_start_method() == "spawn"
 
 
 def test_a_bug_in_the_reading_names_the_shape(tmp_path, monkeypatch):
@@ -251,19 +275,21 @@ def test_a_bug_in_the_reading_names_the_shape(tmp_path, monkeypatch):
         raise ValueError("no luck")
 
     monkeypatch.setattr(Shape, "read", broken)
-    sent = []
-    monkeypatch.setattr(signal, "signal", lambda *_: None)
-    runner.work(task_of(tmp_path / "box.ply"), SimpleNamespace(send=sent.append))
-    ((name, reason),) = [(found.shape, found.reason) for found in sent]
-    assert name == "box" and reason.startswith("ValueError: no luck (test_evaluation.py:")
+    left_out = runner.work(task_of(tmp_path / "box.ply"), None)
+    assert left_out.shape == "box"
+    assert left_out.reason.startswith("ValueError: no luck (test_evaluation.py:")
 
 
-def refuse(task: Task, rows) -> None:
-    rows.send(LeftOut(task.path.stem, "no good"))
+def prepare_to_refuse():
+    return refuse
+
+
+def refuse(task: Task, tell) -> LeftOut:
+    return LeftOut(task.path.stem, "no good")
 
 
 def test_a_shape_is_left_out_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "work", refuse)
+    monkeypatch.setattr(runner, "prepare", prepare_to_refuse)
     tasks = [task_of(tmp_path / "box.ply"), task_of(tmp_path / "box.ply", ("ours",))]
     assert complete(tasks, Store(tmp_path / "rows.jsonl"), 1) == [LeftOut("box", "no good")]
 

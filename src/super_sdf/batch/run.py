@@ -17,14 +17,14 @@ from typing import Any
 
 from ..files.parts import remove_abandoned_parts
 from ..machine.memory import held_memory, memory_bound
-from ..machine.pool import Death, Pool
+from ..machine.pool import Death, Pool, PoolOptions
 from ..machine.threads import count_cores
 from .job import Job, Result, Row, failed_row
 from .journal import read_journal
 from .ledger import Ledger
 from .lock import FolderLock
 from .plan import Batch, Planner, Settings, expected_work
-from .workers import Loading, choose_workers, convert_here, make_worker, useful_workers
+from .workers import Loading, choose_workers, convert_here, prepare_worker, useful_workers
 
 # Of what ``expected_work`` counts: done in the time that several processes would take to start.
 LITTLE = 30_000
@@ -68,8 +68,8 @@ class Run:
         if workers == 1:
             yield from convert_here(queue, folder, loading)
         else:
-            prepare = partial(make_worker, loading, folder)
-            yield from Pool(queue, prepare, self._clean).results(workers)
+            prepare = partial(prepare_worker, loading, folder)
+            yield from Pool(queue, prepare, PoolOptions(self._clean_up)).results(workers)
 
     def _count_workers(self) -> int:
         """Return how many processes are to convert."""
@@ -81,7 +81,8 @@ class Run:
         self.batch.notes += [note] if note else []
         return workers
 
-    def _clean(self, job: Job, pid: int) -> None:
+    def _clean_up(self, job: Job, pid: int) -> None:
+        """Remove what a dead worker left of a job's output."""
         remove_abandoned_parts([self.settings.folder / job.target], pid)
 
     def is_over(self) -> bool:

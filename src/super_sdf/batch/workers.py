@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 from ..machine.memory import free_memory
 from ..machine.pool import Tasks
+from ..machine.serving import Work
 from ..machine.threads import count_cores
 from ..network.cuda import available_devices
 from ..network.network import Network, load_network
@@ -58,14 +58,15 @@ def useful_workers(asked: int, jobs: int, max_memory: int | None = None) -> tupl
     return min(asked, most), None if asked <= most else f"--jobs {asked} is cut to {most}: {cause}"
 
 
-def make_worker(loading: Loading, folder: Path) -> Callable[[Job], Row]:
-    """Load the network, and return what converts a job with it."""
-    return partial(attempt, folder=folder, network=loading.load())
+def prepare_worker(loading: Loading, folder: Path) -> Work:
+    """Load the network; return the function that converts a job and returns its row."""
+    network = loading.load()
+    return lambda job, tell: attempt(job, folder, network)
 
 
 def convert_here(jobs: Tasks[Job], folder: Path, loading: Loading) -> Iterator[tuple[Job, Row]]:
-    """Convert one file after another in this process; yield each as it is done."""
-    convert_job = make_worker(loading, folder)
+    """Convert one file after another in this process; yield each job and its row."""
+    network = loading.load()
     while len(jobs):
         job = jobs.popleft()
-        yield job, convert_job(job)
+        yield job, attempt(job, folder, network)

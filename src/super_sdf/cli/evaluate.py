@@ -177,7 +177,7 @@ def run_evaluate(sources: tuple[Path, ...], options: dict[str, Any]) -> bool:
             options["out"],
             up=options["up"],
             pictures=not options["no_pictures"],
-            progress=None if options["quiet"] else progress_lines(),
+            on_task=None if options["quiet"] else progress_lines(),
         )
     for entry in outcome.left_out:
         tell(f"Left out: {entry.shape}: {entry.reason}")

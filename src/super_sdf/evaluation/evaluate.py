@@ -5,7 +5,7 @@ plan -> tasks -> rows (kept) -> report
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,12 +16,9 @@ from .measuring import PROCESS, Row, Task, failed_row, reason_of
 from .plan import Plan
 from .report import write_report
 from .results import Results
-from .runner import LeftOut, complete
+from .runner import LeftOut, OnTask, complete
 from .store import Store
 from .timing import time_shape
-
-Progress = Callable[[int, int, str, float], None]
-"""Called with (tasks done, tasks in all, what was just done, the share of the work done)."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +35,7 @@ def evaluate(
     *,
     up: str = "z",
     pictures: bool = True,
-    progress: Progress | None = None,
+    on_task: OnTask | None = None,
 ) -> Outcome:
     """Measure a plan and write its report.
 
@@ -56,8 +53,8 @@ def evaluate(
         The axis that points up in the pictures.
     pictures : bool
         Whether the best and worst shapes are drawn.
-    progress : callable, optional
-        See ``Progress``.
+    on_task : callable, optional
+        Called after each task: see ``OnTask``.
 
     Raises
     ------
@@ -73,29 +70,17 @@ def evaluate(
     check_folder(out)
     tasks = plan.tasks()
     store = Store(make_folder(out) / ROWS)
-    tell = progress or (lambda done, total, what, share: None)
-    left_out = complete(
-        tasks,
-        store,
-        plan.jobs,
-        lambda done, total, task, share: tell(done, total, name_of(task), share),
-    )
+    left_out = complete(tasks, store, plan.jobs, on_task)
     results = Results(plan, tasks, store, left_out)
     if not results.floors:
         first = results.left_out[0]
         raise FileError(f"no shape could be measured; {first.shape}: {first.reason}")
-    timings = time_processes(results, tell) if "timings" in plan.experiments else {}
+    timings = time_processes(results, on_task) if "timings" in plan.experiments else {}
     report = write_report(results, out, timings, up=up, pictures=pictures)
     return Outcome(report, results.left_out)
 
 
-def name_of(task: Task) -> str:
-    """Return what a task is called while it goes on."""
-    named = [str(task.setting), *(task.methods if task.limit else [])]
-    return f"{task.path.stem} ({', '.join(named)})"
-
-
-def time_processes(results: Results, tell: Progress) -> dict[int, list[Row]]:
+def time_processes(results: Results, on_task: OnTask | None) -> dict[int, list[Row]]:
     """Return the times of the command by size, each shape's kept; nothing else runs meanwhile.
 
     What fails is added to what the results leave out.
@@ -114,7 +99,8 @@ def time_processes(results: Results, tell: Progress) -> dict[int, list[Row]]:
         else:
             said = f"timing ({task.setting}): {row['error']}"
             results.left_out.append(LeftOut(task.path.stem, said))
-        tell(done, len(tasks), f"timing {name_of(task)}", done / len(tasks))
+        if on_task:
+            on_task(done, len(tasks), f"timing {task}", done / len(tasks))
     return timings
 
 

@@ -59,6 +59,10 @@ class Task:
     threads: int = 0
     limit: float | None = None
 
+    def __str__(self) -> str:
+        named = [str(self.setting), *(self.methods if self.limit else [])]
+        return f"{self.path.stem} ({', '.join(named)})"
+
     def key(self, method: str) -> Row:
         """Return what a method's row is known by."""
         return {
