@@ -1,5 +1,6 @@
 """Batches and their processes, killed, ended, short of memory: nothing is lost or left over."""
 
+import errno
 import json
 import os
 import signal
@@ -129,6 +130,45 @@ def test_as_many_processes_as_cores_and_memory_allow(monkeypatch):
 def test_a_lock_refused_is_a_file_error():
     with FolderLock(Path("out")), pytest.raises(FileError, match="in use by another batch"):
         FolderLock(Path("out"))
+
+
+HOLD = "import sys; from pathlib import Path; from super_sdf.batch.lock import FolderLock\n"
+HOLD += "with FolderLock(Path('out')): print('held', flush=True); sys.stdin.read()"
+
+
+def test_a_lock_is_exclusive_among_processes_and_ends_with_its_own(run_batch):
+    words = [sys.executable, "-c", HOLD]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
+        assert holder.stdout.readline() == b"held\n"
+        want = "Error: out is in use by another batch: wait for it, or give another\n"
+        assert run_batch("in/a.npy") == (1, "", want)
+        holder.kill()
+        holder.wait()
+        assert run_batch("in/a.npy")[0] == 0
+
+
+def test_where_a_file_system_has_no_locks_a_batch_runs_without(run_batch, monkeypatch):
+    def refuse(self, *_, **__):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr("super_sdf.batch.lock.FileLock.acquire", refuse)
+    assert run_batch("in/a.npy")[0] == 0 and len(rows()) == 1
+
+
+def test_a_lock_file_that_cannot_be_written_is_named(run_batch, monkeypatch):
+    def refuse(self, *_, **__):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    monkeypatch.setattr("super_sdf.batch.lock.FileLock.acquire", refuse)
+    assert run_batch("in/a.npy") == (1, "", "Error: out cannot be written: Permission denied\n")
+
+
+def test_what_is_locked_is_not_what_workers_read(run_batch):
+    """Windows lets no other process read it."""
+    from super_sdf.batch import journal
+
+    with FolderLock(Path("out")) as lock:
+        assert Path(lock.lock.lock_file).name == journal.LOCK_NAME != journal.NAME
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])

@@ -378,14 +378,17 @@ def test_what_is_no_row_is_passed_over(tmp_path):
     assert len(odd) > 0.7 * len(changes)
     lines = [*DAMAGED, *(json.dumps(found).encode() for found in odd)]
     path.write_bytes(b"\n".join([*lines, json.dumps(good).encode(), b'{"shape": "torn']))
-    store = Store(path)
-    assert list(store.rows.values()) == [good]
-    assert path.read_bytes().endswith(b"torn\n")
+    store, kept = Store(path), path.read_bytes()
+    assert list(store.rows.values()) == [good] and kept.endswith(b"torn")
+    other = {**good, "method": "bound"}
+    store.add(other)  # in place of what a killed process left unfinished
+    line = json.dumps(other).encode() + b"\n"
+    assert path.read_bytes() == kept.removesuffix(b'{"shape": "torn') + line
 
 
 def test_rows_that_cannot_be_kept_end_it_in_one_line():
     store = Store(Path("/dev/null"))
-    store.path = Path("/dev/full")
+    store.file.path = Path("/dev/full")
     with pytest.raises(WriteError, match=r"^/dev/full cannot be written: No space left on"):
         store.add(row("box", 0.5, **task_of(Path("box.ply")).key("mc")))
 
@@ -522,6 +525,24 @@ def test_the_command_is_timed_as_a_process(monkeypatch):
     assert 0.05 < figures["seconds"] < 60 and 20 < figures["peak_mb"] < 2000
     with pytest.raises(SuperSdfError, match=r"super_sdf upsample none\.npz x\.ply ended with 1"):
         timing.run_command(["upsample", "none.npz", "x.ply"])
+
+
+FAKE_PSUTIL = """
+from types import SimpleNamespace
+Error = OSError
+def Process(pid):
+    return SimpleNamespace(memory_info=lambda: SimpleNamespace(peak_wset=7_000_000))
+"""
+
+
+def test_on_windows_the_peak_is_read_while_the_process_runs(tmp_path, monkeypatch):
+    (tmp_path / "psutil.py").write_text(FAKE_PSUTIL)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setattr(timing, "LAUNCHER", "import os; del os.wait4\n" + timing.LAUNCHER)
+    seconds, peak, printed = timing.run_python(["-c", "import time; time.sleep(.1); print('hi')"])
+    assert 0.1 < seconds < 30 and peak == 7 and printed == "hi\n"
+    with pytest.raises(SuperSdfError, match="ended with 3"):
+        timing.run_python(["-c", "raise SystemExit(3)"])
 
 
 def test_gaps_and_wins_are_what_they_are_called():

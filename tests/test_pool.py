@@ -12,7 +12,6 @@ import pytest
 from super_sdf.errors import SuperSdfError
 from super_sdf.machine import serving
 from super_sdf.machine.pool import Death, Pool, PoolOptions, describe_exit
-from super_sdf.machine.records import append_line, append_shared_line, parse_line
 from super_sdf.machine.serving import ClockStarted
 
 KILLED = Death("was killed by SIGKILL (most likely out of memory)")
@@ -179,45 +178,3 @@ def test_on_windows_signals_are_not_blocked(monkeypatch):
     serving.settle_signals()
     assert heard == [(signal.SIGINT, signal.SIG_IGN)]
     assert work([2], square, 1)[0] == {2: 4}
-
-
-def test_lines_are_appended_whole_or_not_at_all(tmp_path):
-    path = tmp_path / "lines"
-    append_line(path, {"a": 1})
-    append_shared_line(path, "b")
-    assert path.read_bytes() == b'{"a": 1}\n\n"b"\n'
-    with pytest.raises(OSError, match="No space left on device"):
-        append_line(Full(path), [2])
-    assert path.read_bytes() == b'{"a": 1}\n\n"b"\n'
-    assert [parse_line(line) for line in (b"[1]", b"[", 10**5 * b"[", b"\xff")] == [
-        [1],
-        *3 * [None],
-    ]
-
-
-class Full:
-    """A path to a file that takes three bytes more, and then no more."""
-
-    def __init__(self, path):
-        self.path, self.room = path, 3
-
-    def open(self, mode, buffering):
-        """Open it, with this for its write."""
-        self.file = self.path.open(mode, buffering=buffering)
-        return self
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        self.file.close()
-
-    def __getattr__(self, name):
-        return getattr(self.file, name)
-
-    def write(self, data):
-        """Take what there is room for."""
-        if not self.room:
-            raise OSError(28, "No space left on device")
-        self.room = 0
-        return self.file.write(bytes(data[:3]))

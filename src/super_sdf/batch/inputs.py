@@ -18,6 +18,7 @@ from ..files.grids import GRID_SUFFIXES
 from ..files.meshes import check_mesh_suffix
 from ..files.regular import reason_of
 from .job import Job
+from .journal import LOCK_NAME
 from .journal import NAME as JOURNAL
 from .ledger import NAME as LEDGER
 from .manifest import read_manifest
@@ -57,7 +58,7 @@ def find_jobs(arguments: Sequence[str], suffix: str, options: ConvertOptions) ->
     for kind in {PurePath(job.target).suffix for job in jobs}:
         check_mesh_suffix(Path(f"*{kind}"))
     for job in jobs:
-        if PurePath(job.target).parts[0].casefold() in (JOURNAL, LEDGER):
+        if PurePath(job.target).parts[0].casefold() in (JOURNAL, LOCK_NAME, LEDGER):
             raise OptionError(
                 f"{job.source} would become {job.target}, but the first of these names is the "
                 "batch's own: rename it"

@@ -96,7 +96,7 @@ class Planner:
             else:
                 before = batch.done_before if row["status"] == "ok" else batch.failed_before
                 before.append(Result(job, row))
-        last = self.journal.begun - self.ledger.written
+        last = self.journal.started - self.ledger.written
         batch.waiting.sort(key=lambda job: (job.target in last, -expected_work(job)))
         batch.work = sum(map(expected_work, batch.waiting))
         return batch

@@ -39,8 +39,7 @@ class Run:
     def __init__(self, jobs: Sequence[Job], settings: Settings, lock: FolderLock) -> None:
         self.settings, self.lock = settings, lock
         self.ledger = Ledger(settings.folder)
-        self.ledger.cut_torn_line()
-        lock.begun -= self.ledger.written
+        lock.started -= self.ledger.written
         self.planner = Planner(settings, self.ledger, read_journal(settings.folder))
         self.batch = self.planner.plan(jobs)
         self.died: set[str] = set()  # outputs at which a process ended
@@ -95,7 +94,7 @@ class Run:
         Whether it may replace what is there is asked now: what a process that died was at, or an
         orphan of a killed batch, may have taken its name meanwhile.
         """
-        self.lock.begin(job.target)
+        self.lock.start(job.target)
         if not os.path.lexists(self.settings.folder / job.target):
             return job
         self.planner.journal = read_journal(self.settings.folder)

@@ -1,17 +1,16 @@
-"""The file that remembers what was measured: a line of JSON for each shape, setting and method.
+"""The store of an evaluation: a line of JSON for each shape, setting and method measured.
 
-Rows are appended as they come, so that a kill costs the one under way. A line that is no row of
-this protocol is passed over, and what it stood for is measured again.
+Rows are appended as they come, so a kill costs only the measurement under way. A line that is not a
+row of this protocol is skipped, and measured again if it is still asked for.
 """
 
 from __future__ import annotations
 
-import json
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from ..errors import WriteError
+from ..machine.records import RecordFile
 from .measuring import NUMBERS, OPTIONAL_NUMBERS, PROCESS, PROTOCOL, Row, Task
 
 # What a row is known by, and the types of it; the rest of it are figures.
@@ -34,15 +33,11 @@ class Store:
     """The rows of a file of JSON lines, by key."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.file = RecordFile(path)
         self.rows: dict[tuple[Any, ...], Row] = {}
-        line = b"\n"
-        if path.exists():
-            with path.open("rb") as file:
-                for line in file:
-                    self._take_line(line)
-        if not line.endswith(b"\n"):  # it was being written when the writer was killed
-            self._write("\n")
+        for record in self.file.read():
+            if is_row(record):
+                self._take(record)
 
     def add(self, row: Row) -> None:
         """Keep a row, in memory and in the file.
@@ -52,8 +47,14 @@ class Store:
         WriteError
             If the file takes no more.
         """
+        try:
+            self.file.append(row)
+        except OSError as error:
+            raise WriteError(
+                f"{self.file.path} cannot be written: {error.strerror}; the rows before are kept, "
+                "and the same command goes on from there"
+            ) from error
         self._take(row)
-        self._write(json.dumps(row) + "\n")
 
     def get(self, task: Task, method: str) -> Row | None:
         """Return a method's row, if it was measured."""
@@ -71,25 +72,8 @@ class Store:
         limit = row.get("limit")
         return limit is not None and task.limit is not None and limit >= task.limit
 
-    def _take_line(self, line: bytes) -> None:
-        """Take a line of the file if it is a row."""
-        with suppress(ValueError, RecursionError):  # damaged, or nested too deep for the parser
-            found = json.loads(line)
-            if is_row(found):
-                self._take(found)
-
     def _take(self, row: Row) -> None:
         self.rows[tuple(row[name] for name in KEY_TYPES)] = row
-
-    def _write(self, text: str) -> None:
-        try:
-            with self.path.open("a", encoding="utf-8") as out:
-                out.write(text)
-        except OSError as error:
-            raise WriteError(
-                f"{self.path} cannot be written: {error.strerror}; the rows before are kept, and "
-                "the same command goes on from there"
-            ) from error
 
 
 def is_row(found: Any) -> bool:
