@@ -20,16 +20,31 @@ from .cases import Case, Setting, Shape
 from .measuring import Row
 
 RUNS = 5
-# A process counts as its own peak what its parent held when it was started, so the parent has to be
-# a small one, and it holds the clock.
+# Runs Python with its arguments; prints exit code, seconds, and the peak of memory in bytes. That
+# peak includes what the parent held when it started the process, so the parent has to be small.
+# Windows has no wait4: there the peak is read while the process runs.
 LAUNCHER = """
 import os, sys, time
-start = time.perf_counter()
-child = os.spawnv(os.P_NOWAIT, sys.executable, [sys.executable, *sys.argv[1:]])
-_, status, usage = os.wait4(child, 0)
-seconds = time.perf_counter() - start
+command = [sys.executable, *sys.argv[1:]]
+if hasattr(os, "wait4"):
+    start = time.perf_counter()
+    child = os.spawnv(os.P_NOWAIT, sys.executable, command)
+    _, status, usage = os.wait4(child, 0)
+    seconds, code = time.perf_counter() - start, os.waitstatus_to_exitcode(status)
+    peak = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+else:
+    import psutil, subprocess
+    start, peak = time.perf_counter(), 0
+    child = subprocess.Popen(command)
+    while (code := child.poll()) is None:
+        try:
+            peak = psutil.Process(child.pid).memory_info().peak_wset
+        except psutil.Error:  # it has just ended
+            pass
+        time.sleep(0.005)
+    seconds = time.perf_counter() - start
 print()
-print(os.waitstatus_to_exitcode(status), seconds, usage.ru_maxrss)
+print(code, seconds, peak)
 """
 
 
@@ -51,7 +66,7 @@ def processor_name() -> str:
 
 
 def run_command(words: Sequence[str]) -> tuple[float, float]:
-    """Run ``super-sdf`` once; return seconds and its peak of memory in MB.
+    """Run ``super-sdf`` once; return its seconds and its peak of memory in MB.
 
     Raises
     ------
@@ -63,7 +78,7 @@ def run_command(words: Sequence[str]) -> tuple[float, float]:
 
 
 def run_python(words: Sequence[str]) -> tuple[float, float, str]:
-    """Run Python once with these arguments; return seconds, peak in MB, and what it printed.
+    """Run Python once with these arguments; return seconds, peak in MB, and its output.
 
     Raises
     ------
@@ -76,8 +91,7 @@ def run_python(words: Sequence[str]) -> tuple[float, float, str]:
     code, seconds, peak = last.split()
     if int(code):
         raise SuperSdfError(f"python {' '.join(words)} ended with {code}")
-    kilobyte = 1 if sys.platform == "darwin" else 1024
-    return float(seconds), int(peak) * kilobyte / 1e6, printed
+    return float(seconds), int(peak) / 1e6, printed
 
 
 @contextmanager
