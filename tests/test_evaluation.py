@@ -19,13 +19,13 @@ from solids import cube, saved, sphere, torus
 
 from super_sdf import Mesh, SuperSdfError
 from super_sdf.cli.main import cli
-from super_sdf.errors import WriteError
-from super_sdf.evaluation import measuring, plan, published, report, runner, tables, timing
+from super_sdf.errors import OptionError, WriteError
+from super_sdf.evaluation import measuring, published, report, runner, tables, timing
 from super_sdf.evaluation.cases import Setting, Shape
 from super_sdf.evaluation.measuring import Task
-from super_sdf.evaluation.plan import Plan
 from super_sdf.evaluation.results import Results
 from super_sdf.evaluation.runner import LeftOut, Runner, complete
+from super_sdf.evaluation.scope import Scope, find_meshes, spread
 from super_sdf.evaluation.store import KEY_TYPES, Store, is_row
 from super_sdf.machine.serving import ClockStarted
 
@@ -294,9 +294,9 @@ def test_a_shape_is_left_out_once(tmp_path, monkeypatch):
     assert complete(tasks, Store(tmp_path / "rows.jsonl"), 1) == [LeftOut("box", "no good")]
 
 
-def test_the_plan_measures_each_method_once(meshes):
-    paths = plan.find_meshes([meshes])
-    asked = Plan(paths, sizes=(32,), experiments=("factors", "noise", "iterated", "scale"))
+def test_each_shape_is_measured_by_each_method_once(meshes):
+    paths = find_meshes([meshes])
+    asked = Scope(paths, sizes=(32,), experiments=("factors", "noise", "iterated", "scale"))
     tasks = asked.tasks()
     keys = [tuple(task.key(m).values()) for task in tasks for m in task.methods]
     assert len(keys) == len(set(keys))
@@ -306,16 +306,27 @@ def test_the_plan_measures_each_method_once(meshes):
     assert {Setting(32, scale=scale) for scale in (0.25, 0.5, 0.75)} <= settings
 
 
+def test_every_name_has_a_method_and_a_label():
+    from super_sdf.evaluation import methods, names, peers, scope
+
+    assert tuple(names.METHOD_LABELS) == tuple(methods.METHODS)
+    assert tuple(names.PEER_LABELS) == tuple(peers.PEERS)
+    for name in names.EXPERIMENTS:
+        scope.experiment(name, (32,))
+    with pytest.raises(OptionError, match="experiment is 'x': give one of factors, noise"):
+        scope.experiment("x", (32,))
+
+
 def test_shapes_are_spread_over_the_list():
     paths = tuple(Path(str(n)) for n in range(10))
-    assert plan.spread(paths, 3) == (paths[0], paths[3], paths[6])
-    assert plan.spread(paths, 20) == paths
+    assert spread(paths, 3) == (paths[0], paths[3], paths[6])
+    assert spread(paths, 20) == paths
 
 
 def test_two_shapes_of_one_name_are_refused(meshes, tmp_path):
     twin = saved(cube(), tmp_path / "box.stl")
     with pytest.raises(Exception, match="two meshes are named 'box'"):
-        plan.find_meshes([meshes, twin])
+        find_meshes([meshes, twin])
 
 
 @pytest.mark.parametrize(
@@ -346,7 +357,7 @@ def test_what_makes_no_sense_is_said_in_one_line(words, message, meshes, monkeyp
     assert not Path("out").exists()
 
 
-def row(name: str, f1: float, **figures: object) -> measuring.Row:
+def row(name: str, f1: float, **figures: object) -> measuring.Measurement:
     known = dict.fromkeys((*measuring.NUMBERS, *measuring.OPTIONAL_NUMBERS, "excess_cd"), 0.001)
     said = {"shape": name, "f1": f1, "closed": True, "outward": True, "faces": 4, "error": None}
     return {**known, **said, "notes": [], **figures}
@@ -397,7 +408,7 @@ def test_a_failure_is_left_out_of_its_table_and_named(meshes, tmp_path):
     results = made_up(meshes, tmp_path, methods=("mc", "ours"), peers=("rfta",))
     task = next(task for task in results.tasks if task.path.stem == "ring" and task.setting.size)
     results.store.add({**task.key("ours"), "error": "out of memory"})
-    again = Results(results.plan, results.tasks, results.store, [LeftOut("lost", "it is")])
+    again = Results(results.scope, results.tasks, results.store, [LeftOut("lost", "it is")])
     assert again.left_out == [
         LeftOut("lost", "it is"),
         LeftOut("ring", "ours (32^3, factor 4): out of memory"),
@@ -479,8 +490,8 @@ def test_an_interrupt_says_what_is_kept(meshes, tmp_path, monkeypatch, command):
 
 
 def made_up(meshes: Path, out: Path, **options: object) -> Results:
-    """Results of a plan as if measured: F1 falls with noise and grows with everything else."""
-    asked = Plan(plan.find_meshes([meshes]), sizes=(32,), **options)
+    """Results of a scope as if measured: F1 falls with noise and grows with everything else."""
+    asked = Scope(find_meshes([meshes]), sizes=(32,), **options)
     store = Store(out / "results.jsonl")
     tasks = asked.tasks()
     for task in tasks:

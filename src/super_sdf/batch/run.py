@@ -29,8 +29,8 @@ from .workers import Loading, choose_workers, convert_here, prepare_worker, usef
 # Of what ``expected_work`` counts: done in the time that several processes would take to start.
 LITTLE = 30_000
 
-Progress = Callable[[Batch], None]
-"""Called after each file."""
+OnFile = Callable[[Batch], None]
+"""Called after each file, with the batch as it stands."""
 
 
 class Run:
@@ -44,7 +44,7 @@ class Run:
         self.batch = self.planner.plan(jobs)
         self.died: set[str] = set()  # outputs at which a process ended
 
-    def complete(self, progress: Progress | None = None) -> None:
+    def complete(self, on_file: OnFile | None = None) -> None:
         """Do what is to be done; each file is in the ledger before the next is told of."""
         start = time.perf_counter()
         self._note_refused()
@@ -52,8 +52,8 @@ class Run:
             for job, answer in answers:
                 self._take(job, answer)
                 self.batch.seconds = time.perf_counter() - start
-                if progress:
-                    progress(self.batch)
+                if on_file:
+                    on_file(self.batch)
 
     def _convert(self) -> Generator[tuple[Job, Row | Death], None, None]:
         """Convert in this process or in several."""

@@ -17,14 +17,14 @@ from .common import print_result, tell
 if TYPE_CHECKING:
     from ..batch.job import Job
     from ..batch.plan import Batch
-    from ..batch.run import Progress
+    from ..batch.run import OnFile
 
 SHOWN = 20  # failures on the screen; all are in the report
 REDRAW = 0.1  # seconds between two drawings of the progress line
 
 
 @contextmanager
-def progress_line(total: int, quiet: bool) -> Iterator[Progress | None]:
+def progress_line(total: int, quiet: bool) -> Iterator[OnFile | None]:
     """Keep a line on stderr up to date, if somebody is there to see it."""
     if quiet or not total or sys.stderr is None or not sys.stderr.isatty():
         yield None

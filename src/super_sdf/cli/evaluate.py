@@ -11,6 +11,7 @@ from typing import Any
 
 import click
 
+from ..evaluation.names import EXPERIMENTS, METHOD_LABELS, PEER_LABELS
 from ..machine.extras import check_modules
 from .common import CONTEXT, InterruptedCommand, one_line_errors, print_result, tell
 from .interrupts import raising_interrupts
@@ -84,16 +85,16 @@ def takes(option: click.Option, word: str, ctx: click.Context) -> bool:
 @click.option(
     "--methods",
     multiple=True,
-    type=click.Choice(["mc", "mc-lewiner", "trilinear", "bspline", "ours", "bound"]),
+    type=click.Choice(tuple(METHOD_LABELS)),
     metavar="NAME...",
-    help="Of mc, mc-lewiner, trilinear, bspline, ours, bound; all unless given.",
+    help=f"Of {', '.join(METHOD_LABELS)}; all unless given.",
 )
 @click.option(
     "--experiments",
     multiple=True,
-    type=click.Choice(["factors", "noise", "iterated", "scale", "timings"]),
+    type=click.Choice(EXPERIMENTS),
     metavar="NAME...",
-    help="The paper's, beside what it printed: factors, noise, iterated, scale, timings.",
+    help=f"The paper's, beside what it printed: {', '.join(EXPERIMENTS)}.",
 )
 @click.option(
     "--experiment-shapes",
@@ -105,9 +106,9 @@ def takes(option: click.Option, word: str, ctx: click.Context) -> bool:
 @click.option(
     "--peers",
     multiple=True,
-    type=click.Choice(["rfta", "dual-contouring"]),
+    type=click.Choice(tuple(PEER_LABELS)),
     metavar="NAME...",
-    help="Other methods: rfta, dual-contouring. Minutes a shape; wants the extra peers.",
+    help=f"Other methods: {', '.join(PEER_LABELS)}. Minutes a shape; wants the extra peers.",
 )
 @click.option(
     "--peer-shapes", type=click.IntRange(1), default=5, show_default=True, help="Shapes for them."
@@ -154,8 +155,7 @@ def evaluate(sources: tuple[Path, ...], **options: Any) -> None:
 def run_evaluate(sources: tuple[Path, ...], options: dict[str, Any]) -> bool:
     """Plan, measure, report; say which shapes were left out, and return whether any was."""
     from ..evaluation.evaluate import evaluate
-    from ..evaluation.methods import METHODS
-    from ..evaluation.plan import Plan, find_meshes, spread
+    from ..evaluation.scope import Scope, find_meshes, spread
     from ..machine.threads import count_cores
 
     if options["peers"]:
@@ -163,9 +163,9 @@ def run_evaluate(sources: tuple[Path, ...], options: dict[str, Any]) -> bool:
     paths = find_meshes(sources)
     jobs = min(options["jobs"] or count_cores(), count_cores())
     once: dict[str, Any] = {name: tuple(dict.fromkeys(options[name])) for name in LISTS}
-    plan = Plan(
+    scope = Scope(
         spread(paths, options["limit"] or len(paths)),
-        methods=tuple(name for name in METHODS if name in (options["methods"] or METHODS)),
+        methods=tuple(n for n in METHOD_LABELS if n in (options["methods"] or METHOD_LABELS)),
         jobs=jobs,
         threads=max(1, count_cores() // jobs),
         **{name: options[name] for name in NUMBERS},
@@ -173,7 +173,7 @@ def run_evaluate(sources: tuple[Path, ...], options: dict[str, Any]) -> bool:
     )
     with interrupts_explained(options["out"]):
         outcome = evaluate(
-            plan,
+            scope,
             options["out"],
             up=options["up"],
             pictures=not options["no_pictures"],

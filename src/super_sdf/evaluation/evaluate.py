@@ -1,6 +1,6 @@
 """The whole evaluation on a page: measure what is missing, time whole processes, report.
 
-plan -> tasks -> rows (kept) -> report
+scope -> tasks -> rows (kept) -> report
 """
 
 from __future__ import annotations
@@ -12,11 +12,12 @@ from pathlib import Path
 from ..errors import FileError, SuperSdfError
 from .cases import Shape
 from .folder import ROWS, check_folder, make_folder
-from .measuring import PROCESS, Row, Task, failed_row, reason_of
-from .plan import Plan
+from .measuring import Measurement, Task, failed_row, reason_of
+from .names import PROCESS
 from .report import write_report
 from .results import Results
 from .runner import LeftOut, OnTask, complete
+from .scope import Scope
 from .store import Store
 from .timing import time_shape
 
@@ -30,22 +31,22 @@ class Outcome:
 
 
 def evaluate(
-    plan: Plan,
+    scope: Scope,
     out: Path,
     *,
     up: str = "z",
     pictures: bool = True,
     on_task: OnTask | None = None,
 ) -> Outcome:
-    """Measure a plan and write its report.
+    """Measure a scope and write its report.
 
     Rows are kept in ``out/results.jsonl`` as they come: called again, after a kill or with a
-    larger plan, only what is missing is measured. Every random number is seeded by the shape's
+    larger scope, only what is missing is measured. Every random number is seeded by the shape's
     name, so figures of quality are the same in every run.
 
     Parameters
     ----------
-    plan : Plan
+    scope : Scope
         What is asked for.
     out : Path
         Folder of the report: a new one, an empty one, or that of an earlier evaluation.
@@ -59,40 +60,40 @@ def evaluate(
     Raises
     ------
     OptionError
-        If the plan makes no sense.
+        If the scope makes no sense.
     FileError
         If the folder cannot be made or holds what no evaluation wrote, or no shape could be
         measured.
     ModelError
         If the network cannot be loaded.
     """
-    plan.check()
+    scope.check()
     check_folder(out)
-    tasks = plan.tasks()
+    tasks = scope.tasks()
     store = Store(make_folder(out) / ROWS)
-    left_out = complete(tasks, store, plan.jobs, on_task)
-    results = Results(plan, tasks, store, left_out)
+    left_out = complete(tasks, store, scope.jobs, on_task)
+    results = Results(scope, tasks, store, left_out)
     if not results.floors:
         first = results.left_out[0]
         raise FileError(f"no shape could be measured; {first.shape}: {first.reason}")
-    timings = time_processes(results, on_task) if "timings" in plan.experiments else {}
+    timings = time_processes(results, on_task) if "timings" in scope.experiments else {}
     report = write_report(results, out, timings, up=up, pictures=pictures)
     return Outcome(report, results.left_out)
 
 
-def time_processes(results: Results, on_task: OnTask | None) -> dict[int, list[Row]]:
+def time_processes(results: Results, on_task: OnTask | None) -> dict[int, list[Measurement]]:
     """Return the times of the command by size, each shape's kept; nothing else runs meanwhile.
 
     What fails is added to what the results leave out.
     """
-    plan, timings = results.plan, dict[int, list[Row]]()
-    names = results.names(plan.experiment_paths())
-    settings = plan.settings()
+    scope, timings = results.scope, dict[int, list[Measurement]]()
+    names = results.names(scope.experiment_paths())
+    settings = scope.settings()
     tasks = [t for t in results.tasks if t.setting in settings and t.path.stem in names]
     tasks = [task for task in tasks if task.limit is None]
     for done, task in enumerate(tasks, 1):
         if not results.store.is_final(task, PROCESS):
-            results.store.add(time_task(task, plan.model))
+            results.store.add(time_task(task, scope.model))
         row = results.store.get(task, PROCESS) or {}
         if row["error"] is None:
             timings.setdefault(task.setting.size, []).append(row)
@@ -104,7 +105,7 @@ def time_processes(results: Results, on_task: OnTask | None) -> dict[int, list[R
     return timings
 
 
-def time_task(task: Task, model: str) -> Row:
+def time_task(task: Task, model: str) -> Measurement:
     """Return the row of the command's time on a task's grid, or why there is none."""
     try:
         row = time_shape(Shape.read(task.path), task.setting, ["--model", model])

@@ -7,16 +7,17 @@ from pathlib import Path
 
 from ..evaluation import published
 from .cases import Setting
-from .measuring import OURS, Row
-from .plan import BASE_SIZE, FACTORS, NOISES, PASSES, SCALES
+from .measuring import Measurement
+from .names import LABELS, OURS
 from .results import Results
-from .tables import CD, F1, LABELS, NC, SHORT, gap_closed, markdown, mean_of, mean_row, percent
+from .scope import BASE_SIZE, FACTORS, NOISES, PASSES, SCALES
+from .tables import CD, F1, NC, SHORT, gap_closed, markdown, mean_of, mean_row, percent
 from .timing import RUNS, describe_machine
 
 
 def factor_section(results: Results) -> str:
     """Return ours at the factors 2 to 16, each beside its own bound (Fig. 9)."""
-    paths = results.plan.experiment_paths()
+    paths = results.scope.experiment_paths()
     rows = [
         ["1", *mean_row(LABELS["mc"], results.rows(Setting(BASE_SIZE), "mc", paths), SHORT), "-"]
     ]
@@ -35,7 +36,7 @@ def factor_section(results: Results) -> str:
 
 def noise_section(results: Results) -> str:
     """Return F1 by noise, beside the published (supplement, Table 1)."""
-    paths = results.plan.experiment_paths()
+    paths = results.scope.experiment_paths()
     rows = []
     for noise in NOISES:
         setting = Setting(BASE_SIZE, noise=noise)
@@ -52,7 +53,7 @@ def noise_section(results: Results) -> str:
 
 def iterated_section(results: Results) -> str:
     """Return ours refined once and twice, beside the published (supplement, Table 2)."""
-    paths, rows = results.plan.experiment_paths(), []
+    paths, rows = results.scope.experiment_paths(), []
     for passes in PASSES:
         setting = Setting(BASE_SIZE, passes=passes)
         sizes = " -> ".join(f"{BASE_SIZE * setting.factor**n}^3" for n in range(passes + 1))
@@ -64,8 +65,8 @@ def iterated_section(results: Results) -> str:
 
 def scale_section(results: Results) -> str:
     """Return all methods on shapes that fill a part of the grid (supplement, Table 3)."""
-    paths, rows = results.plan.experiment_paths(), []
-    for size in results.plan.sizes:
+    paths, rows = results.scope.experiment_paths(), []
+    for size in results.scope.sizes:
         for scale in SCALES:
             setting = Setting(size, scale=scale)
             names = ("mc", "bspline", OURS, "bound")
@@ -88,7 +89,7 @@ SECTIONS = {
 }
 
 
-def timing_section(timings: Mapping[int, Sequence[Row]]) -> str:
+def timing_section(timings: Mapping[int, Sequence[Measurement]]) -> str:
     """Return whole processes' times beside the published (Table 2)."""
     rows = []
     for size, found in timings.items():

@@ -21,16 +21,14 @@ from ..network.decoder import Decoder
 from ..network.network import find_model, load_network
 from .cases import RESULT_POINTS, Case, Setting, Shape
 from .methods import METHODS, Surface
+from .names import OURS, PROCESS
 from .peers import PEERS
 
-Row = dict[str, Any]
+Measurement = dict[str, Any]
 
 PROTOCOL = 2  # count up when a figure changes its meaning: the rows kept so far are then void
-FLOOR = "floor"
 NO_SETTING = Setting(0, 0)  # the floor's: the reference against itself
-OURS = "ours"
 BLOCK = 1 << 20  # bytes of a file that are held at a time
-PROCESS = "process"  # ours, as a whole process (see ``timing``)
 # The figures of a row, and those of them that may be None: what was not measured or is not known.
 NUMBERS = (
     *("cd", "f1", "recall", "precision", "nc", "signed_nc"),
@@ -63,7 +61,7 @@ class Task:
         named = [str(self.setting), *(self.methods if self.limit else [])]
         return f"{self.path.stem} ({', '.join(named)})"
 
-    def key(self, method: str) -> Row:
+    def key(self, method: str) -> Measurement:
         """Return what a method's row is known by."""
         return {
             "shape": self.path.stem,
@@ -75,7 +73,7 @@ class Task:
         }
 
 
-def measure_task(task: Task, shape: Shape) -> Iterator[Row]:
+def measure_task(task: Task, shape: Shape) -> Iterator[Measurement]:
     """Yield a row for each method of a task, which is of that shape."""
     try:
         # On the CPU, so that every machine agrees.
@@ -89,7 +87,7 @@ def measure_task(task: Task, shape: Shape) -> Iterator[Row]:
         yield {**task.key(method), **figures, "notes": list(shape.notes)}
 
 
-def measure_method(shape: Shape, case: Case | None, method: str, network: Decoder) -> Row:
+def measure_method(shape: Shape, case: Case | None, method: str, network: Decoder) -> Measurement:
     """Return a method's figures; if it raises, none, with the reason in "error".
 
     A failure is no score: it says something of the machine or of a bug, not of the method.
@@ -113,7 +111,7 @@ def make_surface(shape: Shape, case: Case | None, method: str, network: Decoder)
     return {**METHODS, **PEERS}[method](case, network)
 
 
-def failed_row(task: Task, method: str, error: str) -> Row:
+def failed_row(task: Task, method: str, error: str) -> Measurement:
     """Return the row of a method that could not be measured: no figures, and why."""
     return {**task.key(method), "error": error}
 
@@ -130,7 +128,7 @@ def reason_of(problem: Exception) -> str:
     return f"{type(problem).__name__}: {said}{place}"
 
 
-def measure_surface(shape: Shape, mesh: Mesh) -> Row:
+def measure_surface(shape: Shape, mesh: Mesh) -> Measurement:
     """Return every mesh figure of a result; without faces, a dot at the origin is measured."""
     drawn = metrics.sample_surface(mesh, shape.seed(RESULT_POINTS))
     edge_points = metrics.edge_points(drawn)
@@ -144,7 +142,7 @@ def measure_surface(shape: Shape, mesh: Mesh) -> Row:
     }
 
 
-def measure_field(case: Case | None, surface: Surface) -> Row:
+def measure_field(case: Case | None, surface: Surface) -> Measurement:
     """Return the squared and absolute error at the nodes of the band, each node once."""
     if case is None or surface.field is None:
         return {"field_mse": None, "field_mae": None}

@@ -49,9 +49,9 @@ def coarse_surface(case: Case, network: Decoder, *, table: str) -> Surface:
     return Surface(isosurface(field, case.spacing, case.low + case.spacing / 2, table))
 
 
-def upsampled_surface(case: Case, network: Decoder, *, order: int) -> Surface:
+def spline_surface(case: Case, network: Decoder, *, order: int) -> Surface:
     """Mesh the spline interpolation of the coarse grid at the fine nodes."""
-    field = upsample(case.grid.values, case.factor, order)
+    field = interpolate_spline(case.grid.values, case.factor, order)
     return Surface(isosurface(field, case.fine, case.low), lambda: field)
 
 
@@ -114,7 +114,7 @@ def isosurface(field: FloatArray, spacing: float, low: float, table: str = "lore
     return Mesh(vertices.astype(np.float64) * spacing + low, faces.astype(np.int32))
 
 
-def upsample(coarse: FloatArray, factor: int, order: int) -> FloatArray:
+def interpolate_spline(coarse: FloatArray, factor: int, order: int) -> FloatArray:
     """Return SciPy's spline interpolation of that order at the fine nodes, (K n + 1)^3."""
     field = np.asarray(coarse, np.float32)
     for _ in range(3):  # takes the first axis and puts its nodes last: three times, all in place
@@ -140,8 +140,8 @@ def lattice_weights(n: int, factor: int, order: int) -> FloatArray:
 METHODS: dict[str, Method] = {
     "mc": partial(coarse_surface, table="lorensen"),
     "mc-lewiner": partial(coarse_surface, table="lewiner"),
-    "trilinear": partial(upsampled_surface, order=1),
-    "bspline": partial(upsampled_surface, order=3),
+    "trilinear": partial(spline_surface, order=1),
+    "bspline": partial(spline_surface, order=3),
     "ours": our_surface,
     "bound": bound_surface,
 }

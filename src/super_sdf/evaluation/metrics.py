@@ -35,7 +35,7 @@ Numbers = dict[str, float | None]
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class SurfacePoints:
     """Points (n, 3) of a surface and the unit normals (n, 3) of the faces that they lie on."""
 
     points: Points
@@ -43,7 +43,7 @@ class Samples:
 
 
 # What stands in for a result without a surface; it has no normal.
-DOT = Samples(np.zeros((1, 3)), np.zeros((1, 3)))
+DOT = SurfacePoints(np.zeros((1, 3)), np.zeros((1, 3)))
 # NC of a point without a normal: the mean of |n.n'| over all directions of n.
 NO_NORMAL_NC = 0.5
 
@@ -61,7 +61,7 @@ def face_vectors(mesh: Mesh) -> Points:
     return np.cross(b - a, c - a)
 
 
-def sample_surface(mesh: Mesh, seed: tuple[int, int], count: int = SAMPLE_COUNT) -> Samples:
+def sample_surface(mesh: Mesh, seed: tuple[int, int], count: int = SAMPLE_COUNT) -> SurfacePoints:
     """Draw points area-uniformly; a mesh without area gives one dot at the origin."""
     vectors = face_vectors(mesh)
     lengths = np.linalg.norm(vectors, axis=1)
@@ -72,7 +72,7 @@ def sample_surface(mesh: Mesh, seed: tuple[int, int], count: int = SAMPLE_COUNT)
     root, v = np.sqrt(random.random(count)), random.random(count)
     weights = np.stack([1 - root, root * (1 - v), root * v], axis=1)  # uniform in the triangle
     points = np.einsum("nk,nkd->nd", weights, mesh.vertices[mesh.faces[face]])
-    return Samples(points, vectors[face] / lengths[face, None])
+    return SurfacePoints(points, vectors[face] / lengths[face, None])
 
 
 def draw_index(weights: Distances, uniform: Distances) -> NDArray[np.intp]:
@@ -82,7 +82,7 @@ def draw_index(weights: Distances, uniform: Distances) -> NDArray[np.intp]:
     return np.minimum(index, np.flatnonzero(weights)[-1])  # rounding may reach past the last one
 
 
-def compare_samples(reference: Samples, result: Samples) -> Numbers:
+def compare_samples(reference: SurfacePoints, result: SurfacePoints) -> Numbers:
     """Return CD (squared, summed), F1 with recall and precision at 0.003, NC and signed NC."""
     there, there_at = cKDTree(result.points).query(reference.points)
     back, back_at = cKDTree(reference.points).query(result.points)
@@ -113,7 +113,7 @@ def harmonic_mean(recall: float, precision: float) -> float:
 
 
 def compare_surfaces(
-    reference: Solid, result: Mesh, drawn: Samples, result_drawn: Samples
+    reference: Solid, result: Mesh, drawn: SurfacePoints, result_drawn: SurfacePoints
 ) -> Numbers:
     """Return exact point-to-triangle distances: mean, 99th percentile and maximum, both ways.
 
@@ -175,7 +175,7 @@ def sharp_edges(mesh: Mesh) -> IntArray:
     return edges[pairs[whole & (dot < SHARP_COSINE * lengths[one] * lengths[other]), 0]]
 
 
-def edge_points(samples: Samples) -> Points:
+def edge_points(samples: SurfacePoints) -> Points:
     """Return the sampled points, (k, 3), that lie near a sharp edge.
 
     As in NMC, NDC and PoNQ: the points with another one nearby whose normal is turned, up or

@@ -11,11 +11,12 @@ from matplotlib.ticker import MaxNLocator
 
 from ..files.output import replacing
 from .folder import make_folder
-from .measuring import FLOOR, OURS, Row
-from .tables import LABELS, mean_of
+from .measuring import Measurement
+from .names import FLOOR, LABELS, OURS
+from .tables import mean_of
 
-Results = Mapping[int, Mapping[str, Sequence[Row]]]
-"""Rows by size and method."""
+BySize = Mapping[int, Mapping[str, Sequence[Measurement]]]
+"""Measurements by size of the grid and method."""
 
 # What is drawn. Colour-blind safe (Okabe and Ito); ours stands out.
 COLOURS = {
@@ -33,7 +34,7 @@ MEASURES = (
 )
 
 
-def draw_plots(by_size: Results, folder: Path) -> dict[str, str]:
+def draw_plots(by_size: BySize, folder: Path) -> dict[str, str]:
     """Draw all plots into a folder; return their titles by file name."""
     make_folder(folder)
     plots = {
@@ -47,7 +48,7 @@ def draw_plots(by_size: Results, folder: Path) -> dict[str, str]:
     return {name: title for name, (title, _) in plots.items()}
 
 
-def draw_resolution(by_size: Results) -> Figure:
+def draw_resolution(by_size: BySize) -> Figure:
     """Draw the mean of each measure against the size of the grid."""
     figure, axes = make_axes(len(MEASURES))
     sizes = list(by_size)
@@ -63,7 +64,7 @@ def draw_resolution(by_size: Results) -> Figure:
     return with_legend(figure, axes[1])
 
 
-def draw_distribution(by_size: Results) -> Figure:
+def draw_distribution(by_size: BySize) -> Figure:
     """Draw the F1 of every shape, worst first, a curve a method."""
     figure, axes = make_axes(len(by_size))
     for ax, (size, by_method) in zip(axes, by_size.items()):
@@ -77,7 +78,7 @@ def draw_distribution(by_size: Results) -> Figure:
     return with_legend(figure, axes[0])
 
 
-def draw_time(by_size: Results) -> Figure:
+def draw_time(by_size: BySize) -> Figure:
     """Draw mean F1 against mean seconds, a curve a method, a point a size."""
     figure, axes = make_axes(1)
     for method in [name for name in drawn(by_size) if name not in (FLOOR, "bound")]:
@@ -100,7 +101,7 @@ def draw_time(by_size: Results) -> Figure:
     return with_legend(figure, axes[0])
 
 
-def drawn(by_size: Results) -> list[str]:
+def drawn(by_size: BySize) -> list[str]:
     """Return the methods that are drawn: the two tables of marching cubes would hide each other."""
     return [name for name in next(iter(by_size.values())) if name in COLOURS]
 

@@ -19,14 +19,14 @@ from ..network.network import load_network
 from ..pictures.rendering import Panel, can_render, render_panels, vertex_errors
 from .cases import Case, Setting, Shape
 from .folder import REPORT, SHAPES, make_folder, write_page
-from .measuring import OURS, Row
+from .measuring import Measurement
 from .methods import METHODS
+from .names import LABELS, OURS
 from .plots import draw_plots
 from .results import Results
 from .tables import (
     COST,
     EF1,
-    LABELS,
     SHORT,
     cost_table,
     empty_lines,
@@ -53,7 +53,12 @@ other shapes (Thingi30)."""
 
 
 def write_report(
-    results: Results, out: Path, timings: Mapping[int, Sequence[Row]], *, up: str, pictures: bool
+    results: Results,
+    out: Path,
+    timings: Mapping[int, Sequence[Measurement]],
+    *,
+    up: str,
+    pictures: bool,
 ) -> Path:
     """Write report.md, shapes.md, plots and pictures; return the path of the report.
 
@@ -70,16 +75,16 @@ def write_report(
     pictures : bool
         Whether the best and the worst shapes are drawn.
     """
-    plan = results.plan
+    scope = results.scope
     sections = [title_section(results)]
-    sections += [size_section(results, setting) for setting in plan.settings()]
+    sections += [size_section(results, setting) for setting in scope.settings()]
     tables = experiment_tables.SECTIONS
-    sections += [tables[name](results) for name in plan.experiments if name in tables]
-    sections += [peer_section(results)] if plan.peers else []
+    sections += [tables[name](results) for name in scope.experiments if name in tables]
+    sections += [peer_section(results)] if scope.peers else []
     sections += [experiment_tables.timing_section(timings)] if timings else []
     sections += [cost_section(results), plot_section(results, out)]
-    sections += [picture_section(results, out, up)] if pictures and OURS in plan.methods else []
-    shapes = [f"## {s.size}^3\n\n{shape_table(results.by_method(s))}" for s in plan.settings()]
+    sections += [picture_section(results, out, up)] if pictures and OURS in scope.methods else []
+    shapes = [f"## {s.size}^3\n\n{shape_table(results.by_method(s))}" for s in scope.settings()]
     write_page(out / SHAPES, "\n\n".join(shapes) + "\n")
     text = "\n\n".join(filter(None, [*sections, note_section(results)])) + "\n"
     return write_page(out / REPORT, text)
@@ -112,10 +117,10 @@ def size_section(results: Results, setting: Setting) -> str:
 
 def peer_section(results: Results) -> str:
     """Return the peers beside ours, each on the shapes that it finished."""
-    plan, rows = results.plan, []
-    setting, paths = Setting(plan.peer_size), plan.peer_paths()
+    scope, rows = results.scope, []
+    setting, paths = Setting(scope.peer_size), scope.peer_paths()
     columns = (*SHORT, EF1, *COST)
-    for name in ("mc", "bspline", OURS, *plan.peers):
+    for name in ("mc", "bspline", OURS, *scope.peers):
         done = results.rows(setting, name, paths)
         closed = f"{sum(row['closed'] for row in done)} of {len(done)}"
         finished = f"{len(done)} of {len(results.names(paths))}"
@@ -123,25 +128,25 @@ def peer_section(results: Results) -> str:
     titles = ["method", *(column.title for column in columns), "closed", "finished"]
     failed = [
         f"{LABELS[name]}, {row['shape']}: {row['error']}."
-        for name in plan.peers
+        for name in scope.peers
         for row in results.out_of_time(setting, name, paths)
     ]
-    title = f"## Peers, {plan.peer_size}^3, {len(results.names(paths))} shapes"
+    title = f"## Peers, {scope.peer_size}^3, {len(results.names(paths))} shapes"
     return "\n\n".join([title, markdown(titles, rows), *failed])
 
 
 def cost_section(results: Results) -> str:
     """Return time and memory of making each mesh, from grid to mesh in memory."""
-    names = [name for name in results.plan.methods if name != "bound"]  # nobody could run that
+    names = [name for name in results.scope.methods if name != "bound"]  # nobody could run that
     tables = [
         f"**{setting.size}^3**\n\n"
         + cost_table({LABELS[name]: results.rows(setting, name) for name in names})
-        for setting in results.plan.settings()
+        for setting in results.scope.settings()
     ]
-    jobs = results.plan.jobs
+    jobs = results.scope.jobs
     said = (
         f"From the samples in memory to the mesh in memory, {jobs} at a time on one machine, the "
-        f"network with {results.plan.threads or 'all'} threads: to compare methods, not to quote. "
+        f"network with {results.scope.threads or 'all'} threads: to compare methods, not to quote. "
         "The peak is what was held beyond what was held before."
     )
     return "\n\n".join(["## Time and memory", describe_machine(), said, *tables])
@@ -149,7 +154,7 @@ def cost_section(results: Results) -> str:
 
 def plot_section(results: Results, out: Path) -> str:
     """Draw the plots and return where they are shown."""
-    by_size = {setting.size: results.by_method(setting) for setting in results.plan.settings()}
+    by_size = {setting.size: results.by_method(setting) for setting in results.scope.settings()}
     titles = draw_plots(by_size, out / "plots")
     return "\n\n".join(["## Plots", *(f"![{text}](plots/{name})" for name, text in titles.items())])
 
@@ -159,7 +164,7 @@ def picture_section(results: Results, out: Path, up: str) -> str:
 
     By F1 over the floor's, which is low where 100,000 points lie far apart: on large surfaces.
     """
-    setting, floors = results.plan.settings()[0], results.floors
+    setting, floors = results.scope.settings()[0], results.floors
     ranked = results.rows(setting, OURS)
     ranked.sort(key=lambda row: row["f1"] / floors[row["shape"]]["f1"], reverse=True)
     if not ranked:
@@ -168,7 +173,7 @@ def picture_section(results: Results, out: Path, up: str) -> str:
     title = extremes_title(len(ranked), setting)
     if not can_render():
         return f"{title}\n\nNot drawn: PyVista is not installed ({how_to_install('view')})."
-    paths = {path.stem: path for path in results.plan.paths}
+    paths = {path.stem: path for path in results.scope.paths}
     lines, folder = [title], make_folder(out / "pictures")
     for row in shown:
         picture = folder / f"{row['shape']}.png"
@@ -177,7 +182,7 @@ def picture_section(results: Results, out: Path, up: str) -> str:
             f"**{row['shape']}**, F1 {row['f1']:.3f} (floor {floor:.3f}), NC {row['nc']:.3f}"
         )
         try:
-            draw_shape(paths[row["shape"]], setting, results.plan.model, picture, up)
+            draw_shape(paths[row["shape"]], setting, results.scope.model, picture, up)
             lines.append(f"![{row['shape']}](pictures/{picture.name})")
         except SuperSdfError as problem:  # the tables are worth more than a picture
             lines.append(f"Not drawn: {problem}.")

@@ -1,4 +1,4 @@
-"""The rows of a plan as the tables want them: by setting and method, in the order of the shapes.
+"""The rows of a scope as the tables want them: by setting and method, in the order of the shapes.
 
 A failure is no score, and methods are compared on the same shapes: a shape of which a method could
 not be measured in a setting is left out of that setting's tables for all methods, and named.
@@ -10,14 +10,15 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from .cases import Setting
-from .measuring import FLOOR, NO_SETTING, Row, Task
-from .plan import Plan
+from .measuring import NO_SETTING, Measurement, Task
+from .names import FLOOR
 from .runner import LeftOut
+from .scope import Scope
 from .store import Store
 
 
 class Results:
-    """The rows of a plan, shape by shape.
+    """The rows of a scope, shape by shape.
 
     Attributes
     ----------
@@ -26,9 +27,9 @@ class Results:
     """
 
     def __init__(
-        self, plan: Plan, tasks: Sequence[Task], store: Store, left_out: Sequence[LeftOut]
+        self, scope: Scope, tasks: Sequence[Task], store: Store, left_out: Sequence[LeftOut]
     ) -> None:
-        self.plan, self.tasks, self.store = plan, tasks, store
+        self.scope, self.tasks, self.store = scope, tasks, store
         failures = list(self._failures(tasks))
         self.left_out = [*left_out, *(LeftOut(task.path.stem, said) for task, said in failures)]
         self.failed: dict[Setting, set[str]] = {}
@@ -52,13 +53,13 @@ class Results:
         """Return the names of those shapes among the paths that were measured."""
         return [path.stem for path in paths if path.stem in self.floors]
 
-    def rows(self, setting: Setting, method: str, paths: Sequence[Path] = ()) -> list[Row]:
+    def rows(self, setting: Setting, method: str, paths: Sequence[Path] = ()) -> list[Measurement]:
         """Return a method's rows, in the order of the paths (all shapes unless given).
 
         With the excess CD: what CD is above that of two perfect samplings of the reference.
         """
         failed = self.failed.get(setting, set())
-        names = [name for name in self.names(paths or self.plan.paths) if name not in failed]
+        names = [name for name in self.names(paths or self.scope.paths) if name not in failed]
         if method == FLOOR:
             setting = NO_SETTING
         return [
@@ -67,12 +68,14 @@ class Results:
             if row["error"] is None
         ]
 
-    def out_of_time(self, setting: Setting, method: str, paths: Sequence[Path]) -> list[Row]:
+    def out_of_time(
+        self, setting: Setting, method: str, paths: Sequence[Path]
+    ) -> list[Measurement]:
         """Return the rows of a method that its limit ended."""
         rows = self._rows(setting, method, self.names(paths))
         return [row for row in rows if row["error"] is not None and row.get("limit") is not None]
 
-    def _rows(self, setting: Setting, method: str, names: Sequence[str]) -> list[Row]:
+    def _rows(self, setting: Setting, method: str, names: Sequence[str]) -> list[Measurement]:
         """Return the rows of the shapes named that are in the store."""
         tasks = {
             task.path.stem: task
@@ -82,6 +85,6 @@ class Results:
         found = [self.store.get(tasks[name], method) for name in names if name in tasks]
         return [row for row in found if row is not None]
 
-    def by_method(self, setting: Setting) -> dict[str, list[Row]]:
+    def by_method(self, setting: Setting) -> dict[str, list[Measurement]]:
         """Return the rows of each method of the main table, the floor last."""
-        return {name: self.rows(setting, name) for name in (*self.plan.methods, FLOOR)}
+        return {name: self.rows(setting, name) for name in (*self.scope.methods, FLOOR)}

@@ -15,7 +15,7 @@ from pathlib import Path
 from ..machine.pool import Death, Pool, PoolOptions
 from ..machine.serving import ClockStarted, Tell, Work
 from .cases import Shape
-from .measuring import Row, Task, failed_row, measure_task, reason_of
+from .measuring import Measurement, Task, failed_row, measure_task, reason_of
 from .store import Store
 
 OnTask = Callable[[int, int, str, float], None]
@@ -30,7 +30,7 @@ class LeftOut:
     reason: str
 
 
-Result = tuple[Task, Row | LeftOut | None]
+Result = tuple[Task, Measurement | LeftOut | None]
 """A row of a task; or why its shape is left out; or None when the task is finished."""
 
 

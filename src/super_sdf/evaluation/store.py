@@ -11,7 +11,8 @@ from typing import Any
 
 from ..errors import WriteError
 from ..machine.records import RecordFile
-from .measuring import NUMBERS, OPTIONAL_NUMBERS, PROCESS, PROTOCOL, Row, Task
+from .measuring import NUMBERS, OPTIONAL_NUMBERS, PROTOCOL, Measurement, Task
+from .names import PROCESS
 
 # What a row is known by, and the types of it; the rest of it are figures.
 KEY_TYPES: dict[str, tuple[type, ...]] = {
@@ -34,12 +35,12 @@ class Store:
 
     def __init__(self, path: Path) -> None:
         self.file = RecordFile(path)
-        self.rows: dict[tuple[Any, ...], Row] = {}
+        self.rows: dict[tuple[Any, ...], Measurement] = {}
         for record in self.file.read():
             if is_row(record):
                 self._take(record)
 
-    def add(self, row: Row) -> None:
+    def add(self, row: Measurement) -> None:
         """Keep a row, in memory and in the file.
 
         Raises
@@ -56,7 +57,7 @@ class Store:
             ) from error
         self._take(row)
 
-    def get(self, task: Task, method: str) -> Row | None:
+    def get(self, task: Task, method: str) -> Measurement | None:
         """Return a method's row, if it was measured."""
         key = task.key(method)
         return self.rows.get(tuple(key[name] for name in KEY_TYPES))
@@ -72,7 +73,7 @@ class Store:
         limit = row.get("limit")
         return limit is not None and task.limit is not None and limit >= task.limit
 
-    def _take(self, row: Row) -> None:
+    def _take(self, row: Measurement) -> None:
         self.rows[tuple(row[name] for name in KEY_TYPES)] = row
 
 

@@ -11,19 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..evaluation import published
-from .measuring import FLOOR, OURS, Row
-
-LABELS = {
-    "mc": "MC",
-    "mc-lewiner": "MC, Lewiner's table",
-    "trilinear": "trilinear + MC",
-    "bspline": "B-spline + MC",
-    OURS: "super-sdf",
-    "bound": "bound: true distance at the nodes",
-    FLOOR: "floor: the reference against itself",
-    "rfta": "RFTA",
-    "dual-contouring": "dual contouring of distances",
-}
+from .measuring import Measurement
+from .names import LABELS, OURS
 
 
 @dataclass(frozen=True)
@@ -74,7 +63,7 @@ def markdown(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join(head + [f"| {' | '.join(row)} |" for row in rows])
 
 
-def mean_of(rows: Sequence[Row], key: str) -> float | None:
+def mean_of(rows: Sequence[Measurement], key: str) -> float | None:
     """Return the plain mean over the rows that have this figure; of ``..._max`` the greatest."""
     figures = [row[key.removesuffix("_max")] for row in rows]
     figures = [figure for figure in figures if figure is not None]
@@ -83,17 +72,19 @@ def mean_of(rows: Sequence[Row], key: str) -> float | None:
     return float(max(figures) if key.endswith("_max") else np.mean(figures))
 
 
-def mean_row(label: str, rows: Sequence[Row], columns: Sequence[Column] = SURFACE) -> list[str]:
+def mean_row(
+    label: str, rows: Sequence[Measurement], columns: Sequence[Column] = SURFACE
+) -> list[str]:
     """Return a table's row of means."""
     return [label, *(column.cell(mean_of(rows, column.key)) for column in columns)]
 
 
-def count_row(rows: Sequence[Row]) -> list[str]:
+def count_row(rows: Sequence[Measurement]) -> list[str]:
     """Return how many of the rows are closed, and how many face outward."""
     return [f"{sum(row[key] for row in rows)} of {len(rows)}" for key in ("closed", "outward")]
 
 
-def surface_table(by_method: Mapping[str, Sequence[Row]], size: int) -> str:
+def surface_table(by_method: Mapping[str, Sequence[Measurement]], size: int) -> str:
     """Return the main table of one size, the published rows below ours."""
     rows = [mean_row(LABELS[name], found) + count_row(found) for name, found in by_method.items()]
     titles = ["method", *(column.title for column in SURFACE), "closed", "outward"]
@@ -111,7 +102,7 @@ def published_rows(size: int) -> list[list[str]]:
     return rows
 
 
-def shape_table(by_method: Mapping[str, Sequence[Row]]) -> str:
+def shape_table(by_method: Mapping[str, Sequence[Measurement]]) -> str:
     """Return a table with a row for each shape and method."""
     titles = ["shape, method", *(column.title for column in SURFACE), "closed", "outward"]
     rows = [
@@ -122,14 +113,14 @@ def shape_table(by_method: Mapping[str, Sequence[Row]]) -> str:
     return markdown(titles, rows)
 
 
-def cost_table(by_label: Mapping[str, Sequence[Row]]) -> str:
+def cost_table(by_label: Mapping[str, Sequence[Measurement]]) -> str:
     """Return a table of time and memory."""
     titles = ["method", *(column.title for column in COST)]
     return markdown(titles, [mean_row(label, rows, COST) for label, rows in by_label.items()])
 
 
 def gap_closed(
-    ours: Sequence[Row], base: Sequence[Row], bound: Sequence[Row], key: str
+    ours: Sequence[Measurement], base: Sequence[Measurement], bound: Sequence[Measurement], key: str
 ) -> float | None:
     """Return the share of the way from B-spline to the bound that ours has gone, in the mean."""
     figures = [mean_of(rows, key) for rows in (ours, base, bound)]
@@ -144,7 +135,7 @@ def percent(share: float | None) -> str:
     return "-" if share is None else f"{100 * share:.0f} %"
 
 
-def gap_line(by_method: Mapping[str, Sequence[Row]]) -> str:
+def gap_line(by_method: Mapping[str, Sequence[Measurement]]) -> str:
     """Return the gaps closed, if the three methods were measured."""
     if not {OURS, "bspline", "bound"} <= set(by_method):
         return ""
@@ -153,7 +144,7 @@ def gap_line(by_method: Mapping[str, Sequence[Row]]) -> str:
     return f"Gap between B-spline and the bound closed by super-sdf: {', '.join(shares)}."
 
 
-def win_line(by_method: Mapping[str, Sequence[Row]]) -> str:
+def win_line(by_method: Mapping[str, Sequence[Measurement]]) -> str:
     """Return on how many shapes ours has the better F1, and those on which it has not."""
     if not {OURS, "bspline"} <= set(by_method):
         return ""
@@ -167,7 +158,7 @@ def win_line(by_method: Mapping[str, Sequence[Row]]) -> str:
     return f"{line} Not on: {', '.join(lost)}." if lost else line
 
 
-def empty_lines(by_method: Mapping[str, Sequence[Row]]) -> list[str]:
+def empty_lines(by_method: Mapping[str, Sequence[Measurement]]) -> list[str]:
     """Return a line for each method that found no surface in some shapes, with their names."""
     lines = []
     for method, rows in by_method.items():

@@ -17,7 +17,7 @@ import numpy as np
 from ..errors import SuperSdfError
 from ..machine.threads import count_cores
 from .cases import Case, Setting, Shape
-from .measuring import Row
+from .measuring import Measurement
 
 RUNS = 5
 # Runs Python with its arguments; prints exit code, seconds, and the peak of memory in bytes. That
@@ -104,7 +104,7 @@ def grid_file(shape: Shape, setting: Setting) -> Iterator[Path]:
         yield grid
 
 
-def time_shape(shape: Shape, setting: Setting, options: Sequence[str] = ()) -> Row:
+def time_shape(shape: Shape, setting: Setting, options: Sequence[str] = ()) -> Measurement:
     """Time the command on a shape's grid: median seconds of ``RUNS`` after one not counted."""
     with grid_file(shape, setting) as grid:
         words = ["upsample", str(grid), str(grid.with_suffix(".ply")), "--force", "--quiet"]

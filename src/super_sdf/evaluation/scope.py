@@ -10,8 +10,8 @@ from pathlib import Path
 from ..errors import FileError, OptionError
 from ..files.regular import check_regular_file
 from .cases import Setting
-from .measuring import FLOOR, NO_SETTING, OURS, Task, digest_of_file, digest_of_ours
-from .methods import METHODS
+from .measuring import NO_SETTING, Task, digest_of_file, digest_of_ours
+from .names import EXPERIMENTS, FLOOR, METHOD_LABELS, OURS
 
 MESH_SUFFIXES = (".ply", ".stl", ".obj", ".off", ".glb", ".gltf", ".3mf")
 BASE_SIZE = 32  # the paper's experiments start from it
@@ -19,14 +19,13 @@ FACTORS = (2, 4, 8, 16)
 NOISES = (0.0, 0.2, 0.5, 1.0)
 PASSES = (1, 2)
 SCALES = (0.25, 0.5, 0.75)
-EXPERIMENTS = ("factors", "noise", "iterated", "scale", "timings")
 
 Wanted = tuple[Setting, tuple[str, ...]]
 """A setting and the methods that are measured in it."""
 
 
 @dataclass(frozen=True)
-class Plan:
+class Scope:
     """What was asked for.
 
     Attributes
@@ -42,7 +41,7 @@ class Plan:
     paths: tuple[Path, ...]
     sizes: tuple[int, ...] = (32, 64, 128)
     factor: int = 4
-    methods: tuple[str, ...] = tuple(METHODS)
+    methods: tuple[str, ...] = tuple(METHOD_LABELS)
     model: str = "base"
     experiments: tuple[str, ...] = ()
     experiment_shapes: int = 10
