@@ -77,17 +77,17 @@ def tell_plan(plan: Batch, as_json: bool) -> None:
 
 def plan_lines(plan: Batch) -> Iterator[str]:
     """Yield what would be done with each file, a line each."""
-    from ..batch.job import in_a_line
+    from ..batch.job import one_line
 
     folder = plan.settings.folder
     for job in plan.waiting:
-        yield in_a_line(f"to do: {job.source} -> {folder / job.target}")
+        yield one_line(f"to do: {job.source} -> {folder / job.target}")
     for job, _ in plan.done_before:
-        yield in_a_line(f"done before: {job.source} -> {folder / job.target}")
+        yield one_line(f"done before: {job.source} -> {folder / job.target}")
     for result in plan.failed_before:
         yield f"{kind_of(result.row).replace('_', ' ')}: {result.failure()}"
     for path, reason in plan.unread:
-        yield in_a_line(f"unread: {path} {reason}")
+        yield one_line(f"unread: {path} {reason}")
 
 
 def plan_report(plan: Batch) -> dict[str, Any]:

@@ -1,7 +1,4 @@
-"""The whole evaluation on a page: measure what is missing, time whole processes, report.
-
-scope -> tasks -> rows (kept) -> report
-"""
+"""The whole evaluation on a page: measure what is missing, time whole processes, report."""
 
 from __future__ import annotations
 
@@ -24,7 +21,7 @@ from .timing import time_shape
 
 @dataclass(frozen=True)
 class Outcome:
-    """Where the report is, and which shapes are not in it, or not in all of its tables."""
+    """Path of the report, and the shapes that are missing in some or all of its tables."""
 
     report: Path
     left_out: Sequence[LeftOut]
@@ -38,31 +35,31 @@ def evaluate(
     pictures: bool = True,
     on_task: OnTask | None = None,
 ) -> Outcome:
-    """Measure a scope and write its report.
+    """Measure everything in a scope and write the report.
 
-    Rows are kept in ``out/results.jsonl`` as they come: called again, after a kill or with a
-    larger scope, only what is missing is measured. Every random number is seeded by the shape's
-    name, so figures of quality are the same in every run.
+    Measurements are kept in ``out/results.jsonl`` as they come: called again, after a kill or with
+    a larger scope, only what is missing is measured. All random numbers are seeded by the name of
+    the shape, so the quality is the same in every run.
 
     Parameters
     ----------
     scope : Scope
-        What is asked for.
+        Shapes, sizes, methods, experiments and peers.
     out : Path
-        Folder of the report: a new one, an empty one, or that of an earlier evaluation.
+        Folder of the report: new, empty, or of an earlier evaluation.
     up : {"x", "y", "z"}
         The axis that points up in the pictures.
     pictures : bool
-        Whether the best and worst shapes are drawn.
+        Whether to draw the best and worst shapes.
     on_task : callable, optional
         Called after each task: see ``OnTask``.
 
     Raises
     ------
     OptionError
-        If the scope makes no sense.
+        If the scope is not valid.
     FileError
-        If the folder cannot be made or holds what no evaluation wrote, or no shape could be
+        If the folder cannot be made or was not made by an evaluation, or no shape could be
         measured.
     ModelError
         If the network cannot be loaded.
@@ -82,9 +79,9 @@ def evaluate(
 
 
 def time_processes(results: Results, on_task: OnTask | None) -> dict[int, list[Measurement]]:
-    """Return the times of the command by size, each shape's kept; nothing else runs meanwhile.
+    """Return the times of the command on each shape, by size; nothing else runs meanwhile.
 
-    What fails is added to what the results leave out.
+    Failures are added to ``results.left_out``.
     """
     scope, timings = results.scope, dict[int, list[Measurement]]()
     names = results.names(scope.experiment_paths())
@@ -98,15 +95,15 @@ def time_processes(results: Results, on_task: OnTask | None) -> dict[int, list[M
         if row["error"] is None:
             timings.setdefault(task.setting.size, []).append(row)
         else:
-            said = f"timing ({task.setting}): {row['error']}"
-            results.left_out.append(LeftOut(task.path.stem, said))
+            reason = f"timing ({task.setting}): {row['error']}"
+            results.left_out.append(LeftOut(task.path.stem, reason))
         if on_task:
             on_task(done, len(tasks), f"timing {task}", done / len(tasks))
     return timings
 
 
 def time_task(task: Task, model: str) -> Measurement:
-    """Return the row of the command's time on a task's grid, or why there is none."""
+    """Return the time of the command on a task's grid, or a failure."""
     try:
         row = time_shape(Shape.read(task.path), task.setting, ["--model", model])
     except SuperSdfError as problem:

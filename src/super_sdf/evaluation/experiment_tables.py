@@ -1,4 +1,4 @@
-"""The paper's experiments, ours beside what is printed of them."""
+"""Tables of the paper's experiments, our results beside the published ones."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .timing import RUNS, describe_machine
 
 
 def factor_section(results: Results) -> str:
-    """Return ours at the factors 2 to 16, each beside its own bound (Fig. 9)."""
+    """Return the section on the factors 2 to 16, each with its own bound (Fig. 9)."""
     paths = results.scope.experiment_paths()
     rows = [
         ["1", *mean_row(LABELS["mc"], results.rows(Setting(BASE_SIZE), "mc", paths), SHORT), "-"]
@@ -35,7 +35,7 @@ def factor_section(results: Results) -> str:
 
 
 def noise_section(results: Results) -> str:
-    """Return F1 by noise, beside the published (supplement, Table 1)."""
+    """Return the section on F1 by noise, beside the published F1 (supplement, Table 1)."""
     paths = results.scope.experiment_paths()
     rows = []
     for noise in NOISES:
@@ -52,7 +52,7 @@ def noise_section(results: Results) -> str:
 
 
 def iterated_section(results: Results) -> str:
-    """Return ours refined once and twice, beside the published (supplement, Table 2)."""
+    """Return the section on refining once and twice, beside the paper (supplement, Table 2)."""
     paths, rows = results.scope.experiment_paths(), []
     for passes in PASSES:
         setting = Setting(BASE_SIZE, passes=passes)
@@ -64,7 +64,7 @@ def iterated_section(results: Results) -> str:
 
 
 def scale_section(results: Results) -> str:
-    """Return all methods on shapes that fill a part of the grid (supplement, Table 3)."""
+    """Return the section on shapes that fill a part of the grid (supplement, Table 3)."""
     paths, rows = results.scope.experiment_paths(), []
     for size in results.scope.sizes:
         for scale in SCALES:
@@ -90,7 +90,7 @@ SECTIONS = {
 
 
 def timing_section(timings: Mapping[int, Sequence[Measurement]]) -> str:
-    """Return whole processes' times beside the published (Table 2)."""
+    """Return the section on the times of whole processes, beside the published (Table 2)."""
     rows = []
     for size, found in timings.items():
         seconds = [row["seconds"] for row in found]
@@ -114,20 +114,20 @@ def timing_section(timings: Mapping[int, Sequence[Measurement]]) -> str:
 
 
 def title_of(title: str, paths: Sequence[Path]) -> str:
-    """Return the heading of an experiment."""
+    """Return the heading of an experiment's section."""
     return f"## {title}, {len(paths)} shapes"
 
 
 def gain(one: float | None, other: float | None) -> float | None:
-    """Return a difference if both are known."""
+    """Return the difference of two figures, None if one is unknown."""
     return None if one is None or other is None else one - other
 
 
 def published_titles() -> list[str]:
-    """Return the titles of what is printed of the paper's method."""
+    """Return the titles of the columns with the paper's figures."""
     return [f"*{column.title}, paper*" for column in (CD, F1, NC)]
 
 
 def published_cells(figures: tuple[float, float, float] | None) -> list[str]:
-    """Return what is printed of the paper's method, CD x1e5, or dashes."""
+    """Return the cells with the paper's CD x1e5, F1 and NC, or dashes."""
     return ["-"] * 3 if figures is None else [f"{figure:.3f}" for figure in figures]
