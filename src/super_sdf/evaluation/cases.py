@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import OptionError, seen
-from ..evaluation import metrics
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import check_fits
 from ..mesh import Mesh
@@ -26,6 +25,7 @@ from ..steps.band import find_band, rescale
 from ..steps.nodes import check_factor
 from ..truth.sampling import sample_grid, unit_layout
 from ..truth.solid import Distances, Solid, load_solid
+from . import metrics
 
 # Peak memory per node of the fine lattice: dense fields, their masks, and meshing one of them.
 BYTES_PER_NODE = 20
@@ -200,8 +200,8 @@ def exact_field(case: Case) -> FloatArray:
     """Return the signed distances at the fine nodes, (K n + 1)^3.
 
     They are exact in the band and at every cell that the surface may cross: a node of such a cell
-    is within sqrt(3) h/K of the surface, so the sample of its block is within sqrt(3) (1/2 + 1/K) h.
-    Elsewhere they are the nearest sample, which has the right sign.
+    is within sqrt(3) h/K of the surface, so the sample of its block is within
+    sqrt(3) (1/2 + 1/K) h. Elsewhere they are the nearest sample, which has the right sign.
     """
     factor = case.factor
     reach = 3**0.5 * (0.5 + 1 / factor) * case.spacing

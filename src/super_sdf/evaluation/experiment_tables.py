@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ..evaluation import published
+from . import published
 from .cases import Setting
 from .measuring import Measurement
 from .names import LABELS, OURS

@@ -41,7 +41,7 @@ def check_ours(path: Path) -> None:
 
 
 def is_ours(path: Path) -> bool:
-    """Return whether an evaluation wrote a file: a store, maybe with an unfinished line, or a page."""
+    """Return whether an evaluation wrote a file: a page, or rows, the last maybe unfinished."""
     if not path.is_file():
         return False
     with path.open("rb") as file:

@@ -14,7 +14,7 @@ from ..machine.records import RecordFile
 from .measuring import NUMBERS, OPTIONAL_NUMBERS, PROTOCOL, Measurement, Task
 from .names import PROCESS
 
-# What a row is known by, and the types of it; the rest of it are figures.
+# The key of a row, with types; everything else in a row are figures.
 KEY_TYPES: dict[str, tuple[type, ...]] = {
     "shape": (str,),
     "mesh": (str,),
@@ -27,7 +27,7 @@ KEY_TYPES: dict[str, tuple[type, ...]] = {
     "digest": (str,),
     "protocol": (int,),
 }
-LARGEST = 1e300  # a number beyond is damage
+LARGEST = 1e300  # a larger number shows that the line is damaged
 
 
 class Store:
@@ -58,14 +58,15 @@ class Store:
         self._take(row)
 
     def get(self, task: Task, method: str) -> Measurement | None:
-        """Return a method's row, if it was measured."""
+        """Return the measurement of a method, None if there is none."""
         key = task.key(method)
         return self.rows.get(tuple(key[name] for name in KEY_TYPES))
 
     def is_final(self, task: Task, method: str) -> bool:
-        """Say whether a row is there that another run would not better.
+        """Return whether a method need not be measured again.
 
-        A failure may have had a passing cause; one by the limit has not, unless given more time.
+        A failure may have a passing cause, so it is measured again. What ran out of time is
+        measured again only with a higher limit.
         """
         row = self.get(task, method)
         if row is None or row["error"] is None:
@@ -77,25 +78,25 @@ class Store:
         self.rows[tuple(row[name] for name in KEY_TYPES)] = row
 
 
-def is_row(found: Any) -> bool:
-    """Say whether something read is a row of this protocol: a failure, or all its figures."""
-    if not isinstance(found, dict) or found.get("protocol") != PROTOCOL:
+def is_row(record: Any) -> bool:
+    """Return whether a parsed line is a complete measurement, or a failure, of this protocol."""
+    if not isinstance(record, dict) or record.get("protocol") != PROTOCOL:
         return False
-    if not all(type(found.get(name)) in kinds for name, kinds in KEY_TYPES.items()):
+    if not all(type(record.get(name)) in kinds for name, kinds in KEY_TYPES.items()):
         return False
-    if found.get("error", 0) is not None:
-        return isinstance(found.get("error"), str) and is_number(found.get("limit") or 0)
-    if found["method"] == PROCESS:
-        return is_number(found.get("seconds")) and is_number(found.get("peak_mb"))
-    notes = found.get("notes")
+    if record.get("error", 0) is not None:
+        return isinstance(record.get("error"), str) and is_number(record.get("limit") or 0)
+    if record["method"] == PROCESS:
+        return is_number(record.get("seconds")) and is_number(record.get("peak_mb"))
+    notes = record.get("notes")
     return (
-        all(is_number(found.get(name)) for name in NUMBERS)
-        and all(is_number(found.get(name) or 0) for name in OPTIONAL_NUMBERS)
+        all(is_number(record.get(name)) for name in NUMBERS)
+        and all(is_number(record.get(name) or 0) for name in OPTIONAL_NUMBERS)
         and isinstance(notes, list)
         and all(isinstance(note, str) for note in notes)
     )
 
 
-def is_number(found: Any) -> bool:
-    """Say whether something is a number, true and false among them, of a sensible size."""
-    return isinstance(found, (int, float)) and -LARGEST < found < LARGEST
+def is_number(value: Any) -> bool:
+    """Return whether a value is a finite number or a bool."""
+    return isinstance(value, (int, float)) and -LARGEST < value < LARGEST

@@ -1,4 +1,4 @@
-"""How long the command takes and how much memory, whole processes, start and files included."""
+"""Time and memory of the whole command, including its start and files."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ print(code, seconds, peak)
 
 
 def describe_machine() -> str:
-    """Return the processor and the versions that figures of time depend on, in a line."""
+    """Return the processor and the versions that times depend on, in one line."""
     return (
         f"{processor_name()}, {count_cores()} cores, {platform.system()}, Python "
         f"{platform.python_version()}, NumPy {np.__version__}, onnxruntime {version('onnxruntime')}"
@@ -57,7 +57,7 @@ def describe_machine() -> str:
 
 
 def processor_name() -> str:
-    """Return the model of the processor, or its kind where the system does not say."""
+    """Return the model of the processor, or its architecture if the system does not tell."""
     with suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
@@ -96,7 +96,7 @@ def run_python(words: Sequence[str]) -> tuple[float, float, str]:
 
 @contextmanager
 def grid_file(shape: Shape, setting: Setting) -> Iterator[Path]:
-    """Yield a file with a shape's grid, in a folder that is removed afterwards."""
+    """Yield the path of a shape's grid, in a temporary folder."""
     case = Case(shape, setting)
     with tempfile.TemporaryDirectory() as folder:
         grid = Path(folder) / "grid.npz"
@@ -105,11 +105,11 @@ def grid_file(shape: Shape, setting: Setting) -> Iterator[Path]:
 
 
 def time_shape(shape: Shape, setting: Setting, options: Sequence[str] = ()) -> Measurement:
-    """Time the command on a shape's grid: median seconds of ``RUNS`` after one not counted."""
+    """Return the time of the command on a shape's grid: the median of ``RUNS`` after a warm-up."""
     with grid_file(shape, setting) as grid:
         words = ["upsample", str(grid), str(grid.with_suffix(".ply")), "--force", "--quiet"]
         words += ["--inside", "negative", "--factor", str(setting.factor), *options]
-        run_command(words)  # files into the cache
+        run_command(words)  # warm-up: reads the files into the cache
         runs = [run_command(words) for _ in range(RUNS)]
     seconds, peaks = zip(*runs)
     return {"seconds": statistics.median(seconds), "peak_mb": max(peaks), "error": None}
