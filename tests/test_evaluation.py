@@ -10,9 +10,11 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from click.testing import CliRunner
 from solids import cube, saved, sphere, torus
@@ -53,6 +55,13 @@ def evaluate(*words: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True)
 
 
+def is_over(process: psutil.Process) -> bool:
+    """Say whether a process has ended, if only its parent has still to hear of it."""
+    with suppress(psutil.NoSuchProcess):
+        return process.status() == psutil.STATUS_ZOMBIE
+    return True
+
+
 def quality_of(out: Path) -> dict[tuple, tuple]:
     """Return the figures of quality of each row."""
     rows = [json.loads(line) for line in (out / "results.jsonl").read_text().splitlines()]
@@ -78,8 +87,11 @@ def test_killed_and_started_again_it_ends_with_the_same_tables(meshes, tmp_path)
     while not (store.exists() and len(store.read_text().splitlines()) > 3):
         assert child.poll() is None
         time.sleep(0.02)
+    workers = psutil.Process(child.pid).children(recursive=True)
     child.send_signal(signal.SIGKILL)
     child.wait()
+    psutil.wait_procs(workers, timeout=10)
+    assert workers and all(map(is_over, workers))  # no orphans
     with store.open("a") as file:
         file.write('{"shape": "torn')  # as if killed while writing
     kept = len(store.read_text().splitlines())

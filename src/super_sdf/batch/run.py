@@ -48,9 +48,9 @@ class Run:
         """Convert what is to be converted; call ``on_file`` after each file is in the ledger."""
         start = time.perf_counter()
         self._note_refused()
-        with closing(self._convert()) as answers:
-            for job, answer in answers:
-                self._take(job, answer)
+        with closing(self._convert()) as results:
+            for job, result in results:
+                self._take(job, result)
                 self.batch.seconds = time.perf_counter() - start
                 if on_file:
                     on_file(self.batch)
@@ -101,18 +101,19 @@ class Run:
         self.planner.journal = read_journal(self.settings.folder)
         return replace(job, replace=self.planner.may_replace(job))
 
-    def _take(self, job: Job, answer: Row | Death) -> None:
+    def _take(self, job: Job, result: Row | Death) -> None:
         """Keep the row of a job; if its worker died, try the job once more, after the others."""
-        if not isinstance(answer, Death):
-            self._keep(job, answer)
+        if not isinstance(result, Death):
+            self._keep(job, result)
         elif job.target in self.died:
-            reason = f"the process that converted it {answer.cause}, twice"
+            reason = f"the process that converted it {result.cause}, twice"
             self._keep(job, failed_row(job, reason))
         else:
             self.died.add(job.target)
             self.batch.waiting.append(job)
 
     def _keep(self, job: Job, row: Row) -> None:
+        """Put the row of a finished job into the ledger and count it."""
         row["options"] = self.planner.digest(job)
         self.ledger.add(row)
         is_ok = row["status"] == "ok"

@@ -23,11 +23,15 @@ def factor_section(results: Results) -> str:
     ]
     for factor in FACTORS:
         setting = Setting(BASE_SIZE, factor)
-        found = {name: results.rows(setting, name, paths) for name in ("bspline", OURS, "bound")}
-        gap = percent(gap_closed(found[OURS], found["bspline"], found["bound"], "f1"))
+        measured = {name: results.rows(setting, name, paths) for name in ("bspline", OURS, "bound")}
+        gap = percent(gap_closed(measured[OURS], measured["bspline"], measured["bound"], "f1"))
         rows += [
-            [str(factor), *mean_row(LABELS[name], found[name], SHORT), gap if name == OURS else "-"]
-            for name in found
+            [
+                str(factor),
+                *mean_row(LABELS[name], measured[name], SHORT),
+                gap if name == OURS else "-",
+            ]
+            for name in measured
         ]
     titles = ["factor", "method", *(column.title for column in SHORT), "F1 gap closed"]
     table = markdown(titles, rows)
@@ -70,11 +74,11 @@ def scale_section(results: Results) -> str:
         for scale in SCALES:
             setting = Setting(size, scale=scale)
             names = ("mc", "bspline", OURS, "bound")
-            found = {name: results.rows(setting, name, paths) for name in names}
-            gap = percent(gap_closed(found[OURS], found["bspline"], found["bound"], "f1"))
+            measured = {name: results.rows(setting, name, paths) for name in names}
+            gap = percent(gap_closed(measured[OURS], measured["bspline"], measured["bound"], "f1"))
             for name in names:
                 other = published.SCALED.get((scale, size)) if name == OURS else None
-                row = [f"{scale:g}, {size}^3", *mean_row(LABELS[name], found[name], SHORT)]
+                row = [f"{scale:g}, {size}^3", *mean_row(LABELS[name], measured[name], SHORT)]
                 rows.append([*row, gap if name == OURS else "-", *published_cells(other)])
     titles = ["scale, grid", "method", *(column.title for column in SHORT), "F1 gap closed"]
     title = title_of("Scale: longest side of the shape over that of the grid", paths)
@@ -92,10 +96,10 @@ SECTIONS = {
 def timing_section(timings: Mapping[int, Sequence[Measurement]]) -> str:
     """Return the section on the times of whole processes, beside the published (Table 2)."""
     rows = []
-    for size, found in timings.items():
-        seconds = [row["seconds"] for row in found]
+    for size, measured in timings.items():
+        seconds = [row["seconds"] for row in measured]
         cells = [sum(seconds) / len(seconds), min(seconds), max(seconds)]
-        peak = max(row["peak_mb"] for row in found)
+        peak = max(row["peak_mb"] for row in measured)
         rows.append([f"{size}^3", LABELS[OURS], *(f"{s:.2f}" for s in cells), f"{peak:.0f}"])
         for name, theirs in published.SECONDS.get(size, {}).items():
             cells = [f"{s:.2f}" for s in theirs]

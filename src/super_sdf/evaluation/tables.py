@@ -86,7 +86,10 @@ def count_row(rows: Sequence[Measurement]) -> list[str]:
 
 def surface_table(by_method: Mapping[str, Sequence[Measurement]], size: int) -> str:
     """Return the main table of one size, the published rows below ours."""
-    rows = [mean_row(LABELS[name], found) + count_row(found) for name, found in by_method.items()]
+    rows = [
+        mean_row(LABELS[name], measured) + count_row(measured)
+        for name, measured in by_method.items()
+    ]
     titles = ["method", *(column.title for column in SURFACE), "closed", "outward"]
     return markdown(titles, rows + published_rows(size))
 
@@ -107,8 +110,8 @@ def shape_table(by_method: Mapping[str, Sequence[Measurement]]) -> str:
     titles = ["shape, method", *(column.title for column in SURFACE), "closed", "outward"]
     rows = [
         mean_row(f"{row['shape']}, {name}", [row]) + count_row([row])
-        for found in zip(*by_method.values())
-        for name, row in zip(by_method, found)
+        for measured in zip(*by_method.values())
+        for name, row in zip(by_method, measured)
     ]
     return markdown(titles, rows)
 
