@@ -328,7 +328,7 @@ def test_usage_errors_exit_with_2(command):
 
 
 def test_every_option_has_help():
-    for subcommand in cli.cli.commands.values():
+    for subcommand in (load() for load in cli.COMMANDS.values()):
         for parameter in subcommand.params:
             if isinstance(parameter, click.Option):
                 assert parameter.help, parameter.name

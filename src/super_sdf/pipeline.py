@@ -3,7 +3,7 @@
     grid -> band -> patches and neighbours -> network -> shared nodes averaged
          -> surface moved to touch the samples' spheres -> isosurface
 
-A grid that is too large to be refined at once is refined slab by slab (see ``plan``); the mesh is
+A grid that is too large to be refined at once is refined slab by slab (see ``slabs``); the mesh is
 the same.
 
 >>> from super_sdf import make_grid, reconstruct
@@ -12,9 +12,8 @@ the same.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -32,11 +31,12 @@ from .options import (
     check_network,
     check_progress,
 )
-from .progress import STEPS, Progress, Steps
+from .progress import STEPS, Progress, StepCounter
 from .slabs.cutting import Slab, peak_bytes, plan_slabs
 from .slabs.footprint import NETWORK_BYTES
+from .slabs.pieces import Piece, describe_piece
 from .steps.cap import close_at_border
-from .steps.field import FineField, border_is_crossed
+from .steps.field import FineField
 from .steps.marching import extract_pieces
 from .steps.nodes import (
     average_shared,
@@ -102,7 +102,7 @@ def upsample(
     check_progress(progress)
     factor, offset = check_factor(factor), check_distance(offset)
     resources = allot(getattr(network, "threads", 0), check_max_memory(max_memory))
-    steps = Steps(progress, [name for name in STEPS if name != "isosurface"])
+    steps = StepCounter(progress, [name for name in STEPS if name != "isosurface"])
     band = find_surface(grid, factor, offset, resources)
     (slab,) = plan_slabs(band, factor, None, resources, bytes_of(network))
     steps.finish("band")
@@ -124,9 +124,22 @@ def reconstruct(
 ) -> Mesh:
     """Turn a coarse grid into a fine mesh.
 
-    ``network`` is the shipped one unless given. A surface that runs out of the grid is left open
-    there, or closed along the border with ``cap``. ``max_memory`` bounds what the process may hold,
-    in bytes, beside the mesh; a share of what is free unless given. Otherwise as ``upsample``.
+    Parameters and errors are those of ``upsample``, but:
+
+    Parameters
+    ----------
+    network : Network, optional
+        The shipped one, ``base``, unless given.
+    cap : bool
+        Close a surface that runs out of the grid along the grid's border; else it is left open.
+    max_memory : int, optional
+        Bytes that the process may hold in all, beside the mesh; a share of what is free unless
+        given.
+
+    Returns
+    -------
+    Mesh
+        In world units, closed unless the surface runs out of the grid.
     """
     check_grid(grid)
     if network is None:
@@ -139,35 +152,6 @@ def reconstruct(
     return join_meshes([mesh for piece in pieces for mesh in piece.meshes])
 
 
-@dataclass(frozen=True, eq=False)
-class Piece:
-    """What came of a slab.
-
-    Attributes
-    ----------
-    meshes : list of Mesh
-        Triangles of the slab: rows of all vertices so far, those of the slab among them.
-    counts : dict
-        Of the slab: ``decoded_voxels``, ``nodes``, ``pinned_nodes``, ``vertices``, ``triangles``.
-    whole : dict
-        Of all pieces, the same in each: ``band_voxels``, ``noisy_voxels`` (see ``FineField``), how
-        many ``slabs``, and ``planned_bytes``, what the plan says that the process holds at most.
-    is_cut : bool
-        Whether the surface runs out of the grid here.
-    signs : set of bool
-        Whether there are outer nodes (True), and others (False).
-    seconds : dict
-        What each step took, by its name in ``progress.STEPS``; the first piece's has the band's.
-    """
-
-    meshes: list[Mesh]
-    counts: dict[str, int]
-    whole: dict[str, int]
-    is_cut: bool
-    signs: set[bool]
-    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
-
-
 def reconstruct_slabs(
     grid: SdfGrid,
     network: Decoder,
@@ -178,7 +162,7 @@ def reconstruct_slabs(
     max_memory: int | None = None,
     progress: Progress | None = None,
 ) -> Iterator[Piece]:
-    """Yield the mesh slab by slab, as few slabs as fit in memory. Otherwise as ``reconstruct``.
+    """Yield the mesh of ``reconstruct`` slab by slab, in as few slabs as fit in memory.
 
     Joined, the pieces are the same mesh, bit for bit, whatever the slabs and threads.
     """
@@ -200,13 +184,13 @@ def _slabs(
     max_memory: int | None,
     progress: Progress | None,
 ) -> Iterator[Piece]:
-    """Yield the pieces of ``reconstruct_slabs``, whose arguments were checked."""
+    """Yield the pieces of ``reconstruct_slabs``, with checked arguments."""
     resources = allot(getattr(network, "threads", 0), max_memory)
-    steps = Steps(progress)
+    steps = StepCounter(progress)
     band = find_surface(grid, factor, offset, resources)
-    reach, taken = getattr(network, "receptive_field", None), bytes_of(network)
-    slabs = plan_slabs(band, factor, reach, resources, taken)
-    planned = peak_bytes(band, slabs, factor, taken, resources.threads)
+    reach, needed = getattr(network, "receptive_field", None), bytes_of(network)
+    slabs = plan_slabs(band, factor, reach, resources, needed)
+    planned = peak_bytes(band, slabs, factor, needed, resources.threads)
     steps.divide(len(slabs))
     steps.finish("band")
     vertices = 0
@@ -225,20 +209,20 @@ def _slabs(
         seen |= piece.signs
         yield piece
         del piece  # before the next is made
-        steps.watch.start()  # what passed meanwhile is the caller's
+        steps.watch.start()  # the time since the yield is the caller's
     if len(seen) < 2:
         raise no_surface(grid, offset)
 
 
 def bytes_of(network: Decoder) -> tuple[float, float]:
-    """Return what a network takes for each voxel that it sees, and for each value."""
-    taken: tuple[float, float] = getattr(network, "memory_bytes", NETWORK_BYTES)
-    return taken
+    """Return the bytes that a network needs for each voxel that it sees, and for each value."""
+    needed: tuple[float, float] = getattr(network, "memory_bytes", NETWORK_BYTES)
+    return needed
 
 
 def find_surface(grid: SdfGrid, factor: int, offset: float, resources: Resources) -> Band:
-    """Return the band of a grid, if a surface can be in it."""
-    vertex_type(grid, factor)  # raises if there is none
+    """Return the band of a grid, or raise if it cannot hold a surface."""
+    vertex_type(grid, factor)  # raises where no numbers tell vertices apart
     band = survey(grid, offset, resources)  # Eqs. 2 and 4
     if not band.decoded.any():
         raise no_surface(grid, offset)
@@ -251,13 +235,13 @@ def refine(
     factor: int,
     slab: Slab,
     threads: int = 1,
-    steps: Steps | None = None,
+    steps: StepCounter | None = None,
 ) -> FineField:
     """Return the fine field of a slab, or of the whole band."""
-    steps = steps or Steps()
+    steps = steps or StepCounter()
     patches, table, voxels = inputs = band.network_inputs(slab.seen, slab.decoded)
-    listen = steps.within("network")
-    blocks = decode(network, inputs, block_offsets(factor), listen, threads)  # Eqs. 3, 5
+    progress = steps.within("network")
+    blocks = decode(network, inputs, block_offsets(factor), progress, threads)  # Eqs. 3, 5
     steps.finish("network")
 
     row_of = rows_among(voxels, len(table))
@@ -278,22 +262,11 @@ def refine(
     )
 
 
-def describe_piece(field: FineField, meshes: list[Mesh], planned: dict[str, int]) -> Piece:
-    """Return the meshes of a slab with what there is to say of them."""
-    own = field.own_rows
-    counts = {
-        "decoded_voxels": own.stop - own.start,
-        "nodes": field.parts.count_nodes(field.factor, own),
-        "pinned_nodes": field.pinned,
-        "vertices": sum(len(mesh.vertices) for mesh in meshes),
-        "triangles": sum(len(mesh.faces) for mesh in meshes),
-    }
-    whole = {"band_voxels": field.band_voxels, "noisy_voxels": field.noisy_voxels, **planned}
-    return Piece(meshes, counts, whole, border_is_crossed(field), field.signs())
-
-
 def rows_among(voxels: IntArray, count: int) -> IntArray:
-    """Return which row of ``voxels`` each of ``count`` voxels is, -1 if none; one -1 more."""
+    """Return the row in ``voxels`` of each of ``count`` voxels, -1 if it has none.
+
+    One more -1 at the end is for the index -1, absent neighbours.
+    """
     row_of = np.full(count + 1, -1, np.int32)
     row_of[voxels] = np.arange(len(voxels), dtype=np.int32)
     return row_of

@@ -45,7 +45,7 @@ class Stopwatch:
         self.start()
 
 
-class Steps:
+class StepCounter:
     """Reports progress and measures time, step by step; ``finish`` ends each step.
 
     Parameters

@@ -10,46 +10,91 @@ import sys
 import click
 
 from .. import __version__
-from .batch import batch_command
 from .common import CONTEXT, InterruptedCommand, print_stderr
-from .evaluate import evaluate_command
-from .info import info_command
 from .interrupts import ending_at_once
-from .render import render_command
-from .sample import sample_command
 from .streams import discard_unwritable_output
-from .upsample import upsample_command
 
 
-@click.group(context_settings=CONTEXT)
+def _upsample() -> click.Command:
+    from .upsample import upsample_command
+
+    return upsample_command
+
+
+def _batch() -> click.Command:
+    from .batch import batch_command
+
+    return batch_command
+
+
+def _sample() -> click.Command:
+    from .sample import sample_command
+
+    return sample_command
+
+
+def _evaluate() -> click.Command:
+    from .evaluate import evaluate_command
+
+    return evaluate_command
+
+
+def _render() -> click.Command:
+    from .render import render_command
+
+    return render_command
+
+
+def _info() -> click.Command:
+    from .info import info_command
+
+    return info_command
+
+
+COMMANDS = {
+    "upsample": _upsample,
+    "batch": _batch,
+    "sample": _sample,
+    "evaluate": _evaluate,
+    "render": _render,
+    "info": _info,
+}
+
+
+class LazyGroup(click.Group):
+    """A group that imports a command when it is used, so that one does not wait for the others."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names of the commands, in the order of the help."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Return a command, None if there is none of this name."""
+        return COMMANDS[cmd_name]() if cmd_name in COMMANDS else None
+
+
+@click.group(cls=LazyGroup, context_settings=CONTEXT)
 @click.version_option(__version__, prog_name="super-sdf")
 def cli() -> None:
     """Turn coarse signed distance grids into fine meshes."""
 
 
-for command in (
-    upsample_command,
-    batch_command,
-    sample_command,
-    evaluate_command,
-    render_command,
-    info_command,
-):
-    cli.add_command(command)
-
-
 def main() -> None:
     """Run the command line and exit with its exit code; every error is one line on stderr."""
-    with ending_at_once():
-        try:
-            code = run()
-        finally:
-            discard_unwritable_output()
-    if code:
+    if code := run():
         sys.exit(code)
 
 
 def run() -> int:
+    """Run a command and write its output; return the exit code."""
+    with ending_at_once():
+        try:
+            return run_command()
+        finally:
+            discard_unwritable_output()
+
+
+def run_command() -> int:
     """Run a command; return the exit code."""
     try:
         cli.main(standalone_mode=False)

@@ -6,9 +6,12 @@ units is the spacing.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import BoolArray
 from ..errors import GridError
 from .planes import SampleArray
 
@@ -51,23 +54,40 @@ def _plane_gradients(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return gradients (n, 3) and bends (n,) at samples next to the surface in plane i."""
     first = max(i - 1, 0)
-    slab = values[first : i + 2].astype(np.float64)
-    np.clip(slab, -LARGEST_VALUE, LARGEST_VALUE, out=slab)
-    inside = slab <= 0
-    near = np.zeros(slab.shape, bool)
-    bend = np.zeros(slab.shape)
+    slab = np.asarray(values[first : i + 2])
+    at = [np.full(1, i - first), *np.nonzero(_beside_surface(slab <= 0, i - first))]
+    centre = _read(slab, at)
+    gradient, change = np.empty((len(centre), 3)), np.zeros(len(centre))
     for axis in range(3):
-        s, d, n, b = (np.moveaxis(a, axis, 0) for a in (inside, slab, near, bend))
-        crossed = s[1:] != s[:-1]
-        n[1:] |= crossed
-        n[:-1] |= crossed
-        b[1:-1] += np.abs(d[2:] - 2 * d[1:-1] + d[:-2])
-    chosen = near[i - first]
-    gradient = np.asarray(np.gradient(slab))[:, i - first][:, chosen].T
-    change, length = bend[i - first][chosen], lengths(gradient)
+        low, high = (list(at), list(at))
+        low[axis] = np.maximum(at[axis] - 1, 0)
+        high[axis] = np.minimum(at[axis] + 1, slab.shape[axis] - 1)
+        below, above, steps = _read(slab, low), _read(slab, high), high[axis] - low[axis]
+        gradient[:, axis] = (above - below) / steps
+        change += np.where(steps == 2, np.abs(above - 2 * centre + below), 0)
+    length = lengths(gradient)
     relative = np.full(len(length), np.inf)  # where opposite neighbours are equal, or nearly
     np.divide(change, length, out=relative, where=length > 1e-9 * change)
     return gradient, relative
+
+
+def _beside_surface(inside: BoolArray, middle: int) -> BoolArray:
+    """Return which samples of a plane have a neighbour along an axis on the other side."""
+    plane = inside[middle]
+    beside = np.zeros(plane.shape, bool)
+    for other in (*inside[:middle], *inside[middle + 1 :]):
+        beside |= plane != other
+    for axis in range(2):
+        samples, marks = np.moveaxis(plane, axis, 0), np.moveaxis(beside, axis, 0)
+        crossed = samples[1:] != samples[:-1]
+        marks[1:] |= crossed
+        marks[:-1] |= crossed
+    return beside
+
+
+def _read(slab: NDArray[Any], at: list[NDArray[np.intp]]) -> NDArray[np.float64]:
+    """Return samples at some indices, clamped to ``LARGEST_VALUE``."""
+    return np.clip(slab[tuple(at)].astype(np.float64), -LARGEST_VALUE, LARGEST_VALUE)
 
 
 def typical_length(gradients: NDArray[np.float64], bend: NDArray[np.float64]) -> float:
