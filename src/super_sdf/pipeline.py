@@ -251,7 +251,7 @@ def refine(
     fit_to_spheres(blocks, parts, factor, ExactSamples(patches, exact, table, row_of), threads)
     own_ijk = band.voxel_ijk[slab.seen][voxels]
     skipped = signs_of_skipped(parts, own_ijk, patches, voxels, band.shape)
-    pinned = pin_to_skipped(blocks, parts, factor, skipped)
+    pinned = pin_to_skipped(blocks[:, :-1], parts, factor, skipped)
     steps.finish("nodes")
     field = FineField(band.shape, factor, own_ijk, blocks[:, :-1], parts, slab.planes)
     return replace(

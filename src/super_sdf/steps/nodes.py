@@ -154,8 +154,9 @@ def number_parts(parts: SharedParts, sizes: NDArray[np.int64]) -> tuple[IntArray
     """
     owned = parts.owned()
     count = check_count(int(np.count_nonzero(owned, axis=1) @ sizes), "nodes")
-    ends = np.cumsum((owned.T * sizes.astype(np.int32)).ravel(), dtype=np.int32)
-    starts = np.ascontiguousarray(ends.reshape(-1, 27).T) - sizes[:, None].astype(np.int32)
+    starts = np.cumsum(owned * sizes[:, None].astype(np.int32), axis=0, dtype=np.int32)
+    before = np.cumsum(starts[-1], dtype=np.int32) - starts[-1]  # of earlier voxels
+    starts += before - sizes[:, None].astype(np.int32)
     for part, sharing in enumerate(SHARING):
         for place in sharing[sharing < CENTRE]:
             rows = np.flatnonzero(parts.owner[part] == place)
@@ -198,6 +199,10 @@ def _average_group(
         total: NDArray[Any] = np.zeros((len(columns[0]), table.shape[1]), kind)
         times: NDArray[Any] = np.zeros(table.shape[1], kind)
         for other, nodes in zip(sides, columns):
+            if other is own:
+                total += blocks[nodes, :-1]
+                times += 1
+                continue
             voxel = table[CENTRE + int((own - other) @ STRIDES)].astype(np.intp)
             times += voxel >= 0
             for row, node in enumerate(nodes):
@@ -293,12 +298,10 @@ def pin_to_skipped(
         sign = np.zeros(skipped.shape[1], np.int8)
         for place in SHARING[part]:
             np.copyto(sign, skipped[place], where=skipped[place] != 0)
-        rows = np.flatnonzero(sign)
-        outside = sign[rows] > 0
+        known, outside = sign != 0, sign > 0
         for node in nodes:
-            wrong = (blocks[node, rows] > 0) != outside
+            wrong = known & ((blocks[node] > 0) != outside)
             if wrong.any():
-                at = rows[wrong]
-                blocks[node, at] = np.where(outside[wrong], BARELY_OUTSIDE, BARELY_INSIDE)
-                changed[at] += parts.owner[part, at] == CENTRE
+                blocks[node, wrong] = np.where(outside[wrong], BARELY_OUTSIDE, BARELY_INSIDE)
+                changed += wrong & (parts.owner[part] == CENTRE)
     return changed

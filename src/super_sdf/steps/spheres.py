@@ -39,7 +39,7 @@ FLAT = 0.7  # the largest slope towards a neighbour; that of a distance is near 
 CORNER_PARTS = np.flatnonzero(np.abs(NEIGHBOURHOOD).all(1))
 MOST_NOISY = 0.02  # share of samples that are no distances: beyond, none is taken for exact
 
-TEMPORARIES = 128  # numbers for each sample, on the way to its foot point
+TEMPORARIES = 64  # numbers for each sample, on the way to its foot point
 
 # Planes of voxels to both sides that a block's fitted values depend on: what is said round it, by
 # samples one voxel on, given what was said one voxel further, whose tries read blocks as far again.
