@@ -124,7 +124,7 @@ def accepts(option: click.Option, word: str, ctx: click.Context) -> bool:
     type=click.Choice(PEERS),
     metavar="NAME...",
     help=f"Published methods to run as well: {', '.join(PEERS)}. They take minutes per shape and "
-    "need the extra peers.",
+    "need the extra 'peers'.",
 )
 @click.option(
     "--peer-shapes",
@@ -154,7 +154,7 @@ def accepts(option: click.Option, word: str, ctx: click.Context) -> bool:
     help="Shipped network (fast, base or best) or an ONNX file.",
 )
 @click.option(
-    "--jobs", type=click.IntRange(1), help="Processes. Default and maximum: one per core."
+    "--jobs", type=click.IntRange(1), help="Worker processes. Default and maximum: one per core."
 )
 @click.option(
     "--up",
