@@ -36,7 +36,7 @@ KILLS = {
 LIMITS = ("file limit", "full disk")
 BALLAST = "ballast"  # a file that fills the disk until the first run is over
 Process = subprocess.Popen[bytes]
-OWN_FILES = {"report.jsonl", ".super-sdf-batch"}
+OWN_FILES = {"report.jsonl", ".super-sdf-batch", ".super-sdf-batch.lock"}
 
 
 @dataclass(frozen=True)
@@ -127,6 +127,7 @@ def incomplete(setting: Setting) -> str | None:
     found = setting.found()
     if found.pop(".super-sdf-batch", b"") != b"":
         return "the journal is not empty"
+    found.pop(".super-sdf-batch.lock", None)
     rows = {row["out"]: row for row in map(json.loads, found.pop("report.jsonl").splitlines())}
     if {name for name, row in rows.items() if row["status"] == "ok"} != setting.right.keys():
         return "the report lacks a row"

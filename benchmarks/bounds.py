@@ -1,7 +1,7 @@
 """Whether a conversion stays within ``--max-memory``: peak memory of the process over the limit.
 
     python -m benchmarks.bounds --sizes 128 --factors 2 4
-    python -m benchmarks.bounds --fields gyroid "wall across x" --precisions int8 --code numpy
+    python -m benchmarks.bounds --fields gyroid "wall across x" --precisions int8
     python -m benchmarks.bounds --quick
     python -m benchmarks.bounds --mesh fandisk.ply
 
@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -30,7 +29,6 @@ from super_sdf.evaluation.timing import LAUNCHER, describe_machine, run_command
 
 FIELDS = ("ball", "gyroid", "wall across x", "wall across z")
 SUFFIXES = (".ply", ".stl", ".obj")
-CODE = {"numpy": "0", "numba": "1"}
 SHARE = 0.6
 ALLOWED = 1.05
 LARGEST = 4_000_000_000  # bytes; grids whose smallest plan is larger are skipped
@@ -41,16 +39,18 @@ PLAN = """
 import sys
 from super_sdf import load_network
 from super_sdf.files.grids import read_grid
+from super_sdf.machine.resources import allot
 from super_sdf.pipeline import find_surface
 from super_sdf.slabs.cutting import peak_bytes, ways_to_cut, whole
 
 path, factor, precision = sys.argv[1:]
 network = load_network(precision=precision, device="cpu")
 grid = read_grid(path, spacing=1.0)
-band = find_surface(grid, int(factor), 0.0, None)
+resources = allot(network.threads)
+band = find_surface(grid, int(factor), 0.0, resources)
 *_, thinnest = ways_to_cut(band, network.receptive_field)
 for slabs in ([whole(band)], thinnest):
-    print(peak_bytes(band, slabs, int(factor), network.memory_bytes))
+    print(peak_bytes(band, slabs, int(factor), network.memory_bytes, resources.threads))
 """
 
 
@@ -62,7 +62,6 @@ class Case:
     size: int
     factor: int
     precision: str
-    code: str
     suffix: str
     source: str
 
@@ -123,11 +122,10 @@ def sample_mesh(mesh: Path, n: int, folder: Path) -> None:
     np.savez(folder / "grid.npz", values=values)
 
 
-def run_python(words: list[str], code: str) -> tuple[str, str]:
-    """Run Python with or without numba; return its stdout and stderr."""
+def run_python(words: list[str]) -> tuple[str, str]:
+    """Run Python; return its stdout and stderr."""
     command = [sys.executable, "-c", LAUNCHER, *words]
-    environment = os.environ | {"SUPER_SDF_COMPILED": CODE[code]}
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
     return done.stdout.rstrip("\n"), done.stderr
 
 
@@ -135,7 +133,7 @@ def plan(case: Case, folder: Path) -> tuple[int, int]:
     """Return the planned bytes of the whole grid, and of its thinnest slabs."""
     path = folder / f"grid{case.source}"
     words = ["-c", PLAN, str(path), str(case.factor), case.precision]
-    printed, errors = run_python(words, case.code)
+    printed, errors = run_python(words)
     whole, thinnest, *_ = printed.splitlines()
     if not whole:
         raise SystemExit(errors)
@@ -148,7 +146,7 @@ def convert(case: Case, folder: Path, bound: int) -> Run:
     words = ["-m", "super_sdf", "upsample", str(folder / f"grid{case.source}"), str(target)]
     words += ["--spacing", "1", "--force", "--json", "--quiet", "--device", "cpu"]
     words += ["--factor", str(case.factor), "--precision", case.precision]
-    printed, errors = run_python([*words, "--max-memory", str(bound)], case.code)
+    printed, errors = run_python([*words, "--max-memory", str(bound)])
     printed, _, last = printed.rpartition("\n")
     status, seconds, peak = last.split()
     peak_bytes = int(peak) * (1 if sys.platform == "darwin" else 1024)
@@ -159,7 +157,7 @@ def convert(case: Case, folder: Path, bound: int) -> Run:
 
 def row(case: Case, name: str, bound: int, run: Run) -> str:
     """Return a row of the table."""
-    what = [case.field, f"{case.size}^3", case.factor, case.precision, case.code]
+    what = [case.field, f"{case.size}^3", case.factor, case.precision]
     cells = [*what, f"{case.source} to {case.suffix}", name, f"{bound / 1e6:,.0f}"]
     if run.refusal:
         cells += ["refused", "", f"{run.peak / 1e6:,.0f}", "", f"{run.seconds:.1f}"]
@@ -186,7 +184,6 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--sizes", type=int, nargs="+", default=[128, 256])
     parser.add_argument("--factors", type=int, nargs="+", default=[2, 4, 16])
     parser.add_argument("--precisions", nargs="+", default=["float32", "int8"])
-    parser.add_argument("--code", nargs="+", choices=CODE, default=list(CODE))
     parser.add_argument("--suffixes", nargs="+", default=SUFFIXES)
     parser.add_argument("--sources", nargs="+", choices=[".npy", ".npz"], default=[".npy", ".npz"])
     parser.add_argument("--bounds", nargs="+", choices=["share", "least"], default=["share"])
@@ -203,11 +200,7 @@ def parse() -> argparse.Namespace:
 def cases(arguments: argparse.Namespace, field: str, size: int) -> Iterator[Case]:
     """Yield the conversions to try on a grid."""
     for choice in product(
-        arguments.factors,
-        arguments.precisions,
-        arguments.code,
-        arguments.suffixes,
-        arguments.sources,
+        arguments.factors, arguments.precisions, arguments.suffixes, arguments.sources
     ):
         yield Case(field, size, *choice)
 
@@ -217,8 +210,8 @@ def main() -> None:
     arguments, over = parse(), []
     print(f"{describe_machine()}; MB\n")
     print(
-        "| grid | size | factor | precision | code | files | bound | MB | slabs | planned | peak | "
-        "of the bound | s |\n| --- | ---: | ---: |" + " --- |" * 4 + " ---: |" * 6
+        "| grid | size | factor | precision | files | bound | MB | slabs | planned | peak | "
+        "of the bound | s |\n| --- | ---: | ---: |" + " --- |" * 3 + " ---: |" * 6
     )
     fields = [(name, None) for name in arguments.fields] + [
         (mesh.stem, mesh) for mesh in arguments.mesh

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.evaluation.cases import Setting, Shape
-from super_sdf.evaluation.plan import find_meshes
+from super_sdf.evaluation.scope import find_meshes
 from super_sdf.evaluation.timing import grid_file
 from super_sdf.network.network import DEFAULT_QUALITY, Network, load_network, shipped_models
 

@@ -19,14 +19,14 @@ from pathlib import Path
 from benchmarks.options import parse
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.evaluation.cases import Setting, Shape
-from super_sdf.evaluation.measuring import Row
-from super_sdf.evaluation.plan import find_meshes, spread
+from super_sdf.evaluation.measuring import Measurement
+from super_sdf.evaluation.scope import find_meshes, spread
 from super_sdf.evaluation.timing import RUNS, describe_machine, grid_file, time_shape
 from super_sdf.machine.memory import forget_peak, held_memory
 from super_sdf.network.network import Network, load_network
 
 
-def time_warm(shape: Shape, setting: Setting, network: Network) -> Row:
+def time_warm(shape: Shape, setting: Setting, network: Network) -> Measurement:
     """Time a conversion in this process, as ``time_shape`` times the command."""
     seconds, options = [], ConvertOptions(setting.factor, inside="negative")
     with grid_file(shape, setting) as grid:
@@ -55,7 +55,7 @@ def main() -> None:
     paths = spread(find_meshes(arguments.meshes), arguments.shapes)
     network = load_network() if arguments.warm else None
 
-    def measure(path: Path, setting: Setting) -> Row:
+    def measure(path: Path, setting: Setting) -> Measurement:
         shape = Shape.read(path)
         if network:
             return time_warm(shape, setting, network)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from super_sdf.evaluation.plan import find_meshes
+from super_sdf.evaluation.scope import find_meshes
 
 HALVES = ("choose", "final")
 SEED = 0

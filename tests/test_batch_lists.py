@@ -100,6 +100,8 @@ LISTS = {
     + '": give an object, {"in": "a.npy"}',
     '{"in": "a.npy", "out": "report.jsonl/x.ply"}': "a.npy would become report.jsonl/x.ply, but "
     "the first of these names is the batch's own: rename it",
+    '{"in": "a.npy", "out": ".super-sdf-batch.lock/x.ply"}': "a.npy would become "
+    ".super-sdf-batch.lock/x.ply, but the first of these names is the batch's own: rename it",
     '{"in": "a.npy", "out": "a/../../b.ply"}': "list.jsonl, line 1: 'out' is 'a/../../b.ply': give "
     "a path within the output folder",
     '{"in": "a.npy", "out": "../a.ply"}': "list.jsonl, line 1: 'out' is '../a.ply': give a path "

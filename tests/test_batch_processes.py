@@ -1,5 +1,6 @@
 """Batches and their processes, killed, ended, short of memory: nothing is lost or left over."""
 
+import errno
 import json
 import os
 import signal
@@ -131,6 +132,45 @@ def test_a_lock_refused_is_a_file_error():
         FolderLock(Path("out"))
 
 
+HOLD = "import sys; from pathlib import Path; from super_sdf.batch.lock import FolderLock\n"
+HOLD += "with FolderLock(Path('out')): print('held', flush=True); sys.stdin.read()"
+
+
+def test_a_lock_is_exclusive_among_processes_and_ends_with_its_own(run_batch):
+    words = [sys.executable, "-c", HOLD]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
+        assert holder.stdout.readline() == b"held\n"
+        want = "Error: out is in use by another batch: wait for it, or give another\n"
+        assert run_batch("in/a.npy") == (1, "", want)
+        holder.kill()
+        holder.wait()
+        assert run_batch("in/a.npy")[0] == 0
+
+
+def test_where_a_file_system_has_no_locks_a_batch_runs_without(run_batch, monkeypatch):
+    def refuse(self, *_, **__):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr("super_sdf.batch.lock.FileLock.acquire", refuse)
+    assert run_batch("in/a.npy")[0] == 0 and len(rows()) == 1
+
+
+def test_a_lock_file_that_cannot_be_written_is_named(run_batch, monkeypatch):
+    def refuse(self, *_, **__):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    monkeypatch.setattr("super_sdf.batch.lock.FileLock.acquire", refuse)
+    assert run_batch("in/a.npy") == (1, "", "Error: out cannot be written: Permission denied\n")
+
+
+def test_what_is_locked_is_not_what_workers_read(run_batch):
+    """Windows lets no other process read it."""
+    from super_sdf.batch import journal
+
+    with FolderLock(Path("out")) as lock:
+        assert Path(lock.lock.lock_file).name == journal.LOCK_NAME != journal.NAME
+
+
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
 def test_a_signal_ends_batch_and_workers_in_a_line(name):
     larger_grids(8)
@@ -165,12 +205,12 @@ def test_a_file_at_which_two_processes_die_is_named(command, monkeypatch):
             seen.append(job := self.tasks.popleft())
             made = {"content": None, "output": None, "closed": True, "inferred": [], "warnings": []}
             row = {**batch_job.failed_row(job, None), **made, "status": "ok", "retry": False}
-            yield job, Death("died of SIGKILL") if job.source.name == "a.npy" else row
+            yield job, Death("was killed by SIGKILL") if job.source.name == "a.npy" else row
 
     monkeypatch.setattr(Pool, "results", deaths)
     monkeypatch.setattr("super_sdf.batch.workers.count_cores", lambda: 2)
     code, _, err = command("batch", "in", "--out", "out", "--quality", "fast", "--jobs", 2)
-    reason = "the process that converted it died of SIGKILL, twice"
+    reason = "the process that converted it was killed by SIGKILL, twice"
     assert code == 1 and err.startswith(f"Failed: in/a.npy: {reason}\n3 done, 1 failed")
     assert [job.source.name for job in seen].count("a.npy") == 2
     assert seen[-1].source.name == "a.npy"  # the others first

@@ -176,4 +176,4 @@ def test_a_journal_of_any_content_is_read(run_batch):
     lines = b'"../../x"\n[1]\n{"out": [], "sha256": 1}\n' + 100_000 * b"[" + b'\n\xff\n7\n"to'
     Path("out/.super-sdf-batch").write_bytes(lines)
     assert run_batch("in/a.npy")[0] == 0
-    assert read_journal(Path("out")).begun == set()
+    assert read_journal(Path("out")).started == set()

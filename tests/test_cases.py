@@ -27,10 +27,10 @@ def case_of(mesh: Mesh, setting: Setting) -> Case:
 @pytest.mark.parametrize("order", [1, 3])
 def test_upsampling_keeps_samples_and_straight_lines(order):
     coarse = np.random.default_rng(1).random((16, 16, 16))
-    fine = methods.upsample(coarse, 4, order)
+    fine = methods.interpolate_spline(coarse, 4, order)
     np.testing.assert_allclose(fine[2::4, 2::4, 2::4], coarse, atol=1e-6)
     ramp = np.broadcast_to(np.arange(32.0)[:, None, None], (32, 32, 32))
-    middle = methods.upsample(ramp, 4, order)[40:-40, 64, 64]
+    middle = methods.interpolate_spline(ramp, 4, order)[40:-40, 64, 64]
     np.testing.assert_allclose(middle, np.arange(40, 89) / 4 - 0.5, atol=1e-4)
 
 
@@ -38,7 +38,7 @@ def test_upsampling_is_that_of_scipy():
     coarse = np.random.default_rng(2).random((6, 6, 6))
     position = np.meshgrid(*[np.arange(25) / 4 - 0.5] * 3, indexing="ij")
     expected = ndimage.map_coordinates(coarse, position, order=3, mode="nearest")
-    np.testing.assert_allclose(methods.upsample(coarse, 4, 3), expected, atol=1e-5)
+    np.testing.assert_allclose(methods.interpolate_spline(coarse, 4, 3), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("setting", [Setting(12, 2), Setting(12, 4), Setting(12, 4, scale=0.5)])
@@ -65,7 +65,7 @@ def unfitted(monkeypatch):
 def test_ours_with_a_trilinear_network_is_the_trilinear_baseline():
     case = case_of(sphere(), Setting(16))
     ours = methods.our_surface(case, trilinear)
-    baseline = methods.upsampled_surface(case, trilinear, order=1)
+    baseline = methods.spline_surface(case, trilinear, order=1)
     near = case.band & (np.abs(baseline.field()) < case.spacing)  # patches are cut off at 3 h
     np.testing.assert_allclose(ours.field()[near], baseline.field()[near], atol=1e-6)
     assert ours.mesh.is_closed()

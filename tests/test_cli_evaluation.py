@@ -13,11 +13,7 @@ from conftest import ball
 from solids import cube, inverted, joined, saved, torus
 
 from super_sdf import Mesh, read_grid
-from super_sdf.cli import evaluate
 from super_sdf.cli.evaluate import ListCommand
-from super_sdf.evaluation.methods import METHODS
-from super_sdf.evaluation.peers import PEERS
-from super_sdf.evaluation.plan import EXPERIMENTS
 from super_sdf.machine import extras
 
 
@@ -27,12 +23,6 @@ def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     saved(Mesh(cube().vertices * [3, 1, 1], cube().faces), tmp_path / "box.ply")
     return tmp_path
-
-
-def test_the_help_of_evaluate_has_the_names_that_evaluation_knows():
-    assert sorted(evaluate.METHODS) == sorted(METHODS)
-    assert evaluate.EXPERIMENTS == EXPERIMENTS
-    assert sorted(evaluate.PEERS) == sorted(PEERS)
 
 
 def test_a_mesh_becomes_a_grid_and_a_mesh_again(here, command):

@@ -4,30 +4,34 @@ from __future__ import annotations
 
 import errno
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
+import psutil
 import pytest
 from click.testing import CliRunner
 from solids import cube, saved, sphere, torus
 
 from super_sdf import Mesh, SuperSdfError
 from super_sdf.cli.main import cli
-from super_sdf.errors import WriteError
-from super_sdf.evaluation import measuring, plan, published, report, runner, tables, timing
+from super_sdf.errors import OptionError, WriteError
+from super_sdf.evaluation import measuring, published, report, runner, tables, timing
 from super_sdf.evaluation.cases import Setting, Shape
 from super_sdf.evaluation.measuring import Task
-from super_sdf.evaluation.plan import Plan
 from super_sdf.evaluation.results import Results
 from super_sdf.evaluation.runner import LeftOut, Runner, complete
+from super_sdf.evaluation.scope import Scope, find_meshes, spread
 from super_sdf.evaluation.store import KEY_TYPES, Store, is_row
+from super_sdf.machine.serving import ClockStarted
 
+KILLED = "was killed by SIGKILL (most likely out of memory)"
 QUALITY = ("cd", "f1", "nc", "signed_nc", "p2s", "ecd", "ef1", "field_mse", "faces", "closed")
 
 
@@ -49,6 +53,13 @@ def evaluate(*words: object) -> subprocess.CompletedProcess[str]:
     """Run the command as a user does: its processes need a program that can be imported."""
     command = [sys.executable, "-m", "super_sdf", "evaluate", *map(str, words)]
     return subprocess.run(command, capture_output=True, text=True)
+
+
+def is_over(process: psutil.Process) -> bool:
+    """Say whether a process has ended, if only its parent has still to hear of it."""
+    with suppress(psutil.NoSuchProcess):
+        return process.status() == psutil.STATUS_ZOMBIE
+    return True
 
 
 def quality_of(out: Path) -> dict[tuple, tuple]:
@@ -76,8 +87,11 @@ def test_killed_and_started_again_it_ends_with_the_same_tables(meshes, tmp_path)
     while not (store.exists() and len(store.read_text().splitlines()) > 3):
         assert child.poll() is None
         time.sleep(0.02)
+    workers = psutil.Process(child.pid).children(recursive=True)
     child.send_signal(signal.SIGKILL)
     child.wait()
+    psutil.wait_procs(workers, timeout=10)
+    assert workers and all(map(is_over, workers))  # no orphans
     with store.open("a") as file:
         file.write('{"shape": "torn')  # as if killed while writing
     kept = len(store.read_text().splitlines())
@@ -159,25 +173,33 @@ def test_failures_are_tried_again_but_not_what_ran_out_of_time(tmp_path):
     assert not store.is_final(task_of(tmp_path / "box.ply", limit=20.0), "mc")
 
 
-def die(task: Task, rows) -> None:
+def prepare_to_die():
+    return die
+
+
+def die(task: Task, tell) -> None:
     """Stand in for a process that is killed after its first row."""
-    rows.send(runner.READ)
+    tell(ClockStarted())
     row = {**task.key(task.methods[0]), "error": None}
-    rows.send(row)
+    tell(row)
     if len(task.methods) > 2:
         os.kill(os.getpid(), signal.SIGKILL)
     for method in task.methods[1:]:
-        rows.send({**row, "method": method})
+        tell({**row, "method": method})
 
 
-def sleep(task: Task, rows) -> None:
+def prepare_to_sleep():
+    return sleep
+
+
+def sleep(task: Task, tell) -> None:
     """Stand in for a process that does not end."""
-    rows.send(runner.READ)
+    tell(ClockStarted())
     time.sleep(60)
 
 
 def test_a_process_that_dies_fails_one_method_and_the_rest_go_on(tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "work", die)
+    monkeypatch.setattr(runner, "prepare", prepare_to_die)
     task = task_of(saved(cube(), tmp_path / "box.ply"), ("mc", "ours", "bspline", "bound"))
     store = Store(tmp_path / "rows.jsonl")
     seen = []
@@ -185,7 +207,7 @@ def test_a_process_that_dies_fails_one_method_and_the_rest_go_on(tmp_path, monke
     errors = {name: store.get(task, name)["error"] for name in task.methods}
     assert errors == {
         "mc": None,
-        "ours": "its process died of SIGKILL (mostly for want of memory)",
+        "ours": f"its process {KILLED}",
         "bspline": None,
         "bound": None,
     }
@@ -194,28 +216,35 @@ def test_a_process_that_dies_fails_one_method_and_the_rest_go_on(tmp_path, monke
 
 
 def test_a_process_over_its_limit_is_ended(tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "work", sleep)
+    monkeypatch.setattr(runner, "prepare", prepare_to_sleep)
     task = task_of(saved(cube(), tmp_path / "box.ply"), limit=0.2)
     (_, row), (_, end) = Runner([task], 1).results()
     assert row["error"] == "over the limit of 0.2 s" and row["limit"] == 0.2
     assert end is None
 
 
-def crash(task: Task, rows) -> None:
+def prepare_to_crash():
+    return crash
+
+
+def crash(task: Task, tell) -> None:
     """Stand in for a reader that takes its process down."""
     os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_a_mesh_that_crashes_its_reader_is_left_out(tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "work", crash)
+    monkeypatch.setattr(runner, "prepare", prepare_to_crash)
     tasks = [task_of(tmp_path / "box.ply"), task_of(tmp_path / "box.ply", ("ours", "bound"))]
-    left_out = complete(tasks, Store(tmp_path / "rows.jsonl"), 1)
-    reason = "while it was read its process died of SIGKILL (mostly for want of memory)"
-    assert left_out == [LeftOut("box", reason)]
+    seen = []
+    left_out = complete(
+        tasks, Store(tmp_path / "rows.jsonl"), 1, lambda *step: seen.append(step[:2])
+    )
+    assert left_out == [LeftOut("box", f"while it was read its process {KILLED}")]
+    assert seen == [(1, 2), (2, 2)]
 
 
 def test_a_process_killed_before_it_had_its_shape_is_tried_once_more(tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "work", crash_once)
+    monkeypatch.setattr(runner, "prepare", prepare_to_crash_once)
     path = saved(cube(), tmp_path / "box.ply")
     tasks = [task_of(path), task_of(path, ("ours", "bound"))]
     store = Store(tmp_path / "rows.jsonl")
@@ -223,27 +252,34 @@ def test_a_process_killed_before_it_had_its_shape_is_tried_once_more(tmp_path, m
     assert all(store.get(task, name)["error"] is None for task in tasks for name in task.methods)
 
 
-def crash_once(task: Task, rows) -> None:
-    """Stand in for a process that somebody kills, in the middle of what it sends."""
+def prepare_to_crash_once():
+    return crash_once
+
+
+def crash_once(task: Task, tell) -> None:
+    """Stand in for a process that somebody kills."""
     marker = task.path.with_suffix(f".{task.methods[0]}")
     if not marker.exists():
         marker.touch()
-        os.write(rows.fileno(), b"\0\0\1\0half of a message")
         os.kill(os.getpid(), signal.SIGKILL)
-    rows.send(runner.READ)
+    tell(ClockStarted())
     for method in task.methods:
-        rows.send({**task.key(method), "error": None})
+        tell({**task.key(method), "error": None})
 
 
-def test_a_process_that_does_not_start_leaves_its_shape_out(tmp_path, monkeypatch):
-    one = Runner([task_of(tmp_path / "box.ply")], 1)
-    monkeypatch.setattr(one.context.Process, "start", no_process)
-    reason = "its process did not start: Too many open files"
-    assert [found for _, found in one.results()] == [LeftOut("box", reason), None]
+def test_without_room_for_a_process_it_ends_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(runner.make_context().Process, "start", no_process)
+    with pytest.raises(SuperSdfError, match="no process can be started: Too many open files"):
+        list(Runner([task_of(tmp_path / "box.ply")], 1).results())
 
 
 def no_process(self) -> None:
     raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+
+def test_where_nothing_can_be_forked_processes_are_spawned(monkeypatch):
+    monkeypatch.setattr(multiprocessing, "get_all_start_methods", lambda: ["spawn"])
+    assert runner.make_context().get_start_method() == "spawn"
 
 
 def test_a_bug_in_the_reading_names_the_shape(tmp_path, monkeypatch):
@@ -251,26 +287,28 @@ def test_a_bug_in_the_reading_names_the_shape(tmp_path, monkeypatch):
         raise ValueError("no luck")
 
     monkeypatch.setattr(Shape, "read", broken)
-    sent = []
-    monkeypatch.setattr(signal, "signal", lambda *_: None)
-    runner.work(task_of(tmp_path / "box.ply"), SimpleNamespace(send=sent.append))
-    ((name, reason),) = [(found.shape, found.reason) for found in sent]
-    assert name == "box" and reason.startswith("ValueError: no luck (test_evaluation.py:")
+    left_out = runner.work(task_of(tmp_path / "box.ply"), None)
+    assert left_out.shape == "box"
+    assert left_out.reason.startswith("ValueError: no luck (test_evaluation.py:")
 
 
-def refuse(task: Task, rows) -> None:
-    rows.send(LeftOut(task.path.stem, "no good"))
+def prepare_to_refuse():
+    return refuse
+
+
+def refuse(task: Task, tell) -> LeftOut:
+    return LeftOut(task.path.stem, "no good")
 
 
 def test_a_shape_is_left_out_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "work", refuse)
+    monkeypatch.setattr(runner, "prepare", prepare_to_refuse)
     tasks = [task_of(tmp_path / "box.ply"), task_of(tmp_path / "box.ply", ("ours",))]
     assert complete(tasks, Store(tmp_path / "rows.jsonl"), 1) == [LeftOut("box", "no good")]
 
 
-def test_the_plan_measures_each_method_once(meshes):
-    paths = plan.find_meshes([meshes])
-    asked = Plan(paths, sizes=(32,), experiments=("factors", "noise", "iterated", "scale"))
+def test_each_shape_is_measured_by_each_method_once(meshes):
+    paths = find_meshes([meshes])
+    asked = Scope(paths, sizes=(32,), experiments=("factors", "noise", "iterated", "scale"))
     tasks = asked.tasks()
     keys = [tuple(task.key(m).values()) for task in tasks for m in task.methods]
     assert len(keys) == len(set(keys))
@@ -280,16 +318,27 @@ def test_the_plan_measures_each_method_once(meshes):
     assert {Setting(32, scale=scale) for scale in (0.25, 0.5, 0.75)} <= settings
 
 
+def test_every_name_has_a_method_and_a_label():
+    from super_sdf.evaluation import methods, names, peers, scope
+
+    assert tuple(names.METHOD_LABELS) == tuple(methods.METHODS)
+    assert tuple(names.PEER_LABELS) == tuple(peers.PEERS)
+    for name in names.EXPERIMENTS:
+        scope.experiment(name, (32,))
+    with pytest.raises(OptionError, match="experiment is 'x': give one of factors, noise"):
+        scope.experiment("x", (32,))
+
+
 def test_shapes_are_spread_over_the_list():
     paths = tuple(Path(str(n)) for n in range(10))
-    assert plan.spread(paths, 3) == (paths[0], paths[3], paths[6])
-    assert plan.spread(paths, 20) == paths
+    assert spread(paths, 3) == (paths[0], paths[3], paths[6])
+    assert spread(paths, 20) == paths
 
 
 def test_two_shapes_of_one_name_are_refused(meshes, tmp_path):
     twin = saved(cube(), tmp_path / "box.stl")
     with pytest.raises(Exception, match="two meshes are named 'box'"):
-        plan.find_meshes([meshes, twin])
+        find_meshes([meshes, twin])
 
 
 @pytest.mark.parametrize(
@@ -320,7 +369,7 @@ def test_what_makes_no_sense_is_said_in_one_line(words, message, meshes, monkeyp
     assert not Path("out").exists()
 
 
-def row(name: str, f1: float, **figures: object) -> measuring.Row:
+def row(name: str, f1: float, **figures: object) -> measuring.Measurement:
     known = dict.fromkeys((*measuring.NUMBERS, *measuring.OPTIONAL_NUMBERS, "excess_cd"), 0.001)
     said = {"shape": name, "f1": f1, "closed": True, "outward": True, "faces": 4, "error": None}
     return {**known, **said, "notes": [], **figures}
@@ -352,14 +401,17 @@ def test_what_is_no_row_is_passed_over(tmp_path):
     assert len(odd) > 0.7 * len(changes)
     lines = [*DAMAGED, *(json.dumps(found).encode() for found in odd)]
     path.write_bytes(b"\n".join([*lines, json.dumps(good).encode(), b'{"shape": "torn']))
-    store = Store(path)
-    assert list(store.rows.values()) == [good]
-    assert path.read_bytes().endswith(b"torn\n")
+    store, kept = Store(path), path.read_bytes()
+    assert list(store.rows.values()) == [good] and kept.endswith(b"torn")
+    other = {**good, "method": "bound"}
+    store.add(other)  # in place of what a killed process left unfinished
+    line = json.dumps(other).encode() + b"\n"
+    assert path.read_bytes() == kept.removesuffix(b'{"shape": "torn') + line
 
 
 def test_rows_that_cannot_be_kept_end_it_in_one_line():
     store = Store(Path("/dev/null"))
-    store.path = Path("/dev/full")
+    store.file.path = Path("/dev/full")
     with pytest.raises(WriteError, match=r"^/dev/full cannot be written: No space left on"):
         store.add(row("box", 0.5, **task_of(Path("box.ply")).key("mc")))
 
@@ -368,7 +420,7 @@ def test_a_failure_is_left_out_of_its_table_and_named(meshes, tmp_path):
     results = made_up(meshes, tmp_path, methods=("mc", "ours"), peers=("rfta",))
     task = next(task for task in results.tasks if task.path.stem == "ring" and task.setting.size)
     results.store.add({**task.key("ours"), "error": "out of memory"})
-    again = Results(results.plan, results.tasks, results.store, [LeftOut("lost", "it is")])
+    again = Results(results.scope, results.tasks, results.store, [LeftOut("lost", "it is")])
     assert again.left_out == [
         LeftOut("lost", "it is"),
         LeftOut("ring", "ours (32^3, factor 4): out of memory"),
@@ -450,8 +502,8 @@ def test_an_interrupt_says_what_is_kept(meshes, tmp_path, monkeypatch, command):
 
 
 def made_up(meshes: Path, out: Path, **options: object) -> Results:
-    """Results of a plan as if measured: F1 falls with noise and grows with everything else."""
-    asked = Plan(plan.find_meshes([meshes]), sizes=(32,), **options)
+    """Results of a scope as if measured: F1 falls with noise and grows with everything else."""
+    asked = Scope(find_meshes([meshes]), sizes=(32,), **options)
     store = Store(out / "results.jsonl")
     tasks = asked.tasks()
     for task in tasks:
@@ -496,6 +548,24 @@ def test_the_command_is_timed_as_a_process(monkeypatch):
     assert 0.05 < figures["seconds"] < 60 and 20 < figures["peak_mb"] < 2000
     with pytest.raises(SuperSdfError, match=r"super_sdf upsample none\.npz x\.ply ended with 1"):
         timing.run_command(["upsample", "none.npz", "x.ply"])
+
+
+FAKE_PSUTIL = """
+from types import SimpleNamespace
+Error = OSError
+def Process(pid):
+    return SimpleNamespace(memory_info=lambda: SimpleNamespace(peak_wset=7_000_000))
+"""
+
+
+def test_on_windows_the_peak_is_read_while_the_process_runs(tmp_path, monkeypatch):
+    (tmp_path / "psutil.py").write_text(FAKE_PSUTIL)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setattr(timing, "LAUNCHER", "import os; del os.wait4\n" + timing.LAUNCHER)
+    seconds, peak, printed = timing.run_python(["-c", "import time; time.sleep(.1); print('hi')"])
+    assert 0.1 < seconds < 30 and peak == 7 and printed == "hi\n"
+    with pytest.raises(SuperSdfError, match="ended with 3"):
+        timing.run_python(["-c", "raise SystemExit(3)"])
 
 
 def test_gaps_and_wins_are_what_they_are_called():

@@ -1,27 +1,59 @@
 """Supervised processes: any may die, at any moment, and the work is done or named."""
 
+import multiprocessing
+import multiprocessing.connection
 import os
 import signal
+import time
 from collections import deque
 
 import pytest
 
 from super_sdf.errors import SuperSdfError
-from super_sdf.machine import pool as pools
-from super_sdf.machine.pool import Death, Pool, describe_end
-from super_sdf.machine.records import append_line, append_shared_line, parse_line
+from super_sdf.machine import serving
+from super_sdf.machine.pool import Death, Pool, PoolOptions, describe_exit
+from super_sdf.machine.serving import ClockStarted
+
+KILLED = Death("was killed by SIGKILL (most likely out of memory)")
 
 
 def square():
-    """Return what answers tasks: a number by its square, a name by a death of that kind."""
+    """Return what answers tasks: a number by its square, a word by a death of that kind."""
     return answer
 
 
-def answer(task):
+def answer(task, tell):
     """Answer, or die."""
     if task == "while it works":
         os.kill(os.getpid(), signal.SIGKILL)
-    return task * task
+    if task == "while it sends":
+        multiprocessing.connection.Connection._send_bytes = send_half
+    if task == "in good order":
+        os._exit(0)
+    if task == "by a bug":
+        raise OSError("odd")
+    return task * task if isinstance(task, int) else None
+
+
+def send_half(pipe, message):
+    """Die in the middle of a message: its length is announced, and most of it never comes."""
+    os.write(pipe.fileno(), b"\0\0\1\0half of a message")
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def count_up():
+    """Return what tells all numbers below its task."""
+    return count
+
+
+def count(task, tell):
+    """Tell the numbers with the clock started at 1; stay at 3 for ever."""
+    for number in range(task):
+        if number == 1:
+            tell(ClockStarted())
+        tell((number, os.getpid()))
+        time.sleep(60 if number == 3 else 0)
+    return "done"
 
 
 def die():
@@ -39,24 +71,32 @@ def blunder():
     return [][0]
 
 
-def work(tasks, prepare, count=2):
+def work(tasks, prepare, workers=2, **options):
     """Return what came of the tasks, and at which a process had to be cleaned up after."""
     cleaned = []
-    pool = Pool(deque(tasks), prepare, lambda task, pid: cleaned.append(task))
-    return dict(pool.results(count)), cleaned
+    options = PoolOptions(lambda task, pid: cleaned.append(task), **options)
+    return dict(Pool(deque(tasks), prepare, options).results(workers)), cleaned
 
 
-def test_a_death_is_the_answer_of_its_task_alone():
-    done, cleaned = work([1, "while it works", 2, 3], square)
-    death = Death("died of SIGKILL (for want of memory, mostly)")
-    assert done == {1: 1, 2: 4, 3: 9, "while it works": death}
-    assert cleaned == ["while it works"]
+@pytest.mark.parametrize(
+    ("task", "death"),
+    [
+        ("while it works", KILLED),
+        ("while it sends", KILLED),
+        ("in good order", Death("ended with exit code 0")),
+        ("by a bug", Death("ended with exit code 1")),
+    ],
+)
+def test_a_death_is_the_result_of_its_task_alone(task, death):
+    done, cleaned = work([1, task, 2, 3], square)
+    assert done == {1: 1, 2: 4, 3: 9, task: death}
+    assert cleaned == [task]
 
 
 @pytest.mark.parametrize(
     ("prepare", "text"),
     [
-        (die, "5 processes in a row ended before they were ready, the last died of SIGTERM: try"),
+        (die, "5 processes in a row ended before they were ready; the last one was killed by SIGT"),
         (refuse, "^no network$"),
         (blunder, "^IndexError: list index out of range$"),
     ],
@@ -67,7 +107,7 @@ def test_where_no_process_gets_ready_that_is_said(prepare, text):
 
 
 def test_a_process_killed_before_it_is_ready_is_replaced(monkeypatch):
-    start, victims = Pool._start, []
+    start, victims = Pool._start_worker, []
 
     def kill_the_first(self):
         start(self)
@@ -75,78 +115,66 @@ def test_a_process_killed_before_it_is_ready_is_replaced(monkeypatch):
             victims.append(list(self.workers.values())[-1].process)
             victims[0].kill()
 
-    monkeypatch.setattr(Pool, "_start", kill_the_first)
+    monkeypatch.setattr(Pool, "_start_worker", kill_the_first)
     assert work([2, 3], square, 1)[0] == {2: 4, 3: 9} and victims[0].exitcode == -signal.SIGKILL
 
 
-def test_half_an_answer_is_a_death():
-    pool = Pool(deque([5]), square, lambda task, pid: None)
-    results = pool.results(1)
-    receive = pools.Connection.recv
+def test_partial_results_arrive_in_order_before_the_final_one():
+    results = [result for _, result in Pool(deque([3]), count_up).results(1)]
+    numbers = [result[0] for result in results if type(result) is tuple]
+    assert numbers == [0, 1, 2] and results[1] == ClockStarted() and results[-1] == "done"
 
-    def cut(pipe):
-        if next(iter(pool.workers.values())).ready:
-            raise OSError("got end of file during message")
-        return receive(pipe)
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pools.Connection, "recv", cut)
-        ((task, said),) = results
-    assert task == 5 and isinstance(said, Death)
+def test_a_task_over_its_limit_is_ended_and_the_next_one_goes_on():
+    pool = Pool(deque([5, 3, 2]), count_up, PoolOptions(time_limit=lambda task: 0.3))
+    results = list(pool.results(1))
+    ends = {task: result for task, result in results if type(result) is not tuple}
+    assert ends == {5: Death("over the limit of 0.3 s", is_late=True), 3: "done", 2: "done"}
+    assert [result[0] for task, result in results if task == 5 and type(result) is tuple] == [
+        *range(4)
+    ]
+
+
+@pytest.mark.parametrize(("is_reused", "processes"), [(True, 1), (False, 3)])
+def test_a_task_may_have_a_process_of_its_own(is_reused, processes):
+    pool = Pool(deque([1, 1, 1]), count_up, PoolOptions(is_reused=is_reused))
+    told = [result for _, result in pool.results(1) if type(result) is tuple]
+    assert len({pid for _, pid in told}) == processes
+
+
+def test_processes_end_with_the_iteration():
+    pool = Pool(deque([5, 5]), count_up)
+    results = pool.results(2)
+    (_, (_, pid)) = next(results)
+    processes = [worker.process for worker in pool.workers.values()]
+    assert pid in [process.pid for process in processes]
+    results.close()
+    assert not any(process.is_alive() for process in processes) and not pool.workers
 
 
 def test_without_room_for_a_process_that_is_said(monkeypatch):
     def refuse_files(self):
         raise OSError(24, "Too many open files")
 
-    monkeypatch.setattr(Pool, "_start", refuse_files)
+    monkeypatch.setattr(Pool, "_start_worker", refuse_files)
     with pytest.raises(SuperSdfError, match="no process can be started: Too many open files: try"):
         work([1], square)
 
 
 def test_an_end_has_a_name():
-    assert describe_end(3) == "ended with exit code 3"
-    assert describe_end(-signal.SIGTERM) == "died of SIGTERM"
-    assert describe_end(-63) == "died of signal 63"
+    assert describe_exit(3) == "ended with exit code 3"
+    assert describe_exit(-signal.SIGTERM) == "was killed by SIGTERM"
+    assert describe_exit(-63) == "was killed by signal 63"
+    assert describe_exit(0xC0000005) == "crashed (0xc0000005)"  # Windows: access violation
 
 
-def test_lines_are_appended_whole_or_not_at_all(tmp_path):
-    path = tmp_path / "lines"
-    append_line(path, {"a": 1})
-    append_shared_line(path, "b")
-    assert path.read_bytes() == b'{"a": 1}\n\n"b"\n'
-    with pytest.raises(OSError, match="No space left on device"):
-        append_line(Full(path), [2])
-    assert path.read_bytes() == b'{"a": 1}\n\n"b"\n'
-    assert [parse_line(line) for line in (b"[1]", b"[", 10**5 * b"[", b"\xff")] == [
-        [1],
-        *3 * [None],
-    ]
-
-
-class Full:
-    """A path to a file that takes three bytes more, and then no more."""
-
-    def __init__(self, path):
-        self.path, self.room = path, 3
-
-    def open(self, mode, buffering):
-        """Open it, with this for its write."""
-        self.file = self.path.open(mode, buffering=buffering)
-        return self
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        self.file.close()
-
-    def __getattr__(self, name):
-        return getattr(self.file, name)
-
-    def write(self, data):
-        """Take what there is room for."""
-        if not self.room:
-            raise OSError(28, "No space left on device")
-        self.room = 0
-        return self.file.write(bytes(data[:3]))
+def test_on_windows_signals_are_not_blocked(monkeypatch):
+    """There neither masks nor SIGHUP exist."""
+    heard = []
+    monkeypatch.delattr(signal, "pthread_sigmask")
+    monkeypatch.delattr(signal, "SIGHUP")
+    monkeypatch.setattr(signal, "signal", lambda *arguments: heard.append(arguments))
+    assert serving.ending_signals() == {signal.SIGINT, signal.SIGTERM}
+    serving.settle_signals()
+    assert heard == [(signal.SIGINT, signal.SIG_IGN)]
+    assert work([2], square, 1)[0] == {2: 4}

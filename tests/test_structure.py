@@ -15,7 +15,7 @@ MODULES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts): path
     for path in PACKAGE.rglob("*.py")
 }
-# Rooms that need more than the four packages that are always installed.
+# Rooms that need more than the few packages that are always installed.
 WITH_EXTRAS = {"evaluation", "pictures", "truth"}
 
 
@@ -78,8 +78,9 @@ def test_no_string_names_a_module(module):
 
 
 @pytest.mark.parametrize("module", [m for m in MODULES if room_of(m) not in WITH_EXTRAS])
-def test_the_runtime_needs_four_packages(module):
+def test_the_runtime_needs_few_packages(module):
     allowed = {"click", "numpy", "onnxruntime", "trimesh"} | set(sys.stdlib_module_names)
+    allowed |= {"batch.lock": {"filelock"}, "machine.memory": {"psutil"}}.get(module, set())
     foreign = imported(MODULES[module]) - set(MODULES) - {"", "__init__"}
     assert {name.split(".")[0] for name in foreign} <= allowed
 

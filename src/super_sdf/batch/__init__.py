@@ -1,4 +1,4 @@
-"""Many grids to meshes: found, planned, shared out, resumed. The command is ``super-sdf batch``.
+"""Converting many grids: find the inputs, plan, convert in several processes, resume.
 
-It may import ``convert`` and what lies below.
+The command is ``super-sdf batch``. This room may import ``convert`` and what lies below it.
 """

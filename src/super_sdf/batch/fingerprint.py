@@ -1,7 +1,7 @@
-"""What a file was when it was looked at, so that one may say later whether it still is that.
+"""Fingerprints of files, which show whether a file has changed since the last run.
 
-Size and time of change answer at once where they are the same; else the content's SHA-256 does,
-the fastest of Python's hashes on processors of today.
+If size and modification time are the same, it has not; otherwise the SHA-256 of its content tells.
+On current processors SHA-256 is the fastest of Python's hashes.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from typing import Any
 
 CHUNK = 1 << 20  # bytes read at a time
 Fingerprint = dict[str, Any]
-"""``sha256``, ``size`` in bytes and ``mtime_ns``, as they stand in JSON."""
+"""``sha256``, ``size`` in bytes and ``mtime_ns``, as written in JSON."""
 
 
 def fingerprint(path: Path) -> Fingerprint | None:
-    """Return what a file is now, None if it cannot be read or is no regular file."""
+    """Return the fingerprint of a file, None if it cannot be read or is no regular file."""
     try:
-        if not path.is_file():  # to open a pipe would wait for ever
+        if not path.is_file():  # opening a pipe would block
             return None
         with path.open("rb", buffering=0) as file:
-            state = os.fstat(file.fileno())  # before it is read: a change while it is shows later
+            state = os.fstat(file.fileno())  # before reading, so that a change meanwhile shows
             digest = hashlib.sha256()
-            left = state.st_size  # of what the system makes up as it is read there is no end
+            left = state.st_size  # files that the system generates may have no end
             while left > 0 and (chunk := file.read(min(CHUNK, left))):
                 digest.update(chunk)
                 left -= len(chunk)
@@ -35,9 +35,9 @@ def fingerprint(path: Path) -> Fingerprint | None:
 
 
 def is_unchanged(path: Path, known: Fingerprint | None, *, same_path: bool = True) -> bool:
-    """Say whether a file is what it was; None stands for one that could not be read.
+    """Return whether a file still has a known fingerprint; None stands for an unreadable file.
 
-    It is read only if its time is another, or if it was known by another path.
+    Its content is read only if the modification time or the path is another.
     """
     if known is None:
         return not (os.path.isfile(path) and os.access(path, os.R_OK))
@@ -52,7 +52,7 @@ def is_unchanged(path: Path, known: Fingerprint | None, *, same_path: bool = Tru
     return now is not None and bool(now["sha256"] == known["sha256"])
 
 
-def is_fingerprint(found: Any) -> bool:
-    """Say whether something read from JSON is what ``fingerprint`` returns."""
+def is_fingerprint(value: Any) -> bool:
+    """Return whether a value from JSON has the form of a fingerprint."""
     types = {"sha256": str, "size": int, "mtime_ns": int}
-    return isinstance(found, dict) and all(type(found.get(k)) is t for k, t in types.items())
+    return isinstance(value, dict) and all(type(value.get(k)) is t for k, t in types.items())

@@ -1,7 +1,7 @@
-"""Which files a batch converts, and to which: files, folders, patterns and manifests.
+"""Finds the inputs of a batch and names their outputs: files, folders, patterns and manifests.
 
-Below a folder, and below the fixed part of a pattern, the folders of the inputs are those of the
-outputs. Everything that can be refused is refused here, before the work starts.
+The folders below a given folder, or below the fixed part of a pattern, are mirrored in the output
+folder. All checks of the arguments are made here, before the work starts.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from ..files.grids import GRID_SUFFIXES
 from ..files.meshes import check_mesh_suffix
 from ..files.regular import reason_of
 from .job import Job
+from .journal import LOCK_NAME
 from .journal import NAME as JOURNAL
 from .ledger import NAME as LEDGER
 from .manifest import read_manifest
@@ -27,21 +28,21 @@ MANIFEST_SUFFIXES = (".txt", ".jsonl")
 
 
 class Inputs(NamedTuple):
-    """What there is to do; and which folders could not be looked into, each with the reason."""
+    """The jobs, and the folders that could not be read, each with the reason."""
 
     jobs: list[Job]
     unread: list[tuple[str, str]]
 
 
 def find_jobs(arguments: Sequence[str], suffix: str, options: ConvertOptions) -> Inputs:
-    """Return what the arguments name, each once.
+    """Return the jobs that the arguments name, each once.
 
     Parameters
     ----------
     arguments : sequence of str
         Files, folders, glob patterns, manifests.
     suffix : str
-        Of the meshes, ".ply" say.
+        Mesh file format, such as ".ply".
     options : ConvertOptions
         For all files, unless a manifest says otherwise.
 
@@ -57,7 +58,7 @@ def find_jobs(arguments: Sequence[str], suffix: str, options: ConvertOptions) ->
     for kind in {PurePath(job.target).suffix for job in jobs}:
         check_mesh_suffix(Path(f"*{kind}"))
     for job in jobs:
-        if PurePath(job.target).parts[0].casefold() in (JOURNAL, LEDGER):
+        if PurePath(job.target).parts[0].casefold() in (JOURNAL, LOCK_NAME, LEDGER):
             raise OptionError(
                 f"{job.source} would become {job.target}, but the first of these names is the "
                 "batch's own: rename it"
@@ -66,7 +67,7 @@ def find_jobs(arguments: Sequence[str], suffix: str, options: ConvertOptions) ->
 
 
 class Search:
-    """Finds what arguments stand for; ``unread`` says which folders could not be read."""
+    """Expands arguments into jobs; ``unread`` lists the folders that could not be read."""
 
     def __init__(self, suffix: str, options: ConvertOptions) -> None:
         self.suffix, self.options = suffix, options
@@ -96,7 +97,7 @@ class Search:
     def _below(self, root: Path, paths: Iterable[Path], argument: str) -> list[Job]:
         """Return a job for every grid among the paths; outputs mirror the folders below root.
 
-        What has a grid's name and is no regular file is one, too: it fails by its name.
+        Anything with a grid's suffix counts. If it is no regular file, its job fails and names it.
         """
         grids = sorted(
             path for path in paths if path.suffix.lower() in GRID_SUFFIXES and not path.is_dir()
@@ -115,11 +116,11 @@ class Search:
 
 
 def _each_once(jobs: Iterable[Job]) -> list[Job]:
-    """Return the jobs without repetitions; refuse two inputs for one output."""
+    """Return the jobs without repetitions; raise OptionError for two inputs of one output."""
     by_target: dict[str, Job] = {}
     for job in jobs:
         other = by_target.setdefault(os.path.normcase(job.target), job)
-        if _what(other) != _what(job):
+        if _identity(other) != _identity(job):
             raise OptionError(
                 f"{other.source} and {job.source} would both become {job.target}: rename one, or "
                 "give 'out' in a .jsonl manifest"
@@ -127,5 +128,5 @@ def _each_once(jobs: Iterable[Job]) -> list[Job]:
     return list(by_target.values())
 
 
-def _what(job: Job) -> tuple[str, ConvertOptions]:
+def _identity(job: Job) -> tuple[str, ConvertOptions]:
     return os.path.abspath(job.source), job.options

@@ -1,4 +1,4 @@
-"""One file of a batch: what is to be done, and the row that says what came of it."""
+"""One file of a batch: the job, and the row of the report with its outcome."""
 
 from __future__ import annotations
 
@@ -16,22 +16,31 @@ from .fingerprint import Fingerprint, fingerprint
 from .journal import note_made
 
 Row = dict[str, Any]
-"""A line of the ledger.
+"""A line of the ledger, ``report.jsonl``.
 
-in, out : the input's absolute path; the output's, relative to the output folder
-status, reason : "ok", None; or "failed", why
-retry : whether it failed for a reason that another run may not meet
-content, output : fingerprints of the input, and of the mesh
-options : digest of all that the mesh depends on beside the input
-seconds : the time it took in all; the stages' are in ``stages``
+in, out : absolute path of the input; path of the output, relative to the output folder
+status, reason : "ok" and None, or "failed" and why
+retry : whether another run may succeed with the same input and options
+content, output : fingerprints of the input and of the mesh
+options : digest of all that the mesh depends on, besides the input
+seconds : time in all; that of each stage is in ``stages``
 """
 
 
 @dataclass(frozen=True)
 class Job:
-    """A grid to convert: its path as it was given, the mesh's within the output folder.
+    """A grid to convert.
 
-    ``replace``: whether a file that is there may be replaced, asked when the job begins.
+    Attributes
+    ----------
+    source : Path
+        The grid, as it was given.
+    target : str
+        The mesh, relative to the output folder.
+    options : ConvertOptions
+        How it is converted.
+    replace : bool
+        Whether an existing file may be replaced; decided when the job starts.
     """
 
     source: Path
@@ -41,24 +50,24 @@ class Job:
 
 
 class Result(NamedTuple):
-    """What came of a job, now or in a run before."""
+    """A job and its row, of this run or an earlier one."""
 
     job: Job
     row: Row
 
     def failure(self) -> str:
-        """Return which file failed, and why, in a line."""
+        """Return which file failed and why, in one line."""
         source, reason = str(self.job.source), str(self.row["reason"])
-        return in_a_line(reason if source in reason else f"{source}: {reason}")
+        return one_line(reason if source in reason else f"{source}: {reason}")
 
 
 def attempt(job: Job, folder: Path, network: Decoder) -> Row:
-    """Convert a file and return its row; whatever goes wrong stands in the row."""
+    """Convert a file and return its row; an error becomes a row, too."""
     start, target = time.perf_counter(), folder / job.target
-    content, made = fingerprint(job.source), []
+    content, mesh_prints = fingerprint(job.source), []
 
     def note(part: Path) -> None:
-        made.append(_note_mesh(part, folder, job.target))
+        mesh_prints.append(_note_mesh(part, folder, job.target))
 
     try:
         check_regular_file(job.source)
@@ -67,15 +76,16 @@ def attempt(job: Job, folder: Path, network: Decoder) -> Row:
             job.source, target, network, job.options, force=job.replace, before_rename=note
         )
     except Exception as error:  # a bug that one file shows must not cost the others
-        row = failed_row(job, _reason(error), retry=not _is_inputs_fault(error), content=content)
+        retry = not _is_caused_by_input(error)
+        row = failed_row(job, _reason(error), retry=retry, content=content)
         return {**row, "seconds": _since(start)}
     return {
-        **_head(job),
+        **_paths(job),
         "status": "ok",
         "reason": None,
         "retry": False,
         "content": content,
-        "output": made[0],
+        "output": mesh_prints[0],
         **done.report(),
         "seconds": _since(start),
         "stages": {stage: round(spent, 4) for stage, spent in done.seconds.items()},
@@ -83,12 +93,12 @@ def attempt(job: Job, folder: Path, network: Decoder) -> Row:
 
 
 def _note_mesh(part: Path, folder: Path, target: str) -> Fingerprint:
-    """Note in the journal which mesh is about to take its name; return its fingerprint."""
-    made = fingerprint(part)
-    if made is None:
+    """Note a mesh in the journal before it is moved to its name; return its fingerprint."""
+    mesh_print = fingerprint(part)
+    if mesh_print is None:
         raise WriteError(f"{part} cannot be read again")
-    note_made(folder, target, made["sha256"])
-    return made
+    note_made(folder, target, mesh_print["sha256"])
+    return mesh_print
 
 
 def _make_folder(folder: Path) -> None:
@@ -102,11 +112,12 @@ def _make_folder(folder: Path) -> None:
 
 def failed_row(job: Job, reason: str, *, retry: bool = True, content: Any = None) -> Row:
     """Return the row of a job that failed."""
-    said = {"status": "failed", "reason": reason, "retry": retry, "content": content}
-    return {**_head(job), **said, "output": None, "seconds": 0.0}
+    outcome = {"status": "failed", "reason": reason, "retry": retry, "content": content}
+    return {**_paths(job), **outcome, "output": None, "seconds": 0.0}
 
 
-def _head(job: Job) -> Row:
+def _paths(job: Job) -> Row:
+    """Return the entries that every row begins with."""
     return {"in": os.path.abspath(job.source), "out": job.target}
 
 
@@ -114,28 +125,29 @@ def _since(start: float) -> float:
     return round(time.perf_counter() - start, 4)
 
 
-def _is_inputs_fault(error: Exception) -> bool:
-    """Say whether the same file with the same options will always fail so."""
+def _is_caused_by_input(error: Exception) -> bool:
+    """Return whether the same file with the same options will always fail like this."""
     by_input = isinstance(error, (GridError, OptionError, FileError))
     return by_input and not isinstance(error, WriteError)
 
 
 def _reason(error: Exception) -> str:
-    """Return what went wrong, in a line."""
+    """Return what went wrong, in one line."""
     if isinstance(error, MemoryError) and not _is_ours(error):
         return "out of memory: use a smaller --factor or grid"
     if isinstance(error, OSError) and not _is_ours(error):  # no bug: a name too long, say
         return f"the system refuses it: {error.strerror or error}"
-    first = in_a_line(next(iter(str(error).splitlines()), ""))
+    first = one_line(next(iter(str(error).splitlines()), ""))
     return first if _is_ours(error) else f"{type(error).__name__}: {first}"
 
 
 def _is_ours(error: Exception) -> bool:
+    """Return whether an error is of this package's own classes, whose messages are for users."""
     return type(error).__module__ == GridError.__module__
 
 
-def in_a_line(text: str) -> str:
-    """Return a text as one line that any terminal shows, whatever is in the names of files."""
+def one_line(text: str) -> str:
+    """Return a text as one printable line; other characters, as in file names, are escaped."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

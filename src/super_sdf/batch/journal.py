@@ -1,62 +1,72 @@
-"""What a batch is about to do in its folder, noted before it does it: ``.super-sdf-batch``.
+"""The journal ``.super-sdf-batch`` in the output folder: what a batch is about to write there.
 
-A line is a JSON string, an output that is begun; or an object, the SHA-256 of a mesh that is about
-to take its name. Should the process be killed then, the next one knows what may be half written,
-and which meshes are a batch's own though no row of the report tells of them.
+A line is a JSON string, the name of an output that is started; or an object with the SHA-256 of a
+mesh that is about to be moved to its name. If the process is killed, the next batch knows from it
+which outputs may be unfinished, and which meshes a batch made although the report has no row of
+them.
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 from ..errors import WriteError
-from ..machine.records import append_shared_line, parse_line
+from ..machine.records import RecordFile
 
 NAME = ".super-sdf-batch"
+LOCK_NAME = f"{NAME}.lock"
 
 
 class Journal(NamedTuple):
-    """Outputs that were begun, and the SHA-256 of those that were made, by output."""
+    """The outputs that were started, and by output the SHA-256 of the meshes that were made."""
 
-    begun: set[str]
+    started: set[str]
     made: dict[str, set[str]]
 
 
 def read_journal(folder: Path) -> Journal:
-    """Return what stands in a folder's journal; lines without meaning are passed over."""
+    """Return what a folder's journal holds; lines that are not the journal's are skipped."""
     journal = Journal(set(), {})
-    try:
-        lines = (folder / NAME).read_bytes().split(b"\n")
-    except OSError:
-        return journal
-    for found in map(parse_line, lines):
-        if isinstance(found, str) and _is_within(found):
-            journal.begun.add(found)
-        elif isinstance(found, dict):
-            target, digest = found.get("out"), found.get("sha256")
-            if isinstance(target, str) and isinstance(digest, str):
-                journal.made.setdefault(target, set()).add(digest)
+    with suppress(OSError):
+        for line in _journal_file(folder).read():
+            if isinstance(line, str) and _is_within(line):
+                journal.started.add(line)
+            elif isinstance(line, dict):
+                target, digest = line.get("out"), line.get("sha256")
+                if isinstance(target, str) and isinstance(digest, str):
+                    journal.made.setdefault(target, set()).add(digest)
     return journal
 
 
-def note_begun(folder: Path, target: str) -> None:
+def note_started(folder: Path, target: str) -> None:
     """Note that an output is about to be written."""
-    _note(folder / NAME, target)
+    _append(folder, target)
 
 
 def note_made(folder: Path, target: str, digest: str) -> None:
-    """Note the SHA-256 of a mesh that is about to take its name; any process may."""
-    _note(folder / NAME, {"out": target, "sha256": digest})
+    """Note the SHA-256 of a mesh that is about to be moved to its name; any process may call it."""
+    _append(folder, {"out": target, "sha256": digest})
 
 
-def _note(path: Path, record: Any) -> None:
+def clear_journal(folder: Path) -> None:
+    """Empty the journal: nothing is unfinished."""
+    _journal_file(folder).clear()
+
+
+def _append(folder: Path, record: Any) -> None:
+    file = _journal_file(folder)
     try:
-        append_shared_line(path, record)
+        file.append(record)
     except OSError as error:
-        raise WriteError(f"{path} cannot be written: {error.strerror}") from error
+        raise WriteError(f"{file.path} cannot be written: {error.strerror}") from error
+
+
+def _journal_file(folder: Path) -> RecordFile:
+    return RecordFile(folder / NAME, is_shared=True)
 
 
 def _is_within(target: str) -> bool:
-    """Say whether an output lies in its folder: unfinished files are removed nowhere else."""
+    """Return whether an output lies in its folder: unfinished files are removed nowhere else."""
     return not PurePath(target).is_absolute() and ".." not in PurePath(target).parts

@@ -1,10 +1,10 @@
-"""Lists of inputs: ``.txt``, a path a line, or ``.jsonl``, a JSON object a line.
+"""Manifests, lists of inputs: ``.txt`` with a path per line, ``.jsonl`` with an object per line.
 
     {"in": "a.npy", "out": "parts/a.stl", "spacing": 0.5, "inside": "negative"}
 
 Inputs are relative to the manifest, outputs to the output folder. Blank lines, and in ``.txt``
-those that start with ``#``, are passed over. Options are those of ``ConvertOptions``. The text is
-UTF-8; a byte order mark before it, and CRLF at the lines' ends, change nothing.
+lines that start with ``#``, are skipped. Options are those of ``ConvertOptions``. The text is
+UTF-8; a byte order mark and CRLF line ends are accepted.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from .job import Job
 
 Entry = dict[str, Any]
 USAGE = 'give an object, {"in": "a.npy"}'
-LONGEST = 240  # characters of a line, or of what is wrong with it, that are shown
+LONGEST = 240  # characters of a line or an error that a message quotes
 
 
 def read_manifest(path: Path, suffix: str, options: ConvertOptions) -> list[Job]:
-    """Return a job a line.
+    """Return a job for each line.
 
     Raises
     ------
     FileError
         If the file cannot be read.
     OptionError
-        If a line has no meaning; it is named.
+        If a line is not valid; the message has its number.
     """
     jobs = []
     for number, entry in _entries(path):
@@ -51,7 +51,7 @@ def read_manifest(path: Path, suffix: str, options: ConvertOptions) -> list[Job]
 
 
 def _entries(path: Path) -> Iterator[tuple[int, Entry]]:
-    """Yield the number and the content of each line that has one."""
+    """Yield the number and the entry of each line that is not blank or a comment."""
     try:
         lines = path.read_text("utf-8-sig").split("\n")
     except (OSError, UnicodeDecodeError) as error:
@@ -66,7 +66,7 @@ def _entries(path: Path) -> Iterator[tuple[int, Entry]]:
 def _parse(line: str, where: str) -> Entry:
     """Return a line's JSON object."""
     try:
-        entry = json.loads(line, object_pairs_hook=_without_doubles, parse_constant=_no_constant)
+        entry = json.loads(line, object_pairs_hook=_unique_keys, parse_constant=_refuse_constant)
     except OptionError as error:
         raise OptionError(f"{where}: {shorten(str(error))}") from None
     except ValueError as error:
@@ -78,8 +78,8 @@ def _parse(line: str, where: str) -> Entry:
     return entry
 
 
-def _without_doubles(pairs: list[tuple[str, Any]]) -> Entry:
-    """Return an object of JSON, unless it says something twice."""
+def _unique_keys(pairs: list[tuple[str, Any]]) -> Entry:
+    """Return an object of JSON; raise OptionError if it has a key twice."""
     entry = dict(pairs)
     if len(entry) < len(pairs):
         names = [name for name, _ in pairs]
@@ -88,19 +88,19 @@ def _without_doubles(pairs: list[tuple[str, Any]]) -> Entry:
     return entry
 
 
-def _no_constant(name: str) -> float:
-    """Refuse NaN and the infinities, which Python's parser takes and JSON has not."""
+def _refuse_constant(name: str) -> float:
+    """Raise OptionError for NaN and infinities: Python's parser accepts them, JSON has none."""
     raise OptionError(f"{name} is no number: give a finite one")
 
 
 def shorten(text: str) -> str:
-    """Return a text that fits into a message, without its middle where it is long."""
+    """Return a text for a message; the middle of a long one is left out."""
     half = LONGEST // 2
     return text if len(text) <= LONGEST else f"{text[:half]}...{text[-half:]}"
 
 
 def _job(entry: Entry, home: Path, suffix: str, options: ConvertOptions) -> Job:
-    """Return what a line asks for."""
+    """Return the job that a line describes."""
     source, target = entry.pop("in", None), entry.pop("out", None)
     if not isinstance(source, str) or not source:
         raise OptionError(f"'in' is {source!r}: give the path of a grid")
@@ -114,7 +114,7 @@ def _job(entry: Entry, home: Path, suffix: str, options: ConvertOptions) -> Job:
 
 
 def _default_target(source: str, suffix: str) -> PurePath:
-    """Return where a mesh goes: below the output folder as the grid is below the manifest."""
+    """Return the path of a mesh in the output folder: that of the grid below the manifest."""
     if PurePath(source).name in ("", ".."):
         raise OptionError(f"'in' is {source!r}: give the path of a grid")
     path = PurePath(source).with_suffix(suffix)
@@ -122,7 +122,7 @@ def _default_target(source: str, suffix: str) -> PurePath:
 
 
 def _check_target(target: Any) -> PurePath:
-    """Return a path that stays within the output folder and has a mesh's suffix."""
+    """Return the path given for a mesh; raise OptionError if it leaves the output folder, say."""
     path = PurePath(target) if isinstance(target, str) else PurePath()
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise OptionError(f"'out' is {target!r}: give a file, one of {', '.join(MESH_SUFFIXES)}")
@@ -133,7 +133,7 @@ def _check_target(target: Any) -> PurePath:
 
 
 def _check_name(name: str, path: str) -> None:
-    """Raise if no file can be called so: a NUL in it, or half a pair of UTF-16."""
+    """Raise OptionError for impossible file names: with a NUL, or half a surrogate pair."""
     try:
         is_impossible = b"\0" in os.fsencode(path)
     except UnicodeEncodeError:

@@ -1,4 +1,4 @@
-"""What a batch has to do, and what it need not: the plan, before anything is begun."""
+"""The plan of a batch: which jobs are to be done and which are done already."""
 
 from __future__ import annotations
 
@@ -19,7 +19,23 @@ from .ledger import Ledger
 
 @dataclass(frozen=True)
 class Settings:
-    """How a batch is run; ``workers`` and ``threads`` (of each) 0: chosen from the cores."""
+    """How a batch is run.
+
+    Attributes
+    ----------
+    folder : Path
+        The output folder.
+    model, precision, device : str
+        The network and where it runs: see ``load_network``.
+    threads, workers : int
+        Threads of each worker process, and worker processes; 0: chosen by the number of cores.
+    force : bool
+        Convert everything again; replace files that no batch made.
+    retry : bool
+        Try inputs again that failed before.
+    fail_fast : bool
+        Start nothing more after the first failure.
+    """
 
     folder: Path
     model: str = "base"
@@ -34,22 +50,24 @@ class Settings:
 
 @dataclass
 class Batch:
-    """What stands to be done, and what came of it, as it comes.
+    """The state of a batch: jobs to be done, and the results so far.
 
     Attributes
     ----------
     waiting : list of Job
-        Not begun, in the order in which they will be.
+        Jobs that were not started yet, in their order.
     done_before, failed_before : list of Result
-        What a run before left, so that there is nothing to do; refused outputs too.
+        Results of earlier runs that still hold; also outputs that may not be replaced.
     done, failed : list of Result
-        What this run did.
+        Results of this run.
     work, work_done : float
-        How long it all takes about, in no unit.
+        Estimated work, of all jobs and of those finished, in arbitrary units.
+    seconds : float
+        Time since the start of the run.
     unread : list of (str, str)
-        Folders that could not be looked into, and why.
+        Folders that could not be read, and why.
     notes : list of str
-        What a user should know of how it is run.
+        Notes for the user on how the batch is run.
     """
 
     settings: Settings
@@ -65,16 +83,16 @@ class Batch:
     notes: list[str] = field(default_factory=list)
 
     def failures(self) -> list[Result]:
-        """Return all that failed, now or before."""
+        """Return the failures of this run and of earlier ones."""
         return self.failed_before + self.failed
 
     def results(self) -> list[Result]:
-        """Return all meshes that are there, made now or before."""
+        """Return the meshes that exist, of this run and of earlier ones."""
         return self.done_before + self.done
 
 
 class Planner:
-    """Tells what is to be done from what was done before with the same content and options."""
+    """Decides which jobs are to be done: those not done with the same content and options."""
 
     def __init__(self, settings: Settings, ledger: Ledger, journal: Journal) -> None:
         self.settings, self.ledger, self.journal = settings, ledger, journal
@@ -83,10 +101,10 @@ class Planner:
         self.network = network and network["sha256"], symmetries
 
     def plan(self, jobs: Sequence[Job]) -> Batch:
-        """Sort the jobs into done, failed for good, refused, and to be done.
+        """Return the jobs sorted into done, failed for good, refused, and to be done.
 
-        The largest go first, so that no process is left with one when the others are through; but
-        those last that were begun and never finished, for they may have been what ended the run.
+        The largest come first, so that no worker starts one when the others have finished. Jobs
+        that an earlier run started and never finished come last: they may have killed it.
         """
         batch = Batch(self.settings)
         for job in jobs:
@@ -96,21 +114,21 @@ class Planner:
             else:
                 before = batch.done_before if row["status"] == "ok" else batch.failed_before
                 before.append(Result(job, row))
-        last = self.journal.begun - self.ledger.written
+        last = self.journal.started - self.ledger.written
         batch.waiting.sort(key=lambda job: (job.target in last, -expected_work(job)))
         batch.work = sum(map(expected_work, batch.waiting))
         return batch
 
     def digest(self, job: Job) -> str:
-        """Return the hash of all that a mesh depends on, beside its grid.
+        """Return the hash of all that a mesh depends on, besides its grid.
 
-        Device, threads and memory are left out: they do not change what is asked.
+        Device, threads and memory do not count: the mesh asked for is the same.
         """
-        asked = [asdict(replace(job.options, max_memory=None)), self.network, __version__]
-        return hashlib.sha256(json.dumps(asked).encode()).hexdigest()
+        settings = [asdict(replace(job.options, max_memory=None)), self.network, __version__]
+        return hashlib.sha256(json.dumps(settings).encode()).hexdigest()
 
     def _known(self, job: Job) -> Row | None:
-        """Return the row of a run before, if it still holds."""
+        """Return the row of an earlier run, None if there is none that still holds."""
         row = self.ledger.rows.get(job.target)
         if row is None or self.settings.force or row["options"] != self.digest(job):
             return None
@@ -124,17 +142,17 @@ class Planner:
         return row
 
     def _refused(self, job: Job) -> Row | None:
-        """Return why an output may not be written: something is there that no batch made."""
+        """Return a failed row if the output exists and no batch made it, else None."""
         if not os.path.lexists(self._path(job)) or self.may_replace(job):
             return None
         reason = f"{self._path(job)} exists and was not made by a batch: remove it or use --force"
         return {**failed_row(job, reason), "options": self.digest(job)}
 
     def may_replace(self, job: Job) -> bool:
-        """Say whether a job may replace the file that is there.
+        """Return whether a job may replace the existing file.
 
-        Its content tells: a mesh that took its name, and whose process was killed before its row
-        was written, is in the journal.
+        It may if a batch made that file: it has a row in the ledger, or its hash is in the journal
+        because the process was killed before the row was written.
         """
         if self.settings.force or job.target in self.ledger.written:
             return True
@@ -147,13 +165,13 @@ class Planner:
 
 
 def preview(jobs: Sequence[Job], settings: Settings) -> Batch:
-    """Return what would be done; write nothing."""
+    """Return the plan of a batch, writing nothing."""
     folder = settings.folder
     return Planner(settings, Ledger(folder), read_journal(folder)).plan(jobs)
 
 
 def expected_work(job: Job) -> float:
-    """Return about how long a job takes: as its surface, and something for every file."""
+    """Return the estimated work of a job: proportional to its surface, plus a constant."""
     try:
         size = job.source.stat().st_size
     except OSError:

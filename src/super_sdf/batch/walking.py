@@ -1,7 +1,7 @@
-"""Which files lie below a folder or match a pattern, however its links lead.
+"""Finds the files below a folder or matching a pattern, and reports unreadable folders.
 
-Links to folders are followed where a pattern names them, not below a folder or by ``**``: so a
-circle of links has an end. Folders that cannot be read are named.
+Links to folders are followed where a pattern names them, but not below a folder or by ``**``, so
+circular links do no harm.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ OnError = Callable[[OSError], None]
 
 
 def files_below(folder: Path, on_error: OnError) -> Iterator[Path]:
-    """Yield what lies below a folder and is no folder."""
+    """Yield everything below a folder that is not a folder itself."""
     for path, _, names in os.walk(folder, onerror=on_error):
         yield from (Path(path, name) for name in names)
 
 
 def matches(pattern: Path, on_error: OnError) -> list[Path]:
-    """Return what a glob pattern matches, each once; ``**`` stands for any folders."""
+    """Return the paths that a glob pattern matches, each once; ``**`` matches any folders."""
     root = fixed_part(pattern)
     paths = [root]
     for part in pattern.parts[len(root.parts) :]:
@@ -33,14 +33,14 @@ def matches(pattern: Path, on_error: OnError) -> list[Path]:
 
 
 def fixed_part(pattern: Path) -> Path:
-    """Return the folder above the first part of a pattern that is one."""
+    """Return the folder before the first part of a path that has wildcards."""
     parts = pattern.parts
     first = next(i for i, part in enumerate(parts) if glob.has_magic(part))
     return Path(*parts[:first])
 
 
 def _step(path: Path, part: str, on_error: OnError) -> Iterator[Path]:
-    """Yield where one part of a pattern leads."""
+    """Yield the paths in a folder that match one part of a pattern."""
     if part == "**":
         yield from _visible_below(path, on_error)
     elif glob.has_magic(part):
@@ -50,7 +50,7 @@ def _step(path: Path, part: str, on_error: OnError) -> Iterator[Path]:
 
 
 def _visible_below(path: Path, on_error: OnError) -> Iterator[Path]:
-    """Yield a path, and all below it that is not hidden."""
+    """Yield a path, and everything below it that is not hidden."""
     yield path
     for folder, folders, names in os.walk(path, onerror=on_error):
         below = (Path(folder, name) for name in folders if not name.startswith("."))
@@ -61,7 +61,7 @@ def _visible_below(path: Path, on_error: OnError) -> Iterator[Path]:
 
 
 def _names(path: Path, on_error: OnError) -> list[str]:
-    """Return what is in a folder; nothing is in a file."""
+    """Return the names in a folder; none if it is a file."""
     try:
         return os.listdir(path)
     except (NotADirectoryError, FileNotFoundError):
@@ -72,5 +72,5 @@ def _names(path: Path, on_error: OnError) -> list[str]:
 
 
 def _fits(name: str, part: str) -> bool:
-    """Say whether a name matches; hidden ones only where the pattern says the dot."""
+    """Return whether a name matches; hidden ones only if the pattern starts with a dot."""
     return fnmatch(name, part) and (part.startswith(".") or not name.startswith("."))

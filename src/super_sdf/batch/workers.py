@@ -1,23 +1,21 @@
-"""Who converts: this process, or several that a pool supervises; each loads its network once."""
+"""Converting in this process or in workers, each of which loads the network once."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 from ..machine.memory import free_memory
 from ..machine.pool import Tasks
+from ..machine.serving import Work
 from ..machine.threads import count_cores
 from ..network.cuda import available_devices
 from ..network.network import Network, load_network
 from .job import Job, Row, attempt
 
-# Of memory, for each process that is started unasked: the network, and a grid of 128^3; and the
-# least with which a process can do anything.
-BYTES_PER_WORKER = 10**9
-LEAST_BYTES = 3 * 10**8
+BYTES_PER_WORKER = 10**9  # for the network and a grid of 128^3, where --jobs is not given
+MIN_BYTES_PER_WORKER = 3 * 10**8  # with less a worker cannot convert anything
 
 
 @dataclass(frozen=True)
@@ -30,14 +28,14 @@ class Loading:
     threads: int
 
     def load(self) -> Network:
-        """Load the network."""
+        """Return the network."""
         return load_network(
             self.model, device=self.device, threads=self.threads, precision=self.precision
         )
 
 
 def choose_workers(device: str, jobs: int, max_memory: int | None = None) -> int:
-    """Return how many processes are best: one a core, as far as memory goes; one on a GPU."""
+    """Return how many processes to use: one per core if memory allows; one on a GPU."""
     if device == "cuda" or (device == "auto" and "cuda" in available_devices()):
         return 1
     free = max_memory or free_memory()
@@ -46,26 +44,29 @@ def choose_workers(device: str, jobs: int, max_memory: int | None = None) -> int
 
 
 def useful_workers(asked: int, jobs: int, max_memory: int | None = None) -> tuple[int, str | None]:
-    """Return how many of the processes asked for can be of use, and why no more can."""
+    """Return how many of the processes asked for are useful, and a note if that is fewer."""
     cores = count_cores()
     limits = [
         (jobs, "there is no more to do"),
         (cores, "this process may use no more cores"),
     ]
     if max_memory is not None:
-        limits.append((max(1, max_memory // LEAST_BYTES), "--max-memory has no room for more"))
+        limits.append(
+            (max(1, max_memory // MIN_BYTES_PER_WORKER), "--max-memory has no room for more")
+        )
     most, cause = min(limits)
     return min(asked, most), None if asked <= most else f"--jobs {asked} is cut to {most}: {cause}"
 
 
-def make_worker(loading: Loading, folder: Path) -> Callable[[Job], Row]:
-    """Load the network, and return what converts a job with it."""
-    return partial(attempt, folder=folder, network=loading.load())
+def prepare_worker(loading: Loading, folder: Path) -> Work:
+    """Load the network; return the function that converts a job and returns its row."""
+    network = loading.load()
+    return lambda job, tell: attempt(job, folder, network)
 
 
 def convert_here(jobs: Tasks[Job], folder: Path, loading: Loading) -> Iterator[tuple[Job, Row]]:
-    """Convert one file after another in this process; yield each as it is done."""
-    convert_job = make_worker(loading, folder)
+    """Convert one file after another in this process; yield each job and its row."""
+    network = loading.load()
     while len(jobs):
         job = jobs.popleft()
-        yield job, convert_job(job)
+        yield job, attempt(job, folder, network)

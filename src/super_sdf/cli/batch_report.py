@@ -17,14 +17,14 @@ from .common import print_stderr, print_stdout
 if TYPE_CHECKING:
     from ..batch.job import Job
     from ..batch.plan import Batch
-    from ..batch.run import Progress
+    from ..batch.run import OnFile
 
 MOST_FAILURES = 20  # printed; the report has all
 REDRAW_SECONDS = 0.1  # between two drawings of the progress line
 
 
 @contextmanager
-def progress_line(total: int, quiet: bool) -> Iterator[Progress | None]:
+def progress_line(total: int, quiet: bool) -> Iterator[OnFile | None]:
     """Keep a progress line on stderr up to date; None if stderr is no terminal."""
     if quiet or not total or sys.stderr is None or not sys.stderr.isatty():
         yield None
@@ -77,17 +77,17 @@ def print_plan(plan: Batch, as_json: bool) -> None:
 
 def plan_lines(plan: Batch) -> Iterator[str]:
     """Yield a line per file: what would be done with it."""
-    from ..batch.job import in_a_line
+    from ..batch.job import one_line
 
     folder = plan.settings.folder
     for job in plan.waiting:
-        yield in_a_line(f"to do: {job.source} -> {folder / job.target}")
+        yield one_line(f"to do: {job.source} -> {folder / job.target}")
     for job, _ in plan.done_before:
-        yield in_a_line(f"done before: {job.source} -> {folder / job.target}")
+        yield one_line(f"done before: {job.source} -> {folder / job.target}")
     for result in plan.failed_before:
         yield f"{failure_kind(result.row).replace('_', ' ')}: {result.failure()}"
     for path, reason in plan.unread:
-        yield in_a_line(f"unread: {path} {reason}")
+        yield one_line(f"unread: {path} {reason}")
 
 
 def plan_report(plan: Batch) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from typing import Any
 
 import click
 
+from ..evaluation.names import EXPERIMENTS, METHOD_LABELS, PEER_LABELS
 from ..machine.extras import check_modules
 from ..pictures.choices import AXES
 from .choices import LazyDefault, convert_default, default_quality
@@ -23,11 +24,6 @@ Examples:
   super-sdf evaluate meshes/ --sizes 32 64 --experiments noise factors --out report/
   super-sdf evaluate a.ply b.ply --sizes 32 --peers rfta --out report/
 """
-# The names that ``evaluation`` knows: help must show them without the extra ``eval``, which that
-# room needs; a test compares.
-METHODS = ("mc", "mc-lewiner", "trilinear", "bspline", "ours", "bound")
-EXPERIMENTS = ("factors", "noise", "iterated", "scale", "timings")
-PEERS = ("rfta", "dual-contouring")
 # Options that the plan takes as they are, and lists, from which repeated entries are dropped.
 NUMBERS = ("factor", "model", "experiment_shapes", "peer_shapes", "peer_size", "peer_limit")
 LISTS = ("sizes", "experiments", "peers")
@@ -100,9 +96,9 @@ def accepts(option: click.Option, word: str, ctx: click.Context) -> bool:
 @click.option(
     "--methods",
     multiple=True,
-    type=click.Choice(METHODS),
+    type=click.Choice(tuple(METHOD_LABELS)),
     metavar="NAME...",
-    help=f"Methods to compare: {', '.join(METHODS)}. Default: all.",
+    help=f"Methods to compare: {', '.join(METHOD_LABELS)}. Default: all.",
 )
 @click.option(
     "--experiments",
@@ -121,10 +117,10 @@ def accepts(option: click.Option, word: str, ctx: click.Context) -> bool:
 @click.option(
     "--peers",
     multiple=True,
-    type=click.Choice(PEERS),
+    type=click.Choice(tuple(PEER_LABELS)),
     metavar="NAME...",
-    help=f"Published methods to run as well: {', '.join(PEERS)}. They take minutes per shape and "
-    "need the extra 'peers'.",
+    help=f"Published methods to run as well: {', '.join(PEER_LABELS)}. They take minutes per "
+    "shape and need the extra 'peers'.",
 )
 @click.option(
     "--peer-shapes",
@@ -184,8 +180,7 @@ def evaluate_command(sources: tuple[Path, ...], **options: Any) -> None:
 def run_evaluate(sources: tuple[Path, ...], options: dict[str, Any]) -> bool:
     """Plan, measure, report; return whether every shape was measured."""
     from ..evaluation.evaluate import evaluate
-    from ..evaluation.methods import METHODS
-    from ..evaluation.plan import Plan, find_meshes, spread
+    from ..evaluation.scope import Scope, find_meshes, spread
     from ..machine.threads import count_cores
 
     if options["peers"]:
@@ -193,9 +188,9 @@ def run_evaluate(sources: tuple[Path, ...], options: dict[str, Any]) -> bool:
     paths = find_meshes(sources)
     jobs = min(options["jobs"] or count_cores(), count_cores())
     once: dict[str, Any] = {name: tuple(dict.fromkeys(options[name])) for name in LISTS}
-    plan = Plan(
+    scope = Scope(
         spread(paths, options["limit"] or len(paths)),
-        methods=tuple(name for name in METHODS if name in (options["methods"] or METHODS)),
+        methods=tuple(n for n in METHOD_LABELS if n in (options["methods"] or METHOD_LABELS)),
         jobs=jobs,
         threads=max(1, count_cores() // jobs),
         **{name: options[name] for name in NUMBERS},
@@ -203,11 +198,11 @@ def run_evaluate(sources: tuple[Path, ...], options: dict[str, Any]) -> bool:
     )
     with describing_interrupts(options["out"]):
         outcome = evaluate(
-            plan,
+            scope,
             options["out"],
             up=options["up"],
             pictures=not options["no_pictures"],
-            progress=None if options["quiet"] else progress_lines(),
+            on_task=None if options["quiet"] else progress_lines(),
         )
     for entry in outcome.left_out:
         print_stderr(f"Left out: {entry.shape}: {entry.reason}")

@@ -1,8 +1,8 @@
-"""The measuring stick: grids from meshes, quality against truth and peers, tables, pictures.
+"""Evaluation: quality of meshes against the truth, the baselines and other people's methods.
 
-It needs the extra ``eval`` (libigl, SciPy, scikit-image, matplotlib), pictures of meshes the extra
-``view`` (PyVista); the runtime imports nothing from here.
+It needs the extra ``eval`` (libigl, SciPy, scikit-image, matplotlib), and for pictures of meshes
+the extra ``view`` (PyVista). The command is ``super-sdf evaluate``.
 
-    solid -> sampling -> cases -> methods, peers -> measuring -> store, runner -> tables, plots
-    -> report
+    scope -> tasks -> runner -> measuring (cases, methods, peers, metrics) -> store -> results
+    -> tables, plots -> report
 """

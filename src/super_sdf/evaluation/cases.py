@@ -1,6 +1,7 @@
-"""What is measured against what: a shape in the frame, sampled in a setting, and the truth there.
+"""Test cases: a reference shape sampled on a grid, with the exact distances on the fine lattice.
 
-The frame: the shape centred on its bounding box, the box diagonal 1. All lengths are in its unit.
+Shapes are centred on their bounding boxes and scaled to a box diagonal of 1. All lengths are in
+that unit.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import OptionError, seen
-from ..evaluation import metrics
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import check_fits
 from ..mesh import Mesh
@@ -25,15 +25,16 @@ from ..steps.band import find_band, rescale
 from ..steps.nodes import check_factor
 from ..truth.sampling import sample_grid, unit_layout
 from ..truth.solid import Distances, Solid, load_solid
+from . import metrics
 
-# At most, of the dense fields, their masks, and the meshing of one of them.
+# Peak memory per node of the fine lattice: dense fields, their masks, and meshing one of them.
 BYTES_PER_NODE = 20
 
 # Streams of random numbers, each seeded by the shape's name and its own number.
 REFERENCE_POINTS, REFERENCE_EDGES, RESULT_POINTS, NOISE = range(4)
 
 
-LARGEST_SIZE = 100_000  # samples along an axis: a grid of more is beyond any memory
+LARGEST_SIZE = 100_000  # samples along an axis; a larger grid fits into no memory
 
 
 @dataclass(frozen=True)
@@ -45,14 +46,14 @@ class Setting:
     size : int
         Samples along each axis of the grid; 0 where nothing is sampled (the floor).
     factor : int
-        K, how many times finer.
+        Upscaling factor K.
     noise : float
-        Added to each sample: uniform in plus or minus this share of half a voxel.
+        Amplitude of the uniform noise on the samples, in half voxels.
     scale : float
-        Longest side of the shape's box over that of the grid; 0 for the frame: the grid's side is
-        the box diagonal.
+        Longest side of the shape's box over the side of the grid; 0: the grid's side is the box
+        diagonal, 1.
     passes : int
-        How often the result is refined again.
+        How many times the grid is refined by the factor.
     """
 
     size: int
@@ -62,7 +63,7 @@ class Setting:
     passes: int = 1
 
     def check(self, name: str = "size") -> None:
-        """Raise OptionError if a number is out of range; ``name`` is what the size is called."""
+        """Raise OptionError if a number is out of range; messages call the size ``name``."""
         check_factor(self.factor)
         if self.size < 4:
             raise OptionError(f"{name} is {self.size}: give at least 4 samples along an axis")
@@ -72,15 +73,15 @@ class Setting:
     def __str__(self) -> str:
         if not self.size:
             return "reference"
-        noted = [f"{self.size}^3", f"factor {self.factor}"]
-        noted += [f"noise {self.noise:g}"] if self.noise else []
-        noted += [f"scale {self.scale:g}"] if self.scale else []
-        noted += [f"{self.passes} passes"] if self.passes > 1 else []
-        return ", ".join(noted)
+        parts = [f"{self.size}^3", f"factor {self.factor}"]
+        parts += [f"noise {self.noise:g}"] if self.noise else []
+        parts += [f"scale {self.scale:g}"] if self.scale else []
+        parts += [f"{self.passes} passes"] if self.passes > 1 else []
+        return ", ".join(parts)
 
 
 class Shape:
-    """A reference in the frame, and what is drawn from it once for all methods."""
+    """A normalised reference mesh, and the points that are drawn from it for all methods."""
 
     def __init__(self, name: str, mesh: Mesh) -> None:
         self.name = name
@@ -95,7 +96,7 @@ class Shape:
 
     @classmethod
     def read(cls, path: Path) -> Shape:
-        """Read a shape from a mesh file; it is named after the file.
+        """Return the shape of a mesh file, named after the file.
 
         Raises
         ------
@@ -115,18 +116,25 @@ class Shape:
 class Case:
     """A shape sampled in a setting.
 
-    The baselines and the truth are dense on the fine lattice, so its size is bounded by memory:
-    OutOfMemoryError if it would not fit.
+    The fields of the baselines and the truth are dense, so they must fit into memory.
 
     Attributes
     ----------
     coarse : (n, n, n) float32
         Exact signed distances at the samples.
     grid : SdfGrid
-        What the methods are given: the same, with noise if the setting has any.
+        Input of the methods: the same, with the setting's noise.
+    side : float
+        Length of the grid's cube.
+    low : float
+        Coordinate of the first node of the fine lattice on every axis.
     spacing, fine : float
-        Between samples, and between the nodes of the fine lattice, of which the first is at
-        ``low`` on every axis.
+        Distance between samples, and between nodes of the fine lattice.
+
+    Raises
+    ------
+    OutOfMemoryError
+        If the dense fields do not fit into memory.
     """
 
     def __init__(self, shape: Shape, setting: Setting) -> None:
@@ -148,31 +156,31 @@ class Case:
 
     @cached_property
     def voxels(self) -> IntArray:
-        """The band of the exact distances (Eq. 2), (V, 3)."""
+        """Voxels of the band of the exact distances (Eq. 2), (V, 3)."""
         return find_band(rescale(SdfGrid.trusted(self.coarse, self.spacing)))
 
     @cached_property
     def band(self) -> BoolArray:
-        """Which fine nodes lie in the blocks of the band, faces included, (K n + 1)^3."""
+        """Mask of the fine nodes in the blocks of the band, faces included, (K n + 1)^3."""
         active = np.zeros(self.coarse.shape, bool)
         active[tuple(self.voxels.T)] = True
         return spread_to_nodes(active, self.factor)
 
     @cached_property
     def truth(self) -> FloatArray:
-        """The exact distance at the nodes of the band and of every cell that can be crossed."""
+        """Exact distances at the fine nodes, (K n + 1)^3: see ``exact_field``."""
         return exact_field(self)
 
 
 def side_of(mesh: Mesh, scale: float) -> float:
-    """Return the side of the grid's cube in which a mesh of the frame has that scale."""
+    """Return the side of the grid's cube in which a normalised mesh has a given scale."""
     if not scale:
         return 1.0
     return float(np.ptp(mesh.vertices, axis=0).max()) / scale
 
 
 def spread_to_nodes(voxels: BoolArray, factor: int) -> BoolArray:
-    """Return which fine nodes lie in the blocks of the given voxels, faces included."""
+    """Return the mask of the fine nodes, (K n + 1)^3, in the blocks of a mask of voxels, n^3."""
     for axis in range(3):
         source = np.moveaxis(voxels, axis, 0)
         target = np.zeros((factor * len(source) + 1, *source.shape[1:]), bool)
@@ -183,16 +191,17 @@ def spread_to_nodes(voxels: BoolArray, factor: int) -> BoolArray:
 
 
 def spread_samples(samples: FloatArray, factor: int) -> FloatArray:
-    """Return a sample of the voxel that each fine node lies in, (K n + 1)^3."""
+    """Return for each fine node the sample of a voxel that it lies in, (K n + 1)^3."""
     nearest = [np.minimum(np.arange(factor * n + 1) // factor, n - 1) for n in samples.shape]
     return samples[np.ix_(*nearest)]
 
 
 def exact_field(case: Case) -> FloatArray:
-    """Return the signed distance at the fine nodes of the band and of crossing cells.
+    """Return the signed distances at the fine nodes, (K n + 1)^3.
 
-    A node of a crossing cell is within sqrt(3) h/K of the surface, so its block's sample within
-    sqrt(3) (1/2 + 1/K) h. Elsewhere stands the nearest sample, which has the right sign.
+    They are exact in the band and at every cell that the surface may cross: a node of such a cell
+    is within sqrt(3) h/K of the surface, so the sample of its block is within
+    sqrt(3) (1/2 + 1/K) h. Elsewhere they are the nearest sample, which has the right sign.
     """
     factor = case.factor
     reach = 3**0.5 * (0.5 + 1 / factor) * case.spacing
@@ -210,13 +219,22 @@ def exact_field(case: Case) -> FloatArray:
 def signed_from_samples(
     solid: Solid, points: NDArray[Any], known: FloatArray, apart: NDArray[Any]
 ) -> Distances:
-    """Return the signed distance of points (n, 3), each ``apart`` from one where it is known.
+    """Return the signed distances of points, (n,), negative inside.
 
-    If the balls round the two points that hold no surface overlap, the two have one sign. The
-    winding number is asked for the others only.
+    Parameters
+    ----------
+    solid : Solid
+    points : (n, 3) float
+    known : (n,) float
+        The signed distance at another point near each.
+    apart : (n,) float
+        How far that other point is.
+
+    The balls round the two points with their distances as radii hold no surface. If they overlap,
+    both points have the same sign. Only for the others the winding number is computed.
     """
-    found = solid.distance(points)
+    distance = solid.distance(points)
     inside = known < 0
-    unsure = found + np.abs(known) < apart * (1 + 1e-6)
+    unsure = distance + np.abs(known) < apart * (1 + 1e-6)
     inside[unsure] = solid.is_inside(points[unsure])
-    return np.where(inside, -found, found)
+    return np.where(inside, -distance, distance)

@@ -1,125 +1,109 @@
-"""The whole evaluation on a page: measure what is missing, time whole processes, report.
-
-plan -> tasks -> rows (kept) -> report
-"""
+"""The whole evaluation on a page: measure what is missing, time whole processes, report."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import FileError, SuperSdfError
 from .cases import Shape
 from .folder import ROWS, check_folder, make_folder
-from .measuring import PROCESS, Row, Task, failed_row, reason_of
-from .plan import Plan
+from .measuring import Measurement, Task, failed_row, reason_of
+from .names import PROCESS
 from .report import write_report
 from .results import Results
-from .runner import LeftOut, complete
+from .runner import LeftOut, OnTask, complete
+from .scope import Scope
 from .store import Store
 from .timing import time_shape
-
-Progress = Callable[[int, int, str, float], None]
-"""Called with (tasks done, tasks in all, what was just done, the share of the work done)."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Where the report is, and which shapes are not in it, or not in all of its tables."""
+    """Path of the report, and the shapes that are missing in some or all of its tables."""
 
     report: Path
     left_out: Sequence[LeftOut]
 
 
 def evaluate(
-    plan: Plan,
+    scope: Scope,
     out: Path,
     *,
     up: str = "z",
     pictures: bool = True,
-    progress: Progress | None = None,
+    on_task: OnTask | None = None,
 ) -> Outcome:
-    """Measure a plan and write its report.
+    """Measure everything in a scope and write the report.
 
-    Rows are kept in ``out/results.jsonl`` as they come: called again, after a kill or with a
-    larger plan, only what is missing is measured. Every random number is seeded by the shape's
-    name, so figures of quality are the same in every run.
+    Measurements are kept in ``out/results.jsonl`` as they come: called again, after a kill or with
+    a larger scope, only what is missing is measured. All random numbers are seeded by the name of
+    the shape, so the quality is the same in every run.
 
     Parameters
     ----------
-    plan : Plan
-        What is asked for.
+    scope : Scope
+        Shapes, sizes, methods, experiments and peers.
     out : Path
-        Folder of the report: a new one, an empty one, or that of an earlier evaluation.
+        Folder of the report: new, empty, or of an earlier evaluation.
     up : {"x", "y", "z"}
         The axis that points up in the pictures.
     pictures : bool
-        Whether the best and worst shapes are drawn.
-    progress : callable, optional
-        See ``Progress``.
+        Whether to draw the best and worst shapes.
+    on_task : callable, optional
+        Called after each task: see ``OnTask``.
 
     Raises
     ------
     OptionError
-        If the plan makes no sense.
+        If the scope is not valid.
     FileError
-        If the folder cannot be made or holds what no evaluation wrote, or no shape could be
+        If the folder cannot be made or was not made by an evaluation, or no shape could be
         measured.
     ModelError
         If the network cannot be loaded.
     """
-    plan.check()
+    scope.check()
     check_folder(out)
-    tasks = plan.tasks()
+    tasks = scope.tasks()
     store = Store(make_folder(out) / ROWS)
-    tell = progress or (lambda done, total, what, share: None)
-    left_out = complete(
-        tasks,
-        store,
-        plan.jobs,
-        lambda done, total, task, share: tell(done, total, name_of(task), share),
-    )
-    results = Results(plan, tasks, store, left_out)
+    left_out = complete(tasks, store, scope.jobs, on_task)
+    results = Results(scope, tasks, store, left_out)
     if not results.floors:
         first = results.left_out[0]
         raise FileError(f"no shape could be measured; {first.shape}: {first.reason}")
-    timings = time_processes(results, tell) if "timings" in plan.experiments else {}
+    timings = time_processes(results, on_task) if "timings" in scope.experiments else {}
     report = write_report(results, out, timings, up=up, pictures=pictures)
     return Outcome(report, results.left_out)
 
 
-def name_of(task: Task) -> str:
-    """Return what a task is called while it goes on."""
-    named = [str(task.setting), *(task.methods if task.limit else [])]
-    return f"{task.path.stem} ({', '.join(named)})"
+def time_processes(results: Results, on_task: OnTask | None) -> dict[int, list[Measurement]]:
+    """Return the times of the command on each shape, by size; nothing else runs meanwhile.
 
-
-def time_processes(results: Results, tell: Progress) -> dict[int, list[Row]]:
-    """Return the times of the command by size, each shape's kept; nothing else runs meanwhile.
-
-    What fails is added to what the results leave out.
+    Failures are added to ``results.left_out``.
     """
-    plan, timings = results.plan, dict[int, list[Row]]()
-    names = results.names(plan.experiment_paths())
-    settings = plan.settings()
+    scope, timings = results.scope, dict[int, list[Measurement]]()
+    names = results.names(scope.experiment_paths())
+    settings = scope.settings()
     tasks = [t for t in results.tasks if t.setting in settings and t.path.stem in names]
     tasks = [task for task in tasks if task.limit is None]
     for done, task in enumerate(tasks, 1):
         if not results.store.is_final(task, PROCESS):
-            results.store.add(time_task(task, plan.model))
+            results.store.add(time_task(task, scope.model))
         row = results.store.get(task, PROCESS) or {}
         if row["error"] is None:
             timings.setdefault(task.setting.size, []).append(row)
         else:
-            said = f"timing ({task.setting}): {row['error']}"
-            results.left_out.append(LeftOut(task.path.stem, said))
-        tell(done, len(tasks), f"timing {name_of(task)}", done / len(tasks))
+            reason = f"timing ({task.setting}): {row['error']}"
+            results.left_out.append(LeftOut(task.path.stem, reason))
+        if on_task:
+            on_task(done, len(tasks), f"timing {task}", done / len(tasks))
     return timings
 
 
-def time_task(task: Task, model: str) -> Row:
-    """Return the row of the command's time on a task's grid, or why there is none."""
+def time_task(task: Task, model: str) -> Measurement:
+    """Return the time of the command on a task's grid, or a failure."""
     try:
         row = time_shape(Shape.read(task.path), task.setting, ["--model", model])
     except SuperSdfError as problem:

@@ -1,32 +1,37 @@
-"""The paper's experiments, ours beside what is printed of them."""
+"""Tables of the paper's experiments, our results beside the published ones."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ..evaluation import published
+from . import published
 from .cases import Setting
-from .measuring import OURS, Row
-from .plan import BASE_SIZE, FACTORS, NOISES, PASSES, SCALES
+from .measuring import Measurement
+from .names import LABELS, OURS
 from .results import Results
-from .tables import CD, F1, LABELS, NC, SHORT, gap_closed, markdown, mean_of, mean_row, percent
+from .scope import BASE_SIZE, FACTORS, NOISES, PASSES, SCALES
+from .tables import CD, F1, NC, SHORT, gap_closed, markdown, mean_of, mean_row, percent
 from .timing import RUNS, describe_machine
 
 
 def factor_section(results: Results) -> str:
-    """Return ours at the factors 2 to 16, each beside its own bound (Fig. 9)."""
-    paths = results.plan.experiment_paths()
+    """Return the section on the factors 2 to 16, each with its own bound (Fig. 9)."""
+    paths = results.scope.experiment_paths()
     rows = [
         ["1", *mean_row(LABELS["mc"], results.rows(Setting(BASE_SIZE), "mc", paths), SHORT), "-"]
     ]
     for factor in FACTORS:
         setting = Setting(BASE_SIZE, factor)
-        found = {name: results.rows(setting, name, paths) for name in ("bspline", OURS, "bound")}
-        gap = percent(gap_closed(found[OURS], found["bspline"], found["bound"], "f1"))
+        measured = {name: results.rows(setting, name, paths) for name in ("bspline", OURS, "bound")}
+        gap = percent(gap_closed(measured[OURS], measured["bspline"], measured["bound"], "f1"))
         rows += [
-            [str(factor), *mean_row(LABELS[name], found[name], SHORT), gap if name == OURS else "-"]
-            for name in found
+            [
+                str(factor),
+                *mean_row(LABELS[name], measured[name], SHORT),
+                gap if name == OURS else "-",
+            ]
+            for name in measured
         ]
     titles = ["factor", "method", *(column.title for column in SHORT), "F1 gap closed"]
     table = markdown(titles, rows)
@@ -34,8 +39,8 @@ def factor_section(results: Results) -> str:
 
 
 def noise_section(results: Results) -> str:
-    """Return F1 by noise, beside the published (supplement, Table 1)."""
-    paths = results.plan.experiment_paths()
+    """Return the section on F1 by noise, beside the published F1 (supplement, Table 1)."""
+    paths = results.scope.experiment_paths()
     rows = []
     for noise in NOISES:
         setting = Setting(BASE_SIZE, noise=noise)
@@ -51,8 +56,8 @@ def noise_section(results: Results) -> str:
 
 
 def iterated_section(results: Results) -> str:
-    """Return ours refined once and twice, beside the published (supplement, Table 2)."""
-    paths, rows = results.plan.experiment_paths(), []
+    """Return the section on refining once and twice, beside the paper (supplement, Table 2)."""
+    paths, rows = results.scope.experiment_paths(), []
     for passes in PASSES:
         setting = Setting(BASE_SIZE, passes=passes)
         sizes = " -> ".join(f"{BASE_SIZE * setting.factor**n}^3" for n in range(passes + 1))
@@ -63,17 +68,17 @@ def iterated_section(results: Results) -> str:
 
 
 def scale_section(results: Results) -> str:
-    """Return all methods on shapes that fill a part of the grid (supplement, Table 3)."""
-    paths, rows = results.plan.experiment_paths(), []
-    for size in results.plan.sizes:
+    """Return the section on shapes that fill a part of the grid (supplement, Table 3)."""
+    paths, rows = results.scope.experiment_paths(), []
+    for size in results.scope.sizes:
         for scale in SCALES:
             setting = Setting(size, scale=scale)
             names = ("mc", "bspline", OURS, "bound")
-            found = {name: results.rows(setting, name, paths) for name in names}
-            gap = percent(gap_closed(found[OURS], found["bspline"], found["bound"], "f1"))
+            measured = {name: results.rows(setting, name, paths) for name in names}
+            gap = percent(gap_closed(measured[OURS], measured["bspline"], measured["bound"], "f1"))
             for name in names:
                 other = published.SCALED.get((scale, size)) if name == OURS else None
-                row = [f"{scale:g}, {size}^3", *mean_row(LABELS[name], found[name], SHORT)]
+                row = [f"{scale:g}, {size}^3", *mean_row(LABELS[name], measured[name], SHORT)]
                 rows.append([*row, gap if name == OURS else "-", *published_cells(other)])
     titles = ["scale, grid", "method", *(column.title for column in SHORT), "F1 gap closed"]
     title = title_of("Scale: longest side of the shape over that of the grid", paths)
@@ -88,13 +93,13 @@ SECTIONS = {
 }
 
 
-def timing_section(timings: Mapping[int, Sequence[Row]]) -> str:
-    """Return whole processes' times beside the published (Table 2)."""
+def timing_section(timings: Mapping[int, Sequence[Measurement]]) -> str:
+    """Return the section on the times of whole processes, beside the published (Table 2)."""
     rows = []
-    for size, found in timings.items():
-        seconds = [row["seconds"] for row in found]
+    for size, measured in timings.items():
+        seconds = [row["seconds"] for row in measured]
         cells = [sum(seconds) / len(seconds), min(seconds), max(seconds)]
-        peak = max(row["peak_mb"] for row in found)
+        peak = max(row["peak_mb"] for row in measured)
         rows.append([f"{size}^3", LABELS[OURS], *(f"{s:.2f}" for s in cells), f"{peak:.0f}"])
         for name, theirs in published.SECONDS.get(size, {}).items():
             cells = [f"{s:.2f}" for s in theirs]
@@ -113,20 +118,20 @@ def timing_section(timings: Mapping[int, Sequence[Row]]) -> str:
 
 
 def title_of(title: str, paths: Sequence[Path]) -> str:
-    """Return the heading of an experiment."""
+    """Return the heading of an experiment's section."""
     return f"## {title}, {len(paths)} shapes"
 
 
 def gain(one: float | None, other: float | None) -> float | None:
-    """Return a difference if both are known."""
+    """Return the difference of two figures, None if one is unknown."""
     return None if one is None or other is None else one - other
 
 
 def published_titles() -> list[str]:
-    """Return the titles of what is printed of the paper's method."""
+    """Return the titles of the columns with the paper's figures."""
     return [f"*{column.title}, paper*" for column in (CD, F1, NC)]
 
 
 def published_cells(figures: tuple[float, float, float] | None) -> list[str]:
-    """Return what is printed of the paper's method, CD x1e5, or dashes."""
+    """Return the cells with the paper's CD x1e5, F1 and NC, or dashes."""
     return ["-"] * 3 if figures is None else [f"{figure:.3f}" for figure in figures]

@@ -1,6 +1,6 @@
-"""The folder of a report: new, empty, or one that an earlier evaluation made.
+"""The folder of a report: new, empty, or made by an earlier evaluation.
 
-What an evaluation did not write is never replaced.
+Files that no evaluation wrote are never replaced.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from ..files.output import replacing
 
 ROWS, REPORT, SHAPES = "results.jsonl", "report.md", "shapes.md"
 ROW_START = b'{"shape": '
-# How the pages of every version begin.
+# How these pages begin, in every version.
 PAGE_STARTS = {REPORT: rb"# Quality of super-sdf on ", SHAPES: rb"## \d+\^3"}
 
 
 def check_folder(out: Path) -> None:
-    """Raise FileError unless a report can go into a folder without harm to foreign files."""
+    """Raise FileError unless a folder is new, empty or made by an evaluation."""
     if not os.path.lexists(out):
         return
     if not out.is_dir():
@@ -35,32 +35,32 @@ def check_folder(out: Path) -> None:
 
 
 def check_ours(path: Path) -> None:
-    """Raise FileError unless an evaluation wrote a file, or there is none."""
+    """Raise FileError if a file exists that no evaluation wrote."""
     if os.path.lexists(path) and not is_ours(path):
         raise FileError(f"{path} was not written by an evaluation: move it or use another folder")
 
 
 def is_ours(path: Path) -> bool:
-    """Say whether an evaluation wrote a file: rows, perhaps the last one torn, or a page."""
+    """Return whether an evaluation wrote a file: a page, or rows, the last maybe unfinished."""
     if not path.is_file():
         return False
     with path.open("rb") as file:
         if path.name != ROWS:
             return re.match(PAGE_STARTS[path.name], file.read(100)) is not None
         head = file.read(len(ROW_START))
-        if ROW_START.startswith(head):  # empty, or killed in the first row
+        if ROW_START.startswith(head):  # empty, or killed while writing the first row
             return True
         file.seek(0)
         return any(line.startswith(ROW_START) for line in file)
 
 
 def make_folder(path: Path) -> Path:
-    """Return a folder after making it, if need be.
+    """Make a folder if it does not exist; return it.
 
     Raises
     ------
     FileError
-        If it cannot be made, or nothing can be written there.
+        If it cannot be made, or is not writable.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -72,11 +72,16 @@ def make_folder(path: Path) -> Path:
 
 
 def write_page(path: Path, text: str) -> Path:
-    """Write a page of Markdown; it appears whole, and never in place of a foreign file.
+    """Write a page of Markdown, whole or not at all; return its path.
 
-    A file's name may hold bytes that are no text: they are written as escapes.
+    File names may hold bytes that are not valid text: they are escaped.
+
+    Raises
+    ------
+    FileError
+        If a file exists there that no evaluation wrote.
     """
-    check_ours(path)  # another may have come there during the work
+    check_ours(path)  # again, for it may have appeared during the work
     with replacing(path) as part:
         part.write_text(text, encoding="utf-8", errors="backslashreplace")
     return path

@@ -1,4 +1,4 @@
-"""A row of figures: one shape, one setting, one method."""
+"""Measures one method on one shape in one setting."""
 
 from __future__ import annotations
 
@@ -13,32 +13,31 @@ from typing import Any
 import numpy as np
 
 from ..errors import FileError, SuperSdfError
-from ..evaluation import metrics
 from ..files.regular import check_regular_file
 from ..machine.memory import forget_peak, held_memory
 from ..mesh import Mesh
 from ..network.decoder import Decoder
 from ..network.network import find_model, load_network
+from . import metrics
 from .cases import RESULT_POINTS, Case, Setting, Shape
 from .methods import METHODS, Surface
+from .names import OURS, PROCESS
 from .peers import PEERS
 
-Row = dict[str, Any]
+Measurement = dict[str, Any]
+"""A line of ``results.jsonl``: the key (see ``Task.key``), then the figures, or the "error"."""
 
-PROTOCOL = 2  # count up when a figure changes its meaning: the rows kept so far are then void
-FLOOR = "floor"
-NO_SETTING = Setting(0, 0)  # the floor's: the reference against itself
-OURS = "ours"
-BLOCK = 1 << 20  # bytes of a file that are held at a time
-PROCESS = "process"  # ours, as a whole process (see ``timing``)
-# The figures of a row, and those of them that may be None: what was not measured or is not known.
+PROTOCOL = 2  # increase it when a figure changes its meaning: older measurements do not count then
+NO_SETTING = Setting(0, 0)  # of the floor: nothing is sampled
+BLOCK = 1 << 20  # bytes of a file that are read at a time
+# The figures of a measurement; the optional ones are None where they are unknown.
 NUMBERS = (
     *("cd", "f1", "recall", "precision", "nc", "signed_nc"),
     *("p2s", "p2s_there", "p2s_back", "p99", "p99_there", "p99_back"),
     *("max", "max_there", "max_back", "closed", "outward", "faces", "seconds"),
 )
 OPTIONAL_NUMBERS = ("ecd", "ef1", "field_mse", "field_mae", "peak_mb")
-# Rooms of the package that no surface depends on.
+# Folders of the package whose code does not change any surface.
 NOT_THE_METHOD = {"batch", "cli", "evaluation", "pictures"}
 
 
@@ -46,8 +45,21 @@ NOT_THE_METHOD = {"batch", "cli", "evaluation", "pictures"}
 class Task:
     """What one process measures: some methods on one shape in one setting.
 
-    ``limit`` is the seconds it may take, if there is a limit; ``mesh`` and ``digest`` are the
-    sums of the mesh file and of what ours is made by: a row is known by them.
+    Attributes
+    ----------
+    path : Path
+        The mesh file of the shape.
+    mesh, digest : str
+        Hashes of the mesh file, and of our network and code.
+    setting : Setting
+    methods : tuple of str
+        Names of methods or peers, in the order of measuring.
+    model : str
+        The network: see ``load_network``.
+    threads : int
+        Threads of the network; 0: one per core.
+    limit : float, optional
+        Seconds that the task may take.
     """
 
     path: Path
@@ -59,8 +71,12 @@ class Task:
     threads: int = 0
     limit: float | None = None
 
-    def key(self, method: str) -> Row:
-        """Return what a method's row is known by."""
+    def __str__(self) -> str:
+        named = [str(self.setting), *(self.methods if self.limit else [])]
+        return f"{self.path.stem} ({', '.join(named)})"
+
+    def key(self, method: str) -> Measurement:
+        """Return the key of a method's measurement: it is valid as long as nothing here changes."""
         return {
             "shape": self.path.stem,
             "mesh": self.mesh,
@@ -71,13 +87,13 @@ class Task:
         }
 
 
-def measure_task(task: Task, shape: Shape) -> Iterator[Row]:
-    """Yield a row for each method of a task, which is of that shape."""
+def measure_task(task: Task, shape: Shape) -> Iterator[Measurement]:
+    """Yield a measurement for each method of a task; ``shape`` is that of the task."""
     try:
-        # On the CPU, so that every machine agrees.
+        # On the CPU, for the same results on every machine.
         network = load_network(task.model, device="cpu", threads=task.threads)
         case = None if task.setting == NO_SETTING else Case(shape, task.setting)
-    except Exception as problem:  # every method of the task fails by it; the others still count
+    except Exception as problem:  # all methods of the task fail; other tasks still count
         yield from (failed_row(task, method, reason_of(problem)) for method in task.methods)
         return
     for method in task.methods:
@@ -85,12 +101,12 @@ def measure_task(task: Task, shape: Shape) -> Iterator[Row]:
         yield {**task.key(method), **figures, "notes": list(shape.notes)}
 
 
-def measure_method(shape: Shape, case: Case | None, method: str, network: Decoder) -> Row:
-    """Return a method's figures; if it raises, none, with the reason in "error".
+def measure_method(shape: Shape, case: Case | None, method: str, network: Decoder) -> Measurement:
+    """Return a method's figures, or the reason in "error" if it raised an exception.
 
-    A failure is no score: it says something of the machine or of a bug, not of the method.
-    ``seconds`` and ``peak_mb`` are those of making the mesh: from the grid in memory to the mesh
-    in memory, and what was held at most beyond what was held before.
+    A failure is not a score: its cause is the machine or a bug, not the method. ``seconds`` is the
+    time from the grid in memory to the mesh in memory, ``peak_mb`` the peak of memory meanwhile,
+    less what the process held before.
     """
     held, clock = start_memory(), time.perf_counter()
     try:
@@ -103,31 +119,31 @@ def measure_method(shape: Shape, case: Case | None, method: str, network: Decode
 
 
 def make_surface(shape: Shape, case: Case | None, method: str, network: Decoder) -> Surface:
-    """Return what a method makes of a case; of the floor, the reference itself."""
+    """Return the surface that a method makes of a case; without a case, the reference itself."""
     if case is None:
         return Surface(shape.mesh)
     return {**METHODS, **PEERS}[method](case, network)
 
 
-def failed_row(task: Task, method: str, error: str) -> Row:
-    """Return the row of a method that could not be measured: no figures, and why."""
+def failed_row(task: Task, method: str, error: str) -> Measurement:
+    """Return the measurement of a method that failed: the reason, and no figures."""
     return {**task.key(method), "error": error}
 
 
 def reason_of(problem: Exception) -> str:
-    """Return what went wrong in a line; of a bug also where."""
-    said = (str(problem).splitlines() or [""])[0]
+    """Return what went wrong in one line; for a bug also where."""
+    message = (str(problem).splitlines() or [""])[0]
     if isinstance(problem, SuperSdfError):
-        return said
+        return message
     if isinstance(problem, MemoryError):
         return "out of memory"
     last = traceback.extract_tb(problem.__traceback__)[-1:]
     place = "".join(f" ({Path(frame.filename).name}:{frame.lineno})" for frame in last)
-    return f"{type(problem).__name__}: {said}{place}"
+    return f"{type(problem).__name__}: {message}{place}"
 
 
-def measure_surface(shape: Shape, mesh: Mesh) -> Row:
-    """Return every mesh figure of a result; without faces, a dot at the origin is measured."""
+def measure_surface(shape: Shape, mesh: Mesh) -> Measurement:
+    """Return the figures of a result's mesh; a mesh without faces counts as a dot at the origin."""
     drawn = metrics.sample_surface(mesh, shape.seed(RESULT_POINTS))
     edge_points = metrics.edge_points(drawn)
     return {
@@ -140,8 +156,8 @@ def measure_surface(shape: Shape, mesh: Mesh) -> Row:
     }
 
 
-def measure_field(case: Case | None, surface: Surface) -> Row:
-    """Return the squared and absolute error at the nodes of the band, each node once."""
+def measure_field(case: Case | None, surface: Surface) -> Measurement:
+    """Return the mean squared and absolute errors at the nodes of the band, each counted once."""
     if case is None or surface.field is None:
         return {"field_mse": None, "field_mae": None}
     error = surface.field()[case.band].astype(np.float64) - case.truth[case.band]
@@ -149,19 +165,19 @@ def measure_field(case: Case | None, surface: Surface) -> Row:
 
 
 def start_memory() -> int | None:
-    """Return the bytes held now, and count the peak from here."""
+    """Return the bytes held now; the peak of memory counts from here."""
     forget_peak()
     return held_memory()
 
 
 def peak_since(held: int | None) -> float | None:
-    """Return by how many MB the peak is above what was held; None where it is not known."""
+    """Return the peak of memory less what was held at the start, in MB; None if unknown."""
     peak = held_memory(peak=True)
     return None if held is None or peak is None else round(max(peak - held, 0) / 1e6, 1)
 
 
 def digest_of_file(path: Path) -> str:
-    """Return the sum of a file that tells it from others.
+    """Return a hash of a file's content.
 
     Raises
     ------
@@ -179,8 +195,8 @@ def digest_of_file(path: Path) -> str:
 
 
 def digest_of_ours(model: str) -> str:
-    """Return the sum of the network's file and of the code that runs it."""
-    load_network(model, device="cpu")  # says what is wrong, before anything is measured
+    """Return a hash of the network's file and of the code that runs it."""
+    load_network(model, device="cpu")  # raises ModelError before anything is measured
     network, symmetries = find_model(model)
     digest = hashlib.sha256(b"" if symmetries == 1 else str(symmetries).encode())
     for path in [network, *code_of_method()]:
@@ -189,9 +205,9 @@ def digest_of_ours(model: str) -> str:
 
 
 def code_of_method() -> list[Path]:
-    """Return the source files that a surface can depend on: all but those of rooms left out."""
+    """Return the source files that a surface may depend on."""
     package = Path(__file__).parent.parent
-    rooms = {path.name for path in package.iterdir()}
-    assert rooms >= NOT_THE_METHOD, "a room that is left out is not there"
+    folders = {path.name for path in package.iterdir()}
+    assert folders >= NOT_THE_METHOD, "a folder in NOT_THE_METHOD does not exist"
     files = package.rglob("*.py")
     return sorted(p for p in files if p.relative_to(package).parts[0] not in NOT_THE_METHOD)

@@ -1,6 +1,6 @@
-"""The methods that make a surface of a coarse grid: ours, what it is compared with, its bound.
+"""The methods that reconstruct a surface from a coarse grid: ours, the baselines, our bound.
 
-Each is given a case and a network, which only ours runs, and returns a surface in the frame.
+Each takes a case and a network, which only ours uses, and returns a surface.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from ..steps.nodes import block_ijk
 from ..steps.survey import survey
 from .cases import Case, spread_samples
 
-NUDGE = np.float32(1e-9)  # what an exact zero becomes: a vertex on a node can open the surface
+NUDGE = np.float32(1e-9)  # replaces exact zeros: a vertex on a node can open the surface
 EMPTY = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """What a method made: a mesh, and if it refines the field, a way to its values.
+    """The result of a method: a mesh, and the refined field if the method has one.
 
     ``field`` returns the values at the fine nodes, (K n + 1)^3, known at least in the band. It is
-    a function because only measuring asks for it, after the clock has stopped.
+    a function so that it is not computed while the method is timed.
     """
 
     mesh: Mesh
@@ -44,27 +44,26 @@ Method = Callable[[Case, Decoder], Surface]
 
 
 def coarse_surface(case: Case, network: Decoder, *, table: str) -> Surface:
-    """Mesh the coarse grid as it is, by one of scikit-image's tables: lorensen or lewiner."""
+    """Mesh the coarse grid by marching cubes; ``table`` is lorensen or lewiner."""
     field = np.array(case.grid.values)
     return Surface(isosurface(field, case.spacing, case.low + case.spacing / 2, table))
 
 
-def upsampled_surface(case: Case, network: Decoder, *, order: int) -> Surface:
+def spline_surface(case: Case, network: Decoder, *, order: int) -> Surface:
     """Mesh the spline interpolation of the coarse grid at the fine nodes."""
-    field = upsample(case.grid.values, case.factor, order)
+    field = interpolate_spline(case.grid.values, case.factor, order)
     return Surface(isosurface(field, case.fine, case.low), lambda: field)
 
 
 def bound_surface(case: Case, network: Decoder) -> Surface:
-    """Mesh the true distance at the fine nodes: what no upsampling to them can beat."""
+    """Mesh the true distances at the fine nodes: the bound of all upsampling to them."""
     return Surface(isosurface(case.truth.copy(), case.fine, case.low))
 
 
 def our_surface(case: Case, network: Decoder) -> Surface:
-    """Mesh the coarse grid with super-sdf, as often as the setting says.
+    """Mesh the coarse grid with super-sdf, in as many passes as the setting has.
 
-    Capped, as one would ask who wants solids: where no surface leaves the grid that changes
-    nothing. Where no surface is found, the mesh is empty.
+    The mesh is capped where the surface leaves the grid. Without a surface it is empty.
     """
     grid = case.grid
     try:
@@ -74,26 +73,27 @@ def our_surface(case: Case, network: Decoder) -> Surface:
     except NoSurfaceError:
         return Surface(EMPTY)
     if case.setting.passes > 1 or case.setting.noise:
-        return Surface(mesh)  # no field of the very nodes and voxels that the protocol compares
+        return Surface(mesh)  # its field has other nodes or another band than the protocol's
     return Surface(mesh, lambda: band_field(case.grid, network, case.factor))
 
 
 def refined_grid(grid: SdfGrid, network: Decoder, factor: int) -> SdfGrid:
-    """Return the fine lattice as a grid, to be refined once more: all blocks of the band.
+    """Return the fine lattice as a grid, to be refined again.
 
-    Elsewhere stands the nearest sample: it has the right sign, and is beyond the finer band.
+    Outside the blocks of the band its values are the nearest samples, which have the right sign
+    and are outside the finer band.
     """
     field = band_field(grid, network, factor)
-    rest = spread_samples(np.asarray(grid.values, np.float32), factor)
-    first = np.array(grid.origin) - grid.voxel_size / 2
-    values = np.where(np.isnan(field), rest, field)
-    return SdfGrid.trusted(values, grid.voxel_size / factor, first)
+    nearest = spread_samples(np.asarray(grid.values, np.float32), factor)
+    origin = np.array(grid.origin) - grid.voxel_size / 2
+    values = np.where(np.isnan(field), nearest, field)
+    return SdfGrid.trusted(values, grid.voxel_size / factor, origin)
 
 
 def band_field(grid: SdfGrid, network: Decoder, factor: int) -> FloatArray:
-    """Return our distances at all nodes of the band's blocks, NaN elsewhere.
+    """Return our distances at the fine nodes in the band's blocks, NaN elsewhere, (K n + 1)^3.
 
-    The pipeline decodes only the voxels that can hold the surface; the protocol asks for all.
+    The pipeline decodes only voxels that can hold the surface; the protocol compares all.
     """
     band = survey(grid)
     band = replace(band, decoded=np.ones(len(band.voxel_ijk), bool))
@@ -106,7 +106,22 @@ def band_field(grid: SdfGrid, network: Decoder, factor: int) -> FloatArray:
 
 
 def isosurface(field: FloatArray, spacing: float, low: float, table: str = "lorensen") -> Mesh:
-    """Mesh a dense field, zeros nudged in place; empty if it has one sign only."""
+    """Mesh a dense field by marching cubes; zeros in it are replaced by ``NUDGE``.
+
+    Parameters
+    ----------
+    field : (n, m, l) float32
+    spacing : float
+        Distance between nodes.
+    low : float
+        Coordinate of the first node on every axis.
+    table : {"lorensen", "lewiner"}
+
+    Returns
+    -------
+    Mesh
+        Empty if the field has one sign only.
+    """
     field[field == 0] = NUDGE
     if not field.min() < 0 < field.max():
         return EMPTY
@@ -114,21 +129,21 @@ def isosurface(field: FloatArray, spacing: float, low: float, table: str = "lore
     return Mesh(vertices.astype(np.float64) * spacing + low, faces.astype(np.int32))
 
 
-def upsample(coarse: FloatArray, factor: int, order: int) -> FloatArray:
-    """Return SciPy's spline interpolation of that order at the fine nodes, (K n + 1)^3."""
+def interpolate_spline(coarse: FloatArray, factor: int, order: int) -> FloatArray:
+    """Return SciPy's spline interpolation of a given order at the fine nodes, (K n + 1)^3."""
     field = np.asarray(coarse, np.float32)
-    for _ in range(3):  # takes the first axis and puts its nodes last: three times, all in place
+    for _ in range(3):  # refines the first axis and moves it to the end; after three, all in order
         field = np.tensordot(field, lattice_weights(field.shape[0], factor, order), (0, 1))
     return field
 
 
 @lru_cache(maxsize=8)
 def lattice_weights(n: int, factor: int, order: int) -> FloatArray:
-    """Return the weights of n samples in the K n + 1 nodes of one axis, (K n + 1, n).
+    """Return the matrix that interpolates n samples at the K n + 1 nodes of one axis, (K n + 1, n).
 
-    A spline is linear in the samples and a product over the axes, so this is the interpolation of
-    a whole grid, without the 3 GB of coordinates of a 513^3 lattice. Beyond the outer samples,
-    half a voxel on each side, it continues the last one ("nearest").
+    Spline interpolation is linear in the samples and separable, so one matrix for each axis does
+    it, without the 3 GB of coordinates of a 513^3 lattice. In the half voxel beyond the outer
+    samples, their values are continued ("nearest").
     """
     position = [np.arange(factor * n + 1) / factor - 0.5]
     columns = [
@@ -140,8 +155,8 @@ def lattice_weights(n: int, factor: int, order: int) -> FloatArray:
 METHODS: dict[str, Method] = {
     "mc": partial(coarse_surface, table="lorensen"),
     "mc-lewiner": partial(coarse_surface, table="lewiner"),
-    "trilinear": partial(upsampled_surface, order=1),
-    "bspline": partial(upsampled_surface, order=3),
+    "trilinear": partial(spline_surface, order=1),
+    "bspline": partial(spline_surface, order=3),
     "ours": our_surface,
     "bound": bound_surface,
 }

@@ -1,7 +1,7 @@
-"""The quality measures that NMC, NDC, VoroMesh and PoNQ share: arrays in, numbers out.
+"""The quality metrics of NMC, NDC, VoroMesh and PoNQ.
 
-All lengths are in the frame's unit: reference mesh centred on its bounding box, box diagonal 1.
-P are the points drawn from the reference, Q those drawn from the result.
+All lengths are in units of the reference's box diagonal. P are points sampled on the reference, Q
+points sampled on the result.
 
 References
 ----------
@@ -25,44 +25,44 @@ SAMPLE_COUNT = 100_000
 F1_DISTANCE = 0.003
 EDGE_DISTANCE = 0.005
 SHARP_COSINE = np.cos(np.radians(30))
-# A sampled point is an edge point if one this near has a normal turned by more than the angle.
+# A point is an edge point if the normal of another point within this radius differs by more.
 EDGE_RADIUS = 0.004
-# So many of the nearest points are looked at: all within the radius if the area is over 0.1, and
-# a bound on the work if the result is a mere crumb, where all 1e5 points are within the radius.
+# Nearest points that are examined: all within the radius if the area is over 0.1. On a tiny result,
+# with all 1e5 points within the radius, it bounds the work.
 EDGE_NEIGHBOURS = 64
 
 Numbers = dict[str, float | None]
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
-    """Points (n, 3) of a surface and the unit normals (n, 3) of the faces that they lie on."""
+class SurfacePoints:
+    """Points (n, 3) sampled on a surface, and the unit normals (n, 3) of their faces."""
 
     points: Points
     normals: Points
 
 
-# What stands in for a result without a surface; it has no normal.
-DOT = Samples(np.zeros((1, 3)), np.zeros((1, 3)))
-# NC of a point without a normal: the mean of |n.n'| over all directions of n.
+# Stands for a result without a surface; it has no normal.
+DOT = SurfacePoints(np.zeros((1, 3)), np.zeros((1, 3)))
+# NC of a point without a normal: the mean of |n.n'| over all directions n.
 NO_NORMAL_NC = 0.5
 
 
 def normalise(mesh: Mesh) -> Mesh:
-    """Return the mesh, float64, centred on its bounding box and scaled to a diagonal of 1."""
+    """Return a mesh, float64, centred on its bounding box and scaled to a box diagonal of 1."""
     vertices = mesh.vertices.astype(np.float64)
     low, high = vertices.min(0), vertices.max(0)
     return Mesh((vertices - (low + high) / 2) / np.linalg.norm(high - low), mesh.faces)
 
 
 def face_vectors(mesh: Mesh) -> Points:
-    """Return each face's normal times twice its area, (m, 3); outward if counter-clockwise."""
+    """Return the normal of each face times twice its area, (m, 3), outward if counter-clockwise."""
     a, b, c = mesh.vertices[mesh.faces.T]
     return np.cross(b - a, c - a)
 
 
-def sample_surface(mesh: Mesh, seed: tuple[int, int], count: int = SAMPLE_COUNT) -> Samples:
-    """Draw points area-uniformly; a mesh without area gives one dot at the origin."""
+def sample_surface(mesh: Mesh, seed: tuple[int, int], count: int = SAMPLE_COUNT) -> SurfacePoints:
+    """Return points sampled uniformly by area; of a mesh without area, one dot at the origin."""
     vectors = face_vectors(mesh)
     lengths = np.linalg.norm(vectors, axis=1)
     if not lengths.sum() > 0:
@@ -72,18 +72,18 @@ def sample_surface(mesh: Mesh, seed: tuple[int, int], count: int = SAMPLE_COUNT)
     root, v = np.sqrt(random.random(count)), random.random(count)
     weights = np.stack([1 - root, root * (1 - v), root * v], axis=1)  # uniform in the triangle
     points = np.einsum("nk,nkd->nd", weights, mesh.vertices[mesh.faces[face]])
-    return Samples(points, vectors[face] / lengths[face, None])
+    return SurfacePoints(points, vectors[face] / lengths[face, None])
 
 
 def draw_index(weights: Distances, uniform: Distances) -> NDArray[np.intp]:
-    """Turn numbers of [0, 1), (n,), into indices drawn in proportion to the weights, (m,)."""
+    """Return indices (n,) drawn in proportion to weights (m,), from numbers in [0, 1), (n,)."""
     cumulative = np.cumsum(weights)
     index = np.searchsorted(cumulative, uniform * cumulative[-1], side="right")
     return np.minimum(index, np.flatnonzero(weights)[-1])  # rounding may reach past the last one
 
 
-def compare_samples(reference: Samples, result: Samples) -> Numbers:
-    """Return CD (squared, summed), F1 with recall and precision at 0.003, NC and signed NC."""
+def compare_samples(reference: SurfacePoints, result: SurfacePoints) -> Numbers:
+    """Return CD (sum of mean squares), F1, recall and precision at 0.003, NC and signed NC."""
     there, there_at = cKDTree(result.points).query(reference.points)
     back, back_at = cKDTree(reference.points).query(result.points)
     there_nc = normal_agreement(reference.normals, result.normals[there_at])
@@ -107,18 +107,18 @@ def normal_agreement(normals: Points, others: Points) -> tuple[float, float]:
 
 
 def harmonic_mean(recall: float, precision: float) -> float:
-    """Return 2rp/(r + p), and 0 if both are 0."""
+    """Return 2rp/(r + p), 0 if both are 0."""
     total = recall + precision
     return float(2 * recall * precision / total) if total > 0 else 0.0
 
 
 def compare_surfaces(
-    reference: Solid, result: Mesh, drawn: Samples, result_drawn: Samples
+    reference: Solid, result: Mesh, drawn: SurfacePoints, result_drawn: SurfacePoints
 ) -> Numbers:
     """Return exact point-to-triangle distances: mean, 99th percentile and maximum, both ways.
 
-    ``drawn`` and ``result_drawn`` are P and Q. "there" is from P to the result's triangles, "back"
-    from Q to the reference's; the figure without a direction is their mean, or the larger maximum.
+    ``drawn`` is P, ``result_drawn`` Q. "there" is from P to the result's triangles, "back" from Q
+    to the reference's. Figures without a direction are the mean of both, or the larger maximum.
     """
     there = distance_or_dot(Solid(result), drawn.points)
     back = distance_or_dot(reference, result_drawn.points)
@@ -137,20 +137,21 @@ def compare_surfaces(
 
 
 def distance_or_dot(solid: Solid, points: Points) -> Distances:
-    """Return each point's distance to the mesh, (n,), or to the origin if it has no faces."""
+    """Return the distances of points to a mesh, (n,), or to the origin if it has no faces."""
     if not len(solid.mesh.faces):
-        distances: Distances = np.linalg.norm(points, axis=1)
-        return distances
-    found = solid.distance(points)
-    if not np.isfinite(found).all():
-        raise ValueError(f"{np.sum(~np.isfinite(found))} point-to-triangle distances not finite")
-    return found
+        radii: Distances = np.linalg.norm(points, axis=1)
+        return radii
+    distances = solid.distance(points)
+    if not np.isfinite(distances).all():
+        count = np.sum(~np.isfinite(distances))
+        raise ValueError(f"{count} point-to-triangle distances are not finite")
+    return distances
 
 
 def sample_edges(
     vertices: Points, edges: IntArray, seed: tuple[int, int], count: int = SAMPLE_COUNT
 ) -> Points:
-    """Draw points, (count, 3), length-uniformly from edges, (e, 2); (0, 3) if there is none."""
+    """Return points (count, 3) sampled uniformly by length on edges (e, 2); none without edges."""
     ends = vertices[edges]  # (e, 2, 3)
     if not len(ends):
         return np.zeros((0, 3))
@@ -161,7 +162,7 @@ def sample_edges(
 
 
 def sharp_edges(mesh: Mesh) -> IntArray:
-    """Return the edges of exactly two faces whose normals differ by over 30 degrees, (e, 2)."""
+    """Return the edges (e, 2) of exactly two faces whose normals differ by over 30 degrees."""
     vectors = face_vectors(mesh)
     lengths = np.linalg.norm(vectors, axis=1)
     edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
@@ -175,14 +176,15 @@ def sharp_edges(mesh: Mesh) -> IntArray:
     return edges[pairs[whole & (dot < SHARP_COSINE * lengths[one] * lengths[other]), 0]]
 
 
-def edge_points(samples: Samples) -> Points:
-    """Return the sampled points, (k, 3), that lie near a sharp edge.
+def edge_points(drawn: SurfacePoints) -> Points:
+    """Return the points (k, 3) that lie near a sharp edge.
 
-    As in NMC, NDC and PoNQ: the points with another one nearby whose normal is turned, up or
-    down, so that the two sides of a thin sheet are no edge. The angle is that of `sharp_edges`.
+    As in NMC, NDC and PoNQ, these are the points with another one nearby whose normal differs by
+    more than the angle of `sharp_edges`, whatever its sign: the two sides of a thin sheet are no
+    edge.
     """
-    points, normals = samples.points, samples.normals
-    # A row's missing neighbours get the index n: itself is put there, which is no edge.
+    points, normals = drawn.points, drawn.normals
+    # Missing neighbours have the index n; the point itself replaces them, which is no edge.
     nearby = cKDTree(points).query(points, EDGE_NEIGHBOURS, distance_upper_bound=EDGE_RADIUS)[1]
     nearby = np.where(nearby == len(points), np.arange(len(points))[:, None], nearby)
     turned = np.zeros(len(points), bool)
@@ -192,12 +194,17 @@ def edge_points(samples: Samples) -> Points:
 
 
 def compare_edges(vertices: Points, edges: IntArray, drawn: Points, result: Points) -> Numbers:
-    """Return ECD (squared, summed) and EF1 at 0.005 of a result's edge points, (k, 3).
+    """Return ECD (sum of mean squares) and EF1 at 0.005, both None without edges.
 
-    The reference is given by its vertices, its sharp edges (e, 2) and points drawn from them. The
-    distance to it is exact: a search among points is slow where many are equally far, as those of
-    a circle are from its axis. None where the reference has no sharp edge; a result without any
-    is a dot at the origin.
+    Parameters
+    ----------
+    vertices, edges : (n, 3) float, (e, 2) int
+        Sharp edges of the reference. The distance to them is exact: a search among points is slow
+        where many are equally far, as those of a circle are from its axis.
+    drawn : (m, 3) float
+        Points sampled on these edges.
+    result : (k, 3) float
+        Edge points of the result; if there are none, a dot at the origin.
     """
     if not len(edges):
         return {"ecd": None, "ef1": None}

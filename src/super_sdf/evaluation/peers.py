@@ -1,6 +1,6 @@
 """Other people's methods, where their packages are installed (extra ``peers``).
 
-They take minutes a shape and no factor: each makes what surface it likes from the samples.
+They take minutes per shape, and no factor: the samples alone decide the result's resolution.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def samples_of(grid: SdfGrid) -> Points:
 
 
 def reach_for_the_arcs(case: Case, network: Decoder) -> Surface:
-    """Mesh the grid with Reach for the Arcs (Sellán et al. 2024), its defaults."""
+    """Mesh the grid with Reach for the Arcs (Sellán et al. 2024), with its defaults."""
     from gpytoolbox import reach_for_the_arcs
 
     points = samples_of(case.grid)
@@ -36,7 +36,7 @@ def dual_contouring(case: Case, network: Decoder) -> Surface:
     from gpytoolbox import dual_contouring_of_signed_distance_data
 
     shape = case.grid.shape
-    order = np.arange(np.prod(shape)).reshape(shape).ravel(order="F")  # i runs fastest there
+    order = np.arange(np.prod(shape)).reshape(shape).ravel(order="F")  # there i varies fastest
     values = np.ravel(case.grid.values).astype(np.float64)[order]
     vertices, quads = dual_contouring_of_signed_distance_data(
         values, samples_of(case.grid)[order], *shape

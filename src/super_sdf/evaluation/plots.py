@@ -1,4 +1,4 @@
-"""Plots of the tables: error against resolution, distribution over shapes, quality against time."""
+"""Plots: quality by resolution, its distribution over the shapes, quality against time."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from matplotlib.ticker import MaxNLocator
 
 from ..files.output import replacing
 from .folder import make_folder
-from .measuring import FLOOR, OURS, Row
-from .tables import LABELS, mean_of
+from .measuring import Measurement
+from .names import FLOOR, LABELS, OURS
+from .tables import mean_of
 
-Results = Mapping[int, Mapping[str, Sequence[Row]]]
-"""Rows by size and method."""
+BySize = Mapping[int, Mapping[str, Sequence[Measurement]]]
+"""Measurements by size of the grid and method."""
 
-# What is drawn. Colour-blind safe (Okabe and Ito); ours stands out.
+# The methods that are drawn, in colours that the colour-blind can tell apart (Okabe and Ito).
 COLOURS = {
     "mc": "#777777",
     "trilinear": "#56b4e9",
@@ -33,7 +34,7 @@ MEASURES = (
 )
 
 
-def draw_plots(by_size: Results, folder: Path) -> dict[str, str]:
+def draw_plots(by_size: BySize, folder: Path) -> dict[str, str]:
     """Draw all plots into a folder; return their titles by file name."""
     make_folder(folder)
     plots = {
@@ -47,14 +48,14 @@ def draw_plots(by_size: Results, folder: Path) -> dict[str, str]:
     return {name: title for name, (title, _) in plots.items()}
 
 
-def draw_resolution(by_size: Results) -> Figure:
+def draw_resolution(by_size: BySize) -> Figure:
     """Draw the mean of each measure against the size of the grid."""
     figure, axes = make_axes(len(MEASURES))
     sizes = list(by_size)
     for ax, (key, title) in zip(axes, MEASURES):
         for method in drawn(by_size):
             means = [mean_of(by_size[size][method], key) for size in sizes]
-            if key != "p2s" or method != FLOOR:  # that is 0, which a logarithm does not show
+            if key != "p2s" or method != FLOOR:  # 0, which a logarithmic axis cannot show
                 ax.plot(sizes, means, "o-", color=COLOURS[method], label=LABELS[method])
         ax.set(xscale="log", xlabel="samples along an axis", title=title)
         ax.set_xticks(sizes, [str(size) for size in sizes])
@@ -63,8 +64,8 @@ def draw_resolution(by_size: Results) -> Figure:
     return with_legend(figure, axes[1])
 
 
-def draw_distribution(by_size: Results) -> Figure:
-    """Draw the F1 of every shape, worst first, a curve a method."""
+def draw_distribution(by_size: BySize) -> Figure:
+    """Draw the F1 of every shape, worst first, with a curve for each method."""
     figure, axes = make_axes(len(by_size))
     for ax, (size, by_method) in zip(axes, by_size.items()):
         for method in drawn(by_size):
@@ -77,8 +78,8 @@ def draw_distribution(by_size: Results) -> Figure:
     return with_legend(figure, axes[0])
 
 
-def draw_time(by_size: Results) -> Figure:
-    """Draw mean F1 against mean seconds, a curve a method, a point a size."""
+def draw_time(by_size: BySize) -> Figure:
+    """Draw mean F1 against mean seconds: a curve for each method, a point for each size."""
     figure, axes = make_axes(1)
     for method in [name for name in drawn(by_size) if name not in (FLOOR, "bound")]:
         points = [
@@ -100,13 +101,13 @@ def draw_time(by_size: Results) -> Figure:
     return with_legend(figure, axes[0])
 
 
-def drawn(by_size: Results) -> list[str]:
-    """Return the methods that are drawn: the two tables of marching cubes would hide each other."""
+def drawn(by_size: BySize) -> list[str]:
+    """Return the methods that are drawn; Lewiner's table would hide the other marching cubes."""
     return [name for name in next(iter(by_size.values())) if name in COLOURS]
 
 
 def make_axes(count: int) -> tuple[Figure, Sequence[Any]]:
-    """Return a figure with so many plots beside each other."""
+    """Return a figure with ``count`` plots side by side, and their axes."""
     figure = Figure(figsize=(max(4.2 * count, 7), 5.2), layout="constrained")
     axes = figure.subplots(1, count, squeeze=False)[0]
     for ax in axes:
@@ -115,7 +116,7 @@ def make_axes(count: int) -> tuple[Figure, Sequence[Any]]:
 
 
 def with_legend(figure: Figure, ax: Any) -> Figure:
-    """Put one legend under all plots of a figure."""
+    """Put one legend below all plots of a figure; return the figure."""
     figure.legend(
         *ax.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False
     )

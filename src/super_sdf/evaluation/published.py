@@ -1,6 +1,6 @@
-"""What others have printed, to be read beside what is measured here, on other shapes.
+"""Published figures, to compare with; they are of other shapes.
 
-The shapes are Thingi30, 30 of Thingi10K, in the same frame and under the same protocol. CD x1e5.
+The shapes are Thingi30, 30 of Thingi10K, normalised and measured in the same way. CD x1e5.
 
 References
 ----------
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 PAPER = "SUPER-SDF (paper)"
 
-# Table 3: CD x1e5, F1, NC by size and method. A key that is one of ours names the same method.
+# Table 3: CD x1e5, F1, NC by size and method. A name that our tables use, too, is the same method.
 SURFACES: dict[int, dict[str, tuple[float, float, float]]] = {
     32: {
         "MC": (9.124, 0.606, 0.905),
@@ -87,7 +87,7 @@ SCALED: dict[tuple[float, int], tuple[float, float, float]] = {
     (0.75, 128): (0.636, 0.939, 0.989),
 }
 
-# Table 2: seconds a shape, mean, least and most; the paper's and PoNQ on an RTX 3080.
+# Table 2: seconds per shape: mean, minimum, maximum; the paper's and PoNQ on an RTX 3080.
 SECONDS: dict[int, dict[str, tuple[float, float, float]]] = {
     32: {
         "MES": (185.464, 38.121, 1475.907),
@@ -107,7 +107,7 @@ SECONDS: dict[int, dict[str, tuple[float, float, float]]] = {
     },
 }
 
-# Fig. 9, a curve without figures.
+# Fig. 9, a plot without numbers.
 FACTORS = (
     "The paper (Fig. 9, one shape, 32^3): best at 4, slightly worse in CD and NC at 8 and at 16."
 )

@@ -12,21 +12,21 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ..errors import SuperSdfError
-from ..evaluation import experiment_tables
 from ..machine.extras import how_to_install
 from ..mesh import Mesh
 from ..network.network import load_network
 from ..pictures.rendering import Panel, can_render, render_panels, vertex_errors
+from . import experiment_tables
 from .cases import Case, Setting, Shape
 from .folder import REPORT, SHAPES, make_folder, write_page
-from .measuring import OURS, Row
+from .measuring import Measurement
 from .methods import METHODS
+from .names import LABELS, OURS
 from .plots import draw_plots
 from .results import Results
 from .tables import (
     COST,
     EF1,
-    LABELS,
     SHORT,
     cost_table,
     empty_lines,
@@ -39,61 +39,66 @@ from .tables import (
 )
 from .timing import describe_machine
 
-EXTREMES = 5  # best shapes shown, and worst
-ERROR_TOP = 0.25  # of a voxel: the end of the colour bar in the pictures
+EXTREMES = 5  # number of best shapes shown, and of worst
+ERROR_TOP = 0.25  # upper end of the colour bar in the pictures, in voxels
 PROTOCOL_LINES = """\
-Lengths are in units of the reference's box diagonal. 100,000 points are drawn from each surface; CD
+Lengths are in units of the reference's box diagonal. 100,000 points are sampled on each surface; CD
 is the sum of the mean squared distances both ways, F1 at 0.003, NC the normal consistency. p2s is
-the mean exact distance from point to triangle, of both directions ("ref to res", "res to ref");
-ECD and EF1 (at 0.005) compare sharp edges. Field errors are those at the fine nodes of the band.
-The bound is marching cubes of the true distance at the same nodes; the floor is what two perfect
-samplings of the reference score. A result without a surface counts as a dot at the origin; a shape
-that a method failed on is left out of that table for all methods, and named. Published rows are of
+the mean exact point-to-triangle distance of both directions ("ref to res", "res to ref"); ECD and
+EF1 (at 0.005) compare sharp edges. Field errors are those at the fine nodes of the band. The bound
+is marching cubes of the true distances at the same nodes; the floor compares two independent
+samplings of the reference. A result without a surface counts as a dot at the origin; a shape on
+which a method failed is left out of that table for all methods, and named. Published rows are of
 other shapes (Thingi30)."""
 
 
 def write_report(
-    results: Results, out: Path, timings: Mapping[int, Sequence[Row]], *, up: str, pictures: bool
+    results: Results,
+    out: Path,
+    timings: Mapping[int, Sequence[Measurement]],
+    *,
+    up: str,
+    pictures: bool,
 ) -> Path:
-    """Write report.md, shapes.md, plots and pictures; return the path of the report.
+    """Write report.md, shapes.md, plots and pictures; return the path of report.md.
 
     Parameters
     ----------
     results : Results
-        What was measured.
+        The measurements.
     out : Path
-        A folder.
-    timings : rows by size
-        Of whole processes; empty if they were not asked for.
+        The folder of the report.
+    timings : measurements by size
+        Of whole processes; empty if not asked for.
     up : {"x", "y", "z"}
         The axis that points up in the pictures.
     pictures : bool
-        Whether the best and the worst shapes are drawn.
+        Whether to draw the best and the worst shapes.
     """
-    plan = results.plan
+    scope = results.scope
     sections = [title_section(results)]
-    sections += [size_section(results, setting) for setting in plan.settings()]
+    sections += [size_section(results, setting) for setting in scope.settings()]
     tables = experiment_tables.SECTIONS
-    sections += [tables[name](results) for name in plan.experiments if name in tables]
-    sections += [peer_section(results)] if plan.peers else []
+    sections += [tables[name](results) for name in scope.experiments if name in tables]
+    sections += [peer_section(results)] if scope.peers else []
     sections += [experiment_tables.timing_section(timings)] if timings else []
     sections += [cost_section(results), plot_section(results, out)]
-    sections += [picture_section(results, out, up)] if pictures and OURS in plan.methods else []
-    shapes = [f"## {s.size}^3\n\n{shape_table(results.by_method(s))}" for s in plan.settings()]
+    sections += [picture_section(results, out, up)] if pictures and OURS in scope.methods else []
+    shapes = [f"## {s.size}^3\n\n{shape_table(results.by_method(s))}" for s in scope.settings()]
     write_page(out / SHAPES, "\n\n".join(shapes) + "\n")
     text = "\n\n".join(filter(None, [*sections, note_section(results)])) + "\n"
     return write_page(out / REPORT, text)
 
 
 def title_section(results: Results) -> str:
-    """Return what was measured, how, and what could not be."""
+    """Return the title, the protocol, and what could not be measured."""
     lines = [f"# Quality of super-sdf on {len(results.floors)} shapes", PROTOCOL_LINES]
     lines += [f"Left out, {entry.shape}: {entry.reason}." for entry in results.left_out]
     return "\n\n".join(lines)
 
 
 def note_section(results: Results) -> str:
-    """Return what is odd about the shapes themselves."""
+    """Return notes on flaws of the shapes themselves."""
     lines = [
         f"- {row['shape']}: {'; '.join(row['notes'])}."
         for row in results.floors.values()
@@ -103,7 +108,7 @@ def note_section(results: Results) -> str:
 
 
 def size_section(results: Results, setting: Setting) -> str:
-    """Return all that is said of the quality at one size."""
+    """Return the section on the quality at one size."""
     by_method = results.by_method(setting)
     lines = [win_line(by_method), gap_line(by_method), *empty_lines(by_method)]
     title = f"## {setting.size}^3, factor {setting.factor}"
@@ -111,11 +116,11 @@ def size_section(results: Results, setting: Setting) -> str:
 
 
 def peer_section(results: Results) -> str:
-    """Return the peers beside ours, each on the shapes that it finished."""
-    plan, rows = results.plan, []
-    setting, paths = Setting(plan.peer_size), plan.peer_paths()
+    """Return the section on the peers, each on the shapes that it finished."""
+    scope, rows = results.scope, []
+    setting, paths = Setting(scope.peer_size), scope.peer_paths()
     columns = (*SHORT, EF1, *COST)
-    for name in ("mc", "bspline", OURS, *plan.peers):
+    for name in ("mc", "bspline", OURS, *scope.peers):
         done = results.rows(setting, name, paths)
         closed = f"{sum(row['closed'] for row in done)} of {len(done)}"
         finished = f"{len(done)} of {len(results.names(paths))}"
@@ -123,43 +128,44 @@ def peer_section(results: Results) -> str:
     titles = ["method", *(column.title for column in columns), "closed", "finished"]
     failed = [
         f"{LABELS[name]}, {row['shape']}: {row['error']}."
-        for name in plan.peers
+        for name in scope.peers
         for row in results.out_of_time(setting, name, paths)
     ]
-    title = f"## Peers, {plan.peer_size}^3, {len(results.names(paths))} shapes"
+    title = f"## Peers, {scope.peer_size}^3, {len(results.names(paths))} shapes"
     return "\n\n".join([title, markdown(titles, rows), *failed])
 
 
 def cost_section(results: Results) -> str:
-    """Return time and memory of making each mesh, from grid to mesh in memory."""
-    names = [name for name in results.plan.methods if name != "bound"]  # nobody could run that
+    """Return the section on time and memory, from the grid in memory to the mesh in memory."""
+    names = [name for name in results.scope.methods if name != "bound"]  # it needs the truth
     tables = [
         f"**{setting.size}^3**\n\n"
         + cost_table({LABELS[name]: results.rows(setting, name) for name in names})
-        for setting in results.plan.settings()
+        for setting in results.scope.settings()
     ]
-    jobs = results.plan.jobs
-    said = (
+    jobs = results.scope.jobs
+    text = (
         f"From the samples in memory to the mesh in memory, {jobs} at a time on one machine, the "
-        f"network with {results.plan.threads or 'all'} threads: to compare methods, not to quote. "
-        "The peak is what was held beyond what was held before."
+        f"network with {results.scope.threads or 'all'} threads: to compare methods, not to quote. "
+        "The peak is what the process held beyond what it held before."
     )
-    return "\n\n".join(["## Time and memory", describe_machine(), said, *tables])
+    return "\n\n".join(["## Time and memory", describe_machine(), text, *tables])
 
 
 def plot_section(results: Results, out: Path) -> str:
-    """Draw the plots and return where they are shown."""
-    by_size = {setting.size: results.by_method(setting) for setting in results.plan.settings()}
+    """Draw the plots; return the section that shows them."""
+    by_size = {setting.size: results.by_method(setting) for setting in results.scope.settings()}
     titles = draw_plots(by_size, out / "plots")
     return "\n\n".join(["## Plots", *(f"![{text}](plots/{name})" for name, text in titles.items())])
 
 
 def picture_section(results: Results, out: Path, up: str) -> str:
-    """Draw the shapes on which ours is best and worst, and return where they are shown.
+    """Draw the shapes on which ours is best and worst; return the section that shows them.
 
-    By F1 over the floor's, which is low where 100,000 points lie far apart: on large surfaces.
+    They are ranked by F1 over the floor's F1, which is low on large surfaces: there 100,000 points
+    are far apart.
     """
-    setting, floors = results.plan.settings()[0], results.floors
+    setting, floors = results.scope.settings()[0], results.floors
     ranked = results.rows(setting, OURS)
     ranked.sort(key=lambda row: row["f1"] / floors[row["shape"]]["f1"], reverse=True)
     if not ranked:
@@ -168,7 +174,7 @@ def picture_section(results: Results, out: Path, up: str) -> str:
     title = extremes_title(len(ranked), setting)
     if not can_render():
         return f"{title}\n\nNot drawn: PyVista is not installed ({how_to_install('view')})."
-    paths = {path.stem: path for path in results.plan.paths}
+    paths = {path.stem: path for path in results.scope.paths}
     lines, folder = [title], make_folder(out / "pictures")
     for row in shown:
         picture = folder / f"{row['shape']}.png"
@@ -177,15 +183,15 @@ def picture_section(results: Results, out: Path, up: str) -> str:
             f"**{row['shape']}**, F1 {row['f1']:.3f} (floor {floor:.3f}), NC {row['nc']:.3f}"
         )
         try:
-            draw_shape(paths[row["shape"]], setting, results.plan.model, picture, up)
+            draw_shape(paths[row["shape"]], setting, results.scope.model, picture, up)
             lines.append(f"![{row['shape']}](pictures/{picture.name})")
-        except SuperSdfError as problem:  # the tables are worth more than a picture
+        except SuperSdfError as problem:  # the tables matter more than a picture
             lines.append(f"Not drawn: {problem}.")
     return "\n\n".join(lines)
 
 
 def extremes_title(count: int, setting: Setting) -> str:
-    """Return the heading of the pictures: all shapes if there are few, best first."""
+    """Return the heading of the pictures, which show all shapes if there are few."""
     if count == 1:
         return f"## The shape at {setting.size}^3"
     if count < 2 * EXTREMES:
@@ -197,7 +203,7 @@ def extremes_title(count: int, setting: Setting) -> str:
 
 
 def draw_shape(path: Path, setting: Setting, model: str, target: Path, up: str) -> None:
-    """Draw coarse marching cubes, ours, the reference, and ours coloured by its error."""
+    """Draw a picture of coarse marching cubes, ours, the reference, and the error of ours."""
     shape = Shape.read(path)
     case = Case(shape, setting)
     network = load_network(model, device="cpu")
@@ -219,5 +225,5 @@ def draw_shape(path: Path, setting: Setting, model: str, target: Path, up: str) 
 
 
 def titled(mesh: Mesh, title: str) -> str:
-    """Return a panel's title, which says so if there is nothing below it."""
+    """Return the title of a panel, which says so if the mesh is empty."""
     return title if len(mesh.faces) else f"{title}: no surface"

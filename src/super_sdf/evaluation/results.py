@@ -1,7 +1,7 @@
-"""The rows of a plan as the tables want them: by setting and method, in the order of the shapes.
+"""The measurements of a scope, by setting and method, in the order of the shapes.
 
-A failure is no score, and methods are compared on the same shapes: a shape of which a method could
-not be measured in a setting is left out of that setting's tables for all methods, and named.
+A failure is not a score, and methods are compared on the same shapes: if a method failed on a shape
+in a setting, the shape is left out of that setting's tables for all methods, and named.
 """
 
 from __future__ import annotations
@@ -10,35 +10,41 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from .cases import Setting
-from .measuring import FLOOR, NO_SETTING, Row, Task
-from .plan import Plan
+from .measuring import NO_SETTING, Measurement, Task
+from .names import FLOOR
 from .runner import LeftOut
+from .scope import Scope
 from .store import Store
 
 
 class Results:
-    """The rows of a plan, shape by shape.
+    """The measurements of a scope.
 
     Attributes
     ----------
-    left_out : shapes that could not be measured at all, and those that failed somewhere
-    floors : the row of the reference against itself, by shape; only shapes that have it count
+    left_out : list of LeftOut
+        Shapes that could not be measured at all, or failed in some setting.
+    failed : dict of sets
+        The names of the shapes that failed, by setting.
+    floors : dict of measurements
+        The reference against itself, by shape; shapes without it are in no table.
     """
 
     def __init__(
-        self, plan: Plan, tasks: Sequence[Task], store: Store, left_out: Sequence[LeftOut]
+        self, scope: Scope, tasks: Sequence[Task], store: Store, left_out: Sequence[LeftOut]
     ) -> None:
-        self.plan, self.tasks, self.store = plan, tasks, store
+        self.scope, self.tasks, self.store = scope, tasks, store
         failures = list(self._failures(tasks))
-        self.left_out = [*left_out, *(LeftOut(task.path.stem, said) for task, said in failures)]
+        self.left_out = [*left_out, *(LeftOut(task.path.stem, reason) for task, reason in failures)]
         self.failed: dict[Setting, set[str]] = {}
-        for task, _ in (pair for pair in failures if pair[0].limit is None):  # no peer's
-            self.failed.setdefault(task.setting, set()).add(task.path.stem)
-        found = [store.get(task, FLOOR) for task in tasks if FLOOR in task.methods]
-        self.floors = {row["shape"]: row for row in found if row and row["error"] is None}
+        for task, _ in failures:
+            if task.limit is None:  # not of a peer: each is compared on the shapes it finished
+                self.failed.setdefault(task.setting, set()).add(task.path.stem)
+        rows = [store.get(task, FLOOR) for task in tasks if FLOOR in task.methods]
+        self.floors = {row["shape"]: row for row in rows if row and row["error"] is None}
 
     def _failures(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, str]]:
-        """Yield what failed of each task, and why; what ran out of time is in the peers' table."""
+        """Yield each task with failures and why; what ran out of time is in the peers' table."""
         for task in tasks:
             methods: dict[str, list[str]] = {}
             for method in task.methods:
@@ -49,16 +55,16 @@ class Results:
                 yield task, f"{', '.join(names)} ({task.setting}): {reason}"
 
     def names(self, paths: Sequence[Path]) -> list[str]:
-        """Return the names of those shapes among the paths that were measured."""
+        """Return the names of the shapes among the paths that were measured."""
         return [path.stem for path in paths if path.stem in self.floors]
 
-    def rows(self, setting: Setting, method: str, paths: Sequence[Path] = ()) -> list[Row]:
-        """Return a method's rows, in the order of the paths (all shapes unless given).
+    def rows(self, setting: Setting, method: str, paths: Sequence[Path] = ()) -> list[Measurement]:
+        """Return the measurements of a method, in the order of the paths (default: all shapes).
 
-        With the excess CD: what CD is above that of two perfect samplings of the reference.
+        ``excess_cd`` is added: CD less the CD of two samplings of the reference.
         """
         failed = self.failed.get(setting, set())
-        names = [name for name in self.names(paths or self.plan.paths) if name not in failed]
+        names = [name for name in self.names(paths or self.scope.paths) if name not in failed]
         if method == FLOOR:
             setting = NO_SETTING
         return [
@@ -67,21 +73,23 @@ class Results:
             if row["error"] is None
         ]
 
-    def out_of_time(self, setting: Setting, method: str, paths: Sequence[Path]) -> list[Row]:
-        """Return the rows of a method that its limit ended."""
+    def out_of_time(
+        self, setting: Setting, method: str, paths: Sequence[Path]
+    ) -> list[Measurement]:
+        """Return the measurements of a method that its time limit ended."""
         rows = self._rows(setting, method, self.names(paths))
         return [row for row in rows if row["error"] is not None and row.get("limit") is not None]
 
-    def _rows(self, setting: Setting, method: str, names: Sequence[str]) -> list[Row]:
-        """Return the rows of the shapes named that are in the store."""
+    def _rows(self, setting: Setting, method: str, names: Sequence[str]) -> list[Measurement]:
+        """Return the measurements of the named shapes that are in the store."""
         tasks = {
             task.path.stem: task
             for task in self.tasks
             if task.setting == setting and method in task.methods
         }
-        found = [self.store.get(tasks[name], method) for name in names if name in tasks]
-        return [row for row in found if row is not None]
+        rows = [self.store.get(tasks[name], method) for name in names if name in tasks]
+        return [row for row in rows if row is not None]
 
-    def by_method(self, setting: Setting) -> dict[str, list[Row]]:
-        """Return the rows of each method of the main table, the floor last."""
-        return {name: self.rows(setting, name) for name in (*self.plan.methods, FLOOR)}
+    def by_method(self, setting: Setting) -> dict[str, list[Measurement]]:
+        """Return the measurements of each method of the main table, the floor last."""
+        return {name: self.rows(setting, name) for name in (*self.scope.methods, FLOOR)}

@@ -1,34 +1,25 @@
-"""Processes that measure.
+"""Runs the tasks of an evaluation, each in a process of its own.
 
-Each task runs in a process of its own, so that one that crashes, runs out of memory or out of time
-takes nothing with it.
+So a task that crashes, or runs out of memory or time, harms no other, and its memory is its own.
 """
 
 from __future__ import annotations
 
 import multiprocessing
-import signal
-import time
+from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass, replace
-from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-from . import measuring
+from ..machine.pool import Death, Pool, PoolOptions
+from ..machine.serving import ClockStarted, Tell, Work
 from .cases import Shape
-from .measuring import Row, Task, failed_row, measure_task, reason_of
+from .measuring import Measurement, Task, failed_row, measure_task, reason_of
 from .store import Store
 
-READ = "read"  # what a process sends once it has its shape
-GRACE = 10.0  # seconds that a process has to end after its last row
-POLL = 0.5  # seconds between looks at the clock where there is a limit
-# Modules that every task wants, loaded once: processes are then forked in milliseconds.
-PRELOAD = [measuring.__name__]
-
-Progress = Callable[[int, int, Task, float], None]
-"""Called with (tasks done, tasks in all, the task just done, the share of the work done)."""
+OnTask = Callable[[int, int, str, float], None]
+"""Called after each task: (tasks done, tasks in all, name of the task, share of the work done)."""
 
 
 @dataclass(frozen=True)
@@ -39,163 +30,129 @@ class LeftOut:
     reason: str
 
 
-Found = tuple[Task, Row | LeftOut | None]
-"""A row of a task, why its shape is left out, or None after the last of a task."""
+Result = tuple[Task, Measurement | LeftOut | None]
+"""A row of a task; or why its shape is left out; or None when the task is finished."""
 
 
-@dataclass(eq=False)
-class Running:
-    """A task under way: its process, the pipe that its rows come by, what it has still to send.
+def prepare() -> Work:
+    """Return what works at a task: each worker process calls this once."""
+    return work
 
-    ``began`` is when it had read its shape; the limit counts from there.
+
+def work(task: Task, tell: Tell) -> LeftOut | None:
+    """Read a task's shape and tell a row for each method; return why the shape is left out, if so.
+
+    The time limit counts from when the shape was read.
     """
-
-    task: Task
-    process: BaseProcess
-    rows: Connection
-    owed: list[str]
-    began: float | None = None
-
-    def is_late(self) -> bool:
-        """Say whether its time is over."""
-        if self.began is None or self.task.limit is None:
-            return False
-        return time.monotonic() - self.began > self.task.limit
-
-    def end(self) -> None:
-        """End the process, if it has not ended."""
-        self.process.kill()
-        self.process.join()
-        self.rows.close()
+    try:
+        shape = Shape.read(task.path)
+    except Exception as problem:  # the other shapes still count
+        return LeftOut(task.path.stem, reason_of(problem))
+    tell(ClockStarted())
+    for row in measure_task(task, shape):
+        tell(row)
+    return None
 
 
 class Runner:
-    """Measures tasks, several at a time; iterate over ``results``."""
+    """Measures tasks, several at a time; iterate over ``results``.
+
+    Attributes
+    ----------
+    waiting : deque of Task
+        What is still to be started.
+    started : set of Task
+        The tasks whose shapes were read.
+    unmeasured : dict of lists
+        The methods of each task under way that have no row yet, in the order of measuring.
+    tried : set of Task
+        The tasks whose process died before it had read the shape.
+    left_out : set of Path
+        The shapes that are left out.
+    """
 
     def __init__(self, tasks: Sequence[Task], jobs: int) -> None:
-        self.waiting, self.jobs = list(reversed(tasks)), jobs
-        self.running: dict[Connection, Running] = {}
-        self.left_out: set[Path] = set()
+        self.waiting, self.jobs = deque(tasks), jobs
+        self.started: set[Task] = set()
+        self.unmeasured: dict[Task, list[str]] = {}
         self.tried: set[Task] = set()
-        self.context = make_context()
+        self.left_out: set[Path] = set()
 
-    def results(self) -> Generator[Found, None, None]:
-        """Yield each row as it comes, with None after the last one of a task."""
-        try:
-            while self.waiting or self.running:
-                while self.waiting and len(self.running) < self.jobs:
-                    yield from self._start(self.waiting.pop())
-                for source in wait(list(self.running), POLL):
-                    yield from self._receive(self.running[source])  # type: ignore[index]
-                for late in [entry for entry in self.running.values() if entry.is_late()]:
-                    yield from self._give_up(late, f"over the limit of {late.task.limit:g} s")
-        finally:
-            for entry in self.running.values():
-                entry.process.kill()
+    def results(self) -> Generator[Result, None, None]:
+        """Yield each row as it arrives, and None when a task is finished."""
+        options: PoolOptions[Task] = PoolOptions(
+            time_limit=lambda task: task.limit, start_method=make_context(), is_reused=False
+        )
+        with closing(Pool(self.waiting, prepare, options).results(self.jobs)) as results:
+            for task, result in results:
+                if isinstance(result, ClockStarted):
+                    self.started.add(task)
+                elif isinstance(result, Death):
+                    yield from self._take_death(task, result)
+                elif isinstance(result, LeftOut):
+                    yield from self._leave_out(task, result.reason)
+                elif result is None:
+                    yield task, None
+                else:
+                    self._methods_left(task).remove(result["method"])
+                    yield task, result
 
-    def _start(self, task: Task) -> Iterator[Found]:
-        """Start a process for a task, unless its shape is left out by now."""
-        if task.path in self.left_out:
+    def _methods_left(self, task: Task) -> list[str]:
+        """Return the methods of a task that have no row yet; the first one is under way."""
+        return self.unmeasured.setdefault(task, list(task.methods))
+
+    def _take_death(self, task: Task, death: Death) -> Iterator[Result]:
+        """Yield the failure of the method that was under way; queue the methods after it."""
+        reason = death.cause if death.is_late else f"its process {death.cause}"
+        if task not in self.started:
+            yield from self._try_again(task, f"while it was read {reason}")
+            return
+        methods = self._methods_left(task)
+        if methods:
+            limit = task.limit if death.is_late else None
+            yield task, {**failed_row(task, methods[0], reason), "limit": limit}
+        if methods[1:]:
+            self.waiting.appendleft(replace(task, methods=tuple(methods[1:])))
+        else:
             yield task, None
-            return
-        ours, theirs = self.context.Pipe(duplex=False)
-        process = self.context.Process(target=work, args=(task, theirs), daemon=True)  # type: ignore[attr-defined]
-        try:
-            process.start()
-        except OSError as error:  # no more processes or files, or it was killed in between
-            ours.close()
-            yield from self._try_again(task, f"its process did not start: {error.strerror}")
-        else:
-            self.running[ours] = Running(task, process, ours, list(task.methods))
-        finally:
-            theirs.close()
 
-    def _receive(self, entry: Running) -> Iterator[Found]:
-        """Take what a process has sent; if it ended owing rows, the first of them has failed."""
-        try:
-            found: Row | LeftOut | str = entry.rows.recv()
-        except (EOFError, OSError):  # the latter if it was killed while it sent
-            entry.process.join(GRACE)
-            yield from self._give_up(entry, how_it_ended(entry.process.exitcode))
-            return
-        if isinstance(found, LeftOut):
-            yield from self._leave_out(entry.task, found.reason)
-            entry.owed = []
-        elif isinstance(found, str):
-            entry.began = time.monotonic()
-        else:
-            entry.owed.remove(found["method"])
-            yield entry.task, found
+    def _try_again(self, task: Task, reason: str) -> Iterator[Result]:
+        """Queue a task again whose process died before it had read the shape; but only once.
 
-    def _leave_out(self, task: Task, reason: str) -> Iterator[Found]:
-        """Name the shape of a task as left out, once."""
+        The first time somebody may have killed it. The second time the shape is to blame.
+        """
+        if task in self.tried:
+            yield from self._leave_out(task, reason)
+        else:
+            self.tried.add(task)
+            self.waiting.appendleft(task)
+
+    def _leave_out(self, task: Task, reason: str) -> Iterator[Result]:
+        """Leave out a shape: name it once, and finish this task and those that wait for it."""
         if task.path not in self.left_out:
             self.left_out.add(task.path)
             yield task, LeftOut(task.path.stem, reason)
-
-    def _try_again(self, task: Task, reason: str) -> Iterator[Found]:
-        """Put a task that did not come to its shape back in the queue; the second time, end it.
-
-        Once may be somebody's kill. Twice, it is the shape that no process survives.
-        """
-        if task not in self.tried:
-            self.tried.add(task)
-            self.waiting.append(task)
-            return
-        yield from self._leave_out(task, reason)
-        yield task, None
-
-    def _give_up(self, entry: Running, reason: str) -> Iterator[Found]:
-        """End a task's process; what it owes after the method under way goes back in the queue."""
-        late, task = entry.is_late(), entry.task
-        del self.running[entry.rows]
-        entry.end()
-        if entry.owed and entry.began is None:
-            yield from self._try_again(task, f"while it was read {reason}")
-            return
-        if entry.owed:
-            row = failed_row(task, entry.owed[0], reason)
-            yield task, {**row, "limit": task.limit if late else None}
-        if entry.owed[1:]:
-            self.waiting.append(replace(task, methods=tuple(entry.owed[1:])))
-        else:
-            yield task, None
-
-
-def how_it_ended(code: int | None) -> str:
-    """Say how a process ended that still had to send something."""
-    if code is None or code >= 0:
-        return f"its process ended with exit code {code}"
-    name = signal.Signals(-code).name
-    hint = " (mostly for want of memory)" if name == "SIGKILL" else ""
-    return f"its process died of {name}{hint}"
+        dropped = [other for other in self.waiting if other.path == task.path]
+        for other in dropped:
+            self.waiting.remove(other)
+        for finished in [task, *dropped]:
+            yield finished, None
 
 
 def make_context() -> multiprocessing.context.BaseContext:
-    """Return how processes are started: forked from one that has the modules, where there is."""
+    """Return how processes are started: forked from a server that has this module, where possible.
+
+    A fork takes milliseconds, and there is one for each task.
+    """
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(PRELOAD)
+    context.set_forkserver_preload([__name__])
     return context
 
 
-def work(task: Task, rows: Connection) -> None:
-    """Measure a task in a process of its own; send ``READ`` and rows, or why there are none."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent to handle
-    with suppress(BrokenPipeError):  # nobody listens any more
-        try:
-            shape = Shape.read(task.path)
-        except Exception as problem:  # the other shapes still count
-            rows.send(LeftOut(task.path.stem, reason_of(problem)))
-            return
-        rows.send(READ)
-        for row in measure_task(task, shape):
-            rows.send(row)
-
-
 def missing_tasks(tasks: Sequence[Task], store: Store) -> list[Task]:
-    """Return the tasks with the methods that are not in the store."""
+    """Return the tasks that have methods without a final row in the store, cut to those methods."""
     cut = [
         replace(task, methods=tuple(m for m in task.methods if not store.is_final(task, m)))
         for task in tasks
@@ -209,21 +166,21 @@ def expected_work(task: Task) -> float:
 
 
 def complete(
-    tasks: Sequence[Task], store: Store, jobs: int, progress: Progress | None = None
+    tasks: Sequence[Task], store: Store, jobs: int, on_task: OnTask | None = None
 ) -> list[LeftOut]:
-    """Measure what is not in the store, and keep it; return the shapes that were left out."""
+    """Measure what the store lacks and keep it there; return the shapes that were left out."""
     missing = missing_tasks(tasks, store)
     left_out: list[LeftOut] = []
-    done, work_done, work = 0, 0.0, sum(map(expected_work, missing))
-    with closing(Runner(missing, jobs).results()) as results:  # ends the processes, come what may
-        for task, found in results:
-            if isinstance(found, LeftOut):
-                left_out.append(found)
-            elif found is not None:
-                store.add(found)
+    done, work_done, whole_work = 0, 0.0, sum(map(expected_work, missing))
+    with closing(Runner(missing, jobs).results()) as results:  # that ends the processes
+        for task, result in results:
+            if isinstance(result, LeftOut):
+                left_out.append(result)
+            elif result is not None:
+                store.add(result)
             else:
                 done += 1
                 work_done += expected_work(task)
-                if progress:
-                    progress(done, len(missing), task, work_done / work)
+                if on_task:
+                    on_task(done, len(missing), str(task), work_done / whole_work)
     return left_out

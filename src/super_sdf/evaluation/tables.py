@@ -1,6 +1,6 @@
-"""Tables in Markdown from rows of figures; rows with time and memory apart from the rest.
+"""Markdown tables of measurements; time and memory have tables of their own.
 
-What is measured of quality comes out the same in every run, so its tables do too.
+Quality is the same in every run, so its tables are, too.
 """
 
 from __future__ import annotations
@@ -10,25 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..evaluation import published
-from .measuring import FLOOR, OURS, Row
-
-LABELS = {
-    "mc": "MC",
-    "mc-lewiner": "MC, Lewiner's table",
-    "trilinear": "trilinear + MC",
-    "bspline": "B-spline + MC",
-    OURS: "super-sdf",
-    "bound": "bound: true distance at the nodes",
-    FLOOR: "floor: the reference against itself",
-    "rfta": "RFTA",
-    "dual-contouring": "dual contouring of distances",
-}
+from . import published
+from .measuring import Measurement
+from .names import LABELS, OURS
 
 
 @dataclass(frozen=True)
 class Column:
-    """A figure of the rows, how it is titled, scaled and rounded."""
+    """A column of a table: the figure that it shows, its title, scale and rounding."""
 
     title: str
     key: str
@@ -36,7 +25,7 @@ class Column:
     digits: int = 3
 
     def cell(self, figure: float | None) -> str:
-        """Return a figure as it stands in the table."""
+        """Return a figure as text, "-" if it is unknown."""
         return "-" if figure is None else f"{figure * self.scale:.{self.digits}f}"
 
 
@@ -64,18 +53,18 @@ GAPS = (
     ("NC", "nc"),
     ("excess CD", "excess_cd"),
     ("point-to-surface", "p2s"),
-    ("result to reference only", "p2s_back"),  # one-sided: thin parts that are lost do not count
+    ("result to reference only", "p2s_back"),  # one-sided: lost thin parts do not count
 )
 
 
 def markdown(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table, its first column to the left and the others to the right."""
+    """Return a table with its first column aligned left and the others right."""
     head = [f"| {' | '.join(titles)} |", "| --- " + "| ---: " * (len(titles) - 1) + "|"]
     return "\n".join(head + [f"| {' | '.join(row)} |" for row in rows])
 
 
-def mean_of(rows: Sequence[Row], key: str) -> float | None:
-    """Return the plain mean over the rows that have this figure; of ``..._max`` the greatest."""
+def mean_of(rows: Sequence[Measurement], key: str) -> float | None:
+    """Return the mean of a figure over the rows that have it; of ``..._max`` the maximum."""
     figures = [row[key.removesuffix("_max")] for row in rows]
     figures = [figure for figure in figures if figure is not None]
     if not figures:
@@ -83,25 +72,30 @@ def mean_of(rows: Sequence[Row], key: str) -> float | None:
     return float(max(figures) if key.endswith("_max") else np.mean(figures))
 
 
-def mean_row(label: str, rows: Sequence[Row], columns: Sequence[Column] = SURFACE) -> list[str]:
+def mean_row(
+    label: str, rows: Sequence[Measurement], columns: Sequence[Column] = SURFACE
+) -> list[str]:
     """Return a table's row of means."""
     return [label, *(column.cell(mean_of(rows, column.key)) for column in columns)]
 
 
-def count_row(rows: Sequence[Row]) -> list[str]:
-    """Return how many of the rows are closed, and how many face outward."""
+def count_row(rows: Sequence[Measurement]) -> list[str]:
+    """Return how many of the meshes are closed, and how many face outward."""
     return [f"{sum(row[key] for row in rows)} of {len(rows)}" for key in ("closed", "outward")]
 
 
-def surface_table(by_method: Mapping[str, Sequence[Row]], size: int) -> str:
+def surface_table(by_method: Mapping[str, Sequence[Measurement]], size: int) -> str:
     """Return the main table of one size, the published rows below ours."""
-    rows = [mean_row(LABELS[name], found) + count_row(found) for name, found in by_method.items()]
+    rows = [
+        mean_row(LABELS[name], measured) + count_row(measured)
+        for name, measured in by_method.items()
+    ]
     titles = ["method", *(column.title for column in SURFACE), "closed", "outward"]
     return markdown(titles, rows + published_rows(size))
 
 
 def published_rows(size: int) -> list[list[str]]:
-    """Return what is printed of others at this size, marked so; "-" where it was not given."""
+    """Return the published rows of a size, marked as such; "-" where a figure is not given."""
     rows = []
     for name, (cd, f1, nc) in published.SURFACES.get(size, {}).items():
         mse, mae = published.FIELDS[size].get(name, (None, None))
@@ -111,27 +105,27 @@ def published_rows(size: int) -> list[list[str]]:
     return rows
 
 
-def shape_table(by_method: Mapping[str, Sequence[Row]]) -> str:
-    """Return a table with a row for each shape and method."""
+def shape_table(by_method: Mapping[str, Sequence[Measurement]]) -> str:
+    """Return the table of all shapes, with a row for each shape and method."""
     titles = ["shape, method", *(column.title for column in SURFACE), "closed", "outward"]
     rows = [
         mean_row(f"{row['shape']}, {name}", [row]) + count_row([row])
-        for found in zip(*by_method.values())
-        for name, row in zip(by_method, found)
+        for measured in zip(*by_method.values())
+        for name, row in zip(by_method, measured)
     ]
     return markdown(titles, rows)
 
 
-def cost_table(by_label: Mapping[str, Sequence[Row]]) -> str:
+def cost_table(by_label: Mapping[str, Sequence[Measurement]]) -> str:
     """Return a table of time and memory."""
     titles = ["method", *(column.title for column in COST)]
     return markdown(titles, [mean_row(label, rows, COST) for label, rows in by_label.items()])
 
 
 def gap_closed(
-    ours: Sequence[Row], base: Sequence[Row], bound: Sequence[Row], key: str
+    ours: Sequence[Measurement], base: Sequence[Measurement], bound: Sequence[Measurement], key: str
 ) -> float | None:
-    """Return the share of the way from B-spline to the bound that ours has gone, in the mean."""
+    """Return the share of the gap from B-spline to the bound that ours closes, of the means."""
     figures = [mean_of(rows, key) for rows in (ours, base, bound)]
     if None in figures:
         return None
@@ -140,12 +134,12 @@ def gap_closed(
 
 
 def percent(share: float | None) -> str:
-    """Return a share as it stands in a text."""
+    """Return a share as text in percent, "-" if it is unknown."""
     return "-" if share is None else f"{100 * share:.0f} %"
 
 
-def gap_line(by_method: Mapping[str, Sequence[Row]]) -> str:
-    """Return the gaps closed, if the three methods were measured."""
+def gap_line(by_method: Mapping[str, Sequence[Measurement]]) -> str:
+    """Return a line on the gaps closed, empty unless the three methods were measured."""
     if not {OURS, "bspline", "bound"} <= set(by_method):
         return ""
     three = by_method[OURS], by_method["bspline"], by_method["bound"]
@@ -153,8 +147,8 @@ def gap_line(by_method: Mapping[str, Sequence[Row]]) -> str:
     return f"Gap between B-spline and the bound closed by super-sdf: {', '.join(shares)}."
 
 
-def win_line(by_method: Mapping[str, Sequence[Row]]) -> str:
-    """Return on how many shapes ours has the better F1, and those on which it has not."""
+def win_line(by_method: Mapping[str, Sequence[Measurement]]) -> str:
+    """Return a line on how many shapes ours has the better F1, with the others by name."""
     if not {OURS, "bspline"} <= set(by_method):
         return ""
     pairs = list(zip(by_method[OURS], by_method["bspline"]))
@@ -167,8 +161,8 @@ def win_line(by_method: Mapping[str, Sequence[Row]]) -> str:
     return f"{line} Not on: {', '.join(lost)}." if lost else line
 
 
-def empty_lines(by_method: Mapping[str, Sequence[Row]]) -> list[str]:
-    """Return a line for each method that found no surface in some shapes, with their names."""
+def empty_lines(by_method: Mapping[str, Sequence[Measurement]]) -> list[str]:
+    """Return a line for each method that found no surface on some shapes, with their names."""
     lines = []
     for method, rows in by_method.items():
         names = [row["shape"] for row in rows if not row["faces"]]

@@ -1,4 +1,4 @@
-"""How long the command takes and how much memory, whole processes, start and files included."""
+"""Time and memory of the whole command, including its start and files."""
 
 from __future__ import annotations
 
@@ -17,24 +17,39 @@ import numpy as np
 from ..errors import SuperSdfError
 from ..machine.threads import count_cores
 from .cases import Case, Setting, Shape
-from .measuring import Row
+from .measuring import Measurement
 
 RUNS = 5
-# A process counts as its own peak what its parent held when it was started, so the parent has to be
-# a small one, and it holds the clock.
+# Runs Python with its arguments; prints exit code, seconds, and the peak of memory in bytes. That
+# peak includes what the parent held when it started the process, so the parent has to be small.
+# Windows has no wait4: there the peak is read while the process runs.
 LAUNCHER = """
 import os, sys, time
-start = time.perf_counter()
-child = os.spawnv(os.P_NOWAIT, sys.executable, [sys.executable, *sys.argv[1:]])
-_, status, usage = os.wait4(child, 0)
-seconds = time.perf_counter() - start
+command = [sys.executable, *sys.argv[1:]]
+if hasattr(os, "wait4"):
+    start = time.perf_counter()
+    child = os.spawnv(os.P_NOWAIT, sys.executable, command)
+    _, status, usage = os.wait4(child, 0)
+    seconds, code = time.perf_counter() - start, os.waitstatus_to_exitcode(status)
+    peak = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+else:
+    import psutil, subprocess
+    start, peak = time.perf_counter(), 0
+    child = subprocess.Popen(command)
+    while (code := child.poll()) is None:
+        try:
+            peak = psutil.Process(child.pid).memory_info().peak_wset
+        except psutil.Error:  # it has just ended
+            pass
+        time.sleep(0.005)
+    seconds = time.perf_counter() - start
 print()
-print(os.waitstatus_to_exitcode(status), seconds, usage.ru_maxrss)
+print(code, seconds, peak)
 """
 
 
 def describe_machine() -> str:
-    """Return the processor and the versions that figures of time depend on, in a line."""
+    """Return the processor and the versions that times depend on, in one line."""
     return (
         f"{processor_name()}, {count_cores()} cores, {platform.system()}, Python "
         f"{platform.python_version()}, NumPy {np.__version__}, onnxruntime {version('onnxruntime')}"
@@ -42,7 +57,7 @@ def describe_machine() -> str:
 
 
 def processor_name() -> str:
-    """Return the model of the processor, or its kind where the system does not say."""
+    """Return the model of the processor, or its architecture if the system does not tell."""
     with suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
@@ -51,7 +66,7 @@ def processor_name() -> str:
 
 
 def run_command(words: Sequence[str]) -> tuple[float, float]:
-    """Run ``super-sdf`` once; return seconds and its peak of memory in MB.
+    """Run ``super-sdf`` once; return its seconds and its peak of memory in MB.
 
     Raises
     ------
@@ -63,7 +78,7 @@ def run_command(words: Sequence[str]) -> tuple[float, float]:
 
 
 def run_python(words: Sequence[str]) -> tuple[float, float, str]:
-    """Run Python once with these arguments; return seconds, peak in MB, and what it printed.
+    """Run Python once with these arguments; return seconds, peak in MB, and its output.
 
     Raises
     ------
@@ -76,13 +91,12 @@ def run_python(words: Sequence[str]) -> tuple[float, float, str]:
     code, seconds, peak = last.split()
     if int(code):
         raise SuperSdfError(f"python {' '.join(words)} ended with {code}")
-    kilobyte = 1 if sys.platform == "darwin" else 1024
-    return float(seconds), int(peak) * kilobyte / 1e6, printed
+    return float(seconds), int(peak) / 1e6, printed
 
 
 @contextmanager
 def grid_file(shape: Shape, setting: Setting) -> Iterator[Path]:
-    """Yield a file with a shape's grid, in a folder that is removed afterwards."""
+    """Yield the path of a shape's grid, in a temporary folder."""
     case = Case(shape, setting)
     with tempfile.TemporaryDirectory() as folder:
         grid = Path(folder) / "grid.npz"
@@ -90,12 +104,12 @@ def grid_file(shape: Shape, setting: Setting) -> Iterator[Path]:
         yield grid
 
 
-def time_shape(shape: Shape, setting: Setting, options: Sequence[str] = ()) -> Row:
-    """Time the command on a shape's grid: median seconds of ``RUNS`` after one not counted."""
+def time_shape(shape: Shape, setting: Setting, options: Sequence[str] = ()) -> Measurement:
+    """Return the time of the command on a shape's grid: the median of ``RUNS`` after a warm-up."""
     with grid_file(shape, setting) as grid:
         words = ["upsample", str(grid), str(grid.with_suffix(".ply")), "--force", "--quiet"]
         words += ["--inside", "negative", "--factor", str(setting.factor), *options]
-        run_command(words)  # files into the cache
+        run_command(words)  # warm-up: reads the files into the cache
         runs = [run_command(words) for _ in range(RUNS)]
     seconds, peaks = zip(*runs)
     return {"seconds": statistics.median(seconds), "peak_mb": max(peaks), "error": None}

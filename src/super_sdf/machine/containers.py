@@ -1,6 +1,6 @@
-"""What a Linux control group, as containers are, leaves to this process: memory and cores.
+"""The limits of memory and processor time that a Linux control group sets, as of a container.
 
-Groups lie in each other; each may have bounds, and the tightest counts.
+Control groups are nested; the tightest limit counts. Other systems have none.
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ OWN = Path("/proc/self/cgroup")
 
 
 def left_memory() -> int | None:
-    """Return how many bytes this process may still take, None without a bound.
+    """Return how many bytes this process may still take, None without a limit.
 
-    Files that the system keeps in memory count as taken there, but are let go of when that is
-    short; those not in use are left out, therefore.
+    The kernel counts cached files as used, but drops inactive ones when memory is short, so those
+    are subtracted.
     """
     left = [room for group in groups("memory") if (room := _left_in(group)) is not None]
     return min(left, default=None)
 
 
 def bound_of_cores() -> float:
-    """Return how many cores' time this process may take, infinity without a bound."""
+    """Return how many cores' worth of time this process may use, infinity without a limit."""
     return min(map(_cores_of, groups("cpu")), default=inf)
 
 
 def groups(controller: str) -> Iterator[Path]:
-    """Yield the folders of the groups that this process is in, the innermost first.
+    """Yield the folders of the groups that this process is in, innermost first.
 
-    In a container the path of its group may not be there: what is, is the group itself.
+    In a container the path of the group may not exist: what is mounted there is the group itself.
     """
     with suppress(OSError):
         for line in OWN.read_text().splitlines():
@@ -45,20 +45,20 @@ def groups(controller: str) -> Iterator[Path]:
 
 
 def _left_in(group: Path) -> int | None:
-    """Return what a group leaves, of version 2 or 1; None where there is no bound."""
-    for bound, taken, kept in (
+    """Return the bytes that a group of version 2 or 1 leaves, None without a limit."""
+    for limit_name, used_name, cache_name in (
         ("memory.max", "memory.current", "inactive_file"),
         ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
     ):
-        with suppress(OSError, ValueError):  # of the other version, or its bound is the word "max"
-            limit = int((group / bound).read_text())
-            used = int((group / taken).read_text())
-            return max(limit - max(used - _statistic(group, kept), 0), 0)
+        with suppress(OSError, ValueError):  # of the other version, or the limit is "max"
+            limit = int((group / limit_name).read_text())
+            used = int((group / used_name).read_text())
+            return max(limit - max(used - _statistic(group, cache_name), 0), 0)
     return None
 
 
 def _statistic(group: Path, name: str) -> int:
-    """Return an entry of a group's statistics, 0 if it is not there."""
+    """Return an entry of a group's memory statistics, 0 if there is none of that name."""
     with suppress(OSError, ValueError):
         for line in (group / "memory.stat").read_text().splitlines():
             key, number = line.split()
@@ -68,7 +68,7 @@ def _statistic(group: Path, name: str) -> int:
 
 
 def _cores_of(group: Path) -> float:
-    """Return how many cores' time a group may take, of version 2 or 1."""
+    """Return how many cores' worth of time a group of version 2 or 1 may use."""
     with suppress(OSError, ValueError):  # as above
         quota, period = (group / "cpu.max").read_text().split()
         return int(quota) / int(period)

@@ -1,115 +1,162 @@
-"""Several processes that work at tasks, any of which may die without harm to the others.
+"""A supervised pool of worker processes: any of them may die without harm to the others.
 
-Processes are spawned: that works on every system, and beside the threads of onnxruntime, which a
-fork does not survive. Each is given a task at a time, once it is ready for one, so that who dies is
-known by its task.
+Each worker has a pipe of its own and gets one task at a time, when it is ready for it. So the task
+of a worker that dies is known, and what it was sending when it died harms no other worker.
 """
 
 from __future__ import annotations
 
 import multiprocessing
 import signal
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
-from multiprocessing.context import SpawnProcess
+from multiprocessing.context import BaseContext
+from multiprocessing.process import BaseProcess
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 from ..errors import SuperSdfError
-from .serving import Prepare, Ready, Refusal, ending_signals_blocked, serve
+from .serving import (
+    ClockStarted,
+    Final,
+    Partial,
+    Prepare,
+    PrepareFailed,
+    Ready,
+    ending_signals_blocked,
+    serve,
+)
 
 Task = TypeVar("Task")
-Given = TypeVar("Given", covariant=True)
-MOST_FALSE_STARTS = 5  # processes in a row that end before they are ready
+TaskOut = TypeVar("TaskOut", covariant=True)
+MAX_FAILED_STARTS = 5  # workers in a row that end before they are ready
+EXIT_SECONDS = 10.0  # that a worker has to exit after it closed its pipe
+SPAWN = multiprocessing.get_context("spawn")
 
 
 class Death(NamedTuple):
-    """The answer of a process that ended at its task: how."""
+    """The final result of a task whose worker died, or was killed at the task's time limit."""
 
     cause: str
+    is_late: bool = False
 
 
-class Tasks(Protocol[Given]):
-    """What is to be done, such as a deque; how many, and which, may change with every answer."""
+class Tasks(Protocol[TaskOut]):
+    """A queue of tasks, such as a deque; it may change whenever a result is yielded."""
 
     def __len__(self) -> int:
-        """Return how many tasks may be begun now."""
+        """Return how many tasks can be started now."""
 
-    def popleft(self) -> Given:
-        """Return the next one, which is begun with that."""
+    def popleft(self) -> TaskOut:
+        """Return the next task, which is started then."""
 
 
 @dataclass(eq=False)
 class Worker(Generic[Task]):
-    """A process, the pipe to it, and its task; ``ready`` once it can take one."""
+    """A worker process, the pipe to it, its current task, and when that has to be finished."""
 
-    process: SpawnProcess
+    process: BaseProcess
     pipe: Connection
+    is_ready: bool = False
     task: Task | None = None
-    ready: bool = False
+    deadline: float | None = None
+
+
+@dataclass(frozen=True)
+class PoolOptions(Generic[Task]):
+    """How a pool runs its workers.
+
+    Attributes
+    ----------
+    clean_up : callable
+        Called with a task that was not finished and its worker's process ID, to remove what the
+        worker left behind.
+    time_limit : callable
+        Returns the seconds that a task may take from ``ClockStarted`` on; None: no limit.
+    start_method : multiprocessing context
+        How processes are started. Spawning works on every system and is safe beside the threads of
+        onnxruntime, unlike forking this process.
+    is_reused : bool
+        Whether a worker takes one task after another, or each task gets a process of its own.
+    """
+
+    clean_up: Callable[[Task, int], None] = lambda task, pid: None
+    time_limit: Callable[[Task], float | None] = lambda task: None
+    start_method: BaseContext = SPAWN
+    is_reused: bool = True
 
 
 class Pool(Generic[Task]):
-    """Several processes; iterate over ``results``.
+    """Worker processes that share a queue of tasks.
 
     Parameters
     ----------
     tasks : Tasks
-        What is to be done. A task is taken when a process begins it.
+        The queue. A task is taken from it when a worker starts it.
     prepare : callable
-        Called without arguments in each process, it returns the function that answers a task. Both
-        it and what the function is given and returns go from process to process by pickle.
-    clean : callable
-        Called with a task and the number of the process that ended at it, to remove what it left.
+        Called without arguments in each worker; returns the function that works at a task. Tasks
+        and results are pickled.
+    options : PoolOptions
+        How the workers are run.
     """
 
     def __init__(
-        self, tasks: Tasks[Task], prepare: Prepare, clean: Callable[[Task, int], None]
+        self, tasks: Tasks[Task], prepare: Prepare, options: PoolOptions[Task] | None = None
     ) -> None:
-        self.tasks, self.prepare, self.clean = tasks, prepare, clean
+        self.tasks, self.prepare = tasks, prepare
+        self.options: PoolOptions[Task] = options or PoolOptions()
         self.workers: dict[Connection, Worker[Task]] = {}
-        self.false_starts = 0
+        self.failed_starts = 0
 
-    def results(self, count: int) -> Iterator[tuple[Task, Any]]:
-        """Run the tasks in ``count`` processes; yield each when done, with its answer or a Death.
+    def results(self, count: int) -> Generator[tuple[Task, Any], None, None]:
+        """Run the tasks in ``count`` workers.
+
+        Yields
+        ------
+        task, result
+            The partial results of each task as they arrive, then its final result or a Death.
 
         Raises
         ------
         SuperSdfError
-            If no process can be started, or what ``prepare`` raised.
+            If no worker can be started, or what ``prepare`` raised.
         """
         try:
-            while self._fill(count):
-                for pipe in wait(list(self.workers)):
+            while self._start_workers(count):
+                for pipe in wait(list(self.workers), self._seconds_to_deadline()):
                     yield from self._receive(self.workers[pipe])  # type: ignore[index]
+                yield from self._kill_late_workers()
         finally:
             for worker in list(self.workers.values()):
-                self._end(worker)
+                self._stop(worker)
 
-    def _fill(self, count: int) -> bool:
-        """Start what processes are wanting; say whether there is something to wait for."""
-        while len(self.workers) < count and self._count_loading() < len(self.tasks):
+    def _start_workers(self, count: int) -> bool:
+        """Start the workers that are missing; return whether there is anything to wait for."""
+        while len(self.workers) < count and self._count_preparing() < len(self.tasks):
             try:
-                self._start()
-            except OSError as error:  # too many files, or processes: those that run do the work
+                self._start_worker()
+            except OSError as error:  # too many open files or processes: make do with fewer
                 if not self.workers:
                     raise SuperSdfError(
                         f"no process can be started: {error.strerror}: try --jobs 1"
                     ) from error
                 break
-        busy = any(worker.task is not None for worker in self.workers.values())
-        return busy or len(self.tasks) > 0
+        is_busy = any(worker.task is not None for worker in self.workers.values())
+        return is_busy or len(self.tasks) > 0
 
-    def _count_loading(self) -> int:
-        return sum(not worker.ready for worker in self.workers.values())
+    def _count_preparing(self) -> int:
+        return sum(not worker.is_ready for worker in self.workers.values())
 
-    def _start(self) -> None:
-        context = multiprocessing.get_context("spawn")
+    def _start_worker(self) -> None:
+        context = self.options.start_method
         ours, theirs = context.Pipe()
-        process = context.Process(target=serve, args=(theirs, self.prepare), daemon=True)
+        process = context.Process(  # type: ignore[attr-defined]
+            target=serve, args=(theirs, self.prepare), daemon=True
+        )
         try:
-            with ending_signals_blocked():  # so that no process is started and not known
+            with ending_signals_blocked():  # no process may start without being noted here
                 process.start()
                 self.workers[ours] = Worker(process, ours)
         except OSError:
@@ -119,60 +166,94 @@ class Pool(Generic[Task]):
             theirs.close()
 
     def _receive(self, worker: Worker[Task]) -> Iterator[tuple[Task, Any]]:
-        """Take what a process has sent: that it is ready, that it cannot be, or an answer."""
+        """Take a message from a worker; yield the result that it brings, if any."""
         try:
-            said = worker.pipe.recv()
-        except Exception:  # the pipe's end, half a pickle, or one that cannot be read
-            yield from self._bury(worker)
+            message = worker.pipe.recv()
+        except (EOFError, OSError):  # it has ended, perhaps while it was sending
+            worker.process.join(EXIT_SECONDS)  # killed at once, it would lose its exit code
+            yield from self._report_death(worker)
             return
-        if isinstance(said, Refusal):
-            raise said.error
-        if isinstance(said, Ready):
-            worker.ready, self.false_starts = True, 0
+        except Exception:  # what it sent cannot be unpickled
+            yield from self._report_death(worker)
+            return
+        if isinstance(message, PrepareFailed):
+            raise message.error
+        if isinstance(message, Ready):
+            worker.is_ready, self.failed_starts = True, 0
+            self._assign_task(worker)
         elif worker.task is not None:
-            task, worker.task = worker.task, None
-            yield task, said
-        self._give(worker)
+            yield from self._take_result(worker, worker.task, message)
 
-    def _give(self, worker: Worker[Task]) -> None:
-        """Give a process its next task, or see it off if there is none."""
+    def _take_result(
+        self, worker: Worker[Task], task: Task, message: Partial | Final
+    ) -> Iterator[tuple[Task, Any]]:
+        """Yield a result; after a final one, give the worker its next task."""
+        if isinstance(message.value, ClockStarted):
+            limit = self.options.time_limit(task)
+            worker.deadline = None if limit is None else time.monotonic() + limit
+        if isinstance(message, Partial):
+            yield task, message.value
+            return
+        worker.task = worker.deadline = None
+        yield task, message.value
+        if self.options.is_reused:
+            self._assign_task(worker)
+        else:
+            self._stop(worker)
+
+    def _assign_task(self, worker: Worker[Task]) -> None:
+        """Give a worker the next task, or stop it if there is none."""
         if not len(self.tasks):
-            self._end(worker)
+            self._stop(worker)
             return
         worker.task = self.tasks.popleft()
-        with suppress(OSError):  # it has died: the pipe will say so to who listens
+        with suppress(OSError):  # it has died: the next read from its pipe will show that
             worker.pipe.send(worker.task)
 
-    def _bury(self, worker: Worker[Task]) -> Iterator[tuple[Task, Death]]:
-        """Note what a dead process was at."""
-        self._end(worker)
-        cause = describe_end(worker.process.exitcode)
-        if not worker.ready:
-            self.false_starts += 1
-            if self.false_starts == MOST_FALSE_STARTS:
+    def _seconds_to_deadline(self) -> float | None:
+        """Return the seconds until the first deadline, None if there is none."""
+        deadlines = [w.deadline for w in self.workers.values() if w.deadline is not None]
+        return max(min(deadlines) - time.monotonic(), 0) if deadlines else None
+
+    def _kill_late_workers(self) -> Iterator[tuple[Task, Death]]:
+        """Kill the workers whose tasks are over their time limits; yield those tasks."""
+        now = time.monotonic()
+        for worker in list(self.workers.values()):
+            if worker.deadline is not None and worker.task is not None and worker.deadline <= now:
+                self._stop(worker)
+                limit = self.options.time_limit(worker.task)
+                yield worker.task, Death(f"over the limit of {limit:g} s", is_late=True)
+
+    def _report_death(self, worker: Worker[Task]) -> Iterator[tuple[Task, Death]]:
+        """Remove a dead worker; yield the task that it was working at."""
+        self._stop(worker)
+        cause = describe_exit(worker.process.exitcode)
+        if not worker.is_ready:
+            self.failed_starts += 1
+            if self.failed_starts == MAX_FAILED_STARTS:
                 raise SuperSdfError(
-                    f"{MOST_FALSE_STARTS} processes in a row ended before they were ready, the "
-                    f"last {cause}: try --jobs 1"
+                    f"{MAX_FAILED_STARTS} processes in a row ended before they were ready; the "
+                    f"last one {cause}: try --jobs 1"
                 )
         elif worker.task is not None:
             yield worker.task, Death(cause)
 
-    def _end(self, worker: Worker[Task]) -> None:
-        """See a process off, with what it leaves."""
+    def _stop(self, worker: Worker[Task]) -> None:
+        """Kill a worker if it still runs, and clean up after its unfinished task."""
         worker.process.kill()
         worker.process.join()
         if self.workers.pop(worker.pipe, None):
             worker.pipe.close()
         if worker.process.pid and worker.task is not None:
-            self.clean(worker.task, worker.process.pid)
+            self.options.clean_up(worker.task, worker.process.pid)
 
 
-def describe_end(code: int | None) -> str:
-    """Say how a process ended that should not have."""
+def describe_exit(code: int | None) -> str:
+    """Return how a process ended, as a verb: "was killed by SIGTERM"."""
     if code is None or code >= 0:
-        return f"ended with exit code {code}"
+        return f"ended with exit code {code}" if (code or 0) < 256 else f"crashed ({code:#x})"
     with suppress(ValueError):  # a signal without a name
         name = signal.Signals(-code).name
-        hint = " (for want of memory, mostly)" if name == "SIGKILL" else ""
-        return f"died of {name}{hint}"
-    return f"died of signal {-code}"
+        hint = " (most likely out of memory)" if name == "SIGKILL" else ""
+        return f"was killed by {name}{hint}"
+    return f"was killed by signal {-code}"

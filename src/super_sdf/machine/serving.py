@@ -1,4 +1,4 @@
-"""A worker process from within: it prepares once, and answers tasks until its parent ends."""
+"""The worker's side of the pool: prepare once, then work at tasks until the parent ends."""
 
 from __future__ import annotations
 
@@ -13,47 +13,71 @@ from typing import Any, NamedTuple
 
 from ..errors import SuperSdfError
 
-Prepare = Callable[[], Callable[[Any], Any]]
-"""Makes a worker's function out of nothing: it loads a network, say."""
+Tell = Callable[[Any], None]
+"""Sends a partial result of the current task to the parent, or ``ClockStarted``."""
+
+Work = Callable[[Any, Tell], Any]
+"""Works at a task; what it returns is the task's final result."""
+
+Prepare = Callable[[], Work]
+"""Called once in each worker, to load a network, say; returns what works at the tasks."""
+
+
+class ClockStarted(NamedTuple):
+    """What a worker tells when a task's time limit begins to count."""
 
 
 class Ready(NamedTuple):
-    """A process can take tasks."""
+    """Message: the worker can take a task."""
 
 
-class Refusal(NamedTuple):
-    """A process cannot prepare, and no other could."""
+class PrepareFailed(NamedTuple):
+    """Message: the worker could not prepare itself, and no other worker could."""
 
     error: SuperSdfError
 
 
+class Partial(NamedTuple):
+    """Message: a partial result of the current task; more will follow."""
+
+    value: Any
+
+
+class Final(NamedTuple):
+    """Message: the final result of the current task. The worker can take the next one."""
+
+    value: Any
+
+
 def serve(pipe: Connection, prepare: Prepare) -> None:
-    """Answer the tasks that come by the pipe, until nobody is at its other end."""
+    """Run a worker process: take tasks from the pipe and send their results, until it closes."""
     settle_signals()
     threading.Thread(target=end_with_parent, daemon=True).start()
-    with suppress(EOFError, OSError):
+    with suppress(EOFError, ConnectionError):  # the parent has ended, or needs no more workers
         try:
-            answer = prepare()
+            work = prepare()
         except SuperSdfError as error:
-            pipe.send(Refusal(error))
+            pipe.send(PrepareFailed(error))
             return
-        except Exception as error:  # of a bug, too, the parent is to say a line
-            pipe.send(Refusal(SuperSdfError(f"{type(error).__name__}: {error}".split("\n")[0])))
+        except Exception as error:  # even a bug is reported by the parent in one line
+            line = f"{type(error).__name__}: {error}".split("\n")[0]
+            pipe.send(PrepareFailed(SuperSdfError(line)))
             return
         pipe.send(Ready())
         while True:
-            pipe.send(answer(pipe.recv()))
+            task = pipe.recv()
+            pipe.send(Final(work(task, lambda value: pipe.send(Partial(value)))))
 
 
 def settle_signals() -> None:
-    """Leave Ctrl-C to the parent, and let what it had blocked at the start end this process."""
+    """Ignore Ctrl-C, which the parent handles, and unblock what it had blocked at the start."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, _ending_signals())
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, ending_signals())
 
 
 def end_with_parent() -> None:
-    """End this process when its parent does, however that does: an orphan would write on."""
+    """End this process when its parent ends, even by a kill: an orphan would go on writing."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         wait([parent.sentinel])
@@ -62,19 +86,24 @@ def end_with_parent() -> None:
 
 @contextmanager
 def ending_signals_blocked() -> Iterator[None]:
-    """Put off SIGINT, SIGTERM and SIGHUP, for this thread and for processes that it starts."""
+    """Block SIGINT, SIGTERM and SIGHUP in this thread and in processes that it starts.
+
+    Windows cannot block signals; nothing happens there.
+    """
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
     from multiprocessing import resource_tracker
 
-    resource_tracker.ensure_running()  # it would lift the block when a process first needs it
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _ending_signals())
+    resource_tracker.ensure_running()  # otherwise it lifts the block when it is first needed
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ending_signals())
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _ending_signals() -> set[signal.Signals]:
-    return {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+def ending_signals() -> set[signal.Signals]:
+    """Return the signals of this system that ask a process to end; Windows has no SIGHUP."""
+    names = ("SIGINT", "SIGTERM", "SIGHUP")
+    return {getattr(signal, name) for name in names if hasattr(signal, name)}

@@ -12,9 +12,9 @@ from ..steps.survey import Band
 # ``benchmarks.bounds``), in bytes: for each voxel that the network sees, for each that is decoded,
 # for each node of a decoded block, for each thread's chunk, and whatever the grid.
 STAGES = {
-    "average": (108, 375, 7.2, 1e7, 5e6),
-    "fit": (108, 850, 3.3, 1e7, 1e7),
-    "isosurface": (108, 140, 5.7, 1e7, 5e6),
+    "average": (216, 300, 5.0, 1e7, 2e7),
+    "fit": (216, 1150, 4.0, 1e7, 2.5e7),
+    "isosurface": (216, 200, 7.0, 1e7, 2.5e7),
 }
 # A network's own, unless it says otherwise: bytes for each voxel that it sees, its neighbours among
 # them, and for each value.

@@ -1,4 +1,4 @@
-"""What is to be measured: the main table, the paper's experiments, the peers. No measuring here."""
+"""The scope of an evaluation: what is measured, as a list of tasks."""
 
 from __future__ import annotations
 
@@ -10,39 +10,45 @@ from pathlib import Path
 from ..errors import FileError, OptionError
 from ..files.regular import check_regular_file
 from .cases import Setting
-from .measuring import FLOOR, NO_SETTING, OURS, Task, digest_of_file, digest_of_ours
-from .methods import METHODS
+from .measuring import NO_SETTING, Task, digest_of_file, digest_of_ours
+from .names import EXPERIMENTS, FLOOR, METHOD_LABELS, OURS
 
 MESH_SUFFIXES = (".ply", ".stl", ".obj", ".off", ".glb", ".gltf", ".3mf")
-BASE_SIZE = 32  # the paper's experiments start from it
+BASE_SIZE = 32  # samples along an axis in the paper's experiments
 FACTORS = (2, 4, 8, 16)
 NOISES = (0.0, 0.2, 0.5, 1.0)
 PASSES = (1, 2)
 SCALES = (0.25, 0.5, 0.75)
-EXPERIMENTS = ("factors", "noise", "iterated", "scale", "timings")
 
-Wanted = tuple[Setting, tuple[str, ...]]
-"""A setting and the methods that are measured in it."""
+MethodsIn = tuple[Setting, tuple[str, ...]]
+"""A setting, and the methods that are measured in it."""
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What was asked for.
+class Scope:
+    """What an evaluation measures: shapes, sizes, methods, experiments, peers.
 
     Attributes
     ----------
-    paths : mesh files
-    sizes, factor, methods : of the main table
-    model : a shipped network or an ONNX file
-    experiments : of ``EXPERIMENTS``; ``experiment_shapes`` shapes, spread over the list
-    peers : of ``PEERS``; at ``peer_size`` on ``peer_shapes`` shapes, each within ``peer_limit`` s
-    jobs, threads : processes, and threads of the network in each
+    paths : tuple of Path
+        The mesh files.
+    sizes, factor, methods
+        Of the main table.
+    model : str
+        A shipped network or an ONNX file.
+    experiments : tuple of str
+        Some of ``EXPERIMENTS``, measured on ``experiment_shapes`` of the shapes.
+    peers : tuple of str
+        Some of ``PEERS``, measured at ``peer_size`` on ``peer_shapes`` of the shapes, each within
+        ``peer_limit`` seconds.
+    jobs, threads : int
+        Processes at a time, and threads of the network in each.
     """
 
     paths: tuple[Path, ...]
     sizes: tuple[int, ...] = (32, 64, 128)
     factor: int = 4
-    methods: tuple[str, ...] = tuple(METHODS)
+    methods: tuple[str, ...] = tuple(METHOD_LABELS)
     model: str = "base"
     experiments: tuple[str, ...] = ()
     experiment_shapes: int = 10
@@ -54,7 +60,7 @@ class Plan:
     threads: int = 1
 
     def check(self) -> None:
-        """Raise OptionError if something makes no sense."""
+        """Raise OptionError if a number is out of range, or there is nothing to measure."""
         for size in self.sizes:
             Setting(size, self.factor).check()
         if not self.paths or not self.sizes:
@@ -76,8 +82,10 @@ class Plan:
         return spread(self.paths, self.peer_shapes)
 
     def tasks(self) -> list[Task]:
-        """Return what is to be measured, main table first, no method twice."""
-        wanted: list[tuple[Path, Wanted]] = [(path, (NO_SETTING, (FLOOR,))) for path in self.paths]
+        """Return the tasks, those of the main table first; no method is measured twice."""
+        wanted: list[tuple[Path, MethodsIn]] = [
+            (path, (NO_SETTING, (FLOOR,))) for path in self.paths
+        ]
         for setting in self.settings():
             wanted += [(path, (setting, self.methods)) for path in self.paths]
         for name in self.experiments:
@@ -87,7 +95,7 @@ class Plan:
         beside = (Setting(self.peer_size), ("mc", "bspline", OURS)) if self.peers else None
         wanted += [(path, beside) for path in self.peer_paths() if beside]
         tasks = self._as_tasks(merged(wanted))
-        # A task for each peer, for the limit is for one of them.
+        # A task for each peer alone, because the limit is for one peer.
         alike = [task for task in tasks if task.setting == Setting(self.peer_size)]
         return tasks + [
             replace(task, methods=(peer,), limit=self.peer_limit)
@@ -96,7 +104,7 @@ class Plan:
             if task.path in self.peer_paths()
         ]
 
-    def _as_tasks(self, wanted: Iterable[tuple[Path, Wanted]]) -> list[Task]:
+    def _as_tasks(self, wanted: Iterable[tuple[Path, MethodsIn]]) -> list[Task]:
         """Return a task for each shape and setting."""
         ours = digest_of_ours(self.model)
         sums = {path: digest_of_file(path) for path in self.paths}
@@ -106,14 +114,15 @@ class Plan:
         ]
 
 
-def experiment(name: str, sizes: Sequence[int]) -> list[Wanted]:
-    """Return what an experiment of the paper measures; the scales at the sizes of the main table.
+def experiment(name: str, sizes: Sequence[int]) -> list[MethodsIn]:
+    """Return the settings and methods of an experiment of the paper.
 
-    Nothing for "timings": those are of whole processes, one at a time (see ``timing``).
+    "scale" is at the sizes of the main table. "timings" has none: whole processes are timed one at
+    a time (see ``timing``).
     """
     refined = ("bspline", OURS, "bound")
     if name == "factors":
-        coarse: list[Wanted] = [(Setting(BASE_SIZE), ("mc",))]
+        coarse: list[MethodsIn] = [(Setting(BASE_SIZE), ("mc",))]
         return coarse + [(Setting(BASE_SIZE, factor), refined) for factor in FACTORS]
     if name == "noise":
         return [(Setting(BASE_SIZE, noise=noise), ("mc", "bspline", OURS)) for noise in NOISES]
@@ -126,8 +135,8 @@ def experiment(name: str, sizes: Sequence[int]) -> list[Wanted]:
     raise OptionError(f"experiment is {name!r}: give one of {', '.join(EXPERIMENTS)}")
 
 
-def merged(wanted: Iterable[tuple[Path, Wanted]]) -> list[tuple[Path, Wanted]]:
-    """Join what is wanted of one shape in one setting; each method once."""
+def merged(wanted: Iterable[tuple[Path, MethodsIn]]) -> list[tuple[Path, MethodsIn]]:
+    """Return the entries with those of one shape and setting joined; each method once."""
     methods: dict[tuple[Path, Setting], dict[str, None]] = {}
     for path, (setting, names) in wanted:
         methods.setdefault((path, setting), {}).update(dict.fromkeys(names))
@@ -135,37 +144,38 @@ def merged(wanted: Iterable[tuple[Path, Wanted]]) -> list[tuple[Path, Wanted]]:
 
 
 def spread(paths: tuple[Path, ...], count: int) -> tuple[Path, ...]:
-    """Return so many of the paths, evenly spread over them."""
+    """Return ``count`` of the paths, evenly spread over them."""
     if count >= len(paths):
         return paths
     return tuple(paths[i * len(paths) // count] for i in range(count))
 
 
 def meshes_in(folder: Path) -> list[Path]:
-    """Return the mesh files of a folder, by name."""
+    """Return the mesh files of a folder, sorted by name."""
     try:
-        found = sorted(p for p in folder.iterdir() if p.suffix.lower() in MESH_SUFFIXES)
+        paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in MESH_SUFFIXES)
     except OSError as error:
         raise FileError(f"{folder} cannot be read: {error.strerror}") from error
-    if not found:
+    if not paths:
         raise FileError(f"{folder} holds no mesh: give {', '.join(MESH_SUFFIXES)}")
-    return found
+    return paths
 
 
 def find_meshes(sources: Sequence[Path]) -> tuple[Path, ...]:
-    """Return mesh files, and those in folders, by name.
+    """Return the given mesh files, and those in the given folders, sorted by name.
 
     Raises
     ------
     FileError
-        If a source is missing, no regular file or holds no mesh, or two shapes have one name.
+        If a source does not exist, is no regular file or holds no mesh, or if two shapes have the
+        same name.
     """
-    found: list[Path] = []
+    paths: list[Path] = []
     for source in sources:
         inside = meshes_in(source) if os.path.isdir(source) else [source]
-        found += [check_regular_file(path) for path in inside]
-    names = [path.stem for path in found]
+        paths += [check_regular_file(path) for path in inside]
+    names = [path.stem for path in paths]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice:
         raise FileError(f"two meshes are named {twice!r}: shapes are known by their file names")
-    return tuple(found)
+    return tuple(paths)
