@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from .common import one_line_errors
+
 if TYPE_CHECKING:
     Choice = click.Choice[str]
 else:
@@ -28,7 +30,8 @@ class LazyChoice(Choice):
     @cached_property
     def choices(self) -> tuple[str, ...]:  # type: ignore[override]
         """All values, in the order of the help."""
-        return tuple(self.load())
+        with one_line_errors():  # onnxruntime may be broken
+            return tuple(self.load())
 
 
 @dataclass(frozen=True)
@@ -39,10 +42,11 @@ class LazyDefault:
 
     def __call__(self) -> Any:
         """Return the default."""
-        return self.load()
+        with one_line_errors():
+            return self.load()
 
     def __str__(self) -> str:
-        return str(self.load())
+        return str(self())
 
 
 def convert_default(name: str) -> LazyDefault:

@@ -120,7 +120,7 @@ def accepts(option: click.Option, word: str, ctx: click.Context) -> bool:
     type=click.Choice(tuple(PEER_LABELS)),
     metavar="NAME...",
     help=f"Published methods to run as well: {', '.join(PEER_LABELS)}. They take minutes per "
-    "shape and need the extra peers.",
+    "shape and need the extra 'peers'.",
 )
 @click.option(
     "--peer-shapes",
@@ -150,7 +150,7 @@ def accepts(option: click.Option, word: str, ctx: click.Context) -> bool:
     help="Shipped network (fast, base or best) or an ONNX file.",
 )
 @click.option(
-    "--jobs", type=click.IntRange(1), help="Processes. Default and maximum: one per core."
+    "--jobs", type=click.IntRange(1), help="Worker processes. Default and maximum: one per core."
 )
 @click.option(
     "--up",

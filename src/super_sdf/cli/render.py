@@ -84,7 +84,8 @@ FOR_MESHES = ("colour", "reference", "top", "up", "zoom")
     "--at",
     type=float,
     metavar="D",
-    help="For a grid: world position of the section on that axis. Default: mid-surface.",
+    help="For a grid: world position of the section on that axis. Default: the middle of the "
+    "surface.",
 )
 @click.option(
     "--factor",
