@@ -34,7 +34,8 @@ from super_sdf.convert import ConvertOptions, convert
 from super_sdf.evaluation.cases import Setting, Shape
 from super_sdf.evaluation.scope import find_meshes
 from super_sdf.evaluation.timing import grid_file
-from super_sdf.network.network import DEFAULT_QUALITY, Network, load_network, shipped_models
+from super_sdf.network.names import DEFAULT_QUALITY
+from super_sdf.network.network import Network, load_network, shipped_models
 from super_sdf.slabs.cutting import Slab, cut
 from super_sdf.steps.survey import Band
 

@@ -62,28 +62,28 @@ def convert_default(name: str) -> LazyDefault:
 
 def devices() -> tuple[str, ...]:
     """Return the names of the devices; the first is the default."""
-    from ..network.device import DEVICES
+    from ..network.names import DEVICES
 
     return DEVICES
 
 
 def precisions() -> tuple[str, ...]:
     """Return the precisions of a network; the first is the default."""
-    from ..network.network import PRECISIONS
+    from ..network.names import PRECISIONS
 
     return PRECISIONS
 
 
 def qualities() -> tuple[str, ...]:
     """Return the names of the shipped networks, the fastest first."""
-    from ..network.network import QUALITIES
+    from ..network.names import QUALITIES
 
     return tuple(QUALITIES)
 
 
 def default_quality() -> str:
     """Return the shipped network that is used unless another is chosen."""
-    from ..network.network import DEFAULT_QUALITY
+    from ..network.names import DEFAULT_QUALITY
 
     return DEFAULT_QUALITY
 

@@ -14,10 +14,10 @@ from typing import Any
 
 from ..errors import DeviceError, ModelError
 from .cuda import CUDA, check_cuda, first_line, has_gpu, onnxruntime_version
+from .names import DEVICES
 from .onnx import ort
 from .running import run_bound, run_on_cpu
 
-DEVICES = ("auto", "cpu", "cuda")
 CPU = "CPUExecutionProvider"
 CUDA_OPTIONS = {
     "device_id": "0",

@@ -19,16 +19,13 @@ from ..options import check_path, check_threads
 from ..progress import Tell
 from .contract import INPUTS, one_voxel, read_card
 from .device import open_session
+from .names import DEFAULT_QUALITY, PRECISIONS, QUALITIES
 from .onnx import ort
 from .pace import LONG, Pace, work_of
 from .running import CUDA_CHUNK, Look, run_bound, run_on_cpu
 from .symmetry import cube_symmetries, turn
 
 MODELS = Path(__file__).parent.parent / "models"
-DEFAULT_QUALITY = "base"
-# A shipped file, and over how many symmetries of the cube its answers are averaged.
-QUALITIES = {"fast": ("fast", 1), "base": ("base", 1), "best": ("base", 8)}
-PRECISIONS = ("float32", "int8")
 # What a run takes, measured, for each voxel that it sees, its row of the neighbour table included,
 # and for each value; and what it takes to average over symmetries: turned copies, and the mean.
 BYTES = {"float32": (680.0, 8.0), "int8": (950.0, 8.0)}
