@@ -20,6 +20,7 @@ import argparse
 import hashlib
 import json
 import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -31,13 +32,13 @@ import trimesh
 
 from super_sdf import pipeline
 from super_sdf.convert import ConvertOptions, convert
-from super_sdf.evaluation.cases import Setting, Shape
+from super_sdf.evaluation.cases import Shape
 from super_sdf.evaluation.scope import find_meshes
-from super_sdf.evaluation.timing import grid_file
 from super_sdf.network.names import DEFAULT_QUALITY
 from super_sdf.network.network import Network, load_network, shipped_models
 from super_sdf.slabs.cutting import Slab, cut
 from super_sdf.steps.survey import Band
+from super_sdf.truth.sampling import sample_solid, unit_layout
 
 ALLOWED = 1e-6
 
@@ -64,11 +65,13 @@ def write_meshes(
     """Yield a name and the mesh file of a shape, for each size and number of slabs."""
     shape, options = Shape.read(path), ConvertOptions(inside="negative")
     for size in sizes:
-        with grid_file(shape, Setting(size, options.factor)) as grid:
+        grid = sample_solid(shape.solid, unit_layout(size))
+        with tempfile.TemporaryDirectory() as name:
+            source, target = Path(name) / "grid.npz", Path(name) / "mesh.ply"
+            np.savez(source, values=grid.values, spacing=grid.spacing, origin=grid.origin)
             for count in slabs:
-                target = grid.with_suffix(".ply")
                 with cut_into(count):
-                    convert(grid, target, network, options, force=True)
+                    convert(source, target, network, options, force=True)
                 yield f"{path.stem} {size}" + f" in {count} slabs" * (count > 1), target
 
 

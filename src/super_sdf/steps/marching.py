@@ -70,7 +70,7 @@ def extract_pieces(
     before = field.plane_before(core).start if core.start < core.stop else core.start
     rows = slice(before, core.stop)
     crossings = find_crossings(field, rows, threads)
-    first = first_vertex - int(np.searchsorted(crossings.own_row, core.start))
+    first = first_vertex - crossings.own(core).start
     check_count(first + len(crossings.own_row), "vertices")
     groups = groups_of_planes(field)
     widest = max((rows.stop - field.plane_before(rows).start for rows in groups), default=0)
@@ -105,6 +105,25 @@ class Crossings:
     cell_row: IntArray
     cell: NDArray[np.int16]
     case: NDArray[np.uint8]
+
+    def own(self, rows: slice) -> slice:
+        """Return which of the own edges belong to some voxels."""
+        return _between(self.own_row, rows)
+
+    def others(self, rows: slice) -> slice:
+        """Return which of the other edges some voxels have."""
+        return _between(self.other_row, rows)
+
+    def cells(self, rows: slice) -> slice:
+        """Return which of the cells some voxels have."""
+        return _between(self.cell_row, rows)
+
+
+def _between(sorted_rows: IntArray, rows: slice) -> slice:
+    """Return the places of some rows; bounds of another type would copy the array."""
+    ends = np.array([rows.start, rows.stop], sorted_rows.dtype)
+    start, stop = np.searchsorted(sorted_rows, ends)
+    return slice(int(start), int(stop))
 
 
 def find_crossings(field: FineField, rows: slice, threads: int = 1) -> Crossings:
@@ -193,7 +212,7 @@ def place_vertices(
     field: FineField, grid: SdfGrid, crossings: Crossings, rows: slice
 ) -> NDArray[Any]:
     """Return the vertices on the edges that some voxels own, (n, 3), in world coordinates."""
-    own = slice(*np.searchsorted(crossings.own_row, [rows.start, rows.stop]))
+    own = crossings.own(rows)
     row, edge = crossings.own_row[own], crossings.own_edge[own]
     axis, node = np.divmod(edge, np.int16(len(field.blocks)))
     share = _crossing(field.blocks[node, row], field.blocks[_ends(field.factor)[edge], row])
@@ -242,8 +261,8 @@ def connect(field: FineField, crossings: Crossings, rows: slice, first: int) -> 
     """
     before = field.plane_before(rows).start
     edges = 3 * len(field.blocks)
-    vertex_at = _number_vertices(field, crossings, slice(before, rows.stop), first)
-    some = slice(*np.searchsorted(crossings.cell_row, [rows.start, rows.stop]))
+    vertex_at = _number_vertices(field, crossings, before, rows, first)
+    some = crossings.cells(rows)
     case = crossings.case[some]
     counts, starts, table = _flat_triangles(field.factor)
     low = (crossings.cell_row[some] - before) * np.int64(edges)
@@ -254,25 +273,25 @@ def connect(field: FineField, crossings: Crossings, rows: slice, first: int) -> 
     return faces
 
 
-def _number_vertices(field: FineField, crossings: Crossings, rows: slice, first: int) -> IntArray:
-    """Return for the edges of some voxels' blocks, flat, the vertex if there is one.
+def _number_vertices(
+    field: FineField, crossings: Crossings, before: int, rows: slice, first: int
+) -> IntArray:
+    """Return for the edges of the blocks of some voxels, flat, the vertex if there is one.
 
-    All but the vertices on edges of the first plane that voxels before it own.
+    The table begins at voxel ``before``, the first of the plane before: of that plane it has only
+    the edges that each voxel owns.
     """
     edges = 3 * len(field.blocks)
-    vertex_at = np.empty((rows.stop - rows.start) * edges, np.int32)  # what is not set is not read
-    own = slice(*np.searchsorted(crossings.own_row, [rows.start, rows.stop]))
-    row = crossings.own_row[own] - np.int64(rows.start)
-    vertex_at[row * edges + crossings.own_edge[own]] = np.arange(
-        first + own.start, first + own.stop
-    )
-    other = slice(*np.searchsorted(crossings.other_row, [rows.start, rows.stop]))
-    row, edge = crossings.other_row[other], crossings.other_edge[other].astype(np.int64)
+    vertex_at = np.empty((rows.stop - before) * edges, np.int32)  # what is not set is not read
+    own = crossings.own(slice(before, rows.stop))
+    at = (crossings.own_row[own] - np.int64(before)) * edges + crossings.own_edge[own]
+    vertex_at[at] = np.arange(first + own.start, first + own.stop)
+    others = crossings.others(rows)
+    row, edge = crossings.other_row[others], crossings.other_edge[others].astype(np.int64)
     place = field.parts.owner[part_of_edge(field.factor)[edge], row]
-    owner = field.parts.table[place, row] - np.int64(rows.start)
-    there = owner >= 0
-    at = owner * edges + edge - _shifts(field.factor)[place]
-    vertex_at[((row - np.int64(rows.start)) * edges + edge)[there]] = vertex_at[at[there]]
+    owner = field.parts.table[place, row] - np.int64(before)
+    same_edge = owner * edges + edge - _shifts(field.factor)[place]
+    vertex_at[(row - np.int64(before)) * edges + edge] = vertex_at.take(same_edge)
     return vertex_at
 
 
