@@ -128,7 +128,7 @@ def share_parts(table: IntArray) -> SharedParts:
     owner = np.full(by_place.shape, CENTRE, np.int8)
     for part, sharing in enumerate(SHARING):
         for place in sharing[sharing < CENTRE][::-1]:  # the first comes last, and stays
-            owner[part][there[place]] = place
+            np.copyto(owner[part], place, where=there[place])
     return SharedParts(by_place, owner)
 
 
@@ -160,7 +160,8 @@ def number_parts(parts: SharedParts, sizes: NDArray[np.int64]) -> tuple[IntArray
     for part, sharing in enumerate(SHARING):
         for place in sharing[sharing < CENTRE]:
             rows = np.flatnonzero(parts.owner[part] == place)
-            starts[part, rows] = starts[seen_from(part, place), parts.table[place, rows]]
+            neighbour = parts.table[place].take(rows)
+            starts[part][rows] = starts[seen_from(part, place)].take(neighbour)
     return starts, count
 
 
@@ -259,13 +260,13 @@ def signs_of_skipped(
         1 outside, -1 inside; 0 where nothing was skipped.
     """
     signs = np.zeros(parts.table.shape, np.int8)
-    last = np.array(shape) - 1
+    inner = [(ijk != 0, ijk != n - 1) for ijk, n in zip(np.ascontiguousarray(voxel_ijk.T), shape)]
     for place, step in enumerate(NEIGHBOURHOOD):
         skipped = parts.table[place] < 0
         for axis in np.flatnonzero(step):  # beyond the grid nothing was skipped
-            skipped &= voxel_ijk[:, axis] != (last[axis] if step[axis] > 0 else 0)
+            skipped &= inner[axis][int(step[axis] > 0)]
         rows = np.flatnonzero(skipped)
-        signs[place, rows] = np.where(patches[voxels[rows], place] > 0, 1, -1)
+        signs[place][rows] = np.where(patches[voxels.take(rows), place] > 0, 1, -1)
     return signs
 
 

@@ -126,9 +126,9 @@ def correction_of(feet: FootPoints, parts: SharedParts) -> FloatArray:
     """Return what foot points say in the mean at the parts of each block, (27, D)."""
     numbers, count = number_parts(parts, np.ones(27, np.int64))
     coarse, at, shares = mean_at_nodes(feet, feet.values, numbers, count, 1)
-    left = feet.values - (coarse[at] * shares).sum(0)
+    left = feet.values - (coarse.take(at) * shares).sum(0)
     fine, *_ = mean_at_nodes(feet, left, numbers, count, 2)
-    return prolong(coarse[numbers[CORNER_PARTS]], 1, 2) + fine[numbers]
+    return prolong(coarse.take(numbers[CORNER_PARTS]), 1, 2) + fine.take(numbers)
 
 
 def exact_samples(patches: FloatArray, lipschitz: BoolArray, threads: int = 1) -> BoolArray:
@@ -248,7 +248,7 @@ def mean_at_nodes(
         The mean; the nodes round each foot point, and its trilinear weights for them.
     """
     part, shares = parts_round(feet.place, cells)
-    at = numbers[part, feet.rows].astype(np.intp)
+    at = numbers.ravel().take(part * numbers.shape[1] + feet.rows).astype(np.intp)
     weight = (shares * feet.weights).astype(np.float64)
     sums: list[NDArray[np.float64]] = []
     for _ in range(3):  # of weights, values and squares
