@@ -27,7 +27,7 @@ def test_nodes_are_counted_beyond_32_bits():
 def test_vertices_are_refused_before_they_would_wrap():
     """Those of earlier slabs among them, up to the last number that there is."""
     field = upsample(ball(), trilinear, 2)
-    room = index_width.LARGEST - len(extract_mesh(field, ball()).vertices)
+    room = index_width.MAX_INDEX - len(extract_mesh(field, ball()).vertices)
     assert extract_mesh(field, ball(), first_vertex=room).faces.min() == room
     with pytest.raises(OptionError, match=r"^there are 2,147,483,648 vertices, and 2,147,483,647"):
         extract_mesh(field, ball(), first_vertex=room + 1)
@@ -38,9 +38,9 @@ def test_far_too_many_vertices_are_refused_before_the_network_runs(monkeypatch):
     vertices = len(reconstruct(ball(30, 11.0), trilinear, 4).vertices)
     estimate = band.count_crossings() * 4**2
     assert 0.8 < estimate / vertices < 1.25
-    monkeypatch.setattr(index_width, "LARGEST", estimate // 2)
+    monkeypatch.setattr(index_width, "MAX_INDEX", estimate // 2)
     check_vertices(band, 4)
-    monkeypatch.setattr(index_width, "LARGEST", estimate // 2 - 1)
+    monkeypatch.setattr(index_width, "MAX_INDEX", estimate // 2 - 1)
     with pytest.raises(OptionError, match=rf"there are {estimate // 2:,} vertices, at the"):
         check_vertices(band, 4)
 

@@ -10,7 +10,7 @@ from onnx_files import DOUBLE, FLOAT, INPUTS, metadata, write_network
 
 from super_sdf import load_network, reconstruct, upsample
 from super_sdf.errors import DeviceError, FileError, ModelError, OptionError
-from super_sdf.network.decoder import check_kind, to_blocks
+from super_sdf.network.decoder import check_output, to_blocks
 from super_sdf.network.network import QUALITIES, Network, shipped_models
 from super_sdf.steps.band import find_band, gather_patches, neighbour_table, rescale
 from super_sdf.steps.nodes import block_offsets
@@ -228,9 +228,9 @@ def test_one_bad_value_among_many_is_found(no_warnings, value):
     ],
 )
 def test_a_function_in_place_of_a_network_is_checked_too(given, what):
-    wanted = r" in place of float32 of shape \(4, 3\), \(voxels, offsets\)$"
+    wanted = r" instead of float32 of shape \(4, 3\), \(voxels, offsets\)$"
     with pytest.raises(ModelError, match=f"^the network gave {what}{wanted}"):
-        check_kind(given, (4, 3))
+        check_output(given, (4, 3))
 
 
 def test_a_function_may_give_double_precision_in_any_order():
@@ -250,8 +250,8 @@ CARDS = {
     "truth": ({"receptive_field": "true"}, "its receptive field is True; it must be a whole"),
     "words": ({"receptive_field": "six"}, "its receptive field is 'six'; it must be a whole"),
     "list": ({"receptive_field": "[6]"}, r"its receptive field is \[6\]; it must be a whole"),
-    "digits": ({"receptive_field": LONG}, "its metadata 'receptive_field' is no value that can be"),
-    "deep": ({"data": DEEP}, r"its metadata 'data' is no value that can be read, '\[\[\[\[\[\["),
+    "digits": ({"receptive_field": LONG}, "its metadata 'receptive_field' cannot be read, '7777"),
+    "deep": ({"data": DEEP}, r"its metadata 'data' cannot be read, '\[\[\[\[\[\["),
     "no version": (None, r"is no super-sdf network of format 1 \(format none, inputs patches ten"),
     "version": (
         {"format_version": "1\n" * 900},

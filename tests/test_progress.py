@@ -15,7 +15,7 @@ from test_network import network_inputs
 
 from super_sdf import load_network, reconstruct, upsample
 from super_sdf.network import network, running
-from super_sdf.network.pace import TRUSTED, Pace, share_of_time, work_of
+from super_sdf.network.pace import LINEAR_UP_TO, Pace, share_of_time, work_of
 from super_sdf.progress import StepCounter
 from super_sdf.steps.nodes import block_offsets
 
@@ -34,9 +34,9 @@ def tell(told):
 
 @pytest.fixture
 def watched(monkeypatch):
-    """Watch every run, and look often."""
-    monkeypatch.setattr(network, "LONG", 0)
-    monkeypatch.setattr(running, "LOOK", 1e-4)
+    """Watch every run, and poll often."""
+    monkeypatch.setattr(network, "LONG_RUN", 0)
+    monkeypatch.setattr(running, "POLL_INTERVAL", 1e-4)
 
 
 def test_steps_are_told_in_thousandths_of_the_usual_time(told, tell):
@@ -80,20 +80,20 @@ def test_watched_runs_give_the_same_bits(monkeypatch):
     asked = *network_inputs(ball()), block_offsets(4)
     fast = load_network("fast", device="cpu")
     plain = fast(*asked)
-    monkeypatch.setattr(network, "LONG", 0)
+    monkeypatch.setattr(network, "LONG_RUN", 0)
     np.testing.assert_array_equal(fast(*asked), plain)
     np.testing.assert_array_equal(fast(*asked, progress=lambda share: None), plain)
 
 
 def test_a_bound_run_is_watched_and_stopped_as_well(monkeypatch):
-    monkeypatch.setattr(running, "LOOK", 1e-4)
+    monkeypatch.setattr(running, "POLL_INTERVAL", 1e-4)
     feeds = dict(zip(network.INPUTS, (*network_inputs(ball()), block_offsets(4))))
     session, looks = load_network("fast", device="cpu").session, []
-    watched = running.run_bound(session, feeds, "cpu", look=lambda: looks.append(1))
+    watched = running.run_bound(session, feeds, "cpu", poll=lambda: looks.append(1))
     np.testing.assert_array_equal(watched, running.run_bound(session, feeds, "cpu"))
     assert looks
     with pytest.raises(ZeroDivisionError):
-        running.run_bound(session, feeds, "cpu", look=lambda: 1 / 0)
+        running.run_bound(session, feeds, "cpu", poll=lambda: 1 / 0)
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError("enough")])
@@ -137,14 +137,14 @@ FEEDS = {"patches": np.zeros((1, 27)), "voxels": np.zeros(1), "offsets": np.zero
 def test_an_interrupt_stops_a_run_in_the_middle():
     session = EndlessSession(lambda: os.kill(os.getpid(), signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
-        running.run_on_cpu(session, FEEDS, look=lambda: None)
+        running.run_on_cpu(session, FEEDS, poll=lambda: None)
     assert session.ended
 
 
 def test_a_look_that_raises_stops_a_run_in_the_middle():
     session = EndlessSession()
     with pytest.raises(ZeroDivisionError):
-        running.run_on_cpu(session, FEEDS, look=lambda: 1 / 0)
+        running.run_on_cpu(session, FEEDS, poll=lambda: 1 / 0)
     assert session.ended
 
 
@@ -164,15 +164,15 @@ def test_the_pace_is_learnt_from_a_part_only_if_somebody_listens(watched, monkey
     runs = []
     real = network.run_on_cpu
 
-    def counted(session, feeds, look=None):
+    def counted(session, feeds, poll=None):
         runs.append(len(feeds["patches"]))
-        return real(session, feeds, look=look)
+        return real(session, feeds, poll=poll)
 
     fast = load_network("fast", device="cpu")
     monkeypatch.setattr(network, "run_on_cpu", counted)
     fast(*asked, progress=lambda share: None)
     fast(*asked, progress=lambda share: None)
-    assert runs == [network.PART - 1, len(asked[0]), len(asked[0])]
+    assert runs == [network.TRIAL_ROWS - 1, len(asked[0]), len(asked[0])]
     runs.clear()
     other = load_network("fast", device="cpu")
     other(*asked)
@@ -182,17 +182,17 @@ def test_the_pace_is_learnt_from_a_part_only_if_somebody_listens(watched, monkey
 def test_a_part_is_cut_off_from_the_rest():
     table = np.array([[0, 1, 2], [2, 1, -1], [0, 0, 0]], np.int32)
     feeds = dict(zip(network.INPUTS, (np.zeros((3, 27)), table, np.array([2, 1]), "offsets")))
-    part = network.first_rows(feeds, 2)
+    part = network.crop_inputs(feeds, 2)
     np.testing.assert_array_equal(part["neighbours"], [[0, 1, -1], [-1, 1, -1]])
     assert len(part["patches"]) == 2 and part["voxels"].tolist() == [1]
-    assert network.first_rows(feeds, 1)["voxels"].tolist() == [0]  # something must be decoded
+    assert network.crop_inputs(feeds, 1)["voxels"].tolist() == [0]  # something must be decoded
 
 
 @given(st.floats(0, 1e6), st.floats(0, 1e6))
 def test_the_share_grows_with_time_and_is_never_all(one, two):
     low, high = (share_of_time(seconds, 10.0) for seconds in sorted((one, two)))
     assert 0 <= low <= high < 1
-    assert low == min(one, two) / 10 or min(one, two) > 10 * TRUSTED
+    assert low == min(one, two) / 10 or min(one, two) > 10 * LINEAR_UP_TO
 
 
 def test_before_anything_is_known_no_time_is_foretold():

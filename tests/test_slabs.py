@@ -103,7 +103,7 @@ def test_what_a_slab_depends_on_is_needed(network, monkeypatch):
 def test_threads_change_nothing(monkeypatch, field, factor):
     grid = SdfGrid.trusted(FIELDS[field], (1.0,) * 3, (1.0, 2.0, 3.0))
     monkeypatch.setattr(threads, "CHUNK", 5000)
-    monkeypatch.setattr(threads, "WORTH", 1000)
+    monkeypatch.setattr(threads, "MIN_PER_THREAD", 1000)
     monkeypatch.setattr(threads, "count_cores", lambda: 3)
     meshes = [reconstruct(grid, answering(number), factor) for number in (1, 2, 3)]
     for mesh in meshes[1:]:
@@ -133,7 +133,7 @@ def test_a_function_that_does_not_say_how_far_it_sees_is_asked_once():
     band = survey(ball())
     list(reconstruct_slabs(ball(), answer, max_memory=10**12))
     assert asked == [len(band.voxel_ijk)]
-    with pytest.raises(OutOfMemoryError, match="MB of memory at once, 100 MB may be taken; "):
+    with pytest.raises(OutOfMemoryError, match="MB of memory at once, 100 MB may be used; "):
         list(reconstruct_slabs(ball(), answer, max_memory=10**8))
 
 
@@ -173,6 +173,6 @@ def test_less_memory_makes_more_slabs_and_too_little_is_refused(bare_plan):
 
 def test_a_band_larger_than_memory_is_refused_while_it_is_read():
     with pytest.raises(
-        OutOfMemoryError, match=r"the band of the first \d+ planes has [\d,]+ voxels"
+        OutOfMemoryError, match=r"the band of the first \d+ planes already has [\d,]+ voxels, which"
     ):
         survey(ball(), resources=Resources(memory=1000))

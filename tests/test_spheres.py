@@ -12,13 +12,13 @@ from super_sdf.steps.field import FineField
 from super_sdf.steps.interpolation import prolong, sample_trilinear
 from super_sdf.steps.nodes import block_ijk, number_parts, share_parts
 from super_sdf.steps.spheres import (
-    PRIOR,
+    PRIOR_WEIGHT,
     ExactSamples,
-    agreed_mean,
     exact_samples,
     find_foot_points,
     fit_to_spheres,
     mean_at_nodes,
+    shrunk_mean,
 )
 from super_sdf.steps.survey import survey
 
@@ -141,10 +141,10 @@ def test_of_no_samples_none_is_exact():
 
 def test_means_are_drawn_to_nothing_by_little_weight_and_by_disagreement():
     one = np.ones(1)
-    assert agreed_mean(one, 0.2 * one, 0.04 * one) == pytest.approx(0.2 / (1 + PRIOR))
-    split = agreed_mean(2 * one, 0.2 * one, 0.2 * one)  # mean 0.1, variance 0.09
-    assert split == pytest.approx(0.2 / (2 + PRIOR) * 0.01 / (0.01 + 0.5 * 0.09))
-    assert agreed_mean(0 * one, 0 * one, 0 * one) == 0
+    assert shrunk_mean(one, 0.2 * one, 0.04 * one) == pytest.approx(0.2 / (1 + PRIOR_WEIGHT))
+    split = shrunk_mean(2 * one, 0.2 * one, 0.2 * one)  # mean 0.1, variance 0.09
+    assert split == pytest.approx(0.2 / (2 + PRIOR_WEIGHT) * 0.01 / (0.01 + 0.5 * 0.09))
+    assert shrunk_mean(0 * one, 0 * one, 0 * one) == 0
 
 
 @pytest.mark.parametrize("cells", [1, 2])
