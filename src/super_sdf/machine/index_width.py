@@ -15,7 +15,7 @@ def check_count(count: int, what: str) -> int:
     """Return ``count``, the number of ``what``; OptionError if 32-bit numbers are too few."""
     if count > MAX_INDEX:
         raise OptionError(
-            f"there are {count:,} {what}, and {MAX_INDEX:,} can be numbered: use a smaller factor, "
-            "or fewer samples"
+            f"there are {count:,} {what}, but 32-bit indices allow only {MAX_INDEX:,}: use a "
+            "smaller factor, or fewer samples"
         )
     return count

@@ -110,7 +110,7 @@ def check_vertices(band: Band, factor: int) -> None:
     """
     if int(band.decoded_before[-1]) * 3 * factor**3 > index_width.MAX_INDEX:
         least = band.count_crossings() * factor**2 // 2
-        index_width.check_count(least, "vertices, at the least")
+        index_width.check_count(least, "vertices or more")
 
 
 def peak_bytes(

@@ -115,7 +115,7 @@ class SharedParts:
     """
 
     table: IntArray
-    owner: Signs
+    owner: NDArray[np.int8]
 
     def owned(self, rows: slice = slice(None)) -> BoolArray:
         """Return which parts the voxels in ``rows`` own, (27, n) bool."""

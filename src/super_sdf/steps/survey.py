@@ -112,12 +112,14 @@ class Band:
             The second and the third are row numbers within ``seen``.
         """
         seen, decoded = seen or self.all_rows, decoded or self.all_rows
-        table = neighbour_table(*_cropped(self.voxel_ijk[seen], self.shape))
+        table = neighbour_table(*_crop_planes(self.voxel_ijk[seen], self.shape))
         voxels = np.flatnonzero(self.decoded[decoded]) + decoded.start - seen.start
         return self.patches[seen], table, voxels.astype(np.int32)
 
 
-def _cropped(voxel_ijk: IntArray, shape: tuple[int, int, int]) -> tuple[IntArray, tuple[int, ...]]:
+def _crop_planes(
+    voxel_ijk: IntArray, shape: tuple[int, int, int]
+) -> tuple[IntArray, tuple[int, ...]]:
     """Return voxels counted from the first plane that has any, and the shape up to the last one."""
     first, last = int(voxel_ijk[0, 0]), int(voxel_ijk[-1, 0])
     return voxel_ijk - np.array([first, 0, 0], np.int32), (last - first + 1, *shape[1:])
@@ -161,7 +163,7 @@ def survey(grid: SdfGrid, offset: float = 0.0, resources: Resources = ONE_THREAD
         if not any(up.near for up, _ in jumps):
             raise no_surface(grid, offset)
         check_not_filled(jumps, offset, grid.voxel_size)
-    return describe(grid.shape, voxel_ijk, _joined(patches), resources.threads)
+    return make_band(grid.shape, voxel_ijk, _concatenate(patches), resources.threads)
 
 
 def _check_bound(voxels: int, planes: int, held: int, bound: int | None) -> None:
@@ -178,7 +180,7 @@ def _check_bound(voxels: int, planes: int, held: int, bound: int | None) -> None
         )
 
 
-def describe(
+def make_band(
     shape: tuple[int, int, int], voxel_ijk: IntArray, patches: FloatArray, threads: int = 1
 ) -> Band:
     """Return the band of voxels (V, 3) with patches (V, 27), in half voxels."""
@@ -201,7 +203,7 @@ def _band_of_planes(
     ijk = find_band(rescaled)
     own = ijk[(ijk[:, 0] >= first - low) & (ijk[:, 0] < last - low)]
     patches = gather_patches(rescaled, own)
-    if offset:  # with a truncated field, 0 is the offset farthest from the truncation
+    if offset:  # at 0 there is no better offset to suggest
         check_not_cut_off(patches, offset, grid.voxel_size)
         jumps.append(find_jumps(rescaled))
     return own + np.array([low, 0, 0], np.int32), patches
@@ -214,7 +216,7 @@ def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:
     )
 
 
-def _joined(parts: list[FloatArray]) -> FloatArray:
+def _concatenate(parts: list[FloatArray]) -> FloatArray:
     """Concatenate arrays (n, 27) and empty the list on the way, so that little is held twice."""
     joined = np.empty((sum(map(len, parts)), 27), np.float32)
     start = len(joined)
