@@ -226,7 +226,7 @@ def find_warnings(counts: dict[str, int], closed: bool) -> tuple[str, ...]:
         share = in_percent(counts["noisy_voxels"], counts["band_voxels"])
         warnings.append(
             f"in {share} of the band the values differ by more than distances can: they "
-            "are treated as noisy there, and corrected"
+            "are taken as noisy there, and corrected"
         )
     if counts["pinned_nodes"]:
         warnings.append(
