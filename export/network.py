@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from export.augment import Prepared, batch_table
 from super_sdf.neighbourhood import CENTRE
-from super_sdf.steps.band import REACH
+from super_sdf.steps.band import MAX_DIFFERENCE
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ def is_noisy(patches: Tensor, table: Tensor) -> Tensor:
     In such a patch two samples differ by more than their distance, as in
     ``steps.band.is_lipschitz``.
     """
-    excess = (patches - patches[:, CENTRE, None]).abs() - patches.new_tensor(REACH)
+    excess = (patches - patches[:, CENTRE, None]).abs() - patches.new_tensor(MAX_DIFFERENCE)
     most = torch.cat([excess.amax(1), patches.new_zeros(1)])
     return (most[table].amax(1, keepdim=True) > 0).float()
 

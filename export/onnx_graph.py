@@ -22,7 +22,7 @@ from export.network import SuperSdfNet
 from export.writer import Writer
 from super_sdf.neighbourhood import CENTRE
 from super_sdf.network.running import CHUNK_INPUT
-from super_sdf.steps.band import REACH
+from super_sdf.steps.band import MAX_DIFFERENCE
 
 CHUNK = 512  # voxels at a time; on a CPU 256 to 2048 differ by a few percent
 
@@ -134,7 +134,7 @@ def scan_stem(graph: Graph, net: SuperSdfNet, numbers: str, there: str) -> tuple
     features = body.op("Mul", made, "there")
     centre = body.op("Gather", patch, body.integers(CENTRE), axis=1)
     apart = body.op("Abs", body.op("Sub", patch, centre))
-    beyond = body.op("Sub", apart, body.constant(REACH))
+    beyond = body.op("Sub", apart, body.constant(MAX_DIFFERENCE))
     most = body.op("ReduceMax", beyond, body.integers(1), keepdims=1)
     excess = body.op("Mul", most, "there")
     given = [rows_of("some", TensorProto.INT64), rows_of("there", TensorProto.FLOAT, 1)]

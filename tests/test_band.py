@@ -30,7 +30,7 @@ def test_the_band_of_a_distance_is_equation_2():
     np.testing.assert_array_equal(find_band(rescale(grid)), want)
 
 
-def test_a_jump_over_the_band_is_taken_in():
+def test_both_voxels_of_a_jump_over_the_band_are_active():
     values = np.full((6, 4, 4), 9.0, np.float32)
     values[3:] = -9.0
     assert set(find_band(values)[:, 0]) == {2, 3}

@@ -14,6 +14,7 @@ from conftest import ball
 
 import super_sdf
 from super_sdf.cli import main as cli
+from super_sdf.cli.upsample import upsample_command
 
 
 @pytest.fixture
@@ -335,7 +336,7 @@ def test_every_option_has_help():
 
 
 def test_the_help_names_every_mesh_format():
-    printed = cli.upsample_command.help
+    printed = upsample_command.help
     from super_sdf.files.meshes import MESH_SUFFIXES
 
     assert all(f" {suffix}" in printed for suffix in MESH_SUFFIXES)
@@ -345,8 +346,8 @@ def test_defaults_are_those_of_the_library(command):
     from super_sdf.convert import ConvertOptions
 
     defaults = {
-        parameter.name: parameter.get_default(click.Context(cli.upsample_command))
-        for parameter in cli.upsample_command.params
+        parameter.name: parameter.get_default(click.Context(upsample_command))
+        for parameter in upsample_command.params
     }
     for name in ("factor", "inside", "offset", "cap"):
         assert defaults[name] == getattr(ConvertOptions, name)

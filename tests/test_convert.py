@@ -1,4 +1,4 @@
-"""One file to another: what is written, what is told, and nothing where it fails."""
+"""Conversion of one file: the mesh, the report, and no file after a failure."""
 
 import os
 import re
@@ -20,7 +20,7 @@ def here(tmp_path, monkeypatch):
     np.save("in.npy", ball(16, 4.0).values)
 
 
-def test_the_options_reach_the_mesh_and_the_findings_the_caller():
+def test_options_take_effect_and_the_result_is_reported():
     np.save("in.npy", -2 * ball(16, 4.0).values)
     options = ConvertOptions(2, (2.0,), (1.0, 2.0, 3.0), "positive", 2.0)
     done = convert("in.npy", "out.ply", trilinear, options)
@@ -33,7 +33,7 @@ def test_the_options_reach_the_mesh_and_the_findings_the_caller():
     assert mesh.bounds.mean(0) == pytest.approx(np.array([1, 2, 3]) + 2 * 7.63, abs=0.2)
 
 
-def test_stages_are_timed_and_steps_told():
+def test_stages_are_timed_and_steps_reported():
     steps = []
     done = convert(
         "in.npy", "out.ply", trilinear, ConvertOptions(2), progress=lambda *s: steps.append(s)
@@ -43,7 +43,7 @@ def test_stages_are_timed_and_steps_told():
 
 
 @pytest.mark.parametrize("cap", [False, True])
-def test_closed_is_what_the_mesh_is(cap):
+def test_closed_agrees_with_the_mesh(cap):
     np.save("cut.npy", ball(16, 4.0).values[:9])
     done = convert("cut.npy", "out.ply", trilinear, ConvertOptions(2, cap=cap))
     assert done.closed == cap == trimesh.load("out.ply").is_watertight
@@ -63,7 +63,7 @@ def test_a_failure_writes_nothing_and_a_file_is_replaced_only_by_force():
 
 @pytest.mark.parametrize("factor", [2, 4])
 @pytest.mark.parametrize("suffix", MESH_SUFFIXES)
-def test_the_size_of_the_file_is_known_before(factor, suffix):
+def test_the_size_of_the_file_is_estimated(factor, suffix):
     x, y, z = np.indices((24,) * 3) * 0.5
     gyroid = np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)
     np.save("gyroid.npy", gyroid.astype(np.float32))
@@ -74,18 +74,18 @@ def test_the_size_of_the_file_is_known_before(factor, suffix):
 
 
 def test_a_large_file_is_announced_before_the_work(monkeypatch):
-    said = []
+    announced = []
     options = ConvertOptions(2)
-    convert("in.npy", "out.ply", trilinear, options, announce=said.append)
-    assert said == []
+    convert("in.npy", "out.ply", trilinear, options, announce=announced.append)
+    assert announced == []
     monkeypatch.setattr(expectation, "LARGE", 40_000)
 
     def work(*_):
-        assert said == ["new.ply will have about 2,500 triangles, 47,424 bytes"]
+        assert announced == ["new.ply will have about 2,500 triangles, 47,424 bytes"]
         raise MemoryError
 
     with pytest.raises(MemoryError):
-        convert("in.npy", "new.ply", work, options, announce=said.append)
+        convert("in.npy", "new.ply", work, options, announce=announced.append)
 
 
 def test_a_file_that_its_disk_cannot_hold_is_refused_before_the_work(monkeypatch):
@@ -101,6 +101,6 @@ def test_a_file_that_its_disk_cannot_hold_is_refused_before_the_work(monkeypatch
     assert sorted(os.listdir()) == ["in.npy", "out.ply"]
 
 
-def test_the_box_is_that_of_the_vertices():
+def test_the_bounds_are_those_of_the_vertices():
     done = convert("in.npy", "out.ply", trilinear, ConvertOptions(2, (1.0,), (5.0, -5.0, 0.0)))
     np.testing.assert_allclose(done.report()["bounds"], trimesh.load("out.ply").bounds)

@@ -1,7 +1,7 @@
-"""CUDA without a GPU: what is bound where, what is missing is said, nothing falls back in silence.
+"""CUDA, tested without a GPU: bindings, errors that name what is missing, no silent fallback.
 
-The GPU is played by fakes; `python -m benchmarks.cuda` and `super-sdf info --check --device cuda`
-measure a real one.
+Fakes stand in for the GPU; `python -m benchmarks.cuda` and `super-sdf info --check --device cuda`
+test a real one.
 """
 
 import ctypes
@@ -33,7 +33,7 @@ HERE = f"onnxruntime {ort.__version__}"
 
 
 def no_library(missing):
-    """Return a loader that finds every library but one."""
+    """Return a library loader that finds every library except one."""
 
     def load(name, *arguments):
         if missing and (name == missing or str(name).endswith("providers_cuda.so")):
@@ -44,14 +44,14 @@ def no_library(missing):
 
 @pytest.fixture
 def cuda_build(cpu_build, monkeypatch):
-    """An onnxruntime that was built for CUDA 13, and a driver and all libraries."""
+    """An onnxruntime built for CUDA 13, with a driver and all libraries."""
     monkeypatch.setattr(ort, "get_available_providers", lambda: [CUDA, CPU])
     monkeypatch.setattr(ort, "cuda_version", "13.0", raising=False)
     monkeypatch.setattr(ctypes, "CDLL", no_library(None))
 
 
 class FakeBinding:
-    """Notes what is bound where."""
+    """A binding that records what is bound to which device."""
 
     def __init__(self):
         self.inputs, self.outputs, self.copies = {}, {}, 0
@@ -69,7 +69,7 @@ class FakeBinding:
 
 
 class FakeSession:
-    """A session on CUDA with the contract of ours."""
+    """A session on CUDA that fulfils the contract."""
 
     def __init__(self):
         self.bindings, self.fails = [], ""
@@ -92,7 +92,7 @@ class FakeSession:
 
 @pytest.fixture
 def cuda_session(cuda_build, monkeypatch):
-    """What onnxruntime opens on CUDA; on the CPU it opens the real thing."""
+    """The session that onnxruntime opens on CUDA; on the CPU it opens real ones."""
     fake, real = FakeSession(), ort.InferenceSession
 
     def opened(path, options, providers, **more):
@@ -144,16 +144,16 @@ def test_cuda_options_keep_precision_and_memory():
     assert CUDA_OPTIONS["arena_extend_strategy"] == "kSameAsRequested"
 
 
-@pytest.mark.parametrize("asked", ["auto", "cuda"])
-def test_cuda_that_works_is_used(cuda_session, asked):
-    network = load_network(device=asked)
+@pytest.mark.parametrize("requested", ["auto", "cuda"])
+def test_cuda_that_works_is_used(cuda_session, requested):
+    network = load_network(device=requested)
     assert (network.device, network.notes) == ("cuda", ())
-    assert len(cuda_session.bindings) == 1  # it was tried
+    assert len(cuda_session.bindings) == 1  # the trial run
     network(*one_voxel().values())
     assert cuda_session.bindings[1].outputs == {"values": ("cuda", 0)}
 
 
-def test_best_asks_cuda_eight_times(cuda_session):
+def test_best_runs_eight_times_on_cuda(cuda_session):
     load_network("best", device="cuda")(*one_voxel().values())
     assert len(cuda_session.bindings) == 1 + 8  # the trial first
 
@@ -204,7 +204,7 @@ def test_a_run_that_fails_later_is_an_error(cuda_session):
 
 
 @pytest.mark.parametrize("gpu", [True, False])
-def test_auto_falls_back_and_says_so_where_there_is_a_gpu(monkeypatch, gpu):
+def test_auto_falls_back_with_a_note_if_there_is_a_gpu(monkeypatch, gpu):
     monkeypatch.setattr(device, "has_gpu", lambda: gpu)
     network = load_network(device="auto")
     reason = f"{HERE} here has no CUDA provider: install onnxruntime-gpu in place of onnxruntime"
@@ -221,17 +221,17 @@ def test_the_command_prints_the_note(tmp_path, monkeypatch, command):
     assert "\nNote: a GPU seems to be here, but the network runs on the CPU: onnxruntime" in err
 
 
-def test_the_cpu_is_asked_for_and_used_without_a_look_at_cuda(monkeypatch):
-    monkeypatch.setattr(device, "check_cuda", lambda: pytest.fail("CUDA was looked at"))
+def test_device_cpu_does_not_check_cuda(monkeypatch):
+    monkeypatch.setattr(device, "check_cuda", lambda: pytest.fail("CUDA was checked"))
     network = load_network(device="cpu")
     assert (network.device, network.notes) == ("cpu", ())
 
 
-@pytest.mark.parametrize("asked", ["auto", "cpu", "cuda"])
-def test_a_bad_file_is_no_fault_of_cuda(tmp_path, monkeypatch, asked):
+@pytest.mark.parametrize("requested", ["auto", "cpu", "cuda"])
+def test_a_bad_file_is_not_reported_as_a_failure_of_cuda(tmp_path, monkeypatch, requested):
     (tmp_path / "bad.onnx").write_bytes(b"not a graph")
     with pytest.raises(ModelError, match=r"bad\.onnx is no ONNX file that onnxruntime can run"):
-        load_network(tmp_path / "bad.onnx", device=asked)
+        load_network(tmp_path / "bad.onnx", device=requested)
 
 
 def test_a_gpu_is_seen_by_its_driver(monkeypatch):
@@ -266,9 +266,9 @@ def test_shipped_files_let_the_chunk_be_chosen():
         assert [given.name for given in session.get_overridable_initializers()] == [CHUNK_INPUT]
 
 
-def test_the_benchmark_says_that_there_is_nothing_to_measure(monkeypatch, capsys):
+def test_the_benchmark_reports_that_there_is_nothing_to_measure(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["benchmarks.cuda"])
     runpy.run_path(str(ROOT / "benchmarks" / "cuda.py"), run_name="__main__")
-    said = capsys.readouterr().out
-    assert said.startswith(f"nothing to measure: {ASKED}{HERE} here has no CUDA provider")
-    assert said.count("\n") == 1
+    out = capsys.readouterr().out
+    assert out.startswith(f"nothing to measure: {ASKED}{HERE} here has no CUDA provider")
+    assert out.count("\n") == 1

@@ -9,7 +9,7 @@ from super_sdf.steps.field import border_is_crossed
 
 
 def cut_ball() -> SdfGrid:
-    """A ball of radius 6 whose middle lies 2 samples inside a corner of the grid."""
+    """Return a ball of radius 6 samples whose centre is 2.3 samples from a corner of the grid."""
     ijk = np.indices((14, 15, 16)).astype(np.float64)
     return SdfGrid.trusted(np.linalg.norm(ijk - 2.3, axis=0) - 6, (0.5,) * 3, (1.0, 2.0, 3.0))
 
@@ -35,7 +35,7 @@ def test_the_cap_closes_it_along_the_border(factor):
 
 
 def inside_volume(grid: SdfGrid, low: np.ndarray) -> float:
-    """Count the ball's part in the grid on a lattice of 100^3 points."""
+    """Return the volume of the ball inside the grid, estimated on a lattice of 100^3 points."""
     middle = np.array(grid.origin) + 2.3 * 0.5
     side = 4.5
     points = low + (np.indices((100,) * 3).reshape(3, -1).T + 0.5) * side / 100

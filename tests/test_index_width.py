@@ -1,4 +1,4 @@
-"""What is numbered fits in 32 bits, or is refused with the figure."""
+"""Counts of nodes and vertices beyond 32-bit indices are refused, with the count."""
 
 import numpy as np
 import pytest
@@ -14,22 +14,23 @@ from super_sdf.steps.survey import survey
 
 
 def test_nodes_are_counted_beyond_32_bits():
-    """Of a stand-in for a large table: voxels that share nothing, with parts of many nodes."""
+    """A few voxels that share nothing, with very many nodes per part, stand in for a large grid."""
     table = np.full((5, 27), -1, np.int32)
     table[:, 13] = np.arange(5)
     parts = share_parts(table)
-    with pytest.raises(OptionError, match=r"^there are 13,500,000,000 nodes, and 2,147,483,647 "):
+    with pytest.raises(OptionError, match=r"^there are 13,500,000,000 nodes, but 32-bit indices "):
         number_parts(parts, np.full(27, 10**8))
     starts, count = number_parts(parts, np.full(27, 10**7))
     assert count == 135 * 10**7 and starts.max() == 134 * 10**7
 
 
-def test_vertices_are_refused_before_they_would_wrap():
-    """Those of earlier slabs among them, up to the last number that there is."""
+def test_too_many_vertices_are_refused_before_an_index_overflows():
+    """The vertices of earlier slabs count, and the last valid index is used."""
     field = upsample(ball(), trilinear, 2)
-    room = index_width.LARGEST - len(extract_mesh(field, ball()).vertices)
+    room = index_width.MAX_INDEX - len(extract_mesh(field, ball()).vertices)
     assert extract_mesh(field, ball(), first_vertex=room).faces.min() == room
-    with pytest.raises(OptionError, match=r"^there are 2,147,483,648 vertices, and 2,147,483,647"):
+    message = r"^there are 2,147,483,648 vertices, but 32-bit indices allow only 2,147,483,647: use"
+    with pytest.raises(OptionError, match=message):
         extract_mesh(field, ball(), first_vertex=room + 1)
 
 
@@ -38,10 +39,10 @@ def test_far_too_many_vertices_are_refused_before_the_network_runs(monkeypatch):
     vertices = len(reconstruct(ball(30, 11.0), trilinear, 4).vertices)
     estimate = band.count_crossings() * 4**2
     assert 0.8 < estimate / vertices < 1.25
-    monkeypatch.setattr(index_width, "LARGEST", estimate // 2)
+    monkeypatch.setattr(index_width, "MAX_INDEX", estimate // 2)
     check_vertices(band, 4)
-    monkeypatch.setattr(index_width, "LARGEST", estimate // 2 - 1)
-    with pytest.raises(OptionError, match=rf"there are {estimate // 2:,} vertices, at the"):
+    monkeypatch.setattr(index_width, "MAX_INDEX", estimate // 2 - 1)
+    with pytest.raises(OptionError, match=rf"there are {estimate // 2:,} vertices or more, but"):
         check_vertices(band, 4)
 
 

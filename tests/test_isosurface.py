@@ -1,4 +1,4 @@
-"""Marching cubes: the table, manifoldness on anything, and scikit-image as an oracle."""
+"""Marching cubes: the table, manifoldness on random fields, and scikit-image as an oracle."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def test_every_case_uses_exactly_its_crossed_edges():
 
 
 @pytest.mark.parametrize("corner", range(8))
-def test_one_inside_corner_gives_one_triangle_that_looks_away(corner):
+def test_one_inside_corner_gives_one_triangle_that_faces_away(corner):
     counts, table = triangle_table()
     assert counts[1 << corner] == 1
     middle = CORNERS[list(EDGE_START)] + 0.5 * np.eye(3)[list(EDGE_AXIS)]
@@ -66,7 +66,7 @@ def test_a_smooth_surface_is_that_of_scikit_image():
     verts, faces, _, _ = marching_cubes(lattice, 0.0, method="lorensen")
     a, b, c = verts[faces].transpose(1, 0, 2).astype(np.float64)
     want = abs(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
-    assert mesh.volume() == pytest.approx(want, rel=1e-3)  # quads are cut otherwise
+    assert mesh.volume() == pytest.approx(want, rel=1e-3)  # diagonals of quads differ
     assert len(mesh.faces) == len(faces)
     assert mesh.open_edges() == 0
 
@@ -111,7 +111,7 @@ def test_truncated_fields_are_closed(limit, error):
 
 
 def test_exact_zeros_survive_merging_by_position():
-    """Many programs merge vertices at one place: a cube whose faces run through nodes."""
+    """Many programs merge coincident vertices; this cube's faces run through nodes."""
     import trimesh
 
     ijk = np.indices((14, 14, 14)) - 6

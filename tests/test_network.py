@@ -1,4 +1,4 @@
-"""The ONNX file's contract, what a network gives, and devices asked for."""
+"""The contract of the ONNX file, the values of a network, and the errors of bad files."""
 
 import os
 import warnings
@@ -10,7 +10,7 @@ from onnx_files import DOUBLE, FLOAT, INPUTS, metadata, write_network
 
 from super_sdf import load_network, reconstruct, upsample
 from super_sdf.errors import DeviceError, FileError, ModelError, OptionError
-from super_sdf.network.decoder import check_kind, to_blocks
+from super_sdf.network.decoder import check_output, to_blocks
 from super_sdf.network.names import QUALITIES
 from super_sdf.network.network import Network, shipped_models
 from super_sdf.steps.band import find_band, gather_patches, neighbour_table, rescale
@@ -24,7 +24,7 @@ def network_inputs(grid):
     return gather_patches(field, voxels), neighbour_table(voxels, grid.shape), rows
 
 
-def test_the_card_says_what_the_file_is():
+def test_the_card_describes_the_network():
     card = load_network("base").card
     for key in (
         "receptive_field",
@@ -39,7 +39,7 @@ def test_the_card_says_what_the_file_is():
         assert card[key], key
 
 
-def test_voxels_and_offsets_may_be_asked_in_any_order():
+def test_voxels_and_offsets_may_be_in_any_order():
     patches, table, rows = network_inputs(ball())
     network, offsets = load_network(), block_offsets(2)
     whole = network(patches, table, rows, offsets)
@@ -61,7 +61,7 @@ def test_a_prediction_depends_on_the_receptive_field_and_no_more():
     assert (network(patches, table, rows[:1], block_offsets(2)) != before).any()
 
 
-def test_shipped_networks_are_small_and_keep_the_contract():
+def test_shipped_networks_are_small_and_fulfil_the_contract():
     names = {name for name, _ in QUALITIES.values()}
     assert {name.removesuffix("-int8") for name in shipped_models()} == names
     for name, path in shipped_models().items():
@@ -70,8 +70,8 @@ def test_shipped_networks_are_small_and_keep_the_contract():
 
 
 @pytest.mark.parametrize("factor", [4, 8])
-def test_a_prediction_depends_neither_on_threads_nor_on_what_else_is_asked(factor):
-    """To the last bit: so a mesh may be made in slabs, or by another number of threads."""
+def test_a_prediction_depends_neither_on_threads_nor_on_the_other_voxels_decoded(factor):
+    """Bit for bit, so that a mesh does not depend on its slabs or on the number of threads."""
     patches, table, rows = network_inputs(ball())
     offsets = block_offsets(factor)
     one, two = (load_network("fast", threads=threads) for threads in (1, 2))
@@ -80,7 +80,7 @@ def test_a_prediction_depends_neither_on_threads_nor_on_what_else_is_asked(facto
         np.testing.assert_array_equal(two(patches, table, some, offsets), values[some])
 
 
-def test_int8_is_near_float32_and_says_what_it_is():
+def test_int8_is_near_float32_and_its_card_has_the_precision():
     patches, table, rows = network_inputs(ball())
     one, other = load_network(), load_network(precision="int8")
     assert other.card["precision"] == "int8" and other.device == "cpu"
@@ -90,7 +90,7 @@ def test_int8_is_near_float32_and_says_what_it_is():
 
 
 def test_int8_gives_the_same_bits_for_any_part_and_any_threads():
-    """So it does for any slabs: who else is in the call makes no difference."""
+    """The other voxels in a call make no difference, so slabs make none either."""
     grid = ball(36, 13.0)
     field = rescale(grid)
     voxels = find_band(field)
@@ -110,7 +110,7 @@ def test_int8_gives_the_same_bits_for_any_part_and_any_threads():
         np.testing.assert_array_equal(part, whole[wanted])
 
 
-def test_int8_of_what_has_none_is_an_error(tmp_path):
+def test_int8_without_an_int8_file_is_an_error(tmp_path):
     with pytest.raises(
         OptionError, match=r"none\.onnx has no int8 variant, .*none-int8\.onnx: write"
     ):
@@ -121,13 +121,13 @@ def test_int8_of_what_has_none_is_an_error(tmp_path):
         load_network(precision="int8", device="cuda")
 
 
-def test_a_failing_run_is_one_error_of_ours():
+def test_a_failing_run_is_a_device_error():
     patches, table, rows = network_inputs(ball())
     with pytest.raises(DeviceError, match="the network failed on cpu: "):
         load_network()(patches, table, rows + 10**6, block_offsets(2))
 
 
-def test_what_is_no_network_is_refused(tmp_path):
+def test_names_files_and_devices_that_do_not_exist_are_refused(tmp_path):
     with pytest.raises(
         FileError, match="no model 'other': give an ONNX file or one of: fast, base, best"
     ):
@@ -141,17 +141,17 @@ def test_what_is_no_network_is_refused(tmp_path):
 
 @pytest.fixture
 def no_warnings():
-    """Let nothing be said on the way."""
+    """Turn warnings into errors."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         yield
 
 
-def test_any_file_of_the_contract_runs(tmp_path):
+def test_any_file_that_fulfils_the_contract_runs(tmp_path):
     assert len(reconstruct(ball(), load_network(write_network(tmp_path / "own.onnx"))).faces)
 
 
-# The last step of a network, how its output is declared, and how it is refused.
+# The last operators of a network, the declaration of its output, and the error.
 TRANSPOSED = [("Transpose", ("sum",), "values", {})]
 ONE_COLUMN = [("Identity", ("mean",), "values", {})]
 WRONG = {
@@ -166,10 +166,10 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_a_network_whose_output_is_another_is_refused(tmp_path, name):
-    last, output, said = WRONG[name]
+def test_a_network_with_another_output_is_refused(tmp_path, name):
+    last, output, message = WRONG[name]
     path = write_network(tmp_path / "own.onnx", last, output=output)
-    with pytest.raises(ModelError, match=f"^{path}{said}") as caught:
+    with pytest.raises(ModelError, match=f"^{path}{message}") as caught:
         load_network(path, device="cpu")
     assert "\n" not in str(caught.value)
 
@@ -199,10 +199,10 @@ def test_values_that_are_not_finite_are_refused_with_their_count(
     for work in (upsample, reconstruct):
         with pytest.raises(ModelError) as caught:
             work(ball(), network, 2)
-        bad, said = str(caught.value).split(" values that the network gave are ")
+        bad, rest = str(caught.value).split(" values that the network gave are ")
         count, _, whole = bad.replace(",", "").split(" ", 2)
         assert int(count) == int(whole.split()[-1]) > 0
-        assert said == (
+        assert rest == (
             "NaN, infinite or beyond 1e15: it cannot be used for this grid; use another --model"
         )
 
@@ -228,15 +228,15 @@ def test_one_bad_value_among_many_is_found(no_warnings, value):
         (None, r"NoneType of shape \(\)"),
     ],
 )
-def test_a_function_in_place_of_a_network_is_checked_too(given, what):
-    wanted = r" in place of float32 of shape \(4, 3\), \(voxels, offsets\)$"
+def test_the_values_of_a_function_as_network_are_checked_too(given, what):
+    wanted = r" instead of float32 of shape \(4, 3\), \(voxels, offsets\)$"
     with pytest.raises(ModelError, match=f"^the network gave {what}{wanted}"):
-        check_kind(given, (4, 3))
+        check_output(given, (4, 3))
 
 
-def test_a_function_may_give_double_precision_in_any_order():
-    def doubled(*asked):
-        return np.asfortranarray(trilinear(*asked), np.float64)
+def test_a_function_may_return_double_precision_in_any_memory_order():
+    def doubled(*inputs):
+        return np.asfortranarray(trilinear(*inputs), np.float64)
 
     one, two = reconstruct(ball(), trilinear), reconstruct(ball(), doubled)
     np.testing.assert_array_equal(one.vertices, two.vertices)
@@ -251,8 +251,8 @@ CARDS = {
     "truth": ({"receptive_field": "true"}, "its receptive field is True; it must be a whole"),
     "words": ({"receptive_field": "six"}, "its receptive field is 'six'; it must be a whole"),
     "list": ({"receptive_field": "[6]"}, r"its receptive field is \[6\]; it must be a whole"),
-    "digits": ({"receptive_field": LONG}, "its metadata 'receptive_field' is no value that can be"),
-    "deep": ({"data": DEEP}, r"its metadata 'data' is no value that can be read, '\[\[\[\[\[\["),
+    "digits": ({"receptive_field": LONG}, "its metadata 'receptive_field' cannot be read, '7777"),
+    "deep": ({"data": DEEP}, r"its metadata 'data' cannot be read, '\[\[\[\[\[\["),
     "no version": (None, r"is no super-sdf network of format 1 \(format none, inputs patches ten"),
     "version": (
         {"format_version": "1\n" * 900},
@@ -262,19 +262,19 @@ CARDS = {
 
 
 @pytest.mark.parametrize("name", CARDS)
-def test_metadata_that_cannot_be_used_is_one_line(tmp_path, name):
-    changed, said = CARDS[name]
+def test_invalid_metadata_is_an_error_of_one_line(tmp_path, name):
+    changed, message = CARDS[name]
     path = tmp_path / "own.onnx"
     if changed is None:
         write_network(path, card={})
     else:
         path.write_bytes(shipped_models()["fast"].read_bytes() + metadata(changed))
-    with pytest.raises(ModelError, match=said) as caught:
+    with pytest.raises(ModelError, match=message) as caught:
         load_network(path, device="cpu")
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 400 + len(str(path))
 
 
-def test_a_card_need_not_say_the_receptive_field(tmp_path):
+def test_a_card_need_not_have_the_receptive_field(tmp_path):
     card = {"format_version": "1", "note": "not JSON"}
     network = load_network(write_network(tmp_path / "own.onnx", card=card), device="cpu")
     assert network.receptive_field is None and network.card["note"] == "not JSON"
@@ -283,7 +283,7 @@ def test_a_card_need_not_say_the_receptive_field(tmp_path):
 @pytest.mark.parametrize(
     "kind", ["folder", "FIFO", "empty", "half", "text", "absent", "long", "NUL"]
 )
-def test_what_is_no_model_file_is_one_line(tmp_path, command, kind):
+def test_a_path_that_is_no_model_file_is_an_error_of_one_line(tmp_path, command, kind):
     path = tmp_path / "own.onnx"
     if kind == "folder":
         path.mkdir()

@@ -1,4 +1,4 @@
-"""The fine lattice: numbering, averaging (Eq. 7), kept samples, pinned signs."""
+"""The fine lattice: numbering of nodes, averaging (Eq. 7), pinned signs."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def test_odd_and_absurd_factors_are_refused(factor):
 
 
 def field_of(voxels, table, factor, blocks=None):
-    """Return a field of these voxels: it numbers the nodes."""
+    """Return a field of these voxels, which numbers their nodes."""
     blocks = np.empty(((factor + 1) ** 3, len(voxels)), np.float32) if blocks is None else blocks
     return FineField((6, 5, 7), factor, voxels, blocks, share_parts(table), (0, 6))
 
@@ -73,7 +73,7 @@ def test_nodes_belong_to_the_first_voxel_that_has_them_and_come_in_its_order():
 @pytest.mark.parametrize("factor", [2, 4])
 @pytest.mark.parametrize("threads", [1, 3])
 def test_shared_nodes_are_plain_means_in_every_block(monkeypatch, factor, threads):
-    monkeypatch.setattr("super_sdf.machine.threads.WORTH", 1)
+    monkeypatch.setattr("super_sdf.machine.threads.MIN_PER_THREAD", 1)
     voxels, table = some_voxels(7)
     blocks = np.random.default_rng(0).normal(size=((factor + 1) ** 3, len(voxels) + 1))
     blocks = blocks.astype(np.float32)
@@ -92,7 +92,7 @@ def test_pinned_nodes_take_the_sign_of_the_skipped_voxel():
     parts = share_parts(np.where(np.arange(27) == 13, 0, -1)[None].astype(np.int32))
     blocks = np.ones((27, 1), np.float32)
     patches = np.ones((1, 27), np.float32)
-    patches[0, 22] = -1  # the neighbour at +x is inside; others are beyond the grid, but that at -x
+    patches[0, 22] = -1  # the neighbour at +x is inside, that at -x outside; no others in the grid
     ijk, voxels = np.array([[1, 0, 0]], np.int32), np.zeros(1, np.int32)
     skipped = signs_of_skipped(parts, ijk, patches, voxels, (3, 1, 1))
     assert pin_to_skipped(blocks, parts, 2, skipped).tolist() == [9]
@@ -106,7 +106,7 @@ def test_a_pinned_node_of_two_voxels_is_pinned_in_both_and_counted_once():
     skipped = signs_of_skipped(parts, voxels, patches, np.arange(2, dtype=np.int32), (3, 3, 4))
     blocks = np.ones((27, 2), np.float32)
     changed = pin_to_skipped(blocks, parts, 2, skipped)
-    left = (block_ijk(2) == 1).all(1)  # all nodes but those in the middle touch a skipped voxel
-    between = (block_ijk(2) == [1, 1, 2]).all(1)  # and that in the middle of the common face
-    assert (blocks[~left & ~between, 0] < 0).all() and (blocks[left | between, 0] > 0).all()
+    middle = (block_ijk(2) == 1).all(1)  # all other nodes touch a skipped voxel ...
+    between = (block_ijk(2) == [1, 1, 2]).all(1)  # ... except the middle of the common face
+    assert (blocks[~middle & ~between, 0] < 0).all() and (blocks[middle | between, 0] > 0).all()
     assert changed.tolist() == [25, 17]

@@ -1,4 +1,4 @@
-"""Surfaces at a distance: closed forms, the sign of the solid, and where the distances end."""
+"""Surfaces at an offset: closed forms, the sign of the solid, and how far distances reach."""
 
 from pathlib import Path
 
@@ -20,14 +20,14 @@ def network():
 
 
 def cube(unit: float = 1.0) -> np.ndarray:
-    """Exact distances to a cube of side 8.6 units in a grid of spacing 1 unit."""
+    """Return exact distances to a cube of side 8.6 units in a grid of spacing 1 unit."""
     beyond = np.abs(np.indices((22, 22, 22)) - 10.37) - SIDE / 2
     outside = np.linalg.norm(np.maximum(beyond, 0), axis=0)
     return (outside + np.minimum(beyond.max(0), 0)) * unit
 
 
 def cube_volume(offset: float) -> float:
-    """Steiner's formula outwards: faces, edges, corners; inwards a smaller cube."""
+    """Return the volume at an offset: outwards by Steiner's formula, inwards a smaller cube."""
     if offset < 0:
         return (SIDE + 2 * offset) ** 3
     ball = 4 / 3 * np.pi * offset**3
@@ -60,7 +60,7 @@ def test_both_signs_give_the_same_mesh(network):
 
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize(
-    "offset, says",
+    "offset, reason",
     [
         (2.9, "they end at 3: the largest that works is 1.5"),
         (1.51, "they end at 3: the largest that works is 1.5"),
@@ -68,15 +68,17 @@ def test_both_signs_give_the_same_mesh(network):
         (-2.9, "they end at -3: the smallest that works is -1.5"),
     ],
 )
-def test_an_offset_near_the_cut_is_refused_with_the_one_that_works(network, sign, offset, says):
-    grid = make_grid(sign * np.clip(cube() - 1.5, -3, 3), spacing=1)  # cut off on both sides
+def test_an_offset_near_the_truncation_is_refused_with_one_that_works(
+    network, sign, offset, reason
+):
+    grid = make_grid(sign * np.clip(cube() - 1.5, -3, 3), spacing=1)  # truncated on both sides
     with pytest.raises(GridError) as caught:
         reconstruct(grid, network, 2, offset=offset)
-    want = f"offset {offset:g} needs distances 1.5 spacings (1.5) to either side of it, but {says}"
-    assert str(caught.value) == want
+    needs = f"offset {offset:g} needs distances 1.5 spacings (1.5) to either side of it"
+    assert str(caught.value) == f"{needs}, but {reason}"
 
 
-def test_the_offset_that_works_does(network):
+def test_the_suggested_offset_works(network):
     for scale in (1.0, 0.1, 1 / 3, 1e-5):
         grid = make_grid(np.clip(cube(scale), -3 * scale, 3 * scale), spacing=scale)
         with pytest.raises(GridError) as caught:
@@ -99,7 +101,7 @@ def test_fill_values_end_the_distances_too(network, fill):
     assert mesh.volume() == pytest.approx(cube_volume(0.49), rel=0.02)
 
 
-def test_fields_cut_off_at_once_have_one_surface(network):
+def test_fields_truncated_near_the_surface_have_only_the_surface_at_0(network):
     grid = make_grid(np.clip(cube(), -1, 1), spacing=1)
     with pytest.raises(GridError, match=r"but they end at 1: only 0 works$"):
         reconstruct(grid, network, 2, offset=0.2)
@@ -107,7 +109,7 @@ def test_fields_cut_off_at_once_have_one_surface(network):
 
 
 @pytest.mark.parametrize("fill", [3, 1000])
-def test_beyond_all_values_there_is_no_surface(network, fill):
+def test_an_offset_beyond_all_values_has_no_surface(network, fill):
     values = np.where(np.abs(cube()) > 3, np.copysign(fill, cube()), cube())
     with pytest.raises(GridError) as caught:
         reconstruct(make_grid(values, spacing=1), network, 2, offset=99)
@@ -121,7 +123,7 @@ def test_noisy_distances_may_be_moved(network):
 
 
 def test_the_command_reads_the_sign_from_the_solid(command, tmp_path, monkeypatch):
-    """At the level of the offset most of the border is inside."""
+    """The border's sign is read at level 0; at the offset most of the border is inside."""
     monkeypatch.chdir(tmp_path)
     np.save("cube.npy", cube()[4:-4, 4:-4, 4:-4].astype(np.float32))
     code, _, err = command("upsample", "cube.npy", "a.ply", "--offset", 3, "--cap", "--factor", 2)
@@ -131,13 +133,13 @@ def test_the_command_reads_the_sign_from_the_solid(command, tmp_path, monkeypatc
     assert mesh.is_watertight and mesh.volume > 0.9 * (high - low) ** 3 > cube_volume(0)
 
 
-def test_the_command_refuses_an_offset_near_the_cut(command, tmp_path, monkeypatch):
+def test_the_command_refuses_an_offset_near_the_truncation(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    says = (
+    message = (
         "Error: offset 5.5 needs distances 1.5 spacings (2.25) to either side of it, but they end "
         "at 6: the largest that works is 3.75\n"
     )
-    assert command("upsample", PART, "a.ply", "--offset", 5.5) == (1, "", says)
+    assert command("upsample", PART, "a.ply", "--offset", 5.5) == (1, "", message)
     code, _, err = command("upsample", PART, "a.ply", "--offset", "nan")
     assert code == 2 and err.endswith("offset is nan: give a finite number, in world units\n")
     assert not list(tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""The whole method: closed forms, and what must not change the result."""
+"""The whole method: closed forms, and changes that must not affect the result."""
 
 from itertools import permutations, product
 
@@ -84,7 +84,7 @@ def test_voxels_agree_on_shared_faces_by_construction(network):
     assert same.any() and (np.diff(value[order])[same] == 0).all()
 
 
-def test_unit_and_place_change_nothing_but_the_vertices(network):
+def test_unit_and_origin_only_scale_and_move_the_vertices(network):
     grid = ball()
     mesh = reconstruct(grid, network)
     for unit, origin in ((2.0**-10, (0, 0, 0)), (1024.0, (0, 0, 0)), (1.0, (-3, 5, 7))):
@@ -108,11 +108,11 @@ SYMMETRIES = [
 
 
 @pytest.mark.parametrize("name", ["stand-in", "shipped"])
-def test_symmetries_of_the_cube_carry_the_vertices_along(network, name, monkeypatch):
-    """Exactly for an interpolation alone.
+def test_symmetries_of_the_cube_map_the_vertices_along(network, name, monkeypatch):
+    """The transformed field gives the transformed mesh: exactly for trilinear interpolation.
 
-    The network was only trained to it, and on the faces of cells the fit to the spheres takes one
-    side's gradient: see the bounds.
+    Less exactly for the network, which has only learnt the symmetry, and for the fit to the
+    spheres, which on a face between cells takes the gradient of one side.
     """
     answer, most, mean = (trilinear, 1e-5, 1e-5) if name == "stand-in" else (network, 0.25, 0.02)
     if name == "stand-in":
@@ -133,7 +133,7 @@ def test_symmetries_of_the_cube_carry_the_vertices_along(network, name, monkeypa
 
 @pytest.mark.parametrize("noise", [0.0, 0.1, 0.3, 0.5])
 def test_decoding_only_what_can_hold_the_surface_loses_nothing(noise, monkeypatch):
-    """Also on values that are no distances: uniform noise of up to half a voxel."""
+    """Not even if the values are no distances: with uniform noise of up to half a voxel."""
     grid = ball()
     values = grid.values + np.random.default_rng(0).uniform(-noise, noise, grid.shape)
     noisy = SdfGrid.trusted(values, grid.spacing)
@@ -177,7 +177,7 @@ def test_two_samples_an_axis_are_enough(network):
     np.testing.assert_allclose(mesh.vertices[:, 0], 0.5, atol=0.05)
 
 
-def test_samples_too_far_for_a_surface_are_none(network):
-    values = 1.3 + 0.01 * np.indices((8, 8, 8))[0]  # in the band, but nothing can be between them
+def test_a_band_too_far_for_a_surface_is_refused(network):
+    values = 1.3 + 0.01 * np.indices((8, 8, 8))[0]  # in the band, but too far to hold a surface
     with pytest.raises(GridError, match=r"no surface at 0: the values go from 1\.3 to 1\.37"):
         reconstruct(SdfGrid(values, (1.0,) * 3), network, cap=True)

@@ -1,4 +1,4 @@
-"""Cut in slabs, by any threads: the same mesh, to the last bit."""
+"""Any number of slabs and threads gives the same mesh, bit for bit."""
 
 from itertools import pairwise
 
@@ -25,7 +25,7 @@ def network():
 
 
 def rod(seed=0):
-    """A bent rod along x, longer than what a slab depends on."""
+    """Return distances to a bent rod along x, longer than the planes that a slab depends on."""
     i, j, k = np.indices((56, 14, 15)).astype(np.float64)
     middle = np.hypot(j - 6.6 - 1.5 * np.sin(i / 6), k - 7.2)
     return np.maximum(middle - 3.4, np.abs(i - 27.6) - 24.3)
@@ -50,7 +50,7 @@ FIELDS = {
 
 
 def in_pieces(grid, network, monkeypatch, pieces, **options):
-    """Reconstruct in so many slabs."""
+    """Reconstruct in ``pieces`` slabs."""
     monkeypatch.setattr(
         pipeline, "plan_slabs", lambda band, factor, field, *bounds: cut(band, pieces, field)
     )
@@ -76,7 +76,7 @@ def test_slabs_change_nothing(network, monkeypatch, field, factor, cap):
 
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 10**6), st.integers(2, 30))
-def test_slabs_change_nothing_on_anything(network, seed, pieces):
+def test_slabs_change_nothing_on_random_fields(network, seed, pieces):
     values = np.random.default_rng(seed).uniform(-3, 3, (36, 5, 6))
     grid = SdfGrid.trusted(values, (1.0,) * 3)
     with pytest.MonkeyPatch.context() as patch:
@@ -88,8 +88,8 @@ def test_slabs_change_nothing_on_anything(network, seed, pieces):
     np.testing.assert_array_equal(mesh.vertices, one.vertices)
 
 
-def test_what_a_slab_depends_on_is_needed(network, monkeypatch):
-    """With less round it the mesh would be another: the test above can fail."""
+def test_slabs_need_all_the_planes_beside_them(network, monkeypatch):
+    """With fewer planes the mesh differs, so the tests above can fail."""
     grid = SdfGrid.trusted(FIELDS["clean"], (1.0,) * 3)
     one = reconstruct(grid, network)
     monkeypatch.setattr(cutting, "DECODED_BESIDE", 2)
@@ -103,16 +103,16 @@ def test_what_a_slab_depends_on_is_needed(network, monkeypatch):
 def test_threads_change_nothing(monkeypatch, field, factor):
     grid = SdfGrid.trusted(FIELDS[field], (1.0,) * 3, (1.0, 2.0, 3.0))
     monkeypatch.setattr(threads, "CHUNK", 5000)
-    monkeypatch.setattr(threads, "WORTH", 1000)
+    monkeypatch.setattr(threads, "MIN_PER_THREAD", 1000)
     monkeypatch.setattr(threads, "count_cores", lambda: 3)
-    meshes = [reconstruct(grid, answering(number), factor) for number in (1, 2, 3)]
+    meshes = [reconstruct(grid, with_threads(number), factor) for number in (1, 2, 3)]
     for mesh in meshes[1:]:
         np.testing.assert_array_equal(mesh.faces, meshes[0].faces)
         np.testing.assert_array_equal(mesh.vertices, meshes[0].vertices)
 
 
-def answering(number):
-    """Return a stand-in for a network that is given some threads."""
+def with_threads(number):
+    """Return a stand-in for a network with this number of threads."""
 
     class Threaded:
         threads = number
@@ -123,18 +123,18 @@ def answering(number):
     return Threaded()
 
 
-def test_a_function_that_does_not_say_how_far_it_sees_is_asked_once():
-    asked = []
+def test_a_network_without_a_receptive_field_is_called_once_for_the_whole_band():
+    calls = []
 
-    def answer(patches, table, voxels, offsets):
-        asked.append(len(patches))
+    def network(patches, table, voxels, offsets):
+        calls.append(len(patches))
         return trilinear(patches, table, voxels, offsets)
 
     band = survey(ball())
-    list(reconstruct_slabs(ball(), answer, max_memory=10**12))
-    assert asked == [len(band.voxel_ijk)]
-    with pytest.raises(OutOfMemoryError, match="MB of memory at once, 100 MB may be taken; "):
-        list(reconstruct_slabs(ball(), answer, max_memory=10**8))
+    list(reconstruct_slabs(ball(), network, max_memory=10**12))
+    assert calls == [len(band.voxel_ijk)]
+    with pytest.raises(OutOfMemoryError, match="MB of memory at once, 100 MB may be used; "):
+        list(reconstruct_slabs(ball(), network, max_memory=10**8))
 
 
 @pytest.mark.parametrize("pieces", [1, 2, 5, 1000])
@@ -173,6 +173,6 @@ def test_less_memory_makes_more_slabs_and_too_little_is_refused(bare_plan):
 
 def test_a_band_larger_than_memory_is_refused_while_it_is_read():
     with pytest.raises(
-        OutOfMemoryError, match=r"the band of the first \d+ planes has [\d,]+ voxels"
+        OutOfMemoryError, match=r"the band of the first \d+ planes already has [\d,]+ voxels, which"
     ):
         survey(ball(), resources=Resources(memory=1000))

@@ -1,4 +1,4 @@
-"""The fit of the surface to the samples' spheres: closed forms, and what must be left alone."""
+"""The fit of the surface to the samples' spheres: closed forms, and samples without effect."""
 
 from dataclasses import replace
 
@@ -12,13 +12,13 @@ from super_sdf.steps.field import FineField
 from super_sdf.steps.interpolation import prolong, sample_trilinear
 from super_sdf.steps.nodes import block_ijk, number_parts, share_parts
 from super_sdf.steps.spheres import (
-    PRIOR,
+    PRIOR_WEIGHT,
     ExactSamples,
-    agreed_mean,
     exact_samples,
     find_foot_points,
     fit_to_spheres,
     mean_at_nodes,
+    shrunk_mean,
 )
 from super_sdf.steps.survey import survey
 
@@ -26,7 +26,7 @@ CENTRE_OF_BALL = 10 - 0.37
 
 
 def blocks_of(grid, factor=4):
-    """Return samples, parts and the positions of the nodes, (Q, D, 3), in half voxels."""
+    """Return the exact samples, parts and node positions (Q, D, 3) in half voxels of a grid."""
     band = survey(grid)
     table = neighbour_table(band.voxel_ijk, grid.shape)
     voxels = np.flatnonzero(band.decoded).astype(np.int32)
@@ -41,7 +41,7 @@ def blocks_of(grid, factor=4):
 
 
 def distance_to_ball(nodes, radius=6.0):
-    """Return blocks of distances, with the column of zeros."""
+    """Return blocks of distances to the ball in half voxels, with the column of zeros."""
     exact = np.linalg.norm(nodes - 2 * CENTRE_OF_BALL, axis=2) - 2 * radius
     return with_zeros(exact.astype(np.float32))
 
@@ -79,7 +79,7 @@ def test_a_linear_field_is_sampled_exactly():
 
 
 @pytest.mark.parametrize("bias", [-0.2, 0.1, 0.2])
-def test_a_surface_that_is_off_everywhere_is_brought_back(bias):
+def test_a_constant_error_is_corrected(bias):
     samples, parts, position = blocks_of(ball())
     exact = distance_to_ball(position)
     biased = exact + np.float32(bias)
@@ -89,7 +89,7 @@ def test_a_surface_that_is_off_everywhere_is_brought_back(bias):
     assert off.mean() < 0.2 * abs(bias)
 
 
-def test_an_exact_field_stays():
+def test_an_exact_field_hardly_changes():
     samples, parts, position = blocks_of(ball())
     exact = distance_to_ball(position)
     assert np.abs(fitted(exact, parts, samples) - exact).max() < 0.03
@@ -119,7 +119,7 @@ def test_noisy_samples_move_nothing():
     np.testing.assert_array_equal(fitted(blocks, parts, samples), blocks)
 
 
-def test_one_bad_sample_costs_only_its_neighbours_their_word():
+def test_one_bad_sample_excludes_only_its_neighbours():
     grid = ball()
     grid.values[3, 9, 9] += 3  # near the surface
     band = survey(grid)
@@ -128,27 +128,27 @@ def test_one_bad_sample_costs_only_its_neighbours_their_word():
     np.testing.assert_array_equal(band.exact, near & band.lipschitz)
 
 
-def test_samples_that_were_cut_off_say_nothing():
+def test_truncated_samples_are_not_exact():
     grid = ball()
     band = survey(SdfGrid.trusted(np.clip(grid.values, -0.25, 0.25), grid.spacing))
     np.testing.assert_array_equal(band.exact, np.abs(band.patches[:, 13]) < 0.5)
     assert band.exact.any()
 
 
-def test_of_no_samples_none_is_exact():
+def test_an_empty_band_has_no_exact_samples():
     assert not len(exact_samples(np.empty((0, 27), np.float32), np.empty(0, bool)))
 
 
-def test_means_are_drawn_to_nothing_by_little_weight_and_by_disagreement():
+def test_means_are_shrunk_by_little_weight_and_by_variance():
     one = np.ones(1)
-    assert agreed_mean(one, 0.2 * one, 0.04 * one) == pytest.approx(0.2 / (1 + PRIOR))
-    split = agreed_mean(2 * one, 0.2 * one, 0.2 * one)  # mean 0.1, variance 0.09
-    assert split == pytest.approx(0.2 / (2 + PRIOR) * 0.01 / (0.01 + 0.5 * 0.09))
-    assert agreed_mean(0 * one, 0 * one, 0 * one) == 0
+    assert shrunk_mean(one, 0.2 * one, 0.04 * one) == pytest.approx(0.2 / (1 + PRIOR_WEIGHT))
+    split = shrunk_mean(2 * one, 0.2 * one, 0.2 * one)  # mean 0.1, variance 0.09
+    assert split == pytest.approx(0.2 / (2 + PRIOR_WEIGHT) * 0.01 / (0.01 + 0.5 * 0.09))
+    assert shrunk_mean(0 * one, 0 * one, 0 * one) == 0
 
 
 @pytest.mark.parametrize("cells", [1, 2])
-def test_nodes_that_no_foot_point_is_near_are_not_moved(cells):
+def test_nodes_without_foot_points_nearby_are_not_corrected(cells):
     samples, parts, position = blocks_of(ball())
     blocks = distance_to_ball(position + 0.1)
     above = replace(samples, exact=samples.exact[:40])  # on one side: samples come in C order
@@ -172,7 +172,7 @@ def test_a_linear_function_is_prolonged_exactly(factor):
     np.testing.assert_array_equal(whole, corners)
 
 
-def test_a_ball_by_interpolation_gets_better(monkeypatch):
+def test_the_fit_improves_an_interpolated_ball(monkeypatch):
     def error(mesh):
         return np.abs(np.linalg.norm(mesh.vertices - CENTRE_OF_BALL, axis=1) - 6).mean()
 
@@ -182,7 +182,7 @@ def test_a_ball_by_interpolation_gets_better(monkeypatch):
 
 
 def test_a_wall_between_the_samples_is_found():
-    """A third of a voxel thick, and no sample inside: all values are positive."""
+    """It is a third of a voxel thick and contains no sample: all values are positive."""
     ijk = np.indices((16, 16, 16)) - 7.5
     beyond = np.abs(ijk) - np.array([4.6, 0.17, 4.6])[:, None, None, None]
     outer = np.linalg.norm(np.maximum(beyond, 0), axis=0) + np.minimum(beyond.max(0), 0)

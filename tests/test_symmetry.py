@@ -1,4 +1,4 @@
-"""The cube's symmetries, and networks averaged over them."""
+"""The symmetries of the cube, and networks averaged over them."""
 
 import numpy as np
 from conftest import ball
@@ -31,8 +31,8 @@ def test_a_turned_plane_is_a_plane():
         np.testing.assert_allclose(offsets @ symmetry, block_offsets(2), atol=1e-6)
 
 
-def test_best_answers_a_mirrored_field_with_the_mirrored_surface():
-    """And the plain network only nearly so: else the mean would be idle."""
+def test_best_maps_a_mirrored_field_to_the_mirrored_surface():
+    """The plain network does so only approximately; otherwise the mean would have no effect."""
     grid = ball()
     mirrored = rescale(grid)[::-1].copy()
     answers = {}

@@ -1,4 +1,4 @@
-"""One grid file to one mesh file: read, refine, extract the surface, write, report.
+"""Conversion of one grid file to one mesh file: read, refine, extract the surface, write, report.
 
 >>> from super_sdf.convert import ConvertOptions, convert
 >>> convert("part.npz", "part.ply", load_network(), ConvertOptions())    # doctest: +SKIP
@@ -62,18 +62,18 @@ class Conversion:
     Attributes
     ----------
     shape, spacing, origin
-        The grid's.
+        Of the grid; spacing and origin in world units.
     counts : dict
-        Voxels, nodes, vertices and triangles, by name, and the expected triangles and bytes.
+        The counts named in ``COUNTS``, and ``expected_triangles`` and ``expected_bytes``.
     bounds : two Triples
-        The lowest and the highest coordinates of vertices.
+        The lowest and the highest coordinates of the vertices, in world units.
     closed : bool
-        Whether the mesh has no open edge. It is a closed manifold by construction unless the
-        surface runs out of the grid and is not capped, so edges are not counted.
+        Whether the mesh has no open edge. Edges are not counted: the mesh is a closed manifold by
+        construction, unless the surface runs out of the grid and is not capped.
     notes, warnings : tuple of str
-        What was inferred, and what may be wrong with the result, a sentence each.
+        Sentences on what was inferred, and on what may be wrong with the result.
     seconds : dict
-        The time that each stage took.
+        Seconds per stage.
     """
 
     shape: tuple[int, int, int]
@@ -87,7 +87,7 @@ class Conversion:
     seconds: dict[str, float]
 
     def report(self) -> dict[str, Any]:
-        """Return the result as it stands in JSON."""
+        """Return the result as a dictionary that can be written as JSON."""
         return {
             "shape": list(self.shape),
             "spacing": list(self.spacing),
@@ -116,7 +116,7 @@ def convert(
     Parameters
     ----------
     source, target : path
-        As ``read_grid`` and ``write_mesh`` want them.
+        The grid file and the mesh file, in formats of ``read_grid`` and ``write_mesh``.
     network : Network
         From ``load_network``; it can be used for any number of files.
     options : ConvertOptions
@@ -124,16 +124,16 @@ def convert(
     force : bool
         Replace the target if it exists.
     progress : callable, optional
-        Called with (done, total), see ``progress.Progress``; what it raises ends the work.
+        Called with (done, total), see ``progress.Progress``; an exception in it ends the work.
     before_rename : callable, optional
-        Called with the path of the finished mesh, before it takes the target's name.
+        Called with the path of the finished temporary file, before it is renamed to ``target``.
     announce : callable, optional
         Called before the work with a sentence on the size of the mesh file, if it will be large.
 
     Raises
     ------
     SuperSdfError
-        As ``read_grid``, ``upsample`` and ``write_mesh`` raise it; nothing was written then.
+        As in ``read_grid``, ``upsample`` and ``write_mesh``. Nothing is written then.
     """
     watch = Stopwatch()
     grid = read_grid(
@@ -147,8 +147,8 @@ def convert(
     about = check_format_holds(target, grid, options.factor)
     notes = (*grid.notes, *local_origin_note(target, about))
     expected = expect(grid, options.factor, options.offset, target)
-    if announce and (said := expected.said(target)):
-        announce(said)
+    if announce and (sentence := expected.said(target)):
+        announce(sentence)
     watch.lap("read")
     pieces = reconstruct_slabs(
         grid,
@@ -167,7 +167,7 @@ def convert(
 
 
 class Tally:
-    """Counts and extents of the pieces of a mesh, summed while they are written."""
+    """Counts and bounding box of a mesh, summed over its pieces while they are written."""
 
     def __init__(self, expected: Expectation) -> None:
         self.expected = expected
@@ -178,7 +178,7 @@ class Tally:
     def count(self, pieces: Iterable[Piece], watch: Stopwatch) -> Iterator[Mesh]:
         """Yield the meshes of the pieces, and count them.
 
-        The time until the next mesh is asked for is booked as writing.
+        The time until the caller takes the next mesh counts as writing.
         """
         for piece in pieces:
             watch.take(piece.seconds)
@@ -188,11 +188,11 @@ class Tally:
             for mesh in piece.meshes:
                 self.extend_box(mesh)
             yield from piece.meshes
-            del piece  # before the next is made
+            del piece  # before the next one is made
             watch.lap("write")
 
     def extend_box(self, mesh: Mesh) -> None:
-        """Extend the bounding box by a mesh: by axis, which is five times as fast as by rows."""
+        """Extend the bounding box by a mesh, axis by axis: five times as fast as ``min(0)``."""
         for axis, coordinates in enumerate(mesh.vertices.T):
             if len(coordinates):
                 self.low[axis] = min(self.low[axis], coordinates.min())
@@ -218,7 +218,7 @@ def describe(
 
 
 def find_warnings(counts: dict[str, int], closed: bool) -> tuple[str, ...]:
-    """Return a sentence for each thing that may be wrong with the result."""
+    """Return a sentence on each thing that may be wrong with the result."""
     warnings = []
     if not closed:
         warnings.append("the surface runs out of the grid and is open there (close it with --cap)")
@@ -226,7 +226,7 @@ def find_warnings(counts: dict[str, int], closed: bool) -> tuple[str, ...]:
         share = in_percent(counts["noisy_voxels"], counts["band_voxels"])
         warnings.append(
             f"in {share} of the band the values differ by more than distances can: they "
-            "are taken for noisy there, and corrected"
+            "are taken as noisy there, and corrected"
         )
     if counts["pinned_nodes"]:
         warnings.append(
@@ -237,7 +237,7 @@ def find_warnings(counts: dict[str, int], closed: bool) -> tuple[str, ...]:
 
 
 def in_percent(part: int, whole: int) -> str:
-    """Return a share that is not 0, as a percentage of two digits."""
+    """Return a share, which must not be 0, as a percentage with two digits."""
     share = 100 * part / whole
     if share < 0.01:
         return "less than 0.01 %"

@@ -12,8 +12,8 @@ from .arrays import IntArray
 from .errors import GridError
 from .grid.sdf_grid import SdfGrid
 
-# A vertex keeps this share of its lattice edge away from both ends: where a node's value is 0
-# several vertices would otherwise coincide, and programs that merge points would tear the mesh.
+# A vertex stays this share of its lattice edge away from both ends. Otherwise vertices would
+# coincide where a node's value is 0, and programs that merge points would tear the mesh.
 CLEARANCE = 1e-3
 
 
@@ -53,7 +53,7 @@ class Mesh:
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
     def open_edges(self) -> int:
-        """Count edges that are not used exactly once in each direction: 0 for a closed mesh."""
+        """Count the edges that are not used exactly once in each direction: 0 in a closed mesh."""
         start = self.faces.ravel().astype(np.int64)
         end = np.roll(self.faces, -1, axis=1).ravel().astype(np.int64)
         size = len(self.vertices)
@@ -68,7 +68,7 @@ class Mesh:
 
 
 def join_meshes(pieces: list[Mesh]) -> Mesh:
-    """Join pieces whose triangles index the vertices of all pieces, in order."""
+    """Join pieces, in order, whose faces index the vertices of all pieces."""
     if len(pieces) == 1:
         return pieces[0]
     return Mesh(
@@ -83,7 +83,7 @@ def vertex_type(grid: SdfGrid, factor: int) -> type[np.float32] | type[np.float6
     Raises
     ------
     GridError
-        If neither resolves them.
+        If float64 does not resolve them either.
     """
     reach = max(abs(x) + h * n for x, h, n in zip(grid.origin, grid.spacing, grid.shape))
     for kind in (np.float32, np.float64):

@@ -11,4 +11,4 @@ NEIGHBOURHOOD: IntArray = np.indices((3, 3, 3)).reshape(3, 27).T.astype(np.int32
 CENTRE = 13
 """Index of the centre voxel itself."""
 STRIDES = np.array([9, 3, 1])
-"""Difference between neighbouring indices along each axis."""
+"""Difference of the indices of two places next to each other along each axis."""

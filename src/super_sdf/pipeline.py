@@ -1,6 +1,6 @@
-"""The method on a page: the paper's Section 4, a named step a line.
+"""The method on a page: the paper's Section 4, one named step per line.
 
-    grid -> band -> patches and neighbours -> network -> shared nodes averaged
+    grid -> band -> patches and neighbour table -> network -> averaged shared nodes
          -> surface moved to touch the samples' spheres -> isosurface
 
 A grid that is too large to be refined at once is refined slab by slab (see ``slabs``); the mesh is
@@ -64,20 +64,19 @@ def upsample(
     Parameters
     ----------
     grid : SdfGrid
-        Coarse signed distances, negative inside.
+        Coarse signed distances in world units, negative inside.
     network : Network
         From ``load_network``.
     factor : int
-        How many times finer, K: 2, 4, 8, 16 (any even number up to 16).
+        How many times finer per axis, K: an even number from 2 to 16.
     offset : float
-        Refine round the surface at this distance (world units) from the solid's own, instead of
-        that (Sec. 5.3). Positive is outwards, whichever sign the given values have inside:
-        ``grid.values``, which equal the offset there, are always negative inside. The distances
-        must go 1.5 spacings further.
+        Refine the surface at this distance from the solid (world units) instead of the solid's own
+        (Sec. 5.3). Positive is outwards, whichever sign the input had inside, since ``grid.values``
+        are always negative inside. The distances must reach 1.5 spacings beyond the offset.
     max_memory : int, optional
-        Bytes that the process may hold in all; a share of what is free unless given.
+        Bytes that the process may hold in all; by default a share of the free memory.
     progress : callable, optional
-        Called with (done, total), see ``progress.Progress``; what it raises ends the work.
+        Called with (done, total), see ``progress.Progress``; an exception in it ends the work.
 
     Returns
     -------
@@ -87,15 +86,16 @@ def upsample(
     Raises
     ------
     OptionError
-        If the factor is odd or out of range, or another argument is not what it should be.
+        If the factor is odd or out of range, or another argument is invalid.
     OutOfMemoryError
         If the fine values would not fit in memory.
     ModelError
-        If the network gives values that are not finite.
+        If the network returns values that are not finite.
     GridError
-        If the distances end within 1.5 spacings of the offset; if it is too far from the origin for
-        vertices to be told apart; if no surface is found: thin parts may pass between samples that
-        are all outside, so this is known only in the end.
+        If the distances end within 1.5 spacings of the offset; if the grid is so far from the
+        origin that floating-point numbers cannot resolve its vertices; if there is no surface. The
+        last is raised only at the end, since a thin part may lie between samples that are all
+        outside.
     """
     check_grid(grid)
     check_network(network)
@@ -104,7 +104,7 @@ def upsample(
     resources = allot(getattr(network, "threads", 0), check_max_memory(max_memory))
     steps = StepCounter(progress, [name for name in STEPS if name != "isosurface"])
     band = find_surface(grid, factor, offset, resources)
-    (slab,) = plan_slabs(band, factor, None, resources, bytes_of(network))
+    (slab,) = plan_slabs(band, factor, None, resources, memory_needs(network))
     steps.finish("band")
     field = refine(band, network, factor, slab, resources.threads, steps)
     if len(field.signs()) < 2:
@@ -124,22 +124,23 @@ def reconstruct(
 ) -> Mesh:
     """Turn a coarse grid into a fine mesh.
 
-    Parameters and errors are those of ``upsample``, but:
+    Parameters and errors are those of ``upsample``, except for these:
 
     Parameters
     ----------
     network : Network, optional
-        The shipped one, ``base``, unless given.
+        By default the shipped network ``base``.
     cap : bool
-        Close a surface that runs out of the grid along the grid's border; else it is left open.
+        Close a surface that runs out of the grid along the grid's border; otherwise it is left
+        open.
     max_memory : int, optional
-        Bytes that the process may hold in all, beside the mesh; a share of what is free unless
-        given.
+        Bytes that the process may hold in all, besides the mesh; by default a share of the free
+        memory.
 
     Returns
     -------
     Mesh
-        In world units, closed unless the surface runs out of the grid.
+        In world units; closed, unless the surface runs out of the grid and ``cap`` is False.
     """
     check_grid(grid)
     if network is None:
@@ -164,7 +165,7 @@ def reconstruct_slabs(
 ) -> Iterator[Piece]:
     """Yield the mesh of ``reconstruct`` slab by slab, in as few slabs as fit in memory.
 
-    Joined, the pieces are the same mesh, bit for bit, whatever the slabs and threads.
+    Joined, the pieces are the same mesh, bit for bit, for any number of slabs and threads.
     """
     check_grid(grid)
     check_network(network)
@@ -184,11 +185,11 @@ def _slabs(
     max_memory: int | None,
     progress: Progress | None,
 ) -> Iterator[Piece]:
-    """Yield the pieces of ``reconstruct_slabs``, with checked arguments."""
+    """Yield the pieces of ``reconstruct_slabs``; arguments are checked before the first one."""
     resources = allot(getattr(network, "threads", 0), max_memory)
     steps = StepCounter(progress)
     band = find_surface(grid, factor, offset, resources)
-    reach, needed = getattr(network, "receptive_field", None), bytes_of(network)
+    reach, needed = getattr(network, "receptive_field", None), memory_needs(network)
     slabs = plan_slabs(band, factor, reach, resources, needed)
     planned = peak_bytes(band, slabs, factor, needed, resources.threads)
     steps.divide(len(slabs))
@@ -202,27 +203,27 @@ def _slabs(
         whole = close_at_border(field, grid, offset) if cap else field
         meshes = extract_pieces(whole, grid, vertices, resources.threads)
         piece = describe_piece(field, meshes, {"slabs": len(slabs), "planned_bytes": planned})
-        del field, whole, meshes  # no more of them than one at a time
+        del field, whole, meshes  # before those of the next slab are made
         steps.finish("isosurface")
         piece.seconds.update(steps.take_seconds())
         vertices += piece.counts["vertices"]
         seen |= piece.signs
         yield piece
-        del piece  # before the next is made
-        steps.watch.start()  # the time since the yield is the caller's
+        del piece  # before the next one is made
+        steps.watch.start()  # the time since the yield was the caller's
     if len(seen) < 2:
         raise no_surface(grid, offset)
 
 
-def bytes_of(network: Decoder) -> tuple[float, float]:
-    """Return the bytes that a network needs for each voxel that it sees, and for each value."""
+def memory_needs(network: Decoder) -> tuple[float, float]:
+    """Return the memory of a network in bytes, per voxel that it sees and per value."""
     needed: tuple[float, float] = getattr(network, "memory_bytes", NETWORK_BYTES)
     return needed
 
 
 def find_surface(grid: SdfGrid, factor: int, offset: float, resources: Resources) -> Band:
-    """Return the band of a grid, or raise if it cannot hold a surface."""
-    vertex_type(grid, factor)  # raises where no numbers tell vertices apart
+    """Return the band of a grid; GridError if no voxel can hold a surface."""
+    vertex_type(grid, factor)  # raises if not even float64 resolves the vertices
     band = survey(grid, offset, resources)  # Eqs. 2 and 4
     if not band.decoded.any():
         raise no_surface(grid, offset)
@@ -237,7 +238,7 @@ def refine(
     threads: int = 1,
     steps: StepCounter | None = None,
 ) -> FineField:
-    """Return the fine field of a slab, or of the whole band."""
+    """Return the fine field of a slab: the steps from the network to the final values."""
     steps = steps or StepCounter()
     patches, table, voxels = inputs = band.network_inputs(slab.seen, slab.decoded)
     progress = steps.within("network")
@@ -263,9 +264,10 @@ def refine(
 
 
 def rows_among(voxels: IntArray, count: int) -> IntArray:
-    """Return the row in ``voxels`` of each of ``count`` voxels, -1 if it has none.
+    """Return the row in ``voxels`` of each of ``count`` voxels, -1 if it is not among them.
 
-    One more -1 at the end is for the index -1, absent neighbours.
+    The result, (count + 1,) int32, has one more -1 at the end, for the index -1 of absent
+    neighbours.
     """
     row_of = np.full(count + 1, -1, np.int32)
     row_of[voxels] = np.arange(len(voxels), dtype=np.int32)

@@ -12,7 +12,7 @@ While the network runs it is called several times a second with an estimate from
 If it raises an exception, the work stops with that exception.
 """
 
-Tell = Callable[[float], None]
+ShareCallback = Callable[[float], None]
 """Called with the finished share of a step, from 0 to 1."""
 
 TOTAL = 1000
@@ -79,7 +79,7 @@ class StepCounter:
         seconds, self.watch.seconds = self.watch.seconds, {}
         return seconds
 
-    def within(self, name: str) -> Tell | None:
+    def within(self, name: str) -> ShareCallback | None:
         """Return a callback for the share of a step that starts now; None without ``progress``."""
         begin, length = self.done, self.lengths[name]
         return (lambda share: self._show(begin + share * length)) if self.progress else None

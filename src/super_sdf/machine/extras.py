@@ -1,4 +1,4 @@
-"""Optional packages: which extra brings which, and how an extra is installed."""
+"""Optional packages: the extras that install them, and checks that they are installed."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from importlib.util import find_spec
 
 from ..errors import FileError
 
-# Modules that the extras bring, beside those of the extra that they build on.
+# Modules that each extra installs, besides those of the extra that it builds on.
 EXTRAS = {
     "3mf": ("lxml", "networkx"),
     "eval": ("igl", "matplotlib", "scipy", "skimage"),
@@ -23,19 +23,19 @@ def all_modules(extra: str) -> tuple[str, ...]:
 
 
 def missing_modules(modules: tuple[str, ...]) -> list[str]:
-    """Return those of the modules that are not installed."""
+    """Return the modules that are not installed."""
     return [name for name in modules if find_spec(name) is None]
 
 
 def how_to_install(extra: str) -> str:
-    """Return the command that installs an extra: the package is installed from its sources."""
+    """Return the command that installs an extra, from a clone of the sources."""
     return f"pip install -e '.[{extra}]' in a clone of super-sdf"
 
 
 def check_modules(what: str, extra: str, modules: tuple[str, ...] | None = None) -> None:
-    """Raise FileError if modules that ``what`` needs are missing, with the extra that brings them.
+    """Raise FileError if modules that ``what`` needs are missing, naming the extra to install.
 
-    ``modules`` are those needed, all of the extra unless given.
+    ``modules`` are the modules needed; by default all of the extra.
     """
     missing = missing_modules(all_modules(extra) if modules is None else modules)
     if missing:

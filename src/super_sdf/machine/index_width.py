@@ -1,20 +1,21 @@
-"""How far 32-bit numbers go: vertices of a mesh, whose files hold such, and nodes of a field.
+"""The limit of 32-bit indices, for the vertices of a mesh (as in its files) and nodes of a field.
 
-A number that wraps would be another's, so what is numbered is counted first, in Python's integers.
+An index that overflows would refer to another vertex, so the number of vertices or nodes is checked
+first, in Python's integers.
 """
 
 from __future__ import annotations
 
 from ..errors import OptionError
 
-LARGEST = 2**31 - 1
+MAX_INDEX = 2**31 - 1
 
 
 def check_count(count: int, what: str) -> int:
-    """Return ``count``, the number of ``what``, or raise if it exceeds 32-bit numbers."""
-    if count > LARGEST:
+    """Return ``count``, the number of ``what``; OptionError if 32-bit numbers are too few."""
+    if count > MAX_INDEX:
         raise OptionError(
-            f"there are {count:,} {what}, and {LARGEST:,} can be numbered: use a smaller factor, "
-            "or fewer samples"
+            f"there are {count:,} {what}, but 32-bit indices allow only {MAX_INDEX:,}: use a "
+            "smaller factor, or fewer samples"
         )
     return count

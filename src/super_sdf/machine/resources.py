@@ -1,4 +1,4 @@
-"""What a run may use: decided once, where it begins, and handed down to every step."""
+"""The threads and memory of a run: decided once at the start, and passed down to every step."""
 
 from __future__ import annotations
 
@@ -10,32 +10,33 @@ from .threads import useful_threads
 
 @dataclass(frozen=True)
 class Resources:
-    """What a run may use.
+    """The threads and memory that a run may use.
 
     Attributes
     ----------
     threads : int
-        How many work at a time.
+        Number of threads.
     memory : int, optional
-        Bytes that the process may hold in all; None if nobody can say.
+        Bytes that the process may hold in all; None for no bound.
     """
 
     threads: int = 1
     memory: int | None = None
 
 
-ALONE = Resources()
-"""One thread, and memory without a bound."""
+ONE_THREAD = Resources()
+"""One thread, and no memory bound."""
 
 
 def allot(threads: int = 0, max_memory: int | None = None) -> Resources:
-    """Return what a run may use.
+    """Return the threads and memory that a run may use.
 
     Parameters
     ----------
     threads : int
-        As asked for; 0 for one per core, and never more.
+        Requested number; 0 for one per core, which is also the maximum.
     max_memory : int, optional
-        Bytes that the process may hold; what it holds and a share of what is free unless given.
+        Bytes that the process may hold in all. By default what it holds already and a share of the
+        free memory.
     """
     return Resources(useful_threads(threads), memory_bound(max_memory))

@@ -1,6 +1,6 @@
-"""Threads, and work that is cut into pieces for them.
+"""Threads, and work cut into chunks for them.
 
-Pieces do not depend on each other, so they may run at the same time; results come in their order.
+Pieces of work are independent of each other and may run at the same time; results come in order.
 """
 
 from __future__ import annotations
@@ -16,32 +16,29 @@ from .containers import bound_of_cores
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
 
-CHUNK = 1 << 19  # numbers that are worked on at a time, so that temporaries stay in cache
-WORTH = 1 << 21  # numbers for each thread, or threads cost more than they save
+CHUNK = 1 << 19  # temporaries (array elements) per chunk, so that they stay in cache
+MIN_PER_THREAD = 1 << 21  # array elements; with fewer, a thread costs more than it saves
 
 
 def count_cores() -> int:
-    """Return how many cores this process may use: in a container, its share of them, rounded up."""
+    """Return the number of cores this process may use; in a container its quota, rounded up."""
     return max(ceil(min(cores_of_system(), bound_of_cores())), 1)
 
 
 def cores_of_system() -> int:
-    """Return how many cores the system lets this process run on."""
+    """Return the number of cores that the system lets this process run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def useful_threads(requested: int) -> int:
-    """Return the number of threads to use for a requested number, 0 meaning one per core.
-
-    More than there are cores would wait for each other.
-    """
+    """Return the number of threads to use: as requested, 0 meaning one per core, but no more."""
     cores = count_cores()
     return min(requested or cores, cores)
 
 
-def worthwhile(numbers: int, threads: int) -> int:
-    """Return how many of the threads are worth starting for work on ``numbers`` numbers."""
-    return max(min(threads, numbers // WORTH), 1)
+def worthwhile_threads(size: int, threads: int) -> int:
+    """Return how many of the threads are worth starting for work on ``size`` array elements."""
+    return max(min(threads, size // MIN_PER_THREAD), 1)
 
 
 def rows_in_chunk(width: int) -> int:
@@ -59,13 +56,13 @@ def map_chunks(
     work: Callable[[slice], Result], count: int, width: int, threads: int = 1
 ) -> list[Result]:
     """Return ``work(rows)`` for chunks of ``count`` rows that need ``width`` temporaries each."""
-    return map_threads(work, chunks_of(count, width), worthwhile(count * width, threads))
+    return map_threads(work, chunks_of(count, width), worthwhile_threads(count * width, threads))
 
 
 def map_threads(
     work: Callable[[Piece], Result], pieces: Sequence[Piece], threads: int = 1
 ) -> list[Result]:
-    """Return ``work(piece)`` for each piece, by as many threads."""
+    """Return ``work(piece)`` for each piece, in order, with up to ``threads`` threads."""
     threads = min(threads, len(pieces))
     if threads < 2:
         return [work(piece) for piece in pieces]

@@ -1,4 +1,4 @@
 """The network: an ONNX file, its contract, and the device that it runs on.
 
-It may import ``machine`` and what lies below.
+It may import ``files`` and the rooms below it.
 """

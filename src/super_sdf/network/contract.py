@@ -1,8 +1,8 @@
-"""What an ONNX file must keep to be a network of this package: inputs, output, metadata.
+"""The contract of an ONNX file with this package: its inputs, output and metadata.
 
-Inputs ``patches`` (V, 27), ``neighbours`` (V, 27), ``voxels`` (D,), ``offsets`` (Q, 3); output
-``values`` (D, Q). All lengths are in half voxels. The metadata, the card, says what it was made
-for.
+Inputs are ``patches`` (V, 27), ``neighbours`` (V, 27), ``voxels`` (D,) and ``offsets`` (Q, 3); the
+output is ``values`` (D, Q). Distances and offsets are in half voxels. The metadata, the model card,
+holds the receptive field, the training factors, data and accuracy.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ INPUTS = {
     "offsets": "tensor(float)",
 }
 OUTPUT, OUTPUT_TYPE = "values", "tensor(float)"
-# Voxels to each side. The patch alone reaches one; a network that sees farther than this sees the
-# whole grid, and its card leaves the field out.
-LARGEST_FIELD = 1000
-SHOWN = 60  # characters of what a file says, in messages
+# Voxels to each side; a patch alone reaches one. The card of a network that sees farther, up to the
+# whole grid, leaves the receptive field out.
+MAX_RECEPTIVE_FIELD = 1000
+MAX_SHOWN = 60  # characters of metadata in messages
 
 
 def one_voxel() -> dict[str, Any]:
-    """Return the inputs to try a network with: one voxel without neighbours, and two offsets.
+    """Return the inputs of a trial run: one voxel without neighbours, and two offsets.
 
-    Two, so that an output with its axes swapped is noticed.
+    There are two offsets so that an output with its axes swapped is noticed.
     """
     return {
         "patches": np.zeros((1, 27), np.float32),
@@ -45,53 +45,59 @@ def one_voxel() -> dict[str, Any]:
 
 
 def read_card(session: ort.InferenceSession, path: Path) -> dict[str, Any]:
-    """Return a file's metadata after checking that it keeps the contract, or raise ModelError."""
+    """Return the metadata of a file.
+
+    Raises
+    ------
+    ModelError
+        If the file does not fulfil the contract.
+    """
     try:
         inputs = {given.name: given.type for given in session.get_inputs()}
         outputs = {made.name: made.type for made in session.get_outputs()}
         metadata = session.get_modelmeta().custom_metadata_map
     except UnicodeDecodeError as error:
-        raise ModelError(f"{path} holds names that are no UTF-8 text: it is damaged") from error
+        raise ModelError(f"{path} is damaged: it has names that are not UTF-8 text") from error
     version = metadata.get("format_version", "none")
     if inputs != INPUTS or outputs != {OUTPUT: OUTPUT_TYPE} or version != str(FORMAT_VERSION):
         raise ModelError(
-            f"{path} is no super-sdf network of format {FORMAT_VERSION} (format {shortly(version)},"
-            f" inputs {describe(inputs)}, outputs {describe(outputs)}); export one with "
-            "export/to_onnx.py"
+            f"{path} is no super-sdf network of format {FORMAT_VERSION} (format {shorten(version)}"
+            f", inputs {describe_types(inputs)}, outputs {describe_types(outputs)}); export one "
+            "with export/to_onnx.py"
         )
     card = {key: _parse(key, text, path) for key, text in metadata.items()}
     _check_field(card.get("receptive_field", 1), path)
     return card
 
 
-def shortly(text: str) -> str:
-    """Return what a file says as a piece of one line."""
+def shorten(text: str) -> str:
+    """Return text from a file as part of one line, cut to ``MAX_SHOWN`` characters."""
     line = " ".join(text.split())
-    return line if len(line) <= SHOWN else f"{line[:SHOWN]}..."
+    return line if len(line) <= MAX_SHOWN else f"{line[:MAX_SHOWN]}..."
 
 
-def describe(values: Mapping[str, str]) -> str:
-    """Name inputs or outputs with their types."""
-    return shortly(", ".join(f"{name} {kind}" for name, kind in values.items()))
+def describe_types(values: Mapping[str, str]) -> str:
+    """Return the names of inputs or outputs with their types, in one line."""
+    return shorten(", ".join(f"{name} {kind}" for name, kind in values.items()))
 
 
 def _parse(key: str, text: str, path: Path) -> Any:
-    """Read a metadata value: JSON where it is JSON, else text."""
+    """Return a metadata value parsed as JSON, or as text if it is not JSON."""
     try:
         return json.loads(text)
     except json.JSONDecodeError:
         return text
     except (ValueError, RecursionError) as error:  # thousands of digits; nested too deep
         raise ModelError(
-            f"{path}: its metadata {shortly(key)!r} is no value that can be read, "
-            f"{shortly(text)!r}; export it again with export/to_onnx.py"
+            f"{path}: its metadata {shorten(key)!r} cannot be read, {shorten(text)!r}; export it "
+            "again with export/to_onnx.py"
         ) from error
 
 
 def _check_field(field: Any, path: Path) -> None:
-    """Raise ModelError unless a receptive field is a number of voxels."""
-    if type(field) is not int or not 1 <= field <= LARGEST_FIELD:  # True is an int, too
+    """Raise ModelError unless a receptive field is a valid number of voxels."""
+    if type(field) is not int or not 1 <= field <= MAX_RECEPTIVE_FIELD:  # True is an int, too
         raise ModelError(
-            f"{path}: its receptive field is {shortly(repr(field))}; it must be a whole number of "
-            f"voxels from 1 to {LARGEST_FIELD}: export it again with export/to_onnx.py"
+            f"{path}: its receptive field is {shorten(repr(field))}; it must be a whole number of "
+            f"voxels from 1 to {MAX_RECEPTIVE_FIELD}: export it again with export/to_onnx.py"
         )

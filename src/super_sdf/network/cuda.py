@@ -1,6 +1,6 @@
-"""What CUDA needs of this machine, and what of it is missing, in plain words.
+"""Checks that CUDA can run on this machine, with errors that name what is missing.
 
-onnxruntime itself falls back to the CPU without a word: see ``device``.
+onnxruntime itself falls back to the CPU silently: see ``device``.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ DRIVER = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
 
 
 def available_devices() -> list[str]:
-    """Return the devices that this onnxruntime was built for."""
+    """Return the devices that the installed onnxruntime was built for."""
     return ["cpu"] + ["cuda"] * (CUDA in ort.get_available_providers())
 
 
 def onnxruntime_version() -> str:
-    """Return the version of onnxruntime with that of the CUDA it was built for."""
+    """Return the version of onnxruntime, and of the CUDA that it was built for."""
     cuda = getattr(ort, "cuda_version", "")
     return f"onnxruntime {ort.__version__}" + (f" for CUDA {cuda}" if cuda else "")
 
@@ -49,12 +49,12 @@ def check_cuda() -> None:
 
 
 def missing_library() -> str | None:
-    """Return the first library that onnxruntime's CUDA provider wants and that is not there.
+    """Return the first library that onnxruntime's CUDA provider needs and that is not installed.
 
-    The loader is asked, with the very file that onnxruntime would load, for its list of libraries
-    is another in each version. None where the loader does not name files (Windows).
+    This tries to load the provider, since each version needs other libraries. None if nothing is
+    missing, or on systems whose loader does not name files (Windows).
     """
-    if hasattr(ort, "preload_dlls"):  # since 1.21; finds what pip installed
+    if hasattr(ort, "preload_dlls"):  # since 1.21; finds libraries that pip installed
         with redirect_stdout(io.StringIO()):  # it prints
             ort.preload_dlls()
     provider = Path(ort.__file__).parent / "capi" / "libonnxruntime_providers_cuda.so"
@@ -67,12 +67,12 @@ def missing_library() -> str | None:
 
 
 def has_gpu() -> bool:
-    """Say whether this machine seems to have an NVIDIA GPU: its device file or its driver."""
+    """Return whether there seems to be an NVIDIA GPU: its device file or its driver exists."""
     return Path("/dev/nvidia0").exists() or has_driver()
 
 
 def has_driver() -> bool:
-    """Say whether the NVIDIA driver's library is there."""
+    """Return whether the NVIDIA driver's library can be loaded."""
     try:
         ctypes.CDLL(DRIVER)
     except OSError:
@@ -81,7 +81,7 @@ def has_driver() -> bool:
 
 
 def describe_gpu() -> str | None:
-    """Return the first GPU's name, driver and memory, None where nvidia-smi does not say."""
+    """Return the first GPU's name, driver and free memory; None if nvidia-smi cannot tell."""
     values = query_gpu("name", "driver_version", "memory.total", "memory.used")
     if values is None:
         return None
@@ -91,7 +91,7 @@ def describe_gpu() -> str | None:
 
 
 def query_gpu(*fields: str) -> list[str] | None:
-    """Ask nvidia-smi for fields of the first GPU; memory comes in MiB."""
+    """Return fields of the first GPU from nvidia-smi, memory in MiB; None if it fails."""
     words = ["nvidia-smi", "-i", "0", f"--query-gpu={','.join(fields)}"]
     try:
         run = subprocess.run(
@@ -103,9 +103,10 @@ def query_gpu(*fields: str) -> list[str] | None:
 
 
 def first_line(error: Exception) -> str:
-    """Return what an error of onnxruntime says, in one line.
+    """Return the message of an onnxruntime error in one line.
 
-    Where CUDA failed that is inside a long line of source files and template arguments.
+    For a failure of CUDA this is the part of interest in a long line of source files and template
+    arguments.
     """
     failure = re.search(r"CUDA failure \d+: [^;\n]*", str(error))
     if failure:

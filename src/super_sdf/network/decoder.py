@@ -1,4 +1,4 @@
-"""What the pipeline asks of a network, and whether the answer can be used."""
+"""Running a network on a band, and checking the values that it returns."""
 
 from __future__ import annotations
 
@@ -9,24 +9,32 @@ import numpy as np
 from ..arrays import FloatArray, IntArray
 from ..errors import ModelError
 from ..machine.threads import map_chunks
-from ..progress import Tell
+from ..progress import ShareCallback
 
-# Half voxels: the squares of sums of such values are still numbers in single precision.
-LARGEST = np.float32(1e15)
+# In half voxels; squares of sums of such values are still finite in single precision.
+MAX_VALUE = np.float32(1e15)
 
 
 class Decoder(Protocol):
-    """What the pipeline asks of a network: see ``network.Network``.
+    """The interface of a network to the pipeline; ``network.Network`` and any function have it.
 
-    If it has a ``receptive_field`` (voxels to each side), it need not see the whole band at once.
-    If it says that it ``tells_progress``, it is given what to tell, as ``progress``. Its
-    ``memory_bytes`` say what it takes: see ``footprint.slab_bytes``.
+    Optional attributes:
+
+    ``receptive_field``
+        Voxels to each side that a value depends on. Without it, the network must see the whole
+        band at once.
+    ``reports_progress``
+        True if a call takes the argument ``progress``, a ``ShareCallback``.
+    ``memory_bytes``
+        Memory that a call takes: see ``footprint.slab_bytes``.
+    ``threads``
+        CPU threads, also for the other steps; 0 for one per core.
     """
 
     def __call__(
         self, patches: FloatArray, table: IntArray, voxels: IntArray, offsets: FloatArray
     ) -> FloatArray:
-        """Map patches (V, 27), neighbours (V, 27), voxels (D,), offsets (Q, 3) to (D, Q)."""
+        """Return values (D, Q) of patches (V, 27), table (V, 27), voxels (D,), offsets (Q, 3)."""
         ...
 
 
@@ -34,64 +42,71 @@ def decode(
     network: Decoder,
     inputs: tuple[FloatArray, IntArray, IntArray],
     offsets: FloatArray,
-    progress: Tell | None = None,
+    progress: ShareCallback | None = None,
     threads: int = 1,
 ) -> FloatArray:
-    """Return a network's values in half voxels, of which all are usable.
+    """Run a network, and return its checked values as blocks.
 
     Parameters
     ----------
     network : Decoder
         Called once.
     inputs : tuple of arrays
-        Patches (V, 27), neighbours (V, 27), voxels (D,).
+        Patches (V, 27), neighbour table (V, 27), voxels (D,).
     offsets : (Q, 3) float32
-        In half voxels.
+        Query offsets in half voxels.
     progress : callable, optional
-        Told the share that is done, if the network tells it.
+        Called with the finished share, if the network reports it.
     threads : int
-        How many work at a time, after the network.
+        Threads to use after the network.
 
     Returns
     -------
     (Q, D + 1) float32
-        A row for each offset, a column for each voxel, and one of zeros: see ``steps.nodes``.
+        Values in half voxels: a row per offset, a column per voxel, and a last column of zeros.
+        See ``steps.nodes``.
 
     Raises
     ------
     ModelError
-        If the values have another shape, or are not finite. Nothing after the network looks again.
+        If the values have another shape or type, or are not finite. Later steps do not check.
     """
-    tells = progress is not None and getattr(network, "tells_progress", False)
-    told: dict[str, Any] = {"progress": progress} if tells else {}
-    values = network(*inputs, offsets, **told)
-    check_kind(values, (len(inputs[2]), len(offsets)))
+    reports = progress is not None and getattr(network, "reports_progress", False)
+    options: dict[str, Any] = {"progress": progress} if reports else {}
+    values = network(*inputs, offsets, **options)
+    check_output(values, (len(inputs[2]), len(offsets)))
     return to_blocks(values, threads)
 
 
-def check_kind(values: Any, shape: tuple[int, int]) -> None:
-    """Raise if a network's values are not floating-point numbers of this shape."""
+def check_output(values: Any, shape: tuple[int, int]) -> None:
+    """Raise ModelError if a network's values are not floating-point numbers of this shape."""
     kind = getattr(values, "dtype", type(values).__name__)
     if not isinstance(values, np.ndarray) or values.shape != shape or values.dtype.kind != "f":
         raise ModelError(
-            f"the network gave {kind} of shape {np.shape(values)} in place of float32 of shape "
+            f"the network gave {kind} of shape {np.shape(values)} instead of float32 of shape "
             f"{shape}, (voxels, offsets)"
         )
 
 
 def to_blocks(values: FloatArray, threads: int = 1) -> FloatArray:
-    """Return values (D, Q) as blocks (Q, D + 1), if all of them can be used."""
+    """Return values (D, Q) as blocks (Q, D + 1), the last column 0.
+
+    Raises
+    ------
+    ModelError
+        If any value is not finite, or beyond ``MAX_VALUE``.
+    """
     count, offsets = values.shape
     blocks = np.empty((offsets, count + 1), np.float32)
     blocks[:, count] = 0
 
-    def check_and_turn(rows: slice) -> int:
-        with np.errstate(over="ignore"):  # what is too large is refused
+    def transpose_and_check(rows: slice) -> int:
+        with np.errstate(over="ignore"):  # values that are too large are counted
             some = values[rows].astype(np.float32, copy=False)
         blocks[:, rows] = some.T
         return count_unusable(some)
 
-    bad = sum(map_chunks(check_and_turn, count, 4 * offsets, threads))
+    bad = sum(map_chunks(transpose_and_check, count, 4 * offsets, threads))
     if bad:
         raise ModelError(
             f"{bad:,} of the {values.size:,} values that the network gave are NaN, infinite or "
@@ -101,7 +116,7 @@ def to_blocks(values: FloatArray, threads: int = 1) -> FloatArray:
 
 
 def count_unusable(values: FloatArray) -> int:
-    """Count values that are NaN, infinite or too large, in a moment if there are none."""
-    if values.min() >= -LARGEST and values.max() <= LARGEST:  # both false of NaN
+    """Count values that are NaN, infinite or too large; fast if there are none."""
+    if values.min() >= -MAX_VALUE and values.max() <= MAX_VALUE:  # both are False for NaN
         return 0
-    return int(np.count_nonzero(~(np.abs(values) <= LARGEST)))
+    return int(np.count_nonzero(~(np.abs(values) <= MAX_VALUE)))

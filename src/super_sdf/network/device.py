@@ -1,8 +1,8 @@
-"""Where a network runs: the CPU or a GPU through CUDA, and in plain words why not.
+"""Opening a network on a device: the CPU, or a GPU through CUDA.
 
-onnxruntime falls back to the CPU without a word when CUDA cannot run. Nothing here does: asked for
-"cuda", it is CUDA or an error that says what is missing; asked for "auto", it is CUDA, or the CPU
-with a note if there is a GPU that might have been used.
+onnxruntime falls back to the CPU silently when CUDA cannot run. Here nothing is silent: device
+"cuda" means CUDA or an error that names what is missing; "auto" means CUDA, or the CPU, with a note
+if there is a GPU that could have been used.
 """
 
 from __future__ import annotations
@@ -21,18 +21,28 @@ from .running import run_bound, run_on_cpu
 CPU = "CPUExecutionProvider"
 CUDA_OPTIONS = {
     "device_id": "0",
-    # What a run takes, and no more; with SHRINK the next run does not find it fragmented.
+    # Take only the memory that a run needs; with SHRINK the next run finds it unfragmented.
     "arena_extend_strategy": "kSameAsRequested",
-    "cudnn_conv_algo_search": "HEURISTIC",  # should a network have convolutions: no trials of each
-    "use_tf32": "0",  # ten bits of a number are too few for 1e-4 of a voxel
+    "cudnn_conv_algo_search": "HEURISTIC",  # no timed trials, for networks with convolutions
+    "use_tf32": "0",  # its 10-bit mantissa is too short for 1e-4 of a voxel
 }
 
 
 @dataclass(frozen=True, eq=False)
-class Opened:
-    """An open session: where, what the user should know of that, and why it did not run there.
+class OpenedSession:
+    """An open session.
 
-    ``failure`` is empty if it ran; else it may be a network of another kind.
+    Attributes
+    ----------
+    session : InferenceSession
+        The session.
+    device : str
+        Where it runs: "cpu" or "cuda".
+    notes : tuple of str
+        What the user should know about the choice of device.
+    failure : str
+        The error of the trial run, empty if it succeeded. After a failure the file may be a network
+        with another contract.
     """
 
     session: ort.InferenceSession
@@ -41,7 +51,7 @@ class Opened:
     failure: str = ""
 
 
-def open_session(path: Path, device: str, threads: int, trial: Mapping[str, Any]) -> Opened:
+def open_session(path: Path, device: str, threads: int, trial: Mapping[str, Any]) -> OpenedSession:
     """Open an ONNX file on a device.
 
     Parameters
@@ -49,49 +59,50 @@ def open_session(path: Path, device: str, threads: int, trial: Mapping[str, Any]
     path : path
         The file.
     device : str
-        "cuda", "cpu", or "auto": CUDA where it runs, else the CPU.
+        "cuda", "cpu", or "auto": CUDA if it runs, otherwise the CPU.
     threads : int
-        CPU threads; 0 for one a core.
+        CPU threads; 0 for one per core.
     trial : dict
-        Inputs to run once: sessions open that cannot run, on a GPU too old or full.
+        Inputs of a trial run: a session can open although it cannot run, for example on a GPU that
+        is too old or whose memory is full.
 
     Raises
     ------
     ModelError
         If onnxruntime cannot read the file.
     DeviceError
-        If CUDA was asked for and cannot run.
+        If the device is "cuda" and CUDA cannot run.
     """
     if device not in DEVICES:
         raise DeviceError(f"device is {device!r}: give one of {', '.join(DEVICES)}")
     if device == "cpu":
         return open_on_cpu(path, threads, trial)
     try:
-        return Opened(open_on_cuda(path, threads, trial), "cuda")
+        return OpenedSession(open_on_cuda(path, threads, trial), "cuda")
     except DeviceError as error:
-        opened = open_on_cpu(path, threads, trial)  # first: it may be the file that is at fault
+        opened = open_on_cpu(path, threads, trial)  # first, since the file may be the cause
         if device == "cuda":
             raise DeviceError(f"cuda was asked for, but {error}; or use --device cpu") from error
         note = f"a GPU seems to be here, but the network runs on the CPU: {error}"
         return replace(opened, notes=(note,) * has_gpu())
 
 
-def open_on_cpu(path: Path, threads: int, trial: Mapping[str, Any]) -> Opened:
-    """Open a file on the CPU and run it once, or raise ModelError if it cannot be opened."""
+def open_on_cpu(path: Path, threads: int, trial: Mapping[str, Any]) -> OpenedSession:
+    """Open a file on the CPU and run it once; ModelError if it cannot be opened."""
     try:
         session = ort.InferenceSession(str(path), session_options(threads), providers=[CPU])
-    except Exception as error:  # onnxruntime's errors have no common base but this
+    except Exception as error:  # onnxruntime's errors have no other common base class
         reason = first_line(error)
         raise ModelError(f"{path} is no ONNX file that onnxruntime can run: {reason}") from error
     try:
-        run_on_cpu(session, trial)  # what the arena takes first it never gives back: a little
-    except DeviceError as error:  # a file that is no network of ours, as its card will tell
-        return Opened(session, "cpu", failure=str(error))
-    return Opened(session, "cpu")
+        run_on_cpu(session, trial)  # small: the arena never gives back its first allocation
+    except DeviceError as error:  # the check of its card may explain why
+        return OpenedSession(session, "cpu", failure=str(error))
+    return OpenedSession(session, "cpu")
 
 
 def open_on_cuda(path: Path, threads: int, trial: Mapping[str, Any]) -> ort.InferenceSession:
-    """Open a file on CUDA and run it once, or raise DeviceError, which says what is missing."""
+    """Open a file on CUDA and run it once; DeviceError, with what is missing, if it cannot run."""
     check_cuda()
     providers = [(CUDA, CUDA_OPTIONS), CPU]
     try:
@@ -101,15 +112,15 @@ def open_on_cuda(path: Path, threads: int, trial: Mapping[str, Any]) -> ort.Infe
         if CUDA in session.get_providers():
             run_bound(session, trial)
             return session
-    except Exception as error:  # onnxruntime's errors have no common base but this
+    except Exception as error:  # onnxruntime's errors have no other common base class
         raise DeviceError(f"CUDA does not run here: {first_line(error)}") from error
     raise DeviceError(f"{onnxruntime_version()} could not start its CUDA provider")
 
 
 def session_options(threads: int) -> ort.SessionOptions:
-    """Return what sessions on every device are told."""
+    """Return the options of sessions, the same on every device."""
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
-    options.log_severity_level = 4  # errors come as exceptions; the rest is not for users
-    options.enable_mem_pattern = False  # it is for inputs of one size
+    options.log_severity_level = 4  # errors are raised; the other messages are not for users
+    options.enable_mem_pattern = False  # useful only if all inputs have the same size
     return options

@@ -1,4 +1,4 @@
-"""The network: an ONNX file that keeps the ``contract``, opened on a ``device``."""
+"""The network: an ONNX file that fulfils the ``contract``, opened on a ``device``."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from ..errors import DeviceError, FileError, ModelError, OptionError
 from ..files.regular import check_regular_file
 from ..machine.threads import cores_of_system, useful_threads
 from ..options import check_path, check_threads
-from ..progress import Tell
+from ..progress import ShareCallback
 from .contract import INPUTS, one_voxel, read_card
 from .device import open_session
 from .names import DEFAULT_QUALITY, PRECISIONS, QUALITIES
 from .onnx import ort
-from .pace import LONG, Pace, work_of
-from .running import CUDA_CHUNK, Look, run_bound, run_on_cpu
+from .pace import LONG_RUN, Pace, work_of
+from .running import CUDA_CHUNK, Poll, run_bound, run_on_cpu
 from .symmetry import cube_symmetries, turn
 
 MODELS = Path(__file__).parent.parent / "models"
-# What a run takes, measured, for each voxel that it sees, its row of the neighbour table included,
-# and for each value; and what it takes to average over symmetries: turned copies, and the mean.
+# Memory of a run, measured: bytes per voxel that it sees, including its row of the neighbour table,
+# and per value. Averaging over symmetries takes more: for the transformed inputs, and for the mean.
 BYTES = {"float32": (680.0, 8.0), "int8": (950.0, 8.0)}
-TURNED_BYTES = (240.0, 4.0)
+SYMMETRY_BYTES = (240.0, 4.0)
 NO_NETWORKS = "super-sdf was installed without its networks: install it again"
-PART = 1024  # rows of a run from which its time is told: two chunks
+TRIAL_ROWS = 1024  # voxels of a run on the CPU that measures the pace: two chunks
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -45,15 +45,15 @@ class Network:
     device : str
         Where it runs: "cpu" or "cuda".
     symmetries : int
-        Over how many symmetries of the cube the values are averaged.
+        Number of symmetries of the cube over which the values are averaged.
     threads : int
-        CPU threads; 0 for one a core.
+        CPU threads; 0 for one per core.
     notes : tuple of str
-        What the user should know of the device.
+        What the user should know about device and threads.
     pace : Pace
-        How long runs take, learnt from them.
-    tells_progress : bool
-        That a call takes ``progress``: see ``decoder.Decoder``.
+        The time that runs take, measured in earlier ones.
+    reports_progress : bool
+        True: a call takes ``progress``, see ``decoder.Decoder``.
     """
 
     session: ort.InferenceSession
@@ -63,7 +63,7 @@ class Network:
     threads: int = 0
     notes: tuple[str, ...] = ()
     pace: Pace = field(default_factory=Pace, repr=False)
-    tells_progress: ClassVar[bool] = True
+    reports_progress: ClassVar[bool] = True
 
     def __repr__(self) -> str:
         threads = self.threads or "all"
@@ -74,16 +74,16 @@ class Network:
 
     @property
     def receptive_field(self) -> int | None:
-        """Voxels to each side that a prediction depends on, None if the file does not say."""
+        """Voxels to each side that a value depends on; None if the card does not have it."""
         return self.card.get("receptive_field")
 
     @property
     def memory_bytes(self) -> tuple[float, float]:
-        """What a run takes at most: bytes for each voxel that it sees, and for each value."""
+        """Peak memory of a run: bytes per voxel that it sees, and bytes per value."""
         voxel, value = BYTES["int8" if self.card.get("precision") == "int8" else "float32"]
         if self.symmetries == 1:
             return voxel, value
-        return voxel + TURNED_BYTES[0], value + TURNED_BYTES[1]
+        return voxel + SYMMETRY_BYTES[0], value + SYMMETRY_BYTES[1]
 
     def __call__(
         self,
@@ -91,26 +91,42 @@ class Network:
         table: IntArray,
         voxels: IntArray,
         offsets: FloatArray,
-        progress: Tell | None = None,
+        progress: ShareCallback | None = None,
     ) -> FloatArray:
-        """Return the values (D, Q) of voxels (D,) at offsets (Q, 3), in half voxels.
+        """Return the values of voxels at query offsets.
 
-        ``progress`` is called several times a second with the share that is done, 0 to 1, an
-        estimate by the clock. An interrupt, or what it raises, ends the call in milliseconds.
+        Parameters
+        ----------
+        patches : (V, 27) float32
+            The samples round each voxel of the band, in half voxels.
+        table : (V, 27) int32
+            Neighbour table of the band.
+        voxels : (D,) int32
+            Rows of the band to decode.
+        offsets : (Q, 3) float32
+            Query offsets from the voxels' samples, in half voxels.
+        progress : callable, optional
+            Called several times a second with the finished share, 0 to 1, estimated from the
+            elapsed time. An exception in it, or an interrupt, ends the call within milliseconds.
+
+        Returns
+        -------
+        (D, Q) float32
+            Signed distances in half voxels.
 
         Raises
         ------
         DeviceError
-            If onnxruntime fails, for want of memory on a GPU, say.
+            If onnxruntime fails, for example for lack of memory on a GPU.
         """
         if self.symmetries == 1:
             return self._run(patches, table, voxels, offsets, progress)
         mean = np.zeros((len(voxels), len(offsets)), np.float32)
         for number, symmetry in enumerate(cube_symmetries()[: self.symmetries]):
             turned, turned_table, moved = turn(symmetry, patches, table, offsets)
-            tell = progress and part_of(progress, number, self.symmetries)
-            values = self._run(turned, turned_table, voxels, moved, tell)
-            with np.errstate(invalid="ignore"):  # infinities are the caller's to refuse
+            part_progress = progress and progress_of_part(progress, number, self.symmetries)
+            values = self._run(turned, turned_table, voxels, moved, part_progress)
+            with np.errstate(invalid="ignore"):  # the caller checks for infinities
                 mean += values / self.symmetries
         return mean
 
@@ -120,50 +136,50 @@ class Network:
         table: IntArray,
         voxels: IntArray,
         offsets: FloatArray,
-        progress: Tell | None,
+        progress: ShareCallback | None,
     ) -> FloatArray:
-        """Run the session; watched if that takes long, for a thread takes a tenth of a millisecond.
+        """Run the session once; polled only if the run is long, since a thread costs 0.1 ms.
 
-        Of fewer voxels than offsets onnxruntime would make the sums in an order that depends on how
-        many threads there are, so voxels are repeated until there are as many.
+        With fewer voxels than offsets, the order of onnxruntime's sums would depend on the number
+        of threads, so voxels are repeated until there are as many as offsets.
         """
         count = len(voxels)
         voxels = np.resize(voxels, max(count, len(offsets)))
         feeds = dict(zip(INPUTS, (patches, table, voxels, offsets)))
         work = work_of(len(patches), len(voxels), len(offsets))
-        if work < LONG:
-            return self._ask(feeds)[:count]
+        if work < LONG_RUN:
+            return self._run_session(feeds)[:count]
         if progress and self.pace.seconds is None:
-            self._try_part(feeds)
+            self._time_part(feeds)
         watch = self.pace.watch(work, progress or (lambda share: None))
         begun = time.perf_counter()
-        values = self._ask(feeds, watch)
+        values = self._run_session(feeds, watch)
         self.pace.learn(work, time.perf_counter() - begun)
         return values[:count]
 
-    def _ask(self, feeds: Mapping[str, Any], look: Look | None = None) -> FloatArray:
-        """Run the session where it is."""
+    def _run_session(self, feeds: Mapping[str, Any], poll: Poll | None = None) -> FloatArray:
+        """Run the session on its device."""
         run = run_bound if self.device == "cuda" else run_on_cpu
-        return run(self.session, feeds, look=look)
+        return run(self.session, feeds, poll=poll)
 
-    def _try_part(self, feeds: Mapping[str, Any]) -> None:
-        """Learn the pace from a small part of a run: the first chunks."""
-        rows = CUDA_CHUNK if self.device == "cuda" else PART
-        part = first_rows(feeds, rows - 1)  # one more is added to fill the last chunk
+    def _time_part(self, feeds: Mapping[str, Any]) -> None:
+        """Measure the pace in a small part of a run: the first chunks."""
+        rows = CUDA_CHUNK if self.device == "cuda" else TRIAL_ROWS
+        part = crop_inputs(feeds, rows - 1)  # the graph pads to whole chunks, by at least one row
         begun = time.perf_counter()
-        self._ask(part)
-        offsets = len(part["offsets"])  # no fewer voxels than these are decoded at a time
+        self._run_session(part)
+        offsets = len(part["offsets"])  # at least this many voxels are decoded, see _run
         work = work_of(rows, max(len(part["voxels"]), offsets), offsets)
         self.pace.learn(work, time.perf_counter() - begun)
 
 
-def part_of(progress: Tell, number: int, count: int) -> Tell:
-    """Return what tells of the whole when it is told how far one part of ``count`` is."""
+def progress_of_part(progress: ShareCallback, number: int, count: int) -> ShareCallback:
+    """Return a callback for the share of part ``number`` of ``count`` that reports the whole."""
     return lambda share: progress((number + share) / count)
 
 
-def first_rows(feeds: Mapping[str, Any], rows: int) -> dict[str, Any]:
-    """Return the inputs of the first rows of a band, cut off from the others."""
+def crop_inputs(feeds: Mapping[str, Any], rows: int) -> dict[str, Any]:
+    """Return inputs with only the first rows of the band, without neighbours in the others."""
     table, voxels = feeds["neighbours"][:rows], feeds["voxels"]
     decoded = voxels[voxels < rows]
     return {
@@ -175,19 +191,19 @@ def first_rows(feeds: Mapping[str, Any], rows: int) -> dict[str, Any]:
 
 
 def shipped_models() -> dict[str, Path]:
-    """Return the networks that come with the package, by name; none if it lost their folder."""
+    """Return the files of the networks that come with the package, by name; empty without them."""
     return {path.stem: path for path in sorted(MODELS.glob("*.onnx"))}
 
 
 def find_model(model: str | Path, precision: str = "float32") -> tuple[Path, int]:
-    """Return the file of a quality or of a path, and how many symmetries it is averaged over.
+    """Return the file of a quality or path, and the number of symmetries to average over.
 
     Raises
     ------
     FileError
-        If there is no such file, or what has its name is no regular file.
+        If there is no such file, or it is not a regular file.
     OptionError
-        If there is none of this precision.
+        If there is no file of this precision.
     """
     if precision not in PRECISIONS:
         raise OptionError(f"precision is {precision!r}: give one of {', '.join(PRECISIONS)}")
@@ -196,7 +212,7 @@ def find_model(model: str | Path, precision: str = "float32") -> tuple[Path, int
         raise FileError(f"the network {name!r} is missing: {NO_NETWORKS}")
     path = shipped_models().get(name, Path(model))
     if precision == "int8":
-        path = path.with_name(f"{path.stem}-int8.onnx")  # beside that of float32
+        path = path.with_name(f"{path.stem}-int8.onnx")  # beside the float32 file
         if not os.path.lexists(path):
             raise OptionError(
                 f"{model} has no int8 variant, {path}: write one with export.quantize"
@@ -221,22 +237,22 @@ def load_network(
     model : str or path
         "fast", "base" or "best" (base, averaged over reflections), or an ONNX file.
     device : str
-        "cuda", "cpu", or "auto": CUDA where it runs, else the CPU.
+        "cuda", "cpu", or "auto": CUDA if it runs, otherwise the CPU.
     threads : int
-        CPU threads; 0 for one a core, and never more.
+        CPU threads; 0 for one per core, which is also the maximum.
     precision : str
-        "float32", or "int8" for the variant in whole numbers, quicker on the CPU, where it runs.
+        "float32", or "int8" for the quantised variant, which is faster and runs on the CPU only.
 
     Raises
     ------
     FileError
         If there is no such file.
     OptionError
-        If there is none of this precision, or another argument is not what it should be.
+        If there is no file of this precision, or another argument is invalid.
     ModelError
-        If it is not a network of this format.
+        If the file is not a network of this format.
     DeviceError
-        If CUDA was asked for and cannot run.
+        If the device is "cuda" and CUDA cannot run.
     """
     threads = check_threads(threads)
     check_path(model, "model")
@@ -245,7 +261,7 @@ def load_network(
         device = _cpu_for_int8(device)
     useful = useful_threads(threads)
     if not threads and useful == cores_of_system():
-        useful = 0  # onnxruntime's own choice, one a physical core
+        useful = 0  # onnxruntime's default, one thread per physical core
     opened = open_session(path, device, useful, one_voxel())
     card = read_card(opened.session, path)
     if opened.failure:
@@ -255,14 +271,14 @@ def load_network(
 
 
 def _note_threads(requested: int, useful: int) -> tuple[str, ...]:
-    """Return a note if fewer threads work than were asked for."""
+    """Return a note if fewer threads are used than requested."""
     if not requested or requested <= useful:
         return ()
     return (f"--threads {requested} is cut to {useful}, the cores that this process may use",)
 
 
 def _cpu_for_int8(device: str) -> str:
-    """Return the device for whole numbers: they gain nothing on a GPU."""
+    """Return the device for int8, which is not faster on a GPU."""
     if device == "cuda":
         raise DeviceError("int8 is for the CPU: use --precision float32 with --device cuda")
     return "cpu" if device == "auto" else device

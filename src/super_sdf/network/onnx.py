@@ -1,8 +1,8 @@
-"""The one place that imports onnxruntime, so that all of this package does it alike.
+"""The only module that imports onnxruntime, so that it is always imported without telemetry.
 
-Since 2026 the wheels for Linux and macOS send usage data unless they are told not to: the import
-writes files under the user's cache folder, and a process that lives for a minute sends what it
-runs on. A tool for people's own shapes does not do that unasked.
+Since 2026 the wheels for Linux and macOS send usage data by default: the import writes files under
+the user's cache folder, and a process that runs for a minute sends data about its machine. A tool
+for people's own shapes must not do that without their consent.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from contextlib import contextmanager
 
 from ..errors import DeviceError
 
-# onnxruntime reads it once, when it is imported.
+# An environment variable that onnxruntime reads once, when it is imported.
 SWITCH = "ORT_DISABLE_TELEMETRY"
 
 
 @contextmanager
 def without_telemetry() -> Iterator[None]:
-    """Switch onnxruntime's telemetry off while it is imported, unless the user has decided.
+    """Switch off onnxruntime's telemetry while it is imported, unless the user set the variable.
 
-    The variable is taken back afterwards: programs that this process starts find the environment
-    as the user left it. If onnxruntime was imported before, by someone else, nothing is changed.
+    The variable is removed afterwards, so that child processes see the user's own environment. It
+    has no effect if other code imported onnxruntime before.
     """
     if SWITCH in os.environ:
         yield
@@ -37,7 +37,7 @@ def without_telemetry() -> Iterator[None]:
 try:
     with without_telemetry():
         import onnxruntime as ort
-except Exception as error:  # a broken installation fails in many ways, not by ImportError alone
+except Exception as error:  # a broken installation fails in other ways than ImportError, too
     reason = next(iter(str(error).strip().splitlines()), type(error).__name__)
     raise DeviceError(
         f"onnxruntime cannot be imported ({reason}): pip install --force-reinstall onnxruntime"

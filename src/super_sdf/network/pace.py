@@ -1,7 +1,7 @@
-"""How far a run of the network is: onnxruntime does not say, so the clock is asked.
+"""Progress of a run of the network, estimated from the elapsed time.
 
-The time of a run is nearly proportional to its voxels and values; how long one takes is known from
-the run before, or from a small part of this one, run first.
+onnxruntime does not report progress. The time of a run is nearly proportional to its number of
+voxels and values; the factor is measured in the run before, or in a small part of this one.
 """
 
 from __future__ import annotations
@@ -10,39 +10,39 @@ import math
 import time
 from collections.abc import Callable
 
-from ..progress import Tell
+from ..progress import ShareCallback
 
-VALUES_PER_VOXEL = 300  # values to decode that take as long as a voxel to encode
-LONG = 20_000  # voxels, or values in their terms: a few tenths of a second on a core
-TRUSTED = 0.8  # beyond this share of a run it creeps: the run may well take longer than the last
+VALUES_PER_VOXEL = 300  # decoding this many values takes as long as encoding a voxel
+LONG_RUN = 20_000  # in the unit of ``work_of``: a few tenths of a second on one core
+LINEAR_UP_TO = 0.8  # above this share progress slows down: a run may take longer than expected
 
 
 def work_of(voxels: int, decoded: int, offsets: int) -> float:
-    """Return how much there is to do in a run, in voxels."""
+    """Return the work of a run, in voxels to encode; values to decode are converted."""
     return voxels + decoded * offsets / VALUES_PER_VOXEL
 
 
 class Pace:
-    """The time that a network takes for a voxel, from its last long run."""
+    """The seconds that a network takes per voxel of work, from its last long run."""
 
     def __init__(self) -> None:
         self.seconds: float | None = None
 
     def learn(self, work: float, seconds: float) -> None:
-        """Keep what a run took."""
+        """Record the seconds that a run took for its work."""
         self.seconds = seconds / work
 
-    def watch(self, work: float, tell: Tell) -> Callable[[], None]:
-        """Return what tells, whenever it is called, how far the run is that begins now."""
+    def watch(self, work: float, progress: ShareCallback) -> Callable[[], None]:
+        """Return a function that reports the progress of a run that starts now, when called."""
         began = time.perf_counter()
         expected = work * (self.seconds or math.inf)
-        return lambda: tell(share_of_time(time.perf_counter() - began, expected))
+        return lambda: progress(share_of_time(time.perf_counter() - began, expected))
 
 
 def share_of_time(seconds: float, expected: float) -> float:
-    """Return the share of a run that is probably done: never 1, however long it takes."""
+    """Return the estimated finished share of a run; it stays below 1, however long it takes."""
     share = seconds / expected
-    if share <= TRUSTED:
+    if share <= LINEAR_UP_TO:
         return share
-    left = 1 - TRUSTED
-    return 1 - left / (1 + (share - TRUSTED) / left)
+    left = 1 - LINEAR_UP_TO
+    return 1 - left / (1 + (share - LINEAR_UP_TO) / left)

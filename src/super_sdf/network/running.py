@@ -1,4 +1,4 @@
-"""One run of a session: what is bound where, and how a long one is watched and stopped."""
+"""Running a session: binding its inputs and output, and interrupting a long run."""
 
 from __future__ import annotations
 
@@ -14,29 +14,41 @@ from ..errors import DeviceError
 from .cuda import first_line
 from .onnx import ort
 
-# Memory comes from an arena, so that the arrays of one layer serve the next: fresh memory has to be
-# zeroed by the system, which takes a third of the time of the network itself. After a run the arena
-# gives back what it took, for the next grid has another size; after a small one there is no need.
+# onnxruntime allocates from an arena, so that layers reuse the memory of earlier ones: the system
+# has to zero fresh memory, which takes a third of the time of the network itself. After a large run
+# the arena is shrunk, since the next grid has another size; after a small one there is no need.
 SHRINK = "memory.enable_memory_arena_shrinkage"
 SMALL = 20_000  # voxels ...
-SMALL_OUTPUT = 5_000_000  # ... and values
-# An input that networks may have besides the four: how many rows of the neighbour table at a time.
-# The file's own suits a CPU's cache; a GPU waits between chunks, so that they should be large: the
-# gathered rows of this one are 27 * 64 floats each, 113 MB.
+SMALL_OUTPUT = 5_000_000  # ... and values of a run after which the arena is not shrunk
+# An optional fifth input of networks: the rows of the neighbour table per chunk. Its default in the
+# file suits the cache of a CPU. A GPU waits between chunks, so it gets large ones: this many rows
+# of 27 * 64 gathered floats take 113 MB.
 CHUNK_INPUT, CUDA_CHUNK = "chunk", 16384
-LOOK = 0.1  # seconds between two looks at a run
+POLL_INTERVAL = 0.1  # seconds
 
-Look = Callable[[], None]
-"""Called every ``LOOK`` seconds of a run; if it raises, the run is stopped."""
+Poll = Callable[[], None]
+"""Called every ``POLL_INTERVAL`` seconds during a run; if it raises, the run is stopped."""
 
 
 def run_on_cpu(
-    session: ort.InferenceSession, feeds: Mapping[str, Any], look: Look | None = None
+    session: ort.InferenceSession, feeds: Mapping[str, Any], poll: Poll | None = None
 ) -> FloatArray:
-    """Run a session and return its one output, (voxels, offsets).
+    """Run a session on the CPU and return its output.
 
-    The output is bound to an array of ours: in the arena it would keep that from giving back.
-    With ``look`` the run can be stopped, as by an interrupt; see ``_run_watched``.
+    Parameters
+    ----------
+    session : InferenceSession
+        The network.
+    feeds : dict
+        Its inputs by name, see ``contract``.
+    poll : callable, optional
+        Called during the run. With it, an exception in ``poll`` or an interrupt stops the run.
+
+    Returns
+    -------
+    (D, Q) float32
+        A row per voxel, a column per offset. It is allocated here: an output in onnxruntime's arena
+        would prevent the arena from shrinking.
 
     Raises
     ------
@@ -53,7 +65,7 @@ def run_on_cpu(
             binding.bind_cpu_input(name, array)
         output = session.get_outputs()[0].name
         binding.bind_output(output, "cpu", 0, np.float32, values.shape, values.ctypes.data)
-    _run(session, binding, options, "cpu", look, keep=(feeds, values))
+    _run(session, binding, options, "cpu", poll, keep=(feeds, values))
     return values
 
 
@@ -62,13 +74,13 @@ def run_bound(
     feeds: Mapping[str, Any],
     place: str = "cuda",
     chunk: int = CUDA_CHUNK,
-    look: Look | None = None,
+    poll: Poll | None = None,
 ) -> FloatArray:
-    """Run a session with its inputs and its one output on a device.
+    """Run a session with its inputs and its output on a device, and return the output.
 
-    Each input is copied there once and the output back once; nothing else is. ``chunk`` is how many
-    rows of the neighbour table go at a time, where the file leaves that open. Otherwise as
-    ``run_on_cpu``.
+    Each input is copied to the device once and the output back once, nothing more. ``chunk`` is the
+    number of rows of the neighbour table per chunk, for networks that have this input. Everything
+    else is as in ``run_on_cpu``.
     """
     options = ort.RunOptions()
     if place == "cuda":
@@ -77,12 +89,12 @@ def run_bound(
         binding = session.io_binding()
         bound = {name: ort.OrtValue.ortvalue_from_numpy(feeds[name], place, 0) for name in feeds}
         if any(given.name == CHUNK_INPUT for given in session.get_overridable_initializers()):
-            # A size: it is wanted on the CPU, which launches the work.
+            # On the CPU, which launches the kernels.
             bound[CHUNK_INPUT] = ort.OrtValue.ortvalue_from_numpy(np.array([chunk]), "cpu", 0)
         for name, value in bound.items():
             binding.bind_ortvalue_input(name, value)
         binding.bind_output(session.get_outputs()[0].name, place, 0)
-    _run(session, binding, options, place, look, keep=bound)
+    _run(session, binding, options, place, poll, keep=bound)
     with failures_on(place):
         values: FloatArray = binding.copy_outputs_to_cpu()[0]
     return values
@@ -90,10 +102,10 @@ def run_bound(
 
 @contextmanager
 def failures_on(device: str) -> Iterator[None]:
-    """Turn what onnxruntime raises into DeviceError."""
+    """Turn exceptions of onnxruntime into DeviceError."""
     try:
         yield
-    except Exception as error:  # onnxruntime's errors have no common base but this
+    except Exception as error:  # onnxruntime's errors have no other common base class
         raise DeviceError(f"the network failed on {device}: {first_line(error)}") from error
 
 
@@ -102,29 +114,29 @@ def _run(
     binding: Any,
     options: Any,
     device: str,
-    look: Look | None,
+    poll: Poll | None,
     keep: Any,
 ) -> None:
-    """Run a session, here or watched; ``keep`` is what is bound, which must outlive the run."""
+    """Run a session, in a thread if ``poll`` is given; ``keep`` holds the bound arrays alive."""
 
     def work(keep: Any = keep) -> None:
         with failures_on(device):
             session.run_with_iobinding(binding, options)
 
-    if look is None:
+    if poll is None:
         work()
     else:
-        _run_watched(work, options, look)
+        _run_polled(work, options, poll)
 
 
-def _run_watched(work: Callable[[], None], options: Any, look: Look) -> None:
-    """Work in a thread and look on; an interrupt, or what ``look`` raises, stops the run.
+def _run_polled(work: Callable[[], None], options: Any, poll: Poll) -> None:
+    """Do ``work`` in a thread and poll; an interrupt or an exception in ``poll`` stops the run.
 
-    Within onnxruntime nobody hears an interrupt. It looks at ``terminate`` between two operators,
-    also in the loops over chunks, so a run ends within milliseconds.
+    Python handles no interrupt while onnxruntime runs. onnxruntime reads ``options.terminate``
+    between two operators, also in the loops over chunks, so a run ends within milliseconds.
     """
     failures: list[BaseException] = []
-    ended = Event()  # not Thread.join: interrupted, that takes a running thread for an ended one
+    ended = Event()  # not Thread.join, which after an interrupt may return before the thread ends
 
     def keep_failure() -> None:
         try:
@@ -137,11 +149,11 @@ def _run_watched(work: Callable[[], None], options: Any, look: Look) -> None:
     thread = Thread(target=keep_failure, name="super-sdf network")
     try:
         thread.start()
-        while not ended.wait(LOOK):
-            look()
+        while not ended.wait(POLL_INTERVAL):
+            poll()
     except BaseException:
         options.terminate = True
-        if thread.ident:  # it runs, and an interrupt did not come before that
+        if thread.ident:  # not if the interrupt came before the thread started
             ended.wait()
         raise
     if failures:

@@ -1,7 +1,8 @@
-"""The symmetries of the cube, which turn distance fields into distance fields.
+"""The 48 symmetries of the cube: rotations and reflections that map the grid to itself.
 
-A network only nearly gives the turned field the turned surface. The mean over its answers to the
-field in several positions, each turned back, has a smaller error, for so many times the work.
+A transformed distance field is the distance field of the transformed surface, but a network
+reproduces this only approximately. The mean of its values for several transformed fields, each
+mapped back, has a smaller error, at a cost proportional to the number of symmetries.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ from ..neighbourhood import NEIGHBOURHOOD
 
 
 def cube_symmetries() -> IntArray:
-    """Return the 48 turns and reflections of the cube, (48, 3, 3).
+    """Return the 48 rotations and reflections of the cube as matrices, (48, 3, 3) int32.
 
-    First the identity, then the other seven that swap no axes.
+    The first is the identity; the first eight keep every axis on itself.
     """
     signs = [np.diag(sign) for sign in product((1, -1), repeat=3)]
     orders = [np.eye(3, dtype=np.int32)[list(order)] for order in permutations(range(3))]
@@ -25,10 +26,10 @@ def cube_symmetries() -> IntArray:
 
 
 def turned_places(symmetry: IntArray) -> IntArray:
-    """Return where in the neighbourhood stood what a symmetry, (3, 3), puts at each place, (27,).
+    """Return for each place of a neighbourhood the place that a symmetry (3, 3) maps to it, (27,).
 
-    With it patches and neighbour tables are turned: ``patches[:, turned_places(symmetry)]``. Query
-    offsets are turned by ``offsets @ symmetry.T``.
+    It transforms patches and neighbour tables: ``patches[:, turned_places(symmetry)]``. Query
+    offsets are transformed by ``offsets @ symmetry.T``.
     """
     source = NEIGHBOURHOOD @ symmetry
     places: IntArray = ((source + 1) @ np.array([9, 3, 1])).astype(np.int32)
@@ -38,7 +39,7 @@ def turned_places(symmetry: IntArray) -> IntArray:
 def turn(
     symmetry: IntArray, patches: FloatArray, table: IntArray, offsets: FloatArray
 ) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Turn a band: patches (V, 27), neighbour table (V, 27), query offsets (Q, 3)."""
+    """Transform a band by a symmetry: patches (V, 27), neighbour table (V, 27), offsets (Q, 3)."""
     places = turned_places(symmetry)
     turned = np.ascontiguousarray(patches[:, places]), np.ascontiguousarray(table[:, places])
     return *turned, offsets @ symmetry.T.astype(np.float32)

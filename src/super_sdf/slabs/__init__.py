@@ -1,1 +1,1 @@
-"""How a grid is cut into slabs so that the work fits in memory. It may import the steps."""
+"""Cutting a grid into slabs so that the work fits in memory. It may import the steps."""

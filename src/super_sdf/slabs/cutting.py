@@ -1,11 +1,12 @@
-"""How a grid is cut into slabs so that the work fits in memory: decided before it begins.
+"""Cutting a grid into slabs so that the work fits in memory, planned before it begins.
 
-The result is the same for every cut. What a block's values depend on ends some planes away:
+The result is the same for every cut, because each slab is worked on with as many planes to either
+side as its values depend on:
 
-    planes of the slab                   its vertices and triangles are made
-    + FINAL_BESIDE                       values must be final: which vertices are whose
+    planes of the slab                   vertices and triangles are made here
+    + FINAL_BESIDE                       values are final: they decide who owns shared vertices
     + spheres.REACH_IN_VOXELS            blocks are decoded
-    + the network's receptive field      voxels are shown to the network
+    + the network's receptive field      voxels are given to the network
 """
 
 from __future__ import annotations
@@ -30,16 +31,16 @@ DECODED_BESIDE = FINAL_BESIDE + REACH_IN_VOXELS
 
 @dataclass(frozen=True)
 class Slab:
-    """Planes of voxels to be meshed, from the first to before the last, and rows of the band.
+    """A slab: planes of voxels to mesh, and the rows of the band that this needs.
 
     Attributes
     ----------
     planes : two ints
-        The slab's own planes.
+        The slab's own planes, from the first to before the second.
     decoded : slice
-        Voxels among which are those to decode.
+        Rows of the band of which the voxels that can hold the surface are decoded.
     seen : slice
-        Voxels that the network sees.
+        Rows of the band that the network sees.
     """
 
     planes: tuple[int, int]
@@ -64,30 +65,30 @@ def plan_slabs(
     Parameters
     ----------
     band : Band
-        Of the whole grid.
+        The band of the whole grid.
     factor : int
         K.
     receptive_field : int, optional
-        Voxels to each side that the network's answer depends on; if it is not known, the network
-        must see the whole band at once.
+        Voxels to each side that the network's values depend on. If it is None, the network must see
+        the whole band at once.
     resources : Resources
-        What the run may use.
+        The threads and memory that the run may use.
     network_bytes : two floats
-        What the network takes: see ``footprint.slab_bytes``.
+        Memory of the network in bytes, per voxel and per value: see ``footprint.slab_bytes``.
 
     Raises
     ------
     OutOfMemoryError
         If the thinnest slabs do not fit.
     OptionError
-        If the mesh has more vertices than can be numbered, as far as that can be said.
+        If the mesh will certainly have more vertices than 32-bit numbers.
     """
     check_vertices(band, factor)
     how = "at once" if receptive_field is None else "even plane by plane"
     bound, need = resources.memory, 0
     for nth, slabs in enumerate(_ways(band, receptive_field)):
         if nth == 1:
-            give_back()  # else what was freed counts as held
+            give_back()  # otherwise freed memory counts as held
         need = peak_bytes(band, slabs, factor, network_bytes, resources.threads)
         if bound is None or need <= bound:
             return slabs
@@ -95,21 +96,21 @@ def plan_slabs(
 
 
 def _ways(band: Band, receptive_field: int | None) -> Iterator[list[Slab]]:
-    """Yield the whole band, and if the network need not see it at once, more and more slabs."""
+    """Yield the whole band, and then, if the receptive field is known, more and more slabs."""
     yield [whole(band)]
     if receptive_field is not None:
         yield from ways_to_cut(band, receptive_field)
 
 
 def check_vertices(band: Band, factor: int) -> None:
-    """Raise if the mesh will surely have more vertices than can be numbered.
+    """Raise OptionError if the mesh will certainly have more vertices than 32-bit numbers.
 
-    The surface crosses K^2 times as many edges of the fine lattice as between samples, about; only
-    far more than can be numbered are refused before they are counted.
+    The surface crosses about K^2 times as many edges of the fine lattice as of the coarse one. Half
+    of this estimate is certain; the exact number is checked when the vertices have been counted.
     """
-    if int(band.decoded_before[-1]) * 3 * factor**3 > index_width.LARGEST:
+    if int(band.decoded_before[-1]) * 3 * factor**3 > index_width.MAX_INDEX:
         least = band.count_crossings() * factor**2 // 2
-        index_width.check_count(least, "vertices, at the least")
+        index_width.check_count(least, "vertices or more")
 
 
 def peak_bytes(
@@ -119,7 +120,7 @@ def peak_bytes(
     network_bytes: tuple[float, float] = NETWORK_BYTES,
     threads: int = 1,
 ) -> int:
-    """Return what the process will hold at the most: now, and for the largest slab."""
+    """Return the peak memory of the process in bytes: what it holds now plus the largest slab."""
     held = held_memory() or band.patches.nbytes
     needs = (
         slab_bytes(band, slab.seen, slab.decoded, slab.planes, factor, network_bytes, threads)
@@ -129,7 +130,7 @@ def peak_bytes(
 
 
 def cut(band: Band, pieces: int, receptive_field: int) -> list[Slab]:
-    """Cut a band into slabs with about the same number of decoded voxels, at most so many."""
+    """Cut a band into at most ``pieces`` slabs with about the same number of decoded voxels."""
     share = band.decoded_before / max(int(band.decoded_before[-1]), 1)
     inner = np.searchsorted(share, np.arange(1, pieces) / pieces)
     bounds = np.unique(np.clip([0, *inner, band.shape[0]], 0, band.shape[0])).tolist()
@@ -146,16 +147,16 @@ def ways_to_cut(band: Band, receptive_field: int) -> Iterator[list[Slab]]:
 
 
 def _slab(band: Band, first: int, last: int, receptive_field: int) -> Slab:
-    """Return a slab with what it depends on."""
+    """Return the slab of planes ``first`` to before ``last``, with the rows it depends on."""
     decoded = band.rows(first - DECODED_BESIDE, last + DECODED_BESIDE)
     beside = DECODED_BESIDE + receptive_field
     return Slab((first, last), decoded, band.rows(first - beside, last + beside))
 
 
 def _does_not_fit(band: Band, factor: int, how: str, need: int, bound: int) -> OutOfMemoryError:
-    """Return the error for work that is too large."""
+    """Return the error for work that does not fit in memory."""
     return OutOfMemoryError(
         f"factor {factor} on {int(band.decoded_before[-1]):,} voxels needs {in_words(need)} of "
-        f"memory {how}, {in_words(bound)} may be taken; use a smaller factor, or allow more "
+        f"memory {how}, {in_words(bound)} may be used; use a smaller factor, or allow more "
         "(--max-memory)"
     )

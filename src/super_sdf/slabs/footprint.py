@@ -1,4 +1,4 @@
-"""What a slab takes in memory, stage by stage, at the most."""
+"""The peak memory of each stage of the work on a slab."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from ..machine.threads import CHUNK, rows_in_chunk
 from ..steps.marching import LOOKUP_BYTES, lookups_at_once
 from ..steps.survey import Band
 
-# What a process takes at the most in each stage after the network, measured (``benchmarks.large``,
-# ``benchmarks.bounds``), in bytes: for each voxel that the network sees, for each that is decoded,
-# for each node of a decoded block, for each thread's chunk, and whatever the grid.
+# Peak memory of the stages after the network in bytes, measured (``benchmarks.large``,
+# ``benchmarks.bounds``): per voxel that the network sees, per decoded voxel, per node of a decoded
+# block, per thread (its chunk), and a constant.
 STAGES = {
     "average": (216, 300, 5.0, 1e7, 2e7),
     "fit": (216, 1150, 4.0, 1e7, 2.5e7),
     "isosurface": (216, 200, 7.0, 1e7, 2.5e7),
 }
-# A network's own, unless it says otherwise: bytes for each voxel that it sees, its neighbours among
-# them, and for each value.
+# Default for a network: bytes per voxel that it sees, including its row of the neighbour table, and
+# per value.
 NETWORK_BYTES = (680.0, 8.0)
-# The head of a network works on a chunk of voxels at all offsets at a time.
+# The head of a network works on a chunk of voxels at all offsets at once.
 BYTES_PER_OFFSET = 27_000
 NETWORK_FIXED = 5_000_000
 
@@ -35,9 +35,22 @@ def slab_bytes(
     network_bytes: tuple[float, float] = NETWORK_BYTES,
     threads: int = 1,
 ) -> int:
-    """Return what a process takes for a slab beside what it holds already, at the most.
+    """Return the peak memory of the work on a slab, in bytes beyond what the process holds already.
 
-    ``network_bytes`` is for each voxel that the network sees, and for each value.
+    Parameters
+    ----------
+    band : Band
+        The band of the whole grid.
+    seen, decoded : slice
+        Rows of the band, see ``cutting.Slab``.
+    planes : two ints
+        The slab's own planes.
+    factor : int
+        K.
+    network_bytes : two floats
+        Memory of the network in bytes, per voxel that it sees and per value.
+    threads : int
+        Threads that work at the same time.
     """
     voxels, own = seen.stop - seen.start, band.count_decoded(decoded)
     values = own * (factor + 1) ** 3
@@ -51,14 +64,14 @@ def slab_bytes(
 def _bytes_for_network(
     voxels: int, decoded: int, factor: int, network_bytes: tuple[float, float]
 ) -> float:
-    """Return what the network takes: it is asked for as many voxels as offsets, at least."""
+    """Return the bytes of the network, which decodes at least as many voxels as offsets."""
     offsets = (factor + 1) ** 3
     fixed = BYTES_PER_OFFSET * offsets + NETWORK_FIXED
     return float(np.dot(network_bytes, [voxels, max(decoded, offsets) * offsets])) + fixed
 
 
 def _lookup_bytes(band: Band, planes: Range, decoded: int, factor: int, threads: int) -> int:
-    """Return what the tables take in which the vertices of whole planes are looked up."""
+    """Return the bytes of the vertex lookup tables of whole planes, see ``marching.connect``."""
     nodes = (factor + 1) ** 3
     before = band.decoded_before[max(planes[0] - 1, 0) : planes[1] + 1]
     two_planes = int((before[2:] - before[:-2]).max()) if len(before) > 2 else decoded

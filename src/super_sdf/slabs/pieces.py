@@ -1,4 +1,4 @@
-"""The mesh of one slab, and the counts that belong to it."""
+"""The mesh of one slab, with counts and times."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ class Piece:
     Attributes
     ----------
     meshes : list of Mesh
-        Triangles of the slab: rows of all vertices so far, those of the slab among them.
+        Vertices and triangles of the slab. Faces index the vertices of all slabs so far.
     counts : dict
-        Of the slab: ``decoded_voxels``, ``nodes``, ``pinned_nodes``, ``vertices``, ``triangles``.
+        Counts of the slab: ``decoded_voxels``, ``nodes``, ``pinned_nodes``, ``vertices``,
+        ``triangles``.
     whole : dict
-        Of all pieces, the same in each: ``band_voxels``, ``noisy_voxels`` (see ``FineField``), the
-        number of ``slabs``, and ``planned_bytes``, what the process holds at most by the plan.
+        Counts of the whole run, the same in each piece: ``band_voxels``, ``noisy_voxels`` (see
+        ``FineField``), ``slabs``, and ``planned_bytes``, the planned peak memory of the process.
     is_cut : bool
-        Whether the surface runs out of the grid here.
+        Whether the surface runs out of the grid in this slab.
     signs : set of bool
-        Whether there are outer nodes (True), and others (False).
+        Which signs the slab's nodes have: True outside, False inside.
     seconds : dict
-        The time of each step, by its name in ``progress.STEPS``; the first piece's has the band's.
+        Seconds of each step, by its name in ``progress.STEPS``; the band is in the first piece.
     """
 
     meshes: list[Mesh]

@@ -1,4 +1,4 @@
-"""The steps of the method, each from arrays to arrays.
+"""The steps of the method, each a function from arrays to arrays.
 
-They may import ``network`` and what lies below, but no files.
+They may import ``network`` and the rooms below it, but not ``files``.
 """

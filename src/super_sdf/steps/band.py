@@ -1,7 +1,7 @@
-"""The band of voxels near the surface, their patches, and who is whose neighbour (Eqs. 2 and 4).
+"""The band of voxels near the surface, their patches and their neighbour table (Eqs. 2 and 4).
 
-Everything here lives in index space with rescaled values: a voxel has side 2, so a distance of
-one spacing h is 2 and the band is ``abs(value) < 3``.
+Everything here is in index space with values in half voxels: a voxel has side 2, a distance of
+one spacing h is 2, and the band is ``abs(value) < 3``.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from ..grid.sdf_grid import SdfGrid
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD
 
 HALF_BAND = 3.0  # Eq. 2 after Eq. 4: 1.5 h
-# Patch values are cut off here (3 h): farther samples say nothing about this voxel's surface, and
-# a field that was truncated at 3 h or beyond gives the same result as the whole one.
+# Patch values are clipped to this (3 h): samples that are farther from the surface do not matter to
+# it, and a field that was truncated at 3 h or beyond gives the same result as the whole one.
 PATCH_LIMIT = 6.0
 # A voxel whose sample is farther than its corners, sqrt(3)/2 h, cannot hold the surface of an
 # exact distance. The margin, a quarter of h, is for the network's own error.
 DECODE_LIMIT = 3**0.5 + 0.5
-# Neighbouring distances may differ by no more than the samples are apart; slack for rounding.
+# Two distances differ by no more than their samples are apart (Lipschitz); slack for rounding.
 LIPSCHITZ_SLACK = 0.1
 
-# Planes of about so many samples are worked on at a time, to stay small; but never fewer than so
-# many planes, for a block looks at one more on either side.
+# Planes are worked on in blocks of about this many samples, to save memory, but of at least this
+# many planes, since a block also reads one plane more on either side.
 BLOCK_SAMPLES = 1 << 18
 BLOCK_PLANES = 4
 
-# How far the sample in the middle and that at each place may differ.
-REACH = (2 * np.linalg.norm(NEIGHBOURHOOD, axis=1) + LIPSCHITZ_SLACK).astype(np.float32)
+# The largest difference between a voxel's sample and that at each place of its patch, (27,).
+MAX_DIFFERENCE = (2 * np.linalg.norm(NEIGHBOURHOOD, axis=1) + LIPSCHITZ_SLACK).astype(np.float32)
 
 
 def rescale(
@@ -38,9 +38,21 @@ def rescale(
 ) -> FloatArray:
     """Return the samples in half voxels, ``(values - offset) * 2 / h`` (Eq. 4).
 
-    ``offset`` (world units) shifts the field, so that the surface at that distance, positive
-    outwards, becomes the zero level (Sec. 5.3). The band's values then lie in [-3, 3] whatever the
-    unit. Of planes ``first`` to before ``last`` only, if these are given.
+    Values in the band then lie in [-3, 3], whatever the unit of the grid.
+
+    Parameters
+    ----------
+    grid : SdfGrid
+        Signed distances in world units, shape (nx, ny, nz).
+    offset : float
+        Distance in world units, positive outwards, of the surface that becomes the zero level
+        (Sec. 5.3).
+    first, last : int
+        Planes to read, from ``first`` to before ``last``; all by default.
+
+    Returns
+    -------
+    (last - first, ny, nz) float32
     """
     planes = grid.planes(first, grid.shape[0] if last is None else last)
     rescaled = np.empty(planes.shape, np.float32)
@@ -55,10 +67,10 @@ def rescale(
 
 
 def find_band(rescaled: FloatArray) -> IntArray:
-    """Return the active voxels, ``abs(rescaled) < 3`` (Eq. 2), as (V, 3) indices in C order.
+    """Return the active voxels, ``abs(rescaled) < 3`` (Eq. 2), as (V, 3) int32 in C order.
 
-    A distance cannot jump from beyond the band on one side to beyond it on the other. Where the
-    input does so all the same, both voxels are taken in: a surface must pass between them.
+    A distance cannot jump over the band, from beyond it on one side to beyond it on the other.
+    Where the input does, both voxels are added: a surface must pass between them.
     """
     active = np.abs(rescaled) < HALF_BAND
     outside = rescaled > 0
@@ -69,7 +81,7 @@ def find_band(rescaled: FloatArray) -> IntArray:
 
 
 def _dilate(mask: BoolArray) -> BoolArray:
-    """Grow a mask by one voxel in all 26 directions."""
+    """Return a mask grown by one voxel in all 26 directions."""
     grown = mask.copy()
     for axis in range(3):
         source = np.moveaxis(grown.copy(), axis, 0)
@@ -80,7 +92,7 @@ def _dilate(mask: BoolArray) -> BoolArray:
 
 
 def pad_by_extrapolation(rescaled: FloatArray) -> FloatArray:
-    """Continue the grid by one sample on every side, linearly, and cut it off at 3 h."""
+    """Return the grid padded by one sample on every side, extrapolated linearly, clipped to 3 h."""
     padded = np.pad(np.clip(rescaled, -2 * PATCH_LIMIT, 2 * PATCH_LIMIT), 1)
     for axis in range(3):
         planes = np.moveaxis(padded, axis, 0)
@@ -90,7 +102,19 @@ def pad_by_extrapolation(rescaled: FloatArray) -> FloatArray:
 
 
 def gather_patches(rescaled: FloatArray, voxel_ijk: IntArray) -> FloatArray:
-    """Return the 27 samples round each voxel, (V, 27) in the order of ``NEIGHBOURHOOD``."""
+    """Return the 27 samples round each voxel, in half voxels, in the order of ``NEIGHBOURHOOD``.
+
+    Parameters
+    ----------
+    rescaled : (nx, ny, nz) float32
+        Samples in half voxels.
+    voxel_ijk : (V, 3) int32
+        The voxels.
+
+    Returns
+    -------
+    (V, 27) float32
+    """
     padded = pad_by_extrapolation(rescaled)
     centre, steps = _flat_steps(voxel_ijk, rescaled.shape)
     patches = np.empty((len(voxel_ijk), 27), np.float32)
@@ -100,7 +124,7 @@ def gather_patches(rescaled: FloatArray, voxel_ijk: IntArray) -> FloatArray:
 
 
 def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, ...]) -> IntArray:
-    """Return who stands at each of the 27 places round each voxel.
+    """Return the neighbour table: the voxels at the 27 places round each voxel.
 
     Parameters
     ----------
@@ -112,8 +136,8 @@ def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, ...]) -> IntArray:
     Returns
     -------
     (V, 27) int32
-        Row numbers into ``voxel_ijk`` in the order of ``NEIGHBOURHOOD``, -1 where there is none.
-        As an index, -1 is the last row: append a row of zeros to what is gathered.
+        Rows of ``voxel_ijk`` in the order of ``NEIGHBOURHOOD``, -1 where there is no voxel. As an
+        index -1 is the last row, so append a row of zeros to the array that is gathered from.
     """
     table = np.empty((len(voxel_ijk), 27), np.int32)
     for first, last in plane_blocks(shape):
@@ -132,7 +156,7 @@ def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, ...]) -> IntArray:
 def plane_blocks(
     shape: tuple[int, ...], first: int = 0, last: int | None = None
 ) -> Iterator[tuple[int, int]]:
-    """Yield planes in blocks of about ``BLOCK_SAMPLES``, (first, behind the last)."""
+    """Yield (start, stop) of blocks of planes with about ``BLOCK_SAMPLES`` samples each."""
     step = max(BLOCK_SAMPLES // (shape[1] * shape[2]), BLOCK_PLANES)
     end = shape[0] if last is None else last
     for start in range(first, end, step):
@@ -142,29 +166,30 @@ def plane_blocks(
 def _flat_steps(
     voxel_ijk: IntArray, shape: tuple[int, ...]
 ) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], list[int]]:
-    """Return flat positions in the grid padded by one, and the 27 steps to the neighbours."""
+    """Return flat indices (V,) into the grid padded by one, and the 27 steps to the neighbours."""
     strides = np.array([(shape[1] + 2) * (shape[2] + 2), shape[2] + 2, 1], np.int64)
     return (voxel_ijk + 1) @ strides, [int(step) for step in NEIGHBOURHOOD @ strides]
 
 
 def is_lipschitz(patches: FloatArray) -> BoolArray:
-    """Say of each patch, (V,) of bool, whether its samples can be distances.
+    """Return which patches (V, 27) can be distances, (V,) bool: those that are 1-Lipschitz.
 
-    Distances of two points differ by no more than the points are apart. In a noisy field that is
-    broken nearly everywhere, in one that is no distance in many places.
+    The distances of two points differ by no more than the points are apart. This fails nearly
+    everywhere in a noisy field, and in many places of a field that is not a distance.
     """
     centre = patches[:, CENTRE]
     keeps = np.ones(len(patches), bool)
     for column in range(27):
-        keeps &= np.abs(patches[:, column] - centre) <= REACH[column]
+        keeps &= np.abs(patches[:, column] - centre) <= MAX_DIFFERENCE[column]
     return keeps
 
 
 def can_hold_surface(patches: FloatArray, lipschitz: BoolArray) -> BoolArray:
-    """Say which voxels, (V,) of bool, may contain a piece of the surface.
+    """Return which voxels may contain a piece of the surface, (V,) bool.
 
-    If its patch is of distances (``is_lipschitz``), a voxel whose sample is farther than its corner
-    holds no surface. Else the sample proves nothing, and the voxel is kept.
+    If a voxel's patch can be distances (``lipschitz``, from ``is_lipschitz``), a sample farther
+    from the surface than the voxel's corners proves that the voxel holds none. Otherwise the sample
+    proves nothing, and the voxel is kept.
     """
     near: BoolArray = np.abs(patches[:, CENTRE]) <= DECODE_LIMIT
     return near | ~lipschitz

@@ -1,4 +1,4 @@
-"""A surface that runs out of the grid, closed along the grid's border."""
+"""Closing a surface that runs out of the grid, along the grid's border."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from .nodes import (
 
 
 def close_at_border(field: FineField, grid: SdfGrid, offset: float = 0.0) -> FineField:
-    """Surround the grid by voxels that are outside, so that the surface is closed at its border.
+    """Surround the grid with outside voxels, so that the surface is closed along the border.
 
-    Added are the border voxels inside the solid that were not decoded, and next to all border
-    voxels a layer of outer ones. The nodes beyond the border lie on it (see ``marching``), so
-    what is added is flat. Of a slab its planes are closed, and those beside them that say whose
-    vertex is whose.
+    Adds the border voxels inside the solid that were not decoded, and a layer of outside voxels
+    beyond the border. Nodes beyond the border are placed on it (see ``marching``), so the cap is
+    flat. A slab is closed in its own planes and in those beside them on which the ownership of its
+    vertices depends.
     """
     first, last = max(field.planes[0] - 2, 0), min(field.planes[1] + 1, field.shape[0])
     rows = field.rows(first, last)
@@ -41,34 +41,34 @@ def close_at_border(field: FineField, grid: SdfGrid, offset: float = 0.0) -> Fin
 
     padded = tuple(n + 2 for n in field.shape)
     parts = share_parts(neighbour_table(voxel_ijk + 1, padded))
-    column_of = np.empty(len(order), np.int32)  # of each voxel of the border
+    column_of = np.empty(len(order), np.int32)  # of each voxel before sorting
     column_of[order] = np.arange(len(order))
     known_at, solid_at, _ = np.split(column_of, [len(known), len(border)])
     blocks = np.full((len(field.blocks), len(voxel_ijk)), BARELY_OUTSIDE, np.float32)
-    spread(BARELY_INSIDE, solid_at, blocks, parts, field.factor)
-    spread(field.blocks[:, rows], known_at, blocks, parts, field.factor)  # after: values stay
-    ends = (-1, field.shape[0] + 1)  # the outer layers go with the first slab and the last
+    set_blocks(BARELY_INSIDE, solid_at, blocks, parts, field.factor)
+    set_blocks(field.blocks[:, rows], known_at, blocks, parts, field.factor)  # last: these win
+    ends = (-1, field.shape[0] + 1)  # the outer layers belong to the first slab and the last
     planes = [ends[n] if at in (0, field.shape[0]) else at for n, at in enumerate(field.planes)]
     return replace(
         field, voxel_ijk=voxel_ijk, blocks=blocks, parts=parts, planes=(planes[0], planes[1])
     )
 
 
-def spread(
+def set_blocks(
     values: FloatArray | np.float32,
     columns: IntArray,
     blocks: FloatArray,
     parts: SharedParts,
     factor: int,
 ) -> None:
-    """Set the blocks of some voxels, and what other blocks share with them.
+    """Set the blocks of some voxels, and the nodes that other blocks share with them.
 
     Parameters
     ----------
     values : (Q, n) float32, or one number
-        The blocks' values.
+        The blocks' values, in half voxels.
     columns : (n,) int32
-        The voxels.
+        The voxels' columns of ``blocks``.
     blocks : (Q, D) float32
         Changed in place.
     parts : SharedParts
@@ -89,7 +89,7 @@ def spread(
 def _filled_border(
     grid: SdfGrid, offset: float, first: int, last: int, known: IntArray
 ) -> IntArray:
-    """Return the border voxels of some planes that are inside and not among those known."""
+    """Return the border voxels (n, 3) of some planes that are inside and not in ``known``."""
     found = []
     for low, high in plane_blocks(grid.shape, first, last):
         inside = rescale(grid, offset, low, high) <= 0
@@ -102,7 +102,7 @@ def _filled_border(
 
 
 def _outer_voxels(voxel_ijk: IntArray, shape: tuple[int, int, int]) -> IntArray:
-    """Return the neighbours of these voxels that lie one voxel outside the grid."""
+    """Return the neighbours (n, 3) of these voxels that lie beyond the grid."""
     last = np.array(shape, np.int32) - 1
     border = voxel_ijk[((voxel_ijk == 0) | (voxel_ijk == last)).any(1)]
     around = (border[:, None] + NEIGHBOURHOOD).reshape(-1, 3)

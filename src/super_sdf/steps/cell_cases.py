@@ -1,11 +1,11 @@
-"""The 256 cases of marching cubes, made from one rule instead of copied.
+"""The 256 cases of marching cubes, generated from one rule.
 
 A cell has 8 corners, numbered ``4 x + 2 y + z``, and 12 edges. A case has a bit for each corner
-that is inside. On every face of the cell the surface is cut in segments, so that inside corners
-at opposite ends of a diagonal stay apart: the rule sees only that face, so the cells on its two
-sides agree (Lorensen and Cline 1987, with a face-consistent choice in the ambiguous cases; Montani
-et al. 1994). The segments close to loops, and each loop is cut into triangles by diagonals that
-do not lie on a face, so that no edge can belong to more than two triangles.
+that is inside. The surface meets each face of the cell in segments, which always separate inside
+corners at opposite ends of a diagonal. This rule uses only the face itself, so the two cells that
+share it agree (Lorensen and Cline 1987, with a face-consistent choice in the ambiguous cases;
+Montani et al. 1994). The segments form closed loops, and each loop is triangulated by diagonals
+that do not lie on a face, so that no edge can belong to more than two triangles.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ def triangle_table() -> tuple[IntArray, IntArray]:
     Returns
     -------
     (256,) int32 and (256, T, 3) int32
-        How many triangles a case has, and the cell edges that carry their vertices, in an order
-        that makes them look from inside to outside; unused rows are 0.
+        The number of triangles of a case, and the cell edges on which their vertices lie, in
+        counter-clockwise order seen from outside; unused rows are 0.
     """
     cases = [[t for loop in _loops(case) for t in _triangulate(loop)] for case in range(256)]
     counts = np.array([len(triangles) for triangles in cases], np.int32)
@@ -65,7 +65,7 @@ def _loops(case: int) -> Iterator[list[int]]:
 def _segments(case: int, face: tuple[int, ...]) -> Iterator[tuple[int, int]]:
     """Yield the segments on a face: one for each run of inside corners, from its start to its end.
 
-    Going round counter-clockwise, a run starts where outside turns to inside.
+    A run starts where, going round counter-clockwise, an inside corner follows an outside one.
     """
     inside = [bool(case >> corner & 1) for corner in face]
     for at in range(4):
@@ -77,7 +77,7 @@ def _segments(case: int, face: tuple[int, ...]) -> Iterator[tuple[int, int]]:
 
 
 def _triangulate(loop: list[int]) -> list[tuple[int, int, int]]:
-    """Cut a loop into triangles without a diagonal on a face of the cell."""
+    """Return the triangles of a loop, cut along diagonals that lie on no face of the cell."""
     if len(loop) < 3:
         return []
     first, last = loop[0], loop[-1]
@@ -93,11 +93,11 @@ def _triangulate(loop: list[int]) -> list[tuple[int, int, int]]:
 
 
 class _CannotCutError(Exception):
-    """Raised for a part of a loop that cannot be cut; another middle may do."""
+    """Raised for a part of a loop that cannot be triangulated; another middle may work."""
 
 
 def _share_face(a: int, b: int) -> bool:
-    """Say whether two cell edges lie on one face."""
+    """Return whether two cell edges lie on one face."""
     ends = {EDGE_START[a], EDGE_START[a] + _STEP[EDGE_AXIS[a]]}
     ends |= {EDGE_START[b], EDGE_START[b] + _STEP[EDGE_AXIS[b]]}
     return any(ends <= set(face) for face in FACES)

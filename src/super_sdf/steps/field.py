@@ -1,4 +1,4 @@
-"""The fine field where it is known: blocks of nodes round the surface, never a dense array."""
+"""The fine field near the surface: blocks of nodes, never a dense array."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .nodes import SharedParts, block_ijk, number_parts, part_of_node, part_size
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FineField:
-    """Values on the nodes of some voxels' blocks: those of a whole grid, or of a slab of it.
+    """Values at the nodes of the decoded voxels' blocks, in a whole grid or in a slab of it.
 
     Attributes
     ----------
@@ -31,15 +31,15 @@ class FineField:
     parts : SharedParts
         Which voxels share which nodes.
     planes : two ints
-        The values are final in the voxels from the first of these planes to before the second, and
-        in the next plane on either side; of voxels beyond they are only a help.
+        The slab's planes of voxels, from the first to before the second. Values are final in these
+        and in the next plane on either side; those of other voxels are intermediate.
     band_voxels : int
-        Voxels of the whole grid that the network saw.
+        Voxels in the band of the whole grid.
     noisy_voxels : int
         Those of them round which samples differ by more than distances can.
     pinned : int
-        Nodes in ``planes`` whose sign had to be set to that of a voxel that holds no surface: where
-        this is not 0, the input is no distance field there, or the network failed.
+        Nodes in ``planes`` whose sign had to be changed to that of a voxel that holds no surface.
+        If there are any, the input is not a distance field there, or the network failed.
     """
 
     shape: tuple[int, int, int]
@@ -62,12 +62,12 @@ class FineField:
 
     @cached_property
     def numbers(self) -> IntArray:
-        """The nodes of each voxel's block, (D, Q), rows of ``values``; numbered when asked for.
+        """The nodes of each voxel's block as indices of ``values``, (D, Q); computed when read.
 
         Raises
         ------
         OptionError
-            If there are more than 32-bit numbers.
+            If there are more nodes than 32-bit numbers.
         """
         starts, _ = number_parts(self.parts, part_sizes(self.factor))
         part, place = part_of_node(self.factor)
@@ -75,7 +75,7 @@ class FineField:
 
     @cached_property
     def values(self) -> FloatArray:
-        """The values of all nodes, each once, (n,) float32 in half voxels; made when asked for."""
+        """The values of all nodes, each once, (n,) float32 in half voxels; computed when read."""
         values = np.empty(self.parts.count_nodes(self.factor), np.float32)
         values[self.numbers] = self.blocks.T
         return values
@@ -91,12 +91,12 @@ class FineField:
         return self.rows(*self.planes)
 
     def plane_before(self, rows: slice) -> slice:
-        """Return the rows of the voxels in the plane before that of a row."""
+        """Return the rows of the voxels in the plane before that of the first of ``rows``."""
         plane = int(self.voxel_ijk[rows.start, 0])
         return self.rows(plane - 1, plane)
 
     def signs(self) -> set[bool]:
-        """Return whether there are outer nodes in ``planes`` (True), and others (False)."""
+        """Return which signs occur in ``planes``: True if a node is outside, False if inside."""
         values = self.blocks[:, self.own_rows]
         if not values.size:
             return set()
@@ -104,7 +104,7 @@ class FineField:
 
 
 def border_is_crossed(field: FineField) -> bool:
-    """Say whether the surface runs through the outer faces of the grid, in the field's planes."""
+    """Return whether the surface crosses the border of the grid, in the field's planes."""
     core = np.arange(len(field.voxel_ijk))[field.own_rows]
     side = block_ijk(field.factor)
     for axis, samples in enumerate(field.shape):
@@ -117,7 +117,7 @@ def border_is_crossed(field: FineField) -> bool:
 
 
 def _any_is_crossed(field: FineField, rows: IntArray, block_nodes: NDArray[np.intp]) -> bool:
-    """Say whether in any of some voxels' blocks some of these nodes are inside, and others not."""
+    """Return whether in the block of any of these voxels some of the nodes are inside, not all."""
 
     def crossed(chunk: slice) -> bool:
         inside = field.blocks[block_nodes[:, None], rows[chunk]] <= 0

@@ -1,7 +1,8 @@
 """Trilinear interpolation within blocks: at any place, and from a coarse lattice to a finer one.
 
-A place is given as a block, a column of values (Q, D), and where in it, from 0 to 1 along each
-axis. All sums are written out, so that they do not depend on how many places there are.
+A place is given by its block, a column of the values (Q, D), and the position in it, 0 to 1 along
+each axis. All sums are written out, so that the bits of a result do not depend on the number of
+places.
 """
 
 from __future__ import annotations
@@ -18,23 +19,23 @@ CELL = np.indices((2, 2, 2)).reshape(3, 8).T
 def sample_trilinear(
     blocks: FloatArray, rows: IntArray, place: FloatArray, factor: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return value and gradient at places.
+    """Return the value and the gradient at places.
 
     Parameters
     ----------
     blocks : (Q, D + 1) float32
-        The nodes' values, contiguous; the last column stands for no block.
+        The nodes' values, contiguous; the last column is for absent blocks.
     rows : (n,) int32
         Blocks; -1 reads the last column.
     place : (3, n) float32
-        Where in the block.
+        Positions in the blocks, 0 to 1.
     factor : int
         K, the cells along a block.
 
     Returns
     -------
     (n,) and (3, n) float32
-        The value, and its gradient in units of cells.
+        The value, in the unit of ``blocks``, and its gradient per cell.
     """
     low, (x, y, z) = find_cell(place, factor)
     side, width = factor + 1, blocks.shape[1]
@@ -53,25 +54,26 @@ def sample_trilinear(
 
 
 def find_cell(place: FloatArray, cells: int) -> tuple[IntArray, FloatArray]:
-    """Return the cell that places (3, n) lie in, and where in it, from 0 to 1."""
+    """Return the cells of places (3, n), (3, n) int32, and the positions in them, 0 to 1."""
     scaled = place * np.float32(cells)
     low = np.minimum(scaled.astype(np.int32), cells - 1)
     return low, scaled - low.astype(np.float32)
 
 
 def prolong(values: FloatArray, cells: int, finer: int) -> FloatArray:
-    """Return the values at the nodes of a finer lattice of the same blocks, trilinearly.
+    """Interpolate values trilinearly to the nodes of a finer lattice of the same blocks.
 
     Parameters
     ----------
     values : ((cells + 1)^3, n) float32
-        The nodes' values in n blocks. Equal copies of a shared node give equal copies.
+        The nodes' values in n blocks.
     cells, finer : int
         Cells along a block, before and after.
 
     Returns
     -------
     ((finer + 1)^3, n) float32
+        If the copies of shared nodes were equal before, they are equal, bit for bit.
     """
     block = values.reshape(*(cells + 1,) * 3, -1)
     for axis in range(3):
@@ -86,9 +88,9 @@ def prolong(values: FloatArray, cells: int, finer: int) -> FloatArray:
 
 @lru_cache
 def finer_places(cells: int, finer: int) -> list[tuple[int, np.float32]]:
-    """Return along an axis the coarse node before each finer node, and how far on it lies.
+    """Return along an axis the coarse node before each finer node, and the share beyond it.
 
-    A finer node that lies on a coarse one is at its place and no further, also at the end.
+    The share is 0 for a finer node that lies on a coarse one, the last one included.
     """
     places = [divmod(number * cells, finer) for number in range(finer + 1)]
     return [(low, np.float32(rest / finer)) for low, rest in places]

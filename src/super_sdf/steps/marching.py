@@ -1,15 +1,19 @@
 """Marching cubes on the blocks of a sparse field.
 
-Every cell of the fine lattice lies in exactly one voxel, and a shared node has one value, so the
-cells need no search and no welding by distance: a vertex is named by the lattice edge it lies on.
-Two cells see the same edges on their common face, hence the mesh is a closed, oriented
-2-manifold wherever the field's blocks do not end.
+Every cell of the fine lattice lies in exactly one voxel, and a node has the same value in all
+blocks that share it. Vertices lie on lattice edges and are identified by them, so nothing is welded
+by distance. Cells that share a face see the same edges on it, so the mesh is a closed, oriented
+2-manifold, except where the blocks end. In steps:
 
-Vertices and triangles come in the order of the voxels, so a surface made slab by slab is the same
-as one made at once.
+1. ``find_crossings`` lists the lattice edges and cells of each block that the surface crosses.
+2. ``place_vertices`` makes a vertex on each crossed edge, in the voxel that owns the edge.
+3. ``connect`` looks up the vertices on the edges of each crossed cell, and makes its triangles.
 
-The edge that runs from node q of a block along axis a has the number ``a Q + q`` in that block. So
-seen from another block of the neighbourhood, or from a cell, its number differs by a constant.
+Vertices and triangles are in the order of the voxels, so a surface made slab by slab is the same as
+one made at once.
+
+The edge from node q of a block along axis a has the number ``a Q + q`` in the block, Q = (K+1)^3.
+Its number in another block that shares it, or relative to a cell, therefore differs by a constant.
 """
 
 from __future__ import annotations
@@ -34,21 +38,39 @@ from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, triangle_table
 from .field import FineField
 from .nodes import block_ijk, part_of_node
 
-# Bytes for each node of a block, in the table in which the vertices on its edges are looked up.
+# Bytes per node of a block in the vertex lookup table: three edges, four bytes each.
 LOOKUP_BYTES = 12
-# Nodes beyond the grid's border (a closed surface, see cap.close_at_border) lie this far out, in
-# fine spacings: enough for distinct vertices.
+# Nodes beyond the grid's border (of a cap, see cap.close_at_border) are placed this far outside it,
+# in fine spacings: enough for distinct vertices.
 CAP_HEIGHT = 0.02
 NO_FACES = np.empty((0, 3), np.int32)
 
 
 def extract_mesh(field: FineField, grid: SdfGrid, first_vertex: int = 0) -> Mesh:
-    """Return the zero level of a field's planes as triangles in world coordinates.
+    """Return the zero level of a field as triangles in world coordinates.
 
-    A node with value 0 is inside. Vertices lie on lattice edges, by linear interpolation. Those of
-    planes before the field's own are numbered up to ``first_vertex``, the own ones from there on;
-    faces may use both.
-    References: Lorensen and Cline, "Marching Cubes", 1987.
+    Vertices lie on lattice edges, by linear interpolation. A node with value 0 is inside.
+
+    Parameters
+    ----------
+    field : FineField
+        From ``upsample``.
+    grid : SdfGrid
+        The coarse grid that it was made from, for spacing and origin.
+    first_vertex : int
+        The number of the first vertex, for a field of a slab: the number of vertices in the slabs
+        before. Faces may also refer to vertices of the slab before.
+
+    Raises
+    ------
+    OptionError
+        If there are more vertices than 32-bit numbers, including those before.
+    OptionTypeError
+        If ``field`` or ``grid`` is something else.
+
+    References
+    ----------
+    Lorensen and Cline, "Marching Cubes", 1987.
     """
     if not isinstance(field, FineField):
         raise OptionTypeError(f"field is {seen(field)}: give one from upsample(grid, network)")
@@ -64,7 +86,7 @@ def extract_pieces(
     Raises
     ------
     OptionError
-        If there are more vertices than can be numbered, those before among them.
+        If there are more vertices than 32-bit numbers, including those before.
     """
     core = field.own_rows
     before = field.plane_before(core).start if core.start < core.stop else core.start
@@ -86,16 +108,16 @@ def extract_pieces(
 
 @dataclass(frozen=True, eq=False)
 class Crossings:
-    """Where the surface crosses the blocks of some voxels, in the order of the voxels.
+    """Edges and cells that the surface crosses in the blocks of some voxels, in their order.
 
     Attributes
     ----------
     own_row, own_edge : (n,) int32, int16
-        Voxels, and crossed edges of their blocks that belong to the voxel: each has a vertex.
+        Voxels, and crossed edges of their blocks that the voxel owns: each has a vertex.
     other_row, other_edge : (m,) int32, int16
-        Crossed edges that belong to another of the voxels that share them.
+        Voxels, and crossed edges of their blocks that another voxel owns.
     cell_row, cell, case : (c,) int32, int16, uint8
-        Voxels, crossed cells of their blocks, and the cells' cases.
+        Voxels, crossed cells of their blocks, and the marching cubes cases of these cells.
     """
 
     own_row: IntArray
@@ -127,7 +149,7 @@ def _between(sorted_rows: IntArray, rows: slice) -> slice:
 
 
 def find_crossings(field: FineField, rows: slice, threads: int = 1) -> Crossings:
-    """Return where the surface crosses the blocks of some voxels."""
+    """Return the edges and cells that the surface crosses in the blocks of some voxels."""
     chunks = map_chunks(
         lambda some: _crossings_of_chunk(field, rows.start + some.start, rows.start + some.stop),
         rows.stop - rows.start,
@@ -139,7 +161,7 @@ def find_crossings(field: FineField, rows: slice, threads: int = 1) -> Crossings
 
 
 def _crossings_of_chunk(field: FineField, start: int, stop: int) -> tuple[NDArray[Any], ...]:
-    """Return the arrays of ``Crossings`` for some voxels."""
+    """Return the arrays of ``Crossings`` for the voxels from ``start`` to before ``stop``."""
     inside = field.blocks[:, start:stop] <= 0
     crossed = np.flatnonzero(inside.any(0) & ~inside.all(0))
     rows = (start + crossed).astype(np.int32)
@@ -156,13 +178,19 @@ def _crossings_of_chunk(field: FineField, start: int, stop: int) -> tuple[NDArra
 def _split(
     places: NDArray[np.intp], rows: IntArray, width: int
 ) -> tuple[IntArray, NDArray[np.int16]]:
-    """Return the voxel and the place in its block of places in a table of ``width`` columns."""
+    """Split flat indices into a table of ``width`` columns: the voxel of the row, and the column.
+
+    ``rows`` are the voxels of the table's rows.
+    """
     line = places // width
     return rows[line], (places - line * width).astype(np.int16)
 
 
 def _crossed_edges(inside: BoolArray) -> NDArray[np.intp]:
-    """Return the crossed edges of blocks (K+1, K+1, K+1, n), in a table of 3 Q columns."""
+    """Return the crossed edges of blocks, as flat indices into a table (n, 3 Q).
+
+    ``inside`` is (K+1, K+1, K+1, n), True at inside nodes.
+    """
     crossed = np.zeros((3, *inside.shape), bool)
     np.not_equal(inside[1:], inside[:-1], out=crossed[0, :-1])
     np.not_equal(inside[:, 1:], inside[:, :-1], out=crossed[1, :, :-1])
@@ -171,7 +199,10 @@ def _crossed_edges(inside: BoolArray) -> NDArray[np.intp]:
 
 
 def _cases(inside: BoolArray) -> NDArray[np.uint8]:
-    """Return the cases of the cells of blocks (K+1, K+1, K+1, n), flat, voxel by voxel."""
+    """Return the marching cubes cases of all cells of blocks, (n K^3,), voxel by voxel.
+
+    ``inside`` is (K+1, K+1, K+1, n), True at inside nodes.
+    """
     bits: NDArray[Any] = inside.view(np.uint8)
     bits = bits[:, :, :-1] | bits[:, :, 1:] << 1
     bits = bits[:, :-1] | bits[:, 1:] << 2
@@ -181,7 +212,7 @@ def _cases(inside: BoolArray) -> NDArray[np.uint8]:
 
 @lru_cache
 def part_of_edge(factor: int) -> IntArray:
-    """Return the part of the block in which each edge lies, (3 Q,): its part's owner owns it."""
+    """Return the part of the block in which each edge lies, (3 Q,); the part's owner owns it."""
     side = np.tile(NEIGHBOURHOOD[part_of_node(factor)[0]], (3, 1, 1))
     side[np.arange(3), :, np.arange(3)] = 0  # not at either end of its axis
     part: IntArray = ((side.reshape(-1, 3) + 1) @ STRIDES).astype(np.int32)
@@ -189,7 +220,7 @@ def part_of_edge(factor: int) -> IntArray:
 
 
 def groups_of_planes(field: FineField) -> list[slice]:
-    """Cut a field's planes into runs of whole planes: one, or with about a chunk of voxels."""
+    """Return the rows of the field's own planes, cut into runs of planes of about a chunk each."""
     core = field.own_rows
     plane = field.voxel_ijk[core, 0]
     starts = core.start + np.flatnonzero(np.diff(plane, prepend=plane[:1] - 1))
@@ -202,8 +233,9 @@ def groups_of_planes(field: FineField) -> list[slice]:
 def lookups_at_once(voxels: int, widest: int, threads: int) -> int:
     """Return how many threads may hold a vertex lookup table at the same time.
 
-    A plane may hold the whole surface. Tables of ``widest`` voxels, one a thread, take at most
-    twice what the values of all voxels take, or one thread does all.
+    A table may be large, since one plane may hold the whole surface. All tables together, of
+    ``widest`` voxels each, take at most twice the memory of the values of all ``voxels``; if even
+    two would take more, there is one thread.
     """
     return max(min(8 * voxels // max(LOOKUP_BYTES * widest, 1), threads), 1)
 
@@ -211,7 +243,7 @@ def lookups_at_once(voxels: int, widest: int, threads: int) -> int:
 def place_vertices(
     field: FineField, grid: SdfGrid, crossings: Crossings, rows: slice
 ) -> NDArray[Any]:
-    """Return the vertices on the edges that some voxels own, (n, 3), in world coordinates."""
+    """Return the vertices on the edges that some voxels own, (n, 3), in world units."""
     own = crossings.own(rows)
     row, edge = crossings.own_row[own], crossings.own_edge[own]
     axis, node = np.divmod(edge, np.int16(len(field.blocks)))
@@ -222,7 +254,7 @@ def place_vertices(
         start = field.factor * voxel + block_ijk(field.factor)[node, along]
         runs, last = axis == along, field.shape[along] * field.factor
         lattice: NDArray[np.float64] = start + np.where(runs, share, 0.0)
-        if ((voxel < 0) | (voxel >= field.shape[along])).any():  # a cap
+        if ((voxel < 0) | (voxel >= field.shape[along])).any():  # voxels of a cap
             lattice = _onto_border(start, runs, share, last)
         # The fine index K i + K/2 is sample i.
         sample = lattice / field.factor - 0.5
@@ -232,12 +264,18 @@ def place_vertices(
 
 @lru_cache
 def _ends(factor: int) -> NDArray[np.intp]:
-    """Return the node at the far end of each edge of a block, (3 Q,); past it if there is none."""
+    """Return the node at the far end of each edge of a block, (3 Q,).
+
+    Edges that leave the block have a number here too, which is not used.
+    """
     return (np.arange((factor + 1) ** 3) + _strides(factor)[:, None]).ravel()
 
 
 def _crossing(low: FloatArray, high: FloatArray) -> NDArray[np.float64]:
-    """Return where linear interpolation is 0, as a share of the edge from its low end."""
+    """Return where on edges the linear interpolation is 0, (n,), 0 to 1 from the low end.
+
+    It stays ``CLEARANCE`` away from both ends.
+    """
     low64, high64 = low.astype(np.float64), high.astype(np.float64)
     return np.clip(low64 / (low64 - high64), CLEARANCE, 1 - CLEARANCE)
 
@@ -245,9 +283,23 @@ def _crossing(low: FloatArray, high: FloatArray) -> NDArray[np.float64]:
 def _onto_border(
     start: IntArray, runs: BoolArray, share: NDArray[np.float64], last: int
 ) -> NDArray[np.float64]:
-    """Return coordinates on edges whose nodes beyond the border are brought back to it.
+    """Return coordinates along an axis of vertices, with nodes beyond the border moved onto it.
 
-    ``runs`` says which edges run along the axis of the coordinates.
+    Parameters
+    ----------
+    start : (n,) int
+        Fine index of the edges' low ends along the axis.
+    runs : (n,) bool
+        Which edges run along the axis.
+    share : (n,) float64
+        Positions of the vertices on the edges, 0 to 1.
+    last : int
+        Fine index of the border at the high end of the axis; that at its low end is 0.
+
+    Returns
+    -------
+    (n,) float64
+        In fine spacings.
     """
     low = np.clip(start.astype(np.float64), -CAP_HEIGHT, last + CAP_HEIGHT)
     high = np.clip(start + runs.astype(np.float64), -CAP_HEIGHT, last + CAP_HEIGHT)
@@ -255,9 +307,9 @@ def _onto_border(
 
 
 def connect(field: FineField, crossings: Crossings, rows: slice, first: int) -> IntArray:
-    """Return the triangles in some whole planes of voxels, in the order of voxels and cells.
+    """Return the triangles (m, 3) in some whole planes, in the order of voxels and cells.
 
-    ``first`` is the number of the first vertex of ``crossings``.
+    ``first`` is the vertex number of the first of ``crossings``' own edges.
     """
     before = field.plane_before(rows).start
     edges = 3 * len(field.blocks)
@@ -276,13 +328,13 @@ def connect(field: FineField, crossings: Crossings, rows: slice, first: int) -> 
 def _number_vertices(
     field: FineField, crossings: Crossings, before: int, rows: slice, first: int
 ) -> IntArray:
-    """Return for the edges of the blocks of some voxels, flat, the vertex if there is one.
+    """Return the vertex lookup table: the vertex on each edge of some voxels' blocks, (n 3 Q,).
 
-    The table begins at voxel ``before``, the first of the plane before: of that plane it has only
-    the edges that each voxel owns.
+    Only entries of crossed edges are set. The table begins at voxel ``before``, the first of the
+    plane before; of that plane it has only the edges that each voxel owns.
     """
     edges = 3 * len(field.blocks)
-    vertex_at = np.empty((rows.stop - before) * edges, np.int32)  # what is not set is not read
+    vertex_at = np.empty((rows.stop - before) * edges, np.int32)  # unset entries are not read
     own = crossings.own(slice(before, rows.stop))
     at = (crossings.own_row[own] - np.int64(before)) * edges + crossings.own_edge[own]
     vertex_at[at] = np.arange(first + own.start, first + own.stop)
@@ -297,13 +349,13 @@ def _number_vertices(
 
 @lru_cache
 def _shifts(factor: int) -> NDArray[np.int64]:
-    """Return how far an edge's number is from that which the voxel at each place gives it."""
+    """Return an edge's number in a block minus its number in each neighbouring block, (27,)."""
     shifts: NDArray[np.int64] = factor * NEIGHBOURHOOD.astype(np.int64) @ _strides(factor)
     return shifts
 
 
 def _strides(factor: int) -> NDArray[np.int64]:
-    """Return from a node of a block to the next along each axis."""
+    """Return the steps from a node of a block to the next one along each axis, (3,)."""
     return np.array([(factor + 1) ** 2, factor + 1, 1])
 
 
@@ -315,13 +367,13 @@ def _low_nodes(factor: int) -> NDArray[np.intp]:
 
 @lru_cache
 def _flat_triangles(factor: int) -> tuple[IntArray, IntArray, NDArray[np.int64]]:
-    """Return the triangles of all cases in a row.
+    """Return the triangles of all cases, one after the other.
 
     Returns
     -------
     (256,) int32, (256,) int32, (n, 3) int64
-        How many each case has, which is its first, and the edges that carry their vertices, from
-        the number of the cell's low node.
+        The number of triangles of each case, its first triangle, and the edges on which the
+        triangles' vertices lie, counted from the number of the cell's low node.
     """
     counts, table = triangle_table()
     start = (CORNERS @ _strides(factor))[np.array(EDGE_START)]

@@ -1,16 +1,16 @@
-"""The fine lattice: the nodes of each voxel's block, and the mean of those that blocks share.
+"""The fine lattice: the nodes of each voxel's block, and the averaging of nodes that blocks share.
 
-Nodes are points of spacing h/K. A voxel's block is its (K+1)^3 nodes, faces included (Eq. 3), in
-C order. The fine index of coarse sample i is ``K*i + K/2``.
+Nodes have spacing h/K. A voxel's block is its Q = (K+1)^3 nodes, faces included (Eq. 3), in C
+order. Coarse sample i has the fine index ``K*i + K/2``.
 
-Values are kept block by block, (Q, D): a row for each of the block's Q nodes, a column for each
-voxel. What is done to a node is so done to all voxels in one pass over contiguous memory. Blocks
-that share a node have a copy of it each, and from ``average_shared`` on the copies are equal, bit
-for bit. One column more, always 0, stands for voxels that are not there: index -1 reads it.
+Values are stored by block in an array (Q, D): a row per node of the block, a column per voxel. An
+operation on a node is one pass over contiguous memory for all voxels. Blocks that share a node
+each hold a copy of its value; ``average_shared`` makes the copies equal, bit for bit, and they stay
+so. One more column, always 0, stands for absent voxels: their index -1 reads it.
 
-A block has 27 parts: 8 corners, 12 edges, 6 faces and the inside, in the order of
-``NEIGHBOURHOOD``. A part is shared as a whole, and belongs to the first of the voxels that share
-it.
+A block has 27 parts: 8 corners, 12 edges, 6 faces and the interior, in the order of
+``NEIGHBOURHOOD``. Voxels share whole parts. A part belongs to the first of the voxels that share
+it (its owner), which decides where its nodes are counted and numbered.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from numpy.typing import NDArray
 from ..arrays import BoolArray, FloatArray, IntArray, Signs
 from ..errors import OptionError, OptionTypeError, seen
 from ..machine.index_width import check_count
-from ..machine.threads import map_threads, worthwhile
+from ..machine.threads import map_threads, worthwhile_threads
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 
 MAX_FACTOR = 16
-# What a node is set to when only its sign is known.
+# The value of a node of which only the sign is known, in half voxels.
 BARELY_INSIDE, BARELY_OUTSIDE = np.float32(-1e-3), np.float32(1e-3)
 
-# The neighbours that share each part, the voxel itself among them: those that lie on its side.
+# The neighbours that share each part, the voxel itself included.
 SHARING = [
     np.flatnonzero(((NEIGHBOURHOOD == 0) | (sides == NEIGHBOURHOOD)).all(1))
     for sides in NEIGHBOURHOOD
@@ -42,7 +42,15 @@ SHARING = [
 
 
 def check_factor(factor: Any) -> int:
-    """Return the factor if it is even and 2 to 16: an odd one has no node on the sample."""
+    """Return the factor if it is an even number from 2 to 16.
+
+    Raises
+    ------
+    OptionError
+        If it is out of range, or odd: then no node lies on a sample.
+    OptionTypeError
+        If it is no whole number.
+    """
     if not isinstance(factor, Integral) or isinstance(factor, bool):
         raise OptionTypeError(f"factor is {seen(factor)}: give a whole number")
     whole = int(factor)
@@ -55,7 +63,7 @@ def check_factor(factor: Any) -> int:
 
 
 def block_ijk(factor: int) -> IntArray:
-    """Return the block's nodes counted from the voxel's low corner, (Q, 3) in 0..K."""
+    """Return the indices of the block's nodes from the voxel's low corner, (Q, 3) in 0..K."""
     side = factor + 1
     return np.indices((side,) * 3).reshape(3, -1).T.astype(np.int32)
 
@@ -67,7 +75,7 @@ def block_offsets(factor: int) -> FloatArray:
 
 @lru_cache
 def part_of_node(factor: int) -> tuple[IntArray, IntArray]:
-    """Return for each block node its part, 0 to 26, and its place in it."""
+    """Return the part of each node of a block, (Q,) in 0..26, and its index in the part, (Q,)."""
     block = block_ijk(factor)
     part = (np.where(block == 0, 0, np.where(block == factor, 2, 1)) @ STRIDES).astype(np.int32)
     place = np.empty_like(part)
@@ -78,19 +86,19 @@ def part_of_node(factor: int) -> tuple[IntArray, IntArray]:
 
 @lru_cache
 def nodes_of_part(factor: int) -> list[NDArray[np.intp]]:
-    """Return the block nodes of each part."""
+    """Return the nodes of each of the 27 parts, as indices into the block."""
     part, _ = part_of_node(factor)
     return [np.flatnonzero(part == number) for number in range(27)]
 
 
 @lru_cache
 def part_sizes(factor: int) -> NDArray[np.int64]:
-    """Return how many nodes each part has, (27,)."""
+    """Return the number of nodes of each part, (27,)."""
     return np.array([len(nodes) for nodes in nodes_of_part(factor)])
 
 
 def seen_from(part: int, neighbour: int | np.integer[Any]) -> int:
-    """Return which part of a neighbour that shares it a part is: it is on the other side there."""
+    """Return the number that a shared part has in a neighbour: it is on the other side there."""
     return int((NEIGHBOURHOOD[part] - 2 * NEIGHBOURHOOD[neighbour] + 1) @ STRIDES)
 
 
@@ -101,33 +109,32 @@ class SharedParts:
     Attributes
     ----------
     table : (27, D) int32
-        Neighbours among the D voxels themselves, -1 where there is none.
+        Neighbour table of the D voxels, -1 where there is no neighbour.
     owner : (27, D) int8
-        Where the voxel that owns a part stands, as a place in the neighbourhood: ``CENTRE`` for
-        the voxel itself.
+        The owner of each part, as a place in the neighbourhood: ``CENTRE`` is the voxel itself.
     """
 
     table: IntArray
-    owner: Signs
+    owner: NDArray[np.int8]
 
     def owned(self, rows: slice = slice(None)) -> BoolArray:
-        """Say which parts some voxels own, (27, n)."""
+        """Return which parts the voxels in ``rows`` own, (27, n) bool."""
         own: BoolArray = self.owner[:, rows] == CENTRE
         return own
 
     def count_nodes(self, factor: int, rows: slice = slice(None)) -> int:
-        """Return how many nodes belong to some voxels."""
+        """Return the number of nodes that the voxels in ``rows`` own."""
         parts = np.count_nonzero(self.owned(rows), axis=1)
         return int(parts @ part_sizes(factor))
 
 
 def share_parts(table: IntArray) -> SharedParts:
-    """Find the owner of each part, given the voxels' neighbours among themselves, (D, 27)."""
+    """Return the owners of all parts, given the voxels' neighbour table, (D, 27) int32."""
     by_place = np.ascontiguousarray(table.T)
     there = by_place >= 0
     owner = np.full(by_place.shape, CENTRE, np.int8)
     for part, sharing in enumerate(SHARING):
-        for place in sharing[sharing < CENTRE][::-1]:  # the first comes last, and stays
+        for place in sharing[sharing < CENTRE][::-1]:  # the first is written last
             np.copyto(owner[part], place, where=there[place])
     return SharedParts(by_place, owner)
 
@@ -140,17 +147,17 @@ def number_parts(parts: SharedParts, sizes: NDArray[np.int64]) -> tuple[IntArray
     parts : SharedParts
         Of D voxels.
     sizes : (27,) int64
-        How many nodes a part has.
+        Nodes per part.
 
     Returns
     -------
     (27, D) int32 and int
-        The number of the first node of each part, and how many nodes there are.
+        The number of the first node of each part, and the number of nodes.
 
     Raises
     ------
     OptionError
-        If there are more than 32-bit numbers.
+        If there are more nodes than 32-bit numbers.
     """
     owned = parts.owned()
     count = check_count(int(np.count_nonzero(owned, axis=1) @ sizes), "nodes")
@@ -177,29 +184,33 @@ def average_shared(blocks: FloatArray, parts: SharedParts, factor: int, threads:
     factor : int
         K.
     threads : int
-        How many work at a time.
+        Threads to use.
 
     Notes
     -----
-    Sums run in the order of the voxels, in double precision (two numbers need none), so that all
-    copies get the same bits and the result does not depend on how the work was divided.
+    Sums are taken in the order of the voxels and in double precision (in single for two numbers,
+    whose sum does not depend on the order), so that all copies get the same bits and the result
+    does not depend on how the work was divided.
     """
     groups = [axes for axes in product((False, True), repeat=3) if any(axes)]
-    threads = worthwhile(blocks.size, threads)
+    threads = worthwhile_threads(blocks.size, threads)
     map_threads(lambda axes: _average_group(blocks, parts.table, factor, axes), groups, threads)
 
 
 def _average_group(
     blocks: FloatArray, table: IntArray, factor: int, axes: tuple[bool, ...]
 ) -> None:
-    """Average the nodes that are shared across some axes and inside along the others."""
-    sides, columns = columns_of_group(factor, axes)
-    kind = np.float32 if len(sides) == 2 else np.float64
+    """Average the nodes at the block's ends along ``axes`` and inside along the other axes.
+
+    With one such axis they are the interiors of faces, with two of edges, with three the corners.
+    """
+    places, nodes_at = nodes_of_group(factor, axes)
+    kind = np.float32 if len(places) == 2 else np.float64
     means = []
-    for own in sides:
-        total: NDArray[Any] = np.zeros((len(columns[0]), table.shape[1]), kind)
+    for own in places:
+        total: NDArray[Any] = np.zeros((len(nodes_at[0]), table.shape[1]), kind)
         times: NDArray[Any] = np.zeros(table.shape[1], kind)
-        for other, nodes in zip(sides, columns):
+        for other, nodes in zip(places, nodes_at):
             if other is own:
                 total += blocks[nodes, :-1]
                 times += 1
@@ -209,27 +220,28 @@ def _average_group(
             for row, node in enumerate(nodes):
                 total[row] += blocks[node].take(voxel)
         means.append((total / times).astype(np.float32))
-    for nodes, mean in zip(columns, means):
+    for nodes, mean in zip(nodes_at, means):
         blocks[nodes, :-1] = mean
 
 
 @lru_cache
-def columns_of_group(
+def nodes_of_group(
     factor: int, axes: tuple[bool, ...]
 ) -> tuple[list[IntArray], list[NDArray[np.intp]]]:
-    """Return the sides at which voxels can meet, in their order, and the nodes seen from each.
+    """Return the places that a shared node can have in a block, and the block's nodes there.
 
-    Sides are (3,), 1 for a node at the voxel's high end of an axis, 0 at its low end and along the
-    other axes.
+    The same node is at another place in each of the blocks that share it. A place is (3,) int32: 1
+    at the block's high end of an axis, 0 at its low end and along axes that are not shared. Places
+    come in the order of the voxels that see the node there.
     """
     block = block_ijk(factor)
     ends = [(1, 0) if shared else (0,) for shared in axes]
-    sides = [np.array(side, np.int32) for side in product(*ends)]
+    places = [np.array(place, np.int32) for place in product(*ends)]
     inner = (block > 0) & (block < factor)
-    columns = [
-        np.flatnonzero(np.where(axes, block == factor * side, inner).all(1)) for side in sides
+    nodes_at = [
+        np.flatnonzero(np.where(axes, block == factor * place, inner).all(1)) for place in places
     ]
-    return sides, columns
+    return places, nodes_at
 
 
 def signs_of_skipped(
@@ -239,7 +251,7 @@ def signs_of_skipped(
     voxels: IntArray,
     shape: tuple[int, int, int],
 ) -> Signs:
-    """Return the signs of the voxels beside the decoded ones that were not decoded.
+    """Return the signs of the skipped voxels, those beside decoded ones that were not decoded.
 
     Parameters
     ----------
@@ -248,16 +260,16 @@ def signs_of_skipped(
     voxel_ijk : (D, 3) int32
         The decoded voxels.
     patches : (V, 27) float32
-        The band's samples, which have the signs of the neighbours.
+        The samples round each voxel of the band.
     voxels : (D,) int32
-        Which rows of the band were decoded.
+        The rows of the band that were decoded.
     shape : three ints
-        Samples of the grid: beyond it nothing was skipped.
+        Samples of the grid along each axis; there are no voxels to skip beyond it.
 
     Returns
     -------
     (27, D) int8
-        1 outside, -1 inside; 0 where nothing was skipped.
+        Of the neighbours of each decoded voxel: 1 outside, -1 inside, 0 not skipped.
     """
     signs = np.zeros(parts.table.shape, np.int8)
     inner = [(ijk != 0, ijk != n - 1) for ijk, n in zip(np.ascontiguousarray(voxel_ijk.T), shape)]
@@ -273,26 +285,26 @@ def signs_of_skipped(
 def pin_to_skipped(
     blocks: FloatArray, parts: SharedParts, factor: int, skipped: Signs
 ) -> NDArray[np.int64]:
-    """Give nodes shared with a voxel that was not decoded that voxel's sign.
+    """Give the nodes shared with a skipped voxel that voxel's sign.
 
-    Such a voxel holds no surface, so all its nodes have its sign; with this no sign change can
-    reach the edge of what was decoded, and the isosurface has no hole there.
+    A skipped voxel holds no surface, so all its nodes have its sign. Once they do, no sign change
+    reaches the boundary of the decoded voxels, and the isosurface has no hole there.
 
     Parameters
     ----------
     blocks : (Q, D) float32
-        Node values, changed in place.
+        Node values in half voxels, changed in place.
     parts : SharedParts
         Of the decoded voxels.
     factor : int
         K.
     skipped : (27, D) int8
-        From ``signs_of_skipped``. No two skipped voxels round a node differ in sign.
+        From ``signs_of_skipped``. Skipped voxels that share a node have the same sign.
 
     Returns
     -------
     (D,) int64
-        How many nodes of each voxel's own had the other sign.
+        For each voxel, the number of nodes that it owns whose sign was changed.
     """
     changed = np.zeros(skipped.shape[1], np.int64)
     for part, nodes in enumerate(nodes_of_part(factor)):

@@ -1,7 +1,7 @@
-"""Whether the distances go far enough round an offset.
+"""Checks that the distances reach far enough to both sides of an offset.
 
-A field may be cut off at some distance, or hold a fill value from there on. A surface too near to
-that distance would come out in loose pieces, or in the wrong place.
+A field may be truncated at some distance, or hold a fill value beyond it. A surface too near that
+distance would come out in loose pieces, or in the wrong place.
 """
 
 from __future__ import annotations
@@ -15,21 +15,28 @@ from ..errors import GridError
 from ..neighbourhood import CENTRE
 from .band import HALF_BAND, PATCH_LIMIT
 
-# Neighbouring samples of noisy distances differ by up to twice the spacing (4 half voxels), from a
-# fill value they differ by more. A small share of such jumps is tolerated: wrong samples.
-JUMP, MOST_JUMPS = 4.2, 0.05
-# How far distances must go beyond the offset, in half voxels, before they are cut off at one value;
-# and before fill values begin, which would be taken for noise.
-CUT_OFF_ROOM, FILL_ROOM = HALF_BAND, 5.0
-# Tolerances in half voxels, so that the offset that the message names works: for rounding, and
+# Neighbouring samples of noisy distances differ by up to twice the spacing (4 half voxels); a
+# distance and a fill value differ by more, a jump. A small share of jumps is tolerated as outliers.
+MIN_JUMP, MAX_JUMP_SHARE = 4.2, 0.05
+# How far distances must reach beyond the offset, in half voxels, where they are truncated; and
+# where fill values begin, which would be taken for noise.
+CUT_OFF_MARGIN, FILL_MARGIN = HALF_BAND, 5.0
+# Tolerances in half voxels, so that the offset that the message suggests works: for rounding, and
 # because no sample lies exactly where fill values begin.
 ROUNDING, UNSAMPLED = 1e-3, 0.1
 
 
 class Jumps(NamedTuple):
-    """Samples near an offset next to which the field jumps away, and how many are near in all.
+    """Counts of the samples near an offset, and of those from which the field jumps to a neighbour.
 
-    ``end`` is the farthest from which it jumps, in half voxels from the offset.
+    Attributes
+    ----------
+    edges : int
+        Samples near the offset with a jump to a neighbour.
+    near : int
+        Samples near the offset.
+    end : float
+        The farthest sample with a jump, in half voxels from the offset; -inf if there is none.
     """
 
     edges: int
@@ -38,29 +45,29 @@ class Jumps(NamedTuple):
 
 
 def check_not_cut_off(patches: FloatArray, offset: float, voxel_size: float) -> None:
-    """Raise if the distances are cut off within 1.5 voxels of an offset.
+    """Raise if the distances are truncated within 1.5 voxels of an offset.
 
     Parameters
     ----------
     patches : (V, 27) float32
-        The samples round some voxels of the band at the offset, in half voxels from it.
+        The samples round voxels of the band at the offset, in half voxels from it.
     offset, voxel_size : float
         In world units.
 
     Raises
     ------
     GridError
-        The text says which offset works.
+        If they are; its message suggests an offset that works.
     """
     centre = patches[:, CENTRE]
-    cut_off = is_flat(patches) & (np.abs(centre) < CUT_OFF_ROOM - ROUNDING)
+    cut_off = is_flat(patches) & (np.abs(centre) < CUT_OFF_MARGIN - ROUNDING)
     if cut_off.any():
         end = offset + float(centre[cut_off][0]) * voxel_size / 2
-        raise too_near(offset, voxel_size, end, CUT_OFF_ROOM, outwards=end > 0)
+        raise too_near(offset, voxel_size, end, CUT_OFF_MARGIN, outwards=end > 0)
 
 
 def is_flat(patches: FloatArray) -> BoolArray:
-    """Say which samples, (V,), equal all their neighbours: no distance does."""
+    """Return which samples equal all their neighbours, (V,) bool: a distance never does."""
     flat = np.ones(len(patches), bool)
     for column in range(27):
         flat &= patches[:, column] == patches[:, CENTRE]
@@ -68,7 +75,7 @@ def is_flat(patches: FloatArray) -> BoolArray:
 
 
 def find_jumps(rescaled: FloatArray) -> tuple[Jumps, Jumps]:
-    """Return the jumps upwards and downwards in some planes, in half voxels from the offset."""
+    """Return the jumps upwards and downwards in planes (n, ny, nz), in half voxels."""
     return _jumps_up(rescaled), _jumps_up(-rescaled)
 
 
@@ -78,27 +85,43 @@ def _jumps_up(rescaled: FloatArray) -> Jumps:
     for axis in range(3):
         values, found = np.moveaxis(rescaled, axis, 0), np.moveaxis(jumps, axis, 0)
         step = values[1:] - values[:-1]
-        found[:-1] |= step > JUMP
-        found[1:] |= step < -JUMP
+        found[:-1] |= step > MIN_JUMP
+        found[1:] |= step < -MIN_JUMP
     near = np.abs(rescaled) < PATCH_LIMIT
     jumps &= near
     return Jumps(int(jumps.sum()), int(near.sum()), float(rescaled[jumps].max(initial=-np.inf)))
 
 
 def check_not_filled(found: list[tuple[Jumps, Jumps]], offset: float, voxel_size: float) -> None:
-    """Raise if there are fill values within 2.5 voxels of an offset, of all planes' jumps."""
+    """Raise if fill values begin within 2.5 voxels of an offset.
+
+    Parameters
+    ----------
+    found : list
+        The jumps of all planes, from ``find_jumps``.
+    offset, voxel_size : float
+        In world units.
+
+    Raises
+    ------
+    GridError
+        If they do; its message suggests an offset that works.
+    """
     for side, parts in zip((1, -1), zip(*found)):
         count, near = sum(part.edges for part in parts), sum(part.near for part in parts)
         reach = max(part.end for part in parts)
-        if count > MOST_JUMPS * near and reach < FILL_ROOM - UNSAMPLED:
+        if count > MAX_JUMP_SHARE * near and reach < FILL_MARGIN - UNSAMPLED:
             end = offset + side * reach * voxel_size / 2
-            raise too_near(offset, voxel_size, end, FILL_ROOM, outwards=side > 0)
+            raise too_near(offset, voxel_size, end, FILL_MARGIN, outwards=side > 0)
 
 
 def too_near(
     offset: float, voxel_size: float, end: float, needed: float, *, outwards: bool
 ) -> GridError:
-    """Return the error for an offset that is too near to where the distances end."""
+    """Return the error for an offset too near ``end``, where the distances end (world units).
+
+    ``needed`` is how far they must reach, in half voxels.
+    """
     room = needed / 2 * voxel_size
     limit, which = (end - room, "largest") if outwards else (end + room, "smallest")
     works = f"the {which} that works is {limit:.6g}" if limit * end > 0 else "only 0 works"

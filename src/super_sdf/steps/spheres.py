@@ -1,13 +1,17 @@
-"""Every sample is the radius of a sphere that touches the surface: move the surface to touch them.
+"""Move the surface so that it touches the sphere of every sample.
 
-The foot point of a sample x with distance d is the surface point nearest to it, x - d n with the
-surface's normal n there. What the refined field says at foot points should be 0. It is not quite,
-for a network sees a sample as one number among many. What it says there is spread over the
-neighbourhood and subtracted: first between the corners of voxels, so that walls which no sample
-lies in are found; what is left, on a lattice twice as fine.
+An exact sample x with distance d is the centre of a sphere of radius |d| that touches the surface
+at its foot point x - d n, where n is the surface normal there. The refined field should be 0 at the
+foot point. It is not quite, since the network sees a sample as one number among many. In steps:
+
+1. ``find_foot_points`` follows the field's gradient from each exact sample to its foot point, and
+   reads the field there: the error, with a weight for how far to trust it.
+2. ``mean_at_nodes`` averages the errors at the corners of voxels, which also corrects walls that
+   lie between samples; then what is left of them on a lattice twice as fine.
+3. ``fit_to_spheres`` subtracts the averages from the field, by trilinear interpolation.
 
 Reference: Sellán, Batty and Stein, "Reach For the Spheres: Tangency-Aware Surface Reconstruction
-of SDFs", 2023, for the constraint; the solution here is another.
+of SDFs", 2023, for the constraint; it is solved differently here.
 
 Lengths are in half voxels, as in ``band``.
 """
@@ -23,43 +27,45 @@ from numpy.typing import NDArray
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..machine.threads import map_chunks
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
-from .band import REACH
+from .band import MAX_DIFFERENCE
 from .interpolation import CELL, find_cell, prolong, sample_trilinear
 from .nodes import SharedParts, nodes_of_part, number_parts
 
-DIRECTIONS = 5  # tried for each sample: see find_foot_points
-FARTHEST = 2.8  # samples near the band's edge, 3, may have been cut off there
-USUAL = 0.2  # a value at a foot point that is larger is less likely a matter of position ...
-LARGEST = 0.6  # ... and counts as no more than this
-ALIGNMENT = 3  # squarings of the cosine between a sample's direction and the normal it meets
-LEAST_WEIGHT = 1e-3  # a weight below is none
-PRIOR = 0.2  # foot points that speak for no correction at all
-DISAGREEMENT = 0.5  # how much the variance of what foot points say speaks against it
-FLAT = 0.7  # the largest slope towards a neighbour; that of a distance is near 1
+ITERATIONS = 5  # of the search for a foot point
+MAX_DISTANCE = 2.8  # samples near the band's edge, 3, may have been truncated there
+TYPICAL_ERROR = 0.2  # scale of the Cauchy weight of an error at a foot point
+MAX_ERROR = 0.6  # larger errors are clipped
+SQUARINGS = 3  # of the cosine between the search direction and the normal: its 8th power
+MIN_WEIGHT = 1e-3  # foot points of a smaller weight are dropped
+PRIOR_WEIGHT = 0.2  # of the assumption that the error is 0, in foot points
+VARIANCE_PENALTY = 0.5  # how strongly disagreement of the errors reduces their mean
+MIN_SLOPE = 0.7  # towards the steepest neighbour; near 1 for a distance
 CORNER_PARTS = np.flatnonzero(np.abs(NEIGHBOURHOOD).all(1))
-MOST_NOISY = 0.02  # share of samples that are no distances: beyond, none is taken for exact
+MAX_NOISY_SHARE = 0.02  # of all samples; in a noisier field no sample is taken as exact
 
-TEMPORARIES = 64  # numbers for each sample, on the way to its foot point
+TEMPORARIES = 64  # numbers per sample in the search for its foot point
 
-# Planes of voxels to both sides that a block's fitted values depend on: what is said round it, by
-# samples one voxel on, given what was said one voxel further, whose tries read blocks as far again.
+# The fitted values of a block depend on this many planes of voxels to either side, one each for:
+# the foot points in the blocks beside it; those in the blocks beside these, for the coarse mean;
+# their samples; the blocks that the search for a foot point reads; the averaging of shared nodes.
 REACH_IN_VOXELS = 5
 
 
 @dataclass(frozen=True, eq=False)
 class ExactSamples:
-    """Samples that can be taken for exact distances, and where they find the blocks round them.
+    """Samples that can be taken as exact distances, and the blocks round them.
 
     Attributes
     ----------
     patches : (V, 27) float32
-        The band's samples.
+        The samples round each voxel of the band, in half voxels.
     exact : (n,) int32
-        The rows of those that are exact.
+        Rows of ``patches`` whose own sample is exact.
     table : (V, 27) int32
-        Neighbours in the band, -1 where there is none.
+        Neighbour table of the band, -1 where there is no neighbour.
     row_of : (V + 1,) int32
-        Which block is a voxel's, -1 if it was not decoded; the last stands for absent ones.
+        The block of each voxel, -1 if it was not decoded. The last entry is -1, for the index -1
+        of absent neighbours.
     """
 
     patches: FloatArray
@@ -70,18 +76,18 @@ class ExactSamples:
 
 @dataclass(frozen=True, eq=False)
 class FootPoints:
-    """Foot points of samples, and what the field is there.
+    """Foot points of samples, and the field's value there.
 
     Attributes
     ----------
     rows : (n,) int32
-        The block each lies in.
+        The block that each lies in.
     place : (3, n) float32
-        Where in the block, from 0 to 1.
+        Position in the block, 0 to 1 along each axis.
     values : (n,) float32
-        The field there, which should be 0.
+        The field there, in half voxels: the error, since it should be 0.
     weights : (n,) float32
-        How far to trust that.
+        How far to trust it, 0 to 1.
     """
 
     rows: IntArray
@@ -95,7 +101,7 @@ def fit_to_spheres(
 ) -> None:
     """Move the surface so that it touches the samples' spheres.
 
-    Nodes at exact samples keep the sample; without such samples nothing is moved.
+    Nodes at exact samples keep the sample's value. Without exact samples nothing is changed.
 
     Parameters
     ----------
@@ -106,91 +112,128 @@ def fit_to_spheres(
     factor : int
         K.
     samples : ExactSamples
-        Whose spheres.
+        The samples whose spheres the surface should touch.
     threads : int
-        How many work at a time.
+        Threads to use.
     """
-    if not len(samples.exact):  # a noisy field, say
+    if not len(samples.exact):  # in a noisy field, for example
         return
     feet = find_foot_points(blocks, factor, samples, threads)
-    correction = correction_of(feet, parts)
+    correction = find_correction(feet, parts)
 
     def subtract(rows: slice) -> None:
         blocks[:, rows] -= prolong(correction[:, rows], 2, factor)
 
     map_chunks(subtract, correction.shape[1], len(blocks), threads)
-    keep_samples(blocks, factor, samples)
+    restore_samples(blocks, factor, samples)
 
 
-def correction_of(feet: FootPoints, parts: SharedParts) -> FloatArray:
-    """Return what foot points say in the mean at the parts of each block, (27, D)."""
+def find_correction(feet: FootPoints, parts: SharedParts) -> FloatArray:
+    """Return the correction on the lattice of 2 cells per block, (27, D), in half voxels.
+
+    It is the mean error at the corners of voxels, interpolated to the finer lattice, plus the mean
+    there of the errors that this leaves.
+    """
     numbers, count = number_parts(parts, np.ones(27, np.int64))
     coarse, at, shares = mean_at_nodes(feet, feet.values, numbers, count, 1)
-    left = feet.values - (coarse.take(at) * shares).sum(0)
-    fine, *_ = mean_at_nodes(feet, left, numbers, count, 2)
+    remaining = feet.values - (coarse.take(at) * shares).sum(0)
+    fine, *_ = mean_at_nodes(feet, remaining, numbers, count, 2)
     return prolong(coarse.take(numbers[CORNER_PARTS]), 1, 2) + fine.take(numbers)
 
 
 def exact_samples(patches: FloatArray, lipschitz: BoolArray, threads: int = 1) -> BoolArray:
-    """Say which samples of a whole band, (V,), can be taken for exact distances.
+    """Return which samples of a whole band can be taken as exact distances.
 
-    Where more than a few of all are none (``lipschitz``, from ``is_lipschitz``), no sample is.
+    Parameters
+    ----------
+    patches : (V, 27) float32
+        The samples round each voxel, in half voxels.
+    lipschitz : (V,) bool
+        From ``is_lipschitz``. If more than a few are False the field is noisy, and no sample is
+        taken as exact.
+    threads : int
+        Threads to use.
+
+    Returns
+    -------
+    (V,) bool
     """
-    if not len(patches) or (~lipschitz).mean() > MOST_NOISY:
+    if not len(patches) or (~lipschitz).mean() > MAX_NOISY_SHARE:
         return np.zeros(len(patches), bool)
     sample = patches[:, CENTRE]
     limits = np.float32(sample.min()), np.float32(sample.max())
-    near = np.abs(sample) < FARTHEST
+    near = np.abs(sample) < MAX_DISTANCE
     cut_off = map_chunks(lambda rows: is_cut_off(patches[rows], limits), len(patches), 27, threads)
     exact: BoolArray = lipschitz & near & ~np.concatenate(cut_off)
     return exact
 
 
 def is_cut_off(patches: FloatArray, limits: tuple[np.float32, np.float32]) -> BoolArray:
-    """Say which samples, (V,), were cut off: at the limit of their sign, and no neighbour steep."""
+    """Return which samples were truncated, (V,) bool.
+
+    A truncated sample has the largest value of its sign, and no neighbour towards which the field
+    is as steep as a distance. ``limits`` are the lowest and the highest sample.
+    """
     sample = patches[:, CENTRE]
     at_limit = sample == np.where(sample > 0, limits[1], limits[0])
-    slope = np.abs(patches - sample[:, None]) / np.maximum(REACH, 1)
-    cut_off: BoolArray = at_limit & (slope.max(1) < FLAT)
+    slope = np.abs(patches - sample[:, None]) / np.maximum(MAX_DIFFERENCE, 1)
+    cut_off: BoolArray = at_limit & (slope.max(1) < MIN_SLOPE)
     return cut_off
 
 
 def find_foot_points(
     blocks: FloatArray, factor: int, samples: ExactSamples, threads: int = 1
 ) -> FootPoints:
-    """Return the foot points of samples, without those beyond the blocks.
+    """Return the foot points of the exact samples, leaving out those outside all blocks.
 
-    The direction to the surface is the field's gradient where it is reached, hence found by
-    turns: first the patch's gradient, then half-way towards the field's where that led. Of all
-    points at the right distance the nearest to the surface, or deepest beyond, is the best: a
-    sphere that touches is outside everywhere else.
+    Parameters
+    ----------
+    blocks : (Q, D + 1) float32
+        Node values in half voxels; the last column is 0.
+    factor : int
+        K.
+    samples : ExactSamples
+        The samples.
+    threads : int
+        Threads to use.
+
+    Notes
+    -----
+    The direction from a sample to its foot point is the field's gradient at the foot point, so the
+    search iterates: it starts along the gradient of the patch, and then turns half-way towards the
+    gradient of the field at the point reached. All the candidates lie at the sample's distance. The
+    one where the field is lowest, for a sample outside (highest, for one inside), is the best: a
+    sphere that touches the surface lies on the sample's side of it everywhere else.
     """
     chunks = map_chunks(
-        lambda some: best_tries(blocks, factor, samples, some),
+        lambda some: best_candidates(blocks, factor, samples, some),
         len(samples.exact),
         TEMPORARIES,
         threads,
     )
     rows, place, value, cosine = (np.concatenate(arrays, -1) for arrays in zip(*chunks))
-    return weighted_feet(rows, place, value, cosine)
+    return weigh_foot_points(rows, place, value, cosine)
 
 
-def best_tries(
+def best_candidates(
     blocks: FloatArray, factor: int, samples: ExactSamples, chunk: slice
 ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-    """Return block, place, value and cosine of the best foot point of some samples."""
+    """Return block (n,), place (3, n), value (n,) and cosine (n,) of samples' best candidates.
+
+    The cosine is that between the search direction and the normal of the field.
+    """
     exact = samples.exact[chunk]
     patch = samples.patches[exact].T
     distance = patch[CENTRE]
     direction = _unit(patch[CENTRE + STRIDES] - patch[CENTRE - STRIDES])
-    tries = []
-    for _ in range(DIRECTIONS):
+    candidates = []
+    for _ in range(ITERATIONS):
         rows, place = locate(-distance * direction, exact, samples)
         value, gradient = sample_trilinear(blocks, rows, place, factor)
         normal = _unit(gradient)
-        tries.append((rows, place, value, _dot(direction, normal)))
+        candidates.append((rows, place, value, _dot(direction, normal)))
         direction = np.where(rows >= 0, _unit(direction + normal), direction)
-    rows, place, value, cosine = (np.stack(arrays) for arrays in zip(*tries))
+    rows, place, value, cosine = (np.stack(arrays) for arrays in zip(*candidates))
     clearance = np.where(rows >= 0, np.copysign(np.float32(1), distance) * value, np.inf)
     best = clearance.argmin(0), np.arange(len(exact))
     return rows[best], place[best[0], :, best[1]].T, value[best], cosine[best]
@@ -199,10 +242,22 @@ def best_tries(
 def locate(
     steps: FloatArray, exact: IntArray, samples: ExactSamples
 ) -> tuple[IntArray, FloatArray]:
-    """Return the blocks, (n,), that points at ``steps`` (3, n) from samples lie in, and where.
+    """Return the block and the place in it of points at ``steps`` from samples.
 
-    No step is longer than 3 along an axis, so a point lies in the sample's voxel or a neighbour's.
-    The place is from 0 to 1 along each axis; the block -1 where there is none.
+    Parameters
+    ----------
+    steps : (3, n) float32
+        In half voxels; at most 3 along an axis, so a point lies in the sample's voxel or a
+        neighbour of it.
+    exact : (n,) int32
+        The samples' rows in the band.
+    samples : ExactSamples
+        The neighbours and blocks of the samples.
+
+    Returns
+    -------
+    (n,) int32 and (3, n) float32
+        The block, -1 if it was not decoded; the position in it, 0 to 1 along each axis.
     """
     half = steps * np.float32(0.5)
     aside = np.clip(np.rint(half), -1, 1)
@@ -210,44 +265,60 @@ def locate(
     return samples.row_of[neighbour], np.clip(half - aside + np.float32(0.5), 0, 1)
 
 
-def weighted_feet(
+def weigh_foot_points(
     rows: IntArray, place: FloatArray, values: FloatArray, cosine: FloatArray
 ) -> FootPoints:
-    """Return the foot points that count, by the angle at which they are met and what is there."""
-    unusual = values / np.float32(USUAL)
+    """Return the foot points with their weights, leaving out those of almost no weight.
+
+    The weight falls with the angle between the search direction and the normal, and with the error
+    (a Cauchy weight): a large error is probably a foot point on the wrong part of the surface.
+
+    Parameters
+    ----------
+    rows : (n,) int32
+        Blocks, -1 for none.
+    place : (3, n) float32
+        Positions in the blocks, 0 to 1.
+    values : (n,) float32
+        The field there, in half voxels.
+    cosine : (n,) float32
+        Between search direction and normal.
+    """
+    unusual = values / np.float32(TYPICAL_ERROR)
     aligned = np.clip(cosine, 0, 1)
-    for _ in range(ALIGNMENT):  # not a power: its last bit depends on the place in the array
+    for _ in range(SQUARINGS):  # np.power's last bit depends on the position in the array
         aligned *= aligned
     weights = aligned / (1 + unusual * unusual)
-    kept = (rows >= 0) & (weights > LEAST_WEIGHT)
-    values = np.clip(values[kept], -LARGEST, LARGEST)
+    kept = (rows >= 0) & (weights > MIN_WEIGHT)
+    values = np.clip(values[kept], -MAX_ERROR, MAX_ERROR)
     return FootPoints(rows[kept], np.ascontiguousarray(place[:, kept]), values, weights[kept])
 
 
 def mean_at_nodes(
     feet: FootPoints, values: FloatArray, numbers: IntArray, count: int, cells: int
 ) -> tuple[FloatArray, NDArray[np.intp], FloatArray]:
-    """Return the mean at each node of what is at the foot points in the cells round it.
+    """Return the weighted mean at each node of the values at foot points in the cells round it.
 
     Parameters
     ----------
     feet : FootPoints
-        Where, and how far to trust it.
+        Positions and weights.
     values : (n,) float32
-        What is there.
+        The values at the foot points, in half voxels.
     numbers : (27, D) int32
-        The nodes: a number below ``count`` for each part of each block.
+        The node of each part of each block, 0 to ``count - 1``.
     count : int
-        How many numbers there are.
+        Number of nodes.
     cells : {1, 2}
-        Along a block: of 1 the corners are the nodes, of 2 all parts.
+        Cells along a block. With 1 the nodes are the corners of blocks, with 2 all parts.
 
     Returns
     -------
     (count,) float32, (8, n) int64, (8, n) float32
-        The mean; the nodes round each foot point, and its trilinear weights for them.
+        The mean, in half voxels; the 8 nodes round each foot point, and its trilinear weights for
+        them.
     """
-    part, shares = parts_round(feet.place, cells)
+    part, shares = surrounding_parts(feet.place, cells)
     at = numbers.ravel().take(part * numbers.shape[1] + feet.rows).astype(np.intp)
     weight = (shares * feet.weights).astype(np.float64)
     sums: list[NDArray[np.float64]] = []
@@ -255,12 +326,12 @@ def mean_at_nodes(
         total: NDArray[Any] = np.bincount(at.ravel(), weight.ravel(), count)
         sums.append(total)
         weight *= values
-    means = map_chunks(lambda some: agreed_mean(*(s[some] for s in sums)), count, 8)
+    means = map_chunks(lambda some: shrunk_mean(*(s[some] for s in sums)), count, 8)
     return np.concatenate(means), at, shares
 
 
-def parts_round(place: FloatArray, cells: int) -> tuple[NDArray[np.int64], FloatArray]:
-    """Return the parts that are the nodes round places (3, n), (8, n), and trilinear weights."""
+def surrounding_parts(place: FloatArray, cells: int) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return the 8 nodes round each place (3, n), as parts (8, n), and their trilinear weights."""
     low, within = find_cell(place, cells)
     step = STRIDES * (2 // cells)
     part = step @ low + (CELL @ step)[:, None]
@@ -269,18 +340,28 @@ def parts_round(place: FloatArray, cells: int) -> tuple[NDArray[np.int64], Float
     return part, shares
 
 
-def agreed_mean(
+def shrunk_mean(
     weight: NDArray[np.float64], total: NDArray[np.float64], squares: NDArray[np.float64]
 ) -> FloatArray:
-    """Return the means of weighted sums, drawn to 0 where there is little weight or agreement."""
+    """Return the means of weighted sums, shrunk towards 0 by little weight or large variance.
+
+    Parameters
+    ----------
+    weight, total, squares : (n,) float64
+        Weighted sums of 1, of the values and of their squares.
+
+    Returns
+    -------
+    (n,) float32
+    """
     mean = total / np.maximum(weight, 1e-9)
     variance = np.maximum(squares / np.maximum(weight, 1e-9) - mean**2, 0)
-    agreement = mean**2 / np.maximum(mean**2 + DISAGREEMENT * variance, 1e-12)
-    return (agreement * total / (weight + PRIOR)).astype(np.float32)
+    agreement = mean**2 / np.maximum(mean**2 + VARIANCE_PENALTY * variance, 1e-12)
+    return (agreement * total / (weight + PRIOR_WEIGHT)).astype(np.float32)
 
 
-def keep_samples(blocks: FloatArray, factor: int, samples: ExactSamples) -> None:
-    """Put exact samples back where they are nodes: in the middle of blocks."""
+def restore_samples(blocks: FloatArray, factor: int, samples: ExactSamples) -> None:
+    """Set the node in the middle of each block to its sample again, if that is exact."""
     decoded = samples.exact[samples.row_of[samples.exact] >= 0]
     inside = nodes_of_part(factor)[CENTRE]
     middle = inside[len(inside) // 2]
@@ -288,12 +369,12 @@ def keep_samples(blocks: FloatArray, factor: int, samples: ExactSamples) -> None
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
-    """Return vectors (3, n) of length 1; 0 stays 0."""
+    """Return the vectors (3, n) scaled to length 1; 0 stays 0."""
     length = np.maximum(np.sqrt(_dot(vectors, vectors)), np.float32(1e-6))
     return (vectors / length).astype(np.float32, copy=False)
 
 
 def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return the products of vectors (3, n), summed in their order."""
+    """Return the dot products of vectors (3, n), (n,), summed in a fixed order."""
     product: FloatArray = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
     return product

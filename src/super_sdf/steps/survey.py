@@ -1,6 +1,7 @@
-"""The band of a whole grid, found plane by plane: all that is kept of the input.
+"""The band of a whole grid, found plane by plane: all that the steps need of the input.
 
-It grows with the surface, 123 bytes a voxel, not with the grid, and the grid is read once.
+The grid is read once. The band takes 123 bytes per voxel, so it grows with the surface, not with
+the grid.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import NoSurfaceError, OutOfMemoryError
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import held_memory, in_words
-from ..machine.resources import ALONE, Resources
+from ..machine.resources import ONE_THREAD, Resources
 from ..machine.threads import map_threads
 from ..neighbourhood import CENTRE, STRIDES
 from .band import (
@@ -35,7 +36,7 @@ BYTES_PER_VOXEL = 123  # of a band
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """The active voxels of a grid (Eq. 2) and what their samples say.
+    """The active voxels of a grid (Eq. 2), their samples, and what these can be used for.
 
     Attributes
     ----------
@@ -44,13 +45,13 @@ class Band:
     voxel_ijk : (V, 3) int32
         The voxels, in C order.
     patches : (V, 27) float32
-        The samples round each, in half voxels.
+        The samples round each voxel, in half voxels.
     lipschitz : (V,) bool
-        Where they can be distances.
+        Which patches can be distances.
     decoded : (V,) bool
-        Which voxels can hold the surface.
+        Which voxels can hold the surface, and so are decoded.
     exact : (V,) bool
-        Which samples can be taken for exact distances.
+        Which voxels' own samples can be taken as exact distances.
     """
 
     shape: tuple[int, int, int]
@@ -68,25 +69,25 @@ class Band:
     def rows(self, first: int, last: int) -> slice:
         """Return the rows of the voxels in planes ``first`` to before ``last``."""
         low, high = max(first, 0), min(last, self.shape[0])
-        return slice(int(self.seen_before[low]), int(self.seen_before[high]))
+        return slice(int(self.voxels_before[low]), int(self.voxels_before[high]))
 
     @cached_property
-    def seen_before(self) -> NDArray[np.int64]:
-        """How many voxels there are before each plane, and in all, (nx + 1,)."""
+    def voxels_before(self) -> NDArray[np.int64]:
+        """The number of voxels before each plane, and that of all voxels, (nx + 1,)."""
         return np.searchsorted(self.voxel_ijk[:, 0], np.arange(self.shape[0] + 1))
 
     @cached_property
     def decoded_before(self) -> NDArray[np.int64]:
-        """How many voxels to decode there are before each plane, and in all, (nx + 1,)."""
-        return np.append(0, np.cumsum(self.decoded))[self.seen_before]
+        """The number of decoded voxels before each plane, and that of all, (nx + 1,)."""
+        return np.append(0, np.cumsum(self.decoded))[self.voxels_before]
 
     def count_decoded(self, rows: slice) -> int:
-        """Return how many voxels are to be decoded in rows of whole planes."""
-        first, last = np.searchsorted(self.seen_before, [rows.start, rows.stop])
+        """Return the number of decoded voxels among ``rows``, which must be whole planes."""
+        first, last = np.searchsorted(self.voxels_before, [rows.start, rows.stop])
         return int(self.decoded_before[last] - self.decoded_before[first])
 
     def count_crossings(self) -> int:
-        """Return between how many samples and their next along an axis the surface passes."""
+        """Count the pairs of samples next to each other along an axis with the surface between."""
         inside = self.patches[:, CENTRE] <= 0
         return sum(
             int(np.count_nonzero(inside != (self.patches[:, CENTRE + step] <= 0)))
@@ -96,35 +97,52 @@ class Band:
     def network_inputs(
         self, seen: slice | None = None, decoded: slice | None = None
     ) -> tuple[FloatArray, IntArray, IntArray]:
-        """Return what the network is asked: patches, neighbours, and which voxels to decode.
+        """Return the network's inputs: patches, neighbour table, and the voxels to decode.
 
-        It sees the voxels in rows ``seen``, and decodes of those in rows ``decoded`` what can hold
-        the surface; all unless given.
+        Parameters
+        ----------
+        seen : slice, optional
+            Rows of the n voxels that the network sees; all by default.
+        decoded : slice, optional
+            Rows of which the voxels that can hold the surface are decoded; all by default.
+
+        Returns
+        -------
+        (n, 27) float32, (n, 27) int32, (d,) int32
+            The second and the third are row numbers within ``seen``.
         """
         seen, decoded = seen or self.all_rows, decoded or self.all_rows
-        table = neighbour_table(*_cropped(self.voxel_ijk[seen], self.shape))
+        table = neighbour_table(*_crop_planes(self.voxel_ijk[seen], self.shape))
         voxels = np.flatnonzero(self.decoded[decoded]) + decoded.start - seen.start
         return self.patches[seen], table, voxels.astype(np.int32)
 
 
-def _cropped(voxel_ijk: IntArray, shape: tuple[int, int, int]) -> tuple[IntArray, tuple[int, ...]]:
-    """Return voxels counted from the first plane in which there is one, and so many planes."""
+def _crop_planes(
+    voxel_ijk: IntArray, shape: tuple[int, int, int]
+) -> tuple[IntArray, tuple[int, ...]]:
+    """Return voxels counted from the first plane that has any, and the shape up to the last one."""
     first, last = int(voxel_ijk[0, 0]), int(voxel_ijk[-1, 0])
     return voxel_ijk - np.array([first, 0, 0], np.int32), (last - first + 1, *shape[1:])
 
 
-def survey(grid: SdfGrid, offset: float = 0.0, resources: Resources = ALONE) -> Band:
+def survey(grid: SdfGrid, offset: float = 0.0, resources: Resources = ONE_THREAD) -> Band:
     """Read a grid once and return its band.
 
-    ``offset`` (world units, positive outwards) is the distance at which the surface is looked for.
-    ``resources`` is what the run may use.
+    Parameters
+    ----------
+    grid : SdfGrid
+        Signed distances in world units.
+    offset : float
+        Distance of the surface in world units, positive outwards.
+    resources : Resources
+        The threads and memory that the run may use.
 
     Raises
     ------
     GridError
-        If the distances end too near to the offset.
+        If the distances end too near the offset.
     OutOfMemoryError
-        As soon as the band alone is larger than the bound: it is not worth reading on.
+        As soon as the part of the band read so far exceeds the memory bound.
     """
     sizes: list[int] = []
     jumps: list[tuple[Jumps, Jumps]] = []
@@ -145,27 +163,27 @@ def survey(grid: SdfGrid, offset: float = 0.0, resources: Resources = ALONE) -> 
         if not any(up.near for up, _ in jumps):
             raise no_surface(grid, offset)
         check_not_filled(jumps, offset, grid.voxel_size)
-    return describe(grid.shape, voxel_ijk, _joined(patches), resources.threads)
+    return make_band(grid.shape, voxel_ijk, _concatenate(patches), resources.threads)
 
 
 def _check_bound(voxels: int, planes: int, held: int, bound: int | None) -> None:
-    """Raise if so many voxels of the band do not fit in what of the bound is not held already.
+    """Raise if ``voxels`` of the band do not fit in the memory bound, beside the bytes ``held``.
 
-    If that is nothing, the band is not at fault unless it is larger than the bound by itself.
+    If the process held more than the bound before, only the band itself is compared with the bound.
     """
     need = voxels * BYTES_PER_VOXEL
     if bound is not None and need > (bound - held if held < bound else bound):
         raise OutOfMemoryError(
-            f"the band of the first {planes:,} planes has {voxels:,} voxels already, which alone "
-            f"take {in_words(need)} of memory, {in_words(bound)} may be taken in all; is this a "
+            f"the band of the first {planes:,} planes already has {voxels:,} voxels, which take "
+            f"{in_words(need)} of memory, and {in_words(bound)} may be used in all; is this a "
             "distance field? If so, allow more (--max-memory)"
         )
 
 
-def describe(
+def make_band(
     shape: tuple[int, int, int], voxel_ijk: IntArray, patches: FloatArray, threads: int = 1
 ) -> Band:
-    """Return a band with all that its patches say."""
+    """Return the band of voxels (V, 3) with patches (V, 27), in half voxels."""
     lipschitz = is_lipschitz(patches)
     decoded = can_hold_surface(patches, lipschitz)
     exact = exact_samples(patches, lipschitz, threads)
@@ -175,30 +193,31 @@ def describe(
 def _band_of_planes(
     grid: SdfGrid, offset: float, first: int, last: int, jumps: list[tuple[Jumps, Jumps]]
 ) -> tuple[IntArray, FloatArray]:
-    """Return the voxels of some planes, and their patches: they see one plane further.
+    """Return the band's voxels in planes ``first`` to before ``last``, and their patches.
 
-    With an offset, how far the distances go is looked at too, and ``jumps`` added to.
+    One more plane is read on either side. With an offset, the distances are checked for truncation,
+    and their jumps are appended to ``jumps``.
     """
     low, high = max(first - 1, 0), min(last + 1, grid.shape[0])
     rescaled = rescale(grid, offset, low, high)
     ijk = find_band(rescaled)
     own = ijk[(ijk[:, 0] >= first - low) & (ijk[:, 0] < last - low)]
     patches = gather_patches(rescaled, own)
-    if offset:  # at 0 there is no nearer surface to be had
+    if offset:  # at 0 there is no better offset to suggest
         check_not_cut_off(patches, offset, grid.voxel_size)
         jumps.append(find_jumps(rescaled))
     return own + np.array([low, 0, 0], np.int32), patches
 
 
 def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:
-    """Return the error for a grid in which nothing is to be found."""
+    """Return the error for a grid without a surface at an offset."""
     return NoSurfaceError(
         f"no surface at {offset:g}: the values go from {grid.low:.6g} to {grid.high:.6g}"
     )
 
 
-def _joined(parts: list[FloatArray]) -> FloatArray:
-    """Return the arrays in one and empty the list, so that there is hardly a second copy."""
+def _concatenate(parts: list[FloatArray]) -> FloatArray:
+    """Concatenate arrays (n, 27) and empty the list on the way, so that little is held twice."""
     joined = np.empty((sum(map(len, parts)), 27), np.float32)
     start = len(joined)
     while parts:
