@@ -26,12 +26,13 @@ from ..steps.nodes import check_factor
 from ..truth.sampling import sample_grid, unit_layout
 from ..truth.solid import Distances, Solid, load_solid
 from . import metrics
+from .edges import EdgeCurves
 
 # Peak memory per node of the fine lattice: dense fields, their masks, and meshing one of them.
 BYTES_PER_NODE = 20
 
 # Streams of random numbers, each seeded by the shape's name and its own number.
-REFERENCE_POINTS, REFERENCE_EDGES, RESULT_POINTS, NOISE = range(4)
+REFERENCE_POINTS, REFERENCE_EDGES, RESULT_POINTS, NOISE, RESULT_EDGES = range(5)
 
 
 LARGEST_SIZE = 100_000  # samples along an axis; a larger grid fits into no memory
@@ -89,10 +90,7 @@ class Shape:
         self.mesh = self.solid.mesh
         self.notes: Sequence[str] = ()
         self.drawn = metrics.sample_surface(self.mesh, self.seed(REFERENCE_POINTS))
-        self.sharp = metrics.sharp_edges(self.mesh)
-        self.sharp_drawn = metrics.sample_edges(
-            self.mesh.vertices, self.sharp, self.seed(REFERENCE_EDGES)
-        )
+        self.sharp = EdgeCurves.of(self.mesh, self.seed(REFERENCE_EDGES))
 
     @classmethod
     def read(cls, path: Path) -> Shape:

@@ -64,9 +64,12 @@ def markdown(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def mean_of(rows: Sequence[Measurement], key: str) -> float | None:
-    """Return the mean of a figure over the rows that have it; of ``..._max`` the maximum."""
-    figures = [row[key.removesuffix("_max")] for row in rows]
-    figures = [figure for figure in figures if figure is not None]
+    """Return the mean of a figure over the rows that have it; of ``..._max`` the maximum.
+
+    Rows of earlier versions lack the figures that came later.
+    """
+    name = key.removesuffix("_max")
+    figures = [row[name] for row in rows if row.get(name) is not None]
     if not figures:
         return None
     return float(max(figures) if key.endswith("_max") else np.mean(figures))
