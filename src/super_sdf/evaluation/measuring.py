@@ -21,8 +21,8 @@ from ..network.network import find_model, load_network
 from ..truth.solid import Solid
 from . import edges, metrics
 from .cases import RESULT_EDGES, RESULT_POINTS, Case, Setting, Shape
-from .methods import METHODS, Surface
-from .names import OURS, PROCESS
+from .methods import MESHED_METHODS, METHODS, Surface
+from .names import OF_OUR_CODE
 from .peers import PEERS
 
 Measurement = dict[str, Any]
@@ -66,6 +66,8 @@ class Task:
         Threads of the network; 0: one per core.
     limit : float, optional
         Seconds that the task may take.
+    turned : int, optional
+        Seed by which the shape is turned at random; as its file has it unless given.
     """
 
     path: Path
@@ -76,6 +78,7 @@ class Task:
     digest: str
     threads: int = 0
     limit: float | None = None
+    turned: int | None = None
 
     def __str__(self) -> str:
         named = [str(self.setting), *(self.methods if self.limit else [])]
@@ -86,9 +89,10 @@ class Task:
         return {
             "shape": self.path.stem,
             "mesh": self.mesh,
+            "turned": self.turned,
             **asdict(self.setting),
             "method": method,
-            "digest": self.digest if method in (OURS, PROCESS) else "",
+            "digest": self.digest if method in OF_OUR_CODE else "",
             "protocol": PROTOCOL,
         }
 
@@ -130,7 +134,7 @@ def make_surface(shape: Shape, case: Case | None, method: str, network: Decoder)
     """Return the surface that a method makes of a case; without a case, the reference itself."""
     if case is None:
         return Surface(shape.mesh)
-    return {**METHODS, **PEERS}[method](case, network)
+    return {**MESHED_METHODS, **METHODS, **PEERS}[method](case, network)
 
 
 def failed_row(task: Task, method: str, error: str) -> Measurement:
