@@ -74,14 +74,6 @@ class EdgeCurves:
         )
         return distances
 
-    def both_ways(self, points: Points) -> tuple[Distances, Distances]:
-        """Return the distances from these edges to the points, (m,), and back, (k,).
-
-        Without points, one at the origin stands in.
-        """
-        points = points if len(points) else DOT.points
-        return cKDTree(points).query(self.drawn)[0], self.distance(points)
-
 
 def sample_edges(
     vertices: Points, edges: IntArray, seed: tuple[int, int], count: int = SAMPLE_COUNT
@@ -135,7 +127,8 @@ def compare_edges(reference: EdgeCurves, result: Points) -> Numbers:
     """
     if not len(reference.edges):
         return {"ecd": None, "ef1": None}
-    there, back = reference.both_ways(result)
+    result = result if len(result) else DOT.points
+    there, back = cKDTree(result).query(reference.drawn)[0], reference.distance(result)
     return {
         "ecd": float(np.mean(there**2) + np.mean(back**2)),
         "ef1": edge_f1(there, back, EDGE_DISTANCE),
@@ -152,10 +145,10 @@ def compare_in_voxels(
 ) -> Numbers:
     """Return EFv and the mean distance of the reference's edges to the result, None without edges.
 
-    EFv is the F1 of points on the sharp edges of both meshes, at a tenth of a voxel. (The edge
-    points of EF1 lie up to 0.004 beside an edge: at 64^3 a perfect result would score 0.5.) The
-    distance is that of points on the reference's edges to the result's nearest triangle, in voxels:
-    how much of the edges is cut off or stands proud.
+    EFv is the F1 of points on the sharp edges of both meshes, at a tenth of a voxel; 0 for a result
+    without sharp edges. (The edge points of EF1 lie up to 0.004 beside an edge: at 64^3 a perfect
+    result would score 0.5.) The distance is that of points on the reference's edges to the result's
+    nearest triangle, in voxels: how much of the edges is cut off or stands proud.
 
     Parameters
     ----------
@@ -169,13 +162,12 @@ def compare_in_voxels(
     """
     if not len(reference.edges):
         return {"efv": None, "edge_distance": None}
-    drawn = EdgeCurves.of(result.mesh, seed).drawn
-    there, back = reference.both_ways(drawn)
+    curves, efv = EdgeCurves.of(result.mesh, seed), 0.0
+    if len(curves.edges):
+        there, back = curves.distance(reference.drawn), reference.distance(curves.drawn)
+        efv = edge_f1(there, back, VOXEL_SHARE * spacing)
     distances = distance_or_dot(result, reference.drawn)
-    return {
-        "efv": edge_f1(there, back, VOXEL_SHARE * spacing),
-        "edge_distance": float(distances.mean() / spacing),
-    }
+    return {"efv": efv, "edge_distance": float(distances.mean() / spacing)}
 
 
 def compare_angles(
