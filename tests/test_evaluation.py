@@ -22,8 +22,18 @@ from solids import cube, saved, sphere, torus
 from super_sdf import Mesh, SuperSdfError
 from super_sdf.cli.main import cli
 from super_sdf.errors import OptionError, WriteError
-from super_sdf.evaluation import measuring, published, report, runner, tables, timing
-from super_sdf.evaluation.cases import Setting, Shape
+from super_sdf.evaluation import (
+    experiment_tables,
+    measuring,
+    names,
+    published,
+    report,
+    runner,
+    scope,
+    tables,
+    timing,
+)
+from super_sdf.evaluation.cases import Setting, Shape, random_rotation
 from super_sdf.evaluation.measuring import Task
 from super_sdf.evaluation.results import Results
 from super_sdf.evaluation.runner import LeftOut, Runner, complete
@@ -156,11 +166,69 @@ def test_a_row_of_another_mesh_network_or_setting_is_another_row(tmp_path):
     for changed in (
         replace(task, mesh="other"),
         replace(task, digest="other"),
+        replace(task, turned=0),
         replace(task, setting=Setting(8, noise=0.5)),
         replace(task, setting=Setting(8, 2)),
     ):
         assert store.get(changed, "ours") is None
     assert task.key("mc") == replace(task, digest="other").key("mc")  # not made by our code
+
+
+def test_rows_of_earlier_versions_are_read(tmp_path):
+    """They know of no turn, and lack the figures that came later: tables show "-" for those."""
+    task = task_of(tmp_path / "box.ply")
+    later = ("turned", "efv", "edge_distance", "angle_near", "angle_beyond", "min_angle", "slivers")
+    known = {**row("box", 0.5), **task.key("mc")}
+    old = {name: value for name, value in known.items() if name not in later}
+    assert len(old) == len(known) - len(later)
+    path = tmp_path / "rows.jsonl"
+    path.write_text(json.dumps(old) + "\n")
+    found = Store(path).get(task, "mc")
+    assert found == old and Store(path).is_final(task, "mc")
+    table = tables.edge_table({"MC": [found]}).splitlines()[-1]
+    assert table == "| MC | - | 0.001 | - | - | - | - | 4 | - | - |"
+    assert tables.surface_table({"mc": [found]}, 8)
+    assert tables.mean_of([found, known], "efv") == 0.001
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_shape_is_turned_by_its_name_and_a_seed(meshes, seed):
+    path = meshes / "box.ply"
+    plain, turned, again = Shape.read(path), Shape.read(path, seed), Shape.read(path, seed)
+    np.testing.assert_array_equal(turned.mesh.vertices, again.mesh.vertices)
+    assert np.linalg.norm(np.ptp(turned.mesh.vertices, axis=0)) == pytest.approx(1)
+    # Still a cube, but smaller in its box.
+    side = turned.mesh.volume() ** (1 / 3)
+    assert side < 0.99 * plain.mesh.volume() ** (1 / 3)
+    np.testing.assert_allclose(np.linalg.norm(turned.mesh.vertices, axis=1), side * 0.75**0.5)
+    other = saved(cube(), meshes / "cube.ply")
+    for differs in (Shape.read(path, seed + 1), Shape.read(other, seed)):
+        assert np.abs(turned.mesh.vertices - differs.mesh.vertices).max() > 0.01
+
+
+def test_turns_are_rotations_and_favour_no_direction():
+    random = np.random.default_rng(0)
+    turns = np.array([random_rotation(random) for _ in range(4000)])
+    np.testing.assert_allclose(
+        turns @ turns.transpose(0, 2, 1), np.eye(3)[None] + 0 * turns, atol=1e-12
+    )
+    np.testing.assert_allclose(np.linalg.det(turns), 1)
+    np.testing.assert_allclose(turns.mean(0), 0, atol=0.03)
+    np.testing.assert_allclose((turns**2).mean(0), 1 / 3, atol=0.02)
+
+
+def test_turned_shapes_are_measured_turned(meshes, tmp_path):
+    words = ("--sizes", 8, "--methods", "mc", "--no-pictures", "--limit", 1, "--jobs", 1)
+    out = tmp_path / "out"
+    for turn in ((), ("--turned", 5), ("--turned", 5)):
+        done = evaluate(meshes / "box.ply", *words, *turn, "--out", out)
+        assert done.returncode == 0, done.stderr
+    assert done.stderr.count(" of ") == 0  # the second time nothing is left to measure
+    assert "The shapes are turned at random, by seed 5." in (out / "report.md").read_text()
+    lines = [json.loads(line) for line in (out / "results.jsonl").read_text().splitlines()]
+    assert [line["turned"] for line in lines] == [None, None, 5, 5]
+    floors = [line["cd"] for line in lines if line["method"] == "floor"]
+    assert floors[1] < 0.9 * floors[0]  # of a smaller cube
 
 
 def test_failures_are_tried_again_but_not_what_ran_out_of_time(tmp_path):
@@ -283,7 +351,7 @@ def test_where_nothing_can_be_forked_processes_are_spawned(monkeypatch):
 
 
 def test_a_bug_in_the_reading_names_the_shape(tmp_path, monkeypatch):
-    def broken(path):
+    def broken(*_):
         raise ValueError("no luck")
 
     monkeypatch.setattr(Shape, "read", broken)
@@ -308,7 +376,8 @@ def test_a_shape_is_left_out_once(tmp_path, monkeypatch):
 
 def test_each_shape_is_measured_by_each_method_once(meshes):
     paths = find_meshes([meshes])
-    asked = Scope(paths, sizes=(32,), experiments=("factors", "noise", "iterated", "scale"))
+    experiments = ("factors", "noise", "iterated", "scale", "meshers")
+    asked = Scope(paths, sizes=(32,), experiments=experiments)
     tasks = asked.tasks()
     keys = [tuple(task.key(m).values()) for task in tasks for m in task.methods]
     assert len(keys) == len(set(keys))
@@ -319,10 +388,13 @@ def test_each_shape_is_measured_by_each_method_once(meshes):
 
 
 def test_every_name_has_a_method_and_a_label():
-    from super_sdf.evaluation import methods, names, peers, scope
+    from super_sdf.evaluation import methods, peers
 
     assert tuple(names.METHOD_LABELS) == tuple(methods.METHODS)
     assert tuple(names.PEER_LABELS) == tuple(peers.PEERS)
+    assert tuple(names.MESHERS) == tuple(methods.BY_MESHER)
+    assert set(methods.MESHED_METHODS) >= {"ours", "bound"}
+    assert set(names.OF_OUR_CODE) <= {*methods.MESHED_METHODS, names.PROCESS}
     for name in names.EXPERIMENTS:
         scope.experiment(name, (32,))
     with pytest.raises(OptionError, match="experiment is 'x': give one of factors, noise"):
@@ -353,6 +425,7 @@ def test_two_shapes_of_one_name_are_refused(meshes, tmp_path):
         (["/dev/zero"], "Error: /dev/zero is a device: give a file"),
         (["pipe/a.ply"], "Error: pipe/a.ply is a named pipe: give a file"),
         (["x" * 300], f"Error: {'x' * 300} does not exist: the name is longer"),
+        ([".", "--turned", "-1"], "Error: turned is -1: give a seed of 0 or more"),
         ([".", "--peer-size", "0"], "Error: peer size is 0: give at least 4 samples"),
         ([".", "--peer-limit", "nan"], "Error: peer limit is nan: give more than 0 seconds"),
         ([".", "--peer-limit", "-1"], "Error: peer limit is -1: give more than 0 seconds"),
@@ -540,6 +613,35 @@ def test_experiments_stand_beside_what_is_published(meshes, tmp_path):
     rfta = next(line for line in lines if line.startswith("| RFTA |"))
     assert rfta.endswith("| 0 of 0 | 0 of 3 |")
     assert "RFTA, box: over the limit of 1 s." in lines
+
+
+def test_every_mesher_has_rows_of_ours_and_of_its_bound(meshes, tmp_path, monkeypatch):
+    for module in (names, scope, experiment_tables):
+        monkeypatch.setattr(module, "MESHERS", ("marching", "other"))
+    results = made_up(meshes, tmp_path, experiments=("meshers",), experiment_shapes=2)
+    methods = {(task.setting.factor, task.methods) for task in results.tasks if task.setting.size}
+    assert (2, ("ours", "bound", "ours-other", "bound-other")) in methods
+    section = experiment_tables.mesher_section(results).splitlines()
+    assert section[0] == "## Meshers, 2 shapes"
+    assert [line.split(" | ")[:3] for line in section[4:]] == [
+        [f"| 32^3, factor {factor}", mesher, label]
+        for factor in (2, 4)
+        for mesher in ("marching", "other")
+        for label in ("super-sdf", "bound: true distance at the nodes")
+    ]
+    assert section[4].endswith("| 0.520 | 0.001 | 10.00 | 0.001 | 0.001 | 0.001 | 0.00 | 0.00 | "
+                               "4 | 0.10 | 0.00 | 2 of 2 |")  # fmt: skip
+
+
+def test_edges_have_a_table_for_each_size(meshes, tmp_path):
+    results = made_up(meshes, tmp_path, methods=("mc", "ours"))
+    lines = report.edge_section(results).splitlines()
+    assert "**32^3, factor 4**" in lines
+    assert "| super-sdf | 3 | 0.001 | 0.001 | 0.001 | 0.00 | 0.00 | 4 | 0.10 | 0.00 |" in lines
+    shapes = tables.shape_table(results.by_method(Setting(32))).splitlines()
+    titles = [cell.strip() for cell in shapes[0].split("|")]
+    assert {"EFv", "edge distance", "angle near", "slivers %"} <= set(titles)
+    assert len(titles) == len(set(titles[1:-1])) + 2
 
 
 def test_the_command_is_timed_as_a_process(monkeypatch):

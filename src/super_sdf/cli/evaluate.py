@@ -25,7 +25,15 @@ Examples:
   super-sdf evaluate a.ply b.ply --sizes 32 --peers rfta --out report/
 """
 # Options that the plan takes as they are, and lists, from which repeated entries are dropped.
-NUMBERS = ("factor", "model", "experiment_shapes", "peer_shapes", "peer_size", "peer_limit")
+NUMBERS = (
+    "factor",
+    "model",
+    "experiment_shapes",
+    "peer_shapes",
+    "peer_size",
+    "peer_limit",
+    "turned",
+)
 LISTS = ("sizes", "experiments", "peers")
 
 
@@ -105,7 +113,7 @@ def accepts(option: click.Option, word: str, ctx: click.Context) -> bool:
     multiple=True,
     type=click.Choice(EXPERIMENTS),
     metavar="NAME...",
-    help=f"Experiments of the paper to repeat, beside its results: {', '.join(EXPERIMENTS)}.",
+    help=f"Experiments, those of the paper beside its results: {', '.join(EXPERIMENTS)}.",
 )
 @click.option(
     "--experiment-shapes",
@@ -142,6 +150,12 @@ def accepts(option: click.Option, word: str, ctx: click.Context) -> bool:
 )
 @click.option(
     "--limit", type=click.IntRange(1), help="Use only this many meshes, spread over the list."
+)
+@click.option(
+    "--turned",
+    type=int,
+    metavar="SEED",
+    help="Turn every mesh at random first: parts along the axes flatter every method on a lattice.",
 )
 @click.option(
     "--model",

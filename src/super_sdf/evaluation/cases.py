@@ -26,12 +26,13 @@ from ..steps.nodes import check_factor
 from ..truth.sampling import sample_grid, unit_layout
 from ..truth.solid import Distances, Solid, load_solid
 from . import metrics
+from .edges import EdgeCurves
 
 # Peak memory per node of the fine lattice: dense fields, their masks, and meshing one of them.
 BYTES_PER_NODE = 20
 
 # Streams of random numbers, each seeded by the shape's name and its own number.
-REFERENCE_POINTS, REFERENCE_EDGES, RESULT_POINTS, NOISE = range(4)
+REFERENCE_POINTS, REFERENCE_EDGES, RESULT_POINTS, NOISE, RESULT_EDGES, TURN = range(6)
 
 
 LARGEST_SIZE = 100_000  # samples along an axis; a larger grid fits into no memory
@@ -89,14 +90,14 @@ class Shape:
         self.mesh = self.solid.mesh
         self.notes: Sequence[str] = ()
         self.drawn = metrics.sample_surface(self.mesh, self.seed(REFERENCE_POINTS))
-        self.sharp = metrics.sharp_edges(self.mesh)
-        self.sharp_drawn = metrics.sample_edges(
-            self.mesh.vertices, self.sharp, self.seed(REFERENCE_EDGES)
-        )
+        self.sharp = EdgeCurves.of(self.mesh, self.seed(REFERENCE_EDGES))
 
     @classmethod
-    def read(cls, path: Path) -> Shape:
+    def read(cls, path: Path, turned: int | None = None) -> Shape:
         """Return the shape of a mesh file, named after the file.
+
+        With a seed ``turned`` it is turned at random, the same way for the same seed and name,
+        before it is put into the frame.
 
         Raises
         ------
@@ -104,13 +105,30 @@ class Shape:
             If it cannot be read or bounds no solid.
         """
         solid, notes = load_solid(path)
-        shape = cls(path.stem, solid.mesh)
+        mesh = solid.mesh
+        if turned is not None:
+            random = np.random.default_rng((turned, *name_seed(path.stem, TURN)))
+            mesh = mesh.transformed(random_rotation(random), np.zeros(3))
+        shape = cls(path.stem, mesh)
         shape.notes = notes
         return shape
 
     def seed(self, stream: int) -> tuple[int, int]:
         """Return the seed of a stream of random numbers."""
-        return zlib.crc32(self.name.encode(errors="surrogateescape")), stream
+        return name_seed(self.name, stream)
+
+
+def name_seed(name: str, stream: int) -> tuple[int, int]:
+    """Return the seed of a stream of random numbers of a shape."""
+    return zlib.crc32(name.encode(errors="surrogateescape")), stream
+
+
+def random_rotation(random: np.random.Generator) -> NDArray[np.float64]:
+    """Return a rotation matrix, (3, 3), all rotations equally likely: of a random quaternion."""
+    quaternion = random.normal(size=4)
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + 2 * w * cross + 2 * cross @ cross
 
 
 class Case:

@@ -105,7 +105,7 @@ def time_processes(results: Results, on_task: OnTask | None) -> dict[int, list[M
 def time_task(task: Task, model: str) -> Measurement:
     """Return the time of the command on a task's grid, or a failure."""
     try:
-        row = time_shape(Shape.read(task.path), task.setting, ["--model", model])
+        row = time_shape(Shape.read(task.path, task.turned), task.setting, ["--model", model])
     except SuperSdfError as problem:
         return failed_row(task, PROCESS, reason_of(problem))
     return {**task.key(PROCESS), **row}

@@ -1,18 +1,21 @@
-"""Tables of the paper's experiments, our results beside the published ones."""
+"""Tables of the experiments; in those of the paper the published results stand beside ours."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 
 from . import published
 from .cases import Setting
 from .measuring import Measurement
-from .names import LABELS, OURS
+from .names import LABELS, MESHED, MESHERS, OURS, meshed_by
 from .results import Results
-from .scope import BASE_SIZE, FACTORS, NOISES, PASSES, SCALES
-from .tables import CD, F1, NC, SHORT, gap_closed, markdown, mean_of, mean_row, percent
+from .scope import BASE_SIZE, FACTORS, MESHER_FACTORS, NOISES, PASSES, SCALES
+from .tables import BACK, CD, EDGES, F1, NC, SHORT, gap_closed, markdown, mean_of, mean_row, percent
 from .timing import RUNS, describe_machine
+
+MESHER_COLUMNS = (F1, NC, BACK, *EDGES)
 
 
 def factor_section(results: Results) -> str:
@@ -85,11 +88,26 @@ def scale_section(results: Results) -> str:
     return f"{title}\n\n{markdown([*titles, *published_titles()], rows)}"
 
 
+def mesher_section(results: Results) -> str:
+    """Return the section on the meshers, with our field and with the true one (the bound)."""
+    paths, rows = results.scope.experiment_paths(), []
+    for size, factor in product(results.scope.sizes, MESHER_FACTORS):
+        for mesher, method in product(MESHERS, MESHED):
+            name = meshed_by(method, mesher)
+            measured = results.rows(Setting(size, factor), name, paths)
+            closed = f"{sum(row['closed'] for row in measured)} of {len(measured)}"
+            where = [f"{size}^3, factor {factor}", mesher]
+            rows.append([*where, *mean_row(LABELS[method], measured, MESHER_COLUMNS), closed])
+    titles = ["grid", "mesher", "method", *(column.title for column in MESHER_COLUMNS), "closed"]
+    return f"{title_of('Meshers', paths)}\n\n{markdown(titles, rows)}"
+
+
 SECTIONS = {
     "factors": factor_section,
     "noise": noise_section,
     "iterated": iterated_section,
     "scale": scale_section,
+    "meshers": mesher_section,
 }
 
 

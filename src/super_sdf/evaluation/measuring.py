@@ -18,10 +18,11 @@ from ..machine.memory import forget_peak, held_memory
 from ..mesh import Mesh
 from ..network.decoder import Decoder
 from ..network.network import find_model, load_network
-from . import metrics
-from .cases import RESULT_POINTS, Case, Setting, Shape
-from .methods import METHODS, Surface
-from .names import OURS, PROCESS
+from ..truth.solid import Solid
+from . import edges, metrics
+from .cases import RESULT_EDGES, RESULT_POINTS, Case, Setting, Shape
+from .methods import MESHED_METHODS, METHODS, Surface
+from .names import OF_OUR_CODE
 from .peers import PEERS
 
 Measurement = dict[str, Any]
@@ -30,13 +31,18 @@ Measurement = dict[str, Any]
 PROTOCOL = 2  # increase it when a figure changes its meaning: older measurements do not count then
 NO_SETTING = Setting(0, 0)  # of the floor: nothing is sampled
 BLOCK = 1 << 20  # bytes of a file that are read at a time
-# The figures of a measurement; the optional ones are None where they are unknown.
+# The figures of a measurement; the optional ones are None, or absent, where they are unknown.
 NUMBERS = (
     *("cd", "f1", "recall", "precision", "nc", "signed_nc"),
     *("p2s", "p2s_there", "p2s_back", "p99", "p99_there", "p99_back"),
     *("max", "max_there", "max_back", "closed", "outward", "faces", "seconds"),
 )
-OPTIONAL_NUMBERS = ("ecd", "ef1", "field_mse", "field_mae", "peak_mb")
+VOXEL_NUMBERS = ("efv", "edge_distance", "angle_near", "angle_beyond")
+OPTIONAL_NUMBERS = (
+    *("ecd", "ef1", "field_mse", "field_mae", "peak_mb"),
+    *VOXEL_NUMBERS,
+    *("min_angle", "slivers"),
+)
 # Folders of the package whose code does not change any surface.
 NOT_THE_METHOD = {"batch", "cli", "evaluation", "pictures"}
 
@@ -60,6 +66,8 @@ class Task:
         Threads of the network; 0: one per core.
     limit : float, optional
         Seconds that the task may take.
+    turned : int, optional
+        Seed by which the shape is turned at random; as its file has it unless given.
     """
 
     path: Path
@@ -70,6 +78,7 @@ class Task:
     digest: str
     threads: int = 0
     limit: float | None = None
+    turned: int | None = None
 
     def __str__(self) -> str:
         named = [str(self.setting), *(self.methods if self.limit else [])]
@@ -80,9 +89,10 @@ class Task:
         return {
             "shape": self.path.stem,
             "mesh": self.mesh,
+            "turned": self.turned,
             **asdict(self.setting),
             "method": method,
-            "digest": self.digest if method in (OURS, PROCESS) else "",
+            "digest": self.digest if method in OF_OUR_CODE else "",
             "protocol": PROTOCOL,
         }
 
@@ -112,7 +122,9 @@ def measure_method(shape: Shape, case: Case | None, method: str, network: Decode
     try:
         surface = make_surface(shape, case, method, network)
         seconds, peak = time.perf_counter() - clock, peak_since(held)
-        figures = {**measure_surface(shape, surface.mesh), **measure_field(case, surface)}
+        spacing = None if case is None else case.spacing
+        figures = measure_surface(shape, surface.mesh, spacing)
+        figures |= measure_field(case, surface)
     except Exception as problem:  # named in the report; the other shapes still count
         return {"error": reason_of(problem)}
     return {**figures, "seconds": seconds, "peak_mb": peak, "error": None}
@@ -122,7 +134,7 @@ def make_surface(shape: Shape, case: Case | None, method: str, network: Decoder)
     """Return the surface that a method makes of a case; without a case, the reference itself."""
     if case is None:
         return Surface(shape.mesh)
-    return {**METHODS, **PEERS}[method](case, network)
+    return {**MESHED_METHODS, **METHODS, **PEERS}[method](case, network)
 
 
 def failed_row(task: Task, method: str, error: str) -> Measurement:
@@ -142,17 +154,33 @@ def reason_of(problem: Exception) -> str:
     return f"{type(problem).__name__}: {message}{place}"
 
 
-def measure_surface(shape: Shape, mesh: Mesh) -> Measurement:
-    """Return the figures of a result's mesh; a mesh without faces counts as a dot at the origin."""
-    drawn = metrics.sample_surface(mesh, shape.seed(RESULT_POINTS))
-    edge_points = metrics.edge_points(drawn)
+def measure_surface(shape: Shape, mesh: Mesh, spacing: float | None) -> Measurement:
+    """Return the figures of a result's mesh; a mesh without faces counts as a dot at the origin.
+
+    ``spacing`` is that of the coarse grid; without one, figures in voxels are None.
+    """
+    drawn, result = metrics.sample_surface(mesh, shape.seed(RESULT_POINTS)), Solid(mesh)
     return {
         **metrics.compare_samples(shape.drawn, drawn),
-        **metrics.compare_surfaces(shape.solid, mesh, shape.drawn, drawn),
-        **metrics.compare_edges(shape.mesh.vertices, shape.sharp, shape.sharp_drawn, edge_points),
+        **metrics.compare_surfaces(shape.solid, result, shape.drawn, drawn),
+        **edges.compare_edges(shape.sharp, edges.edge_points(drawn)),
+        **measure_edges(shape, result, drawn, spacing),
+        **metrics.compare_triangles(mesh),
         "closed": mesh.is_closed(),
         "outward": mesh.volume() > 0,
         "faces": len(mesh.faces),
+    }
+
+
+def measure_edges(
+    shape: Shape, result: Solid, drawn: metrics.SurfacePoints, spacing: float | None
+) -> Measurement:
+    """Return the figures of edges and normals that have the coarse voxel as their unit."""
+    if spacing is None:
+        return dict.fromkeys(VOXEL_NUMBERS)
+    return {
+        **edges.compare_in_voxels(shape.sharp, result, shape.seed(RESULT_EDGES), spacing),
+        **edges.compare_angles(shape.solid, shape.sharp, drawn, spacing),
     }
 
 

@@ -23,6 +23,7 @@ from ..slabs.cutting import whole
 from ..steps.nodes import block_ijk
 from ..steps.survey import survey
 from .cases import Case, spread_samples
+from .names import MESHERS, OURS, meshed_by
 
 NUDGE = np.float32(1e-9)  # replaces exact zeros: a vertex on a node can open the surface
 EMPTY = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
@@ -43,6 +44,23 @@ class Surface:
 Method = Callable[[Case, Decoder], Surface]
 
 
+@dataclass(frozen=True)
+class Mesher:
+    """How a mesher is run on a grid and on a dense field.
+
+    Attributes
+    ----------
+    refined : callable
+        Takes a coarse grid, the network and the factor; returns super-sdf's mesh, closed.
+    dense : callable
+        Takes a field, (n, m, l) float32, the distance between its nodes and the coordinate of the
+        first one on every axis; returns the mesh. It may change the field.
+    """
+
+    refined: Callable[[SdfGrid, Decoder, int], Mesh]
+    dense: Callable[[FloatArray, float, float], Mesh]
+
+
 def coarse_surface(case: Case, network: Decoder, *, table: str) -> Surface:
     """Mesh the coarse grid by marching cubes; ``table`` is lorensen or lewiner."""
     field = np.array(case.grid.values)
@@ -55,12 +73,12 @@ def spline_surface(case: Case, network: Decoder, *, order: int) -> Surface:
     return Surface(isosurface(field, case.fine, case.low), lambda: field)
 
 
-def bound_surface(case: Case, network: Decoder) -> Surface:
+def bound_surface(case: Case, network: Decoder, *, mesher: str = MESHERS[0]) -> Surface:
     """Mesh the true distances at the fine nodes: the bound of all upsampling to them."""
-    return Surface(isosurface(case.truth.copy(), case.fine, case.low))
+    return Surface(BY_MESHER[mesher].dense(case.truth.copy(), case.fine, case.low))
 
 
-def our_surface(case: Case, network: Decoder) -> Surface:
+def our_surface(case: Case, network: Decoder, *, mesher: str = MESHERS[0]) -> Surface:
     """Mesh the coarse grid with super-sdf, in as many passes as the setting has.
 
     The mesh is capped where the surface leaves the grid. Without a surface it is empty.
@@ -69,7 +87,7 @@ def our_surface(case: Case, network: Decoder) -> Surface:
     try:
         for _ in range(case.setting.passes - 1):
             grid = refined_grid(grid, network, case.factor)
-        mesh = reconstruct(grid, network, factor=case.factor, cap=True)
+        mesh = BY_MESHER[mesher].refined(grid, network, case.factor)
     except NoSurfaceError:
         return Surface(EMPTY)
     if case.setting.passes > 1 or case.setting.noise:
@@ -152,6 +170,13 @@ def lattice_weights(n: int, factor: int, order: int) -> FloatArray:
     return np.stack(columns, axis=1).astype(np.float32)
 
 
+def refined_surface(grid: SdfGrid, network: Decoder, factor: int) -> Mesh:
+    """Mesh a grid with super-sdf and marching cubes, capped at the grid's border."""
+    return reconstruct(grid, network, factor=factor, cap=True)
+
+
+BY_MESHER: dict[str, Mesher] = {"marching": Mesher(refined_surface, isosurface)}
+
 METHODS: dict[str, Method] = {
     "mc": partial(coarse_surface, table="lorensen"),
     "mc-lewiner": partial(coarse_surface, table="lewiner"),
@@ -159,4 +184,10 @@ METHODS: dict[str, Method] = {
     "bspline": partial(spline_surface, order=3),
     "ours": our_surface,
     "bound": bound_surface,
+}
+
+MESHED_METHODS: dict[str, Method] = {
+    meshed_by(method, mesher): partial(surface, mesher=mesher)
+    for method, surface in ((OURS, our_surface), ("bound", bound_surface))
+    for mesher in BY_MESHER
 }

@@ -5,31 +5,23 @@ points sampled on the result.
 
 References
 ----------
-Chen and Zhang, Neural Marching Cubes (2021): F1 at 0.003, edge points, ECD and EF1 at 0.005.
+Chen and Zhang, Neural Marching Cubes (2021): F1 at 0.003.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import igl
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..arrays import IntArray
 from ..mesh import Mesh
 from ..truth.solid import Distances, Points, Solid
 
 SAMPLE_COUNT = 100_000
 F1_DISTANCE = 0.003
-EDGE_DISTANCE = 0.005
-SHARP_COSINE = np.cos(np.radians(30))
-# A point is an edge point if the normal of another point within this radius differs by more.
-EDGE_RADIUS = 0.004
-# Nearest points that are examined: all within the radius if the area is over 0.1. On a tiny result,
-# with all 1e5 points within the radius, it bounds the work.
-EDGE_NEIGHBOURS = 64
+SLIVER_ANGLE = 5.0  # degrees
 
 Numbers = dict[str, float | None]
 
@@ -113,14 +105,14 @@ def harmonic_mean(recall: float, precision: float) -> float:
 
 
 def compare_surfaces(
-    reference: Solid, result: Mesh, drawn: SurfacePoints, result_drawn: SurfacePoints
+    reference: Solid, result: Solid, drawn: SurfacePoints, result_drawn: SurfacePoints
 ) -> Numbers:
     """Return exact point-to-triangle distances: mean, 99th percentile and maximum, both ways.
 
     ``drawn`` is P, ``result_drawn`` Q. "there" is from P to the result's triangles, "back" from Q
     to the reference's. Figures without a direction are the mean of both, or the larger maximum.
     """
-    there = distance_or_dot(Solid(result), drawn.points)
+    there = distance_or_dot(result, drawn.points)
     back = distance_or_dot(reference, result_drawn.points)
     mean, p99 = (there.mean(), back.mean()), (np.quantile(there, 0.99), np.quantile(back, 0.99))
     return {
@@ -148,71 +140,22 @@ def distance_or_dot(solid: Solid, points: Points) -> Distances:
     return distances
 
 
-def sample_edges(
-    vertices: Points, edges: IntArray, seed: tuple[int, int], count: int = SAMPLE_COUNT
-) -> Points:
-    """Return points (count, 3) sampled uniformly by length on edges (e, 2); none without edges."""
-    ends = vertices[edges]  # (e, 2, 3)
-    if not len(ends):
-        return np.zeros((0, 3))
-    random = np.random.default_rng(seed)
-    lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-    low, high = ends[draw_index(lengths, random.random(count))].swapaxes(0, 1)
-    return low + random.random((count, 1)) * (high - low)
+def compare_triangles(mesh: Mesh) -> Numbers:
+    """Return the smallest angle in degrees, and the share of triangles with one under 5 degrees.
 
-
-def sharp_edges(mesh: Mesh) -> IntArray:
-    """Return the edges (e, 2) of exactly two faces whose normals differ by over 30 degrees."""
-    vectors = face_vectors(mesh)
-    lengths = np.linalg.norm(vectors, axis=1)
-    edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    order = np.lexsort((edges[:, 1], edges[:, 0]))
-    _, first, count = np.unique(edges[order], axis=0, return_index=True, return_counts=True)
-    pairs = order[first[count == 2][:, None] + [0, 1]]
-    one, other = pairs.T // 3
-    # A face without area has no normal, so its edges have no angle.
-    whole = (lengths[one] > 0) & (lengths[other] > 0)
-    dot = np.einsum("nd,nd->n", vectors[one], vectors[other])
-    return edges[pairs[whole & (dot < SHARP_COSINE * lengths[one] * lengths[other]), 0]]
-
-
-def edge_points(drawn: SurfacePoints) -> Points:
-    """Return the points (k, 3) that lie near a sharp edge.
-
-    As in NMC, NDC and PoNQ, these are the points with another one nearby whose normal differs by
-    more than the angle of `sharp_edges`, whatever its sign: the two sides of a thin sheet are no
-    edge.
+    Both are None for a mesh without faces. A triangle without area has an angle of 0.
     """
-    points, normals = drawn.points, drawn.normals
-    # Missing neighbours have the index n; the point itself replaces them, which is no edge.
-    nearby = cKDTree(points).query(points, EDGE_NEIGHBOURS, distance_upper_bound=EDGE_RADIUS)[1]
-    nearby = np.where(nearby == len(points), np.arange(len(points))[:, None], nearby)
-    turned = np.zeros(len(points), bool)
-    for column in nearby.T:
-        turned |= np.abs(np.einsum("nd,nd->n", normals, normals[column])) < SHARP_COSINE
-    return points[turned]
+    if not len(mesh.faces):
+        return {"min_angle": None, "slivers": None}
+    angles = smallest_angles(mesh)
+    return {"min_angle": float(angles.min()), "slivers": float(np.mean(angles < SLIVER_ANGLE))}
 
 
-def compare_edges(vertices: Points, edges: IntArray, drawn: Points, result: Points) -> Numbers:
-    """Return ECD (sum of mean squares) and EF1 at 0.005, both None without edges.
-
-    Parameters
-    ----------
-    vertices, edges : (n, 3) float, (e, 2) int
-        Sharp edges of the reference. The distance to them is exact: a search among points is slow
-        where many are equally far, as those of a circle are from its axis.
-    drawn : (m, 3) float
-        Points sampled on these edges.
-    result : (k, 3) float
-        Edge points of the result; if there are none, a dot at the origin.
-    """
-    if not len(edges):
-        return {"ecd": None, "ef1": None}
-    result = result if len(result) else DOT.points
-    there = cKDTree(result).query(drawn)[0]
-    back = np.sqrt(igl.point_mesh_squared_distance(result, vertices, edges)[0])
-    recall, precision = np.mean(there < EDGE_DISTANCE), np.mean(back < EDGE_DISTANCE)
-    return {
-        "ecd": float(np.mean(there**2) + np.mean(back**2)),
-        "ef1": harmonic_mean(recall, precision),
-    }
+def smallest_angles(mesh: Mesh) -> Distances:
+    """Return the smallest angle of each triangle, (m,), in degrees."""
+    corners = mesh.vertices.astype(np.float64)[mesh.faces]  # (m, 3, 3)
+    ahead, back = (np.roll(corners, step, axis=1) - corners for step in (-1, 1))
+    sine = np.linalg.norm(np.cross(ahead, back), axis=2)
+    cosine = np.einsum("mkd,mkd->mk", ahead, back)
+    angles: Distances = np.degrees(np.arctan2(sine, cosine)).min(axis=1)
+    return angles

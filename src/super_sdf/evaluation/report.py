@@ -24,11 +24,13 @@ from .methods import METHODS
 from .names import LABELS, OURS
 from .plots import draw_plots
 from .results import Results
+from .scope import Scope
 from .tables import (
     COST,
     EF1,
     SHORT,
     cost_table,
+    edge_table,
     empty_lines,
     gap_line,
     markdown,
@@ -50,6 +52,14 @@ is marching cubes of the true distances at the same nodes; the floor compares tw
 samplings of the reference. A result without a surface counts as a dot at the origin; a shape on
 which a method failed is left out of that table for all methods, and named. Published rows are of
 other shapes (Thingi30)."""
+
+EDGE_LINES = """\
+EFv is the F1 of points on the sharp edges (over 30 degrees) of both meshes, at a tenth of a coarse
+voxel. The edge distance is that of points on the reference's edges to the result's triangles, in
+coarse voxels: its mean. The angles, in degrees, are those between the result's normals and that of
+the nearest triangle of the reference, within a coarse voxel of the reference's edges ("near") and
+beyond. Slivers are triangles with an angle under 5 degrees; the min angle is the mean over the
+shapes of the smallest. "Shapes" counts those with edges that were measured."""
 
 
 def write_report(
@@ -78,6 +88,7 @@ def write_report(
     scope = results.scope
     sections = [title_section(results)]
     sections += [size_section(results, setting) for setting in scope.settings()]
+    sections += [edge_section(results)]
     tables = experiment_tables.SECTIONS
     sections += [tables[name](results) for name in scope.experiments if name in tables]
     sections += [peer_section(results)] if scope.peers else []
@@ -93,6 +104,8 @@ def write_report(
 def title_section(results: Results) -> str:
     """Return the title, the protocol, and what could not be measured."""
     lines = [f"# Quality of super-sdf on {len(results.floors)} shapes", PROTOCOL_LINES]
+    turned = results.scope.turned
+    lines += [] if turned is None else [f"The shapes are turned at random, by seed {turned}."]
     lines += [f"Left out, {entry.shape}: {entry.reason}." for entry in results.left_out]
     return "\n\n".join(lines)
 
@@ -113,6 +126,16 @@ def size_section(results: Results, setting: Setting) -> str:
     lines = [win_line(by_method), gap_line(by_method), *empty_lines(by_method)]
     title = f"## {setting.size}^3, factor {setting.factor}"
     return "\n\n".join([title, surface_table(by_method, setting.size), *filter(None, lines)])
+
+
+def edge_section(results: Results) -> str:
+    """Return the section on edges, angles and triangles."""
+    tables = [
+        f"**{setting.size}^3, factor {setting.factor}**\n\n"
+        + edge_table({LABELS[name]: rows for name, rows in results.by_method(setting).items()})
+        for setting in results.scope.settings()
+    ]
+    return "\n\n".join(["## Edges and triangles", EDGE_LINES, *tables])
 
 
 def peer_section(results: Results) -> str:
@@ -183,7 +206,7 @@ def picture_section(results: Results, out: Path, up: str) -> str:
             f"**{row['shape']}**, F1 {row['f1']:.3f} (floor {floor:.3f}), NC {row['nc']:.3f}"
         )
         try:
-            draw_shape(paths[row["shape"]], setting, results.scope.model, picture, up)
+            draw_shape(results.scope, paths[row["shape"]], picture, up)
             lines.append(f"![{row['shape']}](pictures/{picture.name})")
         except SuperSdfError as problem:  # the tables matter more than a picture
             lines.append(f"Not drawn: {problem}.")
@@ -202,11 +225,11 @@ def extremes_title(count: int, setting: Setting) -> str:
     )
 
 
-def draw_shape(path: Path, setting: Setting, model: str, target: Path, up: str) -> None:
+def draw_shape(scope: Scope, path: Path, target: Path, up: str) -> None:
     """Draw a picture of coarse marching cubes, ours, the reference, and the error of ours."""
-    shape = Shape.read(path)
+    setting, shape = scope.settings()[0], Shape.read(path, scope.turned)
     case = Case(shape, setting)
-    network = load_network(model, device="cpu")
+    network = load_network(scope.model, device="cpu")
     coarse, ours = (METHODS[name](case, network).mesh for name in ("mc", OURS))
     panels = [
         Panel(coarse, titled(coarse, f"marching cubes of {setting.size}^3")),

@@ -45,7 +45,7 @@ def work(task: Task, tell: Tell) -> LeftOut | None:
     The time limit counts from when the shape was read.
     """
     try:
-        shape = Shape.read(task.path)
+        shape = Shape.read(task.path, task.turned)
     except Exception as problem:  # the other shapes still count
         return LeftOut(task.path.stem, reason_of(problem))
     tell(ClockStarted())

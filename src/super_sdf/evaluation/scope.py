@@ -7,11 +7,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ..errors import FileError, OptionError
+from ..errors import FileError, OptionError, seen
 from ..files.regular import check_regular_file
 from .cases import Setting
 from .measuring import NO_SETTING, Task, digest_of_file, digest_of_ours
-from .names import EXPERIMENTS, FLOOR, METHOD_LABELS, OURS
+from .names import EXPERIMENTS, FLOOR, MESHED, MESHERS, METHOD_LABELS, OURS, meshed_by
 
 MESH_SUFFIXES = (".ply", ".stl", ".obj", ".off", ".glb", ".gltf", ".3mf")
 BASE_SIZE = 32  # samples along an axis in the paper's experiments
@@ -19,6 +19,7 @@ FACTORS = (2, 4, 8, 16)
 NOISES = (0.0, 0.2, 0.5, 1.0)
 PASSES = (1, 2)
 SCALES = (0.25, 0.5, 0.75)
+MESHER_FACTORS = (2, 4)  # every mesher; 1 goes here when a field is refined without more nodes
 
 MethodsIn = tuple[Setting, tuple[str, ...]]
 """A setting, and the methods that are measured in it."""
@@ -43,6 +44,8 @@ class Scope:
         ``peer_limit`` seconds.
     jobs, threads : int
         Processes at a time, and threads of the network in each.
+    turned : int, optional
+        Seed by which the shapes are turned at random.
     """
 
     paths: tuple[Path, ...]
@@ -58,6 +61,7 @@ class Scope:
     peer_limit: float = 900.0
     jobs: int = 1
     threads: int = 1
+    turned: int | None = None
 
     def check(self) -> None:
         """Raise OptionError if a number is out of range, or there is nothing to measure."""
@@ -68,6 +72,8 @@ class Scope:
         Setting(self.peer_size).check("peer size")
         if not self.peer_limit > 0:
             raise OptionError(f"peer limit is {self.peer_limit:g}: give more than 0 seconds")
+        if self.turned is not None and self.turned < 0:
+            raise OptionError(f"turned is {seen(self.turned)}: give a seed of 0 or more")
 
     def settings(self) -> list[Setting]:
         """Return the settings of the main table."""
@@ -109,16 +115,25 @@ class Scope:
         ours = digest_of_ours(self.model)
         sums = {path: digest_of_file(path) for path in self.paths}
         return [
-            Task(path, sums[path], setting, methods, self.model, ours, self.threads)
+            Task(
+                path,
+                sums[path],
+                setting,
+                methods,
+                self.model,
+                ours,
+                self.threads,
+                turned=self.turned,
+            )
             for path, (setting, methods) in wanted
         ]
 
 
 def experiment(name: str, sizes: Sequence[int]) -> list[MethodsIn]:
-    """Return the settings and methods of an experiment of the paper.
+    """Return the settings and methods of an experiment.
 
-    "scale" is at the sizes of the main table. "timings" has none: whole processes are timed one at
-    a time (see ``timing``).
+    "scale" and "meshers" are at the sizes of the main table. "timings" has none: whole processes
+    are timed one at a time (see ``timing``).
     """
     refined = ("bspline", OURS, "bound")
     if name == "factors":
@@ -130,6 +145,9 @@ def experiment(name: str, sizes: Sequence[int]) -> list[MethodsIn]:
         return [(Setting(BASE_SIZE, passes=passes), (OURS,)) for passes in PASSES]
     if name == "scale":
         return [(Setting(n, scale=s), ("mc", *refined)) for n in sizes for s in SCALES]
+    if name == "meshers":
+        methods = tuple(meshed_by(method, mesher) for mesher in MESHERS for method in MESHED)
+        return [(Setting(n, factor), methods) for n in sizes for factor in MESHER_FACTORS]
     if name == "timings":
         return []
     raise OptionError(f"experiment is {name!r}: give one of {', '.join(EXPERIMENTS)}")

@@ -18,6 +18,7 @@ from .names import PROCESS
 KEY_TYPES: dict[str, tuple[type, ...]] = {
     "shape": (str,),
     "mesh": (str,),
+    "turned": (int, type(None)),  # rows of earlier versions lack it, as no shape was turned
     "size": (int,),
     "factor": (int,),
     "noise": (int, float),
@@ -75,7 +76,7 @@ class Store:
         return limit is not None and task.limit is not None and limit >= task.limit
 
     def _take(self, row: Measurement) -> None:
-        self.rows[tuple(row[name] for name in KEY_TYPES)] = row
+        self.rows[tuple(row.get(name) for name in KEY_TYPES)] = row
 
 
 def is_row(record: Any) -> bool:

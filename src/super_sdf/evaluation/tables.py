@@ -33,13 +33,19 @@ CD, F1, NC = Column("CD x1e5", "cd", 1e5), Column("F1", "f1"), Column("NC", "nc"
 P2S = Column("p2s x1e4", "p2s", 1e4, 2)
 BACK = Column("res to ref", "p2s_back", 1e4, 2)
 EF1 = Column("EF1", "ef1")
+TRIANGLES = Column("triangles", "faces", 1, 0)
 SURFACE = (
     *(CD, Column("excess CD x1e5", "excess_cd", 1e5), F1, NC, Column("signed NC", "signed_nc")),
     *(P2S, Column("ref to res", "p2s_there", 1e4, 2), BACK),
     *(Column("p99 x1e4", "p99", 1e4, 1), Column("max x1e4", "max", 1e4, 0)),
     *(Column("ECD x1e5", "ecd", 1e5, 2), EF1),
     *(Column("field MSE x1e6", "field_mse", 1e6), Column("field MAE x1e4", "field_mae", 1e4, 2)),
-    Column("triangles", "faces", 1, 0),
+    TRIANGLES,
+)
+EDGES = (
+    *(EF1, Column("EFv", "efv"), Column("edge distance", "edge_distance")),
+    *(Column("angle near", "angle_near", 1, 2), Column("angle beyond", "angle_beyond", 1, 2)),
+    *(TRIANGLES, Column("slivers %", "slivers", 100, 2), Column("min angle", "min_angle", 1, 2)),
 )
 SHORT = (CD, F1, NC, P2S, BACK)
 COST = (
@@ -64,9 +70,12 @@ def markdown(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def mean_of(rows: Sequence[Measurement], key: str) -> float | None:
-    """Return the mean of a figure over the rows that have it; of ``..._max`` the maximum."""
-    figures = [row[key.removesuffix("_max")] for row in rows]
-    figures = [figure for figure in figures if figure is not None]
+    """Return the mean of a figure over the rows that have it; of ``..._max`` the maximum.
+
+    Rows of earlier versions lack the figures that came later.
+    """
+    name = key.removesuffix("_max")
+    figures = [row[name] for row in rows if row.get(name) is not None]
     if not figures:
         return None
     return float(max(figures) if key.endswith("_max") else np.mean(figures))
@@ -105,11 +114,28 @@ def published_rows(size: int) -> list[list[str]]:
     return rows
 
 
+def edge_table(by_label: Mapping[str, Sequence[Measurement]]) -> str:
+    """Return a table of edges, angles and triangles."""
+    titles = ["method", "shapes", *(column.title for column in EDGES)]
+    rows = [
+        [label, *edge_count(measured), *mean_row("", measured, EDGES)[1:]]
+        for label, measured in by_label.items()
+    ]
+    return markdown(titles, rows)
+
+
+def edge_count(rows: Sequence[Measurement]) -> list[str]:
+    """Return the number of shapes with sharp edges, "-" where that was not measured."""
+    known = sum(row.get("edge_distance") is not None for row in rows)
+    return [str(known) if known else "-"]
+
+
 def shape_table(by_method: Mapping[str, Sequence[Measurement]]) -> str:
     """Return the table of all shapes, with a row for each shape and method."""
-    titles = ["shape, method", *(column.title for column in SURFACE), "closed", "outward"]
+    columns = (*SURFACE, *(column for column in EDGES if column not in SURFACE))
+    titles = ["shape, method", *(column.title for column in columns), "closed", "outward"]
     rows = [
-        mean_row(f"{row['shape']}, {name}", [row]) + count_row([row])
+        mean_row(f"{row['shape']}, {name}", [row], columns) + count_row([row])
         for measured in zip(*by_method.values())
         for name, row in zip(by_method, measured)
     ]

@@ -63,6 +63,12 @@ class Solid:
         squared = self._triangles.squared_distance(self.mesh.vertices, self.mesh.faces, points)[0]
         return np.sqrt(squared)
 
+    def nearest_face(self, points: Points) -> NDArray[np.int64]:
+        """Return the index of the nearest triangle, (n,), of points (n, 3)."""
+        found = self._triangles.squared_distance(self.mesh.vertices, self.mesh.faces, points)
+        faces: NDArray[np.int64] = np.ravel(found[1])
+        return faces
+
     def winding_number(self, points: Points) -> Distances:
         """Return the winding number of points (n, 3), (n,): 1 inside, 0 outside."""
         return self._winding.winding_number(points) if len(points) else np.zeros(0)
