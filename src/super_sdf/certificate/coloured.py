@@ -15,7 +15,8 @@ from ..files.output import check_free
 from .check import Certificate
 from .touching import Touching
 
-NEIGHBOURS = 4  # foot points that a vertex looks at
+NEIGHBOURS = 8  # foot points that a vertex looks at
+SMOOTHING = 0.02  # voxels: distance of a foot point that halves its weight
 FARTHEST = 1.5  # voxels: foot points farther away say nothing of a vertex
 FULL = 0.1  # voxels: residual at which a colour is saturated
 TOUCHING, PIERCED, NOT_TOUCHING, UNKNOWN = (
@@ -46,19 +47,20 @@ def vertex_residuals(
 ) -> FloatArray:
     """Return the residual at each vertex, (n,), in voxels; NaN where no foot point is near.
 
-    It is the mean of those at the nearest foot points, each weighted by the inverse of its
-    distance.
+    Its size is the mean of the absolute residuals at the nearest foot points, each weighted by the
+    inverse of its distance; its sign is that of the mean with signs.
     """
     if not len(touching.values):
         return np.full(len(vertices), np.nan, np.float32)
+    reach = FARTHEST * voxel_size
     away, rows = cKDTree(touching.feet).query(
-        vertices, NEIGHBOURS, distance_upper_bound=FARTHEST * voxel_size, workers=-1
+        vertices, NEIGHBOURS, distance_upper_bound=reach, workers=-1
     )
-    weight = np.where(np.isfinite(away), 1 / (away + 0.1 * voxel_size), 0)
+    weight = np.where(np.isfinite(away), 1 / (away + SMOOTHING * voxel_size), 0)
     said = np.append(touching.residuals, np.float32(0))[rows]  # the last for missing neighbours
     with np.errstate(invalid="ignore"):
-        mean: FloatArray = ((weight * said).sum(1) / weight.sum(1)).astype(np.float32)
-    return mean
+        size = (weight * np.abs(said)).sum(1) / weight.sum(1)
+    return np.copysign(size, (weight * said).sum(1)).astype(np.float32)
 
 
 def colours(residuals: FloatArray) -> NDArray[np.uint8]:

@@ -59,12 +59,14 @@ def merged(mesh: Mesh) -> Mesh:
     """
     from trimesh.grouping import unique_rows
 
-    used, faces = np.unique(mesh.faces, return_inverse=True)
+    used = np.zeros(len(mesh.vertices), bool)
+    used[mesh.faces] = True
+    faces = (np.cumsum(used, dtype=np.int32) - 1)[mesh.faces]
     vertices = mesh.vertices[used]
     step = MERGE_DISTANCE * min(1.0, float(np.ptp(vertices, axis=0).max()))
     step = max(step, float(np.abs(vertices).max()) * SMALLEST_STEP) or 1.0
     first, place = unique_rows(np.round(vertices / step).astype(np.int64), keep_order=True)
-    return Mesh(vertices[first], place[faces].reshape(-1, 3).astype(np.int32))
+    return Mesh(vertices[first], place.astype(np.int32)[faces])
 
 
 def _load(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
