@@ -6,12 +6,15 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from ..convert import ConvertOptions
 from ..errors import OutOfMemoryError
 from ..files.grids import read_grid
+from ..files.regular import check_regular_file
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import give_back, held_memory, in_words
 from ..machine.resources import Resources, allot
@@ -26,6 +29,7 @@ from .touching import NOTICEABLE, Touching, touch
 # Bytes for each triangle and each exact sample, beside mesh and band, at the most: search trees.
 BYTES_PER_TRIANGLE = 400
 BYTES_PER_SAMPLE = 150
+HEADER_BYTES = 4096  # of a PLY file, in which the number of faces is looked for
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,12 @@ class CheckOptions:
     offset: float = 0.0
     max_memory: int | None = None
     intersections: bool = True
+
+    @classmethod
+    def of(cls, options: ConvertOptions) -> CheckOptions:
+        """Return how a grid is read that was converted with these options."""
+        names = ("spacing", "origin", "inside", "offset", "max_memory")
+        return cls(**{name: getattr(options, name) for name in names})
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,12 +169,14 @@ def check_files(
         As ``read_mesh``, ``read_grid`` and ``check_mesh`` raise it.
     """
     options = options or CheckOptions()
+    bound = allot(0, check_max_memory(options.max_memory))
+    check_room(stated_triangles(check_regular_file(mesh)), 0, bound)
     found = read_grid(
         grid,
         spacing=options.spacing,
         origin=options.origin,
         inside=options.inside,
-        max_memory=check_max_memory(options.max_memory),
+        max_memory=options.max_memory,
     )
     return check_mesh(read_mesh(mesh), found, options)
 
@@ -202,6 +214,18 @@ def check_mesh(mesh: Mesh, grid: SdfGrid, options: CheckOptions | None = None) -
     give_back()
     strays = find_strays(mesh.vertices, grid, offset) if len(touching.values) else None
     return Certificate(mesh, grid.voxel_size, surface, touching, strays, grid.notes)
+
+
+def stated_triangles(path: Path) -> int:
+    """Return how many triangles a mesh file has, by its header; 0 if that does not tell."""
+    with path.open("rb") as file:
+        header = file.read(HEADER_BYTES)
+    if path.suffix.lower() == ".ply":
+        found = re.search(rb"^element face (\d{1,12})\s*$", header, re.MULTILINE)
+        return int(found.group(1)) if found else 0
+    count = int.from_bytes(header[80:84], "little")
+    is_stl = path.suffix.lower() == ".stl" and path.stat().st_size == 84 + 50 * count
+    return count if is_stl else 0
 
 
 def check_room(triangles: int, samples: int, resources: Resources) -> None:

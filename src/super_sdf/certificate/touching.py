@@ -91,7 +91,7 @@ def touch(mesh: Mesh, band: Band, grid: SdfGrid) -> Touching:
     grid : SdfGrid
         Where the samples lie.
     """
-    exact = np.flatnonzero(band.exact)
+    exact = np.flatnonzero(band.exact & ~at_limit(band.patches[:, CENTRE]))
     # if none is exact, too many are no distances for any to be taken for one
     noisy = int(np.count_nonzero(~band.lipschitz)) if len(exact) else len(band.exact)
     points = band.voxel_ijk[exact] * np.array(grid.spacing) + np.array(grid.origin)
@@ -104,6 +104,15 @@ def touch(mesh: Mesh, band: Band, grid: SdfGrid) -> Touching:
     residuals = (distances - np.abs(values)).astype(np.float32)
     cut_off = len(band.exact) - len(exact) - noisy
     return Touching(cut_off, noisy, points, values, residuals, feet, wrong)
+
+
+def at_limit(samples: FloatArray) -> BoolArray:
+    """Return which samples, (n,), are the largest or smallest of all.
+
+    ``is_cut_off`` keeps truncated samples beside the surface, whose neighbours are steep.
+    """
+    found: BoolArray = (samples == samples.min()) | (samples == samples.max())
+    return found
 
 
 def nearest_points(mesh: Mesh, points: Points) -> tuple[Distances, Points]:

@@ -11,13 +11,12 @@ import click
 
 from ..machine.extras import check_modules
 from .common import CONTEXT, one_line_errors, print_stderr, print_stdout
-from .conversion import grid_options, parse_size
+from .conversion import CHECK_MODULES, grid_options, parse_size
 from .interrupts import raising_interrupts
 
 if TYPE_CHECKING:
-    from ..certificate.check import Certificate
+    from ..certificate.check import Certificate, CheckOptions
 
-MODULES = ("igl", "scipy")
 EXAMPLES = """\b
 Examples:
   super-sdf check part.ply part.npz
@@ -100,7 +99,7 @@ def check_command(mesh: Path, grid: Path, **options: Any) -> None:
     what upsample takes. The exit code is 1 if a limit is passed, whatever the mesh otherwise.
     """
     with one_line_errors():
-        check_modules("check", "eval", MODULES)
+        check_modules("check", "eval", CHECK_MODULES)
         passed = run_check(mesh, grid, options)
     for sentence in passed:
         print_stderr(f"Limit passed: {sentence}")
@@ -128,13 +127,13 @@ def run_check(mesh: Path, grid: Path, options: dict[str, Any]) -> list[str]:
     return passed
 
 
-def make_check_options(options: dict[str, Any]) -> Any:
+def make_check_options(options: dict[str, Any]) -> CheckOptions:
     """Return the options of the check, picked from all options of a command."""
     from ..certificate.check import CheckOptions
 
     names = ("spacing", "origin", "inside", "offset", "max_memory")
     chosen = {name: options[name] for name in names}
-    return CheckOptions(**chosen, intersections=not options.get("skip_intersections", False))
+    return CheckOptions(**chosen, intersections=not options["skip_intersections"])
 
 
 def print_certificate(

@@ -9,6 +9,7 @@ import click
 from click.core import ParameterSource
 
 from ..errors import OptionError
+from ..machine.extras import check_modules
 from .choices import (
     LazyChoice,
     LazyDefault,
@@ -24,6 +25,8 @@ from .choices import (
 if TYPE_CHECKING:
     from ..convert import ConvertOptions
 
+
+CHECK_MODULES = ("igl", "scipy")  # of the extra eval, for certificates
 
 Option = Callable[[Callable[..., Any]], Callable[..., Any]]
 """Adds an option to a command."""
@@ -162,6 +165,13 @@ def _with_options(command: Callable[..., Any], options: tuple[Option, ...]) -> C
     for option in reversed(options):
         command = option(command)
     return command
+
+
+def check_can_check(target: str) -> None:
+    """Raise FileError if meshes like ``target`` cannot be read again for ``--check``."""
+    check_modules("--check", "eval", CHECK_MODULES)
+    if target.lower().endswith(".3mf"):
+        check_modules("--check of .3mf files", "3mf")
 
 
 def chosen_model(options: dict[str, Any]) -> str:
