@@ -15,6 +15,8 @@ vertices
 found
     Median over shapes of the share of the vertices among the worst twentieth by true distance that
     are also among the worst twentieth by residual (chance: 0.05).
+
+In brackets: the tenth and the ninetieth percentile over shapes.
 """
 
 from __future__ import annotations
@@ -113,13 +115,17 @@ def correlations(rows: list[Row]) -> list[str]:
     largest = spearmanr([r.largest for r in rows], [r.max_error for r in rows]).statistic
     vertices = np.quantile([row.vertices for row in rows], [0.1, 0.5, 0.9])
     found = np.quantile([row.found for row in rows], [0.1, 0.5, 0.9])
-    below = np.median([row.error / row.mean for row in rows])
+    ratio = np.quantile([row.both_ways / row.mean for row in rows], [0.1, 0.5, 0.9])
+    above = sum(row.max_error < row.largest for row in rows)
     return [
         f"shapes: {one:.2f} to the reference, {both:.2f} both ways; largest against largest "
         f"{largest:.2f}",
         "vertices: {:.2f} ({:.2f} to {:.2f})".format(*vertices[[1, 0, 2]]),
         "found: {:.2f} ({:.2f} to {:.2f})".format(*found[[1, 0, 2]]),
-        f"mean error over mean residual: {below:.1f} (median)",
+        "mean error both ways over mean residual: {:.1f} ({:.1f} to {:.1f})".format(
+            *ratio[[1, 0, 2]]
+        ),
+        f"shapes whose largest residual is above their largest error: {above}",
     ]
 
 
