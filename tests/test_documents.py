@@ -46,7 +46,7 @@ def test_the_main_job_of_the_readme(tmp_path, monkeypatch):
     assert (mesh.bounds[1] < np.array([66.06, 73.45, 15.55]) + 0.1).all()
 
 
-@pytest.mark.parametrize("command", ["upsample", "batch"])
+@pytest.mark.parametrize("command", ["upsample", "batch", "check"])
 def test_the_help_text_in_the_readme_is_what_the_command_prints(command):
     printed = CliRunner().invoke(cli, [command, "--help"], terminal_width=100).output
     usage = f"Usage: super-sdf {command}"

@@ -23,6 +23,7 @@ status, reason : "ok" and None, or "failed" and why
 retry : whether another run may succeed with the same input and options
 content, output : fingerprints of the input and of the mesh
 options : digest of all that the mesh depends on, besides the input
+check : with ``--check`` the certificate, or why there is none
 seconds : time in all; that of each stage is in ``stages``
 """
 
@@ -61,8 +62,11 @@ class Result(NamedTuple):
         return one_line(reason if source in reason else f"{source}: {reason}")
 
 
-def attempt(job: Job, folder: Path, network: Decoder) -> Row:
-    """Convert a file and return its row; an error becomes a row, too."""
+def attempt(job: Job, folder: Path, network: Decoder, check: bool = False) -> Row:
+    """Convert a file and return its row; an error becomes a row, too.
+
+    With ``check``, the row has the certificate of the mesh.
+    """
     start, target = time.perf_counter(), folder / job.target
     content, mesh_prints = fingerprint(job.source), []
 
@@ -79,6 +83,7 @@ def attempt(job: Job, folder: Path, network: Decoder) -> Row:
         retry = not _is_caused_by_input(error)
         row = failed_row(job, _reason(error), retry=retry, content=content)
         return {**row, "seconds": _since(start)}
+    certificate = {"check": _certify(job, target)} if check else {}
     return {
         **_paths(job),
         "status": "ok",
@@ -87,9 +92,20 @@ def attempt(job: Job, folder: Path, network: Decoder) -> Row:
         "content": content,
         "output": mesh_prints[0],
         **done.report(),
+        **certificate,
         "seconds": _since(start),
         "stages": {stage: round(spent, 4) for stage, spent in done.seconds.items()},
     }
+
+
+def _certify(job: Job, target: Path) -> dict[str, Any]:
+    """Return the certificate of a finished mesh, or under ``error`` why it has none."""
+    from ..certificate.check import CheckOptions, check_files
+
+    try:
+        return check_files(target, job.source, CheckOptions.of(job.options)).report()
+    except Exception as error:  # the mesh is good all the same
+        return {"error": _reason(error)}
 
 
 def _note_mesh(part: Path, folder: Path, target: str) -> Fingerprint:

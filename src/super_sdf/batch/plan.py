@@ -35,6 +35,8 @@ class Settings:
         Try inputs again that failed before.
     fail_fast : bool
         Start nothing more after the first failure.
+    check : bool
+        Check each mesh against its samples; meshes without a certificate are made again.
     """
 
     folder: Path
@@ -46,6 +48,7 @@ class Settings:
     force: bool = False
     retry: bool = False
     fail_fast: bool = False
+    check: bool = False
 
 
 @dataclass
@@ -138,6 +141,8 @@ class Planner:
         if not is_unchanged(job.source, row["content"], same_path=same_path):
             return None
         if row["status"] == "ok" and not is_unchanged(self._path(job), row["output"]):
+            return None
+        if row["status"] == "ok" and self.settings.check and "check" not in row:
             return None
         return row
 

@@ -12,7 +12,13 @@ import click
 from .batch_report import print_plan, print_summary, progress_line
 from .choices import LazyChoice, mesh_formats
 from .common import CONTEXT, InterruptedCommand, one_line_errors
-from .conversion import chosen_model, conversion_options, make_options
+from .conversion import (
+    check_can_check,
+    check_option,
+    chosen_model,
+    conversion_options,
+    make_options,
+)
 from .interrupts import raising_interrupts
 
 if TYPE_CHECKING:
@@ -50,6 +56,7 @@ Examples:
     help="Mesh file format.",
 )
 @conversion_options
+@check_option
 @click.option(
     "--jobs",
     type=click.IntRange(0),
@@ -91,10 +98,12 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
 
     start = time.perf_counter()
     check_factor(options["factor"])
+    if options["check"]:
+        check_can_check(f".{options['kind']}")
     jobs, unread = find_jobs(sources, f".{options['kind']}", make_options(options))
     model = chosen_model(options)
     find_model(model, options["precision"])
-    flags = {name: options[name] for name in ("force", "retry", "fail_fast")}
+    flags = {name: options[name] for name in ("force", "retry", "fail_fast", "check")}
     settings = Settings(
         folder,
         model,

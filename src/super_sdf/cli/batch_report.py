@@ -149,7 +149,22 @@ def remarks(batch: Batch) -> list[str]:
         lines.append(f"Note: spacing, origin or sign of {inferred} was inferred: see {report}")
     if warned:
         lines.append(f"Warning: {warned} are from noisy or contradictory values: see {report}")
-    return lines
+    return lines + check_lines([row for row in rows if "check" in row])
+
+
+def check_lines(rows: list[dict[str, Any]]) -> list[str]:
+    """Return in a line what the certificates of new meshes say, and in one how many are missing."""
+    if not rows:
+        return []
+    residuals = {row["out"]: row["check"].get("residual") for row in rows}
+    known = {name: found for name, found in residuals.items() if found}
+    lines = []
+    if known:
+        worst = max(known, key=lambda name: float(known[name]["mean"]))
+        mean = f"{known[worst]['mean']:.4f}"
+        lines.append(f"Check: mean residual {mean} voxels at most, of {worst}; see the report")
+    missing = len(rows) - len(known)
+    return lines + [f"Warning: {missing} without a residual: see the report"] * (missing > 0)
 
 
 def sentence(batch: Batch) -> str:

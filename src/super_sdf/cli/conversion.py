@@ -1,4 +1,4 @@
-"""The options that ``upsample`` and ``batch`` share."""
+"""The options that ``upsample`` and ``batch`` share, some of them with ``check``."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import click
 from click.core import ParameterSource
 
 from ..errors import OptionError
+from ..machine.extras import check_modules
 from .choices import (
     LazyChoice,
     LazyDefault,
@@ -23,6 +24,12 @@ from .choices import (
 
 if TYPE_CHECKING:
     from ..convert import ConvertOptions
+
+
+CHECK_MODULES = ("igl", "scipy")  # of the extra eval, for certificates
+
+Option = Callable[[Callable[..., Any]], Callable[..., Any]]
+"""Adds an option to a command."""
 
 
 def parse_numbers(
@@ -59,14 +66,7 @@ def parse_size(ctx: click.Context, param: click.Parameter, value: str | None) ->
     return size
 
 
-OPTIONS = (
-    click.option(
-        "--factor",
-        type=int,
-        default=convert_default("factor"),
-        show_default=True,
-        help="Refinement per axis: 2, 4, 8 or 16 times finer than the grid.",
-    ),
+GRID_OPTIONS: tuple[Option, ...] = (
     click.option(
         "--spacing",
         callback=parse_numbers,
@@ -87,6 +87,17 @@ OPTIONS = (
         show_default=True,
         help="Sign of the values inside the solid; auto takes the border of the grid as outside.",
     ),
+)
+
+OPTIONS: tuple[Option, ...] = (
+    click.option(
+        "--factor",
+        type=int,
+        default=convert_default("factor"),
+        show_default=True,
+        help="Refinement per axis: 2, 4, 8 or 16 times finer than the grid.",
+    ),
+    *GRID_OPTIONS,
     click.option(
         "--offset",
         type=float,
@@ -133,11 +144,34 @@ OPTIONS = (
 )
 
 
+check_option = click.option(
+    "--check",
+    is_flag=True,
+    help="Check each mesh against its samples, as check does. Needs the extra eval.",
+)
+
+
 def conversion_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options to a command, in the order of ``OPTIONS``."""
-    for option in reversed(OPTIONS):
+    return _with_options(command, OPTIONS)
+
+
+def grid_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options that say how a grid is read, in the order of ``GRID_OPTIONS``."""
+    return _with_options(command, GRID_OPTIONS)
+
+
+def _with_options(command: Callable[..., Any], options: tuple[Option, ...]) -> Callable[..., Any]:
+    for option in reversed(options):
         command = option(command)
     return command
+
+
+def check_can_check(target: str) -> None:
+    """Raise FileError if meshes like ``target`` cannot be read again for ``--check``."""
+    check_modules("--check", "eval", CHECK_MODULES)
+    if target.lower().endswith(".3mf"):
+        check_modules("--check of .3mf files", "3mf")
 
 
 def chosen_model(options: dict[str, Any]) -> str:

@@ -27,6 +27,12 @@ def _batch() -> click.Command:
     return batch_command
 
 
+def _check() -> click.Command:
+    from .check import check_command
+
+    return check_command
+
+
 def _sample() -> click.Command:
     from .sample import sample_command
 
@@ -54,6 +60,7 @@ def _info() -> click.Command:
 COMMANDS = {
     "upsample": _upsample,
     "batch": _batch,
+    "check": _check,
     "sample": _sample,
     "evaluate": _evaluate,
     "render": _render,

@@ -9,10 +9,17 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .common import CONTEXT, one_line_errors, print_stderr, print_stdout, progress_bar
-from .conversion import chosen_model, conversion_options, make_options
+from .conversion import (
+    check_can_check,
+    check_option,
+    chosen_model,
+    conversion_options,
+    make_options,
+)
 from .interrupts import raising_interrupts
 
 if TYPE_CHECKING:
+    from ..certificate.check import Certificate
     from ..convert import Conversion
     from ..network.network import Network
 
@@ -32,6 +39,7 @@ Examples:
 @click.argument("source", metavar="IN")
 @click.argument("target", metavar="OUT")
 @conversion_options
+@check_option
 @click.option("--force", is_flag=True, help="Replace OUT if it exists.")
 @click.option("--json", "as_json", is_flag=True, help="Print counts, times and notes as JSON.")
 @click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
@@ -45,6 +53,9 @@ def upsample_command(source: str, target: str, **options: Any) -> None:
     with one_line_errors():
         run = Upsampling(source, target, options)
         run.work()
+    with one_line_errors(f"{target} is written"), raising_interrupts():
+        if options["check"]:
+            run.check()
         run.print_report()
 
 
@@ -57,6 +68,7 @@ class Upsampling:
         self.seconds: dict[str, float] = {}
         self.network: Network
         self.result: Conversion
+        self.certificate: Certificate | None = None
 
     def work(self) -> None:
         """Check the options, load the network, convert."""
@@ -69,6 +81,8 @@ class Upsampling:
         options, watch = self.options, Stopwatch()
         check_factor(options["factor"])
         check_target(self.target, force=options["force"])
+        if options["check"]:
+            check_can_check(self.target)
         watch.lap("start")
         self.network = load_network(
             self.model,
@@ -88,6 +102,20 @@ class Upsampling:
                 announce=self.announce,
             )
         self.seconds = watch.seconds | self.result.seconds
+
+    def check(self) -> None:
+        """Check the finished mesh against its samples."""
+        from ..certificate.check import CheckOptions, check_files
+        from ..errors import SuperSdfError
+        from ..progress import Stopwatch
+
+        watch, options = Stopwatch(), CheckOptions.of(make_options(self.options))
+        try:
+            self.certificate = check_files(self.target, self.source, options)
+        except SuperSdfError as error:
+            raise type(error)(f"{error}; {self.target} is written, but not checked") from error
+        watch.lap("check")
+        self.seconds |= watch.seconds
 
     def announce(self, line: str) -> None:
         """Print, before the work, what may make the user stop it; the bar is redrawn below."""
@@ -111,6 +139,8 @@ class Upsampling:
             for stage, seconds in self.seconds.items():
                 print_stderr(f"{stage}: {seconds:.3f} s")
         print_stderr(f"{self.target}: {self.summary()}")
+        if self.certificate:
+            print_stderr(f"Check: {self.certificate.summary()}")
 
     def report(self) -> dict[str, Any]:
         """Return counts, times and notes as ``--json`` prints them."""
@@ -124,6 +154,7 @@ class Upsampling:
             "device": self.network.device,
             "device_notes": self.device_notes(),
             **self.result.report(),
+            **({"check": self.certificate.report()} if self.certificate else {}),
             "seconds": {stage: round(seconds, 4) for stage, seconds in self.seconds.items()},
         }
 

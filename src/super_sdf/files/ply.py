@@ -23,7 +23,7 @@ def write_ply(pieces: Iterable[Mesh], path: Path) -> None:
     """
     with path.open("wb") as file, spool_beside(path) as waiting:
         file.write(_ply_header("float", 0, 0))
-        written = write_split(pieces, (file, waiting), (little_endian, _ply_rows))
+        written = write_split(pieces, (file, waiting), (little_endian, ply_rows))
         append_spool(waiting, file)
         file.seek(0)
         number = "double" if written.dtype == np.float64 else "float"
@@ -45,7 +45,7 @@ def _ply_header(number: str, vertices: int, faces: int) -> bytes:
     return (first + " " * (HEADER_BYTES - len(first) - len(rest)) + rest).encode("ascii")
 
 
-def _ply_rows(faces: NDArray[Any]) -> bytes:
+def ply_rows(faces: NDArray[Any]) -> bytes:
     """Return triangles as PLY lists: the number of corners, then their indices."""
     rows = np.empty(len(faces), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
     rows["count"], rows["corners"] = 3, faces

@@ -41,13 +41,20 @@ def read_mesh(path: str | Path) -> Mesh:
     if faces.min() < 0 or faces.max() >= len(vertices):
         wrong = faces.min() if faces.min() < 0 else faces.max()
         raise MeshError(f"{path} has a face of vertex {wrong}, of {len(vertices):,}: repair it")
-    used = vertices[faces.ravel()]
+    used = vertices[used_vertices(len(vertices), faces)]
     if not np.isfinite(used).all():
         raise MeshError(f"{path} holds coordinates that are not finite: repair it first")
     largest = np.abs(used).max()
     if largest > LARGEST_COORDINATE:
         raise MeshError(f"{path} reaches to {largest:.3g}: scale it to coordinates under 1e30")
     return merged(Mesh(vertices, faces.astype(np.int32)))
+
+
+def used_vertices(count: int, faces: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return which of ``count`` vertices are corners of faces (m, 3), (count,)."""
+    used = np.zeros(count, bool)
+    used[faces] = True
+    return used
 
 
 def merged(mesh: Mesh) -> Mesh:
@@ -59,12 +66,13 @@ def merged(mesh: Mesh) -> Mesh:
     """
     from trimesh.grouping import unique_rows
 
-    used, faces = np.unique(mesh.faces, return_inverse=True)
+    used = used_vertices(len(mesh.vertices), mesh.faces)
+    faces = (np.cumsum(used, dtype=np.int32) - 1)[mesh.faces]
     vertices = mesh.vertices[used]
     step = MERGE_DISTANCE * min(1.0, float(np.ptp(vertices, axis=0).max()))
     step = max(step, float(np.abs(vertices).max()) * SMALLEST_STEP) or 1.0
     first, place = unique_rows(np.round(vertices / step).astype(np.int64), keep_order=True)
-    return Mesh(vertices[first], place[faces].reshape(-1, 3).astype(np.int32))
+    return Mesh(vertices[first], place.astype(np.int32)[faces])
 
 
 def _load(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

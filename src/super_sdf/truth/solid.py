@@ -69,6 +69,14 @@ class Solid:
         faces: NDArray[np.int64] = np.ravel(found[1])
         return faces
 
+    def foot_points(self, points: Points) -> tuple[Distances, Points]:
+        """Return the unsigned distance, (n,), of points (n, 3), and the nearest points, (n, 3)."""
+        if not len(points):
+            return np.zeros(0), np.zeros((0, 3))
+        mesh = self.mesh
+        squared, _, feet = self._triangles.squared_distance(mesh.vertices, mesh.faces, points)
+        return np.sqrt(squared), feet
+
     def winding_number(self, points: Points) -> Distances:
         """Return the winding number of points (n, 3), (n,): 1 inside, 0 outside."""
         return self._winding.winding_number(points) if len(points) else np.zeros(0)

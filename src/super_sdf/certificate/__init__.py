@@ -1,0 +1,5 @@
+"""How well a mesh fits the samples of its grid, and whether it is valid; needs the extra ``eval``.
+
+No true surface is needed. It may import ``convert``, ``truth``, ``steps``, ``files``, ``mesh``,
+``grid`` and ``machine``.
+"""

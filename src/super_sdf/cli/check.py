@@ -1,0 +1,151 @@
+"""The command ``check``: whether a mesh is valid and fits the samples of its grid."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ..machine.extras import check_modules
+from .common import CONTEXT, one_line_errors, print_stderr, print_stdout
+from .conversion import CHECK_MODULES, grid_options, parse_size
+from .interrupts import raising_interrupts
+
+if TYPE_CHECKING:
+    from ..certificate.check import Certificate, CheckOptions
+
+EXAMPLES = """\b
+Examples:
+  super-sdf check part.ply part.npz
+  super-sdf check part.ply part.npz --out coloured.ply --max-mean 0.01 --no-faults
+"""
+
+
+@click.command(
+    "check",
+    context_settings=CONTEXT,
+    epilog=EXAMPLES,
+    short_help="Check a mesh against the grid that it was made from.",
+)
+@click.argument("mesh", metavar="MESH", type=click.Path(path_type=Path))
+@click.argument("grid", metavar="GRID", type=click.Path(path_type=Path))
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="COLOURED.ply",
+    help="Write the mesh with a colour and the property residual (voxels) for each vertex, from "
+    "the samples nearest to which it lies. White: the mesh touches their balls; red: it pierces "
+    "them; blue: it does not reach them, both fully at 0.1 voxel; olive: no sample is near.",
+)
+@click.option(
+    "--max-residual",
+    type=float,
+    metavar="VOXELS",
+    help="Fail if the largest residual of a sample is above this.",
+)
+@click.option(
+    "--max-mean", type=float, metavar="VOXELS", help="Fail if the mean residual is above this."
+)
+@click.option(
+    "--max-share",
+    type=float,
+    metavar="SHARE",
+    help="Fail if more than this share of the samples, from 0 to 1, has a residual above 0.1 "
+    "voxel.",
+)
+@click.option(
+    "--no-faults",
+    is_flag=True,
+    help="Fail if the mesh is open, not manifold, not oriented outward, intersects itself, has "
+    "samples on the wrong side, or vertices where the grid has no surface.",
+)
+@click.option(
+    "--skip-intersections",
+    is_flag=True,
+    help="Do not count self-intersections, which takes up to half of the time.",
+)
+@grid_options
+@click.option(
+    "--offset",
+    type=float,
+    default=0.0,
+    show_default=True,
+    metavar="D",
+    help="The --offset that the mesh was made with.",
+)
+@click.option(
+    "--max-memory",
+    callback=parse_size,
+    metavar="SIZE",
+    help="Memory limit of the process, such as 1500M or 4G. Default: 60 % of the free memory. "
+    "Larger meshes are refused.",
+)
+@click.option("--force", is_flag=True, help="Replace COLOURED.ply if it exists.")
+@click.option("--json", "as_json", is_flag=True, help="Print the figures as JSON.")
+@click.option("-q", "--quiet", is_flag=True, help="Print errors and passed limits only.")
+def check_command(mesh: Path, grid: Path, **options: Any) -> None:
+    """Check the mesh file MESH against the signed distance grid GRID that it was made from.
+
+    The true surface is not needed. Every exact sample is the radius of an empty ball that touches
+    the surface; its residual is its distance to the mesh minus that radius, in voxels: positive if
+    the mesh does not reach the ball, negative if it pierces it. Truncated or noisy samples promise
+    nothing and are left out. The mesh is also checked for being closed, oriented and manifold, and
+    for self-intersections.
+
+    MESH is any mesh file that trimesh reads; vertices at the same position count as one. GRID is
+    what upsample takes. The exit code is 1 if a limit is passed, whatever the mesh otherwise.
+    """
+    with one_line_errors():
+        check_modules("check", "eval", CHECK_MODULES)
+        passed = run_check(mesh, grid, options)
+    for sentence in passed:
+        print_stderr(f"Limit passed: {sentence}")
+    if passed:
+        sys.exit(1)
+
+
+def run_check(mesh: Path, grid: Path, options: dict[str, Any]) -> list[str]:
+    """Check the files, print the certificate, write the coloured mesh; return passed limits."""
+    from ..certificate.check import check_files
+    from ..certificate.coloured import check_coloured, write_coloured
+    from ..certificate.limits import Limits
+
+    names = ("max_residual", "max_mean", "max_share", "no_faults")
+    limits = Limits(**{name: options[name] for name in names})
+    limits.check()
+    if options["out"]:
+        check_coloured(options["out"], force=options["force"])
+    certificate = check_files(mesh, grid, make_check_options(options))
+    if options["out"]:
+        with raising_interrupts():
+            write_coloured(certificate, options["out"], force=options["force"])
+    passed = limits.passed(certificate)
+    print_certificate(certificate, {"mesh": str(mesh), "grid": str(grid)}, passed, options)
+    return passed
+
+
+def make_check_options(options: dict[str, Any]) -> CheckOptions:
+    """Return the options of the check, picked from all options of a command."""
+    from ..certificate.check import CheckOptions
+
+    names = ("spacing", "origin", "inside", "offset", "max_memory")
+    chosen = {name: options[name] for name in names}
+    return CheckOptions(**chosen, intersections=not options["skip_intersections"])
+
+
+def print_certificate(
+    certificate: Certificate, files: dict[str, str], passed: list[str], options: dict[str, Any]
+) -> None:
+    """Print the certificate to stdout, as lines or as JSON, and notes to stderr."""
+    kept = f"{options['out']} is written" if options["out"] else "nothing was written"
+    if options["as_json"]:
+        report = {**files, **certificate.report(), "limits_passed": passed}
+        print_stdout(json.dumps(report, indent=2), kept)
+    elif not options["quiet"]:
+        print_stdout("\n".join(certificate.lines()), kept)
+    if not options["quiet"]:
+        for note in certificate.notes:
+            print_stderr(f"Note: {note}")

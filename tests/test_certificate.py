@@ -1,0 +1,336 @@
+"""The certificate of a mesh, on surfaces whose residuals have closed forms."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from conftest import ball, count_fans
+from solids import cube, inverted, joined, saved, sphere, torus
+
+from super_sdf import Mesh, SdfGrid
+from super_sdf.certificate import surface
+from super_sdf.certificate.check import CheckOptions, check_files, check_mesh, stated_triangles
+from super_sdf.certificate.coloured import PIERCED, TOUCHING, UNKNOWN, colours, vertex_residuals
+from super_sdf.certificate.limits import NO_EVIDENCE, Limits
+from super_sdf.errors import OptionError, OutOfMemoryError
+from super_sdf.machine import extras
+
+H = 1 / 24  # of the grids
+RADIUS = 0.4
+
+
+def sphere_values(h: float = H, radius: float = RADIUS, half: float = 0.6) -> np.ndarray:
+    axis = np.arange(-half, half + h / 2, h)
+    return np.sqrt(sum(x**2 for x in np.meshgrid(axis, axis, axis, indexing="ij"))) - radius
+
+
+def sphere_grid(clamp: float = np.inf) -> SdfGrid:
+    """Return the exact distance to the sphere of ``round_mesh``, truncated at so many voxels."""
+    values = np.clip(sphere_values(), -clamp * H, clamp * H).astype(np.float32)
+    return SdfGrid(values, H, (-0.6, -0.6, -0.6))
+
+
+def round_mesh(radius: float = RADIUS) -> Mesh:
+    """Return a fine sphere with vertices on it: triangles are at most 1e-4 voxels inside."""
+    found = trimesh.creation.icosphere(subdivisions=6, radius=radius)
+    return Mesh(np.array(found.vertices), np.array(found.faces, np.int32))
+
+
+@pytest.fixture(scope="module")
+def ball_mesh() -> Mesh:
+    return round_mesh()
+
+
+def moved(mesh: Mesh, x: float) -> Mesh:
+    return Mesh(mesh.vertices + np.array([x, 0, 0]), mesh.faces)
+
+
+def test_a_sphere_touches_the_balls_of_its_own_grid(ball_mesh):
+    found = check_mesh(ball_mesh, sphere_grid())
+    figures = found.touching.summary()
+    assert len(found.touching.values) > 3000 and found.touching.noisy == 0
+    assert figures["largest"] < 0.005 and figures["share_above_tenth"] == 0
+    assert found.faults() == []
+    assert found.surface.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=1e-3)
+    assert found.surface.area == pytest.approx(4 * np.pi * RADIUS**2, rel=1e-3)
+    assert (found.surface.components, found.surface.self_intersections) == (1, 0)
+
+
+def test_a_shift_is_its_cosine(ball_mesh):
+    """Along x by a: a sample in direction n is off by a n_x, the mean of its absolute a / 2."""
+    found = check_mesh(moved(ball_mesh, 0.1 * H), sphere_grid()).touching
+    assert found.summary()["largest"] == pytest.approx(0.1, abs=0.01)
+    assert found.summary()["mean"] == pytest.approx(0.05, abs=0.005)
+    cosine = found.points[:, 0] / np.linalg.norm(found.points, axis=1)
+    outside = np.sign(found.values)
+    clear = np.abs(found.values) > 0.2
+    np.testing.assert_allclose(found.residuals[clear], (-0.1 * cosine * outside)[clear], atol=0.01)
+    at = np.array(found.summary()["largest_at"])
+    assert abs(at[0]) > 0.9 * np.linalg.norm(at)
+
+
+def test_a_smaller_sphere_does_not_reach_outside_and_is_pierced_inside():
+    found = check_mesh(round_mesh(RADIUS - 0.2 * H), sphere_grid()).touching
+    clear = np.abs(found.values) > 0.3
+    outside = found.values > 0
+    np.testing.assert_allclose(found.residuals[clear & outside], 0.2, atol=0.01)
+    np.testing.assert_allclose(found.residuals[clear & ~outside], -0.2, atol=0.01)
+    between = (found.values < -0.001) & (found.values > -0.19)  # inside, the mesh says outside
+    expected = between & (
+        np.abs(found.values) + np.abs(found.residuals + np.abs(found.values)) > 0.1
+    )
+    assert np.array_equal(found.wrong_side, expected) and found.wrong_side.any()
+
+
+def test_a_mesh_inside_out_is_noticed(ball_mesh):
+    found = check_mesh(inverted(ball_mesh), sphere_grid())
+    assert found.touching.summary()["largest"] < 0.005  # its triangles are where they should be
+    assert not found.surface.oriented and found.surface.volume < 0
+    inside = found.touching.values < -0.1
+    assert found.touching.wrong_side[inside].all()
+    assert "triangles that face inward" in found.faults()
+
+
+def test_holes_components_and_twists_are_counted(ball_mesh):
+    lidless = surface.examine_surface(Mesh(ball_mesh.vertices, ball_mesh.faces[1:]))
+    assert not lidless.closed and lidless.edges.open_edges == 3
+    assert lidless.manifold and lidless.oriented
+    two = surface.examine_surface(joined(ball_mesh, moved(ball_mesh, 1.0)))
+    assert two.components == 2 and two.faults() == []
+    crossing = surface.examine_surface(joined(ball_mesh, moved(ball_mesh, 0.1)))
+    assert crossing.self_intersections > 50
+    faces = cube().faces.copy()
+    faces[0] = faces[0][::-1]
+    twisted = surface.examine_surface(Mesh(cube().vertices, faces))
+    assert twisted.edges.flipped_edges == 3 and not twisted.oriented
+    doubled = surface.examine_surface(Mesh(cube().vertices, np.concatenate([faces, faces[5:6]])))
+    assert doubled.edges.crowded_edges == 3 and not doubled.manifold
+    collapsed = np.concatenate([cube().faces, [[0, 0, 1]]]).astype(np.int32)
+    assert surface.examine_surface(Mesh(cube().vertices, collapsed)).faults() == []
+
+
+def test_a_vertex_shared_by_two_pieces_is_pinched():
+    other = cube()
+    corner = np.flatnonzero((cube().vertices == 0.5).all(1))[0]
+    opposite = np.flatnonzero((other.vertices == -0.5).all(1))[0]
+    faces = other.faces + 8
+    faces[faces == opposite + 8] = corner
+    found = surface.examine_surface(
+        Mesh(
+            np.concatenate([cube().vertices, other.vertices + 1]),
+            np.concatenate([cube().faces, faces]),
+        )
+    )
+    assert (found.pinched_vertices, found.edges.open_edges, found.components) == (1, 0, 1)
+    assert not found.manifold and found.closed
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_fans_are_those_of_a_graph_search(seed):
+    """On random triangles, open and crowded: where no edge is crowded both agree."""
+    random = np.random.default_rng(seed)
+    faces = torus(12, 8).faces[random.random(192) < 0.7]
+    opposite, edges = surface.pair_edges(faces, 96)
+    assert edges.crowded_edges == edges.flipped_edges == 0
+    fans = surface.count_fans(faces, opposite)
+    assert np.array_equal(fans[np.unique(faces)], count_fans(faces))
+
+
+def test_intersections_do_not_depend_on_the_slabs(monkeypatch):
+    random = np.random.default_rng(3)
+    vertices = random.random((90, 3))
+    faces = surface.without_collapsed(random.integers(0, 90, (120, 3)).astype(np.int32))
+    whole = surface.count_intersections(vertices, faces)
+    monkeypatch.setattr(surface, "FACES_IN_SLAB", 7)
+    assert surface.count_intersections(vertices, faces) == whole > 100
+
+
+def test_truncated_samples_promise_nothing(ball_mesh):
+    near = check_mesh(ball_mesh, sphere_grid(clamp=1.5)).touching
+    whole = check_mesh(ball_mesh, sphere_grid()).touching
+    assert len(near.values) == len(whole.values)  # beyond 1.4 voxels none counts anyway
+    early = check_mesh(ball_mesh, SdfGrid.trusted(
+        np.clip(sphere_values(), -0.9 * H, 0.9 * H).astype(np.float32), H, (-0.6,) * 3
+    )).touching  # fmt: skip
+    assert np.abs(early.values).max() < 0.9 and early.cut_off > 1000
+    assert early.summary()["largest"] < 0.005
+
+
+def test_noisy_samples_promise_nothing(ball_mesh):
+    noise = np.random.default_rng(0).uniform(-0.5, 0.5, sphere_values().shape) * H
+    noisy = SdfGrid.trusted((sphere_values() + 2 * noise).astype(np.float32), H, (-0.6,) * 3)
+    found = check_mesh(ball_mesh, noisy)
+    assert len(found.touching.values) == 0 and found.touching.noisy > 3000
+    assert found.report()["residual"] is None and found.strays is None
+    assert "residual: unknown, since no sample is exact" in found.lines()
+    assert Limits(max_mean=9.0).passed(found) == [NO_EVIDENCE]
+    assert Limits().passed(found) == []
+
+
+def test_a_piece_far_from_every_sample_is_noticed(ball_mesh):
+    """The samples near the surface see nothing of it, but those round it promise empty balls."""
+    speck = round_mesh(0.02)
+    found = check_mesh(joined(ball_mesh, speck), sphere_grid())
+    assert found.touching.summary()["largest"] < 0.005
+    assert found.strays.count == len(speck.vertices)
+    assert found.strays.deepest == pytest.approx((RADIUS - 0.02) / H, abs=1)
+    outside = check_mesh(moved(joined(ball_mesh, moved(ball_mesh, 2.0)), 0), sphere_grid())
+    assert outside.strays.beyond == len(ball_mesh.vertices)
+
+
+def test_colours_are_those_of_the_residuals(ball_mesh):
+    found = check_mesh(moved(ball_mesh, 0.1 * H), sphere_grid())
+    values = vertex_residuals(ball_mesh.vertices, found.touching, H)
+    front = ball_mesh.vertices[:, 0] > 0.95 * RADIUS
+    assert np.abs(values[front]).mean() == pytest.approx(0.1, abs=0.01)
+    said = colours(np.array([0, -1, -0.05, np.nan], np.float32))
+    assert [tuple(row) for row in said[[0, 1, 3]]] == [TOUCHING, PIERCED, UNKNOWN]
+    np.testing.assert_allclose(said[2], (np.array(TOUCHING) + PIERCED) / 2, atol=1)
+    far = vertex_residuals(np.array([[9.0, 9, 9]]), found.touching, H)
+    assert np.isnan(far).all()
+
+
+def test_memory_is_refused_with_the_figure(ball_mesh, tmp_path):
+    path = saved(ball_mesh, tmp_path / "ball.ply")
+    assert stated_triangles(path) == len(ball_mesh.faces)
+    assert stated_triangles(saved(ball_mesh, tmp_path / "ball.stl")) == len(ball_mesh.faces)
+    assert stated_triangles(saved(ball_mesh, tmp_path / "ball.off")) == 0
+    with pytest.raises(
+        OutOfMemoryError, match=r"checking 81,920 triangles needs \d+ MB of memory, 9 MB"
+    ):
+        check_files(path, tmp_path / "never-read.npz", CheckOptions(max_memory=9_000_000))
+
+
+def test_limits(ball_mesh):
+    found = check_mesh(moved(ball_mesh, 0.15 * H), sphere_grid())
+    assert Limits(0.2, 0.1, 0.5).passed(found) == []
+    passed = Limits(0.1, 0.05, 0.01, True).passed(found)
+    assert passed[0].startswith("the largest residual is 0.1")
+    assert passed[0].endswith(" voxels, --max-residual is 0.1")
+    assert passed[1].startswith("the mean residual is 0.07")
+    assert passed[2].endswith(", --max-share is 0.01") and len(passed) == 4
+    for wrong in (Limits(max_residual=-1.0), Limits(max_mean=np.nan), Limits(max_share=2.0)):
+        with pytest.raises(OptionError):
+            wrong.check()
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch, ball_mesh):
+    """A folder with a grid of the sphere, its mesh, and a shifted one."""
+    monkeypatch.chdir(tmp_path)
+    np.savez("ball.npz", values=sphere_grid().values, spacing=H, origin=(-0.6, -0.6, -0.6))
+    saved(ball_mesh, Path("ball.ply"))
+    saved(moved(ball_mesh, 0.1 * H), Path("off.ply"))
+    return tmp_path
+
+
+def test_the_command_prints_figures(here, command):
+    code, out, err = command("check", "ball.ply", "ball.npz", "--max-residual", 0.01, "--no-faults")
+    assert (code, err) == (0, "")
+    lines = out.splitlines()
+    assert lines[0].startswith("mesh: 40,962 vertices, 81,920 triangles, 1 component, volume 0.268")
+    assert lines[1].endswith(" cut off and 0 noisy left out")
+    assert lines[2].startswith("residual in voxels: mean 0.000")
+    assert lines[3] == "above 0.1 voxel: 0.00% of the samples (0.00% not touching, 0.00% pierced)"
+    assert lines[4] == "faults: none (closed, oriented, manifold, no self-intersections)"
+    code, out, _ = command("check", "ball.ply", "ball.npz", "--skip-intersections")
+    assert code == 0 and out.endswith("self-intersections: not counted\n")
+    assert len(os.listdir()) == 3
+
+
+def test_a_passed_limit_is_exit_code_1_and_json_has_all(here, command):
+    code, out, err = command("check", "off.ply", "ball.npz", "--json", "--max-mean", 0.01)
+    report = json.loads(out)
+    assert code == 1
+    assert err == f"Limit passed: {report['limits_passed'][0]}\n"
+    assert report["residual"]["mean"] == pytest.approx(0.05, abs=0.005)
+    assert report["samples"]["noisy"] == 0 and report["wrong_side"] >= 0
+    assert report["surface"]["closed"] and report["surface"]["self_intersections"] == 0
+    assert report["strays"] == {"beyond": 0, "count": 0, "deepest": pytest.approx(0.1, abs=0.05)}
+
+
+def test_the_offset_is_that_of_the_mesh(here, command):
+    saved(round_mesh(RADIUS + H), Path("grown.ply"))
+    words = ("check", "grown.ply", "ball.npz", "--max-residual", 0.01, "-q")
+    assert command(*words, "--offset", H) == (0, "", "")
+    assert command(*words)[0] == 1
+
+
+def test_the_coloured_mesh_is_a_mesh_with_residuals(here, command):
+    assert command("check", "off.ply", "ball.npz", "--out", "c.ply", "-q") == (0, "", "")
+    mesh = trimesh.load("c.ply", process=False)
+    assert len(mesh.faces) == 81920 and mesh.is_watertight
+    residual = mesh.metadata["_ply_raw"]["vertex"]["data"]["residual"]
+    assert np.abs(residual).max() == pytest.approx(0.1, abs=0.01)
+    worst = mesh.visual.vertex_colors[np.abs(residual).argmax()][:3]
+    assert abs(int(worst[0]) - int(worst[2])) > 100
+    assert command("check", "off.ply", "ball.npz", "--out", "c.ply")[0] == 1  # exists
+    assert command("check", "off.ply", "ball.npz", "--out", "c.ply", "--force", "-q")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        ("none.ply ball.npz", 1, "none.ply does not exist"),
+        ("ball.ply none.npz", 1, "none.npz does not exist"),
+        ("ball.ply ball.ply", 2, "ball.ply is not a grid file: give .npy or .npz"),
+        ("ball.ply ball.npz --out c.stl", 2, "c.stl is not a coloured mesh file: give .ply"),
+        ("ball.ply ball.npz --out no/c.ply", 1, "no is not a folder: make it first"),
+        ("ball.ply ball.npz --out off.ply", 1, "off.ply exists: remove it or use --force"),
+        ("ball.ply ball.npz --max-share 2", 2, "--max-share is 2: give a share from 0 to 1"),
+        ("ball.ply ball.npz --max-mean nan", 2, "--max-mean is nan: give 0 voxels or more"),
+        ("ball.ply ball.npz --max-residual -1", 2, "--max-residual is -1: give 0 voxels or more"),
+        ("ball.ply ball.npz --offset nan", 2, "offset is nan: give a finite number, in world"),
+        ("ball.ply ball.npz --offset 9", 1, "no surface at 9: the values go from "),
+        ("ball.ply ball.npz --max-memory 9M", 1, "checking 81,920 triangles needs "),
+        ("ball.ply ball.npz --spacing 9", 1, "spacing"),
+    ],
+)
+def test_errors_are_one_line_and_leave_nothing(here, command, words, code, message):
+    before = sorted(os.listdir())
+    found, out, err = command("check", *words.split())
+    assert (found, out) == (code, "")
+    assert len(err.splitlines()) == 1 and message in err, err
+    assert sorted(os.listdir()) == before
+
+
+def test_a_missing_extra_is_said_before_the_work(here, command, monkeypatch):
+    monkeypatch.setattr(extras, "missing_modules", lambda modules: ["igl"])
+    line = "needs igl: pip install -e '.[eval]' in a clone of super-sdf\n"
+    assert command("check", "none.ply", "none.npz") == (1, "", f"Error: check {line}")
+    for words in (("upsample", "ball.npz", "new.ply"), ("batch", "ball.npz", "--out", "new")):
+        code, _, err = command(*words, "--check")
+        assert (code, err) == (1, f"Error: --check {line}")
+    assert not Path("new.ply").exists() and not Path("new").exists()
+
+
+def test_upsample_checks_what_it_wrote(here, command):
+    code, out, err = command("upsample", "ball.npz", "new.ply", "--check", "--json")
+    assert code == 0
+    report = json.loads(out)["check"]
+    assert report["residual"]["mean"] < 0.02 and report["surface"]["closed"]
+    assert err.splitlines()[-1].startswith("Check: residual 0.00")
+    assert err.splitlines()[-1].endswith("; no faults")
+
+
+def test_batch_records_certificates_and_makes_those_that_are_missing(here, run_batch):
+    Path("in").mkdir()
+    np.savez("in/a.npz", values=ball(16, 5.0).values, spacing=1.0)
+    assert run_batch("in")[0] == 0
+    code, _, err = run_batch("in", "--check")
+    row = json.loads(Path("out/report.jsonl").read_text().splitlines()[-1])
+    assert code == 0 and row["check"]["residual"]["largest"] < 0.2
+    assert row["check"]["surface"]["closed"]
+    assert "1 done, 0 failed" in err and "Check: mean residual 0.0" in err
+    for flags in (("--check",), ()):  # now it is there
+        assert "nothing to do: 1 done before" in run_batch("in", *flags)[2]
+
+
+def test_a_mesh_of_marching_cubes_is_certified_worse_than_the_refined_one(here, command):
+    """On a coarse sphere: the order is right."""
+    coarse = check_mesh(sphere(RADIUS, 24), sphere_grid()).touching.summary()["mean"]
+    fine = check_mesh(sphere(RADIUS, 96), sphere_grid()).touching.summary()["mean"]
+    assert fine < coarse / 4
