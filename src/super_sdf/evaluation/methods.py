@@ -13,19 +13,24 @@ import numpy as np
 from scipy import ndimage
 from skimage.measure import marching_cubes
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, IntArray
 from ..errors import NoSurfaceError
 from ..grid.sdf_grid import SdfGrid
-from ..mesh import Mesh
+from ..mesh import Mesh, join_meshes
 from ..network.decoder import Decoder
-from ..pipeline import reconstruct, refine
+from ..pipeline import reconstruct, refine, upsample
 from ..slabs.cutting import whole
-from ..steps.nodes import block_ijk
+from ..steps.band import neighbour_table
+from ..steps.cap import close_at_border
+from ..steps.field import FineField
+from ..steps.nodes import block_ijk, share_parts
+from ..steps.sharp import extract_sharp_pieces
 from ..steps.survey import survey
 from .cases import Case, spread_samples
 from .names import MESHERS, OURS, meshed_by
 
 NUDGE = np.float32(1e-9)  # replaces exact zeros: a vertex on a node can open the surface
+FACTOR_OF_BLOCKS = 4  # of the blocks that a dense field is cut into
 EMPTY = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
 
 
@@ -175,7 +180,41 @@ def refined_surface(grid: SdfGrid, network: Decoder, factor: int) -> Mesh:
     return reconstruct(grid, network, factor=factor, cap=True)
 
 
-BY_MESHER: dict[str, Mesher] = {"marching": Mesher(refined_surface, isosurface)}
+def sharp_surface(grid: SdfGrid, network: Decoder, factor: int) -> Mesh:
+    """Mesh a grid with super-sdf and the mesher that keeps edges, capped at the grid's border."""
+    field = close_at_border(upsample(grid, network, factor), grid)
+    return join_meshes(extract_sharp_pieces(field, grid))
+
+
+def sharp_isosurface(field: FloatArray, spacing: float, low: float) -> Mesh:
+    """Mesh a dense field, (4 n + 1)^3, by the mesher that keeps edges; see ``isosurface``."""
+    if not field.min() < 0 < field.max():
+        return EMPTY
+    factor = FACTOR_OF_BLOCKS if (len(field) - 1) % FACTOR_OF_BLOCKS == 0 else 2
+    shape = tuple((nodes - 1) // factor for nodes in field.shape)
+    block = block_ijk(factor)
+    inside = np.stack([_node_of_blocks(field, node, factor) <= 0 for node in block])
+    crossed = ndimage.binary_dilation(inside.any(0) & ~inside.all(0), np.ones((3, 3, 3)), 2)
+    voxel_ijk = np.argwhere(crossed).astype(np.int32)
+    values = [_node_of_blocks(field, node, factor)[crossed] for node in block]
+    parts = share_parts(neighbour_table(voxel_ijk, shape))
+    side = spacing * factor
+    blocks = np.stack(values) * np.float32(2 / side)
+    fine = FineField(shape, factor, voxel_ijk, blocks, parts, (0, shape[0]))
+    grid = SdfGrid.trusted(_node_of_blocks(field, block[0], factor), side, low + side / 2)
+    return join_meshes(extract_sharp_pieces(fine, grid))
+
+
+def _node_of_blocks(field: FloatArray, node: IntArray, factor: int) -> FloatArray:
+    """Return one node of every block of a dense field."""
+    first = tuple(slice(start, start + n - factor, factor) for start, n in zip(node, field.shape))
+    return field[first]
+
+
+BY_MESHER: dict[str, Mesher] = {
+    "marching": Mesher(refined_surface, isosurface),
+    "sharp": Mesher(sharp_surface, sharp_isosurface),
+}
 
 METHODS: dict[str, Method] = {
     "mc": partial(coarse_surface, table="lorensen"),

@@ -24,7 +24,7 @@ LABELS = {**METHOD_LABELS, **PEER_LABELS, FLOOR: "floor: the reference against i
 EXPERIMENTS = ("factors", "noise", "iterated", "scale", "timings", "meshers")
 
 # What turns a field into triangles. The first is that of the main tables; add others behind it.
-MESHERS: tuple[str, ...] = ("marching",)
+MESHERS: tuple[str, ...] = ("marching", "sharp")
 MESHED = (OURS, "bound")  # the methods that every mesher is measured with
 
 

@@ -11,9 +11,11 @@ that do not lie on a face, so that no edge can belong to more than two triangles
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import IntArray
 
@@ -48,6 +50,46 @@ def triangle_table() -> tuple[IntArray, IntArray]:
         if triangles:
             table[case, : len(triangles)] = triangles
     return counts, table
+
+
+@dataclass(frozen=True, eq=False)
+class LoopTable:
+    """The loops of all cases, one after the other: each is a patch of the surface in a cell.
+
+    Attributes
+    ----------
+    count, first : (256,) int64
+        How many loops a case has, and which is its first.
+    sides : (L,) int64
+        How many edges a loop has.
+    edges : (L, S) int64
+        Its cell edges in order, counter-clockwise from outside; -1 after the last.
+    triangles : (L, T, 3) int64
+        Places in the loop of the corners of its triangles, of which there are ``sides - 2``.
+    """
+
+    count: NDArray[np.int64]
+    first: NDArray[np.int64]
+    sides: NDArray[np.int64]
+    edges: NDArray[np.int64]
+    triangles: NDArray[np.int64]
+
+
+@lru_cache(maxsize=1)
+def loop_table() -> LoopTable:
+    """Return the loops of every case, in the order of ``triangle_table``."""
+    loops = [list(_loops(case)) for case in range(256)]
+    count = np.array([len(some) for some in loops])
+    flat = [loop for some in loops for loop in some]
+    sides = np.array([len(loop) for loop in flat])
+    edges = np.full((len(flat), sides.max()), -1)
+    triangles = np.zeros((len(flat), sides.max() - 2, 3), np.int64)
+    for row, loop in enumerate(flat):
+        edges[row, : len(loop)] = loop
+        place = {edge: nth for nth, edge in enumerate(loop)}
+        cut = [[place[edge] for edge in triangle] for triangle in _triangulate(loop)]
+        triangles[row, : len(cut)] = cut
+    return LoopTable(count, np.cumsum(count) - count, sides, edges, triangles)
 
 
 def _loops(case: int) -> Iterator[list[int]]:

@@ -246,19 +246,31 @@ def place_vertices(
     """Return the vertices on the edges that some voxels own, (n, 3), in world units."""
     own = crossings.own(rows)
     row, edge = crossings.own_row[own], crossings.own_edge[own]
+    return to_world(lattice_positions(field, row, edge), field, grid)
+
+
+def lattice_positions(
+    field: FineField, row: IntArray, edge: NDArray[np.int16]
+) -> NDArray[np.float64]:
+    """Return where the surface crosses edges of blocks, (3, n), in fine spacings from node 0."""
     axis, node = np.divmod(edge, np.int16(len(field.blocks)))
     share = _crossing(field.blocks[node, row], field.blocks[_ends(field.factor)[edge], row])
-    vertices: NDArray[Any] = np.empty((len(row), 3), vertex_type(grid, field.factor))
-    for along in range(3):
-        voxel = field.voxel_ijk[row, along]
+    positions = np.empty((3, len(row)))
+    for along, samples in enumerate(field.shape):
+        voxel, runs = field.voxel_ijk[row, along], axis == along
         start = field.factor * voxel + block_ijk(field.factor)[node, along]
-        runs, last = axis == along, field.shape[along] * field.factor
-        lattice: NDArray[np.float64] = start + np.where(runs, share, 0.0)
-        if ((voxel < 0) | (voxel >= field.shape[along])).any():  # voxels of a cap
-            lattice = _onto_border(start, runs, share, last)
-        # The fine index K i + K/2 is sample i.
-        sample = lattice / field.factor - 0.5
-        vertices[:, along] = sample * grid.spacing[along] + grid.origin[along]
+        positions[along] = start + np.where(runs, share, 0.0)
+        if ((voxel < 0) | (voxel >= samples)).any():  # voxels of a cap
+            positions[along] = _onto_border(start, runs, share, samples * field.factor)
+    return positions
+
+
+def to_world(positions: NDArray[np.float64], field: FineField, grid: SdfGrid) -> NDArray[Any]:
+    """Return positions (3, n) in fine spacings as vertices (n, 3) in world units."""
+    vertices: NDArray[Any] = np.empty(positions.shape[::-1], vertex_type(grid, field.factor))
+    for axis, position in enumerate(positions):
+        sample = position / field.factor - 0.5  # the fine index K i + K/2 is sample i
+        vertices[:, axis] = sample * grid.spacing[axis] + grid.origin[axis]
     return vertices
 
 
@@ -313,19 +325,19 @@ def connect(field: FineField, crossings: Crossings, rows: slice, first: int) -> 
     """
     before = field.plane_before(rows).start
     edges = 3 * len(field.blocks)
-    vertex_at = _number_vertices(field, crossings, before, rows, first)
+    vertex_at = number_edges(field, crossings, before, rows, first)
     some = crossings.cells(rows)
     case = crossings.case[some]
     counts, starts, table = _flat_triangles(field.factor)
     low = (crossings.cell_row[some] - before) * np.int64(edges)
-    low += _low_nodes(field.factor)[crossings.cell[some]]
+    low += cells_low_nodes(field.factor)[crossings.cell[some]]
     times = counts[case]
     nth = np.arange(times.sum()) + np.repeat(starts[case] - (np.cumsum(times) - times), times)
     faces: IntArray = vertex_at.take(table[nth] + np.repeat(low, times)[:, None])
     return faces
 
 
-def _number_vertices(
+def number_edges(
     field: FineField, crossings: Crossings, before: int, rows: slice, first: int
 ) -> IntArray:
     """Return the vertex lookup table: the vertex on each edge of some voxels' blocks, (n 3 Q,).
@@ -360,7 +372,7 @@ def _strides(factor: int) -> NDArray[np.int64]:
 
 
 @lru_cache
-def _low_nodes(factor: int) -> NDArray[np.intp]:
+def cells_low_nodes(factor: int) -> NDArray[np.intp]:
     """Return the node at the low corner of each cell of a block, (K^3,)."""
     return np.flatnonzero((block_ijk(factor) < factor).all(1))
 

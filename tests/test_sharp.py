@@ -1,0 +1,104 @@
+"""The mesher that keeps edges and corners: where they lie, and a manifold on anything."""
+
+import numpy as np
+import pytest
+from conftest import ball, count_fans, trilinear, walled
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_isosurface import dense_field, fields
+
+from super_sdf import Mesh, SdfGrid, extract_mesh, load_network, upsample
+from super_sdf.evaluation.methods import sharp_isosurface
+from super_sdf.mesh import join_meshes
+from super_sdf.steps.cell_cases import loop_table, triangle_table
+from super_sdf.steps.sharp import extract_sharp_pieces
+
+TURN = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+
+
+def extract_sharp(field, grid) -> Mesh:
+    return join_meshes(extract_sharp_pieces(field, grid))
+
+
+def turned_box(half, samples=22):
+    """The distance to a box that does not stand along the axes, spacing 1."""
+    ijk = np.indices((samples,) * 3).reshape(3, -1) - (samples / 2 + 0.13)
+    beyond = np.abs(TURN.T @ ijk) - half[:, None]
+    distance = np.linalg.norm(np.maximum(beyond, 0), axis=0) + np.minimum(beyond.max(0), 0)
+    return SdfGrid.trusted(distance.reshape((samples,) * 3), 1.0)
+
+
+def test_loops_make_the_triangles_of_the_table():
+    loops, (counts, table) = loop_table(), triangle_table()
+    for case in range(256):
+        made = []
+        for loop in range(loops.first[case], loops.first[case] + loops.count[case]):
+            places = loops.triangles[loop, : loops.sides[loop] - 2]
+            made += loops.edges[loop][places].tolist()
+        assert made == table[case, : counts[case]].tolist()
+
+
+def test_a_smooth_surface_stays_that_of_marching_cubes():
+    field = upsample(ball(), trilinear)
+    plain, sharp = extract_mesh(field, ball()), extract_sharp(field, ball())
+    np.testing.assert_array_equal(sharp.vertices, plain.vertices)
+    assert set(map(tuple, sharp.faces)) == set(map(tuple, plain.faces))
+
+
+def test_edges_and_corners_of_a_box_are_kept():
+    half = np.array([6.2, 5.1, 4.3])
+    grid = turned_box(half)
+    field = upsample(grid, load_network())
+    sharp = extract_sharp(field, grid)
+    assert sharp.is_closed() and (count_fans(sharp.faces) == 1).all()
+    for signs in np.indices((2, 2, 2)).reshape(3, 8).T * 2 - 1:
+        corner = TURN @ (half * signs) + 11.13
+        assert np.linalg.norm(sharp.vertices - corner, axis=1).min() < 0.12
+    assert sharp.volume() == pytest.approx(8 * half.prod(), rel=2e-3)
+
+
+@settings(max_examples=60, deadline=None)
+@given(fields, st.sampled_from([2, 4]))
+def test_any_field_gives_a_closed_oriented_manifold(values, factor):
+    values = walled(values)
+    values[3, 3, 3] = -1
+    grid = SdfGrid.trusted(values, (1.0, 1.0, 1.0))
+    mesh = extract_sharp(upsample(grid, trilinear, factor), grid)
+    assert mesh.open_edges() == 0
+    assert (count_fans(mesh.faces) == 1).all()
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.integers(0, 10**6), st.sampled_from([0.05, 0.3, 1.0]))
+def test_any_lattice_gives_a_closed_manifold_with_features_everywhere(seed, least):
+    """With every patch a feature: fans and turned sides, ambiguous faces among them."""
+    lattice = np.random.default_rng(seed).normal(size=(9, 11, 9)).astype(np.float32) * least
+    lattice[[0, -1]] = lattice[:, [0, -1]] = lattice[:, :, [0, -1]] = 1
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("super_sdf.steps.sharp.SHARP_COSINE", 1.1)
+        patch.setattr("super_sdf.steps.sharp.LEAST_SLOPE_TRUST", 0)
+        patch.setattr("super_sdf.steps.sharp.LEAST_SUPPORT", 0)
+        mesh = extract_sharp(*dense_field(lattice))
+    if len(mesh.faces):
+        assert mesh.open_edges() == 0
+        assert (count_fans(mesh.faces) == 1).all()
+
+
+def test_a_field_that_is_no_distance_has_no_features():
+    grid = turned_box(np.array([6.2, 5.1, 4.3]))
+    field = upsample(SdfGrid.trusted(3 * grid.values, 1.0), trilinear)
+    plain, sharp = extract_mesh(field, grid), extract_sharp(field, grid)
+    np.testing.assert_array_equal(sharp.vertices, plain.vertices)
+
+
+def test_the_true_distance_is_meshed_on_its_edges():
+    """Of a dense field, as for the bound in evaluations."""
+    half = np.array([3.1, 2.5, 2.1])
+    lattice = turned_box(4 * half, 49).values.astype(np.float32) / 4
+    mesh = sharp_isosurface(lattice, 0.25, 0.0)
+    assert mesh.is_closed() and (count_fans(mesh.faces) == 1).all()
+    middle = (49 / 2 + 0.13) / 4
+    for signs in np.indices((2, 2, 2)).reshape(3, 8).T * 2 - 1:
+        corner = TURN @ (half * signs) + middle
+        assert np.linalg.norm(mesh.vertices - corner, axis=1).min() < 0.03
+    assert mesh.volume() == pytest.approx(8 * half.prod(), rel=1e-3)
