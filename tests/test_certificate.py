@@ -16,6 +16,7 @@ from super_sdf.certificate.check import CheckOptions, check_files, check_mesh, s
 from super_sdf.certificate.coloured import PIERCED, TOUCHING, UNKNOWN, colours, vertex_residuals
 from super_sdf.certificate.limits import NO_EVIDENCE, Limits
 from super_sdf.errors import OptionError, OutOfMemoryError
+from super_sdf.files import coloured_ply
 from super_sdf.machine import extras
 
 H = 1 / 24  # of the grids
@@ -295,6 +296,19 @@ def test_errors_are_one_line_and_leave_nothing(here, command, words, code, messa
     assert (found, out) == (code, "")
     assert len(err.splitlines()) == 1 and message in err, err
     assert sorted(os.listdir()) == before
+
+
+def test_a_coloured_mesh_is_never_left_half_written(here, command, monkeypatch):
+    def full(faces):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(coloured_ply, "ply_rows", full)
+    Path("c.ply").write_text("old")
+    before = sorted(os.listdir())
+    code, out, err = command("check", "off.ply", "ball.npz", "--out", "c.ply", "--force")
+    assert (code, out) == (1, "")
+    assert err == "Error: c.ply cannot be written: No space left on device\n"
+    assert sorted(os.listdir()) == before and Path("c.ply").read_text() == "old"
 
 
 def test_a_missing_extra_is_said_before_the_work(here, command, monkeypatch):
