@@ -16,6 +16,7 @@ from super_sdf.certificate.check import CheckOptions, check_files, check_mesh, s
 from super_sdf.certificate.coloured import PIERCED, TOUCHING, UNKNOWN, colours, vertex_residuals
 from super_sdf.certificate.limits import NO_EVIDENCE, Limits
 from super_sdf.errors import OptionError, OutOfMemoryError
+from super_sdf.files import coloured_ply
 from super_sdf.machine import extras
 
 H = 1 / 24  # of the grids
@@ -166,8 +167,8 @@ def test_noisy_samples_promise_nothing(ball_mesh):
     assert len(found.touching.values) == 0 and found.touching.noisy > 3000
     assert found.report()["residual"] is None and found.strays is None
     assert "residual: unknown, since no sample is exact" in found.lines()
-    assert Limits(max_mean=9.0).passed(found) == [NO_EVIDENCE]
-    assert Limits().passed(found) == []
+    assert Limits(max_mean=9.0).exceeded(found) == [NO_EVIDENCE]
+    assert Limits().exceeded(found) == []
 
 
 def test_a_piece_far_from_every_sample_is_noticed(ball_mesh):
@@ -206,8 +207,8 @@ def test_memory_is_refused_with_the_figure(ball_mesh, tmp_path):
 
 def test_limits(ball_mesh):
     found = check_mesh(moved(ball_mesh, 0.15 * H), sphere_grid())
-    assert Limits(0.2, 0.1, 0.5).passed(found) == []
-    passed = Limits(0.1, 0.05, 0.01, True).passed(found)
+    assert Limits(0.2, 0.1, 0.5).exceeded(found) == []
+    passed = Limits(0.1, 0.05, 0.01, True).exceeded(found)
     assert passed[0].startswith("the largest residual is 0.1")
     assert passed[0].endswith(" voxels, --max-residual is 0.1")
     assert passed[1].startswith("the mean residual is 0.07")
@@ -241,11 +242,11 @@ def test_the_command_prints_figures(here, command):
     assert len(os.listdir()) == 3
 
 
-def test_a_passed_limit_is_exit_code_1_and_json_has_all(here, command):
+def test_an_exceeded_limit_is_exit_code_1_and_json_has_all(here, command):
     code, out, err = command("check", "off.ply", "ball.npz", "--json", "--max-mean", 0.01)
     report = json.loads(out)
     assert code == 1
-    assert err == f"Limit passed: {report['limits_passed'][0]}\n"
+    assert err == f"Limit exceeded: {report['limits_exceeded'][0]}\n"
     assert report["residual"]["mean"] == pytest.approx(0.05, abs=0.005)
     assert report["samples"]["noisy"] == 0 and report["wrong_side"] >= 0
     assert report["surface"]["closed"] and report["surface"]["self_intersections"] == 0
@@ -295,6 +296,19 @@ def test_errors_are_one_line_and_leave_nothing(here, command, words, code, messa
     assert (found, out) == (code, "")
     assert len(err.splitlines()) == 1 and message in err, err
     assert sorted(os.listdir()) == before
+
+
+def test_a_coloured_mesh_is_never_left_half_written(here, command, monkeypatch):
+    def full(faces):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(coloured_ply, "ply_rows", full)
+    Path("c.ply").write_text("old")
+    before = sorted(os.listdir())
+    code, out, err = command("check", "off.ply", "ball.npz", "--out", "c.ply", "--force")
+    assert (code, out) == (1, "")
+    assert err == "Error: c.ply cannot be written: No space left on device\n"
+    assert sorted(os.listdir()) == before and Path("c.ply").read_text() == "old"
 
 
 def test_a_missing_extra_is_said_before_the_work(here, command, monkeypatch):

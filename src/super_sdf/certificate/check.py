@@ -27,7 +27,7 @@ from .surface import Surface, examine_surface
 from .touching import NOTICEABLE, Touching, touch
 
 # Bytes for each triangle and each exact sample, beside mesh and band, at the most: search trees.
-BYTES_PER_TRIANGLE = 400
+BYTES_PER_TRIANGLE = 420
 BYTES_PER_SAMPLE = 150
 HEADER_BYTES = 4096  # of a PLY file, in which the number of faces is looked for
 

@@ -38,8 +38,8 @@ class Limits:
         if self.max_share is not None and self.max_share > 1:
             raise OptionError(f"--max-share is {self.max_share:g}: give a share from 0 to 1")
 
-    def passed(self, certificate: Certificate) -> list[str]:
-        """Return a sentence for each limit that a certificate passes."""
+    def exceeded(self, certificate: Certificate) -> list[str]:
+        """Return a sentence for each limit that a certificate exceeds."""
         faults = certificate.faults() if self.no_faults else []
         asked = {
             "largest": ("--max-residual", self.max_residual, "the largest residual is", " voxels"),
@@ -50,9 +50,9 @@ class Limits:
         if asked and not len(certificate.touching.values):
             return [NO_EVIDENCE, *faults]
         figures = certificate.touching.summary() if asked else {}
-        passed = [
+        found = [
             f"{words} {figures[key]:.4g}{unit}, {option} is {limit:g}"
             for key, (option, limit, words, unit) in asked.items()
             if limit is not None and figures[key] > limit
         ]
-        return passed + [f"the mesh has {fault}" for fault in faults]
+        return found + [f"the mesh has {fault}" for fault in faults]

@@ -85,7 +85,7 @@ Examples:
 )
 @click.option("--force", is_flag=True, help="Replace COLOURED.ply if it exists.")
 @click.option("--json", "as_json", is_flag=True, help="Print the figures as JSON.")
-@click.option("-q", "--quiet", is_flag=True, help="Print errors and passed limits only.")
+@click.option("-q", "--quiet", is_flag=True, help="Print errors and exceeded limits only.")
 def check_command(mesh: Path, grid: Path, **options: Any) -> None:
     """Check the mesh file MESH against the signed distance grid GRID that it was made from.
 
@@ -96,19 +96,19 @@ def check_command(mesh: Path, grid: Path, **options: Any) -> None:
     for self-intersections.
 
     MESH is any mesh file that trimesh reads; vertices at the same position count as one. GRID is
-    what upsample takes. The exit code is 1 if a limit is passed, whatever the mesh otherwise.
+    what upsample takes. The exit code is 1 if a limit is exceeded.
     """
     with one_line_errors():
         check_modules("check", "eval", CHECK_MODULES)
-        passed = run_check(mesh, grid, options)
-    for sentence in passed:
-        print_stderr(f"Limit passed: {sentence}")
-    if passed:
+        exceeded = run_check(mesh, grid, options)
+    for sentence in exceeded:
+        print_stderr(f"Limit exceeded: {sentence}")
+    if exceeded:
         sys.exit(1)
 
 
 def run_check(mesh: Path, grid: Path, options: dict[str, Any]) -> list[str]:
-    """Check the files, print the certificate, write the coloured mesh; return passed limits."""
+    """Check the files, print the certificate, write the coloured mesh; return exceeded limits."""
     from ..certificate.check import check_files
     from ..certificate.coloured import check_coloured, write_coloured
     from ..certificate.limits import Limits
@@ -122,9 +122,9 @@ def run_check(mesh: Path, grid: Path, options: dict[str, Any]) -> list[str]:
     if options["out"]:
         with raising_interrupts():
             write_coloured(certificate, options["out"], force=options["force"])
-    passed = limits.passed(certificate)
-    print_certificate(certificate, {"mesh": str(mesh), "grid": str(grid)}, passed, options)
-    return passed
+    exceeded = limits.exceeded(certificate)
+    print_certificate(certificate, {"mesh": str(mesh), "grid": str(grid)}, exceeded, options)
+    return exceeded
 
 
 def make_check_options(options: dict[str, Any]) -> CheckOptions:
@@ -137,12 +137,12 @@ def make_check_options(options: dict[str, Any]) -> CheckOptions:
 
 
 def print_certificate(
-    certificate: Certificate, files: dict[str, str], passed: list[str], options: dict[str, Any]
+    certificate: Certificate, files: dict[str, str], exceeded: list[str], options: dict[str, Any]
 ) -> None:
     """Print the certificate to stdout, as lines or as JSON, and notes to stderr."""
     kept = f"{options['out']} is written" if options["out"] else "nothing was written"
     if options["as_json"]:
-        report = {**files, **certificate.report(), "limits_passed": passed}
+        report = {**files, **certificate.report(), "limits_exceeded": exceeded}
         print_stdout(json.dumps(report, indent=2), kept)
     elif not options["quiet"]:
         print_stdout("\n".join(certificate.lines()), kept)
