@@ -86,7 +86,7 @@ def tables_of(out: Path) -> str:
 
 
 def test_killed_and_started_again_it_ends_with_the_same_tables(meshes, tmp_path):
-    words = [meshes, "--sizes", 12, "--methods", "mc", "ours", "--jobs", 2, "--no-pictures"]
+    words = [meshes, "--sizes", 12, "--methods", "mc", "--jobs", 2, "--no-pictures"]
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     done = evaluate(*words, "--out", whole)
     assert done.returncode == 0, done.stderr
@@ -94,7 +94,7 @@ def test_killed_and_started_again_it_ends_with_the_same_tables(meshes, tmp_path)
     command = [sys.executable, "-m", "super_sdf", "evaluate", *map(str, words)]
     child = subprocess.Popen([*command, "--out", str(cut)], stderr=subprocess.DEVNULL)
     store = cut / "results.jsonl"
-    while not (store.exists() and len(store.read_text().splitlines()) > 3):
+    while not (store.exists() and len(store.read_text().splitlines()) > 1):
         assert child.poll() is None
         time.sleep(0.02)
     workers = psutil.Process(child.pid).children(recursive=True)
