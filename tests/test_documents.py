@@ -30,7 +30,7 @@ def test_the_first_two_commands_set_up_and_run_the_job_and_the_tests():
     first, second = blocks("sh")[:2]
     assert first.startswith("python3 -m venv .venv && ") and second.startswith("python3 -m venv")
     assert "super-sdf upsample examples/part.npz part.ply" in first
-    assert second.rstrip().endswith("python -m pytest")
+    assert second.rstrip().endswith("python -m pytest -n auto")
     assert README.index(first) < README.index("\n## ")  # at the top
 
 
