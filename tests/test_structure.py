@@ -75,6 +75,7 @@ def test_no_string_names_a_module(module):
     strings = [node.value for node in ast.walk(ast.parse(MODULES[module].read_text()))
                if isinstance(node, ast.Constant) and isinstance(node.value, str)]  # fmt: skip
     assert not [text for text in strings if re.fullmatch(r"super_sdf(\.\w+)+", text)]
+    assert "import_module" not in MODULES[module].read_text()
 
 
 @pytest.mark.parametrize("module", [m for m in MODULES if room_of(m) not in WITH_EXTRAS])

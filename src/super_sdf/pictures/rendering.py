@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -264,13 +263,16 @@ def _top_of(values: NDArray[Any]) -> float:
 def _pyvista() -> Any:
     """Import PyVista, which takes a second."""
     check_modules("drawing meshes", "view")
-    return import_module("pyvista")
+    import pyvista
+
+    return pyvista
 
 
 @contextmanager
 def _quiet_without_display() -> Iterator[None]:
     """Keep VTK from warning that it found no display: it draws without one."""
-    log = import_module("vtkmodules.vtkCommonCore").vtkLogger
+    from vtkmodules.vtkCommonCore import vtkLogger as log  # noqa: N813
+
     log.SetStderrVerbosity(log.VERBOSITY_ERROR)
     try:
         yield
