@@ -149,7 +149,7 @@ def convert(case: Case, folder: Path, bound: int) -> Run:
     printed, errors = run_python([*words, "--max-memory", str(bound)])
     printed, _, last = printed.rpartition("\n")
     status, seconds, peak = last.split()
-    peak_bytes = int(peak) * (1 if sys.platform == "darwin" else 1024)
+    peak_bytes = int(peak)
     if int(status):
         return Run(float(seconds), peak_bytes, {}, errors.strip().rpartition("\n")[2])
     return Run(float(seconds), peak_bytes, json.loads(printed))
