@@ -13,8 +13,8 @@ from ..steps.survey import Band
 # block, per thread (its chunk), and a constant.
 STAGES = {
     "average": (216, 300, 5.0, 1e7, 2e7),
-    "fit": (216, 1150, 4.0, 1e7, 2.5e7),
-    "isosurface": (216, 200, 7.0, 1e7, 2.5e7),
+    "fit": (216, 1300, 4.0, 1e7, 3e7),
+    "isosurface": (216, 350, 7.5, 1e7, 3e7),
 }
 # Default for a network: bytes per voxel that it sees, including its row of the neighbour table, and
 # per value.
