@@ -2,7 +2,7 @@
 
     python -m benchmarks.sampling MESH --size 512
 
-Samples a box, and a sphere and a torus with so many triangles that they deviate from the surface by
+Samples a box, and a sphere and a torus with enough triangles that they deviate from the surface by
 less than 1e-6, and prints the largest difference from the closed form over all samples. Then runs
 ``super-sdf sample MESH -n SIZE`` and prints its time and peak of memory.
 """

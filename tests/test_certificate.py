@@ -29,7 +29,7 @@ def sphere_values(h: float = H, radius: float = RADIUS, half: float = 0.6) -> np
 
 
 def sphere_grid(clamp: float = np.inf) -> SdfGrid:
-    """Return the exact distance to the sphere of ``round_mesh``, truncated at so many voxels."""
+    """Return the exact distance to the sphere of ``round_mesh``, truncated at ``clamp`` voxels."""
     values = np.clip(sphere_values(), -clamp * H, clamp * H).astype(np.float32)
     return SdfGrid(values, H, (-0.6, -0.6, -0.6))
 

@@ -175,7 +175,7 @@ def test_a_row_of_another_mesh_network_or_setting_is_another_row(tmp_path):
 
 
 def test_rows_of_earlier_versions_are_read(tmp_path):
-    """They know of no turn, and lack the figures that came later: tables show "-" for those."""
+    """Rows without the column ``turned`` and the newer figures: tables show "-" for these."""
     task = task_of(tmp_path / "box.ply")
     later = ("turned", "efv", "edge_distance", "angle_near", "angle_beyond", "min_angle", "slivers")
     known = {**row("box", 0.5), **task.key("mc")}

@@ -147,7 +147,7 @@ def convert(
     about = check_format_holds(target, grid, options.factor)
     notes = (*grid.notes, *local_origin_note(target, about))
     expected = expect(grid, options.factor, options.offset, target)
-    if announce and (sentence := expected.said(target)):
+    if announce and (sentence := expected.warning(target)):
         announce(sentence)
     watch.lap("read")
     pieces = reconstruct_slabs(

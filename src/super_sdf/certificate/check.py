@@ -229,7 +229,7 @@ def stated_triangles(path: Path) -> int:
 
 
 def check_room(triangles: int, samples: int, resources: Resources) -> None:
-    """Raise OutOfMemoryError if a mesh of so many triangles cannot be checked within the bound."""
+    """Raise OutOfMemoryError if checking a mesh of ``triangles`` would exceed the memory bound."""
     need = triangles * BYTES_PER_TRIANGLE + samples * BYTES_PER_SAMPLE + (held_memory() or 0)
     if resources.memory is not None and need > resources.memory:
         raise OutOfMemoryError(

@@ -34,7 +34,7 @@ class Expectation:
     triangles: int
     size: int
 
-    def said(self, path: str | Path) -> str | None:
+    def warning(self, path: str | Path) -> str | None:
         """Return a sentence that announces a large file, None for others."""
         if self.size < LARGE:
             return None

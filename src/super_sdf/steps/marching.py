@@ -377,6 +377,13 @@ def cells_low_nodes(factor: int) -> NDArray[np.intp]:
     return np.flatnonzero((block_ijk(factor) < factor).all(1))
 
 
+def edge_steps(factor: int) -> NDArray[np.int64]:
+    """Return the number of each edge of a cell, counted from that of its low node, (12,)."""
+    start = (CORNERS @ _strides(factor))[np.array(EDGE_START)]
+    steps: NDArray[np.int64] = start + np.array(EDGE_AXIS) * (factor + 1) ** 3
+    return steps
+
+
 @lru_cache
 def _flat_triangles(factor: int) -> tuple[IntArray, IntArray, NDArray[np.int64]]:
     """Return the triangles of all cases, one after the other.
@@ -388,7 +395,6 @@ def _flat_triangles(factor: int) -> tuple[IntArray, IntArray, NDArray[np.int64]]
         triangles' vertices lie, counted from the number of the cell's low node.
     """
     counts, table = triangle_table()
-    start = (CORNERS @ _strides(factor))[np.array(EDGE_START)]
-    edge = start + np.array(EDGE_AXIS) * (factor + 1) ** 3
+    edge = edge_steps(factor)
     used = np.arange(table.shape[1]) < counts[:, None]
     return counts, (np.cumsum(counts) - counts).astype(np.int32), edge[table[used]]

@@ -35,12 +35,13 @@ from ..machine.index_width import check_count
 from ..machine.threads import map_chunks
 from ..mesh import Mesh, vertex_type
 from ..neighbourhood import CENTRE, STRIDES
-from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, loop_table
+from .cell_cases import loop_table
 from .field import FineField
 from .marching import (
     NO_FACES,
     Crossings,
     cells_low_nodes,
+    edge_steps,
     find_crossings,
     lattice_positions,
     number_edges,
@@ -103,7 +104,17 @@ class Patches:
 
 @dataclass(frozen=True, eq=False)
 class Planes:
-    """A plane at each of some crossings: a point and a normal, and how far to trust them."""
+    """A plane at each crossing.
+
+    Attributes
+    ----------
+    point : (n, 3) float64
+        On the plane; at first where the surface crosses the lattice edge.
+    normal : (n, 3) float64
+        Of unit length; at first of the nearer end of the edge if the ends disagree.
+    trust : (n,) float64
+        1 where the field is a distance, less where its slope is not 1, or the ground not flat.
+    """
 
     point: Vectors
     normal: Vectors
@@ -127,8 +138,8 @@ def extract_sharp_pieces(
     if not len(crossings.own_row):
         return [Mesh(np.empty((0, 3), vertex_type(grid, field.factor)), NO_FACES)]
     patches = find_patches(field, crossings, rows)
-    points = crossing_points(field, crossings, threads)
-    positions, features, peaks = place_features(patches, points)
+    own = planes_at_crossings(field, crossings, threads)
+    positions, features, peaks = place_features(patches, own)
     numbers = _number_vertices(field, crossings, patches, features, first_vertex)
     faces = _faces(field, patches, features, numbers)
     vertices = np.empty((numbers.own, 3))
@@ -159,11 +170,10 @@ def find_patches(field: FineField, crossings: Crossings, rows: slice) -> Patches
     edge_at = number_edges(field, crossings, rows.start, rows, 0)
     count = table.count[crossings.case]
     cell = np.repeat(np.arange(len(count)), count)
-    nth = np.arange(len(cell)) - np.repeat(np.cumsum(count) - count, count)
-    loop = table.first[crossings.case[cell]] + nth
+    loop = table.first[crossings.case[cell]] + _nth(cell, count)
     row = crossings.cell_row[cell]
     low_node = cells_low_nodes(factor)[crossings.cell[cell]]
-    at = ((row - np.int64(rows.start)) * edges + low_node)[:, None] + _edge_steps(factor)[
+    at = ((row - np.int64(rows.start)) * edges + low_node)[:, None] + edge_steps(factor)[
         table.edges[loop]
     ]
     crossing = np.where(table.edges[loop] >= 0, edge_at.take(at, mode="clip"), -1)
@@ -171,46 +181,18 @@ def find_patches(field: FineField, crossings: Crossings, rows: slice) -> Patches
     return Patches(row, low.astype(np.float64), loop, table.sides[loop], crossing)
 
 
-def _edge_steps(factor: int) -> Index:
-    """Return the number of each of a cell's edges, from that of its low node, (12,)."""
-    strides = np.array([(factor + 1) ** 2, factor + 1, 1])
-    steps: Index = (CORNERS @ strides)[np.array(EDGE_START)] + np.array(EDGE_AXIS) * (
-        factor + 1
-    ) ** 3
-    return steps
-
-
-@dataclass(frozen=True, eq=False)
-class CrossingPoints:
-    """Where the surface crosses lattice edges, and the field's gradients at both ends.
-
-    Attributes
-    ----------
-    position : (n, 3) float64
-        By linear interpolation.
-    normal : (n, 3) float64
-        Of unit length; of the nearer end if the ends disagree.
-    trust : (n,) float64
-        1 where the field is a distance, less where its slope is not 1.
-    """
-
-    position: Vectors
-    normal: Vectors
-    trust: NDArray[np.float64]
-
-
-def crossing_points(field: FineField, crossings: Crossings, threads: int = 1) -> CrossingPoints:
-    """Return points and normals on the crossed edges that voxels own."""
+def planes_at_crossings(field: FineField, crossings: Crossings, threads: int = 1) -> Planes:
+    """Return the planes on the crossed edges that voxels own, by the field alone."""
     parts = map_chunks(
-        lambda some: _points_of_chunk(field, crossings, some), len(crossings.own_row), 256, threads
+        lambda some: _planes_of_chunk(field, crossings, some), len(crossings.own_row), 256, threads
     )
-    return CrossingPoints(*(np.concatenate(arrays) for arrays in zip(*parts)))
+    return Planes(*(np.concatenate(arrays) for arrays in zip(*parts)))
 
 
-def _points_of_chunk(
+def _planes_of_chunk(
     field: FineField, crossings: Crossings, some: slice
 ) -> tuple[Vectors, Vectors, NDArray[np.float64]]:
-    """Return the arrays of ``CrossingPoints`` for some crossings."""
+    """Return the arrays of ``Planes`` for some crossings."""
     row = crossings.own_row[some]
     axis, node = np.divmod(crossings.own_edge[some].astype(np.int64), len(field.blocks))
     low_ijk = block_ijk(field.factor)[node]
@@ -281,7 +263,7 @@ def _shifted(
     return _value(field, voxel, ijk)
 
 
-def place_features(patches: Patches, points: CrossingPoints) -> tuple[Vectors, Index, Vectors]:
+def place_features(patches: Patches, own: Planes) -> tuple[Vectors, Index, Vectors]:
     """Return positions of all crossings, which patches have a feature, and its vertices.
 
     Returns
@@ -289,22 +271,22 @@ def place_features(patches: Patches, points: CrossingPoints) -> tuple[Vectors, I
     (n, 3) float64, (f,) int64, (f, 3) float64
         Positions; rows of ``patches``; positions of the features' vertices.
     """
-    seeds = _is_sharp(patches, points.normal, points.trust)
-    near = _dilate(patches, seeds, RINGS, len(points.position))
+    seeds = _is_sharp(patches, own.normal, own.trust)
+    near = _dilate(patches, seeds, RINGS, len(own.point))
     inside = np.flatnonzero((near[patches.crossing] | (patches.crossing < 0)).all(1))
     if not len(inside):
-        return points.position, inside, np.empty((0, 3))
+        return own.point, inside, np.empty((0, 3))
     some = patches.chosen(inside)
-    planes = settle_planes(some, points)
-    is_feature = _is_sharp(some, planes.normal, points.trust) & _is_supported(some, planes)
+    planes = settle_planes(some, own)
+    is_feature = _is_sharp(some, planes.normal, own.trust) & _is_supported(some, planes)
     sharp = np.flatnonzero(is_feature)
     features = inside[sharp]
     chosen = np.zeros(len(patches.row), bool)
     chosen[features] = True
     moved = _dilate(patches, chosen, MOVED_RINGS, len(near)) & near
-    shift = planes.point - points.position
+    shift = planes.point - own.point
     shift *= np.minimum(1, FARTHEST_MOVE / np.maximum(_length(shift), 1e-12))[:, None]
-    position = points.position + np.where(moved[:, None], shift, 0)
+    position = own.point + np.where(moved[:, None], shift, 0)
     return position, features, _meet(some.chosen(sharp), planes)
 
 
@@ -340,17 +322,16 @@ def _dilate(patches: Patches, chosen: BoolArray, rings: int, count: int) -> Bool
     return near
 
 
-def settle_planes(patches: Patches, points: CrossingPoints) -> Planes:
+def settle_planes(patches: Patches, own: Planes) -> Planes:
     """Return a plane for every crossing: its own, or near features that of flat ground beside.
 
     In each round a crossing takes the mean of the planes of those with which it shares a patch,
     weighted by trust, by how alike the normals are, and by how near it lies to the plane.
     """
-    one, other = _pairs(patches, len(points.position))
-    own = Planes(points.position, points.normal, points.trust)
-    rough = np.zeros(len(points.trust))
+    one, other = _pairs(patches, len(own.trust))
+    rough = np.zeros(len(own.trust))
     np.maximum.at(rough, one, 1 - _dot(own.normal[one], own.normal[other]))
-    trust = points.trust / (1 + (rough / ROUGH) ** 2) ** 2 + LEAST_TRUST
+    trust = own.trust / (1 + (rough / ROUGH) ** 2) ** 2 + LEAST_TRUST
     planes = Planes(own.point, own.normal, trust)
     for _ in range(ROUNDS):
         planes = _settle_once(planes, own, one, other)

@@ -58,24 +58,24 @@ class Solid:
 
     def distance(self, points: Points) -> Distances:
         """Return the unsigned distance, (n,), of points (n, 3) to the nearest triangle."""
-        if not len(points):
-            return np.zeros(0)
-        squared = self._triangles.squared_distance(self.mesh.vertices, self.mesh.faces, points)[0]
-        return np.sqrt(squared)
+        return self._nearest(points)[0]
 
     def nearest_face(self, points: Points) -> NDArray[np.int64]:
         """Return the index of the nearest triangle, (n,), of points (n, 3)."""
-        found = self._triangles.squared_distance(self.mesh.vertices, self.mesh.faces, points)
-        faces: NDArray[np.int64] = np.ravel(found[1])
-        return faces
+        return self._nearest(points)[1]
 
     def foot_points(self, points: Points) -> tuple[Distances, Points]:
         """Return the unsigned distance, (n,), of points (n, 3), and the nearest points, (n, 3)."""
+        distance, _, feet = self._nearest(points)
+        return distance, feet
+
+    def _nearest(self, points: Points) -> tuple[Distances, NDArray[np.int64], Points]:
+        """Return distance, triangle and nearest point of points (n, 3)."""
         if not len(points):
-            return np.zeros(0), np.zeros((0, 3))
+            return np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 3))
         mesh = self.mesh
-        squared, _, feet = self._triangles.squared_distance(mesh.vertices, mesh.faces, points)
-        return np.sqrt(squared), feet
+        squared, face, feet = self._triangles.squared_distance(mesh.vertices, mesh.faces, points)
+        return np.sqrt(squared), np.ravel(face), feet
 
     def winding_number(self, points: Points) -> Distances:
         """Return the winding number of points (n, 3), (n,): 1 inside, 0 outside."""
