@@ -176,7 +176,7 @@ def find_patches(field: FineField, crossings: Crossings, rows: slice) -> Patches
     at = ((row - np.int64(rows.start)) * edges + low_node)[:, None] + edge_steps(factor)[
         table.edges[loop]
     ]
-    crossing = np.where(table.edges[loop] >= 0, edge_at.take(at, mode="clip"), -1)
+    crossing = np.where(table.edges[loop] >= 0, edge_at.take(at, mode="clip"), np.int64(-1))
     low = factor * field.voxel_ijk[row] + block_ijk(factor)[low_node]
     return Patches(row, low.astype(np.float64), loop, table.sides[loop], crossing)
 
