@@ -155,7 +155,7 @@ def extract_sharp_pieces(
 
 def planes_beside(factor: int) -> int:
     """Return how many coarse planes to either side a slab's mesh depends on."""
-    return 1 + -(-REACH_IN_CELLS // factor)
+    return -(-(REACH_IN_CELLS + 1) // factor)
 
 
 def _rows_around(field: FineField) -> slice:
