@@ -10,4 +10,4 @@ from .network.network import load_network as load_network
 from .pipeline import reconstruct as reconstruct
 from .pipeline import upsample as upsample
 from .steps.field import FineField as FineField
-from .steps.marching import extract_mesh as extract_mesh
+from .steps.meshers import extract_mesh as extract_mesh
