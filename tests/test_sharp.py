@@ -11,6 +11,7 @@ from super_sdf import Mesh, SdfGrid, extract_mesh, load_network, upsample
 from super_sdf.evaluation.methods import sharp_isosurface
 from super_sdf.mesh import join_meshes
 from super_sdf.steps.cell_cases import loop_table, triangle_table
+from super_sdf.steps.features import Rule
 from super_sdf.steps.sharp import extract_sharp_pieces
 
 TURN = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
@@ -75,9 +76,9 @@ def test_any_lattice_gives_a_closed_manifold_with_features_everywhere(seed, leas
     lattice = np.random.default_rng(seed).normal(size=(9, 11, 9)).astype(np.float32) * least
     lattice[[0, -1]] = lattice[:, [0, -1]] = lattice[:, :, [0, -1]] = 1
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("super_sdf.steps.sharp.SHARP_COSINE", 1.1)
-        patch.setattr("super_sdf.steps.sharp.LEAST_SLOPE_TRUST", 0)
-        patch.setattr("super_sdf.steps.sharp.LEAST_SUPPORT", 0)
+        patch.setattr("super_sdf.steps.features.SHARP_COSINE", 1.1)
+        patch.setattr("super_sdf.steps.features.LEAST_SLOPE_TRUST", 0)
+        patch.setattr("super_sdf.steps.features.RULE", Rule(1.0, ()))
         mesh = extract_sharp(*dense_field(lattice))
     if len(mesh.faces):
         assert mesh.open_edges() == 0

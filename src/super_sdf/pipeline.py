@@ -22,6 +22,7 @@ from .grid.sdf_grid import SdfGrid
 from .machine.memory import give_back
 from .machine.resources import Resources, allot
 from .mesh import Mesh, join_meshes, vertex_type
+from .neighbourhood import CENTRE
 from .network.decoder import Decoder, decode
 from .options import (
     check_cap,
@@ -36,7 +37,7 @@ from .slabs.cutting import Slab, peak_bytes, plan_slabs
 from .slabs.footprint import NETWORK_BYTES
 from .slabs.pieces import Piece, describe_piece
 from .steps.cap import close_at_border
-from .steps.field import FineField
+from .steps.field import FineField, SampleSpheres
 from .steps.mesher_names import DEFAULT_MESHER
 from .steps.meshers import Mesher, extract_pieces, find_mesher
 from .steps.nodes import (
@@ -271,11 +272,15 @@ def refine(
     pinned = pin_to_skipped(blocks[:, :-1], parts, factor, skipped)
     steps.finish("nodes")
     field = FineField(band.shape, factor, own_ijk, blocks[:, :-1], parts, slab.planes)
+    spheres = SampleSpheres(
+        band.shape, band.voxel_ijk[slab.seen][exact], patches[exact, CENTRE].copy()
+    )
     return replace(
         field,
         band_voxels=len(band.voxel_ijk),
         noisy_voxels=int(np.count_nonzero(~band.lipschitz)),
         pinned=int(pinned[field.own_rows].sum()),
+        spheres=spheres,
     )
 
 

@@ -21,10 +21,10 @@ from ..network.decoder import Decoder
 from ..pipeline import reconstruct, refine
 from ..slabs.cutting import whole
 from ..steps.band import neighbour_table
-from ..steps.field import FineField
-from ..steps.nodes import block_ijk, share_parts
+from ..steps.field import FineField, SampleSpheres
 from ..steps.mesher_names import DEFAULT_MESHER, MARCHING, SHARP
 from ..steps.meshers import extract_mesh
+from ..steps.nodes import block_ijk, share_parts
 from ..steps.survey import survey
 from .cases import Case, spread_samples
 from .names import OURS, meshed_by
@@ -194,7 +194,9 @@ def sharp_isosurface(field: FloatArray, spacing: float, low: float) -> Mesh:
     parts = share_parts(neighbour_table(voxel_ijk, shape))
     side = spacing * factor
     blocks = np.stack(values) * np.float32(2 / side)
-    fine = FineField(shape, factor, voxel_ijk, blocks, parts, (0, shape[0]))
+    middle = blocks[len(block) // 2]
+    spheres = SampleSpheres(shape, voxel_ijk, middle)
+    fine = FineField(shape, factor, voxel_ijk, blocks, parts, (0, shape[0]), spheres=spheres)
     grid = SdfGrid.trusted(_node_of_blocks(field, block[0], factor), side, low + side / 2)
     return extract_mesh(fine, grid, mesher=SHARP)
 

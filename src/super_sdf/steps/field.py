@@ -13,6 +13,44 @@ from ..machine.threads import map_chunks
 from .nodes import SharedParts, block_ijk, number_parts, part_of_node, part_sizes
 
 
+@dataclass(frozen=True, eq=False)
+class SampleSpheres:
+    """The spheres of exact samples: the surface touches each and pierces none.
+
+    Attributes
+    ----------
+    shape : three ints
+        Samples of the grid along each axis.
+    voxel_ijk : (m, 3) int32
+        The samples, in C order.
+    distance : (m,) float32
+        Their signed distances, in half voxels.
+    """
+
+    shape: tuple[int, int, int]
+    voxel_ijk: IntArray
+    distance: FloatArray
+
+    @cached_property
+    def _keys(self) -> NDArray[np.int64]:
+        return self._key_of(self.voxel_ijk.astype(np.int64))
+
+    def _key_of(self, voxel_ijk: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the number of each voxel, (...,), in C order of the whole grid."""
+        _, rows, columns = self.shape
+        key: NDArray[np.int64] = (voxel_ijk[..., 0] * rows + voxel_ijk[..., 1]) * columns
+        return key + voxel_ijk[..., 2]
+
+    def find(self, voxel_ijk: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return which sample lies in each voxel (..., 3), -1 if none does, (...,)."""
+        keys, wanted = self._keys, self._key_of(voxel_ijk)
+        if not len(keys):
+            return np.full(wanted.shape, -1, np.int64)
+        at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        in_grid = ((voxel_ijk >= 0) & (voxel_ijk < self.shape)).all(-1)
+        return np.where(in_grid & (keys[at] == wanted), at, -1)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class FineField:
     """Values at the nodes of the decoded voxels' blocks, in a whole grid or in a slab of it.
@@ -41,6 +79,8 @@ class FineField:
     pinned : int
         Nodes in ``planes`` whose sign had to be changed to that of a voxel that holds no surface.
         If there are any, the input is not a distance field there, or the network failed.
+    spheres : SampleSpheres, optional
+        The exact samples in and beside the slab, for a mesher that leans on them.
     """
 
     shape: tuple[int, int, int]
@@ -52,6 +92,7 @@ class FineField:
     band_voxels: int = 0
     noisy_voxels: int = 0
     pinned: int = 0
+    spheres: SampleSpheres | None = None
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.shape))

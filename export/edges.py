@@ -1,0 +1,213 @@
+"""Fit the rule that tells edges from rounded ground: see ``super_sdf.steps.features``.
+
+    python -m export.edges --meshes FOLDER_OF_PLY --procedural 0.4 --count 200 --out edges.npz
+
+Shapes for training are sampled on a grid and refined by the shipped network. For every candidate
+of the mesher the two surfaces there, with the vertex on the edge and without it, are compared with
+the true one. The rule is a logistic regression of which is better on the evidence, weighted by by
+how much. The rows are kept in ``--out``; with ``--fit`` alone they are fitted again.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from export.arguments import Parser, at_least, share
+from export.dataset import draw_mesh, find_meshes
+from export.shapes import random_solid
+from super_sdf.errors import SuperSdfError
+from super_sdf.evaluation.cases import Case, Setting, Shape
+from super_sdf.evaluation.metrics import face_vectors
+from super_sdf.grid.sdf_grid import SdfGrid
+from super_sdf.network.network import Network, load_network
+from super_sdf.pipeline import upsample
+from super_sdf.steps import sharp
+from super_sdf.steps.cap import close_at_border
+from super_sdf.steps.features import Candidates, Rule, find_candidates, move_beside
+from super_sdf.steps.field import FineField
+from super_sdf.steps.marching import find_crossings, to_world
+from super_sdf.steps.patches import Patches, find_patches
+from super_sdf.steps.planes import Planes, planes_at_crossings
+from super_sdf.truth.solid import Solid
+
+SIZES = (24, 32, 32, 48)  # drawn from, samples along an axis
+FACTOR = 4
+DISTANCE, TURN = 0.01, 0.05  # gains that count alike: coarse voxels, and 1 - cosine of normals
+MOST = 5.0  # such gains that one candidate counts for
+AT = np.array([[0.6, 0.2, 0.2], [0.2, 0.6, 0.2], [0.2, 0.2, 0.6]])  # points of a triangle
+PENALTY = 1.0  # of the squares of the weights of the standardised evidence
+STEPS = 30  # of Newton's method
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Candidates of some shapes: the shape of each, its evidence (n, e), and its gain (n, 2).
+
+    A gain is by how much nearer the surface is with a vertex on the edge, in coarse voxels, and by
+    how much 1 - cosine of its normals is less.
+    """
+
+    shape: np.ndarray
+    evidence: np.ndarray
+    gain: np.ndarray
+
+
+def draw_case(rng: np.random.Generator, paths: list[Path], procedural: float, number: int) -> Case:
+    """Return a shape for training, turned at random, sampled on a grid."""
+    drawn = not paths or rng.random() < procedural
+    mesh = random_solid(rng) if drawn else draw_mesh(rng, paths[rng.integers(len(paths))])
+    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    rotation *= np.sign(np.linalg.det(rotation))
+    shape = Shape(f"drawn-{number}", mesh.transformed(rotation, np.zeros(3)))
+    return Case(shape, Setting(int(rng.choice(SIZES)), FACTOR))
+
+
+def rows_of(case: Case, network: Network) -> tuple[np.ndarray, np.ndarray]:
+    """Return the evidence (f, e) and the gain (f, 2) of all candidates of a case."""
+    field = close_at_border(upsample(case.grid, network, FACTOR), case.grid)
+    whole = slice(0, len(field.voxel_ijk))
+    crossings = find_crossings(field, whole)
+    patches = find_patches(field, crossings, whole, 0)
+    own = planes_at_crossings(field, crossings)
+    candidates = find_candidates(patches, own, field)
+    if not len(candidates.patch):
+        return candidates.evidence, np.empty((0, 2))
+    without, with_all = surfaces(patches, own, candidates)
+    gain = [
+        errors_before - errors_after
+        for errors_before, errors_after in zip(
+            errors_of(case.shape.solid, without, len(patches.row), field, case.grid),
+            errors_of(case.shape.solid, with_all, len(patches.row), field, case.grid),
+        )
+    ]
+    return candidates.evidence, np.stack(gain, 1)[candidates.patch]
+
+
+Triangles = tuple[np.ndarray, np.ndarray]
+"""The patch of each triangle, (t,), and its corners in fine spacings, (t, 3, 3)."""
+
+
+def surfaces(patches: Patches, own: Planes, candidates: Candidates) -> tuple[Triangles, Triangles]:
+    """Return the triangles of all candidates without a vertex on the edge, and with one."""
+    count = len(own.point)
+    chosen = np.zeros(len(patches.row), bool)
+    chosen[candidates.patch] = True
+    numbers = sharp.Numbers(np.arange(count), count + np.arange(len(candidates.patch)), 0)
+    patch, faces = sharp.flat_faces(patches, chosen, numbers)
+    flat = patch, own.point[faces]
+    peak_of = np.full(len(patches.row), -1, np.int64)
+    peak_of[candidates.patch] = numbers.of_feature
+    fans = list(sharp.fan_faces(patches, peak_of, candidates.patch, numbers))
+    moved = move_beside(patches, own, candidates, np.ones(len(candidates.patch), bool))
+    points = np.concatenate([moved, candidates.vertex])
+    fan_of = np.concatenate([patch for patch, _ in fans])
+    return flat, (fan_of, points[np.concatenate([faces for _, faces in fans])])
+
+
+def errors_of(
+    solid: Solid, triangles: Triangles, count: int, field: FineField, grid: SdfGrid
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean distance to the true surface of each of ``count`` patches, and 1 - cosine.
+
+    Distances are in coarse voxels. Patches without triangles have 0.
+    """
+    patch, corners = triangles
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normal, axis=1)
+    normal /= np.maximum(area, 1e-12)[:, None]
+    points = np.einsum("pk,tkd->ptd", AT, corners).reshape(-1, 3)
+    world = to_world(points.T, field, grid).astype(np.float64)
+    distance = solid.distance(world).reshape(len(AT), -1).mean(0) / grid.spacing[0]
+    true = face_vectors(solid.mesh)[solid.nearest_face(world)]
+    true /= np.maximum(np.linalg.norm(true, axis=1), 1e-15)[:, None]
+    turned = 1 - np.einsum("ptd,td->pt", true.reshape(len(AT), -1, 3), normal).mean(0)
+    total = np.maximum(np.bincount(patch, area, count), 1e-12)
+    return tuple(np.bincount(patch, area * error, count) / total for error in (distance, turned))
+
+
+def gather(options: argparse.Namespace) -> Rows:
+    """Return the rows of as many shapes as are asked for, leaving out those without a mesh."""
+    rng, network = np.random.default_rng(options.seed), load_network(device="cpu", threads=1)
+    prisms, others = find_meshes(options.meshes)
+    paths = [*prisms[: len(others) // 5], *others]
+    parts: list[tuple[np.ndarray, ...]] = []
+    for number, (evidence, gain) in enumerate(usable(rng, network, paths, options)):
+        parts.append((np.full(len(evidence), number), evidence, gain))
+        rows = Rows(*(np.concatenate(arrays) for arrays in zip(*parts)))
+        if number % 10 == 9 or number + 1 == options.count:
+            np.savez(options.out, shape=rows.shape, evidence=rows.evidence, gain=rows.gain)
+            print(f"{number + 1} shapes, {len(rows.shape)} candidates", flush=True)
+    return rows
+
+
+def usable(
+    rng: np.random.Generator, network: Network, paths: list[Path], options: argparse.Namespace
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield the rows of ``count`` shapes."""
+    found = 0
+    while found < options.count:
+        try:
+            rows = rows_of(draw_case(rng, paths, options.procedural, found), network)
+        except SuperSdfError:
+            continue
+        found += 1
+        yield rows
+
+
+def fit_rule(rows: Rows, bias: float = 0.0) -> Rule:
+    """Return the logistic regression of which surface is better on the evidence.
+
+    A candidate weighs by how much is gained or lost. ``bias`` is added to the scores: what is
+    under 0 keeps marching cubes where the two are close.
+    """
+    gain = rows.gain @ (1 / np.array([DISTANCE, TURN]))
+    weight = np.minimum(np.abs(gain), MOST)
+    mean, spread = rows.evidence.mean(0), np.maximum(rows.evidence.std(0), 1e-9)
+    design = np.c_[np.ones(len(gain)), (rows.evidence - mean) / spread]
+    found = np.zeros(design.shape[1])
+    penalty = PENALTY * np.diag(np.r_[0, np.ones(len(mean))])
+    for _ in range(STEPS):
+        likely = 1 / (1 + np.exp(-np.clip(design @ found, -30, 30)))
+        slope = design.T @ (weight * (likely - (gain > 0))) + penalty @ found
+        curve = (design.T * (weight * likely * (1 - likely))) @ design + penalty
+        found -= np.linalg.solve(curve, slope)
+    weights = found[1:] / spread
+    return Rule(float(found[0] - weights @ mean) + bias, tuple(weights.tolist()))
+
+
+def report(rows: Rows, rule: Rule) -> str:
+    """Return the gains of all candidates, of those that a rule keeps, and of the best ones."""
+    kept = rule.score(rows.evidence) > 0
+    best = rows.gain @ (1 / np.array([DISTANCE, TURN])) > 0
+    lines = [
+        f"{name}: {which.sum()} candidates, {rows.gain[which, 0].sum():.0f} voxels nearer, "
+        f"1 - cosine less by {rows.gain[which, 1].sum():.0f}"
+        for name, which in (("all", kept | True), ("kept", kept), ("best", best))
+    ]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Gather rows, or read those of a file, and print the rule."""
+    parser = Parser(description=__doc__.split("\n")[0])
+    parser.add_argument("--meshes", type=Path, help="folder of closed .ply meshes")
+    parser.add_argument("--procedural", type=share, default=0.4, help="share of procedural shapes")
+    parser.add_argument("--count", type=at_least(1), default=200, help="shapes to draw")
+    parser.add_argument("--out", type=Path, required=True, help="file of the rows, .npz")
+    parser.add_argument("--fit", action="store_true", help="fit the rows in --out again")
+    parser.add_argument("--bias", type=float, default=0.0, help="added to the scores")
+    parser.add_argument("--seed", type=at_least(0), default=0)
+    options = parser.parse_args()
+    rows = Rows(**np.load(options.out)) if options.fit else gather(options)
+    rule = fit_rule(rows, options.bias)
+    print(report(rows, rule))
+    print(f"Rule({rule.bias:.3f}, ({', '.join(f'{weight:.3f}' for weight in rule.weights)}))")
+
+
+if __name__ == "__main__":
+    main()

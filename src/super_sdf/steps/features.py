@@ -1,0 +1,262 @@
+"""Where the surface has an edge or a corner, and where on it a vertex belongs.
+
+1. Candidates are patches whose planes differ, by the settled planes of the faces beside.
+2. Each gets the point where these planes meet, moved so that the samples' spheres agree.
+3. ``evidence`` gathers what speaks for an edge there and what against it: flat ground on both
+   sides, spheres that touch or are pierced. It is averaged along the chain of candidates, since an
+   edge has a length, and weighed by a logistic rule.
+4. Vertices beside the features that are kept are moved onto the settled planes.
+
+The rule was fitted by ``export.edges`` on shapes with and without edges, to whether a vertex on the
+edge brings the surface nearer to the true one.
+
+Positions are in fine spacings, from node (0, 0, 0) of the fine lattice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import BoolArray
+from .field import FineField, SampleSpheres
+from .patches import Index, Patches, dilate
+from .planes import Planes, settle_planes
+from .vectors import Numbers, Vectors, dot, length
+from .wedges import (
+    Contact,
+    Nearby,
+    Wedges,
+    contact_of,
+    count_by_wedge,
+    find_spheres,
+    lean,
+    wedges_of,
+)
+
+SHARP_COSINE = 0.85  # normals of a patch that differ by more, 32 degrees, may make a feature
+LEAST_SLOPE_TRUST = 0.02  # of every crossing of a feature
+RINGS = 6  # patches round a candidate, counted from it, in which planes are settled
+CHAIN_ROUNDS = 5  # in each, a candidate takes the mean of those it shares a crossing with
+MOVED_RINGS = 3  # round a feature, in which vertices may be moved onto the planes: all of them ...
+FADING, FADED_OUT = 1.0, 2.5  # ... up to a distance in fine spacings, none from another on
+FARTHEST_MOVE = 0.5  # fine spacings
+OUTSIDE_CELL = 0.5  # fine spacings by which a feature's vertex may leave its cell
+TOUCHING = 0.04  # coarse spacings from a sphere at which it is touched
+CLOSE_BY = 0.6  # coarse spacings along an edge in which no sphere may be pierced
+TOUCHED_ALONG = 1.0  # coarse spacings along an edge in which spheres are counted
+
+
+@dataclass(frozen=True, eq=False)
+class Rule:
+    """The logistic rule that tells features from rounded ground: ``bias + evidence @ weights``."""
+
+    bias: float
+    weights: tuple[float, ...]
+
+    def score(self, evidence: Vectors) -> Numbers:
+        """Return the score of evidence (f, n), positive for a feature; summed in a fixed order."""
+        score: Numbers = np.full(len(evidence), self.bias)
+        for weight, column in zip(self.weights, evidence.T):
+            score += weight * column
+        return score
+
+
+RULE = Rule(
+    0.805, (0.120, 0.802, -43.356, -2.562, -0.091, 0.877, -13.935, -1.636, -1.153, -0.278, -0.287)
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Patches that may hold an edge or a corner.
+
+    Attributes
+    ----------
+    patch : (f,) int64
+        Their rows in all patches.
+    patches : Patches
+        They alone.
+    vertex : (f, 3) float64
+        The edge's nearest point, or the corner, kept near the patch's cell.
+    evidence : (f, 11) float64
+        Averaged along the chain: see ``evidence_of``.
+    planes : Planes
+        The settled planes of all crossings.
+    near : (n,) bool
+        Which crossings were settled.
+    """
+
+    patch: Index
+    patches: Patches
+    vertex: Vectors
+    evidence: Vectors
+    planes: Planes
+    near: BoolArray
+
+
+def place_features(
+    patches: Patches, own: Planes, field: FineField, threads: int = 1
+) -> tuple[Vectors, Index, Vectors]:
+    """Return positions of all crossings, which patches have a feature, and its vertices.
+
+    Returns
+    -------
+    (n, 3) float64, (f,) int64, (f, 3) float64
+        Positions; rows of ``patches``; positions of the features' vertices.
+    """
+    candidates = find_candidates(patches, own, field, threads)
+    kept = RULE.score(candidates.evidence) > 0
+    position = move_beside(patches, own, candidates, kept)
+    return position, candidates.patch[kept], candidates.vertex[kept]
+
+
+def find_candidates(
+    patches: Patches, own: Planes, field: FineField, threads: int = 1
+) -> Candidates:
+    """Return the patches that may hold a feature, with its vertex and the evidence for it."""
+    seeds = _is_sharp(patches, own.normal, own.trust)
+    near = dilate(patches, seeds, RINGS, len(own.point))
+    inside = np.flatnonzero((near[patches.crossing] | ~patches.there).all(1))
+    some = patches.chosen(inside)
+    planes = settle_planes(some, own) if len(inside) else own
+    sharp = np.flatnonzero(_is_sharp(some, planes.normal, own.trust))
+    chosen = some.chosen(sharp)
+    factor, ijk = field.factor, field.voxel_ijk[chosen.row].astype(np.int64)
+    corners = planes.point[chosen.crossing] / factor, planes.normal[chosen.crossing]
+    wedges = wedges_of(ijk, *corners, chosen.there)
+    spheres = field.spheres or SampleSpheres(field.shape, np.empty((0, 3), np.int32), np.empty(0))
+    nearby = find_spheres(wedges, spheres, threads)
+    leaned = lean(wedges, nearby)
+    evidence = evidence_of(chosen, planes, own, wedges, leaned, nearby)
+    evidence = mean_along_chain(chosen, evidence, len(own.point))
+    low = chosen.low - OUTSIDE_CELL
+    vertex = np.clip(factor * leaned.point, low, low + 1 + 2 * OUTSIDE_CELL)
+    return Candidates(inside[sharp], chosen, vertex, evidence, planes, near)
+
+
+def _is_sharp(patches: Patches, normal: Vectors, trust: Numbers) -> BoolArray:
+    """Return which patches, (P,), have normals that differ by more than ``SHARP_COSINE``.
+
+    Only where the field is a distance at every crossing: of others normals say little.
+    """
+    sharp: BoolArray = np.zeros(len(patches.row), bool)
+    for one in range(patches.crossing.shape[1]):
+        for other in range(one):
+            pair = patches.crossing[:, one], patches.crossing[:, other]
+            rows = np.flatnonzero((pair[0] >= 0) & (pair[1] >= 0))
+            sharp[rows] |= dot(normal[pair[0][rows]], normal[pair[1][rows]]) < SHARP_COSINE
+    known = (trust[patches.crossing] >= LEAST_SLOPE_TRUST) | ~patches.there
+    return sharp & known.all(1)
+
+
+def evidence_of(
+    patches: Patches, planes: Planes, own: Planes, start: Wedges, wedges: Wedges, nearby: Nearby
+) -> Vectors:
+    """Return what speaks for a feature in each patch and against it, (f, 11).
+
+    In this order: the logarithm of the trust in its flattest ground, and how far that is over a
+    tenth; by how much a sphere is pierced, and by how much all are cleared; whether a sphere is
+    touched, and how many; how far the spheres moved the point; the cosine of the normals, and how
+    far it is under -0.2, as on a blade; the logarithm of the trust in the field; 1 if convex.
+    """
+    contact = contact_of(wedges, nearby)
+    trust = np.where(patches.there, planes.trust[patches.crossing], np.inf).min(1)
+    steady = np.where(patches.there, own.trust[patches.crossing], np.inf).min(1)
+    pierced = _deepest(nearby, contact, len(trust))
+    touched = _touched(nearby, contact, len(trust))
+    support = np.log(trust + 1e-3)
+    columns = (
+        *(support, np.maximum(support - np.log(0.1), 0)),
+        *(np.clip(pierced, 0, 0.15), np.clip(-pierced, 0, 0.1)),
+        *(np.minimum(touched, 1), np.minimum(touched, 3)),
+        np.minimum(length(wedges.point - start.point), 0.15),
+        *(start.cosine, np.maximum(-0.2 - start.cosine, 0)),
+        np.log(steady),
+        start.convex > 0,
+    )
+    return np.stack(columns, 1).astype(np.float64)
+
+
+def _deepest(nearby: Nearby, contact: Contact, count: int) -> Numbers:
+    """Return by how much a sphere close by is pierced by each edge, (count,); -0.1 if by none."""
+    close = np.abs(contact.along) < CLOSE_BY
+    deepest: Numbers = np.full(count, -0.1)
+    np.maximum.at(deepest, nearby.wedge[close], -contact.gap[close])
+    return deepest
+
+
+def _touched(nearby: Nearby, contact: Contact, count: int) -> NDArray[np.int32]:
+    """Return how many spheres touch each edge that must, (count,)."""
+    touching = contact.in_cone & (np.abs(contact.gap) < TOUCHING)
+    return count_by_wedge(nearby, touching & (np.abs(contact.along) < TOUCHED_ALONG), count)
+
+
+def mean_along_chain(patches: Patches, evidence: Vectors, count: int) -> Vectors:
+    """Return the evidence of patches (f, n) averaged over those that they are joined to."""
+    patch, crossing = patches.joined()
+    used, crossing = np.unique(crossing, return_inverse=True)
+    shared = np.bincount(crossing, minlength=len(used))
+    mean = evidence
+    for _ in range(CHAIN_ROUNDS):
+        columns = []
+        for column in mean.T:
+            at_crossing = np.bincount(crossing, column[patch], len(used)) / shared
+            columns.append(np.bincount(patch, at_crossing[crossing], len(mean)) / patches.sides)
+        mean = np.stack(columns, 1)
+    return cast(Vectors, mean)
+
+
+def move_beside(patches: Patches, own: Planes, candidates: Candidates, kept: BoolArray) -> Vectors:
+    """Return the positions of all crossings, (n, 3), those beside features on settled planes.
+
+    The move fades with the distance from the feature: where it ended at once, crossings that lie
+    close together would come apart, and make a step.
+    """
+    distance = distance_from(
+        patches, candidates.patch[kept], candidates.vertex[kept], own.point, MOVED_RINGS
+    )
+    share = np.clip((FADED_OUT - distance) / (FADED_OUT - FADING), 0, 1) * candidates.near
+    shift = candidates.planes.point - own.point
+    shift *= np.minimum(1, FARTHEST_MOVE / np.maximum(length(shift), 1e-12))[:, None]
+    position: Vectors = own.point + share[:, None] * shift
+    return position
+
+
+def distance_from(
+    patches: Patches, features: Index, vertex: Vectors, point: Vectors, rings: int
+) -> Numbers:
+    """Return the distance of crossings to the nearest vertex of a feature, (n,).
+
+    It is infinite for crossings that are not within some rings of patches round a feature.
+
+    Parameters
+    ----------
+    patches : Patches
+    features : (f,) int64
+        Rows of the patches that have a feature.
+    vertex : (f, 3) float64
+        Their vertices.
+    point : (n, 3) float64
+        The crossings.
+    rings : int
+    """
+    distance: Numbers = np.full(len(point), np.inf)
+    nearest = np.full(len(point), -1, np.int64)
+    known = np.full(len(patches.row), -1, np.int64)
+    known[features] = np.arange(len(features))
+    patch, crossing = patches.joined()
+    for _ in range(rings):
+        here = np.flatnonzero(known[patch] >= 0)
+        peak, at = known[patch[here]], crossing[here]
+        apart = length(point[at] - vertex[peak])
+        np.minimum.at(distance, at, apart)
+        best = apart == distance[at]
+        nearest[at[best]] = peak[best]
+        away = np.where(patches.there, distance[patches.crossing], np.inf)
+        chosen = np.take_along_axis(patches.crossing, away.argmin(1)[:, None], 1)[:, 0]
+        known = np.where(np.isfinite(away.min(1)), nearest[chosen], -1)
+    return distance

@@ -1,0 +1,116 @@
+"""The patches of the surface in the cells of a field, and which crossings they share.
+
+A patch is a piece of the surface in one cell: a loop of crossed lattice edges, from one to the
+next across the faces of the cell. Two cells that share a face share the crossings on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import BoolArray, IntArray
+from .cell_cases import loop_table
+from .field import FineField
+from .marching import Crossings, cells_low_nodes, edge_steps, number_edges
+from .nodes import block_ijk
+
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """The patches of the surface in the crossed cells of some blocks, in the order of the cells.
+
+    Attributes
+    ----------
+    row : (P,) int32
+        The voxel of each.
+    low : (P, 3) float64
+        The low corner of its cell, in fine spacings.
+    loop : (P,) int64
+        Which row of ``loop_table`` it is.
+    sides : (P,) int64
+        How many crossings it has.
+    crossing : (P, S) int64
+        Its crossings in order, counter-clockwise from outside, -1 after the last.
+    """
+
+    row: IntArray
+    low: NDArray[np.float64]
+    loop: Index
+    sides: Index
+    crossing: Index
+
+    def chosen(self, rows: Index) -> Patches:
+        """Return some of the patches."""
+        return Patches(
+            self.row[rows], self.low[rows], self.loop[rows], self.sides[rows], self.crossing[rows]
+        )
+
+    @property
+    def there(self) -> BoolArray:
+        """Which entries of ``crossing`` are crossings, (P, S)."""
+        return cast(BoolArray, self.crossing >= 0)
+
+    def joined(self) -> tuple[Index, Index]:
+        """Return the patch and the crossing of every entry of ``crossing`` that is one."""
+        patch, place = np.nonzero(self.there)
+        return patch, self.crossing[patch, place]
+
+
+def find_patches(field: FineField, crossings: Crossings, rows: slice, before: int) -> Patches:
+    """Return the patches in the crossed cells of some voxels.
+
+    The crossings are those of the voxels from ``before`` on, the first of the plane before, since
+    these own edges of the cells.
+    """
+    table, factor = loop_table(), field.factor
+    edges = 3 * len(field.blocks)
+    edge_at = number_edges(field, crossings, before, rows, 0)
+    some = crossings.cells(rows)
+    case = crossings.case[some]
+    count = table.count[case]
+    cell = np.repeat(np.arange(len(count)), count)
+    loop = table.first[case[cell]] + nth_of_row(cell, count)
+    row = crossings.cell_row[some][cell]
+    low_node = cells_low_nodes(factor)[crossings.cell[some][cell]]
+    at = ((row - np.int64(before)) * edges + low_node)[:, None] + edge_steps(factor)[
+        table.edges[loop]
+    ]
+    crossing = np.where(table.edges[loop] >= 0, edge_at.take(at, mode="clip"), np.int64(-1))
+    low = factor * field.voxel_ijk[row] + block_ijk(factor)[low_node]
+    return Patches(row, low.astype(np.float64), loop, table.sides[loop], crossing)
+
+
+def dilate(patches: Patches, chosen: BoolArray, rings: int, count: int) -> BoolArray:
+    """Return which of ``count`` crossings lie within some rings of patches round chosen ones."""
+    near: BoolArray = np.zeros(count, bool)
+    there = patches.there
+    for _ in range(rings):
+        mine = patches.crossing[chosen]
+        near[mine[mine >= 0]] = True
+        chosen = cast(BoolArray, np.any(near[patches.crossing] & there, axis=1))
+    return near
+
+
+def pairs_in_patches(patches: Patches) -> tuple[Index, Index]:
+    """Return every ordered pair of crossings of a patch, in the order of the patches.
+
+    Two crossings on a face that two cells share come twice.
+    """
+    sides = patches.crossing.shape[1]
+    one, other = np.nonzero(~np.eye(sides, dtype=bool))
+    first, second = patches.crossing[:, one].ravel(), patches.crossing[:, other].ravel()
+    both = (first >= 0) & (second >= 0)
+    return first[both], second[both]
+
+
+def nth_of_row(row: NDArray[Any], counts: NDArray[Any]) -> Index:
+    """Return the place of each entry among those of its row; rows come in order."""
+    first: Index = np.cumsum(counts) - counts
+    nth: Index = np.arange(len(row)) - first[row]
+    return nth

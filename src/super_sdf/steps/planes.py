@@ -1,0 +1,182 @@
+"""Planes of the surface at its crossings with lattice edges, as the faces beside an edge have them.
+
+    own      the field's gradient at both ends of the lattice edge, from differences that do not
+             straddle a kink
+    settled  near edges, the planes of crossings on flat ground replace those of crossings beside
+             the kink, where the field is rounded off, step by step
+
+Reference: Harten, Engquist, Osher and Chakravarthy, "Uniformly High Order Accurate Essentially
+Non-Oscillatory Schemes", 1987, for the differences.
+
+Positions are in fine spacings, from node (0, 0, 0) of the fine lattice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import IntArray
+from ..machine.threads import map_chunks
+from ..neighbourhood import CENTRE, STRIDES
+from .field import FineField
+from .marching import Crossings, lattice_positions
+from .nodes import block_ijk
+from .patches import Index, Patches, dilate, pairs_in_patches
+from .vectors import Numbers, Vectors, dot, length, sums, unit
+
+ROUNDS = 5  # in each, every crossing looks at those it shares a patch with
+ROUGH = 0.02  # 1 - cosine of normals in a patch from which a crossing is not trusted
+ALIGNED = 0.125  # 1 - cosine up to which planes count as the same
+OFF_PLANE = 0.12  # fine spacings up to which a crossing is taken to lie on a plane
+SLOPE_ERROR = 0.15  # of the field's slope, 1 for a distance, up to which a normal is trusted
+WEAKENING = 0.7  # of the trust in a plane, from crossing to crossing
+LEAST_TRUST = 1e-4
+SETTLED = 0.3  # trust from which a crossing keeps its own plane, unless ...
+SMOOTHED_RINGS = 1  # ... it lies within these of one that does not
+TEMPORARIES = 256  # numbers per crossing in the computation of its plane
+
+
+@dataclass(frozen=True, eq=False)
+class Planes:
+    """A plane at each crossing.
+
+    Attributes
+    ----------
+    point : (n, 3) float64
+        On the plane; at first where the surface crosses the lattice edge.
+    normal : (n, 3) float64
+        Of unit length; at first of the nearer end of the edge if the ends disagree.
+    trust : (n,) float64
+        1 where the field is a distance, less where its slope is not 1, or the ground not flat.
+    """
+
+    point: Vectors
+    normal: Vectors
+    trust: Numbers
+
+
+def planes_at_crossings(field: FineField, crossings: Crossings, threads: int = 1) -> Planes:
+    """Return the planes on the crossed edges that voxels own, by the field alone."""
+    parts = map_chunks(
+        lambda some: _planes_of_chunk(field, crossings, some),
+        len(crossings.own_row),
+        TEMPORARIES,
+        threads,
+    )
+    return Planes(*(np.concatenate(arrays) for arrays in zip(*parts)))
+
+
+def _planes_of_chunk(
+    field: FineField, crossings: Crossings, some: slice
+) -> tuple[Vectors, Vectors, Numbers]:
+    """Return the arrays of ``Planes`` for some crossings."""
+    row = crossings.own_row[some]
+    axis, node = np.divmod(crossings.own_edge[some].astype(np.int64), len(field.blocks))
+    low_ijk = block_ijk(field.factor)[node]
+    high_ijk = low_ijk.copy()
+    high_ijk[np.arange(len(row)), axis] += 1
+    position = lattice_positions(field, row, crossings.own_edge[some]).T
+    start = (field.factor * field.voxel_ijk[row] + low_ijk)[np.arange(len(row)), axis]
+    share = np.clip(position[np.arange(len(row)), axis] - start, 0, 1)
+    gradients = _gradient(field, row, low_ijk), _gradient(field, row, high_ijk)
+    return position, *_mean_normal(*gradients, share)
+
+
+def _mean_normal(low: Vectors, high: Vectors, share: Numbers) -> tuple[Vectors, Numbers]:
+    """Return normals (n, 3) between the gradients at both ends of edges, and the trust in them."""
+    trust = [_near_one(length(gradient)) for gradient in (low, high)]
+    weight = (1 - share) * trust[0], share * trust[1]
+    agree = dot(unit(low), unit(high)) > 0.9
+    mean = low * weight[0][:, None] + high * weight[1][:, None]
+    nearer = np.where((weight[0] >= weight[1])[:, None], low, high)
+    return unit(np.where(agree[:, None], mean, nearer)), np.maximum(*trust)
+
+
+def _near_one(slope: Numbers) -> Numbers:
+    """Return how near slopes are to that of a distance: 1 at 1, quickly less beside it."""
+    return square_falloff((slope - 1) / SLOPE_ERROR) + LEAST_TRUST
+
+
+def square_falloff(off: Numbers) -> Numbers:
+    """Return 1 at 0 and a quarter at 1: rational, so that every system computes the same."""
+    falloff: Numbers = 1 / (1 + off * off) ** 2
+    return falloff
+
+
+def _gradient(field: FineField, row: IntArray, node_ijk: IntArray) -> Vectors:
+    """Return the field's gradient at nodes of blocks, (n, 3); 1 is the slope of a distance.
+
+    Along each axis by the parabola through three of five nodes that bends least: it does not
+    straddle a kink.
+    """
+    gradient = np.zeros((len(row), 3))
+    for axis in range(3):
+        a, b, c, d, e = (_shifted(field, row, node_ijk, axis, step) for step in range(-2, 3))
+        bend = np.abs(np.stack([c - 2 * b + a, d - 2 * c + b, e - 2 * d + c]))
+        slopes = np.stack([1.5 * c - 2 * b + 0.5 * a, 0.5 * (d - b), 2 * d - 1.5 * c - 0.5 * e])
+        bend[~np.isfinite(bend)] = np.inf
+        chosen = slopes[bend.argmin(0), np.arange(len(row))]
+        gradient[:, axis] = np.where(np.isfinite(chosen), chosen, 0)
+    return gradient * (field.factor / 2)
+
+
+def _value(field: FineField, row: NDArray[Any], node_ijk: IntArray) -> Numbers:
+    """Return the values of nodes of blocks, (n,); NaN where there is no block, row -1."""
+    side = field.factor + 1
+    node = (node_ijk[:, 0] * side + node_ijk[:, 1]) * side + node_ijk[:, 2]
+    values: Numbers = field.blocks[node, row].astype(np.float64)
+    values[row < 0] = np.nan
+    return values
+
+
+def _shifted(field: FineField, row: IntArray, node_ijk: IntArray, axis: int, step: int) -> Numbers:
+    """Return the values some nodes further along an axis, maybe in the next block."""
+    ijk, factor = node_ijk.copy(), field.factor
+    ijk[:, axis] += step
+    beyond = np.where(ijk[:, axis] > factor, 1, np.where(ijk[:, axis] < 0, -1, 0))
+    ijk[:, axis] -= factor * beyond
+    voxel = np.where(beyond == 0, row, field.parts.table[CENTRE + int(STRIDES[axis]) * beyond, row])
+    return _value(field, voxel, ijk)
+
+
+def settle_planes(patches: Patches, own: Planes) -> Planes:
+    """Return a plane for every crossing: its own, or that of flat ground beside it.
+
+    In each round a crossing takes the mean of the planes of those with which it shares a patch,
+    weighted by trust, by how alike the normals are, and by how near it lies to the plane.
+    """
+    one, other = pairs_in_patches(patches)
+    rough = np.zeros(len(own.trust))
+    np.maximum.at(rough, one, 1 - dot(own.normal[one], own.normal[other]))
+    trust = own.trust * square_falloff(rough / ROUGH) + LEAST_TRUST
+    planes = Planes(own.point, own.normal, trust)
+    beside = dilate(
+        patches,
+        ((trust < SETTLED)[patches.crossing] & patches.there).any(1),
+        SMOOTHED_RINGS,
+        len(trust),
+    )
+    one, other = one[beside[one]], other[beside[one]]
+    for _ in range(ROUNDS):
+        planes = _settle_once(planes, own, one, other)
+    return planes
+
+
+def _settle_once(planes: Planes, own: Planes, one: Index, other: Index) -> Planes:
+    """Return the planes after one round."""
+    count, normal = len(planes.trust), planes.normal[other]
+    off = dot(own.point[one] - planes.point[other], normal)
+    turned = (1 - dot(planes.normal[one], normal)) / ALIGNED
+    weight = planes.trust[other] * square_falloff(turned) * square_falloff(off / OFF_PLANE)
+    total = np.bincount(one, weight, count)
+    mean = sums(one, weight[:, None] * normal, count)
+    mean = unit(mean + planes.trust[:, None] * planes.normal)
+    here = dot(own.point - planes.point, planes.normal)
+    height = (np.bincount(one, weight * off, count) + planes.trust * here) / (total + planes.trust)
+    passed_on = np.bincount(one, weight * planes.trust[other], count) / (total + 1e-12)
+    trust: Numbers = np.maximum(planes.trust, WEAKENING * passed_on)
+    return Planes(own.point - height[:, None] * mean, mean, trust)
