@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 from manifold3d import CrossSection, Manifold
 
-from export.part_tools import (
-    OVERLAP, SEGMENTS, counterbore, disc, drill, filled, through, upright
-)
+from export.part_tools import OVERLAP, SEGMENTS, counterbore, disc, drill, filled, through, upright
 from export.shapes.draws import joined
 from export.shapes.edges import CHAMFER, ROUND, slab, smooth
 

@@ -39,9 +39,7 @@ def draw_part(number: int, seed: int = 0, detail: str = "usual") -> tuple[str, M
     return f"part-{number:02d}-{kind.__name__}", mesh
 
 
-def write_parts(
-    out: Path, count: int = COUNT, seed: int = 0, detail: str = "usual"
-) -> list[Path]:
+def write_parts(out: Path, count: int = COUNT, seed: int = 0, detail: str = "usual") -> list[Path]:
     """Write parts into a folder, which is made if it is missing; return their paths."""
     out.mkdir(parents=True, exist_ok=True)
     parts = [draw_part(number, seed, detail) for number in range(count)]

@@ -129,8 +129,8 @@ def enclosure(rng: np.random.Generator) -> Manifold:
     solid = fine_slab(outline, height, edge, 0.5, 0).mirror([0, 0, 1]).translate([0, 0, height])
     inner = outline.offset(-wall, circular_segments=SEGMENTS)
     solid -= inner.extrude(9).translate([0, 0, 1.1])
-    rib = rectangle(rng.uniform(1, 1.1), wide - 1, rng.uniform(0, 0.8))
-    solid += rib.extrude(rng.uniform(2, 2.2))
+    rib = rectangle(rng.uniform(1, 1.1), wide - wall, rng.uniform(0, 0.8))
+    solid += rib.extrude(rng.uniform(1.5, 1.7)).translate([0, 0, 0.5])
     window = drill(rng.uniform(0.6, 0.7), 2).rotate([0, 90, 0]).translate([4.5, 0, 1.8])
     return solid - window - drill(0.6, 9).translate([-2, 0, 5])
 

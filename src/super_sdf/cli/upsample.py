@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -110,6 +111,7 @@ class Upsampling:
         from ..progress import Stopwatch
 
         watch, options = Stopwatch(), CheckOptions.of(make_options(self.options))
+        options = replace(options, processes=self.options["threads"])
         try:
             self.certificate = check_files(self.target, self.source, options)
         except SuperSdfError as error:
