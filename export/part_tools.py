@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from manifold3d import CrossSection, Manifold
 import numpy as np
+from manifold3d import CrossSection, Manifold
 
 SEGMENTS = 192  # of a circle: facets meet at 2 degrees, which tells little from a smooth surface
 OVERLAP = 0.01  # a tool starts that far outside the part

@@ -6,8 +6,9 @@ processes: libigl holds Python's lock, so threads would wait for each other.
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
 
@@ -15,7 +16,6 @@ import igl.predicates
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import IntArray
 from ..errors import SuperSdfError
 from ..machine.pool import Death, Pool
 from ..machine.serving import Tell, Work
@@ -96,7 +96,7 @@ class Cutting:
         shares = np.linspace(0, 1, len(mesh.faces) // FACES_IN_SLAB + 2)[1:-1]
         inner = np.unique(np.quantile(self.low, shares, method="lower"))
         limits = [-np.inf, *inner.tolist(), np.inf]
-        self.ranges = deque(zip(limits, limits[1:]))
+        self.ranges = deque(itertools.pairwise(limits))
 
     def __len__(self) -> int:
         return len(self.ranges)

@@ -102,7 +102,6 @@ def _load(path: Path) -> tuple[NDArray[np.float64], NDArray[Any]]:
         reason = str(error).strip().splitlines()
         first = reason[0][:200] if reason else type(error).__name__
         raise FileError(f"{path} cannot be read as a mesh: {first}") from error
-    return vertices, faces
 
 
 def _load_with_trimesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

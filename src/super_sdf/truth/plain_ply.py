@@ -66,6 +66,6 @@ def _header(file: BinaryIO) -> str:
     for _ in range(HEADER_LINES):
         line = file.readline(LINE_BYTES)
         lines += [] if line.startswith((b"comment ", b"obj_info ")) else [line]
-        if line in (b"end_header\n", b"") or len(lines) == 1 and line != b"ply\n":
+        if line in (b"end_header\n", b"") or (len(lines) == 1 and line != b"ply\n"):
             break
     return b"".join(lines).decode("latin-1")
