@@ -134,16 +134,16 @@ def test_fans_are_those_of_a_graph_search(seed):
     """On random triangles, open and crowded: where no edge is crowded both agree."""
     random = np.random.default_rng(seed)
     faces = torus(12, 8).faces[random.random(192) < 0.7]
-    opposite, edges = surface.pair_edges(faces, 96)
+    opposite, edges = topology.pair_edges(faces, 96)
     assert edges.crowded_edges == edges.flipped_edges == 0
-    fans = surface.count_fans(faces, opposite)
+    fans = topology.count_fans(faces, opposite)
     assert np.array_equal(fans[np.unique(faces)], count_fans(faces))
 
 
 def test_intersections_do_not_depend_on_the_slabs(monkeypatch):
     random = np.random.default_rng(3)
     vertices = random.random((90, 3))
-    faces = surface.without_collapsed(random.integers(0, 90, (120, 3)).astype(np.int32))
+    faces = topology.without_collapsed(random.integers(0, 90, (120, 3)).astype(np.int32))
     whole = surface.count_intersections(vertices, faces)
     monkeypatch.setattr(surface, "FACES_IN_SLAB", 7)
     assert surface.count_intersections(vertices, faces) == whole > 100

@@ -12,6 +12,7 @@ import numpy as np
 
 from .errors import OptionError, OptionTypeError, seen
 from .grid.sdf_grid import SdfGrid
+from .mesh import Mesh
 
 
 def check_grid(grid: Any) -> None:
@@ -104,3 +105,55 @@ def check_progress(progress: Any) -> None:
         raise OptionTypeError(
             f"progress is {seen(progress)}: give a function of (done, total), in thousandths"
         )
+
+
+def check_mesh(mesh: Any) -> None:
+    """Raise OptionTypeError if ``mesh`` is not a ``Mesh``."""
+    if not isinstance(mesh, Mesh):
+        raise OptionTypeError(f"mesh is {seen(mesh)}: give one from reconstruct(grid)")
+
+
+def check_goal(error: Any, triangles: Any) -> tuple[float | None, int | None]:
+    """Return to what a mesh is simplified: within an error, or to a number of triangles.
+
+    Raises
+    ------
+    OptionError
+        If not exactly one of them is given, or it is not positive, or not a number
+        (``OptionTypeError``).
+    """
+    if (error is None) == (triangles is None):
+        raise OptionError("give either error or triangles")
+    if triangles is not None:
+        return None, check_triangles(triangles)
+    return check_error(error), None
+
+
+def check_error(error: Any, name: str = "error") -> float:
+    """Return the largest distance of a simplified mesh; ``name`` is its name in messages.
+
+    Raises
+    ------
+    OptionError
+        If it is not positive and finite, or not a number (``OptionTypeError``).
+    """
+    if not isinstance(error, Real) or isinstance(error, bool):
+        raise OptionTypeError(f"{name} is {seen(error)}: give a number greater than 0")
+    if not (isfinite(error) and error > 0):
+        raise OptionError(f"{name} is {error}: give a number greater than 0")
+    return float(error)
+
+
+def check_triangles(triangles: Any) -> int:
+    """Return the largest number of triangles of a simplified mesh.
+
+    Raises
+    ------
+    OptionError
+        If it is less than 4, or not a whole number (``OptionTypeError``).
+    """
+    if not isinstance(triangles, Integral) or isinstance(triangles, bool):
+        raise OptionTypeError(f"triangles is {seen(triangles)}: give a whole number")
+    if triangles < 4:
+        raise OptionError(f"triangles is {triangles}: give 4 or more, as a closed mesh has")
+    return int(triangles)
