@@ -61,12 +61,19 @@ class Original:
         return np.concatenate([p for p, _ in chunks]), np.concatenate([w for _, w in chunks])
 
     def beyond(self, result: Mesh, distance: float) -> Points:
-        """Return the points, (n, 3), of both meshes that are farther than this from the other."""
-        there = Solid(result).distance(self.points[0]) > distance
-        far = [self.points[0][there]]
+        """Return points, (n, 3), of either mesh that are farther than this from the other.
+
+        The points within triangles of this mesh, which are many, are looked at only if all others
+        are near enough.
+        """
+        tree, vertices = Solid(result), self.solid.mesh.vertices
+        found = [vertices[tree.distance(vertices) > distance]]
         for points, _ in points_on(result, self.step):
-            far.append(points[self.solid.distance(points) > distance])
-        return np.concatenate(far)
+            found.append(points[self.solid.distance(points) > distance])
+        if not any(map(len, found)):
+            within = self.points[0][len(vertices) :]
+            found.append(within[tree.distance(within) > distance])
+        return np.concatenate(found)
 
     def deviation(self, result: Mesh) -> Deviation:
         """Return how far a simplified mesh and this one lie apart."""

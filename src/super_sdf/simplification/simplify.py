@@ -28,7 +28,7 @@ from .deviation import Deviation, Original
 # triangles at 32^3, another one 9, 9, 8, 9 and 12 %.
 PLANE_DISTANCE = 2.0
 MOST_PASSES = 12
-ENOUGH = 0.95  # a pass that leaves more of the triangles is the last one
+ENOUGH = 0.9  # a pass that leaves more of the triangles is the last one
 ROUNDS = 8  # of keeping more triangles, before smaller distances are tried
 HALVINGS = 3
 
