@@ -134,10 +134,11 @@ def extract_sharp_pieces(
         If there are more vertices than can be numbered, those before among them.
     """
     rows = _rows_around(field)
-    crossings = find_crossings(field, rows, threads)
+    before = field.plane_before(rows).start if rows.start < rows.stop else rows.start
+    crossings = find_crossings(field, slice(before, rows.stop), threads)
     if not len(crossings.own_row):
         return [Mesh(np.empty((0, 3), vertex_type(grid, field.factor)), NO_FACES)]
-    patches = find_patches(field, crossings, rows)
+    patches = find_patches(field, crossings, rows, before)
     own = planes_at_crossings(field, crossings, threads)
     positions, features, peaks = place_features(patches, own)
     numbers = _number_vertices(field, crossings, patches, features, first_vertex)
@@ -154,7 +155,7 @@ def extract_sharp_pieces(
 
 def planes_beside(factor: int) -> int:
     """Return how many coarse planes to either side a slab's mesh depends on."""
-    return 1 + -(-REACH_IN_CELLS // factor)
+    return -(-(REACH_IN_CELLS + 1) // factor)
 
 
 def _rows_around(field: FineField) -> slice:
@@ -163,20 +164,26 @@ def _rows_around(field: FineField) -> slice:
     return field.rows(field.planes[0] - beside, field.planes[1] + beside)
 
 
-def find_patches(field: FineField, crossings: Crossings, rows: slice) -> Patches:
-    """Return the patches in the crossed cells of some voxels."""
+def find_patches(field: FineField, crossings: Crossings, rows: slice, before: int) -> Patches:
+    """Return the patches in the crossed cells of some voxels.
+
+    The crossings are those of the voxels from ``before`` on, the first of the plane before, since
+    these own edges of the cells.
+    """
     table, factor = loop_table(), field.factor
     edges = 3 * len(field.blocks)
-    edge_at = number_edges(field, crossings, rows.start, rows, 0)
-    count = table.count[crossings.case]
+    edge_at = number_edges(field, crossings, before, rows, 0)
+    some = crossings.cells(rows)
+    case = crossings.case[some]
+    count = table.count[case]
     cell = np.repeat(np.arange(len(count)), count)
-    loop = table.first[crossings.case[cell]] + _nth(cell, count)
-    row = crossings.cell_row[cell]
-    low_node = cells_low_nodes(factor)[crossings.cell[cell]]
-    at = ((row - np.int64(rows.start)) * edges + low_node)[:, None] + edge_steps(factor)[
+    loop = table.first[case[cell]] + _nth(cell, count)
+    row = crossings.cell_row[some][cell]
+    low_node = cells_low_nodes(factor)[crossings.cell[some][cell]]
+    at = ((row - np.int64(before)) * edges + low_node)[:, None] + edge_steps(factor)[
         table.edges[loop]
     ]
-    crossing = np.where(table.edges[loop] >= 0, edge_at.take(at, mode="clip"), -1)
+    crossing = np.where(table.edges[loop] >= 0, edge_at.take(at, mode="clip"), np.int64(-1))
     low = factor * field.voxel_ijk[row] + block_ijk(factor)[low_node]
     return Patches(row, low.astype(np.float64), loop, table.sides[loop], crossing)
 
