@@ -10,7 +10,7 @@ import trimesh
 from conftest import ball, count_fans
 from solids import cube, inverted, joined, saved, sphere, torus
 
-from super_sdf import Mesh, SdfGrid
+from super_sdf import Mesh, SdfGrid, topology
 from super_sdf.certificate import surface
 from super_sdf.certificate.check import CheckOptions, check_files, check_mesh, stated_triangles
 from super_sdf.certificate.coloured import PIERCED, TOUCHING, UNKNOWN, colours, vertex_residuals

@@ -139,7 +139,7 @@ def check_error(error: Any, name: str = "error") -> float:
     """
     if not isinstance(error, Real) or isinstance(error, bool):
         raise OptionTypeError(f"{name} is {seen(error)}: give a number greater than 0")
-    if not (isfinite(error) and error > 0):
+    if not (isfinite(error) and float(error) > 0):
         raise OptionError(f"{name} is {error}: give a number greater than 0")
     return float(error)
 

@@ -113,8 +113,8 @@ def irregular_places(mesh: Mesh) -> NDArray[np.float64]:
     fans = count_fans(faces, opposite)
     unpaired = np.flatnonzero(opposite < 0)
     start, end = faces.ravel()[unpaired], np.roll(faces, -1, axis=1).ravel()[unpaired]
-    points = [np.flatnonzero(fans > 1), _doubled(positions), _corners_of_doubled(faces)]
-    both = np.concatenate(points)
+    pinched = np.flatnonzero(fans > 1)
+    both = np.concatenate([pinched, _doubled(positions), _corners_of_doubled(faces)])
     ends = np.concatenate([start, both]), np.concatenate([end, both])
     return np.concatenate([positions[ends[0]], positions[ends[1]]], axis=1)
 
@@ -125,7 +125,9 @@ def _doubled(rows: NDArray[np.float64]) -> NDArray[np.intp]:
     return np.flatnonzero(uses[inverse] > 1)
 
 
-def _corners_of_doubled(faces: IntArray) -> IntArray:
+def _corners_of_doubled(faces: IntArray) -> NDArray[np.intp]:
     """Return the corners of triangles that have the same three corners as another one."""
-    corners: IntArray = faces[_doubled(np.sort(faces, axis=1).astype(np.float64))].ravel()
+    corners: NDArray[np.intp] = faces.astype(np.intp)[
+        _doubled(np.sort(faces, axis=1).astype(np.float64))
+    ].ravel()
     return corners

@@ -53,9 +53,13 @@ def collapse_to(mesh: Mesh, kept: BoolArray, triangles: int) -> Mesh:
     More are left where the shape, the kept triangles, or open edges do not allow fewer.
     """
     target = max(triangles - int(np.count_nonzero(kept)), 0)
+    return _collapse(mesh, kept, mean_side(mesh), {"target_count": target, "update_rate": 1})
+
+
+def mean_side(mesh: Mesh) -> float:
+    """Return the mean length of the first sides of all triangles."""
     ends = mesh.vertices[mesh.faces[:, :2]].astype(np.float64)
-    side = float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean())
-    return _collapse(mesh, kept, side, {"target_count": target, "update_rate": 1})
+    return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean())
 
 
 def _collapse(mesh: Mesh, kept: BoolArray, unit: float, options: dict[str, Any]) -> Mesh:
@@ -98,8 +102,8 @@ def run_pyfqmr(
 
 def renumbered(faces: IntArray) -> tuple[NDArray[np.intp], IntArray]:
     """Return the vertices that faces (m, 3) use, and the faces with these numbered from 0."""
-    used, numbers = np.unique(faces, return_inverse=True)
-    return used, numbers.reshape(faces.shape).astype(np.int32)
+    used, numbers = np.unique(faces.ravel(), return_inverse=True)
+    return used.astype(np.intp), numbers.astype(np.int32).reshape(-1, 3)
 
 
 def position_rows(points: Points, wanted: Points) -> NDArray[np.intp]:

@@ -352,7 +352,7 @@ def _pairs(patches: Patches, count: int) -> tuple[Index, Index]:
         for other in range(patches.crossing.shape[1]):
             a, b = patches.crossing[:, one], patches.crossing[:, other]
             there = (a >= 0) & (b >= 0) & (a != b)
-            pairs.append(a[there].astype(np.int64) * count + b[there])
+            pairs.append(a[there] * count + b[there])
     return tuple(np.divmod(np.unique(np.concatenate(pairs)), count))  # type: ignore[return-value]
 
 
