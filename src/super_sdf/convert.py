@@ -26,6 +26,8 @@ from .network.decoder import Decoder
 from .pipeline import reconstruct_slabs
 from .progress import Progress, Stopwatch
 from .slabs.pieces import Piece
+from .steps.mesher_names import DEFAULT_MESHER
+from .steps.meshers import find_mesher
 from .steps.nodes import check_factor
 
 
@@ -40,6 +42,7 @@ class ConvertOptions:
     offset: float = 0.0
     cap: bool = False
     max_memory: int | None = None
+    mesher: str = DEFAULT_MESHER
 
 
 COUNTS = (
@@ -120,7 +123,7 @@ def convert(
     network : Network
         From ``load_network``; it can be used for any number of files.
     options : ConvertOptions
-        Factor, spacing, sign, offset, cap and memory bound.
+        Factor, spacing, sign, offset, cap, mesher and memory bound.
     force : bool
         Replace the target if it exists.
     progress : callable, optional
@@ -144,6 +147,7 @@ def convert(
         max_memory=options.max_memory,
     )
     check_factor(options.factor)
+    find_mesher(options.mesher)
     about = check_format_holds(target, grid, options.factor)
     notes = (*grid.notes, *local_origin_note(target, about))
     expected = expect(grid, options.factor, options.offset, target)
@@ -156,6 +160,7 @@ def convert(
         options.factor,
         offset=options.offset,
         cap=options.cap,
+        mesher=options.mesher,
         max_memory=options.max_memory,
         progress=progress,
     )

@@ -11,4 +11,4 @@ from .pipeline import reconstruct as reconstruct
 from .pipeline import upsample as upsample
 from .simplification.simplify import simplify_mesh as simplify_mesh
 from .steps.field import FineField as FineField
-from .steps.marching import extract_mesh as extract_mesh
+from .steps.meshers import extract_mesh as extract_mesh

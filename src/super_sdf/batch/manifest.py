@@ -21,6 +21,7 @@ from ..convert import ConvertOptions
 from ..errors import FileError, OptionError
 from ..files.meshes import MESH_SUFFIXES
 from ..grid.sides import INSIDE
+from ..steps.mesher_names import MESHERS
 from ..steps.nodes import check_factor
 from .job import Job
 
@@ -180,6 +181,12 @@ def _flag(name: str, value: Any) -> bool:
     return value
 
 
+def _mesher(name: str, value: Any) -> str:
+    if value not in MESHERS:
+        raise OptionError(f"{name!r} is {value!r}: give one of {', '.join(MESHERS)}")
+    return str(value)
+
+
 CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "factor": _factor,
     "spacing": _numbers,
@@ -187,4 +194,5 @@ CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "inside": _inside,
     "offset": _number,
     "cap": _flag,
+    "mesher": _mesher,
 }

@@ -17,6 +17,7 @@ from .choices import (
     default_quality,
     device_option,
     first,
+    meshers,
     precisions,
     qualities,
     signs_inside,
@@ -108,6 +109,14 @@ OPTIONS: tuple[Option, ...] = (
         "solid, whichever sign is inside.",
     ),
     click.option("--cap", is_flag=True, help="Close the surface where it runs out of the grid."),
+    click.option(
+        "--mesher",
+        type=LazyChoice(meshers),
+        default=convert_default("mesher"),
+        show_default=True,
+        help="Mesher: marching is marching cubes, which cuts off edges and corners; sharp also "
+        "puts vertices on them and takes longer.",
+    ),
     click.option(
         "--quality",
         type=LazyChoice(qualities),

@@ -149,6 +149,7 @@ class Upsampling:
             "output": self.target,
             "factor": self.options["factor"],
             "offset": self.options["offset"],
+            "mesher": self.options["mesher"],
             "model": self.model,
             "precision": self.options["precision"],
             "device": self.network.device,

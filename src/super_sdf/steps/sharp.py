@@ -33,11 +33,12 @@ from ..arrays import BoolArray, IntArray
 from ..grid.sdf_grid import SdfGrid
 from ..machine.index_width import check_count
 from ..machine.threads import map_chunks
-from ..mesh import Mesh, vertex_type
+from ..mesh import CLEARANCE, Mesh, vertex_type
 from ..neighbourhood import CENTRE, STRIDES
 from .cell_cases import loop_table
 from .field import FineField
 from .marching import (
+    CAP_HEIGHT,
     NO_FACES,
     Crossings,
     cells_low_nodes,
@@ -141,6 +142,8 @@ def extract_sharp_pieces(
     patches = find_patches(field, crossings, rows, before)
     own = planes_at_crossings(field, crossings, threads)
     positions, features, peaks = place_features(patches, own)
+    positions = _kept_in_grid(positions, own.point, field)
+    peaks = _kept_in_grid(peaks, patches.low[features] + 0.5, field)
     numbers = _number_vertices(field, crossings, patches, features, first_vertex)
     faces = _faces(field, patches, features, numbers)
     vertices = np.empty((numbers.own, 3))
@@ -151,6 +154,18 @@ def extract_sharp_pieces(
         mine = _within(row, field.own_rows)
         vertices[number[mine] - first_vertex] = position[mine]
     return [Mesh(to_world(vertices.T, field, grid), faces)]
+
+
+def _kept_in_grid(position: Vectors, start: Vectors, field: FineField) -> Vectors:
+    """Return positions (n, 3) that do not leave the grid, nor its border if they started there.
+
+    An open surface ends on the border, and a cap is flat there. ``start``, (n, 3), is where a
+    vertex was on its lattice edge, or the middle of its cell.
+    """
+    last = np.array(field.shape, np.float64) * field.factor
+    at_border = (start <= 0) | (start >= last)
+    border = np.clip(start, -CAP_HEIGHT, last + CAP_HEIGHT)
+    return np.where(at_border, border, np.clip(position, CLEARANCE, last - CLEARANCE))
 
 
 def planes_beside(factor: int) -> int:
