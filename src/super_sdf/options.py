@@ -113,8 +113,12 @@ def check_mesh(mesh: Any) -> None:
         raise OptionTypeError(f"mesh is {seen(mesh)}: give one from reconstruct(grid)")
 
 
-def check_goal(error: Any, triangles: Any) -> tuple[float | None, int | None]:
+def check_goal(
+    error: Any, triangles: Any, names: tuple[str, str] = ("error", "triangles")
+) -> tuple[float | None, int | None]:
     """Return to what a mesh is simplified: within an error, or to a number of triangles.
+
+    ``names`` are those of the arguments in messages.
 
     Raises
     ------
@@ -122,11 +126,15 @@ def check_goal(error: Any, triangles: Any) -> tuple[float | None, int | None]:
         If not exactly one of them is given, or it is not positive, or not a number
         (``OptionTypeError``).
     """
-    if (error is None) == (triangles is None):
-        raise OptionError("give either error or triangles")
+    if error is None and triangles is None:
+        raise OptionError("give {} or {}".format(*names))
+    if error is not None and triangles is not None:
+        raise OptionError(
+            f"{names[0]} {seen(error)} and {names[1]} {seen(triangles)}: give only one of them"
+        )
     if triangles is not None:
-        return None, check_triangles(triangles)
-    return check_error(error), None
+        return None, check_triangles(triangles, names[1])
+    return check_error(error, names[0]), None
 
 
 def check_error(error: Any, name: str = "error") -> float:
@@ -144,8 +152,8 @@ def check_error(error: Any, name: str = "error") -> float:
     return float(error)
 
 
-def check_triangles(triangles: Any) -> int:
-    """Return the largest number of triangles of a simplified mesh.
+def check_triangles(triangles: Any, name: str = "triangles") -> int:
+    """Return the largest number of triangles of a simplified mesh; ``name`` is its name in messages.
 
     Raises
     ------
@@ -153,7 +161,7 @@ def check_triangles(triangles: Any) -> int:
         If it is less than 4, or not a whole number (``OptionTypeError``).
     """
     if not isinstance(triangles, Integral) or isinstance(triangles, bool):
-        raise OptionTypeError(f"triangles is {seen(triangles)}: give a whole number")
+        raise OptionTypeError(f"{name} is {seen(triangles)}: give a whole number")
     if triangles < 4:
-        raise OptionError(f"triangles is {triangles}: give 4 or more, as a closed mesh has")
+        raise OptionError(f"{name} is {triangles}: give 4 or more, as a closed mesh has")
     return int(triangles)

@@ -22,9 +22,9 @@ from ..pipeline import reconstruct, refine
 from ..slabs.cutting import whole
 from ..steps.band import neighbour_table
 from ..steps.field import FineField
-from ..steps.nodes import block_ijk, share_parts
 from ..steps.mesher_names import DEFAULT_MESHER, MARCHING, SHARP
 from ..steps.meshers import extract_mesh
+from ..steps.nodes import block_ijk, share_parts
 from ..steps.survey import survey
 from .cases import Case, spread_samples
 from .names import OURS, meshed_by

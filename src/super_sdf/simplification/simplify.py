@@ -8,7 +8,8 @@ The modules that do it are imported when they are needed: they need the extra ``
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from ..errors import OutOfMemoryError
 from ..machine.extras import check_modules
@@ -43,6 +44,15 @@ class Simplified:
     triangles_before: int
     deviation: Deviation
     warnings: tuple[str, ...] = ()
+
+    def report(self, voxel_size: float) -> dict[str, Any]:
+        """Return the figures as they stand in JSON; distances are in voxels."""
+        return {
+            "triangles_before": self.triangles_before,
+            "triangles": len(self.mesh.faces),
+            "deviation": asdict(self.deviation.over(voxel_size)),
+            "warnings": list(self.warnings),
+        }
 
 
 def simplify_mesh(
@@ -97,7 +107,10 @@ def simplify_mesh(
         result, warnings = within(mesh, original, error, rounds)
     else:
         result, warnings = down_to(mesh, triangles or 0, rounds)
-    return Simplified(result, len(mesh.faces), original.deviation(result), warnings)
+    deviation = original.deviation(result)
+    if progress:
+        progress(1.0)
+    return Simplified(result, len(mesh.faces), deviation, warnings)
 
 
 def check_can_simplify(what: str = "simplifying") -> None:
