@@ -153,7 +153,7 @@ def check_error(error: Any, name: str = "error") -> float:
 
 
 def check_triangles(triangles: Any, name: str = "triangles") -> int:
-    """Return the largest number of triangles of a simplified mesh; ``name`` is its name in messages.
+    """Return the most triangles of a simplified mesh; ``name`` is the argument's in messages.
 
     Raises
     ------

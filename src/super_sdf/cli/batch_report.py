@@ -172,7 +172,8 @@ def describe_simplified(rows: list[dict[str, Any]]) -> str:
     )
     worst = max(figures, key=lambda name: largest_distance(figures[name]))
     distance = largest_distance(figures[worst])
-    return f"from {before:,} to {after:,} triangles; largest distance {distance:.4f} voxels, of {worst}"
+    counts = f"from {before:,} to {after:,} triangles"
+    return f"{counts}; largest distance {distance:.4f} voxels, of {worst}"
 
 
 def largest_distance(simplified: dict[str, Any]) -> float:

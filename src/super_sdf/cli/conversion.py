@@ -158,9 +158,9 @@ SIMPLIFY_OPTIONS: tuple[Option, ...] = (
         "--simplify",
         type=float,
         metavar="ERROR",
-        help="Simplify the mesh as far as it stays within ERROR, in voxels of the grid (0.02, say), "
-        "of the unsimplified mesh, measured both ways. A closed mesh stays closed. Needs the extra "
-        "simplify.",
+        help="Simplify the mesh as far as it stays within ERROR of the unsimplified mesh, in voxels "
+        "of the grid (such as 0.02), measured both ways. A closed mesh stays closed. Needs the "
+        "extra simplify.",
     ),
     click.option(
         "--triangles",
