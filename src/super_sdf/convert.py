@@ -179,7 +179,8 @@ def convert(
     notes = (*grid.notes, *local_origin_note(target, about))
     expected = expect(grid, options.factor, options.offset, target)
     if options.simplifies:
-        check_room(int(expected.triangles * CERTAIN_SHARE), options.max_memory)
+        least = int(expected.triangles * CERTAIN_SHARE)
+        check_room(least, options.max_memory, estimated=True)
     elif announce and (sentence := expected.warning(target)):
         announce(sentence)
     watch.lap("read")

@@ -96,7 +96,10 @@ def down_to(mesh: Mesh, triangles: int, rounds: Rounds) -> tuple[Mesh, tuple[str
 
 
 def _nearly_to(mesh: Mesh, triangles: int, rounds: Rounds) -> Mesh:
-    """Return a mesh with no fewer triangles: passes with distances that double, flat parts first."""
+    """Return a mesh with no fewer triangles, by passes with distances that double.
+
+    So flat parts come first, where a collapsed edge costs nothing.
+    """
     result, side = mesh, mean_side(mesh)
     for doubling in range(DOUBLINGS):
         distance = LEAST_DISTANCE * side * 2**doubling

@@ -118,13 +118,16 @@ def check_can_simplify(what: str = "simplifying") -> None:
     check_modules(what, "simplify")
 
 
-def check_room(triangles: int, max_memory: int | None) -> None:
-    """Raise OutOfMemoryError if simplifying so many triangles would exceed the memory bound."""
+def check_room(triangles: int, max_memory: int | None, *, estimated: bool = False) -> None:
+    """Raise OutOfMemoryError if simplifying a mesh would exceed the memory bound.
+
+    With ``estimated``, the number of its triangles is a low estimate.
+    """
     give_back()  # otherwise freed memory counts as held
     bound, need = memory_bound(max_memory), triangles * BYTES_PER_TRIANGLE + (held_memory() or 0)
     if bound is not None and need > bound:
         raise OutOfMemoryError(
-            f"simplifying {triangles:,} triangles needs {in_words(need)} of memory, since the "
-            f"whole mesh must be held; {in_words(bound)} may be used; use a smaller factor, allow "
-            "more (--max-memory), or do not simplify"
+            f"simplifying {'at least ' * estimated}{triangles:,} triangles needs {in_words(need)} "
+            f"of memory, since the whole mesh must be held; {in_words(bound)} may be used; use a "
+            "smaller factor, allow more (--max-memory), or do not simplify"
         )
