@@ -42,15 +42,18 @@ from super_sdf.files.grids import read_grid
 from super_sdf.machine.resources import allot
 from super_sdf.pipeline import find_surface
 from super_sdf.slabs.cutting import peak_bytes, ways_to_cut, whole
+from super_sdf.steps.meshers import find_mesher
 
-path, factor, precision = sys.argv[1:]
+path, factor, precision, name = sys.argv[1:]
 network = load_network(precision=precision, device="cpu")
 grid = read_grid(path, spacing=1.0)
 resources = allot(network.threads)
 band = find_surface(grid, int(factor), 0.0, resources)
-*_, thinnest = ways_to_cut(band, network.receptive_field)
+mesher = find_mesher(name)
+beside = mesher.planes_beside(int(factor))
+*_, thinnest = ways_to_cut(band, network.receptive_field, beside)
 for slabs in ([whole(band)], thinnest):
-    print(peak_bytes(band, slabs, int(factor), network.memory_bytes, resources.threads))
+    print(peak_bytes(band, slabs, int(factor), network.memory_bytes, resources.threads, mesher))
 """
 
 

@@ -52,8 +52,8 @@ def digest(path: Path) -> str:
 def cut_into(slabs: int) -> Iterator[None]:
     """Cut every grid into about as many slabs, whatever the memory."""
 
-    def plan(band: Band, factor: int, reach: int, *_: Any) -> list[Slab]:
-        return cut(band, slabs, reach)
+    def plan(band: Band, factor: int, reach: int, *others: Any) -> list[Slab]:
+        return cut(band, slabs, reach, others[-1].planes_beside(factor))
 
     with mock.patch.object(pipeline, "plan_slabs", plan) if slabs > 1 else nullcontext():
         yield

@@ -61,7 +61,9 @@ LISTS = {
     "": "list.jsonl names no file: give a path a line",
     '{"out": "a.ply"}': "list.jsonl, line 1: 'in' is None: give the path of a grid",
     '{"in": "a.npy", "Factor": 2}': "list.jsonl, line 1: 'Factor' is unknown: give in, out, "
-    "factor, spacing, origin, inside, offset, cap",
+    "factor, spacing, origin, inside, offset, cap, mesher",
+    '{"in": "a.npy", "mesher": "x"}': "list.jsonl, line 1: 'mesher' is 'x': give one of marching, "
+    "sharp",
     '\n{"in": "a.npy", "factor": 3}': "list.jsonl, line 2: factor is 3: give an even number from "
     "2 to 16 (an odd one has no node on the samples)",
     '{"in": "a.npy", "factor": true}': "list.jsonl, line 1: 'factor' is True: give a whole number",

@@ -10,7 +10,7 @@ import trimesh
 from conftest import ball, count_fans
 from solids import cube, inverted, joined, saved, sphere, torus
 
-from super_sdf import Mesh, SdfGrid
+from super_sdf import Mesh, SdfGrid, topology
 from super_sdf.certificate import slabs, surface
 from super_sdf.certificate.check import CheckOptions, check_files, check_mesh, stated_triangles
 from super_sdf.certificate.coloured import PIERCED, TOUCHING, UNKNOWN, colours, vertex_residuals
@@ -134,16 +134,16 @@ def test_fans_are_those_of_a_graph_search(seed):
     """On random triangles, open and crowded: where no edge is crowded both agree."""
     random = np.random.default_rng(seed)
     faces = torus(12, 8).faces[random.random(192) < 0.7]
-    opposite, edges = surface.pair_edges(faces, 96)
+    opposite, edges = topology.pair_edges(faces, 96)
     assert edges.crowded_edges == edges.flipped_edges == 0
-    fans = surface.count_fans(faces, opposite)
+    fans = topology.count_fans(faces, opposite)
     assert np.array_equal(fans[np.unique(faces)], count_fans(faces))
 
 
 def test_what_is_found_does_not_depend_on_the_slabs(monkeypatch):
     random = np.random.default_rng(3)
     vertices = random.random((90, 3))
-    faces = surface.without_collapsed(random.integers(0, 90, (120, 3)).astype(np.int32))
+    faces = topology.without_collapsed(random.integers(0, 90, (120, 3)).astype(np.int32))
     points = random.uniform(-0.5, 1.5, (200, 3))
     mesh = Mesh(vertices, faces)
     whole = slabs.search(mesh, points, 0.1, intersections=True)

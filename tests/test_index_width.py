@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from conftest import ball, trilinear
 
-from super_sdf import SdfGrid, reconstruct, upsample
+from super_sdf import SdfGrid, extract_mesh, reconstruct, upsample
 from super_sdf.errors import OptionError
 from super_sdf.machine import index_width
 from super_sdf.slabs.cutting import check_vertices
-from super_sdf.steps.marching import extract_mesh
 from super_sdf.steps.nodes import number_parts, share_parts
 from super_sdf.steps.survey import survey
 

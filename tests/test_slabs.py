@@ -51,9 +51,11 @@ FIELDS = {
 
 def in_pieces(grid, network, monkeypatch, pieces, **options):
     """Reconstruct in ``pieces`` slabs."""
-    monkeypatch.setattr(
-        pipeline, "plan_slabs", lambda band, factor, field, *bounds: cut(band, pieces, field)
-    )
+
+    def plan(band, factor, receptive_field, resources, needed, mesher):
+        return cut(band, pieces, receptive_field, mesher.planes_beside(factor))
+
+    monkeypatch.setattr(pipeline, "plan_slabs", plan)
     return list(reconstruct_slabs(grid, network, **options))
 
 
@@ -92,7 +94,7 @@ def test_slabs_need_all_the_planes_beside_them(network, monkeypatch):
     """With fewer planes the mesh differs, so the tests above can fail."""
     grid = SdfGrid.trusted(FIELDS["clean"], (1.0,) * 3)
     one = reconstruct(grid, network)
-    monkeypatch.setattr(cutting, "DECODED_BESIDE", 2)
+    monkeypatch.setattr(cutting, "REACH_IN_VOXELS", 1)
     parts = in_pieces(grid, network, monkeypatch, 4)
     mesh = join_meshes([mesh for part in parts for mesh in part.meshes])
     assert not np.array_equal(mesh.vertices, one.vertices)
@@ -140,7 +142,7 @@ def test_a_network_without_a_receptive_field_is_called_once_for_the_whole_band()
 @pytest.mark.parametrize("pieces", [1, 2, 5, 1000])
 def test_slabs_cover_the_grid_once(pieces):
     band = survey(SdfGrid.trusted(rod(), (1.0,) * 3))
-    slabs = cut(band, pieces, receptive_field=4)
+    slabs = cut(band, pieces, receptive_field=4, beside=1)
     assert slabs[0].planes[0] == 0 and slabs[-1].planes[1] == 56
     assert all(a.planes[1] == b.planes[0] for a, b in pairwise(slabs))
     for slab in slabs:
@@ -154,7 +156,7 @@ def test_the_thinnest_slabs_all_decode_something():
     values = np.full((60, 14, 15), 9.0)
     values[40:] = rod()[:20]
     band = survey(SdfGrid.trusted(values, (1.0,) * 3))
-    *_, thinnest = cutting.ways_to_cut(band, receptive_field=2)
+    *_, thinnest = cutting.ways_to_cut(band, receptive_field=2, beside=1)
     assert thinnest[0].planes[0] == 0 and thinnest[-1].planes[1] == 60
     assert all(band.count_decoded(band.rows(*slab.planes)) for slab in thinnest)
 

@@ -37,7 +37,8 @@ from .slabs.footprint import NETWORK_BYTES
 from .slabs.pieces import Piece, describe_piece
 from .steps.cap import close_at_border
 from .steps.field import FineField
-from .steps.marching import extract_pieces
+from .steps.mesher_names import DEFAULT_MESHER
+from .steps.meshers import Mesher, extract_pieces, find_mesher
 from .steps.nodes import (
     average_shared,
     block_offsets,
@@ -119,6 +120,7 @@ def reconstruct(
     *,
     offset: float = 0.0,
     cap: bool = False,
+    mesher: str = DEFAULT_MESHER,
     max_memory: int | None = None,
     progress: Progress | None = None,
 ) -> Mesh:
@@ -133,6 +135,9 @@ def reconstruct(
     cap : bool
         Close a surface that runs out of the grid along the grid's border; otherwise it is left
         open.
+    mesher : str
+        "marching" for marching cubes, which cuts off edges and corners; "sharp" also puts vertices
+        on them.
     max_memory : int, optional
         Bytes that the process may hold in all, besides the mesh; by default a share of the free
         memory.
@@ -148,7 +153,14 @@ def reconstruct(
 
         network = load_network()
     pieces = reconstruct_slabs(
-        grid, network, factor, offset=offset, cap=cap, max_memory=max_memory, progress=progress
+        grid,
+        network,
+        factor,
+        offset=offset,
+        cap=cap,
+        mesher=mesher,
+        max_memory=max_memory,
+        progress=progress,
     )
     return join_meshes([mesh for piece in pieces for mesh in piece.meshes])
 
@@ -160,6 +172,7 @@ def reconstruct_slabs(
     *,
     offset: float = 0.0,
     cap: bool = False,
+    mesher: str = DEFAULT_MESHER,
     max_memory: int | None = None,
     progress: Progress | None = None,
 ) -> Iterator[Piece]:
@@ -171,8 +184,9 @@ def reconstruct_slabs(
     check_network(network)
     check_progress(progress)
     factor, offset = check_factor(factor), check_distance(offset)
+    extraction = find_mesher(mesher), check_cap(cap)
     return _slabs(
-        grid, network, factor, offset, check_cap(cap), check_max_memory(max_memory), progress
+        grid, network, factor, offset, *extraction, check_max_memory(max_memory), progress
     )
 
 
@@ -181,6 +195,7 @@ def _slabs(
     network: Decoder,
     factor: int,
     offset: float,
+    mesher: Mesher,
     cap: bool,
     max_memory: int | None,
     progress: Progress | None,
@@ -190,8 +205,9 @@ def _slabs(
     steps = StepCounter(progress)
     band = find_surface(grid, factor, offset, resources)
     reach, needed = getattr(network, "receptive_field", None), memory_needs(network)
-    slabs = plan_slabs(band, factor, reach, resources, needed)
-    planned = peak_bytes(band, slabs, factor, needed, resources.threads)
+    slabs = plan_slabs(band, factor, reach, resources, needed, mesher)
+    planned = peak_bytes(band, slabs, factor, needed, resources.threads, mesher)
+    beside = mesher.planes_beside(factor)
     steps.divide(len(slabs))
     steps.finish("band")
     vertices = 0
@@ -200,8 +216,8 @@ def _slabs(
         if len(slabs) > 1:
             give_back()
         field = refine(band, network, factor, slab, resources.threads, steps)
-        whole = close_at_border(field, grid, offset) if cap else field
-        meshes = extract_pieces(whole, grid, vertices, resources.threads)
+        whole = close_at_border(field, grid, offset, beside) if cap else field
+        meshes = extract_pieces(whole, grid, vertices, resources.threads, mesher)
         piece = describe_piece(field, meshes, {"slabs": len(slabs), "planned_bytes": planned})
         del field, whole, meshes  # before those of the next slab are made
         steps.finish("isosurface")

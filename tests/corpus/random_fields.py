@@ -10,6 +10,8 @@ from conftest import count_fans
 
 from super_sdf import Mesh, SdfGrid, reconstruct
 from super_sdf.pipeline import Decoder
+from super_sdf.steps.marching import CAP_HEIGHT
+from super_sdf.steps.mesher_names import DEFAULT_MESHER
 
 from .case import ball, rng_of
 
@@ -58,19 +60,51 @@ KINDS = {
     "clamped ball": lambda rng, shape: np.clip(ball(shape, rng.uniform(0.2, 0.6)), -0.5, 0.5),
     "rounded ball": lambda rng, shape: np.round(ball(shape, rng.uniform(0.2, 0.6)) * 2) / 2,
     "noisy ball": lambda rng, shape: ball(shape) + rng.uniform(-0.5, 0.5, shape),
+    "facets": lambda rng, shape: facets(rng, shape),
+    "clamped facets": lambda rng, shape: np.clip(facets(rng, shape), -0.5, 0.5),
+    "rounded facets": lambda rng, shape: np.round(facets(rng, shape) * 2) / 2,
     "denormal": lambda rng, shape: rng.normal(size=shape) * rng.choice([1, 1e-44], shape),
 }
 
 
-def faults_of_field(field: RandomField, network: Decoder) -> list[str]:
-    """Return what is wrong with a field's mesh: holes, vertices of two surfaces, no numbers."""
+def facets(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a field of planes that meet in edges and corners, convex and concave.
+
+    Inside it is the largest or the smallest of distances to planes: their slope is 1.
+    """
+    normals = rng.normal(size=(2, 3, 3))
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    middle = (np.array(shape) - 1) / 2 + rng.normal(size=3)
+    along = normals @ (np.indices(shape).reshape(3, -1) - middle[:, None])
+    first, second = (along - rng.uniform(0, 0.3 * max(shape), (2, 3, 1))).max(1)
+    return (np.minimum(first, second) if rng.random() < 0.5 else first).reshape(shape)
+
+
+def faults_of_field(
+    field: RandomField, network: Decoder, mesher: str = DEFAULT_MESHER
+) -> list[str]:
+    """Return what is wrong with a field's mesh: see ``faults_of_mesh``."""
+    return faults_of_mesh(field, mesh_of_field(field, network, mesher))
+
+
+def mesh_of_field(field: RandomField, network: Decoder, mesher: str) -> Mesh:
+    """Return a field's mesh."""
     grid = SdfGrid.trusted(field.values, 1.0)  # they are no distances, and need not be
-    mesh = reconstruct(grid, network, field.factor, cap=field.cap)
+    return reconstruct(grid, network, field.factor, cap=field.cap, mesher=mesher)
+
+
+def faults_of_mesh(field: RandomField, mesh: Mesh) -> list[str]:
+    """Return what is wrong with a mesh: holes, edges or vertices of two surfaces, no numbers."""
     faults = []
     if not np.isfinite(mesh.vertices).all():
         faults.append("vertices are not finite")
     if len(np.unique(mesh.vertices, axis=0)) < len(mesh.vertices):
         faults.append("vertices at the same position")
+    if len(np.unique(np.sort(mesh.faces, axis=1), axis=0)) < len(mesh.faces):
+        faults.append("triangles with the same corners")
+    beyond = np.maximum(-0.5 - mesh.vertices, mesh.vertices - np.array(field.values.shape) + 0.5)
+    if beyond.max() > CAP_HEIGHT / field.factor + 1e-4:
+        faults.append(f"vertices are {beyond.max():.3f} samples outside the grid")
     inner, border = open_edges(mesh, field.values.shape)
     if inner or (field.cap and border):
         faults.append(f"{inner} open edges within the grid, {border} at its border")

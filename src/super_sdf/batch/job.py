@@ -23,6 +23,8 @@ status, reason : "ok" and None, or "failed" and why
 retry : whether another run may succeed with the same input and options
 content, output : fingerprints of the input and of the mesh
 options : digest of all that the mesh depends on, besides the input
+mesher : what made the triangles
+simplified : with ``--simplify`` or ``--triangles``, triangles before and after, and distances
 check : with ``--check`` the certificate, or why there is none
 seconds : time in all; that of each stage is in ``stages``
 """
@@ -91,6 +93,7 @@ def attempt(job: Job, folder: Path, network: Decoder, check: bool = False) -> Ro
         "retry": False,
         "content": content,
         "output": mesh_prints[0],
+        "mesher": job.options.mesher,
         **done.report(),
         **certificate,
         "seconds": _since(start),

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from .. import __version__
 from ..network.network import find_model
+from ..steps.mesher_names import MARCHING
 from .fingerprint import fingerprint, is_unchanged
 from .job import Job, Result, Row, failed_row
 from .journal import Journal, read_journal
@@ -127,7 +128,12 @@ class Planner:
 
         Device, threads and memory do not count: the mesh asked for is the same.
         """
-        settings = [asdict(replace(job.options, max_memory=None)), self.network, __version__]
+        options = asdict(replace(job.options, max_memory=None))
+        if options["mesher"] == MARCHING:
+            del options["mesher"]  # so that rows of versions without this option still hold
+        if not job.options.simplifies:
+            del options["simplify"], options["triangles"]
+        settings = [options, self.network, __version__]
         return hashlib.sha256(json.dumps(settings).encode()).hexdigest()
 
     def _known(self, job: Job) -> Row | None:

@@ -95,6 +95,13 @@ def signs_inside() -> tuple[str, ...]:
     return INSIDE
 
 
+def meshers() -> tuple[str, ...]:
+    """Return the names of the meshers."""
+    from ..steps.mesher_names import MESHERS
+
+    return MESHERS
+
+
 def mesh_formats() -> tuple[str, ...]:
     """Return the mesh file formats, by suffix without its dot."""
     from ..files.meshes import MESH_SUFFIXES

@@ -79,6 +79,7 @@ def print_facts(as_json: bool) -> bool:
     for key in ("super-sdf", "python", "onnxruntime"):
         click.echo(f"{key} {facts[key]}")
     click.echo(f"devices: {', '.join(facts['devices'])}")
+    click.echo(f"meshers: {', '.join(facts['meshers'])}")
     for name, card in facts["models"].items():
         click.echo(f"model {name}")
         for key, value in sorted(card.items()):
@@ -95,6 +96,7 @@ def gather_facts() -> dict[str, Any]:
     from ..network.cuda import available_devices
     from ..network.network import NO_NETWORKS, shipped_models
     from ..network.onnx import ort
+    from ..steps.mesher_names import MESHERS
 
     models = {name: load_card(name) for name in shipped_models()}
     facts = {
@@ -102,6 +104,7 @@ def gather_facts() -> dict[str, Any]:
         "python": platform.python_version(),
         "onnxruntime": ort.__version__,
         "devices": available_devices(),
+        "meshers": MESHERS,
         "models": models,
     }
     return facts if models else {**facts, "fault": NO_NETWORKS}

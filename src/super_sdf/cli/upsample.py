@@ -13,6 +13,7 @@ from .common import CONTEXT, one_line_errors, print_stderr, print_stdout, progre
 from .conversion import (
     check_can_check,
     check_option,
+    check_simplification,
     chosen_model,
     conversion_options,
     make_options,
@@ -84,6 +85,7 @@ class Upsampling:
         check_target(self.target, force=options["force"])
         if options["check"]:
             check_can_check(self.target)
+        check_simplification(options)
         watch.lap("start")
         self.network = load_network(
             self.model,
@@ -141,6 +143,8 @@ class Upsampling:
             for stage, seconds in self.seconds.items():
                 print_stderr(f"{stage}: {seconds:.3f} s")
         print_stderr(f"{self.target}: {self.summary()}")
+        if self.result.simplified:
+            print_stderr(f"Simplified: {describe_simplified(self.result.simplified)}")
         if self.certificate:
             print_stderr(f"Check: {self.certificate.summary()}")
 
@@ -151,6 +155,7 @@ class Upsampling:
             "output": self.target,
             "factor": self.options["factor"],
             "offset": self.options["offset"],
+            "mesher": self.options["mesher"],
             "model": self.model,
             "precision": self.options["precision"],
             "device": self.network.device,
@@ -175,3 +180,13 @@ class Upsampling:
             f"{'closed' if self.result.closed else 'open'}, from {low} to {high}, "
             f"{sum(self.seconds.values()):.1f} s"
         )
+
+
+def describe_simplified(found: dict[str, Any]) -> str:
+    """Describe in one line how much simpler a mesh is and how far from the unsimplified one."""
+    off = found["deviation"]
+    return (
+        f"from {found['triangles_before']:,} to {found['triangles']:,} triangles; largest distance "
+        f"{off['largest']:.4f} voxels from the unsimplified mesh to this one, "
+        f"{off['largest_back']:.4f} back; mean {off['mean']:.4f} and {off['mean_back']:.4f}"
+    )

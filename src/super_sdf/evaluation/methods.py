@@ -16,18 +16,18 @@ from skimage.measure import marching_cubes
 from ..arrays import FloatArray, IntArray
 from ..errors import NoSurfaceError
 from ..grid.sdf_grid import SdfGrid
-from ..mesh import Mesh, join_meshes
+from ..mesh import Mesh
 from ..network.decoder import Decoder
-from ..pipeline import reconstruct, refine, upsample
+from ..pipeline import reconstruct, refine
 from ..slabs.cutting import whole
 from ..steps.band import neighbour_table
-from ..steps.cap import close_at_border
 from ..steps.field import FineField
+from ..steps.mesher_names import DEFAULT_MESHER, MARCHING, SHARP
+from ..steps.meshers import extract_mesh
 from ..steps.nodes import block_ijk, share_parts
-from ..steps.sharp import extract_sharp_pieces
 from ..steps.survey import survey
 from .cases import Case, spread_samples
-from .names import MESHERS, OURS, meshed_by
+from .names import OURS, meshed_by
 
 NUDGE = np.float32(1e-9)  # replaces exact zeros: a vertex on a node can open the surface
 FACTOR_OF_BLOCKS = 4  # of the blocks that a dense field is cut into
@@ -78,12 +78,12 @@ def spline_surface(case: Case, network: Decoder, *, order: int) -> Surface:
     return Surface(isosurface(field, case.fine, case.low), lambda: field)
 
 
-def bound_surface(case: Case, network: Decoder, *, mesher: str = MESHERS[0]) -> Surface:
+def bound_surface(case: Case, network: Decoder, *, mesher: str = DEFAULT_MESHER) -> Surface:
     """Mesh the true distances at the fine nodes: the bound of all upsampling to them."""
     return Surface(BY_MESHER[mesher].dense(case.truth.copy(), case.fine, case.low))
 
 
-def our_surface(case: Case, network: Decoder, *, mesher: str = MESHERS[0]) -> Surface:
+def our_surface(case: Case, network: Decoder, *, mesher: str = DEFAULT_MESHER) -> Surface:
     """Mesh the coarse grid with super-sdf, in as many passes as the setting has.
 
     The mesh is capped where the surface leaves the grid. Without a surface it is empty.
@@ -175,15 +175,9 @@ def lattice_weights(n: int, factor: int, order: int) -> FloatArray:
     return np.stack(columns, axis=1).astype(np.float32)
 
 
-def refined_surface(grid: SdfGrid, network: Decoder, factor: int) -> Mesh:
-    """Mesh a grid with super-sdf and marching cubes, capped at the grid's border."""
-    return reconstruct(grid, network, factor=factor, cap=True)
-
-
-def sharp_surface(grid: SdfGrid, network: Decoder, factor: int) -> Mesh:
-    """Mesh a grid with super-sdf and the mesher that keeps edges, capped at the grid's border."""
-    field = close_at_border(upsample(grid, network, factor), grid)
-    return join_meshes(extract_sharp_pieces(field, grid))
+def refined_surface(grid: SdfGrid, network: Decoder, factor: int, mesher: str) -> Mesh:
+    """Mesh a grid with super-sdf and a mesher, capped at the grid's border."""
+    return reconstruct(grid, network, factor=factor, cap=True, mesher=mesher)
 
 
 def sharp_isosurface(field: FloatArray, spacing: float, low: float) -> Mesh:
@@ -202,7 +196,7 @@ def sharp_isosurface(field: FloatArray, spacing: float, low: float) -> Mesh:
     blocks = np.stack(values) * np.float32(2 / side)
     fine = FineField(shape, factor, voxel_ijk, blocks, parts, (0, shape[0]))
     grid = SdfGrid.trusted(_node_of_blocks(field, block[0], factor), side, low + side / 2)
-    return join_meshes(extract_sharp_pieces(fine, grid))
+    return extract_mesh(fine, grid, mesher=SHARP)
 
 
 def _node_of_blocks(field: FloatArray, node: IntArray, factor: int) -> FloatArray:
@@ -212,8 +206,8 @@ def _node_of_blocks(field: FloatArray, node: IntArray, factor: int) -> FloatArra
 
 
 BY_MESHER: dict[str, Mesher] = {
-    "marching": Mesher(refined_surface, isosurface),
-    "sharp": Mesher(sharp_surface, sharp_isosurface),
+    MARCHING: Mesher(partial(refined_surface, mesher=MARCHING), isosurface),
+    SHARP: Mesher(partial(refined_surface, mesher=SHARP), sharp_isosurface),
 }
 
 METHODS: dict[str, Method] = {

@@ -1,9 +1,11 @@
 """The names of methods, peers and experiments: what the command accepts, and what tables call it.
 
-Nothing is imported here, so the command's help takes them from here without loading NumPy.
+NumPy is not imported here, so the command's help takes them from here without loading it.
 """
 
 from __future__ import annotations
+
+from ..steps.mesher_names import DEFAULT_MESHER, MARCHING, MESHERS
 
 OURS = "ours"
 FLOOR = "floor"  # not a method: the reference measured against itself
@@ -23,19 +25,21 @@ LABELS = {**METHOD_LABELS, **PEER_LABELS, FLOOR: "floor: the reference against i
 
 EXPERIMENTS = ("factors", "noise", "iterated", "scale", "timings", "meshers")
 
-# What turns a field into triangles. The first is that of the main tables; add others behind it.
-MESHERS: tuple[str, ...] = ("marching", "sharp")
 MESHED = (OURS, "bound")  # the methods that every mesher is measured with
 
 
 def meshed_by(method: str, mesher: str) -> str:
-    """Return the name of one of ``MESHED`` with a mesher; with the first it is the method's own."""
-    return method if mesher == MESHERS[0] else f"{method}-{mesher}"
+    """Return the name of one of ``MESHED`` with a mesher; with the default it is the method's own.
+
+    The default mesher is that of the main tables.
+    """
+    return method if mesher == DEFAULT_MESHER else f"{method}-{mesher}"
 
 
 # The measurements that depend on the code and the network of this package: all of ours, and those
-# of the bound with meshers that are this package's. (The first is scikit-image's.)
+# of the bound with meshers that are this package's. (Its marching cubes is scikit-image's.)
 OF_OUR_CODE = (
-    *(OURS, PROCESS),
-    *(meshed_by(method, mesher) for mesher in MESHERS[1:] for method in MESHED),
+    PROCESS,
+    *(meshed_by(OURS, mesher) for mesher in MESHERS),
+    *(meshed_by("bound", mesher) for mesher in MESHERS if mesher != MARCHING),
 )

@@ -4,7 +4,7 @@ The result is the same for every cut, because each slab is worked on with as man
 side as its values depend on:
 
     planes of the slab                   vertices and triangles are made here
-    + FINAL_BESIDE                       values are final: they decide who owns shared vertices
+    + the mesher's planes_beside         values are final: vertices depend on them
     + spheres.REACH_IN_VOXELS            blocks are decoded
     + the network's receptive field      voxels are given to the network
 """
@@ -21,12 +21,13 @@ from ..errors import OutOfMemoryError
 from ..machine import index_width
 from ..machine.memory import give_back, held_memory, in_words
 from ..machine.resources import Resources
+from ..steps.mesher_names import DEFAULT_MESHER
+from ..steps.meshers import BY_NAME, Mesher
 from ..steps.spheres import REACH_IN_VOXELS
 from ..steps.survey import Band
 from .footprint import NETWORK_BYTES, slab_bytes
 
-FINAL_BESIDE = 1
-DECODED_BESIDE = FINAL_BESIDE + REACH_IN_VOXELS
+DEFAULT = BY_NAME[DEFAULT_MESHER]
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,7 @@ def plan_slabs(
     receptive_field: int | None,
     resources: Resources,
     network_bytes: tuple[float, float] = NETWORK_BYTES,
+    mesher: Mesher = DEFAULT,
 ) -> list[Slab]:
     """Return the fewest slabs that fit in memory, in order.
 
@@ -75,6 +77,8 @@ def plan_slabs(
         The threads and memory that the run may use.
     network_bytes : two floats
         Memory of the network in bytes, per voxel and per value: see ``footprint.slab_bytes``.
+    mesher : Mesher
+        What makes triangles of the slabs.
 
     Raises
     ------
@@ -86,20 +90,21 @@ def plan_slabs(
     check_vertices(band, factor)
     how = "at once" if receptive_field is None else "even plane by plane"
     bound, need = resources.memory, 0
-    for nth, slabs in enumerate(_ways(band, receptive_field)):
+    beside = mesher.planes_beside(factor)
+    for nth, slabs in enumerate(_ways(band, receptive_field, beside)):
         if nth == 1:
             give_back()  # otherwise freed memory counts as held
-        need = peak_bytes(band, slabs, factor, network_bytes, resources.threads)
+        need = peak_bytes(band, slabs, factor, network_bytes, resources.threads, mesher)
         if bound is None or need <= bound:
             return slabs
     raise _does_not_fit(band, factor, how, need, bound or 0)
 
 
-def _ways(band: Band, receptive_field: int | None) -> Iterator[list[Slab]]:
+def _ways(band: Band, receptive_field: int | None, beside: int) -> Iterator[list[Slab]]:
     """Yield the whole band, and then, if the receptive field is known, more and more slabs."""
     yield [whole(band)]
     if receptive_field is not None:
-        yield from ways_to_cut(band, receptive_field)
+        yield from ways_to_cut(band, receptive_field, beside)
 
 
 def check_vertices(band: Band, factor: int) -> None:
@@ -119,37 +124,44 @@ def peak_bytes(
     factor: int,
     network_bytes: tuple[float, float] = NETWORK_BYTES,
     threads: int = 1,
+    mesher: Mesher = DEFAULT,
 ) -> int:
     """Return the peak memory of the process in bytes: what it holds now plus the largest slab."""
     held = held_memory() or band.patches.nbytes
     needs = (
-        slab_bytes(band, slab.seen, slab.decoded, slab.planes, factor, network_bytes, threads)
+        slab_bytes(
+            band, slab.seen, slab.decoded, slab.planes, factor, network_bytes, threads, mesher.name
+        )
         for slab in slabs
     )
     return held + max(needs)
 
 
-def cut(band: Band, pieces: int, receptive_field: int) -> list[Slab]:
-    """Cut a band into at most ``pieces`` slabs with about the same number of decoded voxels."""
+def cut(band: Band, pieces: int, receptive_field: int, beside: int) -> list[Slab]:
+    """Cut a band into at most ``pieces`` slabs with about the same number of decoded voxels.
+
+    ``beside`` is the number of planes beside each with final values, from ``planes_beside``.
+    """
     share = band.decoded_before / max(int(band.decoded_before[-1]), 1)
     inner = np.searchsorted(share, np.arange(1, pieces) / pieces)
     bounds = np.unique(np.clip([0, *inner, band.shape[0]], 0, band.shape[0])).tolist()
-    return [_slab(band, first, last, receptive_field) for first, last in pairwise(bounds)]
+    return [_slab(band, first, last, receptive_field, beside) for first, last in pairwise(bounds)]
 
 
-def ways_to_cut(band: Band, receptive_field: int) -> Iterator[list[Slab]]:
+def ways_to_cut(band: Band, receptive_field: int, beside: int) -> Iterator[list[Slab]]:
     """Yield cuts into more and more slabs, down to slabs of one plane."""
     for pieces in range(1, band.shape[0]):
-        yield cut(band, pieces, receptive_field)
+        yield cut(band, pieces, receptive_field, beside)
     planes = np.flatnonzero(np.diff(band.decoded_before)).tolist()  # each slab decodes something
     bounds = [0, *planes[1:], band.shape[0]]
-    yield [_slab(band, first, last, receptive_field) for first, last in pairwise(bounds)]
+    yield [_slab(band, first, last, receptive_field, beside) for first, last in pairwise(bounds)]
 
 
-def _slab(band: Band, first: int, last: int, receptive_field: int) -> Slab:
+def _slab(band: Band, first: int, last: int, receptive_field: int, beside: int) -> Slab:
     """Return the slab of planes ``first`` to before ``last``, with the rows it depends on."""
-    decoded = band.rows(first - DECODED_BESIDE, last + DECODED_BESIDE)
-    beside = DECODED_BESIDE + receptive_field
+    beside += REACH_IN_VOXELS
+    decoded = band.rows(first - beside, last + beside)
+    beside += receptive_field
     return Slab((first, last), decoded, band.rows(first - beside, last + beside))
 
 

@@ -6,6 +6,8 @@ import numpy as np
 
 from ..machine.threads import CHUNK, rows_in_chunk
 from ..steps.marching import LOOKUP_BYTES, lookups_at_once
+from ..steps.mesher_names import DEFAULT_MESHER, MARCHING, SHARP
+from ..steps.meshers import BY_NAME, GROUPS_AT_ONCE, count_groups
 from ..steps.survey import Band
 
 # Peak memory of the stages after the network in bytes, measured (``benchmarks.large``,
@@ -14,8 +16,13 @@ from ..steps.survey import Band
 STAGES = {
     "average": (216, 300, 5.0, 1e7, 2e7),
     "fit": (216, 1300, 4.0, 1e7, 3e7),
-    "isosurface": (216, 350, 7.5, 1e7, 3e7),
+    MARCHING: (216, 350, 7.5, 1e7, 3e7),
+    SHARP: (216, 350, 7.5, 1e7, 3e7),
 }
+BEFORE_MESHER = ("average", "fit")
+# The sharp mesher on a group of planes and those beside: bytes per voxel and factor, measured on a
+# field of edges everywhere; its lookup table comes on top.
+SHARP_BYTES = 2800
 # Default for a network: bytes per voxel that it sees, including its row of the neighbour table, and
 # per value.
 NETWORK_BYTES = (680.0, 8.0)
@@ -34,6 +41,7 @@ def slab_bytes(
     factor: int,
     network_bytes: tuple[float, float] = NETWORK_BYTES,
     threads: int = 1,
+    mesher: str = DEFAULT_MESHER,
 ) -> int:
     """Return the peak memory of the work on a slab, in bytes beyond what the process holds already.
 
@@ -51,12 +59,15 @@ def slab_bytes(
         Memory of the network in bytes, per voxel that it sees and per value.
     threads : int
         Threads that work at the same time.
+    mesher : str
+        The name of what makes triangles of the slab.
     """
     voxels, own = seen.stop - seen.start, band.count_decoded(decoded)
     values = own * (factor + 1) ** 3
     sizes = np.array([voxels, own, values, min(threads, values // CHUNK + 1), 1])
-    needs = dict(zip(STAGES, np.array(list(STAGES.values())) @ sizes))
-    needs["isosurface"] += _lookup_bytes(band, planes, own, factor, threads)
+    needs = {stage: float(np.dot(STAGES[stage], sizes)) for stage in (*BEFORE_MESHER, mesher)}
+    extra = _sharp_bytes if mesher == SHARP else _lookup_bytes
+    needs[mesher] += extra(band, planes, own, factor, threads)
     needs["network"] = _bytes_for_network(voxels, own, factor, network_bytes)
     return int(max(needs.values()))
 
@@ -77,3 +88,15 @@ def _lookup_bytes(band: Band, planes: Range, decoded: int, factor: int, threads:
     two_planes = int((before[2:] - before[:-2]).max()) if len(before) > 2 else decoded
     widest = min(two_planes + rows_in_chunk(nodes), decoded)
     return LOOKUP_BYTES * nodes * widest * lookups_at_once(decoded, widest, threads)
+
+
+def _sharp_bytes(band: Band, planes: Range, decoded: int, factor: int, threads: int) -> int:
+    """Return the bytes of the sharp mesher on as many groups as it works on at once."""
+    groups = count_groups(decoded, planes[1] - planes[0], factor, threads)
+    beside = BY_NAME[SHARP].planes_beside(factor) + 1  # the one before owns vertices
+    before = band.decoded_before[max(planes[0] - beside, 0) : planes[1] + beside]
+    width = min(2 * beside, len(before) - 1)
+    around = int((before[width:] - before[: len(before) - width]).max())
+    voxels = min(decoded // groups + around, decoded)
+    at_once = min(threads, groups, GROUPS_AT_ONCE)
+    return at_once * voxels * (LOOKUP_BYTES * (factor + 1) ** 3 + SHARP_BYTES * factor)

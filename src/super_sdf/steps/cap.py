@@ -22,15 +22,18 @@ from .nodes import (
 )
 
 
-def close_at_border(field: FineField, grid: SdfGrid, offset: float = 0.0) -> FineField:
+def close_at_border(
+    field: FineField, grid: SdfGrid, offset: float = 0.0, beside: int = 1
+) -> FineField:
     """Surround the grid with outside voxels, so that the surface is closed along the border.
 
     Adds the border voxels inside the solid that were not decoded, and a layer of outside voxels
     beyond the border. Nodes beyond the border are placed on it (see ``marching``), so the cap is
-    flat. A slab is closed in its own planes and in those beside them on which the ownership of its
-    vertices depends.
+    flat. A slab is closed in its own planes and in the planes ``beside`` them on which its mesh
+    depends, and in one more before, which owns vertices of those.
     """
-    first, last = max(field.planes[0] - 2, 0), min(field.planes[1] + 1, field.shape[0])
+    first = max(field.planes[0] - beside - 1, 0)
+    last = min(field.planes[1] + beside, field.shape[0])
     rows = field.rows(first, last)
     known = field.voxel_ijk[rows]
     filled = _filled_border(grid, offset, first, last, known)

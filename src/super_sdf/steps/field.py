@@ -32,7 +32,8 @@ class FineField:
         Which voxels share which nodes.
     planes : two ints
         The slab's planes of voxels, from the first to before the second. Values are final in these
-        and in the next plane on either side; those of other voxels are intermediate.
+        and in as many planes on either side as the mesher needs; those of other voxels are
+        intermediate.
     band_voxels : int
         Voxels in the band of the whole grid.
     noisy_voxels : int

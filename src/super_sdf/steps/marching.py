@@ -27,13 +27,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
-from ..errors import OptionTypeError, seen
 from ..grid.sdf_grid import SdfGrid
 from ..machine.index_width import check_count
 from ..machine.threads import map_chunks, map_threads, rows_in_chunk
-from ..mesh import CLEARANCE, Mesh, join_meshes, vertex_type
+from ..mesh import CLEARANCE, Mesh, vertex_type
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
-from ..options import check_grid
 from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, triangle_table
 from .field import FineField
 from .nodes import block_ijk, part_of_node
@@ -46,47 +44,22 @@ CAP_HEIGHT = 0.02
 NO_FACES = np.empty((0, 3), np.int32)
 
 
-def extract_mesh(field: FineField, grid: SdfGrid, first_vertex: int = 0) -> Mesh:
-    """Return the zero level of a field as triangles in world coordinates.
+def extract_pieces(
+    field: FineField, grid: SdfGrid, first_vertex: int = 0, threads: int = 1
+) -> list[Mesh]:
+    """Return the zero level of a field as triangles in world coordinates, in one or more pieces.
 
-    Vertices lie on lattice edges, by linear interpolation. A node with value 0 is inside.
-
-    Parameters
-    ----------
-    field : FineField
-        From ``upsample``.
-    grid : SdfGrid
-        The coarse grid that it was made from, for spacing and origin.
-    first_vertex : int
-        The number of the first vertex, for a field of a slab: the number of vertices in the slabs
-        before. Faces may also refer to vertices of the slab before.
+    Vertices lie on lattice edges, by linear interpolation. A node with value 0 is inside. The
+    arguments are those of ``meshers.extract_mesh``.
 
     Raises
     ------
     OptionError
         If there are more vertices than 32-bit numbers, including those before.
-    OptionTypeError
-        If ``field`` or ``grid`` is something else.
 
     References
     ----------
     Lorensen and Cline, "Marching Cubes", 1987.
-    """
-    if not isinstance(field, FineField):
-        raise OptionTypeError(f"field is {seen(field)}: give one from upsample(grid, network)")
-    check_grid(grid)
-    return join_meshes(extract_pieces(field, grid, first_vertex))
-
-
-def extract_pieces(
-    field: FineField, grid: SdfGrid, first_vertex: int = 0, threads: int = 1
-) -> list[Mesh]:
-    """Return the mesh of ``extract_mesh`` as a list of one or more pieces, in order.
-
-    Raises
-    ------
-    OptionError
-        If there are more vertices than 32-bit numbers, including those before.
     """
     core = field.own_rows
     before = field.plane_before(core).start if core.start < core.stop else core.start

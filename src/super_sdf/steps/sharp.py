@@ -33,11 +33,12 @@ from ..arrays import BoolArray, IntArray
 from ..grid.sdf_grid import SdfGrid
 from ..machine.index_width import check_count
 from ..machine.threads import map_chunks
-from ..mesh import Mesh, vertex_type
+from ..mesh import CLEARANCE, Mesh, vertex_type
 from ..neighbourhood import CENTRE, STRIDES
 from .cell_cases import loop_table
 from .field import FineField
 from .marching import (
+    CAP_HEIGHT,
     NO_FACES,
     Crossings,
     cells_low_nodes,
@@ -134,12 +135,15 @@ def extract_sharp_pieces(
         If there are more vertices than can be numbered, those before among them.
     """
     rows = _rows_around(field)
-    crossings = find_crossings(field, rows, threads)
+    before = field.plane_before(rows).start if rows.start < rows.stop else rows.start
+    crossings = find_crossings(field, slice(before, rows.stop), threads)
     if not len(crossings.own_row):
         return [Mesh(np.empty((0, 3), vertex_type(grid, field.factor)), NO_FACES)]
-    patches = find_patches(field, crossings, rows)
+    patches = find_patches(field, crossings, rows, before)
     own = planes_at_crossings(field, crossings, threads)
     positions, features, peaks = place_features(patches, own)
+    positions = _kept_in_grid(positions, own.point, field)
+    peaks = _kept_in_grid(peaks, patches.low[features] + 0.5, field)
     numbers = _number_vertices(field, crossings, patches, features, first_vertex)
     faces = _faces(field, patches, features, numbers)
     vertices = np.empty((numbers.own, 3))
@@ -152,9 +156,21 @@ def extract_sharp_pieces(
     return [Mesh(to_world(vertices.T, field, grid), faces)]
 
 
+def _kept_in_grid(position: Vectors, start: Vectors, field: FineField) -> Vectors:
+    """Return positions (n, 3) that do not leave the grid, nor its border if they started there.
+
+    An open surface ends on the border, and a cap is flat there. ``start``, (n, 3), is where a
+    vertex was on its lattice edge, or the middle of its cell.
+    """
+    last = np.array(field.shape, np.float64) * field.factor
+    at_border = (start <= 0) | (start >= last)
+    border = np.clip(start, -CAP_HEIGHT, last + CAP_HEIGHT)
+    return np.where(at_border, border, np.clip(position, CLEARANCE, last - CLEARANCE))
+
+
 def planes_beside(factor: int) -> int:
     """Return how many coarse planes to either side a slab's mesh depends on."""
-    return 1 + -(-REACH_IN_CELLS // factor)
+    return -(-(REACH_IN_CELLS + 1) // factor)
 
 
 def _rows_around(field: FineField) -> slice:
@@ -163,20 +179,26 @@ def _rows_around(field: FineField) -> slice:
     return field.rows(field.planes[0] - beside, field.planes[1] + beside)
 
 
-def find_patches(field: FineField, crossings: Crossings, rows: slice) -> Patches:
-    """Return the patches in the crossed cells of some voxels."""
+def find_patches(field: FineField, crossings: Crossings, rows: slice, before: int) -> Patches:
+    """Return the patches in the crossed cells of some voxels.
+
+    The crossings are those of the voxels from ``before`` on, the first of the plane before, since
+    these own edges of the cells.
+    """
     table, factor = loop_table(), field.factor
     edges = 3 * len(field.blocks)
-    edge_at = number_edges(field, crossings, rows.start, rows, 0)
-    count = table.count[crossings.case]
+    edge_at = number_edges(field, crossings, before, rows, 0)
+    some = crossings.cells(rows)
+    case = crossings.case[some]
+    count = table.count[case]
     cell = np.repeat(np.arange(len(count)), count)
-    loop = table.first[crossings.case[cell]] + _nth(cell, count)
-    row = crossings.cell_row[cell]
-    low_node = cells_low_nodes(factor)[crossings.cell[cell]]
-    at = ((row - np.int64(rows.start)) * edges + low_node)[:, None] + edge_steps(factor)[
+    loop = table.first[case[cell]] + _nth(cell, count)
+    row = crossings.cell_row[some][cell]
+    low_node = cells_low_nodes(factor)[crossings.cell[some][cell]]
+    at = ((row - np.int64(before)) * edges + low_node)[:, None] + edge_steps(factor)[
         table.edges[loop]
     ]
-    crossing = np.where(table.edges[loop] >= 0, edge_at.take(at, mode="clip"), -1)
+    crossing = np.where(table.edges[loop] >= 0, edge_at.take(at, mode="clip"), np.int64(-1))
     low = factor * field.voxel_ijk[row] + block_ijk(factor)[low_node]
     return Patches(row, low.astype(np.float64), loop, table.sides[loop], crossing)
 
