@@ -21,11 +21,13 @@ from solids import cube, saved, sphere, torus
 
 from super_sdf import Mesh, SuperSdfError
 from super_sdf.cli.main import cli
-from super_sdf.errors import OptionError, WriteError
+from super_sdf.errors import FileError, OptionError, WriteError
 from super_sdf.evaluation import (
     experiment_tables,
     measuring,
+    methods,
     names,
+    peers,
     published,
     report,
     runner,
@@ -33,13 +35,14 @@ from super_sdf.evaluation import (
     tables,
     timing,
 )
-from super_sdf.evaluation.cases import Setting, Shape, random_rotation
+from super_sdf.evaluation.cases import Case, Setting, Shape, random_rotation
 from super_sdf.evaluation.measuring import Task
 from super_sdf.evaluation.results import Results
 from super_sdf.evaluation.runner import LeftOut, Runner, complete
 from super_sdf.evaluation.scope import Scope, find_meshes, spread
 from super_sdf.evaluation.store import KEY_TYPES, Store, is_row
 from super_sdf.machine.serving import ClockStarted
+from super_sdf.network.network import load_network
 
 KILLED = "was killed by SIGKILL (most likely out of memory)"
 QUALITY = ("cd", "f1", "nc", "signed_nc", "p2s", "ecd", "ef1", "field_mse", "faces", "closed")
@@ -698,3 +701,55 @@ def test_published_figures_are_in_their_tables_order():
         base = published.SURFACES[size]["B-spline + MC"]
         assert cd < base[0] and f1 > base[1] and nc >= base[2]
     assert all(ours > mc for mc, ours in published.NOISE_F1.values())
+
+
+def fake_peer(monkeypatch, runs: list[str]) -> None:
+    """Put a peer in place of RFTA that takes a cube for every shape and notes that it ran."""
+
+    def run(case, network):
+        runs.append(case.shape.name)
+        return methods.Surface(cube())
+
+    monkeypatch.setitem(peers.PEERS, "rfta", peers.Peer("rfta", run))
+
+
+def test_a_peer_is_run_once_and_its_mesh_kept(meshes, tmp_path, monkeypatch):
+    runs: list[str] = []
+    fake_peer(monkeypatch, runs)
+    kept, shape = tmp_path / "kept", Shape.read(meshes / "ball.ply")
+    for _ in range(2):
+        case = Case(shape, Setting(8), kept)
+        surface = peers.PEERS["rfta"](case, None)
+        assert np.array_equal(surface.mesh.vertices, cube().vertices)
+        assert np.array_equal(surface.mesh.faces, cube().faces) and surface.seconds > 0
+    assert runs == ["ball"]
+    peers.PEERS["rfta"](Case(shape, Setting(9), kept), None)  # of other samples
+    assert runs == ["ball", "ball"] and len(list(kept.glob("ball-*-rfta-*.ply"))) == 2
+    next(kept.glob("ball-8-*.json")).unlink()
+    with pytest.raises(FileError, match="cannot be read"):
+        peers.PEERS["rfta"](Case(shape, Setting(8), kept), None)
+
+
+def test_ours_beside_a_peer_has_as_many_triangles(meshes, monkeypatch):
+    fake_peer(monkeypatch, [])
+    case = Case(Shape.read(meshes / "ball.ply"), Setting(12, 2))
+    method = peers.MATCHED_METHODS["ours/rfta"]
+    with pytest.raises(FileError, match="no mesh of rfta is kept: run it again"):
+        method(case, load_network("fast", device="cpu"))
+    peers.PEERS["rfta"](case, None)
+    found = method(case, load_network("fast", device="cpu")).mesh
+    assert len(found.faces) <= 12 and found.is_closed()
+
+
+@pytest.mark.parametrize("mesher", names.OURS_MESHED)
+def test_with_factor_1_the_corners_of_voxels_have_values_of_the_refined_field(meshes, mesher):
+    case = Case(Shape.read(meshes / "ball.ply"), Setting(12, 1))
+    name = names.OURS_MESHED[mesher]
+    network = load_network("fast", device="cpu")
+    one = methods.MESHED_METHODS[name](case, network).mesh
+    coarse = methods.METHODS["mc"](case, network).mesh
+    assert one.is_closed() and 0.5 < len(one.faces) / len(coarse.faces) < 2
+    apart = case.shape.solid.distance(one.vertices).max()
+    assert apart < 0.5 * case.shape.solid.distance(coarse.vertices).max() + 0.1 * case.spacing
+    quarter = methods.SIMPLIFIED_METHODS[names.simplified(name, 4)](case, network).mesh
+    assert len(quarter.faces) == pytest.approx(len(one.faces) / 4, rel=0.1)
