@@ -158,7 +158,7 @@ SIMPLIFY_OPTIONS: tuple[Option, ...] = (
         "--simplify",
         type=float,
         metavar="ERROR",
-        help="Simplify the mesh as far as it stays within ERROR of the unsimplified mesh, in voxels "
+        help="Simplify the mesh as far as it stays within ERROR of the unsimplified one, in voxels "
         "of the grid (such as 0.02), measured both ways. A closed mesh stays closed. Needs the "
         "extra simplify.",
     ),
