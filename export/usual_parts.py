@@ -1,8 +1,8 @@
 """CAD parts whose smallest features are a tenth of the diagonal: 2.5 voxels of a 32^3 grid.
 
-In such a grid the diagonal of a part that is turned at random takes 25 to 30 voxels. Lengths here
-are in tenths of the diagonal, about: 1 is the least width of chamfers, walls, ribs, pockets and
-lands, and the least arc of fillets and diameter of drillings.
+In such a grid the diagonal of a part that is turned at random takes 22 to 30 voxels. Lengths here
+are in tenths of the diagonal, about: 1 is the least width of chamfers, ribs, pockets and most walls
+(0.65 of those beside the pocket of a rod), the least arc of fillets and diameter of drillings.
 """
 
 from __future__ import annotations
