@@ -44,7 +44,7 @@ OPTIONAL_NUMBERS = (
     *("min_angle", "slivers"),
 )
 # Folders of the package whose code does not change any surface.
-NOT_THE_METHOD = {"batch", "cli", "evaluation", "pictures"}
+NOT_THE_METHOD = {"batch", "certificate", "cli", "evaluation", "pictures"}
 
 
 @dataclass(frozen=True)
