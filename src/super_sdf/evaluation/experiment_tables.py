@@ -14,7 +14,6 @@ from .names import (
     LABELS,
     MESHED,
     OURS,
-    OURS_MESHED,
     SHARES,
     meshed_by,
     simplified,
@@ -105,13 +104,12 @@ def mesher_section(results: Results) -> str:
     paths, rows = results.scope.experiment_paths(), []
     for size, factor in product(results.scope.sizes, MESHER_FACTORS):
         for mesher, method in product(MESHERS, MESHED):
-            names = {meshed_by(method, mesher): LABELS[method]}
+            name = meshed_by(method, mesher)
+            names = {name: LABELS[method]}
             if method == OURS and factor == SIMPLIFIED_FACTOR:
-                names |= {
-                    simplified(OURS_MESHED[mesher], n): f"{LABELS[OURS]}, 1/{n}" for n in SHARES
-                }
-            for name, label in names.items():
-                measured = results.rows(Setting(size, factor), name, paths)
+                names |= {simplified(name, n): f"{LABELS[OURS]}, 1/{n}" for n in SHARES}
+            for each, label in names.items():
+                measured = results.rows(Setting(size, factor), each, paths)
                 closed = f"{sum(row['closed'] for row in measured)} of {len(measured)}"
                 where = [f"{size}^3, factor {factor}", mesher]
                 rows.append([*where, *mean_row(label, measured, MESHER_COLUMNS), closed])
