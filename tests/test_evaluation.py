@@ -391,13 +391,14 @@ def test_each_shape_is_measured_by_each_method_once(meshes):
 
 
 def test_every_name_has_a_method_and_a_label():
-    from super_sdf.evaluation import methods, peers
-
     assert tuple(names.METHOD_LABELS) == tuple(methods.METHODS)
     assert tuple(names.PEER_LABELS) == tuple(peers.PEERS)
     assert tuple(names.MESHERS) == tuple(methods.BY_MESHER)
     assert set(methods.MESHED_METHODS) >= {"ours", "bound"}
-    assert set(names.OF_OUR_CODE) <= {*methods.MESHED_METHODS, names.PROCESS}
+    ours = {*methods.MESHED_METHODS, *methods.SIMPLIFIED_METHODS, *peers.MATCHED_METHODS}
+    assert set(names.OF_OUR_CODE) <= {*ours, names.PROCESS}
+    assert len(names.MATCHED) == len(names.PEER_LABELS) * len(methods.BY_MESHER)
+    assert set(names.MATCHED) <= set(names.LABELS)
     for name in names.EXPERIMENTS:
         scope.experiment(name, (32,))
     with pytest.raises(OptionError, match="experiment is 'x': give one of factors, noise"):
