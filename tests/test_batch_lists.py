@@ -61,7 +61,13 @@ LISTS = {
     "": "list.jsonl names no file: give a path a line",
     '{"out": "a.ply"}': "list.jsonl, line 1: 'in' is None: give the path of a grid",
     '{"in": "a.npy", "Factor": 2}': "list.jsonl, line 1: 'Factor' is unknown: give in, out, "
-    "factor, spacing, origin, inside, offset, cap, mesher",
+    "factor, spacing, origin, inside, offset, cap, mesher, simplify, triangles",
+    '{"in": "a.npy", "simplify": 0}': "list.jsonl, line 1: 'simplify' is 0.0: give a number "
+    "greater than 0",
+    '{"in": "a.npy", "simplify": 1, "triangles": 9}': "list.jsonl, line 1: 'simplify' 1.0 and "
+    "'triangles' 9: give only one of them",
+    '{"in": "a.npy", "triangles": 9.5}': "list.jsonl, line 1: 'triangles' is 9.5: give a whole "
+    "number",
     '{"in": "a.npy", "mesher": "x"}': "list.jsonl, line 1: 'mesher' is 'x': give one of marching, "
     "sharp",
     '\n{"in": "a.npy", "factor": 3}': "list.jsonl, line 2: factor is 3: give an even number from "

@@ -10,14 +10,15 @@ import trimesh
 from conftest import ball, count_fans
 from solids import cube, inverted, joined, saved, sphere, torus
 
-from super_sdf import Mesh, SdfGrid
-from super_sdf.certificate import surface
+from super_sdf import Mesh, SdfGrid, topology
+from super_sdf.certificate import slabs, surface
 from super_sdf.certificate.check import CheckOptions, check_files, check_mesh, stated_triangles
 from super_sdf.certificate.coloured import PIERCED, TOUCHING, UNKNOWN, colours, vertex_residuals
 from super_sdf.certificate.limits import NO_EVIDENCE, Limits
 from super_sdf.errors import OptionError, OutOfMemoryError
 from super_sdf.files import coloured_ply
 from super_sdf.machine import extras
+from super_sdf.truth.solid import Solid
 
 H = 1 / 24  # of the grids
 RADIUS = 0.4
@@ -101,8 +102,7 @@ def test_holes_components_and_twists_are_counted(ball_mesh):
     assert lidless.manifold and lidless.oriented
     two = surface.examine_surface(joined(ball_mesh, moved(ball_mesh, 1.0)))
     assert two.components == 2 and two.faults() == []
-    crossing = surface.examine_surface(joined(ball_mesh, moved(ball_mesh, 0.1)))
-    assert crossing.self_intersections > 50
+    assert "3 pairs of triangles that intersect" in surface.examine_surface(cube(), 3).faults()
     faces = cube().faces.copy()
     faces[0] = faces[0][::-1]
     twisted = surface.examine_surface(Mesh(cube().vertices, faces))
@@ -134,19 +134,57 @@ def test_fans_are_those_of_a_graph_search(seed):
     """On random triangles, open and crowded: where no edge is crowded both agree."""
     random = np.random.default_rng(seed)
     faces = torus(12, 8).faces[random.random(192) < 0.7]
-    opposite, edges = surface.pair_edges(faces, 96)
+    opposite, edges = topology.pair_edges(faces, 96)
     assert edges.crowded_edges == edges.flipped_edges == 0
-    fans = surface.count_fans(faces, opposite)
+    fans = topology.count_fans(faces, opposite)
     assert np.array_equal(fans[np.unique(faces)], count_fans(faces))
 
 
-def test_intersections_do_not_depend_on_the_slabs(monkeypatch):
+def test_what_is_found_does_not_depend_on_the_slabs(monkeypatch):
     random = np.random.default_rng(3)
     vertices = random.random((90, 3))
-    faces = surface.without_collapsed(random.integers(0, 90, (120, 3)).astype(np.int32))
-    whole = surface.count_intersections(vertices, faces)
-    monkeypatch.setattr(surface, "FACES_IN_SLAB", 7)
-    assert surface.count_intersections(vertices, faces) == whole > 100
+    faces = topology.without_collapsed(random.integers(0, 90, (120, 3)).astype(np.int32))
+    points = random.uniform(-0.5, 1.5, (200, 3))
+    mesh = Mesh(vertices, faces)
+    whole = slabs.search(mesh, points, 0.1, intersections=True)
+    assert whole.intersections > 100
+    monkeypatch.setattr(slabs, "FACES_IN_SLAB", 7)
+    cut = slabs.search(mesh, points, 0.1, intersections=True)
+    assert cut.intersections == whole.intersections
+    np.testing.assert_allclose(cut.distances, whole.distances, rtol=0, atol=1e-14)
+    assert (whole.distances > 0.1).any()  # some points have to be looked up in the whole mesh
+
+
+def test_processes_find_what_one_does(ball_mesh, monkeypatch):
+    points = np.random.default_rng(4).uniform(-0.5, 0.5, (500, 3))
+    mesh = joined(ball_mesh, moved(ball_mesh, 0.1))
+    whole = slabs.search(mesh, points, np.inf, intersections=True)
+    monkeypatch.setattr(slabs, "FACES_IN_SLAB", 50_000)
+    cut = slabs.search(mesh, points, 0.2, intersections=True, processes=2)
+    assert cut.intersections == whole.intersections > 50
+    np.testing.assert_allclose(cut.distances, whole.distances, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(cut.feet, whole.feet, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("mesh", [cube(), torus(24, 12), sphere(size=12)], ids=str)
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_what_is_behind_a_simple_surface_is_inside(mesh, scale):
+    """Also at edges and corners, where one triangle does not tell, and in any unit."""
+    points = np.random.default_rng(5).uniform(-0.8, 0.8, (5000, 3))
+    scaled = Mesh(mesh.vertices * scale, mesh.faces)
+    found = slabs.nearest(Solid(scaled), points * scale)
+    inside = Solid(mesh).is_inside(points)
+    sure = found.facing != 0
+    assert sure.mean() > 0.99 and inside.any()
+    assert np.array_equal(found.facing[sure] < 0, inside[sure])
+
+
+def test_sides_of_a_mesh_that_meets_itself_are_by_winding_number(ball_mesh):
+    """A point in both balls is behind one sheet and nearest to the inner one, seen from inside."""
+    mesh = joined(ball_mesh, round_mesh(0.5 * RADIUS))
+    found = check_mesh(mesh, sphere_grid())
+    assert not found.surface.is_simple and found.surface.components == 2
+    assert not found.touching.wrong_side.any()
 
 
 def test_truncated_samples_promise_nothing(ball_mesh):

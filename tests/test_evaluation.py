@@ -21,11 +21,13 @@ from solids import cube, saved, sphere, torus
 
 from super_sdf import Mesh, SuperSdfError
 from super_sdf.cli.main import cli
-from super_sdf.errors import OptionError, WriteError
+from super_sdf.errors import FileError, OptionError, WriteError
 from super_sdf.evaluation import (
     experiment_tables,
     measuring,
+    methods,
     names,
+    peers,
     published,
     report,
     runner,
@@ -33,13 +35,14 @@ from super_sdf.evaluation import (
     tables,
     timing,
 )
-from super_sdf.evaluation.cases import Setting, Shape, random_rotation
+from super_sdf.evaluation.cases import Case, Setting, Shape, random_rotation
 from super_sdf.evaluation.measuring import Task
 from super_sdf.evaluation.results import Results
 from super_sdf.evaluation.runner import LeftOut, Runner, complete
 from super_sdf.evaluation.scope import Scope, find_meshes, spread
 from super_sdf.evaluation.store import KEY_TYPES, Store, is_row
 from super_sdf.machine.serving import ClockStarted
+from super_sdf.network.network import load_network
 
 KILLED = "was killed by SIGKILL (most likely out of memory)"
 QUALITY = ("cd", "f1", "nc", "signed_nc", "p2s", "ecd", "ef1", "field_mse", "faces", "closed")
@@ -388,13 +391,14 @@ def test_each_shape_is_measured_by_each_method_once(meshes):
 
 
 def test_every_name_has_a_method_and_a_label():
-    from super_sdf.evaluation import methods, peers
-
     assert tuple(names.METHOD_LABELS) == tuple(methods.METHODS)
     assert tuple(names.PEER_LABELS) == tuple(peers.PEERS)
     assert tuple(names.MESHERS) == tuple(methods.BY_MESHER)
     assert set(methods.MESHED_METHODS) >= {"ours", "bound"}
-    assert set(names.OF_OUR_CODE) <= {*methods.MESHED_METHODS, names.PROCESS}
+    ours = {*methods.MESHED_METHODS, *methods.SIMPLIFIED_METHODS, *peers.MATCHED_METHODS}
+    assert set(names.OF_OUR_CODE) <= {*ours, names.PROCESS}
+    assert len(names.MATCHED) == len(names.PEER_LABELS) * len(methods.BY_MESHER)
+    assert set(names.MATCHED) <= set(names.LABELS)
     for name in names.EXPERIMENTS:
         scope.experiment(name, (32,))
     with pytest.raises(OptionError, match="experiment is 'x': give one of factors, noise"):
@@ -623,13 +627,20 @@ def test_every_mesher_has_rows_of_ours_and_of_its_bound(meshes, tmp_path, monkey
     assert (2, ("ours", "bound", "ours-other", "bound-other")) in methods
     section = experiment_tables.mesher_section(results).splitlines()
     assert section[0] == "## Meshers, 2 shapes"
-    assert [line.split(" | ")[:3] for line in section[4:]] == [
+    rows = section[section.index("") + 1 :]
+    rows = [line for line in rows if line.startswith("| 32^3")]
+    simple = ("super-sdf, 1/4", "super-sdf, 1/16")
+    assert [line.split(" | ")[:3] for line in rows] == [
         [f"| 32^3, factor {factor}", mesher, label]
-        for factor in (2, 4)
+        for factor in (1, 2, 4)
         for mesher in ("marching", "other")
-        for label in ("super-sdf", "bound: true distance at the nodes")
+        for label in (
+            "super-sdf",
+            *(simple if factor == 4 else ()),
+            "bound: true distance at the nodes",
+        )
     ]
-    assert section[4].endswith("| 0.520 | 0.001 | 10.00 | 0.001 | 0.001 | 0.001 | 0.00 | 0.00 | "
+    assert rows[0].endswith("| 0.510 | 0.001 | 10.00 | 0.001 | 0.001 | 0.001 | 0.00 | 0.00 | "
                                "4 | 0.10 | 0.00 | 2 of 2 |")  # fmt: skip
 
 
@@ -698,3 +709,55 @@ def test_published_figures_are_in_their_tables_order():
         base = published.SURFACES[size]["B-spline + MC"]
         assert cd < base[0] and f1 > base[1] and nc >= base[2]
     assert all(ours > mc for mc, ours in published.NOISE_F1.values())
+
+
+def fake_peer(monkeypatch, runs: list[str]) -> None:
+    """Put a peer in place of RFTA that takes a cube for every shape and notes that it ran."""
+
+    def run(case, network):
+        runs.append(case.shape.name)
+        return methods.Surface(cube())
+
+    monkeypatch.setitem(peers.PEERS, "rfta", peers.Peer("rfta", run))
+
+
+def test_a_peer_is_run_once_and_its_mesh_kept(meshes, tmp_path, monkeypatch):
+    runs: list[str] = []
+    fake_peer(monkeypatch, runs)
+    kept, shape = tmp_path / "kept", Shape.read(meshes / "ball.ply")
+    for _ in range(2):
+        case = Case(shape, Setting(8), kept)
+        surface = peers.PEERS["rfta"](case, None)
+        assert np.array_equal(surface.mesh.vertices, cube().vertices)
+        assert np.array_equal(surface.mesh.faces, cube().faces) and surface.seconds > 0
+    assert runs == ["ball"]
+    peers.PEERS["rfta"](Case(shape, Setting(9), kept), None)  # of other samples
+    assert runs == ["ball", "ball"] and len(list(kept.glob("ball-*-rfta-*.ply"))) == 2
+    next(kept.glob("ball-8-*.json")).unlink()
+    with pytest.raises(FileError, match="cannot be read"):
+        peers.PEERS["rfta"](Case(shape, Setting(8), kept), None)
+
+
+def test_ours_beside_a_peer_has_as_many_triangles(meshes, monkeypatch):
+    fake_peer(monkeypatch, [])
+    case = Case(Shape.read(meshes / "ball.ply"), Setting(12, 2))
+    method = peers.MATCHED_METHODS["ours/rfta"]
+    with pytest.raises(FileError, match="no mesh of rfta is kept: run it again"):
+        method(case, load_network("fast", device="cpu"))
+    peers.PEERS["rfta"](case, None)
+    found = method(case, load_network("fast", device="cpu")).mesh
+    assert len(found.faces) <= 12 and found.is_closed()
+
+
+@pytest.mark.parametrize("mesher", names.OURS_MESHED)
+def test_with_factor_1_the_corners_of_voxels_have_values_of_the_refined_field(meshes, mesher):
+    case = Case(Shape.read(meshes / "ball.ply"), Setting(12, 1))
+    name = names.OURS_MESHED[mesher]
+    network = load_network("fast", device="cpu")
+    one = methods.MESHED_METHODS[name](case, network).mesh
+    coarse = methods.METHODS["mc"](case, network).mesh
+    assert one.is_closed() and 0.5 < len(one.faces) / len(coarse.faces) < 2
+    apart = case.shape.solid.distance(one.vertices).max()
+    assert apart < 0.5 * case.shape.solid.distance(coarse.vertices).max() + 0.1 * case.spacing
+    quarter = methods.SIMPLIFIED_METHODS[names.simplified(name, 4)](case, network).mesh
+    assert len(quarter.faces) == pytest.approx(len(one.faces) / 4, rel=0.1)

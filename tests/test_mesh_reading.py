@@ -11,9 +11,10 @@ import pytest
 import trimesh
 from solids import cube, sphere
 
-from super_sdf import Mesh
+from super_sdf import Mesh, write_mesh
 from super_sdf.errors import FileError, MeshError, SuperSdfError
-from super_sdf.truth.mesh_files import merged, read_mesh
+from super_sdf.truth.mesh_files import are_distinct, merged, read_mesh
+from super_sdf.truth.plain_ply import read_plain_ply
 from super_sdf.truth.solid import load_solid
 
 FORMATS = ("ply", "stl", "stl_ascii", "obj", "off", "glb")
@@ -144,3 +145,36 @@ def test_a_mesh_is_not_open_along_the_seams_of_its_texture(tmp_path):
     (tmp_path / "box.obj").write_text("\n".join(rows))
     solid, notes = load_solid(tmp_path / "box.obj")
     assert notes == [] and solid.is_closed and len(solid.mesh.vertices) == 8
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_plain_ply_files_are_read_as_trimesh_reads_them(tmp_path, double):
+    ball = sphere(size=6)
+    kind = np.float64 if double else np.float32
+    write_mesh(Mesh(ball.vertices.astype(kind), ball.faces), tmp_path / "ball.ply")
+    vertices, faces = read_plain_ply(tmp_path / "ball.ply")
+    other = trimesh.load_mesh(tmp_path / "ball.ply", process=False)
+    assert np.array_equal(vertices, other.vertices) and np.array_equal(faces, other.faces)
+    assert vertices.dtype == np.float64
+
+
+def test_other_ply_files_are_left_to_trimesh(tmp_path):
+    """Text, quadrilaterals, more properties of faces, and a file that is cut short."""
+    text = tmp_path / "text.ply"
+    trimesh.Trimesh(*vars(cube()).values()).export(text, encoding="ascii")
+    assert read_plain_ply(text) is None and len(read_mesh(text).faces) == 12
+    plain = tmp_path / "plain.ply"
+    write_mesh(cube(), plain)
+    content = plain.read_bytes()
+    for wrong in (content[:-1], content.replace(b"little", b"big"), b"", b"ply\n" * 100):
+        plain.write_bytes(wrong)
+        assert read_plain_ply(plain) is None
+    start = content.index(b"end_header\n") + len(b"end_header\n") + 8 * 3 * 8
+    plain.write_bytes(content[:start] + b"\x04" + content[start + 1 :])
+    assert read_plain_ply(plain) is None
+
+
+def test_vertices_are_called_distinct_only_if_they_are():
+    rows = np.random.default_rng(0).integers(-3, 3, (40, 3))
+    assert not are_distinct(rows)
+    assert are_distinct(np.unique(rows, axis=0))

@@ -16,7 +16,7 @@ MODULES = {
     for path in PACKAGE.rglob("*.py")
 }
 # Rooms that need more than the few packages that are always installed.
-WITH_EXTRAS = {"certificate", "evaluation", "pictures", "truth"}
+WITH_EXTRAS = {"certificate", "evaluation", "pictures", "simplification", "truth"}
 
 
 def room_of(module: str) -> str:

@@ -6,18 +6,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from manifold3d import CrossSection, Manifold
 
-from export import parts
+from export import part_tools, parts
 from export.shapes.families import FAMILIES
 from export.tests.test_shapes import check_closed, check_size
+from super_sdf import Mesh
 from super_sdf.evaluation.edges import EdgeCurves
-from super_sdf.evaluation.metrics import face_vectors
-from super_sdf.truth.solid import load_solid
+from super_sdf.evaluation.metrics import face_vectors, sample_surface
+from super_sdf.truth.solid import Solid, load_solid
+
+# Least length of the sharp edges, and least square of it over the area: a cube's is 24.
+EDGES = {"usual": (3, 8), "fine": (6, 60)}
 
 
+@pytest.mark.parametrize("detail", parts.DETAILS)
 @pytest.mark.parametrize("number", range(parts.COUNT))
-def test_every_part_is_a_solid_with_edges(number: int) -> None:
-    name, mesh = parts.draw_part(number)
+def test_every_part_is_a_solid_with_edges(number: int, detail: str) -> None:
+    name, mesh = parts.draw_part(number, detail=detail)
     assert name.startswith(f"part-{number:02d}-")
     check_closed(mesh)
     check_size(mesh)
@@ -27,26 +33,49 @@ def test_every_part_is_a_solid_with_edges(number: int) -> None:
     ends = curves.vertices[curves.edges]
     length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum()
     area = np.linalg.norm(face_vectors(mesh), axis=1).sum() / 2
-    assert length > 6 and length**2 > 60 * area  # a cube's is 24 times its area
+    least, share = EDGES[detail]
+    assert length > least and length**2 > share * area
+
+
+def thin(mesh: Mesh) -> float:
+    """Return how thick a part is below all but a twentieth of its surface."""
+    solid, drawn = Solid(mesh), sample_surface(mesh, (0, 0))
+    below, inward = drawn.points[:3000] - 1e-4 * drawn.normals[:3000], -drawn.normals[:3000]
+    hit, place = solid.first_hits(below, 1e6 * inward)
+    corners = solid.mesh.vertices[solid.mesh.faces[hit]]
+    ends = np.einsum("nk,nkd->nd", place, corners)
+    return float(np.quantile(np.linalg.norm(ends - below, axis=1)[hit >= 0], 0.05))
+
+
+def test_features_are_thicker_than_two_voxels_but_for_the_fine_ones() -> None:
+    """In a grid of 32^3 a voxel is about 0.037 of a turned part's diagonal."""
+    usual, fine = (
+        np.median([thin(parts.draw_part(n, detail=detail)[1]) for n in range(12)])
+        for detail in ("usual", "fine")
+    )
+    assert usual > 2 * 0.037 and fine < 1.5 * 0.037
 
 
 def test_a_drill_removes_a_cylinder_and_two_cones() -> None:
-    tool = parts.through(0.1, 1, 0.03)
-    disc = parts.disc(1).area() / np.pi  # of a polygon of as many corners
+    tool = part_tools.through(0.1, 1, 0.03)
+    disc = part_tools.disc(1).area() / np.pi  # of a polygon of as many corners
     cone = np.pi * disc * 0.03 * (0.1**2 + 0.1 * 0.13 + 0.13**2) / 3
-    inside = tool ^ parts.Manifold.cube([1, 1, 1], True)
+    inside = tool ^ Manifold.cube([1, 1, 1], True)
     assert inside.volume() == pytest.approx(np.pi * disc * 0.01 * (1 - 0.06) + 2 * cone, rel=1e-6)
 
 
 def test_fillets_fill_inner_corners_only() -> None:
-    corner = parts.CrossSection.square([2, 1]) + parts.CrossSection.square([1, 2])
-    assert parts.filled(corner, 0.1).area() - 3 == pytest.approx(0.01 * (1 - np.pi / 4), rel=0.02)
-    square = parts.CrossSection.square([1, 1])
-    assert parts.filled(square, 0.1).area() == pytest.approx(1, abs=1e-3)
+    corner = CrossSection.square([2, 1]) + CrossSection.square([1, 2])
+    assert part_tools.filled(corner, 0.1).area() - 3 == pytest.approx(
+        0.01 * (1 - np.pi / 4), rel=0.02
+    )
+    square = CrossSection.square([1, 1])
+    assert part_tools.filled(square, 0.1).area() == pytest.approx(1, abs=1e-3)
 
 
 def test_no_kind_trains_the_network() -> None:
-    assert not set(parts.KINDS) & set(FAMILIES)
+    kinds = {kind.__name__ for kinds in parts.DETAILS.values() for kind in kinds}
+    assert len(kinds) == 6 and not kinds & set(FAMILIES)
     assert len({parts.draw_part(number)[0].split("-")[2] for number in range(6)}) == 6
 
 
@@ -60,6 +89,12 @@ def test_files_are_the_same_for_the_same_seed(tmp_path: Path) -> None:
         assert path.read_bytes() != moved.read_bytes()
         solid, _ = load_solid(path)
         assert solid.is_closed
+
+
+def test_the_command_writes_fine_parts_when_asked(tmp_path: Path) -> None:
+    parts.main([str(tmp_path / "fine"), "--count", "1", "--detail", "fine"])
+    (usual,) = parts.write_parts(tmp_path / "usual", 1)
+    assert (tmp_path / "fine" / usual.name).read_bytes() != usual.read_bytes()
 
 
 def test_parts_of_a_kind_differ() -> None:

@@ -22,6 +22,7 @@ __all__ = [
     "make_grid",
     "read_grid",
     "reconstruct",
+    "simplify_mesh",
     "upsample",
     "write_mesh",
 ]

@@ -15,25 +15,37 @@ from typing import Any
 import numpy as np
 
 from .arrays import Triple
-from .files.expectation import Expectation, expect
+from .files.expectation import CERTAIN_SHARE, Expectation, expect
 from .files.grids import read_grid
 from .files.meshes import write_pieces
 from .files.precision import check_format_holds, local_origin_note
 from .grid.sdf_grid import SdfGrid
 from .grid.spacing import as_triple
-from .mesh import Mesh
+from .mesh import Mesh, join_meshes
 from .network.decoder import Decoder
+from .options import check_goal
 from .pipeline import reconstruct_slabs
-from .progress import Progress, Stopwatch
+from .progress import Progress, Stopwatch, part_of, share_of
+from .simplification.simplify import (
+    Simplified,
+    check_can_simplify,
+    check_room,
+    simplify_mesh,
+)
 from .slabs.pieces import Piece
 from .steps.mesher_names import DEFAULT_MESHER
 from .steps.meshers import find_mesher
 from .steps.nodes import check_factor
 
+SHARE_BEFORE = 0.2  # of the time, until the mesh is simplified
+
 
 @dataclass(frozen=True)
 class ConvertOptions:
-    """The options of a conversion; see ``read_grid`` and ``reconstruct``."""
+    """The options of a conversion; see ``read_grid``, ``reconstruct`` and ``simplify_mesh``.
+
+    ``simplify`` is an error in voxels; at most one of it and ``triangles`` may be given.
+    """
 
     factor: int = 4
     spacing: tuple[float, ...] | None = None
@@ -43,6 +55,13 @@ class ConvertOptions:
     cap: bool = False
     max_memory: int | None = None
     mesher: str = DEFAULT_MESHER
+    simplify: float | None = None
+    triangles: int | None = None
+
+    @property
+    def simplifies(self) -> bool:
+        """Whether the mesh is to be simplified."""
+        return self.simplify is not None or self.triangles is not None
 
 
 COUNTS = (
@@ -77,6 +96,8 @@ class Conversion:
         Sentences on what was inferred, and on what may be wrong with the result.
     seconds : dict
         Seconds per stage.
+    simplified : dict, optional
+        Of a simplified mesh, what ``Simplified.report`` returns; distances are in voxels.
     """
 
     shape: tuple[int, int, int]
@@ -88,6 +109,7 @@ class Conversion:
     notes: tuple[str, ...]
     warnings: tuple[str, ...]
     seconds: dict[str, float]
+    simplified: dict[str, Any] | None = None
 
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
@@ -98,6 +120,7 @@ class Conversion:
             **self.counts,
             "bounds": [list(corner) for corner in self.bounds],
             "closed": self.closed,
+            **({"simplified": self.simplified} if self.simplified else {}),
             "inferred": list(self.notes),
             "warnings": list(self.warnings),
         }
@@ -123,7 +146,7 @@ def convert(
     network : Network
         From ``load_network``; it can be used for any number of files.
     options : ConvertOptions
-        Factor, spacing, sign, offset, cap, mesher and memory bound.
+        Factor, spacing, sign, offset, cap, mesher, memory bound and simplification.
     force : bool
         Replace the target if it exists.
     progress : callable, optional
@@ -136,9 +159,13 @@ def convert(
     Raises
     ------
     SuperSdfError
-        As in ``read_grid``, ``upsample`` and ``write_mesh``. Nothing is written then.
+        As in ``read_grid``, ``upsample``, ``simplify_mesh`` and ``write_mesh``. Nothing is written
+        then.
     """
     watch = Stopwatch()
+    if options.simplifies:
+        check_goal(options.simplify, options.triangles, ("simplify", "triangles"))
+        check_can_simplify()
     grid = read_grid(
         source,
         spacing=options.spacing,
@@ -151,7 +178,10 @@ def convert(
     about = check_format_holds(target, grid, options.factor)
     notes = (*grid.notes, *local_origin_note(target, about))
     expected = expect(grid, options.factor, options.offset, target)
-    if announce and (sentence := expected.warning(target)):
+    if options.simplifies:
+        least = int(expected.triangles * CERTAIN_SHARE)
+        check_room(least, options.max_memory, estimated=True)
+    elif announce and (sentence := expected.warning(target)):
         announce(sentence)
     watch.lap("read")
     pieces = reconstruct_slabs(
@@ -162,10 +192,13 @@ def convert(
         cap=options.cap,
         mesher=options.mesher,
         max_memory=options.max_memory,
-        progress=progress,
+        progress=part_of(progress, 0, SHARE_BEFORE) if options.simplifies else progress,
     )
     tally = Tally(expected)
     meshes = tally.count(pieces, watch)
+    if options.simplifies:
+        rest = part_of(progress, SHARE_BEFORE, 1)
+        meshes = tally.simplify(meshes, grid.voxel_size, options, watch, rest)
     write_pieces(meshes, target, force=force, about=about, before_rename=before_rename)
     watch.lap("write")
     return describe(grid, tally, options, watch.seconds, notes)
@@ -179,6 +212,8 @@ class Tally:
         self.counts: Counter[str] = Counter()
         self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)
         self.is_cut = False
+        self.simplified: Simplified | None = None
+        self.voxel_size = 1.0
 
     def count(self, pieces: Iterable[Piece], watch: Stopwatch) -> Iterator[Mesh]:
         """Yield the meshes of the pieces, and count them.
@@ -195,6 +230,30 @@ class Tally:
             yield from piece.meshes
             del piece  # before the next one is made
             watch.lap("write")
+
+    def simplify(
+        self,
+        pieces: Iterable[Mesh],
+        voxel_size: float,
+        options: ConvertOptions,
+        watch: Stopwatch,
+        progress: Progress | None,
+    ) -> Iterator[Mesh]:
+        """Yield the mesh of all pieces simplified; counts and bounding box are its own then."""
+        found = simplify_mesh(
+            join_meshes(list(pieces)),
+            error=None if options.simplify is None else options.simplify * voxel_size,
+            triangles=options.triangles,
+            max_memory=options.max_memory,
+            progress=share_of(progress),
+        )
+        self.simplified, self.voxel_size = found, voxel_size
+        self.counts["vertices"] = len(found.mesh.vertices)
+        self.counts["triangles"] = len(found.mesh.faces)
+        self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)
+        self.extend_box(found.mesh)
+        watch.lap("simplify")
+        yield found.mesh
 
     def extend_box(self, mesh: Mesh) -> None:
         """Extend the bounding box by a mesh, axis by axis: five times as fast as ``min(0)``."""
@@ -216,10 +275,14 @@ def describe(
     counts = {name: tally.counts[name] for name in COUNTS}
     counts["expected_triangles"] = tally.expected.triangles
     counts["expected_bytes"] = tally.expected.size
-    warnings = find_warnings(counts, closed)
+    warnings, simplified = find_warnings(counts, closed), None
+    if tally.simplified:
+        simplified = tally.simplified.report(tally.voxel_size)
+        closed = tally.simplified.mesh.is_closed()
+        warnings += tally.simplified.warnings
     where = grid.shape, grid.spacing, grid.origin
     bounds = as_triple(tally.low, "low"), as_triple(tally.high, "high")
-    return Conversion(*where, counts, bounds, closed, notes, warnings, seconds)
+    return Conversion(*where, counts, bounds, closed, notes, warnings, seconds, simplified)
 
 
 def find_warnings(counts: dict[str, int], closed: bool) -> tuple[str, ...]:

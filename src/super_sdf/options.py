@@ -12,6 +12,7 @@ import numpy as np
 
 from .errors import OptionError, OptionTypeError, seen
 from .grid.sdf_grid import SdfGrid
+from .mesh import Mesh
 
 
 def check_grid(grid: Any) -> None:
@@ -104,3 +105,63 @@ def check_progress(progress: Any) -> None:
         raise OptionTypeError(
             f"progress is {seen(progress)}: give a function of (done, total), in thousandths"
         )
+
+
+def check_mesh(mesh: Any) -> None:
+    """Raise OptionTypeError if ``mesh`` is not a ``Mesh``."""
+    if not isinstance(mesh, Mesh):
+        raise OptionTypeError(f"mesh is {seen(mesh)}: give one from reconstruct(grid)")
+
+
+def check_goal(
+    error: Any, triangles: Any, names: tuple[str, str] = ("error", "triangles")
+) -> tuple[float | None, int | None]:
+    """Return to what a mesh is simplified: within an error, or to a number of triangles.
+
+    ``names`` are those of the arguments in messages.
+
+    Raises
+    ------
+    OptionError
+        If not exactly one of them is given, or it is not positive, or not a number
+        (``OptionTypeError``).
+    """
+    if error is None and triangles is None:
+        raise OptionError("give {} or {}".format(*names))
+    if error is not None and triangles is not None:
+        raise OptionError(
+            f"{names[0]} {seen(error)} and {names[1]} {seen(triangles)}: give only one of them"
+        )
+    if triangles is not None:
+        return None, check_triangles(triangles, names[1])
+    return check_error(error, names[0]), None
+
+
+def check_error(error: Any, name: str = "error") -> float:
+    """Return the largest distance of a simplified mesh; ``name`` is its name in messages.
+
+    Raises
+    ------
+    OptionError
+        If it is not positive and finite, or not a number (``OptionTypeError``).
+    """
+    if not isinstance(error, Real) or isinstance(error, bool):
+        raise OptionTypeError(f"{name} is {seen(error)}: give a number greater than 0")
+    if not (isfinite(error) and float(error) > 0):
+        raise OptionError(f"{name} is {error}: give a number greater than 0")
+    return float(error)
+
+
+def check_triangles(triangles: Any, name: str = "triangles") -> int:
+    """Return the most triangles of a simplified mesh; ``name`` is the argument's in messages.
+
+    Raises
+    ------
+    OptionError
+        If it is less than 4, or not a whole number (``OptionTypeError``).
+    """
+    if not isinstance(triangles, Integral) or isinstance(triangles, bool):
+        raise OptionTypeError(f"{name} is {seen(triangles)}: give a whole number")
+    if triangles < 4:
+        raise OptionError(f"{name} is {triangles}: give 4 or more, as a closed mesh has")
+    return int(triangles)

@@ -21,6 +21,20 @@ TOTAL = 1000
 STEPS = {"band": 0.02, "network": 0.78, "nodes": 0.1, "isosurface": 0.1}
 
 
+def part_of(progress: Progress | None, begin: float, end: float) -> Progress | None:
+    """Return a callback for a part of the work, between two shares of it; None without one."""
+    if progress is None:
+        return None
+    return lambda done, total: progress(
+        round(TOTAL * (begin + (end - begin) * done / total)), TOTAL
+    )
+
+
+def share_of(progress: Progress | None) -> ShareCallback | None:
+    """Return a callback for the share of the work that is done; None without one."""
+    return None if progress is None else lambda share: progress(round(TOTAL * share), TOTAL)
+
+
 class Stopwatch:
     """Adds up the seconds spent in each stage, by name."""
 

@@ -9,5 +9,6 @@ from .mesh import Mesh as Mesh
 from .network.network import load_network as load_network
 from .pipeline import reconstruct as reconstruct
 from .pipeline import upsample as upsample
+from .simplification.simplify import simplify_mesh as simplify_mesh
 from .steps.field import FineField as FineField
 from .steps.meshers import extract_mesh as extract_mesh

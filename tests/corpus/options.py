@@ -46,8 +46,14 @@ TARGETS = [
     *("folder.ply/x.ply", "n" * 250 + ".stl", "n" * 240 + ".obj", "CON.stl", "a:b.ply"),
 ]
 NUMBER_OPTIONS = {
-    "upsample": ["--factor", "--spacing", "--origin", "--offset", "--threads"],
-    "batch": ["--factor", "--spacing", "--origin", "--offset", "--threads"],
+    "upsample": [
+        *("--factor", "--spacing", "--origin", "--offset", "--threads", "--simplify"),
+        "--triangles",
+    ],
+    "batch": [
+        *("--factor", "--spacing", "--origin", "--offset", "--threads", "--simplify"),
+        "--triangles",
+    ],
     "sample": ["-n", "--spacing", "--padding", "--band"],
     "render": ["--top", "--zoom", "--size"],
     "section": ["--at", "--size", "--factor"],

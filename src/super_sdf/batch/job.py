@@ -24,6 +24,7 @@ retry : whether another run may succeed with the same input and options
 content, output : fingerprints of the input and of the mesh
 options : digest of all that the mesh depends on, besides the input
 mesher : what made the triangles
+simplified : with ``--simplify`` or ``--triangles``, triangles before and after, and distances
 check : with ``--check`` the certificate, or why there is none
 seconds : time in all; that of each stage is in ``stages``
 """

@@ -21,6 +21,7 @@ from ..convert import ConvertOptions
 from ..errors import FileError, OptionError
 from ..files.meshes import MESH_SUFFIXES
 from ..grid.sides import INSIDE
+from ..options import check_error, check_goal, check_triangles
 from ..steps.mesher_names import MESHERS
 from ..steps.nodes import check_factor
 from .job import Job
@@ -111,6 +112,9 @@ def _job(entry: Entry, home: Path, suffix: str, options: ConvertOptions) -> Job:
         raise OptionError(f"{unknown[0]!r} is unknown: give in, out, {', '.join(CHECKS)}")
     asked = {name: CHECKS[name](name, value) for name, value in entry.items()}
     name = _default_target(source, suffix) if target is None else _check_target(target)
+    if asked.keys() & {"simplify", "triangles"}:  # one of them replaces the other
+        asked = {"simplify": None, "triangles": None, **asked}
+        check_goal(asked["simplify"], asked["triangles"], ("'simplify'", "'triangles'"))
     return Job(home / source, name.as_posix(), replace(options, **asked))
 
 
@@ -187,6 +191,14 @@ def _mesher(name: str, value: Any) -> str:
     return str(value)
 
 
+def _error(name: str, value: Any) -> float:
+    return check_error(_number(name, value), repr(name))
+
+
+def _triangles(name: str, value: Any) -> int:
+    return check_triangles(value, repr(name))
+
+
 CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "factor": _factor,
     "spacing": _numbers,
@@ -195,4 +207,6 @@ CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "offset": _number,
     "cap": _flag,
     "mesher": _mesher,
+    "simplify": _error,
+    "triangles": _triangles,
 }

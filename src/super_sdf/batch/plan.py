@@ -131,6 +131,8 @@ class Planner:
         options = asdict(replace(job.options, max_memory=None))
         if options["mesher"] == MARCHING:
             del options["mesher"]  # so that rows of versions without this option still hold
+        if not job.options.simplifies:
+            del options["simplify"], options["triangles"]
         settings = [options, self.network, __version__]
         return hashlib.sha256(json.dumps(settings).encode()).hexdigest()
 

@@ -18,17 +18,20 @@ from ..files.regular import check_regular_file
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import give_back, held_memory, in_words
 from ..machine.resources import Resources, allot
+from ..machine.threads import useful_threads
 from ..mesh import Mesh
 from ..options import check_distance, check_max_memory
 from ..steps.survey import no_surface, survey
 from ..truth.mesh_files import read_mesh
+from .slabs import search
 from .strays import Strays, find_strays
 from .surface import Surface, examine_surface
-from .touching import NOTICEABLE, Touching, touch
+from .touching import NOTICEABLE, Touching, exact_samples, touch
 
 # Bytes for each triangle and each exact sample, beside mesh and band, at the most: search trees.
 BYTES_PER_TRIANGLE = 420
 BYTES_PER_SAMPLE = 150
+REACH = 2.0  # voxels: how far slabs look; the samples near the surface are within 1.4 of it
 HEADER_BYTES = 4096  # of a PLY file, in which the number of faces is looked for
 
 
@@ -42,6 +45,8 @@ class CheckOptions:
         As given when the mesh was made.
     intersections : bool
         Count self-intersections, which takes up to half of the time.
+    processes : int
+        How many may search large meshes at the same time; 0: one per core.
     """
 
     spacing: tuple[float, ...] | None = None
@@ -50,6 +55,7 @@ class CheckOptions:
     offset: float = 0.0
     max_memory: int | None = None
     intersections: bool = True
+    processes: int = 1
 
     @classmethod
     def of(cls, options: ConvertOptions) -> CheckOptions:
@@ -207,10 +213,20 @@ def check_mesh(mesh: Mesh, grid: SdfGrid, options: CheckOptions | None = None) -
     if not len(band.voxel_ijk):
         raise no_surface(grid, offset)
     check_room(len(mesh.faces), len(band.voxel_ijk), resources)
-    surface = examine_surface(mesh, options.intersections)
-    give_back()
-    touching = touch(mesh, band, grid)
+    samples = exact_samples(band, grid)
     del band
+    give_back()
+    found = search(
+        mesh,
+        samples.points,
+        REACH * grid.voxel_size,
+        intersections=options.intersections,
+        processes=useful_threads(options.processes),
+    )
+    surface = examine_surface(mesh, found.intersections)
+    give_back()
+    touching = touch(mesh, samples, found, grid.voxel_size, simple=surface.is_simple)
+    del found
     give_back()
     strays = find_strays(mesh.vertices, grid, offset) if len(touching.values) else None
     return Certificate(mesh, grid.voxel_size, surface, touching, strays, grid.notes)

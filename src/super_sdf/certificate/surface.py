@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import igl.predicates
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
@@ -14,28 +12,9 @@ from scipy.sparse.csgraph import connected_components
 
 from ..arrays import IntArray
 from ..mesh import Mesh
+from ..topology import Edges, count_fans, pair_edges, without_collapsed
 
 FACES_AT_ONCE = 1 << 18  # for area and volume
-FACES_IN_SLAB = 1 << 19  # for self-intersections
-
-
-@dataclass(frozen=True)
-class Edges:
-    """Numbers of edges that are not shared by exactly two triangles of the same orientation.
-
-    Attributes
-    ----------
-    open_edges : int
-        Edges of one triangle.
-    crowded_edges : int
-        Edges of more than two triangles: not manifold.
-    flipped_edges : int
-        Edges of two triangles that pass them in the same direction: not consistently oriented.
-    """
-
-    open_edges: int
-    crowded_edges: int
-    flipped_edges: int
 
 
 @dataclass(frozen=True)
@@ -83,6 +62,12 @@ class Surface:
         """Whether all edges and vertices are manifold; open edges are allowed."""
         return self.edges.crowded_edges == 0 and self.pinched_vertices == 0
 
+    @property
+    def is_simple(self) -> bool:
+        """Whether the mesh is one closed sheet with an inside, known not to meet itself."""
+        whole = self.closed and self.oriented and self.manifold and self.components == 1
+        return whole and self.self_intersections == 0
+
     def faults(self) -> list[str]:
         """Return what keeps the mesh from being the boundary of a solid, in words."""
         edges = self.edges
@@ -104,15 +89,15 @@ class Surface:
         return {**said, **edges, **figures}
 
 
-def examine_surface(mesh: Mesh, intersections: bool = True) -> Surface:
+def examine_surface(mesh: Mesh, self_intersections: int | None = None) -> Surface:
     """Return what a mesh is as a surface.
 
     Parameters
     ----------
     mesh : Mesh
         Vertices at the same position must be one vertex.
-    intersections : bool
-        Count self-intersections, which takes most of the time.
+    self_intersections : int, optional
+        What ``slabs.search`` has counted; None if it was not asked to.
     """
     faces = without_collapsed(mesh.faces)
     opposite, edges = pair_edges(faces, len(mesh.vertices))
@@ -125,69 +110,10 @@ def examine_surface(mesh: Mesh, intersections: bool = True) -> Surface:
         edges,
         pinched,
         count_components(faces, len(mesh.vertices)),
-        count_intersections(mesh.vertices, faces) if intersections else None,
+        self_intersections,
         volume,
         area,
     )
-
-
-def without_collapsed(faces: IntArray) -> IntArray:
-    """Return the faces (m, 3) without those that have a vertex twice, and so no area."""
-    a, b, c = faces.T
-    whole: IntArray = faces[(a != b) & (b != c) & (c != a)]
-    return whole
-
-
-def pair_edges(faces: IntArray, count: int) -> tuple[IntArray, Edges]:
-    """Find the neighbour of each triangle across each of its edges.
-
-    Half-edge 3 f + i runs from corner i of face f to the next corner.
-
-    Parameters
-    ----------
-    faces : (m, 3) int32
-        Corners of the triangles.
-    count : int
-        Number of vertices.
-
-    Returns
-    -------
-    (3 m,) int32, Edges
-        The half-edge that runs along the same edge in the other direction, -1 unless the edge has
-        exactly these two; and the numbers of all other edges.
-    """
-    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    key = np.minimum(start, end).astype(np.int64) * count + np.maximum(start, end)
-    order = np.argsort(key, kind="stable")
-    key = key[order]
-    first = np.flatnonzero(np.append(True, key[1:] != key[:-1]))
-    uses = np.diff(np.append(first, len(key)))
-    pair = first[uses == 2]
-    one, other = order[pair], order[pair + 1]
-    against = start[one] == end[other]
-    opposite = np.full(len(key), -1, np.int32)
-    opposite[one[against]], opposite[other[against]] = other[against], one[against]
-    numbers = (uses == 1).sum(), (uses > 2).sum(), (~against).sum()
-    return opposite, Edges(*map(int, numbers))
-
-
-def count_fans(faces: IntArray, opposite: IntArray) -> NDArray[np.int64]:
-    """Return for each vertex, (n,), how many fans of triangles meet there: 1 in a manifold.
-
-    The half-edges of a vertex are walked from triangle to triangle, in steps of 1, 2, 4, ... A fan
-    is a cycle, counted at its lowest half-edge, or ends at an edge without a neighbour.
-    """
-    start, half = faces.ravel(), np.arange(faces.size, dtype=np.int32)
-    step = opposite[half.reshape(-1, 3)[:, [2, 0, 1]].ravel()]
-    ends = step < 0
-    step = np.where(ends, half, step)
-    lowest = half
-    for _ in range(int(np.bincount(start).max(initial=1)).bit_length()):
-        lowest = np.minimum(lowest, lowest[step])
-        step = step[step]
-    cycles = (lowest == half) & ~ends[step]
-    size = int(start.max(initial=-1)) + 1
-    return np.bincount(start[ends], minlength=size) + np.bincount(start[cycles], minlength=size)
 
 
 def count_components(faces: IntArray, count: int) -> int:
@@ -198,42 +124,6 @@ def count_components(faces: IntArray, count: int) -> int:
     used = np.zeros(count, bool)
     used[faces] = True
     return int(found - np.count_nonzero(~used))
-
-
-def count_intersections(vertices: NDArray[Any], faces: IntArray) -> int | None:
-    """Return the number of pairs of triangles that intersect, None if libigl has no test for it.
-
-    The mesh is cut into slabs, since small search trees are quicker. A pair is counted in the slab
-    in which the common range of its triangles begins.
-    """
-    find = getattr(igl.predicates, "find_self_intersections", None)
-    if find is None:
-        return None
-    positions, count = vertices.astype(np.float64), 0
-    for rows, low, first, last in slabs_of(positions, faces):
-        pairs = find(positions, faces[rows].astype(np.int64))[1]
-        begin = low[rows][pairs].max(1, initial=-np.inf)
-        count += int(np.count_nonzero((begin >= first) & (begin < last)))
-    return count
-
-
-def slabs_of(
-    vertices: NDArray[np.float64], faces: IntArray
-) -> Iterator[tuple[NDArray[np.intp], NDArray[np.float64], float, float]]:
-    """Cut a mesh along its longest axis into slabs in which about equally many triangles begin.
-
-    Yields
-    ------
-    (k,) int64, (m,) float64, float, float
-        The triangles that reach into a slab, the beginning of every triangle, and the range of the
-        slab.
-    """
-    along = vertices[:, int(np.ptp(vertices, axis=0).argmax())][faces]
-    low, high = along.min(1), along.max(1)
-    shares = np.linspace(0, 1, len(faces) // FACES_IN_SLAB + 2)
-    limits = np.unique(np.quantile(low, shares, method="lower"))
-    for first, last in zip(limits, [*limits[1:-1], np.inf]):
-        yield np.flatnonzero((low < last) & (high >= first)), low, float(first), float(last)
 
 
 def measure(vertices: NDArray[Any], faces: IntArray) -> tuple[float, float]:

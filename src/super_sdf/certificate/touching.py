@@ -14,12 +14,12 @@ import numpy as np
 
 from ..arrays import BoolArray, FloatArray
 from ..grid.sdf_grid import SdfGrid
-from ..machine.memory import give_back
 from ..machine.threads import chunks_of
 from ..mesh import Mesh
 from ..neighbourhood import CENTRE
 from ..steps.survey import Band
-from ..truth.solid import Distances, Points, Solid
+from ..truth.solid import Points, Solid
+from .slabs import Found
 
 WIDTH = 4  # 2^17 samples at a time
 NOTICEABLE = 0.1  # voxels: a residual that is counted as large
@@ -79,31 +79,59 @@ class Touching:
         }
 
 
-def touch(mesh: Mesh, band: Band, grid: SdfGrid) -> Touching:
-    """Return where the balls of a band's exact samples meet a mesh.
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """The exact samples of a grid near the surface; see ``Touching`` for what its fields are."""
 
-    Parameters
-    ----------
-    mesh : Mesh
-        In world units.
-    band : Band
-        Of the grid, from ``survey``.
-    grid : SdfGrid
-        Where the samples lie.
-    """
+    cut_off: int
+    noisy: int
+    points: Points
+    values: FloatArray
+
+
+def exact_samples(band: Band, grid: SdfGrid) -> Samples:
+    """Return the exact samples of a band: of its grid, from ``survey``."""
     exact = np.flatnonzero(band.exact & ~at_limit(band.patches[:, CENTRE]))
     # if none is exact, too many are no distances for any to be taken for one
     noisy = int(np.count_nonzero(~band.lipschitz)) if len(exact) else len(band.exact)
     points = band.voxel_ijk[exact] * np.array(grid.spacing) + np.array(grid.origin)
     values = band.patches[exact, CENTRE] / 2  # from half voxels
-    distances, feet = nearest_points(mesh, points)
-    distances /= grid.voxel_size
-    give_back()  # the tree
-    inside = sides(mesh, points)
-    wrong = (inside != (values <= 0)) & (distances + np.abs(values) > NOTICEABLE)
-    residuals = (distances - np.abs(values)).astype(np.float32)
-    cut_off = len(band.exact) - len(exact) - noisy
-    return Touching(cut_off, noisy, points, values, residuals, feet, wrong)
+    return Samples(len(band.exact) - len(exact) - noisy, noisy, points, values)
+
+
+def touch(
+    mesh: Mesh, samples: Samples, found: Found, voxel_size: float, *, simple: bool
+) -> Touching:
+    """Return where the balls of exact samples meet a mesh.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        In world units.
+    samples : Samples
+    found : Found
+        By ``slabs.search`` for the points of the samples.
+    voxel_size : float
+        Spacing of the grid.
+    simple : bool
+        Whether what is behind the surface is inside: see ``Surface.is_simple``.
+    """
+    distances, size = found.distances / voxel_size, np.abs(samples.values)
+    residuals = (distances - size).astype(np.float32)
+    apart = distances + size > NOTICEABLE  # where the side matters
+    inside = found.facing < 0
+    unsure = np.flatnonzero(apart & (found.facing == 0) if simple else apart)
+    inside[unsure] = sides(mesh, samples.points[unsure])
+    wrong = apart & (inside != (samples.values <= 0))
+    return Touching(
+        samples.cut_off,
+        samples.noisy,
+        samples.points,
+        samples.values,
+        residuals,
+        found.feet,
+        wrong,
+    )
 
 
 def at_limit(samples: FloatArray) -> BoolArray:
@@ -113,16 +141,6 @@ def at_limit(samples: FloatArray) -> BoolArray:
     """
     found: BoolArray = (samples == samples.min()) | (samples == samples.max())
     return found
-
-
-def nearest_points(mesh: Mesh, points: Points) -> tuple[Distances, Points]:
-    """Return the distances of points (n, 3) to a mesh, (n,), and its nearest points, (n, 3)."""
-    solid = Solid(mesh)
-    found = [solid.foot_points(points[chunk]) for chunk in chunks_of(len(points), WIDTH)]
-    if not found:
-        return np.zeros(0), np.zeros((0, 3))
-    distances, feet = (np.concatenate(parts) for parts in zip(*found))
-    return distances, feet
 
 
 def sides(mesh: Mesh, points: Points) -> BoolArray:

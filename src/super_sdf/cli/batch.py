@@ -15,6 +15,7 @@ from .common import CONTEXT, InterruptedCommand, one_line_errors
 from .conversion import (
     check_can_check,
     check_option,
+    check_simplification,
     chosen_model,
     conversion_options,
     make_options,
@@ -100,7 +101,9 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
     check_factor(options["factor"])
     if options["check"]:
         check_can_check(f".{options['kind']}")
+    check_simplification(options)
     jobs, unread = find_jobs(sources, f".{options['kind']}", make_options(options))
+    check_jobs_can_be_simplified(jobs)
     model = chosen_model(options)
     find_model(model, options["precision"])
     flags = {name: options[name] for name in ("force", "retry", "fail_fast", "check")}
@@ -124,6 +127,14 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
     print_summary(done, options)
     if done.failures() or done.unread:
         sys.exit(1)
+
+
+def check_jobs_can_be_simplified(jobs: list[Job]) -> None:
+    """Raise FileError if a list of inputs asks for what the missing extra would do."""
+    from ..simplification.simplify import check_can_simplify
+
+    if any(job.options.simplifies for job in jobs):
+        check_can_simplify("simplify")
 
 
 def complete(jobs: list[Job], settings: Settings, quiet: bool) -> Batch:

@@ -142,14 +142,44 @@ def remarks(batch: Batch) -> list[str]:
     """
     rows = [result.row for result in batch.done]
     inferred = sum(bool(row["inferred"]) for row in rows)
-    warned = sum(len(row["warnings"]) > (not row["closed"]) for row in rows)
+    simplified = [row for row in rows if "simplified" in row]
+    unreached = sum(bool(row["simplified"]["warnings"]) for row in simplified)
+    warned = sum(_warnings_of_values(row) > 0 for row in rows)
     report = batch.settings.folder / "report.jsonl"
     lines = [f"Note: {note}" for note in batch.notes]
     if inferred:
         lines.append(f"Note: spacing, origin or sign of {inferred} was inferred: see {report}")
     if warned:
         lines.append(f"Warning: {warned} are from noisy or contradictory values: see {report}")
+    if simplified:
+        lines.append(f"Simplified: {describe_simplified(simplified)}; see the report")
+    if unreached:
+        lines.append(f"Warning: {unreached} were not simplified as asked: see {report}")
     return lines + check_lines([row for row in rows if "check" in row])
+
+
+def _warnings_of_values(row: dict[str, Any]) -> int:
+    """Return how many warnings of a row are neither of an open mesh nor of its simplification."""
+    others = (not row["closed"]) + len(row.get("simplified", {}).get("warnings", []))
+    return len(row["warnings"]) - others
+
+
+def describe_simplified(rows: list[dict[str, Any]]) -> str:
+    """Describe in one line how much simpler meshes are in all, and the largest distance."""
+    figures = {row["out"]: row["simplified"] for row in rows}
+    before, after = (
+        sum(found[key] for found in figures.values()) for key in ("triangles_before", "triangles")
+    )
+    worst = max(figures, key=lambda name: largest_distance(figures[name]))
+    distance = largest_distance(figures[worst])
+    counts = f"from {before:,} to {after:,} triangles"
+    return f"{counts}; largest distance {distance:.4f} voxels, of {worst}"
+
+
+def largest_distance(simplified: dict[str, Any]) -> float:
+    """Return the larger one of the largest distances both ways, in voxels."""
+    off = simplified["deviation"]
+    return float(max(off["largest"], off["largest_back"]))
 
 
 def check_lines(rows: list[dict[str, Any]]) -> list[str]:

@@ -133,7 +133,8 @@ def make_check_options(options: dict[str, Any]) -> CheckOptions:
 
     names = ("spacing", "origin", "inside", "offset", "max_memory")
     chosen = {name: options[name] for name in names}
-    return CheckOptions(**chosen, intersections=not options["skip_intersections"])
+    count = not options["skip_intersections"]
+    return CheckOptions(**chosen, intersections=count, processes=0)
 
 
 def print_certificate(

@@ -153,6 +153,24 @@ OPTIONS: tuple[Option, ...] = (
 )
 
 
+SIMPLIFY_OPTIONS: tuple[Option, ...] = (
+    click.option(
+        "--simplify",
+        type=float,
+        metavar="ERROR",
+        help="Simplify the mesh as far as it stays within ERROR of the unsimplified one, in voxels "
+        "of the grid (such as 0.02), measured both ways. A closed mesh stays closed. Needs the "
+        "extra simplify.",
+    ),
+    click.option(
+        "--triangles",
+        type=int,
+        metavar="N",
+        help="Simplify the mesh to at most N triangles, instead of --simplify. If the shape needs "
+        "more, a warning says how many are left.",
+    ),
+)
+
 check_option = click.option(
     "--check",
     is_flag=True,
@@ -161,8 +179,8 @@ check_option = click.option(
 
 
 def conversion_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options to a command, in the order of ``OPTIONS``."""
-    return _with_options(command, OPTIONS)
+    """Add the options to a command, in the order of ``OPTIONS`` and ``SIMPLIFY_OPTIONS``."""
+    return _with_options(command, OPTIONS + SIMPLIFY_OPTIONS)
 
 
 def grid_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -181,6 +199,19 @@ def check_can_check(target: str) -> None:
     check_modules("--check", "eval", CHECK_MODULES)
     if target.lower().endswith(".3mf"):
         check_modules("--check of .3mf files", "3mf")
+
+
+def check_simplification(options: dict[str, Any]) -> None:
+    """Raise an error if ``--simplify`` or ``--triangles`` has a wrong value or cannot be done."""
+    from ..options import check_goal
+    from ..simplification.simplify import check_can_simplify
+
+    names = ("--simplify", "--triangles")
+    values = options["simplify"], options["triangles"]
+    if values == (None, None):
+        return
+    check_goal(*values, names)
+    check_can_simplify(names[values[0] is None])
 
 
 def chosen_model(options: dict[str, Any]) -> str:

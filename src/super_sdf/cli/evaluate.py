@@ -33,6 +33,7 @@ NUMBERS = (
     "peer_size",
     "peer_limit",
     "turned",
+    "peer_meshes",
 )
 LISTS = ("sizes", "experiments", "peers")
 
@@ -133,7 +134,7 @@ def accepts(option: click.Option, word: str, ctx: click.Context) -> bool:
 @click.option(
     "--peer-shapes",
     type=click.IntRange(1),
-    default=5,
+    default=6,
     show_default=True,
     help="Number of shapes for the peers.",
 )
@@ -147,6 +148,13 @@ def accepts(option: click.Option, word: str, ctx: click.Context) -> bool:
     show_default=True,
     metavar="SECONDS",
     help="Time limit for each peer on each shape.",
+)
+@click.option(
+    "--peer-meshes",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="FOLDER",
+    help="Keep the meshes of the peers in FOLDER, and take them from there instead of running a "
+    "peer on the same samples again.",
 )
 @click.option(
     "--limit", type=click.IntRange(1), help="Use only this many meshes, spread over the list."
@@ -199,6 +207,8 @@ def run_evaluate(sources: tuple[Path, ...], options: dict[str, Any]) -> bool:
 
     if options["peers"]:
         check_modules("--peers", "peers")
+    if "meshers" in options["experiments"] or options["peers"]:
+        check_modules("--peers" if options["peers"] else "--experiments meshers", "simplify")
     paths = find_meshes(sources)
     jobs = min(options["jobs"] or count_cores(), count_cores())
     once: dict[str, Any] = {name: tuple(dict.fromkeys(options[name])) for name in LISTS}

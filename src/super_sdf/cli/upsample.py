@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -12,6 +13,7 @@ from .common import CONTEXT, one_line_errors, print_stderr, print_stdout, progre
 from .conversion import (
     check_can_check,
     check_option,
+    check_simplification,
     chosen_model,
     conversion_options,
     make_options,
@@ -83,6 +85,7 @@ class Upsampling:
         check_target(self.target, force=options["force"])
         if options["check"]:
             check_can_check(self.target)
+        check_simplification(options)
         watch.lap("start")
         self.network = load_network(
             self.model,
@@ -110,6 +113,7 @@ class Upsampling:
         from ..progress import Stopwatch
 
         watch, options = Stopwatch(), CheckOptions.of(make_options(self.options))
+        options = replace(options, processes=self.options["threads"])
         try:
             self.certificate = check_files(self.target, self.source, options)
         except SuperSdfError as error:
@@ -139,6 +143,8 @@ class Upsampling:
             for stage, seconds in self.seconds.items():
                 print_stderr(f"{stage}: {seconds:.3f} s")
         print_stderr(f"{self.target}: {self.summary()}")
+        if self.result.simplified:
+            print_stderr(f"Simplified: {describe_simplified(self.result.simplified)}")
         if self.certificate:
             print_stderr(f"Check: {self.certificate.summary()}")
 
@@ -174,3 +180,13 @@ class Upsampling:
             f"{'closed' if self.result.closed else 'open'}, from {low} to {high}, "
             f"{sum(self.seconds.values()):.1f} s"
         )
+
+
+def describe_simplified(found: dict[str, Any]) -> str:
+    """Describe in one line how much simpler a mesh is and how far from the unsimplified one."""
+    off = found["deviation"]
+    return (
+        f"from {found['triangles_before']:,} to {found['triangles']:,} triangles; largest distance "
+        f"{off['largest']:.4f} voxels from the unsimplified mesh to this one, "
+        f"{off['largest_back']:.4f} back; mean {off['mean']:.4f} and {off['mean_back']:.4f}"
+    )

@@ -148,6 +148,10 @@ class Case:
         Coordinate of the first node of the fine lattice on every axis.
     spacing, fine : float
         Distance between samples, and between nodes of the fine lattice.
+    peer_meshes : Path, optional
+        Folder in which the meshes of peers are kept.
+    peers : dict
+        The surfaces of the peers that were run, by name.
 
     Raises
     ------
@@ -155,7 +159,9 @@ class Case:
         If the dense fields do not fit into memory.
     """
 
-    def __init__(self, shape: Shape, setting: Setting) -> None:
+    def __init__(self, shape: Shape, setting: Setting, peer_meshes: Path | None = None) -> None:
+        self.peer_meshes = peer_meshes
+        self.peers: dict[str, Any] = {}
         nodes = (setting.size * setting.factor**setting.passes + 1) ** 3
         what = f"measuring {setting.size}^3 refined to {nodes:,} nodes"
         check_fits(nodes * BYTES_PER_NODE, what, "use smaller sizes or fewer --jobs")

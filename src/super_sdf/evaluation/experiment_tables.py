@@ -6,15 +6,26 @@ from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
 
+from ..steps.mesher_names import MESHERS
 from . import published
 from .cases import Setting
 from .measuring import Measurement
-from .names import LABELS, MESHED, MESHERS, OURS, meshed_by
+from .names import (
+    LABELS,
+    MESHED,
+    OURS,
+    SHARES,
+    meshed_by,
+    simplified,
+)
 from .results import Results
-from .scope import BASE_SIZE, FACTORS, MESHER_FACTORS, NOISES, PASSES, SCALES
+from .scope import BASE_SIZE, FACTORS, MESHER_FACTORS, NOISES, PASSES, SCALES, SIMPLIFIED_FACTOR
 from .tables import BACK, CD, EDGES, F1, NC, SHORT, gap_closed, markdown, mean_of, mean_row, percent
 from .timing import RUNS, describe_machine
 
+MESHER_LINES = """\
+With factor 1 the field is refined by 4, but meshed at the corners of the voxels only. 1/4 and 1/16:
+simplified to that share of the triangles."""
 MESHER_COLUMNS = (F1, NC, BACK, *EDGES)
 
 
@@ -94,12 +105,16 @@ def mesher_section(results: Results) -> str:
     for size, factor in product(results.scope.sizes, MESHER_FACTORS):
         for mesher, method in product(MESHERS, MESHED):
             name = meshed_by(method, mesher)
-            measured = results.rows(Setting(size, factor), name, paths)
-            closed = f"{sum(row['closed'] for row in measured)} of {len(measured)}"
-            where = [f"{size}^3, factor {factor}", mesher]
-            rows.append([*where, *mean_row(LABELS[method], measured, MESHER_COLUMNS), closed])
+            names = {name: LABELS[method]}
+            if method == OURS and factor == SIMPLIFIED_FACTOR:
+                names |= {simplified(name, n): f"{LABELS[OURS]}, 1/{n}" for n in SHARES}
+            for each, label in names.items():
+                measured = results.rows(Setting(size, factor), each, paths)
+                closed = f"{sum(row['closed'] for row in measured)} of {len(measured)}"
+                where = [f"{size}^3, factor {factor}", mesher]
+                rows.append([*where, *mean_row(label, measured, MESHER_COLUMNS), closed])
     titles = ["grid", "mesher", "method", *(column.title for column in MESHER_COLUMNS), "closed"]
-    return f"{title_of('Meshers', paths)}\n\n{markdown(titles, rows)}"
+    return f"{title_of('Meshers', paths)}\n\n{MESHER_LINES}\n\n{markdown(titles, rows)}"
 
 
 SECTIONS = {

@@ -21,9 +21,9 @@ from ..network.network import find_model, load_network
 from ..truth.solid import Solid
 from . import edges, metrics
 from .cases import RESULT_EDGES, RESULT_POINTS, Case, Setting, Shape
-from .methods import MESHED_METHODS, METHODS, Surface
+from .methods import MESHED_METHODS, METHODS, SIMPLIFIED_METHODS, Method, Surface
 from .names import OF_OUR_CODE
-from .peers import PEERS
+from .peers import MATCHED_METHODS, PEERS
 
 Measurement = dict[str, Any]
 """A line of ``results.jsonl``: the key (see ``Task.key``), then the figures, or the "error"."""
@@ -44,7 +44,7 @@ OPTIONAL_NUMBERS = (
     *("min_angle", "slivers"),
 )
 # Folders of the package whose code does not change any surface.
-NOT_THE_METHOD = {"batch", "cli", "evaluation", "pictures"}
+NOT_THE_METHOD = {"batch", "certificate", "cli", "evaluation", "pictures"}
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,8 @@ class Task:
         Seconds that the task may take.
     turned : int, optional
         Seed by which the shape is turned at random; as its file has it unless given.
+    peer_meshes : Path, optional
+        Folder in which the meshes of peers are kept.
     """
 
     path: Path
@@ -79,6 +81,7 @@ class Task:
     threads: int = 0
     limit: float | None = None
     turned: int | None = None
+    peer_meshes: Path | None = None
 
     def __str__(self) -> str:
         named = [str(self.setting), *(self.methods if self.limit else [])]
@@ -102,7 +105,7 @@ def measure_task(task: Task, shape: Shape) -> Iterator[Measurement]:
     try:
         # On the CPU, for the same results on every machine.
         network = load_network(task.model, device="cpu", threads=task.threads)
-        case = None if task.setting == NO_SETTING else Case(shape, task.setting)
+        case = None if task.setting == NO_SETTING else Case(shape, task.setting, task.peer_meshes)
     except Exception as problem:  # all methods of the task fail; other tasks still count
         yield from (failed_row(task, method, reason_of(problem)) for method in task.methods)
         return
@@ -127,6 +130,8 @@ def measure_method(shape: Shape, case: Case | None, method: str, network: Decode
         figures |= measure_field(case, surface)
     except Exception as problem:  # named in the report; the other shapes still count
         return {"error": reason_of(problem)}
+    if surface.seconds is not None:
+        seconds = surface.seconds
     return {**figures, "seconds": seconds, "peak_mb": peak, "error": None}
 
 
@@ -134,7 +139,9 @@ def make_surface(shape: Shape, case: Case | None, method: str, network: Decoder)
     """Return the surface that a method makes of a case; without a case, the reference itself."""
     if case is None:
         return Surface(shape.mesh)
-    return {**MESHED_METHODS, **METHODS, **PEERS}[method](case, network)
+    ours = {**MESHED_METHODS, **SIMPLIFIED_METHODS, **MATCHED_METHODS}
+    by_name: dict[str, Method] = {**ours, **METHODS, **PEERS}
+    return by_name[method](case, network)
 
 
 def failed_row(task: Task, method: str, error: str) -> Measurement:

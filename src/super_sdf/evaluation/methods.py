@@ -19,6 +19,7 @@ from ..grid.sdf_grid import SdfGrid
 from ..mesh import Mesh
 from ..network.decoder import Decoder
 from ..pipeline import reconstruct, refine
+from ..simplification.simplify import simplify_mesh
 from ..slabs.cutting import whole
 from ..steps.band import neighbour_table
 from ..steps.field import FineField, SampleSpheres
@@ -27,9 +28,10 @@ from ..steps.meshers import extract_mesh
 from ..steps.nodes import block_ijk, share_parts
 from ..steps.survey import survey
 from .cases import Case, spread_samples
-from .names import OURS, meshed_by
+from .names import OURS, SIMPLIFIED, meshed_by
 
 NUDGE = np.float32(1e-9)  # replaces exact zeros: a vertex on a node can open the surface
+FACTOR_FOR_ONE = 4  # with factor 1 the field is refined so far, and meshed at the voxels' corners
 FACTOR_OF_BLOCKS = 4  # of the blocks that a dense field is cut into
 EMPTY = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
 
@@ -39,11 +41,13 @@ class Surface:
     """The result of a method: a mesh, and the refined field if the method has one.
 
     ``field`` returns the values at the fine nodes, (K n + 1)^3, known at least in the band. It is
-    a function so that it is not computed while the method is timed.
+    a function so that it is not computed while the method is timed. ``seconds`` is how long a mesh
+    took that was made in an earlier run.
     """
 
     mesh: Mesh
     field: Callable[[], FloatArray] | None = None
+    seconds: float | None = None
 
 
 Method = Callable[[Case, Decoder], Surface]
@@ -92,6 +96,8 @@ def our_surface(case: Case, network: Decoder, *, mesher: str = DEFAULT_MESHER) -
     try:
         for _ in range(case.setting.passes - 1):
             grid = refined_grid(grid, network, case.factor)
+        if case.factor == 1:
+            return Surface(mesh_corners(grid, network, mesher))
         mesh = BY_MESHER[mesher].refined(grid, network, case.factor)
     except NoSurfaceError:
         return Surface(EMPTY)
@@ -111,6 +117,27 @@ def refined_grid(grid: SdfGrid, network: Decoder, factor: int) -> SdfGrid:
     origin = np.array(grid.origin) - grid.voxel_size / 2
     values = np.where(np.isnan(field), nearest, field)
     return SdfGrid.trusted(values, grid.voxel_size / factor, origin)
+
+
+def mesh_corners(grid: SdfGrid, network: Decoder, mesher: str) -> Mesh:
+    """Mesh the refined field at the corners of the voxels only: few cells, of good values."""
+    fine = band_field(grid, network, FACTOR_FOR_ONE)
+    corners = fine[(slice(None, None, FACTOR_FOR_ONE),) * 3]
+    samples = np.asarray(grid.values, np.float32)
+    field = np.where(np.isnan(corners), spread_samples(samples, 1), corners)
+    low = grid.origin[0] - grid.voxel_size / 2  # the grids of cases are cubes
+    return BY_MESHER[mesher].dense(field, grid.voxel_size, low)
+
+
+def simplified_surface(case: Case, network: Decoder, *, method: Method, share: int) -> Surface:
+    """Simplify the mesh of a method to a share of its triangles."""
+    mesh = method(case, network).mesh
+    return Surface(simplified_to(mesh, len(mesh.faces) // share))
+
+
+def simplified_to(mesh: Mesh, triangles: int) -> Mesh:
+    """Simplify a mesh to a number of triangles."""
+    return simplify_mesh(mesh, triangles=triangles).mesh if triangles < len(mesh.faces) else mesh
 
 
 def band_field(grid: SdfGrid, network: Decoder, factor: int) -> FloatArray:
@@ -184,6 +211,7 @@ def sharp_isosurface(field: FloatArray, spacing: float, low: float) -> Mesh:
     """Mesh a dense field, (4 n + 1)^3, by the mesher that keeps edges; see ``isosurface``."""
     if not field.min() < 0 < field.max():
         return EMPTY
+    field = even_sided(field)
     factor = FACTOR_OF_BLOCKS if (len(field) - 1) % FACTOR_OF_BLOCKS == 0 else 2
     shape = tuple((nodes - 1) // factor for nodes in field.shape)
     block = block_ijk(factor)
@@ -199,6 +227,11 @@ def sharp_isosurface(field: FloatArray, spacing: float, low: float) -> Mesh:
     fine = FineField(shape, factor, voxel_ijk, blocks, parts, (0, shape[0]), spheres=spheres)
     grid = SdfGrid.trusted(_node_of_blocks(field, block[0], factor), side, low + side / 2)
     return extract_mesh(fine, grid, mesher=SHARP)
+
+
+def even_sided(field: FloatArray) -> FloatArray:
+    """Return a field with an even number of cells along each side; the last node is repeated."""
+    return np.pad(field, [(0, (nodes + 1) % 2) for nodes in field.shape], mode="edge")
 
 
 def _node_of_blocks(field: FloatArray, node: IntArray, factor: int) -> FloatArray:
@@ -225,4 +258,9 @@ MESHED_METHODS: dict[str, Method] = {
     meshed_by(method, mesher): partial(surface, mesher=mesher)
     for method, surface in ((OURS, our_surface), ("bound", bound_surface))
     for mesher in BY_MESHER
+}
+
+SIMPLIFIED_METHODS: dict[str, Method] = {
+    name: partial(simplified_surface, method=MESHED_METHODS[ours], share=share)
+    for name, (ours, share) in SIMPLIFIED.items()
 }

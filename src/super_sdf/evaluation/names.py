@@ -22,7 +22,6 @@ METHOD_LABELS = {
     "bound": "bound: true distance at the nodes",
 }
 PEER_LABELS = {"rfta": "RFTA", "dual-contouring": "dual contouring of distances"}
-LABELS = {**METHOD_LABELS, **PEER_LABELS, FLOOR: "floor: the reference against itself"}
 
 EXPERIMENTS = ("factors", "noise", "iterated", "scale", "timings", "meshers")
 
@@ -37,10 +36,40 @@ def meshed_by(method: str, mesher: str) -> str:
     return method if mesher == DEFAULT_MESHER else f"{method}-{mesher}"
 
 
+def simplified(method: str, share: int) -> str:
+    """Return the name of a method whose mesh is simplified to a share of its triangles."""
+    return f"{method}/{share}"
+
+
+def matched(method: str, peer: str) -> str:
+    """Return the name of a method whose mesh is simplified to as many triangles as a peer's."""
+    return f"{method}/{peer}"
+
+
+OURS_MESHED = {mesher: meshed_by(OURS, mesher) for mesher in MESHERS}
+SHARES = (4, 16)  # of the triangles: a quarter and a sixteenth are left
+SIMPLIFIED = {simplified(name, n): (name, n) for name in OURS_MESHED.values() for n in SHARES}
+MATCHED = {
+    matched(name, peer): (name, peer) for peer in PEER_LABELS for name in OURS_MESHED.values()
+}
+OURS_LABELS = {name: f"super-sdf, {mesher}" for mesher, name in OURS_MESHED.items()}
+LABELS = {
+    **OURS_LABELS,
+    **METHOD_LABELS,
+    **PEER_LABELS,
+    **{
+        name: f"{OURS_LABELS[ours]}, as many triangles as {PEER_LABELS[peer]}"
+        for name, (ours, peer) in MATCHED.items()
+    },
+    FLOOR: "floor: the reference against itself",
+}
+
 # The measurements that depend on the code and the network of this package: all of ours, and those
 # of the bound with meshers that are this package's. (Its marching cubes is scikit-image's.)
 OF_OUR_CODE = (
     PROCESS,
-    *(meshed_by(OURS, mesher) for mesher in MESHERS),
+    *OURS_LABELS,
+    *SIMPLIFIED,
+    *MATCHED,
     *(meshed_by("bound", mesher) for mesher in MESHERS if mesher != MARCHING),
 )

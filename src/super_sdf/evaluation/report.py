@@ -21,13 +21,13 @@ from .cases import Case, Setting, Shape
 from .folder import REPORT, SHAPES, make_folder, write_page
 from .measuring import Measurement
 from .methods import METHODS
-from .names import LABELS, OURS
+from .names import LABELS, OURS, OURS_MESHED
 from .plots import draw_plots
 from .results import Results
-from .scope import Scope
+from .scope import Scope, with_matched
 from .tables import (
     COST,
-    EF1,
+    EDGES,
     SHORT,
     cost_table,
     edge_table,
@@ -142,8 +142,9 @@ def peer_section(results: Results) -> str:
     """Return the section on the peers, each on the shapes that it finished."""
     scope, rows = results.scope, []
     setting, paths = Setting(scope.peer_size), scope.peer_paths()
-    columns = (*SHORT, EF1, *COST)
-    for name in ("mc", "bspline", OURS, *scope.peers):
+    columns = (*SHORT, *EDGES, *COST)
+    names = ("mc", "bspline", *OURS_MESHED.values())
+    for name in (*names, *(name for peer in scope.peers for name in with_matched(peer))):
         done = results.rows(setting, name, paths)
         closed = f"{sum(row['closed'] for row in done)} of {len(done)}"
         finished = f"{len(done)} of {len(results.names(paths))}"

@@ -102,16 +102,20 @@ class Runner:
         return self.unmeasured.setdefault(task, list(task.methods))
 
     def _take_death(self, task: Task, death: Death) -> Iterator[Result]:
-        """Yield the failure of the method that was under way; queue the methods after it."""
+        """Yield the failure of the method that was under way; queue the methods after it.
+
+        At a time limit, all that are left fail: the limit is for a peer and what needs its mesh.
+        """
         reason = death.cause if death.is_late else f"its process {death.cause}"
         if task not in self.started:
             yield from self._try_again(task, f"while it was read {reason}")
             return
         methods = self._methods_left(task)
-        if methods:
-            limit = task.limit if death.is_late else None
-            yield task, {**failed_row(task, methods[0], reason), "limit": limit}
-        if methods[1:]:
+        failed = methods if death.is_late else methods[:1]
+        limit = task.limit if death.is_late else None
+        for method in failed:
+            yield task, {**failed_row(task, method, reason), "limit": limit}
+        if len(methods) > len(failed):
             self.waiting.appendleft(replace(task, methods=tuple(methods[1:])))
         else:
             yield task, None

@@ -9,9 +9,20 @@ from pathlib import Path
 
 from ..errors import FileError, OptionError, seen
 from ..files.regular import check_regular_file
+from ..steps.mesher_names import MESHERS
 from .cases import Setting
 from .measuring import NO_SETTING, Task, digest_of_file, digest_of_ours
-from .names import EXPERIMENTS, FLOOR, MESHED, MESHERS, METHOD_LABELS, OURS, meshed_by
+from .names import (
+    EXPERIMENTS,
+    FLOOR,
+    MESHED,
+    METHOD_LABELS,
+    OURS,
+    OURS_MESHED,
+    SIMPLIFIED,
+    matched,
+    meshed_by,
+)
 
 MESH_SUFFIXES = (".ply", ".stl", ".obj", ".off", ".glb", ".gltf", ".3mf")
 BASE_SIZE = 32  # samples along an axis in the paper's experiments
@@ -19,7 +30,8 @@ FACTORS = (2, 4, 8, 16)
 NOISES = (0.0, 0.2, 0.5, 1.0)
 PASSES = (1, 2)
 SCALES = (0.25, 0.5, 0.75)
-MESHER_FACTORS = (2, 4)  # every mesher; 1 goes here when a field is refined without more nodes
+MESHER_FACTORS = (1, 2, 4)  # every mesher; with 1 the field is refined, but the lattice is coarse
+SIMPLIFIED_FACTOR = 4  # at which meshes are simplified
 
 MethodsIn = tuple[Setting, tuple[str, ...]]
 """A setting, and the methods that are measured in it."""
@@ -46,6 +58,8 @@ class Scope:
         Processes at a time, and threads of the network in each.
     turned : int, optional
         Seed by which the shapes are turned at random.
+    peer_meshes : Path, optional
+        Folder in which the meshes of peers are kept, so that each is made once.
     """
 
     paths: tuple[Path, ...]
@@ -56,12 +70,13 @@ class Scope:
     experiments: tuple[str, ...] = ()
     experiment_shapes: int = 10
     peers: tuple[str, ...] = ()
-    peer_shapes: int = 5
+    peer_shapes: int = 6
     peer_size: int = 32
     peer_limit: float = 900.0
     jobs: int = 1
     threads: int = 1
     turned: int | None = None
+    peer_meshes: Path | None = None
 
     def check(self) -> None:
         """Raise OptionError if a number is out of range, or there is nothing to measure."""
@@ -98,13 +113,14 @@ class Scope:
             pairs = experiment(name, self.sizes)
             wanted += [(path, pair) for pair in pairs for path in self.experiment_paths()]
         # Ours and the coarse mesh stand beside the peers.
-        beside = (Setting(self.peer_size), ("mc", "bspline", OURS)) if self.peers else None
+        names = ("mc", "bspline", *OURS_MESHED.values())
+        beside = (Setting(self.peer_size), names) if self.peers else None
         wanted += [(path, beside) for path in self.peer_paths() if beside]
         tasks = self._as_tasks(merged(wanted))
-        # A task for each peer alone, because the limit is for one peer.
+        # A task for each peer alone, because the limit is for one peer and what needs its mesh.
         alike = [task for task in tasks if task.setting == Setting(self.peer_size)]
         return tasks + [
-            replace(task, methods=(peer,), limit=self.peer_limit)
+            replace(task, methods=with_matched(peer), limit=self.peer_limit)
             for peer in self.peers
             for task in alike
             if task.path in self.peer_paths()
@@ -124,6 +140,7 @@ class Scope:
                 ours,
                 self.threads,
                 turned=self.turned,
+                peer_meshes=self.peer_meshes,
             )
             for path, (setting, methods) in wanted
         ]
@@ -147,10 +164,16 @@ def experiment(name: str, sizes: Sequence[int]) -> list[MethodsIn]:
         return [(Setting(n, scale=s), ("mc", *refined)) for n in sizes for s in SCALES]
     if name == "meshers":
         methods = tuple(meshed_by(method, mesher) for mesher in MESHERS for method in MESHED)
-        return [(Setting(n, factor), methods) for n in sizes for factor in MESHER_FACTORS]
+        pairs = [(Setting(n, factor), methods) for n in sizes for factor in MESHER_FACTORS]
+        return pairs + [(Setting(n, SIMPLIFIED_FACTOR), tuple(SIMPLIFIED)) for n in sizes]
     if name == "timings":
         return []
     raise OptionError(f"experiment is {name!r}: give one of {', '.join(EXPERIMENTS)}")
+
+
+def with_matched(peer: str) -> tuple[str, ...]:
+    """Return a peer, and our methods simplified to as many triangles."""
+    return (peer, *(matched(name, peer) for name in OURS_MESHED.values()))
 
 
 def merged(wanted: Iterable[tuple[Path, MethodsIn]]) -> list[tuple[Path, MethodsIn]]:

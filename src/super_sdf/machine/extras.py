@@ -9,6 +9,7 @@ from ..errors import FileError
 # Modules that each extra installs, besides those of the extra that it builds on.
 EXTRAS = {
     "3mf": ("lxml", "networkx"),
+    "simplify": ("igl", "pyfqmr"),
     "eval": ("igl", "matplotlib", "scipy", "skimage"),
     "view": ("pyvista",),
     "peers": ("gpytoolbox",),

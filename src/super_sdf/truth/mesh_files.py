@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 from ..errors import FileError, MeshError, SuperSdfError
 from ..files.regular import check_regular_file
 from ..mesh import Mesh
+from .plain_ply import read_plain_ply
 
 # Products and squares of larger coordinates overflow.
 LARGEST_COORDINATE = 1e30
 MERGE_DISTANCE = 1e-8  # vertices closer than this are merged
+HASH_FACTOR = np.uint64(0x9E3779B97F4A7C15)  # odd, its bits as if random
 SMALLEST_STEP = 1e-18  # of the largest coordinate, so that multiples of it fit in 64 bits
 
 
@@ -71,26 +73,46 @@ def merged(mesh: Mesh) -> Mesh:
     vertices = mesh.vertices[used]
     step = MERGE_DISTANCE * min(1.0, float(np.ptp(vertices, axis=0).max()))
     step = max(step, float(np.abs(vertices).max()) * SMALLEST_STEP) or 1.0
-    first, place = unique_rows(np.round(vertices / step).astype(np.int64), keep_order=True)
+    places = np.round(vertices / step).astype(np.int64)
+    if are_distinct(places):
+        return Mesh(vertices, faces)
+    first, place = unique_rows(places, keep_order=True)
     return Mesh(vertices[first], place.astype(np.int32)[faces])
 
 
-def _load(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return vertices (n, 3) and faces (m, 3) as trimesh reads them, unchecked."""
-    import trimesh
+def are_distinct(rows: NDArray[np.int64]) -> bool:
+    """Return whether the rows, (n, 3), are certainly distinct: their hashes differ."""
+    mixed = np.zeros(len(rows), np.uint64)
+    for column in rows.T:
+        mixed ^= column.astype(np.uint64)
+        mixed *= HASH_FACTOR
+        mixed ^= mixed >> np.uint64(32)
+    mixed.sort()
+    return not bool((mixed[1:] == mixed[:-1]).any())
 
+
+def _load(path: Path) -> tuple[NDArray[np.float64], NDArray[Any]]:
+    """Return vertices (n, 3) and faces (m, 3) as trimesh reads them, unchecked."""
     try:
-        with _quiet():
-            # unprocessed: otherwise faces with non-finite vertices would be dropped silently
-            found = trimesh.load_mesh(path, process=False, resolver=_file_resolver(path))
-            vertices = np.array(getattr(found, "vertices", ()), np.float64).reshape(-1, 3)
-            faces = np.array(getattr(found, "faces", ()), np.int64).reshape(-1, 3)
+        plain = read_plain_ply(path) if path.suffix.lower() == ".ply" else None
+        return plain or _load_with_trimesh(path)
     except SuperSdfError as error:  # in a file that this one refers to
         raise FileError(f"{path} refers to another file: {error}") from error
     except Exception as error:  # the readers of trimesh raise all kinds of errors
         reason = str(error).strip().splitlines()
         first = reason[0][:200] if reason else type(error).__name__
         raise FileError(f"{path} cannot be read as a mesh: {first}") from error
+
+
+def _load_with_trimesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return vertices (n, 3) and faces (m, 3) of any mesh file."""
+    import trimesh
+
+    with _quiet():
+        # unprocessed: otherwise faces with non-finite vertices would be dropped silently
+        found = trimesh.load_mesh(path, process=False, resolver=_file_resolver(path))
+        vertices = np.array(getattr(found, "vertices", ()), np.float64).reshape(-1, 3)
+        faces = np.array(getattr(found, "faces", ()), np.int64).reshape(-1, 3)
     return vertices, faces
 
 

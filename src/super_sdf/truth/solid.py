@@ -58,24 +58,42 @@ class Solid:
 
     def distance(self, points: Points) -> Distances:
         """Return the unsigned distance, (n,), of points (n, 3) to the nearest triangle."""
-        return self._nearest(points)[0]
+        return self.nearest(points)[0]
 
     def nearest_face(self, points: Points) -> NDArray[np.int64]:
         """Return the index of the nearest triangle, (n,), of points (n, 3)."""
-        return self._nearest(points)[1]
+        return self.nearest(points)[1]
 
     def foot_points(self, points: Points) -> tuple[Distances, Points]:
         """Return the unsigned distance, (n,), of points (n, 3), and the nearest points, (n, 3)."""
-        distance, _, feet = self._nearest(points)
+        distance, _, feet = self.nearest(points)
         return distance, feet
 
-    def _nearest(self, points: Points) -> tuple[Distances, NDArray[np.int64], Points]:
+    def nearest(self, points: Points) -> tuple[Distances, NDArray[np.int64], Points]:
         """Return distance, triangle and nearest point of points (n, 3)."""
         if not len(points):
             return np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 3))
         mesh = self.mesh
         squared, face, feet = self._triangles.squared_distance(mesh.vertices, mesh.faces, points)
         return np.sqrt(squared), np.ravel(face), feet
+
+    def first_hits(self, points: Points, rays: Points) -> tuple[NDArray[np.int64], Points]:
+        """Return the first triangle that each ray hits, and where.
+
+        Parameters
+        ----------
+        points, rays : (n, 3) float64
+            Where the rays start, and their directions.
+
+        Returns
+        -------
+        (n,) int64, (n, 3) float64
+            The triangle, -1 if none is hit, and the barycentric coordinates of the hit in it.
+        """
+        mesh = self.mesh
+        face, _, uv = self._triangles.intersect_ray_first(mesh.vertices, mesh.faces, points, rays)
+        u, v = np.asarray(uv)[:, -2:].T
+        return np.ravel(face), np.stack([1 - u - v, u, v], axis=1)
 
     def winding_number(self, points: Points) -> Distances:
         """Return the winding number of points (n, 3), (n,): 1 inside, 0 outside."""

@@ -1,0 +1,256 @@
+"""A mesh cut into slabs, in which its distances and its intersections are found.
+
+Search trees of small meshes are quicker and take less memory, and slabs can be worked on in several
+processes: libigl holds Python's lock, so threads would wait for each other.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import deque
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass
+
+import igl.predicates
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import SuperSdfError
+from ..machine.pool import Death, Pool
+from ..machine.serving import Tell, Work
+from ..mesh import Mesh
+from ..truth.solid import Distances, Points, Solid
+
+FACES_IN_SLAB = 1 << 19
+# The way to a foot inside a triangle and the triangle's normal are parallel up to this cosine.
+PARALLEL = 1 - 1e-9
+# A ray says on which side it started if it hits a triangle at least that far from its edges, as a
+# share of its heights, and at an angle with at least this cosine to its normal.
+CLEAR_HIT, CLEAR_COSINE = 1e-3, 1e-2
+# Of a ray times twice the area that it is aimed at: libigl takes less than 1e-6 for parallel.
+LONG_RAY = 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class Slab:
+    """The triangles of a mesh that reach into a slab or are near it, and points in the slab.
+
+    Attributes
+    ----------
+    mesh : Mesh
+        With vertices of its own.
+    axis : int
+        The slab's normal.
+    first, last : float
+        Its range; no triangle or point is in two slabs.
+    points : (k, 3) float64
+    rows : (k,) int64
+        Numbers of the points among those of all slabs.
+    counts : bool
+        Whether intersections are counted.
+    """
+
+    mesh: Mesh
+    axis: int
+    first: float
+    last: float
+    points: Points
+    rows: NDArray[np.intp]
+    counts: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What was found in a slab, or in all of them.
+
+    Attributes
+    ----------
+    intersections : int, optional
+        Pairs of triangles that intersect; None if they were not counted.
+    distances, feet : (k,) float64, (k, 3) float64
+        Of the points to the nearest triangle, and the nearest points of the mesh.
+    facing : (k,) int8
+        1 for points in front of the surface, -1 for those behind it, as far as the triangles near
+        them tell; 0 where they do not.
+    """
+
+    intersections: int | None
+    distances: Distances
+    feet: Points
+    facing: NDArray[np.int8]
+
+
+class Cutting:
+    """A mesh, cut along its longest axis into slabs in which about equally many triangles begin.
+
+    It is a queue of slabs; each is made when it is taken. Without a tree of its own, each slab has
+    the triangles within ``reach`` of it, so distances up to that are those to the whole mesh.
+    """
+
+    def __init__(self, mesh: Mesh, points: Points, reach: float, *, counts: bool) -> None:
+        self.mesh, self.points, self.reach, self.counts = mesh, points, reach, counts
+        self.axis = int(np.ptp(mesh.vertices, axis=0).argmax())
+        along = mesh.vertices[:, self.axis][mesh.faces]
+        self.low, self.high = along.min(1), along.max(1)
+        shares = np.linspace(0, 1, len(mesh.faces) // FACES_IN_SLAB + 2)[1:-1]
+        inner = np.unique(np.quantile(self.low, shares, method="lower"))
+        limits = [-np.inf, *inner.tolist(), np.inf]
+        self.ranges = deque(itertools.pairwise(limits))
+
+    def __len__(self) -> int:
+        return len(self.ranges)
+
+    def popleft(self) -> Slab:
+        """Return the next slab."""
+        first, last = self.ranges.popleft()
+        near = (self.low < last + self.reach) & (self.high >= first - self.reach)
+        along = self.points[:, self.axis]
+        rows = np.flatnonzero((along >= first) & (along < last))
+        mesh = part_of(self.mesh, np.flatnonzero(near))
+        return Slab(mesh, self.axis, first, last, self.points[rows], rows, self.counts)
+
+
+def part_of(mesh: Mesh, rows: NDArray[np.intp]) -> Mesh:
+    """Return some of a mesh's triangles with vertices of their own, float64."""
+    faces = mesh.faces[rows]
+    used = np.zeros(len(mesh.vertices), bool)
+    used[faces] = True
+    numbers = np.cumsum(used, dtype=np.int32) - 1
+    return Mesh(mesh.vertices[used].astype(np.float64), numbers[faces])
+
+
+def search(
+    mesh: Mesh, points: Points, reach: float, *, intersections: bool, processes: int = 1
+) -> Found:
+    """Return the nearest points of a mesh, and the number of its self-intersections.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    points : (n, 3) float64
+    reach : float
+        Distance up to which slabs look; points farther away are looked up in the whole mesh.
+    intersections : bool
+        Whether to count pairs of triangles that intersect.
+    processes : int
+        How many work at the same time.
+    """
+    cutting = Cutting(mesh, points, reach, counts=intersections)
+    several = min(processes, len(cutting)) > 1
+    total, n = 0 if can_count() and intersections else None, len(points)
+    found = Found(total, np.empty(n), np.empty((n, 3)), np.empty(n, np.int8))
+    for rows, part in in_processes(cutting, processes) if several else in_turn(cutting):
+        _put(found, rows, part)
+        total = None if total is None else total + (part.intersections or 0)
+    far = np.flatnonzero(found.distances > reach)
+    if len(far) and np.isfinite(reach):
+        _put(found, far, nearest(Solid(mesh), points[far]))
+    return Found(total, found.distances, found.feet, found.facing)
+
+
+def _put(found: Found, rows: NDArray[np.intp], part: Found) -> None:
+    """Copy what was found of some points to their rows."""
+    found.distances[rows], found.feet[rows] = part.distances, part.feet
+    found.facing[rows] = part.facing
+
+
+def in_turn(cutting: Cutting) -> Iterator[tuple[NDArray[np.intp], Found]]:
+    """Yield the rows of each slab's points, and what was found in the slab."""
+    while len(cutting):
+        slab = cutting.popleft()
+        yield slab.rows, search_slab(slab)
+
+
+def in_processes(cutting: Cutting, count: int) -> Iterator[tuple[NDArray[np.intp], Found]]:
+    """Yield what ``in_turn`` does, in any order, from ``count`` processes.
+
+    Raises
+    ------
+    SuperSdfError
+        If a process dies.
+    """
+    with closing(Pool(cutting, prepare).results(count)) as results:
+        for slab, found in results:
+            if isinstance(found, Death):
+                raise SuperSdfError(f"a process that checked a part of the mesh {found.cause}")
+            yield slab.rows, found
+
+
+def prepare() -> Work:
+    """Return what works at a slab: each worker process calls this once."""
+    return _work
+
+
+def _work(slab: Slab, tell: Tell) -> Found:
+    return search_slab(slab)
+
+
+def search_slab(slab: Slab) -> Found:
+    """Return what is found in a slab."""
+    found = nearest(Solid(slab.mesh), slab.points)
+    count = count_intersections(slab) if slab.counts else None
+    return Found(count, found.distances, found.feet, found.facing)
+
+
+def nearest(solid: Solid, points: Points) -> Found:
+    """Return the nearest points of a mesh, and on which side of its surface the points lie."""
+    distances, faces, feet = solid.nearest(points)
+    normals = normals_of(solid.mesh, faces)
+    facing = side_of(points - feet, normals, PARALLEL)
+    unsure = np.flatnonzero(facing == 0)
+    facing[unsure] = facing_by_rays(solid, points[unsure], faces[unsure])
+    return Found(None, distances, feet, facing)
+
+
+def facing_by_rays(solid: Solid, points: Points, faces: NDArray[np.int64]) -> NDArray[np.int8]:
+    """Return the ``facing`` of points, (n,), by the first triangles hit on the way to ``faces``.
+
+    A point whose foot lies on an edge may be in front of one triangle there and behind another. But
+    what is first hit on the way to the middle of one of them is seen from the point's own side.
+    """
+    if not len(points):
+        return np.zeros(0, np.int8)
+    mesh = solid.mesh
+    rays = mesh.vertices[mesh.faces[faces]].mean(1) - points
+    sizes = np.linalg.norm(rays, axis=1) * np.linalg.norm(normals_of(mesh, faces), axis=1)
+    rays *= LONG_RAY / np.maximum(sizes, np.finfo(float).tiny)[:, None]
+    hit, place = solid.first_hits(points, rays)
+    clear = (hit >= 0) & (place.min(1) > CLEAR_HIT)
+    facing = side_of(-rays, normals_of(mesh, hit), CLEAR_COSINE)
+    return np.where(clear, facing, np.int8(0))
+
+
+def normals_of(mesh: Mesh, faces: NDArray[np.int64]) -> Points:
+    """Return the normals of triangles, (n, 3), as long as twice their areas."""
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces[faces]], 1, 0)
+    return np.cross(b - a, c - a)
+
+
+def side_of(ways: Points, normals: Points, cosine: float) -> NDArray[np.int8]:
+    """Return the sign of the products of vectors, (n,), 0 where the cosine is not above one."""
+    dots = np.einsum("ij,ij->i", ways, normals)
+    most = np.linalg.norm(ways, axis=1) * np.linalg.norm(normals, axis=1)
+    return np.where(np.abs(dots) > cosine * most, np.sign(dots), 0).astype(np.int8)
+
+
+def can_count() -> bool:
+    """Return whether this version of libigl finds self-intersections."""
+    return hasattr(igl.predicates, "find_self_intersections")
+
+
+def count_intersections(slab: Slab) -> int | None:
+    """Return the number of pairs of triangles that intersect, whose common range begins in a slab.
+
+    It is None if libigl has no test for it.
+    """
+    if not can_count():
+        return None
+    vertices, faces = slab.mesh.vertices, slab.mesh.faces
+    along = vertices[:, slab.axis][faces]
+    low, high = along.min(1), along.max(1)
+    whole = (faces != np.roll(faces, 1, axis=1)).all(1)  # with three vertices, and so an area
+    rows = np.flatnonzero(whole & (low < slab.last) & (high >= slab.first))
+    pairs = igl.predicates.find_self_intersections(vertices, faces[rows].astype(np.int64))[1]
+    begin = low[rows][pairs].max(1, initial=-np.inf)
+    return int(np.count_nonzero((begin >= slab.first) & (begin < slab.last)))

@@ -1,0 +1,133 @@
+"""Simplifying a mesh within a measured distance, or to a number of triangles.
+
+>>> from super_sdf import simplify_mesh
+>>> simplify_mesh(mesh, error=0.02 * grid.voxel_size).mesh               # doctest: +SKIP
+
+The modules that do it are imported when they are needed: they need the extra ``simplify``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from ..errors import OutOfMemoryError
+from ..machine.extras import check_modules
+from ..machine.memory import give_back, held_memory, in_words, memory_bound
+from ..mesh import Mesh
+from ..options import check_goal, check_max_memory, check_mesh
+from ..progress import ShareCallback
+from .deviation import Deviation
+
+# Peak of memory beside the mesh, measured on meshes of 200,000 to 300,000 triangles: 905 to 1,246,
+# of which pyfqmr keeps 300 until the process ends.
+BYTES_PER_TRIANGLE = 1400
+
+
+@dataclass(frozen=True, eq=False)
+class Simplified:
+    """A simplified mesh and its distance from the unsimplified one.
+
+    Attributes
+    ----------
+    mesh : Mesh
+        Closed, oriented and manifold if the unsimplified mesh was; its open edges are the same.
+    triangles_before : int
+        Triangles of the unsimplified mesh.
+    deviation : Deviation
+        In world units.
+    warnings : tuple of str
+        What was asked for and not reached.
+    """
+
+    mesh: Mesh
+    triangles_before: int
+    deviation: Deviation
+    warnings: tuple[str, ...] = ()
+
+    def report(self, voxel_size: float) -> dict[str, Any]:
+        """Return the figures as they stand in JSON; distances are in voxels."""
+        return {
+            "triangles_before": self.triangles_before,
+            "triangles": len(self.mesh.faces),
+            "deviation": asdict(self.deviation.over(voxel_size)),
+            "warnings": list(self.warnings),
+        }
+
+
+def simplify_mesh(
+    mesh: Mesh,
+    *,
+    error: float | None = None,
+    triangles: int | None = None,
+    max_memory: int | None = None,
+    progress: ShareCallback | None = None,
+) -> Simplified:
+    """Simplify a mesh within a distance, or to a number of triangles.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Vertices at the same position must be one vertex.
+    error : float, optional
+        Largest distance, in world units, between the two surfaces, measured both ways at the
+        vertices and at points less than an edge of ``mesh`` apart.
+    triangles : int, optional
+        Largest number of triangles. If it cannot be reached, a warning says how many are left.
+    max_memory : int, optional
+        Bytes that the process may hold in all; by default a share of the free memory.
+    progress : callable, optional
+        Called with the estimated share of the work that is done; an exception in it ends the work.
+
+    Returns
+    -------
+    Simplified
+        With vertices of the same type. Open edges stay exactly where they are.
+
+    Raises
+    ------
+    OptionError
+        If not exactly one of ``error`` and ``triangles`` is given, or it is not positive.
+    FileError
+        If the extra ``simplify`` is not installed.
+    OutOfMemoryError
+        If it would not fit in memory.
+    """
+    check_mesh(mesh)
+    error, triangles = check_goal(error, triangles)
+    check_can_simplify()
+    check_room(len(mesh.faces), check_max_memory(max_memory))
+    from .measuring import Original
+    from .passes import Rounds, down_to, within
+
+    if not len(mesh.faces):
+        return Simplified(mesh, 0, Deviation(0.0, 0.0, 0.0, 0.0))
+    original, rounds = Original(mesh), Rounds(progress)
+    if error is not None:
+        result, warnings = within(mesh, original, error, rounds)
+    else:
+        result, warnings = down_to(mesh, triangles or 0, rounds)
+    deviation = original.deviation(result)
+    if progress:
+        progress(1.0)
+    return Simplified(result, len(mesh.faces), deviation, warnings)
+
+
+def check_can_simplify(what: str = "simplifying") -> None:
+    """Raise FileError if the extra ``simplify`` is not installed; ``what`` begins the message."""
+    check_modules(what, "simplify")
+
+
+def check_room(triangles: int, max_memory: int | None, *, estimated: bool = False) -> None:
+    """Raise OutOfMemoryError if simplifying a mesh would exceed the memory bound.
+
+    With ``estimated``, the number of its triangles is a low estimate.
+    """
+    give_back()  # otherwise freed memory counts as held
+    bound, need = memory_bound(max_memory), triangles * BYTES_PER_TRIANGLE + (held_memory() or 0)
+    if bound is not None and need > bound:
+        raise OutOfMemoryError(
+            f"simplifying {'at least ' * estimated}{triangles:,} triangles needs {in_words(need)} "
+            f"of memory, since the whole mesh must be held; {in_words(bound)} may be used; use a "
+            "smaller factor, allow more (--max-memory), or do not simplify"
+        )

@@ -1,0 +1,137 @@
+"""How the triangles of a mesh meet: at edges and around vertices, whatever their positions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .arrays import IntArray
+from .mesh import Mesh
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Numbers of edges that are not shared by exactly two triangles of the same orientation.
+
+    Attributes
+    ----------
+    open_edges : int
+        Edges of one triangle.
+    crowded_edges : int
+        Edges of more than two triangles: not manifold.
+    flipped_edges : int
+        Edges of two triangles that pass them in the same direction: not consistently oriented.
+    """
+
+    open_edges: int
+    crowded_edges: int
+    flipped_edges: int
+
+
+def without_collapsed(faces: IntArray) -> IntArray:
+    """Return the faces (m, 3) without those that have a vertex twice, and so no area."""
+    a, b, c = faces.T
+    whole = (a != b) & (b != c) & (c != a)
+    return faces if whole.all() else faces[whole]
+
+
+def pair_edges(faces: IntArray, count: int) -> tuple[IntArray, Edges]:
+    """Find the neighbour of each triangle across each of its edges.
+
+    Half-edge 3 f + i runs from corner i of face f to the next corner.
+
+    Parameters
+    ----------
+    faces : (m, 3) int32
+        Corners of the triangles.
+    count : int
+        Number of vertices.
+
+    Returns
+    -------
+    (3 m,) int32, Edges
+        The half-edge that runs along the same edge in the other direction, -1 unless the edge has
+        exactly these two; and the numbers of all other edges.
+    """
+    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    key = np.minimum(start, end).astype(np.int64)
+    key *= count
+    key += np.maximum(start, end)
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    order = order.astype(np.int32)  # meshes are large: half of the memory
+    first = np.flatnonzero(np.append(True, key[1:] != key[:-1]))
+    del key
+    uses = np.diff(np.append(first, faces.size))
+    pair = first[uses == 2]
+    one, other = order[pair], order[pair + 1]
+    against = start[one] == end[other]
+    opposite = np.full(faces.size, -1, np.int32)
+    opposite[one[against]], opposite[other[against]] = other[against], one[against]
+    numbers = (uses == 1).sum(), (uses > 2).sum(), (~against).sum()
+    return opposite, Edges(*map(int, numbers))
+
+
+def count_fans(faces: IntArray, opposite: IntArray) -> NDArray[np.int64]:
+    """Return for each vertex, (n,), how many fans of triangles meet there: 1 in a manifold.
+
+    The half-edges of a vertex are walked from triangle to triangle, in steps of 1, 2, 4, ... A fan
+    is a cycle, counted at its lowest half-edge, or ends at an edge without a neighbour.
+    """
+    start, half = faces.ravel(), np.arange(faces.size, dtype=np.int32)
+    step = opposite[half.reshape(-1, 3)[:, [2, 0, 1]].ravel()]
+    ends = step < 0
+    step = np.where(ends, half, step)
+    lowest = half
+    for _ in range(int(np.bincount(start).max(initial=1)).bit_length()):
+        lowest = np.minimum(lowest, lowest[step])
+        step = step[step]
+    cycles = (lowest == half) & ~ends[step]
+    size = int(start.max(initial=-1)) + 1
+    return np.bincount(start[ends], minlength=size) + np.bincount(start[cycles], minlength=size)
+
+
+def row_keys(rows: NDArray[np.float64]) -> NDArray[np.uint64]:
+    """Return a hash of each row of numbers, (n,): equal rows have equal ones, others hardly ever.
+
+    Zeros of either sign are equal.
+    """
+    keys = np.zeros(len(rows), np.uint64)
+    for column in np.ascontiguousarray(rows.T + 0.0).view(np.uint64):
+        keys = (keys ^ column) * np.uint64(0x9E3779B97F4A7C15)
+        keys ^= keys >> np.uint64(29)
+    return keys
+
+
+def irregular_places(mesh: Mesh) -> NDArray[np.float64]:
+    """Return where a mesh is no closed manifold, (n, 6): the two ends of an edge, or a point twice.
+
+    These are the edges, in the direction of their triangle, without exactly one triangle that
+    passes them in the other direction, and the vertices at which several fans of triangles meet, or
+    that are at the position of another one, or at which two triangles have the same three corners.
+    """
+    positions, faces = mesh.vertices.astype(np.float64), mesh.faces
+    opposite, _ = pair_edges(faces, len(positions))
+    fans = count_fans(faces, opposite)
+    unpaired = np.flatnonzero(opposite < 0)
+    start, end = faces.ravel()[unpaired], np.roll(faces, -1, axis=1).ravel()[unpaired]
+    pinched = np.flatnonzero(fans > 1)
+    both = np.concatenate([pinched, _doubled(positions), _corners_of_doubled(faces)])
+    ends = np.concatenate([start, both]), np.concatenate([end, both])
+    return np.concatenate([positions[ends[0]], positions[ends[1]]], axis=1)
+
+
+def _doubled(rows: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return the rows that are equal to another row."""
+    _, inverse, uses = np.unique(row_keys(rows), return_inverse=True, return_counts=True)
+    return np.flatnonzero(uses[inverse] > 1)
+
+
+def _corners_of_doubled(faces: IntArray) -> NDArray[np.intp]:
+    """Return the corners of triangles that have the same three corners as another one."""
+    corners: NDArray[np.intp] = faces.astype(np.intp)[
+        _doubled(np.sort(faces, axis=1).astype(np.float64))
+    ].ravel()
+    return corners
