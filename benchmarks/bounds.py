@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from super_sdf.evaluation.timing import LAUNCHER, describe_machine, run_command
+from super_sdf.steps.mesher_names import DEFAULT_MESHER, MESHERS
 
 FIELDS = ("ball", "gyroid", "wall across x", "wall across z")
 SUFFIXES = (".ply", ".stl", ".obj")
@@ -67,6 +68,7 @@ class Case:
     precision: str
     suffix: str
     source: str
+    mesher: str = DEFAULT_MESHER
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,7 @@ def run_python(words: list[str]) -> tuple[str, str]:
 def plan(case: Case, folder: Path) -> tuple[int, int]:
     """Return the planned bytes of the whole grid, and of its thinnest slabs."""
     path = folder / f"grid{case.source}"
-    words = ["-c", PLAN, str(path), str(case.factor), case.precision]
+    words = ["-c", PLAN, str(path), str(case.factor), case.precision, case.mesher]
     printed, errors = run_python(words)
     whole, thinnest, *_ = printed.splitlines()
     if not whole:
@@ -149,6 +151,7 @@ def convert(case: Case, folder: Path, bound: int) -> Run:
     words = ["-m", "super_sdf", "upsample", str(folder / f"grid{case.source}"), str(target)]
     words += ["--spacing", "1", "--force", "--json", "--quiet", "--device", "cpu"]
     words += ["--factor", str(case.factor), "--precision", case.precision]
+    words += ["--mesher", case.mesher]
     printed, errors = run_python([*words, "--max-memory", str(bound)])
     printed, _, last = printed.rpartition("\n")
     status, seconds, peak = last.split()
@@ -187,6 +190,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--sizes", type=int, nargs="+", default=[128, 256])
     parser.add_argument("--factors", type=int, nargs="+", default=[2, 4, 16])
     parser.add_argument("--precisions", nargs="+", default=["float32", "int8"])
+    parser.add_argument("--mesher", choices=MESHERS, default=DEFAULT_MESHER)
     parser.add_argument("--suffixes", nargs="+", default=SUFFIXES)
     parser.add_argument("--sources", nargs="+", choices=[".npy", ".npz"], default=[".npy", ".npz"])
     parser.add_argument("--bounds", nargs="+", choices=["share", "least"], default=["share"])
@@ -205,7 +209,7 @@ def cases(arguments: argparse.Namespace, field: str, size: int) -> Iterator[Case
     for choice in product(
         arguments.factors, arguments.precisions, arguments.suffixes, arguments.sources
     ):
-        yield Case(field, size, *choice)
+        yield Case(field, size, *choice, arguments.mesher)
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Random fields, meshed with every mesher: manifolds? How many triangles intersect?
+"""Faults and self-intersections of the meshes of random fields, with every mesher.
 
     python -m benchmarks.random_fields --count 10000
     python -m benchmarks.random_fields --count 1000 --first 4000    # those from number 4000 on

@@ -349,7 +349,7 @@ def test_defaults_are_those_of_the_library(command):
         parameter.name: parameter.get_default(click.Context(upsample_command))
         for parameter in upsample_command.params
     }
-    for name in ("factor", "inside", "offset", "cap"):
+    for name in ("factor", "inside", "offset", "cap", "mesher"):
         assert defaults[name] == getattr(ConvertOptions, name)
     assert (defaults["quality"], defaults["precision"], defaults["device"]) == (
         "base",

@@ -23,6 +23,7 @@ from corpus.trying import try_case
 
 from super_sdf import load_network
 from super_sdf.network.onnx import ort
+from super_sdf.steps.mesher_names import MESHERS
 
 EACH = 45  # cases of a theme
 ALONE = 40  # of all that may hang or crash
@@ -58,11 +59,12 @@ def test_what_may_hang_or_crash_ends_in_a_line_too(cases):
     assert [(o.case.name, fault) for o in outcomes for fault in o.faults] == []
 
 
+@pytest.mark.parametrize("mesher", MESHERS)
 @pytest.mark.parametrize("stand_in", [True, False])
-def test_random_fields_become_closed_manifolds(stand_in):
+def test_random_fields_become_closed_manifolds(stand_in, mesher):
     network = trilinear if stand_in else load_network("fast", threads=1)
     fields = list(make_fields(FIELDS))[stand_in::2]
-    assert [fault for field in fields for fault in faults_of_field(field, network)] == []
+    assert [fault for field in fields for fault in faults_of_field(field, network, mesher)] == []
 
 
 def test_the_corpus_is_large_and_the_same_each_time(cases):

@@ -143,6 +143,8 @@ WRONG = {
     "offset is -inf: give a finite number, in world units": (OptionError, {"offset": -np.inf}),
     "cap is 'no': give True or False": (OptionTypeError, {"cap": "no"}),
     "cap is 1: give True or False": (OptionTypeError, {"cap": 1}),
+    "mesher is 'dual': give one of marching, sharp": (OptionError, {"mesher": "dual"}),
+    "mesher is None: give one of marching, sharp": (OptionTypeError, {"mesher": None}),
     "max_memory is '4G': give a whole number of bytes": (OptionTypeError, {"max_memory": "4G"}),
     "max_memory is 1.5: give a whole number of bytes": (OptionTypeError, {"max_memory": 1.5}),
     "max_memory is -5: give a number of bytes greater than 0": (OptionError, {"max_memory": -5}),
@@ -161,7 +163,7 @@ def test_wrong_arguments_are_named_with_the_value_seen(message):
         reconstruct(**arguments)
     assert str(caught.value) == message and isinstance(caught.value, SuperSdfError)
     assert isinstance(caught.value, TypeError) == (kind is OptionTypeError)
-    if not {"cap", "max_memory"} & set(wrong):
+    if not {"cap", "mesher", "max_memory"} & set(wrong):
         with pytest.raises(kind) as caught:
             upsample(**arguments)
         assert str(caught.value) == message
@@ -176,6 +178,9 @@ OTHERS = {
     "mesh is None: give one from reconstruct(grid)": lambda: write_mesh(None, "a.ply"),
     f"field is {GRID!r:.57}...: give one from upsample(grid, network)": lambda: extract_mesh(
         GRID, GRID
+    ),
+    "mesher is 'x': give one of marching, sharp": lambda: extract_mesh(
+        upsample(GRID, trilinear), GRID, mesher="x"
     ),
     "inside is 1: give one of auto, negative, positive": lambda: make_grid(VALUES, inside=1),
 }

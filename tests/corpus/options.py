@@ -59,7 +59,15 @@ NUMBER_OPTIONS = {
     "section": ["--at", "--size", "--factor"],
 }
 WORD_OPTIONS = {
-    "upsample": ["--inside", "--quality", "--precision", "--model", "--device", "--none"],
+    "upsample": [
+        "--inside",
+        "--mesher",
+        "--quality",
+        "--precision",
+        "--model",
+        "--device",
+        "--none",
+    ],
     "batch": ["--format", "--inside", "--quality", "--model", "--none"],
     "sample": ["--frame", "--none"],
     "render": ["--colour", "--reference", "--up", "--none"],

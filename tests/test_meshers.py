@@ -1,0 +1,207 @@
+"""The choice of a mesher: names, and the same mesh for any slabs, groups, threads and memory."""
+
+import hashlib
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from batches import rows
+from conftest import ball
+from corpus.random_fields import facets
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_slabs import in_pieces, rod
+
+from super_sdf import SdfGrid, __version__, extract_mesh, load_network, reconstruct, upsample
+from super_sdf.batch.plan import Planner
+from super_sdf.convert import ConvertOptions
+from super_sdf.evaluation import names
+from super_sdf.machine import threads
+from super_sdf.mesh import join_meshes
+from super_sdf.slabs import cutting, footprint
+from super_sdf.steps import mesher_names, meshers
+from super_sdf.steps.marching import extract_pieces
+from super_sdf.steps.survey import survey
+
+
+@pytest.fixture(scope="module")
+def network():
+    return load_network("fast", threads=1)
+
+
+def bar(shape=(56, 16, 14), half=(24.3, 3.2, 2.6)):
+    """The distance to a square bar, tilted and rolled, whose edges cross many planes; spacing 1."""
+    tilt, roll = np.array([[1, 0.08, 0], [-0.08, 1, 0], [0, 0, 1]]), 0.5
+    cosine, sine = np.cos(roll), np.sin(roll)
+    turn = np.array([[1, 0, 0], [0, cosine, sine], [0, -sine, cosine]]) @ tilt
+    ijk = np.indices(shape).reshape(3, -1) - (np.array(shape)[:, None] / 2 + 0.13)
+    beyond = np.abs(turn @ ijk / np.hypot(1, 0.04)) - np.array(half)[:, None]
+    distance = np.linalg.norm(np.maximum(beyond, 0), axis=0) + np.minimum(beyond.max(0), 0)
+    return distance.reshape(shape)
+
+
+FIELDS = {
+    "bar": bar(),
+    "bar that leaves the grid": bar()[6:50, :10],
+    "rod": rod()[:40],
+}
+
+
+def assert_same(mesh, other):
+    np.testing.assert_array_equal(mesh.faces, other.faces)
+    np.testing.assert_array_equal(mesh.vertices, other.vertices)
+
+
+def joined(pieces):
+    return join_meshes([mesh for piece in pieces for mesh in piece.meshes])
+
+
+def test_there_is_one_list_of_names_and_one_default():
+    assert tuple(meshers.BY_NAME) == names.MESHERS == mesher_names.MESHERS
+    assert all(mesher.name == name for name, mesher in meshers.BY_NAME.items())
+    assert set(mesher_names.MESHERS) <= set(footprint.STAGES)
+    assert ConvertOptions.mesher == mesher_names.DEFAULT_MESHER
+    assert cutting.DEFAULT.name == mesher_names.DEFAULT_MESHER
+
+
+def test_each_name_gives_its_mesh(network):
+    grid = SdfGrid.trusted(FIELDS["bar"], 1.0)
+    field = upsample(grid, network)
+    plain, sharp = (extract_mesh(field, grid, mesher=name) for name in ("marching", "sharp"))
+    assert_same(plain, join_meshes(extract_pieces(field, grid)))
+    assert len(sharp.vertices) > len(plain.vertices)
+    assert_same(sharp, reconstruct(grid, network, mesher="sharp"))
+    assert_same(plain, reconstruct(grid, network, mesher="marching"))
+
+
+@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("factor, cap", [(2, True), (4, False), (8, True)])
+def test_slabs_change_nothing(network, monkeypatch, name, factor, cap):
+    grid = SdfGrid.trusted(FIELDS[name], 1.0)
+    options = {"factor": factor, "cap": cap, "mesher": "sharp"}
+    (whole,) = in_pieces(grid, network, monkeypatch, 1, **options)
+    one = joined([whole])
+    for pieces in (3, 20 if factor < 8 else 8):
+        parts = in_pieces(grid, network, monkeypatch, pieces, **options)
+        assert len(parts) > 1
+        assert_same(joined(parts), one)
+        assert sum(part.counts["vertices"] for part in parts) == whole.counts["vertices"]
+
+
+@settings(max_examples=6, deadline=None)
+@given(st.integers(0, 10**6), st.integers(2, 30), st.booleans())
+def test_slabs_change_nothing_on_random_facets(network, seed, pieces, cap):
+    values = facets(np.random.default_rng(seed), (36, 9, 8))
+    values.flat[0], values.flat[-1] = 1, -1
+    grid = SdfGrid.trusted(values, 1.0)
+    options = {"factor": 2, "cap": cap, "mesher": "sharp"}
+    with pytest.MonkeyPatch.context() as patch:
+        (whole,) = in_pieces(grid, network, patch, 1, **options)
+        parts = in_pieces(grid, network, patch, pieces, **options)
+    assert_same(joined(parts), joined([whole]))
+
+
+def test_slabs_need_all_the_planes_that_the_mesher_names(network, monkeypatch):
+    """With fewer final planes the mesh differs, so the tests above can fail."""
+    grid = SdfGrid.trusted(FIELDS["bar"], 1.0)
+    one = reconstruct(grid, network, mesher="sharp")
+    few = replace(meshers.BY_NAME["sharp"], planes_beside=lambda factor: 1)
+    monkeypatch.setitem(meshers.BY_NAME, "sharp", few)
+    monkeypatch.setattr(cutting, "REACH_IN_VOXELS", 1)
+    mesh = joined(in_pieces(grid, network, monkeypatch, 4, mesher="sharp"))
+    assert not np.array_equal(mesh.vertices, one.vertices)
+
+
+@pytest.mark.parametrize("factor", [2, 4])
+def test_groups_and_threads_change_nothing(network, monkeypatch, factor):
+    grid = SdfGrid.trusted(FIELDS["bar that leaves the grid"], 1.0)
+    field = upsample(grid, network, factor)
+    mesher = meshers.BY_NAME["sharp"]
+    one = join_meshes(mesher.extract(field, grid, 7, 1))
+    monkeypatch.setattr(threads, "CHUNK", 5000)
+    monkeypatch.setattr(threads, "MIN_PER_THREAD", 1000)
+    for groups, number in ((1, 2), (4, 1), (9, 3)):
+        cells = len(field.voxel_ijk) * factor**2 // groups
+        monkeypatch.setattr(meshers, "CELLS_IN_GROUP", cells)
+        pieces = mesher.extract(field, grid, 7, number)
+        assert len(pieces) > 1 or groups == 1
+        assert_same(join_meshes(pieces), one)
+
+
+def test_memory_bounds_change_nothing(bare_plan):
+    class Alone:  # a new one for every run, so that its threads do not count as held
+        receptive_field = 1
+        threads = 1
+        memory_bytes = (0.0, 0.0)
+
+        def __call__(self, *inputs):
+            from conftest import trilinear
+
+            return trilinear(*inputs)
+
+    grid = SdfGrid.trusted(FIELDS["bar"], 1.0)
+    band = survey(grid)
+    mesher = meshers.BY_NAME["sharp"]
+    need = cutting.peak_bytes(band, [cutting.whole(band)], 4, Alone.memory_bytes, 1, mesher)
+    plain = cutting.peak_bytes(band, [cutting.whole(band)], 4, Alone.memory_bytes, 1)
+    assert need > plain
+    whole = reconstruct(grid, Alone(), mesher="sharp", max_memory=need)
+    for share in (0.98, 0.9):
+        bound = 10**8 + int(share * (need - 10**8))
+        pieces = list(meshed_in(grid, Alone(), bound))
+        assert len(pieces) > 1
+        assert_same(joined(pieces), whole)
+
+
+def meshed_in(grid, network, max_memory):
+    """Return the pieces of a grid with edges, within a bound."""
+    from super_sdf.pipeline import reconstruct_slabs
+
+    return reconstruct_slabs(grid, network, mesher="sharp", max_memory=max_memory)
+
+
+def test_the_command_takes_a_mesher_and_says_which(tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    np.save("in.npy", FIELDS["bar"])
+    options = ("--spacing", 1, "--quality", "fast", "--json", "--quiet")
+    code, out, _ = command("upsample", "in.npy", "sharp.ply", "--mesher", "sharp", *options)
+    assert code == 0 and json.loads(out)["mesher"] == "sharp"
+    code, out, _ = command("upsample", "in.npy", "plain.ply", *options)
+    assert code == 0 and json.loads(out)["mesher"] == mesher_names.DEFAULT_MESHER
+    sizes = [Path(name).stat().st_size for name in ("sharp.ply", "plain.ply")]
+    assert sizes[0] > sizes[1]
+    code, out, err = command("upsample", "in.npy", "x.ply", "--mesher", "dual", *options)
+    assert code == 2 and not Path("x.ply").exists()
+    assert err.endswith("'--mesher': 'dual' is not one of 'marching', 'sharp'.\n")
+
+
+@pytest.mark.usefixtures("grid_folder")
+def test_a_batch_with_another_mesher_is_made_again(run_batch):
+    run_batch("in/a.npy")
+    assert "nothing to do" in run_batch("in/a.npy", "--mesher", "marching")[2]
+    assert "nothing to do" not in run_batch("in/a.npy", "--mesher", "sharp")[2]
+    assert "nothing to do" in run_batch("in/a.npy", "--mesher", "sharp")[2]
+    Path("list.jsonl").write_text('{"in": "in/a.npy", "out": "a.ply", "mesher": "marching"}')
+    assert "nothing to do" not in run_batch("list.jsonl", "--mesher", "sharp")[2]
+    assert [row["mesher"] for row in rows()] == ["marching", "sharp", "marching"]
+
+
+def test_batches_from_before_the_option_still_hold():
+    from super_sdf.batch.job import Job
+
+    planner = Planner.__new__(Planner)
+    planner.network = ("abc", 1)
+    options = ConvertOptions(2, mesher="marching")
+    before = {name: value for name, value in asdict(options).items() if name != "mesher"}
+    text = json.dumps([before, planner.network, __version__])
+    digest = planner.digest(Job(Path("a.npy"), "a.ply", options))
+    assert digest == hashlib.sha256(text.encode()).hexdigest()
+    sharp = replace(options, mesher="sharp")
+    assert planner.digest(Job(Path("a.npy"), "a.ply", sharp)) != digest
+
+
+def test_a_ball_has_no_edges_for_either(network):
+    plain, sharp = (reconstruct(ball(), network, mesher=name) for name in ("marching", "sharp"))
+    np.testing.assert_array_equal(plain.vertices, sharp.vertices)
