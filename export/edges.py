@@ -70,11 +70,11 @@ def draw_case(rng: np.random.Generator, paths: list[Path], procedural: float, nu
 def rows_of(case: Case, network: Network) -> tuple[np.ndarray, np.ndarray]:
     """Return the evidence (f, e) and the gain (f, 2) of all candidates of a case."""
     field = close_at_border(upsample(case.grid, network, FACTOR), case.grid)
-    whole = slice(0, len(field.voxel_ijk))
-    crossings = find_crossings(field, whole)
-    patches = find_patches(field, crossings, whole, 0)
-    own = planes_at_crossings(field, crossings)
-    candidates = find_candidates(patches, own, field)
+    every = np.ones(len(field.voxel_ijk), bool)
+    crossings = find_crossings(field, slice(0, len(every)))
+    patches, used = find_patches(field, crossings, every)
+    own = planes_at_crossings(field, crossings, used)
+    candidates = find_candidates(patches, own, every, field)
     if not len(candidates.patch):
         return candidates.evidence, np.empty((0, 2))
     without, with_all = surfaces(patches, own, candidates)

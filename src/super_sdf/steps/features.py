@@ -16,7 +16,6 @@ Positions are in fine spacings, from node (0, 0, 0) of the fine lattice.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +65,7 @@ class Rule:
 
 
 RULE = Rule(
-    0.805, (0.120, 0.802, -43.356, -2.562, -0.091, 0.877, -13.935, -1.636, -1.153, -0.278, -0.287)
+    0.821, (0.082, 0.829, -44.80, -1.310, -0.161, 0.845, -12.37, -1.673, -0.575, -0.166, -0.352)
 )
 
 
@@ -99,7 +98,7 @@ class Candidates:
 
 
 def place_features(
-    patches: Patches, own: Planes, field: FineField, threads: int = 1
+    patches: Patches, own: Planes, flagged: BoolArray, field: FineField, threads: int = 1
 ) -> tuple[Vectors, Index, Vectors]:
     """Return positions of all crossings, which patches have a feature, and its vertices.
 
@@ -108,17 +107,17 @@ def place_features(
     (n, 3) float64, (f,) int64, (f, 3) float64
         Positions; rows of ``patches``; positions of the features' vertices.
     """
-    candidates = find_candidates(patches, own, field, threads)
+    candidates = find_candidates(patches, own, flagged, field, threads)
     kept = RULE.score(candidates.evidence) > 0
     position = move_beside(patches, own, candidates, kept)
     return position, candidates.patch[kept], candidates.vertex[kept]
 
 
 def find_candidates(
-    patches: Patches, own: Planes, field: FineField, threads: int = 1
+    patches: Patches, own: Planes, flagged: BoolArray, field: FineField, threads: int = 1
 ) -> Candidates:
     """Return the patches that may hold a feature, with its vertex and the evidence for it."""
-    seeds = _is_sharp(patches, own.normal, own.trust)
+    seeds = _is_sharp(patches, own.normal, own.trust) & flagged[patches.row]
     near = dilate(patches, seeds, RINGS, len(own.point))
     inside = np.flatnonzero((near[patches.crossing] | ~patches.there).all(1))
     some = patches.chosen(inside)
@@ -128,7 +127,9 @@ def find_candidates(
     factor, ijk = field.factor, field.voxel_ijk[chosen.row].astype(np.int64)
     corners = planes.point[chosen.crossing] / factor, planes.normal[chosen.crossing]
     wedges = wedges_of(ijk, *corners, chosen.there)
-    spheres = field.spheres or SampleSpheres(field.shape, np.empty((0, 3), np.int32), np.empty(0))
+    spheres = field.spheres or SampleSpheres(
+        field.shape, np.empty((0, 3), np.int32), np.empty(0, np.float32)
+    )
     nearby = find_spheres(wedges, spheres, threads)
     leaned = lean(wedges, nearby)
     evidence = evidence_of(chosen, planes, own, wedges, leaned, nearby)
@@ -207,7 +208,7 @@ def mean_along_chain(patches: Patches, evidence: Vectors, count: int) -> Vectors
             at_crossing = np.bincount(crossing, column[patch], len(used)) / shared
             columns.append(np.bincount(patch, at_crossing[crossing], len(mean)) / patches.sides)
         mean = np.stack(columns, 1)
-    return cast(Vectors, mean)
+    return mean
 
 
 def move_beside(patches: Patches, own: Planes, candidates: Candidates, kept: BoolArray) -> Vectors:

@@ -327,13 +327,13 @@ def number_edges(
     row, edge = crossings.other_row[others], crossings.other_edge[others].astype(np.int64)
     place = field.parts.owner[part_of_edge(field.factor)[edge], row]
     owner = field.parts.table[place, row] - np.int64(before)
-    same_edge = owner * edges + edge - _shifts(field.factor)[place]
+    same_edge = owner * edges + edge - edge_shifts(field.factor)[place]
     vertex_at[(row - np.int64(before)) * edges + edge] = vertex_at.take(same_edge)
     return vertex_at
 
 
 @lru_cache
-def _shifts(factor: int) -> NDArray[np.int64]:
+def edge_shifts(factor: int) -> NDArray[np.int64]:
     """Return an edge's number in a block minus its number in each neighbouring block, (27,)."""
     shifts: NDArray[np.int64] = factor * NEIGHBOURHOOD.astype(np.int64) @ _strides(factor)
     return shifts

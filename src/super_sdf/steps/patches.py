@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..arrays import BoolArray, IntArray
 from .cell_cases import loop_table
 from .field import FineField
-from .marching import Crossings, cells_low_nodes, edge_steps, number_edges
+from .marching import Crossings, cells_low_nodes, edge_shifts, edge_steps, part_of_edge
 from .nodes import block_ijk
 
 Index = NDArray[np.int64]
@@ -62,28 +62,69 @@ class Patches:
         return patch, self.crossing[patch, place]
 
 
-def find_patches(field: FineField, crossings: Crossings, rows: slice, before: int) -> Patches:
-    """Return the patches in the crossed cells of some voxels.
+def find_patches(
+    field: FineField, crossings: Crossings, voxels: BoolArray
+) -> tuple[Patches, Index]:
+    """Return the patches in the crossed cells of some voxels, and the crossings that they use.
 
-    The crossings are those of the voxels from ``before`` on, the first of the plane before, since
-    these own edges of the cells.
+    Parameters
+    ----------
+    field : FineField
+    crossings : Crossings
+        Of all voxels that own an edge of these cells, at least.
+    voxels : (D,) bool
+        Which voxels.
+
+    Returns
+    -------
+    Patches and (m,) int64
+        The patches, whose ``crossing`` counts among those used; their numbers in ``crossings``.
     """
     table, factor = loop_table(), field.factor
-    edges = 3 * len(field.blocks)
-    edge_at = number_edges(field, crossings, before, rows, 0)
-    some = crossings.cells(rows)
+    slot, edge_at = _edges_of(field, crossings, voxels)
+    some = voxels[crossings.cell_row]
     case = crossings.case[some]
     count = table.count[case]
     cell = np.repeat(np.arange(len(count)), count)
     loop = table.first[case[cell]] + nth_of_row(cell, count)
     row = crossings.cell_row[some][cell]
     low_node = cells_low_nodes(factor)[crossings.cell[some][cell]]
-    at = ((row - np.int64(before)) * edges + low_node)[:, None] + edge_steps(factor)[
-        table.edges[loop]
-    ]
-    crossing = np.where(table.edges[loop] >= 0, edge_at.take(at, mode="clip"), np.int64(-1))
+    first = slot[row] * (3 * len(field.blocks)) + low_node
+    at = first[:, None] + edge_steps(factor)[table.edges[loop]]
+    there = table.edges[loop] >= 0
+    crossing = edge_at.take(at, mode="clip")
+    used = np.zeros(len(crossings.own_row), bool)
+    used[crossing[there]] = True
+    new = np.cumsum(used) - 1
     low = factor * field.voxel_ijk[row] + block_ijk(factor)[low_node]
-    return Patches(row, low.astype(np.float64), loop, table.sides[loop], crossing)
+    joined = np.where(there, new[np.where(there, crossing, 0)], -1)
+    patches = Patches(row, low.astype(np.float64), loop, table.sides[loop], joined)
+    return patches, np.flatnonzero(used)
+
+
+def _edges_of(field: FineField, crossings: Crossings, voxels: BoolArray) -> tuple[Index, IntArray]:
+    """Return a table of the crossings on the edges of some voxels' blocks.
+
+    Returns
+    -------
+    (D,) int64 and (n 3 Q,) int32
+        The place of each voxel in the table, of those that own an edge of ``voxels``, too; the
+        crossing on each edge of a place, set only where there is one.
+    """
+    edges = 3 * len(field.blocks)
+    other = voxels[crossings.other_row]
+    row, edge = crossings.other_row[other], crossings.other_edge[other].astype(np.int64)
+    place = field.parts.owner[part_of_edge(field.factor)[edge], row]
+    owner = field.parts.table[place, row]
+    listed = voxels.copy()
+    listed[owner] = True
+    slot: Index = np.cumsum(listed) - 1
+    edge_at = np.empty(int(listed.sum()) * edges, np.int32)  # unset entries are not read
+    own = np.flatnonzero(listed[crossings.own_row])
+    edge_at[slot[crossings.own_row[own]] * edges + crossings.own_edge[own]] = own
+    same_edge = slot[owner] * edges + edge - edge_shifts(field.factor)[place]
+    edge_at[slot[row] * edges + edge] = edge_at[same_edge]
+    return slot, edge_at
 
 
 def dilate(patches: Patches, chosen: BoolArray, rings: int, count: int) -> BoolArray:

@@ -59,27 +59,31 @@ class Planes:
     trust: Numbers
 
 
-def planes_at_crossings(field: FineField, crossings: Crossings, threads: int = 1) -> Planes:
-    """Return the planes on the crossed edges that voxels own, by the field alone."""
+def planes_at_crossings(
+    field: FineField, crossings: Crossings, chosen: Index, threads: int = 1
+) -> Planes:
+    """Return the planes on chosen ones of the crossed edges that voxels own, by the field alone."""
     parts = map_chunks(
-        lambda some: _planes_of_chunk(field, crossings, some),
-        len(crossings.own_row),
+        lambda some: _planes_of_chunk(
+            field, crossings.own_row[chosen[some]], crossings.own_edge[chosen[some]]
+        ),
+        len(chosen),
         TEMPORARIES,
         threads,
     )
-    return Planes(*(np.concatenate(arrays) for arrays in zip(*parts)))
+    empty = np.empty((0, 3)), np.empty((0, 3)), np.empty(0)
+    return Planes(*(np.concatenate(arrays) for arrays in zip(empty, *parts)))
 
 
 def _planes_of_chunk(
-    field: FineField, crossings: Crossings, some: slice
+    field: FineField, row: IntArray, edge: NDArray[np.int16]
 ) -> tuple[Vectors, Vectors, Numbers]:
-    """Return the arrays of ``Planes`` for some crossings."""
-    row = crossings.own_row[some]
-    axis, node = np.divmod(crossings.own_edge[some].astype(np.int64), len(field.blocks))
+    """Return the arrays of ``Planes`` for some edges of voxels' blocks."""
+    axis, node = np.divmod(edge.astype(np.int64), len(field.blocks))
     low_ijk = block_ijk(field.factor)[node]
     high_ijk = low_ijk.copy()
     high_ijk[np.arange(len(row)), axis] += 1
-    position = lattice_positions(field, row, crossings.own_edge[some]).T
+    position = lattice_positions(field, row, edge).T
     start = (field.factor * field.voxel_ijk[row] + low_ijk)[np.arange(len(row)), axis]
     share = np.clip(position[np.arange(len(row)), axis] - start, 0, 1)
     gradients = _gradient(field, row, low_ijk), _gradient(field, row, high_ijk)

@@ -23,7 +23,7 @@ Positions are in fine spacings, from node (0, 0, 0) of the fine lattice.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,13 +34,23 @@ from ..mesh import CLEARANCE, Mesh, vertex_type
 from .cell_cases import loop_table
 from .features import CHAIN_ROUNDS, MOVED_RINGS, RINGS, place_features
 from .field import FineField
-from .marching import CAP_HEIGHT, NO_FACES, Crossings, find_crossings, to_world
+from .kinks import beside, voxels_near_kinks
+from .marching import (
+    CAP_HEIGHT,
+    NO_FACES,
+    Crossings,
+    connect,
+    find_crossings,
+    lattice_positions,
+    to_world,
+)
 from .patches import Index, Patches, find_patches, nth_of_row
 from .planes import ROUNDS, planes_at_crossings
 from .vectors import Vectors
 
 # Cells to every side that a vertex depends on: gradients reach 2 cells and a patch is 1 wide.
 REACH_IN_CELLS = RINGS + ROUNDS + CHAIN_ROUNDS + MOVED_RINGS + 4
+REACH_IN_VOXELS = 2  # further: whether a voxel is examined depends on those beside it
 
 
 def extract_sharp_pieces(
@@ -60,20 +70,40 @@ def extract_sharp_pieces(
     crossings = find_crossings(field, slice(before, rows.stop), threads)
     if not len(crossings.own_row):
         return [Mesh(np.empty((0, 3), vertex_type(grid, field.factor)), NO_FACES)]
-    patches = find_patches(field, crossings, rows, before)
-    own = planes_at_crossings(field, crossings, threads)
-    positions, features, peaks = place_features(patches, own, field, threads)
-    positions = _kept_in_grid(positions, own.point, field)
-    peaks = _kept_in_grid(peaks, patches.low[features] + 0.5, field)
+    kinked = voxels_near_kinks(field, threads)
+    examined = beside(field, kinked, -(-(RINGS + 1) // field.factor))
+    examined &= within(np.arange(len(examined)), rows)
+    patches, used = find_patches(field, crossings, examined)
+    own = planes_at_crossings(field, crossings, used, threads)
+    positions, features, peaks = place_features(patches, own, kinked, field, threads)
     numbers = _number_vertices(field, crossings, patches, features, first_vertex)
-    faces = _faces(field, patches, features, numbers)
+    mine = crossings.own(field.own_rows)
+    edges = crossings.own_row[mine], crossings.own_edge[mine]
     vertices = np.empty((numbers.own, 3))
+    vertices[numbers.of_crossing[mine] - first_vertex] = lattice_positions(field, *edges).T
     for row, number, position in (
-        (crossings.own_row, numbers.of_crossing, positions),
-        (patches.row[features], numbers.of_feature, peaks),
+        (
+            crossings.own_row[used],
+            numbers.of_crossing[used],
+            _kept_in_grid(positions, own.point, field),
+        ),
+        (
+            patches.row[features],
+            numbers.of_feature,
+            _kept_in_grid(peaks, patches.low[features] + 0.5, field),
+        ),
     ):
-        mine = _within(row, field.own_rows)
-        vertices[number[mine] - first_vertex] = position[mine]
+        core = within(row, field.own_rows)
+        vertices[number[core] - first_vertex] = position[core]
+    faces = _faces(
+        field,
+        crossings,
+        examined,
+        patches,
+        features,
+        replace(numbers, of_crossing=numbers.of_crossing[used]),
+        numbers,
+    )
     return [Mesh(to_world(vertices.T, field, grid), faces)]
 
 
@@ -91,7 +121,7 @@ def _kept_in_grid(position: Vectors, start: Vectors, field: FineField) -> Vector
 
 def planes_beside(factor: int) -> int:
     """Return how many coarse planes to either side a slab's mesh depends on."""
-    return -(-(REACH_IN_CELLS + 1) // factor)
+    return -(-(REACH_IN_CELLS + 1) // factor) + REACH_IN_VOXELS
 
 
 def _rows_around(field: FineField) -> slice:
@@ -135,17 +165,48 @@ def _number_vertices(
     return Numbers(of_crossing, before[row] + edges[row] + nth_of_row(row, peaks), own)
 
 
-def _within(row: IntArray, rows: slice) -> BoolArray:
+def within(row: IntArray, rows: slice) -> BoolArray:
     """Return which rows lie in a slice."""
     inside: BoolArray = (row >= rows.start) & (row < rows.stop)
     return inside
 
 
-def _faces(field: FineField, patches: Patches, features: Index, numbers: Numbers) -> IntArray:
-    """Return the triangles of the field's own voxels, in the order of their patches.
+def _faces(
+    field: FineField,
+    crossings: Crossings,
+    examined: BoolArray,
+    patches: Patches,
+    features: Index,
+    used: Numbers,
+    numbers: Numbers,
+) -> IntArray:
+    """Return the triangles of the field's own voxels, plane by plane.
 
-    A side between two fans becomes two triangles of the later patch.
+    In each plane those of voxels that were not examined come first, then the others in the order of
+    their patches. A side between two fans becomes two triangles of the later patch.
     """
+    plain = ~examined[crossings.cell_row]
+    smooth = replace(
+        crossings,
+        cell_row=crossings.cell_row[plain],
+        cell=crossings.cell[plain],
+        case=crossings.case[plain],
+    )
+    patch, faces = examined_faces(patches, features, used)
+    row = patches.row[patch]
+    parts = [NO_FACES]
+    for plane in range(*field.planes):
+        rows = field.rows(plane, plane + 1)
+        if rows.start < rows.stop:
+            flat = connect(field, smooth, rows, 0)
+            parts.append(numbers.of_crossing[flat].astype(np.int32))
+            start, stop = np.searchsorted(row, [rows.start, rows.stop])
+            parts.append(faces[start:stop].astype(np.int32))
+    return np.concatenate(parts)
+
+
+def examined_faces(patches: Patches, features: Index, numbers: Numbers) -> Triangles:
+    """Return the triangles of all patches, in their order."""
     peak_of = np.full(len(patches.row), -1, np.int64)
     peak_of[features] = numbers.of_feature
     parts = [
@@ -155,8 +216,7 @@ def _faces(field: FineField, patches: Patches, features: Index, numbers: Numbers
     patch = np.concatenate([rows for rows, _ in parts])
     faces = np.concatenate([triangles for _, triangles in parts])
     order = np.argsort(patch, kind="stable")
-    order = order[_within(patches.row[patch[order]], field.own_rows)]
-    return faces[order].astype(np.int32)
+    return patch[order], faces[order]
 
 
 Triangles = tuple[Index, Index]

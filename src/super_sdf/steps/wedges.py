@@ -36,11 +36,12 @@ from .vectors import Numbers, Vectors, dot, length, sums, unit
 
 ALONG = 0.6  # distance along an edge at which a sphere counts for a quarter
 FARTHEST_ALONG = 1.8
-OFF_SPHERE = 0.08  # distance from a sphere at which it counts for half
+OFF_SPHERE = 0.05  # distance from a sphere at which it counts for half
 FARTHEST_SPHERE = 0.3
 LARGEST_RADIUS = 1.4  # samples near the band's edge, 1.5, may have been truncated there
 LEAST_RADIUS = 0.05  # of spheres: of smaller ones the direction is unknown
 PIERCED = 0.02  # by which a sphere outside the cone must be pierced to count
+HOLD = 1.0  # of the planes of a patch, in spheres
 ITERATIONS = 3
 LONGEST_STEP = 0.25
 RANK = 0.05  # eigenvalues below this share of the largest leave a direction open
@@ -227,12 +228,12 @@ def _in_cone(wedges: Wedges, near: Nearby, direction: Vectors) -> BoolArray:
 def lean(wedges: Wedges, near: Nearby) -> Wedges:
     """Return the wedges with points at which planes and spheres agree best."""
     start = wedges.point
-    hold = wedges.stiffness * 2
+    hold = wedges.stiffness * HOLD
     along = wedges.tangent[:, :, None] * wedges.tangent[:, None, :]
     hold = hold + 1e-3 * IDENTITY + np.where(wedges.corner, 0, 1e3)[:, None, None] * along
     for _ in range(ITERATIONS):
         matrix, pull = _pull_of_spheres(wedges, near)
-        back = np.einsum("pij,pj->pi", wedges.stiffness * 2, start - wedges.point)
+        back = np.einsum("pij,pj->pi", wedges.stiffness * HOLD, start - wedges.point)
         step = np.linalg.solve(hold + matrix, (pull + back)[..., None])[..., 0]
         point = wedges.point + np.clip(step, -LONGEST_STEP, LONGEST_STEP)
         wedges = replace(wedges, point=point)
