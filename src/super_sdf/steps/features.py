@@ -38,14 +38,13 @@ from .wedges import (
 
 SHARP_COSINE = 0.85  # normals of a patch that differ by more, 32 degrees, may make a feature
 LEAST_SLOPE_TRUST = 0.02  # of every crossing of a feature
-RINGS = 6  # patches round a candidate, counted from it, in which planes are settled
-CHAIN_ROUNDS = 5  # in each, a candidate takes the mean of those it shares a crossing with
+RINGS = 3  # patches round a candidate, counted from it, in which planes are settled
+CHAIN_ROUNDS = 4  # in each, a candidate takes the mean of those it shares a crossing with
 MOVED_RINGS = 3  # round a feature, in which vertices may be moved onto the planes: all of them ...
 FADING, FADED_OUT = 1.0, 2.5  # ... up to a distance in fine spacings, none from another on
 FARTHEST_MOVE = 0.5  # fine spacings
 OUTSIDE_CELL = 0.5  # fine spacings by which a feature's vertex may leave its cell
 TOUCHING = 0.04  # coarse spacings from a sphere at which it is touched
-CLOSE_BY = 0.6  # coarse spacings along an edge in which no sphere may be pierced
 TOUCHED_ALONG = 1.0  # coarse spacings along an edge in which spheres are counted
 
 
@@ -184,7 +183,7 @@ def evidence_of(
 
 def _deepest(nearby: Nearby, contact: Contact, count: int) -> Numbers:
     """Return by how much a sphere close by is pierced by each edge, (count,); -0.1 if by none."""
-    close = np.abs(contact.along) < CLOSE_BY
+    close = contact.is_close
     deepest: Numbers = np.full(count, -0.1)
     np.maximum.at(deepest, nearby.wedge[close], -contact.gap[close])
     return deepest

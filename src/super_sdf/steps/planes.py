@@ -28,7 +28,7 @@ from .nodes import block_ijk
 from .patches import Index, Patches, dilate, pairs_in_patches
 from .vectors import Numbers, Vectors, dot, length, sums, unit
 
-ROUNDS = 5  # in each, every crossing looks at those it shares a patch with
+ROUNDS = 4  # in each, every crossing looks at those it shares a patch with
 ROUGH = 0.02  # 1 - cosine of normals in a patch from which a crossing is not trusted
 ALIGNED = 0.125  # 1 - cosine up to which planes count as the same
 OFF_PLANE = 0.12  # fine spacings up to which a crossing is taken to lie on a plane

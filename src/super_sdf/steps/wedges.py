@@ -24,6 +24,7 @@ Positions and lengths are in coarse spacings, from node (0, 0, 0) of the fine la
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,7 @@ from .vectors import Numbers, Vectors, dot, length, sums, unit
 
 ALONG = 0.6  # distance along an edge at which a sphere counts for a quarter
 FARTHEST_ALONG = 1.8
+CLOSE_BY = 0.3  # distance along an edge within which no sphere may be pierced
 OFF_SPHERE = 0.05  # distance from a sphere at which it counts for half
 FARTHEST_SPHERE = 0.3
 LARGEST_RADIUS = 1.4  # samples near the band's edge, 1.5, may have been truncated there
@@ -125,6 +127,14 @@ class Contact:
     along: Numbers
     gap: Numbers
     in_cone: BoolArray
+
+    @property
+    def is_close(self) -> BoolArray:
+        """Whether the sphere is so near along the edge that this may not pierce it.
+
+        Further on the edge may have ended, at a corner, or turned.
+        """
+        return cast(BoolArray, np.abs(self.along) < CLOSE_BY)
 
 
 def wedges_of(
@@ -243,7 +253,7 @@ def lean(wedges: Wedges, near: Nearby) -> Wedges:
 def _pull_of_spheres(wedges: Wedges, near: Nearby) -> tuple[Vectors, Vectors]:
     """Return matrix (f, 3, 3) and right side (f, 3) of the spheres' part in the least squares."""
     count, wedge, contact = len(wedges.point), near.wedge, contact_of(wedges, near)
-    counts = contact.in_cone | (contact.gap < -PIERCED)
+    counts = contact.in_cone | (contact.is_close & (contact.gap < -PIERCED))
     off = contact.gap / OFF_SPHERE
     weight = counts * square_falloff(contact.along / ALONG) / (1 + off * off)
     pull = -sums(wedge, (weight * contact.gap)[:, None] * contact.direction, count)
