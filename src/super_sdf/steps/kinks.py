@@ -34,7 +34,8 @@ def voxels_near_kinks(field: FineField, threads: int = 1) -> BoolArray:
         before, after = table[CENTRE - step], table[CENTRE + step]
         low = np.minimum(low, np.minimum(_of(low, before, np.inf), _of(low, after, np.inf)))
         high = np.maximum(high, np.maximum(_of(high, before, -np.inf), _of(high, after, -np.inf)))
-    return (high - low > TURN).any(0)
+    turns: BoolArray = np.any(high - low > TURN, axis=0)
+    return turns
 
 
 def _of(values: FloatArray, rows: NDArray[np.int32], absent: float) -> FloatArray:

@@ -54,7 +54,7 @@ class Patches:
     @property
     def there(self) -> BoolArray:
         """Which entries of ``crossing`` are crossings, (P, S)."""
-        return cast(BoolArray, self.crossing >= 0)
+        return self.crossing >= 0
 
     def joined(self) -> tuple[Index, Index]:
         """Return the patch and the crossing of every entry of ``crossing`` that is one."""

@@ -14,12 +14,12 @@ Positions are in fine spacings, from node (0, 0, 0) of the fine lattice.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import IntArray
+from ..arrays import BoolArray, IntArray
 from ..machine.threads import map_chunks
 from ..neighbourhood import CENTRE, STRIDES
 from .field import FineField
@@ -158,12 +158,8 @@ def settle_planes(patches: Patches, own: Planes) -> Planes:
     np.maximum.at(rough, one, 1 - dot(own.normal[one], own.normal[other]))
     trust = own.trust * square_falloff(rough / ROUGH) + LEAST_TRUST
     planes = Planes(own.point, own.normal, trust)
-    beside = dilate(
-        patches,
-        ((trust < SETTLED)[patches.crossing] & patches.there).any(1),
-        SMOOTHED_RINGS,
-        len(trust),
-    )
+    unsettled = np.any((trust < SETTLED)[patches.crossing] & patches.there, axis=1)
+    beside = dilate(patches, cast(BoolArray, unsettled), SMOOTHED_RINGS, len(trust))
     one, other = one[beside[one]], other[beside[one]]
     for _ in range(ROUNDS):
         planes = _settle_once(planes, own, one, other)

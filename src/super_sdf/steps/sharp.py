@@ -24,8 +24,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import BoolArray, IntArray
 from ..grid.sdf_grid import SdfGrid
@@ -70,41 +72,52 @@ def extract_sharp_pieces(
     crossings = find_crossings(field, slice(before, rows.stop), threads)
     if not len(crossings.own_row):
         return [Mesh(np.empty((0, 3), vertex_type(grid, field.factor)), NO_FACES)]
-    kinked = voxels_near_kinks(field, threads)
-    examined = beside(field, kinked, -(-(RINGS + 1) // field.factor))
-    examined &= within(np.arange(len(examined)), rows)
-    patches, used = find_patches(field, crossings, examined)
-    own = planes_at_crossings(field, crossings, used, threads)
-    positions, features, peaks = place_features(patches, own, kinked, field, threads)
-    numbers = _number_vertices(field, crossings, patches, features, first_vertex)
-    mine = crossings.own(field.own_rows)
-    edges = crossings.own_row[mine], crossings.own_edge[mine]
-    vertices = np.empty((numbers.own, 3))
-    vertices[numbers.of_crossing[mine] - first_vertex] = lattice_positions(field, *edges).T
-    for row, number, position in (
-        (
-            crossings.own_row[used],
-            numbers.of_crossing[used],
-            _kept_in_grid(positions, own.point, field),
-        ),
-        (
-            patches.row[features],
-            numbers.of_feature,
-            _kept_in_grid(peaks, patches.low[features] + 0.5, field),
-        ),
-    ):
-        core = within(row, field.own_rows)
-        vertices[number[core] - first_vertex] = position[core]
-    faces = _faces(
-        field,
-        crossings,
-        examined,
-        patches,
-        features,
-        replace(numbers, of_crossing=numbers.of_crossing[used]),
-        numbers,
-    )
+    examined = examine(field, crossings, rows, threads)
+    numbers = _number_vertices(field, crossings, examined, first_vertex)
+    vertices = _vertices(field, crossings, examined, numbers, first_vertex)
+    faces = _faces(field, crossings, examined, numbers)
     return [Mesh(to_world(vertices.T, field, grid), faces)]
+
+
+@dataclass(frozen=True, eq=False)
+class Examined:
+    """What is found in the voxels that may hold an edge; the others are left to marching cubes.
+
+    Attributes
+    ----------
+    voxels : (D,) bool
+        Which voxels were examined.
+    patches : Patches
+        Their patches; ``crossing`` counts among ``used``.
+    used : (m,) int64
+        The crossings of these patches.
+    position : (m, 3) float64
+        Where their vertices belong.
+    features : (f,) int64
+        The patches with an edge or a corner.
+    peak : (f, 3) float64
+        The vertices on these.
+    """
+
+    voxels: BoolArray
+    patches: Patches
+    used: Index
+    position: Vectors
+    features: Index
+    peak: Vectors
+
+
+def examine(field: FineField, crossings: Crossings, rows: slice, threads: int = 1) -> Examined:
+    """Look for edges and corners near kinks of the field, in some voxels."""
+    kinked = voxels_near_kinks(field, threads)
+    voxels = beside(field, kinked, -(-(RINGS + 1) // field.factor))
+    voxels &= within(np.arange(len(voxels)), rows)
+    patches, used = find_patches(field, crossings, voxels)
+    own = planes_at_crossings(field, crossings, used, threads)
+    position, features, peak = place_features(patches, own, kinked, field, threads)
+    position = _kept_in_grid(position, own.point, field)
+    peak = _kept_in_grid(peak, patches.low[features] + 0.5, field)
+    return Examined(voxels, patches, used, position, features, peak)
 
 
 def _kept_in_grid(position: Vectors, start: Vectors, field: FineField) -> Vectors:
@@ -150,10 +163,10 @@ class Numbers:
 
 
 def _number_vertices(
-    field: FineField, crossings: Crossings, patches: Patches, features: Index, first_vertex: int
+    field: FineField, crossings: Crossings, examined: Examined, first_vertex: int
 ) -> Numbers:
     """Number the vertices: the first of the field's own voxels is ``first_vertex``."""
-    count, row = len(field.voxel_ijk) + 1, patches.row[features]
+    count, row = len(field.voxel_ijk) + 1, examined.patches.row[examined.features]
     edges = np.bincount(crossings.own_row, minlength=count)
     peaks = np.bincount(row, minlength=count)
     before = np.cumsum(edges + peaks) - edges - peaks
@@ -165,41 +178,53 @@ def _number_vertices(
     return Numbers(of_crossing, before[row] + edges[row] + nth_of_row(row, peaks), own)
 
 
-def within(row: IntArray, rows: slice) -> BoolArray:
+def _vertices(
+    field: FineField,
+    crossings: Crossings,
+    examined: Examined,
+    numbers: Numbers,
+    first_vertex: int,
+) -> Vectors:
+    """Return the vertices of the field's own voxels, (n, 3), in fine spacings."""
+    vertices = np.empty((numbers.own, 3))
+    mine = crossings.own(field.own_rows)
+    plain = lattice_positions(field, crossings.own_row[mine], crossings.own_edge[mine]).T
+    vertices[numbers.of_crossing[mine] - first_vertex] = plain
+    used, patches = examined.used, examined.patches
+    for row, number, position in (
+        (crossings.own_row[used], numbers.of_crossing[used], examined.position),
+        (patches.row[examined.features], numbers.of_feature, examined.peak),
+    ):
+        core = within(row, field.own_rows)
+        vertices[number[core] - first_vertex] = position[core]
+    return vertices
+
+
+def within(row: NDArray[Any], rows: slice) -> BoolArray:
     """Return which rows lie in a slice."""
     inside: BoolArray = (row >= rows.start) & (row < rows.stop)
     return inside
 
 
 def _faces(
-    field: FineField,
-    crossings: Crossings,
-    examined: BoolArray,
-    patches: Patches,
-    features: Index,
-    used: Numbers,
-    numbers: Numbers,
+    field: FineField, crossings: Crossings, examined: Examined, numbers: Numbers
 ) -> IntArray:
     """Return the triangles of the field's own voxels, plane by plane.
 
     In each plane those of voxels that were not examined come first, then the others in the order of
     their patches. A side between two fans becomes two triangles of the later patch.
     """
-    plain = ~examined[crossings.cell_row]
-    smooth = replace(
-        crossings,
-        cell_row=crossings.cell_row[plain],
-        cell=crossings.cell[plain],
-        case=crossings.case[plain],
-    )
-    patch, faces = examined_faces(patches, features, used)
-    row = patches.row[patch]
+    plain = ~examined.voxels[crossings.cell_row]
+    cells = (crossings.cell_row[plain], crossings.cell[plain], crossings.case[plain])
+    smooth = replace(crossings, cell_row=cells[0], cell=cells[1], case=cells[2])
+    used = replace(numbers, of_crossing=numbers.of_crossing[examined.used])
+    patch, faces = examined_faces(examined.patches, examined.features, used)
+    row = examined.patches.row[patch]
     parts = [NO_FACES]
     for plane in range(*field.planes):
         rows = field.rows(plane, plane + 1)
         if rows.start < rows.stop:
-            flat = connect(field, smooth, rows, 0)
-            parts.append(numbers.of_crossing[flat].astype(np.int32))
+            parts.append(numbers.of_crossing[connect(field, smooth, rows, 0)].astype(np.int32))
             start, stop = np.searchsorted(row, [rows.start, rows.stop])
             parts.append(faces[start:stop].astype(np.int32))
     return np.concatenate(parts)

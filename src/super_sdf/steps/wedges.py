@@ -24,7 +24,6 @@ Positions and lengths are in coarse spacings, from node (0, 0, 0) of the fine la
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,7 +133,7 @@ class Contact:
 
         Further on the edge may have ended, at a corner, or turned.
         """
-        return cast(BoolArray, np.abs(self.along) < CLOSE_BY)
+        return np.abs(self.along) < CLOSE_BY
 
 
 def wedges_of(
@@ -199,7 +198,9 @@ def _spheres_of_chunk(
     wedge, place = np.nonzero(number >= 0)
     number = number[wedge, place]
     wedge = wedge + some.start
-    near = Nearby(wedge, spheres.voxel_ijk[number] + 0.5, spheres.distance[number] / 2)
+    distance: Numbers = spheres.distance[number].astype(np.float64) / 2
+    centre: Vectors = spheres.voxel_ijk[number] + 0.5
+    near = Nearby(wedge, centre, distance)
     contact = contact_of(wedges, near)
     kept = np.abs(contact.gap) < FARTHEST_SPHERE
     kept &= (np.abs(contact.along) < FARTHEST_ALONG) & (np.abs(near.distance) < LARGEST_RADIUS)
