@@ -199,7 +199,7 @@ def _spheres_of_chunk(
     number = number[wedge, place]
     wedge = wedge + some.start
     distance: Numbers = spheres.distance[number].astype(np.float64) / 2
-    centre: Vectors = spheres.voxel_ijk[number] + 0.5
+    centre = spheres.voxel_ijk[number].astype(np.float64) + 0.5
     near = Nearby(wedge, centre, distance)
     contact = contact_of(wedges, near)
     kept = np.abs(contact.gap) < FARTHEST_SPHERE
