@@ -22,7 +22,7 @@ STAGES = {
 BEFORE_MESHER = ("average", "fit")
 # The sharp mesher on a group of planes and those beside: bytes per voxel and factor, measured on a
 # field of edges everywhere; its lookup table comes on top.
-SHARP_BYTES = 2800
+SHARP_BYTES = 1700
 # Default for a network: bytes per voxel that it sees, including its row of the neighbour table, and
 # per value.
 NETWORK_BYTES = (680.0, 8.0)

@@ -25,7 +25,7 @@ from . import marching, sharp
 from .field import FineField
 from .mesher_names import DEFAULT_MESHER, MARCHING, MESHERS, SHARP
 
-CELLS_IN_GROUP = 1 << 23  # K^2 for each voxel: about half as many are crossed
+CELLS_IN_GROUP = 1 << 21  # K^2 for each voxel: about half as many are crossed
 GROUPS_AT_ONCE = 4
 
 Planes = tuple[int, int]
