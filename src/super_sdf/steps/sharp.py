@@ -5,17 +5,16 @@ of the surface in a cell that holds an edge or a corner gets a vertex there and 
 it; the side between two fans is turned so that it joins their vertices (extended marching cubes).
 Elsewhere the mesh is that of marching cubes, and it is a closed manifold for the same reason.
 
-Where a feature lies is read off the planes of the faces beside it:
+In steps:
 
-    normals     of the field on both ends of every crossed lattice edge, from differences that do
-                not straddle a kink
-    planes      near features, the planes of crossings on flat ground replace those of crossings
-                beside the kink, where the field is rounded off, step by step
-    vertices    of the features where the planes of a patch meet; those beside are moved onto them
+    kinks       finds the voxels where the field's gradient turns; others are left to marching cubes
+    patches     lists the pieces of the surface in their cells
+    planes      gives each crossing the plane of its face, not rounded off as the field is at edges
+    wedges      meets these planes, and moves the point so that it agrees with the samples' spheres
+    features    tells edges from rounded ground, and moves the vertices beside them
 
-References: Kobbelt, Botsch, Schwanecke and Seidel, "Feature Sensitive Surface Extraction from
-Volume Data", 2001; Harten, Engquist, Osher and Chakravarthy, "Uniformly High Order Accurate
-Essentially Non-Oscillatory Schemes", 1987, for the differences.
+Reference: Kobbelt, Botsch, Schwanecke and Seidel, "Feature Sensitive Surface Extraction from Volume
+Data", 2001.
 
 Positions are in fine spacings, from node (0, 0, 0) of the fine lattice.
 """
