@@ -81,7 +81,7 @@ def _one_pass(base: Mesh, original: Original, error: float, rounds: Rounds) -> M
 
 
 def down_to(mesh: Mesh, triangles: int, rounds: Rounds) -> tuple[Mesh, tuple[str, ...]]:
-    """Return a mesh with at most ``triangles`` triangles, or a warning that it has more."""
+    """Return a mesh of at most ``triangles`` triangles, or the smallest found and a warning."""
     result = _nearly_to(mesh, triangles, rounds) if len(mesh.faces) > triangles else mesh
     for _ in range(MOST_PASSES):
         if len(result.faces) <= triangles:
