@@ -45,26 +45,34 @@ FADING, FADED_OUT = 1.0, 2.5  # ... up to a distance in fine spacings, none from
 FARTHEST_MOVE = 0.5  # fine spacings
 OUTSIDE_CELL = 0.5  # fine spacings by which a feature's vertex may leave its cell
 TOUCHING = 0.04  # coarse spacings from a sphere at which it is touched
+TOUCHED = 4  # place in the evidence of whether a sphere is touched
 TOUCHED_ALONG = 1.0  # coarse spacings along an edge in which spheres are counted
 
 
 @dataclass(frozen=True, eq=False)
 class Rule:
-    """The logistic rule that tells features from rounded ground: ``bias + evidence @ weights``."""
+    """The logistic rule that tells features from rounded ground: ``bias + evidence @ weights``.
+
+    Where less than ``least_touched`` of a chain touches a sphere there is no feature: in noise
+    no sample is exact, and normals say nothing.
+    """
 
     bias: float
     weights: tuple[float, ...]
+    least_touched: float = 0.0
 
     def score(self, evidence: Vectors) -> Numbers:
         """Return the score of evidence (f, n), positive for a feature; summed in a fixed order."""
         score: Numbers = np.full(len(evidence), self.bias)
         for weight, column in zip(self.weights, evidence.T):
             score += weight * column
-        return score
+        return np.where(evidence[:, TOUCHED] < self.least_touched, -np.inf, score)
 
 
 RULE = Rule(
-    0.820, (0.077, 0.815, -80.34, -4.073, -0.487, 0.951, -8.985, -1.403, -0.494, -0.181, -0.451)
+    0.820,
+    (0.077, 0.815, -80.34, -4.073, -0.487, 0.951, -8.985, -1.403, -0.494, -0.181, -0.451),
+    least_touched=0.1,
 )
 
 
