@@ -18,11 +18,10 @@ from collections import Counter
 from itertools import islice
 from pathlib import Path
 
-import numpy as np
 from scipy.spatial import cKDTree
 
 from super_sdf import Mesh, load_network
-from super_sdf.certificate.slabs import search
+from super_sdf.certificate.slabs import self_intersections
 from super_sdf.certificate.surface import examine_surface
 from super_sdf.steps.mesher_names import MARCHING, MESHERS
 
@@ -64,7 +63,7 @@ def main() -> None:
         fields[kind] += 1
         meshes = {mesher: mesh_of_field(field, network, mesher) for mesher in MESHERS}
         for mesher, mesh in meshes.items():
-            found = search(mesh, np.empty((0, 3)), 0.0, intersections=True).intersections
+            found = self_intersections(mesh)
             surface = examine_surface(mesh, found)
             faults = faults_of_mesh(field, mesh)
             if not surface.manifold or surface.edges.flipped_edges:

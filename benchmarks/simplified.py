@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from super_sdf.certificate.slabs import search
+from super_sdf.certificate.slabs import self_intersections
 from super_sdf.certificate.surface import examine_surface
 from super_sdf.evaluation.cases import Case, Setting, Shape
 from super_sdf.evaluation.measuring import measure_surface
@@ -67,10 +67,7 @@ def measure(shape: Shape, size: int, mesher: str, error: float, network: Network
     start = time.perf_counter()
     found = simplify_mesh(mesh, error=error * case.spacing)
     seconds, off = time.perf_counter() - start, found.deviation.over(case.spacing)
-    surfaces = [
-        examine_surface(m, search(m, np.empty((0, 3)), 0.0, intersections=True).intersections)
-        for m in (mesh, found.mesh)
-    ]
+    surfaces = [examine_surface(m, self_intersections(m)) for m in (mesh, found.mesh)]
     before, after = (figures_of(shape, m, case.spacing) for m in (mesh, found.mesh))
     return Row(
         shape.name, len(mesh.faces), len(found.mesh.faces) / len(mesh.faces),

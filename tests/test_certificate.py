@@ -386,3 +386,10 @@ def test_a_mesh_of_marching_cubes_is_certified_worse_than_the_refined_one(here, 
     coarse = check_mesh(sphere(RADIUS, 24), sphere_grid()).touching.summary()["mean"]
     fine = check_mesh(sphere(RADIUS, 96), sphere_grid()).touching.summary()["mean"]
     assert fine < coarse / 4
+
+
+def test_pairs_of_triangles_that_intersect_are_counted():
+    corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, -0.5], [0.3, 0.2, 0.5], [0.2, 0.3, 0.5]]
+    crossed = Mesh(np.array(corners, np.float64), np.array([[0, 1, 2], [3, 4, 5]], np.int32))
+    assert slabs.self_intersections(crossed) == 1
+    assert slabs.self_intersections(cube()) == 0

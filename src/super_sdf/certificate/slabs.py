@@ -234,6 +234,14 @@ def side_of(ways: Points, normals: Points, cosine: float) -> NDArray[np.int8]:
     return np.where(np.abs(dots) > cosine * most, np.sign(dots), 0).astype(np.int8)
 
 
+def self_intersections(mesh: Mesh) -> int | None:
+    """Return the number of pairs of a mesh's triangles that intersect; None if libigl has no test.
+
+    Vertices at the same position must be one vertex.
+    """
+    return search(mesh, np.empty((0, 3)), 0.0, intersections=True).intersections
+
+
 def can_count() -> bool:
     """Return whether this version of libigl finds self-intersections."""
     return hasattr(igl.predicates, "find_self_intersections")

@@ -84,8 +84,6 @@ class Candidates:
     ----------
     patch : (f,) int64
         Their rows in all patches.
-    patches : Patches
-        They alone.
     vertex : (f, 3) float64
         The edge's nearest point, or the corner, kept near the patch's cell.
     evidence : (f, 11) float64
@@ -97,7 +95,6 @@ class Candidates:
     """
 
     patch: Index
-    patches: Patches
     vertex: Vectors
     evidence: Vectors
     planes: Planes
@@ -105,26 +102,36 @@ class Candidates:
 
 
 def place_features(
-    patches: Patches, own: Planes, flagged: BoolArray, field: FineField, threads: int = 1
+    patches: Patches, own: Planes, kinked: BoolArray, field: FineField, threads: int = 1
 ) -> tuple[Vectors, Index, Vectors]:
     """Return positions of all crossings, which patches have a feature, and its vertices.
+
+    Parameters
+    ----------
+    patches : Patches
+    own : Planes
+        Those of the crossings, by the field alone.
+    kinked : (D,) bool
+        The voxels in which a feature may begin.
+    field : FineField
+    threads : int
 
     Returns
     -------
     (n, 3) float64, (f,) int64, (f, 3) float64
         Positions; rows of ``patches``; positions of the features' vertices.
     """
-    candidates = find_candidates(patches, own, flagged, field, threads)
+    candidates = find_candidates(patches, own, kinked, field, threads)
     kept = RULE.score(candidates.evidence) > 0
     position = move_beside(patches, own, candidates, kept)
     return position, candidates.patch[kept], candidates.vertex[kept]
 
 
 def find_candidates(
-    patches: Patches, own: Planes, flagged: BoolArray, field: FineField, threads: int = 1
+    patches: Patches, own: Planes, kinked: BoolArray, field: FineField, threads: int = 1
 ) -> Candidates:
     """Return the patches that may hold a feature, with its vertex and the evidence for it."""
-    seeds = _is_sharp(patches, own.normal, own.trust) & flagged[patches.row]
+    seeds = _is_sharp(patches, own.normal, own.trust) & kinked[patches.row]
     near = dilate(patches, seeds, RINGS, len(own.point))
     inside = np.flatnonzero((near[patches.crossing] | ~patches.there).all(1))
     some = patches.chosen(inside)
@@ -143,7 +150,7 @@ def find_candidates(
     evidence = mean_along_chain(chosen, evidence, len(own.point))
     low = chosen.low - OUTSIDE_CELL
     vertex = np.clip(factor * leaned.point, low, low + 1 + 2 * OUTSIDE_CELL)
-    return Candidates(inside[sharp], chosen, vertex, evidence, planes, near)
+    return Candidates(inside[sharp], vertex, evidence, planes, near)
 
 
 def _is_sharp(patches: Patches, normal: Vectors, trust: Numbers) -> BoolArray:

@@ -108,7 +108,7 @@ class Examined:
 
 def examine(field: FineField, crossings: Crossings, rows: slice, threads: int = 1) -> Examined:
     """Look for edges and corners near kinks of the field, in some voxels."""
-    kinked = voxels_near_kinks(field, threads)
+    kinked = voxels_near_kinks(field, rows, threads)
     voxels = beside(field, kinked, -(-(RINGS + 1) // field.factor))
     voxels &= within(np.arange(len(voxels)), rows)
     patches, used = find_patches(field, crossings, voxels)
