@@ -5,7 +5,7 @@
 3. ``evidence`` gathers what speaks for an edge there and what against it: flat ground on both
    sides, spheres that touch or are pierced. It is averaged along the chain of candidates, since an
    edge has a length, and weighed by a logistic rule.
-4. Vertices beside the features that are kept are moved onto the settled planes.
+4. Vertices beside the features that are sure are moved onto the settled planes.
 
 The rule was fitted by ``export.edges`` on shapes with and without edges, to whether a vertex on the
 edge brings the surface nearer to the true one.
@@ -40,6 +40,7 @@ SHARP_COSINE = 0.85  # normals of a patch that differ by more, 32 degrees, may m
 LEAST_SLOPE_TRUST = 0.02  # of every crossing of a feature
 RINGS = 3  # patches round a candidate, counted from it, in which planes are settled
 CHAIN_ROUNDS = 4  # in each, a candidate takes the mean of those it shares a crossing with
+SURE = 0.5  # score of a feature from which vertices beside it are moved
 MOVED_RINGS = 3  # round a feature, in which vertices may be moved onto the planes: all of them ...
 FADING, FADED_OUT = 1.0, 2.5  # ... up to a distance in fine spacings, none from another on
 FARTHEST_MOVE = 0.5  # fine spacings
@@ -122,8 +123,9 @@ def place_features(
         Positions; rows of ``patches``; positions of the features' vertices.
     """
     candidates = find_candidates(patches, own, kinked, field, threads)
-    kept = RULE.score(candidates.evidence) > 0
-    position = move_beside(patches, own, candidates, kept)
+    score = RULE.score(candidates.evidence)
+    kept = score > 0
+    position = move_beside(patches, own, candidates, score > SURE)
     return position, candidates.patch[kept], candidates.vertex[kept]
 
 
@@ -225,14 +227,14 @@ def mean_along_chain(patches: Patches, evidence: Vectors, count: int) -> Vectors
     return mean
 
 
-def move_beside(patches: Patches, own: Planes, candidates: Candidates, kept: BoolArray) -> Vectors:
-    """Return the positions of all crossings, (n, 3), those beside features on settled planes.
+def move_beside(patches: Patches, own: Planes, candidates: Candidates, sure: BoolArray) -> Vectors:
+    """Return the positions of all crossings, (n, 3), those beside sure features on settled planes.
 
     The move fades with the distance from the feature: where it ended at once, crossings that lie
     close together would come apart, and make a step.
     """
     distance = distance_from(
-        patches, candidates.patch[kept], candidates.vertex[kept], own.point, MOVED_RINGS
+        patches, candidates.patch[sure], candidates.vertex[sure], own.point, MOVED_RINGS
     )
     share = np.clip((FADED_OUT - distance) / (FADED_OUT - FADING), 0, 1) * candidates.near
     shift = candidates.planes.point - own.point
