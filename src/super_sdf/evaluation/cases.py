@@ -107,8 +107,7 @@ class Shape:
         solid, notes = load_solid(path)
         mesh = solid.mesh
         if turned is not None:
-            random = np.random.default_rng((turned, *name_seed(path.stem, TURN)))
-            mesh = mesh.transformed(random_rotation(random), np.zeros(3))
+            mesh = mesh.transformed(turn_of(path.stem, turned), np.zeros(3))
         shape = cls(path.stem, mesh)
         shape.notes = notes
         return shape
@@ -121,6 +120,11 @@ class Shape:
 def name_seed(name: str, stream: int) -> tuple[int, int]:
     """Return the seed of a stream of random numbers of a shape."""
     return zlib.crc32(name.encode(errors="surrogateescape")), stream
+
+
+def turn_of(name: str, seed: int) -> NDArray[np.float64]:
+    """Return the rotation matrix, (3, 3), by which a seed turns the shape of a name."""
+    return random_rotation(np.random.default_rng((seed, *name_seed(name, TURN))))
 
 
 def random_rotation(random: np.random.Generator) -> NDArray[np.float64]:

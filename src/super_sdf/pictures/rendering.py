@@ -166,7 +166,7 @@ def render_panels(
     frame = fit_frame(panels, view_axes(up, layout.view), layout.zoom)
     values = _values_of(panels)
     top = _top_of(values) if colour == "error" and top is None else top
-    images = [_draw(panel, frame, colour, frame.pixels(layout.size), top) for panel in panels]
+    images = [draw_panel(panel, frame, layout.size, colour, top) for panel in panels]
     titles = [panel.title for panel in panels]
     page = Page(layout.size, images, titles, columns=layout.columns, foot=FOOT[colour])
     if colour == "normal":
@@ -280,12 +280,15 @@ def _quiet_without_display() -> Iterator[None]:
         log.SetStderrVerbosity(log.VERBOSITY_INFO)
 
 
-def _draw(
-    panel: Panel, frame: Frame, colour: str, pixels: tuple[int, int], top: float | None
+def draw_panel(
+    panel: Panel, frame: Frame, size: int, colour: str = "shaded", top: float | None = None
 ) -> Image:
-    """Return the picture of one mesh, (height, width, 3)."""
+    """Return the picture of one mesh, (height, width, 3); its long side has ``size`` pixels.
+
+    ``colour`` and ``top`` are those of ``render_panels``.
+    """
     pyvista = _pyvista()
-    wide, tall = pixels
+    wide, tall = frame.pixels(size)
     window = wide * SUPERSAMPLING, tall * SUPERSAMPLING
     with _quiet_without_display():
         plotter = pyvista.Plotter(off_screen=True, window_size=window)
