@@ -33,10 +33,11 @@ from super_sdf.certificate.check import Certificate, CheckOptions, check_files
 from super_sdf.certificate.coloured import vertex_residuals
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.evaluation.cases import RESULT_POINTS, Setting, Shape
-from super_sdf.evaluation.metrics import compare_surfaces, sample_surface
+from super_sdf.evaluation.metrics import compare_distances, distance_or_dot, sample_surface
 from super_sdf.evaluation.scope import find_meshes
 from super_sdf.evaluation.timing import grid_file
 from super_sdf.network.network import Network, load_network
+from super_sdf.truth.solid import Solid
 
 WORST = 0.05
 HEADER = (
@@ -83,7 +84,8 @@ def measure(shape: Shape, size: int, network: Network) -> Row:
     said = np.abs(vertex_residuals(mesh.vertices, touching, found.voxel_size))
     known = np.isfinite(said)
     drawn = sample_surface(mesh, shape.seed(RESULT_POINTS))
-    surfaces = compare_surfaces(shape.solid, mesh, shape.drawn, drawn)
+    there = distance_or_dot(Solid(mesh), shape.drawn.points)
+    surfaces = compare_distances(there, distance_or_dot(shape.solid, drawn.points))
     summary = touching.summary()
     figures = [summary[name] for name in ("mean", "p99", "largest")]
     errors = [float(true.mean()), surfaces["p2s"], surfaces["max"]]

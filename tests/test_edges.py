@@ -26,7 +26,8 @@ def in_voxels(reference: Mesh, result: Mesh) -> metrics.Numbers:
 def angles_of(reference: Mesh, result: Mesh) -> tuple[float | None, float | None]:
     """Return the mean angles near the edges of a reference and beyond."""
     curves, drawn = EdgeCurves.of(reference, SEED), metrics.sample_surface(result, (7, 1))
-    figures = edges.compare_angles(Solid(reference), curves, drawn, H)
+    nearest = Solid(reference).nearest_face(drawn.points)
+    figures = edges.compare_angles(reference, nearest, curves, drawn, H)
     return figures["angle_near"], figures["angle_beyond"]
 
 
@@ -154,6 +155,26 @@ def test_slivers_are_counted() -> None:
     figures = metrics.compare_triangles(mesh)
     assert figures["slivers"] == 0.25
     assert figures["min_angle"] == pytest.approx(np.degrees(np.arctan2(0.01, 0.5)))
+
+
+@pytest.mark.parametrize("size", [1.0, 0.2, 0.03, 0.001])
+def test_edge_points_are_those_with_an_edge_among_their_nearest(size: float) -> None:
+    """By the definition, for all points. The smaller the box, the more have too many neighbours."""
+    drawn = metrics.sample_surface(Mesh(cube().vertices * size, CUBE_FACES), SEED, 5000)
+    index = np.arange(len(drawn.points))
+    among_all = edges.edge_among_nearest(drawn, index)
+    np.testing.assert_array_equal(edges.edge_points(drawn), drawn.points[among_all])
+    assert among_all.any()
+
+
+def test_crowded_points_are_told_from_others() -> None:
+    """A box of which some points have more neighbours than are examined, and others fewer."""
+    drawn = metrics.sample_surface(Mesh(cube().vertices * 0.027, CUBE_FACES), SEED, 5000)
+    around = drawn.tree.query_ball_point(drawn.points, edges.EDGE_RADIUS, return_length=True)
+    assert around.min() < edges.EDGE_NEIGHBOURS < around.max()
+    assert around.sum() <= edges.EDGE_NEIGHBOURS * len(drawn.points)
+    among_all = edges.edge_among_nearest(drawn, np.arange(len(drawn.points)))
+    np.testing.assert_array_equal(edges.edge_points(drawn), drawn.points[among_all])
 
 
 def test_without_a_grid_nothing_is_measured_in_voxels() -> None:

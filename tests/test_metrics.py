@@ -14,6 +14,16 @@ from super_sdf.truth.solid import Solid
 N = metrics.SAMPLE_COUNT
 
 
+def distances(
+    reference: Mesh, result: Mesh, drawn: metrics.SurfacePoints, result_drawn: metrics.SurfacePoints
+) -> metrics.Numbers:
+    """Return the figures of the distances between two meshes, at points drawn from both."""
+    there = metrics.distance_or_dot(Solid(result), drawn.points)
+    return metrics.compare_distances(
+        there, metrics.distance_or_dot(Solid(reference), result_drawn.points)
+    )
+
+
 def test_two_samplings_of_a_square_show_the_floor() -> None:
     drawn = [metrics.sample_surface(square(), (7, stream)) for stream in range(2)]
     figures = metrics.compare_samples(*drawn)
@@ -38,7 +48,7 @@ def test_samples_are_uniform_in_area_and_lie_on_the_surface() -> None:
 def test_parallel_planes(gap: float) -> None:
     low, high = square(), square(gap)
     drawn = metrics.sample_surface(low, (7, 0)), metrics.sample_surface(high, (7, 1))
-    exact = metrics.compare_surfaces(Solid(low), Solid(high), *drawn)
+    exact = distances(low, high, *drawn)
     for key in ("p2s", "p2s_there", "p2s_back", "p99", "max"):
         assert exact[key] == pytest.approx(gap)
     sampled = metrics.compare_samples(*drawn)
@@ -56,6 +66,21 @@ def test_a_shape_inside_out_has_opposite_normals() -> None:
     assert figures["signed_nc"] == pytest.approx(-1, abs=0.001)
 
 
+@pytest.mark.parametrize(
+    ("faces", "expected"),
+    [
+        ([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]], 0),  # a tetrahedron
+        ([[0, 1, 2], [0, 3, 1], [1, 3, 2]], 3 * 2),  # open: each edge counts in both directions
+        ([[0, 1, 2], [0, 2, 1]], 0),
+        ([[0, 1, 2], [0, 1, 2]], 3 + 3 * 2),  # used twice, and without a partner
+        ([[0, 0, 1]], 1),  # a point; the edge from 0 to 1 is used once in each direction
+    ],
+)
+def test_open_edges_are_counted(faces: list[list[int]], expected: int) -> None:
+    mesh = Mesh(np.zeros((4, 3)), np.array(faces, np.int32))
+    assert mesh.open_edges() == expected and mesh.is_closed() == (expected == 0)
+
+
 def test_an_empty_result_is_a_dot_at_the_origin() -> None:
     drawn = metrics.sample_surface(cube(), (7, 0))
     dot = metrics.sample_surface(EMPTY, (7, 1))
@@ -64,9 +89,31 @@ def test_an_empty_result_is_a_dot_at_the_origin() -> None:
     mean_square = np.mean(np.sum(drawn.points**2, axis=1))
     assert figures["cd"] == pytest.approx(mean_square + 0.25, rel=1e-3)
     assert (figures["f1"], figures["nc"], figures["signed_nc"]) == (0, 0.5, 0)
-    exact = metrics.compare_surfaces(Solid(cube()), Solid(EMPTY), drawn, dot)
+    exact = distances(cube(), EMPTY, drawn, dot)
     assert exact["p2s_back"] == pytest.approx(0.5)
     assert not EMPTY.is_closed() and EMPTY.volume() == 0
+
+
+def test_an_order_in_space_keeps_the_points_and_brings_neighbours_together() -> None:
+    drawn = metrics.sample_surface(sphere(), (7, 0))
+    ordered = drawn.ordered()
+    order = metrics.order_in_space(drawn.points)
+    np.testing.assert_array_equal(np.sort(order), np.arange(N))
+    np.testing.assert_array_equal(ordered.points, drawn.points[order])
+    np.testing.assert_array_equal(ordered.normals, drawn.normals[order])
+    steps = [np.linalg.norm(np.diff(p.points, axis=0), axis=1).mean() for p in (drawn, ordered)]
+    assert steps[1] < steps[0] / 20
+    assert not len(metrics.order_in_space(np.zeros((0, 3))))
+
+
+def test_one_search_gives_both_distances_and_triangles() -> None:
+    points = np.random.default_rng(7).normal(size=(100, 3))
+    distances, faces = metrics.nearest_or_dot(Solid(cube()), points)
+    np.testing.assert_array_equal(distances, Solid(cube()).distance(points))
+    np.testing.assert_array_equal(faces, Solid(cube()).nearest_face(points))
+    radii, none = metrics.nearest_or_dot(Solid(EMPTY), points)
+    np.testing.assert_allclose(radii**2, (points**2).sum(1))
+    assert set(none) == {-1}
 
 
 def test_the_frame() -> None:

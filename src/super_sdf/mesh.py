@@ -58,9 +58,9 @@ class Mesh:
         end = np.roll(self.faces, -1, axis=1).ravel().astype(np.int64)
         size = len(self.vertices)
         forward, times = np.unique(start * size + end, return_counts=True)
-        backward = np.unique(end * size + start)
-        points = int((start == end).sum())
-        return points + int((times > 1).sum()) + len(np.setxor1d(forward, backward))
+        backward = forward % size * size + forward // size
+        unpaired = np.setxor1d(forward, backward, assume_unique=True)
+        return int((start == end).sum()) + int((times > 1).sum()) + len(unpaired)
 
     def is_closed(self) -> bool:
         """Return whether there are faces and no edge is open."""

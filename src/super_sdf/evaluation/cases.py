@@ -89,7 +89,7 @@ class Shape:
         self.solid = Solid(metrics.normalise(mesh))
         self.mesh = self.solid.mesh
         self.notes: Sequence[str] = ()
-        self.drawn = metrics.sample_surface(self.mesh, self.seed(REFERENCE_POINTS))
+        self.drawn = metrics.sample_surface(self.mesh, self.seed(REFERENCE_POINTS)).ordered()
         self.sharp = EdgeCurves.of(self.mesh, self.seed(REFERENCE_EDGES))
 
     @classmethod

@@ -16,18 +16,20 @@ import igl
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..arrays import IntArray
+from ..arrays import BoolArray, IntArray
 from ..mesh import Mesh
 from ..truth.solid import Distances, Points, Solid
 from .metrics import (
     DOT,
     SAMPLE_COUNT,
+    Indices,
     Numbers,
     SurfacePoints,
     distance_or_dot,
     draw_index,
     face_vectors,
     harmonic_mean,
+    order_in_space,
 )
 
 EDGE_DISTANCE = 0.005
@@ -50,7 +52,7 @@ class EdgeCurves:
     vertices, edges : (n, 3) float, (e, 2) int
         Vertices of the mesh, and the two ends of each sharp edge.
     drawn : (m, 3) float
-        Points sampled uniformly by length; none without edges.
+        Points sampled uniformly by length, in the order of ``order_in_space``; none without edges.
     """
 
     vertices: Points
@@ -61,7 +63,8 @@ class EdgeCurves:
     def of(cls, mesh: Mesh, seed: tuple[int, int]) -> EdgeCurves:
         """Return the sharp edges of a mesh."""
         edges = sharp_edges(mesh)
-        return cls(mesh.vertices, edges, sample_edges(mesh.vertices, edges, seed))
+        drawn = sample_edges(mesh.vertices, edges, seed)
+        return cls(mesh.vertices, edges, drawn[order_in_space(drawn)])
 
     def distance(self, points: Points) -> Distances:
         """Return the distance of points (k, 3) to the nearest edge, (k,).
@@ -110,14 +113,31 @@ def edge_points(drawn: SurfacePoints) -> Points:
     more than the angle of `sharp_edges`, whatever its sign: the two sides of a thin sheet are no
     edge.
     """
-    points, normals = drawn.points, drawn.normals
+    tree, count = drawn.tree, len(drawn.points)
+    found, crowded = np.zeros(count, bool), np.ones(count, bool)
+    if tree.count_neighbors(tree, EDGE_RADIUS) <= EDGE_NEIGHBOURS * count:  # so few pairs fit
+        pairs = tree.query_pairs(EDGE_RADIUS, output_type="ndarray")
+        found[pairs[is_turned(drawn.normals, *pairs.T)]] = True
+        crowded = np.bincount(pairs.ravel(), minlength=count) >= EDGE_NEIGHBOURS
+    found[crowded] = edge_among_nearest(drawn, np.flatnonzero(crowded))
+    return drawn.points[found]
+
+
+def edge_among_nearest(drawn: SurfacePoints, index: Indices) -> BoolArray:
+    """Return which of the points of an index (k,) have an edge among their nearest points, (k,)."""
+    points = drawn.points[index]
+    nearby = drawn.tree.query(points, EDGE_NEIGHBOURS, distance_upper_bound=EDGE_RADIUS)[1]
     # Missing neighbours have the index n; the point itself replaces them, which is no edge.
-    nearby = cKDTree(points).query(points, EDGE_NEIGHBOURS, distance_upper_bound=EDGE_RADIUS)[1]
-    nearby = np.where(nearby == len(points), np.arange(len(points))[:, None], nearby)
-    turned = np.zeros(len(points), bool)
-    for column in nearby.T:
-        turned |= np.abs(np.einsum("nd,nd->n", normals, normals[column])) < SHARP_COSINE
-    return points[turned]
+    nearby = np.where(nearby == len(drawn.points), index[:, None], nearby)
+    columns = [is_turned(drawn.normals, index, column) for column in nearby.T]
+    found: BoolArray = np.any(columns, axis=0)
+    return found
+
+
+def is_turned(normals: Points, one: Indices, other: Indices) -> BoolArray:
+    """Return for pairs (p,) of normals (n, 3) whether they make an edge, whatever their signs."""
+    turned: BoolArray = np.abs(np.einsum("pd,pd->p", normals[one], normals[other])) < SHARP_COSINE
+    return turned
 
 
 def compare_edges(reference: EdgeCurves, result: Points) -> Numbers:
@@ -171,32 +191,31 @@ def compare_in_voxels(
 
 
 def compare_angles(
-    reference: Solid, edges: EdgeCurves, drawn: SurfacePoints, spacing: float
+    reference: Mesh, nearest: Indices, edges: EdgeCurves, drawn: SurfacePoints, spacing: float
 ) -> Numbers:
     """Return the mean angles between the result's normals and the reference's, in degrees.
 
-    The normal of each point drawn from the result is compared with that of the nearest triangle of
-    the reference: "near" for points within a coarse voxel of an edge of the reference, "beyond" for
-    the others. None where there are no such points.
+    The normal of each point drawn from the result is compared with that of the ``nearest`` triangle
+    (n,) of the reference: "near" for points within a coarse voxel of an edge of the reference,
+    "beyond" for the others. None where there are no such points.
     """
     if not drawn.normals.any():
         near_angle = NO_NORMAL_ANGLE if len(edges.edges) else None
         return {"angle_near": near_angle, "angle_beyond": NO_NORMAL_ANGLE}
-    angles = normal_angles(reference, drawn)
+    angles = normal_angles(face_vectors(reference)[nearest], drawn.normals)
     near = np.zeros(len(angles), bool)
     if len(edges.edges):
         near = edges.distance(drawn.points) < spacing
     return {"angle_near": mean_known(angles[near]), "angle_beyond": mean_known(angles[~near])}
 
 
-def normal_angles(reference: Solid, drawn: SurfacePoints) -> Distances:
-    """Return the angle, (n,) in degrees, of each normal to that of the nearest triangle.
+def normal_angles(vectors: Points, normals: Points) -> Distances:
+    """Return the angle, (n,) in degrees, of the vector of each triangle, (n, 3), to a unit normal.
 
-    It is NaN where that triangle has no area and so no normal.
+    It is NaN where the triangle has no area and so no normal.
     """
-    vectors = face_vectors(reference.mesh)[reference.nearest_face(drawn.points)]
     lengths = np.linalg.norm(vectors, axis=1)
-    dot = np.einsum("nd,nd->n", vectors, drawn.normals)
+    dot = np.einsum("nd,nd->n", vectors, normals)
     with np.errstate(invalid="ignore"):
         cosine = np.clip(dot / lengths, -1, 1)
     angles: Distances = np.degrees(np.arccos(cosine))

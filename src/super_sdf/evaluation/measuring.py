@@ -166,12 +166,14 @@ def measure_surface(shape: Shape, mesh: Mesh, spacing: float | None) -> Measurem
 
     ``spacing`` is that of the coarse grid; without one, figures in voxels are None.
     """
-    drawn, result = metrics.sample_surface(mesh, shape.seed(RESULT_POINTS)), Solid(mesh)
+    result, drawn = Solid(mesh), metrics.sample_surface(mesh, shape.seed(RESULT_POINTS)).ordered()
+    there = metrics.distance_or_dot(result, shape.drawn.points)
+    back, nearest = metrics.nearest_or_dot(shape.solid, drawn.points)
     return {
         **metrics.compare_samples(shape.drawn, drawn),
-        **metrics.compare_surfaces(shape.solid, result, shape.drawn, drawn),
+        **metrics.compare_distances(there, back),
         **edges.compare_edges(shape.sharp, edges.edge_points(drawn)),
-        **measure_edges(shape, result, drawn, spacing),
+        **measure_edges(shape, result, drawn, nearest, spacing),
         **metrics.compare_triangles(mesh),
         "closed": mesh.is_closed(),
         "outward": mesh.volume() > 0,
@@ -180,14 +182,21 @@ def measure_surface(shape: Shape, mesh: Mesh, spacing: float | None) -> Measurem
 
 
 def measure_edges(
-    shape: Shape, result: Solid, drawn: metrics.SurfacePoints, spacing: float | None
+    shape: Shape,
+    result: Solid,
+    drawn: metrics.SurfacePoints,
+    nearest: metrics.Indices,
+    spacing: float | None,
 ) -> Measurement:
-    """Return the figures of edges and normals that have the coarse voxel as their unit."""
+    """Return the figures of edges and normals that have the coarse voxel as their unit.
+
+    ``nearest`` are the reference's triangles that are nearest to the points drawn.
+    """
     if spacing is None:
         return dict.fromkeys(VOXEL_NUMBERS)
     return {
         **edges.compare_in_voxels(shape.sharp, result, shape.seed(RESULT_EDGES), spacing),
-        **edges.compare_angles(shape.solid, shape.sharp, drawn, spacing),
+        **edges.compare_angles(shape.mesh, nearest, shape.sharp, drawn, spacing),
     }
 
 

@@ -11,6 +11,7 @@ Chen and Zhang, Neural Marching Cubes (2021): F1 at 0.003.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ F1_DISTANCE = 0.003
 SLIVER_ANGLE = 5.0  # degrees
 
 Numbers = dict[str, float | None]
+Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +34,16 @@ class SurfacePoints:
 
     points: Points
     normals: Points
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """A search tree of the points."""
+        return cKDTree(self.points)
+
+    def ordered(self) -> SurfacePoints:
+        """Return the same points in the order of ``order_in_space``."""
+        order = order_in_space(self.points)
+        return SurfacePoints(self.points[order], self.normals[order])
 
 
 # Stands for a result without a surface; it has no normal.
@@ -67,7 +79,17 @@ def sample_surface(mesh: Mesh, seed: tuple[int, int], count: int = SAMPLE_COUNT)
     return SurfacePoints(points, vectors[face] / lengths[face, None])
 
 
-def draw_index(weights: Distances, uniform: Distances) -> NDArray[np.intp]:
+def order_in_space(points: Points) -> Indices:
+    """Return an order, (n,), of points (n, 3) in which neighbours in space follow one another.
+
+    A search for each of them in this order takes a third of the time that it takes in a random one:
+    what it reads is still in the cache from the one before.
+    """
+    order: Indices = cKDTree(points).indices
+    return order
+
+
+def draw_index(weights: Distances, uniform: Distances) -> Indices:
     """Return indices (n,) drawn in proportion to weights (m,), from numbers in [0, 1), (n,)."""
     cumulative = np.cumsum(weights)
     index = np.searchsorted(cumulative, uniform * cumulative[-1], side="right")
@@ -76,8 +98,8 @@ def draw_index(weights: Distances, uniform: Distances) -> NDArray[np.intp]:
 
 def compare_samples(reference: SurfacePoints, result: SurfacePoints) -> Numbers:
     """Return CD (sum of mean squares), F1, recall and precision at 0.003, NC and signed NC."""
-    there, there_at = cKDTree(result.points).query(reference.points)
-    back, back_at = cKDTree(reference.points).query(result.points)
+    there, there_at = result.tree.query(reference.points)
+    back, back_at = reference.tree.query(result.points)
     there_nc = normal_agreement(reference.normals, result.normals[there_at])
     back_nc = normal_agreement(result.normals, reference.normals[back_at])
     recall, precision = np.mean(there < F1_DISTANCE), np.mean(back < F1_DISTANCE)
@@ -104,16 +126,12 @@ def harmonic_mean(recall: float, precision: float) -> float:
     return float(2 * recall * precision / total) if total > 0 else 0.0
 
 
-def compare_surfaces(
-    reference: Solid, result: Solid, drawn: SurfacePoints, result_drawn: SurfacePoints
-) -> Numbers:
-    """Return exact point-to-triangle distances: mean, 99th percentile and maximum, both ways.
+def compare_distances(there: Distances, back: Distances) -> Numbers:
+    """Return the mean, 99th percentile and maximum of point-to-triangle distances, both ways.
 
-    ``drawn`` is P, ``result_drawn`` Q. "there" is from P to the result's triangles, "back" from Q
-    to the reference's. Figures without a direction are the mean of both, or the larger maximum.
+    ``there`` are those from P to the result's triangles, ``back`` those from Q to the reference's:
+    see ``nearest_or_dot``. Figures without a direction are the mean of both, or the larger maximum.
     """
-    there = distance_or_dot(result, drawn.points)
-    back = distance_or_dot(reference, result_drawn.points)
     mean, p99 = (there.mean(), back.mean()), (np.quantile(there, 0.99), np.quantile(back, 0.99))
     return {
         "p2s": float(sum(mean)) / 2,
@@ -128,16 +146,23 @@ def compare_surfaces(
     }
 
 
-def distance_or_dot(solid: Solid, points: Points) -> Distances:
-    """Return the distances of points to a mesh, (n,), or to the origin if it has no faces."""
+def nearest_or_dot(solid: Solid, points: Points) -> tuple[Distances, Indices]:
+    """Return the distances of points to a mesh, (n,), and their nearest triangles, (n,).
+
+    If it has no faces, the distances are those to the origin, and the triangles -1.
+    """
     if not len(solid.mesh.faces):
-        radii: Distances = np.linalg.norm(points, axis=1)
-        return radii
-    distances = solid.distance(points)
+        return np.linalg.norm(points, axis=1), np.full(len(points), -1)
+    distances, faces, _ = solid.nearest(points)
     if not np.isfinite(distances).all():
         count = np.sum(~np.isfinite(distances))
         raise ValueError(f"{count} point-to-triangle distances are not finite")
-    return distances
+    return distances, faces
+
+
+def distance_or_dot(solid: Solid, points: Points) -> Distances:
+    """Return the distances of ``nearest_or_dot``, (n,)."""
+    return nearest_or_dot(solid, points)[0]
 
 
 def compare_triangles(mesh: Mesh) -> Numbers:
