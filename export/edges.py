@@ -26,8 +26,8 @@ from super_sdf.evaluation.metrics import face_vectors
 from super_sdf.grid.sdf_grid import SdfGrid
 from super_sdf.network.network import Network, load_network
 from super_sdf.pipeline import upsample
-from super_sdf.steps import sharp
 from super_sdf.steps.cap import close_at_border
+from super_sdf.steps.fans import Placed, fan_triangles, flat_triangles, unfolded
 from super_sdf.steps.features import Candidates, Rule, find_candidates, move_beside
 from super_sdf.steps.field import FineField
 from super_sdf.steps.marching import find_crossings, to_world
@@ -94,19 +94,16 @@ Triangles = tuple[np.ndarray, np.ndarray]
 
 def surfaces(patches: Patches, own: Planes, candidates: Candidates) -> tuple[Triangles, Triangles]:
     """Return the triangles of all candidates without a vertex on the edge, and with one."""
-    count = len(own.point)
     chosen = np.zeros(len(patches.row), bool)
     chosen[candidates.patch] = True
-    numbers = sharp.Numbers(np.arange(count), count + np.arange(len(candidates.patch)), 0)
-    patch, faces = sharp.flat_faces(patches, chosen, numbers)
-    flat = patch, own.point[faces]
-    peak_of = np.full(len(patches.row), -1, np.int64)
-    peak_of[candidates.patch] = numbers.of_feature
-    fans = list(sharp.fan_faces(patches, peak_of, candidates.patch, numbers))
+    patch, corners = flat_triangles(patches, chosen)
+    flat = patch, own.point[corners]
     moved = move_beside(patches, own, candidates, np.ones(len(candidates.patch), bool))
-    points = np.concatenate([moved, candidates.vertex])
-    fan_of = np.concatenate([patch for patch, _ in fans])
-    return flat, (fan_of, points[np.concatenate([faces for _, faces in fans])])
+    placed = Placed(moved, candidates.planes.normal, candidates.patch, candidates.vertex)
+    placed = unfolded(patches, placed)
+    points = np.concatenate([placed.position, placed.peak])
+    patches_of, corners_of = zip(*fan_triangles(patches, placed))
+    return flat, (np.concatenate(patches_of), points[np.concatenate(corners_of)])
 
 
 def errors_of(

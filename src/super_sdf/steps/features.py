@@ -5,7 +5,8 @@
 3. ``evidence`` gathers what speaks for an edge there and what against it: flat ground on both
    sides, spheres that touch or are pierced. It is averaged along the chain of candidates, since an
    edge has a length, and weighed by a logistic rule.
-4. Vertices beside the features that are sure are moved onto the settled planes.
+4. Vertices beside the features that are sure are moved onto the settled planes, and those of
+   features that would fold the surface back to the middle of their patch (``fans``).
 
 The rule was fitted by ``export.edges`` on shapes with and without edges, to whether a vertex on the
 edge brings the surface nearer to the true one.
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray
+from .fans import Placed, unfolded
 from .field import FineField, SampleSpheres
 from .patches import Index, Patches, dilate
 from .planes import Planes, settle_planes
@@ -104,8 +106,8 @@ class Candidates:
 
 def place_features(
     patches: Patches, own: Planes, kinked: BoolArray, field: FineField, threads: int = 1
-) -> tuple[Vectors, Index, Vectors]:
-    """Return positions of all crossings, which patches have a feature, and its vertices.
+) -> Placed:
+    """Return the positions of all crossings, which patches have a feature, and its vertices.
 
     Parameters
     ----------
@@ -116,17 +118,14 @@ def place_features(
         The voxels in which a feature may begin.
     field : FineField
     threads : int
-
-    Returns
-    -------
-    (n, 3) float64, (f,) int64, (f, 3) float64
-        Positions; rows of ``patches``; positions of the features' vertices.
     """
     candidates = find_candidates(patches, own, kinked, field, threads)
     score = RULE.score(candidates.evidence)
     kept = score > 0
     position = move_beside(patches, own, candidates, score > SURE)
-    return position, candidates.patch[kept], candidates.vertex[kept]
+    normal = candidates.planes.normal
+    placed = Placed(position, normal, candidates.patch[kept], candidates.vertex[kept])
+    return unfolded(patches, placed)
 
 
 def find_candidates(

@@ -12,6 +12,7 @@ In steps:
     planes      gives each crossing the plane of its face, not rounded off as the field is at edges
     wedges      meets these planes, and moves the point so that it agrees with the samples' spheres
     features    tells edges from rounded ground, and moves the vertices beside them
+    fans        joins the vertices to triangles
 
 Reference: Kobbelt, Botsch, Schwanecke and Seidel, "Feature Sensitive Surface Extraction from Volume
 Data", 2001.
@@ -21,7 +22,6 @@ Positions are in fine spacings, from node (0, 0, 0) of the fine lattice.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,8 +32,8 @@ from ..arrays import BoolArray, IntArray
 from ..grid.sdf_grid import SdfGrid
 from ..machine.index_width import check_count
 from ..mesh import CLEARANCE, Mesh, vertex_type
-from .cell_cases import loop_table
 from .features import CHAIN_ROUNDS, MOVED_RINGS, RINGS, place_features
+from .fans import Placed, triangles_of
 from .field import FineField
 from .kinks import beside, voxels_near_kinks
 from .marching import (
@@ -49,8 +49,9 @@ from .patches import Index, Patches, find_patches, nth_of_row
 from .planes import ROUNDS, planes_at_crossings
 from .vectors import Vectors
 
-# Cells to every side that a vertex depends on: gradients reach 2 cells and a patch is 1 wide.
-REACH_IN_CELLS = RINGS + ROUNDS + CHAIN_ROUNDS + MOVED_RINGS + 4
+# Cells to every side that a vertex depends on: gradients reach 2 cells, a patch is 1 wide, and so
+# is the fan beside.
+REACH_IN_CELLS = RINGS + ROUNDS + CHAIN_ROUNDS + MOVED_RINGS + 5
 REACH_IN_VOXELS = 2  # further: whether a voxel is examined depends on those beside it
 
 
@@ -90,20 +91,14 @@ class Examined:
         Their patches; ``crossing`` counts among ``used``.
     used : (m,) int64
         The crossings of these patches.
-    position : (m, 3) float64
-        Where their vertices belong.
-    features : (f,) int64
-        The patches with an edge or a corner.
-    peak : (f, 3) float64
-        The vertices on these.
+    placed : Placed
+        Where the vertices on these crossings and on the features belong.
     """
 
     voxels: BoolArray
     patches: Patches
     used: Index
-    position: Vectors
-    features: Index
-    peak: Vectors
+    placed: Placed
 
 
 def examine(field: FineField, crossings: Crossings, rows: slice, threads: int = 1) -> Examined:
@@ -113,10 +108,10 @@ def examine(field: FineField, crossings: Crossings, rows: slice, threads: int = 
     voxels &= within(np.arange(len(voxels)), rows)
     patches, used = find_patches(field, crossings, voxels)
     own = planes_at_crossings(field, crossings, used, threads)
-    position, features, peak = place_features(patches, own, kinked, field, threads)
-    position = _kept_in_grid(position, own.point, field)
-    peak = _kept_in_grid(peak, patches.low[features] + 0.5, field)
-    return Examined(voxels, patches, used, position, features, peak)
+    placed = place_features(patches, own, kinked, field, threads)
+    position = _kept_in_grid(placed.position, own.point, field)
+    peak = _kept_in_grid(placed.peak, patches.low[placed.feature] + 0.5, field)
+    return Examined(voxels, patches, used, replace(placed, position=position, peak=peak))
 
 
 def _kept_in_grid(position: Vectors, start: Vectors, field: FineField) -> Vectors:
@@ -165,7 +160,7 @@ def _number_vertices(
     field: FineField, crossings: Crossings, examined: Examined, first_vertex: int
 ) -> Numbers:
     """Number the vertices: the first of the field's own voxels is ``first_vertex``."""
-    count, row = len(field.voxel_ijk) + 1, examined.patches.row[examined.features]
+    count, row = len(field.voxel_ijk) + 1, examined.patches.row[examined.placed.feature]
     edges = np.bincount(crossings.own_row, minlength=count)
     peaks = np.bincount(row, minlength=count)
     before = np.cumsum(edges + peaks) - edges - peaks
@@ -189,10 +184,10 @@ def _vertices(
     mine = crossings.own(field.own_rows)
     plain = lattice_positions(field, crossings.own_row[mine], crossings.own_edge[mine]).T
     vertices[numbers.of_crossing[mine] - first_vertex] = plain
-    used, patches = examined.used, examined.patches
+    used, placed = examined.used, examined.placed
     for row, number, position in (
-        (crossings.own_row[used], numbers.of_crossing[used], examined.position),
-        (patches.row[examined.features], numbers.of_feature, examined.peak),
+        (crossings.own_row[used], numbers.of_crossing[used], placed.position),
+        (examined.patches.row[placed.feature], numbers.of_feature, placed.peak),
     ):
         core = within(row, field.own_rows)
         vertices[number[core] - first_vertex] = position[core]
@@ -216,8 +211,8 @@ def _faces(
     plain = ~examined.voxels[crossings.cell_row]
     cells = (crossings.cell_row[plain], crossings.cell[plain], crossings.case[plain])
     smooth = replace(crossings, cell_row=cells[0], cell=cells[1], case=cells[2])
-    used = replace(numbers, of_crossing=numbers.of_crossing[examined.used])
-    patch, faces = examined_faces(examined.patches, examined.features, used)
+    patch, corners = triangles_of(examined.patches, examined.placed)
+    faces = np.concatenate([numbers.of_crossing[examined.used], numbers.of_feature])[corners]
     row = examined.patches.row[patch]
     parts = [NO_FACES]
     for plane in range(*field.planes):
@@ -227,74 +222,3 @@ def _faces(
             start, stop = np.searchsorted(row, [rows.start, rows.stop])
             parts.append(faces[start:stop].astype(np.int32))
     return np.concatenate(parts)
-
-
-def examined_faces(patches: Patches, features: Index, numbers: Numbers) -> Triangles:
-    """Return the triangles of all patches, in their order."""
-    peak_of = np.full(len(patches.row), -1, np.int64)
-    peak_of[features] = numbers.of_feature
-    parts = [
-        flat_faces(patches, peak_of < 0, numbers),
-        *fan_faces(patches, peak_of, features, numbers),
-    ]
-    patch = np.concatenate([rows for rows, _ in parts])
-    faces = np.concatenate([triangles for _, triangles in parts])
-    order = np.argsort(patch, kind="stable")
-    return patch[order], faces[order]
-
-
-Triangles = tuple[Index, Index]
-"""Patches (t,), and the numbers of the corners of a triangle of each, (t, 3)."""
-
-
-def flat_faces(patches: Patches, chosen: BoolArray, numbers: Numbers) -> Triangles:
-    """Return the triangles of patches without a feature: those of marching cubes."""
-    rows = np.flatnonzero(chosen)
-    patch = np.repeat(rows, patches.sides[rows] - 2)
-    nth = nth_of_row(patch, np.bincount(patch, minlength=len(chosen)))
-    corners = loop_table().triangles[patches.loop[patch], nth]
-    crossing = np.take_along_axis(patches.crossing[patch], corners, 1)
-    return patch, numbers.of_crossing[crossing]
-
-
-def fan_faces(
-    patches: Patches, peak_of: Index, features: Index, numbers: Numbers
-) -> Iterator[Triangles]:
-    """Yield the triangles of patches with a feature: fans, and pairs across turned sides."""
-    patch = np.repeat(features, patches.sides[features])
-    nth = nth_of_row(patch, np.bincount(patch, minlength=len(peak_of)))
-    start = patches.crossing[patch, nth]
-    end = patches.crossing[patch, (nth + 1) % patches.sides[patch]]
-    one, other = _shared_sides(start, end, peak_of[patch])
-    kept = np.ones(len(patch), bool)
-    kept[one] = kept[other] = False
-    corners = [numbers.of_crossing[start], numbers.of_crossing[end], peak_of[patch]]
-    yield patch[kept], np.stack(corners, 1)[kept]
-    a, b, peak, beyond = (
-        corners[0][other],
-        corners[1][other],
-        peak_of[patch[other]],
-        peak_of[patch[one]],
-    )
-    yield patch[other], np.stack([a, beyond, peak], 1)
-    yield patch[other], np.stack([b, peak, beyond], 1)
-
-
-def _shared_sides(start: Index, end: Index, peak: Index) -> tuple[Index, Index]:
-    """Return the sides that two fans share, as rows of the earlier and of the later one.
-
-    Two fans that share two sides, across an ambiguous face, keep both: turned, their vertices would
-    be joined twice.
-    """
-    size = int(max(start.max(initial=0), end.max(initial=0))) + 1
-    key, reverse = start * size + end, end * size + start
-    order = np.argsort(key)
-    partner = (
-        order[np.minimum(np.searchsorted(key[order], reverse), len(key) - 1)] if len(key) else key
-    )
-    one = np.flatnonzero((key[partner] == reverse) & (np.arange(len(key)) < partner))
-    other = partner[one]
-    joined = peak[one] * (int(peak.max(initial=0)) + 1) + peak[other]
-    _, index, times = np.unique(joined, return_inverse=True, return_counts=True)
-    once = times[index] == 1
-    return one[once], other[once]
