@@ -62,4 +62,11 @@ def test_both_have_the_same_border(peak: list[float]) -> None:
     _, triangles = triangles_of(TWO, placed([0.5, 0.5, 0], peak))
     edges = edges_of(triangles)
     assert len(triangles) == 8
-    assert {e for e in edges if e[::-1] not in edges} == {(0, 1), (1, 4), (4, 5), (5, 2), (2, 3), (3, 0)}
+    assert {e for e in edges if e[::-1] not in edges} == {
+        (0, 1),
+        (1, 4),
+        (4, 5),
+        (5, 2),
+        (2, 3),
+        (3, 0),
+    }

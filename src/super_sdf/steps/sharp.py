@@ -32,8 +32,8 @@ from ..arrays import BoolArray, IntArray
 from ..grid.sdf_grid import SdfGrid
 from ..machine.index_width import check_count
 from ..mesh import CLEARANCE, Mesh, vertex_type
-from .features import CHAIN_ROUNDS, MOVED_RINGS, RINGS, place_features
 from .fans import Placed, triangles_of
+from .features import CHAIN_ROUNDS, MOVED_RINGS, RINGS, place_features
 from .field import FineField
 from .kinks import beside, voxels_near_kinks
 from .marching import (
