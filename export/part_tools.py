@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from manifold3d import CrossSection, Manifold
+from manifold3d import CrossSection, JoinType, Manifold
 
 SEGMENTS = 192  # of a circle: facets meet at 2 degrees, which tells little from a smooth surface
 OVERLAP = 0.01  # a tool starts that far outside the part
@@ -42,6 +42,6 @@ def upright(solid: Manifold) -> Manifold:
 
 
 def filled(outline: CrossSection, radius: float) -> CrossSection:
-    """Return an outline with fillets in its inner corners."""
-    grown = outline.offset(radius, circular_segments=SEGMENTS)
+    """Return an outline with fillets in its inner corners; the outer ones stay as they are."""
+    grown = outline.offset(radius, JoinType.Miter)
     return grown.offset(-radius, circular_segments=SEGMENTS)

@@ -12,9 +12,9 @@ from manifold3d import CrossSection, Manifold
 
 from export.part_tools import OVERLAP, SEGMENTS, disc, drill, filled, through, upright
 from export.shapes.draws import joined
-from export.shapes.edges import CHAMFER, slab, smooth
+from export.shapes.edges import CHAMFER, SIMPLIFIED, can_move, slab, smooth
 
-FINER = 10  # ``slab`` simplifies outlines by 3e-4: a tenth of that is left when drawn this larger
+FINER = 10  # ``slab`` simplifies outlines: a tenth of that is left when they are drawn this larger
 QUARTER = np.linspace(0, np.pi / 2, SEGMENTS // 8 + 1)
 ROUND = np.stack([1 - np.cos(QUARTER), np.sin(QUARTER)], axis=1)  # as in ``edges``, but smoother
 
@@ -33,8 +33,17 @@ def treated(rng: np.random.Generator, outline: CrossSection, height: float) -> M
 def fine_slab(
     outline: CrossSection, height: float, edge: np.ndarray, size: float, foot: int
 ) -> Manifold:
-    """Extrude an outline as ``slab`` does, its curves simplified less."""
-    drawn = slab(outline.scale([FINER, FINER]), FINER * height, edge, FINER * size, foot)
+    """Extrude an outline as ``slab`` does, its curves simplified less.
+
+    Raises
+    ------
+    ValueError
+        If the edge does not fit: ``slab`` would make it smaller than a grid resolves.
+    """
+    wide = outline.scale([FINER, FINER]).simplify(SIMPLIFIED)
+    if not can_move(wide, FINER * size):
+        raise ValueError(f"an edge of {size:.3g} does not fit the outline")
+    drawn = slab(wide, FINER * height, edge, FINER * size, foot)
     return drawn.scale([1 / FINER] * 3)
 
 
@@ -44,7 +53,7 @@ def housing(rng: np.random.Generator) -> Manifold:
     half = eye + rng.uniform(2.9, 3.2)
     waist = rectangle(2 * eye, height, 0, height / 2)
     side = filled(rectangle(2 * half, foot, 0, foot / 2) + waist + disc(eye, 0, height), 0.7)
-    solid = upright(treated(rng, side, rng.uniform(2.6, 3.4)))
+    solid = upright(side.extrude(rng.uniform(2.6, 3.4)))
     bore = upright(through(rng.uniform(0.7, eye - 1), 5, 0)).translate([0, 0, height])
     holes = [drill(0.6, 3).translate([x, 0, foot]) for x in (1.5 - half, half - 1.5)]
     return solid - bore - joined(holes)
@@ -113,7 +122,7 @@ def slide(rng: np.random.Generator) -> Manifold:
     section += rectangle(wide / 2 + 2.4, 1.1, wide / 4 + 1.2, 0.55)
     body = filled(section, rng.uniform(0.65, 0.8))
     body -= groove(rng, rng.uniform(1.1, 1.3)).translate([0, height])
-    solid = upright(treated(rng, body, 9))
+    solid = upright(body.extrude(9))
     corners = [[0, 0], [1.6, 0], [0, height - 1.5]]
     rib = upright(CrossSection([np.array(corners)]).extrude(rng.uniform(1, 1.2)))
     solid += rib.translate([wide / 2 - OVERLAP, 0, 1.1 - OVERLAP])

@@ -21,6 +21,7 @@ from export.shapes.draws import (
 
 QUARTER = np.linspace(0, np.pi / 2, 7)
 ROUND = np.stack([1 - np.cos(QUARTER), np.sin(QUARTER)], axis=1)  # inset and rise, from the wall on
+SIMPLIFIED = 3e-4  # by which the outline of a slab is simplified
 CHAMFER = np.array([[0.0, 0.0], [1.0, 1.0]])
 
 
@@ -73,7 +74,7 @@ def slab(
     """
     if outline.is_empty():
         return Manifold()
-    outline, size = outline.simplify(3e-4), min(size, 0.45 * height / steep)
+    outline, size = outline.simplify(SIMPLIFIED), min(size, 0.45 * height / steep)
     while size > 1e-3 and not (can_move(outline, size) and can_move(outline, min(foot, 0) * size)):
         size *= 0.7
     if size <= 1e-3:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from manifold3d import CrossSection, Manifold
 
-from export import part_tools, parts
+from export import part_tools, parts, usual_parts
+from export.shapes.edges import CHAMFER
 from export.shapes.families import FAMILIES
 from export.tests.test_shapes import check_closed, check_size
 from super_sdf import Mesh
@@ -100,3 +101,16 @@ def test_the_command_writes_fine_parts_when_asked(tmp_path: Path) -> None:
 def test_parts_of_a_kind_differ() -> None:
     volumes = {round(parts.draw_part(number)[1].volume(), 6) for number in range(parts.COUNT)}
     assert len(volumes) == parts.COUNT
+
+
+def test_an_edge_that_does_not_fit_its_outline_is_refused() -> None:
+    outline = CrossSection.square([1.0, 4.0], True)
+    with pytest.raises(ValueError, match=r"^an edge of 0\.6 does not fit the outline$"):
+        usual_parts.fine_slab(outline, 2.0, CHAMFER, 0.6, 0)
+
+
+def test_fillets_leave_outer_corners_as_they_are() -> None:
+    outline = CrossSection.square([4.0, 1.0], True) + CrossSection.square([1.0, 4.0], True)
+    corners = np.concatenate(part_tools.filled(outline, 0.5).to_polygons())
+    outer = np.array([[2, 0.5], [0.5, 2]])
+    assert np.isclose(corners[:, None], outer).all(-1).any(0).all()
