@@ -39,6 +39,7 @@ SIZES = (24, 32, 32, 48)  # drawn from, samples along an axis
 FACTOR = 4
 DISTANCE, TURN = 0.01, 0.05  # gains that count alike: coarse voxels, and 1 - cosine of normals
 MOST = 5.0  # such gains that one candidate counts for
+MOST_OF_SHAPE = 2000  # candidates that one shape counts for
 AT = np.array([[0.6, 0.2, 0.2], [0.2, 0.6, 0.2], [0.2, 0.2, 0.6]])  # points of a triangle
 PENALTY = 1.0  # of the squares of the weights of the standardised evidence
 STEPS = 30  # of Newton's method
@@ -159,11 +160,13 @@ def usable(
 def fit_rule(rows: Rows, bias: float = 0.0) -> Rule:
     """Return the logistic regression of which surface is better on the evidence.
 
-    A candidate weighs by how much is gained or lost. ``bias`` is added to the scores: what is
+    A candidate weighs by how much is gained or lost, and less where its shape has many more than
+    others. ``bias`` is added to the scores: what is
     under 0 keeps marching cubes where the two are close.
     """
     gain = rows.gain @ (1 / np.array([DISTANCE, TURN]))
     weight = np.minimum(np.abs(gain), MOST)
+    weight *= np.minimum(1, MOST_OF_SHAPE / np.bincount(rows.shape)[rows.shape])
     mean, spread = rows.evidence.mean(0), np.maximum(rows.evidence.std(0), 1e-9)
     design = np.c_[np.ones(len(gain)), (rows.evidence - mean) / spread]
     found = np.zeros(design.shape[1])

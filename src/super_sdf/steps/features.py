@@ -41,7 +41,7 @@ from .wedges import (
 SHARP_COSINE = 0.85  # normals of a patch that differ by more, 32 degrees, may make a feature
 LEAST_SLOPE_TRUST = 0.02  # of every crossing of a feature
 RINGS = 3  # patches round a candidate, counted from it, in which planes are settled
-CHAIN_ROUNDS = 4  # in each, a candidate takes the mean of those it shares a crossing with
+CHAIN_ROUNDS = 8  # in each, a candidate takes the mean of those it shares a crossing with
 SURE = 0.5  # score of a feature from which vertices beside it are moved
 MOVED_RINGS = 3  # round a feature, in which vertices may be moved onto the planes: all of them ...
 FADING, FADED_OUT = 1.0, 2.5  # ... up to a distance in fine spacings, none from another on
@@ -73,8 +73,8 @@ class Rule:
 
 
 RULE = Rule(
-    0.820,
-    (0.077, 0.815, -80.34, -4.073, -0.487, 0.951, -8.985, -1.403, -0.494, -0.181, -0.451),
+    0.979,
+    (0.083, 0.940, -88.25, -2.820, -0.340, 0.900, -10.76, -1.843, -1.684, -0.226, -0.253),
     least_touched=0.1,
 )
 
