@@ -640,8 +640,16 @@ def test_every_mesher_has_rows_of_ours_and_of_its_bound(meshes, tmp_path, monkey
             "bound: true distance at the nodes",
         )
     ]
-    assert rows[0].endswith("| 0.510 | 0.001 | 10.00 | 0.001 | 0.001 | 0.001 | 0.00 | 0.00 | "
-                               "4 | 0.10 | 0.00 | 2 of 2 |")  # fmt: skip
+    assert rows[0].endswith("| 0.510 | 0.001 | 10.00 | 10.00 | 0.001 | 0.001 | 0.001 | 0.00 | "
+                               "0.00 | 4 | 0.10 | 0.00 | 2 of 2 |")  # fmt: skip
+
+
+def test_coarser_lattices_and_fewer_triangles_are_measured_at_the_smallest_size(meshes):
+    asked = Scope(find_meshes([meshes]), sizes=(64, 32), experiments=("meshers",))
+    measured = {(task.setting.size, task.setting.factor): task.methods for task in asked.tasks()}
+    assert {key for key in measured if key[0]} == {(32, 1), (32, 2), (32, 4), (64, 4)}
+    assert "ours-sharp/4" in measured[32, 4]
+    assert "ours-sharp/4" not in measured[64, 4]
 
 
 def test_edges_have_a_table_for_each_size(meshes, tmp_path):

@@ -19,14 +19,35 @@ from .names import (
     simplified,
 )
 from .results import Results
-from .scope import BASE_SIZE, FACTORS, MESHER_FACTORS, NOISES, PASSES, SCALES, SIMPLIFIED_FACTOR
-from .tables import BACK, CD, EDGES, F1, NC, SHORT, gap_closed, markdown, mean_of, mean_row, percent
+from .scope import (
+    BASE_SIZE,
+    FACTORS,
+    NOISES,
+    PASSES,
+    SCALES,
+    SIMPLIFIED_FACTOR,
+    mesher_settings,
+)
+from .tables import (
+    BACK,
+    CD,
+    EDGES,
+    F1,
+    NC,
+    SHORT,
+    THERE,
+    gap_closed,
+    markdown,
+    mean_of,
+    mean_row,
+    percent,
+)
 from .timing import RUNS, describe_machine
 
 MESHER_LINES = """\
 With factor 1 the field is refined by 4, but meshed at the corners of the voxels only. 1/4 and 1/16:
-simplified to that share of the triangles."""
-MESHER_COLUMNS = (F1, NC, BACK, *EDGES)
+simplified to that share of the triangles. These, and other factors than 4, at the smallest size."""
+MESHER_COLUMNS = (F1, NC, THERE, BACK, *EDGES)
 
 
 def factor_section(results: Results) -> str:
@@ -102,11 +123,12 @@ def scale_section(results: Results) -> str:
 def mesher_section(results: Results) -> str:
     """Return the section on the meshers, with our field and with the true one (the bound)."""
     paths, rows = results.scope.experiment_paths(), []
-    for size, factor in product(results.scope.sizes, MESHER_FACTORS):
+    sizes = results.scope.sizes
+    for size, factor in mesher_settings(sizes):
         for mesher, method in product(MESHERS, MESHED):
             name = meshed_by(method, mesher)
             names = {name: LABELS[method]}
-            if method == OURS and factor == SIMPLIFIED_FACTOR:
+            if method == OURS and (size, factor) == (min(sizes), SIMPLIFIED_FACTOR):
                 names |= {simplified(name, n): f"{LABELS[OURS]}, 1/{n}" for n in SHARES}
             for each, label in names.items():
                 measured = results.rows(Setting(size, factor), each, paths)

@@ -31,7 +31,7 @@ NOISES = (0.0, 0.2, 0.5, 1.0)
 PASSES = (1, 2)
 SCALES = (0.25, 0.5, 0.75)
 MESHER_FACTORS = (1, 2, 4)  # every mesher; with 1 the field is refined, but the lattice is coarse
-SIMPLIFIED_FACTOR = 4  # at which meshes are simplified
+SIMPLIFIED_FACTOR = 4  # at which meshes are simplified, and every size is measured
 
 MethodsIn = tuple[Setting, tuple[str, ...]]
 """A setting, and the methods that are measured in it."""
@@ -164,11 +164,21 @@ def experiment(name: str, sizes: Sequence[int]) -> list[MethodsIn]:
         return [(Setting(n, scale=s), ("mc", *refined)) for n in sizes for s in SCALES]
     if name == "meshers":
         methods = tuple(meshed_by(method, mesher) for mesher in MESHERS for method in MESHED)
-        pairs = [(Setting(n, factor), methods) for n in sizes for factor in MESHER_FACTORS]
-        return pairs + [(Setting(n, SIMPLIFIED_FACTOR), tuple(SIMPLIFIED)) for n in sizes]
+        pairs = [(Setting(n, factor), methods) for n, factor in mesher_settings(sizes)]
+        return [*pairs, (Setting(min(sizes), SIMPLIFIED_FACTOR), tuple(SIMPLIFIED))]
     if name == "timings":
         return []
     raise OptionError(f"experiment is {name!r}: give one of {', '.join(EXPERIMENTS)}")
+
+
+def mesher_settings(sizes: Sequence[int]) -> list[tuple[int, int]]:
+    """Return the sizes and factors at which meshers are compared.
+
+    Coarser lattices, and simplified meshes, at the smallest size only: there a mesh has the fewest
+    triangles to spare.
+    """
+    coarser = [(min(sizes), factor) for factor in MESHER_FACTORS if factor != SIMPLIFIED_FACTOR]
+    return coarser + [(size, SIMPLIFIED_FACTOR) for size in sorted(sizes)]
 
 
 def with_matched(peer: str) -> tuple[str, ...]:

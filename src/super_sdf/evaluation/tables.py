@@ -31,12 +31,13 @@ class Column:
 
 CD, F1, NC = Column("CD x1e5", "cd", 1e5), Column("F1", "f1"), Column("NC", "nc")
 P2S = Column("p2s x1e4", "p2s", 1e4, 2)
+THERE = Column("ref to res", "p2s_there", 1e4, 2)
 BACK = Column("res to ref", "p2s_back", 1e4, 2)
 EF1 = Column("EF1", "ef1")
 TRIANGLES = Column("triangles", "faces", 1, 0)
 SURFACE = (
     *(CD, Column("excess CD x1e5", "excess_cd", 1e5), F1, NC, Column("signed NC", "signed_nc")),
-    *(P2S, Column("ref to res", "p2s_there", 1e4, 2), BACK),
+    *(P2S, THERE, BACK),
     *(Column("p99 x1e4", "p99", 1e4, 1), Column("max x1e4", "max", 1e4, 0)),
     *(Column("ECD x1e5", "ecd", 1e5, 2), EF1),
     *(Column("field MSE x1e6", "field_mse", 1e6), Column("field MAE x1e4", "field_mae", 1e4, 2)),
