@@ -7,7 +7,7 @@ import numpy as np
 from ..machine.threads import CHUNK, rows_in_chunk
 from ..steps.marching import LOOKUP_BYTES, lookups_at_once
 from ..steps.mesher_names import DEFAULT_MESHER, MARCHING, SHARP
-from ..steps.meshers import BY_NAME, GROUPS_AT_ONCE, count_groups
+from ..steps.meshers import BY_NAME, count_groups, groups_at_once
 from ..steps.survey import Band
 
 # Peak memory of the stages after the network in bytes, measured (``benchmarks.large``,
@@ -92,11 +92,11 @@ def _lookup_bytes(band: Band, planes: Range, decoded: int, factor: int, threads:
 
 def _sharp_bytes(band: Band, planes: Range, decoded: int, factor: int, threads: int) -> int:
     """Return the bytes of the sharp mesher on as many groups as it works on at once."""
+    threads = min(threads, groups_at_once(planes, band.shape))
     groups = count_groups(decoded, planes[1] - planes[0], factor, threads)
     beside = BY_NAME[SHARP].planes_beside(factor) + 1  # the one before owns vertices
     before = band.decoded_before[max(planes[0] - beside, 0) : planes[1] + beside]
     width = min(2 * beside, len(before) - 1)
     around = int((before[width:] - before[: len(before) - width]).max())
     voxels = min(decoded // groups + around, decoded)
-    at_once = min(threads, groups, GROUPS_AT_ONCE)
-    return at_once * voxels * (LOOKUP_BYTES * (factor + 1) ** 3 + SHARP_BYTES * factor)
+    return min(threads, groups) * voxels * (LOOKUP_BYTES * (factor + 1) ** 3 + SHARP_BYTES * factor)

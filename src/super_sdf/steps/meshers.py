@@ -62,6 +62,7 @@ def extract_sharp_pieces(
     field: FineField, grid: SdfGrid, first_vertex: int = 0, threads: int = 1
 ) -> list[Mesh]:
     """Return the mesh with edges and corners, group by group of the field's own planes."""
+    threads = min(threads, groups_at_once(field.planes, field.shape))
     groups = groups_of_planes(field, threads)
     if len(groups) == 1:
         return sharp.extract_sharp_pieces(field, grid, first_vertex, threads)
@@ -69,8 +70,13 @@ def extract_sharp_pieces(
     def mesh_of(planes: Planes) -> list[Mesh]:
         return sharp.extract_sharp_pieces(replace(field, planes=planes), grid, 0, 1)
 
-    meshes = map_threads(mesh_of, groups, min(threads, GROUPS_AT_ONCE))
+    meshes = map_threads(mesh_of, groups, threads)
     return number_after(first_vertex, [mesh for group in meshes for mesh in group])
+
+
+def groups_at_once(planes: Planes, shape: tuple[int, ...]) -> int:
+    """Return how many groups are worked on at a time: one in a slab, which is to save memory."""
+    return GROUPS_AT_ONCE if planes == (0, shape[0]) else 1
 
 
 def groups_of_planes(field: FineField, threads: int) -> list[Planes]:
