@@ -48,34 +48,28 @@ FADING, FADED_OUT = 1.0, 2.5  # ... up to a distance in fine spacings, none from
 FARTHEST_MOVE = 0.5  # fine spacings
 OUTSIDE_CELL = 0.5  # fine spacings by which a feature's vertex may leave its cell
 TOUCHING = 0.04  # coarse spacings from a sphere at which it is touched
-TOUCHED = 4  # place in the evidence of whether a sphere is touched
+LEAST_SPHERES = 4  # that pass near a feature: in noise no sample is exact, and normals say nothing
 TOUCHED_ALONG = 1.0  # coarse spacings along an edge in which spheres are counted
 
 
 @dataclass(frozen=True, eq=False)
 class Rule:
-    """The logistic rule that tells features from rounded ground: ``bias + evidence @ weights``.
-
-    Where less than ``least_touched`` of a chain touches a sphere there is no feature: in noise
-    no sample is exact, and normals say nothing.
-    """
+    """The logistic rule that tells features from rounded ground: ``bias + evidence @ weights``."""
 
     bias: float
     weights: tuple[float, ...]
-    least_touched: float = 0.0
 
     def score(self, evidence: Vectors) -> Numbers:
         """Return the score of evidence (f, n), positive for a feature; summed in a fixed order."""
         score: Numbers = np.full(len(evidence), self.bias)
         for weight, column in zip(self.weights, evidence.T):
             score += weight * column
-        return np.where(evidence[:, TOUCHED] < self.least_touched, -np.inf, score)
+        return score
 
 
 RULE = Rule(
     0.979,
     (0.083, 0.940, -88.25, -2.820, -0.340, 0.900, -10.76, -1.843, -1.684, -0.226, -0.253),
-    least_touched=0.1,
 )
 
 
@@ -91,6 +85,8 @@ class Candidates:
         The edge's nearest point, or the corner, kept near the patch's cell.
     evidence : (f, 11) float64
         Averaged along the chain: see ``evidence_of``.
+    spheres : (f,) int32
+        How many spheres pass near the edge.
     planes : Planes
         The settled planes of all crossings.
     near : (n,) bool
@@ -100,8 +96,13 @@ class Candidates:
     patch: Index
     vertex: Vectors
     evidence: Vectors
+    spheres: NDArray[np.int32]
     planes: Planes
     near: BoolArray
+
+    def score(self) -> Numbers:
+        """Return the score of each, (f,), positive for a feature."""
+        return np.where(self.spheres < LEAST_SPHERES, -np.inf, RULE.score(self.evidence))
 
 
 def place_features(
@@ -120,7 +121,7 @@ def place_features(
     threads : int
     """
     candidates = find_candidates(patches, own, kinked, field, threads)
-    score = RULE.score(candidates.evidence)
+    score = candidates.score()
     kept = score > 0
     position = move_beside(patches, own, candidates, score > SURE)
     normal = candidates.planes.normal
@@ -151,7 +152,8 @@ def find_candidates(
     evidence = mean_along_chain(chosen, evidence, len(own.point))
     low = chosen.low - OUTSIDE_CELL
     vertex = np.clip(factor * leaned.point, low, low + 1 + 2 * OUTSIDE_CELL)
-    return Candidates(inside[sharp], vertex, evidence, planes, near)
+    count = count_by_wedge(nearby, np.ones(len(nearby.wedge), bool), len(evidence))
+    return Candidates(inside[sharp], vertex, evidence, count, planes, near)
 
 
 def _is_sharp(patches: Patches, normal: Vectors, trust: Numbers) -> BoolArray:
