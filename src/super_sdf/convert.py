@@ -37,6 +37,10 @@ from .steps.mesher_names import DEFAULT_MESHER
 from .steps.meshers import find_mesher
 from .steps.nodes import check_factor
 
+CAPPED = (
+    "the solid runs out of the grid: its surface is closed along the border (leave it open with "
+    "--open)"
+)
 SHARE_BEFORE = 0.2  # of the time, until the mesh is simplified
 
 
@@ -44,7 +48,8 @@ SHARE_BEFORE = 0.2  # of the time, until the mesh is simplified
 class ConvertOptions:
     """The options of a conversion; see ``read_grid``, ``reconstruct`` and ``simplify_mesh``.
 
-    ``simplify`` is an error in voxels; at most one of it and ``triangles`` may be given.
+    ``cap`` is True by default, as for the command, and unlike in ``reconstruct``. ``simplify`` is an
+    error in voxels; at most one of it and ``triangles`` may be given.
     """
 
     factor: int = 4
@@ -52,7 +57,7 @@ class ConvertOptions:
     origin: tuple[float, ...] | None = None
     inside: str = "auto"
     offset: float = 0.0
-    cap: bool = False
+    cap: bool = True
     max_memory: int | None = None
     mesher: str = DEFAULT_MESHER
     simplify: float | None = None
@@ -91,7 +96,7 @@ class Conversion:
         The lowest and the highest coordinates of the vertices, in world units.
     closed : bool
         Whether the mesh has no open edge. Edges are not counted: the mesh is a closed manifold by
-        construction, unless the surface runs out of the grid and is not capped.
+        construction, unless the surface leaves the grid and is not capped.
     notes, warnings : tuple of str
         Sentences on what was inferred, and on what may be wrong with the result.
     seconds : dict
@@ -211,7 +216,7 @@ class Tally:
         self.expected = expected
         self.counts: Counter[str] = Counter()
         self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)
-        self.is_cut = False
+        self.is_cut = self.leaves = False
         self.simplified: Simplified | None = None
         self.voxel_size = 1.0
 
@@ -223,6 +228,7 @@ class Tally:
         for piece in pieces:
             watch.take(piece.seconds)
             self.is_cut |= piece.is_cut
+            self.leaves |= piece.leaves
             self.counts.update(piece.counts)
             self.counts |= Counter(piece.whole)
             for mesh in piece.meshes:
@@ -275,7 +281,9 @@ def describe(
     counts = {name: tally.counts[name] for name in COUNTS}
     counts["expected_triangles"] = tally.expected.triangles
     counts["expected_bytes"] = tally.expected.size
-    warnings, simplified = find_warnings(counts, closed), None
+    warnings, simplified = find_warnings(counts, closed, thin=grid.low >= options.offset), None
+    if options.cap and tally.leaves:
+        notes += (CAPPED,)
     if tally.simplified:
         simplified = tally.simplified.report(tally.voxel_size)
         closed = tally.simplified.mesh.is_closed()
@@ -285,11 +293,19 @@ def describe(
     return Conversion(*where, counts, bounds, closed, notes, warnings, seconds, simplified)
 
 
-def find_warnings(counts: dict[str, int], closed: bool) -> tuple[str, ...]:
-    """Return a sentence on each thing that may be wrong with the result."""
+def find_warnings(counts: dict[str, int], closed: bool, thin: bool = False) -> tuple[str, ...]:
+    """Return a sentence on each thing that may be wrong with the result.
+
+    ``thin`` says that no sample lies inside the solid.
+    """
     warnings = []
     if not closed:
         warnings.append("the surface runs out of the grid and is open there (close it with --cap)")
+    if thin:
+        warnings.append(
+            "no sample lies inside: the solid is thinner than the spacing, and its mesh may have "
+            "holes"
+        )
     if counts["noisy_voxels"]:
         share = in_percent(counts["noisy_voxels"], counts["band_voxels"])
         warnings.append(

@@ -160,7 +160,7 @@ def typical_length(gradients: NDArray[np.float64], bend: NDArray[np.float64]) ->
     Bickel and Frühwirth, "On a fast, robust estimator of the mode", 2006.
     """
     if not len(gradients):
-        raise GridError("the values show no spacing, since nowhere they are smooth: give --spacing")
+        raise GridError("the values show no spacing, since they are smooth nowhere: give --spacing")
     length: NDArray[np.float64] = np.sort(lengths(gradients[_straighter(bend)]))
     while len(length) > 2:
         half = (len(length) + 1) // 2
@@ -192,8 +192,9 @@ def are_consistent(
     measured: float, gradients: NDArray[np.float64], bend: NDArray[np.float64]
 ) -> bool:
     """Return whether the lengths at the straighter samples agree with the measured spacing."""
-    straighter = _straighter(bend) & (bend <= BENT)
-    length = lengths(gradients[straighter])
+    if len(bend) < ENOUGH:
+        return False
+    length = lengths(gradients[_straighter(bend) & (bend <= BENT)])
     agreeing = np.abs(length - measured) <= AGREEMENT * measured
     return len(length) >= ENOUGH and bool(agreeing.mean() >= AGREEING)
 

@@ -105,14 +105,12 @@ def _measure(values: SampleArray, beside: Gradients) -> float:
     """
     everywhere = straight_gradients(values)
     check_equal_axes(*everywhere)
-    measured = typical_length(*everywhere) if len(everywhere[0]) else 0.0
-    if are_consistent(measured, *everywhere):
-        return measured
-    near = typical_length(*beside) if len(beside[0]) else 0.0
-    if len(everywhere[0]) < ENOUGH or are_consistent(near, *beside):
-        measured = near
-    if not measured:
-        return typical_length(*everywhere)
+    if len(everywhere[0]) < ENOUGH and len(beside[0]):
+        return typical_length(*beside)
+    measured = typical_length(*everywhere)
+    if len(beside[0]) and not are_consistent(measured, *everywhere):
+        near = typical_length(*beside)
+        return near if are_consistent(near, *beside) else measured
     return measured
 
 
