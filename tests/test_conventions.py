@@ -81,9 +81,7 @@ REFUSED = {
     "values are true or false: an occupancy grid holds no distances; "
     "make them with scipy.ndimage.distance_transform_edt": torus(8) < 0,
     "no value is below 0 (the smallest is 0.5): every wall is nearer to some sample than "
-    "that, so there is no surface": np.abs(torus(8))
-    + 0.5
-    - np.abs(torus(8)).min(),
+    "that, so there is no surface": np.abs(torus(8)) + 0.5 - np.abs(torus(8)).min(),
     "no value is above 0 (the largest is -1): the grid lies within the solid; if that is "
     "outside and the solid thin, use --inside positive": (-1 - np.indices((3, 3, 3)).sum(0)),
     "values[1, 2, 0] is nan: every sample must be finite; replace unknown far samples by a large "
@@ -121,7 +119,9 @@ def test_values_that_change_by_less_than_the_spacing_are_noted(spacing):
     assert grid.spacing == (spacing,) * 3
     (note,) = grid.notes
     assert note.startswith("the values change by ")
-    assert note.endswith(f"spacing is {spacing:g}: they are not exact distances, or the unit is wrong")
+    assert note.endswith(
+        f"spacing is {spacing:g}: they are not exact distances, or the unit is wrong"
+    )
 
 
 def test_values_that_are_not_quite_distances_are_noted():

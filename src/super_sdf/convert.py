@@ -48,8 +48,8 @@ SHARE_BEFORE = 0.2  # of the time, until the mesh is simplified
 class ConvertOptions:
     """The options of a conversion; see ``read_grid``, ``reconstruct`` and ``simplify_mesh``.
 
-    ``cap`` is True by default, as for the command, and unlike in ``reconstruct``. ``simplify`` is an
-    error in voxels; at most one of it and ``triangles`` may be given.
+    ``cap`` is True by default, as for the command, and unlike in ``reconstruct``. ``simplify`` is
+    an error in voxels; at most one of it and ``triangles`` may be given.
     """
 
     factor: int = 4
@@ -103,6 +103,8 @@ class Conversion:
         Seconds per stage.
     simplified : dict, optional
         Of a simplified mesh, what ``Simplified.report`` returns; distances are in voxels.
+    capped : bool
+        Whether the solid runs out of the grid, and its surface was closed along the border.
     """
 
     shape: tuple[int, int, int]
@@ -115,6 +117,7 @@ class Conversion:
     warnings: tuple[str, ...]
     seconds: dict[str, float]
     simplified: dict[str, Any] | None = None
+    capped: bool = False
 
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
@@ -125,6 +128,7 @@ class Conversion:
             **self.counts,
             "bounds": [list(corner) for corner in self.bounds],
             "closed": self.closed,
+            "capped": self.capped,
             **({"simplified": self.simplified} if self.simplified else {}),
             "inferred": list(self.notes),
             "warnings": list(self.warnings),
@@ -282,15 +286,14 @@ def describe(
     counts["expected_triangles"] = tally.expected.triangles
     counts["expected_bytes"] = tally.expected.size
     warnings, simplified = find_warnings(counts, closed, thin=grid.low >= options.offset), None
-    if options.cap and tally.leaves:
-        notes += (CAPPED,)
     if tally.simplified:
         simplified = tally.simplified.report(tally.voxel_size)
         closed = tally.simplified.mesh.is_closed()
         warnings += tally.simplified.warnings
     where = grid.shape, grid.spacing, grid.origin
     bounds = as_triple(tally.low, "low"), as_triple(tally.high, "high")
-    return Conversion(*where, counts, bounds, closed, notes, warnings, seconds, simplified)
+    capped = options.cap and tally.leaves
+    return Conversion(*where, counts, bounds, closed, notes, warnings, seconds, simplified, capped)
 
 
 def find_warnings(counts: dict[str, int], closed: bool, thin: bool = False) -> tuple[str, ...]:

@@ -102,9 +102,7 @@ def _row_gradients(values: SampleArray, i: int, step: int) -> Gradients:
     return gradient[straight], relative[straight]
 
 
-def _relative_bend(
-    change: NDArray[np.float64], length: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _relative_bend(change: NDArray[np.float64], length: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the bend: infinite where opposite neighbours are equal, or nearly."""
     relative = np.full(len(length), np.inf)
     np.divide(change, length, out=relative, where=length > 1e-9 * change)

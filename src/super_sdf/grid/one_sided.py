@@ -26,8 +26,8 @@ REACH = 3**0.5 / 2 * 1.05  # from a point to the nearest sample at most, with a 
 # steeply: lines that graze the wall do not tell where it is.
 STEEP = 0.25
 # No wall passes between neighbouring samples whose distances add up to more than 1. Where walls cut
-# a region off that holds a sample as deep as this, either it is the inside of a solid in an unsigned
-# field, and the walls have no thickness, or the walls are thin and enclose it.
+# off a region that holds a sample as deep as this, either it is the inside of a solid in an
+# unsigned field, and the walls have no thickness, or the walls are thin and enclose it.
 FREE, DEEP = 1.001, 0.75
 NO_THICKNESS, UNSIGNED_SHARE = 0.03, 0.05
 MOST_FLOODED = 1 << 21  # samples; of a larger grid every second one, or third, is as exact
@@ -109,10 +109,10 @@ def look_near_walls(values: SampleArray, scale: float) -> tuple[Floats, int, int
         if slab[1:3].min() <= REACH:
             for lines in (slab, slab[1], slab[1].T):
                 thickness = find_walls(lines)[1]
-                counts += len(thickness), np.count_nonzero(thickness < NO_THICKNESS)
+                counts += np.array([len(thickness), (thickness < NO_THICKNESS).sum()])
             found += _patches_near(slab[:3])
-    some = np.unique(np.linspace(0, len(found) - 1, CANDIDATES).astype(int)) if found else []
-    patches = np.array([found[n] for n in some]).reshape(-1, 27)
+    some = np.unique(np.linspace(0, max(len(found) - 1, 0), CANDIDATES).astype(int))
+    patches = np.array([found[n] for n in some] if found else []).reshape(-1, 27)
     return patches, int(counts[0]), int(counts[1])
 
 

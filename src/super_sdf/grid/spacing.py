@@ -135,9 +135,7 @@ def _infer_spacing(measured: float, shape: tuple[int, ...], notes: list[str]) ->
     return (measured,) * 3
 
 
-def _check_unit(
-    values: SampleArray, beside: Gradients, spacing: Triple, notes: list[str]
-) -> None:
+def _check_unit(values: SampleArray, beside: Gradients, spacing: Triple, notes: list[str]) -> None:
     """Raise GridError, or add a note, if the values contradict the given spacing.
 
     They do if they change by more. Exact distances change by less beside thin parts: there is no
