@@ -186,7 +186,7 @@ def convert(
     find_mesher(options.mesher)
     about = check_format_holds(target, grid, options.factor)
     notes = (*grid.notes, *local_origin_note(target, about))
-    expected = expect(grid, options.factor, options.offset, target)
+    expected = expect(grid, options.factor, options.offset, target, cap=options.cap)
     if options.simplifies:
         least = int(expected.triangles * CERTAIN_SHARE)
         check_room(least, options.max_memory, estimated=True)
