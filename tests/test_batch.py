@@ -27,7 +27,7 @@ def test_folders_are_mirrored_failures_named_and_meshes_those_of_single_runs(run
     assert err == (
         f"Failed: in/bad.npy: {CONSTANT}\n"
         f"Note: spacing, origin or sign of 1 was inferred: see {Path('out/report.jsonl')}\n"
-        "3 done, 1 failed; 2 meshes closed, 1 open\n"
+        "3 done, 1 failed; 3 meshes closed, 0 open\n"
     )
     made = {"a.ply": "a.npy", "deep/b.ply": "deep/b.npz", "deep/er/c.d.ply": "deep/er/c.d.npy"}
     assert files().keys() == made.keys() | {"report.jsonl"}
@@ -54,7 +54,7 @@ def test_the_report_holds_a_row_a_file(run_batch):
     assert row["in"] == os.path.abspath("in/a.npy") and row["status"] == "ok" and row["closed"]
     assert row["content"] == fingerprint(Path("in/a.npy"))
     assert row["output"] == fingerprint(Path("out/a.ply"))
-    assert not by_name["deep/er/c.d.ply"]["closed"]
+    assert by_name["deep/er/c.d.ply"]["closed"] and by_name["deep/er/c.d.ply"]["capped"]
     bad = by_name["bad.ply"]
     assert (bad["status"], bad["reason"], bad["retry"]) == ("failed", CONSTANT, False)
 
@@ -66,10 +66,10 @@ def test_a_rerun_does_nothing_and_says_so(run_batch):
     assert (code, files(), rows()) == (1, before, report)
     assert err == (
         f"Failed: in/bad.npy: {CONSTANT}\nnothing to do: 3 done before, 1 failed before "
-        "(--retry tries again); 2 meshes closed, 1 open\n"
+        "(--retry tries again); 3 meshes closed, 0 open\n"
     )
     os.remove("in/bad.npy")
-    want = "nothing to do: 3 done before; 2 meshes closed, 1 open\n"
+    want = "nothing to do: 3 done before; 3 meshes closed, 0 open\n"
     assert run_batch("in") == (0, "", want)
 
 
@@ -135,7 +135,7 @@ def test_a_bug_that_one_file_shows_is_named_and_stops_nothing(run_batch, monkeyp
     monkeypatch.setattr(batch_job, "convert", fail)
     code, _, err = run_batch("in")
     assert code == 1 and "Failed: in/a.npy: KeyError: 'odd\\nthing'\n" in err
-    assert err.endswith("2 done, 2 failed; 1 meshes closed, 1 open\n")
+    assert err.endswith("2 done, 2 failed; 2 meshes closed, 0 open\n")
 
 
 def test_two_inputs_for_one_output_are_refused(run_batch, command):
@@ -195,7 +195,7 @@ def test_a_dry_run_in_json_is_the_plan(run_batch):
 
 
 def test_json_is_the_summary(run_batch):
-    code, out, err = run_batch("in", "--json", "--quiet")
+    code, out, err = run_batch("in", "--json", "--quiet", "--open")
     facts = json.loads(out)
     assert code == 1 and err == f"Failed: in/bad.npy: {CONSTANT}\n"
     assert facts.pop("seconds") > 0

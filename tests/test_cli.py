@@ -65,13 +65,19 @@ def test_options_reach_the_result(here, command):
 
 def test_a_surface_that_leaves_the_grid_is_reported_and_capped(here, command):
     np.save("cut.npy", ball().values[:12])
-    _, _, err = command("upsample", "cut.npy", "open.ply")
+    _, _, err = command("upsample", "cut.npy", "open.ply", "--open")
     want = "Warning: the surface runs out of the grid and is open there (close it with --cap)"
     assert want in err
     assert " triangles, open, from (" in err and not trimesh.load("open.ply").is_watertight
-    _, _, err = command("upsample", "cut.npy", "closed.ply", "--cap")
-    assert "Warning" not in err
-    assert trimesh.load("closed.ply").is_watertight
+    want = (
+        "Note: the solid runs out of the grid: its surface is closed along the border (leave it "
+        "open with --open)"
+    )
+    for name, options in ("closed.ply", ()), ("capped.ply", ("--cap",)):
+        _, _, err = command("upsample", "cut.npy", name, *options)
+        assert "Warning" not in err and want in err
+        assert trimesh.load(name).is_watertight
+    assert Path("closed.ply").read_bytes() == Path("capped.ply").read_bytes()
 
 
 def test_steps_in_place_of_distances_are_closed_all_the_same(here, command):

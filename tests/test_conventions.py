@@ -80,10 +80,8 @@ REFUSED = {
     "make them with scipy.ndimage.distance_transform_edt": (torus(8) < 0).astype(np.uint8),
     "values are true or false: an occupancy grid holds no distances; "
     "make them with scipy.ndimage.distance_transform_edt": torus(8) < 0,
-    "no value is below 0 (the smallest is 0.5): an unsigned field has no inside; if the solid is "
-    "thinner than the spacing, use --inside negative": np.abs(torus(8))
-    + 0.5
-    - np.abs(torus(8)).min(),
+    "no value is below 0 (the smallest is 0.5): every wall is nearer to some sample than "
+    "that, so there is no surface": np.abs(torus(8)) + 0.5 - np.abs(torus(8)).min(),
     "no value is above 0 (the largest is -1): the grid lies within the solid; if that is "
     "outside and the solid thin, use --inside positive": (-1 - np.indices((3, 3, 3)).sum(0)),
     "values[1, 2, 0] is nan: every sample must be finite; replace unknown far samples by a large "
@@ -115,6 +113,17 @@ def test_a_wrong_unit_is_refused_with_the_way_out():
     assert want in str(caught.value)
 
 
+@pytest.mark.parametrize("spacing", [2.5, 1000])
+def test_values_that_change_by_less_than_the_spacing_are_noted(spacing):
+    grid = make_grid(ball(24, 8.0).values, spacing=spacing, origin=0)
+    assert grid.spacing == (spacing,) * 3
+    (note,) = grid.notes
+    assert note.startswith("the values change by ")
+    assert note.endswith(
+        f"spacing is {spacing:g}: they are not exact distances, or the unit is wrong"
+    )
+
+
 def test_values_that_are_not_quite_distances_are_noted():
     grid = make_grid(torus(64) * 1.2, spacing=1 / 64, origin=0)
     assert len(grid.notes) == 1 and "they are not exact distances" in grid.notes[0]
@@ -143,11 +152,8 @@ def test_inside_has_three_words():
         make_grid(torus(16), inside="out")
 
 
-def test_a_solid_between_the_samples_needs_a_word_and_a_spacing():
+def test_a_solid_between_the_samples_is_taken_as_it_is():
     x, y = np.indices((12, 12, 12))[:2] - 5.5
     rod = np.hypot(x, y) - 0.6  # nearest samples are 0.7 away
-    with pytest.raises(GridError, match="use --inside negative"):
-        make_grid(rod)
-    with pytest.raises(GridError, match=r"all values are on one side .* give --spacing"):
-        make_grid(rod, inside="negative")
+    assert make_grid(rod).spacing == (1.0, 1.0, 1.0)
     assert make_grid(rod, inside="negative", spacing=1, origin=0).notes == ()

@@ -47,3 +47,28 @@ def test_the_cap_changes_nothing_where_nothing_leaves():
     plain, capped = reconstruct(grid, trilinear), reconstruct(grid, trilinear, cap=True)
     np.testing.assert_array_equal(plain.faces, capped.faces)
     np.testing.assert_array_equal(plain.vertices, capped.vertices)
+
+
+def tip(beyond: float = -0.01) -> SdfGrid:
+    """Return a bar whose end lies a little before the outermost samples, in spacings."""
+    x, y, z = np.indices((17, 14, 15)) - np.array([0, 6.4, 7.3])[:, None, None, None]
+    away = np.stack([x - 16 - beyond, np.abs(y) - 3.2, np.abs(z) - 2.7, 4 - x])
+    outside = np.linalg.norm(np.maximum(away, 0), axis=0)
+    return SdfGrid.trusted(outside + np.minimum(away.max(0), 0), 1.0)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("end", [False, True])
+def test_a_tip_just_before_the_border_is_closed(axis, end):
+    values = np.moveaxis(tip().values, 0, axis)
+    grid = SdfGrid.trusted(values if end else values[::-1, ::-1, ::-1], 1.0)
+    assert border_is_crossed(upsample(grid, trilinear))
+    mesh = reconstruct(grid, trilinear)
+    assert mesh.open_edges() == 0
+    assert mesh.volume() == pytest.approx(12 * 6.4 * 5.4, rel=0.1)
+
+
+def test_a_tip_just_beyond_the_border_leaves_the_grid():
+    grid = tip(beyond=0.01)
+    assert reconstruct(grid, trilinear).open_edges() > 0
+    assert reconstruct(grid, trilinear, cap=True).open_edges() == 0

@@ -37,7 +37,7 @@ def test_values_of_the_other_sign_are_refused():
 
 
 @pytest.mark.parametrize("make", [SdfGrid, lambda v, h: make_grid(v, spacing=h)])
-@pytest.mark.parametrize("unit, spacing", [(1.5, 1.0), (1.0, 1.5 / 2), (1.0, 2.5), (1.0, 1000)])
+@pytest.mark.parametrize("unit, spacing", [(1.5, 1.0), (1.0, 1.5 / 2), (40, 1.0)])
 def test_a_spacing_that_the_values_contradict_is_refused(make, unit, spacing):
     for values in (VALUES, np.abs(np.indices((20, 20, 20)) - 9.3).max(0) - 5.1):
         with pytest.raises(
@@ -60,8 +60,8 @@ def test_thin_parts_may_change_by_less_than_the_spacing():
 def test_what_does_not_change_is_no_unit():
     board = np.where(np.indices((3, 3, 64))[2] % 2, 1.0, -1.0)  # opposite neighbours are equal
     board[2, 2, 2] = -1.5
-    with pytest.raises(GridError, match="change by 0 from sample to sample, but spacing is 1: dis"):
-        make_grid(board, spacing=1.0, inside="negative")
+    (note, _) = make_grid(board, spacing=1.0, inside="negative").notes
+    assert note.startswith("the values change by 0 from sample to sample, but spacing is 1: they")
     with pytest.raises(GridError, match="change by 0 from sample to sample; give --spacing"):
         make_grid(board, inside="negative")
 

@@ -298,7 +298,7 @@ def test_the_written_mesh_is_that_of_the_library(here):
 
 def test_an_open_mesh_is_simplified_too(here, command):
     np.save("cut.npy", ball(20, 6.0).values[:10])
-    code, out, err = command("upsample", "cut.npy", "a.ply", "--simplify", 0.02, "--json")
+    code, out, err = command("upsample", "cut.npy", "a.ply", "--simplify", 0.02, "--json", "--open")
     report = json.loads(out)
     assert code == 0 and not report["closed"]
     assert report["triangles"] < report["simplified"]["triangles_before"] / 2

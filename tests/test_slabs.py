@@ -46,6 +46,7 @@ FIELDS = {
     "noisy": noise(rod()),
     "cut off": np.clip(rod(), -0.4, 0.4),
     "leaves the grid": rod()[8:44, :10],
+    "ends before the border": rod()[:, :13] - 0.3,
 }
 
 

@@ -37,6 +37,10 @@ from .steps.mesher_names import DEFAULT_MESHER
 from .steps.meshers import find_mesher
 from .steps.nodes import check_factor
 
+CAPPED = (
+    "the solid runs out of the grid: its surface is closed along the border (leave it open with "
+    "--open)"
+)
 SHARE_BEFORE = 0.2  # of the time, until the mesh is simplified
 
 
@@ -44,7 +48,8 @@ SHARE_BEFORE = 0.2  # of the time, until the mesh is simplified
 class ConvertOptions:
     """The options of a conversion; see ``read_grid``, ``reconstruct`` and ``simplify_mesh``.
 
-    ``simplify`` is an error in voxels; at most one of it and ``triangles`` may be given.
+    ``cap`` is True by default, as for the command, and unlike in ``reconstruct``. ``simplify`` is
+    an error in voxels; at most one of it and ``triangles`` may be given.
     """
 
     factor: int = 4
@@ -52,7 +57,7 @@ class ConvertOptions:
     origin: tuple[float, ...] | None = None
     inside: str = "auto"
     offset: float = 0.0
-    cap: bool = False
+    cap: bool = True
     max_memory: int | None = None
     mesher: str = DEFAULT_MESHER
     simplify: float | None = None
@@ -91,13 +96,15 @@ class Conversion:
         The lowest and the highest coordinates of the vertices, in world units.
     closed : bool
         Whether the mesh has no open edge. Edges are not counted: the mesh is a closed manifold by
-        construction, unless the surface runs out of the grid and is not capped.
+        construction, unless the surface leaves the grid and is not capped.
     notes, warnings : tuple of str
         Sentences on what was inferred, and on what may be wrong with the result.
     seconds : dict
         Seconds per stage.
     simplified : dict, optional
         Of a simplified mesh, what ``Simplified.report`` returns; distances are in voxels.
+    capped : bool
+        Whether the solid runs out of the grid, and its surface was closed along the border.
     """
 
     shape: tuple[int, int, int]
@@ -110,6 +117,7 @@ class Conversion:
     warnings: tuple[str, ...]
     seconds: dict[str, float]
     simplified: dict[str, Any] | None = None
+    capped: bool = False
 
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
@@ -120,6 +128,7 @@ class Conversion:
             **self.counts,
             "bounds": [list(corner) for corner in self.bounds],
             "closed": self.closed,
+            "capped": self.capped,
             **({"simplified": self.simplified} if self.simplified else {}),
             "inferred": list(self.notes),
             "warnings": list(self.warnings),
@@ -177,7 +186,7 @@ def convert(
     find_mesher(options.mesher)
     about = check_format_holds(target, grid, options.factor)
     notes = (*grid.notes, *local_origin_note(target, about))
-    expected = expect(grid, options.factor, options.offset, target)
+    expected = expect(grid, options.factor, options.offset, target, cap=options.cap)
     if options.simplifies:
         least = int(expected.triangles * CERTAIN_SHARE)
         check_room(least, options.max_memory, estimated=True)
@@ -211,7 +220,7 @@ class Tally:
         self.expected = expected
         self.counts: Counter[str] = Counter()
         self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)
-        self.is_cut = False
+        self.is_cut = self.leaves = False
         self.simplified: Simplified | None = None
         self.voxel_size = 1.0
 
@@ -223,6 +232,7 @@ class Tally:
         for piece in pieces:
             watch.take(piece.seconds)
             self.is_cut |= piece.is_cut
+            self.leaves |= piece.leaves
             self.counts.update(piece.counts)
             self.counts |= Counter(piece.whole)
             for mesh in piece.meshes:
@@ -275,21 +285,30 @@ def describe(
     counts = {name: tally.counts[name] for name in COUNTS}
     counts["expected_triangles"] = tally.expected.triangles
     counts["expected_bytes"] = tally.expected.size
-    warnings, simplified = find_warnings(counts, closed), None
+    warnings, simplified = find_warnings(counts, closed, thin=grid.low >= options.offset), None
     if tally.simplified:
         simplified = tally.simplified.report(tally.voxel_size)
         closed = tally.simplified.mesh.is_closed()
         warnings += tally.simplified.warnings
     where = grid.shape, grid.spacing, grid.origin
     bounds = as_triple(tally.low, "low"), as_triple(tally.high, "high")
-    return Conversion(*where, counts, bounds, closed, notes, warnings, seconds, simplified)
+    capped = options.cap and tally.leaves
+    return Conversion(*where, counts, bounds, closed, notes, warnings, seconds, simplified, capped)
 
 
-def find_warnings(counts: dict[str, int], closed: bool) -> tuple[str, ...]:
-    """Return a sentence on each thing that may be wrong with the result."""
+def find_warnings(counts: dict[str, int], closed: bool, thin: bool = False) -> tuple[str, ...]:
+    """Return a sentence on each thing that may be wrong with the result.
+
+    ``thin`` says that no sample lies inside the solid.
+    """
     warnings = []
     if not closed:
         warnings.append("the surface runs out of the grid and is open there (close it with --cap)")
+    if thin:
+        warnings.append(
+            "no sample lies inside: the solid is thinner than the spacing, and its mesh may have "
+            "holes"
+        )
     if counts["noisy_voxels"]:
         share = in_percent(counts["noisy_voxels"], counts["band_voxels"])
         warnings.append(

@@ -36,7 +36,7 @@ from .progress import STEPS, Progress, StepCounter
 from .slabs.cutting import Slab, peak_bytes, plan_slabs
 from .slabs.footprint import NETWORK_BYTES
 from .slabs.pieces import Piece, describe_piece
-from .steps.cap import close_at_border
+from .steps.cap import close_at_border, close_if_crossed
 from .steps.field import FineField, SampleSpheres
 from .steps.mesher_names import DEFAULT_MESHER
 from .steps.meshers import Mesher, extract_pieces, find_mesher
@@ -134,8 +134,9 @@ def reconstruct(
     network : Network, optional
         By default the shipped network ``base``.
     cap : bool
-        Close a surface that runs out of the grid along the grid's border; otherwise it is left
-        open.
+        Close a surface that leaves the grid along the grid's border, as the command does unless it
+        gets ``--open``. By default it is left open there, so that meshes of neighbouring grids can
+        be joined. A surface leaves the grid where samples on the border are inside.
     mesher : str
         "marching" for marching cubes, which cuts off edges and corners; "sharp" also puts vertices
         on them.
@@ -146,7 +147,7 @@ def reconstruct(
     Returns
     -------
     Mesh
-        In world units; closed, unless the surface runs out of the grid and ``cap`` is False.
+        In world units; closed, unless the surface leaves the grid and ``cap`` is False.
     """
     check_grid(grid)
     if network is None:
@@ -217,9 +218,13 @@ def _slabs(
         if len(slabs) > 1:
             give_back()
         field = refine(band, network, factor, slab, resources.threads, steps)
-        whole = close_at_border(field, grid, offset, beside) if cap else field
+        if not band.leaves:
+            whole = close_if_crossed(field, beside)
+        else:
+            whole = close_at_border(field, grid, offset, beside) if cap else field
         meshes = extract_pieces(whole, grid, vertices, resources.threads, mesher)
-        piece = describe_piece(field, meshes, {"slabs": len(slabs), "planned_bytes": planned})
+        planned_work = {"slabs": len(slabs), "planned_bytes": planned}
+        piece = describe_piece(field, meshes, planned_work, band.leaves)
         del field, whole, meshes  # before those of the next slab are made
         steps.finish("isosurface")
         piece.seconds.update(steps.take_seconds())

@@ -108,7 +108,12 @@ OPTIONS: tuple[Option, ...] = (
         help="Mesh the offset surface at distance D, in world units; a positive D grows the "
         "solid, whichever sign is inside.",
     ),
-    click.option("--cap", is_flag=True, help="Close the surface where it runs out of the grid."),
+    click.option(
+        "--cap/--open",
+        default=convert_default("cap"),
+        help="Where the solid runs out of the grid, close the surface along the border, which is "
+        "the default, or leave it open.",
+    ),
     click.option(
         "--mesher",
         type=LazyChoice(meshers),

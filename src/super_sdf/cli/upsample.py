@@ -133,7 +133,7 @@ class Upsampling:
             print_stdout(json.dumps(report, indent=2), f"{self.target} is written")
         if self.options["quiet"]:
             return
-        for note in (*self.result.notes, *self.device_notes()):
+        for note in (*self.result.notes, *self.cap_notes(), *self.device_notes()):
             print_stderr(f"Note: {note}")
         for warning in self.result.warnings:
             print_stderr(f"Warning: {warning}")
@@ -164,6 +164,12 @@ class Upsampling:
             **({"check": self.certificate.report()} if self.certificate else {}),
             "seconds": {stage: round(seconds, 4) for stage, seconds in self.seconds.items()},
         }
+
+    def cap_notes(self) -> list[str]:
+        """Return the note on a surface that was closed along the border of the grid."""
+        from ..convert import CAPPED
+
+        return [CAPPED] if self.result.capped else []
 
     def device_notes(self) -> list[str]:
         """Return notes on the device of the network."""

@@ -41,15 +41,17 @@ class Expectation:
         return f"{path} will have about {_rounded(self.triangles):,} triangles, {_size(self.size)}"
 
 
-def expect(grid: SdfGrid, factor: int, offset: float, path: str | Path) -> Expectation:
-    """Estimate the size of the mesh of a grid, and of its file.
+def expect(
+    grid: SdfGrid, factor: int, offset: float, path: str | Path, *, cap: bool = False
+) -> Expectation:
+    """Estimate the size of the mesh of a grid, and of its file; ``cap`` is as in ``reconstruct``.
 
     Raises
     ------
     WriteError
         If half of that is more than the free disk space.
     """
-    triangles = 2 * factor**2 * count_crossings(grid, offset)
+    triangles = 2 * factor**2 * count_crossings(grid, offset, cap=cap)
     size = triangles * format_of(path).bytes_per_triangle
     free = free_space(Path(path))
     if CERTAIN_SHARE * size > free:
@@ -61,16 +63,21 @@ def expect(grid: SdfGrid, factor: int, offset: float, path: str | Path) -> Expec
     return Expectation(triangles, size)
 
 
-def count_crossings(grid: SdfGrid, offset: float) -> int:
-    """Count the edges between neighbouring samples on different sides of the offset surface."""
+def count_crossings(grid: SdfGrid, offset: float, *, cap: bool = False) -> int:
+    """Count the edges between neighbouring samples on different sides of the offset surface.
+
+    With ``cap``, all is outside beyond the border of the grid.
+    """
     count, before = 0, None
     for inside in _planes(grid, offset):
         count += int(np.count_nonzero(inside[1:] != inside[:-1]))
         count += int(np.count_nonzero(inside[:, 1:] != inside[:, :-1]))
-        if before is not None:
-            count += int(np.count_nonzero(inside != before))
+        if cap:
+            count += sum(int(np.count_nonzero(side[[0, -1]])) for side in (inside, inside.T))
+        if before is not None or cap:
+            count += int(np.count_nonzero(inside if before is None else inside != before))
         before = inside
-    return count
+    return count + (int(np.count_nonzero(before)) if cap and before is not None else 0)
 
 
 def _planes(grid: SdfGrid, offset: float) -> Iterator[BoolArray]:

@@ -1,4 +1,4 @@
 """The coarse input: its samples, and the sign and spacing that are inferred from them.
 
-It may import ``machine`` and ``errors``.
+It may import ``machine``, ``neighbourhood`` and ``errors``.
 """

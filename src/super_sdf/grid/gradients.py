@@ -1,11 +1,14 @@
-"""Gradients of a field next to its surface, from which the spacing is estimated.
+"""Gradients of a field, from which the spacing is estimated.
 
 Where a distance field is smooth its gradient has length 1 in world units, so its length in index
-units is the spacing.
+units is the spacing. Next to the surface of a thin part no sample is smooth, so samples away from
+the surface count as well; but only those next to it tell how a field that is no distance changes
+there.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -23,12 +26,16 @@ BENT = 0.6  # larger bends: lengths may agree by chance, as for the distance to 
 # Gradients are consistent if nine in ten of the straightest ones agree within 5 %.
 AGREEING, AGREEMENT = 0.9, 0.05
 UNEQUAL = 1.3  # ratio of the spacings measured along two axes from which they differ
+PLANES_AT_FIRST = 64  # read of a large grid, unless too few samples are found there
+MOST_SAMPLES = 1 << 19  # of which gradients are taken, wherever they lie; all of them up to 80^3
+
+Gradients = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
-def surface_gradients(values: SampleArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def surface_gradients(values: SampleArray) -> Gradients:
     """Return gradients and bends of the field at samples next to the surface.
 
-    At most 64 planes are read, spread evenly along x.
+    At most 64 planes are read, spread evenly along x, unless they show too little of the surface.
 
     Parameters
     ----------
@@ -43,15 +50,66 @@ def surface_gradients(values: SampleArray) -> tuple[NDArray[np.float64], NDArray
         Sum of the absolute second differences over the length of the gradient: 0 for a linear
         field.
     """
-    planes = np.unique(np.linspace(0, len(values) - 1, 64).astype(int))
-    found = [_plane_gradients(values, int(i)) for i in planes]
+    gradients, bend = _joined(_plane_gradients(values, i) for i in _spread_planes(values))
+    if (bend < STRAIGHT).sum() < ENOUGH and len(values) > PLANES_AT_FIRST:
+        return _joined(_plane_gradients(values, i) for i in range(len(values)))
+    return gradients, bend
+
+
+def straight_gradients(values: SampleArray) -> Gradients:
+    """Return gradients and bends at samples anywhere in the grid at which the field is not bent.
+
+    Where the values are constant, as those of a truncated field are, there is no gradient. Of large
+    grids, 64 planes are read, and fewer rows of them.
+
+    Returns
+    -------
+    gradients, bend
+        As of ``surface_gradients``.
+    """
+    nx, ny, nz = values.shape
+    if min(nx, ny, nz) < 3:
+        return np.empty((0, 3)), np.empty(0)
+    planes = [i for i in _spread_planes(values) if 0 < i < nx - 1] or [1]
+    step = -(-len(planes) * ny * nz // MOST_SAMPLES)
+    return _joined(_row_gradients(values, i, step) for i in planes)
+
+
+def _spread_planes(values: SampleArray) -> list[int]:
+    """Return at most 64 planes, spread evenly along x."""
+    spread = np.linspace(0, len(values) - 1, PLANES_AT_FIRST).astype(int)
+    return [int(i) for i in np.unique(spread)]
+
+
+def _joined(found: Iterable[Gradients]) -> Gradients:
+    """Concatenate gradients and bends."""
     gradients, bend = (np.concatenate(parts) for parts in zip(*found))
     return gradients, bend
 
 
-def _plane_gradients(
-    values: SampleArray, i: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _row_gradients(values: SampleArray, i: int, step: int) -> Gradients:
+    """Return gradients (n, 3) and bends (n,) of every ``step``-th inner row of an inner plane."""
+    slab = np.asarray(values[i - 1 : i + 2])
+    slab = np.clip(slab.astype(np.float64), -LARGEST_VALUE, LARGEST_VALUE)
+    centre = slab[1, 1:-1, 1:-1][::step]
+    above = slab[2, 1:-1, 1:-1], slab[1, 2:, 1:-1], slab[1, 1:-1, 2:]
+    below = slab[0, 1:-1, 1:-1], slab[1, :-2, 1:-1], slab[1, 1:-1, :-2]
+    pairs = [(high[::step], low[::step]) for high, low in zip(above, below)]
+    gradient = np.stack([(high - low) / 2 for high, low in pairs], -1).reshape(-1, 3)
+    change = sum(np.abs(high - 2 * centre + low) for high, low in pairs)
+    relative = _relative_bend(np.ravel(change), lengths(gradient))
+    straight = relative <= BENT
+    return gradient[straight], relative[straight]
+
+
+def _relative_bend(change: NDArray[np.float64], length: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the bend: infinite where opposite neighbours are equal, or nearly."""
+    relative = np.full(len(length), np.inf)
+    np.divide(change, length, out=relative, where=length > 1e-9 * change)
+    return relative
+
+
+def _plane_gradients(values: SampleArray, i: int) -> Gradients:
     """Return gradients (n, 3) and bends (n,) at samples next to the surface in plane i."""
     first = max(i - 1, 0)
     slab = np.asarray(values[first : i + 2])
@@ -65,10 +123,7 @@ def _plane_gradients(
         below, above, steps = _read(slab, low), _read(slab, high), high[axis] - low[axis]
         gradient[:, axis] = (above - below) / steps
         change += np.where(steps == 2, np.abs(above - 2 * centre + below), 0)
-    length = lengths(gradient)
-    relative = np.full(len(length), np.inf)  # where opposite neighbours are equal, or nearly
-    np.divide(change, length, out=relative, where=length > 1e-9 * change)
-    return gradient, relative
+    return gradient, _relative_bend(change, lengths(gradient))
 
 
 def _beside_surface(inside: BoolArray, middle: int) -> BoolArray:
@@ -103,7 +158,7 @@ def typical_length(gradients: NDArray[np.float64], bend: NDArray[np.float64]) ->
     Bickel and Frühwirth, "On a fast, robust estimator of the mode", 2006.
     """
     if not len(gradients):
-        raise GridError("all values are on one side of the surface: give --spacing")
+        raise GridError("the values show no spacing, since they are smooth nowhere: give --spacing")
     length: NDArray[np.float64] = np.sort(lengths(gradients[_straighter(bend)]))
     while len(length) > 2:
         half = (len(length) + 1) // 2
@@ -135,8 +190,9 @@ def are_consistent(
     measured: float, gradients: NDArray[np.float64], bend: NDArray[np.float64]
 ) -> bool:
     """Return whether the lengths at the straighter samples agree with the measured spacing."""
-    straighter = _straighter(bend) & (bend <= BENT)
-    length = lengths(gradients[straighter])
+    if len(bend) < ENOUGH:
+        return False
+    length = lengths(gradients[_straighter(bend) & (bend <= BENT)])
     agreeing = np.abs(length - measured) <= AGREEMENT * measured
     return len(length) >= ENOUGH and bool(agreeing.mean() >= AGREEING)
 

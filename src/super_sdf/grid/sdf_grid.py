@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Triple
+from .one_sided import check_thin, is_one_sided
 from .planes import PlaneFile, SampleArray
 from .samples import Extremes, as_samples, check_not_flat, check_values
 from .sides import check_negative_inside, is_positive_inside
@@ -178,6 +179,8 @@ def make_grid(
     notes: list[str] = []
     flipped = is_positive_inside(samples, inside, extremes, notes)
     chosen = choose_spacing(samples, spacing, notes)
+    if inside == "auto" and is_one_sided(extremes):
+        check_thin(samples, sum(chosen) / 3, extremes)
     if origin is None:
         notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
         origin = 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ..errors import GridError, OptionError, seen
+from .one_sided import is_one_sided
 from .planes import SampleArray
 from .samples import Extremes
 
@@ -29,14 +30,13 @@ def is_positive_inside(
     ------
     OptionError
         If ``inside`` is unknown.
-    GridError
-        If all values are on one side of the surface.
     """
     if not isinstance(inside, str) or inside not in INSIDE:
         raise OptionError(f"inside is {seen(inside)}: give one of {', '.join(INSIDE)}")
     if inside != "auto":
         return inside == "positive"
-    check_both_sides(extremes)
+    if is_one_sided(extremes):
+        return extremes[0] < 0
     below, total = _count_border(values)
     positive = _is_mostly_negative(below, total)
     share = max(below, total - below) / total
@@ -57,21 +57,6 @@ def check_negative_inside(values: SampleArray) -> None:
             f"{below / total:.0%} of the grid's border is negative, which is inside: make the grid "
             "with make_grid(values, spacing=..., inside='positive'), or inside='negative' if the "
             "solid does run out of the grid there"
-        )
-
-
-def check_both_sides(extremes: Extremes) -> None:
-    """Raise GridError if all values are on one side of the surface."""
-    low, high = extremes
-    if low >= 0:
-        raise GridError(
-            f"no value is below 0 (the smallest is {low:.6g}): an unsigned field has no "
-            "inside; if the solid is thinner than the spacing, use --inside negative"
-        )
-    if high <= 0:
-        raise GridError(
-            f"no value is above 0 (the largest is {high:.6g}): the grid lies within the "
-            "solid; if that is outside and the solid thin, use --inside positive"
         )
 
 

@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..arrays import Triple
 from ..errors import GridError, seen
-from .gradients import are_consistent, check_equal_axes, lengths, surface_gradients, typical_length
+from .gradients import (
+    ENOUGH,
+    Gradients,
+    are_consistent,
+    check_equal_axes,
+    straight_gradients,
+    surface_gradients,
+    typical_length,
+)
 from .planes import SampleArray
 
 # The method needs cubic voxels: spacings that differ by less than this ratio count as equal.
@@ -18,11 +26,9 @@ SNAP = 0.02  # an estimate this close to a usual spacing is replaced by it
 # Ratio of measured to given spacing, or its inverse, above which there is a note.
 TOLERATED = 1.1
 # Distances cannot change by more than the samples are apart. Larger ratios are refused: the first
-# limit applies to gradients that agree with each other, the second to noisy or bent fields.
+# limit applies to gradients that agree with each other, the second to noisy or bent fields. They
+# do change by less at thin parts and where they are truncated, so that is never refused.
 REFUSED, REFUSED_IF_UNSURE = 1.25, 2.0
-# Distances change by less at thin parts and where they are truncated. If nine in ten samples change
-# by less than half the spacing, the unit is wrong.
-SLOW, SLOW_SHARE = 0.5, 0.9
 
 
 def as_triple(number: ArrayLike, name: str) -> Triple:
@@ -78,18 +84,34 @@ def choose_spacing(values: SampleArray, spacing: ArrayLike | None, notes: list[s
     Raises
     ------
     GridError
-        If the values contradict the given spacing, or show none.
+        If the values change by more than the given spacing allows, or show none.
     """
     given = None if spacing is None else check_spacing(spacing)
-    gradients, bend = surface_gradients(values)
-    if given and not len(gradients):
+    beside = surface_gradients(values)
+    if given and not len(beside[0]):
         return given
-    measured = typical_length(gradients, bend)
-    check_equal_axes(gradients, bend)
+    check_equal_axes(*beside)
     if given is None:
-        return _infer_spacing(measured, values.shape, notes)
-    _check_unit(measured, gradients, bend, given, notes)
+        return _infer_spacing(_measure(values, beside), values.shape, notes)
+    _check_unit(values, beside, given, notes)
     return given
+
+
+def _measure(values: SampleArray, beside: Gradients) -> float:
+    """Return the change of the values from sample to sample where the field is smooth.
+
+    It is that of the whole field, unless only the samples beside the surface agree with each other:
+    then the field is no distance, and what it is at the surface matters.
+    """
+    everywhere = straight_gradients(values)
+    check_equal_axes(*everywhere)
+    if len(everywhere[0]) < ENOUGH and len(beside[0]):
+        return typical_length(*beside)
+    measured = typical_length(*everywhere)
+    if len(beside[0]) and not are_consistent(measured, *everywhere):
+        near = typical_length(*beside)
+        return near if are_consistent(near, *beside) else measured
+    return measured
 
 
 def _infer_spacing(measured: float, shape: tuple[int, ...], notes: list[str]) -> Triple:
@@ -113,27 +135,28 @@ def _infer_spacing(measured: float, shape: tuple[int, ...], notes: list[str]) ->
     return (measured,) * 3
 
 
-def _check_unit(
-    measured: float,
-    gradients: NDArray[np.float64],
-    bend: NDArray[np.float64],
-    spacing: Triple,
-    notes: list[str],
-) -> None:
-    """Raise GridError, or add a note, if the values contradict the given spacing."""
-    h = sum(spacing) / 3
+def _check_unit(values: SampleArray, beside: Gradients, spacing: Triple, notes: list[str]) -> None:
+    """Raise GridError, or add a note, if the values contradict the given spacing.
+
+    They do if they change by more. Exact distances change by less beside thin parts: there is no
+    note if the rest of the field agrees with the spacing.
+    """
+    h, measured = sum(spacing) / 3, typical_length(*beside)
     observed = f"the values change by {measured:.6g} from sample to sample, but spacing is "
-    allowed = REFUSED if are_consistent(measured, gradients, bend) else REFUSED_IF_UNSURE
-    if measured > allowed * h or np.quantile(lengths(gradients), SLOW_SHARE) < SLOW * h:
-        scale = f"scale the values by {h / measured:.6g} or " if measured > 0 else ""
+    allowed = REFUSED if are_consistent(measured, *beside) else REFUSED_IF_UNSURE
+    if measured > allowed * h:
         raise GridError(
             f"{observed}{spacing[0]:.6g}: distances and spacing must be in the same unit; "
-            f"{scale}give another --spacing"
+            f"scale the values by {h / measured:.6g} or give another --spacing"
         )
-    if not h / TOLERATED <= measured <= h * TOLERATED:
-        notes.append(
-            f"{observed}{spacing[0]:.6g}: they are not exact distances, or the unit is wrong"
-        )
+    if _agree(measured, h) or (measured < h and _agree(_measure(values, beside), h)):
+        return
+    notes.append(f"{observed}{spacing[0]:.6g}: they are not exact distances, or the unit is wrong")
+
+
+def _agree(measured: float, h: float) -> bool:
+    """Return whether the values change by about as much as the spacing."""
+    return h / TOLERATED <= measured <= h * TOLERATED
 
 
 def _join(triple: Triple) -> str:

@@ -22,8 +22,10 @@ class Piece:
     whole : dict
         Counts of the whole run, the same in each piece: ``band_voxels``, ``noisy_voxels`` (see
         ``FineField``), ``slabs``, and ``planned_bytes``, the planned peak memory of the process.
+    leaves : bool
+        Whether the solid leaves the grid, anywhere: a sample on the border is inside.
     is_cut : bool
-        Whether the surface runs out of the grid in this slab.
+        Whether the surface leaves the grid in this slab.
     signs : set of bool
         Which signs the slab's nodes have: True outside, False inside.
     seconds : dict
@@ -33,13 +35,16 @@ class Piece:
     meshes: list[Mesh]
     counts: dict[str, int]
     whole: dict[str, int]
+    leaves: bool
     is_cut: bool
     signs: set[bool]
     seconds: dict[str, float] = field(default_factory=dict)
 
 
-def describe_piece(fine: FineField, meshes: list[Mesh], planned: dict[str, int]) -> Piece:
-    """Return the meshes of a slab with their counts."""
+def describe_piece(
+    fine: FineField, meshes: list[Mesh], planned: dict[str, int], leaves: bool
+) -> Piece:
+    """Return the meshes of a slab with their counts; ``leaves`` is that of the band."""
     own = fine.own_rows
     counts = {
         "decoded_voxels": own.stop - own.start,
@@ -49,4 +54,5 @@ def describe_piece(fine: FineField, meshes: list[Mesh], planned: dict[str, int])
         "triangles": sum(len(mesh.faces) for mesh in meshes),
     }
     whole = {"band_voxels": fine.band_voxels, "noisy_voxels": fine.noisy_voxels, **planned}
-    return Piece(meshes, counts, whole, border_is_crossed(fine), fine.signs())
+    is_cut = leaves and border_is_crossed(fine)
+    return Piece(meshes, counts, whole, leaves, is_cut, fine.signs())

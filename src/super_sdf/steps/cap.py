@@ -10,7 +10,7 @@ from ..arrays import FloatArray, IntArray
 from ..grid.sdf_grid import SdfGrid
 from ..neighbourhood import NEIGHBOURHOOD
 from .band import neighbour_table, plane_blocks, rescale
-from .field import FineField
+from .field import FineField, border_is_crossed
 from .nodes import (
     BARELY_INSIDE,
     BARELY_OUTSIDE,
@@ -20,6 +20,17 @@ from .nodes import (
     seen_from,
     share_parts,
 )
+
+
+def close_if_crossed(field: FineField, beside: int = 1) -> FineField:
+    """Close the surface where it crosses the border though all samples there are outside.
+
+    A tip that ends just before the border does so: the fine lattice reaches half a voxel farther
+    than the samples. Such a solid does not leave the grid. ``beside`` is as in ``close_at_border``.
+    """
+    if not border_is_crossed(field, beside + 1):
+        return field
+    return _close(field, np.empty((0, 3), np.int32), beside)
 
 
 def close_at_border(
@@ -32,11 +43,20 @@ def close_at_border(
     flat. A slab is closed in its own planes and in the planes ``beside`` them on which its mesh
     depends, and in one more before, which owns vertices of those.
     """
-    first = max(field.planes[0] - beside - 1, 0)
-    last = min(field.planes[1] + beside, field.shape[0])
-    rows = field.rows(first, last)
+    first, last = _planes_beside(field, beside)
+    known = field.voxel_ijk[field.rows(first, last)]
+    return _close(field, _filled_border(grid, offset, first, last, known), beside)
+
+
+def _planes_beside(field: FineField, beside: int) -> tuple[int, int]:
+    """Return the planes on which the mesh of a slab depends, from the first to before the last."""
+    return max(field.planes[0] - beside - 1, 0), min(field.planes[1] + beside, field.shape[0])
+
+
+def _close(field: FineField, filled: IntArray, beside: int) -> FineField:
+    """Return the field with the border voxels ``filled`` inside, and outside ones beyond."""
+    rows = field.rows(*_planes_beside(field, beside))
     known = field.voxel_ijk[rows]
-    filled = _filled_border(grid, offset, first, last, known)
     border = np.concatenate([known, filled])
     voxel_ijk = np.concatenate([border, _outer_voxels(border, field.shape)])
     order = np.lexsort(voxel_ijk.T[::-1])

@@ -145,9 +145,15 @@ class FineField:
         return {bool(values.min() > 0), bool(values.max() > 0)}
 
 
-def border_is_crossed(field: FineField) -> bool:
-    """Return whether the surface crosses the border of the grid, in the field's planes."""
-    core = np.arange(len(field.voxel_ijk))[field.own_rows]
+def border_is_crossed(field: FineField, beside: int = 0) -> bool:
+    """Return whether the surface crosses the border of the grid, in the field's planes.
+
+    The border is that of the fine lattice, half a voxel beyond the outermost samples. So it may be
+    crossed though all samples on the border are outside. ``beside`` is how many planes to look at
+    on either side of the field's own.
+    """
+    rows = field.rows(field.planes[0] - beside, field.planes[1] + beside)
+    core = np.arange(len(field.voxel_ijk))[rows]
     side = block_ijk(field.factor)
     for axis, samples in enumerate(field.shape):
         for voxel, node in ((0, 0), (samples - 1, field.factor)):

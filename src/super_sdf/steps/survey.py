@@ -6,7 +6,7 @@ the grid.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -52,6 +52,8 @@ class Band:
         Which voxels can hold the surface, and so are decoded.
     exact : (V,) bool
         Which voxels' own samples can be taken as exact distances.
+    leaves : bool
+        Whether a sample on the border of the grid is inside: then the solid leaves the grid.
     """
 
     shape: tuple[int, int, int]
@@ -60,6 +62,7 @@ class Band:
     lipschitz: BoolArray
     decoded: BoolArray
     exact: BoolArray
+    leaves: bool = False
 
     @property
     def all_rows(self) -> slice:
@@ -146,10 +149,11 @@ def survey(grid: SdfGrid, offset: float = 0.0, resources: Resources = ONE_THREAD
     """
     sizes: list[int] = []
     jumps: list[tuple[Jumps, Jumps]] = []
+    leaving: list[bool] = []
     held = held_memory() or 0
 
     def read(planes: slice) -> tuple[IntArray, FloatArray]:
-        found = _band_of_planes(grid, offset, planes.start, planes.stop, jumps)
+        found = _band_of_planes(grid, offset, planes.start, planes.stop, jumps, leaving)
         sizes.append(len(found[0]))
         _check_bound(sum(sizes), planes.stop, held, resources.memory)
         return found
@@ -163,7 +167,8 @@ def survey(grid: SdfGrid, offset: float = 0.0, resources: Resources = ONE_THREAD
         if not any(up.near for up, _ in jumps):
             raise no_surface(grid, offset)
         check_not_filled(jumps, offset, grid.voxel_size)
-    return make_band(grid.shape, voxel_ijk, _concatenate(patches), resources.threads)
+    band = make_band(grid.shape, voxel_ijk, _concatenate(patches), resources.threads)
+    return replace(band, leaves=any(leaving))
 
 
 def _check_bound(voxels: int, planes: int, held: int, bound: int | None) -> None:
@@ -191,15 +196,22 @@ def make_band(
 
 
 def _band_of_planes(
-    grid: SdfGrid, offset: float, first: int, last: int, jumps: list[tuple[Jumps, Jumps]]
+    grid: SdfGrid,
+    offset: float,
+    first: int,
+    last: int,
+    jumps: list[tuple[Jumps, Jumps]],
+    leaving: list[bool],
 ) -> tuple[IntArray, FloatArray]:
     """Return the band's voxels in planes ``first`` to before ``last``, and their patches.
 
-    One more plane is read on either side. With an offset, the distances are checked for truncation,
-    and their jumps are appended to ``jumps``.
+    One more plane is read on either side. Whether a sample on the grid's border is inside is
+    appended to ``leaving``. With an offset, the distances are checked for truncation, and their
+    jumps are appended to ``jumps``.
     """
     low, high = max(first - 1, 0), min(last + 1, grid.shape[0])
     rescaled = rescale(grid, offset, low, high)
+    leaving.append(_has_inside_on_border(rescaled, low == 0, high == grid.shape[0]))
     ijk = find_band(rescaled)
     own = ijk[(ijk[:, 0] >= first - low) & (ijk[:, 0] < last - low)]
     patches = gather_patches(rescaled, own)
@@ -207,6 +219,13 @@ def _band_of_planes(
         check_not_cut_off(patches, offset, grid.voxel_size)
         jumps.append(find_jumps(rescaled))
     return own + np.array([low, 0, 0], np.int32), patches
+
+
+def _has_inside_on_border(rescaled: FloatArray, first: bool, last: bool) -> bool:
+    """Return whether a sample on the border is inside, in planes with the first or last or not."""
+    sides = [rescaled[:, [0, -1]], rescaled[:, :, [0, -1]]]
+    ends = [rescaled[0]] * first + [rescaled[-1]] * last
+    return any(bool((side <= 0).any()) for side in (*sides, *ends))
 
 
 def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:

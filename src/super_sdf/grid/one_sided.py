@@ -1,0 +1,207 @@
+"""Fields without a sample inside: thin solids, and what only looks like one.
+
+A wall thinner than the spacing may pass between the samples, which are then all outside. Their
+distances still show it: the sphere of each sample touches the wall and contains none of it. Other
+fields have no inside either: unsigned distances to a thick solid, and values that stay above 0.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import BoolArray
+from ..errors import GridError
+from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
+from .planes import SampleArray
+from .samples import Extremes
+
+Floats = NDArray[np.floating[Any]]
+
+# All lengths are in spacings.
+REACH = 3**0.5 / 2 * 1.05  # from a point to the nearest sample at most, with a margin
+# Along a line of samples the field falls towards a wall and rises behind it, both at least so
+# steeply: lines that graze the wall do not tell where it is.
+STEEP = 0.25
+# No wall passes between neighbouring samples whose distances add up to more than 1. Where walls cut
+# off a region that holds a sample as deep as this, either it is the inside of a solid in an
+# unsigned field, and the walls have no thickness, or the walls are thin and enclose it.
+FREE, DEEP = 1.001, 0.75
+NO_THICKNESS, UNSIGNED_SHARE = 0.03, 0.05
+MOST_FLOODED = 1 << 21  # samples; of a larger grid every second one, or third, is as exact
+CANDIDATES_IN_PLANE, CANDIDATES = 8, 512  # samples near 0 whose neighbours are looked at
+LIPSCHITZ, LIPSCHITZ_SHARE = 1.05, 0.9  # distances change by no more, at most samples
+# Most samples' spheres touch a point that lies in no other sphere, but for the error in the
+# direction to it, and the field rises from there by about 1.
+TOUCHING, TOUCHING_SHARE, LEAST_RISE, MOST_RISE = 0.1, 0.5, 0.75, 3**0.5
+
+FAR = "every wall is nearer to some sample than that, so there is no surface"
+BEYOND = "only samples on the border of the grid are near 0, so no surface lies in it"
+UNSIGNED = (
+    "an unsigned field has no inside; if the solid is thinner than the spacing, use --inside "
+    "negative"
+)
+
+
+def is_one_sided(extremes: Extremes) -> bool:
+    """Return whether no value is below 0, or none above."""
+    return extremes[0] >= 0 or extremes[1] <= 0
+
+
+def check_thin(values: SampleArray, h: float, extremes: Extremes) -> None:
+    """Raise GridError unless values on one side of 0 can be distances to a thin solid.
+
+    Parameters
+    ----------
+    values : (nx, ny, nz) array or PlaneFile
+        Samples, none below 0 or none above.
+    h : float
+        The spacing.
+    extremes : two floats
+        The smallest and the largest sample.
+    """
+    scale = (1 if extremes[0] >= 0 else -1) / h
+    if min(map(abs, extremes)) / h > REACH:
+        raise _refusal(extremes, FAR)
+    patches, walls, unsigned_walls = look_near_walls(values, scale)
+    if not len(patches):
+        raise _refusal(extremes, BEYOND)
+    if not (_are_distances(patches) and _touch_walls(patches)):
+        raise _refusal(extremes, UNSIGNED)
+    if unsigned_walls > UNSIGNED_SHARE * walls and _is_cut_off(values, scale):
+        raise _refusal(extremes, UNSIGNED)
+
+
+def _refusal(extremes: Extremes, reason: str) -> GridError:
+    """Return the error for values that are no distances to a thin solid."""
+    low, high = extremes
+    if low >= 0:
+        return GridError(f"no value is below 0 (the smallest is {low:.6g}): {reason}")
+    return GridError(
+        f"no value is above 0 (the largest is {high:.6g}): the grid lies within the solid; if "
+        "that is outside and the solid thin, use --inside positive"
+    )
+
+
+def look_near_walls(values: SampleArray, scale: float) -> tuple[Floats, int, int]:
+    """Return patches near 0, and how many walls pass between samples, and without thickness.
+
+    Parameters
+    ----------
+    values : (nx, ny, nz) array or PlaneFile
+        Samples.
+    scale : float
+        Their factor to spacings, positive outside.
+
+    Returns
+    -------
+    patches : (n, 27) float64
+        Distances round some of the inner samples near 0, in the order of ``NEIGHBOURHOOD``.
+    walls, without : int
+        Of all lines along the axes; and those of them with less than ``NO_THICKNESS``.
+    """
+    found: list[Floats] = []
+    counts = np.zeros(2, np.int64)
+    for i in range(1, len(values) - 1):
+        slab = np.asarray(values[i - 1 : i + 3], np.float64) * scale
+        if slab[1:3].min() <= REACH:
+            for lines in (slab, slab[1], slab[1].T):
+                thickness = find_walls(lines)[1]
+                counts += np.array([len(thickness), (thickness < NO_THICKNESS).sum()])
+            found += _patches_near(slab[:3])
+    some = np.unique(np.linspace(0, max(len(found) - 1, 0), CANDIDATES).astype(int))
+    patches = np.array([found[n] for n in some] if found else []).reshape(-1, 27)
+    return patches, int(counts[0]), int(counts[1])
+
+
+def _patches_near(slab: Floats) -> list[Floats]:
+    """Return the patches of some inner samples near 0 of the middle one of three planes."""
+    inner = slab[1, 1:-1, 1:-1]
+    near = np.argwhere(inner <= REACH)
+    if not len(near):
+        return []
+    order = np.argsort(inner[tuple(near.T)])
+    spread = np.linspace(0, len(order) - 1, CANDIDATES_IN_PLANE).astype(int)
+    chosen = np.union1d(order[:CANDIDATES_IN_PLANE], order[spread])
+    return [slab[:, j : j + 3, k : k + 3].reshape(27) for j, k in near[chosen]]
+
+
+def find_walls(lines: Floats) -> tuple[BoolArray, Floats]:
+    """Return where a wall lies between two samples of a line, and how thick it is.
+
+    Parameters
+    ----------
+    lines : (n, ...) float64
+        Samples along the first axis, in spacings and positive.
+
+    Returns
+    -------
+    walls : (n - 3, ...) bool
+        Whether there is one between samples i + 1 and i + 2; n is at least 4, else there is none.
+    thickness : (walls,) float64
+        What the distances on either side leave of the way between the two.
+    """
+    before, left, right, after = lines[:-3], lines[1:-2], lines[2:-1], lines[3:]
+    falling, rising = before - left, after - right
+    slope = (falling + rising) / 2
+    thickness = slope - left - right
+    walls = (falling > STEEP) & (rising > STEEP) & (thickness >= -STEEP * slope)
+    return walls, thickness[walls]
+
+
+def _are_distances(patches: Floats) -> bool:
+    """Return whether most samples change by no more than distances can."""
+    change = np.abs(patches - patches[:, CENTRE, None])
+    most = LIPSCHITZ * np.linalg.norm(NEIGHBOURHOOD, axis=1) + NO_THICKNESS
+    return bool((change <= most).all(1).mean() >= LIPSCHITZ_SHARE)
+
+
+def _touch_walls(patches: Floats) -> bool:
+    """Return whether most samples' spheres touch a point that lies in none of the others.
+
+    The direction to it is that in which the field falls, measured on the far side of each sample:
+    on the near side there may be the wall.
+    """
+    centre = patches[:, CENTRE, None]
+    after, before = patches[:, CENTRE + STRIDES], patches[:, CENTRE - STRIDES]
+    rise = np.where(after > before, after - centre, centre - before)
+    length = np.maximum(np.linalg.norm(rise, axis=1), np.finfo(float).tiny)[:, None]
+    feet = -rise / length * centre
+    depth = patches - np.linalg.norm(feet[:, None] - NEIGHBOURHOOD, axis=2)
+    deepest = np.delete(depth, CENTRE, axis=1).max(1)
+    rises = (length[:, 0] >= LEAST_RISE) & (length[:, 0] <= MOST_RISE)
+    return bool((rises & (np.abs(deepest) <= TOUCHING)).mean() >= TOUCHING_SHARE)
+
+
+def _is_cut_off(values: SampleArray, scale: float) -> bool:
+    """Return whether walls cut deep samples off from the farthest sample of the border."""
+    coarse = _every_nth(values, scale)
+    border = coarse.copy()
+    border[1:-1, 1:-1, 1:-1] = -np.inf
+    reached = np.zeros(coarse.shape, bool)
+    reached.flat[border.argmax()] = True
+    before = 0
+    while before != (before := int(reached.sum())):
+        for axis in range(3):
+            _spread(np.moveaxis(reached, axis, 0), np.moveaxis(coarse, axis, 0))
+    return bool((coarse[~reached] >= DEEP).any())
+
+
+def _every_nth(values: SampleArray, scale: float) -> Floats:
+    """Return every n-th sample along each axis, at most ``MOST_FLOODED``, in n spacings."""
+    step = 1
+    while np.prod([-(-count // step) for count in values.shape], dtype=float) > MOST_FLOODED:
+        step += 1
+    planes = [np.asarray(values[i])[::step, ::step] for i in range(0, len(values), step)]
+    return np.array(planes, np.float64) * (scale / step)
+
+
+def _spread(reached: BoolArray, samples: Floats) -> None:
+    """Extend what is reached along the first axis, both ways, where no wall passes between."""
+    free = samples[1:] + samples[:-1] > FREE
+    for i in range(len(free)):
+        reached[i + 1] |= reached[i] & free[i]
+    for i in range(len(free) - 1, -1, -1):
+        reached[i] |= reached[i + 1] & free[i]

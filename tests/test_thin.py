@@ -1,0 +1,168 @@
+"""Solids thinner than the spacing, in which no sample lies, and what only looks like one."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from conftest import ball
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from super_sdf.errors import GridError
+from super_sdf.grid.gradients import straight_gradients, typical_length
+from super_sdf.grid.one_sided import MOST_FLOODED, find_walls
+from super_sdf.grid.sdf_grid import make_grid
+
+N = 32
+X, Y, Z = np.indices((N, N, N)) - 15.5
+R = np.sqrt(X**2 + Y**2 + Z**2)
+
+
+def box(x, y, z, *half):
+    """Return the signed distance to a box of half sides."""
+    q = np.stack([np.abs(a) - h for a, h in zip((x, y, z), half)])
+    return np.linalg.norm(np.maximum(q, 0), axis=0) + np.minimum(q.max(0), 0)
+
+
+def ellipse(x, y, a, b, count=4001):
+    """Return the distance to an ellipse with half axes a and b, from outside."""
+    angle = np.linspace(0, 2 * np.pi, count)
+    around = np.stack([a * np.cos(angle), b * np.sin(angle)], 1)
+    flat = np.stack([x.ravel(), y.ravel()], 1)
+    nearest = [np.linalg.norm(around - p, axis=1).min() for p in flat]
+    return np.array(nearest).reshape(x.shape)
+
+
+def disc(thickness):
+    """Return the distance to an ellipsoid of revolution squeezed between two planes of samples."""
+    radius, height = np.meshgrid(np.arange(0, 24, 0.25), np.abs(Z[0, 0]), indexing="ij")
+    table = ellipse(radius, height, 10.0, thickness / 2)
+    at = np.hypot(X, Y)
+    return np.stack([np.interp(at[..., k], radius[:, 0], table[:, k]) for k in range(N)], -1)
+
+
+THIN = {
+    "plate": box(X, Y, Z, 9, 7, 0.25),
+    "plate of a sixth": box(X, Y, Z + 0.1, 9, 7, 1 / 12),
+    "lying along x": box(X, Y, Z, 0.2, 7, 9),
+    "disc": disc(0.8),
+    "rod": np.hypot(np.hypot(X - 0.1, Y), np.maximum(np.abs(Z) - 9, 0)) - 0.3,
+    "two sheets": np.minimum(box(X, Y, Z - 4, 9, 7, 0.3), box(X, Y - 0.5, Z + 5, 6, 9, 0.2)),
+    "hollow ball": np.abs(R - 9.2) - 0.05,  # holds samples
+    "hollow box": np.abs(box(X, Y, Z, 8, 7, 9)) - 0.4,
+}
+
+
+@pytest.mark.parametrize("name", sorted(set(THIN) - {"hollow ball"}))
+@pytest.mark.parametrize("spacing", [None, 0.1])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_thin_solids_are_told(name, spacing, sign):
+    values = THIN[name] * sign * 0.1
+    assert (values * sign).min() > 0
+    grid = make_grid(values, spacing=spacing, origin=0)
+    assert grid.spacing == pytest.approx((0.1,) * 3, rel=0.01)
+    assert grid.low > 0
+
+
+UNSIGNED = {
+    "ball": np.abs(R - 9.3),
+    "small ball": np.abs(R - 2.4),
+    "box": np.abs(box(X, Y, Z, 8, 7, 9)),
+    "flat box": np.abs(box(X, Y, Z, 8, 7, 1.6)),
+    "bar": np.abs(box(X, Y, Z + 0.2, 9, 2, 2)),
+    "torus": np.abs(np.hypot(np.hypot(X, Y) - 9, Z) - 3.2),
+    "two balls": np.abs(np.minimum(R - 5, np.sqrt((X - 11) ** 2 + Y**2 + Z**2) - 3)),
+    "thick shell": np.abs(np.abs(R - 9) - 2.3),
+    "rod through the grid": np.abs(np.hypot(X, Y) - 4.4),
+    "lower half": np.abs(Z + 3.1),
+    "turned box": np.abs(box((X + Y) / 2**0.5, (X - Y) / 2**0.5, Z, 8, 7, 6)),
+}
+NO_SURFACE = {
+    "never near": R + 5,
+    "a ball that grew away": R + 0.3,
+    "off the border": X + 15.8,
+    "a ball beyond the border": np.sqrt((X + 18.5) ** 2 + Y**2 + Z**2) - 2.6,
+    "a torus that shrank away": np.hypot(np.hypot(X, Y) - 9, Z) + 0.2,
+    "a sheet that shrank away": np.abs(Z) + 0.2,
+    "parabola": (R / 8) ** 2 + 0.1,
+    "bump": 1.2 - np.exp(-(R**2) / 50),
+    "waves": np.cos(np.indices((N, N, N)) / 4).sum(0) + 3.2,
+    "random": np.random.default_rng(0).random((N, N, N)) + 0.01,
+    "steps": np.maximum(R - 9, 0) + 0.5,
+    "slow": 0.1 * R + 0.05,
+}
+FIELDS = {f"unsigned {name}": values for name, values in UNSIGNED.items()} | NO_SURFACE
+
+
+@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("spacing", [None, 1.0])
+def test_what_only_looks_thin_is_refused_in_one_line(name, spacing):
+    with pytest.raises(GridError) as caught:
+        make_grid(FIELDS[name], spacing=spacing)
+    message = str(caught.value)
+    assert message.startswith("no value is below 0 (the smallest is ") and "\n" not in message
+    far, beyond = "a ball that grew away never near", "off the border a ball beyond the border"
+    if name in far:
+        want = "every wall is nearer to some sample than that, so there is no surface"
+    elif name in beyond:
+        want = "only samples on the border of the grid are near 0, so no surface lies in it"
+    else:
+        want = "an unsigned field has no inside"
+        if spacing is None:  # in the spacing that they seem to have, they may be far from 0
+            message = message.replace("every wall is nearer to some sample", want)
+    assert want in message
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(0.02, 0.9), st.floats(-0.04, 0.04), st.integers(0, 2))
+def test_thickness_is_what_the_distances_leave(thickness, shift, axis):
+    values = np.moveaxis(np.abs(Z + shift) - thickness / 2, 2, axis)
+    walls, found = find_walls(np.moveaxis(values, axis, 0))
+    assert walls.sum() == N * N
+    np.testing.assert_allclose(found, thickness, atol=1e-12)
+
+
+def test_large_unsigned_fields_are_told_from_fewer_samples():
+    x, y, z = (np.arange(160, dtype=np.float32) - 79.3)[:, None, None], *np.ogrid[:160, :160]
+    values = np.abs(np.sqrt(x**2 + (y - 80) ** 2 + (z - 80) ** 2) - 50)
+    assert values.size > MOST_FLOODED
+    with pytest.raises(GridError, match="an unsigned field has no inside"):
+        make_grid(values, spacing=1)
+
+
+def test_the_spacing_of_a_thin_part_is_that_of_the_samples_away_from_it():
+    for name, values in THIN.items():
+        assert typical_length(*straight_gradients(values)) == pytest.approx(1, abs=0.01), name
+
+
+def test_a_given_spacing_is_believed_of_a_thin_part():
+    """Beside the part opposite samples are equal, so values change by little there."""
+    walls = np.abs(Z) - 0.501  # one pair of planes inside, one thousandth of a spacing deep
+    assert make_grid(walls, spacing=1.0, origin=0, inside="negative").notes == ()
+
+
+@pytest.mark.parametrize("turned", [(0, 1, 2), (2, 1, 0), (1, 2, 0)])
+@pytest.mark.parametrize("name", sorted(THIN))
+def test_the_axes_may_come_in_any_order(name, turned):
+    values = THIN[name].transpose(turned)
+    assert make_grid(values, inside="negative").spacing == (1.0, 1.0, 1.0)
+
+
+def test_thin_solids_are_meshed_with_a_warning(tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    np.save("thin.npy", THIN["plate"])
+    code, out, err = command("upsample", "thin.npy", "a.ply", "--json")
+    report = json.loads(out)
+    assert code == 0 and report["closed"] and trimesh.load("a.ply").is_watertight
+    (warning,) = report["warnings"]
+    assert warning == (
+        "no sample lies inside: the solid is thinner than the spacing, and its mesh may have holes"
+    )
+    assert f"Warning: {warning}" in err
+
+
+def test_solids_with_samples_inside_are_meshed_without_a_warning(tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    np.save("ball.npy", ball().values)
+    assert json.loads(command("upsample", "ball.npy", "a.ply", "--json")[1])["warnings"] == []
