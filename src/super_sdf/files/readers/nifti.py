@@ -1,0 +1,33 @@
+"""NIfTI files, with nibabel: arrays (x, y, z), x fastest; world coordinates are RAS."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import GridError
+from ..volume import Request, Volume, from_affine, reversed_axes
+
+
+def read_nifti(request: Request) -> Volume:
+    """Read a ``.nii`` or ``.nii.gz`` file.
+
+    The affine is nibabel's: the sform if there is one, else the qform. Values are scaled by the
+    slope and intercept of the header.
+    """
+    import nibabel
+
+    image = nibabel.Nifti1Image.from_filename(request.path, mmap=False, keep_file_open=True)
+    proxy, shape = image.dataobj, image.shape
+    if len(shape) < 3 or any(size != 1 for size in shape[3:]):
+        raise GridError(f"{request.path} has shape {shape}: give a file of three axes (x, y, z)")
+    rest = (0,) * (len(shape) - 3)
+
+    def read(first: int, last: int) -> NDArray[Any]:
+        return np.asarray(proxy[(..., slice(first, last), *rest)]).T
+
+    spacing, origin, direction = from_affine(image.affine)
+    spacing, direction = reversed_axes(spacing, direction)
+    return Volume(shape[2::-1], read(0, 1).dtype, read, spacing, origin, direction)
