@@ -26,8 +26,8 @@ from vtkmodules.util.numpy_support import numpy_to_vtk
 from vtkmodules.vtkCommonDataModel import vtkImageData
 from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
-from super_sdf import GridError, OptionError, OutOfMemoryError, SdfGrid, read_grid
-from super_sdf.errors import FileError
+from super_sdf import SdfGrid, read_grid
+from super_sdf.errors import FileError, GridError, OptionError, OutOfMemoryError
 from super_sdf.files import formats, unpacking
 from super_sdf.grid.planes import PlaneFile
 
@@ -391,26 +391,37 @@ def save_any(name: str) -> None:
         Path(name).write_text(text_sdf(affine))
 
 
+def read_damaged(name: str, capfd: pytest.CaptureFixture[str]) -> str:
+    """Return the message of the error that a file raises; nothing is printed beside."""
+    with pytest.raises((FileError, GridError)) as caught:
+        read_grid(name)
+    message = str(caught.value)
+    assert message.startswith(name) and len(message.splitlines()) == 1 and len(message) < 400
+    assert capfd.readouterr() == ("", "")
+    return message
+
+
 @pytest.mark.parametrize("share", [0.02, 0.5, 0.9])
 @pytest.mark.parametrize("name", DAMAGED)
-def test_a_truncated_file_is_refused_in_one_line(name, share, command, capfd):
+def test_a_truncated_file_is_refused_in_one_line(name, share, capfd):
     save_any(name)
     whole = Path(name).read_bytes()
     Path(name).write_bytes(whole[: int(share * len(whole))])
-    code, out, err = command("upsample", name, "out.ply")
-    assert (code, out) == (1, "") and err.count("\n") == 1
-    assert err.startswith(f"Error: {name}")
-    assert DAMAGED[name] in err or "truncated" in err or "no .sdf grid" in err
-    assert not Path("out.ply").exists()
-    assert capfd.readouterr().err == ""  # nor does a library print anything
+    said = read_damaged(name, capfd)
+    assert f"cannot be read {DAMAGED[name]}" in said or "truncated" in said or "damaged" in said
 
 
 @pytest.mark.parametrize("name", DAMAGED)
-def test_another_kind_of_file_is_refused_in_one_line(name, command, capfd):
+def test_another_kind_of_file_is_refused_in_one_line(name, capfd):
     Path(name).write_bytes(b"hello, this is no grid at all\n" * 20)
-    code, _, err = command("upsample", name, "out.ply")
-    assert code == 1 and err.startswith(f"Error: {name}") and err.count("\n") == 1
-    assert capfd.readouterr().err == ""
+    read_damaged(name, capfd)
+
+
+def test_nothing_is_written_for_a_damaged_file(command):
+    Path("a.nii").write_bytes(b"no")
+    code, out, err = command("upsample", "a.nii", "out.ply")
+    assert (code, out) == (1, "") and err.startswith("Error: a.nii cannot be read as NIfTI: ")
+    assert os.listdir() == ["a.nii"]
 
 
 def test_a_mesh_as_input_is_told_to_be_sampled_first(command):

@@ -139,7 +139,7 @@ def _one_line_errors(path: Path, format_: GridFormat, watched: InputFile | None)
             warnings.simplefilter("ignore")
             yield
     except SuperSdfError as error:
-        if str(path) in str(error) or isinstance(error, OutOfMemoryError):
+        if str(split_member(path)[0]) in str(error) or isinstance(error, OutOfMemoryError):
             raise
         raise type(error)(f"{path}: {error}") from None
     except Exception as error:  # the libraries raise all kinds of errors

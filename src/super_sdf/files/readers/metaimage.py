@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ...errors import GridError
 from ..volume import Request, Volume, reversed_axes
+from .silence import discarded_stderr
 
 
 def read_metaimage(request: Request) -> Volume:
@@ -52,10 +53,14 @@ def _dtype(sitk: Any, pixel: int) -> np.dtype[Any]:
 
 @contextmanager
 def _quiet(sitk: Any) -> Iterator[None]:
-    """Keep ITK from printing warnings to stderr: what matters is raised."""
+    """Keep ITK from printing to stderr: what matters is raised.
+
+    Its parser of headers writes to the file descriptor itself, so that is redirected meanwhile.
+    """
     shown = sitk.ProcessObject.GetGlobalWarningDisplay()
     sitk.ProcessObject.SetGlobalWarningDisplay(False)
     try:
-        yield
+        with discarded_stderr():
+            yield
     finally:
         sitk.ProcessObject.SetGlobalWarningDisplay(shown)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import gzip
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import GridError
+from ..unpacking import PIECE
 from ..volume import Request, Volume, from_affine, reversed_axes
 
 
@@ -19,14 +21,20 @@ def read_nifti(request: Request) -> Volume:
     """
     import nibabel
 
-    image = nibabel.Nifti1Image.from_filename(request.path, mmap=False, keep_file_open=True)
+    is_packed = request.path.suffix.lower() == ".gz"
+    stream: Any = gzip.open(request.path) if is_packed else request.path.open("rb")
+    holder = nibabel.FileHolder(fileobj=stream)
+    image = nibabel.Nifti1Image.from_file_map({"header": holder, "image": holder}, mmap=False)
     proxy, shape = image.dataobj, image.shape
     if len(shape) < 3 or any(size != 1 for size in shape[3:]):
         raise GridError(f"{request.path} has shape {shape}: give a file of three axes (x, y, z)")
     rest = (0,) * (len(shape) - 3)
 
     def read(first: int, last: int) -> NDArray[Any]:
-        return np.asarray(proxy[(..., slice(first, last), *rest)]).T
+        planes = np.asarray(proxy[(..., slice(first, last), *rest)]).T
+        while last == shape[2] and stream.read(PIECE):
+            pass  # at its end gzip compares the checksum
+        return planes
 
     spacing, origin, direction = from_affine(image.affine)
     spacing, direction = reversed_axes(spacing, direction)

@@ -6,6 +6,8 @@ The extent need not begin at 0: sample (i, j, k) of the extent is at
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,9 @@ from numpy.typing import NDArray
 from ...errors import FileError
 from ..volume import Request, Volume, reversed_axes
 from .choosing import choose_member
+from .silence import discarded_stderr
+
+ERROR = "ERROR:"  # begins each error that VTK prints
 
 
 def read_vti(request: Request) -> Volume:
@@ -22,13 +27,11 @@ def read_vti(request: Request) -> Volume:
     from vtkmodules.vtkIOXML import vtkXMLImageDataReader
 
     reader = vtkXMLImageDataReader()
-    errors: list[str] = []
-    for source in (reader, reader.GetExecutive()):
-        _collect_errors(source, errors)
     reader.SetFileName(str(request.path))
-    _check_file(reader, request, errors)
-    reader.UpdateInformation()
-    _raise_errors(request, errors)
+    with _raised_errors(request):
+        if not reader.CanReadFile(str(request.path)):
+            raise FileError(f"{request.path} is no VTK image data, or damaged")
+        reader.UpdateInformation()
     points = _names(reader.GetPointDataArraySelection())
     cells = _names(reader.GetCellDataArraySelection())
     name = choose_member(request, points or cells, "array of points or cells")
@@ -39,8 +42,8 @@ def read_vti(request: Request) -> Volume:
 
     def read(first: int, last: int) -> NDArray[Any]:
         part = (*extent[:4], extent[4] + first, extent[4] + last - of_points)
-        reader.UpdateExtent(part)
-        _raise_errors(request, errors)
+        with _raised_errors(request):
+            reader.UpdateExtent(part)
         output = reader.GetOutput()
         data = output.GetPointData() if of_points else output.GetCellData()
         found = data.GetArray(name)
@@ -86,25 +89,19 @@ def _names(selection: Any) -> list[str]:
     return [selection.GetArrayName(i) for i in range(selection.GetNumberOfArrays())]
 
 
-def _check_file(reader: Any, request: Request, errors: list[str]) -> None:
-    if not reader.CanReadFile(str(request.path)):
-        _raise_errors(request, errors)
-        raise FileError(f"{request.path} is no VTK image data, or damaged")
+@contextmanager
+def _raised_errors(request: Request) -> Iterator[None]:
+    """Raise FileError for the first error that VTK would print to stderr; print nothing."""
+    from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
 
-
-def _collect_errors(source: Any, errors: list[str]) -> None:
-    """Collect what VTK would print to stderr."""
-
-    def collect(caller: Any, event: str, text: str = "") -> None:
-        errors.append(str(text))
-
-    collect.CallDataType = "string0"  # type: ignore[attr-defined]
-    source.AddObserver("ErrorEvent", collect)
-    source.AddObserver("WarningEvent", lambda caller, event: None)
-
-
-def _raise_errors(request: Request, errors: list[str]) -> None:
-    """Raise FileError if VTK reported an error."""
-    if errors:
-        reason = " ".join(errors[0].split()).split("): ")[-1]
-        raise FileError(f"{request.path} cannot be read by VTK: {reason[:200]}")
+    shown, window = vtkOutputWindow.GetInstance(), vtkStringOutputWindow()
+    vtkOutputWindow.SetInstance(window)
+    try:
+        with discarded_stderr():  # VTK's log
+            yield
+    finally:
+        vtkOutputWindow.SetInstance(shown)
+    text = window.GetOutput()
+    if ERROR in text:
+        reason = " ".join(text[text.index(ERROR) :].split()).split("): ")[1:2] or ["damaged"]
+        raise FileError(f"{request.path} cannot be read by VTK: {reason[0][:200]}")
