@@ -12,6 +12,7 @@ import pytest
 from batches import files
 from conftest import ball
 
+from super_sdf.files.formats import GRID_SUFFIXES
 from super_sdf.batch.inputs import find_jobs
 from super_sdf.convert import ConvertOptions
 
@@ -127,16 +128,17 @@ def test_a_list_without_meaning_is_refused_before_the_work(run_batch, text):
 ARGUMENTS = {
     "nothing": "nothing does not exist: give grids, folders, patterns or a manifest",
     "none.npy": "none.npy does not exist: give grids, folders, patterns or a manifest",
-    "in/*.vdb": "in/*.vdb holds no .npy or .npz file",
-    "empty": "empty holds no .npy or .npz file",
-    "odd.vdb": "odd.vdb is neither a grid (.npy, .npz) nor a manifest (.txt, .jsonl)",
+    "in/*.raw": f"in/*.raw holds no grid ({', '.join(GRID_SUFFIXES)})",
+    "empty": f"empty holds no grid ({', '.join(GRID_SUFFIXES)})",
+    "odd.raw": f"odd.raw is neither a grid ({', '.join(GRID_SUFFIXES)}) nor a manifest "
+    "(.txt, .jsonl)",
 }
 
 
 @pytest.mark.parametrize("argument", ARGUMENTS)
 def test_arguments_that_name_no_grid_are_refused(run_batch, argument):
     Path("empty").mkdir()
-    Path("odd.vdb").write_text("")
+    Path("odd.raw").write_text("")
     assert run_batch("in", argument) == (2, "", f"Error: {ARGUMENTS[argument]}\n")
 
 
@@ -178,7 +180,8 @@ def test_what_is_no_regular_file_fails_by_its_name(run_batch):
         assert "Failed: in/zero.npy is a device: give a file\n" in err
         assert "Failed: in/loop.npz cannot be read: its links lead in a circle\n" in err
     os.mkfifo("list.txt")
-    want = "Error: list.txt is neither a grid (.npy, .npz) nor a manifest (.txt, .jsonl)\n"
+    grids = ", ".join(GRID_SUFFIXES)
+    want = f"Error: list.txt is neither a grid ({grids}) nor a manifest (.txt, .jsonl)\n"
     assert run_batch("list.txt") == (2, "", want)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gzip
 import itertools
+import json
 import os
 import subprocess
 import sys
@@ -211,6 +212,8 @@ def test_nrrd_without_a_space():
         header = {"spacings": [SPACING] * 3, "axis mins": origin - shift}
         nrrd.write("a.nrrd", values, {**header, "centerings": [centering] * 3})
         check(read_grid("a.nrrd"))
+    nrrd.write("short.nrrd", values, {"space dimension": 3, "space directions": np.eye(3) / 2})
+    check(read_grid("short.nrrd", origin=origin))
     nrrd.write("bare.nrrd", values)
     grid = read_grid("bare.nrrd", spacing=SPACING, origin=origin)
     check(grid)
@@ -230,7 +233,7 @@ def test_vti_of_cells_and_of_one_of_several_arrays():
         image.GetCellData().AddArray(values)
     write_vti("cells.vti", image)
     check(read_grid("cells.vti:distance"))
-    with pytest.raises(FileError, match="cells.vti holds several arrays, distance, other: give "):
+    with pytest.raises(FileError, match=r"cells.vti holds several arrays, distance, other: give "):
         read_grid("cells.vti")
 
 
@@ -296,14 +299,15 @@ def test_zarr_arrays_and_groups(version):
         group.create_array(name, **{k: v for k, v in about.items() if k != "zarr_format"})
     group["0"][:] = sampled(affine).T
     check(read_grid("g.zarr:/0", **place))
-    with pytest.raises(FileError, match="g.zarr holds several arrays, /0, /1: give g.zarr:/0, say"):
+    with pytest.raises(FileError, match=r"g.zarr holds several arrays, /0, /1: give g.zarr:/0, "):
         read_grid("g.zarr")
     steps = [{"type": "scale", "scale": [SPACING] * 3}]
     steps.append({"type": "translation", "translation": affine[:3, 3][::-1].tolist()})
     axes = [{"name": axis, "type": "space"} for axis in "zyx"]
     levels = [{"path": "0", "coordinateTransformations": steps}, {"path": "1"}]
     scales = [{"axes": axes, "datasets": levels}]
-    group.attrs.update({"multiscales": scales} if version == 2 else {"ome": {"multiscales": scales}})
+    about = {"multiscales": scales}
+    group.attrs.update(about if version == 2 else {"ome": about})
     check(read_grid("g.zarr"))
 
 
@@ -453,7 +457,7 @@ def test_axes_that_the_file_states_are_not_overruled():
 
 def test_what_a_library_loads_whole_is_refused_if_it_would_not_fit():
     save_nrrd("a.nrrd", affine_of(np.eye(3)))
-    with pytest.raises(OutOfMemoryError, match="a.nrrd takes .* since pynrrd loads it whole"):
+    with pytest.raises(OutOfMemoryError, match=r"a.nrrd takes .* since pynrrd loads it whole"):
         read_grid("a.nrrd", max_memory=1000)
 
 
@@ -484,21 +488,53 @@ def test_a_wrong_checksum_in_a_compressed_file_is_found():
     packed = bytearray(gzip.compress(Path("a.nii").read_bytes()))
     packed[-8] ^= 1
     Path("a.nii.gz").write_bytes(packed)
-    with pytest.raises(FileError, match="a.nii.gz cannot be read as NIfTI"):
+    with pytest.raises(FileError, match=r"a.nii.gz cannot be read as NIfTI"):
         read_grid("a.nii.gz")
 
 
 @pytest.mark.parametrize("name", ["a.nii.gz", "a.mha", "a.vti", "a.h5:/field", "a.sdf", "a.vdb"])
 def test_the_command_makes_the_mesh_at_its_place(name, command):
     save_any(name.split(":")[0])
-    given = ["--origin", ",".join(map(str, affine_of(np.eye(3))[:3, 3]))] * (name[2] == "h")
-    given = [f"--origin={given[1]}"] if given else []
-    code, _, err = command("upsample", name, "out.ply", "--quality", "fast", "--spacing", 0.5, *given)
+    origin = ",".join(map(str, affine_of(np.eye(3))[:3, 3]))
+    given = ["--spacing", "0.5", f"--origin={origin}"] if ".h5" in name else []
+    code, _, err = command("upsample", name, "out.ply", "--quality", "fast", *given)
     assert code == 0, err
     mesh = trimesh.load("out.ply")
     assert mesh.is_watertight and mesh.volume > 0
     if name != "a.vdb":
         assert np.abs(part(mesh.vertices)).max() < 0.05
+
+
+def test_batch_takes_the_same_inputs(command):
+    """Arrays of a file by name, folders that are grids, and double suffixes."""
+    affine = affine_of(np.eye(3))
+    os.mkdir("in")
+    save_nifti("in/a.nii.gz", affine)
+    with h5py.File("two.h5", "w") as file:
+        file["deep/b"] = file["c"] = sampled(affine).T
+    store = zarr.create_array("in/d.zarr", shape=SIZES[::-1], chunks=(5, 6, 7), dtype="f4")
+    store[:] = sampled(affine).T
+    arguments = ["in", "two.h5:/deep/b", "two.h5:c", "--out", "out", "--quality", "fast"]
+    arguments += ["--spacing", "0.5", "--jobs", "1", "--json"]
+    code, out, err = command("batch", *arguments)
+    assert code == 0, err
+    names = sorted(path.name for path in Path("out").glob("*.ply"))
+    assert names == ["a.ply", "d.ply", "two-c.ply", "two-deep-b.ply"]
+    options = ("--quality", "fast", "--spacing", 0.5)
+    assert command("upsample", "in/a.nii.gz", "a.ply", *options)[0] == 0
+    assert Path("a.ply").read_bytes() == Path("out/a.ply").read_bytes()
+    before = Path("out/d.ply").read_bytes()
+    store[:] = sampled(affine).T + 0.2
+    code, out, err = command("batch", *arguments)
+    assert code == 0 and json.loads(out)["done"] == 1, out
+    assert Path("out/d.ply").read_bytes() != before
+
+
+def test_the_page_on_formats_lists_those_of_the_table():
+    page = (Path(__file__).parent.parent / "docs" / "formats.md").read_text()
+    for format_ in formats.FORMATS:
+        start = f"| {format_.name} | `{'`, `'.join(format_.suffixes)}` | "
+        assert start + (f"`{format_.extra}`" if format_.extra else "none") in page
 
 
 def test_no_library_is_imported_for_numpy_files():

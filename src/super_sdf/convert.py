@@ -50,6 +50,7 @@ class ConvertOptions:
     factor: int = 4
     spacing: tuple[float, ...] | None = None
     origin: tuple[float, ...] | None = None
+    axes: str | None = None
     inside: str = "auto"
     offset: float = 0.0
     cap: bool = False
@@ -146,7 +147,7 @@ def convert(
     network : Network
         From ``load_network``; it can be used for any number of files.
     options : ConvertOptions
-        Factor, spacing, sign, offset, cap, mesher, memory bound and simplification.
+        Factor, spacing, axis order, sign, offset, cap, mesher, memory bound and simplification.
     force : bool
         Replace the target if it exists.
     progress : callable, optional
@@ -170,6 +171,7 @@ def convert(
         source,
         spacing=options.spacing,
         origin=options.origin,
+        axes=options.axes,
         inside=options.inside,
         max_memory=options.max_memory,
     )

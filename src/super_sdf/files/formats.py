@@ -60,7 +60,7 @@ FORMATS = (
 GRID_SUFFIXES = tuple(suffix for format_ in FORMATS for suffix in format_.suffixes)
 AXES = ("xyz", "zyx")
 _MEMBERS = "|".join(s[1:] for f in FORMATS if f.has_members for s in f.suffixes)
-_WITH_MEMBER = re.compile(rf"(?P<file>.*\.(?:{_MEMBERS}))[:](?P<member>.+)", re.I | re.S)
+_WITH_MEMBER = re.compile(rf"(?P<file>.*\.(?:{_MEMBERS})):(?P<member>.+)", re.I | re.S)
 
 
 def find_format(path: str | Path) -> GridFormat:
@@ -71,11 +71,10 @@ def find_format(path: str | Path) -> GridFormat:
     OptionError
         If it is none of the table, such as a mesh.
     """
-    name = str(split_member(path)[0]).lower()
-    for format_ in FORMATS:
-        if name.endswith(format_.suffixes):
-            return format_
-    if name.endswith(MESH_SUFFIXES):
+    ending = _ending(split_member(path)[0])
+    if ending:
+        return next(format_ for format_ in FORMATS if ending in format_.suffixes)
+    if str(path).lower().endswith(MESH_SUFFIXES):
         raise OptionError(
             f"{path} is a mesh, not a grid: sample it first with "
             f"super-sdf sample {path} {PurePath(path).stem}.npz"
@@ -85,23 +84,33 @@ def find_format(path: str | Path) -> GridFormat:
 
 def is_grid(path: str | Path) -> bool:
     """Return whether a name is that of a grid file, by its end."""
-    return str(split_member(path)[0]).lower().endswith(GRID_SUFFIXES)
+    return bool(_ending(split_member(path)[0]))
 
 
-def split_member(path: str | Path) -> tuple[Path, str | None]:
+def _ending(path: PurePath) -> str:
+    """Return the suffix by which a file is a grid, in lower case; "" if it is none."""
+    name = path.name.lower()
+    found = [end for end in GRID_SUFFIXES if name.endswith(end) and len(name) > len(end)]
+    return max(found, key=len, default="")
+
+
+def split_member(path: str | PurePath) -> tuple[Path, str | None]:
     """Split ``FILE:NAME`` into the file and the name of an array in it, None if none is named."""
     found = _WITH_MEMBER.fullmatch(str(path))
     return (Path(found["file"]), found["member"]) if found else (Path(path), None)
 
 
-def without_suffix(path: PurePath) -> PurePath:
-    """Return the path of a grid without its suffix; the name of an array becomes part of it."""
-    file, member = split_member(Path(path))
-    ending = next(s for s in sorted(GRID_SUFFIXES, key=len)[::-1] if file.name.lower().endswith(s))
-    stem = file.name[: -len(ending)]
+def mesh_path(path: PurePath, suffix: str) -> PurePath:
+    """Return the path of a grid with the suffix of a mesh.
+
+    The name of an array in the file becomes a part of it: ``a.h5:/b/c`` becomes ``a-b-c.ply``.
+    """
+    file, member = split_member(path)
+    ending = _ending(file)
+    stem = file.name[: len(file.name) - len(ending)]
     if member:
         stem += "-" + member.strip("/").replace("/", "-")
-    return PurePath(path if not member else file).parent.joinpath(stem)
+    return PurePath(file).with_name(stem + suffix) if ending else PurePath(path).with_suffix(suffix)
 
 
 def check_library(format_: GridFormat) -> None:
@@ -129,9 +138,16 @@ def choose_axes(format_: GridFormat, given: str | None) -> str:
     return given
 
 
+def _listed(names: list[str]) -> str:
+    return f"{', '.join(names[:-1])} or {names[-1]}"
+
+
 def list_formats() -> str:
     """Return the formats and their suffixes for help texts, in one sentence."""
     names = dict.fromkeys(format_.name for format_ in FORMATS)
     suffixes = {n: [s for f in FORMATS if f.name == n for s in f.suffixes] for n in names}
-    listed = [f"{name} ({', '.join(suffixes[name])})" for name in names]
-    return f"{', '.join(listed[:-1])} or {listed[-1]}"
+    return _listed([f"{name} ({', '.join(suffixes[name])})" for name in names])
+
+
+NAMED = _listed([format_.name for format_ in FORMATS if format_.has_members])
+"""The formats whose files may hold several arrays, for help texts."""

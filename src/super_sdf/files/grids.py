@@ -9,7 +9,7 @@ from __future__ import annotations
 import warnings
 import zipfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from .formats import GridFormat, check_library, choose_axes, find_format, split_
 from .headers import ArrayHeader, Read, read_array_header
 from .output import check_free, replacing
 from .regular import check_regular_file
-from .store import check_store
+from .store import check_grid_file
 from .unpacking import unpack
 from .volume import Request, Volume, axes_direction, take
 
@@ -90,7 +90,8 @@ def read_grid(
         found = _read_numpy(check_regular_file(path), order, room, given)
     else:
         found = _read_foreign(path, format_, order, room, given, max_memory)
-    return make_grid(found["values"], inside=inside, spacing=found["spacing"], origin=found["origin"])
+    values, spacing, origin = (found[key] for key in NPZ_KEYS)
+    return make_grid(values, spacing=spacing, origin=origin, inside=inside)
 
 
 def _read_numpy(path: Path, axes: str, room: int, given: dict[str, Any]) -> dict[str, Any]:
@@ -116,18 +117,15 @@ def _read_foreign(
 ) -> dict[str, Any]:
     """Return values, spacing and origin of a file that its own library reads."""
     file, member = split_member(path)
-    if format_.key == "zarr":
-        check_store(file)
-    else:
-        check_regular_file(file)
+    check_grid_file(path)
     check_library(format_)
     from .readers.table import READERS
 
     watched = None if file.is_dir() else InputFile.open(file)
     bound = memory_bound(max_memory)
     left = None if bound is None else bound - (held_memory() or 0)
-    with _one_line_errors(path, format_, watched):
-        volume = READERS[format_.key](Request(file, member, axes, room, left))
+    with _one_line_errors(path, format_, watched), ExitStack() as files:
+        volume = READERS[format_.key](Request(file, member, axes, room, left, files))
         return take(volume, str(path), room, given)
 
 

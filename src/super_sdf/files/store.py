@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from ..errors import FileError
+from .formats import find_format, split_member
 from .regular import check_regular_file, reason_of
 
 MARKS = ("zarr.json", ".zarray", ".zgroup")  # one of them makes a folder a Zarr store
@@ -34,4 +35,13 @@ def check_store(path: Path) -> Path:
 
 def is_store(path: str | Path) -> bool:
     """Return whether a path is a folder whose name is that of a Zarr store."""
-    return Path(path).suffix.lower() == ".zarr" and os.path.isdir(path)
+    return str(path).lower().endswith(".zarr") and os.path.isdir(path)
+
+
+def check_grid_file(path: str | Path) -> None:
+    """Raise FileError unless the file that ``FILE`` or ``FILE:NAME`` names can be read."""
+    file, _ = split_member(path)
+    if find_format(path).key == "zarr":
+        check_store(file)
+    else:
+        check_regular_file(file)

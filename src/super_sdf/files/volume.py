@@ -7,6 +7,7 @@ method takes: those whose axes are the world's, in any order and direction.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from math import prod
@@ -45,6 +46,8 @@ class Request:
         Bytes of memory that the unpacked array may take.
     left : int or None
         Bytes of memory that the process may still take; None if unknown.
+    files : ExitStack
+        Closes the files that the reader opens, once the volume is copied.
     """
 
     path: Path
@@ -52,6 +55,7 @@ class Request:
     axes: str
     room: int
     left: int | None
+    files: ExitStack
 
     def check_loads(self, size: int, library: str) -> None:
         """Raise OutOfMemoryError if an array that is loaded whole would not fit in memory."""
@@ -218,7 +222,7 @@ def _copy(volume: Volume, placement: Placement, write: Write) -> None:
     count = volume.shape[0]
     for first, last in _slabs(volume):
         block = np.asarray(volume.read(first, last)).astype(volume.dtype, copy=False)
-        block = np.ascontiguousarray(np.flip(block, flipped).transpose(order))
+        block = np.ascontiguousarray(np.flip(block, tuple(flipped)).transpose(order))
         start = count - last if placement.backwards[0] else first
         if slowest == 0:
             write(start * block[0].nbytes, block.reshape(-1).view(np.uint8))

@@ -16,7 +16,7 @@ def read_hdf5(request: Request) -> Volume:
     """Read ``FILE.h5:/DATASET``; without a name the only dataset of three axes."""
     import h5py
 
-    file = h5py.File(request.path, "r")
+    file = request.files.enter_context(h5py.File(request.path, "r"))
     found: list[str] = []
 
     def note(name: str, entry: Any) -> None:

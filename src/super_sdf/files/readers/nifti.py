@@ -22,7 +22,8 @@ def read_nifti(request: Request) -> Volume:
     import nibabel
 
     is_packed = request.path.suffix.lower() == ".gz"
-    stream: Any = gzip.open(request.path) if is_packed else request.path.open("rb")
+    opened: Any = gzip.open if is_packed else open
+    stream = request.files.enter_context(opened(request.path, "rb"))
     holder = nibabel.FileHolder(fileobj=stream)
     image = nibabel.Nifti1Image.from_file_map({"header": holder, "image": holder}, mmap=False)
     proxy, shape = image.dataobj, image.shape

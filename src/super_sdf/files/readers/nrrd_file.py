@@ -36,26 +36,25 @@ def read_nrrd(request: Request) -> Volume:
 
 
 def _place(header: dict[str, Any]) -> tuple[Any, Any, NDArray[np.float64]]:
-    """Return spacing, origin and direction of the array in C order."""
-    if header.get("space directions") is not None:
-        matrix = np.zeros((3, 4))
-        directions = np.asarray(header["space directions"], np.float64)
-        if directions.shape != (3, 3) or not np.isfinite(directions).all():
-            raise FileError(f"its space directions are {directions.tolist()}: give three of three")
-        matrix[:, :3] = directions.T
-        spacing, origin, direction = from_affine(matrix)
-        if header.get("space origin") is None:
-            return *reversed_axes(spacing, direction), None
-        origin = tuple(float(x) for x in header["space origin"])
-        spacing, direction = reversed_axes(spacing, direction)
-        return spacing, origin, direction
-    spacings = header.get("spacings")
+    """Return spacing, origin and direction of the array in C order; None for what is not stated."""
+    directions = header.get("space directions")
+    if directions is not None:
+        columns = np.asarray(directions, np.float64).T
+        if columns.shape != (3, 3) or not np.isfinite(columns).all():
+            raise FileError(f"its space directions are {columns.T.tolist()}: give three of three")
+        lengths, _, direction = from_affine(np.column_stack([columns, np.zeros(3)]))
+        spacing, direction = reversed_axes(lengths, direction)
+        return spacing, _numbers(header.get("space origin")), direction
+    spacings, least = header.get("spacings"), header.get("axis mins")
+    spacing, direction = reversed_axes(XYZ[0] if spacings is None else spacings, XYZ)
     if spacings is None or not np.isfinite(spacings).all():
-        return None, None, XYZ[:, ::-1]
-    spacing, direction = reversed_axes(spacings, XYZ)
-    least = header.get("axis mins")
+        return None, None, direction
     if least is None or not np.isfinite(least).all():
         return spacing, None, direction
     cells = [kind == "cell" for kind in header.get("centerings", ("node",) * 3)]
     origin = np.asarray(least, np.float64) + np.where(cells, np.asarray(spacings) / 2, 0)
-    return spacing, tuple(map(float, origin)), direction
+    return spacing, _numbers(origin), direction
+
+
+def _numbers(numbers: Any) -> tuple[float, ...] | None:
+    return None if numbers is None else tuple(float(number) for number in numbers)

@@ -83,8 +83,8 @@ def _read_text(file: InputFile, beginning: bytes) -> Volume:
         head = None
     if head is None or min(nx, ny, nz) < 1 or 2 * nx * ny * nz - 1 > file.size - head.end():
         raise FileError(
-            f"{file.name} is no .sdf grid, or truncated: SDFGen's text begins with three sizes, the "
-            "origin and the spacing, and a value for each sample follows"
+            f"{file.name} is no .sdf grid, or truncated: SDFGen's text begins with three sizes, "
+            "the origin and the spacing, and a value for each sample follows"
         )
     values = _Values(file, head.end(), nx * ny * nz)
 

@@ -22,7 +22,7 @@ def read_tiff(request: Request) -> Volume:
     """Read the first series of a ``.tif`` file: pages of one size, or an ImageJ or OME stack."""
     import tifffile
 
-    file = tifffile.TiffFile(request.path)
+    file = request.files.enter_context(tifffile.TiffFile(request.path))
     series = file.series[0]
     if len(series.shape) != 3 or "S" in series.axes:
         raise GridError(

@@ -42,7 +42,7 @@ def read_vdb(request: Request) -> Volume:
     if not len(ijk):
         raise GridError(f"{request.path} has no active voxel: it holds no surface")
     level_set = _LevelSet(ijk, values, background)
-    spacing, origin, direction = from_affine(affine)
+    spacing, _, direction = from_affine(affine)
     first = affine[:, :3] @ level_set.first + affine[:, 3]
     shape = level_set.shape
     dtype = np.dtype(np.float32)
