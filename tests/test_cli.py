@@ -13,9 +13,9 @@ import trimesh
 from conftest import ball
 
 import super_sdf
-from super_sdf.files.formats import GRID_SUFFIXES
 from super_sdf.cli import main as cli
 from super_sdf.cli.upsample import upsample_command
+from super_sdf.files.formats import GRID_SUFFIXES
 
 
 @pytest.fixture

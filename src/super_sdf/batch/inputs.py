@@ -83,8 +83,8 @@ class Search:
             return self._below(path, files_below(path, self._note), argument)
         if suffix in MANIFEST_SUFFIXES and os.path.isfile(path):
             return read_manifest(path, self.suffix, self.options)
-        if is_grid(path) and os.path.lexists(split_member(path)[0]):
-            return self._below(path.parent, [path], argument)
+        if is_grid(path) and os.path.lexists(file := split_member(path)[0]):
+            return self._below(file.parent, [path], argument)
         if glob.has_magic(argument):
             return self._below(fixed_part(path), matches(path, self._note), argument)
         if not argument or not os.path.lexists(path):
