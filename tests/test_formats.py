@@ -327,6 +327,17 @@ def test_a_level_set_that_openvdb_wrote():
     assert (exact == -1.5).any() and grid.spacing == (0.5, 0.5, 0.5)
 
 
+def test_a_level_set_with_turned_axes_that_openvdb_wrote():
+    """By OpenVDB 10: a ball of radius 1.5 at index (2, 4, 6), i along y, j along -z, k along x.
+
+    OpenVDB says that this index is at (10, 9, 7).
+    """
+    grid = read_grid(DATA / "turned-ball.vdb")
+    places = np.moveaxis(np.indices(grid.shape), 0, -1) * 0.5 + grid.origin
+    exact = np.clip(np.linalg.norm(places - [10, 9, 7], axis=-1) - 1.5, -1.5, 1.5)
+    assert np.abs(grid.values - exact).max() < 1e-5
+
+
 def text_sdf(affine: np.ndarray) -> str:
     """Return the text that SDFGen's main.cpp writes: endl after each value, i fastest."""
     origin = " ".join(map(str, affine[:3, 3]))

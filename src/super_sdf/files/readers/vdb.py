@@ -62,11 +62,11 @@ def _choose(file: Any, request: Request) -> Any:
 def _affine(transform: dict[str, Any]) -> NDArray[np.float64]:
     """Return the matrix (3, 4) from indices to world coordinates."""
     kind = str(transform["type"])
-    matrix = np.diag(np.asarray(transform["scale"], np.float64))
-    if "scale" not in kind and kind != "translation":  # vectors are rows there
-        matrix = np.asarray(transform["matrix"], np.float64)[:3, :3].T
-    shift = np.asarray(transform["translation"], np.float64)
-    return np.column_stack([matrix, shift])
+    if "scale" in kind or kind == "translation":
+        scale = np.asarray(transform["scale"], np.float64)
+        return np.column_stack([np.diag(scale), transform["translation"]])
+    rows = np.asarray(transform["matrix"], np.float64)  # OpenVDB multiplies rows by it
+    return rows.T[:3]
 
 
 class _LevelSet:
