@@ -50,7 +50,6 @@ class ConvertOptions:
     factor: int = 4
     spacing: tuple[float, ...] | None = None
     origin: tuple[float, ...] | None = None
-    axes: str | None = None
     inside: str = "auto"
     offset: float = 0.0
     cap: bool = False
@@ -58,6 +57,7 @@ class ConvertOptions:
     mesher: str = DEFAULT_MESHER
     simplify: float | None = None
     triangles: int | None = None
+    axes: str | None = None
 
     @property
     def simplifies(self) -> bool:

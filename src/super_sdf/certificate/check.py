@@ -51,12 +51,12 @@ class CheckOptions:
 
     spacing: tuple[float, ...] | None = None
     origin: tuple[float, ...] | None = None
-    axes: str | None = None
     inside: str = "auto"
     offset: float = 0.0
     max_memory: int | None = None
     intersections: bool = True
     processes: int = 1
+    axes: str | None = None
 
     @classmethod
     def of(cls, options: ConvertOptions) -> CheckOptions:
