@@ -14,6 +14,7 @@ from conftest import ball
 
 from super_sdf.batch.inputs import find_jobs
 from super_sdf.convert import ConvertOptions
+from super_sdf.files.formats import GRID_SUFFIXES
 
 pytestmark = pytest.mark.usefixtures("grid_folder")
 
@@ -61,7 +62,7 @@ LISTS = {
     "": "list.jsonl names no file: give a path a line",
     '{"out": "a.ply"}': "list.jsonl, line 1: 'in' is None: give the path of a grid",
     '{"in": "a.npy", "Factor": 2}': "list.jsonl, line 1: 'Factor' is unknown: give in, out, "
-    "factor, spacing, origin, inside, offset, cap, mesher, simplify, triangles",
+    "factor, spacing, origin, axes, inside, offset, cap, mesher, simplify, triangles",
     '{"in": "a.npy", "simplify": 0}': "list.jsonl, line 1: 'simplify' is 0.0: give a number "
     "greater than 0",
     '{"in": "a.npy", "simplify": 1, "triangles": 9}': "list.jsonl, line 1: 'simplify' 1.0 and "
@@ -127,16 +128,17 @@ def test_a_list_without_meaning_is_refused_before_the_work(run_batch, text):
 ARGUMENTS = {
     "nothing": "nothing does not exist: give grids, folders, patterns or a manifest",
     "none.npy": "none.npy does not exist: give grids, folders, patterns or a manifest",
-    "in/*.vdb": "in/*.vdb holds no .npy or .npz file",
-    "empty": "empty holds no .npy or .npz file",
-    "odd.vdb": "odd.vdb is neither a grid (.npy, .npz) nor a manifest (.txt, .jsonl)",
+    "in/*.raw": f"in/*.raw holds no grid ({', '.join(GRID_SUFFIXES)})",
+    "empty": f"empty holds no grid ({', '.join(GRID_SUFFIXES)})",
+    "odd.raw": f"odd.raw is neither a grid ({', '.join(GRID_SUFFIXES)}) nor a manifest "
+    "(.txt, .jsonl)",
 }
 
 
 @pytest.mark.parametrize("argument", ARGUMENTS)
 def test_arguments_that_name_no_grid_are_refused(run_batch, argument):
     Path("empty").mkdir()
-    Path("odd.vdb").write_text("")
+    Path("odd.raw").write_text("")
     assert run_batch("in", argument) == (2, "", f"Error: {ARGUMENTS[argument]}\n")
 
 
@@ -178,7 +180,8 @@ def test_what_is_no_regular_file_fails_by_its_name(run_batch):
         assert "Failed: in/zero.npy is a device: give a file\n" in err
         assert "Failed: in/loop.npz cannot be read: its links lead in a circle\n" in err
     os.mkfifo("list.txt")
-    want = "Error: list.txt is neither a grid (.npy, .npz) nor a manifest (.txt, .jsonl)\n"
+    grids = ", ".join(GRID_SUFFIXES)
+    want = f"Error: list.txt is neither a grid ({grids}) nor a manifest (.txt, .jsonl)\n"
     assert run_batch("list.txt") == (2, "", want)
 
 

@@ -315,7 +315,7 @@ def test_the_coloured_mesh_is_a_mesh_with_residuals(here, command):
     [
         ("none.ply ball.npz", 1, "none.ply does not exist"),
         ("ball.ply none.npz", 1, "none.npz does not exist"),
-        ("ball.ply ball.ply", 2, "ball.ply is not a grid file: give .npy or .npz"),
+        ("ball.ply ball.ply", 2, "ball.ply is a mesh, not a grid: sample it first"),
         ("ball.ply ball.npz --out c.stl", 2, "c.stl is not a coloured mesh file: give .ply"),
         ("ball.ply ball.npz --out no/c.ply", 1, "no is not a folder: make it first"),
         ("ball.ply ball.npz --out off.ply", 1, "off.ply exists: remove it or use --force"),

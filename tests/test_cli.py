@@ -15,6 +15,7 @@ from conftest import ball
 import super_sdf
 from super_sdf.cli import main as cli
 from super_sdf.cli.upsample import upsample_command
+from super_sdf.files.formats import GRID_SUFFIXES
 
 
 @pytest.fixture
@@ -166,7 +167,7 @@ def bad_files() -> None:
 CASES = {
     ("none.npy",): (1, "none.npy does not exist"),
     ("folder.npy",): (1, "folder.npy is a folder: give a file"),
-    ("in.vdb",): (2, "in.vdb is not a grid file: give .npy or .npz"),
+    ("in.raw",): (2, f"in.raw is not a grid file: give one of {', '.join(GRID_SUFFIXES)}"),
     ("text.npy",): (1, "text.npy is not an .npy array: its header cannot be read"),
     ("empty.npy",): (1, "empty.npy is empty: give a file with something in it"),
     ("text.npz",): (1, "text.npz is not a readable .npz archive: File is not a zip file"),

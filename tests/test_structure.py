@@ -15,6 +15,17 @@ MODULES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts): path
     for path in PACKAGE.rglob("*.py")
 }
+# The library of each file format is imported by its reader alone, and only when it reads.
+READERS = {
+    "files.readers.hdf5": {"h5py"},
+    "files.readers.metaimage": {"SimpleITK"},
+    "files.readers.nifti": {"nibabel"},
+    "files.readers.nrrd_file": {"nrrd"},
+    "files.readers.tiff": {"tifffile"},
+    "files.readers.vdb": {"tinyvdb"},
+    "files.readers.vti": {"vtkmodules"},
+    "files.readers.zarr_store": {"zarr"},
+}
 # Rooms that need more than the few packages that are always installed.
 WITH_EXTRAS = {"certificate", "evaluation", "pictures", "simplification", "truth"}
 
@@ -81,7 +92,8 @@ def test_no_string_names_a_module(module):
 @pytest.mark.parametrize("module", [m for m in MODULES if room_of(m) not in WITH_EXTRAS])
 def test_the_runtime_needs_few_packages(module):
     allowed = {"click", "numpy", "onnxruntime", "trimesh"} | set(sys.stdlib_module_names)
-    allowed |= {"batch.lock": {"filelock"}, "machine.memory": {"psutil"}}.get(module, set())
+    others = {"batch.lock": {"filelock"}, "machine.memory": {"psutil"}, **READERS}
+    allowed |= others.get(module, set())
     foreign = imported(MODULES[module]) - set(MODULES) - {"", "__init__"}
     assert {name.split(".")[0] for name in foreign} <= allowed
 

@@ -62,6 +62,7 @@ class ConvertOptions:
     mesher: str = DEFAULT_MESHER
     simplify: float | None = None
     triangles: int | None = None
+    axes: str | None = None
 
     @property
     def simplifies(self) -> bool:
@@ -155,7 +156,7 @@ def convert(
     network : Network
         From ``load_network``; it can be used for any number of files.
     options : ConvertOptions
-        Factor, spacing, sign, offset, cap, mesher, memory bound and simplification.
+        Factor, spacing, axis order, sign, offset, cap, mesher, memory bound and simplification.
     force : bool
         Replace the target if it exists.
     progress : callable, optional
@@ -179,6 +180,7 @@ def convert(
         source,
         spacing=options.spacing,
         origin=options.origin,
+        axes=options.axes,
         inside=options.inside,
         max_memory=options.max_memory,
     )

@@ -14,9 +14,10 @@ from typing import NamedTuple
 
 from ..convert import ConvertOptions
 from ..errors import FileError, OptionError
-from ..files.grids import GRID_SUFFIXES
+from ..files.formats import GRID_SUFFIXES, is_grid, mesh_path, split_member
 from ..files.meshes import check_mesh_suffix
 from ..files.regular import reason_of
+from ..files.store import is_store
 from .job import Job
 from .journal import LOCK_NAME
 from .journal import NAME as JOURNAL
@@ -76,12 +77,14 @@ class Search:
     def expand(self, argument: str) -> list[Job]:
         """Return the jobs that one argument stands for."""
         path, suffix = Path(argument), Path(argument).suffix.lower()
+        if is_store(path):
+            return self._below(path.parent, [path], argument)
         if argument and os.path.isdir(path):
             return self._below(path, files_below(path, self._note), argument)
         if suffix in MANIFEST_SUFFIXES and os.path.isfile(path):
             return read_manifest(path, self.suffix, self.options)
-        if suffix in GRID_SUFFIXES and os.path.lexists(path):
-            return self._below(path.parent, [path], argument)
+        if is_grid(path) and os.path.lexists(file := split_member(path)[0]):
+            return self._below(file.parent, [path], argument)
         if glob.has_magic(argument):
             return self._below(fixed_part(path), matches(path, self._note), argument)
         if not argument or not os.path.lexists(path):
@@ -100,16 +103,16 @@ class Search:
         Anything with a grid's suffix counts. If it is no regular file, its job fails and names it.
         """
         grids = sorted(
-            path for path in paths if path.suffix.lower() in GRID_SUFFIXES and not path.is_dir()
+            path for path in paths if is_grid(path) and (is_store(path) or not path.is_dir())
         )
         if not grids:
             if self.unread:
                 raise FileError(" ".join(self.unread[-1]))
-            raise OptionError(f"{argument} holds no {' or '.join(GRID_SUFFIXES)} file")
+            raise OptionError(f"{argument} holds no grid ({', '.join(GRID_SUFFIXES)})")
         return [Job(p, self._target(p.relative_to(root)), self.options) for p in grids]
 
     def _target(self, path: Path) -> str:
-        return path.with_suffix(self.suffix).as_posix()
+        return mesh_path(path, self.suffix).as_posix()
 
     def _note(self, error: OSError) -> None:
         self.unread.append((str(error.filename), reason_of(error)))

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from ..convert import ConvertOptions, convert
 from ..errors import FileError, GridError, OptionError, WriteError
-from ..files.regular import check_regular_file
+from ..files.store import check_grid_file
 from ..network.decoder import Decoder
 from .fingerprint import Fingerprint, fingerprint
 from .journal import note_made
@@ -76,7 +76,7 @@ def attempt(job: Job, folder: Path, network: Decoder, check: bool = False) -> Ro
         mesh_prints.append(_note_mesh(part, folder, job.target))
 
     try:
-        check_regular_file(job.source)
+        check_grid_file(job.source)
         _make_folder(target.parent)
         done = convert(
             job.source, target, network, job.options, force=job.replace, before_rename=note

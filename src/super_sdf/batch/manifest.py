@@ -19,6 +19,7 @@ from typing import Any
 
 from ..convert import ConvertOptions
 from ..errors import FileError, OptionError
+from ..files.formats import AXES, mesh_path
 from ..files.meshes import MESH_SUFFIXES
 from ..grid.sides import INSIDE
 from ..options import check_error, check_goal, check_triangles
@@ -122,7 +123,7 @@ def _default_target(source: str, suffix: str) -> PurePath:
     """Return the path of a mesh in the output folder: that of the grid below the manifest."""
     if PurePath(source).name in ("", ".."):
         raise OptionError(f"'in' is {source!r}: give the path of a grid")
-    path = PurePath(source).with_suffix(suffix)
+    path = mesh_path(PurePath(source), suffix)
     return PurePath(path.name) if path.is_absolute() or ".." in path.parts else path
 
 
@@ -179,6 +180,12 @@ def _inside(name: str, value: Any) -> str:
     return str(value)
 
 
+def _axes(name: str, value: Any) -> str:
+    if value not in AXES:
+        raise OptionError(f"{name!r} is {value!r}: give one of {', '.join(AXES)}")
+    return str(value)
+
+
 def _flag(name: str, value: Any) -> bool:
     if type(value) is not bool:
         raise OptionError(f"{name!r} is {value!r}: give true or false")
@@ -203,6 +210,7 @@ CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "factor": _factor,
     "spacing": _numbers,
     "origin": _numbers,
+    "axes": _axes,
     "inside": _inside,
     "offset": _number,
     "cap": _flag,

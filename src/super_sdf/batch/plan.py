@@ -12,7 +12,7 @@ from pathlib import Path
 from .. import __version__
 from ..network.network import find_model
 from ..steps.mesher_names import MARCHING
-from .fingerprint import fingerprint, is_unchanged
+from .fingerprint import file_state, fingerprint, is_unchanged
 from .job import Job, Result, Row, failed_row
 from .journal import Journal, read_journal
 from .ledger import Ledger
@@ -131,6 +131,8 @@ class Planner:
         options = asdict(replace(job.options, max_memory=None))
         if options["mesher"] == MARCHING:
             del options["mesher"]  # so that rows of versions without this option still hold
+        if options["axes"] is None:
+            del options["axes"]
         if not job.options.simplifies:
             del options["simplify"], options["triangles"]
         settings = [options, self.network, __version__]
@@ -184,7 +186,7 @@ def preview(jobs: Sequence[Job], settings: Settings) -> Batch:
 def expected_work(job: Job) -> float:
     """Return the estimated work of a job: proportional to its surface, plus a constant."""
     try:
-        size = job.source.stat().st_size
+        size = file_state(job.source)[0]
     except OSError:
         size = 0
     return 1000 + float(size ** (2 / 3))

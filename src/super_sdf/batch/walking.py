@@ -12,13 +12,18 @@ from collections.abc import Callable, Iterator
 from fnmatch import fnmatch
 from pathlib import Path
 
+from ..files.store import is_store
+
 OnError = Callable[[OSError], None]
 """Called with the error of a folder that cannot be read."""
 
 
 def files_below(folder: Path, on_error: OnError) -> Iterator[Path]:
-    """Yield everything below a folder that is not a folder itself."""
-    for path, _, names in os.walk(folder, onerror=on_error):
+    """Yield everything below a folder that is not a folder itself, or a folder that is a grid."""
+    for path, folders, names in os.walk(folder, onerror=on_error):
+        stores = [name for name in folders if is_store(Path(path, name))]
+        folders[:] = [name for name in folders if name not in stores]
+        yield from (Path(path, name) for name in stores)
         yield from (Path(path, name) for name in names)
 
 
@@ -55,7 +60,7 @@ def _visible_below(path: Path, on_error: OnError) -> Iterator[Path]:
     for folder, folders, names in os.walk(path, onerror=on_error):
         below = (Path(folder, name) for name in folders if not name.startswith("."))
         kept = [path for path in below if not path.is_symlink()]
-        folders[:] = [path.name for path in kept]
+        folders[:] = [path.name for path in kept if not is_store(path)]
         yield from kept
         yield from (Path(folder, name) for name in names if not name.startswith("."))
 

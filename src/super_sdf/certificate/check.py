@@ -41,7 +41,7 @@ class CheckOptions:
 
     Attributes
     ----------
-    spacing, origin, inside, offset, max_memory
+    spacing, origin, axes, inside, offset, max_memory
         As given when the mesh was made.
     intersections : bool
         Count self-intersections, which takes up to half of the time.
@@ -56,11 +56,12 @@ class CheckOptions:
     max_memory: int | None = None
     intersections: bool = True
     processes: int = 1
+    axes: str | None = None
 
     @classmethod
     def of(cls, options: ConvertOptions) -> CheckOptions:
         """Return how a grid is read that was converted with these options."""
-        names = ("spacing", "origin", "inside", "offset", "max_memory")
+        names = ("spacing", "origin", "axes", "inside", "offset", "max_memory")
         return cls(**{name: getattr(options, name) for name in names})
 
 
@@ -181,6 +182,7 @@ def check_files(
         grid,
         spacing=options.spacing,
         origin=options.origin,
+        axes=options.axes,
         inside=options.inside,
         max_memory=options.max_memory,
     )

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..files.formats import NAMED, list_formats
 from .batch_report import print_plan, print_summary, progress_line
 from .choices import LazyChoice, mesh_formats
 from .common import CONTEXT, InterruptedCommand, one_line_errors
@@ -26,6 +27,17 @@ if TYPE_CHECKING:
     from ..batch.job import Job
     from ..batch.plan import Batch, Settings
 
+HELP = f"""Convert many grids to meshes in the folder DIR, each as upsample would.
+
+Each IN is a grid file, a folder (searched with its subfolders), a pattern such as '**/*.npy', or a
+list of inputs: .txt with one path per line, or .jsonl with one object per line such as
+{{"in": "a.npy", "out": "a.ply", "spacing": 0.5}}. Paths are relative to the list.
+
+Grid files are {list_formats()}. FILE:NAME names one of several arrays in a {NAMED} file.
+
+A file that fails is reported and does not stop the others. Run the command again to resume
+after an interruption, or with more inputs or other options: only what is missing is done.
+"""
 EXAMPLES = """\b
 Examples:
   super-sdf batch grids/ --out meshes/
@@ -38,6 +50,7 @@ Examples:
     context_settings=CONTEXT,
     epilog=EXAMPLES,
     short_help="Convert many grids; can be stopped and resumed.",
+    help=HELP,
 )
 @click.argument("sources", metavar="IN...", nargs=-1, required=True)
 @click.option(
@@ -77,15 +90,7 @@ Examples:
 @click.option("--json", "as_json", is_flag=True, help="Print the summary, or the plan, as JSON.")
 @click.option("-q", "--quiet", is_flag=True, help="Print failures only.")
 def batch_command(sources: tuple[str, ...], folder: Path, **options: Any) -> None:
-    """Convert many grids to meshes in the folder DIR, each as upsample would.
-
-    Each IN is a .npy or .npz file, a folder (searched with its subfolders), a pattern such as
-    '**/*.npy', or a list of inputs: .txt with one path per line, or .jsonl with one object per
-    line such as {"in": "a.npy", "out": "a.ply", "spacing": 0.5}. Paths are relative to the list.
-
-    A file that fails is reported and does not stop the others. Run the command again to resume
-    after an interruption, or with more inputs or other options: only what is missing is done.
-    """
+    """Convert many grids to meshes."""
     with one_line_errors():
         run_batch(sources, folder, options)
 

@@ -88,6 +88,13 @@ def default_quality() -> str:
     return DEFAULT_QUALITY
 
 
+def axis_orders() -> tuple[str, ...]:
+    """Return the axis orders of an array in a file."""
+    from ..files.formats import AXES
+
+    return AXES
+
+
 def signs_inside() -> tuple[str, ...]:
     """Return the values of ``inside``: which sign the samples inside the solid have."""
     from ..grid.sides import INSIDE

@@ -13,6 +13,7 @@ from ..machine.extras import check_modules
 from .choices import (
     LazyChoice,
     LazyDefault,
+    axis_orders,
     convert_default,
     default_quality,
     device_option,
@@ -80,6 +81,12 @@ GRID_OPTIONS: tuple[Option, ...] = (
         callback=parse_numbers,
         metavar="X,Y,Z",
         help="World position of sample (0, 0, 0). Default: from the file, else 0,0,0.",
+    ),
+    click.option(
+        "--axes",
+        type=LazyChoice(axis_orders),
+        help="Axis order of the array in a NumPy, TIFF, HDF5 or Zarr file. Default: xyz for NumPy, "
+        "zyx for the others. Files of other formats state it.",
     ),
     click.option(
         "--inside",

@@ -98,14 +98,14 @@ FOR_MESHES = ("colour", "reference", "top", "up", "zoom")
 def render_command(sources: tuple[Path, ...], target: Path, **options: Any) -> None:
     """Draw meshes side by side from one camera, or a cross-section of a grid.
 
-    MESH is any mesh file that trimesh reads. A single .npy or .npz grid is drawn instead as a
-    cross-section in false colours with its zero line, before and after refinement. No display is
-    needed.
+    MESH is any mesh file that trimesh reads. A single grid, in any format that upsample reads, is
+    drawn instead as a cross-section in false colours with its zero line, before and after
+    refinement. No display is needed.
     """
-    from ..files.grids import GRID_SUFFIXES
+    from ..files.formats import is_grid
 
     with one_line_errors():
-        grids = [source for source in sources if source.suffix.lower() in GRID_SUFFIXES]
+        grids = [source for source in sources if is_grid(source)]
         check_modules("render", "view", EXTRAS["eval"] if grids else None)
         check_picture(target, force=options["force"])
         if grids and len(sources) > 1:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..files.formats import NAMED, list_formats
 from .common import CONTEXT, one_line_errors, print_stderr, print_stdout, progress_bar
 from .conversion import (
     check_can_check,
@@ -25,10 +26,18 @@ if TYPE_CHECKING:
     from ..convert import Conversion
     from ..network.network import Network
 
+HELP = f"""Refine the signed distance grid IN and write its surface as the mesh OUT.
+
+IN is a grid file: {list_formats()}. FILE:NAME names one of several arrays in a {NAMED}
+file. An .npz file has the keys values, spacing and origin.
+
+OUT is a .ply, .stl, .obj, .off, .glb or .3mf file.
+"""
 EXAMPLES = """\b
 Examples:
   super-sdf upsample part.npz part.ply
   super-sdf upsample field.npy part.stl --spacing 0.5 --factor 8
+  super-sdf upsample scan.h5:/distance part.ply --spacing 0.5
 """
 
 
@@ -37,6 +46,7 @@ Examples:
     context_settings=CONTEXT,
     epilog=EXAMPLES,
     short_help="Refine a grid and write its surface as a mesh.",
+    help=HELP,
 )
 @click.argument("source", metavar="IN")
 @click.argument("target", metavar="OUT")
@@ -47,11 +57,7 @@ Examples:
 @click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
 @click.option("-v", "--verbose", is_flag=True, help="Also print counts and the time per stage.")
 def upsample_command(source: str, target: str, **options: Any) -> None:
-    """Refine the signed distance grid IN and write its surface as the mesh OUT.
-
-    IN is a .npy file (a 3D array with axes x, y, z) or a .npz file (keys values, spacing, origin).
-    OUT is a .ply, .stl, .obj, .off, .glb or .3mf file.
-    """
+    """Convert one grid to a mesh."""
     with one_line_errors():
         run = Upsampling(source, target, options)
         run.work()

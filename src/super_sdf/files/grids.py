@@ -1,12 +1,15 @@
-"""Reading and writing grid files: ``.npy`` (one array) and ``.npz``.
+"""Reading and writing grid files: ``.npy`` (one array), ``.npz``, and other people's formats.
 
 The keys of an ``.npz`` are ``values`` and, optionally, ``spacing`` and ``origin``. Files are
-checked before they are read.
+checked before they are read. ``formats`` has the table of all formats, ``readers`` their readers.
 """
 
 from __future__ import annotations
 
+import warnings
 import zipfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -14,19 +17,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, GridError, OptionError, OutOfMemoryError
+from ..errors import FileError, GridError, OptionError, OutOfMemoryError, SuperSdfError
 from ..grid.planes import InputFile, PlaneFile, SampleArray
 from ..grid.samples import check_kind
 from ..grid.sdf_grid import SdfGrid, make_grid
 from ..machine.memory import held_memory, memory_bound
 from ..options import check_path
 from .archives import Member
+from .formats import GridFormat, check_library, choose_axes, find_format, split_member
 from .headers import ArrayHeader, Read, read_array_header
 from .output import check_free, replacing
 from .regular import check_regular_file
+from .store import check_grid_file
 from .unpacking import unpack
+from .volume import Request, Volume, axes_direction, take
 
-GRID_SUFFIXES = (".npy", ".npz")
 NPZ_KEYS = ("values", "spacing", "origin")
 MOST_NAMED = 10  # members of an archive that an error lists
 # Share of the memory left that an unpacked array may take; bytes if that is unknown.
@@ -40,21 +45,25 @@ def read_grid(
     *,
     spacing: Any = None,
     origin: Any = None,
+    axes: str | None = None,
     inside: str = "auto",
     max_memory: int | None = None,
 ) -> SdfGrid:
-    """Read a grid from an ``.npy`` or ``.npz`` file.
+    """Read a grid from a file of any format in ``formats.FORMATS``; docs/formats.md describes them.
 
-    An ``.npy`` file is not loaded but read plane by plane, now and when the grid is refined. An
-    ``.npz`` file, and an array in Fortran order, is unpacked first: into memory if that takes at
-    most a quarter of what is left of ``max_memory``, else into a temporary file.
+    An ``.npy`` file is not loaded but read plane by plane, now and when the grid is refined. Others
+    are unpacked first, and so are arrays in another axis order: into memory if that takes at most
+    a quarter of what is left of ``max_memory``, else into a temporary file.
 
     Parameters
     ----------
     path : path
-        The file.
+        The file; ``FILE:NAME`` names one of several arrays in a file.
     spacing, origin : number or three, optional
         Used instead of those in the file; see ``make_grid``.
+    axes : {"xyz", "zyx"}, optional
+        The axis order of an array whose file does not state one. Default: x, y, z in ``.npy`` and
+        ``.npz``, else z, y, x.
     inside : {"auto", "negative", "positive"}
         Sign of the values inside the solid; see ``make_grid``.
     max_memory : int, optional
@@ -63,23 +72,97 @@ def read_grid(
     Raises
     ------
     FileError
-        If the file is missing, damaged, truncated, of another kind, or changes while it is read.
+        If the file is missing, damaged, truncated, of another kind, or changes while it is read;
+        if the library for its format is missing.
     OutOfMemoryError
         If there is no room to unpack it.
     GridError
-        If its values are not a signed distance grid.
+        If its values are not a signed distance grid, or its axes are oblique to the world's.
     OptionError
-        If the suffix or ``inside`` is unknown.
+        If the suffix, ``axes`` or ``inside`` is unknown.
     """
     path = check_path(path, "path")
-    if path.suffix.lower() not in GRID_SUFFIXES:
-        raise OptionError(f"{path} is not a grid file: give {' or '.join(GRID_SUFFIXES)}")
-    check_regular_file(path)
-    read = _read_npy if path.suffix.lower() == ".npy" else _read_npz
-    found = read(path, _room(max_memory))
+    format_ = find_format(path)
+    order = choose_axes(format_, axes)
     given = {"spacing": spacing, "origin": origin}
-    chosen = {key: found.get(key) if own is None else own for key, own in given.items()}
-    return make_grid(found["values"], inside=inside, **chosen)
+    room = _room(max_memory)
+    if format_.key in ("npy", "npz"):
+        found = _read_numpy(check_regular_file(path), order, room, given)
+    else:
+        found = _read_foreign(path, format_, order, room, given, max_memory)
+    values, spacing, origin = (found[key] for key in NPZ_KEYS)
+    return make_grid(values, spacing=spacing, origin=origin, inside=inside)
+
+
+def _read_numpy(path: Path, axes: str, room: int, given: dict[str, Any]) -> dict[str, Any]:
+    """Return the arrays of an .npy or .npz file, with the axes x, y, z."""
+    read = _read_npy if path.suffix.lower() == ".npy" else _read_npz
+    found = read(path, room)
+    place = {key: found.get(key) if own is None else own for key, own in given.items()}
+    values = found["values"]
+    if axes != "xyz":
+        turned = axes_direction(axes)
+        volume = Volume(values.shape, values.dtype, lambda a, b: values[a:b], direction=turned)
+        values = take(volume, str(path), room, place)["values"]
+    return {"values": values, **place}
+
+
+def _read_foreign(
+    path: Path,
+    format_: GridFormat,
+    axes: str,
+    room: int,
+    given: dict[str, Any],
+    max_memory: int | None,
+) -> dict[str, Any]:
+    """Return values, spacing and origin of a file that its own library reads."""
+    file, member = split_member(path)
+    check_grid_file(path)
+    check_library(format_)
+    from .readers.table import READERS
+
+    watched = None if file.is_dir() else InputFile.open(file)
+    bound = memory_bound(max_memory)
+    left = None if bound is None else bound - (held_memory() or 0)
+    with _one_line_errors(path, format_, watched), ExitStack() as files:
+        volume = READERS[format_.key](Request(file, member, axes, room, left, files))
+        return take(volume, str(path), room, given)
+
+
+@contextmanager
+def _one_line_errors(path: Path, format_: GridFormat, watched: InputFile | None) -> Iterator[None]:
+    """Turn whatever a library raises into a FileError of one line, and silence its warnings."""
+    try:
+        with warnings.catch_warnings(), _silent_logs():
+            warnings.simplefilter("ignore")
+            yield
+    except SuperSdfError as error:
+        if str(split_member(path)[0]) in str(error) or isinstance(error, OutOfMemoryError):
+            raise
+        raise type(error)(f"{path}: {error}") from None
+    except Exception as error:  # the libraries raise all kinds of errors
+        if isinstance(error, MemoryError):
+            raise
+        if watched:
+            watched.check_unchanged()
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+        reason = lines[-1][:200] if lines else type(error).__name__
+        raise FileError(f"{path} cannot be read as {format_.name}: {reason}") from error
+    if watched:
+        watched.check_unchanged()
+
+
+@contextmanager
+def _silent_logs() -> Iterator[None]:
+    """Keep libraries from logging to stderr: what matters is raised."""
+    import logging
+
+    disabled = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logging.disable(disabled)
 
 
 def _room(max_memory: int | None) -> int:

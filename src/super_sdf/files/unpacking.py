@@ -10,6 +10,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from io import FileIO
 from typing import Any
 
@@ -53,12 +54,26 @@ def unpack(read: Read, header: ArrayHeader, name: str, room: int) -> SampleArray
         If it fits neither in ``room`` nor in the folder for temporary files.
     """
     copy_all = _copy_swapped if header.fortran_order else _copy
+    return fill(partial(copy_all, read, header), header, name, room)
+
+
+def fill(copy: Callable[[Write], None], header: ArrayHeader, name: str, room: int) -> SampleArray:
+    """Return the 3D array (nx, ny, nz) that ``copy`` writes.
+
+    Parameters
+    ----------
+    copy : callable
+        Called with a function that writes bytes; planes of x are contiguous. In them y is fastest
+        if the header says Fortran order, else z.
+    header, name, room
+        As in ``unpack``.
+    """
     if header.size <= room:
         held = np.empty(header.size, np.uint8)
-        copy_all(read, header, _writer_to(held))
+        copy(_writer_to(held))
         return _as_planes(held, header)
     file = _scratch_file(header, name)
-    copy_all(read, header, _writer_to_file(file, name))
+    copy(_writer_to_file(file, name))
     return PlaneFile(
         InputFile(file, name), 0, header.shape, header.dtype, swapped=header.fortran_order
     )

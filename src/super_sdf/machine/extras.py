@@ -8,6 +8,14 @@ from ..errors import FileError
 
 # Modules that each extra installs, besides those of the extra that it builds on.
 EXTRAS = {
+    "nifti": ("nibabel",),
+    "nrrd": ("nrrd",),
+    "metaimage": ("SimpleITK",),
+    "vti": ("vtkmodules",),
+    "tiff": ("tifffile",),
+    "hdf5": ("h5py",),
+    "zarr": ("zarr",),
+    "vdb": ("tinyvdb",),
     "3mf": ("lxml", "networkx"),
     "simplify": ("igl", "pyfqmr"),
     "eval": ("igl", "matplotlib", "scipy", "skimage"),

@@ -1,0 +1,153 @@
+"""The table of grid file formats: help texts, messages, extras and readers follow it.
+
+It needs no package, so that help texts are quick.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+
+from ..errors import OptionError
+from ..machine.extras import check_modules
+
+# What people give by mistake: surfaces, which have to be sampled first.
+MESH_SUFFIXES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf", ".3mf", ".step", ".stp")
+
+
+@dataclass(frozen=True)
+class GridFormat:
+    """A grid file format.
+
+    Attributes
+    ----------
+    key : str
+        Its name in code: the key of its reader.
+    name : str
+        Its name in texts.
+    suffixes : tuple of str
+        How its file names end, in lower case.
+    extra : str or None
+        The extra that installs its library; None if none is needed.
+    axes : str or None
+        The axis order of an array unless ``--axes`` gives another; None if the file states it.
+    has_members : bool
+        Whether a file may hold several arrays, one of which ``FILE:NAME`` names.
+    """
+
+    key: str
+    name: str
+    suffixes: tuple[str, ...]
+    extra: str | None = None
+    axes: str | None = None
+    has_members: bool = False
+
+
+FORMATS = (
+    GridFormat("npy", "NumPy", (".npy",), axes="xyz"),
+    GridFormat("npz", "NumPy", (".npz",), axes="xyz"),
+    GridFormat("nifti", "NIfTI", (".nii", ".nii.gz"), "nifti"),
+    GridFormat("nrrd", "NRRD", (".nrrd", ".nhdr"), "nrrd"),
+    GridFormat("metaimage", "MetaImage", (".mha", ".mhd"), "metaimage"),
+    GridFormat("vti", "VTK image data", (".vti",), "vti", has_members=True),
+    GridFormat("tiff", "TIFF stack", (".tif", ".tiff"), "tiff", axes="zyx"),
+    GridFormat("hdf5", "HDF5", (".h5", ".hdf5", ".hdf"), "hdf5", axes="zyx", has_members=True),
+    GridFormat("zarr", "Zarr", (".zarr",), "zarr", axes="zyx", has_members=True),
+    GridFormat("vdb", "OpenVDB", (".vdb",), "vdb", has_members=True),
+    GridFormat("sdf", "SDFGen", (".sdf",)),
+)
+GRID_SUFFIXES = tuple(suffix for format_ in FORMATS for suffix in format_.suffixes)
+AXES = ("xyz", "zyx")
+_MEMBERS = "|".join(s[1:] for f in FORMATS if f.has_members for s in f.suffixes)
+_WITH_MEMBER = re.compile(rf"(?P<file>.*\.(?:{_MEMBERS})):(?P<member>.+)", re.I | re.S)
+
+
+def find_format(path: str | Path) -> GridFormat:
+    """Return the format of a grid file by the end of its name.
+
+    Raises
+    ------
+    OptionError
+        If it is none of the table, such as a mesh.
+    """
+    ending = _ending(split_member(path)[0])
+    if ending:
+        return next(format_ for format_ in FORMATS if ending in format_.suffixes)
+    if str(path).lower().endswith(MESH_SUFFIXES):
+        raise OptionError(
+            f"{path} is a mesh, not a grid: sample it first with "
+            f"super-sdf sample {path} {PurePath(path).stem}.npz"
+        )
+    raise OptionError(f"{path} is not a grid file: give one of {', '.join(GRID_SUFFIXES)}")
+
+
+def is_grid(path: str | Path) -> bool:
+    """Return whether a name is that of a grid file, by its end."""
+    return bool(_ending(split_member(path)[0]))
+
+
+def _ending(path: PurePath) -> str:
+    """Return the suffix by which a file is a grid, in lower case; "" if it is none."""
+    name = path.name.lower()
+    found = [end for end in GRID_SUFFIXES if name.endswith(end) and len(name) > len(end)]
+    return max(found, key=len, default="")
+
+
+def split_member(path: str | PurePath) -> tuple[Path, str | None]:
+    """Split ``FILE:NAME`` into the file and the name of an array in it, None if none is named."""
+    found = _WITH_MEMBER.fullmatch(str(path))
+    return (Path(found["file"]), found["member"]) if found else (Path(path), None)
+
+
+def mesh_path(path: PurePath, suffix: str) -> PurePath:
+    """Return the path of a grid with the suffix of a mesh.
+
+    The name of an array in the file becomes a part of it: ``a.h5:/b/c`` becomes ``a-b-c.ply``.
+    """
+    file, member = split_member(path)
+    ending = _ending(file)
+    stem = file.name[: len(file.name) - len(ending)]
+    if member:
+        stem += "-" + member.strip("/").replace("/", "-")
+    return PurePath(file).with_name(stem + suffix) if ending else PurePath(path).with_suffix(suffix)
+
+
+def check_library(format_: GridFormat) -> None:
+    """Raise FileError, naming the extra to install, if the format's library is missing."""
+    if format_.extra:
+        check_modules(f"{format_.name} ({format_.suffixes[0]})", format_.extra)
+
+
+def choose_axes(format_: GridFormat, given: str | None) -> str:
+    """Return the axis order of an array file: as given, else the convention of the format.
+
+    Raises
+    ------
+    OptionError
+        If the format's files state their axes, or the order is unknown.
+    """
+    if given is None:
+        return format_.axes or "xyz"
+    if given not in AXES:
+        raise OptionError(f"axes is {given!r}: give one of {', '.join(AXES)}")
+    if format_.axes is None:
+        raise OptionError(
+            f"axes is {given!r}, but {format_.name} files state their axes: leave it out"
+        )
+    return given
+
+
+def _listed(names: list[str]) -> str:
+    return f"{', '.join(names[:-1])} or {names[-1]}"
+
+
+def list_formats() -> str:
+    """Return the formats and their suffixes for help texts, in one sentence."""
+    names = dict.fromkeys(format_.name for format_ in FORMATS)
+    suffixes = {n: [s for f in FORMATS if f.name == n for s in f.suffixes] for n in names}
+    return _listed([f"{name} ({', '.join(suffixes[name])})" for name in names])
+
+
+NAMED = _listed([format_.name for format_ in FORMATS if format_.has_members])
+"""The formats whose files may hold several arrays, for help texts."""

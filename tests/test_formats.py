@@ -1,0 +1,559 @@
+"""Grids of other formats come out at the right place, side and size.
+
+The part is a large ball with a small one beside it, off every axis of symmetry. Files are written
+by the format's own library; where each sample is in the world is said by that library, or another.
+"""
+
+from __future__ import annotations
+
+import gzip
+import itertools
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import nibabel
+import nrrd
+import numpy as np
+import pytest
+import SimpleITK as sitk  # noqa: N813
+import tifffile
+import trimesh
+import zarr
+from vtkmodules.util.numpy_support import numpy_to_vtk
+from vtkmodules.vtkCommonDataModel import vtkImageData
+from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
+
+from super_sdf import SdfGrid, read_grid
+from super_sdf.errors import FileError, GridError, OptionError, OutOfMemoryError
+from super_sdf.files import formats, unpacking
+from super_sdf.grid.planes import PlaneFile
+
+DATA = Path(__file__).parent / "data"
+SPACING = 0.5
+SIZES = (24, 20, 17)  # samples along the three axes of the file
+CENTRE = np.array([103.0, -52.0, 17.0])
+TURNS = [
+    np.eye(3)[:, list(order)] * signs
+    for order in itertools.permutations(range(3))
+    for signs in ((1, 1, 1), (-1, -1, 1), (1, -1, 1), (-1, -1, -1))
+]  # half of them mirrored
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def part(points: np.ndarray) -> np.ndarray:
+    """Return the distances of points (..., 3) from the part."""
+    large = np.linalg.norm(points - CENTRE, axis=-1) - 2.6
+    small = np.linalg.norm(points - CENTRE - [1.9, 0.9, 1.3], axis=-1) - 1.1
+    return np.minimum(large, small)
+
+
+def affine_of(direction: np.ndarray, spacing: float = SPACING) -> np.ndarray:
+    """Return the affine (4, 4) of a grid around the part with SIZES and a direction."""
+    affine = np.eye(4)
+    affine[:3, :3] = direction * spacing
+    affine[:3, 3] = CENTRE + 0.1 - affine[:3, :3] @ (np.array(SIZES) / 2)
+    return affine
+
+
+def sampled(affine: np.ndarray, sizes: tuple[int, ...] = SIZES) -> np.ndarray:
+    """Return the samples (ni, nj, nk) of the part at the positions that an affine gives."""
+    ijk = np.moveaxis(np.indices(sizes), 0, -1)
+    return part(ijk @ affine[:3, :3].T + affine[:3, 3]).astype(np.float32)
+
+
+def check(grid: SdfGrid, spacing: float = SPACING, tolerance: float = 2e-5) -> None:
+    """Check that each sample of the grid is the distance at its place in the world."""
+    assert np.allclose(grid.spacing, spacing, rtol=1e-5)
+    assert sorted(grid.shape) == sorted(SIZES)
+    places = np.moveaxis(np.indices(grid.shape), 0, -1) * spacing + grid.origin
+    assert np.abs(grid.values - part(places)).max() < tolerance
+    assert np.array_equal(grid.planes(3, 5), grid.values[3:5])
+
+
+def save_nifti(path: str, affine: np.ndarray) -> None:
+    nibabel.save(nibabel.Nifti1Image(sampled(affine), affine), path)
+
+
+def save_nrrd(path: str, affine: np.ndarray) -> None:
+    header = {"space": "left-posterior-superior", "space directions": affine[:3, :3].T}
+    nrrd.write(path, sampled(affine), {**header, "space origin": affine[:3, 3]})
+
+
+def save_itk(path: str, affine: np.ndarray) -> None:
+    image = sitk.GetImageFromArray(sampled(affine).T)
+    spacing = np.linalg.norm(affine[:3, :3], axis=0)
+    image.SetSpacing(spacing.tolist())
+    image.SetOrigin(affine[:3, 3].tolist())
+    image.SetDirection((affine[:3, :3] / spacing).ravel().tolist())
+    values = sitk.GetArrayViewFromImage(image).T
+    for index in ((0, 0, 0), (5, 3, 11)):  # ITK agrees where a sample is
+        there = np.array(image.TransformIndexToPhysicalPoint(index))
+        assert np.isclose(values[index], part(there), atol=1e-5)
+    sitk.WriteImage(image, path, path.endswith(".mha"))
+
+
+def save_vti(path: str, affine: np.ndarray, start: tuple[int, ...] = (3, -2, 7)) -> None:
+    spacing = np.linalg.norm(affine[:3, :3], axis=0)
+    image = vtkImageData()
+    image.SetExtent(*(n for s, size in zip(start, SIZES) for n in (s, s + size - 1)))
+    image.SetSpacing(spacing)
+    image.SetDirectionMatrix((affine[:3, :3] / spacing).ravel())
+    image.SetOrigin(affine[:3, 3] - affine[:3, :3] @ start)
+    points = np.array([image.GetPoint(i) for i in range(image.GetNumberOfPoints())])
+    values = numpy_to_vtk(part(points).astype(np.float32), deep=True)
+    values.SetName("distance")
+    image.GetPointData().AddArray(values)
+    write_vti(path, image)
+
+
+def write_vti(path: str, image: vtkImageData) -> None:
+    writer = vtkXMLImageDataWriter()
+    writer.SetFileName(path)
+    writer.SetInputData(image)
+    assert writer.Write()
+
+
+ORIENTED = {
+    "a.nii": save_nifti,
+    "a.nii.gz": save_nifti,
+    "a.nrrd": save_nrrd,
+    "a.nhdr": save_nrrd,
+    "b.nrrd": save_itk,
+    "a.mha": save_itk,
+    "a.mhd": save_itk,
+    "a.vti": save_vti,
+}
+
+
+@pytest.mark.parametrize("turn", range(len(TURNS)))
+@pytest.mark.parametrize("name", ORIENTED)
+def test_axes_in_any_order_and_direction(name, turn):
+    ORIENTED[name](name, affine_of(TURNS[turn]))
+    check(read_grid(name))
+
+
+@pytest.mark.parametrize("name", ORIENTED)
+def test_the_file_is_read_slab_by_slab_into_a_temporary_file(name, monkeypatch):
+    """As if it were too large for memory: the same samples."""
+    for turn in TURNS[::5]:
+        ORIENTED[name](name, affine_of(turn))
+        with monkeypatch.context() as patch:
+            patch.setattr("super_sdf.files.grids.ROOM_SHARE", 0)
+            patch.setattr("super_sdf.files.volume.PIECE", 3000)
+            patch.setattr(unpacking, "PIECE", 3000)
+            grid = read_grid(name)
+        assert isinstance(grid.samples, PlaneFile)
+        check(grid)
+
+
+@pytest.mark.parametrize("name", ORIENTED)
+def test_an_oblique_grid_is_refused_with_its_directions(name):
+    turn = trimesh.transformations.rotation_matrix(0.3, (0, 0, 1))[:3, :3]
+    ORIENTED[name](name, affine_of(turn))
+    with pytest.raises(GridError) as caught:
+        read_grid(name)
+    said = "directions 0.9553, -0.2955, 0; 0.2955, 0.9553, 0; 0, 0, 1: resample it to a grid along"
+    in_file_order = "directions 0, -0.2955, 0.9553; 0, 0.9553, 0.2955; 1, 0, 0: resample it to a"
+    assert said in str(caught.value) or in_file_order in str(caught.value)
+    assert str(caught.value).startswith(f"{name} has axes oblique to the world's")
+
+
+@pytest.mark.parametrize("name", ORIENTED)
+def test_unequal_spacings_are_refused_with_their_values(name):
+    affine = affine_of(TURNS[0] @ np.diag([1, 1, 3]))
+    ORIENTED[name](name, affine)
+    with pytest.raises(GridError, match=r"spacing is 0\.5, 0\.5, 1\.5: the method needs cubic"):
+        read_grid(name)
+
+
+@pytest.mark.parametrize("name", ["a.nii", "a.nii.gz", "b.nrrd", "a.mha", "a.mhd"])
+def test_simpleitk_puts_the_samples_at_the_same_place(name):
+    """ITK's world is LPS: that of NRRD and MetaImage; NIfTI's, RAS, has x and y reversed."""
+    ORIENTED[name](name, affine_of(TURNS[9]))
+    grid, image = read_grid(name), sitk.ReadImage(name)
+    signs = np.array([-1, -1, 1]) if ".nii" in name else np.ones(3)
+    for index in ((0, 0, 0), (23, 0, 0), (4, 19, 16)):
+        there = np.array(image.TransformIndexToPhysicalPoint(index)) * signs
+        ijk = (there - grid.origin) / SPACING
+        assert np.abs(ijk - np.rint(ijk)).max() < 1e-4
+        assert grid.values[tuple(np.rint(ijk).astype(int))] == image[index]
+
+
+def test_nifti_by_qform_slope_and_a_fourth_axis():
+    affine = affine_of(TURNS[5])
+    image = nibabel.Nifti1Image(np.rint(sampled(affine) * 1000).astype(np.int16), None)
+    image = nibabel.Nifti1Image(np.asarray(image.dataobj)[..., None], None, image.header)
+    image.set_qform(affine, code=1)
+    image.set_sform(None, code=0)
+    image.header.set_slope_inter(0.001, 0)
+    nibabel.save(image, "a.nii.gz")
+    packed = nibabel.load("a.nii.gz")
+    assert packed.header["qform_code"] == 1 and packed.header["sform_code"] == 0
+    raw = nibabel.Nifti1Image(sampled(affine), None)
+    raw.set_qform(affine, code=1)
+    raw.header.set_data_dtype(np.int16)  # nibabel chooses slope and intercept
+    nibabel.save(raw, "scaled.nii")
+    assert nibabel.load("scaled.nii").dataobj.slope != 1
+    check(read_grid("scaled.nii"), tolerance=1e-3)
+
+
+def test_nrrd_without_a_space():
+    values = sampled(affine_of(np.eye(3)))
+    origin = affine_of(np.eye(3))[:3, 3]
+    for centering, shift in (("node", 0.0), ("cell", SPACING / 2)):
+        header = {"spacings": [SPACING] * 3, "axis mins": origin - shift}
+        nrrd.write("a.nrrd", values, {**header, "centerings": [centering] * 3})
+        check(read_grid("a.nrrd"))
+    nrrd.write("short.nrrd", values, {"space dimension": 3, "space directions": np.eye(3) / 2})
+    check(read_grid("short.nrrd", origin=origin))
+    nrrd.write("bare.nrrd", values)
+    grid = read_grid("bare.nrrd", spacing=SPACING, origin=origin)
+    check(grid)
+
+
+def test_vti_of_cells_and_of_one_of_several_arrays():
+    affine = affine_of(np.eye(3))
+    image = vtkImageData()
+    image.SetDimensions(*(n + 1 for n in SIZES))
+    image.SetSpacing([SPACING] * 3)
+    image.SetOrigin(affine[:3, 3] - SPACING / 2)
+    centres = [image.GetCell(i).GetBounds() for i in range(image.GetNumberOfCells())]
+    points = np.array(centres).reshape(-1, 3, 2).mean(2)
+    for name, data in (("distance", part(points)), ("other", points[:, 0])):
+        values = numpy_to_vtk(data.astype(np.float32), deep=True)
+        values.SetName(name)
+        image.GetCellData().AddArray(values)
+    write_vti("cells.vti", image)
+    check(read_grid("cells.vti:distance"))
+    with pytest.raises(FileError, match=r"cells.vti holds several arrays, distance, other: give "):
+        read_grid("cells.vti")
+
+
+@pytest.mark.parametrize("options", [{}, {"compression": "zlib"}, {"bigtiff": True}])
+def test_tiff_stacks(options):
+    affine = affine_of(np.eye(3))
+    tifffile.imwrite("a.tif", sampled(affine).T, photometric="minisblack", **options)
+    check(read_grid("a.tif", spacing=SPACING, origin=affine[:3, 3]))
+    grid = read_grid("a.tif", spacing=SPACING)
+    assert grid.origin == (0, 0, 0)
+    tifffile.imwrite("x.tif", sampled(affine), photometric="minisblack", **options)
+    check(read_grid("x.tif", spacing=SPACING, origin=affine[:3, 3], axes="xyz"))
+
+
+def test_spacing_of_imagej_and_ome():
+    affine = affine_of(np.eye(3))
+    data = sampled(affine).T
+    about = {"axes": "ZYX", "spacing": SPACING, "unit": "um"}
+    tifffile.imwrite("j.tif", data, imagej=True, resolution=(2, 2), metadata=about)
+    check(read_grid("j.tif", origin=affine[:3, 3]))
+    sizes = {f"PhysicalSize{axis}": SPACING for axis in "XYZ"}
+    tifffile.imwrite("a.ome.tif", data, metadata={"axes": "ZYX", **sizes})
+    check(read_grid("a.ome.tif", origin=affine[:3, 3]))
+    sizes["PhysicalSizeZ"] = 2.0
+    tifffile.imwrite("flat.ome.tif", data, metadata={"axes": "ZYX", **sizes})
+    with pytest.raises(GridError, match=r"spacing is 0\.5, 0\.5, 2: "):
+        read_grid("flat.ome.tif")
+
+
+def test_hdf5_datasets():
+    affine = affine_of(np.eye(3))
+    with h5py.File("a.h5", "w") as file:
+        file["deep/field"] = sampled(affine).T
+        packed = {"chunks": (4, 5, 6), "compression": "gzip"}
+        file.create_dataset("xyz", data=sampled(affine), **packed)
+        file["xyz"].attrs["spacing"] = [SPACING] * 3
+        file["xyz"].attrs["origin"] = affine[:3, 3]
+        file["flat"] = np.zeros((3, 3))
+        file.create_dataset("um", data=sampled(affine).T)
+        file["um"].attrs["element_size_um"] = [SPACING] * 3
+    check(read_grid("a.h5:/deep/field", spacing=SPACING, origin=affine[:3, 3]))
+    check(read_grid("a.h5:xyz", axes="xyz"))
+    check(read_grid("a.h5:/um", origin=affine[:3, 3]))
+    for name, said in (
+        ("a.h5", "a.h5 holds several arrays, /deep/field, /um, /xyz: give a.h5:/deep/field, say"),
+        ("a.h5:no", "a.h5 has no 3D dataset 'no': it holds /deep/field, /um, /xyz"),
+    ):
+        with pytest.raises(FileError) as caught:
+            read_grid(name)
+        assert str(caught.value) == said
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_zarr_arrays_and_groups(version):
+    affine = affine_of(np.eye(3))
+    place = {"spacing": SPACING, "origin": affine[:3, 3]}
+    about = {"shape": SIZES[::-1], "chunks": (5, 6, 7), "dtype": "f4", "zarr_format": version}
+    array = zarr.create_array("a.zarr", **about)
+    array[:] = sampled(affine).T
+    check(read_grid("a.zarr", **place))
+    group = zarr.open_group("g.zarr", mode="w", zarr_format=version)
+    for name in ("0", "1"):
+        group.create_array(name, **{k: v for k, v in about.items() if k != "zarr_format"})
+    group["0"][:] = sampled(affine).T
+    check(read_grid("g.zarr:/0", **place))
+    with pytest.raises(FileError, match=r"g.zarr holds several arrays, /0, /1: give g.zarr:/0, "):
+        read_grid("g.zarr")
+    steps = [{"type": "scale", "scale": [SPACING] * 3}]
+    steps.append({"type": "translation", "translation": affine[:3, 3][::-1].tolist()})
+    axes = [{"name": axis, "type": "space"} for axis in "zyx"]
+    levels = [{"path": "0", "coordinateTransformations": steps}, {"path": "1"}]
+    scales = [{"axes": axes, "datasets": levels}]
+    about = {"multiscales": scales}
+    group.attrs.update(about if version == 2 else {"ome": about})
+    check(read_grid("g.zarr"))
+
+
+def test_a_level_set_that_openvdb_wrote():
+    """By OpenVDB 10: balls of radius 4.2 at (8, 7, 6) and 2.1 at (14, 7.5, 7), voxels of 0.5.
+
+    Active are the voxels within 3 of the surface; index (-5, 3, 11) is the corner from which the
+    balls are measured, and index (0, 0, 0) is at (10, -20, 30).
+    """
+    grid = read_grid(DATA / "two-balls.vdb")
+    corner = np.array([10, -20, 30]) + 0.5 * np.array([-5, 3, 11])
+    places = np.moveaxis(np.indices(grid.shape), 0, -1) * 0.5 + grid.origin - corner
+    large = np.linalg.norm(places - [8, 7, 6], axis=-1) - 4.2
+    small = np.linalg.norm(places - [14, 7.5, 7], axis=-1) - 2.1
+    exact = np.clip(np.minimum(large, small), -1.5, 1.5)
+    assert np.abs(grid.values - exact).max() < 1e-5
+    assert (exact == -1.5).any() and grid.spacing == (0.5, 0.5, 0.5)
+
+
+def test_a_level_set_with_turned_axes_that_openvdb_wrote():
+    """By OpenVDB 10: a ball of radius 1.5 at index (2, 4, 6), i along y, j along -z, k along x.
+
+    OpenVDB says that this index is at (10, 9, 7).
+    """
+    grid = read_grid(DATA / "turned-ball.vdb")
+    places = np.moveaxis(np.indices(grid.shape), 0, -1) * 0.5 + grid.origin
+    exact = np.clip(np.linalg.norm(places - [10, 9, 7], axis=-1) - 1.5, -1.5, 1.5)
+    assert np.abs(grid.values - exact).max() < 1e-5
+
+
+def text_sdf(affine: np.ndarray) -> str:
+    """Return the text that SDFGen's main.cpp writes: endl after each value, i fastest."""
+    origin = " ".join(map(str, affine[:3, 3]))
+    head = "{} {} {}\n".format(*SIZES) + f"{origin}\n{SPACING}\n"
+    return head + "".join(f"{value:.6g}\n" for value in sampled(affine).ravel("F"))
+
+
+def test_three_dialects_of_sdf(monkeypatch):
+    affine = affine_of(np.eye(3))
+    values, low = sampled(affine), affine[:3, 3].astype("<f4")
+    monkeypatch.setattr("super_sdf.files.readers.sdf.PIECE", 1001)
+    Path("text.sdf").write_text(text_sdf(affine))
+    check(read_grid("text.sdf"))
+    tag = "#sdf 1\ndim {} {} {}\ndata\n".format(*SIZES).encode()
+    Path("tagged.sdf").write_bytes(tag + values.tobytes())
+    check(read_grid("tagged.sdf", spacing=SPACING, origin=low))
+    high = (low + np.array(SIZES) * SPACING).astype("<f4")
+    head = np.array(SIZES, "<i4").tobytes() + low.tobytes() + high.tobytes()
+    Path("boxed.sdf").write_bytes(head + values.tobytes())
+    check(read_grid("boxed.sdf"))
+
+
+def test_axes_of_numpy_files():
+    affine = affine_of(np.eye(3))
+    np.save("zyx.npy", sampled(affine).T)
+    check(read_grid("zyx.npy", axes="zyx", spacing=SPACING, origin=affine[:3, 3]))
+    np.save("c.npy", np.ascontiguousarray(sampled(affine).T))
+    check(read_grid("c.npy", axes="zyx", spacing=SPACING, origin=affine[:3, 3]))
+    np.savez("a.npz", values=sampled(affine).T, spacing=SPACING, origin=affine[:3, 3])
+    check(read_grid("a.npz", axes="zyx"))
+
+
+def test_a_given_spacing_and_origin_replace_those_of_the_file():
+    """The origin is that of the file's sample (0, 0, 0), also if its axes run backwards."""
+    affine = affine_of(np.diag([-1.0, 1.0, -1.0]))
+    nibabel.save(nibabel.Nifti1Image(sampled(affine), np.diag([-3, 2, -1, 1])), "a.nii")
+    check(read_grid("a.nii", spacing=SPACING, origin=affine[:3, 3]))
+
+
+DAMAGED = {
+    "a.nii": "as NIfTI",
+    "a.nii.gz": "as NIfTI",
+    "a.nrrd": "as NRRD",
+    "a.mha": "as MetaImage",
+    "a.vti": "",
+    "a.tif": "as TIFF stack",
+    "a.h5": "as HDF5",
+    "a.vdb": "as OpenVDB",
+    "a.sdf": "",
+}
+
+
+def save_any(name: str) -> None:
+    """Write the part in the format of the name."""
+    affine = affine_of(np.eye(3))
+    if name in ORIENTED:
+        ORIENTED[name](name, affine)
+    elif name == "a.tif":
+        tifffile.imwrite(name, sampled(affine).T, photometric="minisblack")
+    elif name == "a.h5":
+        with h5py.File(name, "w") as file:
+            file["field"] = sampled(affine).T
+    elif name == "a.vdb":
+        Path(name).write_bytes((DATA / "two-balls.vdb").read_bytes())
+    else:
+        Path(name).write_text(text_sdf(affine))
+
+
+def read_damaged(name: str, capfd: pytest.CaptureFixture[str]) -> str:
+    """Return the message of the error that a file raises; nothing is printed beside."""
+    with pytest.raises((FileError, GridError)) as caught:
+        read_grid(name)
+    message = str(caught.value)
+    assert message.startswith(name) and len(message.splitlines()) == 1 and len(message) < 400
+    assert capfd.readouterr() == ("", "")
+    return message
+
+
+@pytest.mark.parametrize("share", [0.02, 0.5, 0.9])
+@pytest.mark.parametrize("name", DAMAGED)
+def test_a_truncated_file_is_refused_in_one_line(name, share, capfd):
+    save_any(name)
+    whole = Path(name).read_bytes()
+    Path(name).write_bytes(whole[: int(share * len(whole))])
+    said = read_damaged(name, capfd)
+    assert f"cannot be read {DAMAGED[name]}" in said or "truncated" in said or "damaged" in said
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_another_kind_of_file_is_refused_in_one_line(name, capfd):
+    Path(name).write_bytes(b"hello, this is no grid at all\n" * 20)
+    read_damaged(name, capfd)
+
+
+def test_nothing_is_written_for_a_damaged_file(command):
+    Path("a.nii").write_bytes(b"no")
+    code, out, err = command("upsample", "a.nii", "out.ply")
+    assert (code, out) == (1, "") and err.startswith("Error: a.nii cannot be read as NIfTI: ")
+    assert os.listdir() == ["a.nii"]
+
+
+def test_a_mesh_as_input_is_told_to_be_sampled_first(command):
+    want = (
+        "Error: part.stl is a mesh, not a grid: sample it first with super-sdf sample part.stl "
+        "part.npz\n"
+    )
+    assert command("upsample", "part.stl", "out.ply")[::2] == (2, want)
+
+
+def test_a_missing_library_is_named_with_the_command_that_installs_it(command, monkeypatch):
+    for name in ("a.nii", "a.nrrd", "a.mha", "a.vti", "a.tif", "a.h5", "a.vdb"):
+        save_any(name)
+        format_ = formats.find_format(name)
+        with monkeypatch.context() as patch:
+            patch.setattr("super_sdf.machine.extras.find_spec", lambda module: None)
+            code, _, err = command("upsample", name, "out.ply")
+        wanted = f"pip install -e '.[{format_.extra}]' in a clone of super-sdf\n"
+        assert code == 1 and err.startswith(f"Error: {format_.name} (") and err.endswith(wanted)
+
+
+def test_axes_that_the_file_states_are_not_overruled():
+    save_nifti("a.nii", affine_of(np.eye(3)))
+    with pytest.raises(OptionError, match="axes is 'zyx', but NIfTI files state their axes"):
+        read_grid("a.nii", axes="zyx")
+    with pytest.raises(OptionError, match="axes is 'yxz': give one of xyz, zyx"):
+        read_grid("a.npy", axes="yxz")
+
+
+def test_what_a_library_loads_whole_is_refused_if_it_would_not_fit():
+    save_nrrd("a.nrrd", affine_of(np.eye(3)))
+    with pytest.raises(OutOfMemoryError, match=r"a.nrrd takes .* since pynrrd loads it whole"):
+        read_grid("a.nrrd", max_memory=1000)
+
+
+def test_special_files_and_folders_are_refused(command):
+    os.mkdir("a.nii")
+    assert command("upsample", "a.nii", "o.ply")[2] == "Error: a.nii is a folder: give a file\n"
+    os.mkdir("a.zarr")
+    want = "Error: a.zarr is no Zarr store: it holds none of zarr.json, .zarray, .zgroup\n"
+    assert command("upsample", "a.zarr", "o.ply")[2] == want
+    Path("b.zarr").write_text("x")
+    want = "Error: b.zarr is a file: a Zarr store is a folder\n"
+    assert command("upsample", "b.zarr", "o.ply")[2] == want
+    assert command("upsample", "no.zarr", "o.ply")[2] == "Error: no.zarr does not exist\n"
+
+
+def test_components_and_missing_axes_are_refused():
+    sitk.WriteImage(sitk.Image([4, 4, 4], sitk.sitkVectorFloat32, 3), "v.mha")
+    tifffile.imwrite("rgb.tif", np.zeros((5, 6, 7, 3), np.uint8), photometric="rgb")
+    nrrd.write("two.nrrd", np.zeros((4, 5)))
+    nibabel.save(nibabel.Nifti1Image(np.zeros((4, 4, 4, 2)), np.eye(4)), "time.nii")
+    for name in ("v.mha", "rgb.tif", "two.nrrd", "time.nii"):
+        with pytest.raises(GridError, match=f"{name} has .*: give a (file|stack) of three axes"):
+            read_grid(name)
+
+
+def test_a_wrong_checksum_in_a_compressed_file_is_found():
+    save_nifti("a.nii", affine_of(np.eye(3)))
+    packed = bytearray(gzip.compress(Path("a.nii").read_bytes()))
+    packed[-8] ^= 1
+    Path("a.nii.gz").write_bytes(packed)
+    with pytest.raises(FileError, match=r"a.nii.gz cannot be read as NIfTI"):
+        read_grid("a.nii.gz")
+
+
+@pytest.mark.parametrize("name", ["a.nii.gz", "a.mha", "a.vti", "a.h5:/field", "a.sdf", "a.vdb"])
+def test_the_command_makes_the_mesh_at_its_place(name, command):
+    save_any(name.split(":")[0])
+    origin = ",".join(map(str, affine_of(np.eye(3))[:3, 3]))
+    given = ["--spacing", "0.5", f"--origin={origin}"] if ".h5" in name else []
+    code, _, err = command("upsample", name, "out.ply", "--quality", "fast", *given)
+    assert code == 0, err
+    mesh = trimesh.load("out.ply")
+    assert mesh.is_watertight and mesh.volume > 0
+    if name != "a.vdb":
+        assert np.abs(part(mesh.vertices)).max() < 0.05
+
+
+def test_batch_takes_the_same_inputs(command):
+    """Arrays of a file by name, folders that are grids, and double suffixes."""
+    affine = affine_of(np.eye(3))
+    os.mkdir("in")
+    save_nifti("in/a.nii.gz", affine)
+    with h5py.File("two.h5", "w") as file:
+        file["deep/b"] = file["c"] = sampled(affine).T
+    store = zarr.create_array("in/d.zarr", shape=SIZES[::-1], chunks=(5, 6, 7), dtype="f4")
+    store[:] = sampled(affine).T
+    arguments = ["in", "two.h5:/deep/b", "two.h5:c", "--out", "out", "--quality", "fast"]
+    arguments += ["--spacing", "0.5", "--jobs", "1", "--json"]
+    code, out, err = command("batch", *arguments)
+    assert code == 0, err
+    names = sorted(path.name for path in Path("out").glob("*.ply"))
+    assert names == ["a.ply", "d.ply", "two-c.ply", "two-deep-b.ply"]
+    options = ("--quality", "fast", "--spacing", 0.5)
+    assert command("upsample", "in/a.nii.gz", "a.ply", *options)[0] == 0
+    assert Path("a.ply").read_bytes() == Path("out/a.ply").read_bytes()
+    before = Path("out/d.ply").read_bytes()
+    store[:] = sampled(affine).T + 0.2
+    code, out, err = command("batch", *arguments)
+    assert code == 0 and json.loads(out)["done"] == 1, out
+    assert Path("out/d.ply").read_bytes() != before
+
+
+def test_the_page_on_formats_lists_those_of_the_table():
+    page = (Path(__file__).parent.parent / "docs" / "formats.md").read_text()
+    for format_ in formats.FORMATS:
+        start = f"| {format_.name} | `{'`, `'.join(format_.suffixes)}` | "
+        assert start + (f"`{format_.extra}`" if format_.extra else "none") in page
+
+
+def test_no_library_is_imported_for_numpy_files():
+    script = (
+        "import sys, numpy; from super_sdf import read_grid;"
+        "f = numpy.linalg.norm(numpy.indices((9, 9, 9)) - 4.1, axis=0) - 2.5;"
+        "numpy.save('a.npy', f); read_grid('a.npy');"
+        "assert not {'nibabel', 'nrrd', 'SimpleITK', 'vtkmodules', 'tifffile', 'h5py', 'zarr',"
+        " 'tinyvdb', 'super_sdf.files.readers'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True)
