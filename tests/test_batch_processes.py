@@ -68,7 +68,7 @@ def test_what_a_killed_batch_left_is_removed_and_nothing_else(run_batch):
     made = {"out": "deep/b.ply", "sha256": fingerprint(Path("out/deep/b.ply"))["sha256"]}
     Path("out/.super-sdf-batch").write_text(f'\n"deep/b.ply"\n\n{json.dumps(made)}\n"to')
     assert run_batch("in/", "--dry-run")[2].startswith("4 to do") and stale.exists()
-    assert run_batch("in")[2].endswith("3 done, 1 failed; 2 meshes closed, 1 open\n")
+    assert run_batch("in")[2].endswith("3 done, 1 failed; 3 meshes closed, 0 open\n")
     assert not stale.exists() and all(map(os.path.exists, kept))
     assert rows()[-1]["out"] == "deep/b.ply"  # last: it may be what ended the run
     assert Path("out/.super-sdf-batch").read_text() == ""

@@ -325,7 +325,7 @@ def test_the_coloured_mesh_is_a_mesh_with_residuals(here, command):
         ("ball.ply ball.npz --offset nan", 2, "offset is nan: give a finite number, in world"),
         ("ball.ply ball.npz --offset 9", 1, "no surface at 9: the values go from "),
         ("ball.ply ball.npz --max-memory 9M", 1, "checking 81,920 triangles needs "),
-        ("ball.ply ball.npz --spacing 9", 1, "spacing"),
+        ("ball.ply ball.npz --spacing 0.001", 1, "spacing"),
     ],
 )
 def test_errors_are_one_line_and_leave_nothing(here, command, words, code, message):
