@@ -102,9 +102,8 @@ def surfaces(patches: Patches, own: Planes, candidates: Candidates) -> tuple[Tri
     moved = move_beside(patches, own, candidates, np.ones(len(candidates.patch), bool))
     placed = Placed(moved, candidates.planes.normal, candidates.patch, candidates.vertex)
     placed = unfolded(patches, placed)
-    points = np.concatenate([placed.position, placed.peak])
     patches_of, corners_of = zip(*fan_triangles(patches, placed))
-    return flat, (np.concatenate(patches_of), points[np.concatenate(corners_of)])
+    return flat, (np.concatenate(patches_of), placed.points[np.concatenate(corners_of)])
 
 
 def errors_of(

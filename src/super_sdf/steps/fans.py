@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -44,10 +45,14 @@ class Placed:
     feature: Index
     peak: Vectors
 
+    @cached_property
+    def points(self) -> Vectors:
+        """All vertices in the order of their numbers, (n + f, 3)."""
+        return np.concatenate([self.position, self.peak])
+
     def facing(self, corners: tuple[Index, Index, Index], crossing: Index) -> Numbers:
         """Return the cosine between triangles, corners (t,) each, and the planes of crossings."""
-        points = np.concatenate([self.position, self.peak])
-        a, b, c = (points[corner] for corner in corners)
+        a, b, c = (self.points[corner] for corner in corners)
         return dot(unit(np.cross(b - a, c - a)), self.normal[crossing])
 
 

@@ -5,8 +5,9 @@
 3. ``evidence`` gathers what speaks for an edge there and what against it: flat ground on both
    sides, spheres that touch or are pierced. It is averaged along the chain of candidates, since an
    edge has a length, and weighed by a logistic rule.
-4. Vertices beside the features that are sure are moved onto the settled planes, and those of
-   features that would fold the surface back to the middle of their patch (``fans``).
+4. Beside features of which the rule is sure, vertices are moved onto the settled planes.
+5. A feature's vertex that would fold the surface goes half way back to the middle of its patch
+   (``fans``).
 
 The rule was fitted by ``export.edges`` on shapes with and without edges, to whether a vertex on the
 edge brings the surface nearer to the true one.
