@@ -40,6 +40,7 @@ from .wedges import (
 )
 
 SHARP_COSINE = 0.85  # normals of a patch that differ by more, 32 degrees, may make a feature
+HALF_ANGLE_COSINE = 0.962  # of a little less than half that angle
 LEAST_SLOPE_TRUST = 0.02  # of every crossing of a feature
 RINGS = 3  # patches round a candidate, counted from it, in which planes are settled
 CHAIN_ROUNDS = 8  # in each, a candidate takes the mean of those it shares a crossing with
@@ -107,7 +108,7 @@ class Candidates:
 
 
 def place_features(
-    patches: Patches, own: Planes, kinked: BoolArray, field: FineField, threads: int = 1
+    patches: Patches, own: Planes, turning: BoolArray, field: FineField, threads: int = 1
 ) -> Placed:
     """Return the positions of all crossings, which patches have a feature, and its vertices.
 
@@ -116,12 +117,12 @@ def place_features(
     patches : Patches
     own : Planes
         Those of the crossings, by the field alone.
-    kinked : (D,) bool
-        The voxels in which a feature may begin.
+    turning : (D,) bool
+        The voxels that hold a patch whose normals differ as at an edge.
     field : FineField
     threads : int
     """
-    candidates = find_candidates(patches, own, kinked, field, threads)
+    candidates = find_candidates(patches, own, turning, field, threads)
     score = candidates.score()
     kept = score > 0
     position = move_beside(patches, own, candidates, score > SURE)
@@ -131,15 +132,15 @@ def place_features(
 
 
 def find_candidates(
-    patches: Patches, own: Planes, kinked: BoolArray, field: FineField, threads: int = 1
+    patches: Patches, own: Planes, turning: BoolArray, field: FineField, threads: int = 1
 ) -> Candidates:
     """Return the patches that may hold a feature, with its vertex and the evidence for it."""
-    seeds = _is_sharp(patches, own.normal, own.trust) & kinked[patches.row]
+    seeds = is_sharp(patches, own.normal, own.trust) & turning[patches.row]
     near = dilate(patches, seeds, RINGS, len(own.point))
     inside = np.flatnonzero((near[patches.crossing] | ~patches.there).all(1))
     some = patches.chosen(inside)
     planes = settle_planes(some, own) if len(inside) else own
-    sharp = np.flatnonzero(_is_sharp(some, planes.normal, own.trust))
+    sharp = np.flatnonzero(is_sharp(some, planes.normal, own.trust))
     chosen = some.chosen(sharp)
     factor, ijk = field.factor, field.voxel_ijk[chosen.row].astype(np.int64)
     corners = planes.point[chosen.crossing] / factor, planes.normal[chosen.crossing]
@@ -157,19 +158,31 @@ def find_candidates(
     return Candidates(inside[sharp], vertex, evidence, count, planes, near)
 
 
-def _is_sharp(patches: Patches, normal: Vectors, trust: Numbers) -> BoolArray:
+def is_sharp(patches: Patches, normal: Vectors, trust: Numbers) -> BoolArray:
     """Return which patches, (P,), have normals that differ by more than ``SHARP_COSINE``.
 
     Only where the field is a distance at every crossing: of others normals say little.
     """
+    sides = patches.crossing.shape[1]
+    # Where all are within half that angle of the first, no two differ by more.
+    pairs = [(0, other) for other in range(1, sides)]
+    some = np.flatnonzero(_least_cosine(patches, normal, pairs) < HALF_ANGLE_COSINE)
+    pairs = [(one, other) for other in range(sides) for one in range(other)]
     sharp: BoolArray = np.zeros(len(patches.row), bool)
-    for one in range(patches.crossing.shape[1]):
-        for other in range(one):
-            pair = patches.crossing[:, one], patches.crossing[:, other]
-            rows = np.flatnonzero((pair[0] >= 0) & (pair[1] >= 0))
-            sharp[rows] |= dot(normal[pair[0][rows]], normal[pair[1][rows]]) < SHARP_COSINE
+    sharp[some] = _least_cosine(patches.chosen(some), normal, pairs) < SHARP_COSINE
     known = (trust[patches.crossing] >= LEAST_SLOPE_TRUST) | ~patches.there
     return sharp & known.all(1)
+
+
+def _least_cosine(patches: Patches, normal: Vectors, pairs: list[tuple[int, int]]) -> Numbers:
+    """Return the least cosine of the normals of some pairs of each patch's crossings, (P,)."""
+    least: Numbers = np.full(len(patches.row), np.inf)
+    for one, other in pairs:
+        first, second = patches.crossing[:, one], patches.crossing[:, other]
+        rows = np.flatnonzero((first >= 0) & (second >= 0))
+        cosine = dot(normal[first[rows]], normal[second[rows]])
+        least[rows] = np.minimum(least[rows], cosine)
+    return least
 
 
 def evidence_of(

@@ -124,8 +124,14 @@ class FineField:
 
     def rows(self, first: int, last: int) -> slice:
         """Return the rows of the voxels in planes ``first`` to before ``last``."""
-        start, stop = np.searchsorted(self.voxel_ijk[:, 0], [first, last])
+        ends = np.array([first, last], self._plane.dtype)  # another type would copy the array
+        start, stop = np.searchsorted(self._plane, ends)
         return slice(int(start), int(stop))
+
+    @cached_property
+    def _plane(self) -> IntArray:
+        """The plane of each voxel, (D,), in one piece."""
+        return np.ascontiguousarray(self.voxel_ijk[:, 0])
 
     @property
     def own_rows(self) -> slice:

@@ -38,8 +38,8 @@ def voxels_near_kinks(field: FineField, rows: slice, threads: int = 1) -> BoolAr
             other = field.parts.table[CENTRE + step, rows]
             known = np.flatnonzero((other >= rows.start) & (other < rows.stop))
             other = other[known] - rows.start
-            low[:, known] = np.minimum(low[:, known], alone[0][:, other])
-            high[:, known] = np.maximum(high[:, known], alone[1][:, other])
+            low[:, known] = np.fmin(low[:, known], alone[0][:, other])
+            high[:, known] = np.fmax(high[:, known], alone[1][:, other])
     near = np.zeros(len(field.voxel_ijk), bool)
     near[rows] = np.any(high - low > TURN, axis=0)
     return near
@@ -48,21 +48,17 @@ def voxels_near_kinks(field: FineField, rows: slice, threads: int = 1) -> BoolAr
 def _ranges(blocks: FloatArray, factor: int) -> tuple[FloatArray, FloatArray]:
     """Return the smallest and largest differences along each axis, (3, n), of blocks (Q, n).
 
-    They are slopes, 1 for a distance. Blocks without nodes near the surface have inf and -inf.
+    They are slopes, 1 for a distance; NaN for blocks without nodes near the surface.
     """
-    side = (factor + 1,) * 3
-    cube = blocks.reshape(*side, -1)
-    near = np.abs(cube) < np.float32(NEAR_SURFACE * 2 / factor)
-    low = np.full((3, blocks.shape[1]), np.inf, np.float32)
-    high = -low
+    near = np.abs(blocks) < np.float32(NEAR_SURFACE * 2 / factor)
+    cube = np.where(near, blocks, np.float32(np.nan)).reshape(*(factor + 1,) * 3, -1)
+    low, high = np.empty((2, 3, blocks.shape[1]), np.float32)
     for axis in range(3):
-        values, close = np.moveaxis(cube, axis, 0), np.moveaxis(near, axis, 0)
-        slope = (values[1:] - values[:-1]) * np.float32(factor / 2)
-        counted = close[1:] & close[:-1]
-        along = (0, 1, 2)
-        low[axis] = np.where(counted, slope, np.float32(np.inf)).min(along)
-        high[axis] = np.where(counted, slope, np.float32(-np.inf)).max(along)
-    return low, high
+        values = np.moveaxis(cube, axis, 0)
+        step = (values[1:] - values[:-1]).reshape(-1, blocks.shape[1])
+        np.fmin.reduce(step, 0, out=low[axis])
+        np.fmax.reduce(step, 0, out=high[axis])
+    return low * np.float32(factor / 2), high * np.float32(factor / 2)
 
 
 def beside(field: FineField, chosen: BoolArray, rings: int) -> BoolArray:

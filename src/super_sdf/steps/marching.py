@@ -227,7 +227,7 @@ def lattice_positions(
 ) -> NDArray[np.float64]:
     """Return where the surface crosses edges of blocks, (3, n), in fine spacings from node 0."""
     axis, node = np.divmod(edge, np.int16(len(field.blocks)))
-    share = _crossing(field.blocks[node, row], field.blocks[_ends(field.factor)[edge], row])
+    share = _crossing(field.blocks[node, row], field.blocks[edge_ends(field.factor)[edge], row])
     positions = np.empty((3, len(row)))
     for along, samples in enumerate(field.shape):
         voxel, runs = field.voxel_ijk[row, along], axis == along
@@ -248,7 +248,7 @@ def to_world(positions: NDArray[np.float64], field: FineField, grid: SdfGrid) ->
 
 
 @lru_cache
-def _ends(factor: int) -> NDArray[np.intp]:
+def edge_ends(factor: int) -> NDArray[np.intp]:
     """Return the node at the far end of each edge of a block, (3 Q,).
 
     Edges that leave the block have a number here too, which is not used.

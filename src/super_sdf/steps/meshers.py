@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import OptionError, OptionTypeError, seen
 from ..grid.sdf_grid import SdfGrid
@@ -100,13 +99,12 @@ def count_groups(voxels: int, planes: int, factor: int, threads: int) -> int:
 
 
 def number_after(first_vertex: int, meshes: list[Mesh]) -> list[Mesh]:
-    """Return meshes that each count vertices from 0 numbered one after the other."""
+    """Return meshes that each count vertices from 0 numbered one after the other, in place."""
     counts = [len(mesh.vertices) for mesh in meshes]
     check_count(first_vertex + sum(counts), "vertices")
-    starts: NDArray[Any] = first_vertex + np.cumsum([0, *counts[:-1]])
-    return [
-        Mesh(mesh.vertices, mesh.faces + np.int32(start)) for mesh, start in zip(meshes, starts)
-    ]
+    for mesh, before in zip(meshes, accumulate(counts, initial=first_vertex)):
+        np.add(mesh.faces, np.int32(before), out=mesh.faces)
+    return meshes
 
 
 BY_NAME = {

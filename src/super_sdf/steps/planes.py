@@ -14,6 +14,7 @@ Positions are in fine spacings, from node (0, 0, 0) of the fine lattice.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, cast
 
 import numpy as np
@@ -23,7 +24,7 @@ from ..arrays import BoolArray, IntArray
 from ..machine.threads import map_chunks
 from ..neighbourhood import CENTRE, STRIDES
 from .field import FineField
-from .marching import Crossings, lattice_positions
+from .marching import Crossings, edge_ends, lattice_positions
 from .nodes import block_ijk
 from .patches import Index, Patches, dilate, pairs_in_patches
 from .vectors import Numbers, Vectors, dot, length, sums, unit
@@ -81,12 +82,10 @@ def _planes_of_chunk(
     """Return the arrays of ``Planes`` for some edges of voxels' blocks."""
     axis, node = np.divmod(edge.astype(np.int64), len(field.blocks))
     low_ijk = block_ijk(field.factor)[node]
-    high_ijk = low_ijk.copy()
-    high_ijk[np.arange(len(row)), axis] += 1
     position = lattice_positions(field, row, edge).T
     start = (field.factor * field.voxel_ijk[row] + low_ijk)[np.arange(len(row)), axis]
     share = np.clip(position[np.arange(len(row)), axis] - start, 0, 1)
-    gradients = _gradient(field, row, low_ijk), _gradient(field, row, high_ijk)
+    gradients = _gradient(field, row, node), _gradient(field, row, edge_ends(field.factor)[edge])
     return position, *_mean_normal(*gradients, share)
 
 
@@ -111,40 +110,62 @@ def square_falloff(off: Numbers) -> Numbers:
     return falloff
 
 
-def _gradient(field: FineField, row: IntArray, node_ijk: IntArray) -> Vectors:
+def _gradient(field: FineField, row: IntArray, node: Index) -> Vectors:
     """Return the field's gradient at nodes of blocks, (n, 3); 1 is the slope of a distance.
 
     Along each axis by the parabola through three of five nodes that bends least: it does not
     straddle a kink.
     """
-    gradient = np.zeros((len(row), 3))
-    for axis in range(3):
-        a, b, c, d, e = (_shifted(field, row, node_ijk, axis, step) for step in range(-2, 3))
-        bend = np.abs(np.stack([c - 2 * b + a, d - 2 * c + b, e - 2 * d + c]))
-        slopes = np.stack([1.5 * c - 2 * b + 0.5 * a, 0.5 * (d - b), 2 * d - 1.5 * c - 0.5 * e])
-        bend[~np.isfinite(bend)] = np.inf
-        chosen = slopes[bend.argmin(0), np.arange(len(row))]
-        gradient[:, axis] = np.where(np.isfinite(chosen), chosen, 0)
+    gradient = np.empty((len(row), 3))
+    here = _value(field, row, node)
+    for axis, walk in enumerate(_walks(field.factor)):
+        a, b, d, e = (
+            _value(field, field.parts.table[place[node], row], end[node]) for place, end in walk
+        )
+        gradient[:, axis] = _slope((a, b, here, d, e))
     return gradient * (field.factor / 2)
 
 
-def _value(field: FineField, row: NDArray[Any], node_ijk: IntArray) -> Numbers:
+def _slope(values: tuple[Numbers, ...]) -> Numbers:
+    """Return the slope at the third of five nodes, (n,): 0 where values are missing."""
+    a, b, c, d, e = values
+    parabolas = (
+        (c - 2 * b + a, 1.5 * c - 2 * b + 0.5 * a),
+        (d - 2 * c + b, 0.5 * (d - b)),
+        (e - 2 * d + c, 2 * d - 1.5 * c - 0.5 * e),
+    )
+    least, slope = np.full(len(c), np.inf), np.zeros(len(c))
+    for bend, own in parabolas:
+        bend = np.abs(bend)
+        better = bend < least  # never of NaN
+        least, slope = np.where(better, bend, least), np.where(better, own, slope)
+    return slope
+
+
+def _value(field: FineField, row: NDArray[Any], node: NDArray[Any]) -> Numbers:
     """Return the values of nodes of blocks, (n,); NaN where there is no block, row -1."""
-    side = field.factor + 1
-    node = (node_ijk[:, 0] * side + node_ijk[:, 1]) * side + node_ijk[:, 2]
     values: Numbers = field.blocks[node, row].astype(np.float64)
     values[row < 0] = np.nan
     return values
 
 
-def _shifted(field: FineField, row: IntArray, node_ijk: IntArray, axis: int, step: int) -> Numbers:
-    """Return the values some nodes further along an axis, maybe in the next block."""
-    ijk, factor = node_ijk.copy(), field.factor
-    ijk[:, axis] += step
-    beyond = np.where(ijk[:, axis] > factor, 1, np.where(ijk[:, axis] < 0, -1, 0))
-    ijk[:, axis] -= factor * beyond
-    voxel = np.where(beyond == 0, row, field.parts.table[CENTRE + int(STRIDES[axis]) * beyond, row])
-    return _value(field, voxel, ijk)
+@lru_cache
+def _walks(factor: int) -> list[list[tuple[Index, Index]]]:
+    """Return where walks of -2, -1, 1 and 2 nodes along each axis end, from each node of a block.
+
+    Each is the place of the neighbouring voxel, (Q,), and the node in its block, (Q,).
+    """
+    side = factor + 1
+
+    def walk(axis: int, step: int) -> tuple[Index, Index]:
+        ijk = block_ijk(factor).astype(np.int64)
+        ijk[:, axis] += step
+        beyond = np.where(ijk[:, axis] > factor, 1, np.where(ijk[:, axis] < 0, -1, 0))
+        ijk[:, axis] -= factor * beyond
+        end = (ijk[:, 0] * side + ijk[:, 1]) * side + ijk[:, 2]
+        return CENTRE + int(STRIDES[axis]) * beyond, end
+
+    return [[walk(axis, step) for step in (-2, -1, 1, 2)] for axis in range(3)]
 
 
 def settle_planes(patches: Patches, own: Planes) -> Planes:

@@ -31,9 +31,10 @@ from numpy.typing import NDArray
 from ..arrays import BoolArray, IntArray
 from ..grid.sdf_grid import SdfGrid
 from ..machine.index_width import check_count
+from ..machine.threads import map_chunks
 from ..mesh import CLEARANCE, Mesh, vertex_type
 from .fans import Placed, triangles_of
-from .features import CHAIN_ROUNDS, MOVED_RINGS, RINGS, place_features
+from .features import CHAIN_ROUNDS, MOVED_RINGS, RINGS, is_sharp, place_features
 from .field import FineField
 from .kinks import beside, voxels_near_kinks
 from .marching import (
@@ -52,6 +53,7 @@ from .vectors import Vectors
 # Cells to every side that a vertex depends on: gradients reach 2 cells, a patch is 1 wide, and so
 # is the fan beside.
 REACH_IN_CELLS = RINGS + ROUNDS + CHAIN_ROUNDS + MOVED_RINGS + 5
+TEMPORARIES = 16  # numbers per crossing in the computation of its position
 REACH_IN_VOXELS = 2  # further: whether a voxel is examined depends on those beside it
 
 
@@ -102,16 +104,28 @@ class Examined:
 
 
 def examine(field: FineField, crossings: Crossings, rows: slice, threads: int = 1) -> Examined:
-    """Look for edges and corners near kinks of the field, in some voxels."""
-    kinked = voxels_near_kinks(field, rows, threads)
-    voxels = beside(field, kinked, -(-(RINGS + 1) // field.factor))
+    """Look for edges and corners in and beside voxels in which a patch of the surface turns."""
+    turning = turning_voxels(field, crossings, rows, threads)
+    voxels = beside(field, turning, -(-(RINGS + 1) // field.factor))
     voxels &= within(np.arange(len(voxels)), rows)
     patches, used = find_patches(field, crossings, voxels)
     own = planes_at_crossings(field, crossings, used, threads)
-    placed = place_features(patches, own, kinked, field, threads)
+    placed = place_features(patches, own, turning, field, threads)
     position = _kept_in_grid(placed.position, own.point, field)
     peak = _kept_in_grid(placed.peak, patches.low[placed.feature] + 0.5, field)
     return Examined(voxels, patches, used, replace(placed, position=position, peak=peak))
+
+
+def turning_voxels(
+    field: FineField, crossings: Crossings, rows: slice, threads: int = 1
+) -> BoolArray:
+    """Return which voxels, (D,), hold a patch whose normals differ as at an edge."""
+    kinked = voxels_near_kinks(field, rows, threads)
+    patches, used = find_patches(field, crossings, kinked)
+    own = planes_at_crossings(field, crossings, used, threads)
+    turning = np.zeros(len(kinked), bool)
+    turning[patches.row[is_sharp(patches, own.normal, own.trust)]] = True
+    return turning
 
 
 def _kept_in_grid(position: Vectors, start: Vectors, field: FineField) -> Vectors:
@@ -182,8 +196,13 @@ def _vertices(
     """Return the vertices of the field's own voxels, (n, 3), in fine spacings."""
     vertices = np.empty((numbers.own, 3))
     mine = crossings.own(field.own_rows)
-    plain = lattice_positions(field, crossings.own_row[mine], crossings.own_edge[mine]).T
-    vertices[numbers.of_crossing[mine] - first_vertex] = plain
+
+    def place(some: slice) -> None:
+        rows = slice(mine.start + some.start, mine.start + some.stop)
+        plain = lattice_positions(field, crossings.own_row[rows], crossings.own_edge[rows])
+        vertices[numbers.of_crossing[rows] - first_vertex] = plain.T
+
+    map_chunks(place, mine.stop - mine.start, TEMPORARIES)
     used, placed = examined.used, examined.placed
     for row, number, position in (
         (crossings.own_row[used], numbers.of_crossing[used], placed.position),
