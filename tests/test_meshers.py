@@ -123,8 +123,8 @@ def test_groups_and_threads_change_nothing(network, monkeypatch, factor):
     monkeypatch.setattr(threads, "CHUNK", 5000)
     monkeypatch.setattr(threads, "MIN_PER_THREAD", 1000)
     for groups, number in ((1, 2), (4, 1), (9, 3)):
-        cells = len(field.voxel_ijk) * factor**2 // groups
-        monkeypatch.setattr(meshers, "CELLS_IN_GROUP", cells)
+        size = sum(meshers.voxel_bytes(factor)) * len(field.voxel_ijk)
+        monkeypatch.setattr(meshers, "GROUP_BYTES", size // groups)
         pieces = mesher.extract(field, grid, 7, number)
         assert len(pieces) > 1 or groups == 1
         assert_same(join_meshes(pieces), one)

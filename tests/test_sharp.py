@@ -9,16 +9,14 @@ from test_isosurface import dense_field, fields
 
 from super_sdf import Mesh, SdfGrid, extract_mesh, load_network, upsample
 from super_sdf.evaluation.methods import sharp_isosurface
-from super_sdf.mesh import join_meshes
 from super_sdf.steps.cell_cases import loop_table, triangle_table
 from super_sdf.steps.features import Rule
-from super_sdf.steps.sharp import extract_sharp_pieces
 
 TURN = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
 
 
 def extract_sharp(field, grid) -> Mesh:
-    return join_meshes(extract_sharp_pieces(field, grid))
+    return extract_mesh(field, grid, mesher="sharp")
 
 
 def turned_box(half, samples=22):

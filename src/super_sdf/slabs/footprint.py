@@ -7,7 +7,7 @@ import numpy as np
 from ..machine.threads import CHUNK, rows_in_chunk
 from ..steps.marching import LOOKUP_BYTES, lookups_at_once
 from ..steps.mesher_names import DEFAULT_MESHER, MARCHING, SHARP
-from ..steps.meshers import BY_NAME, count_groups, groups_at_once
+from ..steps.meshers import BY_NAME, GROUP_BYTES, groups_at_once, voxel_bytes
 from ..steps.survey import Band
 
 # Peak memory of the stages after the network in bytes, measured (``benchmarks.large``,
@@ -20,9 +20,6 @@ STAGES = {
     SHARP: (216, 350, 7.5, 1e7, 3e7),
 }
 BEFORE_MESHER = ("average", "fit")
-# The sharp mesher on a group of planes and those beside: bytes per voxel and factor, measured on a
-# field of edges everywhere; its lookup table comes on top.
-SHARP_BYTES = 1700
 # Default for a network: bytes per voxel that it sees, including its row of the neighbour table, and
 # per value.
 NETWORK_BYTES = (680.0, 8.0)
@@ -91,12 +88,15 @@ def _lookup_bytes(band: Band, planes: Range, decoded: int, factor: int, threads:
 
 
 def _sharp_bytes(band: Band, planes: Range, decoded: int, factor: int, threads: int) -> int:
-    """Return the bytes of the sharp mesher on as many groups as it works on at once."""
-    threads = min(threads, groups_at_once(planes, band.shape))
-    groups = count_groups(decoded, planes[1] - planes[0], factor, threads)
-    beside = BY_NAME[SHARP].planes_beside(factor) + 1  # the one before owns vertices
-    before = band.decoded_before[max(planes[0] - beside, 0) : planes[1] + beside]
-    width = min(2 * beside, len(before) - 1)
+    """Return the bytes of the sharp mesher on as many groups as it works on at once.
+
+    Where edges are is not known yet: every voxel of the planes beside a group may be near one.
+    """
+    beside = BY_NAME[SHARP].planes_beside(factor)
+    before = band.decoded_before[max(planes[0] - beside, 0) : planes[1] + beside + 1]
+    width = min(2 * beside + 1, len(before) - 1)
     around = int((before[width:] - before[: len(before) - width]).max())
-    voxels = min(decoded // groups + around, decoded)
-    return min(threads, groups) * voxels * (LOOKUP_BYTES * (factor + 1) ** 3 + SHARP_BYTES * factor)
+    most = sum(voxel_bytes(factor))
+    return min(threads, groups_at_once(planes, band.shape)) * min(
+        GROUP_BYTES + most * around, most * decoded
+    )

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray
+from ..machine.threads import map_chunks
 from .fans import Placed, unfolded
 from .field import FineField, SampleSpheres
 from .patches import Index, Patches, dilate
@@ -51,6 +52,7 @@ FARTHEST_MOVE = 0.5  # fine spacings
 OUTSIDE_CELL = 0.5  # fine spacings by which a feature's vertex may leave its cell
 TOUCHING = 0.04  # coarse spacings from a sphere at which it is touched
 LEAST_SPHERES = 4  # that pass near a feature: in noise no sample is exact, and normals say nothing
+TEMPORARIES = 1000  # numbers per patch in the search for its spheres among 125 samples
 TOUCHED_ALONG = 1.0  # coarse spacings along an edge in which spheres are counted
 
 
@@ -142,20 +144,35 @@ def find_candidates(
     planes = settle_planes(some, own) if len(inside) else own
     sharp = np.flatnonzero(is_sharp(some, planes.normal, own.trust))
     chosen = some.chosen(sharp)
-    factor, ijk = field.factor, field.voxel_ijk[chosen.row].astype(np.int64)
-    corners = planes.point[chosen.crossing] / factor, planes.normal[chosen.crossing]
-    wedges = wedges_of(ijk, *corners, chosen.there)
+    parts = map_chunks(
+        lambda rows: _measure(chosen.chosen(rows), planes, own, field),
+        len(sharp),
+        TEMPORARIES,
+        threads,
+    )
+    empty = np.empty((0, 3)), np.empty((0, 11)), np.empty(0, np.int32)
+    point, evidence, spheres = (np.concatenate(arrays) for arrays in zip(empty, *parts))
+    evidence = mean_along_chain(chosen, evidence, len(own.point))
+    low = chosen.low - OUTSIDE_CELL
+    vertex = np.clip(field.factor * point, low, low + 1 + 2 * OUTSIDE_CELL)
+    return Candidates(inside[sharp], vertex, evidence, spheres, planes, near)
+
+
+def _measure(
+    patches: Patches, planes: Planes, own: Planes, field: FineField
+) -> tuple[Vectors, Vectors, NDArray[np.int32]]:
+    """Return the point on the edge of some patches, the evidence, and the number of spheres."""
+    ijk = field.voxel_ijk[patches.row].astype(np.int64)
+    corners = planes.point[patches.crossing] / field.factor, planes.normal[patches.crossing]
+    wedges = wedges_of(ijk, *corners, patches.there)
     spheres = field.spheres or SampleSpheres(
         field.shape, np.empty((0, 3), np.int32), np.empty(0, np.float32)
     )
-    nearby = find_spheres(wedges, spheres, threads)
+    nearby = find_spheres(wedges, spheres)
     leaned = lean(wedges, nearby)
-    evidence = evidence_of(chosen, planes, own, wedges, leaned, nearby)
-    evidence = mean_along_chain(chosen, evidence, len(own.point))
-    low = chosen.low - OUTSIDE_CELL
-    vertex = np.clip(factor * leaned.point, low, low + 1 + 2 * OUTSIDE_CELL)
+    evidence = evidence_of(patches, planes, own, wedges, leaned, nearby)
     count = count_by_wedge(nearby, np.ones(len(nearby.wedge), bool), len(evidence))
-    return Candidates(inside[sharp], vertex, evidence, count, planes, near)
+    return leaned.point, evidence, count
 
 
 def is_sharp(patches: Patches, normal: Vectors, trust: Numbers) -> BoolArray:

@@ -1,8 +1,8 @@
 """The meshers: how each makes triangles of a fine field, and which planes beside it that takes.
 
-The mesher that keeps edges holds some hundred bytes for each crossed cell, so it works on groups of
-planes, several at a time. Each is given to it as a slab of its own, so the mesh is the same for
-any groups.
+The mesher that keeps edges holds some hundred bytes for each crossed cell near an edge, so it works
+on groups of planes, several at a time. Each is given to it as a slab of its own, so the mesh is
+the same for any groups.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from ..arrays import BoolArray
 from ..errors import OptionError, OptionTypeError, seen
 from ..grid.sdf_grid import SdfGrid
 from ..machine.index_width import check_count
@@ -24,7 +25,7 @@ from . import marching, sharp
 from .field import FineField
 from .mesher_names import DEFAULT_MESHER, MARCHING, MESHERS, SHARP
 
-CELLS_IN_GROUP = 1 << 21  # K^2 for each voxel: about half as many are crossed
+GROUP_BYTES = 1 << 28  # what the own planes of a group may take
 GROUPS_AT_ONCE = 4
 
 Planes = tuple[int, int]
@@ -61,15 +62,16 @@ def extract_sharp_pieces(
     field: FineField, grid: SdfGrid, first_vertex: int = 0, threads: int = 1
 ) -> list[Mesh]:
     """Return the mesh with edges and corners, group by group of the field's own planes."""
-    threads = min(threads, groups_at_once(field.planes, field.shape))
-    groups = groups_of_planes(field, threads)
+    at_once = min(threads, groups_at_once(field.planes, field.shape))
+    kinked = sharp.find_kinks(field, threads)
+    groups = groups_of_planes(field, kinked, at_once)
     if len(groups) == 1:
-        return sharp.extract_sharp_pieces(field, grid, first_vertex, threads)
+        return sharp.extract_sharp_pieces(field, grid, kinked, first_vertex, at_once)
 
     def mesh_of(planes: Planes) -> list[Mesh]:
-        return sharp.extract_sharp_pieces(replace(field, planes=planes), grid, 0, 1)
+        return sharp.extract_sharp_pieces(replace(field, planes=planes), grid, kinked, 0, 1)
 
-    meshes = map_threads(mesh_of, groups, threads)
+    meshes = map_threads(mesh_of, groups, at_once)
     return number_after(first_vertex, [mesh for group in meshes for mesh in group])
 
 
@@ -78,24 +80,28 @@ def groups_at_once(planes: Planes, shape: tuple[int, ...]) -> int:
     return GROUPS_AT_ONCE if planes == (0, shape[0]) else 1
 
 
-def groups_of_planes(field: FineField, threads: int) -> list[Planes]:
-    """Cut a field's own planes into groups with about equally many voxels."""
-    first, last = field.planes
-    plane = field.voxel_ijk[field.own_rows, 0]
-    count = count_groups(len(plane), last - first, field.factor, threads)
-    inner = plane[np.arange(1, count) * len(plane) // count]
-    bounds = np.unique([first, *np.maximum(inner, first), last]).tolist()
-    return list(pairwise(bounds))
-
-
-def count_groups(voxels: int, planes: int, factor: int, threads: int) -> int:
-    """Return into how many groups the voxels of some planes are divided.
+def groups_of_planes(field: FineField, kinked: BoolArray, threads: int) -> list[Planes]:
+    """Cut a field's own planes into groups that take about the same memory.
 
     As many as memory asks for, and one for each thread if the groups are then not thinner than the
     planes beside them, which are worked on again with every group.
     """
-    thick = planes // (2 * sharp.planes_beside(factor))
-    return max(voxels * factor**2 // CELLS_IN_GROUP, min(threads, thick), 1)
+    first, last = field.planes
+    plain, edged = voxel_bytes(field.factor)
+    size = plain + edged * sharp.near_kinks(field, kinked)[field.own_rows]
+    before = np.cumsum(np.bincount(field.voxel_ijk[field.own_rows, 0] - first, size, last - first))
+    thick = (last - first) // (2 * sharp.planes_beside(field.factor))
+    count = max(-int(-before[-1] // GROUP_BYTES), min(threads, thick), 1)
+    inner = first + np.searchsorted(before, np.arange(1, count) / count * before[-1])
+    return list(pairwise(np.unique([first, *inner, last]).tolist()))
+
+
+def voxel_bytes(factor: int) -> tuple[int, int]:
+    """Return the bytes that a voxel takes in a group, and how many more if it is near a kink.
+
+    Measured on a ball and on a field of turned cubes, three voxels wide.
+    """
+    return 82 * factor**2, 350 * factor**2
 
 
 def number_after(first_vertex: int, meshes: list[Mesh]) -> list[Mesh]:

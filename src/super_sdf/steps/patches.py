@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, IntArray
+from ..machine.threads import chunks_of
 from .cell_cases import loop_table
 from .field import FineField
 from .marching import Crossings, cells_low_nodes, edge_shifts, edge_steps, part_of_edge
@@ -45,7 +46,7 @@ class Patches:
     sides: Index
     crossing: Index
 
-    def chosen(self, rows: Index) -> Patches:
+    def chosen(self, rows: Index | slice) -> Patches:
         """Return some of the patches."""
         return Patches(
             self.row[rows], self.low[rows], self.loop[rows], self.sides[rows], self.crossing[rows]
@@ -144,10 +145,15 @@ def pairs_in_patches(patches: Patches) -> tuple[Index, Index]:
     Two crossings on a face that two cells share come twice.
     """
     sides = patches.crossing.shape[1]
-    one, other = np.nonzero(~np.eye(sides, dtype=bool))
-    first, second = patches.crossing[:, one].ravel(), patches.crossing[:, other].ravel()
-    both = (first >= 0) & (second >= 0)
-    return first[both], second[both]
+    places = np.nonzero(~np.eye(sides, dtype=bool))
+    empty = np.empty(0, np.int64)
+    parts = [(empty, empty)]
+    for some in chunks_of(len(patches.crossing), 6 * len(places[0])):
+        one, other = (patches.crossing[some, place].ravel() for place in places)
+        both = (one >= 0) & (other >= 0)
+        parts.append((one[both], other[both]))
+    first, second = zip(*parts)
+    return np.concatenate(first), np.concatenate(second)
 
 
 def nth_of_row(row: NDArray[Any], counts: NDArray[Any]) -> Index:

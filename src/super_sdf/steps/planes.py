@@ -15,13 +15,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, IntArray
-from ..machine.threads import map_chunks
+from ..machine.threads import chunks_of, map_chunks, rows_in_chunk
 from ..neighbourhood import CENTRE, STRIDES
 from .field import FineField
 from .marching import Crossings, edge_ends, lattice_positions
@@ -38,6 +39,7 @@ WEAKENING = 0.7  # of the trust in a plane, from crossing to crossing
 LEAST_TRUST = 1e-4
 SETTLED = 0.3  # trust from which a crossing keeps its own plane, unless ...
 SMOOTHED_RINGS = 1  # ... it lies within these of one that does not
+PAIR_TEMPORARIES = 24  # numbers per pair of crossings in a round
 TEMPORARIES = 256  # numbers per crossing in the computation of its plane
 
 
@@ -175,29 +177,46 @@ def settle_planes(patches: Patches, own: Planes) -> Planes:
     weighted by trust, by how alike the normals are, and by how near it lies to the plane.
     """
     one, other = pairs_in_patches(patches)
-    rough = np.zeros(len(own.trust))
-    np.maximum.at(rough, one, 1 - dot(own.normal[one], own.normal[other]))
-    trust = own.trust * square_falloff(rough / ROUGH) + LEAST_TRUST
+    trust = own.trust * square_falloff(_roughness(own, one, other) / ROUGH) + LEAST_TRUST
     planes = Planes(own.point, own.normal, trust)
     unsettled = np.any((trust < SETTLED)[patches.crossing] & patches.there, axis=1)
     beside = dilate(patches, cast(BoolArray, unsettled), SMOOTHED_RINGS, len(trust))
     one, other = one[beside[one]], other[beside[one]]
+    order = np.argsort(one, kind="stable")  # so that all pairs of a crossing are in one chunk
+    one, other = one[order], other[order]
+    step = rows_in_chunk(PAIR_TEMPORARIES)
+    bounds = np.unique([0, *one[step::step].tolist(), len(trust)])
+    starts = np.searchsorted(one, bounds)
     for _ in range(ROUNDS):
-        planes = _settle_once(planes, own, one, other)
+        parts = [
+            _settle_once(planes, own, slice(a, b), one[i:j] - a, other[i:j])
+            for (a, b), (i, j) in zip(pairwise(bounds.tolist()), pairwise(starts.tolist()))
+        ]
+        planes = Planes(*(np.concatenate(arrays) for arrays in zip(*parts)))
     return planes
 
 
-def _settle_once(planes: Planes, own: Planes, one: Index, other: Index) -> Planes:
-    """Return the planes after one round."""
-    count, normal = len(planes.trust), planes.normal[other]
-    off = dot(own.point[one] - planes.point[other], normal)
-    turned = (1 - dot(planes.normal[one], normal)) / ALIGNED
+def _roughness(own: Planes, one: Index, other: Index) -> Numbers:
+    """Return the largest 1 - cosine of each crossing's normal and those in its patches, (n,)."""
+    rough: Numbers = np.zeros(len(own.trust))
+    for some in chunks_of(len(one), PAIR_TEMPORARIES):
+        turned = 1 - dot(own.normal[one[some]], own.normal[other[some]])
+        np.maximum.at(rough, one[some], turned)
+    return rough
+
+
+def _settle_once(
+    planes: Planes, own: Planes, rows: slice, one: Index, other: Index
+) -> tuple[Vectors, Vectors, Numbers]:
+    """Return the planes of some crossings after one round; ``one`` counts from the first."""
+    point, mine, trust = planes.point[rows], planes.normal[rows], planes.trust[rows]
+    start, count, normal = own.point[rows], len(trust), planes.normal[other]
+    off = dot(start[one] - planes.point[other], normal)
+    turned = (1 - dot(mine[one], normal)) / ALIGNED
     weight = planes.trust[other] * square_falloff(turned) * square_falloff(off / OFF_PLANE)
     total = np.bincount(one, weight, count)
-    mean = sums(one, weight[:, None] * normal, count)
-    mean = unit(mean + planes.trust[:, None] * planes.normal)
-    here = dot(own.point - planes.point, planes.normal)
-    height = (np.bincount(one, weight * off, count) + planes.trust * here) / (total + planes.trust)
+    mean = unit(sums(one, weight[:, None] * normal, count) + trust[:, None] * mine)
+    here = dot(start - point, mine)
+    height = (np.bincount(one, weight * off, count) + trust * here) / (total + trust)
     passed_on = np.bincount(one, weight * planes.trust[other], count) / (total + 1e-12)
-    trust: Numbers = np.maximum(planes.trust, WEAKENING * passed_on)
-    return Planes(own.point - height[:, None] * mean, mean, trust)
+    return start - height[:, None] * mean, mean, np.maximum(trust, WEAKENING * passed_on)

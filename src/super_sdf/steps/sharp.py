@@ -58,11 +58,16 @@ REACH_IN_VOXELS = 2  # further: whether a voxel is examined depends on those bes
 
 
 def extract_sharp_pieces(
-    field: FineField, grid: SdfGrid, first_vertex: int = 0, threads: int = 1
+    field: FineField,
+    grid: SdfGrid,
+    kinked: BoolArray,
+    first_vertex: int = 0,
+    threads: int = 1,
 ) -> list[Mesh]:
     """Return the mesh of a field's planes with its edges and corners, as a list of one piece.
 
-    Vertices and faces are numbered as by ``marching.extract_pieces``.
+    Vertices and faces are numbered as by ``marching.extract_pieces``; ``kinked`` is from
+    ``find_kinks``, for this field or one of more planes.
 
     Raises
     ------
@@ -74,7 +79,7 @@ def extract_sharp_pieces(
     crossings = find_crossings(field, slice(before, rows.stop), threads)
     if not len(crossings.own_row):
         return [Mesh(np.empty((0, 3), vertex_type(grid, field.factor)), NO_FACES)]
-    examined = examine(field, crossings, rows, threads)
+    examined = examine(field, crossings, rows, kinked, threads)
     numbers = _number_vertices(field, crossings, examined, first_vertex)
     vertices = _vertices(field, crossings, examined, numbers, first_vertex)
     faces = _faces(field, crossings, examined, numbers)
@@ -103,11 +108,23 @@ class Examined:
     placed: Placed
 
 
-def examine(field: FineField, crossings: Crossings, rows: slice, threads: int = 1) -> Examined:
+def find_kinks(field: FineField, threads: int = 1) -> BoolArray:
+    """Return the voxels, (D,), in which an edge may be, in all planes that the mesh depends on."""
+    return voxels_near_kinks(field, _rows_around(field), threads)
+
+
+def near_kinks(field: FineField, chosen: BoolArray) -> BoolArray:
+    """Return the voxels, (D,), that are examined if edges may be in chosen ones."""
+    return beside(field, chosen, -(-(RINGS + 1) // field.factor))
+
+
+def examine(
+    field: FineField, crossings: Crossings, rows: slice, kinked: BoolArray, threads: int = 1
+) -> Examined:
     """Look for edges and corners in and beside voxels in which a patch of the surface turns."""
-    turning = turning_voxels(field, crossings, rows, threads)
-    voxels = beside(field, turning, -(-(RINGS + 1) // field.factor))
-    voxels &= within(np.arange(len(voxels)), rows)
+    here = within(np.arange(len(kinked)), rows)
+    turning = turning_voxels(field, crossings, kinked & here, threads)
+    voxels = near_kinks(field, turning) & here
     patches, used = find_patches(field, crossings, voxels)
     own = planes_at_crossings(field, crossings, used, threads)
     placed = place_features(patches, own, turning, field, threads)
@@ -117,10 +134,9 @@ def examine(field: FineField, crossings: Crossings, rows: slice, threads: int = 
 
 
 def turning_voxels(
-    field: FineField, crossings: Crossings, rows: slice, threads: int = 1
+    field: FineField, crossings: Crossings, kinked: BoolArray, threads: int = 1
 ) -> BoolArray:
-    """Return which voxels, (D,), hold a patch whose normals differ as at an edge."""
-    kinked = voxels_near_kinks(field, rows, threads)
+    """Return which of the kinked voxels, (D,), hold a patch whose normals differ as at an edge."""
     patches, used = find_patches(field, crossings, kinked)
     own = planes_at_crossings(field, crossings, used, threads)
     turning = np.zeros(len(kinked), bool)

@@ -29,7 +29,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, IntArray
-from ..machine.threads import map_chunks
 from .field import SampleSpheres
 from .planes import square_falloff
 from .vectors import Numbers, Vectors, dot, length, sums, unit
@@ -48,7 +47,6 @@ LONGEST_STEP = 0.25
 RANK = 0.05  # eigenvalues below this share of the largest leave a direction open
 NEAR = 2  # voxels to each side whose samples are looked at
 AROUND: NDArray[np.int64] = np.indices((2 * NEAR + 1,) * 3).reshape(3, -1).T.astype(np.int64) - NEAR
-TEMPORARIES = 16 * len(AROUND)  # numbers per wedge in the search for spheres
 IDENTITY = np.eye(3)
 
 
@@ -177,34 +175,18 @@ def _most_different(normal: Vectors, there: BoolArray) -> tuple[NDArray[np.intp]
     return one, other
 
 
-def find_spheres(wedges: Wedges, spheres: SampleSpheres, threads: int = 1) -> Nearby:
+def find_spheres(wedges: Wedges, spheres: SampleSpheres) -> Nearby:
     """Return the spheres that pass within ``FARTHEST_SPHERE`` of each wedge's edge."""
-    parts = map_chunks(
-        lambda some: _spheres_of_chunk(wedges, spheres, some),
-        len(wedges.point),
-        TEMPORARIES,
-        threads,
-    )
-    if not parts:
-        return Nearby(np.empty(0, np.int64), np.empty((0, 3)), np.empty(0))
-    return Nearby(*(np.concatenate(arrays) for arrays in zip(*parts)))
-
-
-def _spheres_of_chunk(
-    wedges: Wedges, spheres: SampleSpheres, some: slice
-) -> tuple[NDArray[np.int64], Vectors, Numbers]:
-    """Return the arrays of ``Nearby`` for some wedges."""
-    number = spheres.find(wedges.voxel[some, None] + AROUND)  # (f, 125)
+    number = spheres.find(wedges.voxel[:, None] + AROUND)  # (f, 125)
     wedge, place = np.nonzero(number >= 0)
     number = number[wedge, place]
-    wedge = wedge + some.start
     distance: Numbers = spheres.distance[number].astype(np.float64) / 2
     centre = spheres.voxel_ijk[number].astype(np.float64) + 0.5
     near = Nearby(wedge, centre, distance)
     contact = contact_of(wedges, near)
     kept = np.abs(contact.gap) < FARTHEST_SPHERE
     kept &= (np.abs(contact.along) < FARTHEST_ALONG) & (np.abs(near.distance) < LARGEST_RADIUS)
-    return near.wedge[kept], near.centre[kept], near.distance[kept]
+    return Nearby(wedge[kept], near.centre[kept], near.distance[kept])
 
 
 def contact_of(wedges: Wedges, near: Nearby) -> Contact:
