@@ -13,7 +13,7 @@ the same.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -36,7 +36,7 @@ from .options import (
 from .progress import STEPS, Progress, StepCounter, part_of
 from .slabs.cutting import Slab, peak_bytes, plan_slabs
 from .slabs.footprint import NETWORK_BYTES
-from .slabs.pieces import Piece, describe_piece
+from .slabs.pieces import Piece, count_input, describe_piece
 from .steps.cap import close
 from .steps.field import FineField, SampleSpheres
 from .steps.lattice import fine_grid
@@ -198,65 +198,65 @@ def reconstruct_slabs(
     check_grid(grid)
     check_network(network)
     check_progress(progress)
-    factor, offset = check_factor(factor), check_distance(offset)
-    extraction = find_mesher(mesher), check_cap(cap)
-    max_memory = check_max_memory(max_memory)
+    run = Run(
+        network,
+        check_factor(factor),
+        find_mesher(mesher),
+        check_cap(cap),
+        check_max_memory(max_memory),
+        save,
+    )
+    offset = check_distance(offset)
     if check_iterations(iterations) > 1:
-        return _iterated(
-            grid, network, factor, offset, *extraction, iterations, max_memory, progress, save
-        )
-    return _slabs(grid, network, factor, offset, *extraction, max_memory, progress, save)
+        return _iterated(run, grid, offset, iterations, progress)
+    return _slabs(run, grid, offset, progress)
+
+
+@dataclass(frozen=True)
+class Run:
+    """The arguments of ``reconstruct_slabs`` that are the same for all grids and iterations."""
+
+    network: Decoder
+    factor: int
+    mesher: Mesher
+    cap: bool
+    max_memory: int | None
+    save: SaveField | None
 
 
 def _iterated(
-    grid: SdfGrid,
-    network: Decoder,
-    factor: int,
-    offset: float,
-    mesher: Mesher,
-    cap: bool,
-    iterations: int,
-    max_memory: int | None,
-    progress: Progress | None,
-    save: SaveField | None,
+    run: Run, grid: SdfGrid, offset: float, iterations: int, progress: Progress | None
 ) -> Iterator[Piece]:
     """Yield the pieces of the last of several runs, each on the fine lattice of the one before.
 
     What is counted of the input, such as its noisy voxels, is that of the first run.
     """
-    share = 1 / (1 + factor**2)  # of the time, that all runs but the last take
-    before = part_of(progress, 0, share)
-    field = upsample(
-        grid, network, factor, offset=offset, max_memory=max_memory, progress=before
-    )
-    first = field
-    for _ in range(iterations - 2):
-        field = upsample(fine_grid(field), network, factor, max_memory=max_memory)
-    rest = part_of(progress, share, 1)
-    pinned = first.pinned
-    of_input = {"band_voxels": first.band_voxels, "noisy_voxels": first.noisy_voxels}
-    del first
-    fine = fine_grid(field)
-    for piece in _slabs(fine, network, factor, 0.0, mesher, cap, max_memory, rest, save):
-        piece.whole.update(of_input)
+    share = 1 / (1 + run.factor**2)  # of the time, that the runs before the last take
+    shown = part_of(progress, 0, share)
+    counts: dict[str, int] = {}
+    for nth in range(iterations - 1):
+        field = upsample(
+            grid,
+            run.network,
+            run.factor,
+            offset=offset,
+            max_memory=run.max_memory,
+            progress=None if nth else shown,
+        )
+        counts = counts or count_input(field)
+        grid, offset = fine_grid(field), 0.0
+    pinned = counts.pop("pinned_nodes")
+    for piece in _slabs(run, grid, offset, part_of(progress, share, 1)):
+        piece.whole.update(counts)
         piece.counts["pinned_nodes"], pinned = pinned, 0
         yield piece
-        del piece
+        del piece  # before the next one is made
 
 
-def _slabs(
-    grid: SdfGrid,
-    network: Decoder,
-    factor: int,
-    offset: float,
-    mesher: Mesher,
-    cap: bool,
-    max_memory: int | None,
-    progress: Progress | None,
-    save: SaveField | None,
-) -> Iterator[Piece]:
-    """Yield the pieces of ``reconstruct_slabs``; arguments are checked before the first one."""
-    resources = allot(getattr(network, "threads", 0), max_memory)
+def _slabs(run: Run, grid: SdfGrid, offset: float, progress: Progress | None) -> Iterator[Piece]:
+    """Yield the pieces of one run; its arguments have been checked."""
+    network, factor, mesher = run.network, run.factor, run.mesher
+    resources = allot(getattr(network, "threads", 0), run.max_memory)
     steps = StepCounter(progress)
     band = find_surface(grid, factor, offset, resources)
     reach, needed = getattr(network, "receptive_field", None), memory_needs(network)
@@ -272,10 +272,10 @@ def _slabs(
             give_back()
         field = refine(band, network, factor, slab, resources.threads, steps)
         field = replace(field, grid=grid, offset=offset)
-        if save:
-            save(field)
+        if run.save:
+            run.save(field)
             steps.watch.lap("save field")
-        whole = close(field, cap=cap, beside=beside)
+        whole = close(field, cap=run.cap, beside=beside)
         meshes = extract_pieces(whole, grid, vertices, resources.threads, mesher)
         planned_work = {"slabs": len(slabs), "planned_bytes": planned}
         piece = describe_piece(field, meshes, planned_work, band.leaves)

@@ -105,6 +105,14 @@ OPTIONS: tuple[Option, ...] = (
         show_default=True,
         help="Refinement per axis: 2, 4, 8 or 16 times finer than the grid.",
     ),
+    click.option(
+        "--iterations",
+        type=int,
+        default=convert_default("iterations"),
+        show_default=True,
+        metavar="N",
+        help="Refine N times by the factor, each time from the refined field before.",
+    ),
     *GRID_OPTIONS,
     click.option(
         "--offset",

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.lib import format as npy
 
 from ..arrays import FloatArray
+from ..files.spool import little_endian
 from ..steps.field import FineField
 from ..steps.lattice import FineLattice, fine_grid
-from ..files.spool import little_endian
 
 CHUNK = 1 << 20  # values at a time, but at least a plane
 BYTES = 4  # of a value

@@ -19,6 +19,10 @@ from numpy.typing import DTypeLike, NDArray
 
 from ..arrays import FloatArray, IntArray
 from ..errors import FileError, OptionError
+from ..files.archives import Member, open_archive
+from ..files.headers import ArrayHeader, read_array_header
+from ..files.regular import check_regular_file
+from ..files.spool import append_spool, little_endian, spool_beside
 from ..grid.planes import InputFile, PlaneSource
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import check_fits
@@ -27,10 +31,6 @@ from ..steps.band import neighbour_table
 from ..steps.cap import find_border_inside
 from ..steps.field import FineField, SampleSpheres
 from ..steps.nodes import check_factor, share_parts
-from ..files.archives import Member, open_archive
-from ..files.headers import ArrayHeader, read_array_header
-from ..files.regular import check_regular_file
-from ..files.spool import append_spool, little_endian, spool_beside
 
 VERSION = 1
 CHUNK = 1 << 20  # values at a time
@@ -98,8 +98,8 @@ class SparseWriter:
         exact = exact_type(grid.voxel_size)
         self.types = {**dict.fromkeys(LISTS, np.int32), "values": exact, "sample_distances": exact}
         head = (
-            *(VERSION, field.shape, field.factor, np.float64(grid.spacing)),
-            *(np.float64(grid.origin), field.offset, field.leaves),
+            *(VERSION, field.shape, field.factor),
+            *(grid.spacing, grid.origin, field.offset, field.leaves),
         )
         for name, value in zip(HEAD, head):
             array = np.asarray(value)
@@ -143,8 +143,10 @@ class NoSamples(PlaneSource):
 
     def read(self, first: int, last: int) -> NDArray[Any]:
         """Raise FileError: there is nothing to read."""
-        raise FileError(f"{self.name} holds the refined field without the coarse samples: read "
-                        "those from their own file")
+        raise FileError(
+            f"{self.name} holds the refined field without the coarse samples: read "
+            "those from their own file"
+        )
 
 
 def read_field(path: str | Path) -> FineField:
@@ -227,9 +229,9 @@ class _Reader:
 
     def _grid(self, shape: tuple[int, ...]) -> SdfGrid:
         """Return the coarse grid, without samples."""
-        place = (self._array(key, "f", (3,)) for key in ("spacing", "origin"))
+        spacing, origin = (self._array(key, "f", (3,)) for key in ("spacing", "origin"))
         samples = NoSamples(shape, self.name)
-        return SdfGrid.trusted(samples, *place, extremes=(-math.inf, math.inf))
+        return SdfGrid.trusted(samples, spacing, origin, extremes=(-math.inf, math.inf))
 
     def _voxels(self, key: str, shape: tuple[int, ...]) -> IntArray:
         """Return voxels (n, 3), which must lie in the grid, all different, in C order."""

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Protocol
 
 from ..errors import OptionError, OptionTypeError, OutOfMemoryError, WriteError, seen
+from ..files.output import check_free, free_space, replacing
 from ..machine.extras import check_modules
 from ..machine.memory import held_memory, in_words, memory_bound
 from ..options import check_path
 from ..steps.field import FineField
 from ..steps.lattice import lattice_shape
 from .dense import BYTES, NpyWriter, VtiWriter
-from ..files.output import check_free, free_space, replacing
 from .sparse import SparseWriter
 
 
