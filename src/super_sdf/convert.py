@@ -10,7 +10,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from .arrays import Triple
 from .errors import WriteError
-from .fields.writing import FieldWriter, check_field_fits, check_field_target, saving_field
+from .fields.writing import FieldFile, check_field_fits, check_field_target, saving_field
 from .files.expectation import CERTAIN_SHARE, Expectation, expect
 from .files.formats import split_member
 from .files.grids import read_grid
@@ -113,6 +113,8 @@ class Conversion:
         Of a simplified mesh, what ``Simplified.report`` returns; distances are in voxels.
     capped : bool
         Whether the solid runs out of the grid, and its surface was closed along the border.
+    field : dict, optional
+        The path of the refined field, and shape, spacing and origin of the fine lattice.
     """
 
     shape: tuple[int, int, int]
@@ -126,6 +128,7 @@ class Conversion:
     seconds: dict[str, float]
     simplified: dict[str, Any] | None = None
     capped: bool = False
+    field: dict[str, Any] | None = None
 
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
@@ -137,6 +140,7 @@ class Conversion:
             "bounds": [list(corner) for corner in self.bounds],
             "closed": self.closed,
             "capped": self.capped,
+            **({"field": self.field} if self.field else {}),
             **({"simplified": self.simplified} if self.simplified else {}),
             "inferred": list(self.notes),
             "warnings": list(self.warnings),
@@ -209,7 +213,7 @@ def convert(
         announce(sentence)
     tally = Tally(expected)
     check_not_input(save_field, source)
-    with open_field(save_field, grid, options, force=force) as writer:
+    with open_field(save_field, grid, options, force=force) as file:
         watch.lap("read")
         pieces = reconstruct_slabs(
             grid,
@@ -221,7 +225,7 @@ def convert(
             iterations=options.iterations,
             max_memory=options.max_memory,
             progress=part_of(progress, 0, SHARE_BEFORE) if options.simplifies else progress,
-            save=writer.add if writer else None,
+            save=file.add if file else None,
         )
         meshes = tally.count(pieces, watch)
         if options.simplifies:
@@ -230,15 +234,16 @@ def convert(
 
         def complete(part: Path) -> None:
             """Complete the field's file, and check that it can appear, before the mesh does."""
-            if writer and save_field is not None:
-                writer.finish()
-                check_field_target(save_field, force=force)
+            if file:
+                file.finish()
+                check_field_target(file.path, force=force)
             if before_rename:
                 before_rename(part)
 
         write_pieces(meshes, target, force=force, about=about, before_rename=complete)
     watch.lap("write")
-    return describe(grid, tally, options, watch.seconds, notes)
+    done = describe(grid, tally, options, watch.seconds, notes)
+    return replace(done, field=file.report()) if file else done
 
 
 def check_not_input(path: str | Path | None, source: str | Path) -> None:
@@ -250,8 +255,8 @@ def check_not_input(path: str | Path | None, source: str | Path) -> None:
 
 def open_field(
     path: str | Path | None, grid: SdfGrid, options: ConvertOptions, *, force: bool
-) -> AbstractContextManager[FieldWriter | None]:
-    """Return the writer of the refined field, which the file appears with; None without a path.
+) -> AbstractContextManager[FieldFile | None]:
+    """Return the file to write the refined field to, which appears at the end; None without a path.
 
     Raises
     ------

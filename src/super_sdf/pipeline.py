@@ -33,7 +33,7 @@ from .options import (
     check_network,
     check_progress,
 )
-from .progress import STEPS, Progress, StepCounter, part_of
+from .progress import STEPS, Progress, StepCounter, Stopwatch, part_of
 from .slabs.cutting import Slab, peak_bytes, plan_slabs
 from .slabs.footprint import NETWORK_BYTES
 from .slabs.pieces import Piece, count_input, describe_piece
@@ -234,6 +234,7 @@ def _iterated(
     share = 1 / (1 + run.factor**2)  # of the time, that the runs before the last take
     shown = part_of(progress, 0, share)
     counts: dict[str, int] = {}
+    watch = Stopwatch()
     for nth in range(iterations - 1):
         field = upsample(
             grid,
@@ -245,10 +246,13 @@ def _iterated(
         )
         counts = counts or count_input(field)
         grid, offset = fine_grid(field), 0.0
-    pinned = counts.pop("pinned_nodes")
+    watch.lap("runs before")
+    spent, pinned = watch.seconds, counts.pop("pinned_nodes")
     for piece in _slabs(run, grid, offset, part_of(progress, share, 1)):
         piece.whole.update(counts)
         piece.counts["pinned_nodes"], pinned = pinned, 0
+        piece.seconds.update(spent)
+        spent = {}
         yield piece
         del piece  # before the next one is made
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -162,7 +161,7 @@ class Upsampling:
             for stage, seconds in self.seconds.items():
                 print_stderr(f"{stage}: {seconds:.3f} s")
         print_stderr(f"{self.target}: {self.summary()}")
-        if self.options["save_field"] is not None:
+        if self.result.field:
             print_stderr(f"{self.options['save_field']}: {self.field_summary()}")
         if self.result.simplified:
             print_stderr(f"Simplified: {describe_simplified(self.result.simplified)}")
@@ -174,7 +173,6 @@ class Upsampling:
         return {
             "input": self.source,
             "output": self.target,
-            "field": self.options["save_field"],
             "factor": self.options["factor"],
             "iterations": self.options["iterations"],
             "offset": self.options["offset"],
@@ -200,12 +198,10 @@ class Upsampling:
 
     def field_summary(self) -> str:
         """Describe the file of the refined field in one line."""
-        size = Path(self.options["save_field"]).stat().st_size
-        counts = self.result.counts
-        return (
-            f"the refined field, {counts['nodes']:,} nodes in {counts['decoded_voxels']:,} voxels, "
-            f"{size:,} bytes"
-        )
+        field = self.result.field or {}
+        shape = " x ".join(map(str, field["shape"]))
+        spacing, origin = (", ".join(f"{x:.12g}" for x in field[k]) for k in ("spacing", "origin"))
+        return f"the refined field, lattice {shape}, spacing {spacing}, origin {origin}"
 
     def summary(self) -> str:
         """Describe the mesh in one line."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import zipfile
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -34,6 +34,7 @@ from ..steps.nodes import check_factor, share_parts
 
 VERSION = 1
 CHUNK = 1 << 20  # values at a time
+LONGEST = 1 << 20  # samples along an axis
 # Small arrays first; the values, which are large, before the arrays that grow with them.
 HEAD = ("version", "shape", "factor", "spacing", "origin", "offset", "leaves")
 LISTS = ("voxels", "sample_voxels", "sample_distances", "border_inside")
@@ -60,7 +61,8 @@ class SparseWriter:
     """
 
     def __init__(self, part: Path, shape: tuple[int, int, int], files: ExitStack) -> None:
-        self.archive = files.enter_context(zipfile.ZipFile(part, "w"))
+        self.archive = zipfile.ZipFile(part, "w")
+        files.callback(self._close)
         self.lists = {name: files.enter_context(spool_beside(part)) for name in LISTS}
         self.counts = dict.fromkeys(LISTS, 0)
         self.values: IO[bytes] | None = None
@@ -91,6 +93,14 @@ class SparseWriter:
             with self._open(name, shape, self.types[name]) as member:
                 append_spool(spool, member)
         self.archive.close()
+
+    def _close(self) -> None:
+        """Close the archive, also if writing to it has failed."""
+        with suppress(OSError, ValueError):
+            if self.values is not None:
+                self.values.close()
+        with suppress(OSError, ValueError):
+            self.archive.close()
 
     def _begin(self, field: FineField) -> None:
         """Write what does not grow with the field, and the header of the values."""
@@ -199,6 +209,8 @@ class _Reader:
                 "newer one"
             )
         shape = tuple(map(int, self._array("shape", "iu", (3,))))
+        if not 2 <= min(shape) <= max(shape) <= LONGEST:
+            raise FileError(f"{self.name} is no refined field: its grid has the shape {shape}")
         factor = self._checked_factor()
         voxels = self._voxels("voxels", shape)
         grid = self._grid(shape)

@@ -7,15 +7,15 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from ..errors import OptionError, OptionTypeError, OutOfMemoryError, WriteError, seen
-from ..files.output import check_free, free_space, replacing
+from ..files.output import check_free, free_space, naming, replacing
 from ..machine.extras import check_modules
 from ..machine.memory import held_memory, in_words, memory_bound
 from ..options import check_path
 from ..steps.field import FineField
-from ..steps.lattice import lattice_shape
+from ..steps.lattice import fine_grid, lattice_shape
 from .dense import BYTES, NpyWriter, VtiWriter
 from .sparse import SparseWriter
 
@@ -112,14 +112,54 @@ def check_field_fits(path: Path, shape: Shape, max_memory: int | None = None) ->
         )
 
 
+class FieldFile:
+    """A file of a field that is being written; errors name it.
+
+    Parameters
+    ----------
+    path : Path
+        The file, as the user named it.
+    shape : three ints
+        Nodes of the fine lattice along each axis.
+    writer : FieldWriter
+        What writes it.
+
+    Attributes
+    ----------
+    place : dict
+        Shape, spacing and origin of the fine lattice, once there is a field.
+    """
+
+    def __init__(self, path: Path, shape: Shape, writer: FieldWriter) -> None:
+        self.path, self.shape, self.writer = path, shape, writer
+        self.place: dict[str, Any] = {}
+
+    def add(self, field: FineField) -> None:
+        """Write the own planes of a slab's field."""
+        if not self.place:
+            fine = fine_grid(field)
+            self.place = {"spacing": list(fine.spacing), "origin": list(fine.origin)}
+        with naming(self.path):
+            self.writer.add(field)
+
+    def finish(self) -> None:
+        """Complete the file."""
+        with naming(self.path):
+            self.writer.finish()
+
+    def report(self) -> dict[str, Any]:
+        """Return what was written, as it stands in JSON."""
+        return {"path": str(self.path), "shape": list(self.shape), **self.place}
+
+
 @contextmanager
-def saving_field(path: Path, shape: Shape, *, force: bool = False) -> Iterator[FieldWriter]:
-    """Yield a writer of a field, whose ``finish`` must be called; then the file appears.
+def saving_field(path: Path, shape: Shape, *, force: bool = False) -> Iterator[FieldFile]:
+    """Yield a file to write a field to; it appears at the end, if ``finish`` was called.
 
     ``shape`` is the number of nodes of the fine lattice along each axis.
     """
     with replacing(path, force=force) as part, ExitStack() as files:
-        yield FORMATS[path.suffix.lower()].writer(part, shape, files)
+        yield FieldFile(path, shape, FORMATS[path.suffix.lower()].writer(part, shape, files))
 
 
 def write_field(field: FineField, path: str | Path, *, force: bool = False) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import FloatArray
+from ..arrays import BoolArray, FloatArray
 from ..grid.planes import PlaneSource
 from ..grid.sdf_grid import SdfGrid
 from .band import rescale
@@ -46,27 +46,42 @@ class FineLattice(PlaneSource):
 
     def read(self, first: int, last: int) -> FloatArray:
         """Return planes ``first`` to before ``last`` of nodes, (last - first, ny, nz) float32."""
-        planes = self._interpolated(first, max(last, first))
-        self._set_blocks(planes, first)
-        return self.field.in_world_units(planes).astype(np.float32)
-
-    def _interpolated(self, first: int, last: int) -> FloatArray:
-        """Return the samples interpolated at planes of nodes, in half voxels."""
-        factor, grid = self.field.factor, self.field.placed
-        low, share = places_of_nodes(first, last, factor, grid.shape[0])
-        start, stop = (int(low[0]), int(low[-1]) + 2) if len(low) else (0, 2)
-        samples = rescale(grid, self.field.offset, start, stop)
-        planes = interpolate(samples, low - start, share, 0)
-        for axis in (1, 2):
-            places = places_of_nodes(0, self.shape[axis], factor, grid.shape[axis])
-            planes = interpolate(planes, *places, axis)
-        outside = samples > 0
-        for axis, ends in enumerate(((first, last), (0, self.shape[1]), (0, self.shape[2]))):
-            nearest = np.minimum(np.arange(*ends) // factor, grid.shape[axis] - 1)
-            outside = outside.take(nearest - start if axis == 0 else nearest, axis)
-        np.maximum(planes, BARELY_OUTSIDE, out=planes, where=outside)
-        np.minimum(planes, BARELY_INSIDE, out=planes, where=~outside)
+        planes = np.empty((max(last - first, 0), *self.shape[1:]), np.float32)
+        if len(planes):
+            self._interpolate(planes, first)
+            self._set_blocks(planes, first)
+        for plane in planes:  # one by one, to save memory
+            plane[...] = self.field.in_world_units(plane)
         return planes
+
+    def _interpolate(self, planes: FloatArray, first: int) -> None:
+        """Fill planes of nodes from ``first`` on with interpolated samples, in half voxels."""
+        factor, grid = self.field.factor, self.field.placed
+        last = first + len(planes)
+        low, share = places_of_nodes(first, last, factor, grid.shape[0])
+        nearest = voxels_of_nodes(first, last, factor, grid.shape[0])
+        start, stop = int(low[0]), int(low[-1]) + 2
+        samples = rescale(grid, self.field.offset, start, stop)
+        for plane, before, beyond, voxel in zip(planes, low - start, share, nearest - start):
+            plane[...] = self._refined(samples[before : before + 2], beyond)
+            outside = self._spread(samples[voxel] > 0)
+            np.maximum(plane, BARELY_OUTSIDE, out=plane, where=outside)
+            np.minimum(plane, BARELY_INSIDE, out=plane, where=~outside)
+
+    def _refined(self, pair: FloatArray, share: np.float32) -> FloatArray:
+        """Return the plane of nodes at a share between two planes of samples."""
+        plane: FloatArray = pair[0] * (1 - share) + pair[1] * share
+        for axis, samples in enumerate(plane.shape):
+            nodes = self.field.factor * samples + 1
+            plane = interpolate(plane, *places_of_nodes(0, nodes, self.field.factor, samples), axis)
+        return plane
+
+    def _spread(self, mask: BoolArray) -> BoolArray:
+        """Return for each node of a plane the mask of the voxel that it lies in."""
+        for axis, samples in enumerate(mask.shape):
+            nodes = self.field.factor * samples + 1
+            mask = mask.take(voxels_of_nodes(0, nodes, self.field.factor, samples), axis)
+        return mask
 
     def _set_blocks(self, planes: FloatArray, first: int) -> None:
         """Write the refined values over the planes of nodes from ``first`` on."""
@@ -97,15 +112,18 @@ def places_of_nodes(
     return low, (place - low).astype(np.float32)
 
 
+def voxels_of_nodes(first: int, last: int, factor: int, samples: int) -> NDArray[np.int64]:
+    """Return for nodes of an axis the voxel that each lies in; on a face, the second one."""
+    return np.minimum(np.arange(first, last) // factor, samples - 1)
+
+
 def interpolate(
-    values: FloatArray, low: NDArray[np.int64], share: FloatArray, axis: int
+    plane: FloatArray, low: NDArray[np.int64], share: FloatArray, axis: int
 ) -> FloatArray:
-    """Return values interpolated linearly along an axis, at ``share`` beyond the rows ``low``."""
-    shape = [1, 1, 1]
-    shape[axis] = len(share)
-    beyond = share.reshape(shape)
-    result: FloatArray = values.take(low, axis) * (1 - beyond)
-    result += values.take(low + 1, axis) * beyond
+    """Return a plane interpolated linearly along an axis, at ``share`` beyond the rows ``low``."""
+    beyond = share[:, None] if axis == 0 else share
+    result: FloatArray = plane.take(low, axis) * (1 - beyond)
+    result += plane.take(low + 1, axis) * beyond
     return result
 
 
