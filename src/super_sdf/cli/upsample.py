@@ -56,7 +56,7 @@ Examples:
     "--save-field",
     metavar="FIELD",
     help="Also write the refined field: .npz for the values near the surface, .npy or .vti for "
-    "the whole fine lattice.",
+    "the whole fine lattice. A .vti needs the extra vti.",
 )
 @click.option("--force", is_flag=True, help="Replace OUT, and FIELD, if they exist.")
 @click.option("--json", "as_json", is_flag=True, help="Print counts, times and notes as JSON.")

@@ -1,4 +1,4 @@
-"""Refined fields as dense arrays over the whole fine lattice: ``.npy``, and ``.vti`` with VTK."""
+"""Refined fields as dense arrays over the whole fine lattice: ``.npy``."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import IO
 
-import numpy as np
 from numpy.lib import format as npy
 
 from ..arrays import FloatArray
 from ..files.spool import little_endian
 from ..steps.field import FineField
-from ..steps.lattice import FineLattice, fine_grid
+from ..steps.lattice import FineLattice
 
 CHUNK = 1 << 20  # values at a time, but at least a plane
 BYTES = 4  # of a value
@@ -35,46 +34,6 @@ class NpyWriter:
     def finish(self) -> None:
         """Complete the file."""
         self.file.close()
-
-
-class VtiWriter:
-    """Gathers the fine lattice in memory and writes it as VTK image data at the end.
-
-    The memory is filled at once, so that the plan of the work counts it.
-    """
-
-    def __init__(self, part: Path, shape: tuple[int, int, int], files: ExitStack) -> None:
-        self.part = part
-        self.values = np.full(shape[::-1], np.float32(np.inf))  # x is the fastest
-        self.spacing = self.origin = (0.0, 0.0, 0.0)
-
-    def add(self, field: FineField) -> None:
-        """Copy the planes of nodes of a slab."""
-        fine = fine_grid(field)
-        self.spacing, self.origin = fine.spacing, fine.origin
-        for first, planes in own_planes(field):
-            self.values[:, :, first : first + len(planes)] = planes.transpose(2, 1, 0)
-
-    def finish(self) -> None:
-        """Write the file."""
-        from vtkmodules.util.numpy_support import numpy_to_vtk
-        from vtkmodules.vtkCommonDataModel import vtkImageData
-        from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
-
-        image = vtkImageData()
-        image.SetDimensions(*self.values.shape[::-1])
-        image.SetSpacing(*self.spacing)
-        image.SetOrigin(*self.origin)
-        array = numpy_to_vtk(self.values.reshape(-1))
-        array.SetName("distance")
-        image.GetPointData().SetScalars(array)
-        writer = vtkXMLImageDataWriter()
-        writer.SetFileName(str(self.part))
-        writer.SetInputData(image)
-        writer.EncodeAppendedDataOff()
-        writer.SetCompressorTypeToNone()
-        if not writer.Write():
-            raise OSError("VTK could not write it")
 
 
 def own_planes(field: FineField) -> Iterator[tuple[int, FloatArray]]:

@@ -16,8 +16,9 @@ from ..machine.memory import held_memory, in_words, memory_bound
 from ..options import check_path
 from ..steps.field import FineField
 from ..steps.lattice import fine_grid, lattice_shape
-from .dense import BYTES, NpyWriter, VtiWriter
+from .dense import BYTES, NpyWriter
 from .sparse import SparseWriter
+from .vti import VtiWriter
 
 
 class FieldWriter(Protocol):
@@ -81,8 +82,8 @@ def check_field_target(path: str | Path, *, force: bool = False) -> Path:
     suffix = path.suffix.lower()
     if suffix == ".vdb":
         raise OptionError(
-            f"{path} cannot be written: no package on PyPI writes OpenVDB level sets; write .npz, "
-            "and make a level set of its nodes with OpenVDB's own module (docs/fields.md)"
+            f"{path} cannot be written: OpenVDB's own module cannot be installed with pip; write "
+            ".npz, and convert it with that module as docs/fields.md shows"
         )
     if suffix not in FORMATS:
         raise OptionError(f"{path} is not a field file: give one of {', '.join(FIELD_SUFFIXES)}")
