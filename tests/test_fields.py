@@ -2,6 +2,10 @@
 
 import os
 import re
+import resource
+import signal
+import subprocess
+import sys
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -302,6 +306,59 @@ def test_damaged_and_foreign_files_are_refused():
     Path("flipped.npz").write_bytes(data)
     with pytest.raises(FileError, match=r"flipped\.npz\[values\] is damaged: its checksum"):
         read_field("flipped.npz")
+
+
+def test_a_field_as_a_grid_is_refused():
+    write_field(upsample(ball(12, 3.0), trilinear, 2), "field.npz")
+    with pytest.raises(FileError) as caught:
+        read_grid("field.npz")
+    assert str(caught.value) == (
+        "field.npz is a refined field, no grid: mesh it with extract_mesh(read_field(path)), or "
+        "refine the grid again with --iterations"
+    )
+
+
+def limit_files():
+    """Let this process write no file of more than 600 kB, as if the disk were full."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (600_000, 600_000))
+
+
+@pytest.mark.parametrize(
+    ("suffix", "reason"),
+    [
+        (".npz", "File too large"),
+        (".npy", "File too large"),
+        (".vti", "VTK says 'No space left on device'"),
+    ],
+)
+def test_a_file_that_the_system_cuts_off_is_an_error_of_one_line(suffix, reason):
+    np.savez("grid.npz", values=ball(12, 3.0).values[:8], spacing=1.0)
+    words = ["upsample", "grid.npz", "a.ply", "--save-field", "f" + suffix]
+    done = subprocess.run(
+        [sys.executable, "-m", "super_sdf", *words, "--factor=8", "--quality=fast", "-q"],
+        preexec_fn=limit_files,
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == f"Error: f{suffix} cannot be written: {reason}\n"
+    assert os.listdir() == ["grid.npz"]
+
+
+def test_batch_iterates_as_upsample_does(command, grid_folder, run_batch):
+    assert run_batch("in/a.npy", "--iterations", 2, "--factor", 2)[0] == 0
+    options = ("--iterations", 2, "--factor", 2, "--quality=fast", "-q")
+    assert command("upsample", "in/a.npy", "a.ply", *options)[0] == 0
+    assert Path("out/a.ply").read_bytes() == Path("a.ply").read_bytes()
+    Path("list.jsonl").write_text(
+        '{"in": "in/a.npy", "out": "b.ply", "iterations": 2, "factor": 2}'
+    )
+    assert run_batch("list.jsonl")[0] == 0
+    assert Path("out/b.ply").read_bytes() == Path("a.ply").read_bytes()
+    Path("list.jsonl").write_text('{"in": "in/a.npy", "out": "b.ply", "iterations": 0}')
+    code, _, said = run_batch("list.jsonl")
+    assert code != 0 and "iterations is 0: give 1 or more" in said
 
 
 def test_targets_are_refused_before_anything_is_written():

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..files.readers.silence import discarded_stderr
 from ..steps.field import FineField
 from ..steps.lattice import fine_grid
 from .dense import own_planes
@@ -34,6 +35,7 @@ class VtiWriter:
         """Write the file."""
         from vtkmodules.util.numpy_support import numpy_to_vtk
         from vtkmodules.vtkCommonDataModel import vtkImageData
+        from vtkmodules.vtkCommonMisc import vtkErrorCode
         from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
         image = vtkImageData()
@@ -48,5 +50,8 @@ class VtiWriter:
         writer.SetInputData(image)
         writer.EncodeAppendedDataOff()
         writer.SetCompressorTypeToNone()
-        if not writer.Write():
-            raise OSError("VTK could not write it")
+        with discarded_stderr():  # VTK's log
+            written = writer.Write()
+        if not written:
+            reason = vtkErrorCode.GetStringFromErrorCode(writer.GetErrorCode())
+            raise OSError(f"VTK says {reason!r}")

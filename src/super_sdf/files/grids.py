@@ -218,6 +218,11 @@ def _find_members(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.Zip
     """Return the members that belong to a grid, by key."""
     infos = archive.infolist()
     names = [info.filename.removesuffix(".npy") for info in infos]
+    if {"voxels", "factor"} <= set(names):
+        raise FileError(
+            f"{path} is a refined field, no grid: mesh it with extract_mesh(read_field(path)), or "
+            "refine the grid again with --iterations"
+        )
     if "values" not in names:
         held = ", ".join(names[:MOST_NAMED]) or "nothing"
         more = f" and {len(names) - MOST_NAMED:,} more" if len(names) > MOST_NAMED else ""
