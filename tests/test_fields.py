@@ -329,7 +329,7 @@ def limit_files():
     [
         (".npz", "File too large"),
         (".npy", "File too large"),
-        (".vti", "VTK says 'No space left on device'"),
+        (".vti", "VTK says 'File too large'"),
     ],
 )
 def test_a_file_that_the_system_cuts_off_is_an_error_of_one_line(suffix, reason):

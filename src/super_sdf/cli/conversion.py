@@ -111,8 +111,8 @@ OPTIONS: tuple[Option, ...] = (
         default=convert_default("iterations"),
         show_default=True,
         metavar="N",
-        help="Refine N times, each time by the factor and from the refined field before. Twice "
-        "factor 4 is about as good as factor 16, and takes longer.",
+        help="Refine N times, each time by the factor and from the refined field before, for "
+        "lattices finer than factor 16. Twice factor 4 is no better than factor 16, and slower.",
     ),
     *GRID_OPTIONS,
     click.option(
