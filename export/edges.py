@@ -70,7 +70,7 @@ def draw_case(rng: np.random.Generator, paths: list[Path], procedural: float, nu
 
 def rows_of(case: Case, network: Network) -> tuple[np.ndarray, np.ndarray]:
     """Return the evidence (f, e) and the gain (f, 2) of all candidates of a case."""
-    field = close_at_border(upsample(case.grid, network, FACTOR), case.grid)
+    field = close_at_border(upsample(case.grid, network, FACTOR))
     every = np.ones(len(field.voxel_ijk), bool)
     crossings = find_crossings(field, slice(0, len(every)))
     patches, used = find_patches(field, crossings, every)

@@ -298,7 +298,7 @@ def test_cells_of_the_fine_section_surround_those_of_the_coarse_one():
 def test_a_field_closed_at_the_border_has_the_same_section():
     grid = slope(0)
     field = upsample(grid, trilinear, 2)
-    closed = close_at_border(field, grid)
+    closed = close_at_border(field)
     open_section, section = (fine_section(each, grid, "x", 6).values for each in (field, closed))
     known = np.isfinite(open_section)
     np.testing.assert_array_equal(section[known], open_section[known])

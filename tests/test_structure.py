@@ -15,8 +15,9 @@ MODULES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts): path
     for path in PACKAGE.rglob("*.py")
 }
-# The library of each file format is imported by its reader alone, and only when it reads.
+# The library of each file format is imported by its reader or writer alone, when it is used.
 READERS = {
+    "fields.vti": {"vtkmodules"},
     "files.readers.hdf5": {"h5py"},
     "files.readers.metaimage": {"SimpleITK"},
     "files.readers.nifti": {"nibabel"},

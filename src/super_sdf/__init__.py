@@ -18,12 +18,15 @@ __all__ = [
     "SuperSdfError",
     "__version__",
     "extract_mesh",
+    "fine_grid",
     "load_network",
     "make_grid",
+    "read_field",
     "read_grid",
     "reconstruct",
     "simplify_mesh",
     "upsample",
+    "write_field",
     "write_mesh",
 ]
 

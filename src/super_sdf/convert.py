@@ -6,16 +6,21 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .arrays import Triple
+from .errors import WriteError
+from .fields.writing import FieldFile, check_field_fits, check_field_target, saving_field
 from .files.expectation import CERTAIN_SHARE, Expectation, expect
+from .files.formats import split_member
 from .files.grids import read_grid
 from .files.meshes import write_pieces
 from .files.precision import check_format_holds, local_origin_note
@@ -23,7 +28,7 @@ from .grid.sdf_grid import SdfGrid
 from .grid.spacing import as_triple
 from .mesh import Mesh, join_meshes
 from .network.decoder import Decoder
-from .options import check_goal
+from .options import check_goal, check_iterations
 from .pipeline import reconstruct_slabs
 from .progress import Progress, Stopwatch, part_of, share_of
 from .simplification.simplify import (
@@ -33,6 +38,7 @@ from .simplification.simplify import (
     simplify_mesh,
 )
 from .slabs.pieces import Piece
+from .steps.lattice import lattice_shape
 from .steps.mesher_names import DEFAULT_MESHER
 from .steps.meshers import find_mesher
 from .steps.nodes import check_factor
@@ -63,6 +69,7 @@ class ConvertOptions:
     simplify: float | None = None
     triangles: int | None = None
     axes: str | None = None
+    iterations: int = 1
 
     @property
     def simplifies(self) -> bool:
@@ -106,6 +113,8 @@ class Conversion:
         Of a simplified mesh, what ``Simplified.report`` returns; distances are in voxels.
     capped : bool
         Whether the solid runs out of the grid, and its surface was closed along the border.
+    field : dict, optional
+        The path of the refined field, and shape, spacing and origin of the fine lattice.
     """
 
     shape: tuple[int, int, int]
@@ -119,6 +128,7 @@ class Conversion:
     seconds: dict[str, float]
     simplified: dict[str, Any] | None = None
     capped: bool = False
+    field: dict[str, Any] | None = None
 
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
@@ -130,6 +140,7 @@ class Conversion:
             "bounds": [list(corner) for corner in self.bounds],
             "closed": self.closed,
             "capped": self.capped,
+            **({"field": self.field} if self.field else {}),
             **({"simplified": self.simplified} if self.simplified else {}),
             "inferred": list(self.notes),
             "warnings": list(self.warnings),
@@ -146,6 +157,7 @@ def convert(
     progress: Progress | None = None,
     before_rename: Callable[[Path], None] | None = None,
     announce: Callable[[str], None] | None = None,
+    save_field: str | Path | None = None,
 ) -> Conversion:
     """Convert a grid file to a mesh file.
 
@@ -156,15 +168,19 @@ def convert(
     network : Network
         From ``load_network``; it can be used for any number of files.
     options : ConvertOptions
-        Factor, spacing, axis order, sign, offset, cap, mesher, memory bound and simplification.
+        Factor, iterations, spacing, axis order, sign, offset, cap, mesher, memory bound and
+        simplification.
     force : bool
-        Replace the target if it exists.
+        Replace the target, and the field's file, if they exist.
     progress : callable, optional
         Called with (done, total), see ``progress.Progress``; an exception in it ends the work.
     before_rename : callable, optional
         Called with the path of the finished temporary file, before it is renamed to ``target``.
     announce : callable, optional
         Called before the work with a sentence on the size of the mesh file, if it will be large.
+    save_field : path, optional
+        A file for the refined field, in a format of ``write_field``. It and the mesh file are both
+        complete at the end, or neither is written.
 
     Raises
     ------
@@ -186,33 +202,74 @@ def convert(
     )
     check_factor(options.factor)
     find_mesher(options.mesher)
-    about = check_format_holds(target, grid, options.factor)
+    total = options.factor ** check_iterations(options.iterations)
+    about = check_format_holds(target, grid, total)
     notes = (*grid.notes, *local_origin_note(target, about))
-    expected = expect(grid, options.factor, options.offset, target, cap=options.cap)
+    expected = expect(grid, total, options.offset, target, cap=options.cap)
     if options.simplifies:
         least = int(expected.triangles * CERTAIN_SHARE)
         check_room(least, options.max_memory, estimated=True)
     elif announce and (sentence := expected.warning(target)):
         announce(sentence)
-    watch.lap("read")
-    pieces = reconstruct_slabs(
-        grid,
-        network,
-        options.factor,
-        offset=options.offset,
-        cap=options.cap,
-        mesher=options.mesher,
-        max_memory=options.max_memory,
-        progress=part_of(progress, 0, SHARE_BEFORE) if options.simplifies else progress,
-    )
     tally = Tally(expected)
-    meshes = tally.count(pieces, watch)
-    if options.simplifies:
-        rest = part_of(progress, SHARE_BEFORE, 1)
-        meshes = tally.simplify(meshes, grid.voxel_size, options, watch, rest)
-    write_pieces(meshes, target, force=force, about=about, before_rename=before_rename)
+    check_not_input(save_field, source)
+    with open_field(save_field, grid, options, force=force) as file:
+        watch.lap("read")
+        pieces = reconstruct_slabs(
+            grid,
+            network,
+            options.factor,
+            offset=options.offset,
+            cap=options.cap,
+            mesher=options.mesher,
+            iterations=options.iterations,
+            max_memory=options.max_memory,
+            progress=part_of(progress, 0, SHARE_BEFORE) if options.simplifies else progress,
+            save=file.add if file else None,
+        )
+        meshes = tally.count(pieces, watch)
+        if options.simplifies:
+            rest = part_of(progress, SHARE_BEFORE, 1)
+            meshes = tally.simplify(meshes, grid.voxel_size, options, watch, rest)
+
+        def complete(part: Path) -> None:
+            """Complete the field's file, and check that it can appear, before the mesh does."""
+            if file:
+                file.finish()
+                check_field_target(file.path, force=force)
+            if before_rename:
+                before_rename(part)
+
+        write_pieces(meshes, target, force=force, about=about, before_rename=complete)
     watch.lap("write")
-    return describe(grid, tally, options, watch.seconds, notes)
+    done = describe(grid, tally, options, watch.seconds, notes)
+    return replace(done, field=file.report()) if file else done
+
+
+def check_not_input(path: str | Path | None, source: str | Path) -> None:
+    """Raise WriteError if the field would replace the grid that is read."""
+    grid_file, _ = split_member(Path(source))
+    if path is not None and os.path.exists(path) and os.path.samefile(path, grid_file):
+        raise WriteError(f"{path} is the grid that is read: give another file for the field")
+
+
+def open_field(
+    path: str | Path | None, grid: SdfGrid, options: ConvertOptions, *, force: bool
+) -> AbstractContextManager[FieldFile | None]:
+    """Return the file to write the refined field to, which appears at the end; None without a path.
+
+    Raises
+    ------
+    SuperSdfError
+        If the file exists, its suffix is unknown, or the field would not fit.
+    """
+    if path is None:
+        return nullcontext()
+    path, shape = check_field_target(path, force=force), grid.shape
+    for _ in range(options.iterations):
+        shape = lattice_shape(shape, options.factor)
+    check_field_fits(path, shape, options.max_memory)
+    return saving_field(path, shape, force=force)
 
 
 class Tally:

@@ -82,6 +82,21 @@ def check_cap(cap: Any) -> bool:
     return bool(cap)
 
 
+def check_iterations(iterations: Any) -> int:
+    """Return how many times a grid is refined, one run after the other.
+
+    Raises
+    ------
+    OptionError
+        If it is less than 1, or not a whole number (``OptionTypeError``).
+    """
+    if not isinstance(iterations, Integral) or isinstance(iterations, bool):
+        raise OptionTypeError(f"iterations is {seen(iterations)}: give a whole number")
+    if iterations < 1:
+        raise OptionError(f"iterations is {seen(int(iterations))}: give 1 or more")
+    return int(iterations)
+
+
 def check_max_memory(size: Any) -> int | None:
     """Return a memory limit in bytes; None means a share of the free memory.
 

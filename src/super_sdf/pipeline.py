@@ -12,8 +12,8 @@ the same.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,16 +28,18 @@ from .options import (
     check_cap,
     check_distance,
     check_grid,
+    check_iterations,
     check_max_memory,
     check_network,
     check_progress,
 )
-from .progress import STEPS, Progress, StepCounter
+from .progress import STEPS, Progress, StepCounter, Stopwatch, part_of
 from .slabs.cutting import Slab, peak_bytes, plan_slabs
 from .slabs.footprint import NETWORK_BYTES
-from .slabs.pieces import Piece, describe_piece
-from .steps.cap import close_at_border, close_if_crossed
+from .slabs.pieces import Piece, count_input, describe_piece
+from .steps.cap import close
 from .steps.field import FineField, SampleSpheres
+from .steps.lattice import fine_grid
 from .steps.mesher_names import DEFAULT_MESHER
 from .steps.meshers import Mesher, extract_pieces, find_mesher
 from .steps.nodes import (
@@ -50,6 +52,9 @@ from .steps.nodes import (
 )
 from .steps.spheres import ExactSamples, fit_to_spheres
 from .steps.survey import Band, no_surface, survey
+
+SaveField = Callable[[FineField], None]
+"""Called with the field of each slab, in order, before its surface is extracted."""
 
 
 def upsample(
@@ -111,7 +116,7 @@ def upsample(
     field = refine(band, network, factor, slab, resources.threads, steps)
     if len(field.signs()) < 2:
         raise no_surface(grid, offset)
-    return field
+    return replace(field, grid=grid, offset=offset)
 
 
 def reconstruct(
@@ -122,6 +127,7 @@ def reconstruct(
     offset: float = 0.0,
     cap: bool = False,
     mesher: str = DEFAULT_MESHER,
+    iterations: int = 1,
     max_memory: int | None = None,
     progress: Progress | None = None,
 ) -> Mesh:
@@ -140,6 +146,9 @@ def reconstruct(
     mesher : str
         "marching" for marching cubes, which cuts off edges and corners; "sharp" also puts vertices
         on them.
+    iterations : int
+        How often to refine by the factor: each run takes the fine lattice of the one before as its
+        grid (see ``fine_grid``), which is sparse in memory.
     max_memory : int, optional
         Bytes that the process may hold in all, besides the mesh; by default a share of the free
         memory.
@@ -161,6 +170,7 @@ def reconstruct(
         offset=offset,
         cap=cap,
         mesher=mesher,
+        iterations=iterations,
         max_memory=max_memory,
         progress=progress,
     )
@@ -175,35 +185,82 @@ def reconstruct_slabs(
     offset: float = 0.0,
     cap: bool = False,
     mesher: str = DEFAULT_MESHER,
+    iterations: int = 1,
     max_memory: int | None = None,
     progress: Progress | None = None,
+    save: SaveField | None = None,
 ) -> Iterator[Piece]:
     """Yield the mesh of ``reconstruct`` slab by slab, in as few slabs as fit in memory.
 
-    Joined, the pieces are the same mesh, bit for bit, for any number of slabs and threads.
+    Joined, the pieces are the same mesh, bit for bit, for any number of slabs and threads. ``save``
+    is called with the field of each slab, final in the slab's own planes and in the one before.
     """
     check_grid(grid)
     check_network(network)
     check_progress(progress)
-    factor, offset = check_factor(factor), check_distance(offset)
-    extraction = find_mesher(mesher), check_cap(cap)
-    return _slabs(
-        grid, network, factor, offset, *extraction, check_max_memory(max_memory), progress
+    run = Run(
+        network,
+        check_factor(factor),
+        find_mesher(mesher),
+        check_cap(cap),
+        check_max_memory(max_memory),
+        save,
     )
+    offset = check_distance(offset)
+    if check_iterations(iterations) > 1:
+        return _iterated(run, grid, offset, iterations, progress)
+    return _slabs(run, grid, offset, progress)
 
 
-def _slabs(
-    grid: SdfGrid,
-    network: Decoder,
-    factor: int,
-    offset: float,
-    mesher: Mesher,
-    cap: bool,
-    max_memory: int | None,
-    progress: Progress | None,
+@dataclass(frozen=True)
+class Run:
+    """The arguments of ``reconstruct_slabs`` that are the same for all grids and iterations."""
+
+    network: Decoder
+    factor: int
+    mesher: Mesher
+    cap: bool
+    max_memory: int | None
+    save: SaveField | None
+
+
+def _iterated(
+    run: Run, grid: SdfGrid, offset: float, iterations: int, progress: Progress | None
 ) -> Iterator[Piece]:
-    """Yield the pieces of ``reconstruct_slabs``; arguments are checked before the first one."""
-    resources = allot(getattr(network, "threads", 0), max_memory)
+    """Yield the pieces of the last of several runs, each on the fine lattice of the one before.
+
+    What is counted of the input, such as its noisy voxels, is that of the first run.
+    """
+    share = 1 / (1 + run.factor**2)  # of the time, that the runs before the last take
+    shown = part_of(progress, 0, share)
+    counts: dict[str, int] = {}
+    watch = Stopwatch()
+    for nth in range(iterations - 1):
+        field = upsample(
+            grid,
+            run.network,
+            run.factor,
+            offset=offset,
+            max_memory=run.max_memory,
+            progress=None if nth else shown,
+        )
+        counts = counts or count_input(field)
+        grid, offset = fine_grid(field), 0.0
+    watch.lap("runs before")
+    spent, pinned = watch.seconds, counts.pop("pinned_nodes")
+    for piece in _slabs(run, grid, offset, part_of(progress, share, 1)):
+        piece.whole.update(counts)
+        piece.counts["pinned_nodes"], pinned = pinned, 0
+        piece.seconds.update(spent)
+        spent = {}
+        yield piece
+        del piece  # before the next one is made
+
+
+def _slabs(run: Run, grid: SdfGrid, offset: float, progress: Progress | None) -> Iterator[Piece]:
+    """Yield the pieces of one run; its arguments have been checked."""
+    network, factor, mesher = run.network, run.factor, run.mesher
+    resources = allot(getattr(network, "threads", 0), run.max_memory)
     steps = StepCounter(progress)
     band = find_surface(grid, factor, offset, resources)
     reach, needed = getattr(network, "receptive_field", None), memory_needs(network)
@@ -218,10 +275,11 @@ def _slabs(
         if len(slabs) > 1:
             give_back()
         field = refine(band, network, factor, slab, resources.threads, steps)
-        if not band.leaves:
-            whole = close_if_crossed(field, beside)
-        else:
-            whole = close_at_border(field, grid, offset, beside) if cap else field
+        field = replace(field, grid=grid, offset=offset)
+        if run.save:
+            run.save(field)
+            steps.watch.lap("save field")
+        whole = close(field, cap=run.cap, beside=beside)
         meshes = extract_pieces(whole, grid, vertices, resources.threads, mesher)
         planned_work = {"slabs": len(slabs), "planned_bytes": planned}
         piece = describe_piece(field, meshes, planned_work, band.leaves)
@@ -286,6 +344,8 @@ def refine(
         noisy_voxels=int(np.count_nonzero(~band.lipschitz)),
         pinned=int(pinned[field.own_rows].sum()),
         spheres=spheres,
+        decoded_voxels=int(band.decoded_before[-1]),
+        leaves=band.leaves,
     )
 
 

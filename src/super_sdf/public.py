@@ -1,6 +1,8 @@
 """The public names of the library, imported from the modules that define them."""
 
 from .errors import SuperSdfError as SuperSdfError
+from .fields.sparse import read_field as read_field
+from .fields.writing import write_field as write_field
 from .files.grids import read_grid as read_grid
 from .files.meshes import write_mesh as write_mesh
 from .grid.sdf_grid import SdfGrid as SdfGrid
@@ -11,4 +13,5 @@ from .pipeline import reconstruct as reconstruct
 from .pipeline import upsample as upsample
 from .simplification.simplify import simplify_mesh as simplify_mesh
 from .steps.field import FineField as FineField
+from .steps.lattice import fine_grid as fine_grid
 from .steps.meshers import extract_mesh as extract_mesh

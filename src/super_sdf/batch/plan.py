@@ -133,6 +133,8 @@ class Planner:
             del options["mesher"]  # so that rows of versions without this option still hold
         if options["axes"] is None:
             del options["axes"]
+        if options["iterations"] == 1:
+            del options["iterations"]
         if not job.options.simplifies:
             del options["simplify"], options["triangles"]
         settings = [options, self.network, __version__]

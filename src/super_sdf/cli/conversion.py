@@ -105,6 +105,15 @@ OPTIONS: tuple[Option, ...] = (
         show_default=True,
         help="Refinement per axis: 2, 4, 8 or 16 times finer than the grid.",
     ),
+    click.option(
+        "--iterations",
+        type=int,
+        default=convert_default("iterations"),
+        show_default=True,
+        metavar="N",
+        help="Refine N times, each time by the factor and from the refined field before, for "
+        "lattices finer than factor 16. Twice factor 4 is no better than factor 16, and slower.",
+    ),
     *GRID_OPTIONS,
     click.option(
         "--offset",

@@ -52,7 +52,13 @@ Examples:
 @click.argument("target", metavar="OUT")
 @conversion_options
 @check_option
-@click.option("--force", is_flag=True, help="Replace OUT if it exists.")
+@click.option(
+    "--save-field",
+    metavar="FIELD",
+    help="Also write the refined field: .npz for the values near the surface, .npy or .vti for "
+    "the whole fine lattice. A .vti needs the extra vti.",
+)
+@click.option("--force", is_flag=True, help="Replace OUT, and FIELD, if they exist.")
 @click.option("--json", "as_json", is_flag=True, help="Print counts, times and notes as JSON.")
 @click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
 @click.option("-v", "--verbose", is_flag=True, help="Also print counts and the time per stage.")
@@ -81,14 +87,19 @@ class Upsampling:
     def work(self) -> None:
         """Check the options, load the network, convert."""
         from ..convert import convert
+        from ..fields.writing import check_field_target
         from ..files.meshes import check_target
         from ..network.network import load_network
+        from ..options import check_iterations
         from ..progress import Stopwatch
         from ..steps.nodes import check_factor
 
         options, watch = self.options, Stopwatch()
         check_factor(options["factor"])
+        check_iterations(options["iterations"])
         check_target(self.target, force=options["force"])
+        if options["save_field"] is not None:
+            check_field_target(options["save_field"], force=options["force"])
         if options["check"]:
             check_can_check(self.target)
         check_simplification(options)
@@ -109,6 +120,7 @@ class Upsampling:
                 force=options["force"],
                 progress=progress,
                 announce=self.announce,
+                save_field=options["save_field"],
             )
         self.seconds = watch.seconds | self.result.seconds
 
@@ -149,6 +161,8 @@ class Upsampling:
             for stage, seconds in self.seconds.items():
                 print_stderr(f"{stage}: {seconds:.3f} s")
         print_stderr(f"{self.target}: {self.summary()}")
+        if self.result.field:
+            print_stderr(f"{self.options['save_field']}: {self.field_summary()}")
         if self.result.simplified:
             print_stderr(f"Simplified: {describe_simplified(self.result.simplified)}")
         if self.certificate:
@@ -160,6 +174,7 @@ class Upsampling:
             "input": self.source,
             "output": self.target,
             "factor": self.options["factor"],
+            "iterations": self.options["iterations"],
             "offset": self.options["offset"],
             "mesher": self.options["mesher"],
             "model": self.model,
@@ -180,6 +195,13 @@ class Upsampling:
     def device_notes(self) -> list[str]:
         """Return notes on the device of the network."""
         return list(self.network.notes)
+
+    def field_summary(self) -> str:
+        """Describe the file of the refined field in one line."""
+        field = self.result.field or {}
+        shape = " x ".join(map(str, field["shape"]))
+        spacing, origin = (", ".join(f"{x:.12g}" for x in field[k]) for k in ("spacing", "origin"))
+        return f"the refined field, lattice {shape}, spacing {spacing}, origin {origin}"
 
     def summary(self) -> str:
         """Describe the mesh in one line."""

@@ -15,6 +15,7 @@ import zlib
 from typing import Any, Protocol
 
 from ..errors import FileError
+from ..grid.planes import InputFile
 
 PIECE = 1 << 16  # compressed bytes at a time
 LARGEST_DICTIONARY = 1 << 26  # bytes that the decoder may allocate for an LZMA member
@@ -57,6 +58,14 @@ class Deflate:
     def decompress(self, data: bytes, max_length: int) -> bytes:
         """Decompress data into at most ``max_length`` bytes."""
         return self._inner.decompress(self._inner.unconsumed_tail + data, max_length)
+
+
+def open_archive(file: InputFile) -> zipfile.ZipFile:
+    """Open a zip archive."""
+    try:
+        return zipfile.ZipFile(file.file)
+    except Exception as error:  # zipfile raises over ten kinds of error on damaged fields
+        raise FileError(f"{file.name} is not a readable .npz archive: {error}") from None
 
 
 class Member:

@@ -23,7 +23,7 @@ from ..grid.samples import check_kind
 from ..grid.sdf_grid import SdfGrid, make_grid
 from ..machine.memory import held_memory, memory_bound
 from ..options import check_path
-from .archives import Member
+from .archives import Member, open_archive
 from .formats import GridFormat, check_library, choose_axes, find_format, split_member
 from .headers import ArrayHeader, Read, read_array_header
 from .output import check_free, replacing
@@ -202,7 +202,7 @@ def _read_npz(path: Path, room: int) -> dict[str, Any]:
     """Read the known arrays of an .npz file."""
     file = InputFile.open(path)
     try:
-        with _open_archive(file) as archive:
+        with open_archive(file) as archive:
             members = _find_members(archive, path)
             found = {
                 key: _read_small(archive, members[key], f"{path}[{key}]")
@@ -214,18 +214,15 @@ def _read_npz(path: Path, room: int) -> dict[str, Any]:
         file.check_unchanged()  # a change explains whatever else went wrong
 
 
-def _open_archive(file: InputFile) -> zipfile.ZipFile:
-    """Open a zip archive."""
-    try:
-        return zipfile.ZipFile(file.file)
-    except Exception as error:  # zipfile raises over ten kinds of error on damaged fields
-        raise FileError(f"{file.name} is not a readable .npz archive: {error}") from None
-
-
 def _find_members(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.ZipInfo]:
     """Return the members that belong to a grid, by key."""
     infos = archive.infolist()
     names = [info.filename.removesuffix(".npy") for info in infos]
+    if {"voxels", "factor"} <= set(names):
+        raise FileError(
+            f"{path} is a refined field, no grid: mesh it with extract_mesh(read_field(path)), or "
+            "refine the grid again with --iterations"
+        )
     if "values" not in names:
         held = ", ".join(names[:MOST_NAMED]) or "nothing"
         more = f" and {len(names) - MOST_NAMED:,} more" if len(names) > MOST_NAMED else ""

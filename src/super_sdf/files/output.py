@@ -105,6 +105,17 @@ def replacing(
         raise _cannot_be_written(path, error) from error
 
 
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Turn the system's errors in the block into a WriteError that names the path."""
+    try:
+        yield
+    except SuperSdfError:  # some are OSErrors, too, but not from the system
+        raise
+    except OSError as error:
+        raise _cannot_be_written(path, error) from error
+
+
 def _rename_if_free(part: Path, target: Path) -> None:
     """Rename a file unless the target exists: a hard link, unlike a rename, never replaces."""
     try:

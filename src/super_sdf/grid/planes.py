@@ -111,7 +111,70 @@ class InputFile:
         return out
 
 
-class PlaneFile:
+class PlaneSource:
+    """A 3D array whose planes along the first axis are made when they are needed.
+
+    Attributes
+    ----------
+    shape, dtype
+        Shape (nx, ny, nz) and type of the array.
+    name : str
+        Its name in error messages.
+    """
+
+    ndim = 3
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    name: str
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
+        raise NotImplementedError
+
+    def __getitem__(self, which: int | slice) -> NDArray[Any]:
+        """Return one plane or a range of planes, as indexing an array would."""
+        if isinstance(which, slice):
+            first, last, step = which.indices(len(self))
+            return self.read(first, last) if step == 1 else self.loaded[which]
+        number = range(len(self))[which]
+        plane: NDArray[Any] = self.read(number, number + 1)[0]
+        return plane
+
+    def __iter__(self) -> Iterator[NDArray[Any]]:
+        step = max(BLOCK_BYTES // self.plane_bytes, 1)
+        for first in range(0, len(self), step):
+            yield from self.read(first, min(first + step, len(self)))
+
+    @property
+    def plane_bytes(self) -> int:
+        """Bytes of a plane."""
+        return self.shape[1] * self.shape[2] * self.dtype.itemsize
+
+    @cached_property
+    def loaded(self) -> NDArray[Any]:
+        """The whole array; it stays in memory.
+
+        Raises
+        ------
+        OutOfMemoryError
+            If it is larger than what is free.
+        """
+        size = prod(self.shape) * self.dtype.itemsize
+        check_fits(size, f"{self.name}, whole,", "read it plane by plane (SdfGrid.planes)")
+        return self.read(0, len(self))
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.array(self.loaded, dtype) if copy else np.asarray(self.loaded, dtype)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the array itself: another process may not have the source."""
+        return np.asarray, (self.loaded,)
+
+
+class PlaneFile(PlaneSource):
     """A 3D array in a file, whose planes along the first axis are read when they are needed.
 
     Parameters
@@ -126,8 +189,6 @@ class PlaneFile:
         Whether the last two axes are swapped in the file: (nx, nz, ny).
     """
 
-    ndim = 3
-
     def __init__(
         self,
         file: InputFile,
@@ -138,11 +199,7 @@ class PlaneFile:
         swapped: bool = False,
     ) -> None:
         self.file, self.offset = file, offset
-        self.shape, self.dtype, self.swapped = shape, dtype, swapped
-        self.plane_bytes = shape[1] * shape[2] * dtype.itemsize
-
-    def __len__(self) -> int:
-        return self.shape[0]
+        self.shape, self.dtype, self.swapped, self.name = shape, dtype, swapped, file.name
 
     def read(self, first: int, last: int) -> NDArray[Any]:
         """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz).
@@ -159,40 +216,6 @@ class PlaneFile:
         self.file.read_into(planes, self.offset + first * self.plane_bytes)
         return planes.transpose(0, 2, 1) if self.swapped else planes
 
-    def __getitem__(self, which: int | slice) -> NDArray[Any]:
-        """Return one plane or a range of planes, as indexing an array would."""
-        if isinstance(which, slice):
-            first, last, step = which.indices(len(self))
-            return self.read(first, last) if step == 1 else self.loaded[which]
-        number = range(len(self))[which]
-        plane: NDArray[Any] = self.read(number, number + 1)[0]
-        return plane
 
-    def __iter__(self) -> Iterator[NDArray[Any]]:
-        step = max(BLOCK_BYTES // self.plane_bytes, 1)
-        for first in range(0, len(self), step):
-            yield from self.read(first, min(first + step, len(self)))
-
-    @cached_property
-    def loaded(self) -> NDArray[Any]:
-        """The whole array; it stays in memory.
-
-        Raises
-        ------
-        OutOfMemoryError
-            If it is larger than what is free.
-        """
-        size = prod(self.shape) * self.dtype.itemsize
-        check_fits(size, f"{self.file.name}, whole,", "read it plane by plane (SdfGrid.planes)")
-        return self.read(0, len(self))
-
-    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
-        return np.array(self.loaded, dtype) if copy else np.asarray(self.loaded, dtype)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the array itself: another process may not have the file."""
-        return np.asarray, (self.loaded,)
-
-
-SampleArray: TypeAlias = NDArray[Any] | PlaneFile
-"""An array of samples in memory, or in a file that is read plane by plane."""
+SampleArray: TypeAlias = NDArray[Any] | PlaneSource
+"""An array of samples in memory, or one whose planes are read or made when needed."""

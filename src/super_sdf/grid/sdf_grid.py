@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Triple
 from .one_sided import check_thin, is_one_sided
-from .planes import PlaneFile, SampleArray
+from .planes import PlaneSource, SampleArray
 from .samples import Extremes, as_samples, check_not_flat, check_values
 from .sides import check_negative_inside, is_positive_inside
 from .spacing import as_triple, check_spacing, choose_spacing
@@ -28,7 +28,7 @@ class SdfGrid:
     ----------
     values : (nx, ny, nz) array_like
         Signed distances in world units, negative inside; i runs along x, j along y, k along z. A
-        memory-mapped array or a ``PlaneFile`` is not loaded.
+        memory-mapped array or a ``PlaneSource`` is not loaded.
     spacing : float or three floats
         World distance between neighbouring samples; equal on all axes.
     origin : float or three floats
@@ -61,7 +61,7 @@ class SdfGrid:
     high: float
 
     def __init__(
-        self, values: ArrayLike | PlaneFile, spacing: ArrayLike, origin: ArrayLike = 0.0
+        self, values: ArrayLike | PlaneSource, spacing: ArrayLike, origin: ArrayLike = 0.0
     ) -> None:
         samples, extremes = _checked(values)
         check_negative_inside(samples)
@@ -72,7 +72,7 @@ class SdfGrid:
     @classmethod
     def trusted(
         cls,
-        values: ArrayLike | PlaneFile,
+        values: ArrayLike | PlaneSource,
         spacing: ArrayLike,
         origin: ArrayLike = 0.0,
         notes: tuple[str, ...] = (),
@@ -123,13 +123,17 @@ class SdfGrid:
     def values(self) -> NDArray[Any]:
         """All samples, negative inside."""
         samples = self.samples
-        whole = samples.loaded if isinstance(samples, PlaneFile) else samples
+        whole = samples.loaded if isinstance(samples, PlaneSource) else samples
         return negated(whole) if self.positive_inside else whole
 
     def planes(self, first: int, last: int) -> NDArray[Any]:
         """Return the samples with first <= i < last, negative inside, (last - first, ny, nz)."""
         samples = self.samples[first:last]
         return negated(samples) if self.positive_inside else samples
+
+    def to_world(self, ijk: ArrayLike) -> NDArray[np.float64]:
+        """Return the world positions (..., 3) of indices (..., 3), which need not be whole."""
+        return np.asarray(ijk, np.float64) * self.spacing + self.origin
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -144,7 +148,7 @@ class SdfGrid:
 
 
 def make_grid(
-    values: ArrayLike | PlaneFile,
+    values: ArrayLike | PlaneSource,
     *,
     spacing: ArrayLike | None = None,
     origin: ArrayLike | None = None,
@@ -189,7 +193,7 @@ def make_grid(
     )
 
 
-def _checked(values: ArrayLike | PlaneFile) -> tuple[SampleArray, Extremes]:
+def _checked(values: ArrayLike | PlaneSource) -> tuple[SampleArray, Extremes]:
     """Return samples as an array, and their extremes; raise GridError if they are no field."""
     samples = as_samples(values)
     extremes = check_values(samples)

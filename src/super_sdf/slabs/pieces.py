@@ -56,3 +56,12 @@ def describe_piece(
     whole = {"band_voxels": fine.band_voxels, "noisy_voxels": fine.noisy_voxels, **planned}
     is_cut = leaves and border_is_crossed(fine)
     return Piece(meshes, counts, whole, leaves, is_cut, fine.signs())
+
+
+def count_input(fine: FineField) -> dict[str, int]:
+    """Return the counts that say how good the input is, of the field of a whole grid."""
+    return {
+        "band_voxels": fine.band_voxels,
+        "noisy_voxels": fine.noisy_voxels,
+        "pinned_nodes": fine.pinned,
+    }

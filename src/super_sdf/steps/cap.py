@@ -22,6 +22,17 @@ from .nodes import (
 )
 
 
+def close(field: FineField, *, cap: bool, beside: int = 1) -> FineField:
+    """Return the field whose isosurface is closed where it should be.
+
+    Where the solid leaves the grid, it is closed along the border if ``cap`` is set. ``beside`` is
+    as in ``close_at_border``.
+    """
+    if not field.leaves:
+        return close_if_crossed(field, beside)
+    return close_at_border(field, beside) if cap else field
+
+
 def close_if_crossed(field: FineField, beside: int = 1) -> FineField:
     """Close the surface where it crosses the border though all samples there are outside.
 
@@ -33,9 +44,7 @@ def close_if_crossed(field: FineField, beside: int = 1) -> FineField:
     return _close(field, np.empty((0, 3), np.int32), beside)
 
 
-def close_at_border(
-    field: FineField, grid: SdfGrid, offset: float = 0.0, beside: int = 1
-) -> FineField:
+def close_at_border(field: FineField, beside: int = 1) -> FineField:
     """Surround the grid with outside voxels, so that the surface is closed along the border.
 
     Adds the border voxels inside the solid that were not decoded, and a layer of outside voxels
@@ -43,9 +52,19 @@ def close_at_border(
     flat. A slab is closed in its own planes and in the planes ``beside`` them on which its mesh
     depends, and in one more before, which owns vertices of those.
     """
-    first, last = _planes_beside(field, beside)
+    return _close(field, find_border_inside(field, *_planes_beside(field, beside)), beside)
+
+
+def find_border_inside(field: FineField, first: int, last: int) -> IntArray:
+    """Return the border voxels (n, 3) of some planes that are inside and have no block.
+
+    The planes must be some whose voxels the field has.
+    """
+    found = field.border_inside
+    if found is not None:
+        return found[(found[:, 0] >= first) & (found[:, 0] < last)]
     known = field.voxel_ijk[field.rows(first, last)]
-    return _close(field, _filled_border(grid, offset, first, last, known), beside)
+    return _filled_border(field.placed, field.offset, first, last, known)
 
 
 def _planes_beside(field: FineField, beside: int) -> tuple[int, int]:
@@ -121,7 +140,7 @@ def _filled_border(
         here = known[(known[:, 0] >= low) & (known[:, 0] < high)]
         inside[here[:, 0] - low, here[:, 1], here[:, 2]] = False
         found.append(np.argwhere(inside) + np.array([low, 0, 0]))
-    return np.concatenate(found).astype(np.int32)
+    return np.concatenate([np.empty((0, 3)), *found]).astype(np.int32)
 
 
 def _outer_voxels(voxel_ijk: IntArray, shape: tuple[int, int, int]) -> IntArray:

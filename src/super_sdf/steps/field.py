@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray, IntArray
+from ..errors import OptionError
+from ..grid.sdf_grid import SdfGrid
 from ..machine.threads import map_chunks
 from .nodes import SharedParts, block_ijk, number_parts, part_of_node, part_sizes
 
@@ -55,6 +57,9 @@ class SampleSpheres:
 class FineField:
     """Values at the nodes of the decoded voxels' blocks, in a whole grid or in a slab of it.
 
+    ``positions`` and ``distances`` are the nodes in world units, each once; ``block_positions`` and
+    ``block_distances`` are those of voxels, block by block. The arrays below are in index space.
+
     Attributes
     ----------
     shape : three ints
@@ -81,6 +86,18 @@ class FineField:
         If there are any, the input is not a distance field there, or the network failed.
     spheres : SampleSpheres, optional
         The exact samples in and beside the slab, for a mesher that leans on them.
+    decoded_voxels : int
+        Voxels with a block in the whole grid.
+    grid : SdfGrid, optional
+        The coarse grid, for positions and units. That of a field from a file has no samples.
+    offset : float
+        The distance from the solid, in world units, of the surface at which the values are 0.
+    leaves : bool
+        Whether the solid may leave the grid: a sample on the border is inside. If False, a surface
+        that crosses the border all the same is closed there.
+    border_inside : (n, 3) int32, optional
+        The voxels on the grid's border that are inside and have no block: what a cap needs of the
+        samples. None if they are to be found in ``grid``.
     """
 
     shape: tuple[int, int, int]
@@ -93,6 +110,11 @@ class FineField:
     noisy_voxels: int = 0
     pinned: int = 0
     spheres: SampleSpheres | None = None
+    decoded_voxels: int = 0
+    grid: SdfGrid | None = None
+    offset: float = 0.0
+    leaves: bool = True
+    border_inside: IntArray | None = None
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.shape))
@@ -121,6 +143,62 @@ class FineField:
         values = np.empty(self.parts.count_nodes(self.factor), np.float32)
         values[self.numbers] = self.blocks.T
         return values
+
+    @cached_property
+    def node_ijk(self) -> IntArray:
+        """The indices of all nodes in the fine lattice, in the order of ``values``, (n, 3) int32.
+
+        Node (i, j, k) is at the coarse index ``(i, j, k) / K - 1/2``.
+        """
+        ijk = np.empty((self.parts.count_nodes(self.factor), 3), np.int32)
+        ijk[self.numbers] = self._block_node_ijk(slice(None))
+        return ijk
+
+    def positions(self) -> NDArray[np.float64]:
+        """Return the world positions of all nodes, each once, (n, 3).
+
+        Raises
+        ------
+        OptionError
+            If the field was made without its ``grid``.
+        """
+        return self._to_world(self.node_ijk)
+
+    def distances(self) -> NDArray[np.float64]:
+        """Return the signed distances at ``positions``, (n,), in world units, negative inside."""
+        return self.in_world_units(self.values)
+
+    def block_positions(self, rows: slice = slice(None)) -> NDArray[np.float64]:
+        """Return the world positions of the nodes of voxels' blocks, (m, Q, 3).
+
+        Parameters
+        ----------
+        rows : slice
+            The voxels, rows of ``voxel_ijk``; all by default.
+        """
+        return self._to_world(self._block_node_ijk(rows))
+
+    def block_distances(self, rows: slice = slice(None)) -> NDArray[np.float64]:
+        """Return the signed distances at ``block_positions``, (m, Q), in world units."""
+        return self.in_world_units(self.blocks[:, rows].T)
+
+    def in_world_units(self, values: FloatArray) -> NDArray[np.float64]:
+        """Return values in half voxels as distances in world units, float64: without rounding."""
+        return np.multiply(values, self.placed.voxel_size / 2, dtype=np.float64)
+
+    @property
+    def placed(self) -> SdfGrid:
+        """The coarse grid; OptionError if the field was made without it."""
+        if self.grid is None:
+            raise OptionError("the field has no grid: make it with upsample(grid, network)")
+        return self.grid
+
+    def _block_node_ijk(self, rows: slice) -> IntArray:
+        """Return the indices of the nodes of voxels' blocks in the fine lattice, (m, Q, 3)."""
+        return self.factor * self.voxel_ijk[rows][:, None] + block_ijk(self.factor)
+
+    def _to_world(self, node_ijk: IntArray) -> NDArray[np.float64]:
+        return self.placed.to_world(node_ijk / self.factor - 0.5)
 
     def rows(self, first: int, last: int) -> slice:
         """Return the rows of the voxels in planes ``first`` to before ``last``."""

@@ -20,8 +20,9 @@ from ..grid.sdf_grid import SdfGrid
 from ..machine.index_width import check_count
 from ..machine.threads import map_threads
 from ..mesh import Mesh, join_meshes
-from ..options import check_grid
+from ..options import check_cap, check_grid
 from . import marching, sharp
+from .cap import close
 from .field import FineField
 from .mesher_names import DEFAULT_MESHER, MARCHING, MESHERS, SHARP
 
@@ -138,7 +139,12 @@ def find_mesher(name: Any) -> Mesher:
 
 
 def extract_mesh(
-    field: FineField, grid: SdfGrid, first_vertex: int = 0, *, mesher: str = DEFAULT_MESHER
+    field: FineField,
+    grid: SdfGrid | None = None,
+    first_vertex: int = 0,
+    *,
+    mesher: str = DEFAULT_MESHER,
+    cap: bool = False,
 ) -> Mesh:
     """Return the zero level of a field as triangles in world coordinates.
 
@@ -148,14 +154,16 @@ def extract_mesh(
     Parameters
     ----------
     field : FineField
-        From ``upsample``.
-    grid : SdfGrid
-        The coarse grid that it was made from, for spacing and origin.
+        From ``upsample`` or ``read_field``.
+    grid : SdfGrid, optional
+        A coarse grid for spacing and origin. Default: the one that the field was made from.
     first_vertex : int
         The number of the first vertex, for a field of a slab: the number of vertices in the slabs
         before. Faces may also refer to vertices of the slab before.
     mesher : str
         "marching" for marching cubes; "sharp" also puts vertices on edges and corners.
+    cap : bool
+        Close a surface that leaves the grid, as in ``reconstruct``.
 
     Raises
     ------
@@ -167,8 +175,11 @@ def extract_mesh(
     """
     if not isinstance(field, FineField):
         raise OptionTypeError(f"field is {seen(field)}: give one from upsample(grid, network)")
+    grid = field.placed if grid is None else grid
     check_grid(grid)
-    return join_meshes(find_mesher(mesher).extract(field, grid, first_vertex, 1))
+    chosen = find_mesher(mesher)
+    whole = close(field, cap=check_cap(cap), beside=chosen.planes_beside(field.factor))
+    return join_meshes(chosen.extract(whole, grid, first_vertex, 1))
 
 
 def extract_pieces(

@@ -1,0 +1,1 @@
+"""Refined fields as files: sparse ``.npz``, which is read back, dense ``.npy`` and ``.vti``."""

@@ -1,0 +1,311 @@
+"""Refined fields as sparse ``.npz`` files: written slab by slab, read back by ``read_field``.
+
+docs/fields.md describes the keys. Values are in world units and exact: as float32 if the spacing is
+a power of two, since the field's own numbers are float32 in half voxels, else as float64.
+"""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import DTypeLike, NDArray
+
+from ..arrays import FloatArray, IntArray
+from ..errors import FileError, OptionError
+from ..files.archives import Member, open_archive
+from ..files.headers import ArrayHeader, read_array_header
+from ..files.regular import check_regular_file
+from ..files.spool import append_spool, little_endian, spool_beside
+from ..grid.planes import InputFile, PlaneSource
+from ..grid.sdf_grid import SdfGrid
+from ..machine.memory import check_fits
+from ..options import check_path
+from ..steps.band import neighbour_table
+from ..steps.cap import find_border_inside
+from ..steps.field import FineField, SampleSpheres
+from ..steps.nodes import check_factor, share_parts
+
+VERSION = 1
+CHUNK = 1 << 20  # values at a time
+LONGEST = 1 << 20  # samples along an axis
+# Small arrays first; the values, which are large, before the arrays that grow with them.
+HEAD = ("version", "shape", "factor", "spacing", "origin", "offset", "leaves")
+LISTS = ("voxels", "sample_voxels", "sample_distances", "border_inside")
+KEYS = (*HEAD, "values", *LISTS)
+
+
+def exact_type(voxel_size: float) -> type[np.float32] | type[np.float64]:
+    """Return the type in which world units are exact: float32 if they only change exponents."""
+    power = math.frexp(voxel_size)[0] == 0.5 and 1e-20 < voxel_size < 1e20
+    return np.float32 if power else np.float64
+
+
+class SparseWriter:
+    """Writes a field slab by slab: blocks to the archive, voxels and samples to temporary files.
+
+    Parameters
+    ----------
+    part : Path
+        The file.
+    shape : three ints
+        Nodes of the whole fine lattice; the file does not depend on it.
+    files : ExitStack
+        Closes the files at the end, however that comes.
+    """
+
+    def __init__(self, part: Path, shape: tuple[int, int, int], files: ExitStack) -> None:
+        self.archive = zipfile.ZipFile(part, "w")
+        files.callback(self._close)
+        self.lists = {name: files.enter_context(spool_beside(part)) for name in LISTS}
+        self.counts = dict.fromkeys(LISTS, 0)
+        self.values: IO[bytes] | None = None
+        self.types: dict[str, DTypeLike] = {}
+
+    def add(self, field: FineField) -> None:
+        """Write the own planes of a slab's field."""
+        if self.values is None:
+            self._begin(field)
+        assert self.values is not None
+        rows = field.own_rows
+        self._extend("voxels", field.voxel_ijk[rows])
+        step = max(CHUNK // len(field.blocks), 1)
+        for first in range(rows.start, rows.stop, step):
+            some = slice(first, min(first + step, rows.stop))
+            self.values.write(self._bytes("values", field.block_distances(some)))
+        self._add_samples(field)
+        if field.leaves:
+            self._extend("border_inside", find_border_inside(field, *field.planes))
+
+    def finish(self) -> None:
+        """Complete the archive with the arrays of which the length is known only now."""
+        if self.values is None:
+            return
+        self.values.close()
+        for name, spool in self.lists.items():
+            shape = (self.counts[name], *([3] if self.types[name] is np.int32 else []))
+            with self._open(name, shape, self.types[name]) as member:
+                append_spool(spool, member)
+        self.archive.close()
+
+    def _close(self) -> None:
+        """Close the archive, also if writing to it has failed."""
+        with suppress(OSError, ValueError):
+            if self.values is not None:
+                self.values.close()
+        with suppress(OSError, ValueError):
+            self.archive.close()
+
+    def _begin(self, field: FineField) -> None:
+        """Write what does not grow with the field, and the header of the values."""
+        grid, side = field.placed, field.factor + 1
+        exact = exact_type(grid.voxel_size)
+        self.types = {**dict.fromkeys(LISTS, np.int32), "values": exact, "sample_distances": exact}
+        head = (
+            *(VERSION, field.shape, field.factor),
+            *(grid.spacing, grid.origin, field.offset, field.leaves),
+        )
+        for name, value in zip(HEAD, head):
+            array = np.asarray(value)
+            with self._open(name, array.shape, array.dtype) as member:
+                member.write(little_endian(array))
+        self.values = self._open("values", (field.decoded_voxels, side, side, side), exact)
+
+    def _add_samples(self, field: FineField) -> None:
+        """Write the exact samples in a slab's own planes."""
+        spheres = field.spheres
+        if spheres is None:
+            return
+        first, last = np.searchsorted(spheres.voxel_ijk[:, 0], field.planes)
+        self._extend("sample_voxels", spheres.voxel_ijk[first:last])
+        distances = field.in_world_units(spheres.distance[first:last])
+        self._extend("sample_distances", distances)
+
+    def _extend(self, name: str, rows: NDArray[Any]) -> None:
+        self.lists[name].write(self._bytes(name, rows))
+        self.counts[name] += len(rows)
+
+    def _bytes(self, name: str, array: NDArray[Any]) -> bytes:
+        return little_endian(array.astype(self.types[name], copy=False))
+
+    def _open(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> IO[bytes]:
+        """Return a new array of the archive, with its header written."""
+        member = self.archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True)
+        descr = np.dtype(dtype).newbyteorder("<").str
+        header = {"descr": descr, "fortran_order": False, "shape": tuple(map(int, shape))}
+        npy.write_array_header_1_0(member, header)
+        return member
+
+
+class NoSamples(PlaneSource):
+    """Stands for the coarse samples of a field that was read from a file, which has none."""
+
+    dtype = np.dtype(np.float32)
+
+    def __init__(self, shape: tuple[int, ...], name: str) -> None:
+        self.shape, self.name = shape, name
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Raise FileError: there is nothing to read."""
+        raise FileError(
+            f"{self.name} holds the refined field without the coarse samples: read "
+            "those from their own file"
+        )
+
+
+def read_field(path: str | Path) -> FineField:
+    """Read a refined field from a ``.npz`` file that ``--save-field`` or ``write_field`` wrote.
+
+    ``extract_mesh`` makes the same mesh of it, byte for byte. Its ``grid`` has shape, spacing and
+    origin, but no samples.
+
+    Parameters
+    ----------
+    path : path
+        The file; docs/fields.md describes its keys.
+
+    Raises
+    ------
+    FileError
+        If the file is missing, damaged, truncated, or holds something else.
+    OutOfMemoryError
+        If the field does not fit in memory.
+    OptionError
+        If the suffix is not .npz.
+    """
+    path = check_path(path, "path")
+    if path.suffix.lower() != ".npz":
+        raise OptionError(f"{path} is no sparse field: give .npz")
+    file = InputFile.open(check_regular_file(path))
+    try:
+        with open_archive(file) as archive:
+            return _Reader(archive, str(path)).read()
+    finally:
+        file.check_unchanged()  # a change explains whatever else went wrong
+
+
+class _Reader:
+    """Reads the arrays of an archive and checks that they make a field."""
+
+    def __init__(self, archive: zipfile.ZipFile, name: str) -> None:
+        self.archive, self.name = archive, name
+        self.members = {i.filename.removesuffix(".npy"): i for i in archive.infolist()}
+
+    def read(self) -> FineField:
+        """Return the field."""
+        missing = [key for key in KEYS if key not in self.members]
+        if missing:
+            raise FileError(f"{self.name} is no refined field: it has no key {missing[0]!r}")
+        version = int(self._array("version", "iu", ()))
+        if version != VERSION:
+            raise FileError(
+                f"{self.name} has format version {version}, this program reads {VERSION}: use a "
+                "newer one"
+            )
+        shape = tuple(map(int, self._array("shape", "iu", (3,))))
+        if not 2 <= min(shape) <= max(shape) <= LONGEST:
+            raise FileError(f"{self.name} is no refined field: its grid has the shape {shape}")
+        factor = self._checked_factor()
+        voxels = self._voxels("voxels", shape)
+        grid = self._grid(shape)
+        blocks = self._blocks(len(voxels), factor, grid)
+        samples = self._voxels("sample_voxels", shape)
+        distance = self._array("sample_distances", "f", (len(samples),))
+        return FineField(
+            (shape[0], shape[1], shape[2]),
+            factor,
+            voxels,
+            blocks,
+            share_parts(neighbour_table(voxels, shape)),
+            (0, shape[0]),
+            spheres=SampleSpheres(shape, samples, _in_half_voxels(distance, grid)),  # type: ignore[arg-type]
+            decoded_voxels=len(voxels),
+            grid=grid,
+            offset=float(self._array("offset", "f", ())),
+            leaves=bool(self._array("leaves", "b", ())),
+            border_inside=self._voxels("border_inside", shape),
+        )
+
+    def _checked_factor(self) -> int:
+        """Return the factor."""
+        try:
+            return check_factor(int(self._array("factor", "iu", ())))
+        except OptionError as error:
+            raise FileError(f"{self.name} is no refined field: {error}") from None
+
+    def _grid(self, shape: tuple[int, ...]) -> SdfGrid:
+        """Return the coarse grid, without samples."""
+        spacing, origin = (self._array(key, "f", (3,)) for key in ("spacing", "origin"))
+        samples = NoSamples(shape, self.name)
+        return SdfGrid.trusted(samples, spacing, origin, extremes=(-math.inf, math.inf))
+
+    def _voxels(self, key: str, shape: tuple[int, ...]) -> IntArray:
+        """Return voxels (n, 3), which must lie in the grid, all different, in C order."""
+        voxels = np.asarray(self._array(key, "i", (None, 3)), np.int64)
+        inside = ((voxels >= 0) & (voxels < shape)).all()
+        number = (voxels[:, 0] * shape[1] + voxels[:, 1]) * shape[2] + voxels[:, 2]
+        if not inside or (np.diff(number) <= 0).any():
+            raise FileError(
+                f"{self.name}[{key}] is damaged: its voxels are not in order in the grid"
+            )
+        return np.ascontiguousarray(voxels, np.int32)
+
+    def _blocks(self, count: int, factor: int, grid: SdfGrid) -> FloatArray:
+        """Return the values (Q, D) in half voxels, read in pieces."""
+        member, header = self._open("values", "f", (count, *(factor + 1,) * 3))
+        nodes = (factor + 1) ** 3
+        check_fits(4 * nodes * count, f"{self.name}, as a field,", "read it on a larger machine")
+        blocks = np.empty((nodes, count), np.float32)
+        for rows, data in _pieces(member, header, nodes):
+            blocks[:, rows] = _in_half_voxels(data, grid).reshape(-1, nodes).T
+        if not np.isfinite(blocks).all():
+            raise FileError(f"{self.name}[values] is damaged: not all values are finite")
+        return blocks
+
+    def _array(self, key: str, kinds: str, shape: tuple[int | None, ...]) -> NDArray[Any]:
+        """Return an array of one of some kinds and of a shape, in which None is any length."""
+        member, header = self._open(key, kinds, shape)
+        check_fits(header.size, f"{self.name}[{key}]", "read it on a larger machine")
+        array: NDArray[Any] = np.frombuffer(member.read(header.size), header.dtype)
+        return array.reshape(header.shape)
+
+    def _open(
+        self, key: str, kinds: str, shape: tuple[int | None, ...]
+    ) -> tuple[Member, ArrayHeader]:
+        """Return the member of a key, to be read after its header, which must be as expected."""
+        name = f"{self.name}[{key}]"
+        member = Member(self.archive, self.members[key], name)
+        header = read_array_header(member.read, name)
+        fits = len(header.shape) == len(shape) and all(
+            want in (None, have) for want, have in zip(shape, header.shape)
+        )
+        if not fits or header.dtype.kind not in kinds or header.fortran_order:
+            raise FileError(f"{name} is {header}: it belongs to no refined field")
+        if header.size != member.left:
+            raise FileError(
+                f"{name} is damaged: its header promises {header}, but {member.left:,} follow"
+            )
+        return member, header
+
+
+def _pieces(
+    member: Member, header: ArrayHeader, nodes: int
+) -> Iterator[tuple[slice, NDArray[Any]]]:
+    """Yield rows of an array of blocks, and their values."""
+    step, count = max(CHUNK // nodes, 1), header.shape[0]
+    for first in range(0, count, step):
+        rows = slice(first, min(first + step, count))
+        size = (rows.stop - first) * nodes * header.dtype.itemsize
+        yield rows, np.frombuffer(member.read(size), header.dtype)
+
+
+def _in_half_voxels(world: NDArray[Any], grid: SdfGrid) -> FloatArray:
+    """Return distances in world units in half voxels: the float32 numbers that were written."""
+    half: FloatArray = np.divide(world, grid.voxel_size / 2, dtype=np.float64).astype(np.float32)
+    return half

@@ -1,0 +1,572 @@
+"""The refined field out: values and places against truth, round trips, both files or none."""
+
+import os
+import re
+import resource
+import signal
+import subprocess
+import sys
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ball, trilinear
+
+from super_sdf import (
+    SdfGrid,
+    extract_mesh,
+    fine_grid,
+    load_network,
+    make_grid,
+    read_field,
+    read_grid,
+    reconstruct,
+    upsample,
+    write_field,
+    write_mesh,
+)
+from super_sdf.errors import FileError, OptionError, OptionTypeError, OutOfMemoryError, WriteError
+from super_sdf.fields import writing
+from super_sdf.machine.memory import held_memory
+from super_sdf.mesh import CLEARANCE
+from super_sdf.pipeline import reconstruct_slabs
+from super_sdf.slabs import cutting
+
+NORMAL = np.array([2.0, -1.0, 2.0]) / 3
+SPACING, ORIGIN = 0.3, (7.0, -8.0, 9.0)
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def plane() -> SdfGrid:
+    """Return the distances from a plane, in a grid that it leaves: trilinear is exact on them."""
+    ijk = np.moveaxis(np.indices((12, 11, 10)), 0, -1)
+    values = (ijk * SPACING + ORIGIN - np.array(ORIGIN) - 1.6) @ NORMAL
+    return SdfGrid.trusted(values.astype(np.float32), SPACING, ORIGIN)
+
+
+def to_plane(points: np.ndarray) -> np.ndarray:
+    """Return the distances of points (..., 3) from the plane."""
+    return (points - ORIGIN - 1.6) @ NORMAL
+
+
+def cut_ball() -> SdfGrid:
+    """Return a ball that leaves its grid on three sides, with voxels inside that have no block."""
+    ijk = np.indices((14, 15, 16)).astype(np.float64)
+    return SdfGrid.trusted(np.linalg.norm(ijk - 2.3, axis=0) * 0.3 - 1.8, 0.3, (1.0, 2.0, 3.0))
+
+
+def tip() -> SdfGrid:
+    """Return a ball that crosses the border of the lattice, though no sample on it is inside."""
+    ijk = np.indices((16, 15, 14)).astype(np.float64)
+    centre = np.array([10.2, 7.0, 6.6])[:, None, None, None]
+    return SdfGrid.trusted(np.linalg.norm(ijk - centre, axis=0) - 4.9, 1.0)
+
+
+GRIDS = {"whole": ball, "leaving": cut_ball, "tip": tip}
+
+
+def same(one, other) -> bool:
+    return all(
+        a.dtype == b.dtype and np.array_equal(a, b)
+        for a, b in ((one.vertices, other.vertices), (one.faces, other.faces))
+    )
+
+
+@pytest.mark.parametrize("factor", [2, 4, 6])
+def test_positions_and_distances_are_those_of_a_plane(factor):
+    field = upsample(plane(), trilinear, factor)
+    points, distances = field.positions(), field.distances()
+    assert points.shape == (len(distances), 3) and distances.dtype == np.float64
+    assert np.abs(distances - to_plane(points)).max() < 1e-6
+    assert len(np.unique(np.rint(points / SPACING * factor * 2), axis=0)) == len(
+        points
+    )  # once each
+    assert (distances < 0).any() and (distances > 0).any()
+    some = slice(5, 9)
+    blocks = field.block_positions(some)
+    assert blocks.shape == (4, (factor + 1) ** 3, 3)
+    assert np.abs(field.block_distances(some) - to_plane(blocks)).max() < 1e-6
+    middle = plane().to_world(field.voxel_ijk[some])
+    assert np.abs(blocks.mean(1) - middle).max() < 1e-12  # a block lies round its sample
+    assert np.ptp(blocks[0], axis=0) == pytest.approx(SPACING)
+
+
+def test_values_are_relative_to_the_offset_surface():
+    field = upsample(plane(), trilinear, offset=0.25)
+    assert np.abs(field.distances() - to_plane(field.positions()) + 0.25).max() < 1e-6
+
+
+def test_a_field_without_a_grid_says_so():
+    field = replace(upsample(ball(), trilinear), grid=None)
+    with pytest.raises(OptionError, match="the field has no grid: make it with upsample"):
+        field.positions()
+    with pytest.raises(OptionError, match="the field has no grid"):
+        extract_mesh(field)
+
+
+@pytest.mark.parametrize("factor", [2, 4, 6])
+def test_the_fine_lattice_of_a_plane_is_the_plane_also_far_from_it(factor):
+    fine = fine_grid(upsample(plane(), trilinear, factor))
+    assert fine.shape == tuple(factor * n + 1 for n in (12, 11, 10))
+    ijk = np.moveaxis(np.indices(fine.shape), 0, -1)
+    points = fine.to_world(ijk)
+    assert np.abs(points[0, 0, 0] - np.array(ORIGIN) + SPACING / 2).max() < 1e-12
+    assert np.abs(fine.values - to_plane(points)).max() < 2e-6
+    assert fine.low == pytest.approx(fine.values.min(), abs=SPACING)
+
+
+def test_planes_of_the_lattice_are_the_same_for_any_cut():
+    fine = fine_grid(upsample(ball(), trilinear))
+    whole = fine.planes(0, fine.shape[0])
+    for first, last in [(0, 1), (0, 7), (7, 8), (40, 43), (76, 81), (80, 81)]:
+        assert np.array_equal(fine.planes(first, last), whole[first:last])
+    assert fine.planes(3, 3).shape == (0, 81, 81)
+    assert np.array_equal(fine.values, whole)
+
+
+def test_the_lattice_holds_the_samples_and_their_signs():
+    grid = ball()
+    fine = fine_grid(upsample(grid, trilinear, 4))
+    at_samples = fine.values[2::4, 2::4, 2::4]
+    assert np.abs(at_samples - grid.values).max() < 1e-5
+    jump = np.full((9, 9, 9), 5, np.float32)  # far values with no band between
+    jump[3:6, 3:6, 3:6] = -5
+    fine = fine_grid(upsample(SdfGrid.trusted(jump, 1.0), trilinear, 4))
+    assert np.array_equal(fine.values[2::4, 2::4, 2::4] < 0, jump < 0)
+
+
+@pytest.mark.parametrize("name", GRIDS)
+@pytest.mark.parametrize("cap", [False, True])
+@pytest.mark.parametrize("mesher", ["marching", "sharp"])
+def test_a_field_that_was_read_back_gives_the_same_mesh(name, cap, mesher):
+    grid = GRIDS[name]()
+    field = upsample(grid, trilinear, 4)
+    write_field(field, "field.npz")
+    back = read_field("field.npz")
+    want = reconstruct(grid, trilinear, 4, cap=cap, mesher=mesher)
+    assert same(want, extract_mesh(back, cap=cap, mesher=mesher))
+    assert same(want, extract_mesh(field, cap=cap, mesher=mesher))
+    assert same(want, extract_mesh(back, grid, cap=cap, mesher=mesher))
+    assert want.is_closed() == (cap or name != "leaving")
+
+
+@pytest.mark.parametrize("spacing", [1.0, 0.25, 0.1, 1 / 3, 1e-9, 3e12])
+def test_numbers_come_back_bit_for_bit_in_every_unit(spacing):
+    grid = SdfGrid.trusted(np.float32(ball().values * spacing), spacing, np.float64(1e3) * spacing)
+    field = upsample(grid, trilinear, 2, offset=spacing / 7)
+    write_field(field, "field.npz")
+    back = read_field("field.npz")
+    assert np.array_equal(back.blocks, field.blocks)
+    assert np.array_equal(back.positions(), field.positions())
+    assert np.array_equal(back.distances(), field.distances())
+    assert back.offset == field.offset and back.grid.spacing == grid.spacing
+    assert np.array_equal(back.spheres.distance, field.spheres.distance)
+    stored = np.load("field.npz")
+    assert stored["values"].dtype == (np.float32 if spacing in (1.0, 0.25) else np.float64)
+
+
+def test_the_examples_of_the_docs_run(capsys):
+    """On a plane: the first gives every node's place and value; the second a mesh."""
+    write_field(upsample(plane(), trilinear, 4), "part-field.npz")
+    text = (Path(__file__).parent.parent / "docs" / "fields.md").read_text()
+    first, second = re.findall(r"```python\n(.*?)```", text, re.S)
+    names: dict = {}
+    exec(first, names)
+    assert np.abs(names["values"] - to_plane(names["points"])).max() < 1e-6
+    assert np.abs(to_plane(names["near"])).max() < 0.1 * SPACING + 1e-6
+    assert capsys.readouterr().out.startswith(f"{len(names['values'])} blocks; ")
+    exec(second, names)
+    assert np.abs(names["distances"] - to_plane(names["points"])).max() < 1e-6
+    want = reconstruct(plane(), trilinear, 4, mesher="sharp", cap=True)
+    write_mesh(want, "want.ply")
+    assert Path("part-sharp.ply").read_bytes() == Path("want.ply").read_bytes()
+
+
+def test_the_keys_are_as_documented():
+    write_field(upsample(plane(), trilinear, 4), "field.npz")
+    data = np.load("field.npz")
+    text = (Path(__file__).parent.parent / "docs" / "fields.md").read_text()
+    table = text[text.index("| Key |") : text.index("Distances are float64")]
+    rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    assert sorted(re.findall(r"`(\w+)`", " ".join(rows))) == sorted(data.files)
+    samples = data["origin"] + data["spacing"] * data["sample_voxels"]
+    assert np.abs(data["sample_distances"] - to_plane(samples)).max() < 1e-6
+    assert tuple(data["shape"]) == (12, 11, 10) and int(data["version"]) == 1
+    assert data["leaves"] and float(data["offset"]) == 0
+    border = data["origin"] + data["spacing"] * data["border_inside"]
+    assert len(border) and (to_plane(border) < 0).all()
+
+
+def test_dense_files_hold_the_lattice_at_its_place():
+    field = upsample(plane(), trilinear, 4)
+    write_field(field, "field.npy")
+    write_field(field, "field.vti")
+    fine, array, image = (
+        fine_grid(field),
+        np.load("field.npy"),
+        read_grid("field.vti", inside="negative"),
+    )
+    assert array.dtype == np.float32 and np.array_equal(array, fine.values)
+    assert np.array_equal(image.values, fine.values)
+    assert image.spacing == pytest.approx(fine.spacing, rel=1e-12)
+    assert image.origin == pytest.approx(fine.origin, rel=1e-12)
+
+
+def test_a_field_from_a_file_has_no_far_values():
+    write_field(upsample(ball(), trilinear, 2), "field.npz")
+    back = read_field("field.npz")
+    write_field(back, "again.npz")
+    assert Path("again.npz").read_bytes() == Path("field.npz").read_bytes()
+    want = (
+        "field.npz holds the refined field without the coarse samples: read those from their own "
+        "file"
+    )
+    with pytest.raises(FileError) as caught:
+        write_field(back, "again.npy")
+    assert str(caught.value) == want
+    assert sorted(os.listdir()) == ["again.npz", "field.npz"]
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".npy", ".vti"])
+@pytest.mark.parametrize("name", GRIDS)
+def test_a_field_saved_in_slabs_is_the_same_file(name, suffix, bare_plan, monkeypatch):
+    grid, network = GRIDS[name](), load_network("fast", threads=1)
+    write_field(upsample(grid, network, 4), "whole" + suffix)
+    monkeypatch.setattr(cutting, "plan_slabs", None)
+    monkeypatch.setattr(
+        "super_sdf.pipeline.plan_slabs",
+        lambda band, factor, reach, resources, needed, mesher: cutting.cut(
+            band, 4, reach, mesher.planes_beside(factor)
+        ),
+    )
+    shape = tuple(4 * n + 1 for n in grid.shape)
+    path = Path("slabs" + suffix)
+    with writing.saving_field(path, shape) as file:
+        pieces = list(reconstruct_slabs(grid, network, 4, save=file.add))
+        file.finish()
+    assert len(pieces) > 2 and pieces[0].whole["slabs"] == len(pieces)
+    assert path.read_bytes() == Path("whole" + suffix).read_bytes()
+
+
+def damage(name: str, **changed) -> str:
+    """Write a field's file with some arrays changed (None: left out); return the error's text."""
+    write_field(upsample(ball(12, 3.0), trilinear, 2), "good.npz", force=True)
+    arrays = {**np.load("good.npz"), **changed}
+    np.savez(name, **{key: value for key, value in arrays.items() if value is not None})
+    with pytest.raises(FileError) as caught:
+        read_field(name)
+    assert len(str(caught.value).splitlines()) == 1
+    return str(caught.value)
+
+
+def test_files_that_are_no_fields_are_refused_in_one_line():
+    assert damage("a.npz", factor=None) == "a.npz is no refined field: it has no key 'factor'"
+    assert damage("a.npz", version=2) == (
+        "a.npz has format version 2, this program reads 1: use a newer one"
+    )
+    assert damage("a.npz", factor=3) == (
+        "a.npz is no refined field: factor is 3: give an even number from 2 to 16 (an odd one has "
+        "no node on the samples)"
+    )
+    assert "belongs to no refined field" in damage("a.npz", factor=4)
+    assert "its grid has the shape (0, 3, 3)" in damage("a.npz", shape=[0, 3, 3])
+    good = np.load("good.npz")
+    for key in ("voxels", "sample_voxels"):
+        text = damage("a.npz", **{key: good[key][::-1]})
+        assert text == f"a.npz[{key}] is damaged: its voxels are not in order in the grid"
+        assert damage("a.npz", **{key: good[key] + 9}) == text
+    spoilt = good["values"].copy()
+    spoilt[3, 1, 1, 1] = np.nan
+    assert damage("a.npz", values=spoilt) == ("a.npz[values] is damaged: not all values are finite")
+    assert "belongs to no refined field" in damage("a.npz", sample_distances=np.zeros(3))
+
+
+def test_damaged_and_foreign_files_are_refused():
+    Path("b.npz").write_bytes(b"hello")
+    with pytest.raises(FileError, match=r"b\.npz is not a readable \.npz archive"):
+        read_field("b.npz")
+    with pytest.raises(FileError, match=r"none\.npz does not exist"):
+        read_field("none.npz")
+    with pytest.raises(OptionError, match=r"b\.npy is no sparse field: give \.npz"):
+        read_field("b.npy")
+    np.savez("grid.npz", values=ball().values)
+    with pytest.raises(FileError, match=r"grid\.npz is no refined field: it has no key 'version'"):
+        read_field("grid.npz")
+    write_field(upsample(ball(12, 3.0), trilinear, 2), "good.npz")
+    data = bytearray(Path("good.npz").read_bytes())
+    with zipfile.ZipFile("good.npz") as archive:
+        place = archive.getinfo("values.npy").header_offset + 5000
+    data[place] ^= 255
+    Path("flipped.npz").write_bytes(data)
+    with pytest.raises(FileError, match=r"flipped\.npz\[values\] is damaged: its checksum"):
+        read_field("flipped.npz")
+
+
+def test_a_field_as_a_grid_is_refused():
+    write_field(upsample(ball(12, 3.0), trilinear, 2), "field.npz")
+    with pytest.raises(FileError) as caught:
+        read_grid("field.npz")
+    assert str(caught.value) == (
+        "field.npz is a refined field, no grid: mesh it with extract_mesh(read_field(path)), or "
+        "refine the grid again with --iterations"
+    )
+
+
+def limit_files():
+    """Let this process write no file of more than 600 kB, as if the disk were full."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (600_000, 600_000))
+
+
+@pytest.mark.parametrize(
+    ("suffix", "reason"),
+    [
+        (".npz", "File too large"),
+        (".npy", "File too large"),
+        (".vti", "VTK says 'File too large'"),
+    ],
+)
+def test_a_file_that_the_system_cuts_off_is_an_error_of_one_line(suffix, reason):
+    np.savez("grid.npz", values=ball(12, 3.0).values[:8], spacing=1.0)
+    words = ["upsample", "grid.npz", "a.ply", "--save-field", "f" + suffix]
+    done = subprocess.run(
+        [sys.executable, "-m", "super_sdf", *words, "--factor=8", "--quality=fast", "-q"],
+        preexec_fn=limit_files,
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == f"Error: f{suffix} cannot be written: {reason}\n"
+    assert os.listdir() == ["grid.npz"]
+
+
+def test_batch_iterates_as_upsample_does(command, grid_folder, run_batch):
+    assert run_batch("in/a.npy", "--iterations", 2, "--factor", 2)[0] == 0
+    options = ("--iterations", 2, "--factor", 2, "--quality=fast", "-q")
+    assert command("upsample", "in/a.npy", "a.ply", *options)[0] == 0
+    assert Path("out/a.ply").read_bytes() == Path("a.ply").read_bytes()
+    Path("list.jsonl").write_text(
+        '{"in": "in/a.npy", "out": "b.ply", "iterations": 2, "factor": 2}'
+    )
+    assert run_batch("list.jsonl")[0] == 0
+    assert Path("out/b.ply").read_bytes() == Path("a.ply").read_bytes()
+    Path("list.jsonl").write_text('{"in": "in/a.npy", "out": "b.ply", "iterations": 0}')
+    code, _, said = run_batch("list.jsonl")
+    assert code != 0 and "iterations is 0: give 1 or more" in said
+
+
+def test_targets_are_refused_before_anything_is_written():
+    field = upsample(ball(12, 3.0), trilinear, 2)
+    with pytest.raises(OptionError) as caught:
+        write_field(field, "field.obj")
+    assert str(caught.value) == "field.obj is not a field file: give one of .npz, .npy, .vti"
+    with pytest.raises(OptionError) as caught:
+        write_field(field, "field.vdb")
+    assert str(caught.value) == (
+        "field.vdb cannot be written: OpenVDB's own module cannot be installed with pip; write "
+        ".npz, and convert it with that module as docs/fields.md shows"
+    )
+    Path("old.npz").write_bytes(b"old")
+    with pytest.raises(WriteError, match=r"old\.npz exists: remove it or use --force"):
+        write_field(field, "old.npz")
+    with pytest.raises(OptionTypeError, match=r"field is 3: give one from upsample"):
+        write_field(3, "field.npz")
+    assert os.listdir() == ["old.npz"] and Path("old.npz").read_bytes() == b"old"
+    write_field(field, "old.npz", force=True)
+    assert read_field("old.npz").factor == 2
+
+
+def test_a_lattice_that_does_not_fit_is_refused(monkeypatch):
+    shape = (1025, 1025, 1025)
+    bound = held_memory() + 10**9
+    with pytest.raises(OutOfMemoryError) as caught:
+        writing.check_field_fits(Path("a.vti"), shape, bound)
+    said = str(caught.value)
+    assert said.startswith(
+        "a.vti cannot be written: 1025 x 1025 x 1025 values take 4.31 GB of memory, "
+    )
+    assert said.endswith(
+        "are left; write .npy, which is written plane by plane, or .npz, which is sparse"
+    )
+    monkeypatch.setattr(writing, "free_space", lambda path: 4_000_000_000)
+    for name in ("a.npy", "a.vti"):
+        with pytest.raises(WriteError) as refused:
+            writing.check_field_fits(Path(name), shape, bound)
+        assert str(refused.value) == (
+            f"{name} cannot be written: 1025 x 1025 x 1025 values take 4.31 GB, 4.00 GB are free "
+            "there; write .npz, which is sparse"
+        )
+    writing.check_field_fits(Path("a.npz"), shape, 1)
+
+
+def test_the_command_writes_the_mesh_and_the_field(command):
+    np.savez("grid.npz", values=cut_ball().values, spacing=0.3, origin=[1, 2, 3])
+    code, _, said = command(
+        "upsample", "grid.npz", "a.ply", "--save-field", "a.npz", "--quality=fast"
+    )
+    assert code == 0 and said.splitlines()[-1] == (
+        "a.npz: the refined field, lattice 57 x 61 x 65, spacing 0.075, 0.075, 0.075, "
+        "origin 0.85, 1.85, 2.85"
+    )
+    write_mesh(extract_mesh(read_field("a.npz"), cap=True), "b.ply")
+    assert Path("a.ply").read_bytes() == Path("b.ply").read_bytes()
+    code, out, _ = command(
+        "upsample",
+        "grid.npz",
+        "c.ply",
+        "--save-field",
+        "c.npy",
+        "--quality=fast",
+        "--open",
+        "--json",
+    )
+    assert code == 0 and '"path": "c.npy"' in out
+    write_mesh(extract_mesh(read_field("a.npz")), "d.ply")
+    assert Path("c.ply").read_bytes() == Path("d.ply").read_bytes()
+    assert np.load("c.npy").shape == (57, 61, 65)
+
+
+REFUSED = {
+    ("--save-field", "old.npz"): "old.npz exists: remove it or use --force",
+    ("--save-field", "a.txt"): "a.txt is not a field file: give one of .npz, .npy, .vti",
+    ("--save-field", "no/a.npz"): "no is not a folder: make it first",
+    ("--save-field", "grid.npz", "--force"): (
+        "grid.npz is the grid that is read: give another file for the field"
+    ),
+    ("--iterations", "0"): "iterations is 0: give 1 or more",
+}
+
+
+@pytest.mark.parametrize("options", REFUSED)
+def test_the_command_refuses_in_one_line_and_writes_nothing(options, command):
+    np.savez("grid.npz", values=ball().values, spacing=1.0)
+    Path("old.npz").write_bytes(b"old")
+    before = Path("grid.npz").read_bytes()
+    code, out, said = command("upsample", "grid.npz", "a.ply", *options)
+    assert code != 0 and (out, said) == ("", f"Error: {REFUSED[options]}\n")
+    assert sorted(os.listdir()) == ["grid.npz", "old.npz"]
+    assert Path("grid.npz").read_bytes() == before and Path("old.npz").read_bytes() == b"old"
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".npy", ".vti"])
+@pytest.mark.parametrize("broken", ["disk", "mesh", "taken", "interrupt"])
+def test_both_files_appear_or_neither(broken, suffix, command, monkeypatch):
+    np.savez("grid.npz", values=ball().values, spacing=1.0)
+    target = "field" + suffix
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    writer = writing.FORMATS[suffix].writer
+    if broken == "disk":
+        monkeypatch.setattr(writer, "finish", full)
+    elif broken == "interrupt":
+        monkeypatch.setattr(writer, "finish", interrupted)
+    elif broken == "mesh":
+        monkeypatch.setattr("super_sdf.files.output._rename_if_free", full)
+    else:
+        finish = writer.finish
+
+        def taken(self):
+            finish(self)
+            Path(target).write_bytes(b"another program's")
+
+        monkeypatch.setattr(writer, "finish", taken)
+    code, _, said = command(
+        "upsample", "grid.npz", "a.ply", "--save-field", target, "--quality=fast", "-q"
+    )
+    assert code == (130 if broken == "interrupt" else 1) and len(said.splitlines()) <= 1
+    assert sorted(os.listdir()) == ([target, "grid.npz"] if broken == "taken" else ["grid.npz"])
+    if broken == "disk":
+        assert said == f"Error: {target} cannot be written: No space left on device\n"
+    if broken == "taken":
+        assert said == f"Error: {target} exists: remove it or use --force\n"
+        assert Path(target).read_bytes() == b"another program's"
+
+
+def test_a_full_disk_while_blocks_are_written_names_the_field(command, monkeypatch):
+    np.savez("grid.npz", values=ball().values, spacing=1.0)
+    monkeypatch.setattr(
+        "super_sdf.fields.sparse.SparseWriter._extend",
+        lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")),
+    )
+    code, _, said = command("upsample", "grid.npz", "a.ply", "--save-field", "f.npz", "-q")
+    assert (code, said) == (1, "Error: f.npz cannot be written: No space left on device\n")
+    assert os.listdir() == ["grid.npz"]
+
+
+def by_hand(grid, network, factor, **options):
+    """Refine a grid, and its dense fine lattice again, as a user would with two commands."""
+    write_field(upsample(grid, network, factor), "first.npy", force=True)
+    half = np.array(grid.origin) - np.array(grid.spacing) / 2
+    spacing = tuple(h / factor for h in grid.spacing)
+    second = make_grid(np.load("first.npy"), spacing=spacing, origin=half)
+    return reconstruct(second, network, factor, **options)
+
+
+@pytest.mark.parametrize("name", GRIDS)
+@pytest.mark.parametrize("mesher", ["marching", "sharp"])
+def test_two_iterations_are_two_runs_by_hand(name, mesher):
+    grid = GRIDS[name]()
+    for cap in (False, True):
+        options = {"cap": cap, "mesher": mesher}
+        twice = reconstruct(grid, trilinear, 2, iterations=2, **options)
+        assert same(twice, by_hand(grid, trilinear, 2, **options))
+
+
+def test_two_iterations_with_the_network_are_two_runs_by_hand():
+    grid, network = ball(), load_network("fast", threads=1)
+    twice = reconstruct(grid, network, 4, cap=True, iterations=2)
+    assert same(twice, by_hand(grid, network, 4, cap=True))
+    assert twice.is_closed() and twice.volume() == pytest.approx(4 / 3 * np.pi * 6**3, rel=2e-3)
+
+
+def test_three_iterations_are_one_more():
+    grid = ball(10, 3.0)
+    fine = fine_grid(upsample(grid, trilinear, 2))
+    rest = reconstruct(fine, trilinear, 2, iterations=2)
+    assert same(reconstruct(grid, trilinear, 2, iterations=3), rest)
+
+
+def test_iterations_of_a_plane_stay_on_it():
+    mesh = reconstruct(plane(), trilinear, 4, iterations=2)
+    off = np.abs(to_plane(mesh.vertices.astype(np.float64)))
+    assert off.max() < CLEARANCE * SPACING / 16  # vertices stay this far from the nodes
+
+
+def test_iterations_mesh_the_offset_surface_once():
+    grid = ball()
+    mesh = reconstruct(grid, trilinear, 2, offset=1.5, iterations=2)
+    assert mesh.volume() == pytest.approx(4 / 3 * np.pi * 7.5**3, rel=0.02)
+
+
+def test_the_command_iterates_and_saves_the_last_field(command):
+    np.savez("grid.npz", values=ball().values, spacing=1.0)
+    options = ("--iterations", 2, "--factor", 2, "--quality=fast")
+    code, out, said = command(
+        "upsample", "grid.npz", "a.ply", "--save-field", "a.npz", "--json", *options
+    )
+    assert code == 0 and '"iterations": 2' in out and "Warning" not in said
+    field = read_field("a.npz")
+    assert field.shape == (41, 41, 41) and field.grid.spacing == (0.5, 0.5, 0.5)
+    write_mesh(extract_mesh(field), "b.ply")
+    assert Path("a.ply").read_bytes() == Path("b.ply").read_bytes()
+    network = load_network("fast")
+    write_mesh(reconstruct(read_grid("grid.npz"), network, 2, cap=True, iterations=2), "c.ply")
+    assert Path("a.ply").read_bytes() == Path("c.ply").read_bytes()
+
+
+def test_iterations_are_checked():
+    with pytest.raises(OptionTypeError, match=r"iterations is 1\.5: give a whole number"):
+        reconstruct(ball(), trilinear, iterations=1.5)
+    with pytest.raises(OptionError, match=r"iterations is -1: give 1 or more"):
+        reconstruct(ball(), trilinear, iterations=-1)
