@@ -8,6 +8,7 @@ the file was opened is an error.
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from functools import cached_property
 from io import FileIO
@@ -111,53 +112,33 @@ class InputFile:
         return out
 
 
-class PlaneFile:
-    """A 3D array in a file, whose planes along the first axis are read when they are needed.
+class SamplePlanes(ABC):
+    """A 3D array whose planes along the first axis are made when they are needed.
 
-    Parameters
+    Attributes
     ----------
-    file : InputFile
-        The file.
-    offset : int
-        The byte in the file at which the array begins.
     shape, dtype
         Shape (nx, ny, nz) and type of the array.
-    swapped : bool
-        Whether the last two axes are swapped in the file: (nx, nz, ny).
+    name : str
+        What the array is called in error messages.
     """
 
     ndim = 3
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    name: str
 
-    def __init__(
-        self,
-        file: InputFile,
-        offset: int,
-        shape: tuple[int, ...],
-        dtype: np.dtype[Any],
-        *,
-        swapped: bool = False,
-    ) -> None:
-        self.file, self.offset = file, offset
-        self.shape, self.dtype, self.swapped = shape, dtype, swapped
-        self.plane_bytes = shape[1] * shape[2] * dtype.itemsize
+    @abstractmethod
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
+
+    @property
+    def plane_bytes(self) -> int:
+        """Bytes of a plane."""
+        return self.shape[1] * self.shape[2] * self.dtype.itemsize
 
     def __len__(self) -> int:
         return self.shape[0]
-
-    def read(self, first: int, last: int) -> NDArray[Any]:
-        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz).
-
-        Raises
-        ------
-        FileError
-            If the file changed since it was opened, or cannot be read any more.
-        """
-        _, ny, nz = self.shape
-        planes = np.empty(
-            (max(last - first, 0), *((nz, ny) if self.swapped else (ny, nz))), self.dtype
-        )
-        self.file.read_into(planes, self.offset + first * self.plane_bytes)
-        return planes.transpose(0, 2, 1) if self.swapped else planes
 
     def __getitem__(self, which: int | slice) -> NDArray[Any]:
         """Return one plane or a range of planes, as indexing an array would."""
@@ -183,16 +164,59 @@ class PlaneFile:
             If it is larger than what is free.
         """
         size = prod(self.shape) * self.dtype.itemsize
-        check_fits(size, f"{self.file.name}, whole,", "read it plane by plane (SdfGrid.planes)")
+        check_fits(size, f"{self.name}, whole,", "read it plane by plane (SdfGrid.planes)")
         return self.read(0, len(self))
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
         return np.array(self.loaded, dtype) if copy else np.asarray(self.loaded, dtype)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the array itself: another process may not have the file."""
+        """Pickle the array itself: another process may not have what it is made from."""
         return np.asarray, (self.loaded,)
 
 
-SampleArray: TypeAlias = NDArray[Any] | PlaneFile
-"""An array of samples in memory, or in a file that is read plane by plane."""
+class PlaneFile(SamplePlanes):
+    """A 3D array in a file, whose planes along the first axis are read when they are needed.
+
+    Parameters
+    ----------
+    file : InputFile
+        The file.
+    offset : int
+        The byte in the file at which the array begins.
+    shape, dtype
+        Shape (nx, ny, nz) and type of the array.
+    swapped : bool
+        Whether the last two axes are swapped in the file: (nx, nz, ny).
+    """
+
+    def __init__(
+        self,
+        file: InputFile,
+        offset: int,
+        shape: tuple[int, ...],
+        dtype: np.dtype[Any],
+        *,
+        swapped: bool = False,
+    ) -> None:
+        self.file, self.offset, self.name = file, offset, file.name
+        self.shape, self.dtype, self.swapped = shape, dtype, swapped
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz).
+
+        Raises
+        ------
+        FileError
+            If the file changed since it was opened, or cannot be read any more.
+        """
+        _, ny, nz = self.shape
+        planes = np.empty(
+            (max(last - first, 0), *((nz, ny) if self.swapped else (ny, nz))), self.dtype
+        )
+        self.file.read_into(planes, self.offset + first * self.plane_bytes)
+        return planes.transpose(0, 2, 1) if self.swapped else planes
+
+
+SampleArray: TypeAlias = NDArray[Any] | SamplePlanes
+"""An array of samples in memory, or one whose planes are read or made when they are needed."""
