@@ -19,6 +19,8 @@ from .files.expectation import CERTAIN_SHARE, Expectation, expect
 from .files.grids import read_grid
 from .files.meshes import write_pieces
 from .files.precision import check_format_holds, local_origin_note
+from .grid.cubic import cubic_grid
+from .grid.direction import Direction
 from .grid.sdf_grid import SdfGrid
 from .grid.spacing import as_triple
 from .mesh import Mesh, join_meshes
@@ -63,6 +65,7 @@ class ConvertOptions:
     simplify: float | None = None
     triangles: int | None = None
     axes: str | None = None
+    direction: tuple[float, ...] | None = None
 
     @property
     def simplifies(self) -> bool:
@@ -89,7 +92,7 @@ class Conversion:
 
     Attributes
     ----------
-    shape, spacing, origin
+    shape, spacing, origin, direction
         Of the grid; spacing and origin in world units.
     counts : dict
         The counts named in ``COUNTS``, and ``expected_triangles`` and ``expected_bytes``.
@@ -111,6 +114,7 @@ class Conversion:
     shape: tuple[int, int, int]
     spacing: Triple
     origin: Triple
+    direction: Direction
     counts: dict[str, int]
     bounds: tuple[Triple, Triple]
     closed: bool
@@ -126,6 +130,7 @@ class Conversion:
             "shape": list(self.shape),
             "spacing": list(self.spacing),
             "origin": list(self.origin),
+            "direction": [list(row) for row in self.direction],
             **self.counts,
             "bounds": [list(corner) for corner in self.bounds],
             "closed": self.closed,
@@ -180,14 +185,16 @@ def convert(
         source,
         spacing=options.spacing,
         origin=options.origin,
+        direction=options.direction,
         axes=options.axes,
         inside=options.inside,
         max_memory=options.max_memory,
     )
     check_factor(options.factor)
     find_mesher(options.mesher)
-    about = check_format_holds(target, grid, options.factor)
-    notes = (*grid.notes, *local_origin_note(target, about))
+    lattice = cubic_grid(grid, options.offset)
+    about = check_format_holds(target, lattice, options.factor)
+    notes = (*lattice.notes, *local_origin_note(target, about))
     expected = expect(grid, options.factor, options.offset, target, cap=options.cap)
     if options.simplifies:
         least = int(expected.triangles * CERTAIN_SHARE)
@@ -292,7 +299,7 @@ def describe(
         simplified = tally.simplified.report(tally.voxel_size)
         closed = tally.simplified.mesh.is_closed()
         warnings += tally.simplified.warnings
-    where = grid.shape, grid.spacing, grid.origin
+    where = grid.shape, grid.spacing, grid.origin, grid.direction
     bounds = as_triple(tally.low, "low"), as_triple(tally.high, "high")
     capped = options.cap and tally.leaves
     return Conversion(*where, counts, bounds, closed, notes, warnings, seconds, simplified, capped)

@@ -1,6 +1,6 @@
 """The method on a page: the paper's Section 4, one named step per line.
 
-    grid -> band -> patches and neighbour table -> network -> averaged shared nodes
+    grid -> cubic lattice -> band -> patches and neighbour table -> network -> averaged shared nodes
          -> surface moved to touch the samples' spheres -> isosurface
 
 A grid that is too large to be refined at once is refined slab by slab (see ``slabs``); the mesh is
@@ -18,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from .arrays import IntArray
+from .grid.cubic import cubic_grid
 from .grid.sdf_grid import SdfGrid
 from .machine.memory import give_back
 from .machine.resources import Resources, allot
@@ -66,7 +67,8 @@ def upsample(
     Parameters
     ----------
     grid : SdfGrid
-        Coarse signed distances in world units, negative inside.
+        Coarse signed distances in world units, negative inside. If the spacing differs between
+        axes, they are resampled to the finest first; the field has that spacing.
     network : Network
         From ``load_network``.
     factor : int
@@ -105,7 +107,8 @@ def upsample(
     factor, offset = check_factor(factor), check_distance(offset)
     resources = allot(getattr(network, "threads", 0), check_max_memory(max_memory))
     steps = StepCounter(progress, [name for name in STEPS if name != "isosurface"])
-    band = find_surface(grid, factor, offset, resources)
+    lattice = cubic_grid(grid, offset)
+    band = find_surface(lattice, factor, offset, resources)
     (slab,) = plan_slabs(band, factor, None, resources, memory_needs(network))
     steps.finish("band")
     field = refine(band, network, factor, slab, resources.threads, steps)
@@ -205,7 +208,8 @@ def _slabs(
     """Yield the pieces of ``reconstruct_slabs``; arguments are checked before the first one."""
     resources = allot(getattr(network, "threads", 0), max_memory)
     steps = StepCounter(progress)
-    band = find_surface(grid, factor, offset, resources)
+    lattice = cubic_grid(grid, offset)
+    band = find_surface(lattice, factor, offset, resources)
     reach, needed = getattr(network, "receptive_field", None), memory_needs(network)
     slabs = plan_slabs(band, factor, reach, resources, needed, mesher)
     planned = peak_bytes(band, slabs, factor, needed, resources.threads, mesher)
@@ -221,8 +225,8 @@ def _slabs(
         if not band.leaves:
             whole = close_if_crossed(field, beside)
         else:
-            whole = close_at_border(field, grid, offset, beside) if cap else field
-        meshes = extract_pieces(whole, grid, vertices, resources.threads, mesher)
+            whole = close_at_border(field, lattice, offset, beside) if cap else field
+        meshes = extract_pieces(whole, lattice, vertices, resources.threads, mesher)
         planned_work = {"slabs": len(slabs), "planned_bytes": planned}
         piece = describe_piece(field, meshes, planned_work, band.leaves)
         del field, whole, meshes  # before those of the next slab are made
@@ -283,7 +287,7 @@ def refine(
     return replace(
         field,
         band_voxels=len(band.voxel_ijk),
-        noisy_voxels=int(np.count_nonzero(~band.lipschitz)),
+        noisy_voxels=band.noisy_voxels,
         pinned=int(pinned[field.own_rows].sum()),
         spheres=spheres,
     )

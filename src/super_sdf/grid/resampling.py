@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, Triple
 from .planes import SampleArray, SamplePlanes
+from .spacing import EQUAL_SPACING
 
 Floats = NDArray[np.float64]
 
@@ -115,11 +116,27 @@ class Resampled(SamplePlanes):
         """
         start = max(own.start - REACH, 0)
         h = self.spacing[self.axis]
-        samples = block[:, start : own.stop + REACH].astype(np.float64)
+        samples = block[:, start : own.stop + REACH].astype(np.float64, order="C")
         np.clip(samples, self.level - MOST * h, self.level + MOST * h, out=samples)
         own = slice(own.start - start, own.stop - start)
         lines = Lines(samples, own, h, (self.spacing[across[0]], self.spacing[across[1]]))
         return lines.values_at(places, self.level, NEAR * self.step)
+
+
+def resample(
+    samples: SampleArray, spacing: Triple, level: float = 0.0
+) -> tuple[SampleArray, Triple]:
+    """Return samples at the finest spacing on all axes, and their spacing.
+
+    Axes whose spacing is the finest up to 0.1 % are left as they are. The coarsest axis comes last,
+    since the finer the others are, the better they tell its slopes.
+    """
+    h, steps = min(spacing), list(spacing)
+    for axis in np.argsort(spacing, kind="stable").tolist():
+        if steps[axis] > h * (1 + EQUAL_SPACING):
+            samples = Resampled(samples, (steps[0], steps[1], steps[2]), axis, h, level)
+            steps[axis] = h
+    return samples, (steps[0], steps[1], steps[2])
 
 
 class Lines:
@@ -137,9 +154,7 @@ class Lines:
         Spacings across the lines.
     """
 
-    def __init__(
-        self, samples: Floats, own: slice, h: float, steps: tuple[float, float]
-    ) -> None:
+    def __init__(self, samples: Floats, own: slice, h: float, steps: tuple[float, float]) -> None:
         self.samples, self.own, self.h, self.steps = samples, own, h, steps
         self.around = np.pad(samples, ((0, 0), *((REACH, REACH),) * 2), constant_values=np.nan)
 
@@ -148,57 +163,53 @@ class Lines:
 
         Those within ``near`` of a ``level`` are kept within their bounds.
         """
-        values = np.empty((len(places), *self.samples[0, self.own].shape))
         cells = np.minimum(places.astype(int), len(self.samples) - 2)
+        shares = places - cells
+        values = np.empty((len(places), *self.samples[0, self.own].shape))
+        is_near = np.zeros(values.shape, bool)
         before, slopes = -2, (values[0], values[0])
-        for out, place, cell in zip(values, places, cells.tolist()):
-            share = float(place) - cell
+        for n, (cell, share) in enumerate(zip(cells.tolist(), shares.tolist())):
             low, high = self.samples[cell, self.own], self.samples[cell + 1, self.own]
             if share in (0, 1):
-                out[...] = high if share else low
+                values[n] = high if share else low
                 continue
             if cell != before:
                 first = slopes[1] if cell == before + 1 else self.slope(cell)
                 before, slopes = cell, (first, self.slope(cell + 1))
-            out[...] = hermite(low, high, slopes[0] * self.h, slopes[1] * self.h, share)
-            ahead, behind = np.abs(low - level), np.abs(high - level)
-            least = np.maximum(ahead - share * self.h, behind - (1 - share) * self.h)
-            self._bound(out, cell, share, np.nonzero(least < near))
+            values[n] = hermite(low, high, slopes[0] * self.h, slopes[1] * self.h, share)
+            reach = near + share * self.h, near + (1 - share) * self.h
+            is_near[n] = (np.abs(low - level) < reach[0]) & (np.abs(high - level) < reach[1])
+        which = np.nonzero(is_near)
+        values[which] = self._bounded(values[which], cells[which[0]], shares[which[0]], which[1:])
         return values
 
     def slope(self, i: int) -> Floats:
         """Return the slope along the lines at sample i, (p, q), as distances allow it."""
-        one, two = self._pairs(i)
-        ahead, behind = (np.subtract(*pair) / self.h for pair in one)
-        slope = (8 * (one[0][0] - one[1][1]) - (two[0] - two[1])) / (12 * self.h)
+        two_before, before, here, after, two_after = (self._sample(i + n) for n in range(-2, 3))
+        slope = (8 * (after - before) - (two_after - two_before)) / (12 * self.h)
         least, most = self._steepness(i)
-        slope = np.copysign(np.clip(np.abs(slope), least, most), slope)
+        slope = np.sign(slope) * np.clip(np.abs(slope), least, most)
+        behind, ahead = (here - before) / self.h, (after - here) / self.h
         mean, half = (ahead + behind) / 2, MARGIN / 2 * np.abs(ahead - behind)
-        return np.clip(slope, mean - half, mean + half)
+        bounded: Floats = np.clip(slope, mean - half, mean + half)
+        return bounded
 
-    def _pairs(self, i: int) -> tuple[Any, tuple[Floats, Floats]]:
-        """Return (after, at) and (at, before) sample i; and the samples two after and before it.
-
-        Beyond the ends of the lines, samples are extrapolated linearly.
-        """
-        count = len(self.samples)
-
-        def sample(n: int) -> Floats:
-            end = min(max(n, 0), count - 1)
-            inner = end + 1 if n < 0 else end - 1
-            found = self.samples[end, self.own]
-            beyond = abs(n - end)
-            return found + beyond * (found - self.samples[inner, self.own]) if beyond else found
-
-        here, after, before = sample(i), sample(i + 1), sample(i - 1)
-        return ((after, here), (here, before)), (sample(i + 2), sample(i - 2))
+    def _sample(self, i: int) -> Floats:
+        """Return sample i of the own lines; beyond their ends, it is extrapolated linearly."""
+        end = min(max(i, 0), len(self.samples) - 1)
+        inner = end + 1 if i < 0 else end - 1
+        found: Floats = self.samples[end, self.own]
+        if i != end:
+            found = found + abs(i - end) * (found - self.samples[inner, self.own])
+        return found
 
     def _steepness(self, i: int) -> tuple[Floats, Floats]:
-        """Return the least and the largest slope along the lines at sample i that |grad| = 1 allows.
+        """Return the least and the largest slope along the lines at sample i, where |grad| = 1.
 
         Across the lines, the slope is between the differences to both neighbours.
         """
-        least = most = 0.0
+        least: Any = 0.0
+        most: Any = 0.0
         for axis, step in enumerate(self.steps):
             differences = np.diff(self.samples[i], axis=axis) / step
             first, last = differences.take([0], axis), differences.take([-1], axis)
@@ -209,22 +220,26 @@ class Lines:
             most = most + (mean + half) ** 2
         return np.sqrt(np.maximum(1 - most, 0)), np.sqrt(np.maximum(1 - least, 0))
 
-    def _bound(
-        self, values: Floats, cell: int, share: float, near: tuple[NDArray[np.intp], ...]
-    ) -> None:
-        """Keep some values of a plane between samples within what the samples round them allow."""
-        width = self.around.shape[2]
-        at = (near[0] + self.own.start + REACH) * width + near[1] + REACH
+    def _bounded(
+        self,
+        values: Floats,
+        cells: NDArray[np.int64],
+        shares: Floats,
+        across: tuple[NDArray[np.intp], ...],
+    ) -> Floats:
+        """Return values between samples, (n,), kept within what the samples round them allow."""
+        _, rows, width = self.around.shape
+        at = (cells * rows + across[0] + self.own.start + REACH) * width + across[1] + REACH
         low, high = np.full(len(at), -np.inf), np.full(len(at), np.inf)
-        for n, along in ((cell, share * self.h), (cell + 1, (1 - share) * self.h)):
-            plane = self.around[n].ravel()
+        for start, along in ((at, shares), (at + rows * width, 1 - shares)):
+            along = (along * self.h) ** 2
             for j, k in OFFSETS:
-                found = plane.take(at + (j * width + k))
-                apart = (along**2 + (j * self.steps[0]) ** 2 + (k * self.steps[1]) ** 2) ** 0.5
+                found = self.around.ravel().take(start + (j * width + k))
+                apart = np.sqrt(along + ((j * self.steps[0]) ** 2 + (k * self.steps[1]) ** 2))
                 np.fmax(low, found - apart, out=low)
                 np.fmin(high, found + apart, out=high)
-        inner = values[near]
-        values[near] = np.where(low <= high, np.clip(inner, low, high), inner)
+        kept: Floats = np.where(low <= high, np.clip(values, low, high), values)
+        return kept
 
 
 def hermite(low: Floats, high: Floats, rise: Floats, rise_after: Floats, share: float) -> Floats:
@@ -243,7 +258,8 @@ def new_places(count: int, h: float, step: float) -> Floats:
     places = np.arange(round((count - 1) * h / step) + 1) * (step / h)
     nearest = np.rint(places)
     places = np.where(np.abs(places - nearest) <= ON_SAMPLE, nearest, places)
-    return np.minimum(places, count - 1)
+    reached: Floats = np.minimum(places, count - 1)
+    return reached
 
 
 def _chunks(count: int, each: int) -> Iterator[slice]:

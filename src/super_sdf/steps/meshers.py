@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import OptionError, OptionTypeError, seen
+from ..grid.cubic import cubic_grid
 from ..grid.sdf_grid import SdfGrid
 from ..machine.index_width import check_count
 from ..machine.threads import map_threads
@@ -146,7 +147,7 @@ def extract_mesh(
     field : FineField
         From ``upsample``.
     grid : SdfGrid
-        The coarse grid that it was made from, for spacing and origin.
+        The coarse grid that it was made from, for spacing, origin and direction.
     first_vertex : int
         The number of the first vertex, for a field of a slab: the number of vertices in the slabs
         before. Faces may also refer to vertices of the slab before.
@@ -164,11 +165,21 @@ def extract_mesh(
     if not isinstance(field, FineField):
         raise OptionTypeError(f"field is {seen(field)}: give one from upsample(grid, network)")
     check_grid(grid)
-    return join_meshes(find_mesher(mesher).extract(field, grid, first_vertex, 1))
+    pieces = extract_pieces(field, cubic_grid(grid), first_vertex, 1, find_mesher(mesher))
+    return join_meshes(pieces)
 
 
 def extract_pieces(
     field: FineField, grid: SdfGrid, first_vertex: int, threads: int, mesher: Mesher
 ) -> list[Mesh]:
-    """Return the mesh of ``extract_mesh`` as a list of one or more pieces, in order."""
-    return mesher.extract(field, grid, first_vertex, threads)
+    """Return the mesh of ``extract_mesh`` as a list of one or more pieces, in order.
+
+    ``grid`` has the lattice of the field: it is from ``cubic_grid``.
+    """
+    pieces = mesher.extract(field, grid, first_vertex, threads)
+    return [turned_over(piece) for piece in pieces] if grid.is_mirrored else pieces
+
+
+def turned_over(mesh: Mesh) -> Mesh:
+    """Return a mesh with its triangles in reverse order: mirrored axes turn them inward."""
+    return Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]))
