@@ -91,7 +91,10 @@ class Samples:
 
 def exact_samples(band: Band, grid: SdfGrid) -> Samples:
     """Return the exact samples of a band: of its grid, from ``survey``."""
-    exact = np.flatnonzero(band.exact & ~at_limit(band.patches[:, CENTRE]))
+    trusted = band.exact & ~at_limit(band.patches[:, CENTRE])
+    if band.sampled is not None:
+        trusted &= band.sampled  # of a resampled grid, what is interpolated promises nothing
+    exact = np.flatnonzero(trusted)
     # if none is exact, too many are no distances for any to be taken for one
     count = len(band.exact) if band.sampled is None else int(np.count_nonzero(band.sampled))
     noisy = band.noisy_voxels if len(exact) else count

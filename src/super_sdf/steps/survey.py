@@ -53,7 +53,8 @@ class Band:
     decoded : (V,) bool
         Which voxels can hold the surface, and so are decoded.
     exact : (V,) bool
-        Which voxels' own samples can be taken as exact distances.
+        Which voxels' own samples can be taken as exact distances. Interpolated values can if they
+        do not contradict others: thin parts need them (``benchmarks.anisotropic``).
     sampled : (V,) bool, optional
         Which voxels' own values are samples of a grid that was resampled, not interpolated; None if
         all are.
@@ -209,11 +210,7 @@ def make_band(
     """Return the band of voxels (V, 3) with patches (V, 27), in half voxels."""
     lipschitz = is_lipschitz(patches)
     decoded = can_hold_surface(patches, lipschitz)
-    if sampled is None:
-        exact = exact_samples(patches, lipschitz, threads)
-    else:  # interpolated values are not, and do not tell whether the samples are noisy
-        exact = np.zeros(len(patches), bool)
-        exact[sampled] = exact_samples(patches[sampled], lipschitz[sampled], threads)
+    exact = exact_samples(patches, lipschitz, threads, sampled)
     return Band(shape, voxel_ijk, patches, lipschitz, decoded, exact, sampled)
 
 
