@@ -218,8 +218,23 @@ CASES = {
     ),
     ("in.npy", "--spacing", "1,1,2"): (
         1,
-        "spacing is 1, 1, 2: the method needs cubic voxels; resample the grid to one spacing on "
-        "all axes",
+        "the values change by 1 along x, 1 along y, 1 along z from sample to sample, but spacing "
+        "is 1, 1, 2: give that of each axis (--spacing X,Y,Z)",
+    ),
+    ("in.npy", "--spacing", "1,1,51"): (
+        1,
+        "spacing is 1, 1, 51: the largest may be 50 times the smallest; leave out samples along "
+        "the finer axes",
+    ),
+    ("in.npy", "--direction", "1,0,0"): (
+        2,
+        "Invalid value for '--direction': '1,0,0': give nine numbers separated by commas, row by "
+        "row",
+    ),
+    ("in.npy", "--direction", "1,0.2,0,0,1,0,0,0,1"): (
+        1,
+        "direction is 1, 0.2, 0; 0, 1, 0; 0, 0, 1: columns 1 and 2 are not at right angles; give "
+        "unit vectors at right angles, or resample a sheared grid",
     ),
     ("in.npy", "--spacing", "-1"): (1, "spacing is -1, -1, -1: it must be greater than 0"),
     ("in.npy", "--model", "huge"): (

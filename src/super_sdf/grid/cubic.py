@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray
+from ..neighbourhood import NEIGHBOURHOOD
 from .resampling import Resampled, resample
 from .sdf_grid import SdfGrid
 
@@ -59,6 +60,18 @@ def describe_resampling(grid: SdfGrid, shape: tuple[int, ...]) -> str:
         f"the spacing differs between axes: the values are resampled along {' and '.join(coarser)} "
         f"to {grid.voxel_size:.6g}, the finest, to {size} samples"
     )
+
+
+def sampled_places(grid: SdfGrid) -> NDArray[np.intp]:
+    """Return the places of ``NEIGHBOURHOOD`` round a sample of a cubic grid that hold samples, too.
+
+    They are those across the axes that were resampled.
+    """
+    samples, across = grid.samples, np.ones(27, bool)
+    while isinstance(samples, Resampled):
+        across &= NEIGHBOURHOOD[:, samples.axis] == 0
+        samples = samples.source
+    return np.flatnonzero(across)
 
 
 def on_samples(grid: SdfGrid, voxel_ijk: NDArray[np.int32]) -> BoolArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Triple
 from ..errors import GridError, seen
@@ -25,6 +25,7 @@ EQUAL_SPACING, MOST_UNEQUAL = 1e-3, 50.0
 # Within these, areas, volumes and squared areas neither overflow nor underflow.
 LEAST_SPACING, MOST_SPACING = 1e-60, 1e60
 SNAP = 0.02  # an estimate this close to a usual spacing is replaced by it
+CLEARLY_UNEQUAL = 1.1  # ratio of estimated spacings, from which on they are taken as different
 # Ratio of measured to given spacing, or its inverse, above which there is a note.
 TOLERATED = 1.1
 # Distances cannot change by more than the samples are apart. Larger ratios are refused: the first
@@ -103,9 +104,22 @@ def choose_spacing(values: SampleArray, spacing: ArrayLike | None, notes: list[s
         return given
     everywhere = straight_gradients(values)
     unequal = unequal_axes(*beside) or unequal_axes(*everywhere)
+    if unequal or not _show_one_spacing(everywhere):
+        each = spacing_of_axes(*everywhere)
+        if each is not None and each.max() > CLEARLY_UNEQUAL * each.min():
+            return _infer_axes(each, notes)
     if unequal:
-        return _infer_axes(everywhere, unequal, notes)
+        steps = ", ".join(f"{step:.4g} along {name}" for name, step in unequal.items())
+        raise GridError(
+            f"spacing not given: the values change by {steps} from sample to sample, and do not "
+            "show it for all axes; give --spacing X,Y,Z"
+        )
     return _infer_spacing(_measure(everywhere, beside), values.shape, notes)
+
+
+def _show_one_spacing(gradients: Gradients) -> bool:
+    """Return whether gradients agree on a spacing, whatever their direction."""
+    return len(gradients[0]) < ENOUGH or are_consistent(typical_length(*gradients), *gradients)
 
 
 def _scaled(gradients: Gradients, spacing: Triple) -> Gradients:
@@ -128,15 +142,8 @@ def _check_axes(gradients: Gradients, spacing: Triple) -> None:
         )
 
 
-def _infer_axes(everywhere: Gradients, unequal: dict[str, float], notes: list[str]) -> Triple:
-    """Return the spacing of each axis with which the gradient has length 1."""
-    found = spacing_of_axes(*everywhere)
-    if found is None:
-        steps = ", ".join(f"{step:.4g} along {name}" for name, step in unequal.items())
-        raise GridError(
-            f"spacing not given: the values change by {steps} from sample to sample, and do not "
-            "show it for all axes; give --spacing X,Y,Z"
-        )
+def _infer_axes(found: NDArray[np.float64], notes: list[str]) -> Triple:
+    """Return the estimated spacings of the axes, those that are nearly equal as one."""
     for near in found.copy():  # axes that are equal but for the error of the estimate
         alike = np.abs(found / near - 1) <= SNAP
         found[alike] = found[alike].mean()

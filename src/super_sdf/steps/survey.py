@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import NoSurfaceError, OutOfMemoryError
-from ..grid.cubic import on_samples
+from ..grid.cubic import on_samples, sampled_places
 from ..grid.resampling import Resampled
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import held_memory, in_words
@@ -53,8 +53,7 @@ class Band:
     decoded : (V,) bool
         Which voxels can hold the surface, and so are decoded.
     exact : (V,) bool
-        Which voxels' own samples can be taken as exact distances. Interpolated values can if they
-        do not contradict others: thin parts need them (``benchmarks.anisotropic``).
+        Which voxels' own samples can be taken as exact distances.
     sampled : (V,) bool, optional
         Which voxels' own values are samples of a grid that was resampled, not interpolated; None if
         all are.
@@ -180,9 +179,9 @@ def survey(grid: SdfGrid, offset: float = 0.0, resources: Resources = ONE_THREAD
         if not any(up.near for up, _ in jumps):
             raise no_surface(grid, offset)
         check_not_filled(jumps, offset, grid.voxel_size)
-    sampled = on_samples(grid, voxel_ijk) if isinstance(grid.samples, Resampled) else None
-    joined = _concatenate(patches)
-    band = make_band(grid.shape, voxel_ijk, joined, resources.threads, sampled)
+    band = make_band(grid.shape, voxel_ijk, _concatenate(patches), resources.threads)
+    if isinstance(grid.samples, Resampled):
+        band = look_at_samples(band, grid, resources.threads)
     return replace(band, leaves=any(leaving))
 
 
@@ -205,13 +204,24 @@ def make_band(
     voxel_ijk: IntArray,
     patches: FloatArray,
     threads: int = 1,
-    sampled: BoolArray | None = None,
 ) -> Band:
     """Return the band of voxels (V, 3) with patches (V, 27), in half voxels."""
     lipschitz = is_lipschitz(patches)
     decoded = can_hold_surface(patches, lipschitz)
-    exact = exact_samples(patches, lipschitz, threads, sampled)
-    return Band(shape, voxel_ijk, patches, lipschitz, decoded, exact, sampled)
+    exact = exact_samples(patches, lipschitz, threads)
+    return Band(shape, voxel_ijk, patches, lipschitz, decoded, exact)
+
+
+def look_at_samples(band: Band, grid: SdfGrid, threads: int = 1) -> Band:
+    """Return the band of a resampled grid, in which samples are trusted by samples alone.
+
+    Interpolated values do not tell whether the samples are noisy. Where they do not contradict
+    others they count as exact, since thin parts need them (``benchmarks.anisotropic``).
+    """
+    sampled, lipschitz = on_samples(grid, band.voxel_ijk), band.lipschitz.copy()
+    lipschitz[sampled] = is_lipschitz(band.patches[sampled], sampled_places(grid))
+    exact = exact_samples(band.patches, lipschitz, threads, sampled)
+    return replace(band, lipschitz=lipschitz, exact=exact, sampled=sampled)
 
 
 def _band_of_planes(
