@@ -13,9 +13,9 @@ with n samples along all axes; the others start from the anisotropic grid:
     coarse    resampled to the coarsest spacing before, with SciPy's cubic spline
 
 The error is the mean of the distances from mesh to truth and back, in spacings of the coarse axis.
-"ratio" compares it with that of the isotropic grid, shape by shape. The last line says how far off
-the spacing is that ``make_grid`` estimates if it is not given. ``--methods`` without a name measures
-that alone. Needs the extra eval.
+"ratio" compares it with that of the isotropic grid, shape by shape. The last line says how far
+off the spacing is that ``make_grid`` estimates if it is not given. ``--methods`` without a name
+measures that alone. Needs the extra eval.
 """
 
 from __future__ import annotations
