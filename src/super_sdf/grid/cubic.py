@@ -13,6 +13,7 @@ from ..arrays import BoolArray
 from ..neighbourhood import NEIGHBOURHOOD
 from .resampling import Resampled, resample
 from .sdf_grid import SdfGrid
+from .spacing import EQUAL_SPACING
 
 
 def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
@@ -52,8 +53,8 @@ def describe_resampling(grid: SdfGrid, shape: tuple[int, ...]) -> str:
     """Return a sentence that names the axes that are resampled, and their spacings."""
     coarser = [
         f"{name} from {h:.6g}"
-        for name, h, new, old in zip("xyz", grid.spacing, shape, grid.shape)
-        if new != old
+        for name, h in zip("xyz", grid.spacing)
+        if h > grid.voxel_size * (1 + EQUAL_SPACING)
     ]
     size = " x ".join(map(str, shape))
     return (

@@ -54,8 +54,8 @@ class SdfGrid:
     GridError
         If the array is not three-dimensional, finite, and at least 2 samples long on each axis; if
         most of its border is negative; if the spacing is not positive, or the direction no rotation
-        or mirrored rotation; or if
-        the values change from sample to sample by more than the spacing, or by much less.
+        or mirrored rotation; or if the values change from sample to sample by more than the
+        spacing.
     """
 
     samples: SampleArray
