@@ -216,10 +216,20 @@ CASES = {
         2,
         "Invalid value for '--spacing': '1,2': give one number, or three separated by commas",
     ),
-    ("in.npy", "--spacing", "1,1,2"): (
+    ("in.npy", "--spacing", "1,1,51"): (
         1,
-        "spacing is 1, 1, 2: the method needs cubic voxels; resample the grid to one spacing on "
-        "all axes",
+        "spacing is 1, 1, 51: the largest may be 50 times the smallest; leave out samples along "
+        "the finer axes",
+    ),
+    ("in.npy", "--direction", "1,0,0"): (
+        2,
+        "Invalid value for '--direction': '1,0,0': give nine numbers separated by commas, row by "
+        "row",
+    ),
+    ("in.npy", "--direction", "1,0.2,0,0,1,0,0,0,1"): (
+        1,
+        "direction is 1, 0.2, 0; 0, 1, 0; 0, 0, 1: columns 1 and 2 are not at right angles; give "
+        "unit vectors at right angles, or resample a sheared grid",
     ),
     ("in.npy", "--spacing", "-1"): (1, "spacing is -1, -1, -1: it must be greater than 0"),
     ("in.npy", "--model", "huge"): (

@@ -129,9 +129,9 @@ def test_values_that_are_not_quite_distances_are_noted():
     assert len(grid.notes) == 1 and "they are not exact distances" in grid.notes[0]
 
 
-def test_spacing_must_be_equal_positive_and_finite():
+def test_spacing_must_be_positive_and_finite():
     for spacing, message in (
-        ((1, 1, 2), "spacing is 1, 1, 2: the method needs cubic voxels"),
+        ((1, 1, 51), "spacing is 1, 1, 51: the largest may be 50 times the smallest"),
         (0, "spacing is 0, 0, 0: it must be greater than 0"),
         (float("nan"), "spacing is nan: it must be finite"),
         ((1, 2), r"spacing is \(1, 2\): give one number or three"),
@@ -140,11 +140,54 @@ def test_spacing_must_be_equal_positive_and_finite():
             make_grid(torus(32), spacing=spacing)
 
 
-def test_values_sampled_unequally_are_refused_whatever_the_spacing():
+def box_with_unequal_spacing() -> np.ndarray:
+    """Distances to a box, with spacings 1, 1, 2."""
     x, y, z = np.abs(np.indices((40, 40, 40)) - 19.4)
-    values = np.maximum(x - 12, np.maximum(y - 9, z - 14))[:, :, ::2]
-    with pytest.raises(GridError, match=r"the values change by .* along x, .* along y, .* along z"):
-        make_grid(values)
+    return np.maximum(x - 12, np.maximum(y - 9, z - 14))[:, :, ::2]
+
+
+def test_the_spacing_of_each_axis_is_estimated_if_they_differ():
+    grid = make_grid(box_with_unequal_spacing(), origin=0)
+    assert grid.spacing == pytest.approx((1, 1, 2), rel=0.005)
+    (note,) = grid.notes
+    assert note.startswith("spacing not given: estimated as 1.0")
+    assert note.endswith(
+        " along x, y, z from the values, so the size of the mesh is approximate (give --spacing)"
+    )
+
+
+@pytest.mark.parametrize("ratio", [1.5, 3.0, 5.0])
+@pytest.mark.parametrize("axis", range(3))
+def test_the_spacings_of_a_smooth_solid_are_estimated(axis, ratio):
+    spacing = np.where(np.arange(3) == axis, 0.02 * ratio, 0.02)
+    shape = np.rint(1 / spacing).astype(int)
+    x, y, z = (np.moveaxis(np.indices(shape), 0, -1) * spacing - 0.49).T
+    values = (np.hypot(np.hypot(x, y) - 0.28, z) - 0.15).T
+    estimated = make_grid(values).spacing
+    assert estimated == pytest.approx(tuple(spacing), rel=0.06)
+    others = [h for n, h in enumerate(estimated) if n != axis]
+    assert others[0] == others[1]  # not almost: they would be resampled
+
+
+def test_a_spacing_that_the_values_contradict_on_one_axis_is_refused():
+    with pytest.raises(GridError) as caught:
+        make_grid(box_with_unequal_spacing(), spacing=1)
+    assert str(caught.value) == (
+        "the values change by 1 along x, 1 along y, 2 along z from sample to sample, but spacing "
+        "is 1, 1, 1: give that of each axis (--spacing X,Y,Z)"
+    )
+    assert make_grid(box_with_unequal_spacing(), spacing=(1, 1, 2), origin=0).notes == ()
+
+
+def test_axes_that_show_no_spacing_are_asked_for():
+    x, y = np.indices((30, 30, 30))[:2]
+    rod = np.maximum(np.abs(x - 14.6) - 8, 3 * np.abs(y - 14.6) - 24)
+    with pytest.raises(GridError) as caught:
+        make_grid(rod)
+    assert str(caught.value) == (
+        "spacing not given: the values change by 1 along x, 3 along y from sample to sample, and "
+        "do not show it for all axes; give --spacing X,Y,Z"
+    )
 
 
 def test_inside_has_three_words():

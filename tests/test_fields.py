@@ -570,3 +570,57 @@ def test_iterations_are_checked():
         reconstruct(ball(), trilinear, iterations=1.5)
     with pytest.raises(OptionError, match=r"iterations is -1: give 1 or more"):
         reconstruct(ball(), trilinear, iterations=-1)
+
+
+def placed(**place) -> SdfGrid:
+    """Return the distances of a ball in a box, in a grid placed in the world."""
+    ijk = np.indices((14, 15, 16)).astype(np.float64)
+    spacing = np.array(place["spacing"])
+    ball = np.linalg.norm((ijk.T - [6.2, 6.9, 7.1]) * spacing, axis=-1).T - 4.1 * spacing.min()
+    return make_grid(ball, **place)
+
+
+TURNED = [[0.0, 0.0, 1.0], [0.8, 0.6, 0.0], [0.6, -0.8, 0.0]]  # mirrored
+
+
+@pytest.mark.parametrize("spacing", [(0.5, 0.5, 0.5), (0.5, 0.5, 0.75)])
+def test_direction_and_spacing_are_kept(spacing):
+    grid = placed(spacing=spacing, origin=(3, -4, 5), direction=TURNED)
+    field = upsample(grid, load_network("fast"))
+    write_field(field, "a.npz")
+    again = read_field("a.npz")
+    np.testing.assert_array_equal(again.placed.direction, grid.direction)
+    np.testing.assert_array_equal(again.positions(), field.positions())
+    centre = grid.to_world([6.2, 6.9, 7.1])
+    near = np.abs(field.distances()) < 0.25
+    truth = np.linalg.norm(field.positions() - centre, axis=1) - 4.1 * min(spacing)
+    np.testing.assert_allclose(field.distances()[near], truth[near], atol=0.03)
+    for mesher in ("marching", "sharp"):
+        mesh = extract_mesh(again, mesher=mesher)
+        whole = reconstruct(grid, load_network("fast"), mesher=mesher)
+        np.testing.assert_array_equal(mesh.vertices, whole.vertices)
+        np.testing.assert_array_equal(mesh.faces, whole.faces)
+
+
+def test_vti_has_the_direction():
+    grid = placed(spacing=(0.5, 0.5, 0.5), origin=(3, -4, 5), direction=TURNED)
+    field = upsample(grid, load_network("fast"))
+    write_field(field, "a.vti")
+    again = read_grid("a.vti")
+    np.testing.assert_allclose(corners(again), corners(fine_grid(field)), atol=1e-5)
+
+
+def corners(grid: SdfGrid) -> np.ndarray:
+    """Return the world positions of a grid's corners, (8, 3), in an order that no axis decides."""
+    ends = np.indices((2, 2, 2)).reshape(3, -1).T * (np.array(grid.shape) - 1)
+    return np.array(sorted(np.round(grid.to_world(ends), 6).tolist()))
+
+
+def test_a_turned_grid_is_refined_twice():
+    grid = placed(spacing=(0.5, 0.5, 0.75), origin=(3, -4, 5), direction=TURNED)
+    mesh = reconstruct(grid, load_network("fast"), 2, iterations=2)
+    centre = grid.to_world([6.2, 6.9, 7.1])
+    radius = np.linalg.norm(mesh.vertices - centre, axis=1)
+    np.testing.assert_allclose(radius, 4.1 * 0.5, atol=0.05)
+    a, b, c = (mesh.vertices[mesh.faces[:, n]] - centre for n in range(3))
+    assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() > 0

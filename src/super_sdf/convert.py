@@ -24,6 +24,8 @@ from .files.formats import split_member
 from .files.grids import read_grid
 from .files.meshes import write_pieces
 from .files.precision import check_format_holds, local_origin_note
+from .grid.cubic import cubic_grid
+from .grid.direction import Direction
 from .grid.sdf_grid import SdfGrid
 from .grid.spacing import as_triple
 from .mesh import Mesh, join_meshes
@@ -70,6 +72,7 @@ class ConvertOptions:
     triangles: int | None = None
     axes: str | None = None
     iterations: int = 1
+    direction: tuple[float, ...] | None = None
 
     @property
     def simplifies(self) -> bool:
@@ -96,7 +99,7 @@ class Conversion:
 
     Attributes
     ----------
-    shape, spacing, origin
+    shape, spacing, origin, direction
         Of the grid; spacing and origin in world units.
     counts : dict
         The counts named in ``COUNTS``, and ``expected_triangles`` and ``expected_bytes``.
@@ -120,6 +123,7 @@ class Conversion:
     shape: tuple[int, int, int]
     spacing: Triple
     origin: Triple
+    direction: Direction
     counts: dict[str, int]
     bounds: tuple[Triple, Triple]
     closed: bool
@@ -136,6 +140,7 @@ class Conversion:
             "shape": list(self.shape),
             "spacing": list(self.spacing),
             "origin": list(self.origin),
+            "direction": [list(row) for row in self.direction],
             **self.counts,
             "bounds": [list(corner) for corner in self.bounds],
             "closed": self.closed,
@@ -196,6 +201,7 @@ def convert(
         source,
         spacing=options.spacing,
         origin=options.origin,
+        direction=options.direction,
         axes=options.axes,
         inside=options.inside,
         max_memory=options.max_memory,
@@ -203,8 +209,9 @@ def convert(
     check_factor(options.factor)
     find_mesher(options.mesher)
     total = options.factor ** check_iterations(options.iterations)
-    about = check_format_holds(target, grid, total)
-    notes = (*grid.notes, *local_origin_note(target, about))
+    lattice = cubic_grid(grid, options.offset)
+    about = check_format_holds(target, lattice, total)
+    notes = (*lattice.notes, *local_origin_note(target, about))
     expected = expect(grid, total, options.offset, target, cap=options.cap)
     if options.simplifies:
         least = int(expected.triangles * CERTAIN_SHARE)
@@ -349,7 +356,7 @@ def describe(
         simplified = tally.simplified.report(tally.voxel_size)
         closed = tally.simplified.mesh.is_closed()
         warnings += tally.simplified.warnings
-    where = grid.shape, grid.spacing, grid.origin
+    where = grid.shape, grid.spacing, grid.origin, grid.direction
     bounds = as_triple(tally.low, "low"), as_triple(tally.high, "high")
     capped = options.cap and tally.leaves
     return Conversion(*where, counts, bounds, closed, notes, warnings, seconds, simplified, capped)

@@ -85,7 +85,7 @@ def vertex_type(grid: SdfGrid, factor: int) -> type[np.float32] | type[np.float6
     GridError
         If float64 does not resolve them either.
     """
-    reach = max(abs(x) + h * n for x, h, n in zip(grid.origin, grid.spacing, grid.shape))
+    reach = grid.reach
     for kind in (np.float32, np.float64):
         if tells_vertices_apart(kind, reach, grid, factor):
             return kind

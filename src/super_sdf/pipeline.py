@@ -1,6 +1,6 @@
 """The method on a page: the paper's Section 4, one named step per line.
 
-    grid -> band -> patches and neighbour table -> network -> averaged shared nodes
+    grid -> cubic lattice -> band -> patches and neighbour table -> network -> averaged shared nodes
          -> surface moved to touch the samples' spheres -> isosurface
 
 A grid that is too large to be refined at once is refined slab by slab (see ``slabs``); the mesh is
@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .arrays import IntArray
+from .grid.cubic import cubic_grid
 from .grid.sdf_grid import SdfGrid
 from .machine.memory import give_back
 from .machine.resources import Resources, allot
@@ -71,7 +72,8 @@ def upsample(
     Parameters
     ----------
     grid : SdfGrid
-        Coarse signed distances in world units, negative inside.
+        Coarse signed distances in world units, negative inside. If the spacing differs between
+        axes, they are resampled to the finest first; the field has that spacing.
     network : Network
         From ``load_network``.
     factor : int
@@ -110,13 +112,14 @@ def upsample(
     factor, offset = check_factor(factor), check_distance(offset)
     resources = allot(getattr(network, "threads", 0), check_max_memory(max_memory))
     steps = StepCounter(progress, [name for name in STEPS if name != "isosurface"])
-    band = find_surface(grid, factor, offset, resources)
+    lattice = cubic_grid(grid, offset)
+    band = find_surface(lattice, factor, offset, resources)
     (slab,) = plan_slabs(band, factor, None, resources, memory_needs(network))
     steps.finish("band")
     field = refine(band, network, factor, slab, resources.threads, steps)
     if len(field.signs()) < 2:
         raise no_surface(grid, offset)
-    return replace(field, grid=grid, offset=offset)
+    return replace(field, grid=lattice, offset=offset)
 
 
 def reconstruct(
@@ -262,7 +265,8 @@ def _slabs(run: Run, grid: SdfGrid, offset: float, progress: Progress | None) ->
     network, factor, mesher = run.network, run.factor, run.mesher
     resources = allot(getattr(network, "threads", 0), run.max_memory)
     steps = StepCounter(progress)
-    band = find_surface(grid, factor, offset, resources)
+    lattice = cubic_grid(grid, offset)
+    band = find_surface(lattice, factor, offset, resources)
     reach, needed = getattr(network, "receptive_field", None), memory_needs(network)
     slabs = plan_slabs(band, factor, reach, resources, needed, mesher)
     planned = peak_bytes(band, slabs, factor, needed, resources.threads, mesher)
@@ -275,12 +279,12 @@ def _slabs(run: Run, grid: SdfGrid, offset: float, progress: Progress | None) ->
         if len(slabs) > 1:
             give_back()
         field = refine(band, network, factor, slab, resources.threads, steps)
-        field = replace(field, grid=grid, offset=offset)
+        field = replace(field, grid=lattice, offset=offset)
         if run.save:
             run.save(field)
             steps.watch.lap("save field")
         whole = close(field, cap=run.cap, beside=beside)
-        meshes = extract_pieces(whole, grid, vertices, resources.threads, mesher)
+        meshes = extract_pieces(whole, lattice, vertices, resources.threads, mesher)
         planned_work = {"slabs": len(slabs), "planned_bytes": planned}
         piece = describe_piece(field, meshes, planned_work, band.leaves)
         del field, whole, meshes  # before those of the next slab are made
@@ -341,7 +345,7 @@ def refine(
     return replace(
         field,
         band_voxels=len(band.voxel_ijk),
-        noisy_voxels=int(np.count_nonzero(~band.lipschitz)),
+        noisy_voxels=band.noisy_voxels,
         pinned=int(pinned[field.own_rows].sum()),
         spheres=spheres,
         decoded_voxels=int(band.decoded_before[-1]),

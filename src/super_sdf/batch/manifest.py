@@ -180,6 +180,12 @@ def _numbers(name: str, value: Any) -> tuple[float, ...]:
     return tuple(_number(name, number) for number in numbers)
 
 
+def _direction(name: str, value: Any) -> tuple[float, ...]:
+    if not isinstance(value, list) or len(value) != 9:
+        raise OptionError(f"{name!r} is {value!r}: give a list of nine numbers, row by row")
+    return tuple(_number(name, number) for number in value)
+
+
 def _inside(name: str, value: Any) -> str:
     if value not in INSIDE:
         raise OptionError(f"{name!r} is {value!r}: give one of {', '.join(INSIDE)}")
@@ -217,6 +223,7 @@ CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "iterations": _iterations,
     "spacing": _numbers,
     "origin": _numbers,
+    "direction": _direction,
     "axes": _axes,
     "inside": _inside,
     "offset": _number,

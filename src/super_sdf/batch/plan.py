@@ -131,8 +131,9 @@ class Planner:
         options = asdict(replace(job.options, max_memory=None))
         if options["mesher"] == MARCHING:
             del options["mesher"]  # so that rows of versions without this option still hold
-        if options["axes"] is None:
-            del options["axes"]
+        for name in ("axes", "direction"):
+            if options[name] is None:
+                del options[name]
         if options["iterations"] == 1:
             del options["iterations"]
         if not job.options.simplifies:

@@ -15,6 +15,7 @@ from ..convert import ConvertOptions
 from ..errors import OutOfMemoryError
 from ..files.grids import read_grid
 from ..files.regular import check_regular_file
+from ..grid.cubic import cubic_grid
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import give_back, held_memory, in_words
 from ..machine.resources import Resources, allot
@@ -41,7 +42,7 @@ class CheckOptions:
 
     Attributes
     ----------
-    spacing, origin, axes, inside, offset, max_memory
+    spacing, origin, direction, axes, inside, offset, max_memory
         As given when the mesh was made.
     intersections : bool
         Count self-intersections, which takes up to half of the time.
@@ -57,11 +58,12 @@ class CheckOptions:
     intersections: bool = True
     processes: int = 1
     axes: str | None = None
+    direction: tuple[float, ...] | None = None
 
     @classmethod
     def of(cls, options: ConvertOptions) -> CheckOptions:
         """Return how a grid is read that was converted with these options."""
-        names = ("spacing", "origin", "axes", "inside", "offset", "max_memory")
+        names = ("spacing", "origin", "direction", "axes", "inside", "offset", "max_memory")
         return cls(**{name: getattr(options, name) for name in names})
 
 
@@ -182,6 +184,7 @@ def check_files(
         grid,
         spacing=options.spacing,
         origin=options.origin,
+        direction=options.direction,
         axes=options.axes,
         inside=options.inside,
         max_memory=options.max_memory,
@@ -211,6 +214,7 @@ def check_mesh(mesh: Mesh, grid: SdfGrid, options: CheckOptions | None = None) -
     options = options or CheckOptions()
     offset = check_distance(options.offset)
     resources = allot(0, check_max_memory(options.max_memory))
+    grid = cubic_grid(grid, offset)
     band = survey(grid, offset, resources)
     if not len(band.voxel_ijk):
         raise no_surface(grid, offset)

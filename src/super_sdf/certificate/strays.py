@@ -50,7 +50,7 @@ def find_strays(vertices: NDArray[Any], grid: SdfGrid, offset: float = 0.0) -> S
     offset : float
         World distance of the meshed surface from the solid's.
     """
-    position = (vertices - np.array(grid.origin)) / np.array(grid.spacing)
+    position = grid.to_index(vertices)
     nearest = np.rint(position).astype(np.int64)
     inside = ((nearest >= 0) & (nearest < grid.shape)).all(1)
     position, nearest = position[inside], nearest[inside]

@@ -91,12 +91,16 @@ class Samples:
 
 def exact_samples(band: Band, grid: SdfGrid) -> Samples:
     """Return the exact samples of a band: of its grid, from ``survey``."""
-    exact = np.flatnonzero(band.exact & ~at_limit(band.patches[:, CENTRE]))
+    trusted = band.exact & ~at_limit(band.patches[:, CENTRE])
+    if band.sampled is not None:
+        trusted &= band.sampled  # of a resampled grid, what is interpolated promises nothing
+    exact = np.flatnonzero(trusted)
     # if none is exact, too many are no distances for any to be taken for one
-    noisy = int(np.count_nonzero(~band.lipschitz)) if len(exact) else len(band.exact)
-    points = band.voxel_ijk[exact] * np.array(grid.spacing) + np.array(grid.origin)
+    count = len(band.exact) if band.sampled is None else int(np.count_nonzero(band.sampled))
+    noisy = band.noisy_voxels if len(exact) else count
+    points = grid.to_world(band.voxel_ijk[exact])
     values = band.patches[exact, CENTRE] / 2  # from half voxels
-    return Samples(len(band.exact) - len(exact) - noisy, noisy, points, values)
+    return Samples(count - len(exact) - noisy, noisy, points, values)
 
 
 def touch(

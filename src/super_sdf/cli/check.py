@@ -131,7 +131,7 @@ def make_check_options(options: dict[str, Any]) -> CheckOptions:
     """Return the options of the check, picked from all options of a command."""
     from ..certificate.check import CheckOptions
 
-    names = ("spacing", "origin", "axes", "inside", "offset", "max_memory")
+    names = ("spacing", "origin", "direction", "axes", "inside", "offset", "max_memory")
     chosen = {name: options[name] for name in names}
     count = not options["skip_intersections"]
     return CheckOptions(**chosen, intersections=count, processes=0)

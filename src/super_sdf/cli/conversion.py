@@ -49,6 +49,21 @@ def parse_numbers(
     return numbers
 
 
+def parse_direction(
+    ctx: click.Context, param: click.Parameter, value: str | None
+) -> tuple[float, ...] | None:
+    """Parse nine numbers separated by commas."""
+    if value is None:
+        return None
+    try:
+        numbers = tuple(float(part) for part in value.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != 9:
+        raise click.BadParameter(f"{value!r}: give nine numbers separated by commas, row by row")
+    return numbers
+
+
 UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9}
 
 
@@ -73,7 +88,8 @@ GRID_OPTIONS: tuple[Option, ...] = (
         "--spacing",
         callback=parse_numbers,
         metavar="H",
-        help="World distance between neighbouring samples. Default: from the file, else estimated "
+        help="World distance between neighbouring samples: one number, or X,Y,Z where it differs "
+        "between axes; the coarser ones are resampled then. Default: from the file, else estimated "
         "from the values.",
     ),
     click.option(
@@ -81,6 +97,14 @@ GRID_OPTIONS: tuple[Option, ...] = (
         callback=parse_numbers,
         metavar="X,Y,Z",
         help="World position of sample (0, 0, 0). Default: from the file, else 0,0,0.",
+    ),
+    click.option(
+        "--direction",
+        callback=parse_direction,
+        metavar="MATRIX",
+        help="World directions of the axes x, y and z of the array: the columns of a rotation or "
+        "mirrored rotation, as nine numbers with commas, row by row. Files of other formats than "
+        "NumPy, TIFF, HDF5 and Zarr state it.",
     ),
     click.option(
         "--axes",

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 HELP = f"""Refine the signed distance grid IN and write its surface as the mesh OUT.
 
 IN is a grid file: {list_formats()}. FILE:NAME names one of several arrays in a {NAMED}
-file. An .npz file has the keys values, spacing and origin.
+file. An .npz file has the keys values, spacing, origin and direction.
 
 OUT is a .ply, .stl, .obj, .off, .glb or .3mf file.
 """

@@ -23,7 +23,7 @@ from ..files.archives import Member, open_archive
 from ..files.headers import ArrayHeader, read_array_header
 from ..files.regular import check_regular_file
 from ..files.spool import append_spool, little_endian, spool_beside
-from ..grid.planes import InputFile, PlaneSource
+from ..grid.planes import InputFile, SamplePlanes
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import check_fits
 from ..options import check_path
@@ -36,7 +36,7 @@ VERSION = 1
 CHUNK = 1 << 20  # values at a time
 LONGEST = 1 << 20  # samples along an axis
 # Small arrays first; the values, which are large, before the arrays that grow with them.
-HEAD = ("version", "shape", "factor", "spacing", "origin", "offset", "leaves")
+HEAD = ("version", "shape", "factor", "spacing", "origin", "direction", "offset", "leaves")
 LISTS = ("voxels", "sample_voxels", "sample_distances", "border_inside")
 KEYS = (*HEAD, "values", *LISTS)
 
@@ -109,7 +109,7 @@ class SparseWriter:
         self.types = {**dict.fromkeys(LISTS, np.int32), "values": exact, "sample_distances": exact}
         head = (
             *(VERSION, field.shape, field.factor),
-            *(grid.spacing, grid.origin, field.offset, field.leaves),
+            *(grid.spacing, grid.origin, grid.direction, field.offset, field.leaves),
         )
         for name, value in zip(HEAD, head):
             array = np.asarray(value)
@@ -143,7 +143,7 @@ class SparseWriter:
         return member
 
 
-class NoSamples(PlaneSource):
+class NoSamples(SamplePlanes):
     """Stands for the coarse samples of a field that was read from a file, which has none."""
 
     dtype = np.dtype(np.float32)
@@ -242,8 +242,9 @@ class _Reader:
     def _grid(self, shape: tuple[int, ...]) -> SdfGrid:
         """Return the coarse grid, without samples."""
         spacing, origin = (self._array(key, "f", (3,)) for key in ("spacing", "origin"))
-        samples = NoSamples(shape, self.name)
-        return SdfGrid.trusted(samples, spacing, origin, extremes=(-math.inf, math.inf))
+        direction, samples = self._array("direction", "f", (3, 3)), NoSamples(shape, self.name)
+        ends = -math.inf, math.inf
+        return SdfGrid.trusted(samples, spacing, origin, direction=direction, extremes=ends)
 
     def _voxels(self, key: str, shape: tuple[int, ...]) -> IntArray:
         """Return voxels (n, 3), which must lie in the grid, all different, in C order."""

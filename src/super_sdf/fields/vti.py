@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..files.readers.silence import discarded_stderr
+from ..grid.sdf_grid import SdfGrid
 from ..steps.field import FineField
 from ..steps.lattice import fine_grid
 from .dense import own_planes
@@ -22,12 +23,11 @@ class VtiWriter:
     def __init__(self, part: Path, shape: tuple[int, int, int], files: ExitStack) -> None:
         self.part = part
         self.values = np.full(shape[::-1], np.float32(np.inf))  # x is the fastest
-        self.spacing = self.origin = (0.0, 0.0, 0.0)
+        self.grid: SdfGrid | None = None
 
     def add(self, field: FineField) -> None:
         """Copy the planes of nodes of a slab."""
-        fine = fine_grid(field)
-        self.spacing, self.origin = fine.spacing, fine.origin
+        self.grid = fine_grid(field)
         for first, planes in own_planes(field):
             self.values[:, :, first : first + len(planes)] = planes.transpose(2, 1, 0)
 
@@ -40,8 +40,10 @@ class VtiWriter:
 
         image = vtkImageData()
         image.SetDimensions(*self.values.shape[::-1])
-        image.SetSpacing(*self.spacing)
-        image.SetOrigin(*self.origin)
+        if self.grid:
+            image.SetSpacing(*self.grid.spacing)
+            image.SetOrigin(*self.grid.origin)
+            image.SetDirectionMatrix(np.ravel(self.grid.direction).tolist())
         array = numpy_to_vtk(self.values.reshape(-1))
         array.SetName("distance")
         image.GetPointData().SetScalars(array)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +52,7 @@ def expect(
     WriteError
         If half of that is more than the free disk space.
     """
-    triangles = 2 * factor**2 * count_crossings(grid, offset, cap=cap)
+    triangles = 2 * factor**2 * round(count_on_lattice(grid, offset, cap=cap))
     size = triangles * format_of(path).bytes_per_triangle
     free = free_space(Path(path))
     if CERTAIN_SHARE * size > free:
@@ -63,21 +64,35 @@ def expect(
     return Expectation(triangles, size)
 
 
-def count_crossings(grid: SdfGrid, offset: float, *, cap: bool = False) -> int:
-    """Count the edges between neighbouring samples on different sides of the offset surface.
+def count_on_lattice(grid: SdfGrid, offset: float, *, cap: bool = False) -> float:
+    """Estimate how many edges of the grid's cubic lattice the offset surface crosses.
+
+    Edges along an axis are as many as the cells of a plane across it.
+    """
+    counts = count_crossings(grid, offset, cap=cap)
+    if grid.is_cubic:
+        return sum(counts)
+    h, cell = grid.voxel_size, prod(grid.spacing)
+    return sum(count * cell / step / h**2 for count, step in zip(counts, grid.spacing))
+
+
+def count_crossings(grid: SdfGrid, offset: float, *, cap: bool = False) -> tuple[int, int, int]:
+    """Count the edges along x, y and z with samples on different sides of the offset surface.
 
     With ``cap``, all is outside beyond the border of the grid.
     """
-    count, before = 0, None
+    x = y = z = 0
+    before = None
     for inside in _planes(grid, offset):
-        count += int(np.count_nonzero(inside[1:] != inside[:-1]))
-        count += int(np.count_nonzero(inside[:, 1:] != inside[:, :-1]))
+        y += int(np.count_nonzero(inside[1:] != inside[:-1]))
+        z += int(np.count_nonzero(inside[:, 1:] != inside[:, :-1]))
         if cap:
-            count += sum(int(np.count_nonzero(side[[0, -1]])) for side in (inside, inside.T))
+            y += int(np.count_nonzero(inside[[0, -1]]))
+            z += int(np.count_nonzero(inside[:, [0, -1]]))
         if before is not None or cap:
-            count += int(np.count_nonzero(inside if before is None else inside != before))
+            x += int(np.count_nonzero(inside if before is None else inside != before))
         before = inside
-    return count + (int(np.count_nonzero(before)) if cap and before is not None else 0)
+    return x + (int(np.count_nonzero(before)) if cap and before is not None else 0), y, z
 
 
 def _planes(grid: SdfGrid, offset: float) -> Iterator[BoolArray]:

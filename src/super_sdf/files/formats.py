@@ -138,6 +138,14 @@ def choose_axes(format_: GridFormat, given: str | None) -> str:
     return given
 
 
+def check_direction_given(format_: GridFormat, direction: object) -> None:
+    """Raise OptionError if a direction is given, but files of the format state it."""
+    if direction is not None and format_.axes is None:
+        raise OptionError(
+            f"direction is given, but {format_.name} files state their axes: leave it out"
+        )
+
+
 def _listed(names: list[str]) -> str:
     return f"{', '.join(names[:-1])} or {names[-1]}"
 

@@ -1,7 +1,8 @@
 """Reading and writing grid files: ``.npy`` (one array), ``.npz``, and other people's formats.
 
-The keys of an ``.npz`` are ``values`` and, optionally, ``spacing`` and ``origin``. Files are
-checked before they are read. ``formats`` has the table of all formats, ``readers`` their readers.
+The keys of an ``.npz`` are ``values`` and, optionally, ``spacing``, ``origin`` and ``direction``.
+Files are checked before they are read. ``formats`` has the table of all formats, ``readers`` their
+readers.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import warnings
 import zipfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -24,7 +26,14 @@ from ..grid.sdf_grid import SdfGrid, make_grid
 from ..machine.memory import held_memory, memory_bound
 from ..options import check_path
 from .archives import Member, open_archive
-from .formats import GridFormat, check_library, choose_axes, find_format, split_member
+from .formats import (
+    GridFormat,
+    check_direction_given,
+    check_library,
+    choose_axes,
+    find_format,
+    split_member,
+)
 from .headers import ArrayHeader, Read, read_array_header
 from .output import check_free, replacing
 from .regular import check_regular_file
@@ -32,7 +41,9 @@ from .store import check_grid_file
 from .unpacking import unpack
 from .volume import Request, Volume, axes_direction, take
 
-NPZ_KEYS = ("values", "spacing", "origin")
+PLACE = ("spacing", "origin", "direction")
+NPZ_KEYS = ("values", *PLACE)
+NUMBERS = "one number or three"
 MOST_NAMED = 10  # members of an archive that an error lists
 # Share of the memory left that an unpacked array may take; bytes if that is unknown.
 ROOM_SHARE, UNKNOWN_ROOM = 0.25, 1 << 28
@@ -45,6 +56,7 @@ def read_grid(
     *,
     spacing: Any = None,
     origin: Any = None,
+    direction: Any = None,
     axes: str | None = None,
     inside: str = "auto",
     max_memory: int | None = None,
@@ -61,6 +73,10 @@ def read_grid(
         The file; ``FILE:NAME`` names one of several arrays in a file.
     spacing, origin : number or three, optional
         Used instead of those in the file; see ``make_grid``.
+    direction : nine numbers or (3, 3), optional
+        How the axes x, y and z of the array lie in the world, used instead of what the file says;
+        see ``make_grid``. Only for files in which it may be missing: ``.npy``, ``.npz``, TIFF, HDF5
+        and Zarr.
     axes : {"xyz", "zyx"}, optional
         The axis order of an array whose file does not state one. Default: x, y, z in ``.npy`` and
         ``.npz``, else z, y, x.
@@ -77,21 +93,22 @@ def read_grid(
     OutOfMemoryError
         If there is no room to unpack it.
     GridError
-        If its values are not a signed distance grid, or its axes are oblique to the world's.
+        If its values are not a signed distance grid, or its axes are not at right angles.
     OptionError
-        If the suffix, ``axes`` or ``inside`` is unknown.
+        If the suffix, ``axes`` or ``inside`` is unknown; if a direction is given, but files of the
+        format state it.
     """
     path = check_path(path, "path")
     format_ = find_format(path)
     order = choose_axes(format_, axes)
-    given = {"spacing": spacing, "origin": origin}
+    check_direction_given(format_, direction)
+    given = {"spacing": spacing, "origin": origin, "direction": direction}
     room = _room(max_memory)
     if format_.key in ("npy", "npz"):
         found = _read_numpy(check_regular_file(path), order, room, given)
     else:
         found = _read_foreign(path, format_, order, room, given, max_memory)
-    values, spacing, origin = (found[key] for key in NPZ_KEYS)
-    return make_grid(values, spacing=spacing, origin=origin, inside=inside)
+    return make_grid(found["values"], **{key: found[key] for key in PLACE}, inside=inside)
 
 
 def _read_numpy(path: Path, axes: str, room: int, given: dict[str, Any]) -> dict[str, Any]:
@@ -115,7 +132,7 @@ def _read_foreign(
     given: dict[str, Any],
     max_memory: int | None,
 ) -> dict[str, Any]:
-    """Return values, spacing and origin of a file that its own library reads."""
+    """Return values and place of a file that its own library reads."""
     file, member = split_member(path)
     check_grid_file(path)
     check_library(format_)
@@ -126,6 +143,8 @@ def _read_foreign(
     left = None if bound is None else bound - (held_memory() or 0)
     with _one_line_errors(path, format_, watched), ExitStack() as files:
         volume = READERS[format_.key](Request(file, member, axes, room, left, files))
+        if given["direction"] is not None:
+            volume = replace(volume, direction=axes_direction(axes))
         return take(volume, str(path), room, given)
 
 
@@ -234,13 +253,14 @@ def _find_members(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.Zip
 
 
 def _read_small(archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str) -> NDArray[Any]:
-    """Read an array of one number or three."""
+    """Read an array of one number or three; of nine, for a direction."""
+    most, asked = (9, "nine numbers") if name.endswith("[direction]") else (3, NUMBERS)
     member = Member(archive, info, name)
     header = read_array_header(member.read, name)
-    if prod(header.shape) > 3:
-        raise GridError(f"{name} has shape {header.shape}: give one number or three")
+    if prod(header.shape) > most:
+        raise GridError(f"{name} has shape {header.shape}: give {asked}")
     if header.dtype.kind not in "fiu":
-        raise GridError(f"{name} has dtype {header.dtype}: give one number or three")
+        raise GridError(f"{name} has dtype {header.dtype}: give {asked}")
     _check_size(header, member.left, name)
     return np.frombuffer(member.read(header.size), header.dtype).reshape(header.shape)
 
@@ -280,7 +300,7 @@ def check_grid_target(path: str | Path, *, force: bool = False) -> Path:
 
 
 def write_grid(grid: SdfGrid, path: str | Path, *, force: bool = False) -> None:
-    """Write a grid as ``.npz`` with the keys values, spacing and origin.
+    """Write a grid as ``.npz``: the keys values, spacing, origin and, if it is turned, direction.
 
     Raises
     ------
@@ -290,5 +310,8 @@ def write_grid(grid: SdfGrid, path: str | Path, *, force: bool = False) -> None:
         If the file exists and ``force`` is not set, or cannot be written.
     """
     path = check_grid_target(path, force=force)
+    arrays: dict[str, Any] = {"spacing": grid.spacing, "origin": grid.origin}
+    if not grid.is_straight:
+        arrays["direction"] = grid.direction
     with replacing(path, force=force) as part, part.open("wb") as file:
-        np.savez(file, values=grid.values, spacing=grid.spacing, origin=grid.origin)
+        np.savez(file, values=grid.values, **arrays)

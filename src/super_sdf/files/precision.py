@@ -15,6 +15,7 @@ import numpy as np
 from ..arrays import Triple
 from ..errors import FileError
 from ..grid.sdf_grid import SdfGrid
+from ..grid.spacing import as_triple
 from ..mesh import CLEARANCE, tells_vertices_apart, vertex_type
 from .meshes import WORLD_ORIGIN, format_of
 
@@ -36,9 +37,9 @@ def check_format_holds(path: str | Path, grid: SdfGrid, factor: int) -> Triple:
     mesh_format = format_of(path)
     if vertex_type(grid, factor) is np.float32 or not mesh_format.single_precision:
         return WORLD_ORIGIN
-    reach = max(abs(x) + h * n for x, h, n in zip(grid.origin, grid.spacing, grid.shape))
+    reach = grid.reach
     if mesh_format.local_origin:
-        reach = max(spacing * samples / 2 for spacing, samples in zip(grid.spacing, grid.shape))
+        reach = _reach_from_middle(grid)
         if tells_vertices_apart(np.float32, reach, grid, factor):
             return _middle(grid)
     apart, suffix = CLEARANCE * grid.voxel_size / factor, Path(path).suffix.lower()
@@ -62,8 +63,18 @@ def local_origin_note(path: str | Path, about: Triple) -> tuple[str, ...]:
 def _middle(grid: SdfGrid) -> Triple:
     """Return the middle of a grid, in world units."""
     axes = zip(grid.origin, grid.spacing, grid.shape)
-    x, y, z = (origin + spacing * (samples - 1) / 2 for origin, spacing, samples in axes)
-    return x, y, z
+    if grid.is_straight:
+        x, y, z = (origin + spacing * (samples - 1) / 2 for origin, spacing, samples in axes)
+        return x, y, z
+    return as_triple(grid.to_world((np.array(grid.shape) - 1) / 2), "middle")
+
+
+def _reach_from_middle(grid: SdfGrid) -> float:
+    """Return the largest coordinate of the grid from its middle on, about."""
+    if grid.is_straight:
+        return max(spacing * samples / 2 for spacing, samples in zip(grid.spacing, grid.shape))
+    sides = np.array(grid.spacing) * grid.shape / 2
+    return float((np.abs(grid.direction) @ sides).max())
 
 
 def _limit_at(reach: float) -> str:

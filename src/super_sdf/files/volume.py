@@ -1,7 +1,8 @@
 """What a reader of a file format returns, and its place in the world.
 
-A reader only says what the file says. Here, and nowhere else, is decided which of these volumes the
-method takes: those whose axes are the world's, in any order and direction.
+A reader only says what the file says. Here, and nowhere else, the axes of the array are brought
+into the order and sense in which they lie nearest to the world's. What is left is the direction of
+the grid.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
+from itertools import permutations
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Triple
 from ..errors import GridError, OutOfMemoryError
+from ..grid.direction import Direction, as_direction, check_direction
 from ..grid.planes import SampleArray
 from ..grid.samples import check_kind
 from ..machine.memory import in_words
@@ -107,10 +110,15 @@ class Volume:
 
 @dataclass(frozen=True)
 class Placement:
-    """Which world axis each axis of an array runs along, and whether backwards."""
+    """Which world axis each axis of an array runs along, or nearest to, and whether backwards.
+
+    ``direction`` is that of the array with its axes in this order and sense, None if they run along
+    the world's.
+    """
 
     world_axes: tuple[int, ...]
     backwards: tuple[bool, ...]
+    direction: Direction | None = None
 
 
 def from_affine(matrix: NDArray[Any]) -> tuple[Triple, Triple, NDArray[np.float64]]:
@@ -150,31 +158,44 @@ def find_placement(volume: Volume, name: str) -> Placement:
     Raises
     ------
     GridError
-        If they are not along the world's axes.
+        If they are not at right angles.
     """
     direction = XYZ if volume.direction is None else np.asarray(volume.direction)
     rounded = np.rint(direction)
     along = np.abs(rounded)
     straight = np.abs(direction - rounded).max() <= STRAIGHT  # False for NaN
-    if not (straight and (along.sum(0) == 1).all() and (along.sum(1) == 1).all()):
-        rows = "; ".join(", ".join(f"{entry:.4g}" for entry in row) for row in direction)
-        raise GridError(
-            f"{name} has axes oblique to the world's, directions {rows}: resample it to a grid "
-            "along x, y, z"
-        )
-    backwards = rounded.sum(0) < 0
-    return Placement(tuple(map(int, along.argmax(0))), tuple(map(bool, backwards)))
+    if straight and (along.sum(0) == 1).all() and (along.sum(1) == 1).all():
+        backwards = rounded.sum(0) < 0
+        return Placement(tuple(map(int, along.argmax(0))), tuple(map(bool, backwards)))
+    try:
+        check_direction(direction)
+    except GridError as error:
+        raise GridError(f"{name}: {error}") from None
+    return _nearest_placement(direction)
+
+
+def _nearest_placement(direction: NDArray[np.float64]) -> Placement:
+    """Return the order and sense in which oblique axes lie nearest to the world's."""
+
+    def nearness(order: tuple[int, ...]) -> float:
+        return float(np.abs(direction[order, (0, 1, 2)]).sum())
+
+    world_axes = max(permutations(range(3)), key=nearness)
+    backwards = direction[world_axes, (0, 1, 2)] < 0
+    turned = np.empty((3, 3))
+    turned[:, world_axes] = np.where(backwards, -direction, direction)
+    return Placement(world_axes, tuple(map(bool, backwards)), as_direction(turned))
 
 
 def take(volume: Volume, name: str, room: int, given: dict[str, Any]) -> dict[str, Any]:
-    """Return values (nx, ny, nz), spacing and origin of a volume, for ``make_grid``.
+    """Return values (nx, ny, nz), spacing, origin and direction of a volume, for ``make_grid``.
 
-    ``given`` holds a spacing and an origin that replace those of the file, or None.
+    ``given`` holds what replaces these of the file, or None.
 
     Raises
     ------
     GridError
-        If the array is no grid, or lies oblique to the world's axes.
+        If the array is no grid, or its axes are not at right angles.
     """
     check_kind(volume.dtype, volume.shape)
     placement = find_placement(volume, name)
@@ -186,20 +207,22 @@ def take(volume: Volume, name: str, room: int, given: dict[str, Any]) -> dict[st
     if origin is not None and any(placement.backwards):
         origin = _lowest_corner(volume, placement, spacing, origin)
     values = volume.stored
-    if values is None or placement != Placement((0, 1, 2), (False,) * 3):
+    if values is None or placement.world_axes != (0, 1, 2) or any(placement.backwards):
         values = _copied(volume, placement, name, room)
-    return {"values": values, "spacing": spacing, "origin": origin}
+    direction = placement.direction if given["direction"] is None else given["direction"]
+    return {"values": values, "spacing": spacing, "origin": origin, "direction": direction}
 
 
 def _lowest_corner(
     volume: Volume, placement: Placement, spacing: Any, origin: Any
 ) -> NDArray[np.float64]:
-    """Return the position of the sample with the least coordinates, which comes first then."""
+    """Return the position of the sample that comes first when no axis runs backwards."""
+    columns = XYZ if placement.direction is None else np.array(placement.direction)
     steps = np.broadcast_to(np.asarray(spacing, np.float64), 3)
     corner = np.broadcast_to(np.asarray(origin, np.float64), 3).copy()
     for count, axis, backwards in zip(volume.shape, placement.world_axes, placement.backwards):
         if backwards:
-            corner[axis] -= (count - 1) * steps[axis]
+            corner -= columns[:, axis] * ((count - 1) * steps[axis])
     return corner
 
 

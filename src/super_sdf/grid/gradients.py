@@ -197,8 +197,8 @@ def are_consistent(
     return len(length) >= ENOUGH and bool(agreeing.mean() >= AGREEING)
 
 
-def check_equal_axes(gradients: NDArray[np.float64], bend: NDArray[np.float64]) -> None:
-    """Raise GridError if the gradients show different spacings along the axes."""
+def unequal_axes(gradients: NDArray[np.float64], bend: NDArray[np.float64]) -> dict[str, float]:
+    """Return the spacing that the gradients along each axis show; empty unless they differ."""
     length = lengths(gradients)
     found: dict[str, float] = {}
     for axis, name in enumerate("xyz"):
@@ -206,8 +206,26 @@ def check_equal_axes(gradients: NDArray[np.float64], bend: NDArray[np.float64]) 
         if along.sum() >= ENOUGH:
             found[name] = typical_length(gradients[along], bend[along])
     if found and max(found.values()) > UNEQUAL * min(found.values()):
-        steps = ", ".join(f"{step:.4g} along {name}" for name, step in found.items())
-        raise GridError(
-            f"the values change by {steps} from sample to sample: the method needs cubic voxels; "
-            "resample the grid to one spacing on all axes"
-        )
+        return found
+    return {}
+
+
+def spacing_of_axes(
+    gradients: NDArray[np.float64], bend: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """Return the spacings (3,) with which most gradients (n, 3) have length 1; None if none have.
+
+    (g_x / h_x)^2 + (g_y / h_y)^2 + (g_z / h_z)^2 = 1 is linear in 1 / h^2. It is solved for the
+    straight gradients, in the mean, then again and again for those that agree better and better.
+    """
+    squares = gradients[bend <= BENT] ** 2
+    agreeing = np.ones(len(squares), bool)
+    for tolerance in (0.5, 0.3, 0.2, 0.1, AGREEMENT, AGREEMENT):
+        if agreeing.sum() < ENOUGH:
+            return None
+        inverse, _, rank, _ = np.linalg.lstsq(squares[agreeing], np.ones(agreeing.sum()), 1e-6)
+        if rank < 3 or inverse.min() <= 0:
+            return None
+        agreeing = np.abs(np.sqrt(squares @ inverse) - 1) <= tolerance
+    spacings: NDArray[np.float64] = 1 / np.sqrt(inverse)
+    return spacings if agreeing.mean() >= AGREEING else None

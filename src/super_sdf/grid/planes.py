@@ -8,6 +8,7 @@ the file was opened is an error.
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from functools import cached_property
 from io import FileIO
@@ -111,7 +112,7 @@ class InputFile:
         return out
 
 
-class PlaneSource:
+class SamplePlanes(ABC):
     """A 3D array whose planes along the first axis are made when they are needed.
 
     Attributes
@@ -119,7 +120,7 @@ class PlaneSource:
     shape, dtype
         Shape (nx, ny, nz) and type of the array.
     name : str
-        Its name in error messages.
+        What the array is called in error messages.
     """
 
     ndim = 3
@@ -127,12 +128,17 @@ class PlaneSource:
     dtype: np.dtype[Any]
     name: str
 
-    def __len__(self) -> int:
-        return self.shape[0]
-
+    @abstractmethod
     def read(self, first: int, last: int) -> NDArray[Any]:
         """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
-        raise NotImplementedError
+
+    @property
+    def plane_bytes(self) -> int:
+        """Bytes of a plane."""
+        return self.shape[1] * self.shape[2] * self.dtype.itemsize
+
+    def __len__(self) -> int:
+        return self.shape[0]
 
     def __getitem__(self, which: int | slice) -> NDArray[Any]:
         """Return one plane or a range of planes, as indexing an array would."""
@@ -147,11 +153,6 @@ class PlaneSource:
         step = max(BLOCK_BYTES // self.plane_bytes, 1)
         for first in range(0, len(self), step):
             yield from self.read(first, min(first + step, len(self)))
-
-    @property
-    def plane_bytes(self) -> int:
-        """Bytes of a plane."""
-        return self.shape[1] * self.shape[2] * self.dtype.itemsize
 
     @cached_property
     def loaded(self) -> NDArray[Any]:
@@ -170,11 +171,11 @@ class PlaneSource:
         return np.array(self.loaded, dtype) if copy else np.asarray(self.loaded, dtype)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the array itself: another process may not have the source."""
+        """Pickle the array itself: another process may not have what it is made from."""
         return np.asarray, (self.loaded,)
 
 
-class PlaneFile(PlaneSource):
+class PlaneFile(SamplePlanes):
     """A 3D array in a file, whose planes along the first axis are read when they are needed.
 
     Parameters
@@ -198,8 +199,8 @@ class PlaneFile(PlaneSource):
         *,
         swapped: bool = False,
     ) -> None:
-        self.file, self.offset = file, offset
-        self.shape, self.dtype, self.swapped, self.name = shape, dtype, swapped, file.name
+        self.file, self.offset, self.name = file, offset, file.name
+        self.shape, self.dtype, self.swapped = shape, dtype, swapped
 
     def read(self, first: int, last: int) -> NDArray[Any]:
         """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz).
@@ -217,5 +218,5 @@ class PlaneFile(PlaneSource):
         return planes.transpose(0, 2, 1) if self.swapped else planes
 
 
-SampleArray: TypeAlias = NDArray[Any] | PlaneSource
-"""An array of samples in memory, or one whose planes are read or made when needed."""
+SampleArray: TypeAlias = NDArray[Any] | SamplePlanes
+"""An array of samples in memory, or one whose planes are read or made when they are needed."""

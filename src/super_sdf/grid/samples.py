@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import GridError, seen
-from .planes import PlaneSource, SampleArray
+from .planes import SampleArray, SamplePlanes
 
 Extremes = tuple[float, float]
 """The smallest and the largest sample."""
@@ -17,15 +17,15 @@ Extremes = tuple[float, float]
 DISTANCES_HINT = "make them with scipy.ndimage.distance_transform_edt"
 
 
-def as_samples(values: ArrayLike | PlaneSource) -> SampleArray:
-    """Return samples as an array; a ``PlaneSource`` is returned as it is.
+def as_samples(values: ArrayLike | SamplePlanes) -> SampleArray:
+    """Return samples as an array; ``SamplePlanes`` are returned as they are.
 
     Raises
     ------
     GridError
         If they make no array, or some are masked.
     """
-    if isinstance(values, PlaneSource):
+    if isinstance(values, SamplePlanes):
         return values
     try:
         samples = np.asanyarray(values)

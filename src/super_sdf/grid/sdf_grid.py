@@ -10,16 +10,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Triple
+from .direction import STRAIGHT, Direction, check_direction, in_rows, is_mirrored
 from .one_sided import check_thin, is_one_sided
-from .planes import PlaneSource, SampleArray
+from .planes import SampleArray, SamplePlanes
+from .resampling import resample
 from .samples import Extremes, as_samples, check_not_flat, check_values
 from .sides import check_negative_inside, is_positive_inside
-from .spacing import as_triple, check_spacing, choose_spacing
+from .spacing import as_triple, check_spacing, choose_spacing, is_cubic
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
 class SdfGrid:
-    """Signed distances at the points ``world = origin + spacing * (i, j, k)``.
+    """Signed distances at the points ``world = origin + direction @ (spacing * (i, j, k))``.
 
     The constructor expects values that are negative inside and a known spacing, and refuses values
     that contradict either. ``make_grid`` infers the sign, and the spacing if it is not given.
@@ -27,12 +29,15 @@ class SdfGrid:
     Parameters
     ----------
     values : (nx, ny, nz) array_like
-        Signed distances in world units, negative inside; i runs along x, j along y, k along z. A
-        memory-mapped array or a ``PlaneSource`` is not loaded.
+        Signed distances in world units, negative inside; i runs along x, j along y, k along z
+        unless there is a direction. A memory-mapped array or ``SamplePlanes`` are not loaded.
     spacing : float or three floats
-        World distance between neighbouring samples; equal on all axes.
+        World distance between neighbouring samples, along each axis of the array.
     origin : float or three floats
         World position of sample (0, 0, 0). Default: 0, 0, 0.
+    direction : (3, 3) array_like or nine numbers, optional
+        The columns are the world directions of the array's axes: unit vectors at right angles,
+        mirrored or not. Default: i runs along x, j along y, k along z.
 
     Attributes
     ----------
@@ -48,35 +53,43 @@ class SdfGrid:
     ------
     GridError
         If the array is not three-dimensional, finite, and at least 2 samples long on each axis; if
-        most of its border is negative; if the spacing is not positive and equal on all axes; or if
-        the values change from sample to sample by more than the spacing, or by much less.
+        most of its border is negative; if the spacing is not positive, or the direction no rotation
+        or mirrored rotation; or if the values change from sample to sample by more than the
+        spacing.
     """
 
     samples: SampleArray
     spacing: Triple
     origin: Triple
+    direction: Direction
     notes: tuple[str, ...]
     positive_inside: bool
     low: float
     high: float
 
     def __init__(
-        self, values: ArrayLike | PlaneSource, spacing: ArrayLike, origin: ArrayLike = 0.0
+        self,
+        values: ArrayLike | SamplePlanes,
+        spacing: ArrayLike,
+        origin: ArrayLike = 0.0,
+        direction: ArrayLike | None = None,
     ) -> None:
         samples, extremes = _checked(values)
         check_negative_inside(samples)
         notes: list[str] = []
         chosen = choose_spacing(samples, check_spacing(spacing), notes)
-        self._set(samples, chosen, origin, tuple(notes), False, extremes)
+        place = chosen, origin, direction
+        self._set(samples, place, tuple(notes), False, extremes)
 
     @classmethod
     def trusted(
         cls,
-        values: ArrayLike | PlaneSource,
+        values: ArrayLike | SamplePlanes,
         spacing: ArrayLike,
         origin: ArrayLike = 0.0,
         notes: tuple[str, ...] = (),
         *,
+        direction: ArrayLike | None = None,
         positive_inside: bool = False,
         extremes: Extremes | None = None,
     ) -> SdfGrid:
@@ -88,14 +101,14 @@ class SdfGrid:
         samples = as_samples(values)
         grid = object.__new__(cls)
         found = extremes or check_values(samples)
-        grid._set(samples, check_spacing(spacing), origin, notes, positive_inside, found)
+        place = check_spacing(spacing), origin, direction
+        grid._set(samples, place, notes, positive_inside, found)
         return grid
 
     def _set(
         self,
         samples: SampleArray,
-        spacing: Triple,
-        origin: ArrayLike,
+        place: tuple[Triple, ArrayLike, ArrayLike | None],
         notes: tuple[str, ...],
         positive_inside: bool,
         extremes: Extremes,
@@ -104,8 +117,9 @@ class SdfGrid:
         set_ = partial(object.__setattr__, self)
         low, high = extremes
         set_("samples", samples)
-        set_("spacing", spacing)
-        set_("origin", as_triple(origin, "origin"))
+        set_("spacing", place[0])
+        set_("origin", as_triple(place[1], "origin"))
+        set_("direction", check_direction(place[2]))
         set_("notes", notes)
         set_("positive_inside", positive_inside)
         set_("low", -high if positive_inside else low)
@@ -114,8 +128,9 @@ class SdfGrid:
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.shape))
         spacing, origin = (", ".join(f"{x:.6g}" for x in at) for at in (self.spacing, self.origin))
+        turned = "" if self.is_straight else f", direction {in_rows(self.direction)}"
         return (
-            f"SdfGrid({shape} {self.samples.dtype}, spacing {spacing}, origin {origin}, "
+            f"SdfGrid({shape} {self.samples.dtype}, spacing {spacing}, origin {origin}{turned}, "
             f"values {self.low:.6g} to {self.high:.6g})"
         )
 
@@ -123,17 +138,13 @@ class SdfGrid:
     def values(self) -> NDArray[Any]:
         """All samples, negative inside."""
         samples = self.samples
-        whole = samples.loaded if isinstance(samples, PlaneSource) else samples
+        whole = samples.loaded if isinstance(samples, SamplePlanes) else samples
         return negated(whole) if self.positive_inside else whole
 
     def planes(self, first: int, last: int) -> NDArray[Any]:
         """Return the samples with first <= i < last, negative inside, (last - first, ny, nz)."""
         samples = self.samples[first:last]
         return negated(samples) if self.positive_inside else samples
-
-    def to_world(self, ijk: ArrayLike) -> NDArray[np.float64]:
-        """Return the world positions (..., 3) of indices (..., 3), which need not be whole."""
-        return np.asarray(ijk, np.float64) * self.spacing + self.origin
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -143,15 +154,54 @@ class SdfGrid:
 
     @property
     def voxel_size(self) -> float:
-        """The spacing h, in world units."""
-        return sum(self.spacing) / 3
+        """The spacing h of the lattice that is refined, in world units: the finest one."""
+        return sum(self.spacing) / 3 if self.is_cubic else min(self.spacing)
+
+    @property
+    def is_cubic(self) -> bool:
+        """Whether the spacing is the same on all axes, up to 0.1 %."""
+        return is_cubic(self.spacing)
+
+    @property
+    def is_straight(self) -> bool:
+        """Whether the array's axes run along the world's: the direction is the identity."""
+        return self.direction == STRAIGHT
+
+    @property
+    def is_mirrored(self) -> bool:
+        """Whether the array's axes are left-handed in the world."""
+        return is_mirrored(self.direction)
+
+    @property
+    def reach(self) -> float:
+        """The largest coordinate of the grid in the world, about."""
+        if self.is_straight:
+            axes = zip(self.origin, self.spacing, self.shape)
+            return max(abs(x) + h * n for x, h, n in axes)
+        sides = np.array(self.spacing) * self.shape
+        return float((np.abs(self.origin) + np.abs(self.direction) @ sides).max())
+
+    def to_world(self, ijk: ArrayLike) -> NDArray[np.float64]:
+        """Return the world positions (..., 3) of indices (..., 3), which need not be whole."""
+        along = np.asarray(ijk, np.float64) * np.array(self.spacing)
+        turned = along if self.is_straight else along @ np.array(self.direction).T
+        world: NDArray[np.float64] = turned + np.array(self.origin)
+        return world
+
+    def to_index(self, world: NDArray[Any]) -> NDArray[np.float64]:
+        """Return world positions (n, 3) in spacings from sample (0, 0, 0)."""
+        along = world - np.array(self.origin)
+        turned = along if self.is_straight else np.linalg.solve(self.direction, along.T).T
+        places: NDArray[np.float64] = turned / np.array(self.spacing)
+        return places
 
 
 def make_grid(
-    values: ArrayLike | PlaneSource,
+    values: ArrayLike | SamplePlanes,
     *,
     spacing: ArrayLike | None = None,
     origin: ArrayLike | None = None,
+    direction: ArrayLike | None = None,
     inside: str = "auto",
 ) -> SdfGrid:
     """Make a grid from an array of signed distances; what is not given is inferred.
@@ -164,6 +214,8 @@ def make_grid(
         World distance between neighbouring samples. Default: estimated from the gradient.
     origin : number or three, optional
         World position of sample (0, 0, 0). Default: 0, 0, 0.
+    direction : (3, 3) array_like or nine numbers, optional
+        The columns are the world directions of the array's axes; see ``SdfGrid``.
     inside : {"auto", "negative", "positive"}
         Sign of the values inside the solid; "auto" takes the border of the grid as outside.
 
@@ -184,16 +236,29 @@ def make_grid(
     flipped = is_positive_inside(samples, inside, extremes, notes)
     chosen = choose_spacing(samples, spacing, notes)
     if inside == "auto" and is_one_sided(extremes):
-        check_thin(samples, sum(chosen) / 3, extremes)
+        check_thin(*_cubic(samples, chosen), extremes)
     if origin is None:
         notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
         origin = 0.0
     return SdfGrid.trusted(
-        samples, chosen, origin, tuple(notes), positive_inside=flipped, extremes=extremes
+        samples,
+        chosen,
+        origin,
+        tuple(notes),
+        direction=direction,
+        positive_inside=flipped,
+        extremes=extremes,
     )
 
 
-def _checked(values: ArrayLike | PlaneSource) -> tuple[SampleArray, Extremes]:
+def _cubic(samples: SampleArray, spacing: Triple) -> tuple[SampleArray, float]:
+    """Return samples at the finest spacing on all axes, and that spacing."""
+    if is_cubic(spacing):
+        return samples, sum(spacing) / 3
+    return resample(samples, spacing)[0], min(spacing)
+
+
+def _checked(values: ArrayLike | SamplePlanes) -> tuple[SampleArray, Extremes]:
     """Return samples as an array, and their extremes; raise GridError if they are no field."""
     samples = as_samples(values)
     extremes = check_values(samples)

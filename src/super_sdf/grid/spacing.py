@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Triple
 from ..errors import GridError, seen
@@ -11,18 +11,21 @@ from .gradients import (
     ENOUGH,
     Gradients,
     are_consistent,
-    check_equal_axes,
+    spacing_of_axes,
     straight_gradients,
     surface_gradients,
     typical_length,
+    unequal_axes,
 )
 from .planes import SampleArray
 
-# The method needs cubic voxels: spacings that differ by less than this ratio count as equal.
-EQUAL_SPACING = 1e-3
+# Spacings that differ by less than this ratio count as equal. Coarser axes are resampled to the
+# finest spacing, so a large ratio makes many samples of few.
+EQUAL_SPACING, MOST_UNEQUAL = 1e-3, 50.0
 # Within these, areas, volumes and squared areas neither overflow nor underflow.
 LEAST_SPACING, MOST_SPACING = 1e-60, 1e60
 SNAP = 0.02  # an estimate this close to a usual spacing is replaced by it
+CLEARLY_UNEQUAL = 1.1  # ratio of estimated spacings, from which on they are taken as different
 # Ratio of measured to given spacing, or its inverse, above which there is a note.
 TOLERATED = 1.1
 # Distances cannot change by more than the samples are apart. Larger ratios are refused: the first
@@ -58,7 +61,7 @@ def check_spacing(spacing: ArrayLike) -> Triple:
     Raises
     ------
     GridError
-        If they are not positive, out of range, or not equal within 0.1 %.
+        If they are not positive, out of range, or one is more than 50 times another.
     """
     triple = as_triple(spacing, "spacing")
     if min(triple) <= 0:
@@ -68,12 +71,17 @@ def check_spacing(spacing: ArrayLike) -> Triple:
             f"spacing is {_join(triple)}: give lengths in a unit in which it is between "
             f"{LEAST_SPACING:g} and {MOST_SPACING:g}"
         )
-    if max(triple) > min(triple) * (1 + EQUAL_SPACING):
+    if max(triple) > min(triple) * MOST_UNEQUAL:
         raise GridError(
-            f"spacing is {_join(triple)}: the method needs cubic voxels; "
-            "resample the grid to one spacing on all axes"
+            f"spacing is {_join(triple)}: the largest may be {MOST_UNEQUAL:g} times the smallest; "
+            "leave out samples along the finer axes"
         )
     return triple
+
+
+def is_cubic(spacing: Triple) -> bool:
+    """Return whether a spacing is the same on all axes, up to 0.1 %."""
+    return max(spacing) <= min(spacing) * (1 + EQUAL_SPACING)
 
 
 def choose_spacing(values: SampleArray, spacing: ArrayLike | None, notes: list[str]) -> Triple:
@@ -90,21 +98,69 @@ def choose_spacing(values: SampleArray, spacing: ArrayLike | None, notes: list[s
     beside = surface_gradients(values)
     if given and not len(beside[0]):
         return given
-    check_equal_axes(*beside)
-    if given is None:
-        return _infer_spacing(_measure(values, beside), values.shape, notes)
-    _check_unit(values, beside, given, notes)
-    return given
+    if given:
+        _check_axes(_scaled(beside, given), given)
+        _check_unit(values, beside, given, notes)
+        return given
+    everywhere = straight_gradients(values)
+    unequal = unequal_axes(*beside) or unequal_axes(*everywhere)
+    if unequal or not _show_one_spacing(everywhere):
+        each = spacing_of_axes(*everywhere)
+        if each is not None and each.max() > CLEARLY_UNEQUAL * each.min():
+            return _infer_axes(each, notes)
+    if unequal:
+        steps = ", ".join(f"{step:.4g} along {name}" for name, step in unequal.items())
+        raise GridError(
+            f"spacing not given: the values change by {steps} from sample to sample, and do not "
+            "show it for all axes; give --spacing X,Y,Z"
+        )
+    return _infer_spacing(_measure(everywhere, beside), values.shape, notes)
 
 
-def _measure(values: SampleArray, beside: Gradients) -> float:
+def _show_one_spacing(gradients: Gradients) -> bool:
+    """Return whether gradients agree on a spacing, whatever their direction."""
+    return len(gradients[0]) < ENOUGH or are_consistent(typical_length(*gradients), *gradients)
+
+
+def _scaled(gradients: Gradients, spacing: Triple) -> Gradients:
+    """Return gradients in index units of the finest axis, if the spacings differ."""
+    if is_cubic(spacing):
+        return gradients
+    return gradients[0] * (min(spacing) / np.array(spacing)), gradients[1]
+
+
+def _check_axes(gradients: Gradients, spacing: Triple) -> None:
+    """Raise GridError if gradients, scaled to one spacing, show different ones along the axes."""
+    found, h = unequal_axes(*gradients), dict(zip("xyz", spacing))
+    if found:
+        steps = ", ".join(
+            f"{step * h[name] / min(spacing):.4g} along {name}" for name, step in found.items()
+        )
+        raise GridError(
+            f"the values change by {steps} from sample to sample, but spacing is "
+            f"{_join(spacing)}: give that of each axis (--spacing X,Y,Z)"
+        )
+
+
+def _infer_axes(found: NDArray[np.float64], notes: list[str]) -> Triple:
+    """Return the estimated spacings of the axes, those that are nearly equal as one."""
+    for near in found.copy():  # axes that are equal but for the error of the estimate
+        alike = np.abs(found / near - 1) <= SNAP
+        found[alike] = found[alike].mean()
+    spacing = check_spacing(found)
+    notes.append(
+        f"spacing not given: estimated as {', '.join(f'{h:.6g}' for h in spacing)} along x, y, z "
+        "from the values, so the size of the mesh is approximate (give --spacing)"
+    )
+    return spacing
+
+
+def _measure(everywhere: Gradients, beside: Gradients) -> float:
     """Return the change of the values from sample to sample where the field is smooth.
 
     It is that of the whole field, unless only the samples beside the surface agree with each other:
     then the field is no distance, and what it is at the surface matters.
     """
-    everywhere = straight_gradients(values)
-    check_equal_axes(*everywhere)
     if len(everywhere[0]) < ENOUGH and len(beside[0]):
         return typical_length(*beside)
     measured = typical_length(*everywhere)
@@ -141,17 +197,25 @@ def _check_unit(values: SampleArray, beside: Gradients, spacing: Triple, notes: 
     They do if they change by more. Exact distances change by less beside thin parts: there is no
     note if the rest of the field agrees with the spacing.
     """
-    h, measured = sum(spacing) / 3, typical_length(*beside)
-    observed = f"the values change by {measured:.6g} from sample to sample, but spacing is "
+    h = sum(spacing) / 3 if is_cubic(spacing) else min(spacing)
+    beside = _scaled(beside, spacing)
+    measured = typical_length(*beside)
+    named = f"{spacing[0]:.6g}" if is_cubic(spacing) else f"{h:.6g} along the finest axis"
+    observed = f"the values change by {measured:.6g} from sample to sample, but spacing is {named}"
     allowed = REFUSED if are_consistent(measured, *beside) else REFUSED_IF_UNSURE
     if measured > allowed * h:
         raise GridError(
-            f"{observed}{spacing[0]:.6g}: distances and spacing must be in the same unit; "
+            f"{observed}: distances and spacing must be in the same unit; "
             f"scale the values by {h / measured:.6g} or give another --spacing"
         )
-    if _agree(measured, h) or (measured < h and _agree(_measure(values, beside), h)):
+    if _agree(measured, h):
         return
-    notes.append(f"{observed}{spacing[0]:.6g}: they are not exact distances, or the unit is wrong")
+    if measured < h:
+        everywhere = _scaled(straight_gradients(values), spacing)
+        _check_axes(everywhere, spacing)
+        if _agree(_measure(everywhere, beside), h):
+            return
+    notes.append(f"{observed}: they are not exact distances, or the unit is wrong")
 
 
 def _agree(measured: float, h: float) -> bool:

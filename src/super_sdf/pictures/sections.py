@@ -16,7 +16,9 @@ from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
 from ..errors import OptionError
+from ..grid.cubic import cubic_grid
 from ..grid.sdf_grid import SdfGrid
+from ..grid.spacing import as_triple
 from ..steps.field import FineField
 from .choices import AXES
 from .page import check_page, write_picture
@@ -83,8 +85,8 @@ def render_section(
     axis : str
         The axis normal to the section: x, y or z.
     at : float, optional
-        World position on that axis; the nearest plane of samples is drawn. Default: the middle of
-        the surface.
+        Position on that axis in world units, along the grid's own axes if it has a direction; the
+        nearest plane of samples is drawn. Default: the middle of the surface.
     size : int
         Width of a panel in pixels.
     force : bool
@@ -101,8 +103,9 @@ def render_section(
     index = find_plane(grid, axis, at)
     figure = _draw(_titled_sections(grid, field, axis, index), axis, grid.voxel_size, size)
     number = AXES.index(axis)
-    position = grid.origin[number] + grid.spacing[number] * index
-    figure.suptitle(f"section at {axis} = {position:.4g}")
+    position = own_origin(grid)[number] + grid.spacing[number] * index
+    along = "" if grid.is_straight else ", along the grid's own axes"
+    figure.suptitle(f"section at {axis} = {position:.4g}{along}")
     write_picture(figure, target, force=force)
 
 
@@ -137,7 +140,7 @@ def find_plane(grid: SdfGrid, axis: str = "z", at: float | None = None) -> int:
     number = AXES.index(axis)
     if at is None:
         return _middle_plane(grid, number)
-    first, step, count = grid.origin[number], grid.spacing[number], grid.shape[number]
+    first, step, count = own_origin(grid)[number], grid.spacing[number], grid.shape[number]
     index = (at - first) / step
     if not -0.5 <= index <= count - 0.5:
         low, high = first - step / 2, first + step * (count - 0.5)
@@ -145,25 +148,38 @@ def find_plane(grid: SdfGrid, axis: str = "z", at: float | None = None) -> int:
     return min(max(round(index), 0), count - 1)
 
 
+def own_origin(grid: SdfGrid) -> tuple[float, float, float]:
+    """Return the position of sample (0, 0, 0) along the grid's own axes, in world units."""
+    if grid.is_straight:
+        return grid.origin
+    return as_triple(np.array(grid.direction).T @ np.array(grid.origin), "origin")
+
+
 def coarse_section(grid: SdfGrid, axis: str, index: int) -> Section:
     """Return the plane of samples with this index along an axis."""
     number = AXES.index(axis)
     values = np.take(grid.values, index, axis=number).astype(np.float64)
     across, along = _others(number)
-    first = grid.origin[across], grid.origin[along]
+    origin = own_origin(grid)
+    first = origin[across], origin[along]
     return Section(values, first, (grid.spacing[across], grid.spacing[along]))
 
 
 def fine_section(field: FineField, grid: SdfGrid, axis: str, index: int) -> Section:
     """Return the fine values on the plane of nodes that coincides with a plane of samples."""
-    if field.shape != grid.shape:
+    lattice = cubic_grid(grid)
+    if field.shape != lattice.shape:
         shape = " x ".join(map(str, field.shape))
         raise OptionError(f"the field refines a grid of {shape}: give that grid")
     number = AXES.index(axis)
-    coarse = coarse_section(grid, axis, index)
-    wide, high = coarse.step
-    first = coarse.first[0] - wide / 2, coarse.first[1] - high / 2
-    values = _node_plane(field, number, index) * (grid.voxel_size / 2)
+    origin = own_origin(lattice)
+    (left, bottom), (wide, high) = (
+        [at[n] for n in _others(number)] for at in (origin, lattice.spacing)
+    )
+    first = left - wide / 2, bottom - high / 2
+    plane = round(index * grid.spacing[number] / lattice.spacing[number])
+    plane = min(plane, lattice.shape[number] - 1)
+    values = _node_plane(field, number, plane) * (lattice.voxel_size / 2)
     return Section(values, first, (wide / field.factor, high / field.factor))
 
 

@@ -6,7 +6,7 @@ one spacing h is 2, and the band is ``abs(value) < 3``.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -171,15 +171,16 @@ def _flat_steps(
     return (voxel_ijk + 1) @ strides, [int(step) for step in NEIGHBOURHOOD @ strides]
 
 
-def is_lipschitz(patches: FloatArray) -> BoolArray:
+def is_lipschitz(patches: FloatArray, places: Iterable[int] = range(27)) -> BoolArray:
     """Return which patches (V, 27) can be distances, (V,) bool: those that are 1-Lipschitz.
 
     The distances of two points differ by no more than the points are apart. This fails nearly
     everywhere in a noisy field, and in many places of a field that is not a distance.
+    ``places`` are those of a patch that are compared with its centre.
     """
     centre = patches[:, CENTRE]
     keeps = np.ones(len(patches), bool)
-    for column in range(27):
+    for column in places:
         keeps &= np.abs(patches[:, column] - centre) <= MAX_DIFFERENCE[column]
     return keeps
 

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray
-from ..grid.planes import PlaneSource
+from ..grid.planes import SamplePlanes
 from ..grid.sdf_grid import SdfGrid
 from .band import rescale
 from .field import FineField
 from .nodes import BARELY_INSIDE, BARELY_OUTSIDE
 
 
-class FineLattice(PlaneSource):
+class FineLattice(SamplePlanes):
     """The values at all nodes of the fine lattice, in world units, negative inside.
 
     Node (i, j, k) is at the coarse index ``(i, j, k) / K - 1/2``.
@@ -156,4 +156,6 @@ def fine_grid(field: FineField) -> SdfGrid:
     lowest, highest = field.in_world_units(ends).tolist()
     extremes = min(lowest, grid.low - field.offset), max(highest, grid.high - field.offset)
     origin = grid.to_world([-0.5, -0.5, -0.5])
-    return SdfGrid.trusted(lattice, spacing, origin, grid.notes, extremes=extremes)
+    return SdfGrid.trusted(
+        lattice, spacing, origin, grid.notes, direction=grid.direction, extremes=extremes
+    )

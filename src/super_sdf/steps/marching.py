@@ -241,6 +241,9 @@ def lattice_positions(
 def to_world(positions: NDArray[np.float64], field: FineField, grid: SdfGrid) -> NDArray[Any]:
     """Return positions (3, n) in fine spacings as vertices (n, 3) in world units."""
     vertices: NDArray[Any] = np.empty(positions.shape[::-1], vertex_type(grid, field.factor))
+    if not grid.is_straight:
+        vertices[:] = grid.to_world(positions.T / field.factor - 0.5)
+        return vertices
     for axis, position in enumerate(positions):
         sample = position / field.factor - 0.5  # the fine index K i + K/2 is sample i
         vertices[:, axis] = sample * grid.spacing[axis] + grid.origin[axis]

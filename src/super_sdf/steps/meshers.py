@@ -16,6 +16,7 @@ import numpy as np
 
 from ..arrays import BoolArray
 from ..errors import OptionError, OptionTypeError, seen
+from ..grid.cubic import cubic_grid
 from ..grid.sdf_grid import SdfGrid
 from ..machine.index_width import check_count
 from ..machine.threads import map_threads
@@ -156,7 +157,8 @@ def extract_mesh(
     field : FineField
         From ``upsample`` or ``read_field``.
     grid : SdfGrid, optional
-        A coarse grid for spacing and origin. Default: the one that the field was made from.
+        A coarse grid for spacing, origin and direction. Default: the one that the field was made
+        from.
     first_vertex : int
         The number of the first vertex, for a field of a slab: the number of vertices in the slabs
         before. Faces may also refer to vertices of the slab before.
@@ -179,11 +181,20 @@ def extract_mesh(
     check_grid(grid)
     chosen = find_mesher(mesher)
     whole = close(field, cap=check_cap(cap), beside=chosen.planes_beside(field.factor))
-    return join_meshes(chosen.extract(whole, grid, first_vertex, 1))
+    return join_meshes(extract_pieces(whole, cubic_grid(grid), first_vertex, 1, chosen))
 
 
 def extract_pieces(
     field: FineField, grid: SdfGrid, first_vertex: int, threads: int, mesher: Mesher
 ) -> list[Mesh]:
-    """Return the mesh of ``extract_mesh`` as a list of one or more pieces, in order."""
-    return mesher.extract(field, grid, first_vertex, threads)
+    """Return the mesh of ``extract_mesh`` as a list of one or more pieces, in order.
+
+    ``grid`` has the lattice of the field: it is from ``cubic_grid``.
+    """
+    pieces = mesher.extract(field, grid, first_vertex, threads)
+    return [turned_over(piece) for piece in pieces] if grid.is_mirrored else pieces
+
+
+def turned_over(mesh: Mesh) -> Mesh:
+    """Return a mesh with its triangles in reverse order: mirrored axes turn them inward."""
+    return Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]))

@@ -141,7 +141,12 @@ def find_correction(feet: FootPoints, parts: SharedParts) -> FloatArray:
     return prolong(coarse.take(numbers[CORNER_PARTS]), 1, 2) + fine.take(numbers)
 
 
-def exact_samples(patches: FloatArray, lipschitz: BoolArray, threads: int = 1) -> BoolArray:
+def exact_samples(
+    patches: FloatArray,
+    lipschitz: BoolArray,
+    threads: int = 1,
+    sampled: BoolArray | None = None,
+) -> BoolArray:
     """Return which samples of a whole band can be taken as exact distances.
 
     Parameters
@@ -153,12 +158,15 @@ def exact_samples(patches: FloatArray, lipschitz: BoolArray, threads: int = 1) -
         taken as exact.
     threads : int
         Threads to use.
+    sampled : (V,) bool, optional
+        Which are samples, not interpolated: these tell whether the field is noisy. All by default.
 
     Returns
     -------
     (V,) bool
     """
-    if not len(patches) or (~lipschitz).mean() > MAX_NOISY_SHARE:
+    telling = lipschitz if sampled is None else lipschitz[sampled]
+    if not len(telling) or (~telling).mean() > MAX_NOISY_SHARE:
         return np.zeros(len(patches), bool)
     sample = patches[:, CENTRE]
     limits = np.float32(sample.min()), np.float32(sample.max())

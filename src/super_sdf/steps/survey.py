@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import NoSurfaceError, OutOfMemoryError
+from ..grid.cubic import on_samples, sampled_places
+from ..grid.resampling import Resampled
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import held_memory, in_words
 from ..machine.resources import ONE_THREAD, Resources
@@ -52,6 +54,9 @@ class Band:
         Which voxels can hold the surface, and so are decoded.
     exact : (V,) bool
         Which voxels' own samples can be taken as exact distances.
+    sampled : (V,) bool, optional
+        Which voxels' own values are samples of a grid that was resampled, not interpolated; None if
+        all are.
     leaves : bool
         Whether a sample on the border of the grid is inside: then the solid leaves the grid.
     """
@@ -62,7 +67,14 @@ class Band:
     lipschitz: BoolArray
     decoded: BoolArray
     exact: BoolArray
+    sampled: BoolArray | None = None
     leaves: bool = False
+
+    @property
+    def noisy_voxels(self) -> int:
+        """The number of voxels whose own samples differ from others by more than distances can."""
+        noisy = ~self.lipschitz if self.sampled is None else ~self.lipschitz & self.sampled
+        return int(np.count_nonzero(noisy))
 
     @property
     def all_rows(self) -> slice:
@@ -134,7 +146,7 @@ def survey(grid: SdfGrid, offset: float = 0.0, resources: Resources = ONE_THREAD
     Parameters
     ----------
     grid : SdfGrid
-        Signed distances in world units.
+        Signed distances in world units, with the same spacing on all axes: see ``cubic_grid``.
     offset : float
         Distance of the surface in world units, positive outwards.
     resources : Resources
@@ -168,6 +180,8 @@ def survey(grid: SdfGrid, offset: float = 0.0, resources: Resources = ONE_THREAD
             raise no_surface(grid, offset)
         check_not_filled(jumps, offset, grid.voxel_size)
     band = make_band(grid.shape, voxel_ijk, _concatenate(patches), resources.threads)
+    if isinstance(grid.samples, Resampled):
+        band = look_at_samples(band, grid, resources.threads)
     return replace(band, leaves=any(leaving))
 
 
@@ -186,13 +200,28 @@ def _check_bound(voxels: int, planes: int, held: int, bound: int | None) -> None
 
 
 def make_band(
-    shape: tuple[int, int, int], voxel_ijk: IntArray, patches: FloatArray, threads: int = 1
+    shape: tuple[int, int, int],
+    voxel_ijk: IntArray,
+    patches: FloatArray,
+    threads: int = 1,
 ) -> Band:
     """Return the band of voxels (V, 3) with patches (V, 27), in half voxels."""
     lipschitz = is_lipschitz(patches)
     decoded = can_hold_surface(patches, lipschitz)
     exact = exact_samples(patches, lipschitz, threads)
     return Band(shape, voxel_ijk, patches, lipschitz, decoded, exact)
+
+
+def look_at_samples(band: Band, grid: SdfGrid, threads: int = 1) -> Band:
+    """Return the band of a resampled grid, in which samples are trusted by samples alone.
+
+    Interpolated values do not tell whether the samples are noisy. Where they do not contradict
+    others they count as exact, since thin parts need them (``benchmarks.anisotropic``).
+    """
+    sampled, lipschitz = on_samples(grid, band.voxel_ijk), band.lipschitz.copy()
+    lipschitz[sampled] = is_lipschitz(band.patches[sampled], sampled_places(grid))
+    exact = exact_samples(band.patches, lipschitz, threads, sampled)
+    return replace(band, lipschitz=lipschitz, exact=exact, sampled=sampled)
 
 
 def _band_of_planes(

@@ -1,4 +1,4 @@
-"""Spacing and origin of arrays in HDF5 and Zarr, by their attributes."""
+"""Spacing, origin and direction of arrays in HDF5 and Zarr, by their attributes."""
 
 from __future__ import annotations
 
@@ -18,13 +18,26 @@ def place_of(
     """Return spacing and direction of the array's axes, and the origin.
 
     ``element_size_um``, as ImageJ and ilastik write it, has the order of the array's axes;
-    ``spacing`` and ``origin`` are x, y, z.
+    ``spacing`` and ``origin`` are x, y, z. The columns of ``direction``, nine numbers row by row,
+    are the world directions of the array's axes x, y and z.
     """
     spacing = _triple(attributes, "element_size_um")
     if spacing is None:
         spacing = _triple(attributes, "spacing")
         spacing = None if spacing is None else in_array_order(spacing, axes)
-    return spacing, _triple(attributes, "origin"), axes_direction(axes)
+    return spacing, _triple(attributes, "origin"), _direction(attributes) @ axes_direction(axes)
+
+
+def _direction(attributes: dict[str, Any]) -> NDArray[np.float64]:
+    """Return the attribute ``direction``, the identity if there is none."""
+    if "direction" not in attributes:
+        return np.eye(3)
+    try:
+        return np.asarray(attributes["direction"], np.float64).reshape(3, 3)
+    except (TypeError, ValueError):
+        raise FileError(
+            f"its attribute direction is {attributes['direction']!r}: give nine numbers"
+        ) from None
 
 
 def _triple(attributes: dict[str, Any], name: str) -> Triple | None:

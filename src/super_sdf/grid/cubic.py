@@ -1,0 +1,84 @@
+"""The cubic lattice of a grid, on which the method works.
+
+A grid with the same spacing on all axes is its own. Of others, the coarser axes are resampled to
+the finest spacing (see ``resampling``), plane by plane.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import BoolArray
+from ..neighbourhood import NEIGHBOURHOOD
+from .resampling import Resampled, resample
+from .sdf_grid import SdfGrid
+from .spacing import EQUAL_SPACING
+
+
+def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
+    """Return a grid on the cubic lattice: the grid itself, if its spacings are equal.
+
+    Parameters
+    ----------
+    grid : SdfGrid
+        Signed distances in world units.
+    offset : float
+        Distance of the surface to be meshed, in world units. Only values near it are as accurate
+        as they can be.
+
+    Returns
+    -------
+    SdfGrid
+        Its samples are made when they are read. Origin and direction are those of ``grid``; its
+        ``notes`` say what was resampled.
+    """
+    if grid.is_cubic:
+        return grid
+    level = -offset if grid.positive_inside else offset
+    samples, spacing = resample(grid.samples, grid.spacing, level)
+    extremes = (-grid.high, -grid.low) if grid.positive_inside else (grid.low, grid.high)
+    return SdfGrid.trusted(
+        samples,
+        spacing,
+        grid.origin,
+        (*grid.notes, describe_resampling(grid, samples.shape)),
+        direction=grid.direction,
+        positive_inside=grid.positive_inside,
+        extremes=extremes,
+    )
+
+
+def describe_resampling(grid: SdfGrid, shape: tuple[int, ...]) -> str:
+    """Return a sentence that names the axes that are resampled, and their spacings."""
+    coarser = [
+        f"{name} from {h:.6g}"
+        for name, h in zip("xyz", grid.spacing)
+        if h > grid.voxel_size * (1 + EQUAL_SPACING)
+    ]
+    size = " x ".join(map(str, shape))
+    return (
+        f"the spacing differs between axes: the values are resampled along {' and '.join(coarser)} "
+        f"to {grid.voxel_size:.6g}, the finest, to {size} samples"
+    )
+
+
+def sampled_places(grid: SdfGrid) -> NDArray[np.intp]:
+    """Return the places of ``NEIGHBOURHOOD`` round a sample of a cubic grid that hold samples, too.
+
+    They are those across the axes that were resampled.
+    """
+    samples, across = grid.samples, np.ones(27, bool)
+    while isinstance(samples, Resampled):
+        across &= NEIGHBOURHOOD[:, samples.axis] == 0
+        samples = samples.source
+    return np.flatnonzero(across)
+
+
+def on_samples(grid: SdfGrid, voxel_ijk: NDArray[np.int32]) -> BoolArray:
+    """Return which values of a cubic grid, at (n, 3) indices, are samples, not interpolated."""
+    known, samples = np.ones(len(voxel_ijk), bool), grid.samples
+    while isinstance(samples, Resampled):
+        known &= samples.on_sample[voxel_ijk[:, samples.axis]]
+        samples = samples.source
+    return known

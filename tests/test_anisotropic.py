@@ -1,0 +1,276 @@
+"""Grids whose spacing differs between axes: the resampled values, and the meshes."""
+
+import json
+from itertools import permutations
+
+import numpy as np
+import pytest
+import trimesh
+from conftest import trilinear
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruct, upsample
+from super_sdf.certificate.check import check_mesh
+from super_sdf.files.expectation import count_on_lattice
+from super_sdf.grid.cubic import cubic_grid, on_samples
+from super_sdf.grid.resampling import Resampled, new_places
+from super_sdf.mesh import join_meshes
+from super_sdf.pictures.sections import coarse_section, fine_section
+from super_sdf.pipeline import reconstruct_slabs
+from super_sdf.steps.survey import survey
+
+BALLS = np.array([(4.1, 3.6, 4.9, 2.3), (5.3, 4.1, 7.0, 1.4), (5.9, 3.0, 4.2, 1.2)])
+BOX = np.array([9.5, 7.5, 10.5])  # the extent of the grid
+SPACINGS = sorted({*permutations((0.4, 0.4, 0.6)), *permutations((0.2, 0.2, 1.0))})
+
+
+def pear(points: np.ndarray) -> np.ndarray:
+    """Distances to balls of different sizes: a part without any symmetry."""
+    return np.min([np.linalg.norm(points - at[:3], axis=-1) - at[3] for at in BALLS], axis=0)
+
+
+def sampled(spacing, field=pear) -> np.ndarray:
+    """A field in the box, with a spacing per axis."""
+    shape = np.rint(BOX / spacing).astype(int) + 1
+    return field(np.moveaxis(np.indices(shape), 0, -1) * np.array(spacing))
+
+
+def slab_of(*half):
+    """The field of a box with these half sides near the middle, exact near its faces."""
+    middle = BOX / 2 + 0.03
+    return lambda points: (np.abs(points - middle) - half).max(-1)
+
+
+def cube_of(spacing) -> SdfGrid:
+    return cubic_grid(make_grid(sampled(spacing), spacing=spacing, origin=0))
+
+
+@pytest.fixture(scope="module")
+def network():
+    return load_network("fast")
+
+
+@pytest.mark.parametrize("spacing", SPACINGS)
+def test_resampled_values_are_nearer_than_linear_ones(spacing):
+    cube = cube_of(spacing)
+    assert cube.spacing == (min(spacing),) * 3
+    places = cube.to_world(np.moveaxis(np.indices(cube.shape), 0, -1))
+    inner = (places <= BOX).all(-1) & (np.abs(pear(places)) < 1.5 * min(spacing))
+    off = np.abs(cube.values - pear(places))[inner]
+    corners = make_grid(sampled(spacing), spacing=spacing)
+    index = np.moveaxis(places / spacing, -1, 0)
+    from scipy.ndimage import map_coordinates
+
+    linear = np.abs(map_coordinates(corners.values, index, order=1, mode="nearest") - pear(places))
+    assert off.mean() < 0.5 * linear[inner].mean()
+    assert off.max() < 0.5 * max(spacing)
+
+
+@pytest.mark.parametrize("spacing", SPACINGS)
+def test_samples_keep_their_values(spacing):
+    cube, values = cube_of(spacing), sampled(spacing)
+    axis = int(np.argmax(spacing))
+    known = on_samples(cube, np.indices(cube.shape).reshape(3, -1).T).reshape(cube.shape)
+    planes = np.flatnonzero(known.all(tuple(a for a in range(3) if a != axis)))
+    assert known.sum() == len(planes) * known[0].size * cube.shape[0] / cube.shape[axis]
+    old = np.rint(planes * min(spacing) / max(spacing)).astype(int)
+    assert np.array_equal(cube.values.take(planes, axis), values.take(old, axis))
+    assert len(planes) >= len(values.take(0, axis)[:1]) and planes[0] == 0
+
+
+@given(st.tuples(*[st.floats(-1, 1)] * 3), st.sampled_from([0.3, 1.0, 4.0]), st.integers(0, 2))
+@settings(max_examples=40, deadline=None)
+def test_linear_fields_of_any_slope_are_reproduced(normal, slope, axis):
+    """Those steeper than distances, too, but for the border, where samples bound from one side."""
+    normal = slope * np.array(normal) / max(np.linalg.norm(normal), 1)
+    spacing = np.where(np.arange(3) == axis, 1.7, 0.5)
+    shape = np.where(np.arange(3) == axis, 7, 12)
+    field = np.moveaxis(np.indices(shape), 0, -1) * spacing @ normal - 1.3 * slope
+    found = Resampled(field, tuple(spacing), axis, 0.5)
+    places = np.moveaxis(np.indices(found.shape).astype(float), 0, -1) * 0.5
+    places[..., axis] = np.minimum(places[..., axis], 6 * 1.7)
+    off = np.abs(found.loaded - (places @ normal - 1.3 * slope))
+    border = 5 if slope > 1 else 0
+    inner = [slice(border, n - border) for n in shape]
+    inner[axis] = slice(None)
+    assert off[tuple(inner)].max() < 1e-9 * max(slope, 1)
+
+
+@given(st.integers(0, 2), st.integers(1, 9), st.integers(0, 2**32 - 1))
+@settings(max_examples=30, deadline=None)
+def test_planes_are_the_same_however_they_are_read(axis, step, seed):
+    """Of noise, too: every value depends on the samples round it alone."""
+    values = np.random.default_rng(seed).uniform(-2, 2, (11, 12, 13))
+    spacing = tuple(np.where(np.arange(3) == axis, 2.3, 1.0))
+    found = Resampled(values, spacing, axis, 1.0)
+    whole = found.read(0, len(found))
+    parts = [found[i : i + step] for i in range(0, len(found), step)]
+    assert np.array_equal(np.concatenate(parts), whole)
+    assert np.array_equal(np.stack(list(found)), whole) and np.array_equal(found[-1], whole[-1])
+    assert np.array_equal(Resampled(-values, spacing, axis, 1.0).loaded, -whole)
+
+
+def test_chunks_change_nothing(monkeypatch):
+    before = [cube_of(spacing).values for spacing in SPACINGS]
+    monkeypatch.setattr("super_sdf.grid.resampling.CHUNK", 1)
+    for spacing, values in zip(SPACINGS, before):
+        assert np.array_equal(cube_of(spacing).values, values)
+
+
+def test_axes_are_swapped_with_the_array():
+    """Resampling along x is resampling along z of the array in reverse order."""
+    values = sampled((1.0, 0.2, 0.2))
+    along_x = Resampled(values, (1.0, 0.2, 0.2), 0, 0.2).loaded
+    along_z = Resampled(values.T, (0.2, 0.2, 1.0), 2, 0.2).loaded
+    assert np.allclose(along_x, along_z.T, atol=1e-12)
+
+
+def test_places_start_on_the_first_sample_and_end_on_the_last():
+    assert np.array_equal(new_places(3, 1.0, 0.5), [0, 0.5, 1, 1.5, 2])
+    assert np.allclose(new_places(3, 1.5, 1.0), [0, 2 / 3, 4 / 3, 2])
+    assert np.array_equal(new_places(2, 1.6, 1.0), [0, 0.625, 1])
+    assert new_places(4, 1.0001, 0.5)[2] == 1  # as near as that, a sample is taken as it is
+
+
+@pytest.mark.parametrize("spacing", SPACINGS)
+def test_the_mesh_lies_on_the_surface(spacing, network):
+    turned = trimesh.transformations.euler_matrix(0.3, -0.2, 0.5)[:3, :3] @ np.diag([1, -1, 1])
+    origin = np.array([10.0, -20.0, 5.0])
+    grid = make_grid(sampled(spacing), spacing=spacing, origin=origin, direction=turned)
+    mesh = reconstruct(grid, network)
+    off = np.abs(pear((mesh.vertices - origin) @ turned))
+    assert off.mean() < 0.01 * max(spacing) and off.max() < 0.35 * max(spacing)
+    assert mesh.is_closed() and mesh.volume() == pytest.approx(VOLUME, rel=0.01)
+
+
+def _volume() -> float:
+    """The volume of the pear, by the share of a fine lattice."""
+    h = 0.05
+    return float((sampled((h, h, h)) < 0).sum() * h**3)
+
+
+VOLUME = _volume()
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.5, -0.6])
+def test_offsets_grow_the_solid(offset, network):
+    grid = make_grid(sampled((0.3, 0.3, 0.9)), spacing=(0.3, 0.3, 0.9))
+    mesh = reconstruct(grid, network, offset=offset)
+    assert np.abs(pear(mesh.vertices.astype(float)) - offset).mean() < 0.02
+    flipped = make_grid(-sampled((0.3, 0.3, 0.9)), spacing=(0.3, 0.3, 0.9))
+    other = reconstruct(flipped, network, offset=offset)
+    assert np.array_equal(mesh.vertices, other.vertices)
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("mesher", ["marching", "sharp"])
+def test_slabs_and_threads_make_the_same_mesh(axis, mesher, network, monkeypatch):
+    from super_sdf import pipeline
+    from super_sdf.slabs.cutting import cut
+
+    spacing = tuple(np.where(np.arange(3) == axis, 1.0, 0.35))
+    grid = make_grid(sampled(spacing), spacing=spacing)
+    whole = reconstruct(grid, network, mesher=mesher)
+    threaded = reconstruct(grid, load_network("fast", threads=2), mesher=mesher)
+    monkeypatch.setattr(
+        pipeline, "plan_slabs",
+        lambda band, k, field, *_: cut(band, 5, field, _[-1].planes_beside(k)),
+    )  # fmt: skip
+    monkeypatch.setattr("super_sdf.steps.band.BLOCK_SAMPLES", 1)
+    pieces = list(reconstruct_slabs(grid, network, mesher=mesher))
+    assert len(pieces) > 2
+    joined = join_meshes([mesh for piece in pieces for mesh in piece.meshes])
+    for other in (threaded, joined):
+        assert np.array_equal(whole.vertices, other.vertices)
+        assert np.array_equal(whole.faces, other.faces)
+
+
+def test_a_field_is_meshed_with_the_grid_that_it_was_made_from():
+    grid = make_grid(sampled((0.4, 0.6, 0.4)), spacing=(0.4, 0.6, 0.4))
+    field = upsample(grid, trilinear)
+    assert field.shape == cubic_grid(grid).shape
+    mesh, other = extract_mesh(field, grid), reconstruct(grid, trilinear)
+    assert np.array_equal(mesh.vertices, other.vertices)
+
+
+def test_the_note_names_what_is_resampled():
+    assert cube_of((0.4, 0.4, 0.4)).notes == ()
+    (note,) = cube_of((0.4, 0.6, 1.0)).notes
+    assert note == (
+        "the spacing differs between axes: the values are resampled along y from 0.6 and z from 1 "
+        "to 0.4, the finest, to 25 x 19 x 26 samples"
+    )
+
+
+def test_equal_spacings_are_not_resampled():
+    grid = make_grid(sampled((0.4, 0.4, 0.4)), spacing=(0.4, 0.4, 0.4003))
+    assert cubic_grid(grid) is grid
+
+
+def test_interpolated_values_do_not_make_a_noisy_field(network):
+    """A thin plate across the coarse axis: what lies between its samples is a guess."""
+    spacing = (0.25, 0.25, 0.75)
+    grid = make_grid(sampled(spacing, slab_of(3.3, 2.5, 0.45)), spacing=spacing)
+    band = survey(cubic_grid(grid))
+    assert band.noisy_voxels == 0 and band.exact.sum() > 0.5 * len(band.exact)
+    assert band.exact[band.sampled & (np.abs(band.patches[:, 13]) < 2.5)].all()
+    noise = np.random.default_rng(0).uniform(-0.3, 0.3, grid.shape)
+    noisy = SdfGrid.trusted(grid.values + noise, spacing)
+    found = survey(cubic_grid(noisy))
+    assert found.noisy_voxels > 0 and not found.exact.any()
+
+
+def test_the_certificate_counts_samples_only(network):
+    grid = make_grid(sampled((0.3, 0.3, 0.6)), spacing=(0.3, 0.3, 0.6))
+    found = check_mesh(reconstruct(grid, network), grid)
+    index = found.touching.points / grid.spacing
+    assert np.abs(index - np.rint(index)).max() < 1e-6
+    assert found.voxel_size == 0.3 and not found.faults()
+    assert np.abs(found.touching.residuals).mean() < 0.02
+    assert np.allclose(pear(found.touching.points), found.touching.values * 0.3, atol=1e-6)
+
+
+def test_the_size_of_the_mesh_is_estimated_on_the_lattice(network):
+    for spacing in ((0.3, 0.3, 0.6), (0.9, 0.3, 0.3)):
+        grid = make_grid(sampled(spacing), spacing=spacing)
+        triangles = 2 * 4**2 * count_on_lattice(grid, 0.0)
+        assert len(reconstruct(grid, network).faces) == pytest.approx(triangles, rel=0.05)
+
+
+@pytest.mark.parametrize("axis", "xyz")
+def test_sections_before_and_after_show_the_same_plane(axis):
+    grid = make_grid(sampled((0.3, 0.6, 0.3)), spacing=(0.3, 0.6, 0.3), origin=(1, 2, 3))
+    index = {"x": 15, "y": 6, "z": 16}[axis]
+    coarse = coarse_section(grid, axis, index)
+    fine = fine_section(upsample(grid, trilinear), grid, axis, index)
+    assert np.allclose(fine.box(), coarse.box(), atol=0.9)
+    inside = [np.nansum(part.values < 0) * part.step[0] * part.step[1] for part in (coarse, fine)]
+    assert (coarse.step == (0.3, 0.3)) == (axis == "y")
+    known = np.isfinite(fine.values) & (fine.values < 0)
+    assert known.any() and inside[0] > 0
+
+
+def test_thin_parts_without_a_sample_inside(network):
+    spacing = (0.4, 0.4, 0.6)
+    grid = make_grid(sampled(spacing, slab_of(3.31, 0.03, 3.27)), spacing=spacing)
+    assert grid.low > 0
+    mesh = reconstruct(grid, network)
+    assert len(mesh.faces) and mesh.is_closed()
+
+
+def test_the_command_says_what_it_resamples(tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    np.savez("a.npz", values=sampled((0.4, 0.4, 0.6)), spacing=(0.4, 0.4, 0.6), origin=(1, 2, 3))
+    code, out, err = command("upsample", "a.npz", "a.ply", "--quality", "fast", "--json")
+    assert code == 0, err
+    assert "Note: the spacing differs between axes: the values are resampled along z" in err
+    report = json.loads(out)
+    assert report["spacing"] == [0.4, 0.4, 0.6] and report["shape"] == [25, 20, 19]
+    assert report["expected_triangles"] == pytest.approx(report["triangles"], rel=0.1)
+    mesh = trimesh.load("a.ply")
+    assert np.abs(pear(mesh.vertices - [1, 2, 3])).max() < 0.15 and mesh.is_watertight
+    np.save("b.npy", sampled((0.4, 0.4, 0.6)))
+    options = ("--quality", "fast", "--spacing", "0.4,0.4,0.6", "--origin", "1,2,3")
+    assert command("upsample", "b.npy", "b.ply", *options)[0] == 0
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()

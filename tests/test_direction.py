@@ -1,0 +1,165 @@
+"""Grids that are turned or mirrored in the world, and their meshes."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from conftest import trilinear
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from super_sdf import SdfGrid, extract_mesh, make_grid, read_grid, reconstruct, upsample
+from super_sdf.errors import GridError, OptionError
+from super_sdf.files.grids import write_grid
+from super_sdf.files.precision import check_format_holds
+from super_sdf.mesh import vertex_type
+
+MIRROR = np.diag([1.0, -1.0, 1.0])
+ORIGIN = np.array([10.0, -20.0, 5.0])
+MESHERS = ("marching", "sharp")
+
+
+def turn(x: float, y: float, z: float) -> np.ndarray:
+    return trimesh.transformations.euler_matrix(x, y, z)[:3, :3]
+
+
+def pear(shape=(18, 15, 21), h=0.5) -> np.ndarray:
+    """Distances to two balls of different size, which no rotation or mirroring maps to itself."""
+    places = np.moveaxis(np.indices(shape), 0, -1) * h
+    balls = ((4.1, 3.6, 4.9, 2.3), (5.3, 4.1, 7.0, 1.4), (5.9, 3.0, 4.2, 1.2))
+    return np.min([np.linalg.norm(places - ball[:3], axis=-1) - ball[3] for ball in balls], axis=0)
+
+
+@given(st.tuples(*[st.floats(-3, 3)] * 3), st.booleans(), st.sampled_from(MESHERS))
+@settings(max_examples=20, deadline=None)
+def test_the_mesh_of_a_turned_grid_is_the_turned_mesh(angles, mirrored, mesher):
+    direction = turn(*angles) @ (MIRROR if mirrored else np.eye(3))
+    straight = reconstruct(make_grid(pear(), spacing=0.5), trilinear, 4, mesher=mesher)
+    grid = make_grid(pear(), spacing=0.5, origin=ORIGIN, direction=direction)
+    mesh = reconstruct(grid, trilinear, 4, mesher=mesher)
+    assert np.abs(straight.vertices @ direction.T + ORIGIN - mesh.vertices).max() < 1e-5
+    assert mesh.is_closed()
+    assert mesh.volume() == pytest.approx(straight.volume(), rel=1e-5) and mesh.volume() > 0
+    faces = straight.faces[:, ::-1] if mirrored else straight.faces
+    assert np.array_equal(mesh.faces, faces)
+
+
+def test_a_field_is_meshed_with_the_direction_of_its_grid():
+    grid = make_grid(pear(), spacing=0.5, direction=turn(0.1, 0.2, 0.3) @ MIRROR)
+    mesh = extract_mesh(upsample(grid, trilinear), grid)
+    other = reconstruct(grid, trilinear)
+    assert np.array_equal(mesh.vertices, other.vertices) and np.array_equal(mesh.faces, other.faces)
+
+
+def test_the_identity_changes_nothing():
+    plain = reconstruct(make_grid(pear(), spacing=0.5, origin=ORIGIN), trilinear)
+    for direction in (np.eye(3), np.eye(3).ravel().tolist(), np.eye(3) + 1e-12):
+        grid = make_grid(pear(), spacing=0.5, origin=ORIGIN, direction=direction)
+        assert grid.is_straight and grid.direction == ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+        assert np.array_equal(reconstruct(grid, trilinear).vertices, plain.vertices)
+
+
+def test_index_and_world_are_inverse():
+    direction = turn(1, 2, 3) @ MIRROR
+    grid = SdfGrid.trusted(pear(), (0.5, 0.7, 0.9), ORIGIN, direction=direction)
+    places = np.random.default_rng(0).uniform(0, 15, (50, 3))
+    world = grid.to_world(places)
+    assert np.abs(grid.to_index(world) - places).max() < 1e-12
+    column = np.array(grid.direction)[:, 1] * 0.7
+    assert np.allclose(grid.to_world(np.array([[0, 1, 0]]))[0] - ORIGIN, column)
+
+
+@pytest.mark.parametrize(
+    "direction, message",
+    [
+        ((1, 0, 0), "direction is (1, 0, 0): give nine numbers, row by row, or a 3 x 3 matrix"),
+        (
+            np.diag([1, 1, 2]),
+            "direction is 1, 0, 0; 0, 1, 0; 0, 0, 2: column 3 has length 2; give unit vectors at "
+            "right angles, or resample a sheared grid",
+        ),
+        (
+            [[1, 0.6, 0], [0, 0.8, 0], [0, 0, 1]],
+            "direction is 1, 0.6, 0; 0, 0.8, 0; 0, 0, 1: columns 1 and 2 are not at right angles; "
+            "give unit vectors at right angles, or resample a sheared grid",
+        ),
+        (
+            np.full((3, 3), np.nan),
+            "direction is nan, nan, nan; nan, nan, nan; nan, nan, nan: it must be finite",
+        ),
+    ],
+)
+def test_what_is_no_direction_is_refused(direction, message):
+    with pytest.raises(GridError) as caught:
+        make_grid(pear(), spacing=0.5, direction=direction)
+    assert str(caught.value) == message
+
+
+def test_the_precision_follows_the_coordinates_of_the_turned_grid():
+    """Turned by a half, a long grid reaches as far to the other side."""
+    values = np.full((3, 3, 3), 1.0)
+    half = np.diag([-1.0, -1.0, 1.0])
+    grid = SdfGrid.trusted(values, 1.0, (1e4, 0, 0), direction=half)
+    assert vertex_type(grid, 4) is np.float64
+    assert vertex_type(SdfGrid.trusted(values, 1.0, (3, 0, 0), direction=half), 4) is np.float32
+    middle = check_format_holds("a.glb", grid, 4)
+    assert middle == (1e4 - 1, -1.0, 1.0)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def test_npz_keeps_the_direction(folder):
+    direction = turn(0.4, 0.1, -0.3) @ MIRROR
+    grid = make_grid(pear(), spacing=0.5, origin=ORIGIN, direction=direction)
+    write_grid(grid, "a.npz")
+    again = read_grid("a.npz")
+    assert again.direction == grid.direction and again.is_mirrored
+    assert "direction -" in repr(again) or "direction 0" in repr(again)
+    write_grid(make_grid(pear(), spacing=0.5), "b.npz")
+    assert sorted(np.load("b.npz")) == ["origin", "spacing", "values"]
+    np.savez("c.npz", values=pear(), direction=np.zeros(12))
+    with pytest.raises(GridError, match=r"c.npz\[direction\] has shape \(12,\): give nine numbers"):
+        read_grid("c.npz")
+
+
+def test_the_command_takes_a_direction_and_check_agrees(folder, command):
+    direction = turn(0.4, 0.1, -0.3) @ MIRROR
+    np.save("a.npy", pear())
+    said = ",".join(f"{entry:.17g}" for entry in direction.ravel())
+    options = ("--spacing", 0.5, "--origin=10,-20,5", f"--direction={said}")
+    code, out, err = command("upsample", "a.npy", "a.ply", "--quality", "fast", "--json", *options)
+    assert code == 0, err
+    assert np.allclose(json.loads(out)["direction"], direction)
+    mesh = trimesh.load("a.ply")
+    back = (mesh.vertices - ORIGIN) @ direction
+    balls = np.array([(4.1, 3.6, 4.9, 2.3), (5.3, 4.1, 7.0, 1.4), (5.9, 3.0, 4.2, 1.2)])
+    far = np.linalg.norm(back[:, None] - balls[:, :3], axis=-1) - balls[:, 3]
+    assert np.abs(far.min(1)).max() < 0.06 and mesh.volume > 0 and mesh.is_watertight
+    code, out, err = command("check", "a.ply", "a.npy", "--no-faults", "--json", *options)
+    report = json.loads(out)
+    assert code == 0, err
+    assert report["strays"]["count"] == 0 and report["residual"]["mean"] < 0.02
+    Path("list.jsonl").write_text(
+        json.dumps({"in": "a.npy", "spacing": 0.5, "origin": [10, -20, 5],
+                    "direction": direction.ravel().tolist()})
+    )  # fmt: skip
+    code, out, err = command("batch", "list.jsonl", "--out", "out", "--quality", "fast", "-q")
+    assert code == 0, err
+    assert Path("out/a.ply").read_bytes() == Path("a.ply").read_bytes()
+
+
+def test_a_direction_in_a_list_has_nine_numbers(folder, command):
+    Path("list.jsonl").write_text('{"in": "a.npy", "direction": [1, 0, 0]}')
+    code, _, err = command("batch", "list.jsonl", "--out", "out")
+    said = "'direction' is [1, 0, 0]: give a list of nine numbers, row by row\n"
+    assert code == 2 and err.endswith(f"Error: list.jsonl, line 1: {said}")
+
+
+def test_formats_that_state_their_axes_take_no_direction(folder):
+    with pytest.raises(OptionError, match="direction is given, but OpenVDB files state their axes"):
+        read_grid("a.vdb", direction=np.eye(3))
