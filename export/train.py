@@ -100,7 +100,6 @@ class Store:
             batch += [sample] if len(sample.voxels) else []
         return batch
 
-
     def _changed(self, rng: np.random.Generator, sample: Sample, recipe: Recipe) -> Prepared:
         """Return a sample as it is shown this time."""
         if self.inputs == "masks":

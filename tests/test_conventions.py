@@ -117,7 +117,10 @@ def test_a_wrong_unit_is_refused_with_the_way_out():
 def test_values_that_change_by_less_than_the_spacing_are_noted(spacing):
     grid = make_grid(ball(24, 8.0).values, spacing=spacing, origin=0)
     assert grid.spacing == (spacing,) * 3
-    (note,) = grid.notes
+    note, kind = grid.notes
+    assert kind.startswith(
+        "values taken as scaled (--field scaled): beside the surface their slope"
+    )
     assert note.startswith("the values change by ")
     assert note.endswith(
         f"spacing is {spacing:g}: they are not exact distances, or the unit is wrong"
@@ -126,7 +129,7 @@ def test_values_that_change_by_less_than_the_spacing_are_noted(spacing):
 
 def test_values_that_are_not_quite_distances_are_noted():
     grid = make_grid(torus(64) * 1.2, spacing=1 / 64, origin=0)
-    assert len(grid.notes) == 1 and "they are not exact distances" in grid.notes[0]
+    assert "they are not exact distances" in grid.notes[0] and grid.field.kind == "scaled"
 
 
 def test_spacing_must_be_equal_positive_and_finite():

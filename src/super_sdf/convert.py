@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from dataclasses import field as dataclass_field
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from .files.expectation import CERTAIN_SHARE, Expectation, expect
 from .files.grids import read_grid
 from .files.meshes import write_pieces
 from .files.precision import check_format_holds, local_origin_note
+from .grid.field import EXACT, MASK, SCALED
 from .grid.sdf_grid import SdfGrid
 from .grid.spacing import as_triple
 from .mesh import Mesh, join_meshes
@@ -63,6 +65,10 @@ class ConvertOptions:
     simplify: float | None = None
     triangles: int | None = None
     axes: str | None = None
+    field: str = "auto"
+    label: float | None = None
+    level: float | None = None
+    scale: float | None = None
 
     @property
     def simplifies(self) -> bool:
@@ -106,6 +112,8 @@ class Conversion:
         Of a simplified mesh, what ``Simplified.report`` returns; distances are in voxels.
     capped : bool
         Whether the solid runs out of the grid, and its surface was closed along the border.
+    field : dict
+        What the values were taken as, and what the samples show of it.
     """
 
     shape: tuple[int, int, int]
@@ -119,6 +127,7 @@ class Conversion:
     seconds: dict[str, float]
     simplified: dict[str, Any] | None = None
     capped: bool = False
+    field: dict[str, Any] = dataclass_field(default_factory=dict)
 
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
@@ -130,6 +139,7 @@ class Conversion:
             "bounds": [list(corner) for corner in self.bounds],
             "closed": self.closed,
             "capped": self.capped,
+            "field": self.field,
             **({"simplified": self.simplified} if self.simplified else {}),
             "inferred": list(self.notes),
             "warnings": list(self.warnings),
@@ -182,6 +192,10 @@ def convert(
         origin=options.origin,
         axes=options.axes,
         inside=options.inside,
+        field=options.field,
+        label=options.label,
+        level=options.level,
+        scale=options.scale,
         max_memory=options.max_memory,
     )
     check_factor(options.factor)
@@ -287,7 +301,8 @@ def describe(
     counts = {name: tally.counts[name] for name in COUNTS}
     counts["expected_triangles"] = tally.expected.triangles
     counts["expected_bytes"] = tally.expected.size
-    warnings, simplified = find_warnings(counts, closed, thin=grid.low >= options.offset), None
+    warnings = find_warnings(counts, closed, thin=grid.low >= options.offset, kind=grid.field.kind)
+    simplified = None
     if tally.simplified:
         simplified = tally.simplified.report(tally.voxel_size)
         closed = tally.simplified.mesh.is_closed()
@@ -295,13 +310,19 @@ def describe(
     where = grid.shape, grid.spacing, grid.origin
     bounds = as_triple(tally.low, "low"), as_triple(tally.high, "high")
     capped = options.cap and tally.leaves
-    return Conversion(*where, counts, bounds, closed, notes, warnings, seconds, simplified, capped)
+    found = grid.field.report()
+    return Conversion(
+        *where, counts, bounds, closed, notes, warnings, seconds, simplified, capped, found
+    )
 
 
-def find_warnings(counts: dict[str, int], closed: bool, thin: bool = False) -> tuple[str, ...]:
+def find_warnings(
+    counts: dict[str, int], closed: bool, thin: bool = False, kind: str = EXACT
+) -> tuple[str, ...]:
     """Return a sentence on each thing that may be wrong with the result.
 
-    ``thin`` says that no sample lies inside the solid.
+    ``thin`` says that no sample lies inside the solid, ``kind`` what the field is: only distances
+    can be noisy, or contradict each other.
     """
     warnings = []
     if not closed:
@@ -311,6 +332,8 @@ def find_warnings(counts: dict[str, int], closed: bool, thin: bool = False) -> t
             "no sample lies inside: the solid is thinner than the spacing, and its mesh may have "
             "holes"
         )
+    if kind in (MASK, SCALED):
+        return tuple(warnings)
     if counts["noisy_voxels"]:
         share = in_percent(counts["noisy_voxels"], counts["band_voxels"])
         warnings.append(

@@ -17,13 +17,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from .arrays import IntArray
+from .arrays import FloatArray, IntArray
+from .grid.field import SCALED
+from .grid.planes import SampleArray
 from .grid.sdf_grid import SdfGrid
 from .machine.memory import give_back
 from .machine.resources import Resources, allot
 from .mesh import Mesh, join_meshes, vertex_type
 from .neighbourhood import CENTRE
 from .network.decoder import Decoder, decode
+from .network.kinds import network_for
 from .options import (
     check_cap,
     check_distance,
@@ -49,6 +52,7 @@ from .steps.nodes import (
     signs_of_skipped,
 )
 from .steps.spheres import ExactSamples, fit_to_spheres
+from .steps.spline import spline_blocks
 from .steps.survey import Band, no_surface, survey
 
 
@@ -103,6 +107,7 @@ def upsample(
     check_network(network)
     check_progress(progress)
     factor, offset = check_factor(factor), check_distance(offset)
+    network = network_for(network, grid.field.kind)
     resources = allot(getattr(network, "threads", 0), check_max_memory(max_memory))
     steps = StepCounter(progress, [name for name in STEPS if name != "isosurface"])
     band = find_surface(grid, factor, offset, resources)
@@ -203,6 +208,7 @@ def _slabs(
     progress: Progress | None,
 ) -> Iterator[Piece]:
     """Yield the pieces of ``reconstruct_slabs``; arguments are checked before the first one."""
+    network = network_for(network, grid.field.kind)
     resources = allot(getattr(network, "threads", 0), max_memory)
     steps = StepCounter(progress)
     band = find_surface(grid, factor, offset, resources)
@@ -264,7 +270,10 @@ def refine(
     steps = steps or StepCounter()
     patches, table, voxels = inputs = band.network_inputs(slab.seen, slab.decoded)
     progress = steps.within("network")
-    blocks = decode(network, inputs, block_offsets(factor), progress, threads)  # Eqs. 3, 5
+    if band.smooth is None:
+        blocks = decode(network, inputs, block_offsets(factor), progress, threads)  # Eqs. 3, 5
+    else:
+        blocks = interpolate(band, band.smooth, network, factor, slab, inputs, threads)
     steps.finish("network")
 
     row_of = rows_among(voxels, len(table))
@@ -287,6 +296,31 @@ def refine(
         pinned=int(pinned[field.own_rows].sum()),
         spheres=spheres,
     )
+
+
+def interpolate(
+    band: Band,
+    smooth: SampleArray,
+    network: Decoder,
+    factor: int,
+    slab: Slab,
+    inputs: tuple[FloatArray, IntArray, IntArray],
+    threads: int = 1,
+) -> FloatArray:
+    """Return the blocks of a field that is no distance: its spline, and the network at kinks.
+
+    Of a field that was cut off near the surface, the network adds nothing.
+    """
+    patches, table, voxels = inputs
+    own_ijk = band.voxel_ijk[slab.seen][voxels]
+    blocks, share = spline_blocks(smooth, own_ijk, factor, band.half_voxel)
+    blocks[:, :-1] -= np.float32(band.level)
+    some = np.flatnonzero(share if band.kind == SCALED else 0 * share)
+    if len(some):
+        kinked = patches, table, voxels[some]
+        added = decode(network, kinked, block_offsets(factor), None, threads)[:, :-1]
+        blocks[:, some] += share[some] * (added - blocks[:, some])
+    return blocks
 
 
 def rows_among(voxels: IntArray, count: int) -> IntArray:

@@ -8,7 +8,7 @@ the file was opened is an error.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cached_property
 from io import FileIO
 from math import prod
@@ -111,7 +111,69 @@ class InputFile:
         return out
 
 
-class PlaneFile:
+class Planes:
+    """A 3D array whose planes along the first axis are made when they are needed.
+
+    Attributes
+    ----------
+    shape, dtype
+        Shape (nx, ny, nz) and type of the array.
+    block : int
+        Planes that are made at a time when iterating over all.
+    """
+
+    ndim = 3
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    block: int
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
+        raise NotImplementedError
+
+    def __getitem__(self, which: int | slice) -> NDArray[Any]:
+        """Return one plane or a range of planes, as indexing an array would."""
+        if isinstance(which, slice):
+            first, last, step = which.indices(len(self))
+            return self.read(first, last) if step == 1 else self.loaded[which]
+        number = range(len(self))[which]
+        plane: NDArray[Any] = self.read(number, number + 1)[0]
+        return plane
+
+    def __iter__(self) -> Iterator[NDArray[Any]]:
+        for first in range(0, len(self), self.block):
+            yield from self.read(first, min(first + self.block, len(self)))
+
+    @cached_property
+    def loaded(self) -> NDArray[Any]:
+        """The whole array; it stays in memory.
+
+        Raises
+        ------
+        OutOfMemoryError
+            If it is larger than what is free.
+        """
+        size = prod(self.shape) * self.dtype.itemsize
+        check_fits(size, f"{self.name}, whole,", "read it plane by plane (SdfGrid.planes)")
+        return self.read(0, len(self))
+
+    @property
+    def name(self) -> str:
+        """What messages call the array."""
+        return "the grid"
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.array(self.loaded, dtype) if copy else np.asarray(self.loaded, dtype)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the array itself: another process may not have the file."""
+        return np.asarray, (self.loaded,)
+
+
+class PlaneFile(Planes):
     """A 3D array in a file, whose planes along the first axis are read when they are needed.
 
     Parameters
@@ -126,8 +188,6 @@ class PlaneFile:
         Whether the last two axes are swapped in the file: (nx, nz, ny).
     """
 
-    ndim = 3
-
     def __init__(
         self,
         file: InputFile,
@@ -140,9 +200,12 @@ class PlaneFile:
         self.file, self.offset = file, offset
         self.shape, self.dtype, self.swapped = shape, dtype, swapped
         self.plane_bytes = shape[1] * shape[2] * dtype.itemsize
+        self.block = max(BLOCK_BYTES // self.plane_bytes, 1)
 
-    def __len__(self) -> int:
-        return self.shape[0]
+    @property
+    def name(self) -> str:
+        """The name of the file."""
+        return self.file.name
 
     def read(self, first: int, last: int) -> NDArray[Any]:
         """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz).
@@ -159,40 +222,42 @@ class PlaneFile:
         self.file.read_into(planes, self.offset + first * self.plane_bytes)
         return planes.transpose(0, 2, 1) if self.swapped else planes
 
-    def __getitem__(self, which: int | slice) -> NDArray[Any]:
-        """Return one plane or a range of planes, as indexing an array would."""
-        if isinstance(which, slice):
-            first, last, step = which.indices(len(self))
-            return self.read(first, last) if step == 1 else self.loaded[which]
-        number = range(len(self))[which]
-        plane: NDArray[Any] = self.read(number, number + 1)[0]
-        return plane
 
-    def __iter__(self) -> Iterator[NDArray[Any]]:
-        step = max(BLOCK_BYTES // self.plane_bytes, 1)
-        for first in range(0, len(self), step):
-            yield from self.read(first, min(first + step, len(self)))
-
-    @cached_property
-    def loaded(self) -> NDArray[Any]:
-        """The whole array; it stays in memory.
-
-        Raises
-        ------
-        OutOfMemoryError
-            If it is larger than what is free.
-        """
-        size = prod(self.shape) * self.dtype.itemsize
-        check_fits(size, f"{self.file.name}, whole,", "read it plane by plane (SdfGrid.planes)")
-        return self.read(0, len(self))
-
-    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
-        return np.array(self.loaded, dtype) if copy else np.asarray(self.loaded, dtype)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the array itself: another process may not have the file."""
-        return np.asarray, (self.loaded,)
+SampleArray: TypeAlias = NDArray[Any] | Planes
+"""An array of samples in memory, or one whose planes are read or made when they are needed."""
 
 
-SampleArray: TypeAlias = NDArray[Any] | PlaneFile
-"""An array of samples in memory, or in a file that is read plane by plane."""
+class DerivedPlanes(Planes):
+    """Planes that are made of those of another array, and of some beside them.
+
+    Parameters
+    ----------
+    source : (nx, ny, nz) array or Planes
+        The other array.
+    make : callable
+        Takes some planes of it; returns as many, of ``dtype``.
+    beside : int
+        How many planes to either side the values of a plane depend on.
+    dtype
+        Type of what ``make`` returns.
+    """
+
+    def __init__(
+        self,
+        source: SampleArray,
+        make: Callable[[NDArray[Any]], NDArray[Any]],
+        beside: int = 0,
+        dtype: DTypeLike = np.float32,
+    ) -> None:
+        self.source, self.make, self.beside = source, make, beside
+        self.shape, self.dtype = tuple(source.shape), np.dtype(dtype)
+        plane_bytes = self.shape[1] * self.shape[2] * self.dtype.itemsize
+        self.block = max(BLOCK_BYTES // plane_bytes, 1, 2 * beside)
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
+        low, high = max(first - self.beside, 0), min(last + self.beside, len(self))
+        if last <= first:
+            return np.empty((0, *self.shape[1:]), self.dtype)
+        made = self.make(np.asarray(self.source[low:high]))
+        return made[first - low : last - low]

@@ -17,7 +17,7 @@ def is_positive_inside(
 
     Parameters
     ----------
-    values : (nx, ny, nz) array or PlaneFile
+    values : (nx, ny, nz) array or Planes
         Samples.
     inside : str
         One of ``INSIDE``.
@@ -31,8 +31,7 @@ def is_positive_inside(
     OptionError
         If ``inside`` is unknown.
     """
-    if not isinstance(inside, str) or inside not in INSIDE:
-        raise OptionError(f"inside is {seen(inside)}: give one of {', '.join(INSIDE)}")
+    check_inside(inside)
     if inside != "auto":
         return inside == "positive"
     if is_one_sided(extremes):
@@ -47,6 +46,12 @@ def is_positive_inside(
             "sign (if that is wrong, use --inside)"
         )
     return positive
+
+
+def check_inside(inside: str) -> None:
+    """Raise OptionError if ``inside`` is unknown."""
+    if not isinstance(inside, str) or inside not in INSIDE:
+        raise OptionError(f"inside is {seen(inside)}: give one of {', '.join(INSIDE)}")
 
 
 def check_negative_inside(values: SampleArray) -> None:

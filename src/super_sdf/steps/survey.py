@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import NoSurfaceError, OutOfMemoryError
+from ..grid.field import EXACT, MASK
+from ..grid.planes import SampleArray
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import held_memory, in_words
 from ..machine.resources import ONE_THREAD, Resources
@@ -54,6 +56,12 @@ class Band:
         Which voxels' own samples can be taken as exact distances.
     leaves : bool
         Whether a sample on the border of the grid is inside: then the solid leaves the grid.
+    kind : str
+        What the field is, see ``grid.field``.
+    smooth : array or Planes, optional
+        Values whose cubic spline has the surface where they are smooth, in world units.
+    half_voxel, level : float
+        Half a spacing in world units, by which these are divided; and what is zero then.
     """
 
     shape: tuple[int, int, int]
@@ -63,6 +71,10 @@ class Band:
     decoded: BoolArray
     exact: BoolArray
     leaves: bool = False
+    kind: str = EXACT
+    smooth: SampleArray | None = None
+    half_voxel: float = 1.0
+    level: float = 0.0
 
     @property
     def all_rows(self) -> slice:
@@ -168,7 +180,25 @@ def survey(grid: SdfGrid, offset: float = 0.0, resources: Resources = ONE_THREAD
             raise no_surface(grid, offset)
         check_not_filled(jumps, offset, grid.voxel_size)
     band = make_band(grid.shape, voxel_ijk, _concatenate(patches), resources.threads)
-    return replace(band, leaves=any(leaving))
+    return replace(limit_to_field(band, grid, offset), leaves=any(leaving))
+
+
+def limit_to_field(band: Band, grid: SdfGrid, offset: float) -> Band:
+    """Return the band of a grid of any kind: what is exact in it, and what is decoded.
+
+    In a mask, only the voxels round which samples lie on both sides hold the surface.
+    """
+    field, scale = grid.field, 2 / grid.voxel_size
+    if field.kind == EXACT:
+        return band
+    sample = band.patches[:, CENTRE]
+    low, high = ((limit - offset) * scale for limit in field.exact)
+    exact = band.exact & (sample > low) & (sample < high)
+    decoded = band.decoded
+    if field.kind == MASK:
+        decoded = ((band.patches > 0) != (sample > 0)[:, None]).any(1)
+    band = replace(band, exact=exact, decoded=decoded, kind=field.kind, smooth=field.smooth)
+    return replace(band, half_voxel=1 / scale, level=offset * scale)
 
 
 def _check_bound(voxels: int, planes: int, held: int, bound: int | None) -> None:

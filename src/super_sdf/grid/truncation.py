@@ -1,0 +1,87 @@
+"""Distances that were cut off near the surface: the missing ones are filled in.
+
+A sample x with distance d and gradient n touches the surface at the foot point x - d n. The
+distance of a sample that was cut off is that to the nearest foot point of the others, and no less
+than where it was cut off.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import BoolArray, FloatArray, IntArray
+from .planes import DerivedPlanes, SampleArray
+from .samples import Extremes
+
+REACH = 3  # voxels from a sample up to which others are filled in with the help of its foot point
+FAR = 2.6  # voxels: the distance of a sample without a foot point near it
+LEAST_SLOPE = 0.3  # of a sample whose foot point is used
+WITHIN = 1 - 1e-5  # share of the limit up to which a value is not cut off
+
+OFFSETS: IntArray = np.indices((2 * REACH + 1,) * 3).reshape(3, -1).T.astype(np.int32) - REACH
+OFFSETS = OFFSETS[(OFFSETS**2).sum(1) <= (REACH + 0.3) ** 2]
+
+
+def filled_planes(values: SampleArray, h: float, limits: Extremes) -> DerivedPlanes:
+    """Return truncated distances with those that are missing filled in, made plane by plane.
+
+    Parameters
+    ----------
+    values : (nx, ny, nz) array or Planes
+        Distances in world units.
+    h : float
+        The spacing.
+    limits : two floats
+        Where they were cut off: the lowest and the highest value.
+    """
+    scale = np.float32(1 / h)
+    low, high = (float(limit * scale) for limit in limits)
+
+    def make(planes: NDArray[Any]) -> FloatArray:
+        return fill_in(planes.astype(np.float32) * scale, low, high) * np.float32(h)
+
+    return DerivedPlanes(values, make, REACH + 1)
+
+
+def fill_in(values: FloatArray, low: float, high: float) -> FloatArray:
+    """Return distances in voxels, (nx, ny, nz), filled in where they were cut off."""
+    cut = (values <= low * WITHIN) | (values >= high * WITHIN)
+    gradient = gradient_within(values, cut)
+    slope = np.sqrt((gradient**2).sum(-1))
+    ijk = np.argwhere(~cut & (slope > LEAST_SLOPE))
+    at = tuple(ijk.T)
+    foot = -(values[at] / slope[at])[:, None] * gradient[at]
+    nearest = np.pad(np.where(cut, np.float32(FAR), np.float32(0)), REACH)
+    for offset in OFFSETS:
+        place = tuple((ijk + offset + REACH).T)
+        distance = np.sqrt(((offset - foot) ** 2).sum(1, dtype=np.float32))
+        nearest[place] = np.minimum(nearest[place], distance)
+    inner = nearest[REACH:-REACH, REACH:-REACH, REACH:-REACH]
+    least = np.abs(np.where(values > 0, high, low)).astype(np.float32)
+    filled = np.sign(values) * np.maximum(inner, least)
+    return np.where(cut, filled, values).astype(np.float32)
+
+
+def gradient_within(values: FloatArray, cut: BoolArray) -> FloatArray:
+    """Return gradients, (nx, ny, nz, 3), by differences to neighbours that were not cut off.
+
+    Where both were, the larger difference is a lower bound.
+    """
+    gradient = np.zeros((*values.shape, 3), np.float32)
+    for axis in range(3):
+        lines, missing = np.moveaxis(values, axis, 0), np.moveaxis(cut, axis, 0)
+        change = np.diff(lines, axis=0)
+        edge = np.zeros((1, *lines.shape[1:]), np.float32)
+        ahead, back = np.concatenate([change, edge]), np.concatenate([edge, change])
+        beyond = np.ones((1, *lines.shape[1:]), bool)
+        no_ahead = np.concatenate([missing[1:], beyond])
+        no_back = np.concatenate([beyond, missing[:-1]])
+        larger = np.where(np.abs(ahead) > np.abs(back), ahead, back)
+        one = np.where(no_ahead, np.where(no_back, larger, back), ahead)
+        both = ~no_ahead & ~no_back
+        along = np.where(both, (ahead + back) / 2, one)
+        np.moveaxis(gradient[..., axis], axis, 0)[:] = along
+    return gradient
