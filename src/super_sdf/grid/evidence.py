@@ -65,13 +65,17 @@ class Evidence:
     @property
     def is_scaled(self) -> bool:
         """Whether the values are no distances in the unit of the spacing."""
-        wrong = self.wrong > WRONG_SLOPES and self.samples >= LEAST_SAMPLES
-        return wrong or abs(self.slope - 1) > OFF
+        return (self.wrong > WRONG_SLOPES and self.is_enough) or abs(self.slope - 1) > OFF
 
     @property
     def is_noisy(self) -> bool:
-        """Whether the values are noisy."""
-        return self.noisy > NOISY and self.samples >= LEAST_SAMPLES
+        """Whether the values are noisy: noise makes slopes wrong, but no more than it is seen."""
+        return self.noisy > NOISY and not self.wrong > WRONG_SLOPES and self.is_enough
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether there are enough samples for shares of them to be evidence."""
+        return self.samples >= LEAST_SAMPLES
 
     def report(self) -> dict[str, Any]:
         """Return the evidence as a dictionary that can be written as JSON."""

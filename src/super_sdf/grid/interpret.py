@@ -305,9 +305,9 @@ def _as_shown(
     if evidence.is_noisy:
         field = replace(found.field, kind=NOISY, evidence=evidence.report())
         notes.append(
-            f"values taken as noisy (--field noisy): at {100 * evidence.noisy:.2g} % of the samples "
-            "beside the surface they change by more than distances can; the noise is at most about "
-            f"{evidence.roughness:.2g} voxels"
+            f"values taken as noisy (--field noisy): at {100 * evidence.noisy:.2g} % of the "
+            "samples beside the surface they change by more than distances can; the noise is at "
+            f"most about {evidence.roughness:.2g} voxels"
         )
         return replace(found, field=field)
     if evidence.is_scaled:
@@ -342,7 +342,8 @@ def _truncated(
         samples = filled_planes(samples, h, limits)
     if np.isfinite(at):
         notes.append(
-            f"values taken as truncated (--field truncated): cut off {at:.3g} voxels from the surface"
+            f"values taken as truncated (--field truncated): cut off {at:.3g} voxels from the "
+            "surface"
         )
     return replace(found, samples=samples, field=field)
 
@@ -360,8 +361,8 @@ def _scaled(
     if evidence.wrong > WRONG_SLOPES:
         why += f", and wrong at {100 * evidence.wrong:.2g} % of the samples"
     notes.append(
-        f"values taken as scaled (--field scaled): {why}; where they are smooth, the surface is that "
-        "of their cubic spline"
+        f"values taken as scaled (--field scaled): {why}; where they are smooth, the surface is "
+        "that of their cubic spline"
     )
     low, high = (x / slope for x in found.extremes)
     samples = normalised_planes(found.samples, h, slope)

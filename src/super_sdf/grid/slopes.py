@@ -63,9 +63,9 @@ def local_slopes(values: FloatArray) -> FloatArray:
         bend += np.abs(e - 4 * d + 6 * c - 4 * b + a)
     length = np.clip(np.sqrt(square), FLAT, STEEP)
     weight = 1 / (1 + (bend / (TYPICAL_ERROR * length)) ** 2) + LEAST_WEIGHT
-    weight = weight.astype(np.float32)
-    total = box_sum(weight * length.astype(np.float32))
-    return np.divide(total, box_sum(weight))
+    trust: FloatArray = np.asarray(weight, np.float32)
+    total: FloatArray = np.asarray(trust * length, np.float32)
+    return np.divide(box_sum(total), box_sum(trust))
 
 
 def box_sum(values: FloatArray) -> FloatArray:
