@@ -76,10 +76,6 @@ def test_small_integers_are_turned_without_overflow():
 
 REFUSED = {
     "every value is 3: a constant field has no surface": np.full((4, 4, 4), 3.0),
-    "the only values are 0 and 1: an occupancy grid holds no distances; "
-    "make them with scipy.ndimage.distance_transform_edt": (torus(8) < 0).astype(np.uint8),
-    "values are true or false: an occupancy grid holds no distances; "
-    "make them with scipy.ndimage.distance_transform_edt": torus(8) < 0,
     "no value is below 0 (the smallest is 0.5): every wall is nearer to some sample than "
     "that, so there is no surface": np.abs(torus(8)) + 0.5 - np.abs(torus(8)).min(),
     "no value is above 0 (the largest is -1): the grid lies within the solid; if that is "

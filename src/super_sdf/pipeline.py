@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from .arrays import FloatArray, IntArray
-from .grid.field import SCALED
+from .grid.field import MASK, SCALED
 from .grid.planes import SampleArray
 from .grid.sdf_grid import SdfGrid
 from .machine.memory import give_back
@@ -41,6 +41,7 @@ from .slabs.footprint import NETWORK_BYTES
 from .slabs.pieces import Piece, describe_piece
 from .steps.cap import close_at_border, close_if_crossed
 from .steps.field import FineField, SampleSpheres
+from .steps.holding import hold_sides
 from .steps.mesher_names import DEFAULT_MESHER
 from .steps.meshers import Mesher, extract_pieces, find_mesher
 from .steps.nodes import (
@@ -281,6 +282,8 @@ def refine(
     average_shared(blocks, parts, factor, threads)  # Eq. 7
     exact = np.flatnonzero(band.exact[slab.seen]).astype(np.int32)
     fit_to_spheres(blocks, parts, factor, ExactSamples(patches, exact, table, row_of), threads)
+    if band.kind == MASK:
+        hold_sides(blocks, factor, patches, voxels)
     own_ijk = band.voxel_ijk[slab.seen][voxels]
     skipped = signs_of_skipped(parts, own_ijk, patches, voxels, band.shape)
     pinned = pin_to_skipped(blocks[:, :-1], parts, factor, skipped)

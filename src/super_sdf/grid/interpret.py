@@ -27,7 +27,7 @@ from .samples import (
     check_values,
     has_two_values,
 )
-from .sides import check_inside, is_positive_inside
+from .sides import check_inside, count_border, is_mostly_negative, is_positive_inside
 from .slopes import normalised_planes
 from .spacing import check_spacing, choose_spacing
 from .truncation import filled_planes
@@ -150,8 +150,7 @@ def _of_mask(
     """Return the distances of a mask; ``above`` says on which side of a level each sample is."""
     if not has_both_sides(above):
         raise GridError(f"every value is {bool(above[0].flat[0])}: a constant field has no surface")
-    signs = _derived(above, lambda planes: planes.astype(np.int8) * 2 - 1, np.int8)
-    positive = is_positive_inside(signs, inside, (-1.0, 1.0), notes)
+    positive = _is_above_inside(above, inside, notes)
     if spacing is None:
         notes.append("spacing not given: taken as 1, since a mask shows none (give --spacing)")
     chosen = check_spacing(1.0 if spacing is None else spacing)
@@ -163,6 +162,22 @@ def _of_mask(
     )
     field = Field(MASK, wanted.field == MASK, NONE_EXACT)
     return Interpreted(mask_planes(above, h), extremes_of_masks(h), chosen, False, field)
+
+
+def _is_above_inside(above: SampleArray, inside: str, notes: list[str]) -> bool:
+    """Return whether the larger value of a mask is inside: the border is outside unless given."""
+    if inside != AUTO:
+        return inside == "positive"
+    signs = _derived(above, lambda planes: planes.astype(np.int8) * 2 - 1, np.int8)
+    below, total = count_border(signs)
+    positive = is_mostly_negative(below, total)
+    share = max(below, total - below) / total
+    if share < 1:
+        notes.append(
+            f"the {'larger' if positive else 'smaller'} value is taken as inside: {share:.0%} of "
+            "the grid's border has the other one (if that is wrong, use --inside)"
+        )
+    return positive
 
 
 def _as_distances(
@@ -205,7 +220,7 @@ def _by_evidence(
         return _of_mask(above, wanted, spacing, inside, notes)
     if is_one_sided(extremes) and inside == AUTO and _are_labels(samples, extremes):
         raise GridError(_one_sided(samples, extremes))
-    if wanted.field in (SCALED, TRUNCATED) or _is_normalised(looked, spacing):
+    if wanted.field == SCALED or _is_normalised(looked, spacing):
         return _of_slope(samples, looked, wanted, spacing, inside, notes)
     found = _as_distances(samples, extremes, wanted, spacing, inside, notes)
     evidence = weigh(looked, sum(found.spacing) / 3)
@@ -269,12 +284,12 @@ def _of_slope(
     chosen = choose_spacing(samples, None, notes) if spacing is None else check_spacing(spacing)
     h = sum(chosen) / 3
     evidence = weigh(looked, h)
-    cut = evidence.cut_low or evidence.cut_high
+    cut = (evidence.cut_low or evidence.cut_high) and wanted.field != SCALED
     slope = _slope_within(looked) / h if cut else evidence.slope
     if not np.isfinite(slope):
         slope = typical_length(*surface_gradients(samples)) / h
     found = Interpreted(samples, extremes, chosen, positive, Field())
-    if cut and (wanted.field == TRUNCATED or wanted.field == AUTO):
+    if cut:
         if abs(slope - 1) > SLOPE_OFF:
             notes.append(f"the values are divided by their slope, {slope:.4g} instead of 1")
             found = _divided(found, slope)
@@ -300,7 +315,7 @@ def _as_shown(
 ) -> Interpreted:
     """Return distances with the kind that the evidence shows."""
     h = sum(found.spacing) / 3
-    if _cut_at(found.extremes, evidence, h) < HARMLESS:
+    if _cut_at(found.extremes, evidence, h) < HARMLESS or wanted.field == TRUNCATED:
         return _truncated(found, evidence, wanted, notes)
     if evidence.is_noisy:
         field = replace(found.field, kind=NOISY, evidence=evidence.report())
