@@ -192,6 +192,30 @@ def test_densities_of_two_values_are_a_mask():
     np.testing.assert_array_equal(grid.values, make_grid(MASK, **PLACE).values)
 
 
+def test_densities_with_a_ramp_have_the_surface_of_their_spline():
+    blurred = ndimage.gaussian_filter(MASK.astype(np.float32), 1.5) * 1000
+    grid = make_grid(blurred, level=500)
+    assert grid.field.kind == "scaled"
+    assert grid.notes[1].startswith("spacing not given: taken as 1, since densities show none")
+
+
+def test_densities_without_a_ramp_are_a_mask():
+    steep = MASK * 1000.0 + np.random.default_rng(0).uniform(0, 30, MASK.shape)
+    grid = make_grid(steep, **PLACE, level=500)
+    assert grid.field.kind == "mask"
+    np.testing.assert_array_equal(grid.values, make_grid(MASK, **PLACE).values)
+
+
+def test_the_shares_of_voxels_inside_are_cut_off():
+    shares = np.clip(0.5 - torus(), 0, 1)
+    grid = make_grid(shares, spacing=2.5, origin=0, level=0.5)
+    assert grid.field.kind == "truncated"
+    assert grid.notes[1].startswith("the values are divided by their slope")
+    mesh = reconstruct(grid, trilinear)
+    x, y, z = (mesh.vertices.T / 2.5 + 0.5) / 32 - 0.5
+    assert np.abs(np.hypot(np.hypot(x, y) - 0.3, z) - 0.12).mean() * 32 < 0.05
+
+
 def test_the_scale_is_the_unit_of_the_values():
     plain = make_grid(torus() / 32, spacing=1 / 32, origin=0)
     scaled = make_grid(torus() * 25.4, spacing=1 / 32, origin=0, scale=1 / 25.4 / 32)

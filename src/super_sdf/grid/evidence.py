@@ -26,7 +26,9 @@ SURE = 0.1  # share by which the slope of a sample may be off to count
 ENOUGH = 30  # such samples, from which a slope is known
 # A slope may be off by the third and fourth differences, and by this.
 ROUNDING = 0.015
-WRONG_SLOPES = 0.01  # share of slopes that are off from which the field is no distance
+# Share of slopes that are off from which the field is no distance: where it is smooth enough for a
+# typical slope, and where it is not.
+WRONG_SLOPES, WRONG_IF_ROUGH = 0.01, 0.05
 CUT_OFF = 0.01  # share of samples amid equal ones, at the lowest or highest value
 LIPSCHITZ, BENT, NOISY = 1.05, 0.3, 0.02  # change, difference and share from which it is noisy
 LEAST_SAMPLES = 100  # from which shares are evidence
@@ -65,12 +67,18 @@ class Evidence:
     @property
     def is_scaled(self) -> bool:
         """Whether the values are no distances in the unit of the spacing."""
-        return (self.wrong > WRONG_SLOPES and self.is_enough) or abs(self.slope - 1) > OFF
+        return self.is_bent or abs(self.slope - 1) > OFF
+
+    @property
+    def is_bent(self) -> bool:
+        """Whether the slope differs from place to place, so that no unit makes distances of it."""
+        allowed = WRONG_SLOPES if np.isfinite(self.slope) else WRONG_IF_ROUGH
+        return self.is_enough and self.wrong > allowed
 
     @property
     def is_noisy(self) -> bool:
         """Whether the values are noisy: noise makes slopes wrong, but no more than it is seen."""
-        return self.noisy > NOISY and not self.wrong > WRONG_SLOPES and self.is_enough
+        return self.is_enough and self.noisy > NOISY and not self.is_bent
 
     @property
     def is_enough(self) -> bool:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Triple
 from ..errors import GridError
-from .evidence import WRONG_SLOPES, Evidence, Looked, look, weigh
+from .evidence import ENOUGH, Evidence, Looked, look, weigh
 from .field import AUTO, EXACT, MASK, NOISY, NONE_EXACT, SCALED, TRUNCATED, Field, Wanted
 from .gradients import surface_gradients, typical_length
 from .masks import extremes_of_masks, has_both_sides, is_distance_transform, mask_planes
@@ -36,6 +36,9 @@ from .truncation import filled_planes
 # below which too few are left for that.
 HARMLESS, FILLED, TOO_NEAR = 3.0, 1.75, 0.85
 SLOPE_OFF = 0.25  # from 1: truncated distances have another unit
+# Densities have no ramp if half of the changes across the level are this share of all there is to
+# change, the lowest and the highest values left out.
+STEP, STEP_TAIL = 0.85, 0.05
 MOST_LABELS = 64  # whole numbers up to this look like labels
 MOST_NAMED = 8  # labels that a message lists
 
@@ -220,7 +223,18 @@ def _by_evidence(
         return _of_mask(above, wanted, spacing, inside, notes)
     if is_one_sided(extremes) and inside == AUTO and _are_labels(samples, extremes):
         raise GridError(_one_sided(samples, extremes))
-    if wanted.field == SCALED or _is_normalised(looked, spacing):
+    if wanted.level is not None and wanted.field == AUTO and _is_step(looked):
+        notes.append("the densities jump from one side of the level to the other")
+        above = _derived(samples, lambda planes: planes > 0, np.bool_)
+        return _of_mask(above, wanted, spacing, inside, notes)
+    if wanted.level is not None and spacing is None:
+        notes.append("spacing not given: taken as 1, since densities show none (give --spacing)")
+        spacing = 1.0
+    if (
+        wanted.field == SCALED
+        or _is_normalised(looked, spacing)
+        or (wanted.level is not None and not _is_distance(looked, spacing))
+    ):
         return _of_slope(samples, looked, wanted, spacing, inside, notes)
     found = _as_distances(samples, extremes, wanted, spacing, inside, notes)
     evidence = weigh(looked, sum(found.spacing) / 3)
@@ -256,6 +270,26 @@ def _is_normalised(looked: Looked, spacing: ArrayLike | None) -> bool:
     return cut and abs(_slope_within(looked) / h - 1) > SLOPE_OFF
 
 
+def _is_distance(looked: Looked, spacing: ArrayLike | None) -> bool:
+    """Return whether densities change as distances do."""
+    evidence = weigh(looked, sum(check_spacing(1.0 if spacing is None else spacing)) / 3)
+    return bool(np.isfinite(evidence.slope)) and not evidence.is_scaled
+
+
+def _is_step(looked: Looked) -> bool:
+    """Return whether densities jump over the level from sample to sample, with no ramp between.
+
+    Then where the surface lies between two samples does not show in their values.
+    """
+    pairs = np.stack([looked.lines[..., 1:3], looked.lines[..., 2:4]]).reshape(-1, 2)
+    across = pairs[(pairs[:, 0] > 0) != (pairs[:, 1] > 0)]
+    if len(across) < ENOUGH:
+        return False
+    low, high = np.quantile(looked.lines, [STEP_TAIL, 1 - STEP_TAIL])
+    jumps = np.abs(across[:, 1] - across[:, 0])
+    return bool(np.median(jumps) > STEP * (high - low))
+
+
 def _slope_within(looked: Looked) -> float:
     """Return the typical change of the values between a sample and its neighbours, none cut off.
 
@@ -289,11 +323,15 @@ def _of_slope(
     if not np.isfinite(slope):
         slope = typical_length(*surface_gradients(samples)) / h
     found = Interpreted(samples, extremes, chosen, positive, Field())
-    if cut:
+    scaled = _scaled_look(looked, slope)
+    divided = weigh(scaled, h)
+    # densities that fade out over voxels are blurred, not cut off
+    fades = wanted.level is not None and _cut_at(scaled.extremes, divided, h) > TOO_NEAR
+    if cut and not (divided.is_bent or fades):
         if abs(slope - 1) > SLOPE_OFF:
             notes.append(f"the values are divided by their slope, {slope:.4g} instead of 1")
             found = _divided(found, slope)
-        return _truncated(found, weigh(_scaled_look(looked, slope), h), wanted, notes)
+        return _truncated(found, divided, wanted, notes)
     return _scaled(found, replace(evidence, slope=slope), wanted, notes)
 
 
@@ -315,7 +353,8 @@ def _as_shown(
 ) -> Interpreted:
     """Return distances with the kind that the evidence shows."""
     h = sum(found.spacing) / 3
-    if _cut_at(found.extremes, evidence, h) < HARMLESS or wanted.field == TRUNCATED:
+    is_cut = _cut_at(found.extremes, evidence, h) < HARMLESS and not evidence.is_bent
+    if is_cut or wanted.field == TRUNCATED:
         return _truncated(found, evidence, wanted, notes)
     if evidence.is_noisy:
         field = replace(found.field, kind=NOISY, evidence=evidence.report())
@@ -373,7 +412,7 @@ def _scaled(
     smooth = _derived(found.samples, lambda v: v * sign)
     field = Field(SCALED, wanted.field == SCALED, NONE_EXACT, smooth, evidence.report())
     why = f"beside the surface their slope is {slope:.4g} instead of 1"
-    if evidence.wrong > WRONG_SLOPES:
+    if evidence.is_bent:
         why += f", and wrong at {100 * evidence.wrong:.2g} % of the samples"
     notes.append(
         f"values taken as scaled (--field scaled): {why}; where they are smooth, the surface is "
