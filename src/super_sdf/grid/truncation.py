@@ -19,6 +19,8 @@ from .samples import Extremes
 REACH = 3  # voxels from a sample up to which others are filled in with the help of its foot point
 FAR = 2.6  # voxels: the distance of a sample without a foot point near it
 LEAST_SLOPE = 0.3  # of a sample whose foot point is used
+DISC = np.float32(0.2)  # voxels
+ROUNDS = 2
 WITHIN = 1 - 1e-5  # share of the limit up to which a value is not cut off
 
 OFFSETS: IntArray = np.indices((2 * REACH + 1,) * 3).reshape(3, -1).T.astype(np.int32) - REACH
@@ -43,26 +45,49 @@ def filled_planes(values: SampleArray, h: float, limits: Extremes) -> DerivedPla
     def make(planes: NDArray[Any]) -> FloatArray:
         return fill_in(planes.astype(np.float32) * scale, low, high) * np.float32(h)
 
-    return DerivedPlanes(values, make, REACH + 1)
+    return DerivedPlanes(values, make, ROUNDS * (REACH + 1))
 
 
 def fill_in(values: FloatArray, low: float, high: float) -> FloatArray:
-    """Return distances in voxels, (nx, ny, nz), filled in where they were cut off."""
+    """Return distances in voxels, (nx, ny, nz), filled in where they were cut off.
+
+    The second round has better gradients: central differences to what the first one filled in.
+    """
     cut = (values <= low * WITHIN) | (values >= high * WITHIN)
+    least = np.abs(np.where(values > 0, high, low)).astype(np.float32)
     gradient = gradient_within(values, cut)
-    slope = np.sqrt((gradient**2).sum(-1))
+    for _ in range(ROUNDS):
+        distance = np.maximum(distance_to_feet(values, gradient, cut), least)
+        values = np.where(cut, np.copysign(distance, values), values)
+        parts = [np.asarray(part, np.float32) for part in np.gradient(values)]
+        gradient = np.stack(parts, -1)
+    return values
+
+
+def distance_to_feet(values: FloatArray, gradient: FloatArray, cut: BoolArray) -> FloatArray:
+    """Return the distance of each sample to the surface at its nearest foot point, ``FAR`` at most.
+
+    At a foot point the surface is taken as a disc of radius ``DISC``: it goes on between them.
+    """
+    slope = np.sqrt((gradient**2).sum(-1, dtype=np.float32))
     ijk = np.argwhere(~cut & (slope > LEAST_SLOPE))
     at = tuple(ijk.T)
-    foot = -(values[at] / slope[at])[:, None] * gradient[at]
-    nearest = np.pad(np.where(cut, np.float32(FAR), np.float32(0)), REACH)
+    normal = gradient[at] / slope[at][:, None]
+    foot = -values[at][:, None] * normal
+    nearest = np.pad(np.full(values.shape, FAR, np.float32), REACH, constant_values=FAR)
+    found = nearest.copy()
     for offset in OFFSETS:
         place = tuple((ijk + offset + REACH).T)
-        distance = np.sqrt(((offset - foot) ** 2).sum(1, dtype=np.float32))
-        nearest[place] = np.minimum(nearest[place], distance)
-    inner = nearest[REACH:-REACH, REACH:-REACH, REACH:-REACH]
-    least = np.abs(np.where(values > 0, high, low)).astype(np.float32)
-    filled = np.sign(values) * np.maximum(inner, least)
-    return np.where(cut, filled, values).astype(np.float32)
+        step = offset.astype(np.float32) - foot
+        square = step[:, 0] ** 2 + step[:, 1] ** 2 + step[:, 2] ** 2
+        closer = square < nearest[place] ** 2
+        where = tuple(axis[closer] for axis in place)
+        step, square, facing = step[closer], square[closer], normal[closer]
+        height = step[:, 0] * facing[:, 0] + step[:, 1] * facing[:, 1] + step[:, 2] * facing[:, 2]
+        aside = np.sqrt(np.maximum(square - height**2, 0))
+        nearest[where] = np.sqrt(square)
+        found[where] = np.hypot(height, np.maximum(aside - DISC, 0))
+    return found[REACH:-REACH, REACH:-REACH, REACH:-REACH]
 
 
 def gradient_within(values: FloatArray, cut: BoolArray) -> FloatArray:
