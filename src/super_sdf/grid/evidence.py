@@ -20,7 +20,7 @@ from .samples import Extremes
 
 Floats = NDArray[np.float64]
 
-PLANES = 24  # of samples beside the surface are looked at, spread evenly
+PLANES = 12  # of samples beside the surface are looked at, spread evenly
 BESIDE = 2  # planes, rows and columns to either side, for fourth differences
 SURE = 0.1  # share by which the slope of a sample may be off to count
 ENOUGH = 30  # such samples, from which a slope is known

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from functools import lru_cache
 
+from ..errors import FileError
 from ..grid.field import MASK
 from .decoder import Decoder
-from .network import Network, load_network
+from .network import NO_NETWORKS, Network, load_network, shipped_models
 
 MASK_MODEL = "mask"
 
@@ -29,4 +30,6 @@ def network_for(network: Decoder, kind: str) -> Decoder:
 @lru_cache(maxsize=2)
 def _for_masks(device: str, threads: int, symmetries: int) -> Network:
     """Load the network for masks, once."""
+    if MASK_MODEL not in shipped_models():
+        raise FileError(f"the network {MASK_MODEL!r} is missing: {NO_NETWORKS}")
     return load_network(MASK_MODEL, device=device, threads=threads).averaged(symmetries)
