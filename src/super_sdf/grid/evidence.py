@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .gradients import LARGEST_VALUE
 from .planes import SampleArray
 from .samples import Extremes
 
@@ -130,7 +131,7 @@ def look(values: SampleArray, extremes: Extremes) -> Looked:
     found, cut, count = [np.empty((0, 3, 5))], np.zeros(2, np.int64), 0
     for i in _inner_planes(len(values)) if min(values.shape) > 2 * BESIDE else []:
         slab = np.asarray(values[i - BESIDE : i + BESIDE + 1])
-        found.append(_lines_beside_surface(slab))
+        found.append(np.clip(_lines_beside_surface(slab), -LARGEST_VALUE, LARGEST_VALUE))
         cut += _count_amid_equal(slab, extremes)
         count += slab[0, BESIDE:-BESIDE, BESIDE:-BESIDE].size
     return Looked(np.concatenate(found), cut / max(count, 1), extremes)
@@ -188,7 +189,7 @@ def weigh(looked: Looked, h: float) -> Evidence:
     is_cut = looked.cut > CUT_OFF
     limits = [x if c else s * np.inf for x, c, s in zip(looked.extremes, is_cut, (-1, 1))]
     whole = ((looked.lines > limits[0]) & (looked.lines < limits[1])).all((1, 2))
-    lines = looked.lines[whole] / h
+    lines = np.clip(looked.lines[whole] / h, -LARGEST_VALUE, LARGEST_VALUE)
     second, third, fourth = differences(lines)
     slope = np.sqrt((((lines[..., 3] - lines[..., 1]) / 2) ** 2).sum(1))
     unsure = (third + fourth).sum(1) / 2

@@ -86,12 +86,12 @@ def interpret(
     if samples.dtype == np.bool_:
         return _of_mask(samples, wanted, spacing, inside, notes)
     if wanted.level is not None:
-        samples = _derived(samples, lambda v: v - np.float32(wanted.level or 0))
+        samples = _derived(samples, lambda v: v - float(wanted.level or 0))
         which = "below" if inside == "negative" else "above"
         notes.append(f"values {which} {wanted.level:g} are taken as inside (see --inside)")
         inside = _above(inside)
     if wanted.scale is not None:
-        samples = _derived(samples, lambda v: v * np.float32(wanted.scale or 1))
+        samples = _derived(samples, lambda v: v * float(wanted.scale or 1))
     extremes = check_values(samples)
     check_not_constant(extremes)
     if has_two_values(samples, extremes) or wanted.field == MASK:
@@ -107,11 +107,11 @@ def _above(inside: str) -> str:
 
 
 def _derived(
-    samples: SampleArray, change: Callable[[NDArray[Any]], NDArray[Any]], dtype: Any = np.float32
+    samples: SampleArray, change: Callable[[NDArray[Any]], NDArray[Any]], dtype: Any = np.float64
 ) -> DerivedPlanes:
-    """Return samples changed one by one, as float32 or another type."""
-    if dtype is np.float32:
-        return DerivedPlanes(samples, lambda planes: change(planes.astype(np.float32)))
+    """Return samples changed one by one, as float64 or of another type."""
+    if dtype is np.float64:
+        return DerivedPlanes(samples, lambda planes: change(planes.astype(np.float64)))
     return DerivedPlanes(samples, change, dtype=dtype)
 
 
@@ -344,7 +344,7 @@ def _scaled_look(looked: Looked, slope: float) -> Looked:
 def _divided(found: Interpreted, slope: float) -> Interpreted:
     """Return values divided by a slope."""
     low, high = found.extremes
-    divided = _derived(found.samples, lambda v: v / np.float32(slope))
+    divided = _derived(found.samples, lambda v: v / slope)
     return replace(found, samples=divided, extremes=(low / slope, high / slope))
 
 
@@ -390,7 +390,7 @@ def _truncated(
     field = Field(TRUNCATED, wanted.field == TRUNCATED, exact, None, evidence.report())
     samples = found.samples
     if at < TOO_NEAR:
-        sign = np.float32(-1 if found.positive_inside else 1)
+        sign = -1.0 if found.positive_inside else 1.0
         field = replace(field, smooth=_derived(samples, lambda v: v * sign))
     elif at < FILLED:
         samples = filled_planes(samples, h, limits)
@@ -408,7 +408,7 @@ def _scaled(
     """Return a field of another slope, divided by it; its cubic spline has the surface."""
     h = sum(found.spacing) / 3
     slope = evidence.slope if np.isfinite(evidence.slope) else 1.0
-    sign = np.float32((-1 if found.positive_inside else 1) / slope)
+    sign = (-1 if found.positive_inside else 1) / slope
     smooth = _derived(found.samples, lambda v: v * sign)
     field = Field(SCALED, wanted.field == SCALED, NONE_EXACT, smooth, evidence.report())
     why = f"beside the surface their slope is {slope:.4g} instead of 1"

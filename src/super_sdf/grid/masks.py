@@ -11,6 +11,8 @@ taking the axes one after the other.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -56,8 +58,11 @@ def squared_distances(marked: BoolArray) -> NDArray[np.uint8]:
 
 def mask_planes(inside: SampleArray, h: float) -> DerivedPlanes:
     """Return the distances of a mask, made plane by plane, in world units; ``h`` is the spacing."""
-    scale = np.float32(h)
-    return DerivedPlanes(inside, lambda planes: mask_distances(planes) * scale, REACH)
+
+    def make(planes: NDArray[Any]) -> NDArray[np.float64]:
+        return mask_distances(planes).astype(np.float64) * h
+
+    return DerivedPlanes(inside, make, REACH)
 
 
 def extremes_of_masks(h: float) -> Extremes:

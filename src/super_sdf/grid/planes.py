@@ -19,9 +19,11 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from ..arrays import FloatArray
 from ..errors import FileError
 from ..machine.memory import check_fits
 
+FAR = 1e6
 BLOCK_BYTES = 1 << 20  # read at a time when iterating over all planes
 
 
@@ -227,6 +229,11 @@ SampleArray: TypeAlias = NDArray[Any] | Planes
 """An array of samples in memory, or one whose planes are read or made when they are needed."""
 
 
+def in_spacings(values: NDArray[Any], unit: float) -> FloatArray:
+    """Return values over a unit as float32; from ``FAR`` on their size does not matter."""
+    return np.clip(values.astype(np.float64) / unit, -FAR, FAR).astype(np.float32)
+
+
 class DerivedPlanes(Planes):
     """Planes that are made of those of another array, and of some beside them.
 
@@ -247,7 +254,7 @@ class DerivedPlanes(Planes):
         source: SampleArray,
         make: Callable[[NDArray[Any]], NDArray[Any]],
         beside: int = 0,
-        dtype: DTypeLike = np.float32,
+        dtype: DTypeLike = np.float64,
     ) -> None:
         self.source, self.make, self.beside = source, make, beside
         self.shape, self.dtype = tuple(source.shape), np.dtype(dtype)
@@ -259,5 +266,5 @@ class DerivedPlanes(Planes):
         low, high = max(first - self.beside, 0), min(last + self.beside, len(self))
         if last <= first:
             return np.empty((0, *self.shape[1:]), self.dtype)
-        made = self.make(np.asarray(self.source[low:high]))
+        made = np.asarray(self.make(np.asarray(self.source[low:high])), self.dtype)
         return made[first - low : last - low]

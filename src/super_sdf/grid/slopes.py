@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray
-from .planes import DerivedPlanes, SampleArray
+from .planes import DerivedPlanes, SampleArray, in_spacings
 
 AROUND = 2  # samples to either side over which slopes are averaged
 TYPICAL_ERROR = 0.1  # of a slope, relative: half the weight
@@ -34,9 +34,9 @@ def normalised_planes(values: SampleArray, h: float, slope: float) -> DerivedPla
         The typical change from sample to sample, over the spacing.
     """
 
-    def make(planes: NDArray[Any]) -> FloatArray:
-        scaled = planes.astype(np.float32) / np.float32(h * slope)
-        return scaled / local_slopes(scaled) * np.float32(h)
+    def make(planes: NDArray[Any]) -> NDArray[np.float64]:
+        scaled = in_spacings(planes, h * slope)
+        return (scaled / local_slopes(scaled)).astype(np.float64) * h
 
     return DerivedPlanes(values, make, AROUND + 2)
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
-from .planes import DerivedPlanes, SampleArray
+from .planes import DerivedPlanes, SampleArray, in_spacings
 from .samples import Extremes
 
 REACH = 3  # voxels from a sample up to which others are filled in with the help of its foot point
@@ -39,11 +39,10 @@ def filled_planes(values: SampleArray, h: float, limits: Extremes) -> DerivedPla
     limits : two floats
         Where they were cut off: the lowest and the highest value.
     """
-    scale = np.float32(1 / h)
-    low, high = (float(limit * scale) for limit in limits)
+    low, high = (limit / h for limit in limits)
 
-    def make(planes: NDArray[Any]) -> FloatArray:
-        return fill_in(planes.astype(np.float32) * scale, low, high) * np.float32(h)
+    def make(planes: NDArray[Any]) -> NDArray[np.float64]:
+        return fill_in(in_spacings(planes, h), low, high).astype(np.float64) * h
 
     return DerivedPlanes(values, make, ROUNDS * (REACH + 1))
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray, IntArray
-from ..grid.planes import SampleArray
+from ..grid.planes import SampleArray, in_spacings
 from ..grid.slopes import local_slopes
 from .band import plane_blocks
 
@@ -56,7 +56,7 @@ def spline_blocks(
         if rows.start == rows.stop:
             continue
         low, high = max(first - TAIL - 2, 0), min(last + TAIL + 2, nx)
-        planes = np.asarray(values[low:high]).astype(np.float32) / np.float32(unit)
+        planes = in_spacings(np.asarray(values[low:high]), unit)
         ijk = voxel_ijk[rows] - np.array([low, 0, 0], np.int32)
         share[rows] = network_share(planes * np.float32(0.5))[tuple(ijk.T)]
         _evaluate(prefilter(planes), ijk + 2, factor, blocks[:, rows])
