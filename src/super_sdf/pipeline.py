@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from .arrays import FloatArray, IntArray
-from .grid.field import MASK, SCALED
+from .grid.field import MASK
 from .grid.planes import SampleArray
 from .grid.sdf_grid import SdfGrid
 from .machine.memory import give_back
@@ -312,13 +312,13 @@ def interpolate(
 ) -> FloatArray:
     """Return the blocks of a field that is no distance: its spline, and the network at kinks.
 
-    Of a field that was cut off near the surface, the network adds nothing.
+    Of a field that is far from a distance, or was cut off, the network adds nothing.
     """
     patches, table, voxels = inputs
     own_ijk = band.voxel_ijk[slab.seen][voxels]
     blocks, share = spline_blocks(smooth, own_ijk, factor, band.half_voxel)
     blocks[:, :-1] -= np.float32(band.level)
-    some = np.flatnonzero(share if band.kind == SCALED else 0 * share)
+    some = np.flatnonzero(share if band.has_kinks else 0 * share)
     if len(some):
         kinked = patches, table, voxels[some]
         added = decode(network, kinked, block_offsets(factor), None, threads)[:, :-1]

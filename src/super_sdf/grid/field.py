@@ -44,6 +44,8 @@ class Field:
         Only samples between these, in world units, negative inside, may be exact distances.
     smooth : array or Planes, optional
         Of a scaled field: the values whose cubic spline has the surface, negative inside.
+    has_kinks : bool
+        Whether a scaled field is mostly a distance, so that the network may refine its kinks.
     evidence : dict
         What the samples show, for ``--json``.
     """
@@ -52,6 +54,7 @@ class Field:
     given: bool = False
     exact: Extremes = (-np.inf, np.inf)
     smooth: SampleArray | None = None
+    has_kinks: bool = False
     evidence: dict[str, Any] = field(default_factory=dict)
 
     def report(self) -> dict[str, Any]:

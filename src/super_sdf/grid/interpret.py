@@ -35,6 +35,7 @@ from .truncation import filled_planes
 # Voxels from which on values may be cut off without a loss; up to which the rest is filled in; and
 # below which too few are left for that.
 HARMLESS, FILLED, TOO_NEAR = 3.0, 1.75, 0.85
+BENT = 0.1  # share of wrong slopes from which the network has no say in a field
 SLOPE_OFF = 0.25  # from 1: truncated distances have another unit
 # Densities have no ramp if half of the changes across the level are this share of all there is to
 # change, the lowest and the highest values left out.
@@ -387,7 +388,7 @@ def _truncated(
     if found.positive_inside:
         below, above = above, below
     exact = low if below else -np.inf, high if above else np.inf
-    field = Field(TRUNCATED, wanted.field == TRUNCATED, exact, None, evidence.report())
+    field = Field(TRUNCATED, wanted.field == TRUNCATED, exact, evidence=evidence.report())
     samples = found.samples
     if at < TOO_NEAR:
         sign = -1.0 if found.positive_inside else 1.0
@@ -410,7 +411,8 @@ def _scaled(
     slope = evidence.slope if np.isfinite(evidence.slope) else 1.0
     sign = (-1 if found.positive_inside else 1) / slope
     smooth = _derived(found.samples, lambda v: v * sign)
-    field = Field(SCALED, wanted.field == SCALED, NONE_EXACT, smooth, evidence.report())
+    field = Field(SCALED, wanted.field == SCALED, NONE_EXACT, smooth)
+    field = replace(field, has_kinks=evidence.wrong < BENT, evidence=evidence.report())
     why = f"beside the surface their slope is {slope:.4g} instead of 1"
     if evidence.is_bent:
         why += f", and wrong at {100 * evidence.wrong:.2g} % of the samples"

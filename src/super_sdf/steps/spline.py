@@ -23,7 +23,7 @@ TAIL = 12  # samples after which the prefilter has fallen to 1e-7
 SIDE = 5  # coefficients along an axis on which the spline within half a voxel of a sample depends
 # Sums of fourth differences, in voxels, up to which a field is smooth, and from which it is not.
 SMOOTH, KINKED = 0.6, 1.3
-WRONG_SLOPE = 0.1  # from 1: local slopes so far off are not those of distances
+WRONG_SLOPE = 0.05  # from 1: local slopes so far off are not those of distances
 
 
 def spline_blocks(

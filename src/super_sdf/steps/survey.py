@@ -60,6 +60,8 @@ class Band:
         What the field is, see ``grid.field``.
     smooth : array or Planes, optional
         Values whose cubic spline has the surface where they are smooth, in world units.
+    has_kinks : bool
+        Whether the network may refine that field where it is not smooth.
     half_voxel, level : float
         Half a spacing in world units, by which these are divided; and what is zero then.
     """
@@ -73,6 +75,7 @@ class Band:
     leaves: bool = False
     kind: str = EXACT
     smooth: SampleArray | None = None
+    has_kinks: bool = False
     half_voxel: float = 1.0
     level: float = 0.0
 
@@ -197,8 +200,11 @@ def limit_to_field(band: Band, grid: SdfGrid, offset: float) -> Band:
     decoded = band.decoded
     if field.kind == MASK:
         decoded = ((band.patches > 0) != (sample > 0)[:, None]).any(1)
+    if field.smooth is not None:  # no distances: what they say of the voxels is not certain
+        decoded = np.ones_like(band.decoded)
     band = replace(band, exact=exact, decoded=decoded, kind=field.kind, smooth=field.smooth)
-    return replace(band, half_voxel=1 / scale, level=offset * scale)
+    level = offset * scale
+    return replace(band, has_kinks=field.has_kinks, half_voxel=1 / scale, level=level)
 
 
 def _check_bound(voxels: int, planes: int, held: int, bound: int | None) -> None:
