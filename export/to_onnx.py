@@ -141,7 +141,8 @@ def check_awake(net: SuperSdfNet) -> None:
     SystemExit
         If more than ``DORMANT`` of the rectified units react to no voxel of procedural shapes.
     """
-    share = dormant_share(net, [[sample] for sample in draw_samples()])
+    samples = draw_samples(masks=not net.config.keeps_samples)
+    share = dormant_share(net, [[sample] for sample in samples if len(sample.voxels)])
     if share > DORMANT:
         raise SystemExit(
             f"{100 * share:.1f} % of the rectified units react to nothing, "

@@ -484,7 +484,7 @@ def test_a_run_starts_dormant_units_again_until_its_last_fifth(tmp_path, samples
 
 def test_a_network_with_dead_units_is_not_exported(samples, monkeypatch):
     net = small_net()
-    monkeypatch.setattr("export.to_onnx.draw_samples", lambda: [prepare(samples[0])])
+    monkeypatch.setattr("export.to_onnx.draw_samples", lambda **_: [prepare(samples[0])])
     revive(net, [], [[prepare(samples[0])]])
     check_awake(net)
     put_to_sleep(net)
