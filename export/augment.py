@@ -2,7 +2,8 @@
 
 A distance field stays one when its cube is turned or mirrored and, near the surface, when another
 level is called zero. Grids of users may also be truncated or noisy: the targets stay clean, so the
-network learns to undo that.
+network learns to undo that. Or they are masks: then only the side of each sample is left, and the
+network gets the distances that the runtime makes of it.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from export.dataset import Sample
+from super_sdf.grid.masks import mask_distances
 from super_sdf.network.symmetry import cube_symmetries, turn
 from super_sdf.steps.band import find_band, gather_patches, neighbour_table
 
@@ -49,13 +51,23 @@ def augment(rng: np.random.Generator, sample: Sample, shares: Shares) -> Prepare
     return turned(rng, truncated(rng, prepare(changed), shares))
 
 
+def augment_mask(rng: np.random.Generator, sample: Sample) -> Prepared:
+    """Make a mask of a sample, at a random level, and gather it."""
+    return turned(rng, prepare(masked(rng, sample)))
+
+
+def prepare_mask(sample: Sample) -> Prepared:
+    """Make a mask of a sample, always the same one, and gather it."""
+    return prepare(masked(np.random.default_rng(len(sample.voxel_ijk)), sample))
+
+
 def prepare(sample: Sample) -> Prepared:
     """Gather a sample with the functions of the runtime; targets outside the band are dropped."""
     band = find_band(sample.window)
     strides = np.array([sample.window.shape[1] * sample.window.shape[2], sample.window.shape[2], 1])
     keys, wanted = band @ strides, sample.voxel_ijk.astype(np.int64) @ strides
-    rows = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    in_band = keys[rows] == wanted
+    rows = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))
+    in_band = keys[rows] == wanted if len(keys) else np.zeros(len(wanted), bool)
     return Prepared(
         band,
         gather_patches(sample.window, band),
@@ -80,6 +92,18 @@ def shifted(rng: np.random.Generator, sample: Sample, shares: Shares) -> Sample:
     level = np.float32(rng.uniform(-1, 1))
     targets = sample.targets.astype(np.float32) - level
     return replace(sample, window=sample.window - level, targets=targets)
+
+
+def masked(rng: np.random.Generator, sample: Sample) -> Sample:
+    """Replace the distances by those of the mask at a level up to half a voxel from zero.
+
+    Without a sample on each side there is nothing to learn: the window is then empty, and so is the
+    band.
+    """
+    level = np.float32(rng.uniform(-1, 1))
+    inside = sample.window < level
+    targets = sample.targets.astype(np.float32) - level
+    return replace(sample, window=2 * mask_distances(inside), targets=targets)
 
 
 def noisy(rng: np.random.Generator, sample: Sample, shares: Shares) -> Sample:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from export.augment import USUAL, Prepared, augment, batch_table
+from export.augment import USUAL, Prepared, augment, augment_mask, batch_table
 from export.dataset import fill_shard
 from export.latency import ball
 from export.network import Block, SuperSdfNet
@@ -45,10 +45,12 @@ class Ranges:
         self.expanded = torch.maximum(self.expanded, expanded.amax(0))
 
 
-def draw_samples(count: int = SAMPLES, seed: int = 0) -> list[Prepared]:
-    """Return samples of procedural shapes, some noisy, some truncated."""
+def draw_samples(count: int = SAMPLES, seed: int = 0, *, masks: bool = False) -> list[Prepared]:
+    """Return samples of procedural shapes, some noisy, some truncated; or masks of them."""
     rng = np.random.default_rng(seed)
     samples = fill_shard(rng, [], 1.0, THIN, count)
+    if masks:
+        return [augment_mask(rng, sample) for sample in samples]
     return [augment(rng, sample, USUAL) for sample in samples]
 
 

@@ -10,7 +10,7 @@ interpolation of the patch. All lengths are in half voxels (Eqs. 4 and 5).
 
 Interpolation and functions keep the value of the sample (Sec. 4.1). A noisy sample should not be
 kept, so there is also a correction of the whole voxel. It is 0 where all samples around the voxel
-can be distances.
+can be distances. The distances of a mask are right to half a voxel only, and none is kept.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ class NetworkConfig:
     functions: int = 256  # of the offset, in the head
     trunk: int = 128
     frequencies: int = 4
+    keeps_samples: bool = True  # the sample's value, where it can be a distance; not with masks
 
     @property
     def receptive_field(self) -> int:
@@ -210,7 +211,10 @@ class SuperSdfNet(nn.Module):
 
     def encode_all(self, patches: Tensor, table: Tensor) -> Encoded:
         """Encode voxels; return all inputs of the head."""
-        return Encoded(self.encode(patches, table), patches, is_noisy(patches, table))
+        noisy = is_noisy(patches, table)
+        if not self.config.keeps_samples:
+            noisy = torch.ones_like(noisy)
+        return Encoded(self.encode(patches, table), patches, noisy)
 
     def decode(self, voxels: Encoded, offsets: Tensor) -> Tensor:
         """Return the values (D, Q) of voxels at offsets (Q, 3)."""

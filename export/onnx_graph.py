@@ -200,7 +200,9 @@ def head_body(net: SuperSdfNet, features: str, excess: str, per_offset: str) -> 
     patches = body.op("Gather", "patches", "some", axis=0)
     per_voxel = body.op("Concat", chosen, branch, patches, axis=1)
     kept = body.op("MatMul", per_voxel, per_offset)
-    correction = body.op("Mul", body.layer(chosen, net.correction), noisy_voxels(body, excess))
+    correction = body.layer(chosen, net.correction)
+    if net.config.keeps_samples:
+        correction = body.op("Mul", correction, noisy_voxels(body, excess))
     values = body.op("Add", kept, correction)
     given, made = rows_of("some", TensorProto.INT32), rows_of(values, TensorProto.FLOAT, "Q")
     return helper.make_graph(body.nodes, "head", [given], [made], body.constants)

@@ -120,10 +120,17 @@ def read_network(path: Path) -> SuperSdfNet:
         functions=channels + len(weights["branch.bias"]),
         trunk=trunk,
         frequencies=(inputs - 3) // 6,
+        keeps_samples=read_inputs(path) == "distances",
     )
     net = SuperSdfNet(config)
     net.load_state_dict(weights)
     return net.eval()
+
+
+def read_inputs(path: Path) -> str:
+    """Return what the network in an exported file was trained on."""
+    card = {prop.key: prop.value for prop in onnx.load(path).metadata_props}
+    return card.get("inputs", "distances")
 
 
 def check_awake(net: SuperSdfNet) -> None:
@@ -134,7 +141,8 @@ def check_awake(net: SuperSdfNet) -> None:
     SystemExit
         If more than ``DORMANT`` of the rectified units react to no voxel of procedural shapes.
     """
-    share = dormant_share(net, [[sample] for sample in draw_samples()])
+    samples = draw_samples(masks=not net.config.keeps_samples)
+    share = dormant_share(net, [[sample] for sample in samples if len(sample.voxels)])
     if share > DORMANT:
         raise SystemExit(
             f"{100 * share:.1f} % of the rectified units react to nothing, "
@@ -159,6 +167,7 @@ def make_card(net: SuperSdfNet, name: str, data: str, accuracy: str) -> dict[str
         "trained_from_commit": commit,
         "accuracy": accuracy,
         "licence": "MIT",
+        **({} if net.config.keeps_samples else {"inputs": "masks"}),
     }
 
 

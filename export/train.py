@@ -5,6 +5,7 @@
     python -m export.train --store training/store --run training/run --device cuda    # a GPU
     python -m export.train ... --start src/super_sdf/models/base.onnx --rate 0.7   # its weights
     python -m export.train ... --start src/super_sdf/models/base.onnx --blocks 9   # more blocks
+    python -m export.train ... --inputs masks      # the network for masks
 
 A run folder holds ``checkpoint.pt`` (weights, averaged weights, optimisers, time spent),
 ``log.csv`` and ``loss.png``. Dormant units are restarted (``dormant``). The learning rate depends
@@ -28,7 +29,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from export.arguments import Parser, at_least, positive, share
-from export.augment import USUAL, Prepared, augment, prepare
+from export.augment import USUAL, Prepared, augment, augment_mask, prepare, prepare_mask
 from export.dataset import CORNERS, Sample, read_shard
 from export.dormant import dormant_share, revive
 from export.network import SIZES, SuperSdfNet
@@ -41,6 +42,7 @@ CHECKPOINT_SECONDS = 180
 LOG_STEPS = 100
 WATCHED = 4  # last batches: a unit that reacted to none of them is dormant
 HELD_OUT = 2  # shards, the first by name, whose errors are logged
+INPUTS = ("distances", "masks")
 NEAR = 0.5  # half voxels from the surface: limit for normals; half of it for values
 
 LOG_COLUMNS = ("step", "seconds", "samples", "loss", "held-out", "near", "normal", "dormant")
@@ -68,11 +70,15 @@ class Store:
         If no shard is left for training, or one is damaged.
     """
 
-    def __init__(self, folder: Path, held_out: int, most: int | None = None) -> None:
+    def __init__(
+        self, folder: Path, held_out: int, most: int | None = None, inputs: str = INPUTS[0]
+    ) -> None:
         check_store(folder, held_out)
-        self.folder, self.most = folder, most
+        self.folder, self.most, self.inputs = folder, most, inputs
         self.seen = sorted(folder.glob("shard-*.npz"))[:held_out]
-        self.held_out = [prepare(s) for path in self.seen for s in read_shard(path)]
+        gathered = prepare_mask if inputs == "masks" else prepare
+        held = [gathered(s) for path in self.seen for s in read_shard(path)]
+        self.held_out = [sample for sample in held if len(sample.voxels)]
         self.samples: list[Sample] = []
         self.order: list[int] = []
         self.refresh()
@@ -90,9 +96,15 @@ class Store:
         while sum(len(sample.patches) for sample in batch) < recipe.batch_voxels:
             if not self.order:
                 self.order = rng.permutation(len(self.samples)).tolist()
-            sample = augment(rng, self.samples[self.order.pop()], recipe.shares)
+            sample = self._changed(rng, self.samples[self.order.pop()], recipe)
             batch += [sample] if len(sample.voxels) else []
         return batch
+
+    def _changed(self, rng: np.random.Generator, sample: Sample, recipe: Recipe) -> Prepared:
+        """Return a sample as it is shown this time."""
+        if self.inputs == "masks":
+            return augment_mask(rng, sample)
+        return augment(rng, sample, recipe.shares)
 
 
 def check_store(folder: Path, held_out: int) -> None:
@@ -286,6 +298,9 @@ def main() -> None:
     parser.add_argument("--minutes", type=positive, default=90.0, help="training time in all")
     parser.add_argument("--rate", type=positive, default=1.0, help="factor on the learning rates")
     parser.add_argument("--noisy", type=share, default=USUAL.noisy, help="share of noisy samples")
+    parser.add_argument(
+        "--inputs", choices=INPUTS, default=INPUTS[0], help="what the network is trained on"
+    )
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
     parser.add_argument("--seed", type=at_least(0), default=0)
     options = parser.parse_args()
@@ -302,12 +317,17 @@ def run_training(options: argparse.Namespace) -> None:
     torch.manual_seed(options.seed)
     recipe = RECIPE.at(options.rate, options.noisy)
     config = SIZES[options.size]
-    config = replace(config, blocks=options.blocks or config.blocks)
+    config = replace(
+        config,
+        blocks=options.blocks or config.blocks,
+        keeps_samples=options.inputs == "distances",
+    )
     run = Run(options.run, SuperSdfNet(config), recipe, options.device)
     if options.start:
         run.start_from(read_weights(options.start))
     run.resume()
-    train(run, Store(options.store, HELD_OUT), options.minutes, options.seed)
+    store = Store(options.store, HELD_OUT, inputs=options.inputs)
+    train(run, store, options.minutes, options.seed)
 
 
 if __name__ == "__main__":

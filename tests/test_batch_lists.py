@@ -62,8 +62,8 @@ LISTS = {
     "": "list.jsonl names no file: give a path a line",
     '{"out": "a.ply"}': "list.jsonl, line 1: 'in' is None: give the path of a grid",
     '{"in": "a.npy", "Factor": 2}': "list.jsonl, line 1: 'Factor' is unknown: give in, out, "
-    "factor, iterations, spacing, origin, direction, axes, inside, offset, cap, mesher, simplify, "
-    "triangles",
+    "factor, iterations, spacing, origin, direction, axes, inside, field, label, level, scale, "
+    "offset, cap, mesher, simplify, triangles",
     '{"in": "a.npy", "simplify": 0}': "list.jsonl, line 1: 'simplify' is 0.0: give a number "
     "greater than 0",
     '{"in": "a.npy", "simplify": 1, "triangles": 9}': "list.jsonl, line 1: 'simplify' 1.0 and "

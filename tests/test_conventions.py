@@ -76,10 +76,6 @@ def test_small_integers_are_turned_without_overflow():
 
 REFUSED = {
     "every value is 3: a constant field has no surface": np.full((4, 4, 4), 3.0),
-    "the only values are 0 and 1: an occupancy grid holds no distances; "
-    "make them with scipy.ndimage.distance_transform_edt": (torus(8) < 0).astype(np.uint8),
-    "values are true or false: an occupancy grid holds no distances; "
-    "make them with scipy.ndimage.distance_transform_edt": torus(8) < 0,
     "no value is below 0 (the smallest is 0.5): every wall is nearer to some sample than "
     "that, so there is no surface": np.abs(torus(8)) + 0.5 - np.abs(torus(8)).min(),
     "no value is above 0 (the largest is -1): the grid lies within the solid; if that is "
@@ -117,7 +113,10 @@ def test_a_wrong_unit_is_refused_with_the_way_out():
 def test_values_that_change_by_less_than_the_spacing_are_noted(spacing):
     grid = make_grid(ball(24, 8.0).values, spacing=spacing, origin=0)
     assert grid.spacing == (spacing,) * 3
-    (note,) = grid.notes
+    note, kind = grid.notes
+    assert kind.startswith(
+        "values taken as scaled (--field scaled): beside the surface their slope"
+    )
     assert note.startswith("the values change by ")
     assert note.endswith(
         f"spacing is {spacing:g}: they are not exact distances, or the unit is wrong"
@@ -126,7 +125,7 @@ def test_values_that_change_by_less_than_the_spacing_are_noted(spacing):
 
 def test_values_that_are_not_quite_distances_are_noted():
     grid = make_grid(torus(64) * 1.2, spacing=1 / 64, origin=0)
-    assert len(grid.notes) == 1 and "they are not exact distances" in grid.notes[0]
+    assert "they are not exact distances" in grid.notes[0] and grid.field.kind == "scaled"
 
 
 def test_spacing_must_be_positive_and_finite():

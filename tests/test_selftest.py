@@ -10,7 +10,7 @@ from super_sdf import selftest
 from super_sdf.errors import DeviceError
 from super_sdf.machine import extras
 from super_sdf.machine.extras import EXTRAS
-from super_sdf.network import network
+from super_sdf.network import kinds, network
 from super_sdf.selftest import Finding, run_checks
 
 pytestmark = pytest.mark.usefixtures("cpu_build")
@@ -44,6 +44,7 @@ def test_everything_is_checked_on_the_cpu():
         "memory",
         "network base on cpu",
         "network fast on cpu",
+        "network mask on cpu",
         "network base-int8 on cpu",
         *(f"extra {name}" for name in EXTRAS),
     ]
@@ -123,7 +124,7 @@ def test_the_command_prints_a_line_a_check_and_its_exit_code_tells(command):
     assert lines[0].startswith("ok       versions: super-sdf ")
     assert all(re.match(r"(ok      |missing ) \w+", line) for line in lines[:-1])
     code, out, _ = command("info", "--check", "--device", "cuda")
-    assert code == 1 and out.splitlines()[-1] == "1 of 19 checks failed"
+    assert code == 1 and out.splitlines()[-1] == "1 of 20 checks failed"
     assert "\nfailed   cuda: onnxruntime " in out
 
 
@@ -160,6 +161,18 @@ def test_a_package_without_networks_says_so(models, command, tmp_path, there):
     assert (code, err) == (1, "") and f"failed   networks: {said}\n" in out
     code, out, err = command("upsample", "in.npy", tmp_path / "out.ply")
     assert (code, out, err) == (1, "", f"Error: the network 'base' is missing: {said}\n")
+
+
+def test_a_package_without_the_network_for_masks_says_so(models, tmp_path, command):
+    models.mkdir()
+    (models / "fast.onnx").write_bytes(SHIPPED["fast"].read_bytes())
+    kinds._for_masks.cache_clear()
+    np.save(tmp_path / "in.npy", np.linalg.norm(np.indices((9, 9, 9)) - 4, axis=0) < 3)
+    code, _, err = command(
+        *("upsample", tmp_path / "in.npy", tmp_path / "out.ply", "--quality", "fast")
+    )
+    said = "super-sdf was installed without its networks: install it again"
+    assert (code, err.splitlines()[-1]) == (1, f"Error: the network 'mask' is missing: {said}")
 
 
 def test_a_network_file_that_cannot_be_read_is_a_line_and_the_others_are_shown(models, command):

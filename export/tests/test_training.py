@@ -14,8 +14,10 @@ from export.augment import (
     Shares,
     batch_table,
     inverted,
+    masked,
     noisy,
     prepare,
+    prepare_mask,
     shifted,
     turned,
 )
@@ -47,6 +49,7 @@ from export.to_onnx import (
     make_card,
     noisy_ball,
     parity,
+    read_network,
     read_weights,
     rewrite,
     write_model,
@@ -190,6 +193,46 @@ def test_targets_follow_the_level_and_the_side_but_not_the_noise(samples):
     rough = noisy(rng, sample, Shares(noisy=1))
     assert 0 < np.abs(rough.window - sample.window).max() <= 1
     np.testing.assert_array_equal(rough.targets, sample.targets)
+
+
+def test_a_mask_keeps_the_side_of_every_sample_and_exact_targets(samples):
+    sample, rng = samples[0], np.random.default_rng(0)
+    mask = masked(rng, sample)
+    level = float(np.median(sample.targets.astype(np.float32) - mask.targets))
+    assert abs(level) <= 1
+    np.testing.assert_array_equal(mask.window < 0, sample.window < np.float32(level))
+    assert np.abs(mask.window).min() == 1  # half a voxel
+    np.testing.assert_allclose(sample.targets - mask.targets, level, atol=1e-3)
+    assert not np.array_equal(masked(rng, sample).window, mask.window)
+
+
+def test_a_window_without_two_sides_makes_no_mask(samples):
+    alone = replace(samples[0], window=np.full_like(samples[0].window, 4.0))
+    assert len(prepare_mask(alone).voxels) == 0
+
+
+def test_a_network_for_masks_corrects_every_sample_also_as_a_file(tmp_path, samples):
+    net = SuperSdfNet(replace(SMALL, keeps_samples=False))
+    torch.nn.init.constant_(net.correction.bias, 0.5)
+    batch = [prepare_mask(sample) for sample in samples[:2]]
+    with torch.no_grad():
+        encoded = net.encode_batch(batch)
+        at_sample = net.decode(encoded, torch.zeros(1, 3))[:, 0]
+        want = encoded.patches[:, CENTRE] + net.correction(encoded.features)[:, 0]
+    torch.testing.assert_close(at_sample, want, atol=1e-5, rtol=0)
+    path = tmp_path / "mask.onnx"
+    write_model(net, path, make_card(net, "mask", "nothing", "none"))
+    assert parity(net, path) < 2e-4 and load_network(path).card["inputs"] == "masks"
+    assert not read_network(path).config.keeps_samples
+
+
+def test_a_store_of_masks_has_masks_held_out_and_drawn(tmp_path, samples):
+    write_shard(tmp_path / "shard-0-0000.npz", samples[:1])
+    write_shard(tmp_path / "shard-0-0001.npz", samples[1:])
+    store = Store(tmp_path, 1, inputs="masks")
+    drawn = store.draw_batch(np.random.default_rng(0), replace(RECIPE, batch_voxels=1))
+    for sample in (*store.held_out, *drawn):
+        assert np.abs(sample.patches[:, CENTRE]).min() == 1
 
 
 def test_noise_may_push_voxels_with_targets_out_of_the_band(samples):
@@ -441,7 +484,7 @@ def test_a_run_starts_dormant_units_again_until_its_last_fifth(tmp_path, samples
 
 def test_a_network_with_dead_units_is_not_exported(samples, monkeypatch):
     net = small_net()
-    monkeypatch.setattr("export.to_onnx.draw_samples", lambda: [prepare(samples[0])])
+    monkeypatch.setattr("export.to_onnx.draw_samples", lambda **_: [prepare(samples[0])])
     revive(net, [], [[prepare(samples[0])]])
     check_awake(net)
     put_to_sleep(net)

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from dataclasses import field as dataclass_field
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from .files.meshes import write_pieces
 from .files.precision import check_format_holds, local_origin_note
 from .grid.cubic import cubic_grid
 from .grid.direction import Direction
+from .grid.field import EXACT, MASK, SCALED
 from .grid.sdf_grid import SdfGrid
 from .grid.spacing import as_triple
 from .mesh import Mesh, join_meshes
@@ -73,6 +75,10 @@ class ConvertOptions:
     axes: str | None = None
     iterations: int = 1
     direction: tuple[float, ...] | None = None
+    field: str = "auto"
+    label: float | None = None
+    level: float | None = None
+    scale: float | None = None
 
     @property
     def simplifies(self) -> bool:
@@ -116,7 +122,9 @@ class Conversion:
         Of a simplified mesh, what ``Simplified.report`` returns; distances are in voxels.
     capped : bool
         Whether the solid runs out of the grid, and its surface was closed along the border.
-    field : dict, optional
+    field : dict
+        What the values were taken as, and what the samples show of it.
+    saved_field : dict, optional
         The path of the refined field, and shape, spacing and origin of the fine lattice.
     """
 
@@ -132,7 +140,8 @@ class Conversion:
     seconds: dict[str, float]
     simplified: dict[str, Any] | None = None
     capped: bool = False
-    field: dict[str, Any] | None = None
+    field: dict[str, Any] = dataclass_field(default_factory=dict)
+    saved_field: dict[str, Any] | None = None
 
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
@@ -145,7 +154,8 @@ class Conversion:
             "bounds": [list(corner) for corner in self.bounds],
             "closed": self.closed,
             "capped": self.capped,
-            **({"field": self.field} if self.field else {}),
+            "field": self.field,
+            **({"saved_field": self.saved_field} if self.saved_field else {}),
             **({"simplified": self.simplified} if self.simplified else {}),
             "inferred": list(self.notes),
             "warnings": list(self.warnings),
@@ -204,6 +214,10 @@ def convert(
         direction=options.direction,
         axes=options.axes,
         inside=options.inside,
+        field=options.field,
+        label=options.label,
+        level=options.level,
+        scale=options.scale,
         max_memory=options.max_memory,
     )
     check_factor(options.factor)
@@ -250,7 +264,7 @@ def convert(
         write_pieces(meshes, target, force=force, about=about, before_rename=complete)
     watch.lap("write")
     done = describe(grid, tally, options, watch.seconds, notes)
-    return replace(done, field=file.report()) if file else done
+    return replace(done, saved_field=file.report()) if file else done
 
 
 def check_not_input(path: str | Path | None, source: str | Path) -> None:
@@ -351,7 +365,8 @@ def describe(
     counts = {name: tally.counts[name] for name in COUNTS}
     counts["expected_triangles"] = tally.expected.triangles
     counts["expected_bytes"] = tally.expected.size
-    warnings, simplified = find_warnings(counts, closed, thin=grid.low >= options.offset), None
+    warnings = find_warnings(counts, closed, thin=grid.low >= options.offset, kind=grid.field.kind)
+    simplified = None
     if tally.simplified:
         simplified = tally.simplified.report(tally.voxel_size)
         closed = tally.simplified.mesh.is_closed()
@@ -359,13 +374,19 @@ def describe(
     where = grid.shape, grid.spacing, grid.origin, grid.direction
     bounds = as_triple(tally.low, "low"), as_triple(tally.high, "high")
     capped = options.cap and tally.leaves
-    return Conversion(*where, counts, bounds, closed, notes, warnings, seconds, simplified, capped)
+    found = grid.field.report()
+    return Conversion(
+        *where, counts, bounds, closed, notes, warnings, seconds, simplified, capped, found
+    )
 
 
-def find_warnings(counts: dict[str, int], closed: bool, thin: bool = False) -> tuple[str, ...]:
+def find_warnings(
+    counts: dict[str, int], closed: bool, thin: bool = False, kind: str = EXACT
+) -> tuple[str, ...]:
     """Return a sentence on each thing that may be wrong with the result.
 
-    ``thin`` says that no sample lies inside the solid.
+    ``thin`` says that no sample lies inside the solid, ``kind`` what the field is: only distances
+    can be noisy, or contradict each other.
     """
     warnings = []
     if not closed:
@@ -375,6 +396,8 @@ def find_warnings(counts: dict[str, int], closed: bool, thin: bool = False) -> t
             "no sample lies inside: the solid is thinner than the spacing, and its mesh may have "
             "holes"
         )
+    if kind in (MASK, SCALED):
+        return tuple(warnings)
     if counts["noisy_voxels"]:
         share = in_percent(counts["noisy_voxels"], counts["band_voxels"])
         warnings.append(

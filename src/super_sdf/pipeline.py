@@ -17,14 +17,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .arrays import IntArray
+from .arrays import FloatArray, IntArray
 from .grid.cubic import cubic_grid
+from .grid.field import MASK
+from .grid.planes import SampleArray
 from .grid.sdf_grid import SdfGrid
 from .machine.memory import give_back
 from .machine.resources import Resources, allot
 from .mesh import Mesh, join_meshes, vertex_type
 from .neighbourhood import CENTRE
 from .network.decoder import Decoder, decode
+from .network.kinds import network_for
 from .options import (
     check_cap,
     check_distance,
@@ -40,6 +43,7 @@ from .slabs.footprint import NETWORK_BYTES
 from .slabs.pieces import Piece, count_input, describe_piece
 from .steps.cap import close
 from .steps.field import FineField, SampleSpheres
+from .steps.holding import hold_sides
 from .steps.lattice import fine_grid
 from .steps.mesher_names import DEFAULT_MESHER
 from .steps.meshers import Mesher, extract_pieces, find_mesher
@@ -52,6 +56,7 @@ from .steps.nodes import (
     signs_of_skipped,
 )
 from .steps.spheres import ExactSamples, fit_to_spheres
+from .steps.spline import spline_blocks
 from .steps.survey import Band, no_surface, survey
 
 SaveField = Callable[[FineField], None]
@@ -110,6 +115,7 @@ def upsample(
     check_network(network)
     check_progress(progress)
     factor, offset = check_factor(factor), check_distance(offset)
+    network = network_for(network, grid.field.kind)
     resources = allot(getattr(network, "threads", 0), check_max_memory(max_memory))
     steps = StepCounter(progress, [name for name in STEPS if name != "isosurface"])
     lattice = cubic_grid(grid, offset)
@@ -262,7 +268,7 @@ def _iterated(
 
 def _slabs(run: Run, grid: SdfGrid, offset: float, progress: Progress | None) -> Iterator[Piece]:
     """Yield the pieces of one run; its arguments have been checked."""
-    network, factor, mesher = run.network, run.factor, run.mesher
+    network, factor, mesher = network_for(run.network, grid.field.kind), run.factor, run.mesher
     resources = allot(getattr(network, "threads", 0), run.max_memory)
     steps = StepCounter(progress)
     lattice = cubic_grid(grid, offset)
@@ -326,7 +332,10 @@ def refine(
     steps = steps or StepCounter()
     patches, table, voxels = inputs = band.network_inputs(slab.seen, slab.decoded)
     progress = steps.within("network")
-    blocks = decode(network, inputs, block_offsets(factor), progress, threads)  # Eqs. 3, 5
+    if band.smooth is None:
+        blocks = decode(network, inputs, block_offsets(factor), progress, threads)  # Eqs. 3, 5
+    else:
+        blocks = interpolate(band, band.smooth, network, factor, slab, inputs, threads)
     steps.finish("network")
 
     row_of = rows_among(voxels, len(table))
@@ -334,6 +343,8 @@ def refine(
     average_shared(blocks, parts, factor, threads)  # Eq. 7
     exact = np.flatnonzero(band.exact[slab.seen]).astype(np.int32)
     fit_to_spheres(blocks, parts, factor, ExactSamples(patches, exact, table, row_of), threads)
+    if band.kind == MASK:
+        hold_sides(blocks, factor, patches, voxels)
     own_ijk = band.voxel_ijk[slab.seen][voxels]
     skipped = signs_of_skipped(parts, own_ijk, patches, voxels, band.shape)
     pinned = pin_to_skipped(blocks[:, :-1], parts, factor, skipped)
@@ -351,6 +362,31 @@ def refine(
         decoded_voxels=int(band.decoded_before[-1]),
         leaves=band.leaves,
     )
+
+
+def interpolate(
+    band: Band,
+    smooth: SampleArray,
+    network: Decoder,
+    factor: int,
+    slab: Slab,
+    inputs: tuple[FloatArray, IntArray, IntArray],
+    threads: int = 1,
+) -> FloatArray:
+    """Return the blocks of a field that is no distance: its spline, and the network at kinks.
+
+    Of a field that is far from a distance, or was cut off, the network adds nothing.
+    """
+    patches, table, voxels = inputs
+    own_ijk = band.voxel_ijk[slab.seen][voxels]
+    blocks, share = spline_blocks(smooth, own_ijk, factor, band.half_voxel)
+    blocks[:, :-1] -= np.float32(band.level)
+    some = np.flatnonzero(share if band.has_kinks else 0 * share)
+    if len(some):
+        kinked = patches, table, voxels[some]
+        added = decode(network, kinked, block_offsets(factor), None, threads)[:, :-1]
+        blocks[:, some] += share[some] * (added - blocks[:, some])
+    return blocks
 
 
 def rows_among(voxels: IntArray, count: int) -> IntArray:

@@ -21,6 +21,7 @@ from ..convert import ConvertOptions
 from ..errors import FileError, OptionError
 from ..files.formats import AXES, mesh_path
 from ..files.meshes import MESH_SUFFIXES
+from ..grid.field import FIELDS
 from ..grid.sides import INSIDE
 from ..options import check_error, check_goal, check_iterations, check_triangles
 from ..steps.mesher_names import MESHERS
@@ -198,6 +199,19 @@ def _axes(name: str, value: Any) -> str:
     return str(value)
 
 
+def _field(name: str, value: Any) -> str:
+    if value not in FIELDS:
+        raise OptionError(f"{name!r} is {value!r}: give one of {', '.join(FIELDS)}")
+    return str(value)
+
+
+def _scale(name: str, value: Any) -> float:
+    number = _number(name, value)
+    if number <= 0:
+        raise OptionError(f"{name!r} is {value!r}: give a number greater than 0")
+    return number
+
+
 def _flag(name: str, value: Any) -> bool:
     if type(value) is not bool:
         raise OptionError(f"{name!r} is {value!r}: give true or false")
@@ -226,6 +240,10 @@ CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "direction": _direction,
     "axes": _axes,
     "inside": _inside,
+    "field": _field,
+    "label": _number,
+    "level": _number,
+    "scale": _scale,
     "offset": _number,
     "cap": _flag,
     "mesher": _mesher,

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from .. import __version__
+from ..grid.field import AUTO
 from ..network.network import find_model
 from ..steps.mesher_names import MARCHING
 from .fingerprint import file_state, fingerprint, is_unchanged
@@ -131,11 +132,13 @@ class Planner:
         options = asdict(replace(job.options, max_memory=None))
         if options["mesher"] == MARCHING:
             del options["mesher"]  # so that rows of versions without this option still hold
-        for name in ("axes", "direction"):
+        for name in ("axes", "direction", "label", "level", "scale"):
             if options[name] is None:
                 del options[name]
         if options["iterations"] == 1:
             del options["iterations"]
+        if options["field"] == AUTO:
+            del options["field"]
         if not job.options.simplifies:
             del options["simplify"], options["triangles"]
         settings = [options, self.network, __version__]

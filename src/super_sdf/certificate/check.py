@@ -33,6 +33,11 @@ from .touching import NOTICEABLE, Touching, exact_samples, touch
 BYTES_PER_TRIANGLE = 420
 BYTES_PER_SAMPLE = 150
 REACH = 2.0  # voxels: how far slabs look; the samples near the surface are within 1.4 of it
+# The options of a conversion that say how its grid is read, and where its surface is.
+SHARED = (
+    *("spacing", "origin", "direction", "axes", "inside", "field", "label", "level", "scale"),
+    *("offset", "max_memory"),
+)
 HEADER_BYTES = 4096  # of a PLY file, in which the number of faces is looked for
 
 
@@ -42,7 +47,7 @@ class CheckOptions:
 
     Attributes
     ----------
-    spacing, origin, direction, axes, inside, offset, max_memory
+    spacing, origin, direction, axes, inside, field, label, level, scale, offset, max_memory
         As given when the mesh was made.
     intersections : bool
         Count self-intersections, which takes up to half of the time.
@@ -59,12 +64,15 @@ class CheckOptions:
     processes: int = 1
     axes: str | None = None
     direction: tuple[float, ...] | None = None
+    field: str = "auto"
+    label: float | None = None
+    level: float | None = None
+    scale: float | None = None
 
     @classmethod
     def of(cls, options: ConvertOptions) -> CheckOptions:
         """Return how a grid is read that was converted with these options."""
-        names = ("spacing", "origin", "direction", "axes", "inside", "offset", "max_memory")
-        return cls(**{name: getattr(options, name) for name in names})
+        return cls(**{name: getattr(options, name) for name in SHARED})
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,6 +195,10 @@ def check_files(
         direction=options.direction,
         axes=options.axes,
         inside=options.inside,
+        field=options.field,
+        label=options.label,
+        level=options.level,
+        scale=options.scale,
         max_memory=options.max_memory,
     )
     return check_mesh(read_mesh(mesh), found, options)

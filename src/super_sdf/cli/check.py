@@ -129,10 +129,9 @@ def run_check(mesh: Path, grid: Path, options: dict[str, Any]) -> list[str]:
 
 def make_check_options(options: dict[str, Any]) -> CheckOptions:
     """Return the options of the check, picked from all options of a command."""
-    from ..certificate.check import CheckOptions
+    from ..certificate.check import SHARED, CheckOptions
 
-    names = ("spacing", "origin", "direction", "axes", "inside", "offset", "max_memory")
-    chosen = {name: options[name] for name in names}
+    chosen = {name: options[name] for name in SHARED}
     count = not options["skip_intersections"]
     return CheckOptions(**chosen, intersections=count, processes=0)
 

@@ -102,6 +102,13 @@ def signs_inside() -> tuple[str, ...]:
     return INSIDE
 
 
+def fields() -> tuple[str, ...]:
+    """Return what the values of a grid can be; the first is the default."""
+    from ..grid.field import FIELDS
+
+    return FIELDS
+
+
 def meshers() -> tuple[str, ...]:
     """Return the names of the meshers."""
     from ..steps.mesher_names import MESHERS

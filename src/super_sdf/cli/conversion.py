@@ -17,6 +17,7 @@ from .choices import (
     convert_default,
     default_quality,
     device_option,
+    fields,
     first,
     meshers,
     precisions,
@@ -118,6 +119,34 @@ GRID_OPTIONS: tuple[Option, ...] = (
         default=convert_default("inside"),
         show_default=True,
         help="Sign of the values inside the solid; auto takes the border of the grid as outside.",
+    ),
+    click.option(
+        "--field",
+        type=LazyChoice(fields),
+        default=convert_default("field"),
+        show_default=True,
+        help="What the values are: exact distances, truncated near the surface, a mask (inside or "
+        "outside, or its distance transform), scaled (a field of another slope than 1), or noisy "
+        "distances; auto goes by what the samples show.",
+    ),
+    click.option(
+        "--label",
+        type=float,
+        metavar="N",
+        help="Mesh the samples with the value N of a label image.",
+    ),
+    click.option(
+        "--level",
+        type=float,
+        metavar="L",
+        help="Mesh the surface at the value L of densities; what is above L is inside, unless "
+        "--inside is negative.",
+    ),
+    click.option(
+        "--scale",
+        type=float,
+        metavar="S",
+        help="World units per unit of the values, if they have another unit than the spacing.",
     ),
 )
 
@@ -280,8 +309,10 @@ def chosen_model(options: dict[str, Any]) -> str:
 
 def make_options(options: dict[str, Any]) -> ConvertOptions:
     """Return the conversion's options, picked from all options of a command."""
-    from dataclasses import fields
+    import dataclasses
 
     from ..convert import ConvertOptions
 
-    return ConvertOptions(**{field.name: options[field.name] for field in fields(ConvertOptions)})
+    return ConvertOptions(
+        **{field.name: options[field.name] for field in dataclasses.fields(ConvertOptions)}
+    )

@@ -161,7 +161,7 @@ class Upsampling:
             for stage, seconds in self.seconds.items():
                 print_stderr(f"{stage}: {seconds:.3f} s")
         print_stderr(f"{self.target}: {self.summary()}")
-        if self.result.field:
+        if self.result.saved_field:
             print_stderr(f"{self.options['save_field']}: {self.field_summary()}")
         if self.result.simplified:
             print_stderr(f"Simplified: {describe_simplified(self.result.simplified)}")
@@ -198,7 +198,7 @@ class Upsampling:
 
     def field_summary(self) -> str:
         """Describe the file of the refined field in one line."""
-        field = self.result.field or {}
+        field = self.result.saved_field or {}
         shape = " x ".join(map(str, field["shape"]))
         spacing, origin = (", ".join(f"{x:.12g}" for x in field[k]) for k in ("spacing", "origin"))
         return f"the refined field, lattice {shape}, spacing {spacing}, origin {origin}"

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, GridError, OptionError, OutOfMemoryError, SuperSdfError
+from ..grid.field import Wanted
 from ..grid.planes import InputFile, PlaneFile, SampleArray
 from ..grid.samples import check_kind
 from ..grid.sdf_grid import SdfGrid, make_grid
@@ -59,6 +60,10 @@ def read_grid(
     direction: Any = None,
     axes: str | None = None,
     inside: str = "auto",
+    field: str = "auto",
+    label: float | None = None,
+    level: float | None = None,
+    scale: float | None = None,
     max_memory: int | None = None,
 ) -> SdfGrid:
     """Read a grid from a file of any format in ``formats.FORMATS``; docs/formats.md describes them.
@@ -82,6 +87,8 @@ def read_grid(
         ``.npz``, else z, y, x.
     inside : {"auto", "negative", "positive"}
         Sign of the values inside the solid; see ``make_grid``.
+    field, label, level, scale
+        What the values are; see ``make_grid``.
     max_memory : int, optional
         Bytes that this process may hold in all. Default: a share of the free memory.
 
@@ -95,9 +102,10 @@ def read_grid(
     GridError
         If its values are not a signed distance grid, or its axes are not at right angles.
     OptionError
-        If the suffix, ``axes`` or ``inside`` is unknown; if a direction is given, but files of the
-        format state it.
+        If the suffix, ``axes``, ``inside`` or ``field`` is unknown; if a direction is given, but
+        files of the format state it.
     """
+    Wanted(field, label, level, scale).check()
     path = check_path(path, "path")
     format_ = find_format(path)
     order = choose_axes(format_, axes)
@@ -108,7 +116,15 @@ def read_grid(
         found = _read_numpy(check_regular_file(path), order, room, given)
     else:
         found = _read_foreign(path, format_, order, room, given, max_memory)
-    return make_grid(found["values"], **{key: found[key] for key in PLACE}, inside=inside)
+    return make_grid(
+        found["values"],
+        **{key: found[key] for key in PLACE},
+        inside=inside,
+        field=field,
+        label=label,
+        level=level,
+        scale=scale,
+    )
 
 
 def _read_numpy(path: Path, axes: str, room: int, given: dict[str, Any]) -> dict[str, Any]:

@@ -46,6 +46,7 @@ def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
         direction=grid.direction,
         positive_inside=grid.positive_inside,
         extremes=extremes,
+        field=grid.field,
     )
 
 

@@ -39,7 +39,7 @@ def surface_gradients(values: SampleArray) -> Gradients:
 
     Parameters
     ----------
-    values : (nx, ny, nz) array or PlaneFile
+    values : (nx, ny, nz) array or Planes
         Samples; positive on one side of the surface.
 
     Returns

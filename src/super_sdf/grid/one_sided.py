@@ -55,7 +55,7 @@ def check_thin(values: SampleArray, h: float, extremes: Extremes) -> None:
 
     Parameters
     ----------
-    values : (nx, ny, nz) array or PlaneFile
+    values : (nx, ny, nz) array or Planes
         Samples, none below 0 or none above.
     h : float
         The spacing.
@@ -90,7 +90,7 @@ def look_near_walls(values: SampleArray, scale: float) -> tuple[Floats, int, int
 
     Parameters
     ----------
-    values : (nx, ny, nz) array or PlaneFile
+    values : (nx, ny, nz) array or Planes
         Samples.
     scale : float
         Their factor to spacings, positive outside.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cached_property
 from io import FileIO
 from math import prod
@@ -20,9 +20,11 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from ..arrays import FloatArray
 from ..errors import FileError
 from ..machine.memory import check_fits
 
+FAR = 1e6  # spacings
 BLOCK_BYTES = 1 << 20  # read at a time when iterating over all planes
 
 
@@ -149,10 +151,14 @@ class SamplePlanes(ABC):
         plane: NDArray[Any] = self.read(number, number + 1)[0]
         return plane
 
+    @property
+    def block(self) -> int:
+        """Planes that are made at a time when iterating over all."""
+        return max(BLOCK_BYTES // self.plane_bytes, 1)
+
     def __iter__(self) -> Iterator[NDArray[Any]]:
-        step = max(BLOCK_BYTES // self.plane_bytes, 1)
-        for first in range(0, len(self), step):
-            yield from self.read(first, min(first + step, len(self)))
+        for first in range(0, len(self), self.block):
+            yield from self.read(first, min(first + self.block, len(self)))
 
     @cached_property
     def loaded(self) -> NDArray[Any]:
@@ -220,3 +226,49 @@ class PlaneFile(SamplePlanes):
 
 SampleArray: TypeAlias = NDArray[Any] | SamplePlanes
 """An array of samples in memory, or one whose planes are read or made when they are needed."""
+
+
+def in_spacings(values: NDArray[Any], unit: float) -> FloatArray:
+    """Return values over a unit as float32; from ``FAR`` on their size does not matter."""
+    return np.clip(values.astype(np.float64) / unit, -FAR, FAR).astype(np.float32)
+
+
+class DerivedPlanes(SamplePlanes):
+    """Planes that are made of those of another array, and of some beside them.
+
+    Parameters
+    ----------
+    source : (nx, ny, nz) array or SamplePlanes
+        The other array.
+    make : callable
+        Takes some planes of it; returns as many, of ``dtype``.
+    beside : int
+        How many planes to either side the values of a plane depend on.
+    dtype
+        Type of what ``make`` returns.
+    """
+
+    name = "the grid"
+
+    def __init__(
+        self,
+        source: SampleArray,
+        make: Callable[[NDArray[Any]], NDArray[Any]],
+        beside: int = 0,
+        dtype: DTypeLike = np.float64,
+    ) -> None:
+        self.source, self.make, self.beside = source, make, beside
+        self.shape, self.dtype = tuple(source.shape), np.dtype(dtype)
+
+    @property
+    def block(self) -> int:
+        """Planes that are made at a time: more, if each needs some beside it."""
+        return max(super().block, 2 * self.beside)
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
+        low, high = max(first - self.beside, 0), min(last + self.beside, len(self))
+        if last <= first:
+            return np.empty((0, *self.shape[1:]), self.dtype)
+        made = np.asarray(self.make(np.asarray(self.source[low:high])), self.dtype)
+        return made[first - low : last - low]

@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import GridError, seen
 from .planes import SampleArray, SamplePlanes
 
+MASK_HINT = "a mask holds no distances; make a grid of it with make_grid or read_grid"
+
 Extremes = tuple[float, float]
 """The smallest and the largest sample."""
-
-DISTANCES_HINT = "make them with scipy.ndimage.distance_transform_edt"
 
 
 def as_samples(values: ArrayLike | SamplePlanes) -> SampleArray:
@@ -57,16 +57,14 @@ def check_values(values: SampleArray) -> Extremes:
         If the array is not numeric and three-dimensional, or a sample is not finite.
     """
     check_kind(values.dtype, values.shape)
+    if values.dtype == np.bool_:
+        raise GridError(f"values are true or false: {MASK_HINT}")
     return _find_extremes(values)
 
 
 def check_kind(dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
     """Raise GridError if an array of this type and shape cannot be a grid."""
-    if dtype == np.bool_:
-        raise GridError(
-            f"values are true or false: an occupancy grid holds no distances; {DISTANCES_HINT}"
-        )
-    if dtype.kind not in "fiu":
+    if dtype.kind not in "fiub":
         raise GridError(f"values have dtype {dtype}: give floating-point or integer numbers")
     if len(shape) != 3:
         raise GridError(f"values have shape {shape}: give three axes (x, y, z)")
@@ -96,12 +94,20 @@ def _find_extremes(values: SampleArray) -> Extremes:
 
 
 def check_not_flat(values: SampleArray, extremes: Extremes) -> None:
-    """Raise GridError if the values are constant or an occupancy grid."""
+    """Raise GridError if the values are constant or a mask."""
+    check_not_constant(extremes)
+    if has_two_values(values, extremes):
+        raise GridError(f"the only values are {extremes[0]:.6g} and {extremes[1]:.6g}: {MASK_HINT}")
+
+
+def check_not_constant(extremes: Extremes) -> None:
+    """Raise GridError if all values are the same."""
     low, high = extremes
     if low == high:
         raise GridError(f"every value is {low:.6g}: a constant field has no surface")
-    if min(values.shape) > 2 and all(((p == low) | (p == high)).all() for p in values):
-        raise GridError(
-            f"the only values are {low:.6g} and {high:.6g}: an occupancy grid holds no distances; "
-            f"{DISTANCES_HINT}"
-        )
+
+
+def has_two_values(values: SampleArray, extremes: Extremes) -> bool:
+    """Return whether there are only two different values; False for grids of 2 samples an axis."""
+    low, high = extremes
+    return min(values.shape) > 2 and all(((p == low) | (p == high)).all() for p in values)

@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Triple
 from .direction import STRAIGHT, Direction, check_direction, in_rows, is_mirrored
-from .one_sided import check_thin, is_one_sided
+from .field import AUTO, Field, Wanted
+from .interpret import interpret
 from .planes import SampleArray, SamplePlanes
-from .resampling import resample
 from .samples import Extremes, as_samples, check_not_flat, check_values
-from .sides import check_negative_inside, is_positive_inside
+from .sides import check_negative_inside
 from .spacing import as_triple, check_spacing, choose_spacing, is_cubic
 
 
@@ -48,6 +48,8 @@ class SdfGrid:
         The smallest and the largest sample, negative inside.
     notes : tuple of str
         Sentences that say what was inferred rather than given.
+    field : Field
+        What the values are, and which of them can be exact.
 
     Raises
     ------
@@ -66,6 +68,7 @@ class SdfGrid:
     positive_inside: bool
     low: float
     high: float
+    field: Field
 
     def __init__(
         self,
@@ -92,17 +95,19 @@ class SdfGrid:
         direction: ArrayLike | None = None,
         positive_inside: bool = False,
         extremes: Extremes | None = None,
+        field: Field | None = None,
     ) -> SdfGrid:
         """Return a grid whose sign and spacing are known and not checked against the values.
 
         With ``positive_inside`` the sign of the values is flipped. With ``extremes``, their minimum
-        and maximum, they are not searched for NaN and infinity again.
+        and maximum, they are not searched for NaN and infinity again. Values are taken as exact
+        distances unless ``field`` says what they are.
         """
         samples = as_samples(values)
         grid = object.__new__(cls)
         found = extremes or check_values(samples)
         place = check_spacing(spacing), origin, direction
-        grid._set(samples, place, notes, positive_inside, found)
+        grid._set(samples, place, notes, positive_inside, found, field)
         return grid
 
     def _set(
@@ -112,6 +117,7 @@ class SdfGrid:
         notes: tuple[str, ...],
         positive_inside: bool,
         extremes: Extremes,
+        field: Field | None = None,
     ) -> None:
         """Set all fields."""
         set_ = partial(object.__setattr__, self)
@@ -124,6 +130,7 @@ class SdfGrid:
         set_("positive_inside", positive_inside)
         set_("low", -high if positive_inside else low)
         set_("high", -low if positive_inside else high)
+        set_("field", field or Field())
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.shape))
@@ -203,13 +210,20 @@ def make_grid(
     origin: ArrayLike | None = None,
     direction: ArrayLike | None = None,
     inside: str = "auto",
+    field: str = AUTO,
+    label: float | None = None,
+    level: float | None = None,
+    scale: float | None = None,
 ) -> SdfGrid:
-    """Make a grid from an array of signed distances; what is not given is inferred.
+    """Make a grid from an array of signed distances, or of other values with a surface.
+
+    What is not given is inferred.
 
     Parameters
     ----------
     values : (nx, ny, nz) array_like
-        Signed distances in world units; i runs along x, j along y, k along z.
+        Signed distances in world units; i runs along x, j along y, k along z. Or a mask, labels,
+        densities, or another field.
     spacing : number or three, optional
         World distance between neighbouring samples. Default: estimated from the gradient.
     origin : number or three, optional
@@ -218,6 +232,16 @@ def make_grid(
         The columns are the world directions of the array's axes; see ``SdfGrid``.
     inside : {"auto", "negative", "positive"}
         Sign of the values inside the solid; "auto" takes the border of the grid as outside.
+    field : {"auto", "exact", "truncated", "mask", "scaled", "noisy"}
+        What the values are; "auto" goes by what the samples show. A mask is known to half a voxel,
+        and scaled is a field of another slope than 1.
+    label : number, optional
+        The samples with this value are the solid.
+    level : number, optional
+        The values are densities, and the surface is where they have this value; what is above is
+        inside, unless ``inside`` is "negative".
+    scale : number, optional
+        World units per unit of the values, if they have another unit than the spacing.
 
     Returns
     -------
@@ -227,35 +251,26 @@ def make_grid(
     Raises
     ------
     GridError
-        If the values are not signed distances, or contradict the spacing.
+        If the values have no surface, or contradict the spacing.
     OptionError
-        If ``inside`` is not one of these.
+        If ``inside`` or ``field`` is not one of these, or another option is no number.
     """
-    samples, extremes = _checked(values)
     notes: list[str] = []
-    flipped = is_positive_inside(samples, inside, extremes, notes)
-    chosen = choose_spacing(samples, spacing, notes)
-    if inside == "auto" and is_one_sided(extremes):
-        check_thin(*_cubic(samples, chosen), extremes)
+    wanted = Wanted(field, label, level, scale)
+    found = interpret(as_samples(values), wanted, spacing, inside, notes)
     if origin is None:
         notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
         origin = 0.0
     return SdfGrid.trusted(
-        samples,
-        chosen,
+        found.samples,
+        found.spacing,
         origin,
         tuple(notes),
         direction=direction,
-        positive_inside=flipped,
-        extremes=extremes,
+        positive_inside=found.positive_inside,
+        extremes=found.extremes,
+        field=found.field,
     )
-
-
-def _cubic(samples: SampleArray, spacing: Triple) -> tuple[SampleArray, float]:
-    """Return samples at the finest spacing on all axes, and that spacing."""
-    if is_cubic(spacing):
-        return samples, sum(spacing) / 3
-    return resample(samples, spacing)[0], min(spacing)
 
 
 def _checked(values: ArrayLike | SamplePlanes) -> tuple[SampleArray, Extremes]:

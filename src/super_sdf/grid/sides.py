@@ -17,7 +17,7 @@ def is_positive_inside(
 
     Parameters
     ----------
-    values : (nx, ny, nz) array or PlaneFile
+    values : (nx, ny, nz) array or Planes
         Samples.
     inside : str
         One of ``INSIDE``.
@@ -31,14 +31,13 @@ def is_positive_inside(
     OptionError
         If ``inside`` is unknown.
     """
-    if not isinstance(inside, str) or inside not in INSIDE:
-        raise OptionError(f"inside is {seen(inside)}: give one of {', '.join(INSIDE)}")
+    check_inside(inside)
     if inside != "auto":
         return inside == "positive"
     if is_one_sided(extremes):
         return extremes[0] < 0
-    below, total = _count_border(values)
-    positive = _is_mostly_negative(below, total)
+    below, total = count_border(values)
+    positive = is_mostly_negative(below, total)
     share = max(below, total - below) / total
     if positive or share < 1:
         sign = "positive" if positive else "negative"
@@ -49,10 +48,16 @@ def is_positive_inside(
     return positive
 
 
+def check_inside(inside: str) -> None:
+    """Raise OptionError if ``inside`` is unknown."""
+    if not isinstance(inside, str) or inside not in INSIDE:
+        raise OptionError(f"inside is {seen(inside)}: give one of {', '.join(INSIDE)}")
+
+
 def check_negative_inside(values: SampleArray) -> None:
     """Raise GridError if most of the border is negative: the sign seems to be reversed."""
-    below, total = _count_border(values)
-    if _is_mostly_negative(below, total):
+    below, total = count_border(values)
+    if is_mostly_negative(below, total):
         raise GridError(
             f"{below / total:.0%} of the grid's border is negative, which is inside: make the grid "
             "with make_grid(values, spacing=..., inside='positive'), or inside='negative' if the "
@@ -60,12 +65,12 @@ def check_negative_inside(values: SampleArray) -> None:
         )
 
 
-def _is_mostly_negative(below: int, total: int) -> bool:
+def is_mostly_negative(below: int, total: int) -> bool:
     """Return whether most samples of the border are negative."""
     return 2 * below > total
 
 
-def _count_border(values: SampleArray) -> tuple[int, int]:
+def count_border(values: SampleArray) -> tuple[int, int]:
     """Return the number of negative samples on the six faces of the grid, and of all there.
 
     A sample on an edge counts for each of its faces.

@@ -206,7 +206,8 @@ def _check_unit(values: SampleArray, beside: Gradients, spacing: Triple, notes: 
     if measured > allowed * h:
         raise GridError(
             f"{observed}: distances and spacing must be in the same unit; "
-            f"scale the values by {h / measured:.6g} or give another --spacing"
+            f"scale the values by {h / measured:.6g} or give another --spacing; values that are no "
+            "distances need --field scaled"
         )
     if _agree(measured, h):
         return

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -52,6 +52,8 @@ class Network:
         What the user should know about device and threads.
     pace : Pace
         The time that runs take, measured in earlier ones.
+    shipped : bool
+        Whether it came with the package and was trained on distances.
     reports_progress : bool
         True: a call takes ``progress``, see ``decoder.Decoder``.
     """
@@ -63,6 +65,7 @@ class Network:
     threads: int = 0
     notes: tuple[str, ...] = ()
     pace: Pace = field(default_factory=Pace, repr=False)
+    shipped: bool = False
     reports_progress: ClassVar[bool] = True
 
     def __repr__(self) -> str:
@@ -71,6 +74,10 @@ class Network:
             f"Network({self.card.get('name', 'unnamed')}, receptive field {self.receptive_field}, "
             f"symmetries {self.symmetries}, device {self.device}, threads {threads})"
         )
+
+    def averaged(self, symmetries: int) -> Network:
+        """Return the same network averaged over a number of symmetries."""
+        return replace(self, symmetries=symmetries, pace=Pace())
 
     @property
     def receptive_field(self) -> int | None:
@@ -267,7 +274,8 @@ def load_network(
     if opened.failure:
         raise ModelError(f"{path} does not run with its own inputs: {opened.failure}")
     notes = (*opened.notes, *_note_threads(threads, useful))
-    return Network(opened.session, card, opened.device, symmetries, useful, notes)
+    shipped = path.parent == MODELS and card.get("inputs") != "masks"
+    return Network(opened.session, card, opened.device, symmetries, useful, notes, shipped=shipped)
 
 
 def _note_threads(requested: int, useful: int) -> tuple[str, ...]:

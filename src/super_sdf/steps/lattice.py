@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray
+from ..grid.field import EXACT, NOISY, NONE_EXACT, Field
 from ..grid.planes import SamplePlanes
 from ..grid.sdf_grid import SdfGrid
 from .band import rescale
@@ -156,6 +157,13 @@ def fine_grid(field: FineField) -> SdfGrid:
     lowest, highest = field.in_world_units(ends).tolist()
     extremes = min(lowest, grid.low - field.offset), max(highest, grid.high - field.offset)
     origin = grid.to_world([-0.5, -0.5, -0.5])
+    kind = Field() if grid.field.kind == EXACT else Field(NOISY, True, NONE_EXACT)
     return SdfGrid.trusted(
-        lattice, spacing, origin, grid.notes, direction=grid.direction, extremes=extremes
+        lattice,
+        spacing,
+        origin,
+        grid.notes,
+        direction=grid.direction,
+        extremes=extremes,
+        field=kind,
     )

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import NoSurfaceError, OutOfMemoryError
 from ..grid.cubic import on_samples, sampled_places
+from ..grid.field import EXACT, MASK
+from ..grid.planes import SampleArray
 from ..grid.resampling import Resampled
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import held_memory, in_words
@@ -59,6 +61,14 @@ class Band:
         all are.
     leaves : bool
         Whether a sample on the border of the grid is inside: then the solid leaves the grid.
+    kind : str
+        What the field is, see ``grid.field``.
+    smooth : array or Planes, optional
+        Values whose cubic spline has the surface where they are smooth, in world units.
+    has_kinks : bool
+        Whether the network may refine that field where it is not smooth.
+    half_voxel, level : float
+        Half a spacing in world units, by which these are divided; and what is zero then.
     """
 
     shape: tuple[int, int, int]
@@ -69,6 +79,11 @@ class Band:
     exact: BoolArray
     sampled: BoolArray | None = None
     leaves: bool = False
+    kind: str = EXACT
+    smooth: SampleArray | None = None
+    has_kinks: bool = False
+    half_voxel: float = 1.0
+    level: float = 0.0
 
     @property
     def noisy_voxels(self) -> int:
@@ -182,7 +197,28 @@ def survey(grid: SdfGrid, offset: float = 0.0, resources: Resources = ONE_THREAD
     band = make_band(grid.shape, voxel_ijk, _concatenate(patches), resources.threads)
     if isinstance(grid.samples, Resampled):
         band = look_at_samples(band, grid, resources.threads)
-    return replace(band, leaves=any(leaving))
+    return replace(limit_to_field(band, grid, offset), leaves=any(leaving))
+
+
+def limit_to_field(band: Band, grid: SdfGrid, offset: float) -> Band:
+    """Return the band of a grid of any kind: what is exact in it, and what is decoded.
+
+    In a mask, only the voxels round which samples lie on both sides hold the surface.
+    """
+    field, scale = grid.field, 2 / grid.voxel_size
+    if field.kind == EXACT:
+        return band
+    sample = band.patches[:, CENTRE]
+    low, high = ((limit - offset) * scale for limit in field.exact)
+    exact = band.exact & (sample > low) & (sample < high)
+    decoded = band.decoded
+    if field.kind == MASK:
+        decoded = ((band.patches > 0) != (sample > 0)[:, None]).any(1)
+    if field.smooth is not None:  # no distances: what they say of the voxels is not certain
+        decoded = np.ones_like(band.decoded)
+    band = replace(band, exact=exact, decoded=decoded, kind=field.kind, smooth=field.smooth)
+    level = offset * scale
+    return replace(band, has_kinks=field.has_kinks, half_voxel=1 / scale, level=level)
 
 
 def _check_bound(voxels: int, planes: int, held: int, bound: int | None) -> None:

@@ -1,0 +1,212 @@
+"""What the values of a grid are: evidence from a few planes of samples, gathered once.
+
+A distance field has slope 1 wherever it is smooth, in units of the spacing. It is bent only where
+its third and fourth differences show it: at a kink between samples, or where it is curved. So a
+slope that is off by more than these differences can explain belongs to a field that is no distance.
+A truncated field is constant away from the surface. A noisy one changes by more than the samples
+are apart, and is bent there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .gradients import LARGEST_VALUE
+from .planes import SampleArray
+from .samples import Extremes
+
+Floats = NDArray[np.float64]
+
+PLANES = 12  # of samples beside the surface are looked at, spread evenly
+BESIDE = 2  # planes, rows and columns to either side, for fourth differences
+SURE = 0.1  # share by which the slope of a sample may be off to count
+ENOUGH = 30  # such samples, from which a slope is known
+# A slope may be off by the third and fourth differences, and by this.
+ROUNDING = 0.015
+# Share of slopes that are off from which the field is no distance: where it is smooth enough for a
+# typical slope, and where it is not.
+WRONG_SLOPES, WRONG_IF_ROUGH = 0.01, 0.05
+CUT_OFF = 0.01  # share of samples amid equal ones, at the lowest or highest value
+LIPSCHITZ, BENT, NOISY = 1.05, 0.3, 0.02  # change, difference and share from which it is noisy
+LEAST_SAMPLES = 100  # from which shares are evidence
+OFF = 0.1  # from 1: typical slopes further off show another unit
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the samples show.
+
+    Attributes
+    ----------
+    samples : int
+        How many samples beside the surface were looked at.
+    slope : float
+        Typical change of the values from sample to sample, over the spacing: 1 for distances. NaN
+        if too few samples are straight.
+    wrong : float
+        Share of the samples at which the slope cannot be that of a distance, whatever its unit.
+    noisy : float
+        Share of the samples at which the values change by more than distances can, beside others.
+    roughness : float
+        Standard deviation of the noise, in spacings, if the fourth differences were all noise.
+    cut_low, cut_high : bool
+        Whether values are cut off at the lowest, and at the highest.
+    """
+
+    samples: int
+    slope: float
+    wrong: float
+    noisy: float
+    roughness: float
+    cut_low: bool
+    cut_high: bool
+
+    @property
+    def is_scaled(self) -> bool:
+        """Whether the values are no distances in the unit of the spacing."""
+        return self.is_bent or abs(self.slope - 1) > OFF
+
+    @property
+    def is_bent(self) -> bool:
+        """Whether the slope differs from place to place, so that no unit makes distances of it."""
+        allowed = WRONG_SLOPES if np.isfinite(self.slope) else WRONG_IF_ROUGH
+        return self.is_enough and self.wrong > allowed
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether the values are noisy: noise makes slopes wrong, but no more than it is seen."""
+        return self.is_enough and self.noisy > NOISY and not self.is_bent
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether there are enough samples for shares of them to be evidence."""
+        return self.samples >= LEAST_SAMPLES
+
+    def report(self) -> dict[str, Any]:
+        """Return the evidence as a dictionary that can be written as JSON."""
+        known = np.isfinite(self.slope)
+        return {
+            "samples": self.samples,
+            "slope": round(self.slope, 4) if known else None,
+            "wrong_slopes": round(self.wrong, 4),
+            "noisy": round(self.noisy, 4),
+            "roughness": round(self.roughness, 4),
+            "cut_off": [self.cut_low, self.cut_high],
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Looked:
+    """What was looked at.
+
+    Attributes
+    ----------
+    lines : (n, 3, 5) float64
+        Five samples in a row along each axis, round samples with one on the other side.
+    cut : (2,) float64
+        Share of the samples that are, as their six neighbours, the lowest, and the highest.
+    extremes : two floats
+        The smallest and the largest sample.
+    """
+
+    lines: Floats
+    cut: Floats
+    extremes: Extremes
+
+
+def look(values: SampleArray, extremes: Extremes) -> Looked:
+    """Look at some samples, those beside the surface above all.
+
+    Parameters
+    ----------
+    values : (nx, ny, nz) array or Planes
+        Samples.
+    extremes : two floats
+        The smallest and the largest sample.
+    """
+    found, cut, count = [np.empty((0, 3, 5))], np.zeros(2, np.int64), 0
+    for i in _inner_planes(len(values)) if min(values.shape) > 2 * BESIDE else []:
+        slab = np.asarray(values[i - BESIDE : i + BESIDE + 1])
+        found.append(np.clip(_lines_beside_surface(slab), -LARGEST_VALUE, LARGEST_VALUE))
+        cut += _count_amid_equal(slab, extremes)
+        count += slab[0, BESIDE:-BESIDE, BESIDE:-BESIDE].size
+    return Looked(np.concatenate(found), cut / max(count, 1), extremes)
+
+
+def _inner_planes(count: int) -> list[int]:
+    """Return planes that have enough planes beside them, spread evenly."""
+    if count <= 2 * BESIDE:
+        return []
+    spread = np.linspace(BESIDE, count - 1 - BESIDE, PLANES).astype(int)
+    return [int(i) for i in np.unique(spread)]
+
+
+def _lines_beside_surface(slab: NDArray[Any]) -> Floats:
+    """Return five samples in a row along each axis, round samples with one on the other side.
+
+    ``slab`` has five planes; the samples are those of the middle one, (n, 3, 5).
+    """
+    inside = slab[1:4] <= 0
+    own = inside[1]
+    beside = (inside[0] != own) | (inside[2] != own)
+    for axis in range(2):
+        marks, samples = np.moveaxis(beside, axis, 0), np.moveaxis(own, axis, 0)
+        crossed = samples[1:] != samples[:-1]
+        marks[1:] |= crossed
+        marks[:-1] |= crossed
+    j, k = np.nonzero(beside[BESIDE:-BESIDE, BESIDE:-BESIDE])
+    j, k = j + BESIDE, k + BESIDE
+    steps = np.arange(-BESIDE, BESIDE + 1)
+    zero = np.zeros_like(steps)
+    lines = [
+        slab[BESIDE + a, j[:, None] + b, k[:, None] + c]
+        for a, b, c in ((steps, zero, zero), (zero, steps, zero), (zero, zero, steps))
+    ]
+    return np.stack(lines, 1).astype(np.float64)
+
+
+def _count_amid_equal(slab: NDArray[Any], extremes: Extremes) -> NDArray[np.int64]:
+    """Count samples of the middle plane that are, as their six neighbours, lowest, and highest."""
+    counts = []
+    for extreme in extremes:
+        plane = slab[BESIDE] == extreme
+        if not plane.any():
+            counts.append(0)
+            continue
+        amid = plane & (slab[BESIDE - 1] == extreme) & (slab[BESIDE + 1] == extreme)
+        amid[1:-1] &= plane[2:] & plane[:-2]
+        amid[:, 1:-1] &= plane[:, 2:] & plane[:, :-2]
+        counts.append(int(amid[BESIDE:-BESIDE, BESIDE:-BESIDE].sum()))
+    return np.array(counts)
+
+
+def weigh(looked: Looked, h: float) -> Evidence:
+    """Return the evidence of what was looked at; ``h`` is the spacing."""
+    is_cut = looked.cut > CUT_OFF
+    limits = [x if c else s * np.inf for x, c, s in zip(looked.extremes, is_cut, (-1, 1))]
+    whole = ((looked.lines > limits[0]) & (looked.lines < limits[1])).all((1, 2))
+    lines = np.clip(looked.lines[whole] / h, -LARGEST_VALUE, LARGEST_VALUE)
+    second, third, fourth = differences(lines)
+    slope = np.sqrt((((lines[..., 3] - lines[..., 1]) / 2) ** 2).sum(1))
+    unsure = (third + fourth).sum(1) / 2
+    sure = unsure < SURE * slope
+    typical = float(np.median(slope[sure])) if sure.sum() >= ENOUGH else float("nan")
+    unit = typical if np.isfinite(typical) else 1.0
+    wrong = np.abs(slope / unit - 1) > unsure / unit + ROUNDING
+    apart = np.abs(np.diff(lines[..., 1:4], axis=-1)).max((1, 2), initial=0)
+    noisy = (apart > LIPSCHITZ * unit) & (second.max(1, initial=0) > BENT * unit)
+    rough = float(np.median(fourth)) / 70**0.5 / 0.6745 if len(fourth) else 0.0
+    shares = [float(x.mean()) if len(x) else 0.0 for x in (wrong, noisy)]
+    low, high = bool(is_cut[0]), bool(is_cut[1])
+    return Evidence(len(lines), typical, shares[0], shares[1], rough, low, high)
+
+
+def differences(lines: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the absolute second, third and fourth differences of lines (..., 5), (...,) each."""
+    a, b, c, d, e = np.moveaxis(lines, -1, 0)
+    second, third = d - 2 * c + b, (e - 2 * d + 2 * b - a) / 2
+    return np.abs(second), np.abs(third), np.abs(e - 4 * d + 6 * c - 4 * b + a)

@@ -1,0 +1,99 @@
+"""What the values of a grid are, and what the method may do with them.
+
+exact      distances
+truncated  distances that are cut off near the surface
+mask       inside or outside, nothing else
+scaled     a field of another slope than 1: another unit, or no distance at all
+noisy      distances with noise
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..errors import OptionError, seen
+from .planes import SampleArray
+from .samples import Extremes
+
+AUTO, EXACT, TRUNCATED, MASK, SCALED, NOISY = (
+    "auto",
+    "exact",
+    "truncated",
+    "mask",
+    "scaled",
+    "noisy",
+)
+FIELDS = (AUTO, EXACT, TRUNCATED, MASK, SCALED, NOISY)
+NONE_EXACT: Extremes = (0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """The kind of a field.
+
+    Attributes
+    ----------
+    kind : str
+        One of ``FIELDS``, but not "auto".
+    given : bool
+        Whether the user said so; otherwise the samples show it.
+    exact : two floats
+        Only samples between these, in world units, negative inside, may be exact distances.
+    smooth : array or Planes, optional
+        Of a scaled field: the values whose cubic spline has the surface, negative inside.
+    has_kinks : bool
+        Whether a scaled field is mostly a distance, so that the network may refine its kinks.
+    evidence : dict
+        What the samples show, for ``--json``.
+    """
+
+    kind: str = EXACT
+    given: bool = False
+    exact: Extremes = (-np.inf, np.inf)
+    smooth: SampleArray | None = None
+    has_kinks: bool = False
+    evidence: dict[str, Any] = field(default_factory=dict)
+
+    def report(self) -> dict[str, Any]:
+        """Return kind and evidence as a dictionary that can be written as JSON."""
+        return {"kind": self.kind, "given": self.given, **self.evidence}
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What the user says about the values; see ``make_grid``."""
+
+    field: str = AUTO
+    label: float | None = None
+    level: float | None = None
+    scale: float | None = None
+
+    def check(self) -> None:
+        """Raise OptionError if an option is unknown, not a number, or contradicts another."""
+        if not isinstance(self.field, str) or self.field not in FIELDS:
+            raise OptionError(f"field is {seen(self.field)}: give one of {', '.join(FIELDS)}")
+        for name in ("label", "level", "scale"):
+            number = getattr(self, name)
+            if number is not None and not _is_finite(number):
+                raise OptionError(f"{name} is {seen(number)}: give a number")
+        if self.scale is not None and self.scale <= 0:
+            raise OptionError(f"scale is {self.scale:g}: it must be greater than 0")
+        if self.label is not None and self.level is not None:
+            raise OptionError(
+                f"label {self.label:g} and level {self.level:g}: give only one of them"
+            )
+        if self.label is not None and self.field not in (AUTO, MASK):
+            raise OptionError(
+                f"label {self.label:g} and field {self.field}: the samples of a label are a mask"
+            )
+
+
+def _is_finite(number: Any) -> bool:
+    """Return whether something is a finite number, and no bool."""
+    try:
+        return not isinstance(number, (bool, np.bool_, str)) and bool(np.isfinite(float(number)))
+    except (TypeError, ValueError):
+        return False

@@ -1,0 +1,144 @@
+"""The cubic spline through the samples, at the nodes of blocks, for fields that are smooth.
+
+Where a field is smooth, its cubic B-spline is nearer to it than any network that was trained on
+distances, whatever its slope. Fourth differences of the samples tell where it is smooth.
+
+Reference: Unser, Aldroubi and Eden, "B-spline signal processing", 1993. The prefilter is the
+symmetric exponential of the pole sqrt(3) - 2, cut off at ``TAIL`` samples. All sums are written
+out, so that the bits of a result do not depend on the slabs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import FloatArray, IntArray
+from ..grid.planes import SampleArray, in_spacings
+from ..grid.slopes import local_slopes
+from .band import plane_blocks
+
+POLE = 3**0.5 - 2
+TAIL = 12  # samples after which the prefilter has fallen to 1e-7
+SIDE = 5  # coefficients along an axis on which the spline within half a voxel of a sample depends
+# Sums of fourth differences, in voxels, up to which a field is smooth, and from which it is not.
+SMOOTH, KINKED = 0.6, 1.3
+WRONG_SLOPE = 0.05  # from 1: local slopes so far off are not those of distances
+
+
+def spline_blocks(
+    values: SampleArray, voxel_ijk: IntArray, factor: int, unit: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the cubic spline at the nodes of voxels' blocks, and the network's share there.
+
+    Parameters
+    ----------
+    values : (nx, ny, nz) array or Planes
+        Samples.
+    voxel_ijk : (D, 3) int32
+        The voxels, in C order.
+    factor : int
+        K.
+    unit : float
+        The values are divided by this.
+
+    Returns
+    -------
+    (Q, D + 1) float32, (D,) float32
+        Blocks, see ``nodes``; the share of the network's values in each voxel, from 0 where the
+        field is smooth, or no distance, to 1.
+    """
+    blocks = np.zeros(((factor + 1) ** 3, len(voxel_ijk) + 1), np.float32)
+    share = np.empty(len(voxel_ijk), np.float32)
+    nx = values.shape[0]
+    for first, last in plane_blocks(tuple(values.shape)):
+        rows = slice(*np.searchsorted(voxel_ijk[:, 0], [first, last]).tolist())
+        if rows.start == rows.stop:
+            continue
+        low, high = max(first - TAIL - 2, 0), min(last + TAIL + 2, nx)
+        planes = in_spacings(np.asarray(values[low:high]), unit)
+        ijk = voxel_ijk[rows] - np.array([low, 0, 0], np.int32)
+        share[rows] = network_share(planes * np.float32(0.5))[tuple(ijk.T)]
+        _evaluate(prefilter(planes), ijk + 2, factor, blocks[:, rows])
+    return blocks, share
+
+
+def prefilter(values: FloatArray) -> FloatArray:
+    """Return the coefficients of the cubic B-spline, with two more on every side."""
+    weights = (3**0.5 * POLE ** np.arange(TAIL + 1)).astype(np.float32)
+    coefficients = values
+    for axis in range(3):
+        lines = _continued(np.moveaxis(coefficients, axis, 0), TAIL + 2)
+        count = len(lines) - 2 * TAIL
+        total = lines[TAIL : TAIL + count] * weights[0]
+        for step in range(1, TAIL + 1):
+            pair = lines[TAIL - step : TAIL - step + count] + lines[TAIL + step :][:count]
+            total += pair * weights[step]
+        coefficients = np.moveaxis(total, 0, axis)
+    return np.ascontiguousarray(coefficients)
+
+
+def _continued(lines: FloatArray, beyond: int) -> FloatArray:
+    """Return lines continued beyond both ends by point reflection, as straight ones would go on."""
+    return np.pad(lines, [(beyond, beyond), (0, 0), (0, 0)], mode="reflect", reflect_type="odd")
+
+
+def roughness(values: FloatArray) -> FloatArray:
+    """Return the sum of the absolute fourth differences, the largest in each neighbourhood."""
+    total = np.zeros_like(values)
+    for axis in range(3):
+        a, b, c, d, e = (
+            _continued(np.moveaxis(values, axis, 0), 2)[step : step + values.shape[axis]]
+            for step in range(5)
+        )
+        total += np.moveaxis(np.abs(e - 4 * d + 6 * c - 4 * b + a), 0, axis)
+    for axis in range(3):
+        lines = np.moveaxis(total, axis, 0)
+        largest = lines.copy()
+        np.maximum(largest[1:], lines[:-1], out=largest[1:])
+        np.maximum(largest[:-1], lines[1:], out=largest[:-1])
+        total = np.moveaxis(largest, 0, axis)
+    return total
+
+
+def node_weights(factor: int) -> NDArray[np.float32]:
+    """Return the weights of the coefficients at -2 to 2 samples for the nodes along an axis."""
+    at = np.arange(factor + 1)[:, None] / factor - 0.5 - np.arange(-2, 3)
+    far = np.abs(at)
+    near = 2 / 3 - far**2 + far**3 / 2
+    weights = np.where(far < 1, near, np.clip(2 - far, 0, None) ** 3 / 6)
+    return weights.astype(np.float32)
+
+
+def _evaluate(coefficients: FloatArray, ijk: IntArray, factor: int, out: FloatArray) -> None:
+    """Set ``out``, (Q, n), to the spline at the nodes of the blocks of voxels (n, 3)."""
+    weights = node_weights(factor)
+    step = np.array([coefficients.shape[1] * coefficients.shape[2], coefficients.shape[2], 1])
+    around = (np.indices((SIDE,) * 3).reshape(3, -1).T - 2) @ step
+    centre = ijk.astype(np.int64) @ step
+    chunk = 4096
+    for start in range(0, len(ijk), chunk):
+        at = centre[start : start + chunk]
+        values = coefficients.ravel().take(around[:, None] + at)
+        block = values.reshape(SIDE, SIDE, SIDE, -1)
+        for axis in range(3):
+            lines = np.moveaxis(block, axis, 0)
+            nodes = np.zeros((factor + 1, *lines.shape[1:]), np.float32)
+            for node, weight in zip(nodes, weights):
+                for line, share in zip(lines, weight):
+                    if share:
+                        node += line * share
+            block = np.moveaxis(nodes, 0, axis)
+        out[:, start : start + chunk] = block.reshape(len(out), -1)
+
+
+def network_share(values: FloatArray) -> FloatArray:
+    """Return the share of the network's values round each sample; ``values`` are in voxels.
+
+    It is 0 where the field is smooth, since the spline is nearer there, and where its slope is not
+    1, since the network knows distances only.
+    """
+    kinked = np.clip((roughness(values) - SMOOTH) / (KINKED - SMOOTH), 0, 1)
+    off = np.abs(local_slopes(values) - 1)
+    share: FloatArray = (kinked * np.clip(2 - off / WRONG_SLOPE, 0, 1)).astype(np.float32)
+    return share

@@ -1,0 +1,437 @@
+"""What the values of a grid are, and what becomes of masks, truncated and scaled fields."""
+
+import json
+
+import numpy as np
+import pytest
+from conftest import ball, trilinear
+from scipy import ndimage
+
+from super_sdf import SdfGrid, load_network, make_grid, pipeline, reconstruct
+from super_sdf.errors import GridError, OptionError
+from super_sdf.grid.evidence import look, weigh
+from super_sdf.grid.field import FIELDS
+from super_sdf.grid.masks import is_distance_transform, mask_distances
+from super_sdf.grid.slopes import local_slopes
+from super_sdf.grid.truncation import fill_in
+from super_sdf.machine import memory
+from super_sdf.mesh import join_meshes
+from super_sdf.network.kinds import network_for
+from super_sdf.pipeline import reconstruct_slabs
+from super_sdf.slabs.cutting import cut
+from super_sdf.steps.holding import hold_sides
+from super_sdf.steps.nodes import block_ijk
+from super_sdf.steps.spline import network_share, node_weights, prefilter, spline_blocks
+from super_sdf.steps.survey import survey
+
+PLACE = {"spacing": 1.0, "origin": 0.0}
+
+
+def lattice(n: int = 32) -> np.ndarray:
+    """Return the coordinates of samples of the unit cube round the origin, (3, n, n, n)."""
+    line = (np.arange(n) + 0.5) / n - 0.5
+    return np.stack(np.meshgrid(line, line, line, indexing="ij"))
+
+
+def torus(n: int = 32) -> np.ndarray:
+    """Return distances to a torus, in voxels."""
+    x, y, z = lattice(n)
+    return n * (np.hypot(np.hypot(x, y) - 0.3, z) - 0.12)
+
+
+def box(n: int = 32) -> np.ndarray:
+    """Return distances to a turned box, in voxels."""
+    x, y, z = lattice(n)
+    turned = np.stack([0.8 * x + 0.6 * y, 0.8 * y - 0.6 * x, z])
+    off = np.abs(turned) - np.array([0.33, 0.21, 0.17])[:, None, None, None]
+    return n * (np.sqrt((np.maximum(off, 0) ** 2).sum(0)) + np.minimum(off.max(0), 0))
+
+
+def ellipsoid(n: int = 32) -> np.ndarray:
+    """Return a polynomial whose zero set is an ellipsoid; its slope is 5 to 14."""
+    x, y, z = lattice(n)
+    return (x / 0.4) ** 2 + (y / 0.25) ** 2 + (z / 0.15) ** 2 - 1
+
+
+def smooth_union(n: int = 48) -> np.ndarray:
+    """Return two balls with a smooth joint, in voxels: their slope is less than 1 there."""
+    x, y, z = lattice(n)
+    one, other = (np.sqrt((x - at) ** 2 + y**2 + z**2) - 0.2 for at in (-0.15, 0.15))
+    blend = np.maximum(0.15 - np.abs(one - other), 0) / 0.15
+    return n * (np.minimum(one, other) - blend**2 * 0.15 / 4)
+
+
+def transforms(inside: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the distance transforms of a mask that people make."""
+    out, into = (ndimage.distance_transform_edt(side) for side in (~inside, inside))
+    return {
+        "both sides": out - into,
+        "both sides, less half a voxel": np.where(inside, 0.5 - into, out - 0.5),
+        "positive inside": into - out,
+        "inside only": into,
+        "outside only": out,
+        "in other units": (0.37 * (out - into)).astype(np.float32),
+    }
+
+
+def noisy(values: np.ndarray, amplitude: float = 0.25) -> np.ndarray:
+    return values + np.random.default_rng(0).uniform(-amplitude, amplitude, values.shape)
+
+
+MASK = torus() < 0
+KINDS = {
+    "a torus": (torus(), "exact"),
+    "a torus of 16^3": (torus(16), "exact"),
+    "a box": (box(), "exact"),
+    "a box along the axes, half-way between samples": (
+        np.abs(np.indices((24, 24, 24)) - 11.5).max(0) - 6,
+        "exact",
+    ),
+    "a plane half-way between samples": (np.indices((12, 12, 12))[0] - 5.5, "exact"),
+    "two balls": (np.minimum(torus(), box()), "exact"),
+    "cut off far away": (np.clip(box(), -3.5, 4), "exact"),
+    "cut off at 1": (np.clip(box(), -1, 1), "truncated"),
+    "cut off unevenly": (np.clip(box(), -1, 2.5), "truncated"),
+    "cut off at 0.5": (np.clip(box(), -0.5, 0.5), "truncated"),
+    "cut off at 1, in units of that": (np.clip(box() / 2.5, -1, 1), "truncated"),
+    "noise": (noisy(box()), "noisy"),
+    "little noise": (noisy(box(), 0.02), "exact"),
+    "an ellipsoid's polynomial": (ellipsoid() * 32 / 14, "scaled"),
+    "a smooth union": (smooth_union(), "scaled"),
+    "half as steep": (torus(48) / 2, "scaled"),
+    "truth": (MASK, "mask"),
+    "bytes": (MASK.astype(np.uint8), "mask"),
+    "255": (MASK * np.float32(255), "mask"),
+    "signs": (np.where(MASK, -1.0, 1.0), "mask"),
+    **{f"transform: {name}": (values, "mask") for name, values in transforms(MASK).items()},
+}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_the_samples_show_what_they_are(name):
+    values, kind = KINDS[name]
+    inside = "negative" if "plane" in name else "auto"
+    grid = make_grid(values, **PLACE, inside=inside)
+    assert grid.field.kind == kind and not grid.field.given
+    assert (kind == "exact") == (not any("values taken as" in note for note in grid.notes))
+
+
+def test_exact_distances_are_passed_on_as_they_are():
+    values = torus().astype(np.float32)
+    grid = make_grid(values, **PLACE)
+    assert grid.samples is values and grid.notes == ()
+    assert grid.field.report()["slope"] == pytest.approx(1, abs=0.01)
+    assert grid.field.exact == (-np.inf, np.inf)
+
+
+@pytest.mark.parametrize("field", FIELDS[1:])
+def test_the_user_may_overrule_the_evidence(field):
+    grid = make_grid(torus(), **PLACE, field=field)
+    assert (grid.field.kind, grid.field.given) == (field, True)
+    assert reconstruct(grid, trilinear).is_closed()
+
+
+def test_distances_of_a_mask_are_those_of_scipy():
+    inside = ndimage.gaussian_filter(np.random.default_rng(0).normal(size=(23, 20, 17)), 2) > 0
+    want = transforms(inside)["both sides, less half a voxel"]
+    np.testing.assert_allclose(mask_distances(inside), np.clip(want, -3.5, 3.5), atol=1e-6)
+
+
+@pytest.mark.parametrize("name", transforms(MASK))
+def test_a_distance_transform_gives_its_step_away(name):
+    values = transforms(MASK)[name]
+    lines = look(values, (values.min(), values.max())).lines
+    assert is_distance_transform(lines) == pytest.approx(0.37 if "units" in name else 1)
+
+
+def test_all_forms_of_a_mask_give_the_same_mesh():
+    forms = [MASK, MASK.astype(np.uint8), np.where(MASK, -1.0, 1.0), MASK * 7.0]
+    forms += transforms(MASK).values()
+    meshes = [reconstruct(make_grid(form, **PLACE), trilinear) for form in forms]
+    for mesh in meshes[1:]:
+        np.testing.assert_array_equal(mesh.vertices, meshes[0].vertices)
+        np.testing.assert_array_equal(mesh.faces, meshes[0].faces)
+
+
+def test_a_label_is_a_mask_of_its_samples():
+    labels = np.where(MASK, 3, 0)
+    labels[:2] = 2
+    grid = make_grid(labels, **PLACE, label=3)
+    np.testing.assert_array_equal(grid.values, make_grid(MASK, **PLACE).values)
+    assert make_grid(labels, **PLACE, label=3, inside="negative").values[16, 16, 16] < 0
+
+
+def test_labels_without_a_choice_are_refused():
+    with pytest.raises(GridError) as caught:
+        make_grid(MASK * 2 + (box() < 0), **PLACE)
+    assert str(caught.value) == (
+        "the values are whole numbers from 0 to 3, as of labels: choose the solid with --label, "
+        "or with --level if they are densities"
+    )
+
+
+def test_a_label_that_no_sample_has_is_refused_with_those_there_are():
+    with pytest.raises(GridError, match=r"no sample has the label 7: the labels are 0, 1, 2$"):
+        make_grid(MASK.astype(int) + (box() < 0), **PLACE, label=7)
+    with pytest.raises(GridError, match=r"every sample has the label 7: the labels are 7$"):
+        make_grid(np.full((8, 8, 8), 7), **PLACE, label=7)
+
+
+def test_densities_have_their_surface_at_a_level():
+    density = 40 - 10 * torus(48).astype(np.float32)
+    grid = make_grid(density, **PLACE, level=40, scale=0.1)
+    assert grid.notes[0] == "values above 40 are taken as inside (see --inside)"
+    np.testing.assert_allclose(grid.values, torus(48), atol=1e-4)
+    below = make_grid(-density, **PLACE, level=-40, scale=0.1, inside="negative")
+    assert below.notes[0] == "values below -40 are taken as inside (see --inside)"
+    np.testing.assert_allclose(below.values, torus(48), atol=1e-4)
+
+
+def test_densities_of_two_values_are_a_mask():
+    grid = make_grid(np.where(MASK, 900, 100), **PLACE, level=500)
+    np.testing.assert_array_equal(grid.values, make_grid(MASK, **PLACE).values)
+
+
+def test_densities_with_a_ramp_have_the_surface_of_their_spline():
+    blurred = ndimage.gaussian_filter(MASK.astype(np.float32), 1.5) * 1000
+    grid = make_grid(blurred, level=500)
+    assert grid.field.kind == "scaled"
+    assert grid.notes[1].startswith("spacing not given: taken as 1, since densities show none")
+
+
+def test_densities_without_a_ramp_are_a_mask():
+    steep = MASK * 1000.0 + np.random.default_rng(0).uniform(0, 30, MASK.shape)
+    grid = make_grid(steep, **PLACE, level=500)
+    assert grid.field.kind == "mask"
+    np.testing.assert_array_equal(grid.values, make_grid(MASK, **PLACE).values)
+
+
+def test_the_shares_of_voxels_inside_are_cut_off():
+    shares = np.clip(0.5 - torus(), 0, 1)
+    grid = make_grid(shares, spacing=2.5, origin=0, level=0.5)
+    assert grid.field.kind == "truncated"
+    assert grid.notes[1].startswith("the values are divided by their slope")
+    mesh = reconstruct(grid, trilinear)
+    x, y, z = (mesh.vertices.T / 2.5 + 0.5) / 32 - 0.5
+    assert np.abs(np.hypot(np.hypot(x, y) - 0.3, z) - 0.12).mean() * 32 < 0.05
+
+
+def test_the_scale_is_the_unit_of_the_values():
+    plain = make_grid(torus() / 32, spacing=1 / 32, origin=0)
+    scaled = make_grid(torus() * 25.4, spacing=1 / 32, origin=0, scale=1 / 25.4 / 32)
+    assert scaled.field.kind == "exact"
+    np.testing.assert_allclose(scaled.values, plain.values, atol=1e-6)
+
+
+BAD = {
+    "field is 'wrong': give one of auto, exact, truncated, mask, scaled, noisy": {"field": "wrong"},
+    "label is 'a': give a number": {"label": "a"},
+    "level is nan: give a number": {"level": float("nan")},
+    "scale is -1: it must be greater than 0": {"scale": -1},
+    "label 1 and level 2: give only one of them": {"label": 1, "level": 2},
+    "label 1 and field exact: the samples of a label are a mask": {"label": 1, "field": "exact"},
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_wrong_options_are_refused(message):
+    with pytest.raises(OptionError) as caught:
+        make_grid(torus(), **PLACE, **BAD[message])
+    assert str(caught.value) == message
+
+
+def test_a_mask_is_no_grid_without_make_grid():
+    for values in (MASK, MASK.astype(int)):
+        with pytest.raises(GridError, match="a mask holds no distances; make a grid of it with"):
+            SdfGrid(values, 1.0)
+
+
+def test_a_mask_of_one_value_is_refused():
+    with pytest.raises(GridError, match="every value is False: a constant field has no surface"):
+        make_grid(np.zeros((5, 5, 5), bool), **PLACE)
+
+
+def test_a_mask_shows_no_spacing():
+    assert make_grid(MASK).notes[0] == (
+        "spacing not given: taken as 1, since a mask shows none (give --spacing)"
+    )
+
+
+def opposite(patches, table, voxels, offsets):
+    """Stand in for a network that is always wrong."""
+    return -trilinear(patches, table, voxels, offsets)
+
+
+@pytest.mark.parametrize("network", [trilinear, opposite])
+def test_samples_of_a_mask_keep_their_side_and_their_joints(network):
+    grid = make_grid(MASK, **PLACE)
+    field = pipeline.upsample(grid, network, 4)
+    ijk = block_ijk(4)
+    for node in np.flatnonzero(np.abs(ijk - 2).sum(1) == np.abs(ijk - 2).max(1)):
+        step = np.sign(ijk[node] - 2)
+        own = MASK[tuple(field.voxel_ijk.T)]
+        other = MASK[tuple(np.clip(field.voxel_ijk + step, 0, 31).T)]
+        same = own == other
+        np.testing.assert_array_equal((field.blocks[node] <= 0)[same], own[same])
+    assert reconstruct(grid, network).is_closed()
+
+
+def test_sides_that_are_right_are_not_touched():
+    band = survey(make_grid(MASK, **PLACE))
+    patches, table, voxels = band.network_inputs()
+    offsets = (block_ijk(4) / 2 - 1).astype(np.float32)
+    blocks = np.zeros((125, len(voxels) + 1), np.float32)
+    blocks[:, :-1] = trilinear(patches, table, voxels, offsets).T
+    before = blocks.copy()
+    assert hold_sides(blocks, 4, patches, voxels) == 0
+    np.testing.assert_array_equal(blocks, before)
+
+
+def test_a_network_of_the_package_is_replaced_for_masks():
+    network = load_network("fast", device="cpu", threads=1)
+    assert network_for(network, "exact") is network
+    assert network_for(trilinear, "mask") is trilinear
+    found = network_for(network, "mask")
+    assert found.card["inputs"] == "masks" and found.threads == network.threads
+    assert network_for(found, "mask") is found
+
+
+def test_the_network_for_masks_is_nearer_than_marching_cubes():
+    def off(mesh):
+        x, y, z = (mesh.vertices.T + 0.5) / 32 - 0.5
+        return np.abs(np.hypot(np.hypot(x, y) - 0.3, z) - 0.12).mean() * 32
+
+    ours = off(reconstruct(make_grid(MASK, **PLACE), load_network(device="cpu")))
+    cubes = off(reconstruct(make_grid(MASK, **PLACE), trilinear, 2))
+    assert ours < 0.7 * cubes
+
+
+def test_what_was_cut_off_is_filled_in():
+    exact = torus().astype(np.float32)
+    near = np.abs(exact) < 2
+    filled = fill_in(np.clip(exact, -1, 1), -1.0, 1.0)
+    kept = np.abs(exact) < 0.999
+    np.testing.assert_array_equal(filled[kept], exact[kept])
+    assert np.abs(filled - exact)[near].max() < 0.5
+    assert (
+        np.abs(filled - exact)[near].mean()
+        < 0.25 * np.abs(np.clip(exact, -1, 1) - exact)[near].mean()
+    )
+
+
+def test_only_samples_that_were_not_cut_off_are_exact():
+    grid = make_grid(np.clip(box(), -1, 2), **PLACE)
+    band = survey(grid)
+    values = band.patches[band.exact, 13] / 2
+    assert values.min() > -1 and values.max() < 2 and band.exact.sum() > 1000
+
+
+@pytest.mark.parametrize("unit", [0.01, 1, 37])
+def test_a_scaled_field_has_the_same_mesh_in_any_unit(unit):
+    want = reconstruct(make_grid(ellipsoid(), **PLACE, field="scaled"), trilinear)
+    mesh = reconstruct(make_grid(ellipsoid() * unit, **PLACE, field="scaled"), trilinear)
+    np.testing.assert_allclose(mesh.vertices, want.vertices, atol=1e-4)
+
+
+def test_a_smooth_field_of_another_slope_is_that_of_its_spline():
+    mesh = reconstruct(make_grid(ellipsoid(), **PLACE, field="scaled"), opposite)
+    x, y, z = (mesh.vertices.T + 0.5) / 32 - 0.5
+    value = (x / 0.4) ** 2 + (y / 0.25) ** 2 + (z / 0.15) ** 2 - 1
+    assert np.abs(value).max() < 0.02  # a twentieth of a change from sample to sample
+
+
+def test_the_spline_is_that_of_scipy():
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=(30, 31, 32)).astype(np.float32)
+    ijk = np.array([[14, 15, 15], [15, 14, 16]], np.int32)
+    blocks, _ = spline_blocks(values, ijk, 4, 1.0)
+    for row, voxel in enumerate(ijk):
+        at = (block_ijk(4) / 4 - 0.5 + voxel).T
+        want = ndimage.map_coordinates(values.astype(float), at, order=3, mode="mirror")
+        np.testing.assert_allclose(blocks[:, row], want, atol=2e-5)
+
+
+def test_the_spline_is_exact_for_planes_up_to_the_border():
+    values = np.indices((6, 7, 8)).astype(np.float32)[1] * 2 - 3
+    ijk = np.argwhere(np.ones(values.shape, bool)).astype(np.int32)
+    blocks, share = spline_blocks(values, ijk, 2, 1.0)
+    want = (block_ijk(2)[:, 1, None] / 2 - 0.5 + ijk[:, 1]) * 2 - 3
+    np.testing.assert_allclose(blocks[:, :-1], want, atol=1e-4)
+    assert not share.any() and prefilter(values).shape == (10, 11, 12)
+    np.testing.assert_allclose(node_weights(4).sum(1), 1, atol=1e-6)
+
+
+def test_the_network_adds_to_a_scaled_field_at_kinks_of_distances_only():
+    assert network_share(box(48).astype(np.float32)).max() == 1
+    assert not network_share(torus(64).astype(np.float32))[16:48, :8].any()
+    assert not network_share(2 * box(48).astype(np.float32)).any()
+
+
+def test_local_slopes_are_those_of_the_field():
+    for slope in (0.5, 1.0, 2.0):
+        tilted = np.tensordot([0.48, 0.6, 0.64], np.indices((9, 10, 11)), 1) * slope
+        np.testing.assert_allclose(local_slopes(tilted.astype(np.float32)), slope, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["truth", "cut off at 1", "a smooth union", "cut off at 0.5"])
+def test_any_number_of_slabs_and_threads_gives_the_same_mesh(name, monkeypatch):
+    values = np.tile(KINDS[name][0], (2, 1, 1))
+    grid, network = make_grid(values, **PLACE), load_network("fast", device="cpu")
+    want = reconstruct(grid, network)
+
+    def plan(band, factor, receptive_field, resources, needed, mesher):
+        return cut(band, 4, receptive_field, mesher.planes_beside(factor))
+
+    monkeypatch.setattr(pipeline, "plan_slabs", plan)
+    one = load_network("fast", device="cpu", threads=1)
+    pieces = list(reconstruct_slabs(grid, one))
+    mesh = join_meshes([mesh for piece in pieces for mesh in piece.meshes])
+    assert len(pieces) > 2
+    np.testing.assert_array_equal(mesh.vertices, want.vertices)
+    np.testing.assert_array_equal(mesh.faces, want.faces)
+
+
+def test_derived_planes_are_made_when_they_are_read(monkeypatch):
+    grid = make_grid(MASK, **PLACE)
+    np.testing.assert_array_equal(grid.planes(5, 9), grid.values[5:9])
+    np.testing.assert_array_equal(np.stack(list(grid.samples)), grid.values)
+    monkeypatch.setattr(memory, "free_memory", lambda: 1)
+    assert grid.samples[3].shape == MASK[3].shape
+
+
+def test_noise_is_told_from_a_wrong_slope():
+    for values, noisy_, scaled in ((noisy(box()), True, False), (smooth_union(), False, True)):
+        found = weigh(look(values, (values.min(), values.max())), 1.0)
+        assert (found.is_noisy, found.is_scaled) == (noisy_, scaled)
+
+
+def test_the_command_says_what_the_values_are(tmp_path, command):
+    np.save(tmp_path / "mask.npy", MASK)
+    words = "upsample", tmp_path / "mask.npy", tmp_path / "out.ply", "--spacing", "1", "--json"
+    code, out, err = command(*map(str, words))
+    assert code == 0 and json.loads(out)["field"] == {"kind": "mask", "given": False}
+    assert "Note: values taken as a mask (--field mask): they show the surface to half a" in err
+
+
+def test_the_command_takes_labels_levels_and_scales(tmp_path, command):
+    np.save(tmp_path / "labels.npy", np.where(MASK, 3, 0) + 2 * (box() < -9))
+    np.save(tmp_path / "grid.npy", 100 - 40 * ball(24, 8).values)
+    base = ["upsample", "--spacing", "1", "--force"]
+    labels, grid, out = (str(tmp_path / name) for name in ("labels.npy", "grid.npy", "out.ply"))
+    assert command(*base, labels, out, "--label", "3")[0] == 0
+    assert command(*base, grid, out, "--level", "100", "--scale", "0.025")[0] == 0
+    code, _, err = command(*base, grid, out, "--level", "100", "--scale", "0")
+    assert (code, err.splitlines()[-1]) == (2, "Error: scale is 0: it must be greater than 0")
+    assert (
+        command("check", out, grid, "--spacing", "1", "--level", "100", "--scale", ".025")[0] == 0
+    )
+
+
+def test_a_list_of_batch_takes_what_the_values_are(tmp_path, command):
+    np.save(tmp_path / "labels.npy", np.where(MASK, 3, 0))
+    job = {"in": "labels.npy", "spacing": 1, "label": 3, "field": "mask"}
+    (tmp_path / "list.jsonl").write_text(json.dumps(job))
+    run = "batch", str(tmp_path / "list.jsonl"), "--out", str(tmp_path / "out")
+    assert command(*run)[0] == 0
+    row = json.loads((tmp_path / "out" / "report.jsonl").read_text())
+    assert row["field"]["kind"] == "mask" and row["closed"]
