@@ -319,6 +319,15 @@ def test_what_was_cut_off_is_filled_in():
     )
 
 
+@pytest.mark.parametrize("low", [-1, -10])
+def test_distances_over_their_truncation_get_their_unit_back(low):
+    grid = make_grid(np.clip(box(), low, 1), spacing=1.5, origin=0)
+    assert grid.field.kind == "truncated"
+    assert grid.notes[0].startswith("the values are divided by their slope, 0.6")
+    kept = np.abs(box()) < 0.9
+    np.testing.assert_allclose(grid.values[kept], 1.5 * box()[kept], rtol=0.03)
+
+
 def test_only_samples_that_were_not_cut_off_are_exact():
     grid = make_grid(np.clip(box(), -1, 2), **PLACE)
     band = survey(grid)

@@ -258,17 +258,19 @@ def _one_sided(samples: SampleArray, extremes: Extremes) -> str:
 
 
 def _is_normalised(looked: Looked, spacing: ArrayLike | None) -> bool:
-    """Return whether values are cut off at -T and T, and steeper or flatter than the spacing says.
+    """Return whether values are cut off at -T and T, or at 1, and their slope is not 1.
 
     So are distances that were divided by the truncation, as many programs store them.
     """
-    if spacing is None or not (looked.cut > 0).all():
+    if spacing is None or not looked.cut.any():
         return False
-    low, high = looked.extremes
     h = sum(check_spacing(spacing)) / 3
     evidence = weigh(looked, h)
-    cut = evidence.cut_low and evidence.cut_high and bool(np.isclose(-low, high, rtol=1e-3))
-    return cut and abs(_slope_within(looked) / h - 1) > SLOPE_OFF
+    cuts = evidence.cut_low, evidence.cut_high
+    ends = [abs(end) for end, is_cut in zip(looked.extremes, cuts) if is_cut]
+    alike = all(cuts) and bool(np.isclose(ends[0], ends[-1], rtol=1e-3))
+    at_one = bool(ends) and bool(np.allclose(ends, 1, rtol=1e-6))
+    return (alike or at_one) and abs(_slope_within(looked) / h - 1) > SLOPE_OFF
 
 
 def _is_distance(looked: Looked, spacing: ArrayLike | None) -> bool:
