@@ -194,7 +194,8 @@ def test_batches_from_before_the_option_still_hold():
     planner = Planner.__new__(Planner)
     planner.network = ("abc", 1)
     options = ConvertOptions(2, mesher="marching")
-    new = {"axes", "iterations", "mesher", "simplify", "triangles"}
+    new = {"axes", "direction", "iterations", "mesher", "simplify", "triangles"}
+    new |= {"field", "label", "level", "scale"}
     before = {name: value for name, value in asdict(options).items() if name not in new}
     text = json.dumps([before, planner.network, __version__])
     digest = planner.digest(Job(Path("a.npy"), "a.ply", options))

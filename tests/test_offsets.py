@@ -102,10 +102,19 @@ def test_fill_values_end_the_distances_too(network, fill):
 
 
 def test_fields_truncated_near_the_surface_have_only_the_surface_at_0(network):
-    grid = make_grid(np.clip(cube(), -1, 1), spacing=1)
+    grid = make_grid(np.clip(cube(), -1, 1), spacing=1, field="exact")
     with pytest.raises(GridError, match=r"but they end at 1: only 0 works$"):
         reconstruct(grid, network, 2, offset=0.2)
     assert reconstruct(grid, network, 2).is_closed()
+
+
+def test_truncated_distances_are_filled_in_for_an_offset(network):
+    grid = make_grid(np.clip(cube(), -1, 1), spacing=1)
+    for offset in (-0.3, 0.4, 0.8):
+        mesh = reconstruct(grid, network, 2, offset=offset)
+        assert mesh.volume() == pytest.approx(cube_volume(offset), rel=0.01)
+    with pytest.raises(GridError, match=r"but they end at 2\.6: the largest that works is 1\.1$"):
+        reconstruct(grid, network, 2, offset=1.2)
 
 
 @pytest.mark.parametrize("fill", [3, 1000])

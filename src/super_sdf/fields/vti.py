@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ..files.readers.silence import discarded_stderr
 from ..grid.sdf_grid import SdfGrid
 from ..steps.field import FineField
 from ..steps.lattice import fine_grid
@@ -37,6 +36,8 @@ class VtiWriter:
         from vtkmodules.vtkCommonDataModel import vtkImageData
         from vtkmodules.vtkCommonMisc import vtkErrorCode
         from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
+
+        from ..files.readers.silence import discarded_stderr
 
         image = vtkImageData()
         image.SetDimensions(*self.values.shape[::-1])
