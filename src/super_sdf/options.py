@@ -90,11 +90,17 @@ def check_iterations(iterations: Any) -> int:
     OptionError
         If it is less than 1, or not a whole number (``OptionTypeError``).
     """
-    if not isinstance(iterations, Integral) or isinstance(iterations, bool):
-        raise OptionTypeError(f"iterations is {seen(iterations)}: give a whole number")
-    if iterations < 1:
-        raise OptionError(f"iterations is {seen(int(iterations))}: give 1 or more")
-    return int(iterations)
+    number = _check_whole(iterations, "iterations")
+    if number < 1:
+        raise OptionError(f"iterations is {seen(number)}: give 1 or more")
+    return number
+
+
+def _check_whole(number: Any, name: str) -> int:
+    """Return a whole number; OptionTypeError if it is none."""
+    if not isinstance(number, Integral) or isinstance(number, bool):
+        raise OptionTypeError(f"{name} is {seen(number)}: give a whole number")
+    return int(number)
 
 
 def check_max_memory(size: Any) -> int | None:
@@ -175,8 +181,7 @@ def check_triangles(triangles: Any, name: str = "triangles") -> int:
     OptionError
         If it is less than 4, or not a whole number (``OptionTypeError``).
     """
-    if not isinstance(triangles, Integral) or isinstance(triangles, bool):
-        raise OptionTypeError(f"{name} is {seen(triangles)}: give a whole number")
-    if triangles < 4:
-        raise OptionError(f"{name} is {triangles}: give 4 or more, as a closed mesh has")
-    return int(triangles)
+    number = _check_whole(triangles, name)
+    if number < 4:
+        raise OptionError(f"{name} is {number}: give 4 or more, as a closed mesh has")
+    return number

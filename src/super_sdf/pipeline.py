@@ -381,8 +381,8 @@ def interpolate(
     own_ijk = band.voxel_ijk[slab.seen][voxels]
     blocks, share = spline_blocks(smooth, own_ijk, factor, band.half_voxel)
     blocks[:, :-1] -= np.float32(band.level)
-    some = np.flatnonzero(share if band.has_kinks else 0 * share)
-    if len(some):
+    some = np.flatnonzero(share)
+    if band.has_kinks and len(some):
         kinked = patches, table, voxels[some]
         added = decode(network, kinked, block_offsets(factor), None, threads)[:, :-1]
         blocks[:, some] += share[some] * (added - blocks[:, some])

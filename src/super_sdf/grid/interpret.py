@@ -141,10 +141,8 @@ def _of_values(
     middle = 0.0
     if wanted.level is None and has_two_values(samples, extremes):
         middle = sum(extremes) / 2
-    elif not extremes[0] < 0 < extremes[1] and wanted.level is None:
-        if extremes[0] < 0 or extremes[1] <= 0:
-            raise GridError(_one_sided(samples, extremes))
-        middle = 0.0  # what is 0 is outside
+    elif wanted.level is None and extremes[1] <= 0:
+        raise GridError(_label_hint(extremes))
     above = _derived(samples, lambda planes: planes > middle, np.bool_)
     return _of_mask(above, wanted, spacing, inside, notes)
 
@@ -159,7 +157,7 @@ def _of_mask(
     if spacing is None:
         notes.append("spacing not given: taken as 1, since a mask shows none (give --spacing)")
     chosen = check_spacing(1.0 if spacing is None else spacing)
-    check_cubic(chosen, "a mask")
+    _check_cubic(chosen, "a mask")
     h = sum(chosen) / 3
     if not positive:
         above = _derived(above, np.logical_not, np.bool_)
@@ -214,7 +212,7 @@ def _by_evidence(
 ) -> Interpreted:
     """Return distances for values that are no mask at first sight, by what the samples show."""
     if spacing is not None and not is_cubic(check_spacing(spacing)):
-        check_cubic(check_spacing(spacing), named(wanted))
+        _check_cubic(check_spacing(spacing), _named(wanted))
         return _as_distances(samples, extremes, wanted, spacing, inside, notes)
     looked = look(samples, extremes)
     transformed = is_distance_transform(looked.lines) if wanted.field == AUTO else 0.0
@@ -228,7 +226,7 @@ def _by_evidence(
         above = _derived(samples, lambda planes: planes > 0, np.bool_)
         return _of_mask(above, wanted, spacing, inside, notes)
     if is_one_sided(extremes) and inside == AUTO and _are_labels(samples, extremes):
-        raise GridError(_one_sided(samples, extremes))
+        raise GridError(_label_hint(extremes))
     if wanted.level is not None and wanted.field == AUTO and _is_step(looked):
         notes.append("the densities jump from one side of the level to the other")
         above = _derived(samples, lambda planes: planes > 0, np.bool_)
@@ -256,14 +254,14 @@ def _cubic(samples: SampleArray, spacing: Triple) -> tuple[SampleArray, float]:
     return resample(samples, spacing)[0], min(spacing)
 
 
-def named(wanted: Wanted) -> str:
+def _named(wanted: Wanted) -> str:
     """Return what the user says that the values are, "" for distances."""
     if wanted.level is not None:
         return "a field of densities"
     return "" if wanted.field in (AUTO, EXACT, NOISY) else f"a {wanted.field} field"
 
 
-def check_cubic(spacing: Triple, name: str) -> None:
+def _check_cubic(spacing: Triple, name: str) -> None:
     """Raise GridError if spacings differ, of a field that has a name and so is no distance."""
     if name and not is_cubic(spacing):
         each = ", ".join(f"{h:g}" for h in spacing)
@@ -279,7 +277,7 @@ def _are_labels(samples: SampleArray, extremes: Extremes) -> bool:
     return whole and extremes[1] <= MOST_LABELS
 
 
-def _one_sided(samples: SampleArray, extremes: Extremes) -> str:
+def _label_hint(extremes: Extremes) -> str:
     """Return the message for values on one side of 0 that are a mask or labels."""
     low, high = extremes
     return (
