@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruct, upsample
 from super_sdf.certificate.check import check_mesh
+from super_sdf.errors import GridError
 from super_sdf.files.expectation import count_on_lattice
 from super_sdf.grid.cubic import cubic_grid, on_samples
 from super_sdf.grid.resampling import Resampled, new_places
@@ -65,6 +66,32 @@ def test_resampled_values_are_nearer_than_linear_ones(spacing):
     linear = np.abs(map_coordinates(corners.values, index, order=1, mode="nearest") - pear(places))
     assert off.mean() < 0.5 * linear[inner].mean()
     assert off.max() < 0.5 * max(spacing)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.2])
+@pytest.mark.parametrize("solid", [1, -1], ids=["wall", "slit"])
+def test_walls_between_the_planes_of_samples_are_kept(solid, tilt):
+    normal = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
+    half, spacing = 0.15, (0.2, 0.2, 1.0)
+
+    def sheet(points):
+        return solid * (np.abs((points - (4.6, 3.6, 5.5)) @ normal) - half)
+
+    inside = "auto" if solid == 1 else "negative"
+    grid = make_grid(sampled(spacing, sheet), spacing=spacing, origin=0, inside=inside)
+    cube = cubic_grid(grid)
+    places = cube.to_world(np.moveaxis(np.indices(cube.shape), 0, -1))
+    between = np.abs(places[..., 0] - 4.6) < 1.2  # no sample of these columns is in the sheet
+    between &= (places[..., 2] > 5) & (places[..., 2] < 6)
+    assert np.allclose(cube.values[between], sheet(places)[between], atol=1e-6)
+    assert (cube.values[between] * solid < 0).any()
+
+
+def test_a_field_that_dips_towards_the_surface_has_no_wall():
+    values = np.abs(np.arange(8.0) - 3.5) + 0.2
+    lines = np.broadcast_to(values[:, None, None], (8, 9, 9))
+    cube = Resampled(lines, (1.0, 1.0, 1.0), 0, 0.2)
+    assert cube.read(0, len(cube.places)).min() > 0
 
 
 @pytest.mark.parametrize("spacing", SPACINGS)
@@ -257,6 +284,12 @@ def test_thin_parts_without_a_sample_inside(network):
     assert grid.low > 0
     mesh = reconstruct(grid, network)
     assert len(mesh.faces) and mesh.is_closed()
+
+
+@pytest.mark.parametrize("spacing", SPACINGS)
+def test_unsigned_fields_are_refused(spacing):
+    with pytest.raises(GridError, match="an unsigned field has no inside"):
+        make_grid(np.abs(sampled(spacing)), spacing=spacing)
 
 
 def test_the_command_says_what_it_resamples(tmp_path, monkeypatch, command):

@@ -20,7 +20,6 @@ from .gradients import surface_gradients, typical_length
 from .masks import extremes_of_masks, has_both_sides, is_distance_transform, mask_planes
 from .one_sided import check_thin, is_one_sided
 from .planes import DerivedPlanes, SampleArray
-from .resampling import resample
 from .samples import (
     Extremes,
     check_kind,
@@ -196,7 +195,7 @@ def _as_distances(
     positive = is_positive_inside(samples, inside, extremes, notes)
     chosen = choose_spacing(samples, spacing, notes)
     if inside == AUTO and is_one_sided(extremes):
-        check_thin(*_cubic(samples, chosen), extremes)
+        check_thin(samples, chosen, extremes)
     field = Field(wanted.field, True, NONE_EXACT) if wanted.field == NOISY else Field()
     field = replace(field, given=wanted.field != AUTO)
     return Interpreted(samples, extremes, chosen, positive, field)
@@ -245,13 +244,6 @@ def _by_evidence(
         return found
     evidence = weigh(looked, sum(found.spacing) / 3)
     return _as_shown(found, evidence, wanted, notes)
-
-
-def _cubic(samples: SampleArray, spacing: Triple) -> tuple[SampleArray, float]:
-    """Return samples at the finest spacing on all axes, and that spacing."""
-    if is_cubic(spacing):
-        return samples, sum(spacing) / 3
-    return resample(samples, spacing)[0], min(spacing)
 
 
 def _named(wanted: Wanted) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray
+from ..arrays import BoolArray, Triple
 from ..errors import GridError
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 from .planes import SampleArray
@@ -20,14 +20,14 @@ from .samples import Extremes
 
 Floats = NDArray[np.floating[Any]]
 
-# All lengths are in spacings.
-REACH = 3**0.5 / 2 * 1.05  # from a point to the nearest sample at most, with a margin
+# All lengths are in spacings, the coarsest one if they differ between axes.
+MARGIN = 1.05  # on half the diagonal of a voxel: so far is the nearest sample at most
 # Along a line of samples the field falls towards a wall and rises behind it, both at least so
 # steeply: lines that graze the wall do not tell where it is.
 STEEP = 0.25
-# No wall passes between neighbouring samples whose distances add up to more than 1. Where walls cut
-# off a region that holds a sample as deep as this, either it is the inside of a solid in an
-# unsigned field, and the walls have no thickness, or the walls are thin and enclose it.
+# No wall passes between neighbouring samples whose distances add up to more than their spacing.
+# Where walls cut off a region that holds a sample as deep as this, either it is the inside of a
+# solid in an unsigned field, and the walls have no thickness, or the walls are thin and enclose it.
 FREE, DEEP = 1.001, 0.75
 NO_THICKNESS, UNSIGNED_SHARE = 0.03, 0.05
 MOST_FLOODED = 1 << 21  # samples; of a larger grid every second one, or third, is as exact
@@ -50,27 +50,28 @@ def is_one_sided(extremes: Extremes) -> bool:
     return extremes[0] >= 0 or extremes[1] <= 0
 
 
-def check_thin(values: SampleArray, h: float, extremes: Extremes) -> None:
+def check_thin(values: SampleArray, spacing: Triple, extremes: Extremes) -> None:
     """Raise GridError unless values on one side of 0 can be distances to a thin solid.
 
     Parameters
     ----------
     values : (nx, ny, nz) array or Planes
         Samples, none below 0 or none above.
-    h : float
-        The spacing.
+    spacing : three floats
+        Along each axis.
     extremes : two floats
         The smallest and the largest sample.
     """
-    scale = (1 if extremes[0] >= 0 else -1) / h
-    if min(map(abs, extremes)) / h > REACH:
+    steps = np.array(spacing) / max(spacing)
+    scale = (1 if extremes[0] >= 0 else -1) / max(spacing)
+    if min(map(abs, extremes)) * abs(scale) > reach(steps):
         raise _refusal(extremes, FAR)
-    patches, walls, unsigned_walls = look_near_walls(values, scale)
+    patches, walls, unsigned_walls = look_near_walls(values, scale, steps)
     if not len(patches):
         raise _refusal(extremes, BEYOND)
-    if not (_are_distances(patches) and _touch_walls(patches)):
+    if not (_are_distances(patches, steps) and _touch_walls(patches, steps)):
         raise _refusal(extremes, UNSIGNED)
-    if unsigned_walls > UNSIGNED_SHARE * walls and _is_cut_off(values, scale):
+    if unsigned_walls > UNSIGNED_SHARE * walls and _is_cut_off(values, scale, steps):
         raise _refusal(extremes, UNSIGNED)
 
 
@@ -85,7 +86,12 @@ def _refusal(extremes: Extremes, reason: str) -> GridError:
     )
 
 
-def look_near_walls(values: SampleArray, scale: float) -> tuple[Floats, int, int]:
+def reach(steps: Floats) -> float:
+    """Return how far a point is from the nearest sample at most, with a margin."""
+    return float(np.linalg.norm(steps)) / 2 * MARGIN
+
+
+def look_near_walls(values: SampleArray, scale: float, steps: Floats) -> tuple[Floats, int, int]:
     """Return patches near 0, and how many walls pass between samples, and without thickness.
 
     Parameters
@@ -94,6 +100,8 @@ def look_near_walls(values: SampleArray, scale: float) -> tuple[Floats, int, int
         Samples.
     scale : float
         Their factor to spacings, positive outside.
+    steps : (3,) float
+        The spacings of the axes, over the coarsest.
 
     Returns
     -------
@@ -103,23 +111,23 @@ def look_near_walls(values: SampleArray, scale: float) -> tuple[Floats, int, int
         Of all lines along the axes; and those of them with less than ``NO_THICKNESS``.
     """
     found: list[Floats] = []
-    counts = np.zeros(2, np.int64)
+    counts, near = np.zeros(2, np.int64), reach(steps)
     for i in range(1, len(values) - 1):
         slab = np.asarray(values[i - 1 : i + 3], np.float64) * scale
-        if slab[1:3].min() <= REACH:
-            for lines in (slab, slab[1], slab[1].T):
-                thickness = find_walls(lines)[1]
+        if slab[1:3].min() <= near:
+            for lines, step in zip((slab, slab[1], slab[1].T), steps):
+                thickness = find_walls(lines / step)[1]
                 counts += np.array([len(thickness), (thickness < NO_THICKNESS).sum()])
-            found += _patches_near(slab[:3])
+            found += _patches_near(slab[:3], near)
     some = np.unique(np.linspace(0, max(len(found) - 1, 0), CANDIDATES).astype(int))
     patches = np.array([found[n] for n in some] if found else []).reshape(-1, 27)
     return patches, int(counts[0]), int(counts[1])
 
 
-def _patches_near(slab: Floats) -> list[Floats]:
+def _patches_near(slab: Floats, limit: float) -> list[Floats]:
     """Return the patches of some inner samples near 0 of the middle one of three planes."""
     inner = slab[1, 1:-1, 1:-1]
-    near = np.argwhere(inner <= REACH)
+    near = np.argwhere(inner <= limit)
     if not len(near):
         return []
     order = np.argsort(inner[tuple(near.T)])
@@ -151,14 +159,14 @@ def find_walls(lines: Floats) -> tuple[BoolArray, Floats]:
     return walls, thickness[walls]
 
 
-def _are_distances(patches: Floats) -> bool:
+def _are_distances(patches: Floats, steps: Floats) -> bool:
     """Return whether most samples change by no more than distances can."""
     change = np.abs(patches - patches[:, CENTRE, None])
-    most = LIPSCHITZ * np.linalg.norm(NEIGHBOURHOOD, axis=1) + NO_THICKNESS
+    most = LIPSCHITZ * np.linalg.norm(NEIGHBOURHOOD * steps, axis=1) + NO_THICKNESS
     return bool((change <= most).all(1).mean() >= LIPSCHITZ_SHARE)
 
 
-def _touch_walls(patches: Floats) -> bool:
+def _touch_walls(patches: Floats, steps: Floats) -> bool:
     """Return whether most samples' spheres touch a point that lies in none of the others.
 
     The direction to it is that in which the field falls, measured on the far side of each sample:
@@ -166,16 +174,16 @@ def _touch_walls(patches: Floats) -> bool:
     """
     centre = patches[:, CENTRE, None]
     after, before = patches[:, CENTRE + STRIDES], patches[:, CENTRE - STRIDES]
-    rise = np.where(after > before, after - centre, centre - before)
+    rise = np.where(after > before, after - centre, centre - before) / steps
     length = np.maximum(np.linalg.norm(rise, axis=1), np.finfo(float).tiny)[:, None]
     feet = -rise / length * centre
-    depth = patches - np.linalg.norm(feet[:, None] - NEIGHBOURHOOD, axis=2)
+    depth = patches - np.linalg.norm(feet[:, None] - NEIGHBOURHOOD * steps, axis=2)
     deepest = np.delete(depth, CENTRE, axis=1).max(1)
     rises = (length[:, 0] >= LEAST_RISE) & (length[:, 0] <= MOST_RISE)
     return bool((rises & (np.abs(deepest) <= TOUCHING)).mean() >= TOUCHING_SHARE)
 
 
-def _is_cut_off(values: SampleArray, scale: float) -> bool:
+def _is_cut_off(values: SampleArray, scale: float, steps: Floats) -> bool:
     """Return whether walls cut deep samples off from the farthest sample of the border."""
     coarse = _every_nth(values, scale)
     border = coarse.copy()
@@ -184,8 +192,8 @@ def _is_cut_off(values: SampleArray, scale: float) -> bool:
     reached.flat[border.argmax()] = True
     before = 0
     while before != (before := int(reached.sum())):
-        for axis in range(3):
-            _spread(np.moveaxis(reached, axis, 0), np.moveaxis(coarse, axis, 0))
+        for axis, step in enumerate(steps):
+            _spread(np.moveaxis(reached, axis, 0), np.moveaxis(coarse, axis, 0), FREE * step)
     return bool((coarse[~reached] >= DEEP).any())
 
 
@@ -198,9 +206,9 @@ def _every_nth(values: SampleArray, scale: float) -> Floats:
     return np.array(planes, np.float64) * (scale / step)
 
 
-def _spread(reached: BoolArray, samples: Floats) -> None:
+def _spread(reached: BoolArray, samples: Floats, limit: float) -> None:
     """Extend what is reached along the first axis, both ways, where no wall passes between."""
-    free = samples[1:] + samples[:-1] > FREE
+    free = samples[1:] + samples[:-1] > limit
     for i in range(len(free)):
         reached[i + 1] |= reached[i] & free[i]
     for i in range(len(free) - 1, -1, -1):

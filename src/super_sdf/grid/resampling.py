@@ -33,6 +33,7 @@ NEAR = 3.5  # new spacings from the surface, up to which values are kept within 
 REACH = 4  # samples across the line, from which on they do not bound a value
 OFFSETS = [(j, k) for j, k in product(range(-REACH, REACH + 1), repeat=2) if j * j + k * k <= 16]
 MARGIN = 2.0  # the slope is as near to the mean of the differences along the line as they are
+STEEP = 0.25  # the least slope with which a field falls towards a wall and rises behind it
 EXTRA = 2  # samples beyond a cell, on either side, that its slopes depend on
 ON_SAMPLE = 1e-3  # spacings from a sample, up to which a new sample takes its value
 MOST = 1e12  # spacings: larger values are cut off, so that squares do not overflow
@@ -176,12 +177,31 @@ class Lines:
             if cell != before:
                 first = slopes[1] if cell == before + 1 else self.slope(cell)
                 before, slopes = cell, (first, self.slope(cell + 1))
-            values[n] = hermite(low, high, slopes[0] * self.h, slopes[1] * self.h, share)
+            smooth = hermite(low, high, slopes[0] * self.h, slopes[1] * self.h, share)
+            values[n] = self._with_walls(cell, share, level, smooth)
             reach = near + share * self.h, near + (1 - share) * self.h
             is_near[n] = (np.abs(low - level) < reach[0]) & (np.abs(high - level) < reach[1])
         which = np.nonzero(is_near)
         values[which] = self._bounded(values[which], cells[which[0]], shares[which[0]], which[1:])
         return values
+
+    def _with_walls(self, cell: int, share: float, level: float, smooth: Floats) -> Floats:
+        """Return values between samples ``cell`` and the next, (p, q), through thin walls, too.
+
+        If the field falls towards the surface, rises behind it, and neither sample is within, the
+        straight lines from both sides meet beyond the surface: there is a wall. ``smooth`` is the
+        value elsewhere.
+        """
+        before, low, high, after = (self._sample(cell + n) - level for n in range(-1, 3))
+        side = np.sign(low)
+        low, high = low * side, high * side
+        falling = np.minimum(before * side - low, self.h)
+        rising = np.minimum(after * side - high, self.h)
+        is_wall = (high > 0) & (np.minimum(falling, rising) > STEEP * self.h)
+        is_wall &= low * rising + high * falling <= falling * rising  # the lines meet beyond 0
+        wall = np.maximum(low - falling * share, high - rising * (1 - share))
+        walled: Floats = np.where(is_wall, wall * side + level, smooth)
+        return walled
 
     def slope(self, i: int) -> Floats:
         """Return the slope along the lines at sample i, (p, q), as distances allow it."""
