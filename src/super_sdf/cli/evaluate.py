@@ -22,6 +22,7 @@ EXAMPLES = """\b
 Examples:
   super-sdf evaluate meshes/ --out report/
   super-sdf evaluate meshes/ --sizes 32 64 --experiments noise factors --out report/
+  super-sdf evaluate meshes/ --sizes 32 --experiments fields --kinds mask --out report/
   super-sdf evaluate a.ply b.ply --sizes 32 --peers rfta --out report/
 """
 # Options that the plan takes as they are, and lists, from which repeated entries are dropped.
