@@ -283,14 +283,16 @@ def figures(**changed: object) -> Measurement:
     return {**known, **counts, "error": None, "notes": [], **changed}
 
 
-def made_up(meshes: Path, out: Path, **changed: dict) -> Results:
-    """Return results of masks and exact grids; ``changed`` has entries by shape, then method."""
+def made_up(
+    meshes: Path, out: Path, kinds: tuple[str, ...] = ("exact", "mask"), **changed: dict
+) -> Results:
+    """Return made-up results of some kinds; ``changed`` has entries by shape, then method."""
     scope = Scope(
         find_meshes([meshes]),
         sizes=(32,),
         methods=("mc",),
         experiments=("fields",),
-        kinds=("exact", "mask"),
+        kinds=kinds,
     )
     store, tasks = Store(out / "results.jsonl"), scope.tasks()
     for task in tasks:
@@ -320,6 +322,23 @@ def test_the_tables_have_a_row_for_each_kind_and_method(meshes, tmp_path):
     assert "Further from the truth than MC, mask: ball (0.6400, MC 0.3200)." in lines
     assert "Refused, exact: egg: no good." in lines
     assert "Pieces of the references, of 3 shapes together: 3." in lines
+
+
+def test_unequal_spacings_are_compared_with_the_coarsest_on_all_axes(meshes, tmp_path):
+    changed = {
+        "ball": {"ours on spacing 1:1:5, y": {"p2s": 0.03}},
+        "egg": {"ours on exact": {"p2s": 0.04}, "mc on spacing 1:1:5, x": {"p2s": 0.05}},
+    }
+    text = field_section(made_up(meshes, tmp_path, ("exact", "unequal"), **changed))
+    assert "| spacing 1:1:5 | super-sdf | 9 | 0.3911 | 0.9600 |" in text
+    assert (
+        "spacing 1:1:5, error over that of super-sdf with the coarsest spacing on all axes, at "
+        "most: MC 1.25 (egg); by hand to the coarsest spacing, cubic spline, super-sdf 1.00 (box); "
+        "super-sdf 3.00 (ball)." in text
+    )
+    (tmp_path / "alone").mkdir()
+    alone = field_section(made_up(meshes, tmp_path / "alone", ("unequal",)))
+    assert "error over" not in alone
 
 
 def test_a_failure_on_a_kind_leaves_the_main_table_alone(meshes, tmp_path):

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from .cases import Setting
-from .field_kinds import KINDS, kinds_at
+from .field_kinds import KINDS, Kind, kinds_at
 from .measuring import Measurement
 from .names import FIELD_METHOD_LABELS, OURS, on_kind
 from .results import Results
@@ -39,11 +39,14 @@ class OnKind:
         Measurements of each method, in the same order of grids, without the refused ones.
     refused : list
         Measurements of super-sdf on the grids that it refused.
+    is_cubic : bool
+        Whether the spacing is the same on all axes.
     """
 
     title: str
     by_method: dict[str, list[Measurement]]
     refused: list[Measurement]
+    is_cubic: bool
 
 
 def field_section(results: Results) -> str:
@@ -61,8 +64,8 @@ def size_part(results: Results, size: int) -> str:
         [one.title, *method_row(one, method, size)] for one in found for method in one.by_method
     ]
     titles = ["values", "method", "grids", *FIGURES, *COUNTS]
-    references = reference_line(found)
-    lines = [*references, *(line for one in found for line in lines_of(one, size))]
+    lines = [*reference_line(found), *equal_spacing_lines(found)]
+    lines += [line for one in found for line in lines_of(one, size)]
     return "\n\n".join([f"**{size}^3**", markdown(titles, rows), *lines])
 
 
@@ -73,7 +76,7 @@ def measured_on_kinds(results: Results, size: int) -> list[OnKind]:
     for title in dict.fromkeys(KINDS[name].title for name in names):
         alike = [name for name in names if KINDS[name].title == title]
         grids = [grid for name in alike for grid in measured_on(results, Setting(size), name)]
-        found.append(by_method(title, KINDS[alike[0]].methods, grids))
+        found.append(on_kind_of(KINDS[alike[0]], grids))
     return found
 
 
@@ -88,13 +91,12 @@ def measured_on(results: Results, setting: Setting, kind: str) -> list[dict[str,
     return [{method: rows[method][name] for method in methods} for name in shapes]
 
 
-def by_method(
-    title: str, methods: Sequence[str], grids: Sequence[dict[str, Measurement]]
-) -> OnKind:
+def on_kind_of(kind: Kind, grids: Sequence[dict[str, Measurement]]) -> OnKind:
     """Return measurements by method, those of refused grids apart."""
     refused = [grid[OURS] for grid in grids if grid[OURS].get("refused")]
     taken = [grid for grid in grids if not grid[OURS].get("refused")]
-    return OnKind(title, {m: [grid[m] for grid in taken] for m in methods}, refused)
+    by_method = {method: [grid[method] for grid in taken] for method in kind.methods}
+    return OnKind(kind.title, by_method, refused, kind.is_cubic)
 
 
 def method_row(one: OnKind, method: str, size: int) -> list[str]:
@@ -144,6 +146,37 @@ def lines_of(one: OnKind, size: int) -> list[str]:
         f"Refused, {one.title}: {', '.join(shapes)}: {reason}."
         for reason, shapes in reasons.items()
     ]
+
+
+def equal_spacing_lines(found: Sequence[OnKind]) -> list[str]:
+    """Return lines that compare unequal spacings with the coarsest one on all axes.
+
+    That grid has fewer samples, so a larger error than there is a loss.
+    """
+    base = {
+        row["shape"]: row["p2s"]
+        for one in found
+        for row in one.by_method[OURS]
+        if one.title == "exact" and row["p2s"] > 0
+    }
+    lines = []
+    for one in found if base else ():
+        worst = "; ".join(worst_ratio(one, method, base) for method in one.by_method)
+        if not one.is_cubic and one.by_method[OURS]:
+            what = "error over that of super-sdf with the coarsest spacing on all axes"
+            lines.append(f"{one.title}, {what}, at most: {worst}.")
+    return lines
+
+
+def worst_ratio(one: OnKind, method: str, base: Mapping[str, float]) -> str:
+    """Return the largest error of a method over that of the same shape in ``base``, and where."""
+    ratios = [
+        (row["p2s"] / base[row["shape"]], row["shape"])
+        for row in one.by_method[method]
+        if row["shape"] in base
+    ]
+    ratio, shape = max(ratios, default=(float("nan"), "-"))
+    return f"{FIELD_METHOD_LABELS[method]} {ratio:.2f} ({shape})"
 
 
 def reference_line(found: Sequence[OnKind]) -> list[str]:
