@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from ..evaluation.names import EXPERIMENTS, METHOD_LABELS, PEER_LABELS
+from ..evaluation.names import EXPERIMENTS, FIELD_GROUPS, METHOD_LABELS, PEER_LABELS
 from ..machine.extras import check_modules
 from ..pictures.choices import AXES
 from .choices import LazyDefault, convert_default, default_quality
@@ -22,6 +22,7 @@ EXAMPLES = """\b
 Examples:
   super-sdf evaluate meshes/ --out report/
   super-sdf evaluate meshes/ --sizes 32 64 --experiments noise factors --out report/
+  super-sdf evaluate meshes/ --sizes 32 --experiments fields --kinds mask --out report/
   super-sdf evaluate a.ply b.ply --sizes 32 --peers rfta --out report/
 """
 # Options that the plan takes as they are, and lists, from which repeated entries are dropped.
@@ -35,7 +36,7 @@ NUMBERS = (
     "turned",
     "peer_meshes",
 )
-LISTS = ("sizes", "experiments", "peers")
+LISTS = ("sizes", "experiments", "kinds", "peers")
 
 
 class ListCommand(click.Command):
@@ -122,6 +123,16 @@ def accepts(option: click.Option, word: str, ctx: click.Context) -> bool:
     default=10,
     show_default=True,
     help="Number of shapes for the experiments, spread over the list.",
+)
+@click.option(
+    "--kinds",
+    multiple=True,
+    type=click.Choice(FIELD_GROUPS),
+    default=FIELD_GROUPS,
+    show_default="all",
+    metavar="NAME...",
+    help=f"Kinds of grids that the experiment 'fields' makes from the exact samples: "
+    f"{', '.join(FIELD_GROUPS)}.",
 )
 @click.option(
     "--peers",

@@ -5,4 +5,7 @@ the extra ``view`` (PyVista). The command is ``super-sdf evaluate``.
 
     scope -> tasks -> runner -> measuring (cases, methods, peers, metrics) -> store -> results
     -> tables, plots -> report
+
+Grids that are not exact distances: field_kinds makes them, field_methods meshes them, and
+field_tables has their tables.
 """

@@ -32,7 +32,7 @@ from .edges import EdgeCurves
 BYTES_PER_NODE = 20
 
 # Streams of random numbers, each seeded by the shape's name and its own number.
-REFERENCE_POINTS, REFERENCE_EDGES, RESULT_POINTS, NOISE, RESULT_EDGES, TURN = range(6)
+REFERENCE_POINTS, REFERENCE_EDGES, RESULT_POINTS, NOISE, RESULT_EDGES, TURN, FIELD_NOISE = range(7)
 
 
 LARGEST_SIZE = 100_000  # samples along an axis; a larger grid fits into no memory

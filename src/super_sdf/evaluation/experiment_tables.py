@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import product
-from pathlib import Path
 
 from ..steps.mesher_names import MESHERS
 from . import published
 from .cases import Setting
+from .field_tables import field_section
 from .measuring import Measurement
 from .names import (
     LABELS,
@@ -41,6 +41,7 @@ from .tables import (
     mean_of,
     mean_row,
     percent,
+    title_of,
 )
 from .timing import RUNS, describe_machine
 
@@ -145,6 +146,7 @@ SECTIONS = {
     "iterated": iterated_section,
     "scale": scale_section,
     "meshers": mesher_section,
+    "fields": field_section,
 }
 
 
@@ -170,11 +172,6 @@ def timing_section(timings: Mapping[int, Sequence[Measurement]]) -> str:
             markdown(titles, rows),
         ]
     )
-
-
-def title_of(title: str, paths: Sequence[Path]) -> str:
-    """Return the heading of an experiment's section."""
-    return f"## {title}, {len(paths)} shapes"
 
 
 def gain(one: float | None, other: float | None) -> float | None:

@@ -5,9 +5,10 @@ Each takes a case and a network, which only ours uses, and returns a surface.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -42,12 +43,13 @@ class Surface:
 
     ``field`` returns the values at the fine nodes, (K n + 1)^3, known at least in the band. It is
     a function so that it is not computed while the method is timed. ``seconds`` is how long a mesh
-    took that was made in an earlier run.
+    took that was made in an earlier run. ``facts`` are further entries of the measurement.
     """
 
     mesh: Mesh
     field: Callable[[], FloatArray] | None = None
     seconds: float | None = None
+    facts: Mapping[str, Any] | None = None
 
 
 Method = Callable[[Case, Decoder], Surface]

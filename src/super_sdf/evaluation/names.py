@@ -23,7 +23,26 @@ METHOD_LABELS = {
 }
 PEER_LABELS = {"rfta": "RFTA", "dual-contouring": "dual contouring of distances"}
 
-EXPERIMENTS = ("factors", "noise", "iterated", "scale", "timings", "meshers")
+EXPERIMENTS = ("factors", "noise", "iterated", "scale", "timings", "meshers", "fields")
+
+# What is done with grids that are not exact distances. Their names end in " on " and the kind.
+WIDTHS = (0.5, 0.8, 1.2)  # voxels, of the Gaussians by which masks are smoothed
+BY_HAND_LABELS = {
+    "linear-finest": "by hand to the finest spacing, linear, super-sdf",
+    "spline-finest": "by hand to the finest spacing, cubic spline, super-sdf",
+    "spline-coarsest": "by hand to the coarsest spacing, cubic spline, super-sdf",
+}
+FIELD_METHOD_LABELS = {
+    "mc": METHOD_LABELS["mc"],
+    "mc-distances": "MC of SciPy's distance transform",
+    **{f"mc-gaussian-{width:g}": f"MC, Gaussian of {width:g} voxels" for width in WIDTHS},
+    "bspline": METHOD_LABELS["bspline"],
+    **BY_HAND_LABELS,
+    OURS: METHOD_LABELS[OURS],
+}
+ON = " on "
+# Groups of kinds of grids, of which the experiment "fields" may measure some.
+FIELD_GROUPS = ("exact", "mask", "truncated", "scaled", "density", "noisy", "unequal")
 
 MESHED = (OURS, "bound")  # the methods that every mesher is measured with
 
@@ -44,6 +63,16 @@ def simplified(method: str, share: int) -> str:
 def matched(method: str, peer: str) -> str:
     """Return the name of a method whose mesh is simplified to as many triangles as a peer's."""
     return f"{method}/{peer}"
+
+
+def on_kind(method: str, kind: str) -> str:
+    """Return the name of a method on a kind of grid: see ``field_kinds.KINDS``."""
+    return f"{method}{ON}{kind}"
+
+
+def is_of_our_code(method: str) -> bool:
+    """Return whether a measurement depends on the code and the network of this package."""
+    return method.split(ON)[0] in OF_OUR_CODE
 
 
 OURS_MESHED = {mesher: meshed_by(OURS, mesher) for mesher in MESHERS}
@@ -68,6 +97,7 @@ LABELS = {
 # of the bound with meshers that are this package's. (Its marching cubes is scikit-image's.)
 OF_OUR_CODE = (
     PROCESS,
+    *BY_HAND_LABELS,
     *OURS_LABELS,
     *SIMPLIFIED,
     *MATCHED,

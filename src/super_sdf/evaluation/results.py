@@ -10,11 +10,20 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from .cases import Setting
+from .field_methods import FIELD_METHODS
 from .measuring import NO_SETTING, Measurement, Task
 from .names import FLOOR
 from .runner import LeftOut
 from .scope import Scope
 from .store import Store
+
+MOST_NAMED = 8  # methods that a line lists
+
+
+def shortened(names: Sequence[str]) -> str:
+    """Return names with commas; of many the first, and the number of the others."""
+    more = len(names) - MOST_NAMED
+    return ", ".join([*names[:MOST_NAMED], *([f"{more} more"] if more > 0 else [])])
 
 
 class Results:
@@ -35,16 +44,20 @@ class Results:
     ) -> None:
         self.scope, self.tasks, self.store = scope, tasks, store
         failures = list(self._failures(tasks))
-        self.left_out = [*left_out, *(LeftOut(task.path.stem, reason) for task, reason in failures)]
+        self.left_out = [*left_out, *(LeftOut(t.path.stem, reason) for t, _, reason in failures)]
         self.failed: dict[Setting, set[str]] = {}
-        for task, _ in failures:
-            if task.limit is None:  # not of a peer: each is compared on the shapes it finished
+        for task, methods, _ in failures:
+            # Not of a peer or a kind of grid: these are compared on the shapes that they finished.
+            if task.limit is None and not FIELD_METHODS.keys() >= set(methods):
                 self.failed.setdefault(task.setting, set()).add(task.path.stem)
         rows = [store.get(task, FLOOR) for task in tasks if FLOOR in task.methods]
         self.floors = {row["shape"]: row for row in rows if row and row["error"] is None}
 
-    def _failures(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, str]]:
-        """Yield each task with failures and why; what ran out of time is in the peers' table."""
+    def _failures(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, list[str], str]]:
+        """Yield each task with the methods that failed for a reason, and the reason in words.
+
+        What ran out of time is in the peers' table.
+        """
         for task in tasks:
             methods: dict[str, list[str]] = {}
             for method in task.methods:
@@ -52,7 +65,7 @@ class Results:
                 if row and row["error"] is not None and row.get("limit") is None:
                     methods.setdefault(row["error"], []).append(method)
             for reason, names in methods.items():
-                yield task, f"{', '.join(names)} ({task.setting}): {reason}"
+                yield task, names, f"{shortened(names)} ({task.setting}): {reason}"
 
     def names(self, paths: Sequence[Path]) -> list[str]:
         """Return the names of the shapes among the paths that were measured."""

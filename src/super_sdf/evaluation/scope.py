@@ -11,9 +11,11 @@ from ..errors import FileError, OptionError, seen
 from ..files.regular import check_regular_file
 from ..steps.mesher_names import MESHERS
 from .cases import Setting
+from .field_kinds import kinds_at, methods_on
 from .measuring import NO_SETTING, Task, digest_of_file, digest_of_ours
 from .names import (
     EXPERIMENTS,
+    FIELD_GROUPS,
     FLOOR,
     MESHED,
     METHOD_LABELS,
@@ -51,6 +53,8 @@ class Scope:
         A shipped network or an ONNX file.
     experiments : tuple of str
         Some of ``EXPERIMENTS``, measured on ``experiment_shapes`` of the shapes.
+    kinds : tuple of str
+        Some of ``FIELD_GROUPS``: what the experiment "fields" measures.
     peers : tuple of str
         Some of ``PEERS``, measured at ``peer_size`` on ``peer_shapes`` of the shapes, each within
         ``peer_limit`` seconds.
@@ -77,6 +81,7 @@ class Scope:
     threads: int = 1
     turned: int | None = None
     peer_meshes: Path | None = None
+    kinds: tuple[str, ...] = FIELD_GROUPS
 
     def check(self) -> None:
         """Raise OptionError if a number is out of range, or there is nothing to measure."""
@@ -110,7 +115,7 @@ class Scope:
         for setting in self.settings():
             wanted += [(path, (setting, self.methods)) for path in self.paths]
         for name in self.experiments:
-            pairs = experiment(name, self.sizes)
+            pairs = experiment(name, self.sizes, self.kinds)
             wanted += [(path, pair) for pair in pairs for path in self.experiment_paths()]
         # Ours and the coarse mesh stand beside the peers.
         names = ("mc", "bspline", *OURS_MESHED.values())
@@ -146,11 +151,13 @@ class Scope:
         ]
 
 
-def experiment(name: str, sizes: Sequence[int]) -> list[MethodsIn]:
-    """Return the settings and methods of an experiment.
+def experiment(
+    name: str, sizes: Sequence[int], kinds: Sequence[str] = FIELD_GROUPS
+) -> list[MethodsIn]:
+    """Return the settings and methods of an experiment; "fields" measures these groups of kinds.
 
-    "scale" and "meshers" are at the sizes of the main table. "timings" has none: whole processes
-    are timed one at a time (see ``timing``).
+    "scale", "meshers" and "fields" are at the sizes of the main table. "timings" has none: whole
+    processes are timed one at a time (see ``timing``).
     """
     refined = ("bspline", OURS, "bound")
     if name == "factors":
@@ -166,6 +173,8 @@ def experiment(name: str, sizes: Sequence[int]) -> list[MethodsIn]:
         methods = tuple(meshed_by(method, mesher) for mesher in MESHERS for method in MESHED)
         pairs = [(Setting(n, factor), methods) for n, factor in mesher_settings(sizes)]
         return [*pairs, (Setting(min(sizes), SIMPLIFIED_FACTOR), tuple(SIMPLIFIED))]
+    if name == "fields":
+        return [(Setting(n), methods_on(kinds_at(n, sizes, kinds))) for n in sizes]
     if name == "timings":
         return []
     raise OptionError(f"experiment is {name!r}: give one of {', '.join(EXPERIMENTS)}")

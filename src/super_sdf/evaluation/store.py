@@ -11,7 +11,7 @@ from typing import Any
 
 from ..errors import WriteError
 from ..machine.records import RecordFile
-from .measuring import NUMBERS, OPTIONAL_NUMBERS, PROTOCOL, Measurement, Task
+from .measuring import NUMBERS, OPTIONAL_NUMBERS, PROTOCOL, TEXTS, Measurement, Task
 from .names import PROCESS
 
 # The key of a row, with types; everything else in a row are figures.
@@ -93,6 +93,7 @@ def is_row(record: Any) -> bool:
     return (
         all(is_number(record.get(name)) for name in NUMBERS)
         and all(is_number(record.get(name) or 0) for name in OPTIONAL_NUMBERS)
+        and all(isinstance(record.get(name) or "", str) for name in TEXTS)
         and isinstance(notes, list)
         and all(isinstance(note, str) for note in notes)
     )

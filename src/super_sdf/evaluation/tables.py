@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -68,6 +69,11 @@ def markdown(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a table with its first column aligned left and the others right."""
     head = [f"| {' | '.join(titles)} |", "| --- " + "| ---: " * (len(titles) - 1) + "|"]
     return "\n".join(head + [f"| {' | '.join(row)} |" for row in rows])
+
+
+def title_of(title: str, paths: Sequence[Path]) -> str:
+    """Return the heading of an experiment's section."""
+    return f"## {title}, {len(paths)} shapes"
 
 
 def mean_of(rows: Sequence[Measurement], key: str) -> float | None:
