@@ -410,7 +410,7 @@ def test_derived_planes_are_made_when_they_are_read(monkeypatch):
 
 def test_noise_is_told_from_a_wrong_slope():
     for values, noisy_, scaled in ((noisy(box()), True, False), (smooth_union(), False, True)):
-        found = weigh(look(values, (values.min(), values.max())), 1.0)
+        found = weigh(look(values, (values.min(), values.max())), (1.0, 1.0, 1.0))
         assert (found.is_noisy, found.is_scaled) == (noisy_, scaled)
 
 
@@ -444,24 +444,3 @@ def test_a_list_of_batch_takes_what_the_values_are(tmp_path, command):
     assert command(*run)[0] == 0
     row = json.loads((tmp_path / "out" / "report.jsonl").read_text())
     assert row["field"]["kind"] == "mask" and row["closed"]
-
-
-@pytest.mark.parametrize(
-    "options, name",
-    [
-        ({"label": 1}, "a mask"),
-        ({"field": "mask"}, "a mask"),
-        ({"level": 0.5}, "a field of densities"),
-    ]
-    + [({"field": kind}, f"a {kind} field") for kind in ("scaled", "truncated")],
-)
-def test_other_kinds_need_equal_spacings(options, name):
-    values = np.zeros((8, 8, 8)) if "label" in options else np.full((8, 8, 8), 0.2)
-    values[2:6, 2:6, 2:6] = 1 if "label" in options or "level" in options else -0.3
-    values[3:5, 3:5, 3:5] -= 0 if "label" in options else 0.1
-    with pytest.raises(GridError) as error:
-        make_grid(values, spacing=(1, 1, 2.5), **options)
-    assert str(error.value) == (
-        f"spacing is 1, 1, 2.5: {name} needs the same spacing on all axes; resample it, or make "
-        "distances of it first"
-    )

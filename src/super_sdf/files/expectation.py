@@ -65,12 +65,12 @@ def expect(
 
 
 def count_on_lattice(grid: SdfGrid, offset: float, *, cap: bool = False) -> float:
-    """Estimate how many edges of the grid's cubic lattice the offset surface crosses.
+    """Estimate how many edges of the lattice that is refined the offset surface crosses.
 
     Edges along an axis are as many as the cells of a plane across it.
     """
     counts = count_crossings(grid, offset, cap=cap)
-    if grid.is_cubic:
+    if grid.is_cubic or grid.field.on_lattice:
         return sum(counts)
     h, cell = grid.voxel_size, prod(grid.spacing)
     return sum(count * cell / step / h**2 for count, step in zip(counts, grid.spacing))

@@ -16,12 +16,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray
+from ..arrays import BoolArray, FloatArray, Triple
 from .planes import DerivedPlanes, SampleArray
 from .samples import Extremes
+from .spacing import is_cubic
 
 LEAST_LINES = 20  # samples beside the surface from which a distance transform is recognised
 MOST_SQUARE = 50  # up to this, squares of rounded distances are still near whole numbers
+# Distances between samples up to so many spacings apart are looked at; their error, in spacings.
+NEAR_SAMPLES, LATTICE_ERROR = 4, 1e-3
 REACH = 4  # voxels; patches are clipped to 3 (``steps.band.PATCH_LIMIT``), and half of one goes off
 
 
@@ -80,7 +83,7 @@ def has_both_sides(inside: SampleArray) -> bool:
     return False
 
 
-def is_distance_transform(lines: NDArray[np.float64]) -> float:
+def is_distance_transform(lines: NDArray[np.float64], spacing: Triple | None = None) -> float:
     """Return the spacing of a distance transform of a mask, 0 if values cannot be one.
 
     Beside the surface all samples of a side have the same value: 1 spacing to the nearest sample of
@@ -91,9 +94,14 @@ def is_distance_transform(lines: NDArray[np.float64]) -> float:
     ----------
     lines : (n, 3, 5) float64
         Five samples in a row along each axis, round samples beside the surface.
+    spacing : three floats, optional
+        The spacing of each axis, if it is known. If they differ, distances between samples are
+        recognised, too; the finest spacing is returned.
     """
     if len(lines) < LEAST_LINES:
         return 0.0
+    if spacing is not None and not is_cubic(spacing) and _are_between_samples(lines, spacing):
+        return min(spacing)
     centre = lines[:, 0, 2]
     above, below = centre[centre > 0], centre[centre <= 0]
     if not len(above) or not len(below) or not (_are_equal(above) and _are_equal(below)):
@@ -106,6 +114,24 @@ def is_distance_transform(lines: NDArray[np.float64]) -> float:
         if np.allclose([high / h, low / h], starts, atol=1e-3) and _on_lattice(lines / h, less):
             return h
     return 0.0
+
+
+def _are_between_samples(lines: NDArray[np.float64], spacing: Triple) -> bool:
+    """Return whether values are distances between samples with unequal spacings, or 0 on one side.
+
+    No sample is nearer to one of the other side than the finest spacing.
+    """
+    steps = np.array(spacing) / min(spacing)
+    size = np.abs(lines) / min(spacing)
+    signed = bool((lines < 0).any() and (lines > 0).any())
+    if not size.any() or (signed and not size.all()) or size[size > 0].min() < 1 - LATTICE_ERROR:
+        return False
+    whole = np.indices((NEAR_SAMPLES + 1,) * 3).reshape(3, -1).T
+    between = np.sort(np.sqrt(((whole * steps) ** 2).sum(1)))
+    near = size[size <= NEAR_SAMPLES]
+    after = np.searchsorted(between, near).clip(1)
+    apart = np.minimum(np.abs(between[after] - near), np.abs(near - between[after - 1]))
+    return bool((apart <= LATTICE_ERROR).all())
 
 
 def _are_equal(values: NDArray[np.float64]) -> bool:

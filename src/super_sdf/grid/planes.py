@@ -272,3 +272,14 @@ class DerivedPlanes(SamplePlanes):
             return np.empty((0, *self.shape[1:]), self.dtype)
         made = np.asarray(self.make(np.asarray(self.source[low:high])), self.dtype)
         return made[first - low : last - low]
+
+
+def changed(
+    samples: SampleArray,
+    change: Callable[[NDArray[Any]], NDArray[Any]],
+    dtype: DTypeLike = np.float64,
+) -> DerivedPlanes:
+    """Return samples changed one by one, each for itself; as float64 they are changed as such."""
+    if dtype is np.float64:
+        return DerivedPlanes(samples, lambda planes: change(planes.astype(np.float64)))
+    return DerivedPlanes(samples, change, dtype=dtype)

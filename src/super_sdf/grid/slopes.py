@@ -21,21 +21,21 @@ LEAST_WEIGHT = 1e-3
 FLAT, STEEP = 0.25, 4.0  # local slopes over the typical one
 
 
-def normalised_planes(values: SampleArray, h: float, slope: float) -> DerivedPlanes:
-    """Return values over their local slope, made plane by plane.
+def normalised_planes(values: SampleArray, h: float, change: float) -> DerivedPlanes:
+    """Return values over their local slope, made plane by plane: distances on the lattice.
 
     Parameters
     ----------
     values : (nx, ny, nz) array or Planes
         Samples.
     h : float
-        The spacing.
-    slope : float
-        The typical change from sample to sample, over the spacing.
+        What a step of the lattice is in the result: the spacing.
+    change : float
+        The typical change of the values from sample to sample.
     """
 
     def make(planes: NDArray[Any]) -> NDArray[np.float64]:
-        scaled = in_spacings(planes, h * slope)
+        scaled = in_spacings(planes, change)
         return (scaled / local_slopes(scaled)).astype(np.float64) * h
 
     return DerivedPlanes(values, make, AROUND + 2)
