@@ -12,12 +12,20 @@ from numpy.typing import ArrayLike
 
 from . import distances, masking
 from .evidence import Looked, is_normalised, look, weigh
-from .field import EXACT, MASK, NOISY, SCALED, Wanted
+from .field import AUTO, EXACT, MASK, NOISY, SCALED, TRUNCATED, Wanted
 from .masks import is_distance_transform
 from .one_sided import is_one_sided
 from .planes import SampleArray, changed
 from .request import Interpreted, Request
-from .samples import Extremes, check_kind, check_not_constant, check_values, has_two_values
+from .samples import (
+    Extremes,
+    check_kind,
+    check_not_constant,
+    find_extremes,
+    has_two_values,
+    not_finite,
+)
+from .unknown import filled
 
 
 def interpret(
@@ -40,7 +48,7 @@ def interpret(
     if samples.dtype == np.bool_:
         return masking.of_mask(samples, request, notes)
     samples, request = _about_zero(samples, request, notes)
-    extremes = check_values(samples)
+    samples, extremes = _known(samples, request, notes)
     check_not_constant(extremes)
     if has_two_values(samples, extremes):
         middle = 0.0 if request.is_density else sum(extremes) / 2
@@ -65,6 +73,19 @@ def _about_zero(
     if scale is not None:
         samples = changed(samples, partial(np.multiply, float(scale)))
     return samples, request
+
+
+def _known(
+    samples: SampleArray, request: Request, notes: list[str]
+) -> tuple[SampleArray, Extremes]:
+    """Return samples, those that are unknown filled in, and the smallest and the largest."""
+    extremes = find_extremes(samples)
+    if extremes is not None:
+        return samples, extremes
+    is_long = samples.dtype.itemsize > 8  # long doubles may be infinite as float64 only
+    if is_long or request.wanted.field not in (AUTO, TRUNCATED):
+        raise not_finite(samples)
+    return filled(samples, notes)
 
 
 def _by_evidence(
