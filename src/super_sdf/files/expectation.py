@@ -16,6 +16,7 @@ import numpy as np
 
 from ..arrays import BoolArray
 from ..errors import WriteError
+from ..grid.planes import SamplePlanes
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import in_words
 from .meshes import format_of
@@ -97,10 +98,11 @@ def count_crossings(grid: SdfGrid, offset: float, *, cap: bool = False) -> tuple
 
 def _planes(grid: SdfGrid, offset: float) -> Iterator[BoolArray]:
     """Yield a mask of the samples inside, plane by plane, since the grid may be in a file."""
-    for i in range(grid.shape[0]):
+    step = grid.samples.block if isinstance(grid.samples, SamplePlanes) else 1
+    for first in range(0, grid.shape[0], step):
         with np.errstate(over="ignore"):  # an offset beyond float32 is beyond all values
-            inside = grid.planes(i, i + 1)[0] <= offset
-        yield inside
+            inside = grid.planes(first, min(first + step, grid.shape[0])) <= offset
+        yield from inside
 
 
 def _rounded(count: int) -> int:

@@ -11,8 +11,6 @@ taking the axes one after the other.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +23,7 @@ LEAST_LINES = 20  # samples beside the surface from which a distance transform i
 MOST_SQUARE = 50  # up to this, squares of rounded distances are still near whole numbers
 # Distances between samples up to so many spacings apart are looked at; their error, in spacings.
 NEAR_SAMPLES, LATTICE_ERROR = 4, 1e-3
+MASK_BYTES = 10  # per sample, measured
 REACH = 4  # voxels; patches are clipped to 3 (``steps.band.PATCH_LIMIT``), and half of one goes off
 
 
@@ -41,14 +40,19 @@ def mask_distances(inside: BoolArray) -> FloatArray:
     (nx, ny, nz) float32
         Half a voxel and more; ``REACH - 0.5`` at most.
     """
-    distances = np.sqrt(np.arange(REACH * REACH + 1, dtype=np.float32)) - np.float32(0.5)
-    outside = distances[squared_distances(inside)]
-    return np.where(inside, -distances[squared_distances(~inside)], outside)
+    roots = np.sqrt(np.arange(REACH * REACH + 1, dtype=np.float32)) - np.float32(0.5)
+    squared = squared_distances(inside)
+    np.copyto(squared, squared_distances(~inside), where=inside)
+    distances = np.empty(inside.shape, np.float32)
+    for plane, numbers in zip(distances, squared):  # one by one, to save memory
+        plane[...] = roots[numbers]
+    return np.negative(distances, out=distances, where=inside)
 
 
 def squared_distances(marked: BoolArray) -> NDArray[np.uint8]:
     """Return the squared distance of each sample to the nearest marked one, at most ``REACH``^2."""
-    squared: NDArray[np.uint8] = np.where(marked, 0, REACH * REACH).astype(np.uint8)
+    squared = np.full(marked.shape, REACH * REACH, np.uint8)
+    squared[marked] = 0
     for axis in range(3):
         before = np.moveaxis(squared, axis, 0)
         after = before.copy()
@@ -61,11 +65,7 @@ def squared_distances(marked: BoolArray) -> NDArray[np.uint8]:
 
 def mask_planes(inside: SampleArray, h: float) -> DerivedPlanes:
     """Return the distances of a mask, made plane by plane, in world units; ``h`` is the spacing."""
-
-    def make(planes: NDArray[Any]) -> NDArray[np.float64]:
-        return mask_distances(planes).astype(np.float64) * h
-
-    return DerivedPlanes(inside, make, REACH)
+    return DerivedPlanes(inside, mask_distances, REACH, unit=h, each=MASK_BYTES)
 
 
 def extremes_of_masks(h: float) -> Extremes:

@@ -18,6 +18,7 @@ from .planes import DerivedPlanes, SampleArray, in_spacings
 AROUND = 2  # samples to either side over which slopes are averaged
 TYPICAL_ERROR = 0.1  # of a slope, relative: half the weight
 LEAST_WEIGHT = 1e-3
+SLOPE_BYTES = 60  # per sample, measured
 FLAT, STEEP = 0.25, 4.0  # local slopes over the typical one
 
 
@@ -34,11 +35,11 @@ def normalised_planes(values: SampleArray, h: float, change: float) -> DerivedPl
         The typical change of the values from sample to sample.
     """
 
-    def make(planes: NDArray[Any]) -> NDArray[np.float64]:
+    def make(planes: NDArray[Any]) -> FloatArray:
         scaled = in_spacings(planes, change)
-        return (scaled / local_slopes(scaled)).astype(np.float64) * h
+        return np.divide(scaled, local_slopes(scaled))
 
-    return DerivedPlanes(values, make, AROUND + 2)
+    return DerivedPlanes(values, make, AROUND + 2, unit=h, each=SLOPE_BYTES)
 
 
 def local_slopes(values: FloatArray) -> FloatArray:

@@ -25,6 +25,7 @@ LEAST_SLOPE = 0.3  # of a sample whose foot point is used
 DISC = np.float32(0.2)  # voxels
 ROUNDS = 2
 WITHIN = 1 - 1e-5  # share of the limit up to which a value is not cut off
+FILL_BYTES = 40  # per sample, measured
 CHUNK = 1 << 14  # samples that are worked on at a time, so that they stay in the cache
 
 
@@ -79,10 +80,11 @@ def filled_planes(values: SampleArray, spacing: Triple, limits: Extremes) -> Der
     low, high = (limit / h for limit in limits)
     steps = Steps((spacing[0] / h, spacing[1] / h, spacing[2] / h))
 
-    def make(planes: NDArray[Any]) -> NDArray[np.float64]:
-        return fill_in(in_spacings(planes, h), low, high, steps).astype(np.float64) * h
+    def make(planes: NDArray[Any]) -> FloatArray:
+        return fill_in(in_spacings(planes, h), low, high, steps)
 
-    return DerivedPlanes(values, make, ROUNDS * (steps.reach[0] + 1))
+    beside = ROUNDS * (max(steps.reach[:2]) + 1)
+    return DerivedPlanes(values, make, beside, unit=h, each=FILL_BYTES)
 
 
 def without_plateaus(values: SampleArray, limits: Extremes, h: float) -> DerivedPlanes:
