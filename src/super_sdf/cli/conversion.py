@@ -90,8 +90,8 @@ GRID_OPTIONS: tuple[Option, ...] = (
         callback=parse_numbers,
         metavar="H",
         help="World distance between neighbouring samples: one number, or X,Y,Z where it differs "
-        "between axes; the coarser ones are resampled then. Default: from the file, else estimated "
-        "from the values.",
+        "between axes; distances are resampled to the finest then. Default: from the file, else "
+        "estimated from the values.",
     ),
     click.option(
         "--origin",
