@@ -2,6 +2,7 @@
 
 import json
 
+import nibabel
 import numpy as np
 import pytest
 from conftest import trilinear
@@ -11,6 +12,7 @@ from super_sdf import (
     extract_mesh,
     make_grid,
     read_field,
+    read_grid,
     reconstruct,
     upsample,
     write_field,
@@ -70,6 +72,11 @@ KINDS = {
     "scaled": (two_parts() * (two_parts() + 60) * 7, {"field": "scaled"}, 0.12),
     "truncated at .5": (np.clip(two_parts(), -1.25, 1.25), {}, 0.3),
     "truncated at 1": (np.clip(two_parts(), -2.5, 2.5), {}, 0.2),
+    "truncated at 1, unknown beyond": (
+        np.where(np.abs(two_parts()) < 2.5, two_parts(), np.nan),
+        {},
+        0.2,
+    ),
     "truncated at 2": (np.clip(two_parts(), -5, 5), {}, 0.08),
 }  # fmt: skip
 TAKEN = {"label": "mask", "transform": "mask", "steep densities": "mask", "ramp": "scaled"}
@@ -151,3 +158,15 @@ def test_the_command_takes_a_label_image_with_thick_slices(tmp_path, command):
     report = json.loads(out)
     assert code == 0 and report["spacing"] == [1, 1, 2.5] and report["closed"]
     assert report["expected_triangles"] == pytest.approx(report["triangles"], rel=0.25)
+
+
+def test_a_label_image_with_thick_slices_is_at_its_place_in_the_world(tmp_path):
+    """TURN is mirrored, as the axes of many scanners are against those of NIfTI."""
+    affine = np.eye(4)
+    affine[:3, :3], affine[:3, 3] = TURN * SPACING, ORIGIN
+    image = nibabel.Nifti1Image(np.where(two_parts() < 0, 3, 1).astype(np.int16), affine)
+    nibabel.save(image, tmp_path / "labels.nii.gz")
+    mesh = reconstruct(read_grid(tmp_path / "labels.nii.gz", label=3), trilinear)
+    found = np.abs(off(mesh, TURN))
+    assert mesh.is_closed() and found.mean() < 0.6
+    assert mesh.volume() == pytest.approx(volume(), rel=0.03)

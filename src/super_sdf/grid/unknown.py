@@ -21,6 +21,7 @@ from .samples import Extremes, not_finite
 
 Ints = NDArray[np.int64]
 
+RUN_BYTES = 32  # per sample of a plane, to number its runs
 WAY_OUT = "replace each by a distance of the right sign (the cut-off value of its side)"
 
 
@@ -53,6 +54,11 @@ class KnownPlanes(SamplePlanes):
             plane[unknown] = np.where(outer, high, low)
             plane[infinite] = np.where(plane[infinite] > 0, high, low)
         return planes
+
+    def working_bytes(self, planes: int) -> int:
+        """Return about how much memory making that many planes takes."""
+        plane = self.shape[1] * self.shape[2]
+        return 2 * planes * self.plane_bytes + RUN_BYTES * plane
 
 
 class Regions:
