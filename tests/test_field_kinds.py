@@ -496,7 +496,8 @@ def test_making_distances_is_planned_and_refused_with_the_figure():
     samples = mask_planes(np.broadcast_to(np.False_, (64, 512, 512)), 1.0)
     least, need = plan_reading(samples, 0, Resources(2, None))
     assert least == 8 and need == 2 * (reading_bytes(samples, 10) + 8 * 512**2 * 20)
-    fewer, less = plan_reading(samples, 1000, Resources(2, need + 999))
+    assert plan_reading(samples, 1000, Resources(2, 1000 + 2 * need)) == (least, need)
+    fewer, less = plan_reading(samples, 1000, Resources(2, 999 + 2 * need))
     assert fewer == 4 and less < need
     assert plan_reading(np.zeros((9, 9, 9)), 0, Resources(2, 1)) == (4, 0)
     with pytest.raises(OutOfMemoryError, match=r"^making distances of the values needs \d+ MB of"):

@@ -97,10 +97,11 @@ def test_the_mesh_is_at_its_place_with_any_kind(name, direction):
     assert mesh.volume() == pytest.approx(volume(), rel=0.03)
 
 
-def test_a_mask_with_unequal_spacings_is_the_stretched_mask():
+@pytest.mark.parametrize("mesher", ["marching", "sharp"])
+def test_a_mask_with_unequal_spacings_is_the_stretched_mask(mesher):
     mask = two_parts() < 0
-    cubes = reconstruct(make_grid(mask, spacing=1, origin=0), trilinear)
-    mesh = reconstruct(make_grid(mask, spacing=SPACING, origin=0), trilinear)
+    cubes = reconstruct(make_grid(mask, spacing=1, origin=0), trilinear, mesher=mesher)
+    mesh = reconstruct(make_grid(mask, spacing=SPACING, origin=0), trilinear, mesher=mesher)
     np.testing.assert_allclose(mesh.vertices, cubes.vertices * SPACING, rtol=1e-5)
     np.testing.assert_array_equal(mesh.faces, cubes.faces)
 

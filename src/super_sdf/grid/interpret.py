@@ -14,7 +14,6 @@ from . import distances, masking
 from .evidence import Looked, is_normalised, look, weigh
 from .field import AUTO, EXACT, MASK, NOISY, SCALED, TRUNCATED, Wanted
 from .masks import is_distance_transform
-from .one_sided import is_one_sided
 from .planes import SampleArray, changed
 from .request import Interpreted, Request
 from .samples import (
@@ -93,26 +92,31 @@ def _by_evidence(
 ) -> Interpreted:
     """Return distances for values that are no mask at first sight, by what the samples show."""
     looked = look(samples, extremes)
-    step = is_distance_transform(looked.lines, request.spacing) if request.is_auto else 0.0
-    if step:
-        request = request.with_spacing(step, "the step of the transform", notes)
-        notes.append("the values are a distance transform, so only their sign says something")
-        return masking.of_signs(samples, extremes, request, notes)
-    if (
-        is_one_sided(extremes)
-        and request.inside == "auto"
-        and masking.are_labels(samples, extremes)
-    ):
+    if request.is_auto and (mask := _mask_shown(samples, looked, request, notes)):
+        return mask
+    if request.inside == "auto" and masking.are_labels(samples, extremes):
         raise masking.refuse_labels(extremes)
-    if request.is_density and request.is_auto and masking.is_step(looked):
-        notes.append("the densities jump from one side of the level to the other")
-        return masking.of_mask(masking.above(samples, 0), request, notes)
     if request.is_density:
         request = request.with_spacing(1, "since densities show none (give --spacing)", notes)
     if _has_other_slope(looked, request):
         return distances.of_slope(samples, looked, request, notes)
     found = distances.as_distances(samples, extremes, request, notes)
     return distances.by_kind(found, looked, request, notes)
+
+
+def _mask_shown(
+    samples: SampleArray, looked: Looked, request: Request, notes: list[str]
+) -> Interpreted | None:
+    """Return the distances of a mask if the samples show one: a transform, or steep densities."""
+    step = is_distance_transform(looked.lines, request.spacing)
+    if step:
+        request = request.with_spacing(step, "the step of the transform", notes)
+        notes.append("the values are a distance transform, so only their sign says something")
+        return masking.of_signs(samples, looked.extremes, request, notes)
+    if request.is_density and masking.is_step(looked):
+        notes.append("the densities jump from one side of the level to the other")
+        return masking.of_mask(masking.above(samples, 0), request, notes)
+    return None
 
 
 def _has_other_slope(looked: Looked, request: Request) -> bool:

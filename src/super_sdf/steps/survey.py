@@ -226,7 +226,8 @@ def plan_reading(samples: SampleArray, held: int, resources: Resources) -> tuple
         planes = min(max(BLOCK_SAMPLES // plane, least), len(samples))
         each = reading_bytes(samples, planes + 2) + planes * plane * BYTES_PER_SAMPLE
         need = min(resources.threads, -(-len(samples) // planes)) * each
-        if resources.memory is None or held + need <= resources.memory:
+        room = np.inf if resources.memory is None else resources.memory - held
+        if need <= (room if least == 1 else room / 2):  # the band needs room, too
             return least, need
     raise OutOfMemoryError(
         f"making distances of the values needs {in_words(held + need)} of memory even plane by "
