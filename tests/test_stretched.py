@@ -171,3 +171,18 @@ def test_a_label_image_with_thick_slices_is_at_its_place_in_the_world(tmp_path):
     found = np.abs(off(mesh, TURN))
     assert mesh.is_closed() and found.mean() < 0.6
     assert mesh.volume() == pytest.approx(volume(), rel=0.03)
+
+
+@pytest.mark.parametrize("cut", [0.5, 0.75, 1, 2])
+def test_a_truncated_box_along_the_axes_keeps_its_unit(cut):
+    """Along z its values change by less than the spacing, and along all axes at corners only."""
+    at = np.abs(np.indices((60, 60, 24)) * SPACING[:, None, None, None] - 29.0)
+    away = at - np.array([15, 12, 11.3])[:, None, None, None]
+    values = np.sqrt((np.maximum(away, 0) ** 2).sum(0)) + np.minimum(away.max(0), 0)
+    grid = make_grid(np.clip(values, -cut * 2.5, cut * 2.5), spacing=SPACING, origin=0)
+    assert grid.notes[-1] == (
+        f"values taken as truncated (--field truncated): cut off {cut:.3g} voxels from the surface"
+    )
+    assert not any("slope" in note for note in grid.notes)
+    mesh = reconstruct(grid, trilinear)
+    assert mesh.is_closed() and mesh.volume() == pytest.approx(30 * 24 * 22.6, rel=0.03)

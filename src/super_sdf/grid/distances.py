@@ -31,12 +31,17 @@ BENT = 0.1  # share of wrong slopes from which the network has no say in a field
 
 
 def as_distances(
-    samples: SampleArray, extremes: Extremes, request: Request, notes: list[str]
+    samples: SampleArray,
+    extremes: Extremes,
+    request: Request,
+    notes: list[str],
+    *,
+    is_cut: bool = False,
 ) -> Interpreted:
-    """Return values that are taken as distances, exact or noisy ones."""
+    """Return values that are taken as distances, exact or noisy ones, some perhaps cut off."""
     wanted = request.wanted.field
     positive = is_positive_inside(samples, request.inside, extremes, notes)
-    spacing = choose_spacing(samples, request.spacing, notes)
+    spacing = choose_spacing(samples, request.spacing, notes, is_cut=is_cut)
     if request.inside == "auto" and is_one_sided(extremes):
         check_thin(*_on_finest(samples, spacing), extremes)
     field = Field(NOISY, exact=NONE_EXACT) if wanted == NOISY else Field()

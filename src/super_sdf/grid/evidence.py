@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Triple
+from ..arrays import BoolArray, Triple
 from .gradients import LARGEST_VALUE
 from .planes import SampleArray
 from .samples import Extremes
@@ -120,6 +120,12 @@ class Looked:
     cut: Floats
     extremes: Extremes
 
+    @property
+    def is_cut(self) -> BoolArray:
+        """Whether values are cut off at the lowest, and at the highest, (2,)."""
+        cut: BoolArray = self.cut > CUT_OFF
+        return cut
+
     def divided(self, slope: float) -> Looked:
         """Return what would have been seen of the values divided by a slope."""
         low, high = self.extremes
@@ -194,7 +200,7 @@ def _count_amid_equal(slab: NDArray[Any], extremes: Extremes) -> NDArray[np.int6
 
 def weigh(looked: Looked, spacing: Triple) -> Evidence:
     """Return the evidence of what was looked at, with the spacing of each axis."""
-    is_cut = looked.cut > CUT_OFF
+    is_cut = looked.is_cut
     limits = [x if c else s * np.inf for x, c, s in zip(looked.extremes, is_cut, (-1, 1))]
     whole = ((looked.lines > limits[0]) & (looked.lines < limits[1])).all((1, 2))
     lines = looked.lines[whole] / np.array(steps_of(spacing))[:, None]
@@ -217,7 +223,8 @@ def weigh(looked: Looked, spacing: Triple) -> Evidence:
 def slope_within(looked: Looked, spacing: Triple) -> float:
     """Return the typical slope between a sample and its neighbours, none of them cut off.
 
-    Of the pairs beside the surface, the steepest along an axis gives the slope.
+    Of the pairs beside the surface, the steepest along an axis gives the slope. It is NaN if there
+    are too few samples that change along all axes: those may all be at corners.
     """
     low, high = looked.extremes
     line = looked.lines[..., 1:4]
@@ -225,7 +232,7 @@ def slope_within(looked: Looked, spacing: Triple) -> float:
     change = np.where(free[..., 1:] & free[..., :-1], np.abs(np.diff(line)), 0).max(-1)
     known = (change > 0).all(1)
     lengths = np.sqrt(((change[known] / np.array(steps_of(spacing))) ** 2).sum(1))
-    return float(np.median(lengths)) if len(lengths) else float("nan")
+    return float(np.median(lengths)) if len(lengths) >= ENOUGH else float("nan")
 
 
 def is_normalised(looked: Looked, spacing: Triple) -> bool:

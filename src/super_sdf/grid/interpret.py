@@ -100,7 +100,8 @@ def _by_evidence(
         request = request.with_spacing(1, "since densities show none (give --spacing)", notes)
     if _has_other_slope(looked, request):
         return distances.of_slope(samples, looked, request, notes)
-    found = distances.as_distances(samples, extremes, request, notes)
+    is_cut = bool(looked.is_cut.any())
+    found = distances.as_distances(samples, extremes, request, notes, is_cut=is_cut)
     return distances.by_kind(found, looked, request, notes)
 
 

@@ -89,10 +89,13 @@ def steps_of(spacing: Triple) -> Triple:
     return (sum(spacing) / 3,) * 3 if is_cubic(spacing) else spacing
 
 
-def choose_spacing(values: SampleArray, spacing: ArrayLike | None, notes: list[str]) -> Triple:
+def choose_spacing(
+    values: SampleArray, spacing: ArrayLike | None, notes: list[str], *, is_cut: bool = False
+) -> Triple:
     """Return the given spacing, or else the one that is measured on the values.
 
-    ``notes`` gets a sentence if the spacing was inferred or is doubtful.
+    ``notes`` gets a sentence if the spacing was inferred or is doubtful. Values that are cut off
+    (``is_cut``) may change by less along an axis with a large spacing.
 
     Raises
     ------
@@ -104,8 +107,9 @@ def choose_spacing(values: SampleArray, spacing: ArrayLike | None, notes: list[s
     if given and not len(beside[0]):
         return given
     if given:
-        _check_axes(in_finest(beside, given), given)
-        _check_unit(values, beside, given, notes)
+        if not is_cut:
+            _check_axes(in_finest(beside, given), given)
+        _check_unit(values, beside, given, notes, is_cut)
         return given
     everywhere = straight_gradients(values)
     unequal = unequal_axes(*beside) or unequal_axes(*everywhere)
@@ -196,7 +200,9 @@ def _infer_spacing(measured: float, shape: tuple[int, ...], notes: list[str]) ->
     return (measured,) * 3
 
 
-def _check_unit(values: SampleArray, beside: Gradients, spacing: Triple, notes: list[str]) -> None:
+def _check_unit(
+    values: SampleArray, beside: Gradients, spacing: Triple, notes: list[str], is_cut: bool
+) -> None:
     """Raise GridError, or add a note, if the values contradict the given spacing.
 
     They do if they change by more. Exact distances change by less beside thin parts: there is no
@@ -218,7 +224,8 @@ def _check_unit(values: SampleArray, beside: Gradients, spacing: Triple, notes: 
         return
     if measured < h:
         everywhere = in_finest(straight_gradients(values), spacing)
-        _check_axes(everywhere, spacing)
+        if not is_cut:
+            _check_axes(everywhere, spacing)
         if _agree(_measure(everywhere, beside), h):
             return
     notes.append(f"{observed}: they are not exact distances, or the unit is wrong")
