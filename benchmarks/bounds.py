@@ -2,6 +2,7 @@
 
     python -m benchmarks.bounds --sizes 128 --factors 2 4
     python -m benchmarks.bounds --fields gyroid "wall across x" --precisions int8
+    python -m benchmarks.bounds --fields mask truncated spline scaled --sizes 256 --factors 4
     python -m benchmarks.bounds --quick
     python -m benchmarks.bounds --mesh fandisk.ply
 
@@ -29,6 +30,7 @@ from super_sdf.evaluation.timing import LAUNCHER, describe_machine, run_command
 from super_sdf.steps.mesher_names import DEFAULT_MESHER, MESHERS
 
 FIELDS = ("ball", "gyroid", "wall across x", "wall across z")
+KINDS = ("mask", "truncated", "spline", "scaled")  # of a ball, see ``of_kind``
 SUFFIXES = (".ply", ".stl", ".obj")
 SHARE = 0.6
 ALLOWED = 1.05
@@ -40,6 +42,7 @@ PLAN = """
 import sys
 from super_sdf import load_network
 from super_sdf.files.grids import read_grid
+from super_sdf.network.kinds import network_for
 from super_sdf.machine.resources import allot
 from super_sdf.pipeline import find_surface
 from super_sdf.slabs.cutting import peak_bytes, ways_to_cut, whole
@@ -48,6 +51,7 @@ from super_sdf.steps.meshers import find_mesher
 path, factor, precision, name = sys.argv[1:]
 network = load_network(precision=precision, device="cpu")
 grid = read_grid(path, spacing=1.0)
+network = network_for(network, grid.field.kind)
 resources = allot(network.threads)
 band = find_surface(grid, int(factor), 0.0, resources)
 mesher = find_mesher(name)
@@ -86,8 +90,8 @@ def values_of(field: str, n: int) -> Iterator[NDArray[np.float32]]:
     at = np.arange(n) - n / 2 + 0.63
     y, z = at[:, None], at[None, :]
     for x in at:
-        if field == "ball":
-            plane = np.sqrt(x**2 + y**2 + z**2) - 0.4 * n
+        if field == "ball" or field in KINDS:
+            plane = of_kind(field, np.sqrt(x**2 + y**2 + z**2) - 0.4 * n, n)
         elif field == "gyroid":
             plane = gyroid(x, y, z, 8 * np.pi / n)
         elif field == "wall across x":
@@ -95,6 +99,16 @@ def values_of(field: str, n: int) -> Iterator[NDArray[np.float32]]:
         else:
             plane = np.broadcast_to(np.abs(z) - 1.7, (n, n))
         yield plane.astype(np.float32)
+
+
+def of_kind(kind: str, distance: NDArray[np.float64], n: int) -> NDArray[np.float64]:
+    """Return distances as values of another kind, or as they are."""
+    if kind == "mask":
+        return np.where(distance < 0, 1.0, 0.0)
+    if kind == "scaled":
+        return distance * (1 + distance / (3 * n))
+    limit = {"truncated": 1.0, "spline": 0.5}.get(kind, np.inf)
+    return np.clip(distance, -limit, limit)
 
 
 def gyroid(
@@ -185,7 +199,7 @@ def bounds_of(whole: int, thinnest: int, share: float, names: list[str]) -> dict
 def parse() -> argparse.Namespace:
     """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--fields", nargs="*", choices=FIELDS, default=FIELDS)
+    parser.add_argument("--fields", nargs="*", choices=FIELDS + KINDS, default=FIELDS)
     parser.add_argument("--mesh", type=Path, nargs="*", default=[], help="files to sample")
     parser.add_argument("--sizes", type=int, nargs="+", default=[128, 256])
     parser.add_argument("--factors", type=int, nargs="+", default=[2, 4, 16])

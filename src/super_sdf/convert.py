@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,19 @@ CAPPED = (
     "the solid runs out of the grid: its surface is closed along the border (leave it open with "
     "--open)"
 )
+READ_OPTIONS = (
+    "spacing",
+    "origin",
+    "direction",
+    "axes",
+    "inside",
+    "field",
+    "label",
+    "level",
+    "scale",
+    "max_memory",
+)
+"""The options of a conversion that ``read_grid`` takes."""
 SHARE_BEFORE = 0.2  # of the time, until the mesh is simplified
 
 
@@ -207,64 +221,89 @@ def convert(
     if options.simplifies:
         check_goal(options.simplify, options.triangles, ("simplify", "triangles"))
         check_can_simplify()
-    grid = read_grid(
-        source,
-        spacing=options.spacing,
-        origin=options.origin,
-        direction=options.direction,
-        axes=options.axes,
-        inside=options.inside,
-        field=options.field,
-        label=options.label,
-        level=options.level,
-        scale=options.scale,
-        max_memory=options.max_memory,
-    )
-    check_factor(options.factor)
-    find_mesher(options.mesher)
-    total = options.factor ** check_iterations(options.iterations)
+    grid = _read(source, options)
+    total = _check_work(options)
     lattice = cubic_grid(grid, options.offset)
     about = check_format_holds(target, lattice, total)
     notes = (*lattice.notes, *local_origin_note(target, about))
     expected = expect(grid, total, options.offset, target, cap=options.cap)
+    _check_size(expected, target, options, announce)
+    tally = Tally(expected)
+    check_not_input(save_field, source)
+    with open_field(save_field, grid, options, force=force) as file:
+        watch.lap("read")
+        meshes = _meshes(grid, network, options, tally, watch, progress, file)
+        complete = partial(_complete_field, file, force=force, then=before_rename)
+        write_pieces(meshes, target, force=force, about=about, before_rename=complete)
+    watch.lap("write")
+    done = describe(grid, tally, options, watch.seconds, notes)
+    return replace(done, saved_field=file.report()) if file else done
+
+
+def _read(source: str | Path, options: ConvertOptions) -> SdfGrid:
+    """Return the grid in a file, read as the options say."""
+    return read_grid(source, **{name: getattr(options, name) for name in READ_OPTIONS})
+
+
+def _check_work(options: ConvertOptions) -> int:
+    """Return how many times finer the mesh is than the grid; OptionError if that cannot be done."""
+    check_factor(options.factor)
+    find_mesher(options.mesher)
+    return int(options.factor ** check_iterations(options.iterations))
+
+
+def _check_size(
+    expected: Expectation,
+    target: str | Path,
+    options: ConvertOptions,
+    announce: Callable[[str], None] | None,
+) -> None:
+    """Announce a large file, or check that there is room to simplify the mesh."""
     if options.simplifies:
         least = int(expected.triangles * CERTAIN_SHARE)
         check_room(least, options.max_memory, estimated=True)
     elif announce and (sentence := expected.warning(target)):
         announce(sentence)
-    tally = Tally(expected)
-    check_not_input(save_field, source)
-    with open_field(save_field, grid, options, force=force) as file:
-        watch.lap("read")
-        pieces = reconstruct_slabs(
-            grid,
-            network,
-            options.factor,
-            offset=options.offset,
-            cap=options.cap,
-            mesher=options.mesher,
-            iterations=options.iterations,
-            max_memory=options.max_memory,
-            progress=part_of(progress, 0, SHARE_BEFORE) if options.simplifies else progress,
-            save=file.add if file else None,
-        )
-        meshes = tally.count(pieces, watch)
-        if options.simplifies:
-            rest = part_of(progress, SHARE_BEFORE, 1)
-            meshes = tally.simplify(meshes, grid.voxel_size, options, watch, rest)
 
-        def complete(part: Path) -> None:
-            """Complete the field's file, and check that it can appear, before the mesh does."""
-            if file:
-                file.finish()
-                check_field_target(file.path, force=force)
-            if before_rename:
-                before_rename(part)
 
-        write_pieces(meshes, target, force=force, about=about, before_rename=complete)
-    watch.lap("write")
-    done = describe(grid, tally, options, watch.seconds, notes)
-    return replace(done, saved_field=file.report()) if file else done
+def _meshes(
+    grid: SdfGrid,
+    network: Decoder,
+    options: ConvertOptions,
+    tally: Tally,
+    watch: Stopwatch,
+    progress: Progress | None,
+    file: FieldFile | None,
+) -> Iterator[Mesh]:
+    """Return the pieces of the mesh, made while they are taken, or the simplified one."""
+    pieces = reconstruct_slabs(
+        grid,
+        network,
+        options.factor,
+        offset=options.offset,
+        cap=options.cap,
+        mesher=options.mesher,
+        iterations=options.iterations,
+        max_memory=options.max_memory,
+        progress=part_of(progress, 0, SHARE_BEFORE) if options.simplifies else progress,
+        save=file.add if file else None,
+    )
+    meshes = tally.count(pieces, watch)
+    if not options.simplifies:
+        return meshes
+    rest = part_of(progress, SHARE_BEFORE, 1)
+    return tally.simplify(meshes, grid.voxel_size, options, watch, rest)
+
+
+def _complete_field(
+    file: FieldFile | None, part: Path, *, force: bool, then: Callable[[Path], None] | None
+) -> None:
+    """Complete the field's file, and check that it can appear, before the mesh ``part`` does."""
+    if file:
+        file.finish()
+        check_field_target(file.path, force=force)
+    if then:
+        then(part)
 
 
 def check_not_input(path: str | Path | None, source: str | Path) -> None:

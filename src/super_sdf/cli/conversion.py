@@ -35,16 +35,21 @@ Option = Callable[[Callable[..., Any]], Callable[..., Any]]
 """Adds an option to a command."""
 
 
+def _floats(value: str) -> tuple[float, ...]:
+    """Return numbers separated by commas, none if one is no number."""
+    try:
+        return tuple(float(part) for part in value.split(","))
+    except ValueError:
+        return ()
+
+
 def parse_numbers(
     ctx: click.Context, param: click.Parameter, value: str | None
 ) -> tuple[float, ...] | None:
     """Parse one number or three separated by commas: "0.5" or "0.5,0.5,0.5"."""
     if value is None:
         return None
-    try:
-        numbers = tuple(float(part) for part in value.split(","))
-    except ValueError:
-        numbers = ()
+    numbers = _floats(value)
     if len(numbers) not in (1, 3):
         raise click.BadParameter(f"{value!r}: give one number, or three separated by commas")
     return numbers
@@ -56,10 +61,7 @@ def parse_direction(
     """Parse nine numbers separated by commas."""
     if value is None:
         return None
-    try:
-        numbers = tuple(float(part) for part in value.split(","))
-    except ValueError:
-        numbers = ()
+    numbers = _floats(value)
     if len(numbers) != 9:
         raise click.BadParameter(f"{value!r}: give nine numbers separated by commas, row by row")
     return numbers
@@ -84,28 +86,49 @@ def parse_size(ctx: click.Context, param: click.Parameter, value: str | None) ->
     return size
 
 
+def _usual(name: str, text: str, **more: Any) -> Option:
+    """Return an option with the default of ``ConvertOptions``, which its help shows."""
+    default = convert_default(name.removeprefix("--"))
+    return click.option(name, default=default, show_default=True, help=text, **more)
+
+
+def _choice(name: str, text: str, load: Callable[[], tuple[str, ...]], default: Any) -> Option:
+    """Return an option with some choices and a default, which its help shows."""
+    return click.option(name, type=LazyChoice(load), default=default, show_default=True, help=text)
+
+
+def _number(name: str, metavar: str, text: str, kind: type = float) -> Option:
+    """Return an option that is a number, and missing by default."""
+    return click.option(name, type=kind, metavar=metavar, help=text)
+
+
+def _parsed(name: str, metavar: str, text: str, parse: Callable[..., Any]) -> Option:
+    """Return an option that a function parses, and that is missing by default."""
+    return click.option(name, callback=parse, metavar=metavar, help=text)
+
+
 GRID_OPTIONS: tuple[Option, ...] = (
-    click.option(
+    _parsed(
         "--spacing",
-        callback=parse_numbers,
-        metavar="H",
-        help="World distance between neighbouring samples: one number, or X,Y,Z where it differs "
-        "between axes; the coarser ones are resampled then. Default: from the file, else estimated "
-        "from the values.",
+        "H",
+        "World distance between neighbouring samples: one number, or X,Y,Z where it differs "
+        "between axes; distances are resampled to the finest then. Default: from the file, else "
+        "estimated from the values.",
+        parse_numbers,
     ),
-    click.option(
+    _parsed(
         "--origin",
-        callback=parse_numbers,
-        metavar="X,Y,Z",
-        help="World position of sample (0, 0, 0). Default: from the file, else 0,0,0.",
+        "X,Y,Z",
+        "World position of sample (0, 0, 0). Default: from the file, else 0,0,0.",
+        parse_numbers,
     ),
-    click.option(
+    _parsed(
         "--direction",
-        callback=parse_direction,
-        metavar="MATRIX",
-        help="World directions of the axes x, y and z of the array: the columns of a rotation or "
+        "MATRIX",
+        "World directions of the axes x, y and z of the array: the columns of a rotation or "
         "mirrored rotation, as nine numbers with commas, row by row. Files of other formats than "
         "NumPy, TIFF, HDF5 and Zarr state it.",
+        parse_direction,
     ),
     click.option(
         "--axes",
@@ -113,69 +136,52 @@ GRID_OPTIONS: tuple[Option, ...] = (
         help="Axis order of the array in a NumPy, TIFF, HDF5 or Zarr file. Default: xyz for NumPy, "
         "zyx for the others. Files of other formats state it.",
     ),
-    click.option(
+    _usual(
         "--inside",
+        "Sign of the values inside the solid; auto takes the border of the grid as outside.",
         type=LazyChoice(signs_inside),
-        default=convert_default("inside"),
-        show_default=True,
-        help="Sign of the values inside the solid; auto takes the border of the grid as outside.",
     ),
-    click.option(
+    _usual(
         "--field",
-        type=LazyChoice(fields),
-        default=convert_default("field"),
-        show_default=True,
-        help="What the values are: exact distances, truncated near the surface, a mask (inside or "
+        "What the values are: exact distances, truncated near the surface, a mask (inside or "
         "outside, or its distance transform), scaled (a field of another slope than 1), or noisy "
         "distances; auto goes by what the samples show.",
+        type=LazyChoice(fields),
     ),
-    click.option(
-        "--label",
-        type=float,
-        metavar="N",
-        help="Mesh the samples with the value N of a label image.",
-    ),
-    click.option(
+    _number("--label", "N", "Mesh the samples with the value N of a label image."),
+    _number(
         "--level",
-        type=float,
-        metavar="L",
-        help="Mesh the surface at the value L of densities; what is above L is inside, unless "
+        "L",
+        "Mesh the surface at the value L of densities; what is above L is inside, unless "
         "--inside is negative.",
     ),
-    click.option(
+    _number(
         "--scale",
-        type=float,
-        metavar="S",
-        help="World units per unit of the values, if they have another unit than the spacing.",
+        "S",
+        "World units per unit of the values, if they have another unit than the spacing.",
     ),
 )
 
 OPTIONS: tuple[Option, ...] = (
-    click.option(
+    _usual(
         "--factor",
+        "Refinement per axis: 2, 4, 8 or 16 times finer than the grid.",
         type=int,
-        default=convert_default("factor"),
-        show_default=True,
-        help="Refinement per axis: 2, 4, 8 or 16 times finer than the grid.",
     ),
-    click.option(
+    _usual(
         "--iterations",
-        type=int,
-        default=convert_default("iterations"),
-        show_default=True,
-        metavar="N",
-        help="Refine N times, each time by the factor and from the refined field before, for "
+        "Refine N times, each time by the factor and from the refined field before, for "
         "lattices finer than factor 16. Twice factor 4 is no better than factor 16, and slower.",
+        type=int,
+        metavar="N",
     ),
     *GRID_OPTIONS,
-    click.option(
+    _usual(
         "--offset",
-        type=float,
-        default=convert_default("offset"),
-        show_default=True,
-        metavar="D",
-        help="Mesh the offset surface at distance D, in world units; a positive D grows the "
+        "Mesh the offset surface at distance D, in world units; a positive D grows the "
         "solid, whichever sign is inside.",
+        type=float,
+        metavar="D",
     ),
     click.option(
         "--cap/--open",
@@ -183,39 +189,35 @@ OPTIONS: tuple[Option, ...] = (
         help="Where the solid runs out of the grid, close the surface along the border, which is "
         "the default, or leave it open.",
     ),
-    click.option(
+    _usual(
         "--mesher",
-        type=LazyChoice(meshers),
-        default=convert_default("mesher"),
-        show_default=True,
-        help="Mesher: marching is marching cubes, which cuts off edges and corners; sharp also "
+        "Mesher: marching is marching cubes, which cuts off edges and corners; sharp also "
         "puts vertices on them and takes longer.",
+        type=LazyChoice(meshers),
     ),
-    click.option(
+    _choice(
         "--quality",
-        type=LazyChoice(qualities),
-        default=LazyDefault(default_quality),
-        show_default=True,
-        help="Network: fast is smaller and quicker; best averages base over 8 reflections and "
+        "Network: fast is smaller and quicker; best averages base over 8 reflections and "
         "takes 8 times as long.",
+        qualities,
+        LazyDefault(default_quality),
     ),
-    click.option(
+    _choice(
         "--precision",
-        type=LazyChoice(precisions),
-        default=first(precisions),
-        show_default=True,
-        help="Arithmetic of the network: int8 is quicker on the CPU and slightly less accurate.",
+        "Arithmetic of the network: int8 is quicker on the CPU and slightly less accurate.",
+        precisions,
+        first(precisions),
     ),
     click.option(
         "--model", metavar="FILE", help="Use the network in this ONNX file instead of --quality."
     ),
     device_option,
-    click.option(
+    _parsed(
         "--max-memory",
-        callback=parse_size,
-        metavar="SIZE",
-        help="Memory limit of the process, such as 1500M or 4G. Default: 60 % of the free memory. "
+        "SIZE",
+        "Memory limit of the process, such as 1500M or 4G. Default: 60 % of the free memory. "
         "Larger grids are refined slab by slab, to the same mesh.",
+        parse_size,
     ),
     click.option(
         "--threads",
@@ -228,20 +230,19 @@ OPTIONS: tuple[Option, ...] = (
 
 
 SIMPLIFY_OPTIONS: tuple[Option, ...] = (
-    click.option(
+    _number(
         "--simplify",
-        type=float,
-        metavar="ERROR",
-        help="Simplify the mesh as far as it stays within ERROR of the unsimplified one, in voxels "
+        "ERROR",
+        "Simplify the mesh as far as it stays within ERROR of the unsimplified one, in voxels "
         "of the grid (such as 0.02), measured both ways. A closed mesh stays closed. Needs the "
         "extra simplify.",
     ),
-    click.option(
+    _number(
         "--triangles",
-        type=int,
-        metavar="N",
-        help="Simplify the mesh to at most N triangles, instead of --simplify. If the shape needs "
+        "N",
+        "Simplify the mesh to at most N triangles, instead of --simplify. If the shape needs "
         "more, a warning says how many are left.",
+        int,
     ),
 )
 

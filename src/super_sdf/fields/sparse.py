@@ -23,6 +23,7 @@ from ..files.archives import Member, open_archive
 from ..files.headers import ArrayHeader, read_array_header
 from ..files.regular import check_regular_file
 from ..files.spool import append_spool, little_endian, spool_beside
+from ..grid.field import Field
 from ..grid.planes import InputFile, SamplePlanes
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import check_fits
@@ -244,7 +245,10 @@ class _Reader:
         spacing, origin = (self._array(key, "f", (3,)) for key in ("spacing", "origin"))
         direction, samples = self._array("direction", "f", (3, 3)), NoSamples(shape, self.name)
         ends = -math.inf, math.inf
-        return SdfGrid.trusted(samples, spacing, origin, direction=direction, extremes=ends)
+        field = Field(on_lattice=True)  # it is on the lattice of the field already
+        return SdfGrid.trusted(
+            samples, spacing, origin, direction=direction, extremes=ends, field=field
+        )
 
     def _voxels(self, key: str, shape: tuple[int, ...]) -> IntArray:
         """Return voxels (n, 3), which must lie in the grid, all different, in C order."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..arrays import BoolArray
 from ..errors import WriteError
+from ..grid.planes import SamplePlanes
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import in_words
 from .meshes import format_of
@@ -65,12 +66,12 @@ def expect(
 
 
 def count_on_lattice(grid: SdfGrid, offset: float, *, cap: bool = False) -> float:
-    """Estimate how many edges of the grid's cubic lattice the offset surface crosses.
+    """Estimate how many edges of the lattice that is refined the offset surface crosses.
 
     Edges along an axis are as many as the cells of a plane across it.
     """
     counts = count_crossings(grid, offset, cap=cap)
-    if grid.is_cubic:
+    if grid.is_cubic or grid.field.on_lattice:
         return sum(counts)
     h, cell = grid.voxel_size, prod(grid.spacing)
     return sum(count * cell / step / h**2 for count, step in zip(counts, grid.spacing))
@@ -97,10 +98,11 @@ def count_crossings(grid: SdfGrid, offset: float, *, cap: bool = False) -> tuple
 
 def _planes(grid: SdfGrid, offset: float) -> Iterator[BoolArray]:
     """Yield a mask of the samples inside, plane by plane, since the grid may be in a file."""
-    for i in range(grid.shape[0]):
+    step = grid.samples.block if isinstance(grid.samples, SamplePlanes) else 1
+    for first in range(0, grid.shape[0], step):
         with np.errstate(over="ignore"):  # an offset beyond float32 is beyond all values
-            inside = grid.planes(i, i + 1)[0] <= offset
-        yield inside
+            inside = grid.planes(first, min(first + step, grid.shape[0])) <= offset
+        yield from inside
 
 
 def _rounded(count: int) -> int:

@@ -1,7 +1,9 @@
 """The cubic lattice of a grid, on which the method works.
 
 A grid with the same spacing on all axes is its own. Of others, the coarser axes are resampled to
-the finest spacing (see ``resampling``), plane by plane.
+the finest spacing (see ``resampling``), plane by plane. Masks, and fields that are meshed by their
+spline, need no cubes: a solid stretched along an axis is as good a solid. They are refined as they
+are, and the mesh gets its spacings at the end.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray
+from ..errors import GridError
 from ..neighbourhood import NEIGHBOURHOOD
 from .resampling import Resampled, resample
 from .sdf_grid import SdfGrid
@@ -17,7 +20,9 @@ from .spacing import EQUAL_SPACING
 
 
 def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
-    """Return a grid on the cubic lattice: the grid itself, if its spacings are equal.
+    """Return a grid on the lattice that is refined: the grid itself, if its spacings are equal.
+
+    So is that of a field that is no distance in the world, but on its own lattice (``Field``).
 
     Parameters
     ----------
@@ -32,8 +37,14 @@ def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
     SdfGrid
         Its samples are made when they are read. Origin and direction are those of ``grid``; its
         ``notes`` say what was resampled.
+
+    Raises
+    ------
+    GridError
+        If there is an offset, and the values are no distances in the world.
     """
-    if grid.is_cubic:
+    if grid.is_cubic or grid.field.on_lattice:
+        check_has_offsets(grid, offset)
         return grid
     level = -offset if grid.positive_inside else offset
     samples, spacing = resample(grid.samples, grid.spacing, level)
@@ -48,6 +59,18 @@ def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
         extremes=extremes,
         field=grid.field,
     )
+
+
+def check_has_offsets(grid: SdfGrid, offset: float) -> None:
+    """Raise GridError if there is an offset, and no distances in the world to find it by."""
+    if offset and grid.field.on_lattice and not grid.is_cubic:
+        each = ", ".join(f"{h:g}" for h in grid.spacing)
+        raise GridError(
+            f"offset {offset:g}: the values are taken as {grid.field.kind}, and with the spacing "
+            f"{each} they are no distances by which an offset surface could be found; mesh the "
+            "solid itself (--offset 0), sample the mesh (super-sdf sample), and mesh that grid "
+            "with the offset"
+        )
 
 
 def describe_resampling(grid: SdfGrid, shape: tuple[int, ...]) -> str:

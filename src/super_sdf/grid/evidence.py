@@ -15,9 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import BoolArray, Triple
 from .gradients import LARGEST_VALUE
 from .planes import SampleArray
 from .samples import Extremes
+from .spacing import steps_of
 
 Floats = NDArray[np.float64]
 
@@ -34,6 +36,7 @@ CUT_OFF = 0.01  # share of samples amid equal ones, at the lowest or highest val
 LIPSCHITZ, BENT, NOISY = 1.05, 0.3, 0.02  # change, difference and share from which it is noisy
 LEAST_SAMPLES = 100  # from which shares are evidence
 OFF = 0.1  # from 1: typical slopes further off show another unit
+SLOPE_OFF = 0.25  # from 1: truncated distances have another unit
 
 
 @dataclass(frozen=True)
@@ -117,6 +120,17 @@ class Looked:
     cut: Floats
     extremes: Extremes
 
+    @property
+    def is_cut(self) -> BoolArray:
+        """Whether values are cut off at the lowest, and at the highest, (2,)."""
+        cut: BoolArray = self.cut > CUT_OFF
+        return cut
+
+    def divided(self, slope: float) -> Looked:
+        """Return what would have been seen of the values divided by a slope."""
+        low, high = self.extremes
+        return Looked(self.lines / slope, self.cut, (low / slope, high / slope))
+
 
 def look(values: SampleArray, extremes: Extremes) -> Looked:
     """Look at some samples, those beside the surface above all.
@@ -184,12 +198,13 @@ def _count_amid_equal(slab: NDArray[Any], extremes: Extremes) -> NDArray[np.int6
     return np.array(counts)
 
 
-def weigh(looked: Looked, h: float) -> Evidence:
-    """Return the evidence of what was looked at; ``h`` is the spacing."""
-    is_cut = looked.cut > CUT_OFF
+def weigh(looked: Looked, spacing: Triple) -> Evidence:
+    """Return the evidence of what was looked at, with the spacing of each axis."""
+    is_cut = looked.is_cut
     limits = [x if c else s * np.inf for x, c, s in zip(looked.extremes, is_cut, (-1, 1))]
     whole = ((looked.lines > limits[0]) & (looked.lines < limits[1])).all((1, 2))
-    lines = np.clip(looked.lines[whole] / h, -LARGEST_VALUE, LARGEST_VALUE)
+    lines = looked.lines[whole] / np.array(steps_of(spacing))[:, None]
+    lines = np.clip(lines, -LARGEST_VALUE, LARGEST_VALUE)
     second, third, fourth = differences(lines)
     slope = np.sqrt((((lines[..., 3] - lines[..., 1]) / 2) ** 2).sum(1))
     unsure = (third + fourth).sum(1) / 2
@@ -203,6 +218,36 @@ def weigh(looked: Looked, h: float) -> Evidence:
     shares = [float(x.mean()) if len(x) else 0.0 for x in (wrong, noisy)]
     low, high = bool(is_cut[0]), bool(is_cut[1])
     return Evidence(len(lines), typical, shares[0], shares[1], rough, low, high)
+
+
+def slope_within(looked: Looked, spacing: Triple) -> float:
+    """Return the typical slope between a sample and its neighbours, none of them cut off.
+
+    Of the pairs beside the surface, the steepest along an axis gives the slope. It is NaN if there
+    are too few samples that change along all axes: those may all be at corners.
+    """
+    low, high = looked.extremes
+    line = looked.lines[..., 1:4]
+    free = (line > low) & (line < high)
+    change = np.where(free[..., 1:] & free[..., :-1], np.abs(np.diff(line)), 0).max(-1)
+    known = (change > 0).all(1)
+    lengths = np.sqrt(((change[known] / np.array(steps_of(spacing))) ** 2).sum(1))
+    return float(np.median(lengths)) if len(lengths) >= ENOUGH else float("nan")
+
+
+def is_normalised(looked: Looked, spacing: Triple) -> bool:
+    """Return whether values are cut off at -T and T, or at 1, and their slope is not 1.
+
+    So are distances that were divided by the truncation, as many programs store them.
+    """
+    if not looked.cut.any():
+        return False
+    evidence = weigh(looked, spacing)
+    cuts = evidence.cut_low, evidence.cut_high
+    ends = [abs(end) for end, is_cut in zip(looked.extremes, cuts) if is_cut]
+    alike = all(cuts) and bool(np.isclose(ends[0], ends[-1], rtol=1e-3))
+    at_one = bool(ends) and bool(np.allclose(ends, 1, rtol=1e-6))
+    return (alike or at_one) and abs(slope_within(looked, spacing) - 1) > SLOPE_OFF
 
 
 def differences(lines: Floats) -> tuple[Floats, Floats, Floats]:

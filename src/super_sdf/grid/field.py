@@ -46,6 +46,9 @@ class Field:
         Of a scaled field: the values whose cubic spline has the surface, negative inside.
     has_kinks : bool
         Whether a scaled field is mostly a distance, so that the network may refine its kinks.
+    on_lattice : bool
+        Whether the values are distances on the lattice of the samples, in steps of the finest
+        spacing, and not in the world. Then no axis is resampled if the spacings differ.
     evidence : dict
         What the samples show, for ``--json``.
     """
@@ -55,6 +58,7 @@ class Field:
     exact: Extremes = (-np.inf, np.inf)
     smooth: SampleArray | None = None
     has_kinks: bool = False
+    on_lattice: bool = False
     evidence: dict[str, Any] = field(default_factory=dict)
 
     def report(self) -> dict[str, Any]:

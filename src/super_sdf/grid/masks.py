@@ -11,17 +11,19 @@ taking the axes one after the other.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray
+from ..arrays import BoolArray, FloatArray, Triple
 from .planes import DerivedPlanes, SampleArray
 from .samples import Extremes
+from .spacing import is_cubic
 
 LEAST_LINES = 20  # samples beside the surface from which a distance transform is recognised
 MOST_SQUARE = 50  # up to this, squares of rounded distances are still near whole numbers
+# Distances between samples up to so many spacings apart are looked at; their error, in spacings.
+NEAR_SAMPLES, LATTICE_ERROR = 4, 1e-3
+MASK_BYTES = 10  # per sample, measured
 REACH = 4  # voxels; patches are clipped to 3 (``steps.band.PATCH_LIMIT``), and half of one goes off
 
 
@@ -38,14 +40,19 @@ def mask_distances(inside: BoolArray) -> FloatArray:
     (nx, ny, nz) float32
         Half a voxel and more; ``REACH - 0.5`` at most.
     """
-    distances = np.sqrt(np.arange(REACH * REACH + 1, dtype=np.float32)) - np.float32(0.5)
-    outside = distances[squared_distances(inside)]
-    return np.where(inside, -distances[squared_distances(~inside)], outside)
+    roots = np.sqrt(np.arange(REACH * REACH + 1, dtype=np.float32)) - np.float32(0.5)
+    squared = squared_distances(inside)
+    np.copyto(squared, squared_distances(~inside), where=inside)
+    distances = np.empty(inside.shape, np.float32)
+    for plane, numbers in zip(distances, squared):  # one by one, to save memory
+        plane[...] = roots[numbers]
+    return np.negative(distances, out=distances, where=inside)
 
 
 def squared_distances(marked: BoolArray) -> NDArray[np.uint8]:
     """Return the squared distance of each sample to the nearest marked one, at most ``REACH``^2."""
-    squared: NDArray[np.uint8] = np.where(marked, 0, REACH * REACH).astype(np.uint8)
+    squared = np.full(marked.shape, REACH * REACH, np.uint8)
+    squared[marked] = 0
     for axis in range(3):
         before = np.moveaxis(squared, axis, 0)
         after = before.copy()
@@ -58,11 +65,7 @@ def squared_distances(marked: BoolArray) -> NDArray[np.uint8]:
 
 def mask_planes(inside: SampleArray, h: float) -> DerivedPlanes:
     """Return the distances of a mask, made plane by plane, in world units; ``h`` is the spacing."""
-
-    def make(planes: NDArray[Any]) -> NDArray[np.float64]:
-        return mask_distances(planes).astype(np.float64) * h
-
-    return DerivedPlanes(inside, make, REACH)
+    return DerivedPlanes(inside, mask_distances, REACH, unit=h, each=MASK_BYTES)
 
 
 def extremes_of_masks(h: float) -> Extremes:
@@ -80,7 +83,7 @@ def has_both_sides(inside: SampleArray) -> bool:
     return False
 
 
-def is_distance_transform(lines: NDArray[np.float64]) -> float:
+def is_distance_transform(lines: NDArray[np.float64], spacing: Triple | None = None) -> float:
     """Return the spacing of a distance transform of a mask, 0 if values cannot be one.
 
     Beside the surface all samples of a side have the same value: 1 spacing to the nearest sample of
@@ -91,9 +94,14 @@ def is_distance_transform(lines: NDArray[np.float64]) -> float:
     ----------
     lines : (n, 3, 5) float64
         Five samples in a row along each axis, round samples beside the surface.
+    spacing : three floats, optional
+        The spacing of each axis, if it is known. If they differ, distances between samples are
+        recognised, too; the finest spacing is returned.
     """
     if len(lines) < LEAST_LINES:
         return 0.0
+    if spacing is not None and not is_cubic(spacing) and _are_between_samples(lines, spacing):
+        return min(spacing)
     centre = lines[:, 0, 2]
     above, below = centre[centre > 0], centre[centre <= 0]
     if not len(above) or not len(below) or not (_are_equal(above) and _are_equal(below)):
@@ -106,6 +114,24 @@ def is_distance_transform(lines: NDArray[np.float64]) -> float:
         if np.allclose([high / h, low / h], starts, atol=1e-3) and _on_lattice(lines / h, less):
             return h
     return 0.0
+
+
+def _are_between_samples(lines: NDArray[np.float64], spacing: Triple) -> bool:
+    """Return whether values are distances between samples with unequal spacings, or 0 on one side.
+
+    No sample is nearer to one of the other side than the finest spacing.
+    """
+    steps = np.array(spacing) / min(spacing)
+    size = np.abs(lines) / min(spacing)
+    signed = bool((lines < 0).any() and (lines > 0).any())
+    if not size.any() or (signed and not size.all()) or size[size > 0].min() < 1 - LATTICE_ERROR:
+        return False
+    whole = np.indices((NEAR_SAMPLES + 1,) * 3).reshape(3, -1).T
+    between = np.sort(np.sqrt(((whole * steps) ** 2).sum(1)))
+    near = size[size <= NEAR_SAMPLES]
+    after = np.searchsorted(between, near).clip(1)
+    apart = np.minimum(np.abs(between[after] - near), np.abs(near - between[after - 1]))
+    return bool((apart <= LATTICE_ERROR).all())
 
 
 def _are_equal(values: NDArray[np.float64]) -> bool:

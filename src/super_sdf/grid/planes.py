@@ -26,6 +26,8 @@ from ..machine.memory import check_fits
 
 FAR = 1e6  # spacings
 BLOCK_BYTES = 1 << 20  # read at a time when iterating over all planes
+LEAST_AT_ONCE = 4  # planes
+WORKING_BYTES = 1 << 26  # taken at a time when planes are made of others
 
 
 class InputFile:
@@ -160,6 +162,10 @@ class SamplePlanes(ABC):
         for first in range(0, len(self), self.block):
             yield from self.read(first, min(first + self.block, len(self)))
 
+    def working_bytes(self, planes: int) -> int:
+        """Return about how much memory making that many planes takes."""
+        return planes * self.plane_bytes
+
     @cached_property
     def loaded(self) -> NDArray[Any]:
         """The whole array; it stays in memory.
@@ -241,11 +247,15 @@ class DerivedPlanes(SamplePlanes):
     source : (nx, ny, nz) array or SamplePlanes
         The other array.
     make : callable
-        Takes some planes of it; returns as many, of ``dtype``.
+        Takes some planes of it; returns as many.
     beside : int
-        How many planes to either side the values of a plane depend on.
+        How many planes to either side the values of a plane depend on, and how many rows.
     dtype
-        Type of what ``make`` returns.
+        Type of the array.
+    unit : float
+        What ``make`` returns is multiplied by this.
+    each : int
+        The bytes that ``make`` takes per sample, of those beside, too.
     """
 
     name = "the grid"
@@ -256,8 +266,12 @@ class DerivedPlanes(SamplePlanes):
         make: Callable[[NDArray[Any]], NDArray[Any]],
         beside: int = 0,
         dtype: DTypeLike = np.float64,
+        *,
+        unit: float = 1.0,
+        each: int = 16,
     ) -> None:
         self.source, self.make, self.beside = source, make, beside
+        self.unit, self.each = unit, each
         self.shape, self.dtype = tuple(source.shape), np.dtype(dtype)
 
     @property
@@ -270,5 +284,52 @@ class DerivedPlanes(SamplePlanes):
         low, high = max(first - self.beside, 0), min(last + self.beside, len(self))
         if last <= first:
             return np.empty((0, *self.shape[1:]), self.dtype)
-        made = np.asarray(self.make(np.asarray(self.source[low:high])), self.dtype)
-        return made[first - low : last - low]
+        source = np.asarray(self.source[low:high])
+        out = np.empty((last - first, *self.shape[1:]), self.dtype)
+        for rows in self._rows(len(source)):
+            around = slice(max(rows.start - self.beside, 0), rows.stop + self.beside)
+            made = self.make(source[:, around])[first - low : last - low]
+            out[:, rows] = made[:, rows.start - around.start :][:, : rows.stop - rows.start]
+        return out if self.unit == 1 else np.multiply(out, self.unit, out=out)
+
+    def _rows(self, planes: int) -> Iterator[slice]:
+        """Yield slices of rows that are worked on at a time, so that little memory is taken."""
+        size = self._rows_at_once(planes)
+        for start in range(0, self.shape[1], size):
+            yield slice(start, min(start + size, self.shape[1]))
+
+    def _rows_at_once(self, planes: int) -> int:
+        """Return how many rows of that many planes are worked on at a time."""
+        fitting = WORKING_BYTES // (planes * self.shape[2] * self.each)
+        if fitting >= self.shape[1]:
+            return self.shape[1]
+        return int(max(fitting - 2 * self.beside, 2 * self.beside, 1))
+
+    def working_bytes(self, planes: int) -> int:
+        """Return about how much memory making that many planes takes, those beside included."""
+        read = min(planes + 2 * self.beside, len(self))
+        rows = min(self._rows_at_once(read) + 2 * self.beside, self.shape[1])
+        own = planes * self.plane_bytes + read * rows * self.shape[2] * self.each
+        stored = read * self.shape[1] * self.shape[2] * np.dtype(self.source.dtype).itemsize
+        return own + max(reading_bytes(self.source, read), stored)
+
+
+def planes_at_once(samples: SampleArray) -> int:
+    """Return how many planes are best made at a time: not few, if each needs many beside it."""
+    return max(2 * samples.beside if isinstance(samples, DerivedPlanes) else 0, LEAST_AT_ONCE)
+
+
+def reading_bytes(samples: SampleArray, planes: int) -> int:
+    """Return about how much memory reading that many planes takes; 0 of an array in memory."""
+    return samples.working_bytes(planes) if isinstance(samples, SamplePlanes) else 0
+
+
+def changed(
+    samples: SampleArray,
+    change: Callable[[NDArray[Any]], NDArray[Any]],
+    dtype: DTypeLike = np.float64,
+) -> DerivedPlanes:
+    """Return samples changed one by one, each for itself; as float64 they are changed as such."""
+    if dtype is np.float64:
+        return DerivedPlanes(samples, lambda planes: change(planes.astype(np.float64)))
+    return DerivedPlanes(samples, change, dtype=dtype)

@@ -59,7 +59,10 @@ def check_values(values: SampleArray) -> Extremes:
     check_kind(values.dtype, values.shape)
     if values.dtype == np.bool_:
         raise GridError(f"values are true or false: {MASK_HINT}")
-    return _find_extremes(values)
+    extremes = find_extremes(values)
+    if extremes is None:
+        raise not_finite(values)
+    return extremes
 
 
 def check_kind(dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
@@ -72,25 +75,31 @@ def check_kind(dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
         raise GridError(f"values have shape {shape}: give at least 2 samples on each axis")
 
 
-def _find_extremes(values: SampleArray) -> Extremes:
-    """Return the smallest and the largest sample, or raise on the first NaN or infinity.
+def find_extremes(values: SampleArray) -> Extremes | None:
+    """Return the smallest and the largest sample, None if one is NaN or infinite.
 
     It is read plane by plane, since the grid may be in a file. The extremes also reveal bad
     samples: the minimum of numbers and a NaN is NaN.
     """
     extremes = []
-    for i, plane in enumerate(values):
+    for plane in values:
         low, high = float(plane.min()), float(plane.max())
         if not (isfinite(low) and isfinite(high)):
-            with np.errstate(over="ignore", invalid="ignore"):  # of long doubles
-                j, k = np.argwhere(~np.isfinite(plane.astype(np.float64)))[0]
-            raise GridError(
-                f"values[{i}, {j}, {k}] is {plane[j, k]!s}: every sample must be finite; "
-                "replace unknown far samples by a large distance of the right sign"
-            )
+            return None
         extremes.append((low, high))
     lows, highs = zip(*extremes)
     return min(lows), max(highs)
+
+
+def not_finite(values: SampleArray) -> GridError:
+    """Return the error for samples of which some are NaN or infinite, which names the first."""
+    with np.errstate(over="ignore", invalid="ignore"):  # of long doubles
+        bad = (np.argwhere(~np.isfinite(plane.astype(np.float64))) for plane in values)
+        i, (j, k) = next((i, places[0]) for i, places in enumerate(bad) if len(places))
+    return GridError(
+        f"values[{i}, {j}, {k}] is {values[i][j, k]!s}: every sample must be finite; "
+        "replace unknown far samples by a large distance of the right sign"
+    )
 
 
 def check_not_flat(values: SampleArray, extremes: Extremes) -> None:

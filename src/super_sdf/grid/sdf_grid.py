@@ -223,7 +223,7 @@ def make_grid(
     ----------
     values : (nx, ny, nz) array_like
         Signed distances in world units; i runs along x, j along y, k along z. Or a mask, labels,
-        densities, or another field.
+        densities, or another field. Samples far from the surface may be NaN or infinite: unknown.
     spacing : number or three, optional
         World distance between neighbouring samples. Default: estimated from the gradient.
     origin : number or three, optional

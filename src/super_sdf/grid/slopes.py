@@ -18,27 +18,28 @@ from .planes import DerivedPlanes, SampleArray, in_spacings
 AROUND = 2  # samples to either side over which slopes are averaged
 TYPICAL_ERROR = 0.1  # of a slope, relative: half the weight
 LEAST_WEIGHT = 1e-3
+SLOPE_BYTES = 60  # per sample, measured
 FLAT, STEEP = 0.25, 4.0  # local slopes over the typical one
 
 
-def normalised_planes(values: SampleArray, h: float, slope: float) -> DerivedPlanes:
-    """Return values over their local slope, made plane by plane.
+def normalised_planes(values: SampleArray, h: float, change: float) -> DerivedPlanes:
+    """Return values over their local slope, made plane by plane: distances on the lattice.
 
     Parameters
     ----------
     values : (nx, ny, nz) array or Planes
         Samples.
     h : float
-        The spacing.
-    slope : float
-        The typical change from sample to sample, over the spacing.
+        What a step of the lattice is in the result: the spacing.
+    change : float
+        The typical change of the values from sample to sample.
     """
 
-    def make(planes: NDArray[Any]) -> NDArray[np.float64]:
-        scaled = in_spacings(planes, h * slope)
-        return (scaled / local_slopes(scaled)).astype(np.float64) * h
+    def make(planes: NDArray[Any]) -> FloatArray:
+        scaled = in_spacings(planes, change)
+        return np.divide(scaled, local_slopes(scaled))
 
-    return DerivedPlanes(values, make, AROUND + 2)
+    return DerivedPlanes(values, make, AROUND + 2, unit=h, each=SLOPE_BYTES)
 
 
 def local_slopes(values: FloatArray) -> FloatArray:

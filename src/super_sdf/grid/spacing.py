@@ -84,10 +84,18 @@ def is_cubic(spacing: Triple) -> bool:
     return max(spacing) <= min(spacing) * (1 + EQUAL_SPACING)
 
 
-def choose_spacing(values: SampleArray, spacing: ArrayLike | None, notes: list[str]) -> Triple:
+def steps_of(spacing: Triple) -> Triple:
+    """Return the spacing of each axis, the mean if they are nearly equal."""
+    return (sum(spacing) / 3,) * 3 if is_cubic(spacing) else spacing
+
+
+def choose_spacing(
+    values: SampleArray, spacing: ArrayLike | None, notes: list[str], *, is_cut: bool = False
+) -> Triple:
     """Return the given spacing, or else the one that is measured on the values.
 
-    ``notes`` gets a sentence if the spacing was inferred or is doubtful.
+    ``notes`` gets a sentence if the spacing was inferred or is doubtful. Values that are cut off
+    (``is_cut``) may change by less along an axis with a large spacing.
 
     Raises
     ------
@@ -99,8 +107,9 @@ def choose_spacing(values: SampleArray, spacing: ArrayLike | None, notes: list[s
     if given and not len(beside[0]):
         return given
     if given:
-        _check_axes(_scaled(beside, given), given)
-        _check_unit(values, beside, given, notes)
+        if not is_cut:
+            _check_axes(in_finest(beside, given), given)
+        _check_unit(values, beside, given, notes, is_cut)
         return given
     everywhere = straight_gradients(values)
     unequal = unequal_axes(*beside) or unequal_axes(*everywhere)
@@ -122,7 +131,7 @@ def _show_one_spacing(gradients: Gradients) -> bool:
     return len(gradients[0]) < ENOUGH or are_consistent(typical_length(*gradients), *gradients)
 
 
-def _scaled(gradients: Gradients, spacing: Triple) -> Gradients:
+def in_finest(gradients: Gradients, spacing: Triple) -> Gradients:
     """Return gradients in index units of the finest axis, if the spacings differ."""
     if is_cubic(spacing):
         return gradients
@@ -191,14 +200,16 @@ def _infer_spacing(measured: float, shape: tuple[int, ...], notes: list[str]) ->
     return (measured,) * 3
 
 
-def _check_unit(values: SampleArray, beside: Gradients, spacing: Triple, notes: list[str]) -> None:
+def _check_unit(
+    values: SampleArray, beside: Gradients, spacing: Triple, notes: list[str], is_cut: bool
+) -> None:
     """Raise GridError, or add a note, if the values contradict the given spacing.
 
     They do if they change by more. Exact distances change by less beside thin parts: there is no
     note if the rest of the field agrees with the spacing.
     """
-    h = sum(spacing) / 3 if is_cubic(spacing) else min(spacing)
-    beside = _scaled(beside, spacing)
+    h = min(steps_of(spacing))
+    beside = in_finest(beside, spacing)
     measured = typical_length(*beside)
     named = f"{spacing[0]:.6g}" if is_cubic(spacing) else f"{h:.6g} along the finest axis"
     observed = f"the values change by {measured:.6g} from sample to sample, but spacing is {named}"
@@ -212,8 +223,9 @@ def _check_unit(values: SampleArray, beside: Gradients, spacing: Triple, notes: 
     if _agree(measured, h):
         return
     if measured < h:
-        everywhere = _scaled(straight_gradients(values), spacing)
-        _check_axes(everywhere, spacing)
+        everywhere = in_finest(straight_gradients(values), spacing)
+        if not is_cut:
+            _check_axes(everywhere, spacing)
         if _agree(_measure(everywhere, beside), h):
             return
     notes.append(f"{observed}: they are not exact distances, or the unit is wrong")

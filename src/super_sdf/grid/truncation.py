@@ -7,12 +7,15 @@ than where it was cut off.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, IntArray
+from ..arrays import BoolArray, FloatArray, IntArray, Triple
+from .planes import FAR as VERY_FAR
 from .planes import DerivedPlanes, SampleArray, in_spacings
 from .samples import Extremes
 
@@ -22,90 +25,218 @@ LEAST_SLOPE = 0.3  # of a sample whose foot point is used
 DISC = np.float32(0.2)  # voxels
 ROUNDS = 2
 WITHIN = 1 - 1e-5  # share of the limit up to which a value is not cut off
+FILL_BYTES = 40  # per sample, measured
+CHUNK = 1 << 14  # samples that are worked on at a time, so that they stay in the cache
 
-OFFSETS: IntArray = np.indices((2 * REACH + 1,) * 3).reshape(3, -1).T.astype(np.int32) - REACH
-OFFSETS = OFFSETS[(OFFSETS**2).sum(1) <= (REACH + 0.3) ** 2]
+
+@dataclass(frozen=True)
+class Steps:
+    """The spacings of the axes, in units of the finest; a voxel is as long as the longest.
+
+    Attributes
+    ----------
+    along : three floats
+    """
+
+    along: Triple = (1.0, 1.0, 1.0)
+
+    @property
+    def voxel(self) -> float:
+        """The longest one."""
+        return max(self.along)
+
+    @cached_property
+    def reach(self) -> tuple[int, int, int]:
+        """How many samples along each axis the farthest offset is."""
+        nx, ny, nz = (int(REACH * self.voxel / step) for step in self.along)
+        return nx, ny, nz
+
+    @cached_property
+    def offsets(self) -> IntArray:
+        """The steps to all samples within reach, (n, 3), but for the sample itself."""
+        reach = np.array(self.reach)
+        box = np.indices(tuple(2 * reach + 1)).reshape(3, -1).T - reach
+        apart = np.sqrt(((box * np.array(self.along)) ** 2).sum(1)) / self.voxel
+        found: IntArray = box[(apart > 0) & (apart**2 <= (REACH + 0.3) ** 2)].astype(np.int32)
+        return found
 
 
-def filled_planes(values: SampleArray, h: float, limits: Extremes) -> DerivedPlanes:
+CUBES = Steps()
+
+
+def filled_planes(values: SampleArray, spacing: Triple, limits: Extremes) -> DerivedPlanes:
     """Return truncated distances with those that are missing filled in, made plane by plane.
 
     Parameters
     ----------
     values : (nx, ny, nz) array or Planes
         Distances in world units.
-    h : float
-        The spacing.
+    spacing : three floats
+        World distance between neighbouring samples along each axis.
     limits : two floats
         Where they were cut off: the lowest and the highest value.
     """
+    h = min(spacing)
     low, high = (limit / h for limit in limits)
+    steps = Steps((spacing[0] / h, spacing[1] / h, spacing[2] / h))
+
+    def make(planes: NDArray[Any]) -> FloatArray:
+        return fill_in(in_spacings(planes, h), low, high, steps)
+
+    beside = ROUNDS * (max(steps.reach[:2]) + 1)
+    return DerivedPlanes(values, make, beside, unit=h, each=FILL_BYTES)
+
+
+def without_plateaus(values: SampleArray, limits: Extremes, h: float) -> DerivedPlanes:
+    """Return truncated distances, those far away where all samples round one were cut off alike.
+
+    They are too far from the surface to matter, however near it they were cut off.
+    """
 
     def make(planes: NDArray[Any]) -> NDArray[np.float64]:
-        return fill_in(in_spacings(planes, h), low, high).astype(np.float64) * h
+        found = planes.astype(np.float64)
+        for limit in limits:
+            amid = _all_around(planes == limit)
+            found[amid] = np.sign(limit) * VERY_FAR * h
+        return found
 
-    return DerivedPlanes(values, make, ROUNDS * (REACH + 1))
+    return DerivedPlanes(values, make, 1)
 
 
-def fill_in(values: FloatArray, low: float, high: float) -> FloatArray:
-    """Return distances in voxels, (nx, ny, nz), filled in where they were cut off.
+def _all_around(marked: BoolArray) -> BoolArray:
+    """Return which samples and the up to 26 round them are all marked."""
+    for axis in range(3):
+        lines = np.moveaxis(marked, axis, 0)
+        among = lines.copy()
+        among[1:] &= lines[:-1]
+        among[:-1] &= lines[1:]
+        marked = np.moveaxis(among, 0, axis)
+    return marked
+
+
+def fill_in(values: FloatArray, low: float, high: float, steps: Steps = CUBES) -> FloatArray:
+    """Return distances in units of the finest spacing, (nx, ny, nz), filled in where cut off.
 
     The second round has better gradients: central differences to what the first one filled in.
     """
     cut = (values <= low * WITHIN) | (values >= high * WITHIN)
-    least = np.abs(np.where(values > 0, high, low)).astype(np.float32)
-    gradient = gradient_within(values, cut)
+    known = np.argwhere(~cut).astype(np.int32)
+    gradient = gradient_within(values, cut, known, steps)
     for _ in range(ROUNDS):
-        distance = np.maximum(distance_to_feet(values, gradient, cut), least)
+        least = np.abs(np.where(values > 0, np.float32(high), np.float32(low)))
+        distance = np.maximum(distance_to_feet(values, known, gradient, cut, steps), least)
         values = np.where(cut, np.copysign(distance, values), values)
-        parts = [np.asarray(part, np.float32) for part in np.gradient(values)]
-        gradient = np.stack(parts, -1)
+        gradient = gradient_at(values, known, steps)
     return values
 
 
-def distance_to_feet(values: FloatArray, gradient: FloatArray, cut: BoolArray) -> FloatArray:
-    """Return the distance of each sample to the surface at its nearest foot point, ``FAR`` at most.
+def distance_to_feet(
+    values: FloatArray, known: IntArray, gradient: FloatArray, cut: BoolArray, steps: Steps
+) -> FloatArray:
+    """Return the distance of each sample that was cut off to the nearest foot point of another.
 
-    At a foot point the surface is taken as a disc of radius ``DISC``: it goes on between them.
+    It is ``FAR`` voxels at most. At a foot point the surface is taken as a disc of radius ``DISC``:
+    it goes on between them.
+
+    Parameters
+    ----------
+    values : (nx, ny, nz) float32
+        In units of the finest spacing.
+    known : (n, 3) int32
+        The samples that were not cut off, in C order.
+    gradient : (n, 3) float32
+        Their gradients.
+    cut : (nx, ny, nz) bool
+        Which samples were.
     """
-    slope = np.sqrt((gradient**2).sum(-1, dtype=np.float32))
-    ijk = np.argwhere(~cut & (slope > LEAST_SLOPE))
-    at = tuple(ijk.T)
-    normal = gradient[at] / slope[at][:, None]
-    foot = -values[at][:, None] * normal
-    nearest = np.pad(np.full(values.shape, FAR, np.float32), REACH, constant_values=FAR)
-    found = nearest.copy()
-    for offset in OFFSETS:
-        place = tuple((ijk + offset + REACH).T)
-        step = offset.astype(np.float32) - foot
-        square = step[:, 0] ** 2 + step[:, 1] ** 2 + step[:, 2] ** 2
-        closer = square < nearest[place] ** 2
-        where = tuple(axis[closer] for axis in place)
-        step, square, facing = step[closer], square[closer], normal[closer]
-        height = step[:, 0] * facing[:, 0] + step[:, 1] * facing[:, 1] + step[:, 2] * facing[:, 2]
-        aside = np.sqrt(np.maximum(square - height**2, 0))
-        nearest[where] = np.sqrt(square)
-        found[where] = np.hypot(height, np.maximum(aside - DISC, 0))
-    return found[REACH:-REACH, REACH:-REACH, REACH:-REACH]
+    far = np.float32(FAR * steps.voxel)
+    margin = [(n, n) for n in steps.reach]
+    nearest = np.pad(np.where(cut, far, np.float32(0)), margin)
+    found = np.pad(np.full(cut.shape, far, np.float32), margin)
+    slope = np.sqrt((gradient**2).sum(1, dtype=np.float32))
+    steep = np.flatnonzero(slope > LEAST_SLOPE)
+    for start in range(0, len(steep), CHUNK):
+        rows = steep[start : start + CHUNK]
+        normal = gradient[rows] / slope[rows, None]
+        foot = -values[tuple(known[rows].T)][:, None] * normal
+        at = np.ravel_multi_index(tuple((known[rows] + steps.reach).T), nearest.shape)
+        _approach(nearest, found, at, np.ascontiguousarray(foot.T), normal.T.copy(), steps)
+    inner = tuple(slice(n, n + size) for n, size in zip(steps.reach, cut.shape))
+    return found[inner]
 
 
-def gradient_within(values: FloatArray, cut: BoolArray) -> FloatArray:
-    """Return gradients, (nx, ny, nz, 3), by differences to neighbours that were not cut off.
+def _approach(
+    nearest: FloatArray,
+    found: FloatArray,
+    at: NDArray[np.intp],
+    foot: FloatArray,
+    normal: FloatArray,
+    steps: Steps,
+) -> None:
+    """Take the samples within reach of some nearer to the surface by the foot points of these.
+
+    Parameters
+    ----------
+    nearest, found : (nx, ny, nz) float32
+        The distance to the nearest foot point so far, and to its disc; changed in place.
+    at : (n,) int
+        Where the samples are in these.
+    foot, normal : (3, n) float32
+        The step from each to its foot point, and the direction of the gradient.
+    """
+    flat, discs = nearest.reshape(-1), found.reshape(-1)
+    strides = np.array([nearest.shape[1] * nearest.shape[2], nearest.shape[2], 1])
+    for offset in steps.offsets:
+        place = at + int(offset @ strides)
+        step = (offset * np.array(steps.along)).astype(np.float32)
+        x, y, z = (along - own for along, own in zip(step, foot))
+        apart = np.sqrt(x * x + y * y + z * z)
+        closer = np.flatnonzero(apart <= flat[place])
+        x, y, z, apart = x[closer], y[closer], z[closer], apart[closer]
+        a, b, c = normal[:, closer]
+        height = x * a + y * b + z * c
+        aside = np.sqrt(np.maximum(apart**2 - height**2, 0))
+        disc, where = np.hypot(height, np.maximum(aside - DISC, 0)), place[closer]
+        alike = apart == flat[where]  # the lower disc, so that the order is no matter
+        discs[where] = np.where(alike, np.minimum(disc, discs[where]), disc)
+        flat[where] = apart
+
+
+def gradient_at(values: FloatArray, at: IntArray, steps: Steps) -> FloatArray:
+    """Return central differences at some samples, (n, 3); one-sided ones at the ends."""
+    gradient = np.empty((len(at), 3), np.float32)
+    for axis, step in enumerate(steps.along):
+        low, high = _beside(at, axis, values.shape[axis])
+        apart = (high[axis] - low[axis]) * np.float32(step)
+        gradient[:, axis] = (values[high] - values[low]) / np.maximum(apart, np.float32(step))
+    return gradient
+
+
+def gradient_within(
+    values: FloatArray, cut: BoolArray, at: IntArray, steps: Steps = CUBES
+) -> FloatArray:
+    """Return gradients at some samples, (n, 3), by differences to neighbours that were not cut off.
 
     Where both were, the larger difference is a lower bound.
     """
-    gradient = np.zeros((*values.shape, 3), np.float32)
-    for axis in range(3):
-        lines, missing = np.moveaxis(values, axis, 0), np.moveaxis(cut, axis, 0)
-        change = np.diff(lines, axis=0)
-        edge = np.zeros((1, *lines.shape[1:]), np.float32)
-        ahead, back = np.concatenate([change, edge]), np.concatenate([edge, change])
-        beyond = np.ones((1, *lines.shape[1:]), bool)
-        no_ahead = np.concatenate([missing[1:], beyond])
-        no_back = np.concatenate([beyond, missing[:-1]])
+    gradient = np.empty((len(at), 3), np.float32)
+    own = values[tuple(at.T)]
+    for axis, step in enumerate(steps.along):
+        low, high = _beside(at, axis, values.shape[axis])
+        ahead, back = values[high] - own, own - values[low]
+        no_ahead = cut[high] | (high[axis] == at[:, axis])
+        no_back = cut[low] | (low[axis] == at[:, axis])
         larger = np.where(np.abs(ahead) > np.abs(back), ahead, back)
         one = np.where(no_ahead, np.where(no_back, larger, back), ahead)
-        both = ~no_ahead & ~no_back
-        along = np.where(both, (ahead + back) / 2, one)
-        np.moveaxis(gradient[..., axis], axis, 0)[:] = along
+        along = np.where(~no_ahead & ~no_back, (ahead + back) / 2, one)
+        gradient[:, axis] = along / np.float32(step)
     return gradient
+
+
+def _beside(
+    at: IntArray, axis: int, count: int
+) -> tuple[tuple[NDArray[Any], ...], tuple[NDArray[Any], ...]]:
+    """Return the indices of the samples before and after some along an axis of ``count``."""
+    low, high = list(at.T), list(at.T)
+    low[axis], high[axis] = np.maximum(at[:, axis] - 1, 0), np.minimum(at[:, axis] + 1, count - 1)
+    return tuple(low), tuple(high)

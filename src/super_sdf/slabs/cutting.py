@@ -134,7 +134,7 @@ def peak_bytes(
         )
         for slab in slabs
     )
-    return held + max(needs)
+    return max(held + max(needs), band.peak)
 
 
 def cut(band: Band, pieces: int, receptive_field: int, beside: int) -> list[Slab]:

@@ -8,6 +8,7 @@ from ..machine.threads import CHUNK, rows_in_chunk
 from ..steps.marching import LOOKUP_BYTES, lookups_at_once
 from ..steps.mesher_names import DEFAULT_MESHER, MARCHING, SHARP
 from ..steps.meshers import BY_NAME, GROUP_BYTES, groups_at_once, voxel_bytes
+from ..steps.spline import spline_bytes
 from ..steps.survey import Band
 
 # Peak memory of the stages after the network in bytes, measured (``benchmarks.large``,
@@ -19,6 +20,7 @@ STAGES = {
     MARCHING: (216, 350, 7.5, 1e7, 3e7),
     SHARP: (216, 350, 7.5, 1e7, 3e7),
 }
+SPLINE = (216, 300, 4.5, 0, 2e7)
 BEFORE_MESHER = ("average", "fit")
 # Default for a network: bytes per voxel that it sees, including its row of the neighbour table, and
 # per value.
@@ -65,7 +67,12 @@ def slab_bytes(
     needs = {stage: float(np.dot(STAGES[stage], sizes)) for stage in (*BEFORE_MESHER, mesher)}
     extra = _sharp_bytes if mesher == SHARP else _lookup_bytes
     needs[mesher] += extra(band, planes, own, factor, threads)
-    needs["network"] = _bytes_for_network(voxels, own, factor, network_bytes)
+    if band.smooth is not None and not band.exact.any():
+        del needs["fit"]  # there are no spheres
+    if band.smooth is not None:
+        needs["spline"] = float(np.dot(SPLINE, sizes)) + spline_bytes(band.shape)
+    if band.smooth is None or band.has_kinks:
+        needs["network"] = _bytes_for_network(voxels, own, factor, network_bytes)
     return int(max(needs.values()))
 
 

@@ -154,10 +154,13 @@ def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, ...]) -> IntArray:
 
 
 def plane_blocks(
-    shape: tuple[int, ...], first: int = 0, last: int | None = None
+    shape: tuple[int, ...], first: int = 0, last: int | None = None, least: int = BLOCK_PLANES
 ) -> Iterator[tuple[int, int]]:
-    """Yield (start, stop) of blocks of planes with about ``BLOCK_SAMPLES`` samples each."""
-    step = max(BLOCK_SAMPLES // (shape[1] * shape[2]), BLOCK_PLANES)
+    """Yield (start, stop) of blocks of planes with about ``BLOCK_SAMPLES`` samples each.
+
+    They have at least ``least`` planes: more, if planes are made of many others beside them.
+    """
+    step = max(BLOCK_SAMPLES // (shape[1] * shape[2]), least)
     end = shape[0] if last is None else last
     for start in range(first, end, step):
         yield start, min(start + step, end)

@@ -7,6 +7,8 @@ ones), with the sign of the sample whose voxel the node lies in.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -158,6 +160,7 @@ def fine_grid(field: FineField) -> SdfGrid:
     extremes = min(lowest, grid.low - field.offset), max(highest, grid.high - field.offset)
     origin = grid.to_world([-0.5, -0.5, -0.5])
     kind = Field() if grid.field.kind == EXACT else Field(NOISY, True, NONE_EXACT)
+    kind = replace(kind, on_lattice=grid.field.on_lattice)
     return SdfGrid.trusted(
         lattice,
         spacing,

@@ -10,6 +10,8 @@ out, so that the bits of a result do not depend on the slabs.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +22,8 @@ from .band import plane_blocks
 
 POLE = 3**0.5 - 2
 TAIL = 12  # samples after which the prefilter has fallen to 1e-7
+BEYOND = TAIL + 2  # samples to either side on which the spline in a voxel depends
+STRIP_SAMPLES, STRIP_BYTES = 1 << 20, 60  # worked on at a time, and bytes of each, measured
 SIDE = 5  # coefficients along an axis on which the spline within half a voxel of a sample depends
 # Sums of fourth differences, in voxels, up to which a field is smooth, and from which it is not.
 SMOOTH, KINKED = 0.6, 1.3
@@ -51,16 +55,37 @@ def spline_blocks(
     blocks = np.zeros(((factor + 1) ** 3, len(voxel_ijk) + 1), np.float32)
     share = np.empty(len(voxel_ijk), np.float32)
     nx = values.shape[0]
-    for first, last in plane_blocks(tuple(values.shape)):
+    for first, last in plane_blocks(tuple(values.shape), least=2 * BEYOND):
         rows = slice(*np.searchsorted(voxel_ijk[:, 0], [first, last]).tolist())
         if rows.start == rows.stop:
             continue
-        low, high = max(first - TAIL - 2, 0), min(last + TAIL + 2, nx)
+        low, high = max(first - BEYOND, 0), min(last + BEYOND, nx)
         planes = in_spacings(np.asarray(values[low:high]), unit)
         ijk = voxel_ijk[rows] - np.array([low, 0, 0], np.int32)
-        share[rows] = network_share(planes * np.float32(0.5))[tuple(ijk.T)]
-        _evaluate(prefilter(planes), ijk + 2, factor, blocks[:, rows])
+        for start, stop in _strips(planes.shape):
+            which = np.flatnonzero((ijk[:, 1] >= start) & (ijk[:, 1] < stop))
+            if len(which):
+                around = max(start - BEYOND, 0)
+                strip = planes[:, around : stop + BEYOND]
+                at = ijk[which] - np.array([0, around, 0], np.int32)
+                share[rows][which] = network_share(strip * np.float32(0.5))[tuple(at.T)]
+                blocks[:, rows.start + which] = _evaluate(prefilter(strip), at + 2, factor)
     return blocks, share
+
+
+def _strips(shape: tuple[int, ...]) -> Iterator[tuple[int, int]]:
+    """Yield (start, stop) of rows of planes that are worked on at a time, to save memory."""
+    size = max(STRIP_SAMPLES // (shape[0] * shape[2]) - 2 * BEYOND, 2 * BEYOND)
+    for start in range(0, shape[1], size):
+        yield start, min(start + size, shape[1])
+
+
+def spline_bytes(shape: tuple[int, ...]) -> int:
+    """Return about how much memory ``spline_blocks`` takes, beyond the blocks."""
+    start, stop = next(plane_blocks(shape, least=2 * BEYOND))
+    planes = min(stop - start + 2 * BEYOND, shape[0])
+    size = max(STRIP_SAMPLES // (planes * shape[2]), 4 * BEYOND)
+    return 16 * planes * shape[1] * shape[2] + STRIP_BYTES * planes * min(size, shape[1]) * shape[2]
 
 
 def prefilter(values: FloatArray) -> FloatArray:
@@ -110,8 +135,9 @@ def node_weights(factor: int) -> NDArray[np.float32]:
     return weights.astype(np.float32)
 
 
-def _evaluate(coefficients: FloatArray, ijk: IntArray, factor: int, out: FloatArray) -> None:
-    """Set ``out``, (Q, n), to the spline at the nodes of the blocks of voxels (n, 3)."""
+def _evaluate(coefficients: FloatArray, ijk: IntArray, factor: int) -> FloatArray:
+    """Return the spline at the nodes of the blocks of voxels (n, 3), (Q, n)."""
+    out = np.empty(((factor + 1) ** 3, len(ijk)), np.float32)
     weights = node_weights(factor)
     step = np.array([coefficients.shape[1] * coefficients.shape[2], coefficients.shape[2], 1])
     around = (np.indices((SIDE,) * 3).reshape(3, -1).T - 2) @ step
@@ -130,6 +156,7 @@ def _evaluate(coefficients: FloatArray, ijk: IntArray, factor: int, out: FloatAr
                         node += line * share
             block = np.moveaxis(nodes, 0, axis)
         out[:, start : start + chunk] = block.reshape(len(out), -1)
+    return out
 
 
 def network_share(values: FloatArray) -> FloatArray:

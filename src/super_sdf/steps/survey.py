@@ -16,14 +16,17 @@ from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import NoSurfaceError, OutOfMemoryError
 from ..grid.cubic import on_samples, sampled_places
 from ..grid.field import EXACT, MASK
-from ..grid.planes import SampleArray
+from ..grid.planes import DerivedPlanes, SampleArray, planes_at_once, reading_bytes
 from ..grid.resampling import Resampled
 from ..grid.sdf_grid import SdfGrid
+from ..grid.unknown import KnownPlanes
 from ..machine.memory import held_memory, in_words
 from ..machine.resources import ONE_THREAD, Resources
 from ..machine.threads import map_threads
 from ..neighbourhood import CENTRE, STRIDES
 from .band import (
+    BLOCK_PLANES,
+    BLOCK_SAMPLES,
     can_hold_surface,
     find_band,
     gather_patches,
@@ -36,6 +39,7 @@ from .offsets import Jumps, check_not_cut_off, check_not_filled, find_jumps
 from .spheres import exact_samples
 
 BYTES_PER_VOXEL = 123  # of a band
+BYTES_PER_SAMPLE = 20  # of the planes among which the band is found, measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +73,8 @@ class Band:
         Whether the network may refine that field where it is not smooth.
     half_voxel, level : float
         Half a spacing in world units, by which these are divided; and what is zero then.
+    peak : int
+        The memory of the process in bytes while the band was found, of samples that are made.
     """
 
     shape: tuple[int, int, int]
@@ -84,6 +90,7 @@ class Band:
     has_kinks: bool = False
     half_voxel: float = 1.0
     level: float = 0.0
+    peak: int = 0
 
     @property
     def noisy_voxels(self) -> int:
@@ -185,7 +192,8 @@ def survey(grid: SdfGrid, offset: float = 0.0, resources: Resources = ONE_THREAD
         _check_bound(sum(sizes), planes.stop, held, resources.memory)
         return found
 
-    blocks = [slice(*block) for block in plane_blocks(grid.shape)]
+    planes, reading = plan_reading(grid.samples, held, resources)
+    blocks = [slice(*block) for block in plane_blocks(grid.shape, least=planes)]
     parts = map_threads(read, blocks, resources.threads)
     voxel_ijk = np.concatenate([ijk for ijk, _ in parts])
     patches = [part for _, part in parts]
@@ -197,7 +205,34 @@ def survey(grid: SdfGrid, offset: float = 0.0, resources: Resources = ONE_THREAD
     band = make_band(grid.shape, voxel_ijk, _concatenate(patches), resources.threads)
     if isinstance(grid.samples, Resampled):
         band = look_at_samples(band, grid, resources.threads)
-    return replace(limit_to_field(band, grid, offset), leaves=any(leaving))
+    peak = held + reading + len(voxel_ijk) * BYTES_PER_VOXEL if reading else 0
+    return replace(limit_to_field(band, grid, offset), leaves=any(leaving), peak=peak)
+
+
+def plan_reading(samples: SampleArray, held: int, resources: Resources) -> tuple[int, int]:
+    """Return how many planes to make at a time, and the bytes that this takes, beside those held.
+
+    It is 0 for samples that are read and not made of others, since it is little.
+
+    Raises
+    ------
+    OutOfMemoryError
+        If they do not fit in memory even plane by plane.
+    """
+    if not isinstance(samples, (DerivedPlanes, KnownPlanes)):
+        return BLOCK_PLANES, 0
+    plane, need = samples.shape[1] * samples.shape[2], 0
+    for least in (planes_at_once(samples), BLOCK_PLANES, 1):
+        planes = min(max(BLOCK_SAMPLES // plane, least), len(samples))
+        each = reading_bytes(samples, planes + 2) + planes * plane * BYTES_PER_SAMPLE
+        need = min(resources.threads, -(-len(samples) // planes)) * each
+        room = np.inf if resources.memory is None else resources.memory - held
+        if need <= (room if least == 1 else room / 2):  # the band needs room, too
+            return least, need
+    raise OutOfMemoryError(
+        f"making distances of the values needs {in_words(held + need)} of memory even plane by "
+        f"plane, {in_words(resources.memory or 0)} may be used; allow more (--max-memory)"
+    )
 
 
 def limit_to_field(band: Band, grid: SdfGrid, offset: float) -> Band:

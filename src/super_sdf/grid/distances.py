@@ -1,0 +1,196 @@
+"""Distances out of values that change from sample to sample: exact, noisy, truncated and scaled.
+
+A scaled or closely truncated field is meshed by its cubic spline, which is the same whatever the
+spacings. So it becomes distances on its lattice, and unequal spacings are no matter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..arrays import Triple
+from .evidence import SLOPE_OFF, Evidence, Looked, slope_within, weigh
+from .field import NOISY, NONE_EXACT, SCALED, TRUNCATED, Field
+from .gradients import surface_gradients, typical_length
+from .one_sided import check_thin, is_one_sided
+from .planes import SampleArray, changed
+from .request import Interpreted, Request
+from .samples import Extremes
+from .sides import is_positive_inside
+from .slopes import normalised_planes
+from .spacing import choose_spacing, in_finest, is_cubic, steps_of
+from .truncation import filled_planes, without_plateaus
+
+# Voxels from which on values may be cut off without a loss; up to which the rest is filled in; and
+# below which too few are left for that.
+HARMLESS, FILLED, TOO_NEAR = 3.0, 1.75, 0.85
+BENT = 0.1  # share of wrong slopes from which the network has no say in a field
+
+
+def as_distances(
+    samples: SampleArray,
+    extremes: Extremes,
+    request: Request,
+    notes: list[str],
+    *,
+    is_cut: bool = False,
+) -> Interpreted:
+    """Return values that are taken as distances, exact or noisy ones, some perhaps cut off."""
+    wanted = request.wanted.field
+    positive = is_positive_inside(samples, request.inside, extremes, notes)
+    spacing = choose_spacing(samples, request.spacing, notes, is_cut=is_cut)
+    if request.inside == "auto" and is_one_sided(extremes):
+        check_thin(samples, steps_of(spacing), extremes)
+    field = Field(NOISY, exact=NONE_EXACT) if wanted == NOISY else Field()
+    field = replace(field, given=not request.is_auto)
+    return Interpreted(samples, extremes, spacing, positive, field)
+
+
+def by_kind(found: Interpreted, looked: Looked, request: Request, notes: list[str]) -> Interpreted:
+    """Return values that were taken as distances with the kind that the samples show."""
+    evidence = weigh(looked, found.spacing)
+    is_cut = _cut_at(found, evidence) < HARMLESS and not evidence.is_bent
+    if is_cut or request.wanted.field == TRUNCATED:
+        return _truncated(found, evidence, request, notes)
+    if evidence.is_noisy:
+        return _noisy(found, evidence, notes)
+    if evidence.is_scaled:
+        return _scaled(found, evidence, request, notes)
+    return replace(found, field=replace(found.field, evidence=evidence.report()))
+
+
+def of_slope(
+    samples: SampleArray, looked: Looked, request: Request, notes: list[str]
+) -> Interpreted:
+    """Return distances for a field of another slope; the given spacing is believed."""
+    positive = is_positive_inside(samples, request.inside, looked.extremes, notes)
+    spacing = request.spacing or choose_spacing(samples, None, notes)
+    found = Interpreted(samples, looked.extremes, spacing, positive, Field())
+    evidence = weigh(looked, spacing)
+    is_cut = (evidence.cut_low or evidence.cut_high) and request.wanted.field != SCALED
+    slope = slope_within(looked, spacing) if is_cut else evidence.slope
+    if not np.isfinite(slope):
+        slope = _slope_beside(samples, spacing)
+    divided = _divided(found, slope)
+    shown = weigh(looked.divided(slope), spacing)
+    # densities that fade out over voxels are blurred, not cut off
+    fades = request.is_density and _cut_at(divided, shown) > TOO_NEAR
+    if not is_cut or shown.is_bent or fades:
+        return _scaled(found, replace(evidence, slope=slope), request, notes)
+    if abs(slope - 1) > SLOPE_OFF:
+        notes.append(f"the values are divided by their slope, {slope:.4g} instead of 1")
+        found = divided
+    return _truncated(found, shown, request, notes)
+
+
+def _slope_beside(samples: SampleArray, spacing: Triple) -> float:
+    """Return the typical slope of values beside their surface."""
+    gradients, bend = surface_gradients(samples)
+    finest = in_finest((gradients, bend), spacing)
+    return typical_length(*finest) / min(steps_of(spacing))
+
+
+def _divided(found: Interpreted, slope: float) -> Interpreted:
+    """Return values divided by a slope."""
+    low, high = found.extremes
+    divided = changed(found.samples, lambda v: v / slope)
+    return replace(found, samples=divided, extremes=(low / slope, high / slope))
+
+
+def _cut_at(found: Interpreted, evidence: Evidence) -> float:
+    """Return at how many voxels from the surface values are cut off; infinite if they are not.
+
+    Where the spacings differ, voxels are as long as the longest one.
+    """
+    h = max(steps_of(found.spacing))
+    low = -found.extremes[0] / h if evidence.cut_low else np.inf
+    high = found.extremes[1] / h if evidence.cut_high else np.inf
+    return float(min(low, high))
+
+
+def _truncated(
+    found: Interpreted, evidence: Evidence, request: Request, notes: list[str]
+) -> Interpreted:
+    """Return truncated distances, the missing ones filled in if that helps."""
+    at = _cut_at(found, evidence)
+    field = Field(TRUNCATED, request.wanted.field == TRUNCATED, _exact_within(found, evidence))
+    found = replace(found, field=replace(field, evidence=evidence.report()))
+    if np.isfinite(at):
+        notes.append(
+            f"values taken as truncated (--field truncated): cut off {at:.3g} voxels from the "
+            "surface"
+        )
+    if at < TOO_NEAR:
+        return _as_spline(found)
+    if at < FILLED:
+        filled = filled_planes(found.samples, steps_of(found.spacing), found.extremes)
+        return replace(found, samples=filled)
+    return found
+
+
+def _exact_within(found: Interpreted, evidence: Evidence) -> Extremes:
+    """Return the values, negative inside, between which truncated distances can be exact."""
+    low = found.extremes[0] if evidence.cut_low else -np.inf
+    high = found.extremes[1] if evidence.cut_high else np.inf
+    return (-high, -low) if found.positive_inside else (low, high)
+
+
+def _as_spline(found: Interpreted) -> Interpreted:
+    """Return distances that were cut off too near the surface, to be meshed by their spline."""
+    sign = -1.0 if found.positive_inside else 1.0
+    smooth = changed(found.samples, lambda v: v * sign)
+    field = replace(found.field, smooth=smooth)
+    if not is_cubic(found.spacing):  # the spheres of samples are none on the lattice
+        field = replace(field, on_lattice=True, exact=NONE_EXACT)
+    samples = without_plateaus(found.samples, found.extremes, min(steps_of(found.spacing)))
+    return replace(found, samples=samples, field=field)
+
+
+def _noisy(found: Interpreted, evidence: Evidence, notes: list[str]) -> Interpreted:
+    """Return noisy distances, and say how noisy they are."""
+    notes.append(
+        f"values taken as noisy (--field noisy): at {100 * evidence.noisy:.2g} % of the "
+        "samples beside the surface they change by more than distances can; the noise is at "
+        f"most about {evidence.roughness:.2g} voxels"
+    )
+    return replace(found, field=replace(found.field, kind=NOISY, evidence=evidence.report()))
+
+
+def _scaled(
+    found: Interpreted, evidence: Evidence, request: Request, notes: list[str]
+) -> Interpreted:
+    """Return a field of another slope, divided by it; its cubic spline has the surface."""
+    slope = evidence.slope if np.isfinite(evidence.slope) else 1.0
+    notes.append(
+        f"values taken as scaled (--field scaled): {_wrong_slope(slope, evidence)}; where they are "
+        "smooth, the surface is that of their cubic spline"
+    )
+    sign = (-1 if found.positive_inside else 1) / slope
+    field = Field(
+        SCALED,
+        request.wanted.field == SCALED,
+        NONE_EXACT,
+        smooth=changed(found.samples, lambda v: v * sign),
+        has_kinks=evidence.wrong < BENT and is_cubic(found.spacing),
+        on_lattice=not is_cubic(found.spacing),
+        evidence=evidence.report(),
+    )
+    low, high = (x / slope for x in found.extremes)
+    return replace(found, samples=_on_lattice(found, slope), extremes=(low, high), field=field)
+
+
+def _wrong_slope(slope: float, evidence: Evidence) -> str:
+    """Return a clause that says how the slope of a field is wrong."""
+    why = f"beside the surface their slope is {slope:.4g} instead of 1"
+    if evidence.is_bent:
+        why += f", and wrong at {100 * evidence.wrong:.2g} % of the samples"
+    return why
+
+
+def _on_lattice(found: Interpreted, slope: float) -> SampleArray:
+    """Return values over their slope on the lattice, which is typically the mean of its steps."""
+    steps = steps_of(found.spacing)
+    step = steps[0] if is_cubic(found.spacing) else float(np.exp(np.log(steps).mean()))
+    return normalised_planes(found.samples, min(steps), step * slope)

@@ -1,0 +1,126 @@
+"""Masks out of other values: labels, two values, distance transforms, and steep densities.
+
+``masks`` makes distances of them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import GridError
+from .evidence import ENOUGH, Looked
+from .field import AUTO, MASK, NONE_EXACT, Field
+from .masks import extremes_of_masks, has_both_sides, mask_planes
+from .planes import SampleArray, changed
+from .request import Interpreted, Request
+from .samples import Extremes
+from .sides import count_border, is_mostly_negative
+from .spacing import is_cubic, steps_of
+
+# Densities have no ramp if half of the changes across the level are this share of all there is to
+# change, the lowest and the highest values left out.
+STEP, STEP_TAIL = 0.85, 0.05
+MOST_LABELS = 64  # whole numbers up to this look like labels
+MOST_NAMED = 8  # labels that a message lists
+
+
+def labelled(samples: SampleArray, label: float) -> SampleArray:
+    """Return which samples have a label; GridError if none or all have."""
+    found = changed(samples, lambda planes: planes == label, np.bool_)
+    if not has_both_sides(found):
+        labels = sorted({float(x) for plane in samples for x in np.unique(plane)[: MOST_NAMED + 1]})
+        named = ", ".join(f"{x:g}" for x in labels[:MOST_NAMED])
+        named += ", ..." if len(labels) > MOST_NAMED else ""
+        which = "every sample" if (np.asarray(samples[0]) == label).any() else "no sample"
+        raise GridError(f"{which} has the label {label:g}: the labels are {named}")
+    return found
+
+
+def above(samples: SampleArray, level: float) -> SampleArray:
+    """Return which samples are above a level."""
+    return changed(samples, lambda planes: planes > level, np.bool_)
+
+
+def are_labels(samples: SampleArray, extremes: Extremes) -> bool:
+    """Return whether values look like labels: small whole numbers from 0 on."""
+    whole = samples.dtype.kind in "iu" and extremes[0] == 0
+    return whole and extremes[1] <= MOST_LABELS
+
+
+def refuse_labels(extremes: Extremes) -> GridError:
+    """Return the error for labels of which none is chosen."""
+    low, high = extremes
+    return GridError(
+        f"the values are whole numbers from {low:g} to {high:g}, as of labels: choose the solid "
+        "with --label, or with --level if they are densities"
+    )
+
+
+def is_step(looked: Looked) -> bool:
+    """Return whether densities jump over the level from sample to sample, with no ramp between.
+
+    Then where the surface lies between two samples does not show in their values.
+    """
+    pairs = np.stack([looked.lines[..., 1:3], looked.lines[..., 2:4]]).reshape(-1, 2)
+    across: NDArray[np.float64] = pairs[(pairs[:, 0] > 0) != (pairs[:, 1] > 0)]
+    if len(across) < ENOUGH:
+        return False
+    low, high = np.quantile(looked.lines, [STEP_TAIL, 1 - STEP_TAIL])
+    jumps = np.abs(across[:, 1] - across[:, 0])
+    return bool(np.median(jumps) > STEP * (high - low))
+
+
+def of_signs(
+    samples: SampleArray, extremes: Extremes, request: Request, notes: list[str]
+) -> Interpreted:
+    """Return the distances of the mask that the signs of numbers make; 0 is the one side or other.
+
+    ``extremes`` are the smallest and the largest sample.
+    """
+    low, high = extremes
+    if low > 0 or high < 0:
+        raise GridError(
+            f"every value is {'above' if low > 0 else 'below'} 0 (they go from {low:.6g} to "
+            f"{high:.6g}), so their signs make no mask: choose the solid with --label, or what is "
+            "above a value with --level"
+        )
+    if high > 0:
+        return of_mask(above(samples, 0), request, notes)
+    below = changed(samples, lambda planes: planes < 0, np.bool_)
+    return of_mask(below, request.other_side(), notes)
+
+
+def of_mask(mask: SampleArray, request: Request, notes: list[str]) -> Interpreted:
+    """Return the distances of a mask, which says on which side of a level each sample is.
+
+    They are distances on its lattice, whatever the spacings: a mask shows none in the world.
+    """
+    if not has_both_sides(mask):
+        raise GridError(f"every value is {bool(mask[0].flat[0])}: a constant field has no surface")
+    if not _is_true_inside(mask, request.inside, notes):
+        mask = changed(mask, np.logical_not, np.bool_)
+    spacing = request.with_spacing(1, "since a mask shows none (give --spacing)", notes).spacing
+    assert spacing is not None
+    notes.append(
+        "values taken as a mask (--field mask): they show the surface to half a voxel only"
+    )
+    h, given = min(steps_of(spacing)), request.wanted.field == MASK
+    field = Field(MASK, given, NONE_EXACT, on_lattice=not is_cubic(spacing))
+    return Interpreted(mask_planes(mask, h), extremes_of_masks(h), spacing, False, field)
+
+
+def _is_true_inside(mask: SampleArray, inside: str, notes: list[str]) -> bool:
+    """Return whether the larger value of a mask is inside: the border is outside unless given."""
+    if inside != AUTO:
+        return inside == "positive"
+    signs = changed(mask, lambda planes: planes.astype(np.int8) * 2 - 1, np.int8)
+    below, total = count_border(signs)
+    positive = is_mostly_negative(below, total)
+    share = max(below, total - below) / total
+    if share < 1:
+        notes.append(
+            f"the {'larger' if positive else 'smaller'} value is taken as inside: {share:.0%} of "
+            "the grid's border has the other one (if that is wrong, use --inside)"
+        )
+    return positive

@@ -1,0 +1,188 @@
+"""Masks, densities, truncated and scaled fields on grids whose spacings differ."""
+
+import json
+
+import nibabel
+import numpy as np
+import pytest
+from conftest import trilinear
+from scipy import ndimage
+
+from super_sdf import (
+    extract_mesh,
+    make_grid,
+    read_field,
+    read_grid,
+    reconstruct,
+    upsample,
+    write_field,
+)
+from super_sdf.errors import GridError
+from super_sdf.grid.masks import is_distance_transform
+
+SPACING = np.array([1.0, 1.0, 2.5])
+SHAPE = (48, 44, 20)
+ORIGIN = np.array([5.0, -7.0, 2.0])
+
+
+def places() -> np.ndarray:
+    """Return the places of samples less the origin, (3, nx, ny, nz)."""
+    return np.indices(SHAPE) * SPACING[:, None, None, None]
+
+
+def ball(middle: tuple[float, ...] = (20.0, 24.0, 22.0), radius: float = 14.0) -> np.ndarray:
+    """Return distances to a ball off the middle of the grid."""
+    return np.sqrt(((places() - np.array(middle)[:, None, None, None]) ** 2).sum(0)) - radius
+
+
+def two_parts() -> np.ndarray:
+    """Return distances to a solid without a symmetry: a large ball and a small one beside it."""
+    return np.minimum(ball(), ball((35.0, 26.0, 30.0), 8.0))
+
+
+def volume(big: float = 14.0, small: float = 8.0) -> float:
+    """Return the volume of the solid of ``two_parts``: two balls less the lens in both."""
+    apart = np.linalg.norm([15.0, 2.0, 8.0])
+    lens = (big + small - apart) ** 2 * (
+        apart**2 + 2 * apart * (big + small) - 3 * (big - small) ** 2
+    )
+    return np.pi * (4 / 3 * (big**3 + small**3) - lens / 12 / apart)
+
+
+def off(mesh, direction: np.ndarray | None = None, origin: np.ndarray = ORIGIN) -> np.ndarray:
+    """Return the distances of a mesh's vertices from the solid of ``two_parts``."""
+    turned = (mesh.vertices - origin) @ (np.eye(3) if direction is None else direction)
+    balls = ((20.0, 24.0, 22.0), 14.0), ((35.0, 26.0, 30.0), 8.0)
+    return np.min([np.linalg.norm(turned - np.array(m), axis=1) - r for m, r in balls], axis=0)
+
+
+KINDS = {
+    "mask": (two_parts() < 0, {}, 0.6),
+    "label": (np.where(two_parts() < 0, 3, 1), {"label": 3}, 0.6),
+    "transform": (
+        ndimage.distance_transform_edt(two_parts() < 0, sampling=SPACING)
+        - ndimage.distance_transform_edt(two_parts() >= 0, sampling=SPACING),
+        {},
+        0.6,
+    ),
+    "steep densities": (np.where(two_parts() < 0, 900.0, 0) + np.indices(SHAPE).sum(0),
+                        {"level": 450}, 0.6),
+    "ramp": (100 / (1 + np.exp(two_parts() / 1.5)), {"level": 50}, 0.12),
+    "shares of voxels": (np.clip(0.5 - two_parts() / 1.5, 0, 1), {"level": 0.5}, 0.3),
+    "scaled": (two_parts() * (two_parts() + 60) * 7, {"field": "scaled"}, 0.12),
+    "truncated at .5": (np.clip(two_parts(), -1.25, 1.25), {}, 0.3),
+    "truncated at 1": (np.clip(two_parts(), -2.5, 2.5), {}, 0.2),
+    "truncated at 1, unknown beyond": (
+        np.where(np.abs(two_parts()) < 2.5, two_parts(), np.nan),
+        {},
+        0.2,
+    ),
+    "truncated at 2": (np.clip(two_parts(), -5, 5), {}, 0.08),
+}  # fmt: skip
+TAKEN = {"label": "mask", "transform": "mask", "steep densities": "mask", "ramp": "scaled"}
+TAKEN["shares of voxels"] = "truncated"
+TURN = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # also mirrored
+
+
+@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("direction", [None, TURN])
+def test_the_mesh_is_at_its_place_with_any_kind(name, direction):
+    values, options, limit = KINDS[name]
+    place = {"spacing": SPACING, "origin": ORIGIN, "direction": direction}
+    grid = make_grid(values, **place, inside="auto", **options)
+    assert grid.field.kind == TAKEN.get(name, name.split(" at")[0])
+    mesh = reconstruct(grid, trilinear)
+    found = np.abs(off(mesh, direction))
+    assert mesh.is_closed() and found.mean() < limit and found.max() < 5 * limit
+    assert mesh.volume() == pytest.approx(volume(), rel=0.03)
+
+
+@pytest.mark.parametrize("mesher", ["marching", "sharp"])
+def test_a_mask_with_unequal_spacings_is_the_stretched_mask(mesher):
+    mask = two_parts() < 0
+    cubes = reconstruct(make_grid(mask, spacing=1, origin=0), trilinear, mesher=mesher)
+    mesh = reconstruct(make_grid(mask, spacing=SPACING, origin=0), trilinear, mesher=mesher)
+    np.testing.assert_allclose(mesh.vertices, cubes.vertices * SPACING, rtol=1e-5)
+    np.testing.assert_array_equal(mesh.faces, cubes.faces)
+
+
+def test_the_kinds_of_distances_are_told_apart_with_unequal_spacings():
+    distances = two_parts()
+    noise = np.random.default_rng(0).uniform(-0.4, 0.4, SHAPE)
+    for values, kind in ((distances, "exact"), (distances + noise, "noisy")):
+        grid = make_grid(values, spacing=SPACING, origin=0)
+        assert grid.field.kind == kind and grid.spacing == tuple(SPACING)
+    assert make_grid(distances, spacing=SPACING).field.report()["slope"] == pytest.approx(1, 0.02)
+
+
+@pytest.mark.parametrize("spacing", [SPACING, np.array([0.7, 0.7, 2.5]), np.array([1, 1.3, 5])])
+def test_distances_between_samples_are_no_exact_distances(spacing):
+    inside = two_parts() < 0
+    out, into = (
+        ndimage.distance_transform_edt(side, sampling=spacing) for side in (~inside, inside)
+    )
+    for values in (out - into, into - out, into, out):
+        grid = make_grid(values, spacing=spacing, origin=0)
+        np.testing.assert_array_equal(grid.values < 0, inside)
+        assert grid.field.kind == "mask"
+    lines = np.array([[[2.0, 1, 0, -1, -2]] * 3] * 40)
+    assert is_distance_transform(lines, (1.0, 1.0, 2.5)) == 0
+
+
+@pytest.mark.parametrize("name", ["mask", "scaled"])
+def test_an_offset_needs_distances_in_the_world(name):
+    values, options, _ = KINDS[name]
+    grid = make_grid(values, spacing=SPACING, **options)
+    with pytest.raises(GridError) as caught:
+        reconstruct(grid, trilinear, offset=0.5)
+    assert str(caught.value) == (
+        f"offset 0.5: the values are taken as {name}, and with the spacing 1, 1, 2.5 they are no "
+        "distances by which an offset surface could be found; mesh the solid itself (--offset 0), "
+        "sample the mesh (super-sdf sample), and mesh that grid with the offset"
+    )
+
+
+def test_a_second_iteration_and_a_saved_field_keep_the_spacings(tmp_path):
+    grid = make_grid(two_parts() < 0, spacing=SPACING, origin=ORIGIN)
+    for iterations in (1, 2):
+        assert np.abs(off(reconstruct(grid, trilinear, 2, iterations=iterations))).mean() < 0.6
+    field = upsample(grid, trilinear, 2)
+    write_field(field, tmp_path / "field.npz")
+    want, mesh = extract_mesh(field), extract_mesh(read_field(tmp_path / "field.npz"))
+    np.testing.assert_array_equal(mesh.vertices, want.vertices)
+
+
+def test_the_command_takes_a_label_image_with_thick_slices(tmp_path, command):
+    np.save(tmp_path / "labels.npy", np.where(two_parts() < 0, 3, 0))
+    words = "upsample", tmp_path / "labels.npy", tmp_path / "out.ply", "--label", "3", "--json"
+    code, out, _ = command(*map(str, words), "--spacing", "1,1,2.5")
+    report = json.loads(out)
+    assert code == 0 and report["spacing"] == [1, 1, 2.5] and report["closed"]
+    assert report["expected_triangles"] == pytest.approx(report["triangles"], rel=0.25)
+
+
+def test_a_label_image_with_thick_slices_is_at_its_place_in_the_world(tmp_path):
+    """TURN is mirrored, as the axes of many scanners are against those of NIfTI."""
+    affine = np.eye(4)
+    affine[:3, :3], affine[:3, 3] = TURN * SPACING, ORIGIN
+    image = nibabel.Nifti1Image(np.where(two_parts() < 0, 3, 1).astype(np.int16), affine)
+    nibabel.save(image, tmp_path / "labels.nii.gz")
+    mesh = reconstruct(read_grid(tmp_path / "labels.nii.gz", label=3), trilinear)
+    found = np.abs(off(mesh, TURN))
+    assert mesh.is_closed() and found.mean() < 0.6
+    assert mesh.volume() == pytest.approx(volume(), rel=0.03)
+
+
+@pytest.mark.parametrize("cut", [0.5, 0.75, 1, 2])
+def test_a_truncated_box_along_the_axes_keeps_its_unit(cut):
+    """Along z its values change by less than the spacing, and along all axes at corners only."""
+    at = np.abs(np.indices((60, 60, 24)) * SPACING[:, None, None, None] - 29.0)
+    away = at - np.array([15, 12, 11.3])[:, None, None, None]
+    values = np.sqrt((np.maximum(away, 0) ** 2).sum(0)) + np.minimum(away.max(0), 0)
+    grid = make_grid(np.clip(values, -cut * 2.5, cut * 2.5), spacing=SPACING, origin=0)
+    assert grid.notes[-1] == (
+        f"values taken as truncated (--field truncated): cut off {cut:.3g} voxels from the surface"
+    )
+    assert not any("slope" in note for note in grid.notes)
+    mesh = reconstruct(grid, trilinear)
+    assert mesh.is_closed() and mesh.volume() == pytest.approx(30 * 24 * 22.6, rel=0.03)
