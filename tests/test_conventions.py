@@ -111,10 +111,9 @@ def test_a_wrong_unit_is_refused_with_the_way_out():
 def test_values_that_change_by_less_than_the_spacing_are_noted(spacing):
     grid = make_grid(ball(24, 8.0).values, spacing=spacing, origin=0)
     assert grid.spacing == (spacing,) * 3
-    note, kind = grid.notes
-    assert kind.startswith(
-        "values taken as scaled (--field scaled): beside the surface their slope"
-    )
+    note, unit = grid.notes
+    assert unit.startswith("the values are distances in another unit: multiplied by ")
+    assert float(unit.split()[9]) == pytest.approx(spacing, rel=3e-3)
     assert note.startswith("the values change by ")
     assert note.endswith(
         f"spacing is {spacing:g}: they are not exact distances, or the unit is wrong"
@@ -123,7 +122,7 @@ def test_values_that_change_by_less_than_the_spacing_are_noted(spacing):
 
 def test_values_that_are_not_quite_distances_are_noted():
     grid = make_grid(torus(64) * 1.2, spacing=1 / 64, origin=0)
-    assert "they are not exact distances" in grid.notes[0] and grid.field.kind == "scaled"
+    assert "they are not exact distances" in grid.notes[0] and "another unit" in grid.notes[1]
 
 
 def test_spacing_must_be_positive_and_finite():

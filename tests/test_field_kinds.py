@@ -82,7 +82,13 @@ def noisy(values: np.ndarray, amplitude: float = 0.25) -> np.ndarray:
     return values + np.random.default_rng(0).uniform(-amplitude, amplitude, values.shape)
 
 
+def thin_frame() -> np.ndarray:
+    """Return distances to walls, 1.4 voxels thick: few samples are smooth as far as the next."""
+    return np.abs(box()) - 0.7
+
+
 MASK = torus() < 0
+WAVES = 1 + 0.5 * np.sin(4 * np.pi * sum(lattice(32)))
 KINDS = {
     "a torus": (torus(), "exact"),
     "a torus of 16^3": (torus(16), "exact"),
@@ -102,7 +108,9 @@ KINDS = {
     "little noise": (noisy(box(), 0.02), "exact"),
     "an ellipsoid's polynomial": (ellipsoid() * 32 / 14, "scaled"),
     "a smooth union": (smooth_union(), "scaled"),
-    "half as steep": (torus(48) / 2, "scaled"),
+    "half as steep": (torus(48) / 2, "exact"),
+    "steeper from place to place": (box() * WAVES, "scaled"),
+    "thin, and steeper from place to place": (thin_frame() * WAVES, "scaled"),
     "truth": (MASK, "mask"),
     "bytes": (MASK.astype(np.uint8), "mask"),
     "255": (MASK * np.float32(255), "mask"),
@@ -126,6 +134,24 @@ def test_exact_distances_are_passed_on_as_they_are():
     assert grid.samples is values and grid.notes == ()
     assert grid.field.report()["slope"] == pytest.approx(1, abs=0.01)
     assert grid.field.exact == (-np.inf, np.inf)
+
+
+@pytest.mark.parametrize("unit", [0.01, 0.5])
+def test_distances_in_another_unit_are_exact_in_that_of_the_spacing(unit):
+    values = (unit * box()).astype(np.float32)
+    grid = make_grid(values, **PLACE)
+    assert np.allclose(grid.values, box(), rtol=3e-3, atol=1e-6)
+    assert grid.notes[-1].startswith("the values are distances in another unit: multiplied by ")
+    told = make_grid(values, **PLACE, scale=1 / unit)
+    assert told.notes == () and np.allclose(told.values, box(), atol=1e-5)
+
+
+def test_noise_is_told_from_slopes_that_vary():
+    for amplitude in (0.05, 0.1, 0.2, 0.4):
+        for values in (box(), torus(), thin_frame()):
+            grid = make_grid(noisy(values, amplitude), **PLACE)
+            assert grid.field.kind in ("noisy", "exact"), amplitude
+    assert not make_grid(thin_frame() * WAVES, **PLACE).field.has_kinks
 
 
 @pytest.mark.parametrize("field", FIELDS[1:])

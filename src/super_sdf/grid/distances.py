@@ -20,7 +20,7 @@ from .request import Interpreted, Request
 from .samples import Extremes
 from .sides import is_positive_inside
 from .slopes import normalised_planes
-from .spacing import choose_spacing, in_finest, is_cubic, steps_of
+from .spacing import choose_spacing, in_finest, is_cubic, measure_spacing, steps_of
 from .truncation import filled_planes, without_plateaus
 
 # Voxels from which on values may be cut off without a loss; up to which the rest is filled in; and
@@ -57,8 +57,24 @@ def by_kind(found: Interpreted, looked: Looked, request: Request, notes: list[st
     if evidence.is_noisy:
         return _noisy(found, evidence, notes)
     if evidence.is_scaled:
-        return _scaled(found, evidence, request, notes)
+        in_unit = _in_another_unit(found, looked, notes)
+        return in_unit or _scaled(found, evidence, request, notes)
     return replace(found, field=replace(found.field, evidence=evidence.report()))
+
+
+def _in_another_unit(found: Interpreted, looked: Looked, notes: list[str]) -> Interpreted | None:
+    """Return distances that only have another unit than the spacing, in the spacing's."""
+    if not is_cubic(found.spacing):
+        return None
+    unit = measure_spacing(found.samples) / found.spacing[0]
+    evidence = weigh(looked.divided(unit), found.spacing)
+    if not np.isfinite(unit) or evidence.is_scaled or evidence.is_noisy:
+        return None
+    notes.append(
+        f"the values are distances in another unit: multiplied by {1 / unit:.6g} (give --scale)"
+    )
+    divided = _divided(found, unit)
+    return replace(divided, field=replace(found.field, evidence=evidence.report()))
 
 
 def of_slope(
@@ -173,12 +189,17 @@ def _scaled(
         request.wanted.field == SCALED,
         NONE_EXACT,
         smooth=changed(found.samples, lambda v: v * sign),
-        has_kinks=evidence.wrong < BENT and is_cubic(found.spacing),
+        has_kinks=_has_distances(evidence) and is_cubic(found.spacing),
         on_lattice=not is_cubic(found.spacing),
         evidence=evidence.report(),
     )
     low, high = (x / slope for x in found.extremes)
     return replace(found, samples=_on_lattice(found, slope), extremes=(low, high), field=field)
+
+
+def _has_distances(evidence: Evidence) -> bool:
+    """Return whether a field has the slope of a distance almost everywhere, as next to kinks."""
+    return evidence.wrong < BENT and not evidence.is_too_steep
 
 
 def _wrong_slope(slope: float, evidence: Evidence) -> str:

@@ -35,6 +35,9 @@ WRONG_SLOPES, WRONG_IF_ROUGH = 0.01, 0.05
 CUT_OFF = 0.01  # share of samples amid equal ones, at the lowest or highest value
 LIPSCHITZ, BENT, NOISY = 1.05, 0.3, 0.02  # change, difference and share from which it is noisy
 LEAST_SAMPLES = 100  # from which shares are evidence
+# Noise makes values change by more than distances can at a share of the samples that grows with its
+# standard deviation: up to 2.5 per spacing were measured.
+MOST_BY_NOISE = 3.0
 OFF = 0.1  # from 1: typical slopes further off show another unit
 SLOPE_OFF = 0.25  # from 1: truncated distances have another unit
 
@@ -77,7 +80,12 @@ class Evidence:
     def is_bent(self) -> bool:
         """Whether the slope differs from place to place, so that no unit makes distances of it."""
         allowed = WRONG_SLOPES if np.isfinite(self.slope) else WRONG_IF_ROUGH
-        return self.is_enough and self.wrong > allowed
+        return self.is_enough and (self.wrong > allowed or self.is_too_steep)
+
+    @property
+    def is_too_steep(self) -> bool:
+        """Whether values change by more than distances can at more samples than noise explains."""
+        return self.noisy > max(NOISY, MOST_BY_NOISE * self.roughness)
 
     @property
     def is_noisy(self) -> bool:

@@ -164,6 +164,14 @@ def _infer_axes(found: NDArray[np.float64], notes: list[str]) -> Triple:
     return spacing
 
 
+def measure_spacing(values: SampleArray) -> float:
+    """Return the change of values from sample to sample where they are smooth; NaN if nowhere."""
+    everywhere, beside = straight_gradients(values), surface_gradients(values)
+    if not (len(everywhere[0]) or len(beside[0])):
+        return float("nan")
+    return _measure(everywhere, beside)
+
+
 def _measure(everywhere: Gradients, beside: Gradients) -> float:
     """Return the change of the values from sample to sample where the field is smooth.
 
