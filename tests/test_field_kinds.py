@@ -154,6 +154,14 @@ def test_noise_is_told_from_slopes_that_vary():
     assert not make_grid(thin_frame() * WAVES, **PLACE).field.has_kinks
 
 
+@pytest.mark.parametrize("cut", [0.3, 0.5, 0.8])
+def test_samples_that_were_not_cut_off_are_exact_and_plateaus_are_no_band(cut):
+    grid = make_grid(np.clip(box(), -cut, cut), **PLACE)
+    band = survey(grid)
+    assert band.exact.sum() == (np.abs(box()) < cut).sum()
+    assert len(band.voxel_ijk) < 0.3 * box().size and band.lipschitz.all()
+
+
 @pytest.mark.parametrize("field", FIELDS[1:])
 def test_the_user_may_overrule_the_evidence(field):
     grid = make_grid(torus(), **PLACE, field=field)

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray, Triple
-from .planes import FAR as VERY_FAR
 from .planes import DerivedPlanes, SampleArray, in_spacings
 from .samples import Extremes
 
@@ -24,6 +23,7 @@ FAR = 2.6  # voxels: the distance of a sample without a foot point near it
 LEAST_SLOPE = 0.3  # of a sample whose foot point is used
 DISC = np.float32(0.2)  # voxels
 ROUNDS = 2
+RINGS = 2  # of samples amid a plateau that are raised, so that they lie beyond the band
 WITHIN = 1 - 1e-5  # share of the limit up to which a value is not cut off
 FILL_BYTES = 40  # per sample, measured
 CHUNK = 1 << 14  # samples that are worked on at a time, so that they stay in the cache
@@ -88,19 +88,22 @@ def filled_planes(values: SampleArray, spacing: Triple, limits: Extremes) -> Der
 
 
 def without_plateaus(values: SampleArray, limits: Extremes, h: float) -> DerivedPlanes:
-    """Return truncated distances, those far away where all samples round one were cut off alike.
+    """Return truncated distances, larger where all samples round one were cut off alike.
 
-    They are too far from the surface to matter, however near it they were cut off.
+    They are too far from the surface to matter, however near it they were cut off. From sample to
+    sample they change by no more than the spacing h, as distances do.
     """
 
     def make(planes: NDArray[Any]) -> NDArray[np.float64]:
         found = planes.astype(np.float64)
         for limit in limits:
-            amid = _all_around(planes == limit)
-            found[amid] = np.sign(limit) * VERY_FAR * h
+            amid = planes == limit
+            for _ in range(RINGS):
+                amid = _all_around(amid)
+                found[amid] += np.sign(limit) * h
         return found
 
-    return DerivedPlanes(values, make, 1)
+    return DerivedPlanes(values, make, RINGS)
 
 
 def _all_around(marked: BoolArray) -> BoolArray:
