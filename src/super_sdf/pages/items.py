@@ -25,6 +25,7 @@ from .thumbnails import thumbnail
 RESULT = "super-sdf"
 LONGEST_HEAD = 1 << 20  # bytes of a file's first line
 COMMENT = b"// "
+CALL = "superSdfMeshes"  # the function of ``page.js``
 
 
 @dataclass
@@ -43,6 +44,8 @@ class Item:
         What is missing, and why.
     made_of : str
         The SHA-256 of the mesh file, if the item is kept in a file.
+    size : int
+        About how many bytes the meshes take in a page; of an item from a file.
     """
 
     thumbnail: str | None = None
@@ -50,10 +53,7 @@ class Item:
     certificate: dict[str, Any] | None = None
     remarks: list[str] = field(default_factory=list)
     made_of: str = ""
-
-    def size(self) -> int:
-        """Return about how many bytes the meshes take in a page."""
-        return sum(len(mesh["data"]) for mesh in self.meshes)
+    size: int = 0
 
 
 def item_of_files(
@@ -61,13 +61,18 @@ def item_of_files(
     grid: str | Path,
     options: CheckOptions,
     certificate: Certificate | None = None,
+    *,
+    draw: bool = True,
 ) -> Item:
-    """Return the item of a mesh file and its grid file; what cannot be made is said in it."""
+    """Return the item of a mesh file and its grid file; what cannot be made is said in it.
+
+    With ``draw`` it has a thumbnail.
+    """
     try:
         read = read_for_check(mesh, grid, options)
     except SuperSdfError as error:
         return Item(certificate={"error": str(error)}, remarks=[f"not shown: {error}"])
-    return item_of(*read, options, certificate, draw=True)
+    return item_of(*read, options, certificate, draw=draw)
 
 
 def item_of(
@@ -101,9 +106,31 @@ def add_mesh(item: Item, make: Callable[[], Shown], *, draw: bool = False) -> No
         item.remarks.append(f"not shown: {error}")
 
 
-def write_item(item: Item, name: str, folder: Path) -> None:
-    """Write the file of an item, complete or not at all."""
-    head = json.dumps({**vars(item), "meshes": item.size()})
-    call = f"superSdfMeshes({json.dumps(name)}, {json.dumps(item.meshes)});"
-    with replacing(folder / f"{name}.js") as part:
-        part.write_bytes(COMMENT + f"{head}\n{call}\n".encode("ascii"))
+def write_item(item: Item, path: Path) -> None:
+    """Write the file of an item, complete or not at all; its stem is the id that the page uses."""
+    size = sum(len(mesh["data"]) for mesh in item.meshes)
+    head = json.dumps({**vars(item), "meshes": [], "size": size})
+    with replacing(path) as part:
+        part.write_bytes(COMMENT + f"{head}\n{item_call(item, path.stem)}\n".encode("ascii"))
+
+
+def item_call(item: Item, name: str) -> str:
+    """Return the line of script that hands the meshes of an item to the page."""
+    return f"{CALL}({json.dumps(name)}, {json.dumps(item.meshes)});"
+
+
+def read_head(path: Path) -> Item | None:
+    """Return an item from its file, without the meshes; None if there is none."""
+    try:
+        with path.open("rb") as file:
+            line = file.readline(LONGEST_HEAD)
+        return Item(**json.loads(line.removeprefix(COMMENT)))
+    except (OSError, ValueError, TypeError):  # of another version, or damaged
+        return None
+
+
+def read_meshes(path: Path) -> list[dict[str, Any]]:
+    """Return the packed meshes from the file of an item that was just written or read."""
+    _, call = path.read_bytes().split(b"\n", 1)
+    meshes: list[dict[str, Any]] = json.loads(call[call.index(b"[") : call.rindex(b"]") + 1])
+    return meshes

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,10 +67,8 @@ def shown_coarse(grid: SdfGrid, options: CheckOptions) -> Shown:
     """Return coarse marching cubes for the page, with residuals if samples are exact."""
     mesh = coarse_surface(grid, options.offset, options.max_memory)
     certificate = None
-    try:
+    with suppress(SuperSdfError):  # then it is shown without residuals
         certificate = check_mesh(mesh, grid, options) if len(mesh.faces) else None
-    except SuperSdfError:  # it is shown without residuals
-        pass
     return shown_result("marching cubes of the samples", mesh, certificate, options.max_memory)
 
 
