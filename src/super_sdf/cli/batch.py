@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import WriteError
+from ..errors import SuperSdfError, WriteError
 from ..files.formats import NAMED, list_formats
 from ..machine.extras import check_modules
 from .batch_report import print_plan, print_summary, progress_line, sentence
 from .choices import LazyChoice, mesh_formats
-from .common import CONTEXT, InterruptedCommand, one_line_errors
+from .common import CONTEXT, InterruptedCommand, one_line_errors, print_stderr
 from .conversion import (
     check_can_check,
     check_option,
@@ -191,7 +191,10 @@ def complete(
                 run.complete(progress)
             write_page(run, jobs, options["report"])
         except KeyboardInterrupt as error:
-            write_page(run, jobs, options["report"], describe_interrupt(error))
+            try:
+                write_page(run, jobs, options["report"], describe_interrupt(error))
+            except SuperSdfError as fault:
+                print_stderr(f"Warning: {fault}")
             kept = f": {len(run.batch.done)} of {total} are done and kept; run it again to go on"
             raise InterruptedCommand(kept, error) from None
     return run.batch
