@@ -25,12 +25,7 @@ from super_sdf.pages.server import PageServer
 from super_sdf.pages.viewing import viewed_texts
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
-ARGUMENTS = (
-    "--no-sandbox",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-)
+WITHOUT_GPU = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 PATIENCE = 120_000  # milliseconds: without a GPU, on a busy machine
 MARKUP = "<b>bold<img src=x onerror=document.title='ran'>"
 OCHRE = (219, 158, 84)  # the inside of a mesh that is cut
