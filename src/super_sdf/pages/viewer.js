@@ -37,6 +37,7 @@ const FROM = [0.6, -1, 0.5]; // the viewer's direction at first: right, front an
 const LIGHT = [0.35, 0.45, 1]; // beside the viewer's head: right, up, towards the mesh
 const UNKNOWN = -128; // the byte of an unknown residual, see packing.py
 const TURN = 0.12; // radians for each press of an arrow key
+const ZOOM = 0.85; // what is seen after "+", as a share of what was
 
 /** Return the numbers whose differences are given, modulo the size of their type. */
 function summed(numbers) {
@@ -202,7 +203,7 @@ class Viewer {
     const keys = {
       ArrowLeft: () => this.controls.rotateLeft(TURN), ArrowRight: () => this.controls.rotateLeft(-TURN),
       ArrowUp: () => this.controls.rotateUp(TURN), ArrowDown: () => this.controls.rotateUp(-TURN),
-      "+": () => this.controls.dollyIn(1.2), "-": () => this.controls.dollyOut(1.2), Home: () => this.reset(),
+      "+": () => this.controls.dollyIn(ZOOM), "-": () => this.controls.dollyOut(ZOOM), Home: () => this.reset(),
     };
     if (!(event.key in keys) || event.ctrlKey || event.metaKey || event.altKey) return;
     keys[event.key]();
