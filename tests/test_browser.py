@@ -218,7 +218,7 @@ def test_names_with_markup_are_text(visit, batch):
     page = visit(batch)
     names = page.locator(".name").all_inner_texts()
     assert f"{MARKUP}.ply" in [name.strip() for name in names]
-    assert page.locator("img[src=x], .name b").count() == 0 and page.title() == "Batch to out"
+    assert page.locator("img[src=x], .name b").count() == 0 and page.title() == "Batch: out"
     assert page.complaints == []
 
 

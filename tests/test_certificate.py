@@ -18,6 +18,7 @@ from super_sdf.certificate.limits import NO_EVIDENCE, Limits
 from super_sdf.errors import OptionError, OutOfMemoryError
 from super_sdf.files import coloured_ply
 from super_sdf.machine import extras
+from super_sdf.pages.shown import coarse_surface
 from super_sdf.truth.solid import Solid
 
 H = 1 / 24  # of the grids
@@ -393,3 +394,12 @@ def test_pairs_of_triangles_that_intersect_are_counted():
     crossed = Mesh(np.array(corners, np.float64), np.array([[0, 1, 2], [3, 4, 5]], np.int32))
     assert slabs.self_intersections(crossed) == 1
     assert slabs.self_intersections(cube()) == 0
+
+
+def test_a_sample_beside_a_triangle_without_area_warns_of_nothing(recwarn):
+    """Coarse marching cubes have such triangles where samples lie on the surface."""
+    away = np.abs(np.indices((16, 16, 16)) - 7.0) - np.array([5, 4, 3])[:, None, None, None]
+    values = np.linalg.norm(np.maximum(away, 0), axis=0) + np.minimum(away.max(0), 0)
+    grid = SdfGrid(values.astype(np.float32), 1.0)
+    check_mesh(coarse_surface(grid), grid)
+    assert [str(warning.message) for warning in recwarn] == []

@@ -212,5 +212,5 @@ def write_page(run: Run, jobs: list[Job], path: Path | None, interrupted: str = 
     if page.unfinished or interrupted:
         why = f", {interrupted}" if interrupted else ""
         alert = f"Incomplete{why}: {len(page.unfinished)} not finished; run it again to go on"
-    words = Words(f"Batch to {run.settings.folder}", sentence(run.batch), alert, run.batch.notes)
+    words = Words(f"Batch: {run.settings.folder}", sentence(run.batch), alert, run.batch.notes)
     page.write(words, force=run.settings.force or is_page(path), draw=not interrupted)

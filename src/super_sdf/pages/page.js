@@ -72,7 +72,7 @@ function summaryOf(file) {
     ? make("img", { className: "thumb", src: file.thumbnail, alt: "", decoding: "async" })
     : make("span", { className: "thumb empty" });
   const figures = [];
-  if (file.residual !== null) figures.push(`${file.residual.toFixed(4)} voxels`);
+  if (file.residual !== null) figures.push(`mean residual ${file.residual.toFixed(4)} voxels`);
   if (file.seconds !== null) figures.push(`${file.seconds.toFixed(1)} s`);
   return make("summary", {}, picture,
     make("span", { className: "what" },
