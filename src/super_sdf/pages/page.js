@@ -163,6 +163,9 @@ function controls(viewer, hasResiduals) {
   ];
 }
 
+/** Return the decimals by which thousandths of a length can be told apart. */
+function decimals(length) { return Math.min(20, Math.max(0, Math.ceil(3 - Math.log10(length || 1)))); }
+
 function cutControls(viewer) {
   const axis = make("select", { "aria-label": "Axis of the cutting plane" },
     make("option", { value: "" }, "none"), ...AXES.map((name) => make("option", { value: name }, name)));
@@ -174,7 +177,7 @@ function cutControls(viewer) {
     const i = AXES.indexOf(axis.value), low = viewer.low[i], high = viewer.high[i];
     slider.disabled = side.disabled = i < 0;
     const at = i < 0 ? 0 : low + (slider.value / 1000) * (high - low);
-    where.value = i < 0 ? "" : `${AXES[i]} = ${at.toPrecision(4)}`;
+    where.value = i < 0 ? "" : `${AXES[i]} = ${at.toFixed(decimals(high - low))}`;
     viewer.cut(i < 0 ? null : i, at, side.checked);
   };
   for (const input of [axis, slider, side]) input.addEventListener("input", update);
