@@ -21,6 +21,8 @@ from super_sdf import load_network
 from super_sdf.batch import page as batch_page
 from super_sdf.cli.main import cli
 from super_sdf.convert import ConvertOptions
+from super_sdf.pages.entries import entry_of
+from super_sdf.pages.html import make_page, write_page
 from super_sdf.pages.server import PageServer
 from super_sdf.pages.viewing import viewed_texts
 
@@ -233,6 +235,27 @@ def test_a_batch_loads_meshes_from_beside_the_page_when_they_are_asked_for(visit
     page.locator("summary", has_text=MARKUP).click()  # only one viewer is open at a time
     page.locator(".file", has_text=MARKUP).locator("canvas").first.wait_for()
     assert page.locator("canvas").count() == 2 and page.complaints == []
+
+
+def test_many_files_are_searched_and_sorted(visit, tmp_path):
+    entries = [
+        entry_of(f"part-{n}.ply", seconds=float(n % 4), residual=n % 3 / 10) for n in range(8)
+    ]
+    said = {"title": "", "lead": "", "alert": "", "summary": [], "notes": [], "files": entries}
+    write_page(make_page(said), tmp_path / "many.html")
+    page = visit((tmp_path / "many.html").as_uri())
+
+    def names():
+        return [name.strip() for name in page.locator(".name:visible").all_inner_texts()]
+
+    page.get_by_label("Order").select_option("slowest first")
+    assert names()[:2] == ["part-3.ply", "part-7.ply"]
+    page.get_by_label("Order").select_option("largest residual first")
+    assert names()[:3] == ["part-2.ply", "part-5.ply", "part-1.ply"]
+    page.get_by_label("Order").select_option("failures first")
+    assert names() == [entry["name"] for entry in entries]
+    page.get_by_label("Find a file").fill("T-5")
+    assert names() == ["part-5.ply"] and page.complaints == []
 
 
 def test_meshes_that_are_gone_from_beside_the_page_are_said(visit, batch, tmp_path):

@@ -2,6 +2,7 @@
 
 import http.client
 import os
+import queue
 import re
 import signal
 import socket
@@ -15,6 +16,7 @@ import pytest
 from pages import blocks, wedge
 
 import super_sdf
+from super_sdf import SdfGrid, reconstruct, write_mesh
 from super_sdf.errors import OptionError
 from super_sdf.pages.server import PageServer
 
@@ -120,6 +122,23 @@ def test_the_command_serves_a_refined_grid_until_ctrl_c(tmp_path):
     assert blocks(page)["facts"]["title"] == "a.npy"
     assert (process.returncode, rest) == (130, "Error: interrupted; the page is closed\n")
     assert [path.name for path in tmp_path.iterdir()] == ["a.npy"]
+
+
+def test_the_browser_is_opened_at_the_address_unless_it_is_not_wanted(
+    command, tmp_path, monkeypatch
+):
+    def interrupted(server):
+        raise KeyboardInterrupt
+
+    opened = queue.Queue()
+    monkeypatch.setattr(PageServer, "serve_forever", interrupted)
+    monkeypatch.setattr("webbrowser.open", opened.put)
+    mesh = tmp_path / "a.ply"
+    write_mesh(reconstruct(SdfGrid(wedge(), 1.0), factor=2), mesh)
+    code, out, err = command("view", mesh)
+    assert (code, out) == (130, "") and err.endswith("\nError: interrupted; the page is closed\n")
+    assert err.startswith(opened.get(timeout=60) + " (Ctrl-C ends it)\n")
+    assert command("view", mesh, "--no-browser")[0] == 130 and opened.empty()
 
 
 def test_errors_of_view_are_one_line(command, tmp_path, monkeypatch):

@@ -67,6 +67,7 @@ def viewed(sources: tuple[str, ...], options: dict[str, Any]) -> dict[str, str]:
 
 def serve(texts: dict[str, str], options: dict[str, Any]) -> None:
     """Serve the texts until a signal ends it."""
+    import threading
     import webbrowser
 
     from ..pages.server import PageServer
@@ -74,7 +75,9 @@ def serve(texts: dict[str, str], options: dict[str, Any]) -> None:
     with PageServer(texts, options["port"]) as server:
         print_stderr(f"{server.address} (Ctrl-C ends it)")
         if not options["no_browser"]:
-            webbrowser.open(server.address)
+            open_beside = threading.Thread(target=webbrowser.open, args=[server.address])
+            open_beside.daemon = True  # a browser in the terminal returns when it is closed
+            open_beside.start()
         try:
             server.serve_forever()
         except KeyboardInterrupt as error:

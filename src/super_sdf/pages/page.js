@@ -35,7 +35,7 @@ function rows(pairs, className = "rows") {
 
 /** Return a block with a heading; null if there is nothing in it. */
 function block(title, pairs) {
-  return pairs.length ? make("section", {}, make("h3", {}, title), rows(pairs)) : null;
+  return pairs.length ? make("section", {}, make("h2", {}, title), rows(pairs)) : null;
 }
 
 function sentences(className, label, texts) {
