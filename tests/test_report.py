@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ball
 from pages import blocks, wedge
 
 from super_sdf.batch import page as batch_page
@@ -179,13 +178,22 @@ def test_a_page_of_others_is_not_replaced_by_a_batch(run_batch, grid_folder):
     )
 
 
-def test_what_cannot_be_drawn_costs_no_mesh(run_batch, grid_folder, monkeypatch):
-    def broken(*arguments, **known):
-        raise RuntimeError("no display")
+def broken(*arguments, **known):
+    """Stand in for what fails."""
+    raise RuntimeError("no display")
 
+
+def test_a_mesh_whose_picture_cannot_be_drawn_is_shown_all_the_same(command, folder, monkeypatch):
     monkeypatch.setattr("super_sdf.pages.items.thumbnail", broken)
+    assert command(*UPSAMPLE, "--report", "a.html")[0] == 0
+    (entry,) = files_of("a.html")
+    assert entry["thumbnail"] is None and entry["meshes"] == "page"
+    assert entry["remarks"] == ["no picture: RuntimeError: no display"]
+
+
+def test_a_bug_in_the_page_of_a_mesh_costs_no_mesh(run_batch, grid_folder, monkeypatch):
+    monkeypatch.setattr("super_sdf.pages.items.item_of_files", broken)
     monkeypatch.setattr(batch_page.BatchPage, "item", lambda *arguments: None)
-    np.save("in/a.npy", ball(12, 3.0).values)
     code, _, _ = run_batch("in/a.npy", "--report", "page.html")
     assert code == 0 and Path("out/a.ply").exists()
     (entry,) = files_of("page.html")

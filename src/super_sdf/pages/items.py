@@ -101,9 +101,13 @@ def add_mesh(item: Item, make: Callable[[], Shown], *, draw: bool = False) -> No
     try:
         shown = make()
         item.meshes.append(pack(shown))
-        item.thumbnail = thumbnail(shown.mesh) if draw else item.thumbnail
     except SuperSdfError as error:
         item.remarks.append(f"not shown: {error}")
+        return
+    try:
+        item.thumbnail = thumbnail(shown.mesh) if draw else item.thumbnail
+    except Exception as error:  # whatever VTK raises where it cannot draw
+        item.remarks.append(f"no picture: {type(error).__name__}: {error}")
 
 
 def write_item(item: Item, path: Path) -> None:
