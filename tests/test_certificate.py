@@ -393,3 +393,13 @@ def test_pairs_of_triangles_that_intersect_are_counted():
     crossed = Mesh(np.array(corners, np.float64), np.array([[0, 1, 2], [3, 4, 5]], np.int32))
     assert slabs.self_intersections(crossed) == 1
     assert slabs.self_intersections(cube()) == 0
+
+
+def test_a_sample_beside_a_triangle_without_area_overflows_nothing():
+    """Coarse marching cubes have such triangles where samples lie on the surface."""
+    cube_mesh = cube()
+    flat = Mesh(cube_mesh.vertices, np.vstack([cube_mesh.faces, [[0, 0, 1]]]).astype(np.int32))
+    with np.errstate(all="raise"):
+        points = flat.vertices[:1] - [[0.1, 0.2, 0.3]]
+        found = slabs.facing_by_rays(Solid(flat), points, np.array([len(cube_mesh.faces)]))
+    assert found.tolist() == [0]

@@ -64,10 +64,13 @@ class Result(NamedTuple):
         return one_line(reason if source in reason else f"{source}: {reason}")
 
 
-def attempt(job: Job, folder: Path, network: Decoder, check: bool = False) -> Row:
+def attempt(
+    job: Job, folder: Path, network: Decoder, check: bool = False, items: Path | None = None
+) -> Row:
     """Convert a file and return its row; an error becomes a row, too.
 
-    With ``check``, the row has the certificate of the mesh.
+    With ``check`` or ``items``, the row has the certificate of the mesh; with ``items``, what a
+    page shows of it is written there.
     """
     start, target = time.perf_counter(), folder / job.target
     content, mesh_prints = fingerprint(job.source), []
@@ -85,7 +88,11 @@ def attempt(job: Job, folder: Path, network: Decoder, check: bool = False) -> Ro
         retry = not _is_caused_by_input(error)
         row = failed_row(job, _reason(error), retry=retry, content=content)
         return {**row, "seconds": _since(start)}
-    certificate = {"check": _certify(job, target)} if check else {}
+    certificate = {}
+    if items:
+        certificate = {"check": _keep_item(job, target, mesh_prints[0], items)}
+    elif check:
+        certificate = {"check": _certify(job, target)}
     return {
         **_paths(job),
         "status": "ok",
@@ -107,6 +114,20 @@ def _certify(job: Job, target: Path) -> dict[str, Any]:
 
     try:
         return check_files(target, job.source, CheckOptions.of(job.options)).report()
+    except Exception as error:  # the mesh is good all the same
+        return {"error": _reason(error)}
+
+
+def _keep_item(job: Job, target: Path, mesh_print: Fingerprint, items: Path) -> dict[str, Any]:
+    """Write what a page shows of a mesh; return its certificate, or why there is none."""
+    from ..certificate.check import CheckOptions
+    from ..pages.items import item_of_files
+    from .items import Items
+
+    try:
+        item = item_of_files(target, job.source, CheckOptions.of(job.options))
+        Items(items).add(item, job.target, mesh_print)
+        return item.certificate or {}
     except Exception as error:  # the mesh is good all the same
         return {"error": _reason(error)}
 

@@ -39,6 +39,8 @@ class Settings:
         Start nothing more after the first failure.
     check : bool
         Check each mesh against its samples; meshes without a certificate are made again.
+    items : Path, optional
+        The folder for what a page shows of each mesh; see ``pages.items``.
     """
 
     folder: Path
@@ -51,6 +53,7 @@ class Settings:
     retry: bool = False
     fail_fast: bool = False
     check: bool = False
+    items: Path | None = None
 
 
 @dataclass

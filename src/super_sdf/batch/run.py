@@ -65,9 +65,9 @@ class Run:
         loading = Loading(settings.model, settings.precision, settings.device, threads)
         queue = Queue(self, workers)
         if workers == 1:
-            yield from convert_here(queue, folder, loading, settings.check)
+            yield from convert_here(queue, folder, loading, settings.check, settings.items)
         else:
-            prepare = partial(prepare_worker, loading, folder, settings.check)
+            prepare = partial(prepare_worker, loading, folder, settings.check, settings.items)
             yield from Pool(queue, prepare, PoolOptions(self._clean_up)).results(workers)
 
     def _count_workers(self) -> int:

@@ -58,17 +58,23 @@ def useful_workers(asked: int, jobs: int, max_memory: int | None = None) -> tupl
     return min(asked, most), None if asked <= most else f"--jobs {asked} is cut to {most}: {cause}"
 
 
-def prepare_worker(loading: Loading, folder: Path, check: bool = False) -> Work:
+def prepare_worker(
+    loading: Loading, folder: Path, check: bool = False, items: Path | None = None
+) -> Work:
     """Load the network; return the function that converts a job and returns its row."""
     network = loading.load()
-    return lambda job, tell: attempt(job, folder, network, check)
+    return lambda job, tell: attempt(job, folder, network, check, items)
 
 
 def convert_here(
-    jobs: Tasks[Job], folder: Path, loading: Loading, check: bool = False
+    jobs: Tasks[Job],
+    folder: Path,
+    loading: Loading,
+    check: bool = False,
+    items: Path | None = None,
 ) -> Iterator[tuple[Job, Row]]:
     """Convert one file after another in this process; yield each job and its row."""
     network = loading.load()
     while len(jobs):
         job = jobs.popleft()
-        yield job, attempt(job, folder, network, check)
+        yield job, attempt(job, folder, network, check, items)

@@ -109,6 +109,7 @@ class Certificate:
             "surface": self.surface.report(),
             **self.touching.report(),
             "strays": None if self.strays is None else asdict(self.strays),
+            "faults": self.faults(),
             "inferred": list(self.notes),
         }
 
@@ -186,6 +187,13 @@ def check_files(
         As ``read_mesh``, ``read_grid`` and ``check_mesh`` raise it.
     """
     options = options or CheckOptions()
+    return check_mesh(*read_for_check(mesh, grid, options), options)
+
+
+def read_for_check(
+    mesh: str | Path, grid: str | Path, options: CheckOptions
+) -> tuple[Mesh, SdfGrid]:
+    """Return a mesh and the grid that it was made from; raise OutOfMemoryError before both."""
     bound = allot(0, check_max_memory(options.max_memory))
     check_room(stated_triangles(check_regular_file(mesh)), 0, bound)
     found = read_grid(
@@ -201,7 +209,7 @@ def check_files(
         scale=options.scale,
         max_memory=options.max_memory,
     )
-    return check_mesh(read_mesh(mesh), found, options)
+    return read_mesh(mesh), found
 
 
 def check_mesh(mesh: Mesh, grid: SdfGrid, options: CheckOptions | None = None) -> Certificate:

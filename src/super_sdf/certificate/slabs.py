@@ -30,6 +30,7 @@ PARALLEL = 1 - 1e-9
 CLEAR_HIT, CLEAR_COSINE = 1e-3, 1e-2
 # Of a ray times twice the area that it is aimed at: libigl takes less than 1e-6 for parallel.
 LONG_RAY = 1e6
+LEAST_SIZE = 1e-100  # of a ray times its triangle: squares of longer rays would overflow
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +215,8 @@ def facing_by_rays(solid: Solid, points: Points, faces: NDArray[np.int64]) -> ND
     mesh = solid.mesh
     rays = mesh.vertices[mesh.faces[faces]].mean(1) - points
     sizes = np.linalg.norm(rays, axis=1) * np.linalg.norm(normals_of(mesh, faces), axis=1)
-    rays *= LONG_RAY / np.maximum(sizes, np.finfo(float).tiny)[:, None]
+    sizes[sizes < LEAST_SIZE] = 1  # on a triangle without area: whatever is hit is not clear
+    rays *= LONG_RAY / sizes[:, None]
     hit, place = solid.first_hits(points, rays)
     clear = (hit >= 0) & (place.min(1) > CLEAR_HIT)
     facing = side_of(-rays, normals_of(mesh, hit), CLEAR_COSINE)

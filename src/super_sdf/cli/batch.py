@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..errors import SuperSdfError, WriteError
 from ..files.formats import NAMED, list_formats
-from .batch_report import print_plan, print_summary, progress_line
+from ..machine.extras import check_modules
+from .batch_report import print_plan, print_summary, progress_line, sentence
 from .choices import LazyChoice, mesh_formats
-from .common import CONTEXT, InterruptedCommand, one_line_errors
+from .common import CONTEXT, InterruptedCommand, one_line_errors, print_stderr
 from .conversion import (
     check_can_check,
     check_option,
@@ -21,11 +23,13 @@ from .conversion import (
     conversion_options,
     make_options,
 )
-from .interrupts import raising_interrupts
+from .interrupts import describe_interrupt, raising_interrupts
+from .reporting import check_report, report_option
 
 if TYPE_CHECKING:
     from ..batch.job import Job
     from ..batch.plan import Batch, Settings
+    from ..batch.run import Run
 
 HELP = f"""Convert many grids to meshes in the folder DIR, each as upsample would.
 
@@ -71,6 +75,7 @@ Examples:
 )
 @conversion_options
 @check_option
+@report_option
 @click.option(
     "--jobs",
     type=click.IntRange(0),
@@ -109,6 +114,8 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
     check_simplification(options)
     jobs, unread = find_jobs(sources, f".{options['kind']}", make_options(options))
     check_jobs_can_be_simplified(jobs)
+    if options["report"]:
+        check_page(options["report"], jobs, folder, force=options["force"])
     model = chosen_model(options)
     find_model(model, options["precision"])
     flags = {name: options[name] for name in ("force", "retry", "fail_fast", "check")}
@@ -119,6 +126,7 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
         device=options["device"],
         threads=options["threads"],
         workers=options["jobs"],
+        items=items_beside(options["report"]),
         **flags,
     )
     if options["dry_run"]:
@@ -126,8 +134,7 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
         plan.unread = unread
         print_plan(plan, options["as_json"])
         return
-    done = complete(jobs, settings, options["quiet"])
-    done.unread = unread
+    done = complete(jobs, settings, options, unread)
     done.seconds = time.perf_counter() - start
     print_summary(done, options)
     if done.failures() or done.unread:
@@ -142,18 +149,68 @@ def check_jobs_can_be_simplified(jobs: list[Job]) -> None:
         check_can_simplify("simplify")
 
 
-def complete(jobs: list[Job], settings: Settings, quiet: bool) -> Batch:
-    """Run the batch; an interrupt reports how many files are done."""
+def check_page(page: Path, jobs: list[Job], folder: Path, *, force: bool) -> None:
+    """Raise if the page or the folder beside it cannot be written.
+
+    A page that super-sdf wrote may be replaced, so that a batch can be resumed.
+    """
+    from ..batch.items import items_folder
+    from ..files.formats import split_member
+    from ..pages.html import is_page
+
+    check_modules("--report", "report")
+    files = [path for job in jobs for path in (split_member(job.source)[0], folder / job.target)]
+    check_report(page, files, force=force or is_page(page))
+    beside = items_folder(page)
+    if beside.exists() and not beside.is_dir():
+        raise WriteError(f"{beside}, for the meshes of the page, is no folder: move it")
+
+
+def items_beside(page: Path | None) -> Path | None:
+    """Return the folder for the meshes of a page, None without a page."""
+    if page is None:
+        return None
+    from ..batch.items import items_folder
+
+    return items_folder(page)
+
+
+def complete(
+    jobs: list[Job], settings: Settings, options: dict[str, Any], unread: list[tuple[str, str]]
+) -> Batch:
+    """Run the batch and write its page; an interrupt reports how many files are done."""
     from ..batch.lock import FolderLock
     from ..batch.run import Run
 
     with raising_interrupts(), FolderLock(settings.folder) as lock:
         run = Run(jobs, settings, lock)
+        run.batch.unread = unread
         total = len(run.batch.waiting)
         try:
-            with progress_line(total, quiet) as progress, raising_interrupts():
+            with progress_line(total, options["quiet"]) as progress, raising_interrupts():
                 run.complete(progress)
+            write_page(run, jobs, options["report"])
         except KeyboardInterrupt as error:
+            try:
+                write_page(run, jobs, options["report"], describe_interrupt(error))
+            except SuperSdfError as fault:
+                print_stderr(f"Warning: {fault}")
             kept = f": {len(run.batch.done)} of {total} are done and kept; run it again to go on"
             raise InterruptedCommand(kept, error) from None
     return run.batch
+
+
+def write_page(run: Run, jobs: list[Job], path: Path | None, interrupted: str = "") -> None:
+    """Write the page, if one was asked for; after an interrupt, at once and without drawing."""
+    if path is None:
+        return
+    from ..batch.page import BatchPage, Words
+    from ..pages.html import is_page
+
+    page = BatchPage(path, run.batch, jobs, run.ledger.rows)
+    alert = ""
+    if page.unfinished or interrupted:
+        why = f", {interrupted}" if interrupted else ""
+        alert = f"Incomplete{why}: {len(page.unfinished)} not finished; run it again to go on"
+    words = Words(f"Batch: {run.settings.folder}", sentence(run.batch), alert, run.batch.notes)
+    page.write(words, force=run.settings.force or is_page(path), draw=not interrupted)

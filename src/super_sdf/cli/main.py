@@ -51,6 +51,12 @@ def _render() -> click.Command:
     return render_command
 
 
+def _view() -> click.Command:
+    from .view import view_command
+
+    return view_command
+
+
 def _info() -> click.Command:
     from .info import info_command
 
@@ -64,6 +70,7 @@ COMMANDS = {
     "sample": _sample,
     "evaluate": _evaluate,
     "render": _render,
+    "view": _view,
     "info": _info,
 }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -20,6 +21,7 @@ from .conversion import (
     make_options,
 )
 from .interrupts import raising_interrupts
+from .reporting import check_report, report_option
 
 if TYPE_CHECKING:
     from ..certificate.check import Certificate
@@ -58,7 +60,8 @@ Examples:
     help="Also write the refined field: .npz for the values near the surface, .npy or .vti for "
     "the whole fine lattice. A .vti needs the extra vti.",
 )
-@click.option("--force", is_flag=True, help="Replace OUT, and FIELD, if they exist.")
+@report_option
+@click.option("--force", is_flag=True, help="Replace OUT, FIELD and PAGE.html if they exist.")
 @click.option("--json", "as_json", is_flag=True, help="Print counts, times and notes as JSON.")
 @click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
 @click.option("-v", "--verbose", is_flag=True, help="Also print counts and the time per stage.")
@@ -70,6 +73,8 @@ def upsample_command(source: str, target: str, **options: Any) -> None:
     with one_line_errors(f"{target} is written"), raising_interrupts():
         if options["check"]:
             run.check()
+        if options["report"]:
+            run.write_page()
         run.print_report()
 
 
@@ -102,6 +107,8 @@ class Upsampling:
             check_field_target(options["save_field"], force=options["force"])
         if options["check"]:
             check_can_check(self.target)
+        if options["report"]:
+            self.check_page()
         check_simplification(options)
         watch.lap("start")
         self.network = load_network(
@@ -139,6 +146,30 @@ class Upsampling:
         watch.lap("check")
         self.seconds |= watch.seconds
 
+    def check_page(self) -> None:
+        """Raise if the page cannot be written, or would replace what is read or written."""
+        from ..files.formats import split_member
+
+        field = [self.options["save_field"]] if self.options["save_field"] else []
+        files = split_member(Path(self.source))[0], self.target, *field
+        check_report(self.options["report"], files, force=self.options["force"])
+
+    def write_page(self) -> None:
+        """Write the page; what cannot be shown in it is said there."""
+        from ..certificate.check import CheckOptions
+        from ..pages.single import write_single
+        from ..progress import Stopwatch
+
+        watch, page = Stopwatch(), self.options["report"]
+        options = replace(
+            CheckOptions.of(make_options(self.options)), processes=self.options["threads"]
+        )
+        notes = [*self.cap_notes(), *self.device_notes()]
+        report = {**self.report(), "notes": notes}
+        write_single(page, report, options, self.certificate, force=self.options["force"])
+        watch.lap("page")
+        self.seconds |= watch.seconds
+
     def announce(self, line: str) -> None:
         """Print, before the work, what may make the user stop it; the bar is redrawn below."""
         if not self.options["quiet"]:
@@ -167,6 +198,8 @@ class Upsampling:
             print_stderr(f"Simplified: {describe_simplified(self.result.simplified)}")
         if self.certificate:
             print_stderr(f"Check: {self.certificate.summary()}")
+        if self.options["report"]:
+            print_stderr(f"Report: {self.options['report']}")
 
     def report(self) -> dict[str, Any]:
         """Return counts, times and notes as ``--json`` prints them."""

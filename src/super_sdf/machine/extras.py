@@ -20,9 +20,10 @@ EXTRAS = {
     "simplify": ("igl", "pyfqmr"),
     "eval": ("igl", "matplotlib", "scipy", "skimage"),
     "view": ("pyvista",),
+    "report": ("pyfqmr", "pyvista"),
     "peers": ("gpytoolbox",),
 }
-BUILT_ON = {"view": "eval", "peers": "eval"}
+BUILT_ON = {"view": "eval", "peers": "eval", "report": "eval"}
 
 
 def all_modules(extra: str) -> tuple[str, ...]:

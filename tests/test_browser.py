@@ -1,0 +1,296 @@
+"""Reports and viewers in headless Chromium: they open, turn, cut and switch, and ask for nothing.
+
+The browser is the distribution's; Playwright only drives it.
+"""
+
+import os
+import shutil
+import threading
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from conftest import ball
+from pages import wedge
+from PIL import Image
+from playwright.sync_api import Error, sync_playwright
+
+from super_sdf import load_network
+from super_sdf.batch import page as batch_page
+from super_sdf.cli.main import cli
+from super_sdf.convert import ConvertOptions
+from super_sdf.pages.entries import entry_of
+from super_sdf.pages.html import make_page, write_page
+from super_sdf.pages.server import PageServer
+from super_sdf.pages.viewing import viewed_texts
+
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+WITHOUT_GPU = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+PATIENCE = 120_000  # milliseconds: without a GPU, on a busy machine
+MARKUP = "<b>bold<img src=x onerror=document.title='ran'>"
+OCHRE = (219, 158, 84)  # the inside of a mesh that is cut
+FAST = ("--quality", "fast", "--factor", "2", "--spacing", "1", "--device", "cpu")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """The distribution's Chromium, without a window and drawing without a GPU."""
+    found = next(filter(None, map(shutil.which, NAMES)), None)
+    if found is None:
+        pytest.fail(f"no {' or '.join(NAMES)} on the PATH: apt-get install chromium")
+    with sync_playwright() as playwright:
+        running = playwright.chromium.launch(
+            executable_path=found, args=["--no-sandbox", *WITHOUT_GPU]
+        )
+        yield running
+        running.close()
+
+
+@pytest.fixture
+def visit(browser):
+    """Open an address; return the page, which has what it asked for and complained of."""
+    opened = []
+
+    def go(address, **options):
+        page = browser.new_page(**{"viewport": {"width": 1000, "height": 900}, **options})
+        page.set_default_timeout(PATIENCE)
+        page.requested, page.complaints = [], []
+        page.on("request", lambda request: page.requested.append(request.url))
+        page.on("console", lambda message: page.complaints.append(message.text))
+        page.on("pageerror", lambda error: page.complaints.append(str(error)))
+        page.goto(address)
+        opened.append(page)
+        return page
+
+    yield go
+    for page in opened:
+        page.close()
+
+
+def run(folder, *arguments):
+    """Run a command in a folder; return its exit code."""
+    before = os.getcwd()
+    os.chdir(folder)
+    try:
+        return CliRunner().invoke(cli, list(arguments)).exit_code
+    finally:
+        os.chdir(before)
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory):
+    """The address of the page of one conversion."""
+    folder = tmp_path_factory.mktemp("report")
+    np.save(folder / "a.npy", wedge())
+    assert run(folder, "upsample", "a.npy", "a.ply", *FAST, "--report", "a.html") == 0
+    return (folder / "a.html").as_uri()
+
+
+@pytest.fixture(scope="module")
+def batch(tmp_path_factory):
+    """The address of the page of a batch with its meshes beside it; one name is markup."""
+    folder = tmp_path_factory.mktemp("batch")
+    (folder / "in").mkdir()
+    np.save(folder / "in" / f"{MARKUP}.npy", ball(12, 3.0).values)
+    np.save(folder / "in" / "b.npy", ball(12, 4.0).values)
+    np.save(folder / "in" / "bad.npy", np.ones((4, 4, 4)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(batch_page, "MOST_WITHIN", 0)
+        arguments = ("in", "--out", "out", "--jobs", "1", "--report", "page & more.html")
+        assert run(folder, "batch", *arguments, *FAST) == 1
+    return (folder / "page & more.html").as_uri()
+
+
+def pictures(page):
+    """Return the pictures of all canvases, (height, width, 3), when they stand still."""
+    page.locator("canvas").last.wait_for()
+    page.wait_for_timeout(300)
+
+    def take():
+        shots = [canvas.screenshot() for canvas in page.locator("canvas").all()]
+        return [np.array(Image.open(BytesIO(shot)).convert("RGB")).astype(int) for shot in shots]
+
+    last, now = take(), take()
+    while not all(map(np.array_equal, last, now)):
+        last, now = now, take()
+    return now
+
+
+def silhouette(picture):
+    """Return where a picture differs from its background, which is in the middle of its top."""
+    return np.abs(picture - picture[4, picture.shape[1] // 2]).max(2) > 8
+
+
+def overlap(a, b):
+    """Return intersection over union of two silhouettes."""
+    return (a & b).sum() / (a | b).sum()
+
+
+def changed(before, after):
+    """Return the share of pixels that differ, for each canvas."""
+    return [float((np.abs(a - b).max(2) > 8).mean()) for a, b in zip(before, after)]
+
+
+def test_the_page_opens_with_two_views_and_asks_for_nothing(visit, report):
+    page = visit(report)
+    shots = pictures(page)
+    assert len(shots) == 2 and page.title() == "a.ply"
+    for shot in shots:
+        shape = silhouette(shot)
+        assert 0.1 < shape.mean() < 0.8 and len(np.unique(shot[shape], axis=0)) > 20
+    assert overlap(*map(silhouette, shots)) > 0.9  # one camera
+    assert page.requested == [report] and page.complaints == []
+    with pytest.raises(Error, match="Failed to fetch"):  # the policy forbids it
+        page.evaluate("fetch('http://127.0.0.1:9/')")
+    assert any("Content Security Policy" in said for said in page.complaints)
+
+
+@pytest.mark.parametrize("way", ["mouse", "keys"])
+def test_turning_one_view_turns_both_alike(visit, report, way):
+    page = visit(report)
+    before = pictures(page)
+    if way == "mouse":
+        box = page.locator("canvas").last.bounding_box()
+        page.mouse.move(box["x"] + 200, box["y"] + 200)
+        page.mouse.down()
+        page.mouse.move(box["x"] + 320, box["y"] + 150, steps=4)
+        page.mouse.up()
+    else:
+        page.locator(".views").focus()
+        for _ in range(8):
+            page.keyboard.press("ArrowLeft")
+    after = pictures(page)
+    for old, new in zip(before, after):
+        assert overlap(silhouette(old), silhouette(new)) < 0.9
+    assert overlap(*map(silhouette, after)) > 0.9
+    page.get_by_role("button", name="Reset view").click()
+    assert max(changed(before, pictures(page))) < 0.01
+
+
+def test_keys_zoom(visit, report):
+    page = visit(report)
+    before = [silhouette(shot).mean() for shot in pictures(page)]
+    page.locator(".views").press("-")
+    after = [silhouette(shot).mean() for shot in pictures(page)]
+    assert all(new < 0.9 * old for old, new in zip(before, after))
+
+
+@pytest.mark.parametrize("label", ["Normals", "Residuals", "Flat shading", "Wireframe"])
+def test_each_switch_changes_the_pictures_and_back(visit, report, label):
+    page = visit(report)
+    before = pictures(page)
+    control = page.get_by_label(label)
+    control.click()
+    assert max(changed(before, pictures(page))) > 0.02
+    (page.get_by_label("Plain") if label in ("Normals", "Residuals") else control).click()
+    assert max(changed(before, pictures(page))) < 0.01
+
+
+def test_residuals_have_a_legend_and_the_colours_of_the_check(visit, report):
+    page = visit(report)
+    page.get_by_label("Residuals").check()
+    assert "does not reach them by 0.1 voxel or more" in page.locator(".legend").inner_text()
+    coarse = pictures(page)[1]  # cuts off edges: does not reach the balls there
+    blue = (coarse[..., 2] > coarse[..., 0] + 80) & silhouette(coarse)
+    assert blue.mean() > 0.01
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+def test_the_cutting_plane_shows_the_inside_and_moves(visit, report, axis):
+    page = visit(report)
+    whole = pictures(page)
+    page.get_by_label("Axis of the cutting plane").select_option(axis)
+    cut = pictures(page)
+    for shot in cut:
+        assert (np.abs(shot - OCHRE).max(2) < 6).mean() > 0.01
+    assert min(changed(whole, cut)) > 0.02
+    slider = page.get_by_label("Position of the cutting plane")
+    for _ in range(8):
+        slider.press("PageUp")
+    assert min(changed(cut, pictures(page))) > 0.01
+    said = page.locator("output").inner_text()
+    assert said.startswith(f"{axis} = ")
+    page.get_by_label("Axis of the cutting plane").select_option("none")
+    assert max(changed(whole, pictures(page))) < 0.01
+
+
+def test_names_with_markup_are_text(visit, batch):
+    page = visit(batch)
+    names = page.locator(".name").all_inner_texts()
+    assert f"{MARKUP}.ply" in [name.strip() for name in names]
+    assert page.locator("img[src=x], .name b").count() == 0 and page.title() == "Batch: out"
+    assert page.complaints == []
+
+
+def test_a_batch_loads_meshes_from_beside_the_page_when_they_are_asked_for(visit, batch):
+    page = visit(batch)
+    assert page.requested == [batch] and page.locator("canvas").count() == 0
+    assert "failed" in page.locator(".file").first.inner_text()
+    page.locator("summary", has_text="b.ply").click()
+    assert all(0.1 < silhouette(shot).mean() < 0.9 for shot in pictures(page))
+    (_, beside) = page.requested
+    assert beside.startswith(batch.removesuffix(".html") + "-files/") and beside.endswith(".js")
+    page.locator("summary", has_text=MARKUP).click()  # only one viewer is open at a time
+    page.locator(".file", has_text=MARKUP).locator("canvas").first.wait_for()
+    assert page.locator("canvas").count() == 2 and page.complaints == []
+
+
+def test_many_files_are_searched_and_sorted(visit, tmp_path):
+    entries = [
+        entry_of(f"part-{n}.ply", seconds=float(n % 4), residual=n % 3 / 10) for n in range(8)
+    ]
+    said = {"title": "", "lead": "", "alert": "", "summary": [], "notes": [], "files": entries}
+    write_page(make_page(said), tmp_path / "many.html")
+    page = visit((tmp_path / "many.html").as_uri())
+
+    def names():
+        return [name.strip() for name in page.locator(".name:visible").all_inner_texts()]
+
+    page.get_by_label("Order").select_option("slowest first")
+    assert names()[:2] == ["part-3.ply", "part-7.ply"]
+    page.get_by_label("Order").select_option("largest residual first")
+    assert names()[:3] == ["part-2.ply", "part-5.ply", "part-1.ply"]
+    page.get_by_label("Order").select_option("failures first")
+    assert names() == [entry["name"] for entry in entries]
+    page.get_by_label("Find a file").fill("T-5")
+    assert names() == ["part-5.ply"] and page.complaints == []
+
+
+def test_meshes_that_are_gone_from_beside_the_page_are_said(visit, batch, tmp_path):
+    copy = tmp_path / "moved.html"
+    shutil.copyfile(Path(visit(batch).evaluate("decodeURIComponent(location.pathname)")), copy)
+    page = visit(copy.as_uri())
+    page.locator("summary", has_text="b.ply").click()
+    said = page.get_by_text("The meshes cannot be shown: ").inner_text()
+    assert said.endswith(".js is not beside this page")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_a_phone_shows_all_of_it_in_either_scheme(visit, report, scheme):
+    page = visit(report, viewport={"width": 360, "height": 740}, color_scheme=scheme)
+    pictures(page)
+    assert page.evaluate("document.documentElement.scrollWidth") == 360
+    colour = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert (sum(map(int, colour[4:-1].split(","))) > 380) == (scheme == "light")
+
+
+def test_view_shows_meshes_and_refined_grids_from_the_server(visit, report, tmp_path):
+    np.save(tmp_path / "a.npy", wedge())
+    mesh = Path(report.removeprefix("file://")).with_suffix(".ply")
+    options = ConvertOptions(factor=2, spacing=(1.0,))
+    texts = viewed_texts(
+        [str(tmp_path / "a.npy"), str(mesh)], lambda: load_network("fast", device="cpu"), options
+    )
+    with PageServer(texts) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        page = visit(server.address)
+        for name, count in (("a.npy", 2), ("a.ply", 1)):
+            page.locator("summary", has_text=name).click()
+            page.locator(".file", has_text=name).locator("canvas").first.wait_for()
+            shots = pictures(page)
+            assert len(shots) == count and all(silhouette(shot).mean() > 0.1 for shot in shots)
+        paths = [url.removeprefix(server.address) for url in page.requested]
+        server.shutdown()
+    assert paths == ["", "meshes/0.js", "meshes/1.js"] and page.complaints == []

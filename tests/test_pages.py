@@ -1,0 +1,217 @@
+"""Pages: meshes packed and unpacked, what is said of files, escaping, the security policy."""
+
+import base64
+import hashlib
+import re
+import zlib
+from io import BytesIO
+
+import numpy as np
+import pytest
+import trimesh
+from conftest import ball
+from pages import blocks, wedge
+from PIL import Image
+
+from super_sdf import Mesh, SdfGrid, reconstruct
+from super_sdf.certificate.check import CheckOptions, check_mesh
+from super_sdf.certificate.coloured import FULL
+from super_sdf.pages import shown
+from super_sdf.pages.entries import certificate_facts, entry_of, entry_of_report
+from super_sdf.pages.html import is_page, make_page, safe_json, write_page
+from super_sdf.pages.items import Item, add_mesh, item_of, read_head, read_meshes, write_item
+from super_sdf.pages.packing import pack, residual_bytes
+from super_sdf.pages.shown import Shown, coarse_surface, reduced, shown_result
+from super_sdf.pages.thumbnails import thumbnail
+
+NASTY = '</script><img src=x onerror=alert(1)> & "quoted" \u2028\udcff'
+
+
+def facts(**known):
+    """Return the facts of a page with nothing in it but what is given."""
+    empty = {"title": "", "lead": "", "alert": "", "summary": [], "notes": [], "files": []}
+    return {**empty, **known}
+
+
+def icosphere(subdivisions=3, radius=5.0):
+    """A ball's mesh about the origin."""
+    found = trimesh.creation.icosphere(subdivisions, radius)
+    return Mesh(np.array(found.vertices), np.array(found.faces, np.int32))
+
+
+def unpack(packed):
+    """Return vertices, faces and residual bytes of a packed mesh, as the page does."""
+    n, m = packed["vertices"], packed["triangles"]
+    raw = zlib.decompress(base64.b64decode(packed["data"]))
+    places = np.cumsum(np.frombuffer(raw, "<u2", 3 * n), dtype=np.uint16).reshape(3, n).T
+    faces = np.cumsum(np.frombuffer(raw, "<u4", 3 * m, 6 * n), dtype=np.uint32).reshape(m, 3)
+    rest = raw[6 * n + 12 * m :]
+    return np.array(packed["low"]) + packed["step"] * places, faces, np.frombuffer(rest, np.int8)
+
+
+def test_a_packed_mesh_comes_out_within_half_a_step():
+    mesh = icosphere()
+    moved = Mesh(mesh.vertices * [1, 2, 0.1] + [1e6, -3, 0], mesh.faces)
+    residuals = np.linspace(-0.2, 0.2, len(mesh.vertices)).astype(np.float32)
+    packed = pack(Shown("ball", moved, 5000, residuals))
+    vertices, faces, said = unpack(packed)
+    assert packed["step"] == pytest.approx(20 / 65535)
+    assert np.abs(vertices - moved.vertices).max() <= packed["step"] * 0.500001
+    assert (faces == mesh.faces).all() and (said == residual_bytes(residuals)).all()
+    assert packed["caption"] == "ball: 5,000 triangles, shown simplified to 1,280"
+
+
+def test_a_mesh_without_residuals_or_without_anything_is_packed():
+    assert not len(unpack(pack(Shown("ball", icosphere(1), 80)))[2])
+    vertices, faces, _ = unpack(pack(Shown("no", Mesh(np.zeros((0, 3)), np.zeros((0, 3), int)), 0)))
+    assert vertices.shape == faces.shape == (0, 3)
+
+
+def test_residuals_are_full_at_a_tenth_of_a_voxel_and_unknown_ones_are_told_apart():
+    values = np.array([0, FULL, -FULL, 5, -5, FULL / 2, np.nan], np.float32)
+    assert residual_bytes(values).tolist() == [0, 127, -127, 127, -127, 64, -128]
+
+
+def test_a_large_mesh_is_simplified_and_a_small_one_left_alone():
+    mesh = icosphere(4)
+    assert reduced(mesh, len(mesh.faces)) is mesh
+    small = reduced(mesh, 1000)
+    assert 500 < len(small.faces) <= 1000
+    assert small.volume() == pytest.approx(mesh.volume(), rel=0.02)
+
+
+def test_a_result_over_the_limit_says_both_counts(monkeypatch):
+    monkeypatch.setattr(shown, "MOST_TRIANGLES", 300)
+    found = shown_result("ball", icosphere(), None)
+    assert found.triangles == 1280 and len(found.mesh.faces) <= 300
+    counts = f"1,280 triangles, shown simplified to {len(found.mesh.faces)}"
+    assert found.caption() == f"ball: {counts}"
+
+
+MIRRORED = ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+@pytest.mark.parametrize("direction", [None, MIRRORED])
+def test_coarse_marching_cubes_lie_on_the_surface_and_face_outward(direction):
+    values = ball(20, 6.0).values
+    grid = SdfGrid.trusted(values * 2, (2, 2, 2), (5, -7, 1), direction=direction)
+    mesh = coarse_surface(grid)
+    middle = grid.to_world(np.array(values.shape) / 2 - 0.37)
+    radii = np.linalg.norm(mesh.vertices - middle, axis=1)
+    assert np.abs(radii - 12).max() < 0.2
+    assert mesh.volume() == pytest.approx(4 / 3 * np.pi * 12**3, rel=0.05)
+    grown = coarse_surface(grid, offset=1.5)
+    assert np.linalg.norm(grown.vertices - middle, axis=1).mean() == pytest.approx(13.5, abs=0.1)
+
+
+def test_coarse_marching_cubes_without_room_are_a_remark():
+    item, grid = Item(), ball(20, 6.0)
+    add_mesh(item, lambda: shown.shown_coarse(grid, CheckOptions(max_memory=10**6)))
+    assert not item.meshes
+    assert re.fullmatch(
+        r"not shown: marching cubes of the samples needs .* of memory, 1 MB may be used",
+        item.remarks[0],
+    )
+
+
+def test_an_item_has_the_residuals_of_both_meshes_and_the_certificate():
+    grid = SdfGrid(wedge(), (1.0, 1.0, 1.0))
+    mesh, options = reconstruct(grid), CheckOptions()
+    item = item_of(mesh, grid, options)
+    ours, coarse = item.meshes
+    assert ours["caption"] == f"super-sdf: {len(mesh.faces):,} triangles"
+    assert coarse["caption"].startswith("marching cubes of the samples: ")
+    assert item.certificate == check_mesh(mesh, grid, options).report()
+    means = [np.abs(unpack(each)[2].astype(float)).mean() for each in (ours, coarse)]
+    assert 0 < means[0] < means[1]  # coarse marching cubes cut off the edges
+    assert item.thumbnail is None and item.remarks == []
+
+
+def test_the_file_of_an_item_is_read_back(tmp_path):
+    path, item = tmp_path / "0123456789abcdef.js", Item(remarks=["a\u2028b"], made_of="digest")
+    add_mesh(item, lambda: Shown(NASTY, icosphere(1), 80), draw=True)
+    write_item(item, path)
+    head = read_head(path)
+    assert (head.remarks, head.made_of, head.thumbnail) == (["a\u2028b"], "digest", item.thumbnail)
+    assert head.meshes == [] and head.size == len(item.meshes[0]["data"])
+    assert read_meshes(path) == item.meshes
+    comment, call, rest = path.read_text("ascii").split("\n")
+    assert comment.startswith("// {") and rest == ""
+    assert call.startswith('superSdfMeshes("0123456789abcdef", [{"caption": "')
+
+
+@pytest.mark.parametrize("text", ["", "// ", "// []", '// {"other": 1}', "\0\xff"])
+def test_a_file_that_is_no_item_is_none(tmp_path, text):
+    (tmp_path / "a.js").write_text(text, "latin-1")
+    assert read_head(tmp_path / "a.js") is None
+    assert read_head(tmp_path / "missing.js") is None
+
+
+def test_a_thumbnail_is_a_small_picture_of_something():
+    kind, data = thumbnail(icosphere()).split(",")
+    assert kind == "data:image/webp;base64" and len(data) < 8000
+    image = np.array(Image.open(BytesIO(base64.b64decode(data))).convert("L"))
+    assert max(image.shape) == 160 and len(np.unique(image)) > 50
+    assert thumbnail(Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))) is None
+
+
+def test_what_comes_from_files_cannot_be_markup_and_is_read_back():
+    said = facts(title=NASTY, files=[entry_of(NASTY, notes=[NASTY])])
+    page = make_page(said, {"0": [{"caption": NASTY}]})
+    assert "<img src=x" not in page and "\u2028" not in page
+    assert page.count("</script>") == page.count("<script") == 5
+    found = blocks(page)
+    assert found["facts"]["title"] == NASTY and found["facts"]["files"][0]["notes"] == [NASTY]
+    assert found["meshes-0"] == [{"caption": NASTY}]
+
+
+def test_json_in_a_page_has_no_character_of_markup():
+    assert safe_json({"a": "<&>\u2028\u2029"}) == '{"a": "\\u003c\\u0026\\u003e\\u2028\\u2029"}'
+
+
+@pytest.mark.parametrize("beside", [False, True])
+def test_the_policy_allows_these_scripts_and_nothing_else(beside):
+    page = make_page(facts(), beside=beside)
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page).group(1)
+    rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
+
+    def hashes(kind):
+        texts = re.findall(rf"<{kind}>(.*?)</{kind}>", page, re.DOTALL)
+        digests = (hashlib.sha256(text.encode()).digest() for text in texts)
+        return [f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests]
+
+    assert len(hashes("script")) == 3
+    assert rules["script-src"].split() == hashes("script") + ["'self'", "file:"] * beside
+    assert rules["style-src"].split() == hashes("style")
+    assert rules["default-src"] == "'none'" and rules["img-src"] == "data:"
+    assert not re.search(r'(src|href)="(?!data:,)', page)
+
+
+def test_a_page_knows_itself(tmp_path):
+    write_page(make_page(facts()), tmp_path / "a.html")
+    (tmp_path / "b.html").write_text("<!doctype html>")
+    assert is_page(tmp_path / "a.html")
+    assert not is_page(tmp_path / "b.html") and not is_page(tmp_path / "missing.html")
+
+
+def test_the_entry_of_a_report_says_counts_times_notes_and_the_certificate():
+    grid = SdfGrid(wedge(), (1.0, 1.0, 1.0))
+    certificate = check_mesh(reconstruct(grid), grid).report()
+    report = {
+        **{"input": "a.npy", "output": "a.ply", "shape": [24, 24, 24], "triangles": 12345},
+        **{"closed": True, "bounds": [[0, 0, 0], [1, 2.5, 3]], "inferred": ["x"], "notes": ["y"]},
+        **{"warnings": ["z"], "check": certificate, "seconds": {"read": 0.5, "network": 1.25}},
+    }
+    entry = entry_of_report("a.ply", report, None)
+    assert entry["line"] == "12,345 triangles, closed, from 24 x 24 x 24 samples"
+    assert entry["notes"] == ["x", "y"] and entry["warnings"] == ["z"] and entry["seconds"] == 1.75
+    assert entry["stages"] == [["read", "0.50 s"], ["network", "1.25 s"]]
+    assert entry["residual"] == certificate["residual"]["mean"] and entry["faults"] == []
+    assert ["bounds", "(0, 0, 0) to (1, 2.5, 3)"] in entry["facts"]
+    assert ["surface", "closed, oriented, manifold"] in entry["certificate"]
+    assert entry["remarks"] == ["not drawn: run the command again for its picture and its meshes"]
+
+
+def test_a_certificate_that_could_not_be_made_says_why():
+    assert certificate_facts({"error": "no room"}) == [["not checked", "no room"]]
+    assert certificate_facts({}) == []

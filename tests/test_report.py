@@ -1,0 +1,200 @@
+"""``--report``: what is checked before, what is written, resumed and interrupted batches."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pages import blocks, wedge
+
+from super_sdf.batch import page as batch_page
+from super_sdf.batch.run import Run
+
+UPSAMPLE = ("upsample", "a.npy", "a.ply", "--quality", "fast", "--factor", 2, "--spacing", 1)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Work in a folder of its own with a grid."""
+    monkeypatch.chdir(tmp_path)
+    np.save("a.npy", wedge())
+
+
+def files_of(page):
+    """Return the entries of a page."""
+    return blocks(Path(page))["facts"]["files"]
+
+
+def test_the_page_of_a_conversion_holds_all_of_it(command, folder):
+    code, _, err = command(*UPSAMPLE, "--report", "a.html")
+    assert code == 0 and err.endswith("\nReport: a.html\n")
+    assert sorted(os.listdir()) == ["a.html", "a.npy", "a.ply"]
+    found = blocks(Path("a.html"))
+    (entry,) = found["facts"]["files"]
+    assert found["facts"]["title"] == "a.ply" and entry["status"] == "ok"
+    assert entry["meshes"] == "page" and entry["thumbnail"].startswith("data:image/webp;base64,")
+    assert entry["notes"] == ["origin not given: sample (0, 0, 0) is at 0, 0, 0"]
+    assert [label for label, _ in found["facts"]["summary"]] == [
+        "result", "time", "mean residual", "largest residual", "faults"
+    ]  # fmt: skip
+    assert {"read", "network", "isosurface"} <= {stage for stage, _ in entry["stages"]}
+    ours, coarse = found["meshes-0"]
+    assert ours["residuals"] and coarse["residuals"] and ours["triangles"] > coarse["triangles"]
+
+
+def test_the_mesh_is_the_same_with_and_without_a_page(command, folder):
+    command(*UPSAMPLE)
+    plain = Path("a.ply").read_bytes()
+    assert command(*UPSAMPLE, "--force", "--check", "--report", "a.html")[0] == 0
+    assert Path("a.ply").read_bytes() == plain
+
+
+def test_a_page_is_replaced_with_force_only(command, folder):
+    Path("a.html").write_text("mine")
+    said = "Error: a.html exists: remove it or use --force\n"
+    assert command(*UPSAMPLE, "--report", "a.html") == (1, "", said)
+    assert Path("a.html").read_text() == "mine" and not Path("a.ply").exists()
+    assert command(*UPSAMPLE, "--report", "a.html", "--force", "-q") == (0, "", "")
+    assert files_of("a.html")
+
+
+def test_a_page_replaces_neither_input_nor_output(command, folder):
+    before = Path("a.npy").read_bytes()
+    os.link("a.npy", "a.html")
+    code, _, err = command(*UPSAMPLE, "--report", "a.html", "--force")
+    assert code == 2 and err.endswith("Error: --report a.html is a.npy: give another file\n")
+    assert Path("a.npy").read_bytes() == before
+    code, _, err = command(*UPSAMPLE, "--report", "a.pdf")
+    assert code == 2 and "a.pdf is not a page: give --report a file .html or .htm" in err
+
+
+@pytest.mark.parametrize("arguments", [UPSAMPLE, ("batch", "a.npy", "--out", "out")])
+def test_a_missing_extra_is_said_before_the_work(command, folder, monkeypatch, arguments):
+    modules = {"pyvista", "pyfqmr"}
+    monkeypatch.setattr(
+        "super_sdf.machine.extras.find_spec", lambda name: None if name in modules else 1
+    )
+    said = "--report needs pyfqmr, pyvista: pip install -e '.[report]' in a clone of super-sdf"
+    assert command(*arguments, "--report", "a.html") == (1, "", f"Error: {said}\n")
+    assert os.listdir() == ["a.npy"]
+
+
+def test_a_mesh_without_room_for_the_check_has_a_page_that_says_so(command, folder, monkeypatch):
+    monkeypatch.setattr("super_sdf.certificate.check.BYTES_PER_TRIANGLE", 10**9)
+    assert command(*UPSAMPLE, "--report", "a.html", "--max-memory", "4G")[0] == 0
+    (entry,) = files_of("a.html")
+    assert entry["meshes"] is None and entry["certificate"][0][0] == "not checked"
+    assert entry["remarks"][0].startswith("not shown: checking ")
+
+
+BATCH = ("in", "--report", "page.html")
+
+
+def test_the_page_of_a_batch_names_failures_first(run_batch, grid_folder):
+    code, _, err = run_batch(*BATCH)
+    assert code == 1 and "Check: mean residual" in err
+    entries = files_of("page.html")
+    assert [entry["name"] for entry in entries] == [
+        "bad.ply",
+        "a.ply",
+        "deep/b.ply",
+        "deep/er/c.d.ply",
+    ]
+    assert [entry["status"] for entry in entries] == ["failed", "ok", "ok", "ok"]
+    assert entries[0]["reason"] == "every value is 1: a constant field has no surface"
+    assert all(entry["thumbnail"] and entry["meshes"] == "page" for entry in entries[1:])
+    found = blocks(Path("page.html"))
+    assert found["facts"]["alert"] == "" and not Path("page-files").exists()
+    assert set(found) == {"facts", *(f"meshes-{entry['id']}" for entry in entries[1:])}
+
+
+def test_many_meshes_are_beside_the_page(run_batch, grid_folder, monkeypatch):
+    monkeypatch.setattr(batch_page, "MOST_WITHIN", 0)
+    run_batch(*BATCH)
+    made = [entry["meshes"] for entry in files_of("page.html")[1:]]
+    assert sorted(made) == sorted(f"page-files/{name}" for name in os.listdir("page-files"))
+    assert set(blocks(Path("page.html"))) == {"facts"}
+    times = {path: path.stat().st_mtime_ns for path in Path("page-files").iterdir()}
+    run_batch(*BATCH)  # a page that was written before is replaced, and nothing drawn again
+    assert {path: path.stat().st_mtime_ns for path in Path("page-files").iterdir()} == times
+    assert len(files_of("page.html")) == 4
+
+
+def test_a_batch_made_without_a_page_is_drawn_and_checked_when_one_is_asked_for(
+    run_batch, grid_folder
+):
+    run_batch("in")
+    before = Path("out/a.ply").stat().st_mtime_ns
+    run_batch(*BATCH)
+    assert Path("out/a.ply").stat().st_mtime_ns == before
+    entry = files_of("page.html")[1]
+    assert entry["meshes"] == "page" and entry["residual"] > 0 and entry["thumbnail"]
+
+
+def test_a_resumed_batch_shows_files_of_all_runs(run_batch, grid_folder):
+    run_batch("in/a.npy", "--report", "page.html")
+    run_batch("in/deep", "--report", "page.html")
+    entries = {entry["name"]: entry for entry in files_of("page.html")}
+    assert set(entries) == {"a.ply", "b.ply", "er/c.d.ply"}
+    assert entries["a.ply"]["remarks"] == [
+        "not drawn: run the command again for its picture and its meshes"
+    ]
+    os.remove("out/a.ply")  # a mesh that is gone is not in the page
+    run_batch("in/deep", "--report", "page.html")
+    assert {entry["name"] for entry in files_of("page.html")} == {"b.ply", "er/c.d.ply"}
+
+
+def test_an_interrupted_batch_writes_an_incomplete_page(run_batch, grid_folder, monkeypatch):
+    keep, kept = Run._keep, []
+
+    def interrupted(self, job, row):
+        keep(self, job, row)
+        kept.append(job.target)
+        if len(kept) == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Run, "_keep", interrupted)
+    code, _, err = run_batch(*BATCH)
+    assert code == 130 and err.startswith("Error: interrupted: ")
+    said = "Incomplete, interrupted: 2 not finished; run it again to go on"
+    assert blocks(Path("page.html"))["facts"]["alert"] == said
+    waiting = [entry["name"] for entry in files_of("page.html") if entry["status"] == "waiting"]
+    assert len(waiting) == 2 and not set(waiting) & set(kept)
+    monkeypatch.setattr(Run, "_keep", keep)
+    run_batch(*BATCH)
+    assert blocks(Path("page.html"))["facts"]["alert"] == ""
+    assert {entry["status"] for entry in files_of("page.html")} == {"ok", "failed"}
+
+
+def test_a_page_of_others_is_not_replaced_by_a_batch(run_batch, grid_folder):
+    Path("page.html").write_text("mine")
+    assert run_batch(*BATCH)[::2] == (1, "Error: page.html exists: remove it or use --force\n")
+    assert Path("page.html").read_text() == "mine" and not Path("out").exists()
+    Path("other-files").write_text("")
+    code, _, err = run_batch("in", "--report", "other.html")
+    assert (code, err) == (
+        1,
+        "Error: other-files, for the meshes of the page, is no folder: move it\n",
+    )
+
+
+def broken(*arguments, **known):
+    """Stand in for what fails."""
+    raise RuntimeError("no display")
+
+
+def test_a_mesh_whose_picture_cannot_be_drawn_is_shown_all_the_same(command, folder, monkeypatch):
+    monkeypatch.setattr("super_sdf.pages.items.thumbnail", broken)
+    assert command(*UPSAMPLE, "--report", "a.html")[0] == 0
+    (entry,) = files_of("a.html")
+    assert entry["thumbnail"] is None and entry["meshes"] == "page"
+    assert entry["remarks"] == ["no picture: RuntimeError: no display"]
+
+
+def test_a_bug_in_the_page_of_a_mesh_costs_no_mesh(run_batch, grid_folder, monkeypatch):
+    monkeypatch.setattr("super_sdf.pages.items.item_of_files", broken)
+    monkeypatch.setattr(batch_page.BatchPage, "item", lambda *arguments: None)
+    code, _, _ = run_batch("in/a.npy", "--report", "page.html")
+    assert code == 0 and Path("out/a.ply").exists()
+    (entry,) = files_of("page.html")
+    assert entry["certificate"] == [["not checked", "RuntimeError: no display"]]
