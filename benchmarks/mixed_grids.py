@@ -97,17 +97,19 @@ def write_mixed(folder: Path, count: int, sizes: list[int], seed: int = 0) -> di
     return solids
 
 
+SHEARED = [[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]
+
 # Broken files, and words that the error message must contain.
 BROKEN = {
     "truncated.npy": "is truncated",
     "empty.npy": "its header cannot be read",
     "pickled.npy": "holds Python objects",
-    "nan.npy": "every sample must be finite",
+    "nan.npy": "touch samples on both sides of the surface",
     "flat.npy": "give three axes",
-    "occupancy.npy": "an occupancy grid holds no distances",
+    "labels.npy": "choose the solid with --label",
     "constant.npy": "a constant field has no surface",
     "unsigned.npy": "an unsigned field has no inside",
-    "anisotropic.npz": "the method needs cubic voxels",
+    "sheared.npz": "are not at right angles",
     "corrupt.npz": "is not a readable .npz archive",
 }
 
@@ -122,12 +124,12 @@ def write_broken(folder: Path) -> None:
     (folder / "truncated.npy").write_bytes(data[: len(data) // 2])
     (folder / "empty.npy").write_bytes(b"")
     np.save(folder / "pickled.npy", np.array([{}], object), allow_pickle=True)
-    np.save(folder / "nan.npy", np.where(values > 0.3, np.nan, values))
+    np.save(folder / "nan.npy", np.where(np.abs(values) < 0.02, np.nan, values))
     np.save(folder / "flat.npy", values[12])
-    np.save(folder / "occupancy.npy", values < 0)
+    np.save(folder / "labels.npy", np.where(values < 0, 3, 0) + (values < -0.1))
     np.save(folder / "constant.npy", np.ones_like(values))
     np.save(folder / "unsigned.npy", np.abs(values))
-    np.savez(folder / "anisotropic.npz", values=values, spacing=(1 / 24, 1 / 24, 1 / 12))
+    np.savez(folder / "sheared.npz", values=values, spacing=1 / 24, direction=SHEARED)
     with zipfile.ZipFile(folder / "corrupt.npz", "w") as archive:
         archive.writestr("values.npy", data)
     raw = bytearray((folder / "corrupt.npz").read_bytes())

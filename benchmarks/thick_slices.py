@@ -21,21 +21,37 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from benchmarks.anisotropic import sample
-from benchmarks.fields import Score, coarse_mesh, score
+from benchmarks.fields import distance
 from super_sdf import load_network, make_grid, reconstruct
+from super_sdf.certificate.surface import count_components
 from super_sdf.evaluation.cases import Shape
+from super_sdf.evaluation.field_kinds import sample_box
+from super_sdf.evaluation.field_methods import closed_isosurface
 from super_sdf.mesh import Mesh
 from super_sdf.network.decoder import Decoder
-from super_sdf.truth.solid import Solid
 
 Floats = NDArray[np.float64]
 CUTS = (0.5, 1.0, 2.0)  # spacings of the slices
+
+
+class Score(NamedTuple):
+    """How far a mesh is from the truth, in slices; its volume over the true one; its pieces."""
+
+    distance: float
+    volume: float
+    pieces: int
+
+
+def score(truth: Mesh, mesh: Mesh, spacing: float) -> Score:
+    """Compare a mesh with the true surface."""
+    pieces = count_components(mesh.faces, len(mesh.vertices))
+    return Score(distance(truth, mesh, spacing), mesh.volume() / truth.volume(), pieces)
 
 
 def placed(mesh: Mesh, spacing: Floats) -> Mesh:
@@ -45,7 +61,7 @@ def placed(mesh: Mesh, spacing: Floats) -> Mesh:
 
 def cubes_of(values: NDArray[np.float64], spacing: Floats) -> Mesh:
     """Return marching cubes of samples whose spacings differ."""
-    return placed(coarse_mesh(values, 1.0, 0.0), spacing)
+    return placed(closed_isosurface(values, 1.0, 0.0), spacing)
 
 
 def ours(values: NDArray[np.float64], spacing: Floats, network: Decoder) -> Mesh:
@@ -114,8 +130,9 @@ def main() -> None:
     for path in (paths[i] for i in chosen):
         shape = Shape.read(path, 0)
         for ratio in options.ratios:
-            grid = sample(Solid(shape.mesh), (round(n * ratio),) * 2 + (n,))
-            values, spacing = grid.values.astype(float), np.array(grid.spacing)
+            fine = round(n * ratio)
+            values = sample_box(shape.solid, (fine, fine, n), 1.0).astype(float)
+            spacing = 1 / np.array(values.shape)
             for kind in options.kinds:
                 for name, mesh in KINDS[kind](values, spacing, network):
                     one = score(shape.mesh, mesh, float(spacing[2]))

@@ -36,7 +36,8 @@ CUT_OFF = 0.01  # share of samples amid equal ones, at the lowest or highest val
 LIPSCHITZ, BENT, NOISY = 1.05, 0.3, 0.02  # change, difference and share from which it is noisy
 LEAST_SAMPLES = 100  # from which shares are evidence
 # Noise makes values change by more than distances can at a share of the samples that grows with its
-# standard deviation: up to 2.5 per spacing were measured.
+# standard deviation: up to 2.6 per spacing were measured, up to 4 on planes along the axes. It
+# hardly makes a slope wrong that is known.
 MOST_BY_NOISE = 3.0
 OFF = 0.1  # from 1: typical slopes further off show another unit
 SLOPE_OFF = 0.25  # from 1: truncated distances have another unit
@@ -85,7 +86,8 @@ class Evidence:
     @property
     def is_too_steep(self) -> bool:
         """Whether values change by more than distances can at more samples than noise explains."""
-        return self.noisy > max(NOISY, MOST_BY_NOISE * self.roughness)
+        steep = self.noisy > max(NOISY, MOST_BY_NOISE * self.roughness)
+        return steep and self.wrong > WRONG_SLOPES
 
     @property
     def is_noisy(self) -> bool:
