@@ -138,7 +138,7 @@ def test_a_network_without_a_receptive_field_is_called_once_for_the_whole_band()
     band = survey(ball())
     list(reconstruct_slabs(ball(), network, max_memory=10**12))
     assert calls == [len(band.voxel_ijk)]
-    with pytest.raises(OutOfMemoryError, match="[MG]B of memory at once, 100 MB may be used; "):
+    with pytest.raises(OutOfMemoryError, match=r"[MG]B of memory at once, 100 MB may be used; "):
         list(reconstruct_slabs(ball(), network, max_memory=10**8))
 
 
