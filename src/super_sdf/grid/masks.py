@@ -21,7 +21,7 @@ from .spacing import is_cubic
 
 LEAST_LINES = 20  # samples beside the surface from which a distance transform is recognised
 MOST_SQUARE = 50  # up to this, squares of rounded distances are still near whole numbers
-# Distances between samples up to so many spacings apart are looked at; their error, in spacings.
+# How far apart samples are whose distances are looked at, and the error of these, in spacings.
 NEAR_SAMPLES, LATTICE_ERROR = 4, 1e-3
 MASK_BYTES = 10  # per sample, measured
 REACH = 4  # voxels; patches are clipped to 3 (``steps.band.PATCH_LIMIT``), and half of one goes off
