@@ -23,7 +23,7 @@ from .errors import WriteError
 from .fields.writing import FieldFile, check_field_fits, check_field_target, saving_field
 from .files.expectation import CERTAIN_SHARE, Expectation, expect
 from .files.formats import split_member
-from .files.grids import read_grid
+from .files.grids import read_grid_with
 from .files.meshes import write_pieces
 from .files.precision import check_format_holds, local_origin_note
 from .grid.cubic import cubic_grid
@@ -52,19 +52,6 @@ CAPPED = (
     "the solid runs out of the grid: its surface is closed along the border (leave it open with "
     "--open)"
 )
-READ_OPTIONS = (
-    "spacing",
-    "origin",
-    "direction",
-    "axes",
-    "inside",
-    "field",
-    "label",
-    "level",
-    "scale",
-    "max_memory",
-)
-"""The options of a conversion that ``read_grid`` takes."""
 SHARE_BEFORE = 0.2  # of the time, until the mesh is simplified
 
 
@@ -221,7 +208,7 @@ def convert(
     if options.simplifies:
         check_goal(options.simplify, options.triangles, ("simplify", "triangles"))
         check_can_simplify()
-    grid = _read(source, options)
+    grid = read_grid_with(source, options)
     total = _check_work(options)
     lattice = cubic_grid(grid, options.offset)
     about = check_format_holds(target, lattice, total)
@@ -238,11 +225,6 @@ def convert(
     watch.lap("write")
     done = describe(grid, tally, options, watch.seconds, notes)
     return replace(done, saved_field=file.report()) if file else done
-
-
-def _read(source: str | Path, options: ConvertOptions) -> SdfGrid:
-    """Return the grid in a file, read as the options say."""
-    return read_grid(source, **{name: getattr(options, name) for name in READ_OPTIONS})
 
 
 def _check_work(options: ConvertOptions) -> int:

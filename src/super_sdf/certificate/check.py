@@ -13,7 +13,7 @@ from typing import Any
 
 from ..convert import ConvertOptions
 from ..errors import OutOfMemoryError
-from ..files.grids import read_grid
+from ..files.grids import READ_OPTIONS, read_grid_with
 from ..files.regular import check_regular_file
 from ..grid.cubic import cubic_grid
 from ..grid.sdf_grid import SdfGrid
@@ -34,10 +34,7 @@ BYTES_PER_TRIANGLE = 420
 BYTES_PER_SAMPLE = 150
 REACH = 2.0  # voxels: how far slabs look; the samples near the surface are within 1.4 of it
 # The options of a conversion that say how its grid is read, and where its surface is.
-SHARED = (
-    *("spacing", "origin", "direction", "axes", "inside", "field", "label", "level", "scale"),
-    *("offset", "max_memory"),
-)
+SHARED = (*READ_OPTIONS, "offset")
 HEADER_BYTES = 4096  # of a PLY file, in which the number of faces is looked for
 
 
@@ -196,19 +193,7 @@ def read_for_check(
     """Return a mesh and the grid that it was made from; raise OutOfMemoryError before both."""
     bound = allot(0, check_max_memory(options.max_memory))
     check_room(stated_triangles(check_regular_file(mesh)), 0, bound)
-    found = read_grid(
-        grid,
-        spacing=options.spacing,
-        origin=options.origin,
-        direction=options.direction,
-        axes=options.axes,
-        inside=options.inside,
-        field=options.field,
-        label=options.label,
-        level=options.level,
-        scale=options.scale,
-        max_memory=options.max_memory,
-    )
+    found = read_grid_with(grid, options)
     return read_mesh(mesh), found
 
 

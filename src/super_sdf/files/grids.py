@@ -52,6 +52,18 @@ ROOM_SHARE, UNKNOWN_ROOM = 0.25, 1 << 28
 BOMB_RATIO = 500
 
 
+READ_OPTIONS = (
+    *("spacing", "origin", "direction", "axes", "inside", "field", "label", "level", "scale"),
+    "max_memory",
+)
+"""What ``read_grid`` takes besides the path."""
+
+
+def read_grid_with(path: str | Path, options: Any) -> SdfGrid:
+    """Read a grid as an object with the attributes ``READ_OPTIONS`` says; see ``read_grid``."""
+    return read_grid(path, **{name: getattr(options, name) for name in READ_OPTIONS})
+
+
 def read_grid(
     path: str | Path,
     *,

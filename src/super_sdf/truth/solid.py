@@ -64,11 +64,6 @@ class Solid:
         """Return the index of the nearest triangle, (n,), of points (n, 3)."""
         return self.nearest(points)[1]
 
-    def foot_points(self, points: Points) -> tuple[Distances, Points]:
-        """Return the unsigned distance, (n,), of points (n, 3), and the nearest points, (n, 3)."""
-        distance, _, feet = self.nearest(points)
-        return distance, feet
-
     def nearest(self, points: Points) -> tuple[Distances, NDArray[np.int64], Points]:
         """Return distance, triangle and nearest point of points (n, 3)."""
         if not len(points):
