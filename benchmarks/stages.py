@@ -31,7 +31,7 @@ from super_sdf.steps.survey import Band
 
 # The function of each stage, in the module where it is looked up.
 STAGES = {
-    "read": [(convert, "read_grid")],
+    "read": [(convert, "read_grid_with")],
     "band": [(pipeline, "survey")],
     "gather": [(Band, "network_inputs")],
     "network": [(Network, "__call__")],
