@@ -14,13 +14,12 @@ from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .arrays import Triple
 from .errors import WriteError
-from .fields.writing import FieldFile, check_field_fits, check_field_target, saving_field
 from .files.expectation import CERTAIN_SHARE, Expectation, expect
 from .files.formats import split_member
 from .files.grids import read_grid_with
@@ -47,6 +46,9 @@ from .steps.lattice import lattice_shape
 from .steps.mesher_names import DEFAULT_MESHER
 from .steps.meshers import find_mesher
 from .steps.nodes import check_factor
+
+if TYPE_CHECKING:
+    from .fields.writing import FieldFile
 
 CAPPED = (
     "the solid runs out of the grid: its surface is closed along the border (leave it open with "
@@ -282,6 +284,8 @@ def _complete_field(
 ) -> None:
     """Complete the field's file, and check that it can appear, before the mesh ``part`` does."""
     if file:
+        from .fields.writing import check_field_target
+
         file.finish()
         check_field_target(file.path, force=force)
     if then:
@@ -307,6 +311,9 @@ def open_field(
     """
     if path is None:
         return nullcontext()
+    # imported here, since few conversions write a field, and the start is part of each
+    from .fields.writing import check_field_fits, check_field_target, saving_field
+
     path, shape = check_field_target(path, force=force), grid.shape
     for _ in range(options.iterations):
         shape = lattice_shape(shape, options.factor)

@@ -7,7 +7,7 @@ import numpy as np
 from ..machine.threads import CHUNK, rows_in_chunk
 from ..steps.marching import LOOKUP_BYTES, lookups_at_once
 from ..steps.mesher_names import DEFAULT_MESHER, MARCHING, SHARP
-from ..steps.meshers import BY_NAME, GROUP_BYTES, groups_at_once, voxel_bytes
+from ..steps.meshers import BY_NAME
 from ..steps.spline import spline_bytes
 from ..steps.survey import Band
 
@@ -99,6 +99,8 @@ def _sharp_bytes(band: Band, planes: Range, decoded: int, factor: int, threads: 
 
     Where edges are is not known yet: every voxel of the planes beside a group may be near one.
     """
+    from ..steps.sharp_groups import GROUP_BYTES, groups_at_once, voxel_bytes
+
     beside = BY_NAME[SHARP].planes_beside(factor)
     before = band.decoded_before[max(planes[0] - beside, 0) : planes[1] + beside + 1]
     width = min(2 * beside + 1, len(before) - 1)
