@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import argparse
 import copy
-import csv
 import time
 from collections import deque
 from dataclasses import dataclass, replace
@@ -25,7 +24,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from export.arguments import Parser, at_least, positive, share
@@ -34,6 +32,7 @@ from export.dataset import CORNERS, Sample, read_shard
 from export.dormant import dormant_share, revive
 from export.network import SIZES, SuperSdfNet
 from export.recipe import RECIPE, Recipe, differences, loss_of, make_optimisers, rate_factor
+from export.run_log import LOG_COLUMNS, append_line, plot_run, read_log
 from export.to_onnx import read_weights
 from super_sdf.errors import FileError
 from super_sdf.files.regular import check_regular_file
@@ -44,8 +43,6 @@ WATCHED = 4  # last batches: a unit that reacted to none of them is dormant
 HELD_OUT = 2  # shards, the first by name, whose errors are logged
 INPUTS = ("distances", "masks")
 NEAR = 0.5  # half voxels from the surface: limit for normals; half of it for values
-
-LOG_COLUMNS = ("step", "seconds", "samples", "loss", "held-out", "near", "normal", "dormant")
 
 
 def predict(net: SuperSdfNet, batch: list[Prepared]) -> list[tuple[Tensor, Tensor]]:
@@ -250,37 +247,16 @@ def train(run: Run, store: Store, minutes: float, seed: int) -> None:
 
 
 def log(run: Run, store: Store, loss: float) -> None:
-    """Append a line to the log and print it; every tenth time measure and plot."""
-    row = [run.step, round(run.seconds), len(store.samples), f"{loss:.5f}"]
+    """Append a line to the log; every tenth time measure and plot."""
+    line = [run.step, round(run.seconds), len(store.samples), f"{loss:.5f}"]
+    path = run.path.with_name("log.csv")
     if run.step % (10 * LOG_STEPS) == 0:
         errors = measure(run.average, store.held_out)
-        row += [f"{errors.everywhere:.5f}", f"{errors.near:.5f}", f"{errors.normal:.5f}"]
-        row += [f"{dormant_share(run.net, [[sample] for sample in store.held_out]):.4f}"]
-        plot_log(run.path.parent)
-    with (run.path.parent / "log.csv").open("a", newline="") as file:
-        csv.writer(file).writerow(row)
-    print(" ".join(f"{name} {value}" for name, value in zip(LOG_COLUMNS, row)), flush=True)
-
-
-def read_log(folder: Path) -> np.ndarray:
-    """Return the lines of a log, (n, len(LOG_COLUMNS)), NaN where nothing was measured."""
-    with (folder / "log.csv").open(newline="") as file:
-        rows = [row + ["nan"] * (len(LOG_COLUMNS) - len(row)) for row in csv.reader(file)]
-    return np.array(rows, float)
-
-
-def plot_log(folder: Path) -> None:
-    """Plot loss and held-out errors against minutes, as ``loss.png``."""
-    columns = dict(zip(LOG_COLUMNS, read_log(folder).T))
-    figure = Figure(figsize=(12, 4), layout="constrained")
-    panels = (["loss"], ["held-out", "near", "normal"], ["dormant"])
-    for ax, names in zip(figure.subplots(1, 3), panels):
-        for name in names:
-            measured = np.isfinite(columns[name])
-            ax.plot(columns["seconds"][measured] / 60, columns[name][measured], label=name)
-        ax.set(xlabel="minutes", yscale="linear" if "dormant" in names else "log")
-        ax.legend()
-    figure.savefig(folder / "loss.png", dpi=100)
+        line += [f"{errors.everywhere:.5f}", f"{errors.near:.5f}", f"{errors.normal:.5f}"]
+        line += [f"{dormant_share(run.net, [[sample] for sample in store.held_out]):.4f}"]
+    append_line(path, line)
+    if len(line) == len(LOG_COLUMNS):
+        plot_run(read_log(path), path.with_name("loss.png"))
 
 
 def main() -> None:

@@ -43,6 +43,7 @@ from export.network import (
     is_noisy,
 )
 from export.recipe import RECIPE, differences, make_optimisers, rate_factor
+from export.run_log import draw_history, read_log
 from export.shapes import random_solid
 from export.to_onnx import (
     check_awake,
@@ -54,9 +55,10 @@ from export.to_onnx import (
     rewrite,
     write_model,
 )
-from export.train import Errors, Run, Store, log, read_log, sample_errors, train
+from export.train import Errors, Run, Store, log, sample_errors, train
 from export.variants import UNet
 from super_sdf import Mesh, load_network
+from super_sdf.errors import FileError
 from super_sdf.neighbourhood import CENTRE, NEIGHBOURHOOD
 from super_sdf.network.contract import INPUTS
 from super_sdf.network.network import shipped_models
@@ -323,9 +325,30 @@ def test_a_log_is_drawn(tmp_path, samples):
     store = Store(tmp_path, 1)
     for run.step in (900, 1000):
         log(run, store, 0.5)
-    lines = read_log(tmp_path)
-    assert np.isnan(lines[0, 4:]).all() and np.isfinite(lines[1]).all()
+    columns = read_log(tmp_path / "log.csv")
+    assert np.isnan(columns["held-out"][0]) and all(np.isfinite(c[1]) for c in columns.values())
     assert (tmp_path / "loss.png").stat().st_size > 1000
+
+
+def test_steps_that_a_resumed_run_takes_again_count_once(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("100,10,5,.3\n200,20,5,.2\n300,30,5,.1\n200,21,5,.25\n300,31,5,.15\n")
+    columns = read_log(path)
+    assert columns["step"].tolist() == [100, 200, 300]
+    assert columns["loss"].tolist() == [0.3, 0.25, 0.15]
+    path.write_text("")
+    with pytest.raises(FileError, match=f"^{path} is empty: give the log.csv of a run$"):
+        read_log(path)
+
+
+def test_consecutive_runs_are_drawn_one_after_the_other(tmp_path, capsys):
+    for name, start in (("one", 0.02), ("two", 0.016)):
+        lines = [f"{1000 * n},{600 * n},5,.1,{start / n},.02,.04,.01" for n in (1, 2)]
+        (tmp_path / name).write_text("\n".join(lines))
+    figure = draw_history([tmp_path / "one", tmp_path / "two"], 0.015)
+    one, two, *_ = (line.get_xydata() for line in figure.axes[0].lines[::2])
+    np.testing.assert_allclose(one, [[1 / 6, 0.02], [1 / 3, 0.01]])
+    np.testing.assert_allclose(two, [[1 / 2, 0.016], [2 / 3, 0.008]])
 
 
 @pytest.mark.parametrize("entry", ENTRIES)
