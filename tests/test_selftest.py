@@ -124,7 +124,7 @@ def test_the_command_prints_a_line_a_check_and_its_exit_code_tells(command):
     assert lines[0].startswith("ok       versions: super-sdf ")
     assert all(re.match(r"(ok      |missing ) \w+", line) for line in lines[:-1])
     code, out, _ = command("info", "--check", "--device", "cuda")
-    assert code == 1 and out.splitlines()[-1] == "1 of 21 checks failed"
+    assert code == 1 and out.splitlines()[-1] == "1 of 22 checks failed"
     assert "\nfailed   cuda: onnxruntime " in out
 
 
