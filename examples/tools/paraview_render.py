@@ -53,7 +53,11 @@ def main(field, picture="part.png", surface="part.vtp"):
     name = image.PointData[0].Name
     coarse = simple.Contour(Input=image, ContourBy=["POINTS", name], Isosurfaces=[0.0])
     fine = refined(image)
+    coarse.UpdatePipeline()
     fine.UpdatePipeline()
+    counts = [s.GetDataInformation().GetNumberOfCells() for s in (coarse, fine)]
+    if not counts[1]:
+        sys.exit("the filter made no surface: its error is above")
     layout = simple.CreateLayout("coarse and fine")
     layout.SplitHorizontal(0, 0.5)
     left = draw(coarse, 1)
@@ -61,7 +65,6 @@ def main(field, picture="part.png", surface="part.vtp"):
     layout.SetSize(1600, 800)
     simple.SaveScreenshot(picture, layout, ImageResolution=[1600, 800])
     simple.SaveData(surface, fine)
-    counts = [s.GetDataInformation().GetNumberOfCells() for s in (coarse, fine)]
     print(f"{counts[0]:,} triangles by Contour, {counts[1]:,} by super-sdf: {picture}, {surface}")
 
 
