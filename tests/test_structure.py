@@ -18,6 +18,7 @@ MODULES = {
 # The library of each file format is imported by its reader or writer alone, when it is used.
 READERS = {
     "fields.vti": {"vtkmodules"},
+    "files.images": {"vtkmodules"},
     "files.readers.hdf5": {"h5py"},
     "files.readers.metaimage": {"SimpleITK"},
     "files.readers.nifti": {"nibabel"},
@@ -26,6 +27,7 @@ READERS = {
     "files.readers.vdb": {"tinyvdb"},
     "files.readers.vti": {"vtkmodules"},
     "files.readers.zarr_store": {"zarr"},
+    "pyvista": {"pyvista"},
 }
 # Rooms that need more than the few packages that are always installed.
 WITH_EXTRAS = {"certificate", "evaluation", "pages", "pictures", "simplification", "truth"}
@@ -43,26 +45,29 @@ def rooms() -> list[set[str]]:
     return [set(re.findall(r"`(\w+)/?`", cell)) for cell in cells]
 
 
-def imported(path: Path) -> set[str]:
-    """Return the modules that a file imports anywhere, of this package without its name."""
-    names: set[str] = set()
+def imported(path: Path) -> tuple[set[str], set[str]]:
+    """Return what a file imports anywhere: its package's modules, without its name, and others."""
+    own_names: set[str] = set()
+    others: set[str] = set()
     inside = path.is_relative_to(PACKAGE)
     here = path.relative_to(PACKAGE).with_suffix("").parts if inside else ()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
+            others |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            others.add(node.module or "")
         elif isinstance(node, ast.ImportFrom):
-            before = here[: len(here) - node.level] if node.level else ()
+            before = here[: len(here) - node.level]
             module = ".".join([*before, *([node.module] if node.module else [])])
             below = {f"{module}.{alias.name}".lstrip(".") for alias in node.names}
-            names |= (below & set(MODULES)) or {module or "__init__"}
-    return names
+            own_names |= (below & set(MODULES)) or {module or "__init__"}
+    return own_names, others
 
 
 def own(path: Path) -> set[str]:
     """Return the modules of the package that one of its files imports."""
     packages = {name.removesuffix(".__init__"): name for name in MODULES}
-    return {packages.get(name, name) for name in imported(path)} & set(MODULES)
+    return {packages.get(name, name) for name in imported(path)[0]} & set(MODULES)
 
 
 def test_the_tour_names_every_room_once():
@@ -95,7 +100,7 @@ def test_the_runtime_needs_few_packages(module):
     allowed = {"click", "numpy", "onnxruntime", "trimesh"} | set(sys.stdlib_module_names)
     others = {"batch.lock": {"filelock"}, "machine.memory": {"psutil"}, **READERS}
     allowed |= others.get(module, set())
-    foreign = imported(MODULES[module]) - set(MODULES) - {"", "__init__"}
+    foreign = imported(MODULES[module])[1]
     assert {name.split(".")[0] for name in foreign} <= allowed
 
 
@@ -111,7 +116,7 @@ def test_onnxruntime_is_imported_in_one_place():
         path.name
         for room in rooms
         for path in room.rglob("*.py")
-        if "onnxruntime" in imported(path)
+        if "onnxruntime" in imported(path)[1]
     }
     assert importing == {"onnx.py"}
 

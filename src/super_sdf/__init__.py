@@ -19,6 +19,7 @@ __all__ = [
     "__version__",
     "extract_mesh",
     "fine_grid",
+    "grid_from_image",
     "load_network",
     "make_grid",
     "read_field",

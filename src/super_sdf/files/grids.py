@@ -123,7 +123,7 @@ def read_grid(
     order = choose_axes(format_, axes)
     check_direction_given(format_, direction)
     given = {"spacing": spacing, "origin": origin, "direction": direction}
-    room = _room(max_memory)
+    room = unpacking_room(max_memory)
     if format_.key in ("npy", "npz"):
         found = _read_numpy(check_regular_file(path), order, room, given)
     else:
@@ -212,7 +212,7 @@ def _silent_logs() -> Iterator[None]:
         logging.disable(disabled)
 
 
-def _room(max_memory: int | None) -> int:
+def unpacking_room(max_memory: int | None) -> int:
     """Return how many bytes of memory an unpacked array may take."""
     bound = memory_bound(max_memory)
     if bound is None:

@@ -136,6 +136,36 @@ def reversed_axes(
     return _triple(np.asarray(spacing, np.float64)[::-1]), np.asarray(direction)[:, ::-1]
 
 
+@dataclass(frozen=True)
+class ImageLattice:
+    """Where the samples of VTK image data lie: at its points, or at the centres of its cells.
+
+    Point (i, j, k) of the extent is at ``origin + direction @ (spacing * (i, j, k))``. The extent,
+    the first and the last point on each axis, need not begin at 0.
+    """
+
+    extent: tuple[int, ...]
+    spacing: NDArray[np.float64]
+    origin: NDArray[np.float64]
+    direction: NDArray[np.float64]
+    of_points: bool
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape (nz, ny, nx) of the array of samples: x is the fastest."""
+        low, high = self.extent[::2], self.extent[1::2]
+        return tuple(high[axis] - low[axis] + self.of_points for axis in (2, 1, 0))
+
+    def volume(
+        self, dtype: Any, read: Callable[[int, int], NDArray[Any]], planes_at_once: int = 1
+    ) -> Volume:
+        """Return the samples, whose planes of z ``read`` returns, at their place in the world."""
+        first = np.array(self.extent[::2]) + (0 if self.of_points else 0.5)
+        start = _triple(self.origin + self.direction @ (self.spacing * first))
+        spacing, direction = reversed_axes(self.spacing, self.direction)
+        return Volume(self.shape, np.dtype(dtype), read, spacing, start, direction, planes_at_once)
+
+
 def axes_direction(axes: str) -> NDArray[np.float64]:
     """Return the direction of an array whose axes are the world's in an order: "xyz", "zyx"."""
     return XYZ if axes == "xyz" else ZYX

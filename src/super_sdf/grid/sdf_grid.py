@@ -13,6 +13,7 @@ from ..arrays import Triple
 from .direction import STRAIGHT, Direction, check_direction, in_rows, is_mirrored
 from .field import AUTO, Field, Wanted
 from .interpret import interpret
+from .labelled import placed
 from .planes import SampleArray, SamplePlanes
 from .samples import Extremes, as_samples, check_not_flat, check_values
 from .sides import check_negative_inside
@@ -31,10 +32,12 @@ class SdfGrid:
     values : (nx, ny, nz) array_like
         Signed distances in world units, negative inside; i runs along x, j along y, k along z
         unless there is a direction. A memory-mapped array or ``SamplePlanes`` are not loaded.
+        Of a ``DataArray`` of xarray, the dimensions are x, y and z, in any order.
     spacing : float or three floats
         World distance between neighbouring samples, along each axis of the array.
-    origin : float or three floats
-        World position of sample (0, 0, 0). Default: 0, 0, 0.
+    origin : float or three floats, optional
+        World position of sample (0, 0, 0). Default: 0, 0, 0, or the lowest coordinates of a
+        ``DataArray``.
     direction : (3, 3) array_like or nine numbers, optional
         The columns are the world directions of the array's axes: unit vectors at right angles,
         mirrored or not. Default: i runs along x, j along y, k along z.
@@ -74,13 +77,15 @@ class SdfGrid:
         self,
         values: ArrayLike | SamplePlanes,
         spacing: ArrayLike,
-        origin: ArrayLike = 0.0,
+        origin: ArrayLike | None = None,
         direction: ArrayLike | None = None,
     ) -> None:
-        samples, extremes = _checked(values)
+        found = placed(values, spacing, origin)
+        samples, extremes = _checked(found.values)
         check_negative_inside(samples)
         notes: list[str] = []
         chosen = choose_spacing(samples, check_spacing(spacing), notes)
+        origin = 0.0 if found.origin is None else found.origin
         place = chosen, origin, direction
         self._set(samples, place, tuple(notes), False, extremes)
 
@@ -89,7 +94,7 @@ class SdfGrid:
         cls,
         values: ArrayLike | SamplePlanes,
         spacing: ArrayLike,
-        origin: ArrayLike = 0.0,
+        origin: ArrayLike | None = None,
         notes: tuple[str, ...] = (),
         *,
         direction: ArrayLike | None = None,
@@ -103,9 +108,11 @@ class SdfGrid:
         and maximum, they are not searched for NaN and infinity again. Values are taken as exact
         distances unless ``field`` says what they are.
         """
-        samples = as_samples(values)
+        given = placed(values, spacing, origin)
+        samples = as_samples(given.values)
         grid = object.__new__(cls)
         found = extremes or check_values(samples)
+        origin = 0.0 if given.origin is None else given.origin
         place = check_spacing(spacing), origin, direction
         grid._set(samples, place, notes, positive_inside, found, field)
         return grid
@@ -224,10 +231,14 @@ def make_grid(
     values : (nx, ny, nz) array_like
         Signed distances in world units; i runs along x, j along y, k along z. Or a mask, labels,
         densities, or another field. Samples far from the surface may be NaN or infinite: unknown.
+        A ``DataArray`` of xarray has the dimensions x, y and z, in any order, and evenly spaced
+        coordinates, increasing or decreasing, or none; others of length 1 are left out.
     spacing : number or three, optional
-        World distance between neighbouring samples. Default: estimated from the gradient.
+        World distance between neighbouring samples. Default: that of the coordinates of a
+        ``DataArray``, else estimated from the gradient.
     origin : number or three, optional
-        World position of sample (0, 0, 0). Default: 0, 0, 0.
+        World position of sample (0, 0, 0). Default: the lowest coordinates of a ``DataArray``, else
+        0, 0, 0.
     direction : (3, 3) array_like or nine numbers, optional
         The columns are the world directions of the array's axes; see ``SdfGrid``.
     inside : {"auto", "negative", "positive"}
@@ -251,13 +262,16 @@ def make_grid(
     Raises
     ------
     GridError
-        If the values have no surface, or contradict the spacing.
+        If the values have no surface, or contradict the spacing; if the dimensions or coordinates
+        of a ``DataArray`` are not as above.
     OptionError
         If ``inside`` or ``field`` is not one of these, or another option is no number.
     """
     notes: list[str] = []
     wanted = Wanted(field, label, level, scale)
-    found = interpret(as_samples(values), wanted, spacing, inside, notes)
+    given = placed(values, spacing, origin)
+    found = interpret(as_samples(given.values), wanted, given.spacing, inside, notes)
+    origin = given.origin
     if origin is None:
         notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
         origin = 0.0

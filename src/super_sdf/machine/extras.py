@@ -17,6 +17,7 @@ EXTRAS = {
     "zarr": ("zarr",),
     "vdb": ("tinyvdb",),
     "3mf": ("lxml", "networkx"),
+    "pyvista": ("pyvista",),
     "simplify": ("igl", "pyfqmr"),
     "eval": ("igl", "matplotlib", "scipy", "skimage"),
     "view": ("pyvista",),

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import FileError
-from ..volume import Request, Volume, reversed_axes
+from ..volume import ImageLattice, Request, Volume
 from .choosing import choose_member
 from .silence import discarded_stderr
 
@@ -35,10 +35,10 @@ def read_vti(request: Request) -> Volume:
     points = _names(reader.GetPointDataArraySelection())
     cells = _names(reader.GetCellDataArraySelection())
     name = choose_member(request, points or cells, "array of points or cells")
-    of_points = bool(points)
-    image = reader.GetOutputInformation(0)
+    image, of_points = reader.GetOutputInformation(0), bool(points)
     extent = _extent(reader, image)
-    shape = tuple(extent[2 * a + 1] - extent[2 * a] + of_points for a in (2, 1, 0))
+    spacing, origin = np.array(image.Get(_key("SPACING"))), np.array(image.Get(_key("ORIGIN")))
+    lattice = ImageLattice(extent, spacing, origin, _direction(image), of_points)
 
     def read(first: int, last: int) -> NDArray[Any]:
         part = (*extent[:4], extent[4] + first, extent[4] + last - of_points)
@@ -51,18 +51,12 @@ def read_vti(request: Request) -> Volume:
             raise FileError(f"{request.path}:{name} is no array of numbers")
         # the reader may return more planes than it was asked for
         start = output.GetExtent()[4] - extent[4]
-        values = vtk_to_numpy(found).reshape(-1, *shape[1:])
+        values = vtk_to_numpy(found).reshape(-1, *lattice.shape[1:])
         planes: NDArray[Any] = values[first - start : last - start]
         return planes
 
-    one = read(0, 1)
-    spacing = np.array(image.Get(_key("SPACING")))
-    direction = _direction(image)
-    first = np.array(extent[::2]) + (0 if of_points else 0.5)
-    origin = np.array(image.Get(_key("ORIGIN"))) + direction @ (spacing * first)
-    turned = reversed_axes(spacing, direction)
-    at_once = request.planes_at_once(shape, one.dtype)
-    return Volume(shape, one.dtype, read, turned[0], tuple(origin), turned[1], at_once)
+    dtype = read(0, 1).dtype
+    return lattice.volume(dtype, read, request.planes_at_once(lattice.shape, dtype))
 
 
 def _key(name: str) -> Any:

@@ -1,0 +1,273 @@
+"""VTK image data in memory, and PyVista's accessor: the grid and the mesh of the same .vti file."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import pyvista
+from click.testing import CliRunner
+from conftest import trilinear
+from vtkmodules.vtkCommonDataModel import vtkImageData
+
+import super_sdf.pyvista  # noqa: F401  (registers the accessor)
+from super_sdf import grid_from_image, load_network, read_grid, reconstruct
+from super_sdf.cli.main import cli
+from super_sdf.errors import GridError, NoSurfaceError, OptionError, OptionTypeError
+
+ROOT = Path(__file__).parent.parent
+SIZES = 20, 22, 24
+RADIUS = 4.2
+TURNED = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+DIRECTIONS = {
+    "straight": np.eye(3),
+    "swapped": np.array([[0, -1, 0], [0, 0, 1], [1, 0, 0]]),
+    "mirrored": np.diag([-1, 1, 1]),
+    "turned": TURNED,
+    "turned and mirrored": TURNED[:, [1, 0, 2]],
+}
+
+
+def sphere(direction: str = "straight", start: tuple[int, int, int] = (0, 0, 0)):
+    """Return an image of a sphere's distances, float32, and the centre of the sphere."""
+    ends = [s + n - 1 for s, n in zip(start, SIZES)]
+    image = pyvista.ImageData(spacing=(0.5, 0.5, 0.5), origin=(10, -20, 30))
+    image.extent = [end for pair in zip(start, ends) for end in pair]
+    image.direction_matrix = DIRECTIONS[direction]
+    centre = image.points.mean(0) + 0.13
+    away = np.linalg.norm(image.points - centre, axis=1)
+    image.point_data["distance"] = (away - RADIUS).astype(np.float32)
+    return image, centre
+
+
+def in_cells(image: pyvista.ImageData, centre: np.ndarray) -> pyvista.ImageData:
+    """Return the same lattice with the distances of its cells' centres."""
+    image = image.copy()
+    image.clear_data()
+    away = np.linalg.norm(image.cell_centers().points - centre, axis=1)
+    image.cell_data["distance"] = (away - RADIUS).astype(np.float32)
+    return image
+
+
+def refusal(call, kind: type[Exception] = GridError) -> str:
+    """Return the error, one line, that a call ends with."""
+    with pytest.raises(kind) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS)
+@pytest.mark.parametrize("start", [(0, 0, 0), (3, -2, 7)])
+def test_a_sphere_comes_out_where_the_image_has_it(direction, start):
+    image, centre = sphere(direction, start)
+    surface = image.super_sdf.contour(2, network=trilinear)
+    assert type(surface) is pyvista.PolyData
+    assert surface.is_all_triangles and surface.is_manifold
+    assert np.abs(np.linalg.norm(surface.points - centre, axis=1) - RADIUS).max() < 0.06
+    outward = np.einsum("ij,ij->i", surface.face_normals, surface.cell_centers().points - centre)
+    assert (outward > 0).all()
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS)
+@pytest.mark.parametrize("where", ["points", "cells"])
+def test_the_surface_is_the_one_of_the_file(direction, where, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    image, centre = sphere(direction, (3, -2, 7))
+    image = in_cells(image, centre) if where == "cells" else image
+    image.save("image.vti")
+    grid = read_grid("image.vti")
+    assert repr(image.super_sdf.grid()) == repr(grid) == repr(grid_from_image(image))
+    assert np.array_equal(image.super_sdf.grid().values, grid.values)
+    mesh = reconstruct(grid, trilinear, 2, cap=True)
+    surface = image.super_sdf.contour(2, network=trilinear)
+    assert surface.points.tobytes() == mesh.vertices.tobytes()
+    assert surface.points.dtype == mesh.vertices.dtype
+    assert np.array_equal(surface.regular_faces, mesh.faces)
+
+
+@pytest.mark.parametrize(
+    "given, options",
+    [
+        ({}, []),
+        ({"factor": 2, "quality": "fast", "mesher": "sharp"},
+         ["--factor", "2", "--quality", "fast", "--mesher", "sharp"]),
+        ({"factor": 2, "offset": 0.6, "scale": 1.0, "field": "exact"},
+         ["--factor", "2", "--offset", "0.6", "--scale", "1", "--field", "exact"]),
+        ({"factor": 2, "level": 1.0, "inside": "negative"},
+         ["--factor", "2", "--level", "1", "--inside", "negative"]),
+    ],
+)  # fmt: skip
+def test_the_surface_is_the_one_of_the_command(given, options, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    image, _ = sphere("turned")
+    image.save("image.vti")
+    result = CliRunner().invoke(cli, ["upsample", "image.vti", "mesh.ply", *options])
+    assert result.exit_code == 0, result.output
+    from super_sdf.truth.mesh_files import read_mesh
+
+    mesh, surface = read_mesh("mesh.ply"), image.super_sdf.contour(**given)
+    assert surface.points.tobytes() == mesh.vertices.astype(surface.points.dtype).tobytes()
+    assert np.array_equal(surface.regular_faces, mesh.faces)
+
+
+def test_a_large_image_goes_through_a_temporary_file(monkeypatch):
+    image, _ = sphere("swapped")
+    held = image.super_sdf.contour(2, network=trilinear)
+    monkeypatch.setattr("super_sdf.files.grids.ROOM_SHARE", 0)
+    surface = image.super_sdf.contour(2, network=trilinear)
+    assert surface.points.tobytes() == held.points.tobytes()
+
+
+def test_positions_far_away_are_in_double_precision():
+    image, _ = sphere()
+    image.origin = (5e6, 0, 0)
+    surface = image.super_sdf.contour(2, network=trilinear)
+    assert surface.points.dtype == np.float64 and surface.is_manifold
+
+
+def test_where_the_solid_runs_out_of_the_image_the_surface_is_closed_unless_left_open():
+    image, _ = sphere()
+    half = image.extract_subset((0, 19, 0, 21, 0, 10))
+    assert half.super_sdf.contour(2, network=trilinear).n_open_edges == 0
+    assert half.super_sdf.contour(2, network=trilinear, cap=False).n_open_edges > 0
+
+
+def test_residuals_are_those_of_the_certificate():
+    image, _ = sphere()
+    surface = image.super_sdf.contour(2, residuals=True)
+    residuals = surface.point_data["residual"]
+    assert residuals.dtype == np.float32 and len(residuals) == surface.n_points
+    assert np.nanmax(np.abs(residuals)) < 0.05
+    bare = image.super_sdf.contour(2)
+    assert bare.point_data.keys() == [] and bare.points.tobytes() == surface.points.tobytes()
+    moved = image.super_sdf.contour(2, residuals=True, offset=0.5)
+    assert np.nanmax(np.abs(moved.point_data["residual"])) < 0.05  # of the offset, too
+
+
+def test_masks_of_booleans_are_meshed():
+    image, centre = sphere()
+    inside = image.point_data["distance"] < 0
+    image.clear_data()
+    image.point_data["mask"] = inside
+    assert image.super_sdf.grid().field.kind == "mask"
+    points = image.super_sdf.contour(2).points
+    assert np.abs(np.linalg.norm(points - centre, axis=1) - RADIUS).max() < 0.3
+
+
+def test_the_active_scalars_are_taken_or_those_with_a_name():
+    image, centre = sphere()
+    image.point_data["larger"] = image.point_data["distance"] - 0.5
+    assert image.active_scalars_name == "distance"
+    lowest = image.super_sdf.grid().low
+    assert image.super_sdf.grid("larger").low == pytest.approx(lowest - 0.5)
+    image.set_active_scalars("larger")
+    assert image.super_sdf.grid().low == pytest.approx(lowest - 0.5)
+    image.cell_data["of cells"] = in_cells(image, centre).cell_data["distance"]
+    assert image.super_sdf.grid("of cells").shape == tuple(n - 1 for n in SIZES)
+    surface = image.super_sdf.contour(2, scalars="larger", network=trilinear)
+    assert np.abs(np.linalg.norm(surface.points - centre, axis=1) - RADIUS - 0.5).max() < 0.06
+
+
+def plain(**arrays: np.ndarray) -> vtkImageData:
+    """Return image data of VTK with arrays at its points, none of them active."""
+    image = vtkImageData()
+    image.SetDimensions(*SIZES)
+    image.SetSpacing(0.5, 0.5, 0.5)
+    for name, values in arrays.items():
+        array = pyvista.convert_array(values, name=name)
+        image.GetPointData().AddArray(array)
+    return image
+
+
+def test_image_data_of_vtk_is_taken_too():
+    image, _ = sphere()
+    values = np.asarray(image.point_data["distance"])
+    bare = plain(distance=values)
+    assert np.array_equal(grid_from_image(bare).values, image.super_sdf.grid().values)
+    several = plain(a=values, b=values)
+    assert refusal(lambda: grid_from_image(several)) == (
+        "the image holds several arrays, a, b: give scalars='a', say"
+    )
+    assert grid_from_image(several, "b").shape == SIZES
+
+
+@pytest.mark.parametrize(
+    "arrays, scalars, message",
+    [
+        ({}, None, "the image holds no array of points or cells"),
+        ({"a": np.zeros(20 * 22 * 24)}, "b", "the image has no array 'b': it holds a"),
+        (
+            {"a": np.zeros((20 * 22 * 24, 3))},
+            None,
+            "the array 'a' of the image has 3 numbers per sample: give an array of one",
+        ),
+        (
+            {"a": np.zeros(7)},
+            None,
+            "the array 'a' of the image has 7 values for 10,560 samples",
+        ),
+        ({"a": np.zeros(20 * 22 * 24)}, None, "every value is 0: a constant field has no surface"),
+    ],
+)
+def test_what_is_no_array_of_samples_is_refused(arrays, scalars, message):
+    assert refusal(lambda: grid_from_image(plain(**arrays), scalars)) == message
+
+
+def test_other_mistakes_are_one_line():
+    image, _ = sphere()
+    contour = image.super_sdf.contour
+    assert refusal(lambda: grid_from_image([1]), OptionTypeError) == (
+        "image is [1]: give VTK image data"
+    )
+    assert refusal(lambda: contour(scalars="b")) == (
+        "the image has no array 'b': it holds distance"
+    )
+    assert refusal(lambda: contour(3), OptionError).startswith("factor is 3: ")
+    network = load_network("fast")
+    assert refusal(lambda: contour(quality="best", network=network), OptionError) == (
+        "quality 'best' and a network are given: give only one"
+    )
+    image.spacing = (0.2, 0.2, 0.2)
+    assert refusal(contour).endswith("values that are no distances need --field scaled")
+    image.spacing = (0.5, 0.5, 0.5)
+    flat = image.extract_subset((0, 19, 0, 21, 4, 4))
+    assert refusal(flat.super_sdf.contour) == (
+        "values have shape (1, 22, 20): give at least 2 samples on each axis"
+    )
+    image["distance"] = np.abs(np.asarray(image["distance"])) + 3
+    assert issubclass(NoSurfaceError, GridError) and refusal(contour)
+
+
+def test_an_old_pyvista_is_named(monkeypatch):
+    script = (
+        "import pyvista; del pyvista.register_dataset_accessor; pyvista.__version__ = '0.44.1'\n"
+        "try:\n    import super_sdf.pyvista\nexcept OSError as error:\n    print(error)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
+    assert done.stdout.decode() == (
+        "super_sdf.pyvista needs PyVista 0.48 or later, this is 0.44.1: "
+        "pip install -e '.[pyvista]' in a clone of super-sdf\n"
+    )
+
+
+def test_pyvista_finds_the_accessor_and_super_sdf_does_not_load_pyvista(tmp_path):
+    """The entry point of pyproject.toml is installed here, whatever the environment has."""
+    text = (ROOT / "pyproject.toml").read_text()
+    (entry,) = re.findall(r'^\[project.entry-points."pyvista.accessors"\]\n(.+)$', text, re.M)
+    (info := tmp_path / "accessor_of_test-1.dist-info").mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: accessor-of-test\nVersion: 1\n")
+    (info / "entry_points.txt").write_text("[pyvista.accessors]\n" + entry.replace('"', ""))
+    script = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
+        "import super_sdf; super_sdf.make_grid, super_sdf.reconstruct, super_sdf.grid_from_image\n"
+        "assert not {'pyvista', 'vtkmodules', 'super_sdf.pyvista'} & set(sys.modules)\n"
+        "import pyvista\n"
+        "assert 'super_sdf.pyvista' not in sys.modules\n"
+        "print(pyvista.ImageData().super_sdf, hasattr(pyvista.PolyData(), 'super_sdf'))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
+    assert done.stdout.startswith(b"<super_sdf.pyvista.ImageAccessor object at ")
+    assert done.stdout.endswith(b" False\n")
