@@ -13,7 +13,7 @@ from ..arrays import Triple
 from .direction import STRAIGHT, Direction, check_direction, in_rows, is_mirrored
 from .field import AUTO, Field, Wanted
 from .interpret import interpret
-from .labelled import placed
+from .named_axes import placed
 from .planes import SampleArray, SamplePlanes
 from .samples import Extremes, as_samples, check_not_flat, check_values
 from .sides import check_negative_inside
