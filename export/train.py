@@ -38,6 +38,7 @@ from super_sdf.errors import FileError
 from super_sdf.files.regular import check_regular_file
 
 CHECKPOINT_SECONDS = 180
+LONGEST_STEP = 30.0  # seconds: the rest of a longer one is taken as a pause (SIGSTOP)
 LOG_STEPS = 100
 WATCHED = 4  # last batches: a unit that reacted to none of them is dormant
 HELD_OUT = 2  # shards, the first by name, whose errors are logged
@@ -235,7 +236,7 @@ def train(run: Run, store: Store, minutes: float, seed: int) -> None:
     while run.seconds < 60 * minutes:
         start = time.monotonic()
         losses.append(run.advance(store.draw_batch(rng, run.recipe), run.seconds / (60 * minutes)))
-        run.seconds += time.monotonic() - start
+        run.seconds += min(time.monotonic() - start, LONGEST_STEP)
         if run.step % LOG_STEPS == 0:
             log(run, store, float(np.mean(losses)))
             losses.clear()
