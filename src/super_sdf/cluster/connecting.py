@@ -6,7 +6,10 @@ Everything that Dask has to say comes as one line, a ClusterError; its own messa
 from __future__ import annotations
 
 import logging
+import os
+import signal
 import tempfile
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -194,6 +197,7 @@ def local_cluster(count: int, killed_at: int) -> Iterator[Any]:
     from distributed import LocalCluster
 
     with tempfile.TemporaryDirectory(prefix="super-sdf-", ignore_cleanup_errors=True) as scratch:
+        start_quiet_tracker()
         with ending_signals_blocked():
             cluster = LocalCluster(
                 n_workers=count,
@@ -210,6 +214,27 @@ def local_cluster(count: int, killed_at: int) -> Iterator[Any]:
         finally:
             with suppress(Exception):  # it is closing: what does not end by itself is killed
                 cluster.close(timeout=CLOSE_SECONDS)
+
+
+def start_quiet_tracker() -> None:
+    """Start Python's resource tracker so that it says nothing of Dask's semaphores after a signal.
+
+    It runs as long as this process, and hears the SIGHUP of a terminal that is closed.
+    """
+    from multiprocessing import resource_tracker
+
+    warnings_before = os.environ.get("PYTHONWARNINGS")
+    hears = threading.current_thread() is threading.main_thread() and hasattr(signal, "SIGHUP")
+    handler = signal.signal(signal.SIGHUP, signal.SIG_IGN) if hears else None
+    os.environ["PYTHONWARNINGS"] = "ignore:resource_tracker"
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        if hears:
+            signal.signal(signal.SIGHUP, handler)
+        del os.environ["PYTHONWARNINGS"]
+        if warnings_before is not None:
+            os.environ["PYTHONWARNINGS"] = warnings_before
 
 
 @contextmanager
