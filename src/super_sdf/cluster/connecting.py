@@ -294,7 +294,8 @@ def silence() -> Iterator[None]:
     """Keep Dask's log messages and warnings from the terminal within the block."""
     import distributed  # noqa: F401, it sets the levels of its loggers
 
-    loggers = [logging.getLogger(name) for name in LOGGERS]
+    names = [name for name in logging.root.manager.loggerDict if name.split(".")[0] in LOGGERS]
+    loggers = [logging.getLogger(name) for name in (*LOGGERS, *names)]
     levels = [logger.level for logger in loggers]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -303,5 +304,5 @@ def silence() -> Iterator[None]:
         try:
             yield
         finally:
-            for logger, level in zip(loggers, levels):
+            for logger, level in reversed(list(zip(loggers, levels))):
                 logger.setLevel(level)
