@@ -5,6 +5,7 @@ Everything that Dask has to say comes as one line, a ClusterError; its own messa
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import signal
@@ -109,7 +110,7 @@ class Cluster:
         try:
             if self.client.status == "running":
                 return question()
-        except (OSError, TimeoutError):
+        except (OSError, asyncio.TimeoutError):
             pass
         raise ClusterError(
             f"the connection to the Dask scheduler at {self.address} was lost: run it again when "
@@ -261,7 +262,7 @@ def open_client(server: Any, address: str) -> Iterator[Client]:
 
 def no_answer(address: str, error: Exception) -> str:
     """Return the message for a scheduler that does not answer."""
-    silent = isinstance(error, (OSError, TimeoutError)) or not str(error)
+    silent = isinstance(error, (OSError, asyncio.TimeoutError)) or not str(error)
     why = "" if silent else f" ({' '.join(str(error).split())})"
     return (
         f"no Dask scheduler answers at {address}{why}: start one with 'dask scheduler' and workers "
@@ -271,7 +272,7 @@ def no_answer(address: str, error: Exception) -> str:
 
 def wait_for_a_worker(cluster: Cluster) -> None:
     """Raise ClusterError if the cluster shows no worker within a while."""
-    with suppress(TimeoutError):
+    with suppress(TimeoutError, asyncio.TimeoutError):  # the same from Python 3.11 on
         cluster.client.wait_for_workers(1, timeout=FIRST_WORKER_SECONDS)
     if not cluster.workers():
         raise ClusterError(
