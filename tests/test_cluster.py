@@ -121,6 +121,7 @@ def workers_of(process):
 
 
 def test_a_batch_on_a_cluster_of_this_machine_writes_what_one_without_it_writes(command):
+    environment = dict(os.environ)
     code, _, said = command("batch", "in", "--out", "plain", *PLAIN, *FAST)
     assert code == 1 and len(meshes("plain")) == 3
     code, _, err = command("batch", "in", "--out", "out", *QUICK, *LOCAL, "--jobs", 2)
@@ -130,6 +131,8 @@ def test_a_batch_on_a_cluster_of_this_machine_writes_what_one_without_it_writes(
     assert outcomes("out") == outcomes("plain")
     assert Path("out/.super-sdf-batch").read_text() == ""
     assert not workers_of(psutil.Process())
+    changed = dict(set(os.environ.items()) ^ set(environment.items()))
+    assert changed.keys() <= {"__DASK_PARENT_PID"}  # later child processes inherit the rest
     code, _, err = command("batch", "in", "--out", "out", *QUICK, *LOCAL)
     assert code == 1 and "nothing to do: 3 done before" in err
 
