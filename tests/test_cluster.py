@@ -164,8 +164,9 @@ def test_a_signal_ends_batch_and_workers_in_a_line(name):
     assert not alive and not list(Path("out").rglob(".*.part"))
 
 
-def test_a_killed_batch_leaves_no_workers():
+def test_a_killed_batch_leaves_no_workers(monkeypatch, tmp_path):
     larger_grids(8)
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # where it leaves the workers' folder
     process = start_batch(*LOCAL, "--jobs", 2)
     workers = workers_of(process)
     process.kill()
