@@ -30,7 +30,15 @@ READERS = {
     "pyvista": {"pyvista"},
 }
 # Rooms that need more than the few packages that are always installed.
-WITH_EXTRAS = {"certificate", "evaluation", "pages", "pictures", "simplification", "truth"}
+WITH_EXTRAS = {
+    "certificate",
+    "cluster",
+    "evaluation",
+    "pages",
+    "pictures",
+    "simplification",
+    "truth",
+}
 
 
 def room_of(module: str) -> str:
@@ -128,6 +136,16 @@ def test_help_loads_click_and_nothing_heavier():
         "heavy = {'numpy', 'onnxruntime', 'trimesh', 'torch'} & set(sys.modules); assert not heavy"
     )
     subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
+
+
+def test_a_batch_without_a_cluster_loads_nothing_of_dask(tmp_path):
+    script = (
+        "import sys; from super_sdf.cli.main import cli;"
+        f"cli.main(['batch', 'examples', '--out', {str(tmp_path)!r}, '--quality', 'fast',"
+        "'--jobs', '2', '--quiet'], standalone_mode=False);"
+        "heavy = {'dask', 'distributed', 'tornado'} & set(sys.modules); assert not heavy"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, cwd=ROOT)
 
 
 def test_public_names_are_there():
