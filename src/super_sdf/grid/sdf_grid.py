@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -131,6 +132,14 @@ class SdfGrid:
         set_("low", -high if positive_inside else low)
         set_("high", -low if positive_inside else high)
         set_("field", field or Field())
+
+    def noted(self, notes: tuple[str, ...]) -> SdfGrid:
+        """Return the same grid with more sentences on it, before those on what was inferred."""
+        if not notes:
+            return self
+        grid = copy(self)
+        object.__setattr__(grid, "notes", (*notes, *self.notes))
+        return grid
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.shape))
