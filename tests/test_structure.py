@@ -28,7 +28,15 @@ READERS = {
     "files.readers.zarr_store": {"zarr"},
 }
 # Rooms that need more than the few packages that are always installed.
-WITH_EXTRAS = {"certificate", "evaluation", "pages", "pictures", "simplification", "truth"}
+WITH_EXTRAS = {
+    "certificate",
+    "cluster",
+    "evaluation",
+    "pages",
+    "pictures",
+    "simplification",
+    "truth",
+}
 
 
 def room_of(module: str) -> str:

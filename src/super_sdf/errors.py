@@ -18,6 +18,8 @@
   - ``ModelError`` (also ``ValueError``): an ONNX file does not fulfil the network's contract.
   - ``DeviceError`` (also ``RuntimeError``): the requested device cannot run here.
   - ``OutOfMemoryError`` (also ``MemoryError``): the work would not fit in memory and was not begun.
+  - ``ClusterError`` (also ``RuntimeError``): a cluster cannot be reached, or its workers lack
+    something.
 """
 
 
@@ -63,6 +65,10 @@ class DeviceError(SuperSdfError, RuntimeError):
 
 class OutOfMemoryError(SuperSdfError, MemoryError):
     """The work would not fit in memory and was not begun."""
+
+
+class ClusterError(SuperSdfError, RuntimeError):
+    """A cluster cannot be reached, its workers lack something, or it was lost."""
 
 
 def seen(value: object) -> str:

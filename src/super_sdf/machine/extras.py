@@ -22,6 +22,7 @@ EXTRAS = {
     "view": ("pyvista",),
     "report": ("pyfqmr", "pyvista"),
     "peers": ("gpytoolbox",),
+    "cluster": ("distributed",),
 }
 BUILT_ON = {"view": "eval", "peers": "eval", "report": "eval"}
 

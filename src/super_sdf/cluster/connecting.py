@@ -1,0 +1,279 @@
+"""Connecting to a cluster: worker processes of this machine, or a Dask scheduler at an address.
+
+Everything that Dask has to say comes as one line, a ClusterError; its own messages are silenced.
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from ..errors import ClusterError
+from ..machine.extras import check_modules
+from ..machine.memory import SHARE, held_memory, memory_bound
+from ..machine.serving import ending_signals_blocked
+from ..machine.threads import count_cores
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+LOCAL = "local"
+CONNECT_SECONDS = 5  # that a scheduler has to answer
+FIRST_WORKER_SECONDS = 10  # that a cluster has to show a worker
+CLOSE_SECONDS = 5  # that the workers of this machine have to end
+HARD_LIMIT = 1.25  # of the memory that a worker of this machine plans with: above, it is killed
+PAUSE_SHARE = 0.75  # of a worker's limit: Dask gives it no more work at 0.8, and kills it at 0.95
+LOGGERS = ("distributed", "tornado", "asyncio", "bokeh")
+CONFIG = {
+    "distributed.worker.memory.target": False,
+    "distributed.worker.memory.spill": False,
+    "distributed.worker.memory.pause": False,
+    "distributed.worker.memory.terminate": 1.0,
+    "distributed.admin.system-monitor.interval": "10s",
+    "distributed.scheduler.http.routes": [],
+    "distributed.worker.http.routes": [],
+    "distributed.worker.profile.enabled": False,
+}
+Answer = TypeVar("Answer")
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What each worker may use.
+
+    Attributes
+    ----------
+    threads : int
+        Threads of each; 0: those that Dask gave it.
+    memory : int, optional
+        Bytes that each may hold in all; None: what its machine allows.
+    """
+
+    threads: int = 0
+    memory: int | None = None
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """A cluster that is connected.
+
+    Attributes
+    ----------
+    client : distributed.Client
+        Dask's connection.
+    address : str
+        That of the scheduler, or "local".
+    limits : Limits
+        What each worker may use.
+    """
+
+    client: Client
+    address: str
+    limits: Limits
+
+    @property
+    def is_local(self) -> bool:
+        """Whether the workers were started by this process."""
+        return self.address == LOCAL
+
+    def workers(self) -> dict[str, int]:
+        """Return the number of threads of each worker, by address.
+
+        Raises
+        ------
+        ClusterError
+            If the connection is lost.
+        """
+        return dict(self.ask(self.client.nthreads))
+
+    def run(
+        self, function: Callable[..., Any], *arguments: Any, workers: list[str]
+    ) -> dict[str, Any]:
+        """Call a function in some workers, beside their work; return results or exceptions."""
+        run = self.client.run
+        return dict(self.ask(lambda: run(function, *arguments, workers=workers, on_error="return")))
+
+    def ask(self, question: Callable[[], Answer]) -> Answer:
+        """Return what the scheduler answers; raise ClusterError if the connection is lost."""
+        try:
+            if self.client.status == "running":
+                return question()
+        except (OSError, TimeoutError):
+            pass
+        raise ClusterError(
+            f"the connection to the Dask scheduler at {self.address} was lost: run it again when "
+            "the scheduler is back"
+        )
+
+
+@contextmanager
+def connect(
+    address: str, *, workers: int = 0, threads: int = 0, max_memory: int | None = None
+) -> Iterator[Cluster]:
+    """Connect to a cluster; at the end, and after errors, everything that was started is closed.
+
+    Parameters
+    ----------
+    address : str
+        "local" for worker processes of this machine, else the address of a Dask scheduler, such as
+        tcp://10.0.0.1:8786.
+    workers : int
+        Worker processes of this machine, for "local"; 0 means one per core.
+    threads : int
+        Threads of each worker; 0: its share of the cores, or those that Dask gave it.
+    max_memory : int, optional
+        Bytes of memory: of all workers together for "local", else of each.
+
+    Raises
+    ------
+    FileError
+        If the extra is missing.
+    ClusterError
+        If nobody answers at the address, or if the cluster has no worker.
+    """
+    check_modules("--cluster", "cluster")
+    with ExitStack() as stack:
+        stack.enter_context(silence())
+        if address == LOCAL:
+            count = workers or count_cores()
+            limits = share_equally(count, threads, max_memory)
+            stack.enter_context(config(CONFIG))
+            killed_at = int(HARD_LIMIT * (limits.memory or 0)) if max_memory else 0
+            server = stack.enter_context(local_cluster(count, killed_at))
+        else:
+            limits, server = Limits(threads, max_memory), address
+        client = stack.enter_context(open_client(server, address))
+        cluster = Cluster(client, address, limits)
+        wait_for_a_worker(cluster)
+        yield cluster
+
+
+def share_equally(count: int, threads: int, max_memory: int | None) -> Limits:
+    """Return the share of each of some processes in the threads and memory of this machine."""
+    bound = memory_bound(max_memory)
+    if bound is not None:
+        bound = max(1, bound - (held_memory() or 0)) // count
+    return Limits(threads or max(1, count_cores() // count), bound)
+
+
+def share_of(limits: Limits, threads: int, limit: int | None, free: int | None) -> Limits:
+    """Return what a worker at an address may use.
+
+    Parameters
+    ----------
+    limits : Limits
+        What was asked for.
+    threads : int
+        The threads that Dask gave it.
+    limit : int, optional
+        The bytes at which Dask kills it; None without a limit.
+    free : int, optional
+        Its part of the memory that is free on its machine.
+    """
+    rooms = [int(share * size) for share, size in ((PAUSE_SHARE, limit), (SHARE, free)) if size]
+    if limits.memory is not None:
+        rooms = [limits.memory, *(rooms[:1] if limit else [])]
+    return Limits(limits.threads or threads, min(rooms, default=None))
+
+
+@contextmanager
+def local_cluster(count: int, killed_at: int) -> Iterator[Any]:
+    """Run worker processes on this machine, each killed at some bytes of memory; 0: no limit.
+
+    They listen on the loopback interface only. Signals are held back while they start: none may
+    start without being known here, and what they inherit keeps a Ctrl-C in the terminal from them.
+    """
+    from distributed import LocalCluster
+
+    with tempfile.TemporaryDirectory(prefix="super-sdf-", ignore_cleanup_errors=True) as scratch:
+        with ending_signals_blocked():
+            cluster = LocalCluster(
+                n_workers=count,
+                threads_per_worker=1,
+                processes=True,
+                host="127.0.0.1",
+                dashboard_address=None,
+                memory_limit=killed_at,
+                local_directory=scratch,
+                silence_logs=logging.CRITICAL,
+            )
+        try:
+            yield cluster
+        finally:
+            with suppress(Exception):  # it is closing: what does not end by itself is killed
+                cluster.close(timeout=CLOSE_SECONDS)
+
+
+@contextmanager
+def open_client(server: Any, address: str) -> Iterator[Client]:
+    """Connect to a scheduler.
+
+    Raises
+    ------
+    ClusterError
+        If it does not answer.
+    """
+    from distributed import Client
+
+    try:
+        client = Client(server, timeout=CONNECT_SECONDS, set_as_default=False)
+    except Exception as error:  # of many kinds: a bad address, a refused or silent port, TLS
+        raise ClusterError(no_answer(address, error)) from error
+    try:
+        yield client
+    finally:
+        with suppress(Exception):
+            client.close(timeout=CLOSE_SECONDS)
+
+
+def no_answer(address: str, error: Exception) -> str:
+    """Return the message for a scheduler that does not answer."""
+    silent = isinstance(error, (OSError, TimeoutError)) or not str(error)
+    why = "" if silent else f" ({' '.join(str(error).split())})"
+    return (
+        f"no Dask scheduler answers at {address}{why}: start one with 'dask scheduler' and workers "
+        "with 'dask worker ADDRESS', or give 'local' or another address"
+    )
+
+
+def wait_for_a_worker(cluster: Cluster) -> None:
+    """Raise ClusterError if the cluster shows no worker within a while."""
+    with suppress(TimeoutError):
+        cluster.client.wait_for_workers(1, timeout=FIRST_WORKER_SECONDS)
+    if not cluster.workers():
+        raise ClusterError(
+            f"the Dask scheduler at {cluster.address} has no workers: start some with "
+            f"'dask worker {cluster.address}'"
+        )
+
+
+@contextmanager
+def config(values: dict[str, Any]) -> Iterator[None]:
+    """Set Dask's configuration within the block; workers that are started there inherit it."""
+    import dask
+
+    with dask.config.set(values):
+        yield
+
+
+@contextmanager
+def silence() -> Iterator[None]:
+    """Keep Dask's log messages and warnings from the terminal within the block."""
+    import distributed  # noqa: F401, it sets the levels of its loggers
+
+    loggers = [logging.getLogger(name) for name in LOGGERS]
+    levels = [logger.level for logger in loggers]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for logger in loggers:
+            logger.setLevel(logging.CRITICAL + 1)
+        try:
+            yield
+        finally:
+            for logger, level in zip(loggers, levels):
+                logger.setLevel(level)
