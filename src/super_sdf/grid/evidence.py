@@ -163,9 +163,7 @@ def look(values: SampleArray, extremes: Extremes) -> Looked:
     return Looked(np.concatenate(found), cut / max(count, 1), extremes)
 
 
-def _look_at_plane(
-    extremes: Extremes, slab: NDArray[Any]
-) -> tuple[Floats, NDArray[np.int64], int]:
+def _look_at_plane(extremes: Extremes, slab: NDArray[Any]) -> tuple[Floats, NDArray[np.int64], int]:
     """Return lines of samples of the middle of five planes, how many are cut off, and of which."""
     slab = np.asarray(slab)
     lines = np.clip(_lines_beside_surface(slab), -LARGEST_VALUE, LARGEST_VALUE)

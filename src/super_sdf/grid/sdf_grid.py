@@ -290,6 +290,19 @@ def _checked(values: ArrayLike | SamplePlanes) -> tuple[SampleArray, Extremes]:
     return samples, extremes
 
 
+def with_samples(grid: SdfGrid, samples: SampleArray) -> SdfGrid:
+    """Return a grid with other samples in the same place, taken as the same."""
+    other = copy(grid)
+    object.__setattr__(other, "samples", samples)
+    return other
+
+
+def without_samples(grid: SdfGrid) -> SdfGrid:
+    """Return a grid that knows all but its samples: their shape and type, place and field."""
+    nothing = np.broadcast_to(np.zeros((), grid.samples.dtype), grid.shape)
+    return with_samples(grid, nothing)
+
+
 def negated(values: NDArray[Any]) -> NDArray[Any]:
     """Return the negated values, as floats so that unsigned integers work."""
     return -values.astype(np.promote_types(values.dtype, np.float32))
