@@ -53,10 +53,11 @@ class Place:
     grids: Path
     meshes: Path
     jobs: int
+    options: tuple[str, ...] = ()
 
     def start(self) -> subprocess.Popen[str]:
         """Start the batch."""
-        options = ["--out", str(self.meshes), "--jobs", str(self.jobs)]
+        options = ["--out", str(self.meshes), "--jobs", str(self.jobs), *self.options]
         return subprocess.Popen(
             [*COMMAND, "batch", str(self.grids), *options], stderr=subprocess.PIPE, text=True
         )

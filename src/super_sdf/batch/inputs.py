@@ -19,7 +19,7 @@ from ..files.meshes import check_mesh_suffix
 from ..files.regular import reason_of
 from ..files.store import is_store
 from .job import Job
-from .journal import LOCK_NAME
+from .journal import LOCK_NAME, is_journal
 from .journal import NAME as JOURNAL
 from .ledger import NAME as LEDGER
 from .manifest import read_manifest
@@ -59,7 +59,8 @@ def find_jobs(arguments: Sequence[str], suffix: str, options: ConvertOptions) ->
     for kind in {PurePath(job.target).suffix for job in jobs}:
         check_mesh_suffix(Path(f"*{kind}"))
     for job in jobs:
-        if PurePath(job.target).parts[0].casefold() in (JOURNAL, LOCK_NAME, LEDGER):
+        first = PurePath(job.target).parts[0].casefold()
+        if first in (JOURNAL, LOCK_NAME, LEDGER) or is_journal(first):
             raise OptionError(
                 f"{job.source} would become {job.target}, but the first of these names is the "
                 "batch's own: rename it"

@@ -12,6 +12,7 @@ from ..convert import ConvertOptions, convert
 from ..errors import FileError, GridError, OptionError, WriteError
 from ..files.store import check_grid_file
 from ..network.decoder import Decoder
+from ..progress import Progress
 from .fingerprint import Fingerprint, fingerprint
 from .journal import note_made
 
@@ -52,6 +53,28 @@ class Job:
     replace: bool = False
 
 
+@dataclass(frozen=True)
+class Outputs:
+    """Where the results of all jobs go.
+
+    Attributes
+    ----------
+    folder : Path
+        The output folder.
+    check : bool
+        Whether each mesh is checked against its samples.
+    items : Path, optional
+        The folder for what a page shows of each mesh; this needs the certificates, too.
+    host : str
+        The machine that runs the batch: another one has a journal of its own.
+    """
+
+    folder: Path
+    check: bool = False
+    items: Path | None = None
+    host: str = ""
+
+
 class Result(NamedTuple):
     """A job and its row, of this run or an earlier one."""
 
@@ -64,34 +87,38 @@ class Result(NamedTuple):
         return one_line(reason if source in reason else f"{source}: {reason}")
 
 
-def attempt(
-    job: Job, folder: Path, network: Decoder, check: bool = False, items: Path | None = None
-) -> Row:
+def attempt(job: Job, outputs: Outputs, network: Decoder, progress: Progress | None = None) -> Row:
     """Convert a file and return its row; an error becomes a row, too.
 
-    With ``check`` or ``items``, the row has the certificate of the mesh; with ``items``, what a
-    page shows of it is written there.
+    With ``check`` or ``items`` of the outputs, the row has the certificate of the mesh; with
+    ``items``, what a page shows of it is written there. An exception in ``progress`` ends the work.
     """
-    start, target = time.perf_counter(), folder / job.target
+    start, target = time.perf_counter(), outputs.folder / job.target
     content, mesh_prints = fingerprint(job.source), []
 
     def note(part: Path) -> None:
-        mesh_prints.append(_note_mesh(part, folder, job.target))
+        mesh_prints.append(_note_mesh(part, outputs, job.target))
 
     try:
         check_grid_file(job.source)
         _make_folder(target.parent)
         done = convert(
-            job.source, target, network, job.options, force=job.replace, before_rename=note
+            job.source,
+            target,
+            network,
+            job.options,
+            force=job.replace,
+            progress=progress,
+            before_rename=note,
         )
     except Exception as error:  # a bug that one file shows must not cost the others
         retry = not _is_caused_by_input(error)
         row = failed_row(job, _reason(error), retry=retry, content=content)
         return {**row, "seconds": _since(start)}
     certificate = {}
-    if items:
-        certificate = {"check": _keep_item(job, target, mesh_prints[0], items)}
-    elif check:
+    if outputs.items:
+        certificate = {"check": _keep_item(job, target, mesh_prints[0], outputs.items)}
+    elif outputs.check:
         certificate = {"check": _certify(job, target)}
     return {
         **_paths(job),
@@ -132,12 +159,12 @@ def _keep_item(job: Job, target: Path, mesh_print: Fingerprint, items: Path) -> 
         return {"error": _reason(error)}
 
 
-def _note_mesh(part: Path, folder: Path, target: str) -> Fingerprint:
+def _note_mesh(part: Path, outputs: Outputs, target: str) -> Fingerprint:
     """Note a mesh in the journal before it is moved to its name; return its fingerprint."""
     mesh_print = fingerprint(part)
     if mesh_print is None:
         raise WriteError(f"{part} cannot be read again")
-    note_made(folder, target, mesh_print["sha256"])
+    note_made(outputs.folder, target, mesh_print["sha256"], outputs.host)
     return mesh_print
 
 

@@ -4,10 +4,17 @@ A line is a JSON string, the name of an output that is started; or an object wit
 mesh that is about to be moved to its name. If the process is killed, the next batch knows from it
 which outputs may be unfinished, and which meshes a batch made although the report has no row of
 them.
+
+On a cluster, each other machine has a journal of its own, ``.super-sdf-batch.MACHINE``: network
+file systems do not let two machines append to one file.
 """
 
 from __future__ import annotations
 
+import os
+import re
+import socket
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
@@ -29,15 +36,36 @@ class Journal(NamedTuple):
 def read_journal(folder: Path) -> Journal:
     """Return what a folder's journal holds; lines that are not the journal's are skipped."""
     journal = Journal(set(), {})
-    with suppress(OSError):
-        for line in _journal_file(folder).read():
-            if isinstance(line, str) and _is_within(line):
-                journal.started.add(line)
-            elif isinstance(line, dict):
-                target, digest = line.get("out"), line.get("sha256")
-                if isinstance(target, str) and isinstance(digest, str):
-                    journal.made.setdefault(target, set()).add(digest)
+    for line in _lines(folder):
+        if isinstance(line, str) and _is_within(line):
+            journal.started.add(line)
+        elif isinstance(line, dict):
+            target, digest = line.get("out"), line.get("sha256")
+            if isinstance(target, str) and isinstance(digest, str):
+                journal.made.setdefault(target, set()).add(digest)
     return journal
+
+
+def _lines(folder: Path) -> Iterator[Any]:
+    """Yield what the lines of all machines' journals hold."""
+    with suppress(OSError):
+        yield from _journal_file(folder).read()
+    for path in _others(folder):
+        with suppress(OSError):
+            yield from RecordFile(path, is_shared=True).read()
+
+
+def _others(folder: Path) -> list[Path]:
+    """Return the journals of other machines."""
+    with suppress(OSError):
+        names = sorted(name for name in os.listdir(folder) if is_journal(name))
+        return [path for path in map(folder.joinpath, names) if path.is_file()]
+    return []
+
+
+def is_journal(name: str) -> bool:
+    """Return whether a file name is that of another machine's journal."""
+    return name.startswith(f"{NAME}.") and name.casefold() != LOCK_NAME
 
 
 def note_started(folder: Path, target: str) -> None:
@@ -45,26 +73,34 @@ def note_started(folder: Path, target: str) -> None:
     _append(folder, target)
 
 
-def note_made(folder: Path, target: str, digest: str) -> None:
-    """Note the SHA-256 of a mesh that is about to be moved to its name; any process may call it."""
-    _append(folder, {"out": target, "sha256": digest})
+def note_made(folder: Path, target: str, digest: str, host: str = "") -> None:
+    """Note the SHA-256 of a mesh that is about to be moved to its name; any process may call it.
+
+    ``host`` is the machine that runs the batch; "" for this one.
+    """
+    here = socket.gethostname()
+    own = host and here != host
+    _append(folder, {"out": target, "sha256": digest}, re.sub(r"[^\w-]", "_", here) if own else "")
 
 
 def clear_journal(folder: Path) -> None:
     """Empty the journal: nothing is unfinished."""
     _journal_file(folder).clear()
+    for path in _others(folder):
+        with suppress(OSError):
+            path.unlink()
 
 
-def _append(folder: Path, record: Any) -> None:
-    file = _journal_file(folder)
+def _append(folder: Path, record: Any, host: str = "") -> None:
+    file = _journal_file(folder, host)
     try:
         file.append(record)
     except OSError as error:
         raise WriteError(f"{file.path} cannot be written: {error.strerror}") from error
 
 
-def _journal_file(folder: Path) -> RecordFile:
-    return RecordFile(folder / NAME, is_shared=True)
+def _journal_file(folder: Path, host: str = "") -> RecordFile:
+    return RecordFile(folder / (f"{NAME}.{host}" if host else NAME), is_shared=True)
 
 
 def _is_within(target: str) -> bool:

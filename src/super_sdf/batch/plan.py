@@ -41,6 +41,9 @@ class Settings:
         Check each mesh against its samples; meshes without a certificate are made again.
     items : Path, optional
         The folder for what a page shows of each mesh; see ``pages.items``.
+    cluster : str, optional
+        Where the files are converted instead: "local" for workers of Dask on this machine, or the
+        address of a scheduler.
     """
 
     folder: Path
@@ -54,6 +57,7 @@ class Settings:
     fail_fast: bool = False
     check: bool = False
     items: Path | None = None
+    cluster: str | None = None
 
 
 @dataclass

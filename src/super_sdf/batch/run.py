@@ -19,7 +19,7 @@ from ..files.parts import remove_abandoned_parts
 from ..machine.memory import held_memory, memory_bound
 from ..machine.pool import Death, Pool, PoolOptions
 from ..machine.threads import count_cores
-from .job import Job, Result, Row, failed_row
+from .job import Job, Outputs, Result, Row, failed_row
 from .journal import read_journal
 from .ledger import Ledger
 from .lock import FolderLock
@@ -31,6 +31,15 @@ SMALL_BATCH = 30_000
 
 OnFile = Callable[[Batch], None]
 """Called after each file, with the batch as it stands."""
+
+Warn = Callable[[str], None]
+"""Called with a sentence that the user should read before the work goes on."""
+
+Results = Generator[tuple[Job, Row | Death], None, None]
+"""Jobs as they end, each with its row, or with a Death if its process ended.
+
+What converts the jobs of a ``Queue`` yields this: this process, processes, or a cluster.
+"""
 
 
 class Run:
@@ -44,38 +53,54 @@ class Run:
         self.batch = self.planner.plan(jobs)
         self.died: set[str] = set()  # outputs whose worker died once
 
-    def complete(self, on_file: OnFile | None = None) -> None:
-        """Convert what is to be converted; call ``on_file`` after each file is in the ledger."""
+    def complete(self, on_file: OnFile | None = None, warn: Warn | None = None) -> None:
+        """Convert what is to be converted; call ``on_file`` after each file is in the ledger.
+
+        ``warn`` is called with what may be wrong with the workers of a cluster; without it, that is
+        among the notes.
+        """
         start = time.perf_counter()
         self._note_refused()
-        with closing(self._convert()) as results:
+        with closing(self._convert(warn or self.batch.notes.append)) as results:
             for job, result in results:
                 self._take(job, result)
                 self.batch.seconds = time.perf_counter() - start
                 if on_file:
                     on_file(self.batch)
 
-    def _convert(self) -> Generator[tuple[Job, Row | Death], None, None]:
-        """Convert in this process or in workers; yield each job with its row or a Death."""
-        settings, folder = self.settings, self.settings.folder
+    def _convert(self, warn: Warn) -> Results:
+        """Convert in this process, in processes or on a cluster."""
+        settings = self.settings
         if not self.batch.waiting or self.is_over():
             return
         workers = self._count_workers()
+        if settings.cluster is not None:
+            yield from self._convert_on_cluster(workers, warn)
+            return
         threads = settings.threads or (max(1, count_cores() // workers) if workers > 1 else 0)
         loading = Loading(settings.model, settings.precision, settings.device, threads)
+        outputs = Outputs(settings.folder, settings.check, settings.items)
         queue = Queue(self, workers)
         if workers == 1:
-            yield from convert_here(queue, folder, loading, settings.check, settings.items)
+            yield from convert_here(queue, loading, outputs)
         else:
-            prepare = partial(prepare_worker, loading, folder, settings.check, settings.items)
+            prepare = partial(prepare_worker, loading, outputs)
             yield from Pool(queue, prepare, PoolOptions(self._clean_up)).results(workers)
 
+    def _convert_on_cluster(self, workers: int, warn: Warn) -> Results:
+        """Convert on a cluster, which determines threads and memory of each worker itself."""
+        from .on_cluster import Handling, convert_on_cluster
+
+        handling = Handling(self._clean_up, lambda job: job.target in self.died, warn)
+        jobs = list(self.batch.waiting)
+        return convert_on_cluster(Queue(self, 1), jobs, self.settings, workers, handling)
+
     def _count_workers(self) -> int:
-        """Return how many processes convert files."""
+        """Return how many processes convert files; on a cluster of this machine also for few."""
         settings, jobs = self.settings, len(self.batch.waiting)
         memory = self.batch.waiting[0].options.max_memory
         if not settings.workers:
-            jobs = jobs if self.batch.work > SMALL_BATCH else 1
+            jobs = jobs if settings.cluster or self.batch.work > SMALL_BATCH else 1
             return choose_workers(settings.device, jobs, memory)
         workers, note = useful_workers(settings.workers, jobs, memory)
         self.batch.notes += [note] if note else []

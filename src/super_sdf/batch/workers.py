@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass
-from pathlib import Path
 
 from ..machine.memory import free_memory
 from ..machine.pool import Tasks
@@ -12,7 +11,7 @@ from ..machine.serving import Work
 from ..machine.threads import count_cores
 from ..network.cuda import available_devices
 from ..network.network import Network, load_network
-from .job import Job, Row, attempt
+from .job import Job, Outputs, Row, attempt
 
 BYTES_PER_WORKER = 10**9  # for the network and a grid of 128^3, where --jobs is not given
 MIN_BYTES_PER_WORKER = 3 * 10**8  # with less a worker cannot convert anything
@@ -58,23 +57,17 @@ def useful_workers(asked: int, jobs: int, max_memory: int | None = None) -> tupl
     return min(asked, most), None if asked <= most else f"--jobs {asked} is cut to {most}: {cause}"
 
 
-def prepare_worker(
-    loading: Loading, folder: Path, check: bool = False, items: Path | None = None
-) -> Work:
+def prepare_worker(loading: Loading, outputs: Outputs) -> Work:
     """Load the network; return the function that converts a job and returns its row."""
     network = loading.load()
-    return lambda job, tell: attempt(job, folder, network, check, items)
+    return lambda job, tell: attempt(job, outputs, network)
 
 
 def convert_here(
-    jobs: Tasks[Job],
-    folder: Path,
-    loading: Loading,
-    check: bool = False,
-    items: Path | None = None,
-) -> Iterator[tuple[Job, Row]]:
+    jobs: Tasks[Job], loading: Loading, outputs: Outputs
+) -> Generator[tuple[Job, Row], None, None]:
     """Convert one file after another in this process; yield each job and its row."""
     network = loading.load()
     while len(jobs):
         job = jobs.popleft()
-        yield job, attempt(job, folder, network, check, items)
+        yield job, attempt(job, outputs, network)

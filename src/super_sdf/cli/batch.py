@@ -14,12 +14,14 @@ from ..files.formats import NAMED, list_formats
 from ..machine.extras import check_modules
 from .batch_report import print_plan, print_summary, progress_line, sentence
 from .choices import LazyChoice, mesh_formats
-from .common import CONTEXT, InterruptedCommand, one_line_errors, print_stderr
+from .common import CONTEXT, InterruptedCommand, one_line_errors, print_stderr, print_warning
 from .conversion import (
     check_can_check,
+    check_cluster,
     check_option,
     check_simplification,
     chosen_model,
+    cluster_option,
     conversion_options,
     make_options,
 )
@@ -84,6 +86,7 @@ Examples:
     help="Worker processes; 0 means one per core, or a single one on CUDA. They share the cores "
     "unless --threads is given.",
 )
+@cluster_option
 @click.option("--fail-fast", is_flag=True, help="Start no further file after the first failure.")
 @click.option("--retry", is_flag=True, help="Retry inputs that failed before and have not changed.")
 @click.option(
@@ -112,6 +115,7 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
     if options["check"]:
         check_can_check(f".{options['kind']}")
     check_simplification(options)
+    check_cluster(options)
     jobs, unread = find_jobs(sources, f".{options['kind']}", make_options(options))
     check_jobs_can_be_simplified(jobs)
     if options["report"]:
@@ -127,6 +131,7 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
         threads=options["threads"],
         workers=options["jobs"],
         items=items_beside(options["report"]),
+        cluster=options["cluster"],
         **flags,
     )
     if options["dry_run"]:
@@ -188,7 +193,7 @@ def complete(
         total = len(run.batch.waiting)
         try:
             with progress_line(total, options["quiet"]) as progress, raising_interrupts():
-                run.complete(progress)
+                run.complete(progress, print_warning)
             write_page(run, jobs, options["report"])
         except KeyboardInterrupt as error:
             try:

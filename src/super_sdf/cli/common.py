@@ -74,6 +74,12 @@ def print_stderr(line: str) -> None:
         click.echo(line.replace("\n", " "), err=True)
 
 
+def print_warning(text: str) -> None:
+    """Print a warning to stderr, in place of a progress line if one is shown there."""
+    cleared = "\r\x1b[K" if sys.stderr is not None and sys.stderr.isatty() else ""
+    print_stderr(f"{cleared}Warning: {text}")
+
+
 def print_stdout(text: str, kept: str) -> None:
     """Print the result that the user asked for to stdout.
 

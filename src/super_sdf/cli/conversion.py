@@ -253,6 +253,15 @@ check_option = click.option(
 )
 
 
+cluster_option = click.option(
+    "--cluster",
+    metavar="ADDRESS",
+    help="Convert on the workers of the Dask scheduler at ADDRESS, such as tcp://10.0.0.1:8786, or "
+    "with 'local' on Dask workers of this machine. --max-memory is then the limit of each worker "
+    "at an ADDRESS. Needs the extra cluster.",
+)
+
+
 def conversion_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options to a command, in the order of ``OPTIONS`` and ``SIMPLIFY_OPTIONS``."""
     return _with_options(command, OPTIONS + SIMPLIFY_OPTIONS)
@@ -274,6 +283,21 @@ def check_can_check(target: str) -> None:
     check_modules("--check", "eval", CHECK_MODULES)
     if target.lower().endswith(".3mf"):
         check_modules("--check of .3mf files", "3mf")
+
+
+def check_cluster(options: dict[str, Any]) -> None:
+    """Raise an error if ``--cluster`` cannot be used, or not with the other options."""
+    address, jobs = options["cluster"], options.get("jobs", 0)
+    if address is None:
+        return
+    if not address.strip():
+        raise OptionError("--cluster is empty: give local or the address of a Dask scheduler")
+    if jobs and address != "local":
+        raise OptionError(
+            f"--jobs {jobs} is for workers of this machine: those at {address} are as many as "
+            "were started there; give only one of --jobs and that --cluster"
+        )
+    check_modules("--cluster", "cluster")
 
 
 def check_simplification(options: dict[str, Any]) -> None:
