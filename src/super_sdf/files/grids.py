@@ -185,12 +185,12 @@ def open_volume(
     from .readers.table import READERS
 
     watched = None if file.is_dir() else InputFile.open(file)
-    with _one_line_errors(path, format_, watched), ExitStack() as files:
+    with one_line_errors(path, format_, watched), ExitStack() as files:
         yield READERS[format_.key](Request(file, member, axes, *memory, files))
 
 
 @contextmanager
-def _one_line_errors(path: Path, format_: GridFormat, watched: InputFile | None) -> Iterator[None]:
+def one_line_errors(path: Path, format_: GridFormat, watched: InputFile | None) -> Iterator[None]:
     """Turn whatever a library raises into a FileError of one line, and silence its warnings."""
     try:
         with warnings.catch_warnings(), _silent_logs():

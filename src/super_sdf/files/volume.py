@@ -239,7 +239,7 @@ def take(
     placement = find_placement(volume, name)
     values = volume.stored
     if values is None or placement.world_axes != (0, 1, 2) or any(placement.backwards):
-        values = _copied(volume, placement, name, room, left)
+        values = unpacked(volume, placement, name, (room, left))
     return {"values": values, **place_in_world(volume, placement, given)}
 
 
@@ -269,19 +269,32 @@ def _lowest_corner(
     return corner
 
 
-def _copied(
-    volume: Volume, placement: Placement, name: str, room: int, left: int | None
+def unpacked(
+    volume: Volume,
+    placement: Placement,
+    name: str,
+    memory: tuple[int, int | None],
+    planes: tuple[int, int] | None = None,
 ) -> SampleArray:
     """Return the samples as an array (nx, ny, nz), in memory or in a temporary file.
 
     Planes of x are made contiguous; within them, the axis comes first along which boxes are short.
+
+    Parameters
+    ----------
+    memory : two ints
+        Bytes that the array may take, and that the process may still take, None if unknown.
+    planes : two ints, optional
+        Only the planes of x from the first to before the second.
     """
+    room, left = memory
     check_chunk(volume, name, left)
     layout = layout_of(volume, placement, left)
     nx, ny, nz = (volume.shape[placement.world_axes.index(w)] for w in range(3))
+    first, last = planes or (0, nx)
     swapped = placement.world_axes[layout.order[1]] == 2
-    header = ArrayHeader((nx, ny, nz), volume.dtype, swapped, 0)
-    return fill(partial(_copy, volume, placement, layout), header, name, room)
+    header = ArrayHeader((last - first, ny, nz), volume.dtype, swapped, 0)
+    return fill(partial(_copy, volume, placement, layout, (first, last)), header, name, room)
 
 
 def check_chunk(volume: Volume, name: str, left: int | None) -> None:
@@ -306,12 +319,24 @@ def layout_of(volume: Volume, placement: Placement, left: int | None = None) -> 
     return choose_layout(volume.shape, volume.unit, orders, budget // volume.dtype.itemsize)
 
 
-def _copy(volume: Volume, placement: Placement, layout: Layout, write: Write) -> None:
-    """Copy a volume box by box."""
-    shape = tuple(volume.shape[axis] for axis in layout.order)
-    for box in boxes_of([(0, count) for count in volume.shape], layout.box):
+def _copy(
+    volume: Volume,
+    placement: Placement,
+    layout: Layout,
+    planes: tuple[int, int],
+    write: Write,
+) -> None:
+    """Copy some planes of x of a volume box by box."""
+    along, count = layout.order[0], planes[1] - planes[0]
+    shape = (count, *(volume.shape[axis] for axis in layout.order[1:]))
+    bounds = [(0, size) for size in volume.shape]
+    bounds[along] = planes
+    if placement.backwards[along]:
+        bounds[along] = volume.shape[along] - planes[1], volume.shape[along] - planes[0]
+    for box in boxes_of(bounds, layout.box):
         block = np.ascontiguousarray(turned(volume.box(box), placement, layout.order))
         start = [_start(volume, placement, box, axis) for axis in layout.order]
+        start[0] -= planes[0]
         for offset, piece in runs_of(block, tuple(start), shape):
             write(offset, piece)
         del block  # before the next one is read

@@ -75,11 +75,13 @@ def extremes_of_masks(h: float) -> Extremes:
 
 def has_both_sides(inside: SampleArray) -> bool:
     """Return whether some samples are inside, and some outside."""
-    seen = [False, False]
-    for outer, inner in over_planes(inside, _sides_of, in_blocks(inside)):
-        seen = [seen[0] or outer, seen[1] or inner]
-        if all(seen):
-            return True
+    seen, ranges = [False, False], in_blocks(inside)
+    middle = len(ranges) // 2  # which mostly shows both
+    for part in (ranges[middle : middle + 1], ranges[:middle] + ranges[middle + 1 :]):
+        for outer, inner in over_planes(inside, _sides_of, part):
+            seen = [seen[0] or outer, seen[1] or inner]
+            if all(seen):
+                return True
     return False
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from io import FileIO
 from math import prod
 from pathlib import Path
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ..arrays import FloatArray
-from ..errors import FileError
+from ..errors import FileError, GridError
 from ..machine.memory import check_fits
 
 FAR = 1e6  # spacings
@@ -132,6 +132,7 @@ class SamplePlanes(ABC):
     """
 
     ndim = 3
+    travels = False  # whether another process can read the samples for itself
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     name: str
@@ -280,6 +281,23 @@ def in_spacings(values: NDArray[Any], unit: float) -> FloatArray:
     return np.clip(values.astype(np.float64) / unit, -FAR, FAR).astype(np.float32)
 
 
+class NoPlanes(SamplePlanes):
+    """Shape and type of an array whose samples are not at hand."""
+
+    name = "the grid"
+
+    def __init__(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+        self.shape, self.dtype = tuple(shape), dtype
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Raise GridError: there are none."""
+        raise GridError("the samples of the grid are not at hand")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what is known."""
+        return NoPlanes, (self.shape, self.dtype)
+
+
 class DerivedPlanes(SamplePlanes):
     """Planes that are made of those of another array, and of some beside them.
 
@@ -328,11 +346,17 @@ class DerivedPlanes(SamplePlanes):
             return self.source.over(samples, work, ranges)
         return super().over(samples, work, ranges)
 
-    def of(self, source: SampleArray) -> DerivedPlanes:
-        """Return planes that are made in the same way of another source of the same shape."""
-        return DerivedPlanes(
-            source, self.make, self.beside, self.dtype, unit=self.unit, each=self.each
-        )
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle how they are made, if their source can be read elsewhere, else the array."""
+        if not getattr(self.source, "travels", False):
+            return super().__reduce__()
+        make = partial(DerivedPlanes, unit=self.unit, each=self.each)
+        return make, (self.source, self.make, self.beside, self.dtype)
+
+    @property
+    def travels(self) -> bool:  # type: ignore[override]
+        """Whether another process can read the source for itself."""
+        return bool(getattr(self.source, "travels", False))
 
     def read(self, first: int, last: int) -> NDArray[Any]:
         """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""

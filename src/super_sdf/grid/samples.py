@@ -131,7 +131,10 @@ def check_not_constant(extremes: Extremes) -> None:
 def has_two_values(values: SampleArray, extremes: Extremes) -> bool:
     """Return whether there are only two different values; False for grids of 2 samples an axis."""
     are_two = partial(_are_extreme, extremes)
-    return min(values.shape) > 2 and all(over_planes(values, are_two, in_blocks(values)))
+    first, rest = in_blocks(values)[:1], in_blocks(values)[1:]  # the first mostly shows it
+    return min(values.shape) > 2 and all(
+        all(over_planes(values, are_two, ranges)) for ranges in (first, rest)
+    )
 
 
 def _are_extreme(extremes: Extremes, planes: NDArray[Any]) -> bool:

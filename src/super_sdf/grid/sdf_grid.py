@@ -14,7 +14,7 @@ from ..arrays import Triple
 from .direction import STRAIGHT, Direction, check_direction, in_rows, is_mirrored
 from .field import AUTO, Field, Wanted
 from .interpret import interpret
-from .planes import SampleArray, SamplePlanes
+from .planes import NoPlanes, SampleArray, SamplePlanes
 from .samples import Extremes, as_samples, check_not_flat, check_values
 from .sides import check_negative_inside
 from .spacing import as_triple, check_spacing, choose_spacing, is_cubic
@@ -299,8 +299,7 @@ def with_samples(grid: SdfGrid, samples: SampleArray) -> SdfGrid:
 
 def without_samples(grid: SdfGrid) -> SdfGrid:
     """Return a grid that knows all but its samples: their shape and type, place and field."""
-    nothing = np.broadcast_to(np.zeros((), grid.samples.dtype), grid.shape)
-    return with_samples(grid, nothing)
+    return with_samples(grid, NoPlanes(grid.shape, grid.samples.dtype))
 
 
 def negated(values: NDArray[Any]) -> NDArray[Any]:
