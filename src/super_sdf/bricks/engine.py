@@ -7,7 +7,9 @@ order of the planes, so they are those of one machine, and the meshes are joined
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +20,7 @@ import numpy as np
 from ..cluster.checking import Needs, check_workers
 from ..cluster.connecting import Cluster
 from ..convert import ConvertOptions
-from ..errors import OptionError
+from ..errors import OptionError, SuperSdfError
 from ..files.expectation import Expectation
 from ..files.formats import split_member
 from ..grid.cubic import check_has_offsets
@@ -119,6 +121,12 @@ class BricksEngine:
         self.told.append(text)
         self.warn(text)
 
+    def close(self) -> None:
+        """Let the workers close the store, and free what they have unpacked of it."""
+        with suppress(SuperSdfError):  # the connection may be lost
+            if not self.cluster.is_local:
+                self.cluster.run(close_stores, workers=list(self.cluster.workers()))
+
     def warnings(self) -> tuple[str, ...]:
         """Return sentences on workers."""
         return tuple(dict.fromkeys(self.told))
@@ -126,8 +134,8 @@ class BricksEngine:
     def report(self) -> dict[str, Any]:
         """Return bricks and workers, with the most memory that each has held, in bytes."""
         workers = [
-            {"address": address, "peak_bytes": last.peak, "max_memory": last.bound}
-            for address, last in sorted(self.workers.items())
+            {"process": process, "peak_bytes": last.peak, "max_memory": last.bound}
+            for process, last in sorted(self.workers.items())
         ]
         return {"bricks": self.bricks, "workers": workers}
 
@@ -196,7 +204,8 @@ def absolute(source: str, options: ConvertOptions) -> Source:
     """Return a grid file by its absolute path."""
     file, member = split_member(Path(source))
     path = str(file.absolute())
-    return Source(path if member is None else f"{path}:{member}", options.axes)
+    path = path if member is None else f"{path}:{member}"
+    return Source(path, options.axes, secrets.token_hex(8))
 
 
 def check_is_local(grid: SdfGrid) -> None:

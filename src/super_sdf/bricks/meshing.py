@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import socket
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -83,7 +85,7 @@ class Meshed:
     pieces : list of Piece
         Those of its slabs. Vertices are counted from the first of the brick.
     worker : str
-        Machine and process that made it.
+        Machine and number of the process that made it.
     peak, bound : int or None
         The most memory that this process has held so far, and that it might hold, in bytes.
     """
@@ -143,11 +145,5 @@ def mesh_brick(network: Network, limits: Limits, task: MeshTask, check: CheckWan
         progress=lambda done, total: check(),
     )
     made = list(pieces)
-    return Meshed(made, _name_of_worker(), held_memory(peak=True), limits.memory)
-
-
-def _name_of_worker() -> str:
-    """Return Dask's address of this process."""
-    from distributed import get_worker
-
-    return str(get_worker().address)
+    worker = f"{socket.gethostname()}:{os.getpid()}"
+    return Meshed(made, worker, held_memory(peak=True), limits.memory)

@@ -38,10 +38,13 @@ class Source(NamedTuple):
         Absolute, perhaps with the name of an array in it.
     axes : str or None
         See ``read_grid``.
+    run : str
+        Differs from run to run: the file may have changed since the one before.
     """
 
     path: str
     axes: str | None
+    run: str = ""
 
     @property
     def is_npy(self) -> bool:

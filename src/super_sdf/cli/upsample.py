@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -178,8 +178,11 @@ class Upsampling:
 
         loading = Loading(absolute_model(self.model), options["precision"], options["device"])
         limits = {"threads": options["threads"], "max_memory": options["max_memory"]}
-        with connect(options["cluster"], workers=options["jobs"], **limits) as cluster:
-            yield BricksEngine(cluster, loading, self.announce)
+        with (
+            connect(options["cluster"], workers=options["jobs"], **limits) as cluster,
+            closing(BricksEngine(cluster, loading, self.announce)) as engine,
+        ):
+            yield engine
 
     def check(self) -> None:
         """Check the finished mesh against its samples."""
