@@ -26,7 +26,7 @@ import numpy as np
 from .. import __version__
 from ..errors import ClusterError, WriteError
 from ..machine.extras import missing_modules
-from ..machine.memory import free_memory
+from ..machine.memory import free_memory, reuse_freed
 from ..machine.serving import settle_signals
 from ..network.cuda import onnxruntime_version
 from ..network.network import find_model, shipped_models
@@ -257,6 +257,7 @@ def members_of(
 
 def report_to(question: Question, dask_worker: Any) -> Report:
     """Return what a worker says of itself; called in it, on its main thread."""
+    reuse_freed()
     if question.is_local:
         with suppress(ValueError):  # not the main thread
             settle_signals()

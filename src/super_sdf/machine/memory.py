@@ -16,6 +16,9 @@ from .containers import left_memory
 SYSTEM = Path("/proc/meminfo")
 PROCESS = Path("/proc/self/status")
 
+# Parameters of glibc's mallopt, from malloc.h.
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+
 # Of the memory that is free, the share that is taken unless a bound is given.
 SHARE = 0.6
 
@@ -98,6 +101,18 @@ def give_back() -> None:
     """Give freed memory back to the system, if the C library has a call for it (glibc)."""
     with suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)
+
+
+def reuse_freed() -> None:
+    """Let this process use freed memory again, as glibc's own settings do after a while.
+
+    Dask sets ``MALLOC_TRIM_THRESHOLD_`` for its workers: then all arrays of more than 128 kB come
+    from the system as fresh pages, and converting a grid takes half as much processor time again.
+    """
+    with suppress(OSError, AttributeError, TypeError):
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(M_MMAP_THRESHOLD, 32 << 20)
+        mallopt(M_TRIM_THRESHOLD, 64 << 20)
 
 
 def forget_peak() -> None:
