@@ -1,10 +1,11 @@
-"""One grid on the workers of a local cluster: time, memory of each worker, against one process.
+"""One grid on the workers of a local cluster: time and memory, against one process.
 
     python -m benchmarks.bricks --size 512 --workers 1 2 4 --max-memory 4G [-- OPTIONS]
 
 Whole processes, start and files included. The grid is that of ``benchmarks.large``, as an .npy for
 one process and as a Zarr store in chunks of 64^3 for the workers, which share the memory. The mesh
-must be the same file: compare its digests. Options after ``--`` are passed to the command.
+must be the same file: compare its digests. What is not done by workers is what the command's own
+process does: its CPU seconds. Options after ``--`` are passed to the command.
 """
 
 from __future__ import annotations
@@ -20,24 +21,39 @@ from benchmarks.options import parse
 from benchmarks.zarr_chunks import layouts, store
 from super_sdf.evaluation.timing import describe_machine, run_python
 
-STAGES = ("read", "band", "bricks", "write")
+# Runs the command in this process; prints CPU seconds of it and of the workers, and its peak.
+COMMAND = """
+import resource, sys, time
+from super_sdf.cli.main import main
+from super_sdf.machine.memory import held_memory
+sys.argv[0] = "super-sdf"
+try:
+    main()
+except SystemExit as end:
+    if end.code:
+        raise
+workers = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(time.process_time(), workers.ru_utime + workers.ru_stime, held_memory(peak=True))
+"""
 
 
 def run(grid: Path, workers: int, bound: str, options: list[str]) -> str:
     """Convert a grid, with workers unless their number is 0; return a row of the table."""
     target = grid.parent / "mesh.ply"
-    words = ["-m", "super_sdf", "upsample", str(grid), str(target), "--force", "--json", "-q"]
+    words = ["-c", COMMAND, "upsample", str(grid), str(target), "--force", "--json", "-q"]
     words += ["--cluster", "local", "--jobs", str(workers)] if workers else []
-    seconds, peak, printed = run_python([*words, "--max-memory", bound, *options])
-    report = json.loads(printed)
-    stages = " | ".join(f"{report['seconds'].get(stage, 0):.1f}" for stage in STAGES)
+    seconds, _, printed = run_python([*words, "--max-memory", bound, *options])
+    text, _, last = printed.rstrip().rpartition("\n")
+    own, others, peak = map(float, last.split())
+    report = json.loads(text)
     found = report.get("workers", [])
     peaks = ", ".join(f"{worker['peak_bytes'] / 1e6:,.0f}" for worker in found)
     each = f"{found[0]['max_memory'] / 1e6:,.0f}" if found else ""
     digest = hashlib.sha256(target.read_bytes()).hexdigest()[:8]
     return (
         f"| {grid.suffix} | {workers or 'none'} | {report.get('bricks', report['slabs'])} | "
-        f"{seconds:.1f} | {stages} | {peak:,.0f} | {each} | {peaks} | {digest} |"
+        f"{seconds:.1f} | {own:.1f} | {others:.1f} | {peak / 1e6:,.0f} | {each} | {peaks} | "
+        f"{digest} |"
     )
 
 
@@ -50,9 +66,8 @@ def main() -> None:
     arguments, options = parse(parser)
     print(f"{describe_machine()}\n")
     print(
-        "| grid | workers | bricks | s in all | read | look at the band | bricks | write | "
-        "MB of the command | MB that each worker may hold | its peak | file |\n"
-        "| --- |" + " ---: |" * 10 + " --- |"
+        "| grid | workers | bricks | s | CPU s, command | CPU s, workers | peak MB, command | "
+        "MB that a worker may hold | its peak | file |\n| --- |" + " ---: |" * 8 + " --- |"
     )
     with tempfile.TemporaryDirectory(dir="/var/tmp") as name:
         grid = write_torus(Path(name, "torus.npy"), arguments.size)
