@@ -94,7 +94,7 @@ def test_a_network_that_cannot_run_is_a_finding_and_the_checks_go_on(monkeypatch
     monkeypatch.setattr(selftest, "run_network", broken)
     findings = list(run_checks("cpu"))
     assert find(findings, "network base on cpu").says == "the network failed on cpu: no"
-    assert findings[-1].what == "extra peers"
+    assert findings[-1].what == "extra cluster"
 
 
 def test_both_kinds_of_onnxruntime_at_once_fail(monkeypatch):

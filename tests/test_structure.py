@@ -133,6 +133,16 @@ def test_help_loads_click_and_nothing_heavier():
     subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
 
 
+def test_a_batch_without_a_cluster_loads_nothing_of_dask(tmp_path):
+    script = (
+        "import sys; from super_sdf.cli.main import cli;"
+        f"cli.main(['batch', 'examples', '--out', {str(tmp_path)!r}, '--quality', 'fast',"
+        "'--jobs', '2', '--quiet'], standalone_mode=False);"
+        "heavy = {'dask', 'distributed', 'tornado'} & set(sys.modules); assert not heavy"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, cwd=ROOT)
+
+
 def test_public_names_are_there():
     import super_sdf
 

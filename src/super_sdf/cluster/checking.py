@@ -11,6 +11,7 @@ import os
 import pkgutil
 import platform
 import secrets
+import signal
 import socket
 import sys
 from collections import Counter
@@ -259,8 +260,9 @@ def report_to(question: Question, dask_worker: Any) -> Report:
     """Return what a worker says of itself; called in it, on its main thread."""
     reuse_freed()
     if question.is_local:
-        with suppress(ValueError):  # not the main thread
+        with suppress(ValueError, AttributeError):  # not the main thread, or Windows
             settle_signals()
+            signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the batch hears it, too
     limit = dask_worker.memory_manager.memory_limit
     return report_here(question)._replace(identity=str(dask_worker.id), limit=limit or None)
 

@@ -5,8 +5,12 @@ Everything that Dask has to say comes as one line, a ClusterError; its own messa
 
 from __future__ import annotations
 
+import asyncio
 import logging
+import os
+import signal
 import tempfile
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -106,7 +110,7 @@ class Cluster:
         try:
             if self.client.status == "running":
                 return question()
-        except (OSError, TimeoutError):
+        except (OSError, asyncio.TimeoutError):
             pass
         raise ClusterError(
             f"the connection to the Dask scheduler at {self.address} was lost: run it again when "
@@ -194,6 +198,7 @@ def local_cluster(count: int, killed_at: int) -> Iterator[Any]:
     from distributed import LocalCluster
 
     with tempfile.TemporaryDirectory(prefix="super-sdf-", ignore_cleanup_errors=True) as scratch:
+        start_quiet_tracker()
         with ending_signals_blocked():
             cluster = LocalCluster(
                 n_workers=count,
@@ -210,6 +215,27 @@ def local_cluster(count: int, killed_at: int) -> Iterator[Any]:
         finally:
             with suppress(Exception):  # it is closing: what does not end by itself is killed
                 cluster.close(timeout=CLOSE_SECONDS)
+
+
+def start_quiet_tracker() -> None:
+    """Start Python's resource tracker so that it says nothing of Dask's semaphores after a signal.
+
+    It runs as long as this process, and hears the SIGHUP of a terminal that is closed.
+    """
+    from multiprocessing import resource_tracker
+
+    warnings_before = os.environ.get("PYTHONWARNINGS")
+    hears = threading.current_thread() is threading.main_thread() and hasattr(signal, "SIGHUP")
+    handler = signal.signal(signal.SIGHUP, signal.SIG_IGN) if hears else None
+    os.environ["PYTHONWARNINGS"] = "ignore:resource_tracker"
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        if hears:
+            signal.signal(signal.SIGHUP, handler)
+        del os.environ["PYTHONWARNINGS"]
+        if warnings_before is not None:
+            os.environ["PYTHONWARNINGS"] = warnings_before
 
 
 @contextmanager
@@ -236,7 +262,7 @@ def open_client(server: Any, address: str) -> Iterator[Client]:
 
 def no_answer(address: str, error: Exception) -> str:
     """Return the message for a scheduler that does not answer."""
-    silent = isinstance(error, (OSError, TimeoutError)) or not str(error)
+    silent = isinstance(error, (OSError, asyncio.TimeoutError)) or not str(error)
     why = "" if silent else f" ({' '.join(str(error).split())})"
     return (
         f"no Dask scheduler answers at {address}{why}: start one with 'dask scheduler' and workers "
@@ -246,7 +272,7 @@ def no_answer(address: str, error: Exception) -> str:
 
 def wait_for_a_worker(cluster: Cluster) -> None:
     """Raise ClusterError if the cluster shows no worker within a while."""
-    with suppress(TimeoutError):
+    with suppress(TimeoutError, asyncio.TimeoutError):  # the same from Python 3.11 on
         cluster.client.wait_for_workers(1, timeout=FIRST_WORKER_SECONDS)
     if not cluster.workers():
         raise ClusterError(
@@ -269,7 +295,8 @@ def silence() -> Iterator[None]:
     """Keep Dask's log messages and warnings from the terminal within the block."""
     import distributed  # noqa: F401, it sets the levels of its loggers
 
-    loggers = [logging.getLogger(name) for name in LOGGERS]
+    names = [name for name in logging.root.manager.loggerDict if name.split(".")[0] in LOGGERS]
+    loggers = [logging.getLogger(name) for name in (*LOGGERS, *names)]
     levels = [logger.level for logger in loggers]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -278,5 +305,5 @@ def silence() -> Iterator[None]:
         try:
             yield
         finally:
-            for logger, level in zip(loggers, levels):
+            for logger, level in reversed(list(zip(loggers, levels))):
                 logger.setLevel(level)

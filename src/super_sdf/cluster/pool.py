@@ -11,6 +11,7 @@ certain whose fault a second death is.
 
 from __future__ import annotations
 
+import asyncio
 import os
 import secrets
 import signal
@@ -37,6 +38,7 @@ RESULT_SECONDS = 2.0  # that a result may take from a worker until it is looked 
 STOP_SECONDS = 5.0  # that workers have to stop what nobody wants any more
 PATIENCE_SECONDS = 60.0  # without any worker
 SHORT_TASK = 1.0  # seconds: after one, a worker gets the next task before it has finished
+KILL = getattr(signal, "SIGKILL", signal.SIGTERM)  # Windows has none, and its SIGTERM kills
 LOST = "was lost by the cluster (most likely out of memory)"
 
 
@@ -252,7 +254,7 @@ class ClusterPool(Generic[Task]):
         while hand.member.address in self.cluster.workers():
             try:
                 return future.result(timeout=RESULT_SECONDS)
-            except TimeoutError:
+            except (TimeoutError, asyncio.TimeoutError):  # the same from Python 3.11 on
                 continue
             except (KilledWorker, OSError):
                 break
@@ -340,4 +342,4 @@ class ClusterPool(Generic[Task]):
         if self.cluster.is_local:
             for address in left:
                 with suppress(OSError):
-                    os.kill(hands[address].member.report.pid, signal.SIGKILL)
+                    os.kill(hands[address].member.report.pid, KILL)
