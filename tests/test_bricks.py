@@ -93,6 +93,8 @@ FIELDS = {
     "mask": (rod() < 0, {}),
     "label": ((rod() < 0) * np.int16(6), {"label": 6.0}),
     "truncated": (np.clip(rod(), -1.2, 1.2), {}),
+    "level": (100 - rod() * 10, {"level": 100.0, "scale": 0.1}),
+    "simplified": (rod(), {"simplify": 0.05}),
     "integers": (np.rint(rod() * 40).astype(np.int16), {"scale": 1 / 40}),
 }
 
