@@ -15,7 +15,7 @@ import signal
 import socket
 import sys
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
@@ -32,6 +32,9 @@ from ..machine.serving import settle_signals
 from ..network.cuda import onnxruntime_version
 from ..network.network import find_model, shipped_models
 from .connecting import Cluster, Limits, share_of
+
+Judge = Callable[[Any], str]
+"""Returns what is wrong with what a worker answered or raised, "" if nothing."""
 
 MOST_FILES = 100  # whose presence each worker checks
 VERSION = "super_sdf:__version__"
@@ -141,32 +144,22 @@ def check_workers(cluster: Cluster, needs: Needs) -> Checked:
 def check_some(cluster: Cluster, needs: Needs, threads: Mapping[str, int]) -> Checked:
     """Check some workers, given by address with their threads; those that end meanwhile are out."""
     faults: dict[str, str] = {}
-    left = list(threads)
-    for function, arguments, judge in (
-        (pkgutil.resolve_name, (VERSION,), judge_version),
-        (digest_of_sources, (), judge_sources),
-    ):
-        answers = cluster.run(function, *arguments, workers=left) if left else {}
-        for address, answer in answers.items():
-            if not is_gone(answer) and (fault := judge(answer)):
-                faults[address] = fault
-        left = [a for a in left if a in answers and a not in faults and not is_gone(answers[a])]
+
+    def ask(workers: Iterable[str], judge: Judge, *call: Any) -> dict[str, Any]:
+        """Return the answers that are right; keep the faults of the others."""
+        answers = cluster.run(*call, workers=list(workers)) if workers else {}
+        there = {address: a for address, a in answers.items() if not isinstance(a, OSError)}
+        faults.update({a: fault for a, answer in there.items() if (fault := judge(answer))})
+        return {address: answer for address, answer in there.items() if address not in faults}
+
+    # The first call needs nothing of this package, the second no more than one function of it.
+    good = ask(threads, judge_version, pkgutil.resolve_name, VERSION)
+    good = ask(good, judge_sources, digest_of_sources)
     with probing(needs.folder) as probe:
         question = Question(needs, some_of(needs.files), probe, cluster.is_local)
-        found = cluster.run(report_to, question, workers=left) if left else {}
         own = report_here(question)
-    reports = {address: r for address, r in found.items() if isinstance(r, Report)}
-    for address, answer in found.items():
-        if address not in reports and not is_gone(answer):
-            faults[address] = f"cannot be checked ({describe(answer)}): restart it"
-    faults |= {a: fault for a, r in reports.items() if (fault := judge_report(r, own, question))}
-    good = {address: report for address, report in reports.items() if address not in faults}
+        good = ask(good, lambda r: judge_report(r, own, question), report_to, question)
     return Checked(members_of(cluster, good, threads), faults, warnings_of(good, own))
-
-
-def is_gone(answer: Any) -> bool:
-    """Return whether a worker ended before it answered."""
-    return isinstance(answer, OSError) and not isinstance(answer, ImportError)
 
 
 def judge_version(answer: Any) -> str:
@@ -193,8 +186,10 @@ def judge_sources(answer: Any) -> str:
     )
 
 
-def judge_report(report: Report, own: Report, question: Question) -> str:
+def judge_report(report: Any, own: Report, question: Question) -> str:
     """Return what a worker lacks of what is here and needed, "" if nothing."""
+    if not isinstance(report, Report):
+        return f"cannot be checked ({describe(report)}): restart it"
     needs = question.needs
     for name, digest in own.models.items():
         if name not in report.models:
@@ -294,16 +289,19 @@ def digests_of_models(needs: Needs) -> dict[str, str]:
     with suppress(OSError, ValueError):
         path, _ = find_model(needs.model, needs.precision)
         paths[path.name if path in paths.values() else str(path)] = path
-    return {name: digest_of(path) for name, path in paths.items()}
+    digests = {}
+    for name, path in paths.items():
+        with suppress(OSError):
+            digests[name] = digest_of(path)
+    return digests
 
 
-@lru_cache(maxsize=16)
 def digest_of(path: Path) -> str:
     """Return the SHA-256 of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=1)  # a worker keeps the code that it has loaded, whatever is installed later
 def digest_of_sources() -> str:
     """Return the SHA-256 of this package's modules; of Python's version where they are compiled."""
     digest = hashlib.sha256()

@@ -45,6 +45,7 @@ CONFIG = {
     "distributed.scheduler.http.routes": [],
     "distributed.worker.http.routes": [],
     "distributed.worker.profile.enabled": False,
+    "distributed.nanny.pre-spawn-environ": {},  # it would stay in the environment of this process
 }
 Answer = TypeVar("Answer")
 
