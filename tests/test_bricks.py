@@ -95,6 +95,7 @@ FIELDS = {
     "truncated": (np.clip(rod(), -1.2, 1.2), {}),
     "level": (100 - rod() * 10, {"level": 100.0, "scale": 0.1}),
     "simplified": (rod(), {"simplify": 0.05}),
+    "placed": (rod(), {"origin": (3.0, 4.0, 5.0), "direction": (0, -1, 0, 1, 0, 0, 0, 0, 1)}),
     "integers": (np.rint(rod() * 40).astype(np.int16), {"scale": 1 / 40}),
 }
 
@@ -261,3 +262,28 @@ def test_layers_are_unpacked_once_and_samples_travel_by_their_path(monkeypatch):
     np.testing.assert_array_equal(pickle.loads(packed)[7:9], 2.0 * values[7:9])
     assert len(made) == 5
     stored.close_stores()
+
+
+def test_spacing_origin_and_direction_of_the_store(cluster, network):
+    """The array's own axes run backwards, so planes of x begin at its end."""
+    made = zarr.create_array("b.zarr", shape=rod().T.shape, chunks=(8, 8, 8), dtype="f8")
+    made[:] = rod().T
+    made.attrs.update(spacing=0.5, origin=[1, 2, 3], direction=[-1, 0, 0, 0, -1, 0, 0, 0, 1])
+    chosen = ConvertOptions(factor=2, scale=0.5)
+    here = convert("b.zarr", "here.ply", network, chosen)
+    bricks = BricksEngine(cluster, LOADING)
+    check_same(here, convert("b.zarr", "there.ply", network, chosen, engine=bricks), bricks)
+
+
+def test_a_file_that_changed_since_the_last_conversion(cluster, network):
+    """Workers stay, but what they have unpacked of the file does not."""
+    for values in (rod(), rod() - 0.2):
+        made = zarr.create_array(
+            "b.zarr", shape=values.T.shape, chunks=(8, 8, 8), dtype="f8", overwrite=True
+        )
+        made[:] = values.T
+        chosen = ConvertOptions(factor=2, spacing=(1.0,))
+        here = convert("b.zarr", "here.ply", network, chosen, force=True)
+        bricks = BricksEngine(cluster, LOADING)
+        there = convert("b.zarr", "there.ply", network, chosen, engine=bricks, force=True)
+        check_same(here, there, bricks)

@@ -205,7 +205,7 @@ def absolute(source: str, options: ConvertOptions) -> Source:
     file, member = split_member(Path(source))
     path = str(file.absolute())
     path = path if member is None else f"{path}:{member}"
-    return Source(path, options.axes, secrets.token_hex(8))
+    return Source(path, options.axes, options.direction is not None, secrets.token_hex(8))
 
 
 def check_is_local(grid: SdfGrid) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +21,7 @@ from ..files.grids import one_line_errors, open_volume, reader_of
 from ..files.headers import read_array_header
 from ..files.regular import check_regular_file
 from ..files.unpacking import PIECE
-from ..files.volume import Volume, find_placement, place_in_world, unpacked
+from ..files.volume import Volume, axes_direction, find_placement, place_in_world, unpacked
 from ..grid.planes import InputFile, PlaneFile, SampleArray, SamplePlanes
 from ..machine.memory import held_memory
 
@@ -38,12 +39,15 @@ class Source(NamedTuple):
         Absolute, perhaps with the name of an array in it.
     axes : str or None
         See ``read_grid``.
+    has_direction : bool
+        Whether the user gives a direction, which replaces that in the file.
     run : str
         Differs from run to run: the file may have changed since the one before.
     """
 
     path: str
     axes: str | None
+    has_direction: bool = False
     run: str = ""
 
     @property
@@ -145,7 +149,10 @@ class Store:
         path = Path(self.source.path)
         self.format = find_format(path)
         axes = choose_axes(self.format, self.source.axes)
-        self.volume = self.files.enter_context(open_volume(path, self.format, axes, (0, None)))
+        volume = self.files.enter_context(open_volume(path, self.format, axes, (0, None)))
+        if self.source.has_direction:
+            volume = replace(volume, direction=axes_direction(axes))
+        self.volume: Volume = volume
         self.placement = find_placement(self.volume, str(path))
         nx, ny, nz = (self.volume.shape[self._axis(w)] for w in range(3))
         self.shape, self.dtype = (nx, ny, nz), self.volume.dtype
@@ -161,9 +168,8 @@ class Store:
         """Return what the store says; ``given`` holds what replaces its place, or None."""
         if self.source.is_npy:
             return Facts(self.shape, self.dtype, self.layer, given, ())
-        volume: Volume = self.volume
-        place = place_in_world(volume, self.placement, given)
-        return Facts(self.shape, self.dtype, self.layer, place, volume.notes)
+        place = place_in_world(self.volume, self.placement, given)
+        return Facts(self.shape, self.dtype, self.layer, place, self.volume.notes)
 
     def read(self, first: int, last: int) -> NDArray[Any]:
         """Return planes ``first`` to before ``last``."""
