@@ -16,43 +16,28 @@ import json
 import tempfile
 from pathlib import Path
 
+from benchmarks.commands import run_command
 from benchmarks.large import write_torus
 from benchmarks.options import parse
 from benchmarks.zarr_chunks import layouts, store
-from super_sdf.evaluation.timing import describe_machine, run_python
-
-# Runs the command in this process; prints CPU seconds of it and of the workers, and its peak.
-COMMAND = """
-import resource, sys, time
-from super_sdf.cli.main import main
-from super_sdf.machine.memory import held_memory
-sys.argv[0] = "super-sdf"
-try:
-    main()
-except SystemExit as end:
-    if end.code:
-        raise
-workers = resource.getrusage(resource.RUSAGE_CHILDREN)
-print(time.process_time(), workers.ru_utime + workers.ru_stime, held_memory(peak=True))
-"""
+from super_sdf.evaluation.timing import describe_machine
 
 
 def run(grid: Path, workers: int, bound: str, options: list[str]) -> str:
     """Convert a grid, with workers unless their number is 0; return a row of the table."""
     target = grid.parent / "mesh.ply"
-    words = ["-c", COMMAND, "upsample", str(grid), str(target), "--force", "--json", "-q"]
+    words = ["upsample", str(grid), str(target), "--force", "--json", "-q"]
     words += ["--cluster", "local", "--jobs", str(workers)] if workers else []
-    seconds, _, printed = run_python([*words, "--max-memory", bound, *options])
-    text, _, last = printed.rstrip().rpartition("\n")
-    own, others, peak = map(float, last.split())
-    report = json.loads(text)
+    taken = run_command([*words, "--max-memory", bound, *options])
+    report = json.loads(taken.printed)
     found = report.get("workers", [])
     peaks = ", ".join(f"{worker['peak_bytes'] / 1e6:,.0f}" for worker in found)
     each = f"{found[0]['max_memory'] / 1e6:,.0f}" if found else ""
     digest = hashlib.sha256(target.read_bytes()).hexdigest()[:8]
     return (
         f"| {grid.suffix} | {workers or 'none'} | {report.get('bricks', report['slabs'])} | "
-        f"{seconds:.1f} | {own:.1f} | {others:.1f} | {peak / 1e6:,.0f} | {each} | {peaks} | "
+        f"{taken.seconds:.1f} | {taken.cpu:.1f} | {taken.cpu_of_workers:.1f} | "
+        f"{taken.peak / 1e6:,.0f} | {each} | {peaks} | "
         f"{digest} |"
     )
 

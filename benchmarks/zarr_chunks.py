@@ -19,10 +19,11 @@ from typing import Any
 import numpy as np
 import zarr
 
+from benchmarks.commands import run_command
 from benchmarks.large import write_torus
 from benchmarks.options import parse
 from super_sdf.errors import SuperSdfError
-from super_sdf.evaluation.timing import describe_machine, run_python
+from super_sdf.evaluation.timing import describe_machine
 
 BLOCK = 64
 
@@ -52,18 +53,18 @@ def store(grid: Path, path: Path, layout: dict[str, Any]) -> None:
 def row(name: str, layout: dict[str, Any], grid: Path, bound: str, options: list[str]) -> str:
     """Convert a grid; return a row of the table."""
     target = grid.parent / "mesh.ply"
-    words = ["-m", "super_sdf", "upsample", str(grid), str(target), "--force", "--json", "-q"]
+    words = ["upsample", str(grid), str(target), "--force", "--json", "-q"]
     shape = " x ".join(map(str, layout.get("chunks", ())))
     shape += f" in {' x '.join(map(str, layout['shards']))}" if "shards" in layout else ""
     try:
-        seconds, peak, printed = run_python([*words, "--max-memory", bound, *options])
+        taken = run_command([*words, "--max-memory", bound, *options])
     except SuperSdfError:  # the command has printed why
         return f"| {name} | {shape} | {bound} | refused |" + " |" * 4
-    report = json.loads(printed)
+    report = json.loads(taken.printed)
     digest = hashlib.sha256(target.read_bytes()).hexdigest()[:8]
     return (
-        f"| {name} | {shape} | {bound} | {report['seconds']['read']:.1f} | {seconds:.1f} | "
-        f"{peak:,.0f} | {report['slabs']} | {digest} |"
+        f"| {name} | {shape} | {bound} | {report['seconds']['read']:.1f} | {taken.cpu:.1f} | "
+        f"{taken.peak / 1e6:,.0f} | {report['slabs']} | {digest} |"
     )
 
 
@@ -76,7 +77,7 @@ def main() -> None:
     arguments, options = parse(parser)
     print(f"{describe_machine()}\n")
     print(
-        "| stored | chunks | bound | s to read | s in all | peak MB | slabs | file |\n"
+        "| stored | chunks | bound | s to read | CPU s in all | peak MB | slabs | file |\n"
         "| --- | --- |" + " ---: |" * 5 + " --- |"
     )
     with tempfile.TemporaryDirectory(dir="/var/tmp") as name:
