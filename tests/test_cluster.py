@@ -288,6 +288,34 @@ def test_a_task_that_kills_workers_is_the_only_one_that_fails(monkeypatch):
     assert cleaned.count(3) == 2 and set(cleaned) == set(died) and len(died) <= 3
 
 
+def prepare_to_wait(limits):
+    """Return work that takes longer than the pool takes to look which workers there are."""
+
+    def work(task, check_wanted):
+        time.sleep(1.2 * cluster_pool.LOOK_SECONDS)
+        return os.getpid()
+
+    return work
+
+
+@pytest.mark.parametrize("fault", ["", "is odd"])
+def test_a_worker_that_comes_later_is_checked_and_used_or_named(monkeypatch, fault):
+    tasks, warnings, needs = deque(range(6)), [], Needs("fast")
+    with connect("local", workers=2, threads=1) as cluster:
+        checked = check_workers(cluster, needs)
+        first, second = checked.members
+        if fault:
+            found = checked._replace(members=[], faults={second.address: fault})
+            monkeypatch.setattr(cluster_pool, "check_some", lambda *_: found)
+        known = checked._replace(members=[first])
+        options = ClusterPoolOptions(warn=warnings.append)
+        pool = ClusterPool(cluster, known, needs, tasks, prepare_to_wait, options)
+        pids = {pid for _, pid in pool.results()}
+    later = set() if fault else {second.report.pid}
+    assert pids == {first.report.pid} | later
+    assert warnings == ([f"worker {second.address} is odd; it is not used"] if fault else [])
+
+
 def own_report(**changes):
     """Return a question about this process and its folder, and the report of it, changed."""
     question = Question(Needs("fast", folder=Path.cwd()), (Path("in/a.npy").resolve(),), None, True)
