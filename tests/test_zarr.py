@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import zarr
@@ -293,6 +294,21 @@ def test_info_of_numpy_files(command, values):
     assert command("info", "no.zarr")[::2] == (1, "Error: no.zarr does not exist\n")
     want = "Error: a.npy and --check: give only one of them\n"
     assert command("info", "a.npy", "--check")[2] == want
+
+
+def test_arrays_of_fewer_axes_are_no_grids(values):
+    store("a.zarr", values[0])
+    with pytest.raises(GridError) as caught:
+        read_grid("a.zarr", spacing=1)
+    assert str(caught.value) == "a.zarr: values have shape (26, 22): give three axes (x, y, z)"
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_chunks_of_hdf5(values, layout):
+    with h5py.File("a.h5", "w") as file:
+        chunks = LAYOUTS[layout]["chunks"]
+        file.create_dataset("d", data=values.T, chunks=chunks, compression="gzip")
+    np.testing.assert_array_equal(read_grid("a.h5", spacing=1).values, values)
 
 
 def test_a_large_store_is_copied_to_a_file(monkeypatch, values):

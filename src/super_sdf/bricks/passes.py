@@ -214,11 +214,15 @@ class TeamPlanes(StoredPlanes):
         planes = -(-self.shape[0] // (BRICKS_PER_WORKER * self.team.size))
         return -(-planes // self.facts.layer) * self.facts.layer
 
+    def _brick_of(self, planes: tuple[Any, ...]) -> int:
+        """Return the number of the brick in which the middle of a range of planes lies."""
+        return int(sum(planes[:2]) // 2 // self.brick)
+
     def over(
         self, samples: SamplePlanes, work: Callable[..., Result], ranges: Ranges
     ) -> Iterator[Result]:
         """Yield what a function makes of ranges of ``samples``, in order, made by the workers."""
-        groups = [list(group) for _, group in groupby(ranges, lambda r: r[0] // self.brick)]
+        groups = [list(group) for _, group in groupby(ranges, self._brick_of)]
         bricks = [
             Brick(number, group[0][0], group[-1][1], RangesTask(samples, work, tuple(group)))
             for number, group in enumerate(groups)

@@ -57,6 +57,8 @@ class Image:
         GridError
             If they are not three, or another axis is longer.
         """
+        if len(shape) < len(SPACE):
+            raise GridError(f"values have shape {tuple(shape)}: give three axes (x, y, z)")
         space = [axis for axis, name in enumerate(self.axes) if name in tuple(SPACE)]
         if len(self.axes) != len(shape) or sorted(self.axes[axis] for axis in space) != list(SPACE):
             named = ", ".join(self.axes)
