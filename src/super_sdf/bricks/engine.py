@@ -153,7 +153,7 @@ class BricksEngine:
         self.bricks = len(tasks)
         watch.lap("band")
         show(round(LOOKED * TOTAL), TOTAL)
-        joining = Joining(seen, replace_peak(self.workers))
+        joining = Joining(seen, keeping_last(self.workers))
         prepare = partial(prepare_meshing, self.source, self.loading)
         for number, made in enumerate(self.team.in_order(tasks, prepare), 1):
             watch.lap("bricks")
@@ -261,7 +261,7 @@ class Joining:
         return Piece(meshes, counts, whole, summary.leaves, is_cut, set(self.signs))
 
 
-def replace_peak(workers: dict[str, Meshed]) -> Callable[[Meshed], None]:
+def keeping_last(workers: dict[str, Meshed]) -> Callable[[Meshed], None]:
     """Return a function that keeps the last result of each worker, without its mesh."""
 
     def keep(made: Meshed) -> None:
