@@ -36,21 +36,25 @@ ON_CLUSTER = ("--cluster", "local")
 MARGIN = 0.1  # of the files at the beginning and at the end, which do not count for the pace
 
 
-def kill_a_worker(batch: Popen[str]) -> None:
-    """Kill a worker process of a batch with SIGKILL."""
-    children = psutil.Process(batch.pid).children(recursive=True)
-    workers = [child for child in children if "spawn_main" in " ".join(child.cmdline())]
-    workers[0].kill()
+def kill_a_worker(batch: Popen[str]) -> str:
+    """Kill a worker process of a batch with SIGKILL; return what happened."""
+    try:
+        children = psutil.Process(batch.pid).children(recursive=True)
+        workers = [child for child in children if "spawn_main" in " ".join(child.cmdline())]
+        workers[0].kill()
+    except (IndexError, psutil.NoSuchProcess):
+        return "too late to kill a worker"
+    return "a worker killed in the middle"
 
 
-def run_with_a_kill(place: Place, count: int) -> tuple[int, str]:
-    """Run a batch, and kill a worker in the middle; return the exit code and the last line."""
+def run_with_a_kill(place: Place, count: int) -> str:
+    """Run a batch, and kill a worker in the middle; return a row with exit code and last line."""
     batch = place.start()
     while len(place.lines()) < count // 2 and batch.poll() is None:
         time.sleep(0.01)
-    kill_a_worker(batch)
+    what = kill_a_worker(batch)
     _, output = batch.communicate()
-    return batch.returncode, output.strip().splitlines()[-1]
+    return f"| {what} | exit code {batch.returncode}: {output.strip().splitlines()[-1]} |"
 
 
 def time_batch(jobs: list[Job], cluster: str | None, workers: int) -> tuple[float, float]:
@@ -99,8 +103,7 @@ def parse() -> argparse.Namespace:
 
 def report_kill(place: Place, solids: dict[str, Placed]) -> None:
     """Print what a batch with a killed worker made."""
-    code, output = run_with_a_kill(place, len(solids))
-    print(f"| a worker killed in the middle | exit code {code}: {output} |")
+    print(run_with_a_kill(place, len(solids)))
     print(f"| right meshes | {count_right(place, solids)} of {len(solids)} |")
     equal = count_equal(place, sorted(solids))
     print(f"| byte for byte those of upsample | {equal} of {len(solids)} |")

@@ -260,7 +260,7 @@ def prepare_to_count(limits):
         if task == 3:
             os.kill(os.getpid(), signal.SIGKILL)
         if task == 4:
-            raise ValueError("four")
+            raise OSError("four")
         return 2 * task, limits.threads
 
     return work
@@ -283,7 +283,7 @@ def test_a_task_that_kills_workers_is_the_only_one_that_fails(monkeypatch):
             else:
                 results[task] = result
     assert results.pop(3) == lost
-    assert results.pop(4) == Death("ended with ValueError: four")
+    assert results.pop(4) == Death("ended with OSError: four")
     assert results == {task: (2 * task, 1) for task in range(12) if task not in (3, 4)}
     assert cleaned.count(3) == 2 and set(cleaned) == set(died) and len(died) <= 3
 

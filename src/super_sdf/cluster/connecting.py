@@ -31,6 +31,7 @@ CONNECT_SECONDS = 5  # that a scheduler has to answer
 FIRST_WORKER_SECONDS = 10  # that a cluster has to show a worker
 CLOSE_SECONDS = 5  # that the workers of this machine have to end
 HARD_LIMIT = 1.25  # of the memory that a worker of this machine plans with: above, it is killed
+LEAST_HARD_LIMIT = 5 * 10**8  # an idle worker holds a third of it
 PAUSE_SHARE = 0.75  # of a worker's limit: Dask gives it no more work at 0.8, and kills it at 0.95
 LOGGERS = ("distributed", "tornado", "asyncio", "bokeh")
 CONFIG = {
@@ -151,7 +152,8 @@ def connect(
             count = workers or count_cores()
             limits = share_equally(count, threads, max_memory)
             stack.enter_context(config(CONFIG))
-            killed_at = int(HARD_LIMIT * (limits.memory or 0)) if max_memory else 0
+            hard = max(int(HARD_LIMIT * (limits.memory or 0)), LEAST_HARD_LIMIT)
+            killed_at = hard if max_memory else 0
             server = stack.enter_context(local_cluster(count, killed_at))
         else:
             limits, server = Limits(threads, max_memory), address

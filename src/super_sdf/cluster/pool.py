@@ -251,16 +251,17 @@ class ClusterPool(Generic[Task]):
         """Return the result of a future that is done; Elsewhere if it was lost with its worker."""
         from distributed import KilledWorker
 
-        while hand.member.address in self.cluster.workers():
+        is_there = True
+        while is_there:
             try:
                 return future.result(timeout=RESULT_SECONDS)
             except (TimeoutError, asyncio.TimeoutError):  # the same from Python 3.11 on
-                continue
-            except (KilledWorker, OSError):
-                break
-            except Exception as error:  # the task's own, or what cannot be pickled
-                if future.cancelled():
+                is_there = hand.member.address in self.cluster.workers()
+            except Exception as error:
+                if future.status != "error" or isinstance(error, KilledWorker):
+                    self.cluster.workers()  # raises if that is because the connection was lost
                     break
+                # The task's own error, or what cannot be pickled.
                 line = f"{type(error).__name__}: {error}".split("\n")[0]
                 if hand.is_ready:
                     return Death(f"ended with {line}")
