@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruct, upsample
 from super_sdf.certificate.check import check_mesh
 from super_sdf.errors import GridError
-from super_sdf.files.expectation import count_on_lattice
+from super_sdf.files.expectation import count_by_plane, count_on_lattice
 from super_sdf.grid.cubic import cubic_grid, on_samples
 from super_sdf.grid.resampling import Resampled, new_places
 from super_sdf.mesh import join_meshes
@@ -261,7 +261,7 @@ def test_the_certificate_counts_samples_only(network):
 def test_the_size_of_the_mesh_is_estimated_on_the_lattice(network):
     for spacing in ((0.3, 0.3, 0.6), (0.9, 0.3, 0.3)):
         grid = make_grid(sampled(spacing), spacing=spacing)
-        triangles = 2 * 4**2 * count_on_lattice(grid, 0.0)
+        triangles = 2 * 4**2 * count_on_lattice(grid, count_by_plane(grid, 0.0))
         assert len(reconstruct(grid, network).faces) == pytest.approx(triangles, rel=0.05)
 
 

@@ -186,4 +186,7 @@ def test_a_network_file_that_cannot_be_read_is_a_line_and_the_others_are_shown(m
     assert "model fast\n  accuracy: " in out
     code, out, err = command("info", "--check", "--device", "cpu")
     assert (code, err) == (1, "") and f"\nfailed   network base on cpu: {fault}" in out
-    assert "\nok       network fast on cpu: " in out and f"\n1 of {2 + 2 + len(EXTRAS)} checks failed\n" in out
+    assert (
+        "\nok       network fast on cpu: " in out
+        and f"\n1 of {2 + 2 + len(EXTRAS)} checks failed\n" in out
+    )

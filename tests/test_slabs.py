@@ -13,12 +13,12 @@ from super_sdf import SdfGrid, load_network, make_grid, pipeline, reconstruct
 from super_sdf.errors import OutOfMemoryError
 from super_sdf.machine import threads
 from super_sdf.machine.resources import Resources
-from super_sdf.mesh import join_meshes
+from super_sdf.mesh import Mesh, join_meshes
 from super_sdf.pipeline import reconstruct_slabs
 from super_sdf.slabs import cutting
-from super_sdf.slabs.cutting import cut, peak_bytes, plan_slabs
+from super_sdf.slabs.cutting import cut, equal_parts, peak_bytes, plan_slabs
 from super_sdf.slabs.footprint import slab_bytes
-from super_sdf.steps.survey import survey
+from super_sdf.steps.survey import look_at_band, survey
 
 
 @pytest.fixture(scope="module")
@@ -201,3 +201,51 @@ def whole_of(band):
     """Return the arguments of ``slab_bytes`` for a whole band and factor 2."""
     slab = cutting.whole(band)
     return slab.seen, slab.decoded, slab.planes, 2
+
+
+def solid_block():
+    """Return a block that fills the grid in its middle planes, whose samples are far from 0."""
+    i, j, k = np.indices((60, 12, 12)).astype(np.float64)
+    sides = np.maximum(np.abs(i - 29.6) - 26.2, np.maximum(np.abs(j - 5.5), np.abs(k - 5.5)) - 14)
+    return sides
+
+
+BRICKS = {**FIELDS, "fills the grid": solid_block(), "fills, turned over": -solid_block()}
+
+
+@pytest.mark.parametrize("field", BRICKS)
+@pytest.mark.parametrize("mesher, cap", [("marching", True), ("marching", False), ("sharp", True)])
+def test_bricks_of_planes_make_the_same_mesh(network, field, mesher, cap):
+    """Each knows only its planes and those beside them, in one slab or several."""
+    grid = SdfGrid.trusted(BRICKS[field], (1.0,) * 3)
+    whole = list(reconstruct_slabs(grid, network, 2, cap=cap, mesher=mesher, max_memory=10**12))
+    one = join_meshes([mesh for piece in whole for mesh in piece.meshes])
+    seen = look_at_band(grid, 0.0)
+    before = np.append(0, np.cumsum(seen.decoded))
+    assert seen.summary.voxels == whole[0].whole["band_voxels"]
+    assert seen.summary.noisy == whole[0].whole["noisy_voxels"]
+    for pieces in (1, 2, 3, 9, 60):
+        meshes, counts, vertices = [], [], 0
+        for planes in equal_parts(before, pieces):
+            brick = list(
+                pipeline.reconstruct_planes(
+                    grid,
+                    network,
+                    2,
+                    planes,
+                    whole=seen.summary,
+                    cap=cap,
+                    mesher=mesher,
+                    max_memory=10**12,
+                )
+            )
+            parts = [mesh for piece in brick for mesh in piece.meshes]
+            meshes += [Mesh(part.vertices, part.faces + vertices) for part in parts]
+            vertices += sum(len(part.vertices) for part in parts)
+            counts += [brick[0].whole | {"is_cut": any(piece.is_cut for piece in brick)}]
+        mesh = join_meshes(meshes)
+        np.testing.assert_array_equal(mesh.vertices, one.vertices)
+        np.testing.assert_array_equal(mesh.faces, one.faces)
+        for name in ("band_voxels", "noisy_voxels"):
+            assert sum(count[name] for count in counts) == whole[0].whole[name]
+        assert any(count["is_cut"] for count in counts) == whole[0].is_cut

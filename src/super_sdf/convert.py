@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -102,6 +102,28 @@ COUNTS = (
 )
 
 
+class Engine(Protocol):
+    """Who reads a grid and makes its mesh, such as the workers of a cluster."""
+
+    def read(self, source: str | Path, options: ConvertOptions) -> SdfGrid:
+        """Return the grid in a file."""
+
+    def pieces(
+        self,
+        grid: SdfGrid,
+        options: ConvertOptions,
+        expected: Expectation,
+        progress: Progress | None,
+    ) -> Iterator[Piece]:
+        """Yield the pieces of the mesh, in order."""
+
+    def report(self) -> dict[str, Any]:
+        """Return what ``Conversion.engine`` is, after the work."""
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return sentences on what may be wrong with the result, after the work."""
+
+
 @dataclass(frozen=True)
 class Conversion:
     """The result of a conversion.
@@ -129,6 +151,8 @@ class Conversion:
         What the values were taken as, and what the samples show of it.
     saved_field : dict, optional
         The path of the refined field, and shape, spacing and origin of the fine lattice.
+    engine : dict
+        Who did the work, if that was not this process.
     """
 
     shape: tuple[int, int, int]
@@ -145,6 +169,7 @@ class Conversion:
     capped: bool = False
     field: dict[str, Any] = dataclass_field(default_factory=dict)
     saved_field: dict[str, Any] | None = None
+    engine: dict[str, Any] = dataclass_field(default_factory=dict)
 
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
@@ -158,6 +183,7 @@ class Conversion:
             "closed": self.closed,
             "capped": self.capped,
             "field": self.field,
+            **self.engine,
             **({"saved_field": self.saved_field} if self.saved_field else {}),
             **({"simplified": self.simplified} if self.simplified else {}),
             "inferred": list(self.notes),
@@ -176,6 +202,7 @@ def convert(
     before_rename: Callable[[Path], None] | None = None,
     announce: Callable[[str], None] | None = None,
     save_field: str | Path | None = None,
+    engine: Engine | None = None,
 ) -> Conversion:
     """Convert a grid file to a mesh file.
 
@@ -199,6 +226,8 @@ def convert(
     save_field : path, optional
         A file for the refined field, in a format of ``write_field``. It and the mesh file are both
         complete at the end, or neither is written.
+    engine : Engine, optional
+        Who reads the grid and makes the mesh; by default this process, with ``network``.
 
     Raises
     ------
@@ -210,7 +239,7 @@ def convert(
     if options.simplifies:
         check_goal(options.simplify, options.triangles, ("simplify", "triangles"))
         check_can_simplify()
-    grid = read_grid_with(source, options)
+    grid = engine.read(source, options) if engine else read_grid_with(source, options)
     total = _check_work(options)
     lattice = cubic_grid(grid, options.offset)
     about = check_format_holds(target, lattice, total)
@@ -221,12 +250,45 @@ def convert(
     check_not_input(save_field, source)
     with open_field(save_field, grid, options, force=force) as file:
         watch.lap("read")
-        meshes = _meshes(grid, network, options, tally, watch, progress, file)
+        maker = Maker(grid, network, options, engine, file)
+        meshes = _meshes(maker, tally, watch, progress)
         complete = partial(_complete_field, file, force=force, then=before_rename)
         write_pieces(meshes, target, force=force, about=about, before_rename=complete)
     watch.lap("write")
     done = describe(grid, tally, options, watch.seconds, notes)
+    if engine:
+        warnings = (*done.warnings, *engine.warnings())
+        done = replace(done, warnings=warnings, engine=engine.report())
     return replace(done, saved_field=file.report()) if file else done
+
+
+@dataclass(frozen=True)
+class Maker:
+    """What makes the pieces of a mesh: a grid, and a network or an engine."""
+
+    grid: SdfGrid
+    network: Decoder
+    options: ConvertOptions
+    engine: Engine | None
+    file: FieldFile | None
+
+    def pieces(self, expected: Expectation, progress: Progress | None) -> Iterator[Piece]:
+        """Yield the pieces, made while they are taken."""
+        options = self.options
+        if self.engine:
+            return self.engine.pieces(self.grid, options, expected, progress)
+        return reconstruct_slabs(
+            self.grid,
+            self.network,
+            options.factor,
+            offset=options.offset,
+            cap=options.cap,
+            mesher=options.mesher,
+            iterations=options.iterations,
+            max_memory=options.max_memory,
+            progress=progress,
+            save=self.file.add if self.file else None,
+        )
 
 
 def _check_work(options: ConvertOptions) -> int:
@@ -251,32 +313,17 @@ def _check_size(
 
 
 def _meshes(
-    grid: SdfGrid,
-    network: Decoder,
-    options: ConvertOptions,
-    tally: Tally,
-    watch: Stopwatch,
-    progress: Progress | None,
-    file: FieldFile | None,
+    maker: Maker, tally: Tally, watch: Stopwatch, progress: Progress | None
 ) -> Iterator[Mesh]:
     """Return the pieces of the mesh, made while they are taken, or the simplified one."""
-    pieces = reconstruct_slabs(
-        grid,
-        network,
-        options.factor,
-        offset=options.offset,
-        cap=options.cap,
-        mesher=options.mesher,
-        iterations=options.iterations,
-        max_memory=options.max_memory,
-        progress=part_of(progress, 0, SHARE_BEFORE) if options.simplifies else progress,
-        save=file.add if file else None,
-    )
+    options = maker.options
+    shown = part_of(progress, 0, SHARE_BEFORE) if options.simplifies else progress
+    pieces = maker.pieces(tally.expected, shown)
     meshes = tally.count(pieces, watch)
     if not options.simplifies:
         return meshes
     rest = part_of(progress, SHARE_BEFORE, 1)
-    return tally.simplify(meshes, grid.voxel_size, options, watch, rest)
+    return tally.simplify(meshes, maker.grid.voxel_size, options, watch, rest)
 
 
 def _complete_field(

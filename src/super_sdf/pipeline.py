@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .arrays import FloatArray, IntArray
+from .errors import OptionError
 from .grid.cubic import cubic_grid
 from .grid.field import MASK
 from .grid.planes import SampleArray
@@ -38,7 +39,7 @@ from .options import (
     check_progress,
 )
 from .progress import STEPS, Progress, StepCounter, Stopwatch, part_of
-from .slabs.cutting import Slab, peak_bytes, plan_slabs
+from .slabs.cutting import Slab, peak_bytes, plan_slabs, planes_needed
 from .slabs.footprint import NETWORK_BYTES
 from .slabs.pieces import Piece, count_input, describe_piece
 from .steps.cap import close
@@ -55,7 +56,7 @@ from .steps.nodes import (
     share_parts,
     signs_of_skipped,
 )
-from .steps.spheres import ExactSamples, fit_to_spheres
+from .steps.spheres import BandSummary, ExactSamples, fit_to_spheres
 from .steps.spline import spline_blocks
 from .steps.survey import Band, no_surface, survey
 
@@ -276,33 +277,122 @@ def _slabs(run: Run, grid: SdfGrid, offset: float, progress: Progress | None) ->
     reach, needed = getattr(network, "receptive_field", None), memory_needs(network)
     slabs = plan_slabs(band, factor, reach, resources, needed, mesher)
     planned = peak_bytes(band, slabs, factor, needed, resources.threads, mesher)
-    beside = mesher.planes_beside(factor)
     steps.divide(len(slabs))
     steps.finish("band")
-    vertices = 0
     seen: set[bool] = set()
+    placed = replace(run, network=network), lattice, offset
+    for piece in _mesh_slabs(placed, band, slabs, planned, resources.threads, steps):
+        seen |= piece.signs
+        yield piece
+        del piece  # before the next one is made
+    if len(seen) < 2:
+        raise no_surface(grid, offset)
+
+
+def _mesh_slabs(
+    placed: tuple[Run, SdfGrid, float],
+    band: Band,
+    slabs: list[Slab],
+    planned: int,
+    threads: int,
+    steps: StepCounter,
+) -> Iterator[Piece]:
+    """Yield the piece of each slab of a band: the run, its lattice and offset are ``placed``."""
+    run, lattice, offset = placed
+    factor, mesher = run.factor, run.mesher
+    beside, vertices = mesher.planes_beside(factor), 0
     for slab in slabs:
         if len(slabs) > 1:
             give_back()
-        field = refine(band, network, factor, slab, resources.threads, steps)
+        field = refine(band, run.network, factor, slab, threads, steps)
         field = replace(field, grid=lattice, offset=offset)
         if run.save:
             run.save(field)
             steps.watch.lap("save field")
         whole = close(field, cap=run.cap, beside=beside)
-        meshes = extract_pieces(whole, lattice, vertices, resources.threads, mesher)
+        meshes = extract_pieces(whole, lattice, vertices, threads, mesher)
         planned_work = {"slabs": len(slabs), "planned_bytes": planned}
         piece = describe_piece(field, meshes, planned_work, band.leaves)
         del field, whole, meshes  # before those of the next slab are made
         steps.finish("isosurface")
         piece.seconds.update(steps.take_seconds())
         vertices += piece.counts["vertices"]
-        seen |= piece.signs
         yield piece
         del piece  # before the next one is made
         steps.watch.start()  # the time since the yield was the caller's
-    if len(seen) < 2:
-        raise no_surface(grid, offset)
+
+
+def reconstruct_planes(
+    grid: SdfGrid,
+    network: Decoder,
+    factor: int,
+    planes: tuple[int, int],
+    *,
+    whole: BandSummary,
+    offset: float = 0.0,
+    cap: bool = False,
+    mesher: str = DEFAULT_MESHER,
+    max_memory: int | None = None,
+    progress: Progress | None = None,
+) -> Iterator[Piece]:
+    """Yield the pieces of ``reconstruct_slabs`` in some planes; it is a brick of a huge grid.
+
+    Only these planes are read, and those beside them on which the mesh depends. The pieces of all
+    bricks, in order, are the same mesh, bit for bit. Vertices are counted from the first of the
+    brick: those of the brick before have numbers below 0.
+
+    Parameters
+    ----------
+    planes : two ints
+        The first plane of the brick, and that after its last.
+    whole : BandSummary
+        Of the band of the whole grid, see ``look_at_band``.
+
+    Raises
+    ------
+    OptionError
+        If the network states no receptive field, so that it has to see the whole grid.
+    OutOfMemoryError
+        If not even a plane of the brick fits in memory.
+    """
+    mesh_with = find_mesher(mesher)
+    run = Run(network, check_factor(factor), mesh_with, check_cap(cap), max_memory, None)
+    reach = receptive_field_for(network, grid)
+    network, needed = network_for(network, grid.field.kind), memory_needs(network)
+    resources = allot(getattr(network, "threads", 0), max_memory)
+    steps = StepCounter(progress)
+    lattice = cubic_grid(grid, offset)
+    more = planes_needed(reach, mesh_with, factor)
+    among = max(planes[0] - more, 0), min(planes[1] + more, grid.shape[0])
+    band = survey(lattice, offset, resources, among, whole)
+    slabs = plan_slabs(band, factor, reach, resources, needed, mesh_with, planes)
+    planned = peak_bytes(band, slabs, factor, needed, resources.threads, mesh_with)
+    steps.divide(len(slabs))
+    steps.finish("band")
+    own = band.rows(*planes)
+    counts = {"band_voxels": own.stop - own.start, "noisy_voxels": band.count_noisy(own)}
+    placed = replace(run, network=network), lattice, offset
+    for piece in _mesh_slabs(placed, band, slabs, planned, resources.threads, steps):
+        piece.whole.update(counts)
+        yield piece
+        del piece  # before the next one is made
+
+
+def receptive_field_for(network: Decoder, grid: SdfGrid) -> int:
+    """Return the receptive field of the network for a grid.
+
+    Raises
+    ------
+    OptionError
+        If it states none.
+    """
+    reach: int | None = getattr(network_for(network, grid.field.kind), "receptive_field", None)
+    if reach is None:
+        raise OptionError(
+            "the network states no receptive field, so it has to see the whole grid at once: "
+            "convert the grid on one machine"
+        )
+    return reach
 
 
 def memory_needs(network: Decoder) -> tuple[float, float]:

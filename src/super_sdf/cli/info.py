@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from .. import __version__
+from ..errors import OptionError
 from .choices import LazyChoice, devices, first
 from .common import CONTEXT, one_line_errors
 
@@ -16,6 +17,7 @@ EXAMPLES = """\b
 Examples:
   super-sdf info --check
   super-sdf info --check --device cuda
+  super-sdf info scan.zarr
 """
 
 
@@ -23,8 +25,9 @@ Examples:
     "info",
     context_settings=CONTEXT,
     epilog=EXAMPLES,
-    short_help="Show versions, devices and networks, or check them.",
+    short_help="Show versions, devices and networks, check them, or describe a grid file.",
 )
+@click.argument("source", metavar="[GRID]", required=False)
 @click.option("--check", is_flag=True, help="Test the installation; exit code 1 if a check fails.")
 @click.option(
     "--device",
@@ -34,17 +37,49 @@ Examples:
     help="With --check: cpu skips CUDA; cuda makes it a failure if CUDA does not work.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def info_command(check: bool, device: str, as_json: bool) -> None:
+def info_command(source: str | None, check: bool, device: str, as_json: bool) -> None:
     """Show versions, devices, and the shipped networks with their metadata.
+
+    With GRID, show instead what that grid file says of itself: shape, type, spacing, origin, and
+    how it is stored, such as the chunks of a Zarr array.
 
     With --check, test instead whether they work on this machine: each network is run on a ball,
     whose distances are known, on the CPU and on CUDA. What is missing is listed with the command
     that installs it.
     """
     with one_line_errors():
+        if source is not None and check:
+            raise OptionError(f"{source} and --check: give only one of them")
+        if source is not None:
+            print_grid(source, as_json)
+            return
         if check:
             sys.exit(0 if print_checks(device, as_json) else 1)
         sys.exit(0 if print_facts(as_json) else 1)
+
+
+def print_grid(source: str, as_json: bool) -> None:
+    """Print what a grid file says of itself."""
+    from ..files.description import describe_grid_file
+
+    found = describe_grid_file(source)
+    if as_json:
+        click.echo(json.dumps(found, indent=2))
+        return
+    for key, value in found.items():
+        if key != "notes":
+            click.echo(f"{key}: {_in_words(value)}")
+    for note in found.get("notes", ()):
+        click.echo(f"note: {note}")
+
+
+def _in_words(value: Any) -> str:
+    """Return a value of the description as text."""
+    if value is None:
+        return "not stated"
+    if isinstance(value, list):
+        return ", ".join(f"{x:.10g}" for x in value)
+    return f"{value:,}" if isinstance(value, int) else str(value)
 
 
 def print_checks(device: str, as_json: bool) -> bool:

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..errors import OptionError
 from ..files.formats import NAMED, list_formats
 from .common import CONTEXT, one_line_errors, print_stderr, print_stdout, progress_bar
 from .conversion import (
     check_can_check,
+    check_cluster,
     check_option,
     check_simplification,
     chosen_model,
+    cluster_option,
     conversion_options,
     make_options,
 )
@@ -25,7 +30,7 @@ from .reporting import check_report, report_option
 
 if TYPE_CHECKING:
     from ..certificate.check import Certificate
-    from ..convert import Conversion
+    from ..convert import Conversion, Engine
     from ..network.network import Network
 
 HELP = f"""Refine the signed distance grid IN and write its surface as the mesh OUT.
@@ -61,6 +66,14 @@ Examples:
     "the whole fine lattice. A .vti needs the extra vti.",
 )
 @report_option
+@cluster_option
+@click.option(
+    "--jobs",
+    type=click.IntRange(0),
+    default=0,
+    metavar="N",
+    help="Worker processes of --cluster local; 0 means one per core.",
+)
 @click.option("--force", is_flag=True, help="Replace OUT, FIELD and PAGE.html if they exist.")
 @click.option("--json", "as_json", is_flag=True, help="Print counts, times and notes as JSON.")
 @click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
@@ -110,6 +123,7 @@ class Upsampling:
         if options["report"]:
             self.check_page()
         check_simplification(options)
+        self.check_cluster()
         watch.lap("start")
         self.network = load_network(
             self.model,
@@ -118,7 +132,11 @@ class Upsampling:
             precision=options["precision"],
         )
         watch.lap("load network")
-        with raising_interrupts(), progress_bar("upsampling", options["quiet"]) as progress:
+        with (
+            raising_interrupts(),
+            self.engine() as engine,
+            progress_bar("upsampling", options["quiet"]) as progress,
+        ):
             self.result = convert(
                 self.source,
                 self.target,
@@ -128,8 +146,43 @@ class Upsampling:
                 progress=progress,
                 announce=self.announce,
                 save_field=options["save_field"],
+                engine=engine,
             )
         self.seconds = watch.seconds | self.result.seconds
+
+    def check_cluster(self) -> None:
+        """Raise an error if ``--cluster`` cannot be used, or not with the other options."""
+        options = self.options
+        if options["cluster"] is None:
+            if options["jobs"]:
+                raise OptionError(
+                    f"--jobs {options['jobs']} is for --cluster local: give that, too, or leave "
+                    "it out"
+                )
+            return
+        check_cluster(options)
+        from ..bricks.engine import check_can_brick
+
+        check_can_brick(self.source, make_options(options), options["save_field"])
+
+    @contextmanager
+    def engine(self) -> Iterator[Engine | None]:
+        """Connect to the cluster; None without one."""
+        options = self.options
+        if options["cluster"] is None:
+            yield None
+            return
+        from ..bricks.engine import BricksEngine
+        from ..bricks.meshing import Loading
+        from ..cluster.connecting import connect
+
+        loading = Loading(absolute_model(self.model), options["precision"], options["device"])
+        limits = {"threads": options["threads"], "max_memory": options["max_memory"]}
+        with (
+            connect(options["cluster"], workers=options["jobs"], **limits) as cluster,
+            closing(BricksEngine(cluster, loading, self.announce)) as engine,
+        ):
+            yield engine
 
     def check(self) -> None:
         """Check the finished mesh against its samples."""
@@ -247,6 +300,13 @@ class Upsampling:
             f"{'closed' if self.result.closed else 'open'}, from {low} to {high}, "
             f"{sum(self.seconds.values()):.1f} s"
         )
+
+
+def absolute_model(model: str) -> str:
+    """Return a network for workers: by its name, or by the absolute path of its file."""
+    from ..network.names import QUALITIES
+
+    return model if model in QUALITIES else str(Path(model).absolute())
 
 
 def describe_simplified(found: dict[str, Any]) -> str:

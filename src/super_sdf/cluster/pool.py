@@ -86,12 +86,15 @@ class ClusterPoolOptions(Generic[Task]):
         Whether a worker may get a short task before it has finished the one before.
     warn : callable
         Called with a sentence about a worker that came later and is not used.
+    choose : callable
+        Takes the queue and the address of a worker; returns the task that this worker gets.
     """
 
     clean_up: Callable[[Task, int], None] = lambda task, pid: None
     is_suspect: Callable[[Task], bool] = lambda task: False
     looks_ahead: bool = True
     warn: Callable[[str], None] = lambda text: None
+    choose: Callable[[Tasks[Task], str], Task] = lambda tasks, address: tasks.popleft()
 
 
 class ClusterPool(Generic[Task]):
@@ -166,11 +169,11 @@ class ClusterPool(Generic[Task]):
         """Give tasks to the workers; return whether there is anything to wait for."""
         ready = [hand for hand in self.hands.values() if hand.is_ready]
         for hand in ready:
-            if not hand.given and (task := self._next()) is not None:
+            if not hand.given and (task := self._next(hand)) is not None:
                 self._submit(hand, task)
         for hand in ready:
             if self.aside is None and len(self.tasks) and self._may_look_ahead(hand):
-                task = self.tasks.popleft()
+                task = self.options.choose(self.tasks, hand.member.address)
                 if self.options.is_suspect(task):
                     self.aside = task
                 else:
@@ -180,12 +183,14 @@ class ClusterPool(Generic[Task]):
         )
         return is_busy or self.aside is not None or len(self.tasks) > 0
 
-    def _next(self) -> Task | None:
-        """Return the next task, None if there is none."""
+    def _next(self, hand: Hand[Task]) -> Task | None:
+        """Return the next task for a worker, None if there is none."""
         if self.aside is not None:
             task, self.aside = self.aside, None
             return task
-        return self.tasks.popleft() if len(self.tasks) else None
+        if not len(self.tasks):
+            return None
+        return self.options.choose(self.tasks, hand.member.address)
 
     def _may_look_ahead(self, hand: Hand[Task]) -> bool:
         """Return whether a worker may get the next task beside the one that it works at."""

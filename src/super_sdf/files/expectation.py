@@ -7,17 +7,19 @@ crossed edge holds one vertex, and a closed mesh has two triangles per vertex.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from math import prod
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import BoolArray
 from ..errors import WriteError
-from ..grid.planes import SamplePlanes
-from ..grid.sdf_grid import SdfGrid
+from ..grid.planes import in_blocks, over_planes
+from ..grid.sdf_grid import SdfGrid, negated
 from ..machine.memory import in_words
 from .meshes import format_of
 from .output import free_space
@@ -31,10 +33,15 @@ CERTAIN_SHARE = 0.5
 
 @dataclass(frozen=True)
 class Expectation:
-    """The estimated number of triangles of a mesh, and the size of its file in bytes."""
+    """The estimated number of triangles of a mesh, and the size of its file in bytes.
+
+    ``by_plane``, (nx, 3) int64, has the edges along x, y and z that the surface crosses in each
+    plane of samples; those along x are those to the plane before.
+    """
 
     triangles: int
     size: int
+    by_plane: NDArray[np.int64] | None = None
 
     def warning(self, path: str | Path) -> str | None:
         """Return a sentence that announces a large file, None for others."""
@@ -53,7 +60,8 @@ def expect(
     WriteError
         If half of that is more than the free disk space.
     """
-    triangles = 2 * factor**2 * round(count_on_lattice(grid, offset, cap=cap))
+    by_plane = count_by_plane(grid, offset, cap=cap)
+    triangles = 2 * factor**2 * round(count_on_lattice(grid, by_plane))
     size = triangles * format_of(path).bytes_per_triangle
     free = free_space(Path(path))
     if CERTAIN_SHARE * size > free:
@@ -62,47 +70,66 @@ def expect(
             f"{_size(size)}, {_size(free)} are free there; use a smaller factor, or another "
             "folder"
         )
-    return Expectation(triangles, size)
+    return Expectation(triangles, size, by_plane)
 
 
-def count_on_lattice(grid: SdfGrid, offset: float, *, cap: bool = False) -> float:
+def count_on_lattice(grid: SdfGrid, by_plane: NDArray[np.int64]) -> float:
     """Estimate how many edges of the lattice that is refined the offset surface crosses.
 
     Edges along an axis are as many as the cells of a plane across it.
     """
-    counts = count_crossings(grid, offset, cap=cap)
+    counts: list[int] = by_plane.sum(0).tolist()
     if grid.is_cubic or grid.field.on_lattice:
         return sum(counts)
     h, cell = grid.voxel_size, prod(grid.spacing)
     return sum(count * cell / step / h**2 for count, step in zip(counts, grid.spacing))
 
 
-def count_crossings(grid: SdfGrid, offset: float, *, cap: bool = False) -> tuple[int, int, int]:
-    """Count the edges along x, y and z with samples on different sides of the offset surface.
+def count_by_plane(grid: SdfGrid, offset: float, *, cap: bool = False) -> NDArray[np.int64]:
+    """Count the edges with samples on different sides of the offset surface, (nx, 3).
 
-    With ``cap``, all is outside beyond the border of the grid.
+    With ``cap``, all is outside beyond the border of the grid. See ``Expectation.by_plane``.
     """
-    x = y = z = 0
+    count = partial(_crossings_of, grid.positive_inside, offset, cap)
+    ranges = [
+        (max(first - 1, 0), last, first > 0, last == len(grid.samples))
+        for first, last in in_blocks(grid.samples)
+    ]
+    return np.concatenate(list(over_planes(grid.samples, count, ranges)))
+
+
+def _crossings_of(
+    positive_inside: bool,
+    offset: float,
+    cap: bool,
+    planes: NDArray[Any],
+    has_before: bool,
+    is_end: bool,
+) -> NDArray[np.int64]:
+    """Count crossed edges plane by plane, (n, 3); ``has_before``: the first is the one before."""
+    counts = []
     before = None
-    for inside in _planes(grid, offset):
-        y += int(np.count_nonzero(inside[1:] != inside[:-1]))
-        z += int(np.count_nonzero(inside[:, 1:] != inside[:, :-1]))
-        if cap:
-            y += int(np.count_nonzero(inside[[0, -1]]))
-            z += int(np.count_nonzero(inside[:, [0, -1]]))
-        if before is not None or cap:
-            x += int(np.count_nonzero(inside if before is None else inside != before))
-        before = inside
-    return x + (int(np.count_nonzero(before)) if cap and before is not None else 0), y, z
-
-
-def _planes(grid: SdfGrid, offset: float) -> Iterator[BoolArray]:
-    """Yield a mask of the samples inside, plane by plane, since the grid may be in a file."""
-    step = grid.samples.block if isinstance(grid.samples, SamplePlanes) else 1
-    for first in range(0, grid.shape[0], step):
+    for plane in planes:
         with np.errstate(over="ignore"):  # an offset beyond float32 is beyond all values
-            inside = grid.planes(first, min(first + step, grid.shape[0])) <= offset
-        yield from inside
+            inside = (negated(plane) if positive_inside else plane) <= offset
+        if before is not None or not has_before:
+            counts.append(_crossings_of_plane(inside, before, cap))
+        before = inside
+    if is_end and cap and before is not None:
+        counts[-1][0] += int(np.count_nonzero(before))
+    return np.array(counts, np.int64)
+
+
+def _crossings_of_plane(inside: BoolArray, before: BoolArray | None, cap: bool) -> list[int]:
+    """Count the crossed edges along x, to the plane before, y and z of a plane of samples."""
+    x, y = 0, int(np.count_nonzero(inside[1:] != inside[:-1]))
+    z = int(np.count_nonzero(inside[:, 1:] != inside[:, :-1]))
+    if cap:
+        y += int(np.count_nonzero(inside[[0, -1]]))
+        z += int(np.count_nonzero(inside[:, [0, -1]]))
+    if before is not None or cap:
+        x = int(np.count_nonzero(inside if before is None else inside != before))
+    return [x, y, z]
 
 
 def _rounded(count: int) -> int:

@@ -53,13 +53,13 @@ FORMATS = (
     GridFormat("vti", "VTK image data", (".vti",), "vti", has_members=True),
     GridFormat("tiff", "TIFF stack", (".tif", ".tiff"), "tiff", axes="zyx"),
     GridFormat("hdf5", "HDF5", (".h5", ".hdf5", ".hdf"), "hdf5", axes="zyx", has_members=True),
-    GridFormat("zarr", "Zarr", (".zarr",), "zarr", axes="zyx", has_members=True),
+    GridFormat("zarr", "Zarr", (".zarr", ".zarr.zip"), "zarr", axes="zyx", has_members=True),
     GridFormat("vdb", "OpenVDB", (".vdb",), "vdb", has_members=True),
     GridFormat("sdf", "SDFGen", (".sdf",)),
 )
 GRID_SUFFIXES = tuple(suffix for format_ in FORMATS for suffix in format_.suffixes)
 AXES = ("xyz", "zyx")
-_MEMBERS = "|".join(s[1:] for f in FORMATS if f.has_members for s in f.suffixes)
+_MEMBERS = "|".join(re.escape(s[1:]) for f in FORMATS if f.has_members for s in f.suffixes)
 _WITH_MEMBER = re.compile(rf"(?P<file>.*\.(?:{_MEMBERS})):(?P<member>.+)", re.I | re.S)
 
 

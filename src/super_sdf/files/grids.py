@@ -128,7 +128,7 @@ def read_grid(
         found = _read_numpy(check_regular_file(path), order, room, given)
     else:
         found = _read_foreign(path, format_, order, room, given, max_memory)
-    return make_grid(
+    grid = make_grid(
         found["values"],
         **{key: found[key] for key in PLACE},
         inside=inside,
@@ -137,6 +137,7 @@ def read_grid(
         level=level,
         scale=scale,
     )
+    return grid.noted(found.get("notes", ()))
 
 
 def _read_numpy(path: Path, axes: str, room: int, given: dict[str, Any]) -> dict[str, Any]:
@@ -161,23 +162,35 @@ def _read_foreign(
     max_memory: int | None,
 ) -> dict[str, Any]:
     """Return values and place of a file that its own library reads."""
+    bound = memory_bound(max_memory)
+    left = None if bound is None else bound - (held_memory() or 0)
+    with open_volume(path, format_, axes, (room, left)) as volume:
+        if given["direction"] is not None:
+            volume = replace(volume, direction=axes_direction(axes))
+        found = take(volume, str(path), room, given, left)
+        return found | {"notes": volume.notes}
+
+
+@contextmanager
+def open_volume(
+    path: Path, format_: GridFormat, axes: str, memory: tuple[int, int | None]
+) -> Iterator[Volume]:
+    """Yield the volume in a file that its own library reads; its errors are of one line.
+
+    ``memory`` is how many bytes the unpacked array may take, and the process in all.
+    """
     file, member = split_member(path)
     check_grid_file(path)
     check_library(format_)
     from .readers.table import READERS
 
     watched = None if file.is_dir() else InputFile.open(file)
-    bound = memory_bound(max_memory)
-    left = None if bound is None else bound - (held_memory() or 0)
-    with _one_line_errors(path, format_, watched), ExitStack() as files:
-        volume = READERS[format_.key](Request(file, member, axes, room, left, files))
-        if given["direction"] is not None:
-            volume = replace(volume, direction=axes_direction(axes))
-        return take(volume, str(path), room, given)
+    with one_line_errors(path, format_, watched), ExitStack() as files:
+        yield READERS[format_.key](Request(file, member, axes, *memory, files))
 
 
 @contextmanager
-def _one_line_errors(path: Path, format_: GridFormat, watched: InputFile | None) -> Iterator[None]:
+def one_line_errors(path: Path, format_: GridFormat, watched: InputFile | None) -> Iterator[None]:
     """Turn whatever a library raises into a FileError of one line, and silence its warnings."""
     try:
         with warnings.catch_warnings(), _silent_logs():
@@ -223,7 +236,7 @@ def unpacking_room(max_memory: int | None) -> int:
 def _read_npy(path: Path, room: int) -> dict[str, Any]:
     """Return the array of an .npy file: a ``PlaneFile``, or unpacked if in Fortran order."""
     file = InputFile.open(path)
-    read = _reader(file)
+    read = reader_of(file)
     header = read_array_header(read, str(path))
     _check_size(header, file.size - header.length, str(path))
     check_kind(header.dtype, header.shape)
@@ -232,7 +245,7 @@ def _read_npy(path: Path, room: int) -> dict[str, Any]:
     return {"values": PlaneFile(file, header.length, header.shape, header.dtype)}
 
 
-def _reader(file: InputFile) -> Read:
+def reader_of(file: InputFile) -> Read:
     """Return a function that reads a file from its beginning on."""
     place = 0
 
@@ -250,9 +263,9 @@ def _read_npz(path: Path, room: int) -> dict[str, Any]:
     file = InputFile.open(path)
     try:
         with open_archive(file) as archive:
-            members = _find_members(archive, path)
+            members = find_members(archive, path)
             found = {
-                key: _read_small(archive, members[key], f"{path}[{key}]")
+                key: read_small(archive, members[key], f"{path}[{key}]")
                 for key in NPZ_KEYS[1:]
                 if key in members
             }
@@ -261,7 +274,7 @@ def _read_npz(path: Path, room: int) -> dict[str, Any]:
         file.check_unchanged()  # a change explains whatever else went wrong
 
 
-def _find_members(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.ZipInfo]:
+def find_members(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.ZipInfo]:
     """Return the members that belong to a grid, by key."""
     infos = archive.infolist()
     names = [info.filename.removesuffix(".npy") for info in infos]
@@ -280,7 +293,7 @@ def _find_members(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.Zip
     return {name: info for name, info in zip(names, infos) if name in NPZ_KEYS}
 
 
-def _read_small(archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str) -> NDArray[Any]:
+def read_small(archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str) -> NDArray[Any]:
     """Read an array of one number or three; of nine, for a direction."""
     most, asked = (9, "nine numbers") if name.endswith("[direction]") else (3, NUMBERS)
     member = Member(archive, info, name)
@@ -293,12 +306,17 @@ def _read_small(archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str) -> N
     return np.frombuffer(member.read(header.size), header.dtype).reshape(header.shape)
 
 
+def npz_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path) -> Member:
+    """Return the values of an .npz file, to be read from their beginning on."""
+    return Member(archive, info, f"{path}[values]")
+
+
 def _read_values(
     archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path, room: int
 ) -> SampleArray:
     """Unpack the array of samples."""
     name = f"{path}[values]"
-    member = Member(archive, info, name)
+    member = npz_member(archive, info, path)
     header = read_array_header(member.read, name)
     _check_size(header, member.left, name)
     check_kind(header.dtype, header.shape)

@@ -41,7 +41,7 @@ def is_store(path: str | Path) -> bool:
 def check_grid_file(path: str | Path) -> None:
     """Raise FileError unless the file that ``FILE`` or ``FILE:NAME`` names can be read."""
     file, _ = split_member(path)
-    if find_format(path).key == "zarr":
+    if find_format(path).key == "zarr" and not file.name.lower().endswith(".zip"):
         check_store(file)
     else:
         check_regular_file(file)

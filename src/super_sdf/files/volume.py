@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import permutations
 from math import prod
@@ -25,10 +25,14 @@ from ..grid.direction import Direction, as_direction, check_direction
 from ..grid.planes import SampleArray
 from ..grid.samples import check_kind
 from ..machine.memory import in_words
+from .boxes import Box, Layout, boxes_of, choose_layout, runs_of
 from .headers import ArrayHeader
 from .unpacking import PIECE, Write, fill
 
 STRAIGHT = 1e-4  # an axis that is off by less than this from a world axis counts as along it
+# Of a chunked array: bytes of a box, unless little memory is left; how many times the memory of a
+# box or chunk reading it takes, with its packed bytes and the copy in another order of axes.
+BOX, LEAST_SHARE, COPIES = 1 << 25, 16, 3
 XYZ = np.eye(3)
 ZYX = np.eye(3)[::-1]
 
@@ -59,6 +63,10 @@ class Request:
     room: int
     left: int | None
     files: ExitStack
+
+    def named(self, member: str | None) -> Request:
+        """Return the same request for another array of the file."""
+        return replace(self, member=member)
 
     def check_loads(self, size: int, library: str) -> None:
         """Raise OutOfMemoryError if an array that is loaded whole would not fit in memory."""
@@ -94,7 +102,15 @@ class Volume:
     direction : (3, 3) array
         The columns are the world directions (unit vectors) of the axes of the array.
     planes_at_once : int
-        Planes that are read together, such as those of a chunk.
+        Planes that are read together.
+    chunks : three ints, optional
+        Samples of a chunk along each axis, if the array is stored in chunks.
+    read_box : callable, optional
+        Returns a box of samples of such an array.
+    notes : tuple of str
+        Sentences on what the file says, for the user.
+    about : dict
+        What else the file says of how the array is stored, for ``info``.
     """
 
     shape: tuple[int, ...]
@@ -106,6 +122,23 @@ class Volume:
     planes_at_once: int = 1
     stored: SampleArray | None = None
     """The array itself, if its planes can be read again and again without unpacking it."""
+    chunks: tuple[int, ...] | None = None
+    read_box: Callable[[Box], NDArray[Any]] | None = None
+    notes: tuple[str, ...] = ()
+    about: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def unit(self) -> tuple[int, ...]:
+        """Samples along each axis that are read together at least."""
+        return self.chunks or (self.planes_at_once, *self.shape[1:])
+
+    def box(self, box: Box) -> NDArray[Any]:
+        """Return a box of samples, of the array's own type."""
+        if self.read_box:
+            samples = self.read_box(box)
+        else:
+            samples = self.read(box[0].start, box[0].stop)[:, box[1], box[2]]
+        return np.asarray(samples).astype(self.dtype, copy=False)
 
 
 @dataclass(frozen=True)
@@ -217,18 +250,31 @@ def _nearest_placement(direction: NDArray[np.float64]) -> Placement:
     return Placement(world_axes, tuple(map(bool, backwards)), as_direction(turned))
 
 
-def take(volume: Volume, name: str, room: int, given: dict[str, Any]) -> dict[str, Any]:
+def take(
+    volume: Volume, name: str, room: int, given: dict[str, Any], left: int | None = None
+) -> dict[str, Any]:
     """Return values (nx, ny, nz), spacing, origin and direction of a volume, for ``make_grid``.
 
-    ``given`` holds what replaces these of the file, or None.
+    ``given`` holds what replaces these of the file, or None. ``left`` is how many bytes of memory
+    the process may still take, None if unknown.
 
     Raises
     ------
     GridError
         If the array is no grid, or its axes are not at right angles.
+    OutOfMemoryError
+        If there is no room to unpack it, or not even for one of its chunks.
     """
     check_kind(volume.dtype, volume.shape)
     placement = find_placement(volume, name)
+    values = volume.stored
+    if values is None or placement.world_axes != (0, 1, 2) or any(placement.backwards):
+        values = unpacked(volume, placement, name, (room, left))
+    return {"values": values, **place_in_world(volume, placement, given)}
+
+
+def place_in_world(volume: Volume, placement: Placement, given: dict[str, Any]) -> dict[str, Any]:
+    """Return spacing, origin and direction of a volume whose axes are brought into a placement."""
     spacing, origin = given["spacing"], given["origin"]
     if spacing is None and volume.spacing is not None:
         spacing = tuple(volume.spacing[placement.world_axes.index(w)] for w in range(3))
@@ -236,11 +282,8 @@ def take(volume: Volume, name: str, room: int, given: dict[str, Any]) -> dict[st
         origin = volume.origin
     if origin is not None and any(placement.backwards):
         origin = _lowest_corner(volume, placement, spacing, origin)
-    values = volume.stored
-    if values is None or placement.world_axes != (0, 1, 2) or any(placement.backwards):
-        values = _copied(volume, placement, name, room)
     direction = placement.direction if given["direction"] is None else given["direction"]
-    return {"values": values, "spacing": spacing, "origin": origin, "direction": direction}
+    return {"spacing": spacing, "origin": origin, "direction": direction}
 
 
 def _lowest_corner(
@@ -256,39 +299,86 @@ def _lowest_corner(
     return corner
 
 
-def _copied(volume: Volume, placement: Placement, name: str, room: int) -> SampleArray:
+def unpacked(
+    volume: Volume,
+    placement: Placement,
+    name: str,
+    memory: tuple[int, int | None],
+    planes: tuple[int, int] | None = None,
+) -> SampleArray:
     """Return the samples as an array (nx, ny, nz), in memory or in a temporary file.
 
-    Planes of x are made contiguous; within them, the axis along which the file is read comes first.
+    Planes of x are made contiguous; within them, the axis comes first along which boxes are short.
+
+    Parameters
+    ----------
+    memory : two ints
+        Bytes that the array may take, and that the process may still take, None if unknown.
+    planes : two ints, optional
+        Only the planes of x from the first to before the second.
     """
+    room, left = memory
+    check_chunk(volume, name, left)
+    layout = layout_of(volume, placement, left)
     nx, ny, nz = (volume.shape[placement.world_axes.index(w)] for w in range(3))
-    header = ArrayHeader((nx, ny, nz), volume.dtype, placement.world_axes[0] == 2, 0)
-    return fill(partial(_copy, volume, placement), header, name, room)
+    first, last = planes or (0, nx)
+    swapped = placement.world_axes[layout.order[1]] == 2
+    header = ArrayHeader((last - first, ny, nz), volume.dtype, swapped, 0)
+    return fill(partial(_copy, volume, placement, layout, (first, last)), header, name, room)
 
 
-def _copy(volume: Volume, placement: Placement, write: Write) -> None:
-    """Copy a volume slab by slab."""
-    slowest = placement.world_axes[0]
-    stored = (0, slowest, 3 - slowest) if slowest else (0, 1, 2)
-    order = [placement.world_axes.index(axis) for axis in stored]
-    flipped = [axis for axis in range(3) if placement.backwards[axis]]
-    count = volume.shape[0]
-    for first, last in _slabs(volume):
-        block = np.asarray(volume.read(first, last)).astype(volume.dtype, copy=False)
-        block = np.ascontiguousarray(np.flip(block, tuple(flipped)).transpose(order))
-        start = count - last if placement.backwards[0] else first
-        if slowest == 0:
-            write(start * block[0].nbytes, block.reshape(-1).view(np.uint8))
-            continue
-        row = block[0, 0].nbytes
-        for i, piece in enumerate(block):
-            write((i * count + start) * row, piece.reshape(-1).view(np.uint8))
+def check_chunk(volume: Volume, name: str, left: int | None) -> None:
+    """Raise OutOfMemoryError if not even one chunk of an array can be unpacked."""
+    size = prod(volume.unit) * volume.dtype.itemsize
+    if volume.chunks and left is not None and COPIES * size > left:
+        chunk = " x ".join(map(str, volume.chunks))
+        raise OutOfMemoryError(
+            f"{name} is stored in chunks of {chunk} samples, {in_words(size)} each, and to unpack "
+            f"one takes {in_words(COPIES * size)} of memory, {in_words(max(left, 0))} are left; "
+            "allow more (--max-memory), or store it in smaller chunks"
+        )
 
 
-def _slabs(volume: Volume) -> list[tuple[int, int]]:
-    """Return the first and last plane of each slab that is read at once."""
-    plane = prod(volume.shape[1:]) * volume.dtype.itemsize
-    step = volume.planes_at_once
-    step *= max(PIECE // (plane * step), 1)
-    count = volume.shape[0]
-    return [(first, min(first + step, count)) for first in range(0, count, step)]
+def layout_of(volume: Volume, placement: Placement, left: int | None = None) -> Layout:
+    """Return how a volume is copied: planes of x, y before z or z before y, box by box."""
+    world = placement.world_axes
+    orders = [tuple(world.index(w) for w in order) for order in ((0, 1, 2), (0, 2, 1))]
+    budget = PIECE
+    if volume.chunks:
+        budget = BOX if left is None else max(min(BOX, left // LEAST_SHARE), PIECE)
+    return choose_layout(volume.shape, volume.unit, orders, budget // volume.dtype.itemsize)
+
+
+def _copy(
+    volume: Volume,
+    placement: Placement,
+    layout: Layout,
+    planes: tuple[int, int],
+    write: Write,
+) -> None:
+    """Copy some planes of x of a volume box by box."""
+    along, count = layout.order[0], planes[1] - planes[0]
+    shape = (count, *(volume.shape[axis] for axis in layout.order[1:]))
+    bounds = [(0, size) for size in volume.shape]
+    bounds[along] = planes
+    if placement.backwards[along]:
+        bounds[along] = volume.shape[along] - planes[1], volume.shape[along] - planes[0]
+    for box in boxes_of(bounds, layout.box):
+        block = np.ascontiguousarray(turned(volume.box(box), placement, layout.order))
+        start = [_start(volume, placement, box, axis) for axis in layout.order]
+        start[0] -= planes[0]
+        for offset, piece in runs_of(block, tuple(start), shape):
+            write(offset, piece)
+        del block  # before the next one is read
+
+
+def turned(block: NDArray[Any], placement: Placement, order: tuple[int, ...]) -> NDArray[Any]:
+    """Return a box of an array with its axes in an order, and none backwards."""
+    flipped = tuple(axis for axis in range(3) if placement.backwards[axis])
+    return np.flip(block, flipped).transpose(order)
+
+
+def _start(volume: Volume, placement: Placement, box: Box, axis: int) -> int:
+    """Return where the samples of a box begin along an axis that no longer runs backwards."""
+    start: int = box[axis].start
+    return volume.shape[axis] - box[axis].stop if placement.backwards[axis] else start

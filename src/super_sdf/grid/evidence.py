@@ -10,6 +10,7 @@ are apart, and is bent there.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, Triple
 from .gradients import LARGEST_VALUE
-from .planes import SampleArray
+from .planes import SampleArray, over_planes
 from .samples import Extremes
 from .spacing import steps_of
 
@@ -153,12 +154,21 @@ def look(values: SampleArray, extremes: Extremes) -> Looked:
         The smallest and the largest sample.
     """
     found, cut, count = [np.empty((0, 3, 5))], np.zeros(2, np.int64), 0
-    for i in _inner_planes(len(values)) if min(values.shape) > 2 * BESIDE else []:
-        slab = np.asarray(values[i - BESIDE : i + BESIDE + 1])
-        found.append(np.clip(_lines_beside_surface(slab), -LARGEST_VALUE, LARGEST_VALUE))
-        cut += _count_amid_equal(slab, extremes)
-        count += slab[0, BESIDE:-BESIDE, BESIDE:-BESIDE].size
+    planes = _inner_planes(len(values)) if min(values.shape) > 2 * BESIDE else []
+    ranges = [(i - BESIDE, i + BESIDE + 1) for i in planes]
+    for lines, amid, size in over_planes(values, partial(_look_at_plane, extremes), ranges):
+        found.append(lines)
+        cut += amid
+        count += size
     return Looked(np.concatenate(found), cut / max(count, 1), extremes)
+
+
+def _look_at_plane(extremes: Extremes, slab: NDArray[Any]) -> tuple[Floats, NDArray[np.int64], int]:
+    """Return lines of samples of the middle of five planes, how many are cut off, and of which."""
+    slab = np.asarray(slab)
+    lines = np.clip(_lines_beside_surface(slab), -LARGEST_VALUE, LARGEST_VALUE)
+    inner = slab[0, BESIDE:-BESIDE, BESIDE:-BESIDE]
+    return lines, _count_amid_equal(slab, extremes), inner.size
 
 
 def _inner_planes(count: int) -> list[int]:

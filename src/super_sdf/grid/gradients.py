@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray
 from ..errors import GridError
-from .planes import SampleArray
+from .planes import SampleArray, over_planes
 
 # Values are clamped to this, so that squares of their differences do not overflow.
 LARGEST_VALUE = 1e150
@@ -50,10 +50,16 @@ def surface_gradients(values: SampleArray) -> Gradients:
         Sum of the absolute second differences over the length of the gradient: 0 for a linear
         field.
     """
-    gradients, bend = _joined(_plane_gradients(values, i) for i in _spread_planes(values))
+    gradients, bend = _gradients_in_planes(values, _spread_planes(values))
     if (bend < STRAIGHT).sum() < ENOUGH and len(values) > PLANES_AT_FIRST:
-        return _joined(_plane_gradients(values, i) for i in range(len(values)))
+        return _gradients_in_planes(values, list(range(len(values))))
     return gradients, bend
+
+
+def _gradients_in_planes(values: SampleArray, planes: list[int]) -> Gradients:
+    """Return gradients and bends at samples next to the surface in some planes."""
+    ranges = [(max(i - 1, 0), min(i + 2, len(values)), min(i, 1)) for i in planes]
+    return _joined(over_planes(values, _plane_gradients, ranges))
 
 
 def straight_gradients(values: SampleArray) -> Gradients:
@@ -72,7 +78,8 @@ def straight_gradients(values: SampleArray) -> Gradients:
         return np.empty((0, 3)), np.empty(0)
     planes = [i for i in _spread_planes(values) if 0 < i < nx - 1] or [1]
     step = -(-len(planes) * ny * nz // MOST_SAMPLES)
-    return _joined(_row_gradients(values, i, step) for i in planes)
+    ranges = [(i - 1, i + 2, step) for i in planes]
+    return _joined(over_planes(values, _row_gradients, ranges))
 
 
 def _spread_planes(values: SampleArray) -> list[int]:
@@ -87,9 +94,8 @@ def _joined(found: Iterable[Gradients]) -> Gradients:
     return gradients, bend
 
 
-def _row_gradients(values: SampleArray, i: int, step: int) -> Gradients:
-    """Return gradients (n, 3) and bends (n,) of every ``step``-th inner row of an inner plane."""
-    slab = np.asarray(values[i - 1 : i + 2])
+def _row_gradients(slab: NDArray[Any], step: int) -> Gradients:
+    """Return gradients (n, 3) and bends (n,) of every ``step``-th inner row of the middle plane."""
     slab = np.clip(slab.astype(np.float64), -LARGEST_VALUE, LARGEST_VALUE)
     centre = slab[1, 1:-1, 1:-1][::step]
     above = slab[2, 1:-1, 1:-1], slab[1, 2:, 1:-1], slab[1, 1:-1, 2:]
@@ -109,11 +115,13 @@ def _relative_bend(change: NDArray[np.float64], length: NDArray[np.float64]) -> 
     return relative
 
 
-def _plane_gradients(values: SampleArray, i: int) -> Gradients:
-    """Return gradients (n, 3) and bends (n,) at samples next to the surface in plane i."""
-    first = max(i - 1, 0)
-    slab = np.asarray(values[first : i + 2])
-    at = [np.full(1, i - first), *np.nonzero(_beside_surface(slab <= 0, i - first))]
+def _plane_gradients(slab: NDArray[Any], middle: int) -> Gradients:
+    """Return gradients (n, 3) and bends (n,) at samples next to the surface in a plane of a slab.
+
+    The slab has the planes beside it, too.
+    """
+    slab = np.asarray(slab)
+    at = [np.full(1, middle), *np.nonzero(_beside_surface(slab <= 0, middle))]
     centre = _read(slab, at)
     gradient, change = np.empty((len(centre), 3)), np.zeros(len(centre))
     for axis in range(3):

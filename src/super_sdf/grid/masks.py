@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, Triple
-from .planes import DerivedPlanes, SampleArray
+from .planes import DerivedPlanes, SampleArray, in_blocks, over_planes
 from .samples import Extremes
 from .spacing import is_cubic
 
@@ -75,12 +75,19 @@ def extremes_of_masks(h: float) -> Extremes:
 
 def has_both_sides(inside: SampleArray) -> bool:
     """Return whether some samples are inside, and some outside."""
-    seen = [False, False]
-    for plane in inside:
-        seen = [seen[0] or not plane.all(), seen[1] or bool(plane.any())]
-        if all(seen):
-            return True
+    seen, ranges = [False, False], in_blocks(inside)
+    middle = len(ranges) // 2  # which mostly shows both
+    for part in (ranges[middle : middle + 1], ranges[:middle] + ranges[middle + 1 :]):
+        for outer, inner in over_planes(inside, _sides_of, part):
+            seen = [seen[0] or outer, seen[1] or inner]
+            if all(seen):
+                return True
     return False
+
+
+def _sides_of(planes: BoolArray) -> tuple[bool, bool]:
+    """Return whether some samples are outside, and some inside."""
+    return not planes.all(), bool(planes.any())
 
 
 def is_distance_transform(lines: NDArray[np.float64], spacing: Triple | None = None) -> float:

@@ -9,25 +9,29 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
-from functools import cached_property
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property, partial
 from io import FileIO
 from math import prod
 from pathlib import Path
 from threading import Lock
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ..arrays import FloatArray
-from ..errors import FileError
+from ..errors import FileError, GridError
 from ..machine.memory import check_fits
 
 FAR = 1e6  # spacings
 BLOCK_BYTES = 1 << 20  # read at a time when iterating over all planes
 LEAST_AT_ONCE = 4  # planes
 WORKING_BYTES = 1 << 26  # taken at a time when planes are made of others
+
+Result = TypeVar("Result")
+Ranges: TypeAlias = Sequence[tuple[Any, ...]]
+"""Ranges of planes: the first, that after the last, and what else a function gets."""
 
 
 class InputFile:
@@ -128,6 +132,7 @@ class SamplePlanes(ABC):
     """
 
     ndim = 3
+    travels = False  # whether another process can read the samples for itself
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     name: str
@@ -161,6 +166,16 @@ class SamplePlanes(ABC):
     def __iter__(self) -> Iterator[NDArray[Any]]:
         for first in range(0, len(self), self.block):
             yield from self.read(first, min(first + self.block, len(self)))
+
+    def over(
+        self, samples: SamplePlanes, work: Callable[..., Result], ranges: Ranges
+    ) -> Iterator[Result]:
+        """Yield what a function makes of ranges of ``samples``, which are made of these.
+
+        Samples of which workers read the planes have their own way.
+        """
+        for first, last, *more in ranges:
+            yield work(samples[first:last], *more)
 
     def working_bytes(self, planes: int) -> int:
         """Return about how much memory making that many planes takes."""
@@ -234,9 +249,53 @@ SampleArray: TypeAlias = NDArray[Any] | SamplePlanes
 """An array of samples in memory, or one whose planes are read or made when they are needed."""
 
 
+def over_planes(
+    samples: SampleArray, work: Callable[..., Result], ranges: Ranges
+) -> Iterator[Result]:
+    """Yield what a function makes of some ranges of planes, in order.
+
+    Parameters
+    ----------
+    samples : (nx, ny, nz) array or SamplePlanes
+        The planes are read here, unless they say who does that: see ``SamplePlanes.over``.
+    work : callable
+        Takes the planes of a range, and what the range has besides its ends.
+    ranges : sequence of tuples
+        The first plane of each range, that after its last, and arguments.
+    """
+    if isinstance(samples, SamplePlanes):
+        yield from samples.over(samples, work, ranges)
+        return
+    for first, last, *more in ranges:
+        yield work(samples[first:last], *more)
+
+
+def in_blocks(samples: SampleArray) -> list[tuple[int, int]]:
+    """Return ranges of all planes, those together that are read together."""
+    step = samples.block if isinstance(samples, SamplePlanes) else 1
+    return [(i, min(i + step, len(samples))) for i in range(0, len(samples), step)]
+
+
 def in_spacings(values: NDArray[Any], unit: float) -> FloatArray:
     """Return values over a unit as float32; from ``FAR`` on their size does not matter."""
     return np.clip(values.astype(np.float64) / unit, -FAR, FAR).astype(np.float32)
+
+
+class NoPlanes(SamplePlanes):
+    """Shape and type of an array whose samples are not at hand."""
+
+    name = "the grid"
+
+    def __init__(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+        self.shape, self.dtype = tuple(shape), dtype
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Raise GridError: there are none."""
+        raise GridError("the samples of the grid are not at hand")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what is known."""
+        return NoPlanes, (self.shape, self.dtype)
 
 
 class DerivedPlanes(SamplePlanes):
@@ -278,6 +337,26 @@ class DerivedPlanes(SamplePlanes):
     def block(self) -> int:
         """Planes that are made at a time: more, if each needs some beside it."""
         return max(super().block, 2 * self.beside)
+
+    def over(
+        self, samples: SamplePlanes, work: Callable[..., Result], ranges: Ranges
+    ) -> Iterator[Result]:
+        """Yield what a function makes of ranges of ``samples``, as the source of these does it."""
+        if isinstance(self.source, SamplePlanes):
+            return self.source.over(samples, work, ranges)
+        return super().over(samples, work, ranges)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle how they are made, if their source can be read elsewhere, else the array."""
+        if not getattr(self.source, "travels", False):
+            return super().__reduce__()
+        make = partial(DerivedPlanes, unit=self.unit, each=self.each)
+        return make, (self.source, self.make, self.beside, self.dtype)
+
+    @property
+    def travels(self) -> bool:  # type: ignore[override]
+        """Whether another process can read the source for itself."""
+        return bool(getattr(self.source, "travels", False))
 
     def read(self, first: int, last: int) -> NDArray[Any]:
         """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from math import isfinite
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import GridError, seen
-from .planes import SampleArray, SamplePlanes
+from .planes import SampleArray, SamplePlanes, in_blocks, over_planes
 
 MASK_HINT = "a mask holds no distances; make a grid of it with make_grid or read_grid"
 
@@ -81,8 +82,19 @@ def find_extremes(values: SampleArray) -> Extremes | None:
     It is read plane by plane, since the grid may be in a file. The extremes also reveal bad
     samples: the minimum of numbers and a NaN is NaN.
     """
+    extremes: list[Extremes] = []
+    for found in over_planes(values, _extremes_of, in_blocks(values)):
+        if found is None:
+            return None
+        extremes.append(found)
+    lows, highs = zip(*extremes)
+    return min(lows), max(highs)
+
+
+def _extremes_of(planes: NDArray[Any]) -> Extremes | None:
+    """Return the smallest and the largest of some samples, None if one is not finite."""
     extremes = []
-    for plane in values:
+    for plane in planes:
         low, high = float(plane.min()), float(plane.max())
         if not (isfinite(low) and isfinite(high)):
             return None
@@ -118,5 +130,14 @@ def check_not_constant(extremes: Extremes) -> None:
 
 def has_two_values(values: SampleArray, extremes: Extremes) -> bool:
     """Return whether there are only two different values; False for grids of 2 samples an axis."""
+    are_two = partial(_are_extreme, extremes)
+    first, rest = in_blocks(values)[:1], in_blocks(values)[1:]  # the first mostly shows it
+    return min(values.shape) > 2 and all(
+        all(over_planes(values, are_two, ranges)) for ranges in (first, rest)
+    )
+
+
+def _are_extreme(extremes: Extremes, planes: NDArray[Any]) -> bool:
+    """Return whether all samples of some planes are the smallest or the largest of the grid."""
     low, high = extremes
-    return min(values.shape) > 2 and all(((p == low) | (p == high)).all() for p in values)
+    return all(bool(((plane == low) | (plane == high)).all()) for plane in planes)

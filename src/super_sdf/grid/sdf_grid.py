@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -14,7 +15,7 @@ from .direction import STRAIGHT, Direction, check_direction, in_rows, is_mirrore
 from .field import AUTO, Field, Wanted
 from .interpret import interpret
 from .named_axes import placed
-from .planes import SampleArray, SamplePlanes
+from .planes import NoPlanes, SampleArray, SamplePlanes
 from .samples import Extremes, as_samples, check_not_flat, check_values
 from .sides import check_negative_inside
 from .spacing import as_triple, check_spacing, choose_spacing, is_cubic
@@ -138,6 +139,14 @@ class SdfGrid:
         set_("low", -high if positive_inside else low)
         set_("high", -low if positive_inside else high)
         set_("field", field or Field())
+
+    def noted(self, notes: tuple[str, ...]) -> SdfGrid:
+        """Return the same grid with more sentences on it, before those on what was inferred."""
+        if not notes:
+            return self
+        grid = copy(self)
+        object.__setattr__(grid, "notes", (*notes, *self.notes))
+        return grid
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.shape))
@@ -293,6 +302,18 @@ def _checked(values: ArrayLike | SamplePlanes) -> tuple[SampleArray, Extremes]:
     extremes = check_values(samples)
     check_not_flat(samples, extremes)
     return samples, extremes
+
+
+def with_samples(grid: SdfGrid, samples: SampleArray) -> SdfGrid:
+    """Return a grid with other samples in the same place, taken as the same."""
+    other = copy(grid)
+    object.__setattr__(other, "samples", samples)
+    return other
+
+
+def without_samples(grid: SdfGrid) -> SdfGrid:
+    """Return a grid that knows all but its samples: their shape and type, place and field."""
+    return with_samples(grid, NoPlanes(grid.shape, grid.samples.dtype))
 
 
 def negated(values: NDArray[Any]) -> NDArray[Any]:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+from numpy.typing import NDArray
+
 from ..errors import GridError, OptionError, seen
 from .one_sided import is_one_sided
-from .planes import SampleArray
+from .planes import SampleArray, in_blocks, over_planes
 from .samples import Extremes
 
 INSIDE = ("auto", "negative", "positive")
@@ -75,8 +79,17 @@ def count_border(values: SampleArray) -> tuple[int, int]:
 
     A sample on an edge counts for each of its faces.
     """
-    below = sum(int((values[end] < 0).sum()) for end in (0, -1))
-    for plane in values:
-        below += sum(int((edge < 0).sum()) for edge in (plane[0], plane[-1], *plane.T[[0, -1]]))
     nx, ny, nz = values.shape
+    below = sum(over_planes(values, _count_below, [(0, 1), (nx - 1, nx)]))
+    below += sum(over_planes(values, _count_below_on_edges, in_blocks(values)))
     return below, 2 * (nx * ny + ny * nz + nz * nx)
+
+
+def _count_below(planes: NDArray[Any]) -> int:
+    """Return the number of negative samples."""
+    return int((planes < 0).sum())
+
+
+def _count_below_on_edges(planes: NDArray[Any]) -> int:
+    """Return the number of negative samples on the four edges of each plane."""
+    return _count_below(planes[:, [0, -1]]) + _count_below(planes[:, :, [0, -1]])

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import OutOfMemoryError
 from ..machine import index_width
@@ -54,6 +55,11 @@ def whole(band: Band) -> Slab:
     return Slab((0, band.shape[0]), band.all_rows, band.all_rows)
 
 
+def planes_needed(receptive_field: int, mesher: Mesher, factor: int) -> int:
+    """Return how many planes to either side of a slab its mesh depends on."""
+    return mesher.planes_beside(factor) + REACH_IN_VOXELS + receptive_field
+
+
 def plan_slabs(
     band: Band,
     factor: int,
@@ -61,6 +67,7 @@ def plan_slabs(
     resources: Resources,
     network_bytes: tuple[float, float] = NETWORK_BYTES,
     mesher: Mesher = DEFAULT,
+    planes: tuple[int, int] | None = None,
 ) -> list[Slab]:
     """Return the fewest slabs that fit in memory, in order.
 
@@ -79,6 +86,8 @@ def plan_slabs(
         Memory of the network in bytes, per voxel and per value: see ``footprint.slab_bytes``.
     mesher : Mesher
         What makes triangles of the slabs.
+    planes : two ints, optional
+        Cut only these planes, from the first to before the second.
 
     Raises
     ------
@@ -91,7 +100,7 @@ def plan_slabs(
     how = "at once" if receptive_field is None else "even plane by plane"
     bound, need = resources.memory, 0
     beside = mesher.planes_beside(factor)
-    for nth, slabs in enumerate(_ways(band, receptive_field, beside)):
+    for nth, slabs in enumerate(_ways(band, receptive_field, beside, planes)):
         if nth == 1:
             give_back()  # otherwise freed memory counts as held
         need = peak_bytes(band, slabs, factor, network_bytes, resources.threads, mesher)
@@ -100,22 +109,29 @@ def plan_slabs(
     raise _does_not_fit(band, factor, how, need, bound or 0)
 
 
-def _ways(band: Band, receptive_field: int | None, beside: int) -> Iterator[list[Slab]]:
+def _ways(
+    band: Band, receptive_field: int | None, beside: int, planes: tuple[int, int] | None = None
+) -> Iterator[list[Slab]]:
     """Yield the whole band, and then, if the receptive field is known, more and more slabs."""
-    yield [whole(band)]
+    if planes is None:
+        yield [whole(band)]
     if receptive_field is not None:
-        yield from ways_to_cut(band, receptive_field, beside)
+        yield from ways_to_cut(band, receptive_field, beside, planes)
 
 
 def check_vertices(band: Band, factor: int) -> None:
-    """Raise OptionError if the mesh will certainly have more vertices than 32-bit numbers.
+    """Raise OptionError if the mesh will certainly have more vertices than 32-bit numbers."""
+    if int(band.decoded_before[-1]) * 3 * factor**3 > index_width.MAX_INDEX:
+        check_crossings(band.count_crossings(), factor)
+
+
+def check_crossings(crossings: int, factor: int) -> None:
+    """Raise OptionError if so many crossed coarse edges certainly make too many vertices.
 
     The surface crosses about K^2 times as many edges of the fine lattice as of the coarse one. Half
     of this estimate is certain; the exact number is checked when the vertices have been counted.
     """
-    if int(band.decoded_before[-1]) * 3 * factor**3 > index_width.MAX_INDEX:
-        least = band.count_crossings() * factor**2 // 2
-        index_width.check_count(least, "vertices or more")
+    index_width.check_count(crossings * factor**2 // 2, "vertices or more")
 
 
 def peak_bytes(
@@ -137,24 +153,50 @@ def peak_bytes(
     return max(held + max(needs), band.peak)
 
 
-def cut(band: Band, pieces: int, receptive_field: int, beside: int) -> list[Slab]:
+def cut(
+    band: Band,
+    pieces: int,
+    receptive_field: int,
+    beside: int,
+    planes: tuple[int, int] | None = None,
+) -> list[Slab]:
     """Cut a band into at most ``pieces`` slabs with about the same number of decoded voxels.
 
-    ``beside`` is the number of planes beside each with final values, from ``planes_beside``.
+    ``beside`` is the number of planes beside each with final values, from ``planes_beside``. With
+    ``planes``, only these are cut.
     """
-    share = band.decoded_before / max(int(band.decoded_before[-1]), 1)
+    first, last = planes or (0, band.shape[0])
+    before = band.decoded_before[first : last + 1] - band.decoded_before[first]
+    return [
+        _slab(band, first + low, first + high, receptive_field, beside)
+        for low, high in equal_parts(before, pieces)
+    ]
+
+
+def equal_parts(before: NDArray[np.int64], pieces: int) -> list[tuple[int, int]]:
+    """Cut planes into at most some pieces with about the same number of decoded voxels.
+
+    Parameters
+    ----------
+    before : (n + 1,) int64
+        Decoded voxels before each plane, and all.
+    """
+    share = before / max(int(before[-1]), 1)
     inner = np.searchsorted(share, np.arange(1, pieces) / pieces)
-    bounds = np.unique(np.clip([0, *inner, band.shape[0]], 0, band.shape[0])).tolist()
-    return [_slab(band, first, last, receptive_field, beside) for first, last in pairwise(bounds)]
+    last = len(before) - 1
+    return list(pairwise(np.unique(np.clip([0, *inner, last], 0, last)).tolist()))
 
 
-def ways_to_cut(band: Band, receptive_field: int, beside: int) -> Iterator[list[Slab]]:
+def ways_to_cut(
+    band: Band, receptive_field: int, beside: int, planes: tuple[int, int] | None = None
+) -> Iterator[list[Slab]]:
     """Yield cuts into more and more slabs, down to slabs of one plane."""
-    for pieces in range(1, band.shape[0]):
-        yield cut(band, pieces, receptive_field, beside)
-    planes = np.flatnonzero(np.diff(band.decoded_before)).tolist()  # each slab decodes something
-    bounds = [0, *planes[1:], band.shape[0]]
-    yield [_slab(band, first, last, receptive_field, beside) for first, last in pairwise(bounds)]
+    first, last = planes or (0, band.shape[0])
+    for pieces in range(1, max(last - first, 2)):
+        yield cut(band, pieces, receptive_field, beside, planes)
+    decoding = np.flatnonzero(np.diff(band.decoded_before[first : last + 1])) + first
+    bounds = [first, *decoding.tolist()[1:], last]  # each slab decodes something
+    yield [_slab(band, low, high, receptive_field, beside) for low, high in pairwise(bounds)]
 
 
 def _slab(band: Band, first: int, last: int, receptive_field: int, beside: int) -> Slab:

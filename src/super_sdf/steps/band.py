@@ -7,8 +7,10 @@ one spacing h is 2, and the band is ``abs(value) < 3``.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..grid.sdf_grid import SdfGrid
@@ -55,8 +57,13 @@ def rescale(
     (last - first, ny, nz) float32
     """
     planes = grid.planes(first, grid.shape[0] if last is None else last)
+    return rescale_planes(planes, grid.voxel_size, offset)
+
+
+def rescale_planes(planes: NDArray[Any], voxel_size: float, offset: float = 0.0) -> FloatArray:
+    """Return samples, negative inside, in half voxels of a size: see ``rescale``."""
     rescaled = np.empty(planes.shape, np.float32)
-    scale = 2.0 / grid.voxel_size
+    scale = 2.0 / voxel_size
     limit = float(np.finfo(np.float32).max) / 4 / scale
     for plane, out in zip(planes, rescaled):  # plane by plane: in cache, and no second copy
         shifted = plane.astype(np.float64)

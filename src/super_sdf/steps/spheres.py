@@ -141,13 +141,51 @@ def find_correction(feet: FootPoints, parts: SharedParts) -> FloatArray:
     return prolong(coarse.take(numbers[CORNER_PARTS]), 1, 2) + fine.take(numbers)
 
 
+@dataclass(frozen=True)
+class BandSummary:
+    """What the band of a whole grid says of its samples, whichever part of it is worked on.
+
+    Attributes
+    ----------
+    voxels, noisy : int
+        Voxels whose samples tell whether the field is noisy, and those round which samples differ
+        by more than distances can.
+    low, high : float
+        The lowest and the highest sample, in half voxels.
+    leaves : bool
+        Whether a sample on the border of the grid is inside.
+    """
+
+    voxels: int
+    noisy: int
+    low: float
+    high: float
+    leaves: bool = False
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether no sample can be taken as exact."""
+        return not self.voxels or self.noisy / self.voxels > MAX_NOISY_SHARE
+
+
+def summarise(sample: FloatArray, lipschitz: BoolArray, leaves: bool = False) -> BandSummary:
+    """Return the summary of samples (V,), some of which tell by ``lipschitz`` how noisy they are.
+
+    No sample is at infinity.
+    """
+    noisy = len(lipschitz) - int(np.count_nonzero(lipschitz))
+    low, high = float(sample.min(initial=np.inf)), float(sample.max(initial=-np.inf))
+    return BandSummary(len(lipschitz), noisy, low, high, leaves)
+
+
 def exact_samples(
     patches: FloatArray,
     lipschitz: BoolArray,
     threads: int = 1,
     sampled: BoolArray | None = None,
+    whole: BandSummary | None = None,
 ) -> BoolArray:
-    """Return which samples of a whole band can be taken as exact distances.
+    """Return which samples of a band can be taken as exact distances.
 
     Parameters
     ----------
@@ -160,16 +198,18 @@ def exact_samples(
         Threads to use.
     sampled : (V,) bool, optional
         Which are samples, not interpolated: these tell whether the field is noisy. All by default.
+    whole : BandSummary, optional
+        Of the band of the whole grid, if these are the voxels of a part of it.
 
     Returns
     -------
     (V,) bool
     """
-    telling = lipschitz if sampled is None else lipschitz[sampled]
-    if not len(telling) or (~telling).mean() > MAX_NOISY_SHARE:
-        return np.zeros(len(patches), bool)
     sample = patches[:, CENTRE]
-    limits = np.float32(sample.min()), np.float32(sample.max())
+    whole = whole or summarise(sample, lipschitz if sampled is None else lipschitz[sampled])
+    if not len(patches) or whole.is_noisy:
+        return np.zeros(len(patches), bool)
+    limits = np.float32(whole.low), np.float32(whole.high)
     near = np.abs(sample) < MAX_DISTANCE
     cut_off = map_chunks(lambda rows: is_cut_off(patches[rows], limits), len(patches), 27, threads)
     exact: BoolArray = lipschitz & near & ~np.concatenate(cut_off)

@@ -7,7 +7,8 @@ the grid.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +17,15 @@ from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import NoSurfaceError, OutOfMemoryError
 from ..grid.cubic import on_samples, sampled_places
 from ..grid.field import EXACT, MASK
-from ..grid.planes import DerivedPlanes, SampleArray, planes_at_once, reading_bytes
+from ..grid.planes import (
+    DerivedPlanes,
+    SampleArray,
+    over_planes,
+    planes_at_once,
+    reading_bytes,
+)
 from ..grid.resampling import Resampled
-from ..grid.sdf_grid import SdfGrid
+from ..grid.sdf_grid import SdfGrid, negated, without_samples
 from ..grid.unknown import KnownPlanes
 from ..machine.memory import held_memory, in_words
 from ..machine.resources import ONE_THREAD, Resources
@@ -33,10 +40,10 @@ from .band import (
     is_lipschitz,
     neighbour_table,
     plane_blocks,
-    rescale,
+    rescale_planes,
 )
 from .offsets import Jumps, check_not_cut_off, check_not_filled, find_jumps
-from .spheres import exact_samples
+from .spheres import BandSummary, exact_samples, summarise
 
 BYTES_PER_VOXEL = 123  # of a band
 BYTES_PER_SAMPLE = 20  # of the planes among which the band is found, measured
@@ -95,8 +102,12 @@ class Band:
     @property
     def noisy_voxels(self) -> int:
         """The number of voxels whose own samples differ from others by more than distances can."""
+        return self.count_noisy(self.all_rows)
+
+    def count_noisy(self, rows: slice) -> int:
+        """Return the number of noisy voxels among some rows."""
         noisy = ~self.lipschitz if self.sampled is None else ~self.lipschitz & self.sampled
-        return int(np.count_nonzero(noisy))
+        return int(np.count_nonzero(noisy[rows]))
 
     @property
     def all_rows(self) -> slice:
@@ -162,7 +173,13 @@ def _crop_planes(
     return voxel_ijk - np.array([first, 0, 0], np.int32), (last - first + 1, *shape[1:])
 
 
-def survey(grid: SdfGrid, offset: float = 0.0, resources: Resources = ONE_THREAD) -> Band:
+def survey(
+    grid: SdfGrid,
+    offset: float = 0.0,
+    resources: Resources = ONE_THREAD,
+    among: tuple[int, int] | None = None,
+    whole: BandSummary | None = None,
+) -> Band:
     """Read a grid once and return its band.
 
     Parameters
@@ -173,6 +190,10 @@ def survey(grid: SdfGrid, offset: float = 0.0, resources: Resources = ONE_THREAD
         Distance of the surface in world units, positive outwards.
     resources : Resources
         The threads and memory that the run may use.
+    among : two ints, optional
+        Look only among planes from the first to before the second, and do not check the offset.
+    whole : BandSummary, optional
+        What ``look_at_band`` says of the whole grid; needed with ``among``.
 
     Raises
     ------
@@ -187,26 +208,28 @@ def survey(grid: SdfGrid, offset: float = 0.0, resources: Resources = ONE_THREAD
     held = held_memory() or 0
 
     def read(planes: slice) -> tuple[IntArray, FloatArray]:
-        found = _band_of_planes(grid, offset, planes.start, planes.stop, jumps, leaving)
+        found = _band_of_planes(
+            grid, offset, planes.start, planes.stop, jumps if among is None else None, leaving
+        )
         sizes.append(len(found[0]))
         _check_bound(sum(sizes), planes.stop, held, resources.memory)
         return found
 
     planes, reading = plan_reading(grid.samples, held, resources)
-    blocks = [slice(*block) for block in plane_blocks(grid.shape, least=planes)]
+    first, last = among or (0, grid.shape[0])
+    blocks = [slice(*block) for block in plane_blocks(grid.shape, first, last, planes)]
     parts = map_threads(read, blocks, resources.threads)
     voxel_ijk = np.concatenate([ijk for ijk, _ in parts])
     patches = [part for _, part in parts]
     del parts
-    if offset:
-        if not any(up.near for up, _ in jumps):
-            raise no_surface(grid, offset)
-        check_not_filled(jumps, offset, grid.voxel_size)
-    band = make_band(grid.shape, voxel_ijk, _concatenate(patches), resources.threads)
+    if offset and among is None:
+        _check_jumps(jumps, grid, offset)
+    band = make_band(grid.shape, voxel_ijk, _concatenate(patches), resources.threads, whole)
     if isinstance(grid.samples, Resampled):
         band = look_at_samples(band, grid, resources.threads)
     peak = held + reading + len(voxel_ijk) * BYTES_PER_VOXEL if reading else 0
-    return replace(limit_to_field(band, grid, offset), leaves=any(leaving), peak=peak)
+    leaves = any(leaving) if whole is None else whole.leaves
+    return replace(limit_to_field(band, grid, offset), leaves=leaves, peak=peak)
 
 
 def plan_reading(samples: SampleArray, held: int, resources: Resources) -> tuple[int, int]:
@@ -275,11 +298,15 @@ def make_band(
     voxel_ijk: IntArray,
     patches: FloatArray,
     threads: int = 1,
+    whole: BandSummary | None = None,
 ) -> Band:
-    """Return the band of voxels (V, 3) with patches (V, 27), in half voxels."""
+    """Return the band of voxels (V, 3) with patches (V, 27), in half voxels.
+
+    ``whole`` is of the band of the whole grid, if this is a part of it.
+    """
     lipschitz = is_lipschitz(patches)
     decoded = can_hold_surface(patches, lipschitz)
-    exact = exact_samples(patches, lipschitz, threads)
+    exact = exact_samples(patches, lipschitz, threads, whole=whole)
     return Band(shape, voxel_ijk, patches, lipschitz, decoded, exact)
 
 
@@ -300,25 +327,118 @@ def _band_of_planes(
     offset: float,
     first: int,
     last: int,
-    jumps: list[tuple[Jumps, Jumps]],
+    jumps: list[tuple[Jumps, Jumps]] | None,
     leaving: list[bool],
 ) -> tuple[IntArray, FloatArray]:
     """Return the band's voxels in planes ``first`` to before ``last``, and their patches.
 
     One more plane is read on either side. Whether a sample on the grid's border is inside is
     appended to ``leaving``. With an offset, the distances are checked for truncation, and their
-    jumps are appended to ``jumps``.
+    jumps are appended to ``jumps``, if it is a list.
     """
     low, high = max(first - 1, 0), min(last + 1, grid.shape[0])
-    rescaled = rescale(grid, offset, low, high)
+    samples = grid.samples[low:high]
+    return _band_of_samples(grid, offset, samples, first, last, jumps, leaving)
+
+
+def _band_of_samples(
+    grid: SdfGrid,
+    offset: float,
+    samples: NDArray[Any],
+    first: int,
+    last: int,
+    jumps: list[tuple[Jumps, Jumps]] | None,
+    leaving: list[bool],
+) -> tuple[IntArray, FloatArray]:
+    """Return the same for samples of these planes and of those beside them."""
+    low, high = max(first - 1, 0), min(last + 1, grid.shape[0])
+    planes = negated(samples) if grid.positive_inside else samples
+    rescaled = rescale_planes(planes, grid.voxel_size, offset)
     leaving.append(_has_inside_on_border(rescaled, low == 0, high == grid.shape[0]))
     ijk = find_band(rescaled)
     own = ijk[(ijk[:, 0] >= first - low) & (ijk[:, 0] < last - low)]
     patches = gather_patches(rescaled, own)
-    if offset:  # at 0 there is no better offset to suggest
+    if offset and jumps is not None:  # at 0 there is no better offset to suggest
         check_not_cut_off(patches, offset, grid.voxel_size)
         jumps.append(find_jumps(rescaled))
     return own + np.array([low, 0, 0], np.int32), patches
+
+
+def _check_jumps(found: list[tuple[Jumps, Jumps]], grid: SdfGrid, offset: float) -> None:
+    """Raise GridError if no sample is near an offset, or fill values begin near it."""
+    if not any(up.near for up, _ in found):
+        raise no_surface(grid, offset)
+    check_not_filled(found, offset, grid.voxel_size)
+
+
+class Glance(NamedTuple):
+    """What is seen of the band in some planes, without keeping it.
+
+    Attributes
+    ----------
+    summary : BandSummary
+        Of the voxels in these planes.
+    decoded : list of int
+        The voxels that are decoded in each plane.
+    crossings : int
+        See ``Band.count_crossings``.
+    jumps : list of (Jumps, Jumps)
+        With an offset.
+    """
+
+    summary: BandSummary
+    decoded: list[int]
+    crossings: int
+    jumps: list[tuple[Jumps, Jumps]]
+
+
+def look_at_band(grid: SdfGrid, offset: float) -> Glance:
+    """Return what the band of a grid says without keeping it, as if ``survey`` had read it.
+
+    The planes are read where the samples are, see ``planes.over_planes``.
+
+    Raises
+    ------
+    GridError
+        As in ``survey``.
+    """
+    count, samples = grid.shape[0], grid.samples
+    least = planes_at_once(samples) if isinstance(samples, DerivedPlanes) else 0
+    ranges = [
+        (max(first - 1, 0), min(last + 1, count), (first, last))
+        for first, last in plane_blocks(grid.shape, least=max(least, BLOCK_PLANES))
+    ]
+    look = partial(_glance, without_samples(grid), offset)
+    found = list(over_planes(samples, look, ranges))
+    jumps = [jump for glance in found for jump in glance.jumps]
+    if offset:
+        _check_jumps(jumps, grid, offset)
+    summaries = [glance.summary for glance in found]
+    summary = BandSummary(
+        sum(part.voxels for part in summaries),
+        sum(part.noisy for part in summaries),
+        min(part.low for part in summaries),
+        max(part.high for part in summaries),
+        any(part.leaves for part in summaries),
+    )
+    decoded = [number for glance in found for number in glance.decoded]
+    return Glance(summary, decoded, sum(glance.crossings for glance in found), jumps)
+
+
+def _glance(grid: SdfGrid, offset: float, planes: NDArray[Any], own: tuple[int, int]) -> Glance:
+    """Return what is seen in the planes ``own``, given with those beside them."""
+    jumps: list[tuple[Jumps, Jumps]] = []
+    leaving: list[bool] = []
+    first, last = own
+    ijk, patches = _band_of_samples(grid, offset, planes, first, last, jumps, leaving)
+    lipschitz = is_lipschitz(patches)
+    band = Band(
+        grid.shape, ijk, patches, lipschitz, can_hold_surface(patches, lipschitz), lipschitz
+    )
+    decoded = limit_to_field(band, grid, offset).decoded
+    by_plane = np.bincount(ijk[decoded, 0] - first, minlength=last - first).tolist()
+    summary = summarise(patches[:, CENTRE], lipschitz, leaving[0])
+    return Glance(summary, by_plane, band.count_crossings(), jumps)
 
 
 def _has_inside_on_border(rescaled: FloatArray, first: bool, last: bool) -> bool:

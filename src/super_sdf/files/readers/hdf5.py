@@ -29,6 +29,6 @@ def read_hdf5(request: Request) -> Volume:
     def read(first: int, last: int) -> NDArray[Any]:
         return np.asarray(values[first:last])
 
-    at_once = values.chunks[0] if values.chunks else 1
     place = place_of(dict(values.attrs), request.axes)
-    return Volume(values.shape, values.dtype, read, *place, at_once)
+    chunked = {"chunks": values.chunks, "read_box": values.__getitem__} if values.chunks else {}
+    return Volume(values.shape, values.dtype, read, *place, **chunked)

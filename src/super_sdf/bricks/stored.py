@@ -1,0 +1,226 @@
+"""Planes of a grid in a store that several processes open for themselves.
+
+A chunked array is unpacked layer by layer: planes of x that share chunks. A layer that was read
+stays unpacked, in memory or in a temporary file, since each pass over the grid needs it again.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FileError, OptionError, OutOfMemoryError
+from ..files.formats import choose_axes, find_format
+from ..files.grids import one_line_errors, open_volume, reader_of
+from ..files.headers import read_array_header
+from ..files.regular import check_regular_file
+from ..files.unpacking import PIECE
+from ..files.volume import Volume, axes_direction, find_placement, place_in_world, unpacked
+from ..grid.planes import InputFile, PlaneFile, SampleArray, SamplePlanes
+from ..machine.memory import held_memory
+
+ROOM_SHARE = 0.25  # of the memory that a process may hold, for layers that stay unpacked
+ROOM = 1 << 28  # bytes, if there is no bound
+WAY_OUT = "convert it on one machine (without --cluster)"
+
+
+class Source(NamedTuple):
+    """A grid file as all processes open it.
+
+    Attributes
+    ----------
+    path : str
+        Absolute, perhaps with the name of an array in it.
+    axes : str or None
+        See ``read_grid``.
+    has_direction : bool
+        Whether the user gives a direction, which replaces that in the file.
+    run : str
+        Differs from run to run: the file may have changed since the one before.
+    """
+
+    path: str
+    axes: str | None
+    has_direction: bool = False
+    run: str = ""
+
+    @property
+    def is_npy(self) -> bool:
+        """Whether it is an .npy file, which is read without unpacking."""
+        return find_format(self.path).key == "npy"
+
+
+def check_source(source: Source) -> None:
+    """Raise OptionError if workers cannot read the planes of such a file for themselves."""
+    key = find_format(source.path).key
+    if key not in ("npy", "zarr"):
+        raise OptionError(
+            f"{source.path} cannot be read by several workers at once: --cluster takes .zarr and "
+            f".npy; {WAY_OUT}, or save it as .zarr"
+        )
+    if source.is_npy and source.axes == "zyx":
+        raise OptionError(
+            f"axes is 'zyx', but workers read planes of x of {source.path}: {WAY_OUT}, or save it "
+            "as .zarr"
+        )
+
+
+class StoredPlanes(SamplePlanes):
+    """The samples of a store, whose planes along x any process reads for itself.
+
+    Pickled, it is the path: another process opens the store when it reads the first plane.
+
+    Parameters
+    ----------
+    source : Source
+        The file.
+    shape, dtype
+        Shape (nx, ny, nz) and type of the array.
+    """
+
+    travels = True
+
+    def __init__(self, source: Source, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+        self.source, self.name = source, source.path
+        self.shape, self.dtype = shape, dtype
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
+        store = opened(self.source)
+        if store.shape != self.shape or store.dtype != self.dtype:
+            raise FileError(f"{self.name} changed while it was read: read it when it is complete")
+        return store.read(first, last)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle where the samples are."""
+        return StoredPlanes, (self.source, self.shape, self.dtype)
+
+
+class Facts(NamedTuple):
+    """What a store says of its grid: shape, type, and place in the world.
+
+    Attributes
+    ----------
+    layer : int
+        Planes that share chunks.
+    place : dict
+        Spacing, origin and direction, as ``make_grid`` takes them.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    layer: int
+    place: dict[str, Any]
+    notes: tuple[str, ...]
+
+
+class Store:
+    """An open store in this process, with the layers that it has unpacked."""
+
+    def __init__(self, source: Source) -> None:
+        self.source = source
+        self.files = ExitStack()
+        self.layers: OrderedDict[int, SampleArray] = OrderedDict()
+        self.bound: int | None = None
+        if source.is_npy:
+            self._open_npy()
+        else:
+            self._open_volume()
+
+    def _open_npy(self) -> None:
+        """Open an .npy file in C order."""
+        path = check_regular_file(Path(self.source.path))
+        file = InputFile.open(path)
+        header = read_array_header(reader_of(file), str(path))
+        if header.fortran_order:
+            raise FileError(f"{path} is in Fortran order: save it in C order, or {WAY_OUT}")
+        self.shape, self.dtype = header.shape, header.dtype
+        self.planes = PlaneFile(file, header.length, header.shape, header.dtype)
+        self.layer = 1
+
+    def _open_volume(self) -> None:
+        """Open a store that a library reads."""
+        path = Path(self.source.path)
+        self.format = find_format(path)
+        axes = choose_axes(self.format, self.source.axes)
+        volume = self.files.enter_context(open_volume(path, self.format, axes, (0, None)))
+        if self.source.has_direction:
+            volume = replace(volume, direction=axes_direction(axes))
+        self.volume: Volume = volume
+        self.placement = find_placement(self.volume, str(path))
+        nx, ny, nz = (self.volume.shape[self._axis(w)] for w in range(3))
+        self.shape, self.dtype = (nx, ny, nz), self.volume.dtype
+        unit = min(self.volume.unit[self._axis(0)], nx)
+        least = PIECE // (ny * nz * self.dtype.itemsize * unit)
+        self.layer = unit * max(least, 1)
+
+    def _axis(self, world: int) -> int:
+        """Return the axis of the array along a world axis."""
+        return self.placement.world_axes.index(world)
+
+    def facts(self, given: dict[str, Any]) -> Facts:
+        """Return what the store says; ``given`` holds what replaces its place, or None."""
+        if self.source.is_npy:
+            return Facts(self.shape, self.dtype, self.layer, given, ())
+        place = place_in_world(self.volume, self.placement, given)
+        return Facts(self.shape, self.dtype, self.layer, place, self.volume.notes)
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Return planes ``first`` to before ``last``."""
+        if self.source.is_npy:
+            return self.planes.read(first, last)
+        parts = []
+        for start in range(first - first % self.layer, last, self.layer):
+            low, high = max(first - start, 0), min(last - start, self.layer)
+            parts.append(np.asarray(self._layer(start)[low:high]))
+        if not parts:
+            return np.empty((0, *self.shape[1:]), self.dtype)
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def _layer(self, start: int) -> SampleArray:
+        """Return the layer that begins at a plane, unpacked once if there is room for it."""
+        if start not in self.layers:
+            planes = start, min(start + self.layer, self.shape[0])
+            try:
+                self.layers[start] = self._unpacked(planes)
+            except OutOfMemoryError:
+                if not self.layers:
+                    raise
+                self.layers.clear()  # make room on the disk
+                self.layers[start] = self._unpacked(planes)
+        return self.layers[start]
+
+    def _unpacked(self, planes: tuple[int, int]) -> SampleArray:
+        """Return some planes unpacked, in memory or in a temporary file."""
+        held = sum(layer.nbytes for layer in self.layers.values() if isinstance(layer, np.ndarray))
+        room = ROOM if self.bound is None else int(ROOM_SHARE * self.bound)
+        left = None if self.bound is None else max(self.bound - (held_memory() or 0), 0)
+        with one_line_errors(Path(self.source.path), self.format, None):
+            return unpacked(
+                self.volume, self.placement, self.source.path, (room - held, left), planes
+            )
+
+
+_stores: dict[Source, Store] = {}
+
+
+def opened(source: Source) -> Store:
+    """Return a store of this process, opened once; the one before is closed."""
+    if source not in _stores:
+        close_stores()
+        _stores[source] = Store(source)
+    return _stores[source]
+
+
+def close_stores() -> None:
+    """Close what is open in this process, and free its layers."""
+    while _stores:
+        _, store = _stores.popitem()
+        store.layers.clear()
+        store.files.close()

@@ -1,0 +1,320 @@
+"""Zarr stores of both formats, however they are chunked; OME-NGFF metadata; ``info`` of a file."""
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import zarr
+from conftest import ball
+
+from super_sdf import read_grid
+from super_sdf.errors import FileError, GridError, OutOfMemoryError
+from super_sdf.files import boxes, grids, unpacking, volume
+
+SHAPE = (30, 26, 22)  # x, y, z
+LAYOUTS = {
+    "cubes": {"chunks": (8, 8, 8)},
+    "first axis whole": {"chunks": (22, 26, 1)},
+    "middle axis whole": {"chunks": (1, 26, 1)},
+    "last axis whole": {"chunks": (1, 26, 30)},
+    "planes": {"chunks": (22, 1, 30)},
+    "one": {"chunks": (22, 26, 30)},
+    "odd": {"chunks": (5, 7, 11)},
+}
+SHARDED = {"sharded": {"chunks": (4, 4, 4), "shards": (16, 8, 8)}}
+STORES = [(2, name) for name in LAYOUTS] + [(3, name) for name in LAYOUTS | SHARDED]
+MODEL = ("--quality", "fast", "--spacing", "1", "-q")
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def values():
+    return ball(shape=SHAPE, radius=7.3).values
+
+
+def store(path, array, version=3, name=None, **layout):
+    """Write an array as a Zarr array, or below a group."""
+    about = {"shape": array.shape, "dtype": array.dtype, **layout}
+    about.setdefault("chunks", (8,) * array.ndim)
+    made = zarr.create_array(path, name=name, zarr_format=version, **about)
+    made[:] = array
+    return made
+
+
+@pytest.mark.parametrize("version, layout", STORES)
+def test_the_mesh_is_that_of_the_npy_for_every_chunking(command, values, version, layout):
+    np.save("a.npy", values)
+    store("a.zarr", values.T, version, **(LAYOUTS | SHARDED)[layout])
+    for source in ("a.npy", "a.zarr"):
+        assert command("upsample", source, f"{source}.ply", *MODEL) == (0, "", "")
+    assert Path("a.zarr.ply").read_bytes() == Path("a.npy.ply").read_bytes()
+
+
+@pytest.mark.parametrize("axes", ["xyz", "zyx"])
+@pytest.mark.parametrize("room", [0, 10**9])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_each_chunk_is_read_once(monkeypatch, values, axes, room, layout):
+    """In boxes of a few chunks, to memory or to a file, the axes in either order."""
+    read = []
+    original = volume.Volume.box
+    monkeypatch.setattr(
+        volume.Volume, "box", lambda own, box: read.append(box) or original(own, box)
+    )
+    monkeypatch.setattr(grids, "_room", lambda bound: room)
+    monkeypatch.setattr(volume, "BOX", 4096)
+    monkeypatch.setattr(volume, "PIECE", 4096)
+    array = values if axes == "xyz" else values.T
+    chunks = [min(*pair) for pair in zip(LAYOUTS[layout]["chunks"], array.shape)]
+    store("a.zarr", array, chunks=tuple(chunks))
+    np.testing.assert_array_equal(read_grid("a.zarr", axes=axes, spacing=1).values, values)
+    touched = np.zeros(array.shape, int)
+    for box in read:
+        touched[box] += 1
+        for part, chunk, count in zip(box, chunks, array.shape):
+            assert part.start % chunk == 0
+            assert part.stop % chunk == 0 or part.stop == count
+    assert (touched == 1).all()
+
+
+def test_boxes_are_long_where_the_copy_is_contiguous():
+    orders = ((2, 1, 0), (2, 0, 1))  # of an array (z, y, x): x y z and x z y
+    planes = boxes.choose_layout((64, 64, 64), (1, 64, 64), orders, 64 * 64 * 4)
+    assert planes == boxes.Layout((2, 0, 1), (4, 64, 64), 4 * 64)
+    rows = boxes.choose_layout((64, 64, 64), (64, 1, 64), orders, 64 * 64 * 4)
+    assert rows == boxes.Layout((2, 1, 0), (64, 4, 64), 4 * 64)
+    cubes = boxes.choose_layout((64, 64, 64), (16, 16, 16), orders, 64 * 64 * 16)
+    assert cubes.box == (64, 64, 16) and cubes.run == 64**3 // 4
+
+
+def test_a_chunk_that_does_not_fit_is_refused_before_it_is_read(monkeypatch, values):
+    store("a.zarr", values.T, chunks=(22, 26, 30))
+    monkeypatch.setattr(grids, "held_memory", lambda: 0)
+    size = 22 * 26 * 30 * 4
+    with pytest.raises(OutOfMemoryError) as caught:
+        read_grid("a.zarr", spacing=1, max_memory=3 * size - 1)
+    assert str(caught.value) == (
+        "a.zarr is stored in chunks of 22 x 26 x 30 samples, 0 MB each, and to unpack one takes "
+        "0 MB of memory, 0 MB are left; allow more (--max-memory), or store it in smaller chunks"
+    )
+    assert read_grid("a.zarr", spacing=1, max_memory=3 * size).shape == SHAPE
+
+
+def test_a_store_in_a_zip_file(values, command):
+    with zarr.storage.ZipStore("a.zarr.zip", mode="w") as zipped:
+        store(zipped, values.T, name="deep/field")
+    np.testing.assert_array_equal(read_grid("a.zarr.zip", spacing=1).values, values)
+    np.testing.assert_array_equal(read_grid("a.zarr.zip:/deep/field", spacing=1).values, values)
+    Path("b.zarr.zip").write_bytes(Path("a.zarr.zip").read_bytes()[:-40])
+    assert command("upsample", "b.zarr.zip", "o.ply")[2] == (
+        "Error: b.zarr.zip cannot be read as Zarr: File is not a zip file\n"
+    )
+
+
+@pytest.mark.filterwarnings("ignore:Consolidated metadata")
+@pytest.mark.parametrize("version", [2, 3])
+def test_consolidated_groups(values, version):
+    zarr.open_group("g.zarr", mode="w", zarr_format=version)
+    store("g.zarr", values.T, version, name="a/b")
+    zarr.consolidate_metadata("g.zarr")
+    np.testing.assert_array_equal(read_grid("g.zarr", spacing=1).values, values)
+    assert read_grid("g.zarr:/a/b", spacing=1).shape == SHAPE
+
+
+def image(path, levels, axes="zyx", version="0.5", unit="micrometer", whole=()):
+    """Write an OME-Zarr image; ``levels`` are (array, transformations)."""
+    group = zarr.open_group(path, mode="a", zarr_format=2 if version == "0.4" else 3)
+    datasets = []
+    for number, (array, steps) in enumerate(levels):
+        made = group.create_array(
+            str(number), shape=array.shape, dtype=array.dtype, chunks=(8,) * array.ndim
+        )
+        made[:] = array
+        datasets.append({"path": str(number), "coordinateTransformations": steps})
+    kinds = {"t": "time", "c": "channel"}
+    named = [{"name": a, "type": kinds.get(a, "space")} for a in axes]
+    for axis in named:
+        if axis["type"] == "space" and unit:
+            axis["unit"] = unit
+    about = {"axes": named, "datasets": datasets, "coordinateTransformations": list(whole)}
+    scales = {"multiscales": [about]}
+    group.attrs.update(scales if version == "0.4" else {"ome": {"version": version, **scales}})
+
+
+def scale(*numbers):
+    return {"type": "scale", "scale": list(numbers)}
+
+
+def translation(*numbers):
+    return {"type": "translation", "translation": list(numbers)}
+
+
+@pytest.mark.parametrize("version", ["0.4", "0.5"])
+def test_levels_of_an_image_and_their_transformations(values, version):
+    """That of the whole image is applied last: 2 * (0.5 i + t) + 1."""
+    half = values[::2, ::2, ::2]
+    levels = [
+        (values.T, [scale(0.5, 0.5, 0.5), translation(3, 2, 1)]),
+        (half.T, [scale(1, 1, 1), translation(3, 2, 1)]),
+    ]
+    image("i.zarr", levels, version=version, whole=[scale(2, 2, 2), translation(1, 1, 1)])
+    fine, coarse = read_grid("i.zarr"), read_grid("i.zarr:/1")
+    assert fine.spacing == (1, 1, 1) and fine.origin == (3, 5, 7)
+    assert fine.notes[0] == "lengths are in the unit of its axes, micrometer"
+    np.testing.assert_array_equal(fine.values, values)
+    assert coarse.spacing == (2, 2, 2) and coarse.origin == (3, 5, 7)
+    np.testing.assert_array_equal(coarse.values, half)
+    assert read_grid("i.zarr:/0").origin == fine.origin
+
+
+def test_axes_of_time_and_channel_have_length_one(values):
+    five = values.T[None, None]
+    image("i.zarr", [(five, [scale(9, 9, 1, 1, 1), translation(9, 9, 3, 2, 1)])], axes="tczyx")
+    grid = read_grid("i.zarr")
+    assert grid.shape == SHAPE and grid.spacing == (1, 1, 1) and grid.origin == (1, 2, 3)
+    np.testing.assert_array_equal(grid.values, values)
+    two = np.stack([values.T, values.T])
+    image("j.zarr", [(two, [scale(1, 1, 1, 1)])], axes="czyx")
+    with pytest.raises(GridError) as caught:
+        read_grid("j.zarr")
+    assert str(caught.value) == (
+        "j.zarr: its axis c has 2 entries, and a grid has three axes in space: store one of them "
+        "as an array of its own"
+    )
+
+
+def test_an_array_without_metadata_may_begin_with_axes_of_length_one(values):
+    store("a.zarr", values.T[None])
+    np.testing.assert_array_equal(read_grid("a.zarr", spacing=1).values, values)
+    store("b.zarr", np.stack([values.T] * 3), chunks=(1, 8, 8, 8))
+    with pytest.raises(GridError, match=r"b.zarr: its axis 0 has 3 entries, and a grid has three "):
+        read_grid("b.zarr", spacing=1)
+
+
+def test_axes_in_another_order(values):
+    steps = [scale(1, 1, 1), translation(1, 2, 3)]
+    image("i.zarr", [(values, steps)], axes="xyz")
+    grid = read_grid("i.zarr")
+    assert grid.origin == (1, 2, 3)
+    np.testing.assert_array_equal(grid.values, values)
+    image("j.zarr", [(np.swapaxes(values, 0, 1), steps)], axes="yxz")
+    grid = read_grid("j.zarr")
+    assert grid.origin == (2, 1, 3)
+    np.testing.assert_array_equal(grid.values, values)
+
+
+def test_axes_with_different_units_state_no_spacing(values):
+    image("i.zarr", [(values.T, [scale(1000, 1, 1)])], unit=None)
+    group = zarr.open_group("i.zarr", mode="a")
+    about = dict(group.attrs)["ome"]
+    for axis, unit in zip(
+        about["multiscales"][0]["axes"], ("nanometer", "micrometer", "micrometer")
+    ):
+        axis["unit"] = unit
+    group.attrs["ome"] = about
+    assert read_grid("i.zarr", spacing=1).notes[0] == (
+        "its axes have different units (x micrometer, y micrometer, z nanometer): spacing and "
+        "origin are not taken from its metadata (give --spacing)"
+    )
+
+
+def test_transformations_of_another_type_are_refused(values):
+    image("i.zarr", [(values.T, [{"type": "affine", "affine": [1, 2]}])])
+    with pytest.raises(GridError) as caught:
+        read_grid("i.zarr")
+    assert str(caught.value) == (
+        "i.zarr: one of its coordinateTransformations has the type 'affine' and 2 numbers: give "
+        "scale or translation, with one number for each of its 3 axes"
+    )
+
+
+def test_an_image_among_several(values):
+    """As bioformats2raw writes them: a group of images, each a group."""
+    for name in ("0", "1"):
+        zarr.open_group("b.zarr", mode="a")
+        image(f"b.zarr/{name}", [(values.T, [scale(1, 1, 1), translation(5, 5, 5)])])
+    with pytest.raises(
+        FileError, match=r"b.zarr holds several arrays, /0/0, /1/0: give b.zarr:/0/0"
+    ):
+        read_grid("b.zarr")
+    assert read_grid("b.zarr:/1").origin == read_grid("b.zarr:/1/0").origin == (5, 5, 5)
+
+
+def test_batch_finds_stores_in_folders_and_by_patterns(run_batch, values):
+    Path("in/deep").mkdir(parents=True)
+    store("in/a.zarr", values.T)
+    store("in/deep/b.zarr", values.T, 2)
+    with zarr.storage.ZipStore("in/c.zarr.zip", mode="w") as zipped:
+        store(zipped, values.T)
+    assert run_batch("in", "--spacing", 1)[0] == 0
+    assert run_batch("in/**/*.zarr", "--spacing", 1, out="by-pattern")[0] == 0
+    made = sorted(path.relative_to("out").as_posix() for path in Path("out").rglob("*.ply"))
+    assert made == ["a.ply", "c.ply", "deep/b.ply"]
+    assert len({Path("out", name).read_bytes() for name in made}) == 1
+    made = sorted(
+        path.relative_to("by-pattern").as_posix() for path in Path("by-pattern").rglob("*.ply")
+    )
+    assert made == ["a.ply", "deep/b.ply"]
+
+
+def test_info_of_a_file_prints_its_chunks(command, values):
+    store("a.zarr", values.T, chunks=(4, 4, 4), shards=(16, 8, 8))
+    said = command("info", "a.zarr")[1]
+    assert said.splitlines() == [
+        "file: a.zarr",
+        "format: Zarr",
+        "shape: 30, 26, 22",
+        "dtype: float32",
+        "bytes: 68,640",
+        "axes in the file: zyx",
+        "spacing: not stated",
+        "origin: not stated",
+        "chunks: 4, 4, 4",
+        "zarr format: 3",
+        "shards: 16, 8, 8",
+    ]
+    image("i.zarr", [(values.T, [scale(1, 1, 1), translation(3, 2, 1)])], version="0.4")
+    found = json.loads(command("info", "i.zarr", "--json")[1])
+    assert found["spacing"] == [1, 1, 1] and found["origin"] == [1, 2, 3]
+    assert found["chunks"] == [8, 8, 8] and found["zarr format"] == 2
+    assert found["notes"] == ["lengths are in the unit of its axes, micrometer"]
+
+
+def test_info_of_numpy_files(command, values):
+    np.save("a.npy", values)
+    np.savez("b.npz", values=values, spacing=0.5, origin=[1, 2, 3])
+    assert "shape: 30, 26, 22\n" in command("info", "a.npy")[1]
+    found = json.loads(command("info", "b.npz", "--json")[1])
+    assert found["spacing"] == [0.5] and found["origin"] == [1, 2, 3] and found["order"] == "C"
+    assert command("info", "no.zarr")[::2] == (1, "Error: no.zarr does not exist\n")
+    want = "Error: a.npy and --check: give only one of them\n"
+    assert command("info", "a.npy", "--check")[2] == want
+
+
+def test_arrays_of_fewer_axes_are_no_grids(values):
+    store("a.zarr", values[0])
+    with pytest.raises(GridError) as caught:
+        read_grid("a.zarr", spacing=1)
+    assert str(caught.value) == "a.zarr: values have shape (26, 22): give three axes (x, y, z)"
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_chunks_of_hdf5(values, layout):
+    with h5py.File("a.h5", "w") as file:
+        chunks = LAYOUTS[layout]["chunks"]
+        file.create_dataset("d", data=values.T, chunks=chunks, compression="gzip")
+    np.testing.assert_array_equal(read_grid("a.h5", spacing=1).values, values)
+
+
+def test_a_large_store_is_copied_to_a_file(monkeypatch, values):
+    made = []
+    original = unpacking._scratch_file
+    monkeypatch.setattr(unpacking, "_scratch_file", lambda *a: made.append(a) or original(*a))
+    monkeypatch.setattr(grids, "_room", lambda bound: values.nbytes - 1)
+    store("a.zarr", values.T)
+    assert read_grid("a.zarr", spacing=1).shape == SHAPE and len(made) == 1
