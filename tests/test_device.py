@@ -153,9 +153,9 @@ def test_cuda_that_works_is_used(cuda_session, requested):
     assert cuda_session.bindings[1].outputs == {"values": ("cuda", 0)}
 
 
-def test_best_runs_eight_times_on_cuda(cuda_session):
+def test_best_runs_four_times_on_cuda(cuda_session):
     load_network("best", device="cuda")(*one_voxel().values())
-    assert len(cuda_session.bindings) == 1 + 8  # the trial first
+    assert len(cuda_session.bindings) == 1 + 4  # the trial first
 
 
 def test_onnxruntime_without_cuda_is_an_error_that_names_the_package():

@@ -1,6 +1,7 @@
 """The symmetries of the cube, and networks averaged over them."""
 
 import numpy as np
+import pytest
 from conftest import ball
 
 from super_sdf import load_network
@@ -10,7 +11,7 @@ from super_sdf.steps.band import find_band, gather_patches, neighbour_table, res
 from super_sdf.steps.nodes import block_offsets
 
 
-def test_the_symmetries_are_a_group_of_48_with_the_reflections_first():
+def test_the_symmetries_are_a_group_of_48_with_half_turns_first_then_reflections():
     group = cube_symmetries()
     assert len({symmetry.tobytes() for symmetry in group}) == 48
     np.testing.assert_array_equal(group[0], np.eye(3))
@@ -18,6 +19,7 @@ def test_the_symmetries_are_a_group_of_48_with_the_reflections_first():
         np.testing.assert_array_equal(symmetry @ symmetry.T, np.eye(3))
         assert {(symmetry @ other).tobytes() for other in group} == {g.tobytes() for g in group}
     assert (np.abs(group[:8]) == np.eye(3)).all()
+    assert np.linalg.det(group[:4]).tolist() == [1, 1, 1, 1]
 
 
 def test_a_turned_plane_is_a_plane():
@@ -31,23 +33,32 @@ def test_a_turned_plane_is_a_plane():
         np.testing.assert_allclose(offsets @ symmetry, block_offsets(2), atol=1e-6)
 
 
-def test_best_maps_a_mirrored_field_to_the_mirrored_surface():
+def dense_values(network, field):
+    """Return a network's values at the nodes of every voxel of the band, NaN elsewhere."""
+    voxels = find_band(field)
+    rows = np.arange(len(voxels), dtype=np.int32)
+    table = neighbour_table(voxels, field.shape)
+    values = network(gather_patches(field, voxels), table, rows, block_offsets(4))
+    dense = np.full((*field.shape, 5, 5, 5), np.nan, np.float32)
+    dense[tuple(voxels.T)] = values.reshape(-1, 5, 5, 5)
+    return dense
+
+
+@pytest.mark.parametrize(
+    ("symmetries", "flipped"),
+    [(4, (0, 1)), (4, (0, 2)), (4, (1, 2)), (8, (0,)), (8, (0, 1, 2))],
+    ids=["half turn about z", "about y", "about x", "mirrored", "inverted"],
+)
+def test_a_mean_maps_a_turned_field_to_the_turned_surface(symmetries, flipped):
     """The plain network does so only approximately; otherwise the mean would have no effect."""
-    grid = ball()
-    mirrored = rescale(grid)[::-1].copy()
-    answers = {}
-    for quality in ("base", "best"):
-        network = load_network(quality)
-        for name, field in (("as it is", rescale(grid)), ("mirrored", mirrored)):
-            voxels = find_band(field)
-            rows = np.arange(len(voxels), dtype=np.int32)
-            table = neighbour_table(voxels, field.shape)
-            values = network(gather_patches(field, voxels), table, rows, block_offsets(4))
-            dense = np.full((*field.shape, 5, 5, 5), np.nan, np.float32)
-            dense[tuple(voxels.T)] = values.reshape(-1, 5, 5, 5)
-            answers[quality, name] = dense[::-1, :, :, ::-1] if name == "mirrored" else dense
-    apart = {
-        quality: np.nanmax(np.abs(answers[quality, "as it is"] - answers[quality, "mirrored"]))
-        for quality in ("base", "best")
-    }
-    assert apart["best"] < 1e-5 < 1e-3 < apart["base"]
+    field, nodes = rescale(ball()), tuple(axis + 3 for axis in flipped)
+    apart = {}
+    for network in (load_network("fast"), load_network("fast").averaged(symmetries)):
+        turned = dense_values(network, np.ascontiguousarray(np.flip(field, flipped)))
+        off = np.abs(np.flip(turned, flipped + nodes) - dense_values(network, field))
+        apart[network.symmetries] = np.nanmax(off)
+    assert apart[symmetries] < 1e-5 < 1e-3 < apart[1]
+
+
+def test_best_is_averaged_over_half_turns():
+    assert load_network("best").symmetries == 4

@@ -8,6 +8,7 @@ mapped back, has a smaller error, at a cost proportional to the number of symmet
 from __future__ import annotations
 
 from itertools import permutations, product
+from math import prod
 
 import numpy as np
 
@@ -18,9 +19,11 @@ from ..neighbourhood import NEIGHBOURHOOD
 def cube_symmetries() -> IntArray:
     """Return the 48 rotations and reflections of the cube as matrices, (48, 3, 3) int32.
 
-    The first is the identity; the first eight keep every axis on itself.
+    The first is the identity, the next three are half turns about the axes: no axis is favoured,
+    and their mean turns with the field. The first eight keep every axis on itself.
     """
-    signs = [np.diag(sign) for sign in product((1, -1), repeat=3)]
+    by_handedness = sorted(product((1, -1), repeat=3), key=lambda sign: -prod(sign))
+    signs = [np.diag(sign) for sign in by_handedness]
     orders = [np.eye(3, dtype=np.int32)[list(order)] for order in permutations(range(3))]
     return np.array([sign @ order for order in orders for sign in signs], np.int32)
 
