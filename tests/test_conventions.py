@@ -1,4 +1,4 @@
-"""What an array says of itself: spacing, sign, and what it is not."""
+"""What an array shows: spacing, sign, and what it is not."""
 
 import numpy as np
 import pytest

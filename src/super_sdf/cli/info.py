@@ -40,7 +40,7 @@ Examples:
 def info_command(source: str | None, check: bool, device: str, as_json: bool) -> None:
     """Show versions, devices, and the shipped networks with their metadata.
 
-    With GRID, show instead what that grid file says of itself: shape, type, spacing, origin, and
+    With GRID, show instead what that grid file states: shape, type, spacing, origin, and
     how it is stored, such as the chunks of a Zarr array.
 
     With --check, test instead whether they work on this machine: each network is run on a ball,
@@ -59,7 +59,7 @@ def info_command(source: str | None, check: bool, device: str, as_json: bool) ->
 
 
 def print_grid(source: str, as_json: bool) -> None:
-    """Print what a grid file says of itself."""
+    """Print what a grid file states."""
     from ..files.description import describe_grid_file
 
     found = describe_grid_file(source)

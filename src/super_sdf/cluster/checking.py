@@ -66,7 +66,7 @@ class Needs:
 
 
 class Report(NamedTuple):
-    """What a worker says of itself.
+    """What a worker has and may use, as it reports it.
 
     Attributes
     ----------
@@ -252,7 +252,7 @@ def members_of(
 
 
 def report_to(question: Question, dask_worker: Any) -> Report:
-    """Return what a worker says of itself; called in it, on its main thread."""
+    """Return the report of a worker; called in it, on its main thread."""
     reuse_freed()
     if question.is_local:
         with suppress(ValueError, AttributeError):  # not the main thread, or Windows

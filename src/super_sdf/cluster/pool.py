@@ -43,7 +43,7 @@ LOST = "was lost by the cluster (most likely out of memory)"
 
 
 @dataclass(eq=False)
-class Hand(Generic[Task]):
+class Worker(Generic[Task]):
     """A worker with what it was given: futures and tasks, the one that it works at first.
 
     Attributes
@@ -130,7 +130,7 @@ class ClusterPool(Generic[Task]):
         self.tasks, self.prepare = tasks, prepare
         self.options: ClusterPoolOptions[Task] = options or ClusterPoolOptions()
         self.run = secrets.token_hex(8)
-        self.hands: dict[str, Hand[Task]] = {}
+        self.workers: dict[str, Worker[Task]] = {}
         self.refused: set[str] = set()
         self.aside: Task | None = None  # waits for a worker that has nothing else
         self.finished: SimpleQueue[Future[Any]] = SimpleQueue()
@@ -162,49 +162,51 @@ class ClusterPool(Generic[Task]):
 
     def _admit(self, member: Member) -> None:
         """Let a worker prepare itself."""
-        hand = self.hands[member.address] = Hand[Task](member)
-        self._submit(hand, None)
+        worker = self.workers[member.address] = Worker[Task](member)
+        self._submit(worker, None)
 
     def _assign(self) -> bool:
         """Give tasks to the workers; return whether there is anything to wait for."""
-        ready = [hand for hand in self.hands.values() if hand.is_ready]
-        for hand in ready:
-            if not hand.given and (task := self._next(hand)) is not None:
-                self._submit(hand, task)
-        for hand in ready:
-            if self.aside is None and len(self.tasks) and self._may_look_ahead(hand):
-                task = self.options.choose(self.tasks, hand.member.address)
+        ready = [worker for worker in self.workers.values() if worker.is_ready]
+        for worker in ready:
+            if not worker.given and (task := self._next(worker)) is not None:
+                self._submit(worker, task)
+        for worker in ready:
+            if self.aside is None and len(self.tasks) and self._may_look_ahead(worker):
+                task = self.options.choose(self.tasks, worker.member.address)
                 if self.options.is_suspect(task):
                     self.aside = task
                 else:
-                    self._submit(hand, task)
+                    self._submit(worker, task)
         is_busy = any(
-            task is not None for hand in self.hands.values() for _, task in hand.given.values()
+            task is not None
+            for worker in self.workers.values()
+            for _, task in worker.given.values()
         )
         return is_busy or self.aside is not None or len(self.tasks) > 0
 
-    def _next(self, hand: Hand[Task]) -> Task | None:
+    def _next(self, worker: Worker[Task]) -> Task | None:
         """Return the next task for a worker, None if there is none."""
         if self.aside is not None:
             task, self.aside = self.aside, None
             return task
         if not len(self.tasks):
             return None
-        return self.options.choose(self.tasks, hand.member.address)
+        return self.options.choose(self.tasks, worker.member.address)
 
-    def _may_look_ahead(self, hand: Hand[Task]) -> bool:
+    def _may_look_ahead(self, worker: Worker[Task]) -> bool:
         """Return whether a worker may get the next task beside the one that it works at."""
-        if not self.options.looks_ahead or len(hand.given) != 1 or hand.pace > SHORT_TASK:
+        if not self.options.looks_ahead or len(worker.given) != 1 or worker.pace > SHORT_TASK:
             return False
-        (_, task), *_ = hand.given.values()
+        (_, task), *_ = worker.given.values()
         return task is not None and not self.options.is_suspect(task)
 
-    def _submit(self, hand: Hand[Task], task: Task | None) -> None:
+    def _submit(self, worker: Worker[Task], task: Task | None) -> None:
         """Give a worker a task, or None to prepare itself."""
         self.count += 1
-        call = hand.call(self.run, self.prepare)
+        call = worker.call(self.run, self.prepare)
         function, arguments = (prepare_here, [call]) if task is None else (work_here, [call, task])
-        submit, address = self.cluster.client.submit, hand.member.address
+        submit, address = self.cluster.client.submit, worker.member.address
         future = self.cluster.ask(
             lambda: submit(
                 function,
@@ -215,9 +217,9 @@ class ClusterPool(Generic[Task]):
                 pure=False,
             )
         )
-        if not hand.given:
-            hand.since = time.monotonic()
-        hand.given[future.key] = future, task
+        if not worker.given:
+            worker.since = time.monotonic()
+        worker.given[future.key] = future, task
         future.add_done_callback(self.finished.put)
 
     def _receive(self) -> Iterator[tuple[Task, Any]]:
@@ -230,24 +232,26 @@ class ClusterPool(Generic[Task]):
 
     def _take(self, future: Future[Any]) -> Iterator[tuple[Task, Any]]:
         """Yield the result of a future that is done, or a Death."""
-        hand = next((hand for hand in self.hands.values() if future.key in hand.given), None)
-        if hand is None:  # its worker was reported dead before
+        worker = next(
+            (worker for worker in self.workers.values() if future.key in worker.given), None
+        )
+        if worker is None:  # its worker was reported dead before
             return
-        value = self._value(future, hand)
+        value = self._value(future, worker)
         if isinstance(value, Elsewhere):
-            yield from self._report_death(hand)
+            yield from self._report_death(worker)
             return
-        _, task = hand.given.pop(future.key)
+        _, task = worker.given.pop(future.key)
         now = time.monotonic()
-        hand.pace, hand.since = now - hand.since, now
+        worker.pace, worker.since = now - worker.since, now
         if isinstance(value, PrepareFailed):
             raise value.error
         if isinstance(value, Ready):
-            hand.is_ready, self.failed_starts = True, 0
+            worker.is_ready, self.failed_starts = True, 0
         elif task is not None:
             yield task, value
 
-    def _value(self, future: Future[Any], hand: Hand[Task]) -> Any:
+    def _value(self, future: Future[Any], worker: Worker[Task]) -> Any:
         """Return the result of a future that is done; Elsewhere if it was lost with its worker."""
         from distributed import KilledWorker
 
@@ -256,14 +260,14 @@ class ClusterPool(Generic[Task]):
             try:
                 return future.result(timeout=RESULT_SECONDS)
             except (TimeoutError, asyncio.TimeoutError):  # the same from Python 3.11 on
-                is_there = hand.member.address in self.cluster.workers()
+                is_there = worker.member.address in self.cluster.workers()
             except Exception as error:
                 if future.status != "error" or isinstance(error, KilledWorker):
                     self.cluster.workers()  # raises if that is because the connection was lost
                     break
                 # The task's own error, or what cannot be pickled.
                 line = f"{type(error).__name__}: {error}".split("\n")[0]
-                if hand.is_ready:
+                if worker.is_ready:
                     return Death(f"ended with {line}")
                 return PrepareFailed(SuperSdfError(line))
         return Elsewhere()
@@ -271,9 +275,9 @@ class ClusterPool(Generic[Task]):
     def _look(self) -> Iterator[tuple[Task, Any]]:
         """Look which workers there are; yield the tasks of those that died, and admit new ones."""
         there = self.cluster.workers()
-        for hand in [hand for address, hand in self.hands.items() if address not in there]:
-            yield from self._report_death(hand)
-        new = {a: n for a, n in there.items() if a not in self.hands and a not in self.refused}
+        for worker in [worker for address, worker in self.workers.items() if address not in there]:
+            yield from self._report_death(worker)
+        new = {a: n for a, n in there.items() if a not in self.workers and a not in self.refused}
         if new and (len(self.tasks) or self.aside is not None):
             checked = check_some(self.cluster, self.needs, new)
             for member in checked.members:
@@ -285,7 +289,7 @@ class ClusterPool(Generic[Task]):
 
     def _check_patience(self) -> None:
         """Raise ClusterError if there has been no worker for a while."""
-        if self.hands:
+        if self.workers:
             self.seen = time.monotonic()
         elif time.monotonic() - self.seen > PATIENCE_SECONDS:
             raise ClusterError(
@@ -293,44 +297,44 @@ class ClusterPool(Generic[Task]):
                 "start some, and run it again"
             )
 
-    def _report_death(self, hand: Hand[Task]) -> Iterator[tuple[Task, Death]]:
+    def _report_death(self, worker: Worker[Task]) -> Iterator[tuple[Task, Death]]:
         """Remove a dead worker; yield the tasks that it had."""
-        del self.hands[hand.member.address]
-        self._cancel(hand)
-        if not hand.is_ready:
+        del self.workers[worker.member.address]
+        self._cancel(worker)
+        if not worker.is_ready:
             self.failed_starts += 1
             if self.failed_starts == MAX_FAILED_STARTS:
                 raise ClusterError(
                     f"{MAX_FAILED_STARTS} workers in a row ended before they were ready, the last "
-                    f"one {hand.member.address}: see its log"
+                    f"one {worker.member.address}: see its log"
                 )
-        for _, task in hand.given.values():
+        for _, task in worker.given.values():
             if task is not None:
-                self.options.clean_up(task, hand.member.report.pid)
+                self.options.clean_up(task, worker.member.report.pid)
                 yield task, Death(LOST)
 
-    def _cancel(self, hand: Hand[Task]) -> None:
+    def _cancel(self, worker: Worker[Task]) -> None:
         """Tell the scheduler that nobody waits for what a worker was given."""
         with suppress(Exception):  # the connection may be lost: then the scheduler knows it, too
-            self.cluster.client.cancel([future for future, _ in hand.given.values()])
+            self.cluster.client.cancel([future for future, _ in worker.given.values()])
 
     def _stop(self) -> None:
         """Stop what the workers are doing, and clean up after it."""
-        hands = {address: hand for address, hand in self.hands.items() if hand.given}
-        for hand in hands.values():
-            self._cancel(hand)
+        hands = {address: worker for address, worker in self.workers.items() if worker.given}
+        for worker in hands.values():
+            self._cancel(worker)
         self._wait_until_stopped(hands)
-        for hand in hands.values():
-            for _, task in hand.given.values():
+        for worker in hands.values():
+            for _, task in worker.given.values():
                 if task is not None:
-                    self.options.clean_up(task, hand.member.report.pid)
+                    self.options.clean_up(task, worker.member.report.pid)
         with suppress(SuperSdfError):
             if not self.cluster.is_local:
-                self.cluster.run(forget, self.run, workers=list(self.hands))
+                self.cluster.run(forget, self.run, workers=list(self.workers))
 
-    def _wait_until_stopped(self, hands: dict[str, Hand[Task]]) -> None:
+    def _wait_until_stopped(self, hands: dict[str, Worker[Task]]) -> None:
         """Wait until workers have stopped; kill those of this machine that do not."""
-        keys = {key for hand in hands.values() for key in hand.given}
+        keys = {key for worker in hands.values() for key in worker.given}
         until, left = time.monotonic() + STOP_SECONDS, list(hands)
         while left and time.monotonic() < until:
             try:

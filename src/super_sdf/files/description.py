@@ -1,4 +1,4 @@
-"""What a grid file says of itself, for ``info``: no sample is read where the format allows it."""
+"""What a grid file states, for ``info``: no sample is read where the format allows it."""
 
 from __future__ import annotations
 
