@@ -353,7 +353,7 @@ def test_another_file_of_the_same_name_is_noticed():
 
 
 def test_workers_without_the_package_or_with_other_sources_are_named():
-    want = f"does not have super-sdf: install super-sdf {__version__} there"
+    want = f"does not have super-sdf: install version {__version__} of it there"
     assert checking.judge_version(ModuleNotFoundError("No module named 'super_sdf'")) == want
     assert checking.judge_version(__version__) == ""
     want = f"cannot import super-sdf (SyntaxError: no): install {__version__} there"

@@ -66,7 +66,7 @@ def test_each_chunk_is_read_once(monkeypatch, values, axes, room, layout):
     monkeypatch.setattr(
         volume.Volume, "box", lambda own, box: read.append(box) or original(own, box)
     )
-    monkeypatch.setattr(grids, "_room", lambda bound: room)
+    monkeypatch.setattr(grids, "unpacking_room", lambda bound: room)
     monkeypatch.setattr(volume, "BOX", 4096)
     monkeypatch.setattr(volume, "PIECE", 4096)
     array = values if axes == "xyz" else values.T
@@ -315,6 +315,6 @@ def test_a_large_store_is_copied_to_a_file(monkeypatch, values):
     made = []
     original = unpacking._scratch_file
     monkeypatch.setattr(unpacking, "_scratch_file", lambda *a: made.append(a) or original(*a))
-    monkeypatch.setattr(grids, "_room", lambda bound: values.nbytes - 1)
+    monkeypatch.setattr(grids, "unpacking_room", lambda bound: values.nbytes - 1)
     store("a.zarr", values.T)
     assert read_grid("a.zarr", spacing=1).shape == SHAPE and len(made) == 1

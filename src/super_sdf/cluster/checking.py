@@ -165,7 +165,7 @@ def check_some(cluster: Cluster, needs: Needs, threads: Mapping[str, int]) -> Ch
 def judge_version(answer: Any) -> str:
     """Return what is wrong with the version of super-sdf that a worker has, "" if nothing."""
     if isinstance(answer, ImportError):
-        return f"does not have super-sdf: install super-sdf {__version__} there"
+        return f"does not have super-sdf: install version {__version__} of it there"
     if isinstance(answer, Exception):
         return f"cannot import super-sdf ({describe(answer)}): install {__version__} there"
     if answer != __version__:
