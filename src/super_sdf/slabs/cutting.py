@@ -126,7 +126,7 @@ def check_vertices(band: Band, factor: int) -> None:
 
 
 def check_crossings(crossings: int, factor: int) -> None:
-    """Raise OptionError if so many crossed coarse edges certainly make too many vertices.
+    """Raise OptionError if this number of crossed coarse edges makes too many vertices for sure.
 
     The surface crosses about K^2 times as many edges of the fine lattice as of the coarse one. Half
     of this estimate is certain; the exact number is checked when the vertices have been counted.

@@ -109,7 +109,7 @@ def _reader(array: Any, space: list[int]) -> Callable[[Box], NDArray[Any]]:
 
 
 def _chunks_at_once(most: int) -> Any:
-    """Let zarr unpack at most so many chunks at the same time; zarr 2 takes one by one."""
+    """Limit how many chunks zarr unpacks at the same time; zarr 2 takes one by one."""
     import zarr
 
     config = getattr(zarr, "config", None)
