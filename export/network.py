@@ -52,8 +52,9 @@ class NetworkConfig:
 SIZES = {
     "fast": NetworkConfig(blocks=3, functions=192),
     "base": NetworkConfig(),
+    "wide": NetworkConfig(channels=96, blocks=9, hidden=192, functions=320),
 }
-"""The networks that are shipped, by name."""
+"""The sizes of networks, by name."""
 
 
 class GatherMatMul(torch.autograd.Function):

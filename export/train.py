@@ -5,6 +5,7 @@
     python -m export.train --store training/store --run training/run --device cuda    # a GPU
     python -m export.train ... --start src/super_sdf/models/base.onnx --rate 0.7   # its weights
     python -m export.train ... --start src/super_sdf/models/base.onnx --blocks 9   # more blocks
+    python -m export.train ... --start src/super_sdf/models/best.onnx --size wide  # more units
     python -m export.train ... --inputs masks      # the network for masks
 
 A run folder holds ``checkpoint.pt`` (weights, averaged weights, optimisers, time spent),
@@ -30,6 +31,7 @@ from export.arguments import Parser, at_least, positive, share
 from export.augment import USUAL, Prepared, augment, augment_mask, prepare, prepare_mask
 from export.dataset import CORNERS, Sample, read_shard
 from export.dormant import dormant_share, revive
+from export.grow import grow_from
 from export.network import SIZES, SuperSdfNet
 from export.recipe import RECIPE, Recipe, differences, loss_of, make_optimisers, rate_factor
 from export.run_log import LOG_COLUMNS, append_line, plot_run, read_log
@@ -157,12 +159,8 @@ class Run:
             self.step, self.seconds = state["step"], state["seconds"]
 
     def start_from(self, weights: dict[str, Tensor]) -> None:
-        """Start with the weights of a network of the same sizes, or with fewer blocks."""
-        new = self.net.load_state_dict(weights, strict=False).missing_keys
-        with torch.no_grad():
-            for name, parameter in self.net.named_parameters():
-                if name in new and ".reduce." in name:  # a new block, which changes nothing yet
-                    parameter.zero_()
+        """Start with the values of a network of the same sizes, or of smaller ones."""
+        grow_from(self.net, weights)
         self.average.load_state_dict(self.net.state_dict())
 
     def advance(self, batch: list[Prepared], spent: float) -> float:
@@ -267,7 +265,7 @@ def main() -> None:
     parser.add_argument("--run", type=Path, required=True, help="folder of the run")
     parser.add_argument("--size", choices=SIZES, default="base", help="size of the network")
     parser.add_argument(
-        "--start", type=Path, help="an .onnx file of that size whose weights to start from"
+        "--start", type=Path, help="an .onnx file of that size, or smaller, to start from"
     )
     parser.add_argument(
         "--blocks", type=at_least(1), help="number of blocks, if not that of the size"

@@ -58,7 +58,7 @@ from export.to_onnx import (
 from export.train import Errors, Run, Store, log, sample_errors, train
 from export.variants import UNet
 from super_sdf import Mesh, load_network
-from super_sdf.errors import FileError
+from super_sdf.errors import FileError, OptionError
 from super_sdf.neighbourhood import CENTRE, NEIGHBOURHOOD
 from super_sdf.network.contract import INPUTS
 from super_sdf.network.network import shipped_models
@@ -456,6 +456,29 @@ def test_a_deeper_network_starts_with_the_values_of_the_file(tmp_path):
     with torch.no_grad():
         torch.testing.assert_close(run.net(*arrays), net(*arrays))
         torch.testing.assert_close(run.average(*arrays), net(*arrays))
+
+
+def test_a_wider_network_starts_with_the_values_of_the_file_and_with_new_units(tmp_path):
+    net = small_net()
+    write_model(net, tmp_path / "small.onnx", make_card(net, "small", "nothing", "none"))
+    wide = replace(SMALL, channels=12, hidden=20, blocks=SMALL.blocks + 1, functions=40)
+    run = Run(tmp_path, SuperSdfNet(wide))
+    run.start_from(read_weights(tmp_path / "small.onnx"))
+    arrays = [torch.from_numpy(array) for array in noisy_ball()]
+    values = run.net(*arrays)
+    with torch.no_grad():
+        torch.testing.assert_close(values, net(*arrays))
+    values.square().mean().backward()  # what reads the new units begins to learn at once
+    assert run.net.blocks[0].expand.weight.grad[:, SMALL.channels :].abs().max() > 0
+    assert run.net.blocks[1].conv.weight.grad.view(27, 12, 12)[:, SMALL.channels :].abs().max() > 0
+    assert run.net.trunk.layers[-1].weight.grad[SMALL.functions :].abs().max() > 0
+
+
+def test_no_network_starts_from_a_larger_one(tmp_path):
+    write_model(small_net(), tmp_path / "small.onnx", make_card(small_net(), "small", "", ""))
+    run = Run(tmp_path, SuperSdfNet(replace(SMALL, hidden=12)))
+    with pytest.raises(OptionError, match=r"stem.0.weight is \(16, 27\), more than the \(12, 27\)"):
+        run.start_from(read_weights(tmp_path / "small.onnx"))
 
 
 def put_to_sleep(net, units=3):
