@@ -150,7 +150,8 @@ def test_slabs_cover_the_grid_once(pieces):
     assert all(a.planes[1] == b.planes[0] for a, b in pairwise(slabs))
     for slab in slabs:
         ijk = band.voxel_ijk[slab.seen]
-        first, last = max(slab.planes[0] - 10, 0), min(slab.planes[1] + 10, 56)
+        reach = 1 + cutting.REACH_IN_VOXELS + 4
+        first, last = max(slab.planes[0] - reach, 0), min(slab.planes[1] + reach, 56)
         want = (band.voxel_ijk[:, 0] >= first) & (band.voxel_ijk[:, 0] < last)
         assert len(ijk) == want.sum() and first <= ijk[0, 0] and ijk[-1, 0] < last
 

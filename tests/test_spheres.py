@@ -8,36 +8,30 @@ from conftest import ball, trilinear
 
 from super_sdf import SdfGrid, load_network, pipeline, reconstruct
 from super_sdf.steps.band import neighbour_table
+from super_sdf.steps.exact import MAX_DISTANCE, exact_samples
 from super_sdf.steps.field import FineField
+from super_sdf.steps.foot_points import find_foot_points, spheres_of_band
 from super_sdf.steps.interpolation import prolong, sample_trilinear
 from super_sdf.steps.nodes import block_ijk, number_parts, share_parts
-from super_sdf.steps.spheres import (
-    PRIOR_WEIGHT,
-    ExactSamples,
-    exact_samples,
-    find_foot_points,
-    fit_to_spheres,
-    mean_at_nodes,
-    shrunk_mean,
-)
+from super_sdf.steps.spheres import PRIOR_WEIGHT, fit_to_spheres, mean_at_nodes, shrunk_mean
 from super_sdf.steps.survey import survey
+from super_sdf.steps.voxel_index import VoxelIndex
 
 CENTRE_OF_BALL = 10 - 0.37
 
 
 def blocks_of(grid, factor=4):
-    """Return the exact samples, parts and node positions (Q, D, 3) in half voxels of a grid."""
+    """Return spheres, index, parts and node positions (Q, D, 3) in half voxels of a grid."""
     band = survey(grid)
     table = neighbour_table(band.voxel_ijk, grid.shape)
     voxels = np.flatnonzero(band.decoded).astype(np.int32)
     row_of = pipeline.rows_among(voxels, len(table))
-    position = 2 * band.voxel_ijk[voxels] + block_ijk(factor)[:, None] * (2 / factor) - 1
-    exact = np.flatnonzero(band.exact).astype(np.int32)
-    return (
-        ExactSamples(band.patches, exact, table, row_of),
-        share_parts(row_of[table[voxels]]),
-        position,
-    )
+    own_ijk = band.voxel_ijk[voxels]
+    exact = np.flatnonzero(band.exact)
+    spheres = spheres_of_band(band.voxel_ijk, band.patches, exact, band.shape, band.limits)
+    position = 2 * own_ijk + block_ijk(factor)[:, None] * (2 / factor) - 1
+    touched = spheres, VoxelIndex(own_ijk, band.shape)
+    return touched, share_parts(row_of[table[voxels]]), position
 
 
 def distance_to_ball(nodes, radius=6.0):
@@ -50,19 +44,61 @@ def with_zeros(blocks):
     return np.pad(blocks, ((0, 0), (0, 1)))
 
 
-def fitted(blocks, parts, samples, factor=4):
+def fitted(blocks, parts, touched, factor=4):
     moved = blocks.copy()
-    fit_to_spheres(moved, parts, factor, samples)
+    fit_to_spheres(moved, parts, factor, *touched)
     return moved
+
+
+def is_near(spheres):
+    """Return which samples lie in the band; the others are a voxel farther away."""
+    return np.abs(spheres.distance) < MAX_DISTANCE
 
 
 @pytest.mark.parametrize("factor", [2, 4, 8])
 def test_foot_points_lie_on_the_surface(factor):
-    samples, _, position = blocks_of(ball(), factor)
-    feet = find_foot_points(distance_to_ball(position), factor, samples)
-    assert len(feet.rows) == len(samples.exact)
+    (spheres, index), _, position = blocks_of(ball(), factor)
+    feet = find_foot_points(distance_to_ball(position), factor, spheres, index)
+    assert len(feet.rows) == len(spheres)
     assert np.abs(feet.values).max() < 0.12 / factor  # linear interpolation of a curved field
-    assert feet.weights.min() > 0.95
+    near = is_near(spheres)
+    assert feet.weights[near].min() > 0.95
+    assert 0.45 < feet.weights[~near].min() < feet.weights[~near].max() < 1
+
+
+def test_samples_a_voxel_beyond_the_band_have_spheres():
+    grid = ball()
+    (spheres, _), _, _ = blocks_of(grid)
+    rescaled = 2 * grid.values / grid.voxel_size
+    np.testing.assert_allclose(spheres.distance, rescaled[tuple(spheres.centre.T)], atol=1e-5)
+    wanted = np.argwhere(np.abs(rescaled) < MAX_DISTANCE)
+    np.testing.assert_array_equal(spheres.centre[is_near(spheres)], wanted)
+    beyond = np.argwhere((np.abs(rescaled) >= MAX_DISTANCE) & (np.abs(rescaled) < MAX_DISTANCE + 2))
+    np.testing.assert_array_equal(spheres.centre[~is_near(spheres)], beyond)
+    outwards = spheres.centre - CENTRE_OF_BALL
+    outwards /= np.linalg.norm(outwards, axis=1)[:, None]
+    assert (outwards * spheres.direction.T).sum(1).min() > 0.95
+
+
+@pytest.mark.parametrize("limit", [1.5, 1.8, 2.1])
+def test_samples_beyond_the_band_that_were_cut_off_have_no_spheres(limit):
+    grid = ball()
+    cut = SdfGrid.trusted(np.clip(grid.values, -limit, limit), grid.spacing)
+    (spheres, _), _, _ = blocks_of(cut)
+    assert np.abs(spheres.distance).max() < 2 * limit
+    exact = 2 * grid.values[tuple(spheres.centre.T)]
+    np.testing.assert_allclose(spheres.distance, exact, atol=1e-5)
+
+
+def test_the_search_turns_until_the_sphere_touches():
+    """Directions that are off by 20 degrees still lead to the surface."""
+    (spheres, index), _, position = blocks_of(ball(), 8)
+    turned = spheres.direction + 0.36 * np.roll(spheres.direction, 1, axis=0)
+    turned /= np.linalg.norm(turned, axis=0)
+    start = replace(spheres, direction=turned.astype(np.float32))
+    feet = find_foot_points(distance_to_ball(position), 8, start, index)
+    assert len(feet.rows) > 0.97 * len(spheres)
+    assert np.abs(feet.values).mean() < 0.02
 
 
 def test_a_linear_field_is_sampled_exactly():
@@ -99,22 +135,23 @@ def test_an_exact_field_hardly_changes():
 def test_copies_of_a_shared_node_stay_equal(factor):
     samples, parts, position = blocks_of(ball(), factor)
     moved = fitted(distance_to_ball(position), parts, samples, factor)[:, :-1]
-    field = FineField((20,) * 3, factor, samples.exact, moved, parts, (0, 20))
+    field = FineField((20,) * 3, factor, np.empty((0, 3)), moved, parts, (0, 20))
     np.testing.assert_array_equal(field.values[field.numbers], moved.T)
 
 
 def test_exact_samples_are_kept():
-    samples, parts, position = blocks_of(ball())
-    moved = fitted(distance_to_ball(position + 0.05), parts, samples)
-    decoded = np.flatnonzero(samples.row_of[:-1] >= 0)
-    np.testing.assert_array_equal(moved[62, samples.row_of[decoded]], samples.patches[decoded, 13])
+    (spheres, index), parts, position = blocks_of(ball())
+    moved = fitted(distance_to_ball(position + 0.05), parts, (spheres, index))
+    rows = index.find(spheres.centre)
+    np.testing.assert_array_equal(moved[62, rows[rows >= 0]], spheres.distance[rows >= 0])
+    assert (rows >= 0).sum() == moved.shape[1] - 1
 
 
 def test_noisy_samples_move_nothing():
     grid = ball()
     noise = np.random.default_rng(0).uniform(-0.3, 0.3, grid.shape)
     samples, parts, position = blocks_of(SdfGrid.trusted(grid.values + noise, grid.spacing))
-    assert not len(samples.exact)
+    assert not len(samples[0])
     blocks = distance_to_ball(position)
     np.testing.assert_array_equal(fitted(blocks, parts, samples), blocks)
 
@@ -149,10 +186,10 @@ def test_means_are_shrunk_by_little_weight_and_by_variance():
 
 @pytest.mark.parametrize("cells", [1, 2])
 def test_nodes_without_foot_points_nearby_are_not_corrected(cells):
-    samples, parts, position = blocks_of(ball())
+    (spheres, index), parts, position = blocks_of(ball())
     blocks = distance_to_ball(position + 0.1)
-    above = replace(samples, exact=samples.exact[:40])  # on one side: samples come in C order
-    feet = find_foot_points(blocks, 4, above)
+    above = spheres.some(slice(40))  # on one side: samples come in C order
+    feet = find_foot_points(blocks, 4, above, index)
     numbers, count = number_parts(parts, np.ones(27, np.int64))
     mean, *_ = mean_at_nodes(feet, feet.values, numbers, count, cells)
     moved = prolong(mean[numbers], 2, 4) != 0

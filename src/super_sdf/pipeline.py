@@ -43,7 +43,9 @@ from .slabs.cutting import Slab, peak_bytes, plan_slabs, planes_needed
 from .slabs.footprint import NETWORK_BYTES
 from .slabs.pieces import Piece, count_input, describe_piece
 from .steps.cap import close
+from .steps.exact import BandSummary
 from .steps.field import FineField, SampleSpheres
+from .steps.foot_points import spheres_of_band
 from .steps.holding import hold_sides
 from .steps.lattice import fine_grid
 from .steps.mesher_names import DEFAULT_MESHER
@@ -56,9 +58,10 @@ from .steps.nodes import (
     share_parts,
     signs_of_skipped,
 )
-from .steps.spheres import BandSummary, ExactSamples, fit_to_spheres
+from .steps.spheres import fit_to_spheres
 from .steps.spline import spline_blocks
 from .steps.survey import Band, no_surface, survey
+from .steps.voxel_index import VoxelIndex
 
 SaveField = Callable[[FineField], None]
 """Called with the field of each slab, in order, before its surface is extracted."""
@@ -428,27 +431,26 @@ def refine(
         blocks = interpolate(band, band.smooth, network, factor, slab, inputs, threads)
     steps.finish("network")
 
-    row_of = rows_among(voxels, len(table))
-    parts = share_parts(row_of[table[voxels]])
+    parts = share_parts(rows_among(voxels, len(table))[table[voxels]])
     average_shared(blocks, parts, factor, threads)  # Eq. 7
-    exact = np.flatnonzero(band.exact[slab.seen]).astype(np.int32)
-    fit_to_spheres(blocks, parts, factor, ExactSamples(patches, exact, table, row_of), threads)
+    seen_ijk, exact = band.voxel_ijk[slab.seen], np.flatnonzero(band.exact[slab.seen])
+    own_ijk = seen_ijk[voxels]
+    spheres = spheres_of_band(seen_ijk, patches, exact, band.shape, band.limits, threads)
+    fit_to_spheres(blocks, parts, factor, spheres, VoxelIndex(own_ijk, band.shape), threads)
+    del spheres
     if band.kind == MASK:
         hold_sides(blocks, factor, patches, voxels)
-    own_ijk = band.voxel_ijk[slab.seen][voxels]
     skipped = signs_of_skipped(parts, own_ijk, patches, voxels, band.shape)
     pinned = pin_to_skipped(blocks[:, :-1], parts, factor, skipped)
     steps.finish("nodes")
     field = FineField(band.shape, factor, own_ijk, blocks[:, :-1], parts, slab.planes)
-    spheres = SampleSpheres(
-        band.shape, band.voxel_ijk[slab.seen][exact], patches[exact, CENTRE].copy()
-    )
+    touching = SampleSpheres(band.shape, seen_ijk[exact], patches[exact, CENTRE].copy())
     return replace(
         field,
         band_voxels=len(band.voxel_ijk),
         noisy_voxels=band.noisy_voxels,
         pinned=int(pinned[field.own_rows].sum()),
-        spheres=spheres,
+        spheres=touching,
         decoded_voxels=int(band.decoded_before[-1]),
         leaves=band.leaves,
     )

@@ -13,6 +13,7 @@ from ..errors import OptionError
 from ..grid.sdf_grid import SdfGrid
 from ..machine.threads import map_chunks
 from .nodes import SharedParts, block_ijk, number_parts, part_of_node, part_sizes
+from .voxel_index import VoxelIndex
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,23 +35,9 @@ class SampleSpheres:
     distance: FloatArray
 
     @cached_property
-    def _keys(self) -> NDArray[np.int64]:
-        return self._key_of(self.voxel_ijk.astype(np.int64))
-
-    def _key_of(self, voxel_ijk: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the number of each voxel, (...,), in C order of the whole grid."""
-        _, rows, columns = self.shape
-        key: NDArray[np.int64] = (voxel_ijk[..., 0] * rows + voxel_ijk[..., 1]) * columns
-        return key + voxel_ijk[..., 2]
-
-    def find(self, voxel_ijk: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return which sample lies in each voxel (..., 3), -1 if none does, (...,)."""
-        keys, wanted = self._keys, self._key_of(voxel_ijk)
-        if not len(keys):
-            return np.full(wanted.shape, -1, np.int64)
-        at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-        in_grid = ((voxel_ijk >= 0) & (voxel_ijk < self.shape)).all(-1)
-        return np.where(in_grid & (keys[at] == wanted), at, -1)
+    def index(self) -> VoxelIndex:
+        """Finds which sample lies in a voxel."""
+        return VoxelIndex(self.voxel_ijk, self.shape)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -42,8 +42,8 @@ from .band import (
     plane_blocks,
     rescale_planes,
 )
+from .exact import BandSummary, exact_samples, summarise
 from .offsets import Jumps, check_not_cut_off, check_not_filled, find_jumps
-from .spheres import BandSummary, exact_samples, summarise
 
 BYTES_PER_VOXEL = 123  # of a band
 BYTES_PER_SAMPLE = 20  # of the planes among which the band is found, measured
@@ -67,6 +67,8 @@ class Band:
         Which voxels can hold the surface, and so are decoded.
     exact : (V,) bool
         Which voxels' own samples can be taken as exact distances.
+    limits : two floats
+        Samples beyond the band may be exact distances if they lie between these, in half voxels.
     sampled : (V,) bool, optional
         Which voxels' own values are samples of a grid that was resampled, not interpolated; None if
         all are.
@@ -90,6 +92,7 @@ class Band:
     lipschitz: BoolArray
     decoded: BoolArray
     exact: BoolArray
+    limits: tuple[float, float] = (0.0, 0.0)
     sampled: BoolArray | None = None
     leaves: bool = False
     kind: str = EXACT
@@ -264,10 +267,14 @@ def limit_to_field(band: Band, grid: SdfGrid, offset: float) -> Band:
     In a mask, only the voxels round which samples lie on both sides hold the surface.
     """
     field, scale = grid.field, 2 / grid.voxel_size
+    low, high = ((limit - offset) * scale for limit in field.exact)
+    ends = ((end - offset) * scale for end in (grid.low, grid.high))  # where it may be cut off
+    lowest, highest = (float(np.float32(end)) for end in ends)  # as samples are, see ``rescale``
+    if band.sampled is None:  # of a resampled grid, what is interpolated there promises little
+        band = replace(band, limits=(max(low, lowest), min(high, highest)))
     if field.kind == EXACT:
         return band
     sample = band.patches[:, CENTRE]
-    low, high = ((limit - offset) * scale for limit in field.exact)
     exact = band.exact & (sample > low) & (sample < high)
     decoded = band.decoded
     if field.kind == MASK:

@@ -177,7 +177,7 @@ def _most_different(normal: Vectors, there: BoolArray) -> tuple[NDArray[np.intp]
 
 def find_spheres(wedges: Wedges, spheres: SampleSpheres) -> Nearby:
     """Return the spheres that pass within ``FARTHEST_SPHERE`` of each wedge's edge."""
-    number = spheres.find(wedges.voxel[:, None] + AROUND)  # (f, 125)
+    number = spheres.index.find(wedges.voxel[:, None] + AROUND)  # (f, 125)
     wedge, place = np.nonzero(number >= 0)
     number = number[wedge, place]
     distance: Numbers = spheres.distance[number].astype(np.float64) / 2

@@ -1,0 +1,308 @@
+"""Where the surface touches the spheres of samples.
+
+An exact sample x with distance d is the centre of a sphere of radius |d| that touches the surface
+at its foot point x - d n, where n is the surface normal there. Samples of the band have one, and
+so have those a voxel beyond it: many of these touch the same edges and tips, of which the samples
+nearby say little.
+
+Lengths are in half voxels, as in ``band``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import BoolArray, FloatArray, IntArray
+from ..machine.threads import map_chunks
+from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
+from .exact import MAX_DISTANCE, MIN_SLOPE
+from .interpolation import sample_trilinear
+from .voxel_index import VoxelIndex
+
+BEYOND = 2.0  # samples this much farther than MAX_DISTANCE have spheres, too
+APART = np.maximum(2 * np.linalg.norm(NEIGHBOURHOOD, axis=1), 1).astype(np.float32)  # of samples
+REACH_IN_VOXELS = 2  # from a sample to its foot point: (MAX_DISTANCE + BEYOND) / 2, rounded
+LOOKS = 9  # at a sphere, for the place where it touches
+FIRST_TURN = 0.5  # share of the way to the normal, for the second look ...
+NEARER, FARTHER = 1.6, 0.4  # ... and what it is multiplied by after a look that gained, or not
+SETTLED = 0.9999  # cosine between a direction and the normal at which nothing is gained any more
+TYPICAL_ERROR = 0.2  # scale of the Cauchy weight of an error at a foot point
+MAX_ERROR = 0.6  # larger errors are clipped
+SQUARINGS = 3  # of the cosine between the search direction and the normal: its 8th power
+FAR_PENALTY = 0.5  # how the weight falls with a sample's distance beyond MAX_DISTANCE
+MIN_WEIGHT = 1e-3  # foot points of a smaller weight are dropped
+
+TEMPORARIES = 64  # numbers per sample in the search for its foot point
+
+
+@dataclass(frozen=True, eq=False)
+class Spheres:
+    """The spheres of exact samples.
+
+    Attributes
+    ----------
+    centre : (n, 3) int32
+        The samples.
+    distance : (n,) float32
+        Their signed distances.
+    direction : (3, n) float32
+        About the gradient of the field there, of length 1.
+    """
+
+    centre: IntArray
+    distance: FloatArray
+    direction: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.distance)
+
+    def some(self, rows: slice | NDArray[np.signedinteger] | BoolArray) -> Spheres:
+        """Return some of the spheres."""
+        return Spheres(self.centre[rows], self.distance[rows], self.direction[:, rows])
+
+
+def joined(parts: Sequence[Spheres]) -> Spheres:
+    """Return all spheres of some parts, in order."""
+    return Spheres(
+        np.concatenate([part.centre for part in parts]),
+        np.concatenate([part.distance for part in parts]),
+        np.concatenate([part.direction for part in parts], 1),
+    )
+
+
+def spheres_of_band(
+    voxel_ijk: IntArray,
+    patches: FloatArray,
+    exact: NDArray[np.signedinteger],
+    shape: tuple[int, int, int],
+    limits: tuple[float, float],
+    threads: int = 1,
+) -> Spheres:
+    """Return the spheres of the exact samples of a band, then of those a voxel beyond.
+
+    Parameters
+    ----------
+    voxel_ijk : (V, 3) int32
+        The voxels of the band, in C order.
+    patches : (V, 27) float32
+        The samples round each, in half voxels.
+    exact : (n,) int
+        The rows whose own sample is exact.
+    shape : three ints
+        Samples of the grid along each axis.
+    limits : two floats
+        Samples beyond the band have no sphere unless they lie between these, in half voxels.
+    threads : int
+        Threads to use.
+    """
+
+    def gather(rows: slice) -> tuple[Spheres, Spheres, FloatArray]:
+        patch = patches[exact[rows]]
+        gradient = _unit((patch[:, CENTRE + STRIDES] - patch[:, CENTRE - STRIDES]).T)
+        own = Spheres(voxel_ijk[exact[rows]], patch[:, CENTRE].copy(), gradient)
+        return own, *spheres_beyond(own, patch, shape, limits)
+
+    parts = map_chunks(gather, len(exact), 4 * TEMPORARIES, threads)
+    if not parts:
+        return Spheres(voxel_ijk[:0], patches[:0, 0], patches[:0, :3].T)
+    own, beyond, slope = zip(*parts)
+    steepest = steepest_of_each(joined(beyond), np.concatenate(slope), shape)
+    return joined([*own, joined(beyond).some(steepest)])
+
+
+def spheres_beyond(
+    own: Spheres, patch: FloatArray, shape: tuple[int, int, int], limits: tuple[float, float]
+) -> tuple[Spheres, FloatArray]:
+    """Return those of the samples around that are farther from the surface than exact ones.
+
+    Also returned is how steeply each rises from the exact sample, about 1 along the gradient. One
+    that was cut off does not rise as distances do, or is at a limit. ``patch`` (n, 27) are the
+    samples round each of the n spheres' centres.
+    """
+    sign = np.copysign(np.float32(1), own.distance)
+    slope = (sign[:, None] * patch - np.abs(own.distance)[:, None]) / APART
+    size = np.abs(patch)
+    found = np.asarray((size >= MAX_DISTANCE) & (size < MAX_DISTANCE + BEYOND))
+    found &= (slope >= MIN_SLOPE) & (patch > limits[0]) & (patch < limits[1])
+    row, step = np.nonzero(found)
+    centre = own.centre[row] + NEIGHBOURHOOD[step]
+    in_grid = np.flatnonzero(((centre >= 0) & (centre < shape)).all(1))
+    row, step = row[in_grid], step[in_grid]
+    beyond = Spheres(centre[in_grid], patch[row, step], own.direction[:, row])
+    return beyond, slope[row, step]
+
+
+def steepest_of_each(
+    beyond: Spheres, slope: FloatArray, shape: tuple[int, int, int]
+) -> NDArray[np.intp]:
+    """Return the rows of the steepest of equal samples, in C order of the samples."""
+    keys = VoxelIndex(beyond.centre, shape).keys
+    order = np.lexsort((-slope, keys))
+    return order[np.diff(keys[order], prepend=-1) > 0]
+
+
+@dataclass(frozen=True, eq=False)
+class FootPoints:
+    """Foot points of samples, and the field's value there.
+
+    Attributes
+    ----------
+    rows : (n,) int32
+        The block that each lies in.
+    place : (3, n) float32
+        Position in the block, 0 to 1 along each axis.
+    values : (n,) float32
+        The field there, in half voxels: the error, since it should be 0.
+    weights : (n,) float32
+        How far to trust it, 0 to 1.
+    """
+
+    rows: IntArray
+    place: FloatArray
+    values: FloatArray
+    weights: FloatArray
+
+
+def find_foot_points(
+    blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex, threads: int = 1
+) -> FootPoints:
+    """Return the foot points of samples, leaving out those outside all blocks.
+
+    Parameters
+    ----------
+    blocks : (Q, D + 1) float32
+        Node values in half voxels; the last column is 0.
+    factor : int
+        K.
+    spheres : Spheres
+        Those of the samples.
+    index : VoxelIndex
+        Of the D voxels.
+    threads : int
+        Threads to use.
+    """
+
+    def search(rows: slice) -> FootPoints:
+        some = spheres.some(rows)
+        return weigh(touch(blocks, factor, some, index), some.distance)
+
+    parts = map_chunks(search, len(spheres), TEMPORARIES, threads)
+    return FootPoints(
+        np.concatenate([part.rows for part in parts]),
+        np.concatenate([part.place for part in parts], 1),
+        np.concatenate([part.values for part in parts]),
+        np.concatenate([part.weights for part in parts]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """The field at a place on each of n spheres.
+
+    Attributes
+    ----------
+    direction : (3, n) float32
+        From the place to the sample, or the other way round for a sample inside.
+    rows : (n,) int32
+        The block that the place lies in, -1 if it was not decoded.
+    place : (3, n) float32
+        The position in it, 0 to 1 along each axis.
+    value : (n,) float32
+        The field.
+    normal : (3, n) float32
+        Its gradient, of length 1.
+    clearance : (n,) float32
+        How far the surface is from the sphere there: below 0 where it pierces it.
+    """
+
+    direction: FloatArray
+    rows: IntArray
+    place: FloatArray
+    value: FloatArray
+    normal: FloatArray
+    clearance: FloatArray
+
+    @property
+    def cosine(self) -> FloatArray:
+        """The cosine between the direction and the normal, (n,)."""
+        return _dot(self.direction, self.normal)
+
+    def put(self, rows: NDArray[np.signedinteger], other: Look, better: BoolArray) -> None:
+        """Replace some of the places by those of another look that are better."""
+        for mine, its in zip(vars(self).values(), vars(other).values()):
+            mine[..., rows[better]] = its[..., better]
+
+
+def touch(blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex) -> Look:
+    """Return the places where spheres touch the surface.
+
+    A sphere that touches the surface lies on the sample's side of it everywhere else. So the place
+    is where the field is lowest on the sphere of a sample outside, highest for one inside, and its
+    direction is the normal there. Each look turns the direction some way to the normal; a turn
+    that gains nothing is taken back, and the next one is smaller.
+    """
+    found = look_along(blocks, factor, spheres, index, spheres.direction)
+    turn = np.full(len(spheres), FIRST_TURN, np.float32)
+    for _ in range(LOOKS - 1):
+        rest = np.flatnonzero((found.rows >= 0) & (found.cosine < SETTLED))
+        if not len(rest):
+            break
+        direction, share = found.direction[:, rest], turn[rest]
+        direction = _unit(direction + share * (found.normal[:, rest] - direction))
+        new = look_along(blocks, factor, spheres.some(rest), index, direction)
+        better = new.clearance < found.clearance[rest]
+        turn[rest] = np.where(
+            better, np.minimum(share * np.float32(NEARER), 1), share * np.float32(FARTHER)
+        )
+        found.put(rest, new, better)
+    return found
+
+
+def look_along(
+    blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex, direction: FloatArray
+) -> Look:
+    """Return what the field is where directions (3, n) meet spheres."""
+    half = spheres.distance * direction * np.float32(-0.5)
+    aside = np.rint(half)
+    rows = index.find(spheres.centre + aside.T.astype(np.int32)).astype(np.int32)
+    place = np.clip(half - aside + np.float32(0.5), 0, 1)
+    value, gradient = sample_trilinear(blocks, rows, place, factor)
+    side = np.copysign(np.float32(1), spheres.distance)
+    clearance = np.where(rows >= 0, side * value, np.float32(np.inf))
+    return Look(direction.copy(), rows, place, value, _unit(gradient), clearance)
+
+
+def weigh(found: Look, distance: FloatArray) -> FootPoints:
+    """Return foot points with their weights, leaving out those of almost no weight.
+
+    The weight falls with the angle between direction and normal, with the error (a Cauchy weight: a
+    large error is probably a place on the wrong part of the surface), and with the sample's
+    ``distance`` (n,), since an error of the direction matters more.
+    """
+    unusual = found.value / np.float32(TYPICAL_ERROR)
+    aligned = np.clip(found.cosine, 0, 1)
+    for _ in range(SQUARINGS):  # np.power's last bit depends on the position in the array
+        aligned *= aligned
+    farther: FloatArray = np.maximum(np.abs(distance) - np.float32(MAX_DISTANCE), 0)
+    penalty: FloatArray = (1 + unusual * unusual) * (1 + np.float32(FAR_PENALTY) * farther)
+    weights = aligned / penalty
+    kept = (found.rows >= 0) & (weights > MIN_WEIGHT)
+    values = np.clip(found.value[kept], -MAX_ERROR, MAX_ERROR)
+    place = np.ascontiguousarray(found.place[:, kept])
+    return FootPoints(found.rows[kept], place, values, weights[kept])
+
+
+def _unit(vectors: FloatArray) -> FloatArray:
+    """Return the vectors (3, n) scaled to length 1; 0 stays 0."""
+    length = np.maximum(np.sqrt(_dot(vectors, vectors)), np.float32(1e-6))
+    return (vectors / length).astype(np.float32, copy=False)
+
+
+def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the dot products of vectors (3, n), (n,), summed in a fixed order."""
+    product: FloatArray = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return product
