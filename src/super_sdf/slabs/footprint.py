@@ -16,7 +16,7 @@ from ..steps.survey import Band
 # block, per thread (its chunk), and a constant.
 STAGES = {
     "average": (216, 300, 5.0, 1e7, 2e7),
-    "fit": (216, 1300, 4.0, 1e7, 3e7),
+    "fit": (216, 1450, 4.0, 1e7, 3e7),
     MARCHING: (216, 350, 7.5, 1e7, 3e7),
     SHARP: (216, 350, 7.5, 1e7, 3e7),
 }

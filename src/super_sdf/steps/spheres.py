@@ -93,6 +93,7 @@ def find_correction(feet: FootPoints, parts: SharedParts) -> FloatArray:
     for cells in MEANS:
         mean, at, shares = mean_at_nodes(feet, left, numbers, count, cells)
         left = left - (mean.take(at) * shares).sum(0)
+        del at, shares
         own = numbers[CORNER_PARTS] if cells == 1 else numbers
         correction += prolong(mean.take(own), cells, 2)
     return correction
@@ -122,8 +123,10 @@ def mean_at_nodes(
         The mean, in half voxels; the 8 nodes round each foot point, and its trilinear weights for
         them.
     """
-    part, shares = surrounding_parts(feet.place, cells)
-    at = numbers.ravel().take(part * numbers.shape[1] + feet.rows).astype(np.intp)
+    at, shares = surrounding_parts(feet.place, cells)
+    at *= numbers.shape[1]  # in place: these arrays are the largest of the fit
+    at += feet.rows
+    at[:] = numbers.ravel().take(at)
     weight = (shares * feet.weights).astype(np.float64)
     sums: list[NDArray[np.float64]] = []
     for _ in range(3):  # of weights, values and squares
