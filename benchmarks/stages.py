@@ -37,7 +37,11 @@ STAGES = {
     "network": [(Network, "__call__")],
     "number": [(pipeline, "share_parts")],
     "average": [(pipeline, "average_shared")],
-    "fit": [(pipeline, "fit_to_spheres"), (pipeline, "pin_to_skipped")],
+    "fit": [
+        (pipeline, "spheres_of_band"),
+        (pipeline, "fit_to_spheres"),
+        (pipeline, "pin_to_skipped"),
+    ],
     "isosurface": [(pipeline, "extract_pieces")],
     "write": [(spool, "write_in_chunks")],
 }

@@ -51,7 +51,7 @@ class NetworkConfig:
 
 SIZES = {
     "fast": NetworkConfig(blocks=3, functions=192),
-    "base": NetworkConfig(),
+    "base": NetworkConfig(blocks=9),
     "wide": NetworkConfig(channels=96, blocks=9, hidden=192, functions=320),
 }
 """The sizes of networks, by name."""
