@@ -18,7 +18,8 @@ from super_sdf.pipeline import reconstruct_slabs
 from super_sdf.slabs import cutting
 from super_sdf.slabs.cutting import cut, equal_parts, peak_bytes, plan_slabs
 from super_sdf.slabs.footprint import slab_bytes
-from super_sdf.steps.survey import look_at_band, survey
+from super_sdf.steps.glance import look_at_band
+from super_sdf.steps.survey import survey
 
 
 @pytest.fixture(scope="module")

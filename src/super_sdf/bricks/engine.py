@@ -31,7 +31,8 @@ from ..mesh import vertex_type
 from ..progress import TOTAL, Progress, Stopwatch
 from ..slabs.cutting import check_crossings, equal_parts
 from ..slabs.pieces import Piece
-from ..steps.survey import BYTES_PER_VOXEL, Glance, look_at_band, no_surface
+from ..steps.glance import Glance, look_at_band
+from ..steps.survey import BYTES_PER_VOXEL, no_surface
 from .meshing import Loading, Meshed, MeshTask, prepare_meshing
 from .passes import Brick, Team, TeamPlanes
 from .stored import WAY_OUT, Source, check_source, close_stores, opened

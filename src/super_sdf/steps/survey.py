@@ -7,8 +7,8 @@ the grid.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +20,11 @@ from ..grid.field import EXACT, MASK
 from ..grid.planes import (
     DerivedPlanes,
     SampleArray,
-    over_planes,
     planes_at_once,
     reading_bytes,
 )
 from ..grid.resampling import Resampled
-from ..grid.sdf_grid import SdfGrid, negated, without_samples
+from ..grid.sdf_grid import SdfGrid, negated
 from ..grid.unknown import KnownPlanes
 from ..machine.memory import held_memory, in_words
 from ..machine.resources import ONE_THREAD, Resources
@@ -42,7 +41,7 @@ from .band import (
     plane_blocks,
     rescale_planes,
 )
-from .exact import BandSummary, exact_samples, summarise
+from .exact import BandSummary, exact_samples
 from .offsets import Jumps, check_not_cut_off, check_not_filled, find_jumps
 
 BYTES_PER_VOXEL = 123  # of a band
@@ -226,7 +225,7 @@ def survey(
     patches = [part for _, part in parts]
     del parts
     if offset and among is None:
-        _check_jumps(jumps, grid, offset)
+        check_jumps(jumps, grid, offset)
     band = make_band(grid.shape, voxel_ijk, _concatenate(patches), resources.threads, whole)
     if isinstance(grid.samples, Resampled):
         band = look_at_samples(band, grid, resources.threads)
@@ -345,10 +344,10 @@ def _band_of_planes(
     """
     low, high = max(first - 1, 0), min(last + 1, grid.shape[0])
     samples = grid.samples[low:high]
-    return _band_of_samples(grid, offset, samples, first, last, jumps, leaving)
+    return band_of_samples(grid, offset, samples, first, last, jumps, leaving)
 
 
-def _band_of_samples(
+def band_of_samples(
     grid: SdfGrid,
     offset: float,
     samples: NDArray[Any],
@@ -371,81 +370,11 @@ def _band_of_samples(
     return own + np.array([low, 0, 0], np.int32), patches
 
 
-def _check_jumps(found: list[tuple[Jumps, Jumps]], grid: SdfGrid, offset: float) -> None:
+def check_jumps(found: list[tuple[Jumps, Jumps]], grid: SdfGrid, offset: float) -> None:
     """Raise GridError if no sample is near an offset, or fill values begin near it."""
     if not any(up.near for up, _ in found):
         raise no_surface(grid, offset)
     check_not_filled(found, offset, grid.voxel_size)
-
-
-class Glance(NamedTuple):
-    """What is seen of the band in some planes, without keeping it.
-
-    Attributes
-    ----------
-    summary : BandSummary
-        Of the voxels in these planes.
-    decoded : list of int
-        The voxels that are decoded in each plane.
-    crossings : int
-        See ``Band.count_crossings``.
-    jumps : list of (Jumps, Jumps)
-        With an offset.
-    """
-
-    summary: BandSummary
-    decoded: list[int]
-    crossings: int
-    jumps: list[tuple[Jumps, Jumps]]
-
-
-def look_at_band(grid: SdfGrid, offset: float) -> Glance:
-    """Return what the band of a grid says without keeping it, as if ``survey`` had read it.
-
-    The planes are read where the samples are, see ``planes.over_planes``.
-
-    Raises
-    ------
-    GridError
-        As in ``survey``.
-    """
-    count, samples = grid.shape[0], grid.samples
-    least = planes_at_once(samples) if isinstance(samples, DerivedPlanes) else 0
-    ranges = [
-        (max(first - 1, 0), min(last + 1, count), (first, last))
-        for first, last in plane_blocks(grid.shape, least=max(least, BLOCK_PLANES))
-    ]
-    look = partial(_glance, without_samples(grid), offset)
-    found = list(over_planes(samples, look, ranges))
-    jumps = [jump for glance in found for jump in glance.jumps]
-    if offset:
-        _check_jumps(jumps, grid, offset)
-    summaries = [glance.summary for glance in found]
-    summary = BandSummary(
-        sum(part.voxels for part in summaries),
-        sum(part.noisy for part in summaries),
-        min(part.low for part in summaries),
-        max(part.high for part in summaries),
-        any(part.leaves for part in summaries),
-    )
-    decoded = [number for glance in found for number in glance.decoded]
-    return Glance(summary, decoded, sum(glance.crossings for glance in found), jumps)
-
-
-def _glance(grid: SdfGrid, offset: float, planes: NDArray[Any], own: tuple[int, int]) -> Glance:
-    """Return what is seen in the planes ``own``, given with those beside them."""
-    jumps: list[tuple[Jumps, Jumps]] = []
-    leaving: list[bool] = []
-    first, last = own
-    ijk, patches = _band_of_samples(grid, offset, planes, first, last, jumps, leaving)
-    lipschitz = is_lipschitz(patches)
-    band = Band(
-        grid.shape, ijk, patches, lipschitz, can_hold_surface(patches, lipschitz), lipschitz
-    )
-    decoded = limit_to_field(band, grid, offset).decoded
-    by_plane = np.bincount(ijk[decoded, 0] - first, minlength=last - first).tolist()
-    summary = summarise(patches[:, CENTRE], lipschitz, leaving[0])
-    return Glance(summary, by_plane, band.count_crossings(), jumps)
 
 
 def _has_inside_on_border(rescaled: FloatArray, first: bool, last: bool) -> bool:
