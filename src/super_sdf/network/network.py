@@ -242,7 +242,7 @@ def load_network(
     Parameters
     ----------
     model : str or path
-        "fast", "base" or "best" (deeper, averaged over half turns), or an ONNX file.
+        "fast", "base" or "best" (base, averaged over half turns), or an ONNX file.
     device : str
         "cuda", "cpu", or "auto": CUDA if it runs, otherwise the CPU.
     threads : int
