@@ -4,7 +4,7 @@
     python -m export.train --store training/store --run training/run --minutes 90     # resumes
     python -m export.train --store training/store --run training/run --device cuda    # a GPU
     python -m export.train ... --start src/super_sdf/models/base.onnx --rate 0.7   # its weights
-    python -m export.train ... --start src/super_sdf/models/base.onnx --blocks 9   # more blocks
+    python -m export.train ... --start src/super_sdf/models/base.onnx --blocks 12  # more blocks
     python -m export.train ... --start src/super_sdf/models/base.onnx --size wide  # more units
     python -m export.train ... --inputs masks      # the network for masks
 

@@ -30,7 +30,8 @@ LOOKS = 9  # at a sphere, for the place where it touches
 FIRST_TURN = 0.5  # share of the way to the normal, for the second look ...
 NEARER, FARTHER = 1.6, 0.4  # ... and what it is multiplied by after a look that gained, or not
 SETTLED = 0.9999  # cosine between a direction and the normal at which nothing is gained any more
-TYPICAL_ERROR = 0.2  # scale of the Cauchy weight of an error at a foot point
+TYPICAL_ERROR = 0.2  # scale of the Cauchy weight of an error at a foot point ...
+CLEAR_ERROR = 0.05  # ... and where a sphere from beyond the band is clear of the surface
 MAX_ERROR = 0.6  # larger errors are clipped
 SQUARINGS = 3  # of the cosine between the search direction and the normal: its 8th power
 FAR_PENALTY = 0.5  # how the weight falls with a sample's distance beyond MAX_DISTANCE
@@ -281,9 +282,11 @@ def weigh(found: Look, distance: FloatArray) -> FootPoints:
 
     The weight falls with the angle between direction and normal, with the error (a Cauchy weight: a
     large error is probably a place on the wrong part of the surface), and with the sample's
-    ``distance`` (n,), since an error of the direction matters more.
+    ``distance`` (n,), since an error of the direction matters more. Spheres from beyond the band
+    mostly touch edges, which linear cells cut off: that they are clear of them is no error.
     """
-    unusual = found.value / np.float32(TYPICAL_ERROR)
+    clear = (np.abs(distance) >= MAX_DISTANCE) & (found.clearance > 0)
+    unusual = found.value / np.where(clear, np.float32(CLEAR_ERROR), np.float32(TYPICAL_ERROR))
     aligned = np.clip(found.cosine, 0, 1)
     for _ in range(SQUARINGS):  # np.power's last bit depends on the position in the array
         aligned *= aligned
