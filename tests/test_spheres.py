@@ -63,7 +63,19 @@ def test_foot_points_lie_on_the_surface(factor):
     assert np.abs(feet.values).max() < 0.12 / factor  # linear interpolation of a curved field
     near = is_near(spheres)
     assert feet.weights[near].min() > 0.95
-    assert 0.45 < feet.weights[~near].min() < feet.weights[~near].max() < 1
+    assert feet.weights[~near].max() < 1  # farther away, they say less
+
+
+def test_a_sphere_from_beyond_the_band_says_less_where_it_is_clear_than_where_it_is_pierced():
+    (spheres, index), _, position = blocks_of(ball())
+    outer = spheres.some(
+        (spheres.distance > MAX_DISTANCE) & (spheres.distance < MAX_DISTANCE + 0.5)
+    )
+    clear, pierced = (
+        find_foot_points(distance_to_ball(position, radius), 4, outer, index).weights.mean()
+        for radius in (5.95, 6.05)
+    )
+    assert clear < 0.4 < 0.6 < pierced
 
 
 def test_samples_a_voxel_beyond_the_band_have_spheres():
