@@ -49,7 +49,7 @@ def test_the_cap_changes_nothing_where_nothing_leaves():
     np.testing.assert_array_equal(plain.vertices, capped.vertices)
 
 
-def tip(beyond: float = -0.01) -> SdfGrid:
+def tip(beyond: float = -0.004) -> SdfGrid:
     """Return a bar whose end lies a little before the outermost samples, in spacings."""
     x, y, z = np.indices((17, 14, 15)) - np.array([0, 6.4, 7.3])[:, None, None, None]
     away = np.stack([x - 16 - beyond, np.abs(y) - 3.2, np.abs(z) - 2.7, 4 - x])

@@ -43,7 +43,6 @@ def test_everything_is_checked_on_the_cpu():
         "versions",
         "memory",
         "network base on cpu",
-        "network best on cpu",
         "network fast on cpu",
         "network mask on cpu",
         "network base-int8 on cpu",
