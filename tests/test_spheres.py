@@ -63,7 +63,7 @@ def test_foot_points_lie_on_the_surface(factor):
     assert np.abs(feet.values).max() < 0.12 / factor  # linear interpolation of a curved field
     near = is_near(spheres)
     assert feet.weights[near].min() > 0.95
-    assert feet.weights[~near].max() < 1  # farther away, they say less
+    assert feet.weights[~near].mean() < 0.85  # farther away, they say less
 
 
 def test_a_sphere_from_beyond_the_band_says_less_where_it_is_clear_than_where_it_is_pierced():

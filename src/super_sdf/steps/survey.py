@@ -45,8 +45,8 @@ from .exact import BandSummary, exact_samples
 from .offsets import Jumps, check_not_cut_off, check_not_filled, find_jumps
 
 BYTES_PER_VOXEL = 123  # of a band
-FAR = 1e30  # half voxels: no sample of the band is there
 BYTES_PER_SAMPLE = 20  # of the planes among which the band is found, measured
+FAR = 1e30  # half voxels: no sample of the band is there
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,9 +269,7 @@ def limit_to_field(band: Band, grid: SdfGrid, offset: float) -> Band:
     field, scale = grid.field, 2 / grid.voxel_size
     low, high = ((limit - offset) * scale for limit in field.exact)
     ends = np.clip([grid.low - offset, grid.high - offset], -FAR / scale, FAR / scale) * scale
-    lowest, highest = map(
-        float, ends.astype(np.float32)
-    )  # where it may be cut off, see ``rescale``
+    lowest, highest = map(float, ends.astype(np.float32))  # where it may be cut off
     if band.sampled is None:  # of a resampled grid, what is interpolated there promises little
         band = replace(band, limits=(max(low, lowest), min(high, highest)))
     if field.kind == EXACT:
