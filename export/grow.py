@@ -28,8 +28,9 @@ def grow_from(net: SuperSdfNet, weights: dict[str, Tensor]) -> None:
     Raises
     ------
     OptionError
-        If a layer of the smaller network has more units.
+        If a layer of the smaller network has more units, or it has more blocks.
     """
+    check_blocks(net, weights)
     channels = len(weights["correction.weight"][0])
     for name, parameter in net.named_parameters():
         if name not in weights:
@@ -43,6 +44,16 @@ def grow_from(net: SuperSdfNet, weights: dict[str, Tensor]) -> None:
             place_units(by_place.mT, weights[name].view(places, channels, -1).mT, name)
         else:
             place_units(parameter, weights[name], name)
+
+
+def check_blocks(net: SuperSdfNet, weights: dict[str, Tensor]) -> None:
+    """Raise OptionError if a network has fewer blocks than the weights it is to get."""
+    blocks = len({name.split(".")[1] for name in weights if name.startswith("blocks.")})
+    if blocks > net.config.blocks:
+        raise OptionError(
+            f"--start has a network of {blocks} blocks, more than the {net.config.blocks} of this "
+            f"size: give --blocks {blocks}"
+        )
 
 
 def place_units(new: Tensor, old: Tensor, name: str) -> None:

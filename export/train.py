@@ -35,6 +35,7 @@ from export.grow import grow_from
 from export.network import SIZES, SuperSdfNet
 from export.recipe import RECIPE, Recipe, differences, loss_of, make_optimisers, rate_factor
 from export.run_log import LOG_COLUMNS, append_line, plot_run, read_log
+from export.sharing import decode_shared, neighbours_with_targets
 from export.to_onnx import read_weights
 from super_sdf.errors import FileError
 from super_sdf.files.regular import check_regular_file
@@ -56,8 +57,9 @@ def predict(net: SuperSdfNet, batch: list[Prepared]) -> list[tuple[Tensor, Tenso
     pairs = []
     for sample, start in zip(batch, starts[:-1]):
         rows = torch.from_numpy(sample.voxels + start).to(device)
-        offsets, target = (torch.from_numpy(a).to(device) for a in (sample.offsets, sample.targets))
-        pairs.append((net.decode(encoded.some(rows), offsets), target))
+        near = torch.from_numpy(neighbours_with_targets(sample)).to(device)
+        values = decode_shared(net, encoded.some(rows), near, sample.offsets)
+        pairs.append((values, torch.from_numpy(sample.targets).to(device)))
     return pairs
 
 

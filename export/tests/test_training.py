@@ -479,6 +479,9 @@ def test_no_network_starts_from_a_larger_one(tmp_path):
     run = Run(tmp_path, SuperSdfNet(replace(SMALL, hidden=12)))
     with pytest.raises(OptionError, match=r"stem.0.weight is \(16, 27\), more than the \(12, 27\)"):
         run.start_from(read_weights(tmp_path / "small.onnx"))
+    run = Run(tmp_path, SuperSdfNet(replace(SMALL, blocks=1)))
+    with pytest.raises(OptionError, match=r"of 2 blocks, more than the 1 of this size: .* 2$"):
+        run.start_from(read_weights(tmp_path / "small.onnx"))
 
 
 def put_to_sleep(net, units=3):

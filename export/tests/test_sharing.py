@@ -1,0 +1,93 @@
+"""The loss is that of the values that the runtime makes: those of shared nodes are averaged."""
+
+import numpy as np
+import torch
+
+from export.augment import CLEAN, augment, prepare
+from export.dataset import Sample
+from export.network import NetworkConfig, SuperSdfNet
+from export.sharing import copies_of_queries, decode_shared, neighbours_with_targets
+from export.train import predict
+from super_sdf.neighbourhood import CENTRE, NEIGHBOURHOOD
+from super_sdf.network.decoder import to_blocks
+from super_sdf.pipeline import rows_among
+from super_sdf.steps.nodes import average_shared, block_offsets, share_parts
+
+SMALL = NetworkConfig(channels=8, blocks=2, hidden=16, functions=24, trunk=16, frequencies=2)
+
+
+def ball_sample(factor=4):
+    """A ball on a window of 9^3, queried at all nodes; some voxels of the band have no targets."""
+    ijk = np.indices((9, 9, 9)).reshape(3, -1).T
+    distance = 2 * (np.linalg.norm(ijk - [4.2, 3.9, 4.1], axis=1) - 2.3)
+    near = ijk[np.abs(distance) <= 2]
+    offsets = block_offsets(factor)
+    points = near[:, None] + offsets / 2
+    targets = 2 * (np.linalg.norm(points - [4.2, 3.9, 4.1], axis=2) - 2.3)
+    window = distance.reshape(9, 9, 9).astype(np.float32)
+    return Sample(window, offsets, near.astype(np.uint8), targets.astype(np.float16))
+
+
+def small_net():
+    torch.manual_seed(0)
+    net = SuperSdfNet(SMALL)
+    for parameter in net.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    return net
+
+
+def test_the_copies_of_a_query_are_the_same_point_in_other_voxels():
+    offsets = np.array([[0, 0.5, -0.5], [1, 0, 0.5], [-1, 1, 0], [1, -1, 1]], np.float32)
+    query, place, moved = copies_of_queries(offsets)
+    assert np.bincount(query).tolist() == [1, 2, 4, 8]
+    assert len({(int(q), int(p)) for q, p in zip(query, place)}) == len(query)
+    assert query[:4].tolist() == [0, 1, 2, 3] and (place[:4] == CENTRE).all()
+    np.testing.assert_array_equal(moved + 2 * NEIGHBOURHOOD[place], offsets[query])
+    assert np.abs(moved).max() <= 1
+
+
+def test_a_query_inside_every_voxel_is_decoded_as_it_is():
+    sample, net = prepare(ball_sample()), small_net()
+    offsets = np.random.default_rng(0).uniform(-0.9, 0.9, (6, 3)).astype(np.float32)
+    voxels = net.encode_batch([sample]).some(torch.from_numpy(sample.voxels))
+    near = torch.from_numpy(neighbours_with_targets(sample))
+    got = decode_shared(net, voxels, near, offsets)
+    torch.testing.assert_close(got, net.decode(voxels, torch.from_numpy(offsets)))
+
+
+def test_shared_nodes_have_the_mean_that_the_runtime_gives_them():
+    sample, net = prepare(ball_sample()), small_net()
+    with torch.no_grad():
+        got = predict(net, [sample])[0][0].numpy()
+        voxels = net.encode_batch([sample]).some(torch.from_numpy(sample.voxels))
+        alone = net.decode(voxels, torch.from_numpy(sample.offsets)).numpy()
+    blocks = to_blocks(alone)
+    near = rows_among(sample.voxels, len(sample.table))[sample.table[sample.voxels]]
+    average_shared(blocks, share_parts(near), 4)
+    np.testing.assert_allclose(got, blocks[:, :-1].T, atol=1e-5)
+    assert np.abs(got - alone).max() > 1e-3
+
+
+def test_a_turned_sample_shares_the_same_nodes():
+    rng, net = np.random.default_rng(3), small_net()
+    for name, weight in net.named_parameters():
+        if name.startswith(("stem", "blocks", "branch", "correction", "trunk")):
+            torch.nn.init.zeros_(weight)  # interpolation alone turns with the cube
+    want = predict(net, [prepare(ball_sample())])[0][0]
+    for _ in range(5):
+        got = predict(net, [augment(rng, ball_sample(), CLEAN)])[0][0]
+        torch.testing.assert_close(got, want, atol=1e-5, rtol=0)
+
+
+def test_the_gradient_reaches_the_voxels_that_share_a_node():
+    sample, net = prepare(ball_sample()), small_net()
+    voxels = net.encode_batch([sample]).some(torch.from_numpy(sample.voxels))
+    features = voxels.features.detach().requires_grad_()
+    voxels = type(voxels)(features, voxels.patches, voxels.noisy)
+    near = torch.from_numpy(neighbours_with_targets(sample))
+    corner = np.array([[1, 1, 1]], np.float32)
+    decode_shared(net, voxels, near, corner)[0, 0].backward()
+    reached = np.flatnonzero(features.grad.abs().sum(1).numpy())
+    count = len(near)
+    shares = [int(row) for row in near[0, [13, 14, 16, 17, 22, 23, 25, 26]] if row < count]
+    assert reached.tolist() == sorted(shares) and len(shares) > 1
