@@ -50,7 +50,7 @@ NEAR = 0.5  # half voxels from the surface: limit for normals; half of it for va
 
 
 def predict(net: SuperSdfNet, batch: list[Prepared]) -> list[tuple[Tensor, Tensor]]:
-    """Return prediction and target, (D, Q), of each sample."""
+    """Return prediction and target, (D, Q), of each sample; shared nodes are averaged."""
     device = next(net.parameters()).device
     encoded = net.encode_batch(batch)
     starts = np.cumsum([0] + [len(sample.patches) for sample in batch])

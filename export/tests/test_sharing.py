@@ -5,15 +5,13 @@ import torch
 
 from export.augment import CLEAN, augment, prepare
 from export.dataset import Sample
-from export.network import NetworkConfig, SuperSdfNet
 from export.sharing import copies_of_queries, decode_shared, neighbours_with_targets
+from export.tests.small_net import small_net
 from export.train import predict
 from super_sdf.neighbourhood import CENTRE, NEIGHBOURHOOD
 from super_sdf.network.decoder import to_blocks
 from super_sdf.pipeline import rows_among
 from super_sdf.steps.nodes import average_shared, block_offsets, share_parts
-
-SMALL = NetworkConfig(channels=8, blocks=2, hidden=16, functions=24, trunk=16, frequencies=2)
 
 
 def ball_sample(factor=4):
@@ -26,14 +24,6 @@ def ball_sample(factor=4):
     targets = 2 * (np.linalg.norm(points - [4.2, 3.9, 4.1], axis=2) - 2.3)
     window = distance.reshape(9, 9, 9).astype(np.float32)
     return Sample(window, offsets, near.astype(np.uint8), targets.astype(np.float16))
-
-
-def small_net():
-    torch.manual_seed(0)
-    net = SuperSdfNet(SMALL)
-    for parameter in net.parameters():
-        torch.nn.init.normal_(parameter, std=0.1)
-    return net
 
 
 def test_the_copies_of_a_query_are_the_same_point_in_other_voxels():

@@ -37,7 +37,6 @@ from export.dormant import dormant_share, moments, rectified_layers, revive
 from export.latency import ball, microseconds
 from export.network import (
     GatherMatMul,
-    NetworkConfig,
     SuperSdfNet,
     interpolation_weights,
     is_noisy,
@@ -45,6 +44,7 @@ from export.network import (
 from export.recipe import RECIPE, differences, make_optimisers, rate_factor
 from export.run_log import draw_history, read_log
 from export.shapes import random_solid
+from export.tests.small_net import SMALL, small_net
 from export.to_onnx import (
     check_awake,
     make_card,
@@ -67,8 +67,6 @@ from super_sdf.steps.band import find_band, is_lipschitz, neighbour_table
 from super_sdf.steps.nodes import block_offsets
 from super_sdf.truth.sampling import sample_grid
 from super_sdf.truth.solid import Solid
-
-SMALL = NetworkConfig(channels=8, blocks=2, hidden=16, functions=24, trunk=16, frequencies=2)
 
 
 def box(low=(-0.3, -0.2, -0.1), high=(0.4, 0.3, 0.2)) -> Mesh:
@@ -403,14 +401,6 @@ def test_a_recipe_with_other_rates_and_less_noise():
     assert (recipe.hidden_rate, recipe.outer_rate) == (2e-3, 1e-3)
     assert recipe.shares == replace(RECIPE.shares, noisy=0.1)
     assert RECIPE.at(1.0, RECIPE.shares.noisy) == RECIPE
-
-
-def small_net():
-    torch.manual_seed(0)
-    net = SuperSdfNet(SMALL)
-    for parameter in net.parameters():  # away from the start, where the blocks do nothing
-        torch.nn.init.normal_(parameter, std=0.1)
-    return net
 
 
 def test_the_onnx_file_agrees_with_torch_and_carries_its_card(tmp_path):
