@@ -160,6 +160,7 @@ def make_card(net: SuperSdfNet, name: str, data: str, accuracy: str) -> dict[str
         "name": name,
         "band": "abs(value) < 1.5 h",
         "receptive_field": net.config.receptive_field,
+        "channels": net.config.channels,
         "value_scaling": "2 / h",
         "training_factors": [2, 4, 8, 16],
         "parameters": sum(p.numel() for p in net.parameters()),

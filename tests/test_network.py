@@ -252,6 +252,8 @@ CARDS = {
     "truth": ({"receptive_field": "true"}, "its receptive field is True; it must be a whole"),
     "words": ({"receptive_field": "six"}, "its receptive field is 'six'; it must be a whole"),
     "list": ({"receptive_field": "[6]"}, r"its receptive field is \[6\]; it must be a whole"),
+    "no width": ({"channels": "0"}, "its width is 0; it must be a whole number of channels from 1"),
+    "wide": ({"channels": '"wide"'}, "its width is 'wide'; it must be a whole number of channels"),
     "digits": ({"receptive_field": LONG}, "its metadata 'receptive_field' cannot be read, '7777"),
     "deep": ({"data": DEEP}, r"its metadata 'data' cannot be read, '\[\[\[\[\[\["),
     "no version": (None, r"is no super-sdf network of format 1 \(format none, inputs patches ten"),
@@ -279,6 +281,14 @@ def test_a_card_need_not_have_the_receptive_field(tmp_path):
     card = {"format_version": "1", "note": "not JSON"}
     network = load_network(write_network(tmp_path / "own.onnx", card=card), device="cpu")
     assert network.receptive_field is None and network.card["note"] == "not JSON"
+
+
+def test_a_wider_network_takes_more_memory(tmp_path):
+    shipped, path = shipped_models()["fast"], tmp_path / "wide.onnx"
+    path.write_bytes(shipped.read_bytes() + metadata({"channels": "128"}))
+    usual, wide = load_network(shipped, device="cpu"), load_network(path, device="cpu")
+    assert usual.memory_bytes == (680, 8) and wide.memory_bytes == (1144, 8)
+    assert wide.averaged(4).memory_bytes == (1384, 12)
 
 
 @pytest.mark.parametrize(

@@ -25,9 +25,13 @@ INPUTS = {
     "offsets": "tensor(float)",
 }
 OUTPUT, OUTPUT_TYPE = "values", "tensor(float)"
-# Voxels to each side; a patch alone reaches one. The card of a network that sees farther, up to the
-# whole grid, leaves the receptive field out.
-MAX_RECEPTIVE_FIELD = 1000
+# The whole numbers of a card: name, unit and largest value. A receptive field is to each side; a
+# patch alone reaches one voxel. The card of a network that sees farther, up to the whole grid,
+# leaves it out. The width decides how much memory a run takes.
+WHOLE = {
+    "receptive_field": ("receptive field", "voxels", 1000),
+    "channels": ("width", "channels", 10_000),
+}
 MAX_SHOWN = 60  # characters of metadata in messages
 
 
@@ -66,7 +70,8 @@ def read_card(session: ort.InferenceSession, path: Path) -> dict[str, Any]:
             "with export/to_onnx.py"
         )
     card = {key: _parse(key, text, path) for key, text in metadata.items()}
-    _check_field(card.get("receptive_field", 1), path)
+    for key in WHOLE.keys() & card.keys():
+        _check_whole(key, card[key], path)
     return card
 
 
@@ -94,10 +99,11 @@ def _parse(key: str, text: str, path: Path) -> Any:
         ) from error
 
 
-def _check_field(field: Any, path: Path) -> None:
-    """Raise ModelError unless a receptive field is a valid number of voxels."""
-    if type(field) is not int or not 1 <= field <= MAX_RECEPTIVE_FIELD:  # True is an int, too
+def _check_whole(key: str, value: Any, path: Path) -> None:
+    """Raise ModelError unless an entry is a whole number from 1 to its largest."""
+    name, unit, most = WHOLE[key]
+    if type(value) is not int or not 1 <= value <= most:  # True is an int, too
         raise ModelError(
-            f"{path}: its receptive field is {shorten(repr(field))}; it must be a whole number of "
-            f"voxels from 1 to {MAX_RECEPTIVE_FIELD}: export it again with export/to_onnx.py"
+            f"{path}: its {name} is {shorten(repr(value))}; it must be a whole number of {unit} "
+            f"from 1 to {most}: export it again with export/to_onnx.py"
         )

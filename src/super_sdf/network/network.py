@@ -26,9 +26,13 @@ from .running import CUDA_CHUNK, Poll, run_bound, run_on_cpu
 from .symmetry import cube_symmetries, turn
 
 MODELS = Path(__file__).parent.parent / "models"
-# Memory of a run, measured: bytes per voxel that it sees, including its row of the neighbour table,
-# and per value. Averaging over symmetries takes more: for the transformed inputs, and for the mean.
-BYTES = {"float32": (680.0, 8.0), "int8": (950.0, 8.0)}
+# Memory of a run, measured: of each voxel that it sees, its patch and its row of the neighbour
+# table and, by precision, what each channel takes; and of each value. Averaging over symmetries
+# takes more: for the transformed inputs, and for the mean.
+INPUT_BYTES = 216.0
+CHANNEL_BYTES = {"float32": 7.25, "int8": 11.5}
+VALUE_BYTES = 8.0
+USUAL_CHANNELS = 64  # of a network whose card does not say
 SYMMETRY_BYTES = (240.0, 4.0)
 NO_NETWORKS = "super-sdf was installed without its networks: install it again"
 TRIAL_ROWS = 1024  # voxels of a run on the CPU that measures the pace: two chunks
@@ -87,10 +91,11 @@ class Network:
     @property
     def memory_bytes(self) -> tuple[float, float]:
         """Peak memory of a run: bytes per voxel that it sees, and bytes per value."""
-        voxel, value = BYTES["int8" if self.card.get("precision") == "int8" else "float32"]
+        each = CHANNEL_BYTES["int8" if self.card.get("precision") == "int8" else "float32"]
+        voxel = INPUT_BYTES + each * self.card.get("channels", USUAL_CHANNELS)
         if self.symmetries == 1:
-            return voxel, value
-        return voxel + SYMMETRY_BYTES[0], value + SYMMETRY_BYTES[1]
+            return voxel, VALUE_BYTES
+        return voxel + SYMMETRY_BYTES[0], VALUE_BYTES + SYMMETRY_BYTES[1]
 
     def __call__(
         self,
