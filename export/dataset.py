@@ -43,7 +43,7 @@ from super_sdf.truth.sampling import sample_grid
 from super_sdf.truth.solid import Solid
 
 CORNERS, FINE_NODES, ANYWHERE = 5, 4, 4  # queries: 4 per corner, 28 in all
-SMALLEST, LARGEST = 7, 100  # voxels along a shape's diagonal
+SIZES = 7.0, 100.0  # voxels along a shape's diagonal
 SWAYED = 0.3  # share of the meshes that are bent
 THIN = -0.2, 0.6  # range of the lowest sample of a thin solid, in spacings
 WINDOW = 32  # samples along each axis: a whole shape at 32^3, a piece of it at 64^3
@@ -60,10 +60,10 @@ class Sample:
     targets: np.ndarray
 
 
-def draw_pose(rng: np.random.Generator, mesh: Mesh) -> Mesh:
+def draw_pose(rng: np.random.Generator, mesh: Mesh, sizes: tuple[float, float] = SIZES) -> Mesh:
     """Place a shape in index space: 7 to 100 voxels along its diagonal, half of them turned."""
     turn = Rotation.random(rng=rng).as_matrix() if rng.random() < 0.5 else np.eye(3)
-    size = np.exp(rng.uniform(np.log(SMALLEST), np.log(LARGEST)))
+    size = np.exp(rng.uniform(*np.log(sizes)))
     diagonal = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
     posed = mesh.transformed(turn * size / diagonal, np.zeros(3))
     low = posed.vertices.min(0)
@@ -90,14 +90,18 @@ def draw_offsets(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_sample(
-    rng: np.random.Generator, mesh: Mesh, lowest: tuple[float, float] = (-np.inf, np.inf)
+    rng: np.random.Generator,
+    mesh: Mesh,
+    lowest: tuple[float, float] = (-np.inf, np.inf),
+    sizes: tuple[float, float] = SIZES,
 ) -> Sample | None:
     """Sample a shape; return None if no sample is near the surface, or all are inside.
 
     A shape so thin that no sample lies inside is kept: its distances reveal it. Also None if the
-    lowest sample is not between the two bounds ``lowest`` (in spacings).
+    lowest sample is not between the two bounds ``lowest`` (in spacings). ``sizes`` is the range of
+    the shape's diagonal.
     """
-    posed = draw_pose(rng, mesh)
+    posed = draw_pose(rng, mesh, sizes)
     shape, first = draw_window(rng, posed)
     solid = Solid(posed)
     values = sample_grid(solid, (shape, 1.0, first))
