@@ -27,6 +27,7 @@ class Recipe:
     batch_voxels: int = 12_000  # small enough for the arrays of a step to stay in cache
     average_decay: float = 0.998  # of the averaged weights, per step
     power: int = 1  # of the error: 1 or 2
+    voxel_power: float = 0.5  # of the number of voxels of a sample, for its weight in a batch
     reach: float = 0.5  # half voxels: decay length of the weight away from the surface ...
     far_weight: float = 0.25  # ... to this
     gradient_weight: float = 0.5
@@ -72,6 +73,17 @@ def loss_of(prediction: Tensor, target: Tensor, recipe: Recipe) -> Tensor:
         unit = (slope.norm(dim=2) - 1).abs()
         loss = loss + recipe.eikonal_weight * (corners * unit).mean()
     return loss
+
+
+def loss_of_batch(pairs: list[tuple[Tensor, Tensor]], recipe: Recipe) -> Tensor:
+    """Return the weighted mean of the losses of samples.
+
+    Small shapes have few voxels and large errors. With equal weights they make up more than half of
+    the loss, and of its noise; weighted by voxels they would hardly count.
+    """
+    losses = torch.stack([loss_of(*pair, recipe) for pair in pairs])
+    weights = losses.new_tensor([len(target) for _, target in pairs]) ** recipe.voxel_power
+    return (weights * losses).sum() / weights.sum()
 
 
 def make_optimisers(net: SuperSdfNet, recipe: Recipe) -> list[torch.optim.Optimizer]:

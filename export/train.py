@@ -33,7 +33,7 @@ from export.dataset import CORNERS, Sample, read_shard
 from export.dormant import dormant_share, revive
 from export.grow import grow_from
 from export.network import SIZES, SuperSdfNet
-from export.recipe import RECIPE, Recipe, differences, loss_of, make_optimisers, rate_factor
+from export.recipe import RECIPE, Recipe, differences, loss_of_batch, make_optimisers, rate_factor
 from export.run_log import LOG_COLUMNS, append_line, plot_run, read_log
 from export.sharing import decode_shared, neighbours_with_targets
 from export.to_onnx import read_weights
@@ -171,8 +171,7 @@ class Run:
             optimiser.param_groups[0]["lr"] = peak * rate_factor(spent, self.recipe)
             optimiser.zero_grad()
         with torch.autocast(self.device, dtype=torch.bfloat16):
-            losses = [loss_of(*pair, self.recipe) for pair in predict(self.net, batch)]
-            loss = torch.stack(losses).mean()
+            loss = loss_of_batch(predict(self.net, batch), self.recipe)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
         for optimiser in self.optimisers:
