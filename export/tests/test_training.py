@@ -41,7 +41,14 @@ from export.network import (
     interpolation_weights,
     is_noisy,
 )
-from export.recipe import RECIPE, differences, make_optimisers, rate_factor
+from export.recipe import (
+    RECIPE,
+    differences,
+    loss_of,
+    loss_of_batch,
+    make_optimisers,
+    rate_factor,
+)
 from export.run_log import draw_history, read_log
 from export.shapes import random_solid
 from export.tests.small_net import SMALL, small_net
@@ -401,6 +408,15 @@ def test_a_recipe_with_other_rates_and_less_noise():
     assert (recipe.hidden_rate, recipe.outer_rate) == (2e-3, 1e-3)
     assert recipe.shares == replace(RECIPE.shares, noisy=0.1)
     assert RECIPE.at(1.0, RECIPE.shares.noisy) == RECIPE
+
+
+def test_a_sample_counts_by_the_root_of_its_voxels():
+    target = torch.ones(16, 4 * CORNERS)
+    pairs = [(target, target), (torch.full((4, 4 * CORNERS), 3.0), target[:4])]
+    alone = loss_of(*pairs[1], RECIPE)
+    torch.testing.assert_close(loss_of_batch(pairs, RECIPE), alone * 2 / (4 + 2))
+    equal = replace(RECIPE, voxel_power=0.0)
+    torch.testing.assert_close(loss_of_batch(pairs, equal), alone / 2)
 
 
 def test_the_onnx_file_agrees_with_torch_and_carries_its_card(tmp_path):
