@@ -61,7 +61,7 @@ class Sample:
 
 
 def draw_pose(rng: np.random.Generator, mesh: Mesh, sizes: tuple[float, float] = SIZES) -> Mesh:
-    """Place a shape in index space: 7 to 100 voxels along its diagonal, half of them turned."""
+    """Place a shape in index space, its diagonal within ``sizes`` voxels; half of them turned."""
     turn = Rotation.random(rng=rng).as_matrix() if rng.random() < 0.5 else np.eye(3)
     size = np.exp(rng.uniform(*np.log(sizes)))
     diagonal = np.linalg.norm(np.ptp(mesh.vertices, axis=0))

@@ -22,7 +22,7 @@ from export.augment import prepare
 from export.dataset import Sample, draw_mesh, find_meshes, make_sample
 from export.shapes.draws import unit_sized
 from export.shapes.families import FAMILIES, Family
-from export.shapes.solid import is_usable
+from export.shapes.solid import is_usable, mesh_of
 from export.to_onnx import read_network
 from export.train import Errors, measure
 from super_sdf import Mesh
@@ -38,8 +38,7 @@ def drawn_from(family: Family) -> Draw:
         solid = unit_sized(family(rng))
         while not is_usable(solid):
             solid = unit_sized(family(rng))
-        made = solid.to_mesh64()
-        return Mesh(made.vert_properties[:, :3], made.tri_verts.astype(np.int32))
+        return mesh_of(solid)
 
     return draw
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from export.augment import Prepared
 from export.network import Encoded, SuperSdfNet
 from super_sdf.neighbourhood import CENTRE, STRIDES
+from super_sdf.pipeline import rows_among
 
 
 def neighbours_with_targets(sample: Prepared) -> np.ndarray:
@@ -22,10 +23,8 @@ def neighbours_with_targets(sample: Prepared) -> np.ndarray:
 
     The result is (D, 27) int64, with D where there is none.
     """
-    count = len(sample.voxels)
-    row_of = np.full(len(sample.patches) + 1, count)
-    row_of[sample.voxels] = np.arange(count)
-    return row_of[sample.table[sample.voxels]]
+    near = rows_among(sample.voxels, len(sample.table))[sample.table[sample.voxels]]
+    return np.where(near < 0, len(near), near).astype(np.int64)
 
 
 def copies_of_queries(offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -101,6 +101,12 @@ def without_crumbs(mesh: Mesh) -> Mesh:
     return Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32))
 
 
+def mesh_of(solid: Manifold) -> Mesh:
+    """Return the surface of a solid."""
+    drawn = solid.to_mesh64()
+    return Mesh(drawn.vert_properties[:, :3], drawn.tri_verts.astype(np.int32))
+
+
 def random_solid(rng: np.random.Generator) -> Mesh:
     """Draw a closed solid with outward faces, its bounding box centred and of diagonal 1.
 
@@ -115,9 +121,7 @@ def random_solid(rng: np.random.Generator) -> Mesh:
     for _ in range(ATTEMPTS):
         solid = draw_candidate(rng)
         if is_usable(solid):
-            drawn = solid.to_mesh64()
-            vertices, faces = drawn.vert_properties[:, :3], drawn.tri_verts.astype(np.int32)
-            mesh = without_crumbs(Mesh(vertices, faces))
+            mesh = without_crumbs(mesh_of(solid))
             low, high = mesh.vertices.min(0), mesh.vertices.max(0)
             scale = 1 / float(np.linalg.norm(high - low))
             return mesh.transformed(scale * np.eye(3), -scale * (low + high) / 2)

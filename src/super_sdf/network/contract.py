@@ -70,8 +70,9 @@ def read_card(session: ort.InferenceSession, path: Path) -> dict[str, Any]:
             "with export/to_onnx.py"
         )
     card = {key: _parse(key, text, path) for key, text in metadata.items()}
-    for key in WHOLE.keys() & card.keys():
-        _check_whole(key, card[key], path)
+    for key in WHOLE:
+        if key in card:
+            _check_whole(key, card[key], path)
     return card
 
 
