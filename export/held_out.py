@@ -1,6 +1,6 @@
 """The errors of exported networks on the held-out windows of a store, as the log of a run has them.
 
-    python -m export.held_out --store training/store src/super_sdf/models/*.onnx
+    python -m export.held_out --store training/store src/super_sdf/models/base.onnx
 
 So a shipped network can be compared with one in training. Networks for masks are measured on masks.
 """

@@ -25,6 +25,7 @@ from export.calibration import draw_samples
 from export.dormant import dormant_share
 from export.network import NetworkConfig, SuperSdfNet
 from export.onnx_graph import build_graph
+from super_sdf.errors import ModelError
 from super_sdf.network.contract import FORMAT_VERSION
 from super_sdf.network.network import load_network
 from super_sdf.steps.band import find_band, gather_patches, neighbour_table
@@ -36,10 +37,18 @@ DORMANT = 0.01  # largest accepted share of dormant units
 
 
 def read_weights(path: Path) -> dict[str, torch.Tensor]:
-    """Return the parameters and buffers of an exported file, to continue training from."""
+    """Return the parameters and buffers of an exported file, to continue training from.
+
+    Raises
+    ------
+    ModelError
+        If its blocks are in int8.
+    """
     graphs = [onnx.load(path).graph]
     graphs += [a.g for node in graphs[0].node for a in node.attribute if a.name == "body"]
     arrays = {i.name: numpy_helper.to_array(i).copy() for g in graphs for i in g.initializer}
+    if any("_int8_" in name for name in arrays):
+        raise ModelError(f"{path} is an int8 network: give the float32 network it was made from")
     linear = {name for name, array in arrays.items() if array.ndim == 2 and "conv" not in name}
     return {
         name: torch.from_numpy(array.T.copy() if name in linear else array)
