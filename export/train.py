@@ -33,6 +33,7 @@ from export.dataset import CORNERS, Sample, read_shard
 from export.dormant import dormant_share, revive
 from export.grow import grow_from
 from export.network import SIZES, SuperSdfNet
+from export.precision import autocast
 from export.recipe import RECIPE, Recipe, differences, loss_of_batch, make_optimisers, rate_factor
 from export.run_log import LOG_COLUMNS, append_line, plot_run, read_log
 from export.sharing import decode_shared, neighbours_with_targets
@@ -170,7 +171,7 @@ class Run:
         for optimiser, peak in zip(self.optimisers, self.peaks):
             optimiser.param_groups[0]["lr"] = peak * rate_factor(spent, self.recipe)
             optimiser.zero_grad()
-        with torch.autocast(self.device, dtype=torch.bfloat16):
+        with autocast(self.device):
             loss = loss_of_batch(predict(self.net, batch), self.recipe)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
@@ -213,7 +214,7 @@ class Errors:
 def measure(net: SuperSdfNet, samples: list[Prepared]) -> Errors:
     """Return the errors on held-out samples."""
     device = next(net.parameters()).device.type
-    with torch.no_grad(), torch.autocast(device, dtype=torch.bfloat16):
+    with torch.no_grad(), autocast(device):
         pairs = [predict(net, [sample])[0] for sample in samples]
     return Errors(*np.nanmean([sample_errors(*pair) for pair in pairs], axis=0).tolist())
 
