@@ -1,6 +1,7 @@
 """Training samples: windows of coarse grids with exact distances at fine query points.
 
     python -m export.dataset --meshes DIR --procedural 0.3 --out training/store --count 5000
+    python -m export.dataset --families sculpture creature --out training/store --seed 9
 
 A sample is one shape in one pose at one resolution. It holds a window of the coarse grid and, for
 each voxel that can hold the surface, the exact distance at a set of query offsets that is drawn
@@ -33,6 +34,7 @@ from scipy.spatial.transform import Rotation
 from export.arguments import Parser, at_least, share
 from export.shapes import random_solid
 from export.shapes.draws import draw_sway
+from export.shapes.families import FAMILIES
 from super_sdf import Mesh, SdfGrid
 from super_sdf.errors import FileError
 from super_sdf.files.regular import check_regular_file
@@ -215,11 +217,11 @@ def draw_mesh(rng: np.random.Generator, path: Path) -> Mesh:
     return Mesh(draw_sway(rng, 0.6)(mesh.vertices / diagonal), mesh.faces)
 
 
-def make_thin_sample(rng: np.random.Generator) -> Sample:
+def make_thin_sample(rng: np.random.Generator, families: Sequence[str] = ()) -> Sample:
     """Squeeze random procedural shapes along their axes until one is thin in its window."""
     sample = None
     while sample is None:
-        solid = random_solid(rng)
+        solid = random_solid(rng, families)
         squeezed = solid.transformed(np.diag(np.exp(rng.normal(0, 1, 3))), np.zeros(3))
         sample = make_sample(rng, squeezed, THIN)
     return sample
@@ -231,17 +233,22 @@ def fill_shard(
     procedural: float,
     thin: float,
     count: int = SHARD,
+    families: Sequence[str] = (),
 ) -> list[Sample]:
     """Make the samples of a shard; a procedural shape replaces a mesh without a usable sample."""
+
+    def draw_solid() -> Mesh:
+        return random_solid(rng, families)
+
     samples: list[Sample] = []
     for number in range(count):
         if rng.random() < thin:
-            samples.append(make_thin_sample(rng))
+            samples.append(make_thin_sample(rng, families))
             continue
         drawn = not files or rng.random() < procedural
-        sample = make_sample(rng, random_solid(rng) if drawn else draw_mesh(rng, files[number]))
+        sample = make_sample(rng, draw_solid() if drawn else draw_mesh(rng, files[number]))
         while sample is None:
-            sample = make_sample(rng, random_solid(rng))
+            sample = make_sample(rng, draw_solid())
         samples.append(sample)
     return samples
 
@@ -255,6 +262,15 @@ def main() -> None:
         type=share,
         default=0.3,
         help="share of procedural shapes when --meshes is given",
+    )
+    parser.add_argument(
+        "--families",
+        nargs="+",
+        choices=FAMILIES,
+        metavar="NAME",
+        default=(),
+        help="families of the procedural shapes; one named twice is drawn twice as often "
+        f"(default: all, which are {', '.join(FAMILIES)})",
     )
     parser.add_argument("--thin", type=share, default=0.05, help="share of thin solids")
     parser.add_argument("--out", type=Path, required=True, help="folder for the shards")
@@ -274,7 +290,8 @@ def fill_store(options: argparse.Namespace) -> None:
         if not path.exists():
             rng = np.random.default_rng([options.seed, number])
             drawn = files[number * SHARD : (number + 1) * SHARD]
-            samples = fill_shard(rng, drawn, options.procedural, options.thin)
+            shares = options.procedural, options.thin
+            samples = fill_shard(rng, drawn, *shares, families=options.families)
             write_shard(path, samples)
             print(f"{path.name}: {sum(len(s.voxel_ijk) for s in samples)} voxels", flush=True)
 

@@ -6,7 +6,7 @@ anywhere in space.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from manifold3d import Manifold
@@ -16,6 +16,7 @@ from export.shapes.edges import chamfered, filleted
 from export.shapes.lettering import text
 from export.shapes.mechanical import gear, plate, repeated, ribs, threads
 from export.shapes.organic import blends, blobs, creature, displaced, gyroid
+from export.shapes.sculpted import sculpture
 from export.shapes.slender import frame, lattice, pipe, shell, thin
 
 Family = Callable[[np.random.Generator], Manifold]
@@ -26,13 +27,15 @@ MACHINED: tuple[Family, ...] = (
     plate, gear, repeated, threads, ribs,
     shell, frame, pipe, thin, lattice, text,
 )  # fmt: skip
-GROWN: tuple[Family, ...] = (blobs, gyroid, blends, creature, displaced)
+GROWN: tuple[Family, ...] = (blobs, gyroid, blends, creature, displaced, sculpture)
 FAMILIES: dict[str, Family] = {family.__name__: family for family in (*MACHINED, *GROWN)}
 
 GROWN_SHARE = 0.4  # few of the meshes at hand have smooth, irregular shapes
 
 
-def draw_family(rng: np.random.Generator) -> Family:
-    """Draw a family."""
+def draw_family(rng: np.random.Generator, names: Sequence[str] = ()) -> Family:
+    """Draw a family: one of those named, equally likely each time they are, or of all."""
+    if names:
+        return FAMILIES[names[rng.integers(len(names))]]
     families = GROWN if rng.random() < GROWN_SHARE else MACHINED
     return families[rng.integers(len(families))]

@@ -121,23 +121,34 @@ def limbs(rng: np.random.Generator) -> np.ndarray:
     return np.concatenate([trunk, trunk * [-1, 1, 1, 1]]) if rng.random() < 0.6 else trunk
 
 
-def creature(rng: np.random.Generator) -> Manifold:
-    """Draw limbs that grow from a trunk and blend into it, their skin smooth or rough."""
-    rods, step, blend = limbs(rng), 0.016, log_uniform(rng, 0.008, 0.03)
+def grown(rng: np.random.Generator, points: np.ndarray) -> np.ndarray:
+    """Draw limbs that grow from a trunk and blend into it: about the distance at grid points."""
+    rods, blend = limbs(rng), log_uniform(rng, 0.008, 0.03)
     places = rods[..., :3].reshape(-1, 3)
     rods[..., :3] -= (places.min(0) + places.max(0)) / 2
     rods *= 0.5 / (np.abs(rods[..., :3]) + rods[..., 3:]).max()
-    points = grid(0.5 + 4 * step, step)
     near = np.zeros(points.shape[:3], np.float32)
     for rod in rods.astype(np.float32):
-        reach = rod[:, 3].max() + 6 * blend
-        low, high = rod[:, :3].min(0) - reach, rod[:, :3].max(0) + reach
-        box = tuple(slice(*np.searchsorted(points[:, 0, 0, 0], ends)) for ends in zip(low, high))
+        box = near_rod(points, rod, 6 * blend)
         near[box] += np.exp(-rod_distance(points[box], rod) / np.float32(blend))
-    values = -blend * np.log(near + np.float32(1e-30))
+    return -blend * np.log(near + np.float32(1e-30))
+
+
+def creature(rng: np.random.Generator) -> Manifold:
+    """Draw limbs that grow from a trunk and blend into it, their skin smooth or rough."""
+    step = 0.016
+    points = grid(0.5 + 4 * step, step)
+    values = grown(rng, points)
     if rng.random() < 0.5:
         values += log_uniform(rng, 0.002, 0.012) * roughness(rng, points, 50)
     return marched(values, points[0, 0, 0, 0], step)
+
+
+def near_rod(points: np.ndarray, rod: np.ndarray, beyond: float) -> tuple[slice, ...]:
+    """Return the box of grid points that lie no farther than ``beyond`` from a rod (2, 4)."""
+    reach, axis = rod[:, 3].max() + beyond, points[:, 0, 0, 0]
+    low, high = rod[:, :3].min(0) - reach, rod[:, :3].max(0) + reach
+    return tuple(slice(*np.searchsorted(axis, ends)) for ends in zip(low, high))
 
 
 def rod_distance(points: np.ndarray, rod: np.ndarray) -> np.ndarray:
@@ -172,13 +183,20 @@ def outside(beyond: np.ndarray) -> np.ndarray:
     return np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(-1), 0)
 
 
-def blends(rng: np.random.Generator) -> Manifold:
-    """Draw bodies that flow into, or are scooped out of, one another with rounded seams."""
-    points, blend = grid(0.75, 0.018), np.float32(log_uniform(rng, 0.01, 0.15))
-    values = draw_distance(rng, points)
+def blended(rng: np.random.Generator, points: np.ndarray, widest: float) -> np.ndarray:
+    """Draw bodies blended into, or scooped out of, one another: about the distance at points.
+
+    The seams are 0.01 to ``widest`` wide.
+    """
+    blend, values = np.float32(log_uniform(rng, 0.01, widest)), draw_distance(rng, points)
     for _ in range(rng.integers(1, 6)):
         other = draw_distance(rng, points)
         sign = 1 if rng.random() < 0.7 else -1
         gap = np.maximum(blend - np.abs(sign * values - other), 0)
         values = sign * (np.minimum(sign * values, other) - gap**2 / (4 * blend))
-    return marched(values, -0.75, 0.018)
+    return values
+
+
+def blends(rng: np.random.Generator) -> Manifold:
+    """Draw bodies that flow into, or are scooped out of, one another with rounded seams."""
+    return marched(blended(rng, grid(0.75, 0.018), 0.15), -0.75, 0.018)

@@ -6,6 +6,8 @@ the solids, bends some, and scales the result to a bounding box diagonal of 1.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from manifold3d import Error, Manifold
 from scipy.sparse import coo_array
@@ -17,7 +19,7 @@ from export.shapes.families import draw_family
 from super_sdf import Mesh
 
 ATTEMPTS = 20  # about one candidate in a hundred fails, mostly by too many faces
-MAX_FACES = 25_000  # more faces say nothing new about a surface seen on coarse grids
+MAX_FACES = 70_000  # the finest reliefs have some 50,000
 MIN_VOLUME = 1e-4  # of the cubed diagonal; the thinnest shells and frames hold some 1e-3
 TOLERANCE = 1e-5  # of the diagonal; shorter edges only spoil the normals of their triangles
 
@@ -69,11 +71,11 @@ def with_features(rng: np.random.Generator, solid: Manifold) -> Manifold:
     return solid
 
 
-def draw_candidate(rng: np.random.Generator) -> Manifold:
+def draw_candidate(rng: np.random.Generator, families: Sequence[str] = ()) -> Manifold:
     """Draw a solid of one family or two, perhaps with features and a bend, its diagonal 1."""
-    solid = unit_sized(draw_family(rng)(rng))
+    solid = unit_sized(draw_family(rng, families)(rng))
     if rng.random() < 0.15:
-        other = unit_sized(turned(rng, draw_family(rng)(rng)))
+        other = unit_sized(turned(rng, draw_family(rng, families)(rng)))
         other = other.scale([rng.uniform(0.3, 0.9)] * 3).translate(list(rng.uniform(-0.2, 0.2, 3)))
         solid = solid + other if rng.random() < 0.6 else solid - other
     if rng.random() < 0.4:
@@ -107,8 +109,10 @@ def mesh_of(solid: Manifold) -> Mesh:
     return Mesh(drawn.vert_properties[:, :3], drawn.tri_verts.astype(np.int32))
 
 
-def random_solid(rng: np.random.Generator) -> Mesh:
+def random_solid(rng: np.random.Generator, families: Sequence[str] = ()) -> Mesh:
     """Draw a closed solid with outward faces, its bounding box centred and of diagonal 1.
+
+    It is of the families named, or of any.
 
     The same state of ``rng`` gives the same solid. About one solid in 300 touches or intersects
     itself, where a bent wall or a level set is very thin; `export.dataset` refuses those.
@@ -119,7 +123,7 @@ def random_solid(rng: np.random.Generator) -> Mesh:
         If 20 candidates in a row are empty, too thin or of too many faces.
     """
     for _ in range(ATTEMPTS):
-        solid = draw_candidate(rng)
+        solid = draw_candidate(rng, families)
         if is_usable(solid):
             mesh = without_crumbs(mesh_of(solid))
             low, high = mesh.vertices.min(0), mesh.vertices.max(0)

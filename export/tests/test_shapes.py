@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from manifold3d import Manifold
+from scipy.ndimage import label
 
 from export.shapes import solid as shapes
 from export.shapes.draws import log_uniform, unit_sized
-from export.shapes.families import FAMILIES
+from export.shapes.families import FAMILIES, draw_family
+from export.shapes.organic import grid
+from export.shapes.sculpted import STEP, bumps, put_spikes, relief, skin_waves, wrinkles
 from export.shapes.solid import MAX_FACES, random_solid, without_crumbs
 from super_sdf import Mesh
 
@@ -55,11 +58,10 @@ def test_random_solid(seed: int) -> None:
 
 
 @pytest.mark.parametrize("name", FAMILIES)
-def test_each_family_through_random_solid(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_family_through_random_solid(name: str) -> None:
     """So do those of each family, with features and bends."""
-    monkeypatch.setattr(shapes, "draw_family", lambda rng: FAMILIES[name])
     for seed in range(3):
-        mesh = random_solid(np.random.default_rng(seed))
+        mesh = random_solid(np.random.default_rng(seed), [name])
         check_closed(mesh)
         check_size(mesh)
         assert mesh.volume() > 0
@@ -87,9 +89,37 @@ def test_stream_of_solids_varies() -> None:
     assert len(set(volumes)) == 10
 
 
+def test_only_named_families_are_drawn_each_as_often_as_it_is_named() -> None:
+    """Names are drawn from alone, and a repeated one more often."""
+    rng = np.random.default_rng(0)
+    drawn = [draw_family(rng, ["creature", "sculpture", "sculpture"]) for _ in range(300)]
+    assert {family.__name__ for family in drawn} == {"creature", "sculpture"}
+    assert drawn.count(FAMILIES["sculpture"]) == pytest.approx(200, abs=30)
+
+
+@pytest.mark.parametrize("draw", [bumps, skin_waves, wrinkles, relief])
+def test_reliefs_are_heights_at_every_point(draw) -> None:
+    """One height for each point, none beyond 1 but for the sums of waves, and not all the same."""
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (4000, 3)).astype(np.float32)
+    for seed in range(8):
+        heights = draw(np.random.default_rng(seed), points)
+        assert heights.shape == (4000,) and np.isfinite(heights).all()
+        assert np.abs(heights - 0.5).mean() < 1 and np.ptp(heights) > 0.1
+
+
+def test_spikes_stick_out_of_a_ball() -> None:
+    """Nothing is taken away, and what is added touches the ball."""
+    points = grid(0.58, STEP)
+    ball = np.linalg.norm(points, axis=-1) - np.float32(0.2)
+    spiked = ball.copy()
+    put_spikes(np.random.default_rng(3), points, spiked)
+    assert (spiked <= ball).all() and ((spiked < 0) & (ball > 0.02)).any()
+    assert label(spiked < STEP)[1] == 1  # thorns may be thinner than a step
+
+
 def test_gives_up_on_unusable_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
     """The search is bounded and ends in an error."""
-    monkeypatch.setattr(shapes, "draw_family", lambda rng: lambda rng: Manifold())
+    monkeypatch.setattr(shapes, "draw_family", lambda rng, names: lambda rng: Manifold())
     with pytest.raises(RuntimeError, match="none of 20"):
         random_solid(np.random.default_rng(0))
 
