@@ -108,7 +108,7 @@ def some_samples(count=3):
     rng = np.random.default_rng(0)
     samples = []
     while len(samples) < count:
-        sample = make_sample(rng, random_solid(rng))
+        sample = make_sample(rng, random_solid(rng, ["csg", "blobs"]))
         samples += [sample] if sample else []
     return samples
 
