@@ -312,7 +312,7 @@ def test_a_count_that_cannot_be_reached_is_a_warning(here, command):
     assert code == 0 and left > 6
     assert (
         "Warning: 6 triangles cannot be reached while the mesh stays a manifold of the same "
-        f"topology: it has {left}\n"
+        f"topology: it has {left:,}\n"
     ) in err
 
 
