@@ -25,13 +25,13 @@ from export.dormant import dormant_share
 from export.latency import ball, microseconds
 from export.network import NetworkConfig, SuperSdfNet
 from export.recipe import RECIPE, Recipe
-from export.train import Errors, Run, Store, measure
+from export.train import Errors, Run, Store, measure, take_step
 
 HELD_OUT = 2  # shards
 SHARDS = 20  # of training
 OURS = NetworkConfig(blocks=5)
 DEEP = NetworkConfig(blocks=8)  # deep enough for units to become dormant
-HIGH = replace(RECIPE, hidden_rate=5e-3, shares=CLEAN)  # short runs tolerate a higher rate
+HIGH = replace(RECIPE, hidden_rate=5e-3, spread=1.0, shares=CLEAN)  # short: a higher rate
 
 Entry = tuple[Callable[[NetworkConfig], SuperSdfNet], NetworkConfig, Recipe]
 
@@ -75,6 +75,7 @@ ENTRIES: dict[str, Entry] = {
     "8 blocks, leaky rectifiers": (blocks_of(variants.LeakyBlock), DEEP, HIGH),
     "8 blocks, smooth rectifiers": (blocks_of(variants.SiluBlock), DEEP, HIGH),
     "8 blocks, normalised features": (blocks_of(variants.NormBlock), DEEP, HIGH),
+    "windows drawn by their loss": (SuperSdfNet, OURS, replace(HIGH, spread=RECIPE.spread)),
     "noise, offsets, truncation": (SuperSdfNet, OURS, replace(HIGH, shares=USUAL)),
 }  # fmt: skip
 
@@ -84,11 +85,11 @@ def train_entry(entry: Entry, store: Store, folder: Path, minutes: float) -> Run
     make, config, recipe = entry
     torch.manual_seed(0)
     rng = np.random.default_rng(0)
-    store.order.clear()
+    store.sampler.restart()
     run = Run(folder, make(config), recipe)
     while run.seconds < 60 * minutes:
         start = time.process_time()
-        run.advance(store.draw_batch(rng, recipe), run.seconds / (60 * minutes))
+        take_step(run, store, rng, run.seconds / (60 * minutes))
         run.seconds += time.process_time() - start
     return run
 

@@ -28,6 +28,7 @@ class Recipe:
     average_decay: float = 0.998  # of the averaged weights, per step
     power: int = 1  # of the error: 1 or 2
     voxel_power: float = 0.5  # of the number of voxels of a sample, for its weight in a batch
+    spread: float = 3.0  # of the chances of windows, by their loss; 1: equal (``sampler``)
     reach: float = 0.5  # half voxels: decay length of the weight away from the surface ...
     far_weight: float = 0.25  # ... to this
     gradient_weight: float = 0.5
@@ -75,14 +76,13 @@ def loss_of(prediction: Tensor, target: Tensor, recipe: Recipe) -> Tensor:
     return loss
 
 
-def loss_of_batch(pairs: list[tuple[Tensor, Tensor]], recipe: Recipe) -> Tensor:
-    """Return the weighted mean of the losses of samples.
+def weigh(losses: Tensor, voxels: list[int], recipe: Recipe) -> Tensor:
+    """Return the mean of the losses of samples, (B,), weighted by their numbers of voxels.
 
     Small shapes have few voxels and large errors. With equal weights they make up more than half of
     the loss, and of its noise; weighted by voxels they would hardly count.
     """
-    losses = torch.stack([loss_of(*pair, recipe) for pair in pairs])
-    weights = losses.new_tensor([len(target) for _, target in pairs]) ** recipe.voxel_power
+    weights = losses.new_tensor(voxels) ** recipe.voxel_power
     return (weights * losses).sum() / weights.sum()
 
 

@@ -11,7 +11,8 @@
 A run folder holds ``checkpoint.pt`` (weights, averaged weights, optimisers, time spent),
 ``log.csv`` and ``loss.png``. Dormant units are restarted (``dormant``). The learning rate depends
 on the share of ``--minutes`` that is spent, so a run always ends annealed, however fast the
-machine. New shards in the store are picked up as they appear.
+machine. Windows on which much is lost are shown more often (``sampler``). New shards in the store
+are picked up as they appear.
 """
 
 from __future__ import annotations
@@ -34,8 +35,17 @@ from export.dormant import dormant_share, revive
 from export.grow import grow_from
 from export.network import SIZES, SuperSdfNet
 from export.precision import autocast
-from export.recipe import RECIPE, Recipe, differences, loss_of_batch, make_optimisers, rate_factor
+from export.recipe import (
+    RECIPE,
+    Recipe,
+    differences,
+    loss_of,
+    make_optimisers,
+    rate_factor,
+    weigh,
+)
 from export.run_log import LOG_COLUMNS, append_line, plot_run, read_log
+from export.sampler import Sampler
 from export.sharing import decode_shared, neighbours_with_targets
 from export.to_onnx import read_weights
 from super_sdf.errors import FileError
@@ -83,7 +93,7 @@ class Store:
         held = [gathered(s) for path in self.seen for s in read_shard(path)]
         self.held_out = [sample for sample in held if len(sample.voxels)]
         self.samples: list[Sample] = []
-        self.order: list[int] = []
+        self.sampler = Sampler()
         self.refresh()
 
     def refresh(self) -> None:
@@ -92,16 +102,22 @@ class Store:
         for path in new[: self.most]:
             self.seen.append(path)
             self.samples += list(read_shard(path))
+        self.sampler.add(len(self.samples) - len(self.sampler.losses))
 
-    def draw_batch(self, rng: np.random.Generator, recipe: Recipe) -> list[Prepared]:
-        """Return samples with about ``batch_voxels`` voxels together, each once per epoch."""
+    def draw_batch(
+        self, rng: np.random.Generator, recipe: Recipe
+    ) -> tuple[list[int], list[Prepared]]:
+        """Return samples with about ``batch_voxels`` voxels together, and which they are."""
+        drawn: list[int] = []
         batch: list[Prepared] = []
         while sum(len(sample.patches) for sample in batch) < recipe.batch_voxels:
-            if not self.order:
-                self.order = rng.permutation(len(self.samples)).tolist()
-            sample = self._changed(rng, self.samples[self.order.pop()], recipe)
-            batch += [sample] if len(sample.voxels) else []
-        return batch
+            index = self.sampler.draw(rng, recipe.spread)
+            sample = self._changed(rng, self.samples[index], recipe)
+            if len(sample.voxels):
+                drawn, batch = [*drawn, index], [*batch, sample]
+            else:
+                self.sampler.record([index], [0.0])
+        return drawn, batch
 
     def _changed(self, rng: np.random.Generator, sample: Sample, recipe: Recipe) -> Prepared:
         """Return a sample as it is shown this time."""
@@ -166,13 +182,15 @@ class Run:
         grow_from(self.net, weights)
         self.average.load_state_dict(self.net.state_dict())
 
-    def advance(self, batch: list[Prepared], spent: float) -> float:
-        """Take one step at the rate for this share of the budget; return the loss."""
+    def advance(self, batch: list[Prepared], spent: float) -> tuple[float, list[float]]:
+        """Take one step at the rate for this share of the budget; return the loss, and each's."""
         for optimiser, peak in zip(self.optimisers, self.peaks):
             optimiser.param_groups[0]["lr"] = peak * rate_factor(spent, self.recipe)
             optimiser.zero_grad()
         with autocast(self.device):
-            loss = loss_of_batch(predict(self.net, batch), self.recipe)
+            pairs = predict(self.net, batch)
+            losses = torch.stack([loss_of(*pair, self.recipe) for pair in pairs])
+            loss = weigh(losses, [len(sample.voxels) for sample in batch], self.recipe)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
         for optimiser in self.optimisers:
@@ -182,7 +200,7 @@ class Run:
         self.recent.append(batch)
         if self.is_time_to_revive(spent):
             revive(self.net, self.optimisers, self.recent)
-        return float(loss.detach())
+        return float(loss.detach()), losses.detach().tolist()
 
     def is_time_to_revive(self, spent: float) -> bool:
         """Return whether dormant units are restarted after this step."""
@@ -234,7 +252,7 @@ def train(run: Run, store: Store, minutes: float, seed: int) -> None:
     saved, losses = time.monotonic(), []
     while run.seconds < 60 * minutes:
         start = time.monotonic()
-        losses.append(run.advance(store.draw_batch(rng, run.recipe), run.seconds / (60 * minutes)))
+        losses.append(take_step(run, store, rng, run.seconds / (60 * minutes)))
         run.seconds += min(time.monotonic() - start, LONGEST_STEP)
         if run.step % LOG_STEPS == 0:
             log(run, store, float(np.mean(losses)))
@@ -244,6 +262,14 @@ def train(run: Run, store: Store, minutes: float, seed: int) -> None:
             run.save()
             saved = time.monotonic()
     run.save()
+
+
+def take_step(run: Run, store: Store, rng: np.random.Generator, spent: float) -> float:
+    """Train on the next batch of a store; return the loss."""
+    drawn, batch = store.draw_batch(rng, run.recipe)
+    loss, losses = run.advance(batch, spent)
+    store.sampler.record(drawn, losses)
+    return loss
 
 
 def log(run: Run, store: Store, loss: float) -> None:

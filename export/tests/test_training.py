@@ -44,10 +44,9 @@ from export.network import (
 from export.recipe import (
     RECIPE,
     differences,
-    loss_of,
-    loss_of_batch,
     make_optimisers,
     rate_factor,
+    weigh,
 )
 from export.run_log import draw_history, read_log
 from export.shapes import random_solid
@@ -62,7 +61,7 @@ from export.to_onnx import (
     rewrite,
     write_model,
 )
-from export.train import Errors, Run, Store, log, sample_errors, train
+from export.train import Errors, Run, Store, log, sample_errors, take_step, train
 from export.variants import UNet
 from super_sdf import Mesh, load_network
 from super_sdf.errors import FileError, OptionError
@@ -237,8 +236,8 @@ def test_a_store_of_masks_has_masks_held_out_and_drawn(tmp_path, samples):
     write_shard(tmp_path / "shard-0-0000.npz", samples[:1])
     write_shard(tmp_path / "shard-0-0001.npz", samples[1:])
     store = Store(tmp_path, 1, inputs="masks")
-    drawn = store.draw_batch(np.random.default_rng(0), replace(RECIPE, batch_voxels=1))
-    for sample in (*store.held_out, *drawn):
+    _, batch = store.draw_batch(np.random.default_rng(0), replace(RECIPE, batch_voxels=1))
+    for sample in (*store.held_out, *batch):
         assert np.abs(sample.patches[:, CENTRE]).min() == 1
 
 
@@ -297,15 +296,15 @@ def test_a_run_learns_and_goes_on_where_it_stopped(tmp_path, samples):
     write_shard(tmp_path / "shard-0-0000.npz", samples[:1])
     write_shard(tmp_path / "shard-0-0001.npz", samples[1:])
     torch.manual_seed(0)
-    run = Run(tmp_path, SuperSdfNet(SMALL))
+    recipe = replace(RECIPE, batch_voxels=1, shares=CLEAN)
+    run = Run(tmp_path, SuperSdfNet(SMALL), recipe)
     rng = np.random.default_rng(0)
     store = Store(tmp_path, 1)
-    recipe = replace(RECIPE, batch_voxels=1, shares=CLEAN)
-    first = np.mean([run.advance(store.draw_batch(rng, recipe), 0.1) for _ in range(4)])
+    first = np.mean([take_step(run, store, rng, 0.1) for _ in range(4)])
     for _ in range(150):
-        run.advance(store.draw_batch(rng, recipe), 0.1)
-    last = np.mean([run.advance(store.draw_batch(rng, recipe), 0.1) for _ in range(4)])
-    assert last < 0.9 * first
+        take_step(run, store, rng, 0.1)
+    last = np.mean([take_step(run, store, rng, 0.1) for _ in range(4)])
+    assert last < 0.9 * first and not np.isnan(store.sampler.losses).any()
     run.save()
     again = Run(tmp_path, SuperSdfNet(SMALL))
     again.resume()
@@ -411,12 +410,9 @@ def test_a_recipe_with_other_rates_and_less_noise():
 
 
 def test_a_sample_counts_by_the_root_of_its_voxels():
-    target = torch.ones(16, 4 * CORNERS)
-    pairs = [(target, target), (torch.full((4, 4 * CORNERS), 3.0), target[:4])]
-    alone = loss_of(*pairs[1], RECIPE)
-    torch.testing.assert_close(loss_of_batch(pairs, RECIPE), alone * 2 / (4 + 2))
-    equal = replace(RECIPE, voxel_power=0.0)
-    torch.testing.assert_close(loss_of_batch(pairs, equal), alone / 2)
+    losses = torch.tensor([0.0, 3.0])
+    assert weigh(losses, [16, 4], RECIPE) == pytest.approx(3 * 2 / (4 + 2))
+    assert weigh(losses, [16, 4], replace(RECIPE, voxel_power=0.0)) == 1.5
 
 
 def test_the_onnx_file_agrees_with_torch_and_carries_its_card(tmp_path):
