@@ -66,7 +66,7 @@ def test_shipped_networks_are_small_and_fulfil_the_contract():
     names = {name for name, _ in QUALITIES.values()}
     assert {name.removesuffix("-int8") for name in shipped_models()} == {*names, MASK_MODEL}
     for name, path in shipped_models().items():
-        assert path.stat().st_size < 8e6
+        assert path.stat().st_size < 20e6
         assert load_network(name).card["name"] == name
 
 
@@ -288,7 +288,7 @@ def test_a_wider_network_takes_more_memory(tmp_path):
     path.write_bytes(shipped.read_bytes() + metadata({"channels": "128"}))
     usual, wide = load_network(shipped, device="cpu"), load_network(path, device="cpu")
     assert usual.memory_bytes == (680, 8) and wide.memory_bytes == (1144, 8)
-    assert wide.averaged(4).memory_bytes == (1384, 12)
+    assert wide.averaged(4).memory_bytes == (1744, 12)
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ INPUT_BYTES = 216.0
 CHANNEL_BYTES = {"float32": 7.25, "int8": 11.5}
 VALUE_BYTES = 8.0
 USUAL_CHANNELS = 64  # of a network whose card does not say
-SYMMETRY_BYTES = (240.0, 4.0)
+SYMMETRY_BYTES = (600.0, 4.0)
 NO_NETWORKS = "super-sdf was installed without its networks: install it again"
 TRIAL_ROWS = 1024  # voxels of a run on the CPU that measures the pace: two chunks
 
@@ -139,7 +139,9 @@ class Network:
             part_progress = progress and progress_of_part(progress, number, self.symmetries)
             values = self._run(turned, turned_table, voxels, moved, part_progress)
             with np.errstate(invalid="ignore"):  # the caller checks for infinities
-                mean += values / self.symmetries
+                values /= self.symmetries
+                mean += values
+            del values  # before the next run, whose peak it would raise
         return mean
 
     def _run(
@@ -247,7 +249,7 @@ def load_network(
     Parameters
     ----------
     model : str or path
-        "fast", "base" or "best" (base, averaged over half turns), or an ONNX file.
+        "fast", "base" or "best" (averaged over half turns), or an ONNX file.
     device : str
         "cuda", "cpu", or "auto": CUDA if it runs, otherwise the CPU.
     threads : int
