@@ -43,9 +43,11 @@ def test_everything_is_checked_on_the_cpu():
         "versions",
         "memory",
         "network base on cpu",
+        "network best on cpu",
         "network fast on cpu",
         "network mask on cpu",
         "network base-int8 on cpu",
+        "network best-int8 on cpu",
         *(f"extra {name}" for name in EXTRAS),
     ]
     assert all(finding.state != "failed" for finding in findings)
