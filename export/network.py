@@ -15,7 +15,7 @@ can be distances. The distances of a mask are right to half a voxel only, and no
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -57,34 +57,72 @@ SIZES = {
 """The sizes of networks, by name."""
 
 
+CHUNK = 256  # voxels gathered at a time on a CPU: their columns stay in cache
+
+
 class GatherMatMul(torch.autograd.Function):
     """``gather(features, table) @ weight``, differentiated without a scatter.
 
     If u is v's neighbour at place k, then v is u's neighbour at place 26 - k. So the gradient is a
-    convolution, too, with the places reversed, and no scatter-add is needed.
+    convolution, too, with the places reversed, and no scatter-add is needed. The columns are
+    gathered again for it: at 27 times the features they would fill the memory.
     """
 
     @staticmethod
     def forward(ctx, features: Tensor, weight: Tensor, table: Tensor) -> Tensor:
         """Map features (V, C), weight (27 C, C_out) and table (V, 27) to (V, C_out)."""
-        columns = gather(features, table)
-        ctx.save_for_backward(columns, weight, table)
-        return columns @ weight
+        ctx.save_for_backward(features, weight, table)
+        return convolve(features, weight, table)
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, None]:
         """Map the gradient (V, C_out) to the gradients of features and weight."""
-        columns, weight, table = ctx.saved_tensors
-        grad = grad.contiguous()
+        features, weight, table = ctx.saved_tensors
         places, channels_out = table.shape[1], weight.shape[1]
         reversed_weight = weight.view(places, -1, channels_out).flip(0).transpose(1, 2)
-        grad_features = gather(grad, table) @ reversed_weight.reshape(places * channels_out, -1)
-        return grad_features, (grad.T @ columns).T, None  # a third faster than columns.T @ grad
+        rows = reversed_weight.reshape(places * channels_out, -1)
+        return convolve(grad, rows, table), weight_gradient(features, grad, table), None
+
+
+def convolve(features: Tensor, weight: Tensor, table: Tensor) -> Tensor:
+    """Return ``gather(features, table) @ weight``, (V, C_out), without all columns at once."""
+    out = features.new_empty(len(table), weight.shape[1])
+    for part, columns in gathered(features, table):
+        torch.mm(columns, weight, out=out[part])
+    return out
+
+
+def weight_gradient(features: Tensor, grad: Tensor, table: Tensor) -> Tensor:
+    """Return the gradient (27 C, C_out) of the weight, summed in float32 at least."""
+    dtype = torch.promote_types(grad.dtype, torch.float32)
+    shape = grad.shape[1], table.shape[1] * features.shape[1]
+    total = torch.zeros(shape, dtype=dtype, device=grad.device)
+    for part, columns in gathered(features, table):
+        total += grad[part].T @ columns  # a third faster than columns.T @ grad[part]
+    return total.T.to(grad.dtype)
+
+
+def gathered(features: Tensor, table: Tensor) -> Iterator[tuple[slice, Tensor]]:
+    """Yield the columns of some voxels after others, and which voxels they are; on a GPU of all."""
+    padded = pad(features)
+    rows = CHUNK if features.device.type == "cpu" else max(len(table), 1)
+    for start in range(0, len(table), rows):
+        part = slice(start, start + rows)
+        yield part, columns_of(padded, table[part])
 
 
 def gather(features: Tensor, table: Tensor) -> Tensor:
     """Return the features of all 27 neighbours side by side, zeros for absent ones (index V)."""
-    padded = torch.cat([features, features.new_zeros(1, features.shape[1])])
+    return columns_of(pad(features), table)
+
+
+def pad(features: Tensor) -> Tensor:
+    """Append the row of zeros that stands for an absent voxel."""
+    return torch.cat([features, features.new_zeros(1, features.shape[1])])
+
+
+def columns_of(padded: Tensor, table: Tensor) -> Tensor:
+    """Return the rows that a table (V, 27) names side by side, (V, 27 C)."""
     return padded.index_select(0, table.reshape(-1)).view(len(table), -1)
 
 
@@ -100,11 +138,7 @@ class NeighbourConv(nn.Module):
     def forward(self, features: Tensor, table: Tensor) -> Tensor:
         """Map (V, C) to (V, C)."""
         dtype = torch.bfloat16 if torch.is_autocast_enabled(features.device.type) else torch.float32
-        features, weight = features.to(dtype), self.weight.to(dtype)
-        if torch.is_grad_enabled():
-            mixed = GatherMatMul.apply(features, weight, table)
-        else:
-            mixed = gather(features, table) @ weight
+        mixed = GatherMatMul.apply(features.to(dtype), self.weight.to(dtype), table)
         return mixed + self.bias.to(dtype)
 
 

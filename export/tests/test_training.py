@@ -38,6 +38,7 @@ from export.latency import ball, microseconds
 from export.network import (
     GatherMatMul,
     SuperSdfNet,
+    gather,
     interpolation_weights,
     is_noisy,
 )
@@ -270,7 +271,9 @@ def test_meshes_come_once_each_with_a_sixth_of_prisms():
     assert len(set(mesh_order(0, prisms, others, 1200)[600:]) & set(prisms)) == 100
 
 
-def test_the_gradient_of_the_neighbour_convolution():
+@pytest.mark.parametrize("chunk", [5, 1000])
+def test_the_gradient_of_the_neighbour_convolution(chunk, monkeypatch):
+    monkeypatch.setattr("export.network.CHUNK", chunk)
     field = np.random.default_rng(0).normal(0, 3, (4, 4, 4)).astype(np.float32)
     voxels = find_band(field)
     table = neighbour_table(voxels, (4, 4, 4))
@@ -280,6 +283,15 @@ def test_the_gradient_of_the_neighbour_convolution():
     assert torch.autograd.gradcheck(
         lambda f, w: GatherMatMul.apply(f, w, table), (features, weight)
     )
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_a_convolution_gathers_some_voxels_after_others(dtype, monkeypatch):
+    table = torch.randint(0, 101, (100, 27))  # 100: no voxel
+    features, weight = torch.randn(100, 4).to(dtype), torch.randn(108, 3).to(dtype)
+    whole = gather(features, table) @ weight
+    monkeypatch.setattr("export.network.CHUNK", 7)
+    torch.testing.assert_close(GatherMatMul.apply(features, weight, table), whole)
 
 
 def test_an_untrained_network_keeps_samples_and_planes():
