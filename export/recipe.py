@@ -37,13 +37,13 @@ class Recipe:
     revive_until: float = 0.8  # share of the budget: restarted units need time to learn
     shares: Shares = USUAL
 
-    def at(self, rate: float, noisy: float) -> Recipe:
-        """Return the recipe with rates multiplied by ``rate`` and this share of noisy samples."""
+    def at(self, rate: float, shares: Shares) -> Recipe:
+        """Return the recipe with rates times ``rate`` and these shares of changed samples."""
         return replace(
             self,
             hidden_rate=rate * self.hidden_rate,
             outer_rate=rate * self.outer_rate,
-            shares=replace(self.shares, noisy=noisy),
+            shares=shares,
         )
 
 
@@ -76,14 +76,14 @@ def loss_of(prediction: Tensor, target: Tensor, recipe: Recipe) -> Tensor:
     return loss
 
 
-def weigh(losses: Tensor, voxels: list[int], recipe: Recipe) -> Tensor:
-    """Return the mean of the losses of samples, (B,), weighted by their numbers of voxels.
+def relative_weights(voxels: list[int], recipe: Recipe) -> Tensor:
+    """Return the weights of the losses of samples by their numbers of voxels, (B,); the sum is 1.
 
     Small shapes have few voxels and large errors. With equal weights they make up more than half of
     the loss, and of its noise; weighted by voxels they would hardly count.
     """
-    weights = losses.new_tensor(voxels) ** recipe.voxel_power
-    return (weights * losses).sum() / weights.sum()
+    weights = torch.tensor(voxels, dtype=torch.float32) ** recipe.voxel_power
+    return weights / weights.sum()
 
 
 def make_optimisers(net: SuperSdfNet, recipe: Recipe) -> list[torch.optim.Optimizer]:

@@ -7,6 +7,7 @@
     python -m export.train ... --start src/super_sdf/models/base.onnx --blocks 12  # more blocks
     python -m export.train ... --start src/super_sdf/models/base.onnx --size wide  # more units
     python -m export.train ... --inputs masks      # the network for masks
+    OMP_NUM_THREADS=1 python -m export.train ... --threads 2   # each works on a part of a batch
 
 A run folder holds ``checkpoint.pt`` (weights, averaged weights, optimisers, time spent),
 ``log.csv`` and ``loss.png``. Dormant units are restarted (``dormant``). The learning rate depends
@@ -21,6 +22,8 @@ import argparse
 import copy
 import time
 from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -42,7 +45,7 @@ from export.recipe import (
     loss_of,
     make_optimisers,
     rate_factor,
-    weigh,
+    relative_weights,
 )
 from export.run_log import LOG_COLUMNS, append_line, plot_run, read_log
 from export.sampler import Sampler
@@ -142,10 +145,15 @@ class Run:
     """The state of a run: weights, their running average, optimisers, steps, seconds spent."""
 
     def __init__(
-        self, folder: Path, net: SuperSdfNet, recipe: Recipe = RECIPE, device: str = "cpu"
+        self,
+        folder: Path,
+        net: SuperSdfNet,
+        recipe: Recipe = RECIPE,
+        device: str = "cpu",
+        threads: int = 1,
     ) -> None:
         self.path = folder / "checkpoint.pt"
-        self.recipe, self.device = recipe, device
+        self.recipe, self.device, self.threads = recipe, device, threads
         self.net = net.to(device)
         self.average = copy.deepcopy(self.net)
         self.optimisers = make_optimisers(self.net, recipe)
@@ -186,12 +194,7 @@ class Run:
         """Take one step at the rate for this share of the budget; return the loss, and each's."""
         for optimiser, peak in zip(self.optimisers, self.peaks):
             optimiser.param_groups[0]["lr"] = peak * rate_factor(spent, self.recipe)
-            optimiser.zero_grad()
-        with autocast(self.device):
-            pairs = predict(self.net, batch)
-            losses = torch.stack([loss_of(*pair, self.recipe) for pair in pairs])
-            loss = weigh(losses, [len(sample.voxels) for sample in batch], self.recipe)
-        loss.backward()
+        losses = self.find_gradients(batch)
         torch.nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
         for optimiser in self.optimisers:
             optimiser.step()
@@ -200,7 +203,35 @@ class Run:
         self.recent.append(batch)
         if self.is_time_to_revive(spent):
             revive(self.net, self.optimisers, self.recent)
-        return float(loss.detach()), losses.detach().tolist()
+        weights = window_weights(batch, self.recipe)
+        return float(weights @ losses), losses.tolist()
+
+    def find_gradients(self, batch: list[Prepared]) -> Tensor:
+        """Set the gradients of the weighted loss of a batch; return the loss of each window.
+
+        Each thread works on some of the windows, since one product is too small to be shared.
+        """
+        weights = window_weights(batch, self.recipe).to(self.device)
+        shares = divide(batch, self.threads)
+        with ThreadPoolExecutor(self.threads) as pool:
+            found = list(pool.map(lambda rows: self._gradients(batch, weights, rows), shares))
+        for parameter, *parts in zip(self.net.parameters(), *(grads for _, grads in found)):
+            parameter.grad = sum(parts[1:], parts[0])
+        losses = torch.empty(len(batch))
+        for rows, (some, _) in zip(shares, found):
+            losses[rows] = some.cpu()
+        return losses
+
+    def _gradients(
+        self, batch: list[Prepared], weights: Tensor, rows: list[int]
+    ) -> tuple[Tensor, Sequence[Tensor]]:
+        """Return the loss of each of some windows, and the gradients of their weighted sum."""
+        with autocast(self.device):
+            pairs = predict(self.net, [batch[row] for row in rows])
+            losses = torch.stack([loss_of(*pair, self.recipe) for pair in pairs])
+        total = (weights[rows] * losses).sum()
+        parameters = list(self.net.parameters())
+        return losses.detach(), torch.autograd.grad(total, parameters, materialize_grads=True)
 
     def is_time_to_revive(self, spent: float) -> bool:
         """Return whether dormant units are restarted after this step."""
@@ -218,6 +249,25 @@ class Run:
         with torch.no_grad():
             for mean, now in zip(self.average.parameters(), self.net.parameters()):
                 mean.lerp_(now, 1 - decay)
+
+
+def window_weights(batch: list[Prepared], recipe: Recipe) -> Tensor:
+    """Return the weight of each window of a batch in its loss, (B,)."""
+    return relative_weights([len(sample.voxels) for sample in batch], recipe)
+
+
+def divide(batch: Sequence[Prepared], parts: int) -> list[list[int]]:
+    """Return which windows of a batch each of at most ``parts`` threads works on.
+
+    The largest windows are given out first, each to the part with the fewest voxels so far.
+    """
+    rows: list[list[int]] = [[] for _ in range(parts)]
+    sizes = [0] * parts
+    for row in sorted(range(len(batch)), key=lambda row: -len(batch[row].patches)):
+        least = sizes.index(min(sizes))
+        rows[least].append(row)
+        sizes[least] += len(batch[row].patches)
+    return [part for part in rows if part]
 
 
 @dataclass(frozen=True)
@@ -301,6 +351,25 @@ def main() -> None:
     parser.add_argument("--rate", type=positive, default=1.0, help="factor on the learning rates")
     parser.add_argument("--noisy", type=share, default=USUAL.noisy, help="share of noisy samples")
     parser.add_argument(
+        "--shifted", type=share, default=USUAL.shifted, help="share with another zero level"
+    )
+    parser.add_argument(
+        "--truncated", type=share, default=USUAL.truncated, help="share of truncated samples"
+    )
+    parser.add_argument(
+        "--batch",
+        type=at_least(1),
+        default=RECIPE.batch_voxels,
+        metavar="VOXELS",
+        help="voxels of a batch; its last window may exceed them",
+    )
+    parser.add_argument(
+        "--threads",
+        type=at_least(1),
+        default=1,
+        help="threads that each work on a part of every batch; set OMP_NUM_THREADS=1 with several",
+    )
+    parser.add_argument(
         "--inputs", choices=INPUTS, default=INPUTS[0], help="what the network is trained on"
     )
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
@@ -317,14 +386,17 @@ def run_training(options: argparse.Namespace) -> None:
         check_regular_file(options.start)
     options.run.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(options.seed)
-    recipe = RECIPE.at(options.rate, options.noisy)
+    shares = replace(
+        USUAL, shifted=options.shifted, noisy=options.noisy, truncated=options.truncated
+    )
+    recipe = replace(RECIPE.at(options.rate, shares), batch_voxels=options.batch)
     config = SIZES[options.size]
     config = replace(
         config,
         blocks=options.blocks or config.blocks,
         keeps_samples=options.inputs == "distances",
     )
-    run = Run(options.run, SuperSdfNet(config), recipe, options.device)
+    run = Run(options.run, SuperSdfNet(config), recipe, options.device, options.threads)
     if options.start:
         run.start_from(read_weights(options.start))
     run.resume()

@@ -1,5 +1,6 @@
 """From a mesh to an ONNX file in small: distances, samples, gradients, resuming, parity."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -47,7 +48,7 @@ from export.recipe import (
     differences,
     make_optimisers,
     rate_factor,
-    weigh,
+    relative_weights,
 )
 from export.run_log import draw_history, read_log
 from export.shapes import random_solid
@@ -62,7 +63,7 @@ from export.to_onnx import (
     rewrite,
     write_model,
 )
-from export.train import Errors, Run, Store, log, sample_errors, take_step, train
+from export.train import Errors, Run, Store, divide, log, sample_errors, take_step, train
 from export.variants import UNet
 from super_sdf import Mesh, load_network
 from super_sdf.errors import FileError, OptionError
@@ -415,16 +416,16 @@ def test_the_rate_warms_up_and_anneals():
 
 
 def test_a_recipe_with_other_rates_and_less_noise():
-    recipe = RECIPE.at(0.5, 0.1)
+    shares = replace(RECIPE.shares, noisy=0.1)
+    recipe = RECIPE.at(0.5, shares)
     assert (recipe.hidden_rate, recipe.outer_rate) == (2e-3, 1e-3)
-    assert recipe.shares == replace(RECIPE.shares, noisy=0.1)
-    assert RECIPE.at(1.0, RECIPE.shares.noisy) == RECIPE
+    assert recipe.shares == shares
+    assert RECIPE.at(1.0, RECIPE.shares) == RECIPE
 
 
 def test_a_sample_counts_by_the_root_of_its_voxels():
-    losses = torch.tensor([0.0, 3.0])
-    assert weigh(losses, [16, 4], RECIPE) == pytest.approx(3 * 2 / (4 + 2))
-    assert weigh(losses, [16, 4], replace(RECIPE, voxel_power=0.0)) == 1.5
+    assert relative_weights([16, 4], RECIPE).tolist() == pytest.approx([2 / 3, 1 / 3])
+    assert relative_weights([16, 4], replace(RECIPE, voxel_power=0.0)).tolist() == [0.5, 0.5]
 
 
 def test_the_onnx_file_agrees_with_torch_and_carries_its_card(tmp_path):
@@ -543,6 +544,26 @@ def test_a_run_starts_dormant_units_again_until_its_last_fifth(tmp_path, samples
         for _ in range(10):
             run.advance(batch, spent)
         assert (dormant_share(run.net, [batch]) > 0.05) == asleep
+
+
+def test_threads_share_a_batch_and_find_the_same_gradients(tmp_path, samples, monkeypatch):
+    monkeypatch.setattr("export.train.autocast", lambda _: nullcontext())
+    batch = [prepare(sample) for sample in samples]
+    found = []
+    for threads in (1, 2):
+        run = Run(tmp_path, small_net(), RECIPE, threads=threads)
+        losses = run.find_gradients(batch)
+        found.append([losses, *(parameter.grad for parameter in run.net.parameters())])
+    for one, two in zip(*found, strict=True):
+        torch.testing.assert_close(one, two, rtol=1e-4, atol=1e-6)
+
+
+def test_every_window_of_a_batch_is_given_to_one_thread(samples):
+    batch = [prepare(sample) for sample in samples]
+    parts = divide(batch, 2)
+    assert len(parts) == 2
+    assert sorted(row for part in parts for row in part) == list(range(len(batch)))
+    assert divide(batch[:1], 2) == [[0]]
 
 
 def test_a_network_with_dead_units_is_not_exported(samples, monkeypatch):
