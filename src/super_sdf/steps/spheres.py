@@ -90,9 +90,10 @@ def find_correction(feet: FootPoints, parts: SharedParts) -> FloatArray:
     """
     numbers, count = number_parts(parts, np.ones(27, np.int64))
     left, correction = feet.values, np.zeros(numbers.shape, np.float32)
-    for cells in MEANS:
+    for turn, cells in enumerate(MEANS, 1):
         mean, at, shares = mean_at_nodes(feet, left, numbers, count, cells)
-        left = left - (mean.take(at) * shares).sum(0)
+        if turn < len(MEANS):
+            left = left - (mean.take(at) * shares).sum(0)
         del at, shares
         own = numbers[CORNER_PARTS] if cells == 1 else numbers
         correction += prolong(mean.take(own), cells, 2)
