@@ -26,13 +26,14 @@ from export.dormant import dormant_share
 from export.network import NetworkConfig, SuperSdfNet
 from export.onnx_graph import build_graph
 from super_sdf.errors import ModelError
-from super_sdf.network.contract import FORMAT_VERSION
+from super_sdf.network.contract import EXACT_DISTANCES, FORMAT_VERSION, MASKS
 from super_sdf.network.network import load_network
 from super_sdf.steps.band import find_band, gather_patches, neighbour_table
 from super_sdf.steps.nodes import block_offsets
 
 OPSET = 18
 PARITY = 2e-4  # half voxels: 1e-4 of a voxel
+DISTANCES = "distances"  # of which some were noisy: what a card without an entry says
 DORMANT = 0.01  # largest accepted share of dormant units
 
 
@@ -129,7 +130,7 @@ def read_network(path: Path) -> SuperSdfNet:
         functions=channels + len(weights["branch.bias"]),
         trunk=trunk,
         frequencies=(inputs - 3) // 6,
-        keeps_samples=read_inputs(path) == "distances",
+        keeps_samples=read_inputs(path) != MASKS,
     )
     net = SuperSdfNet(config)
     net.load_state_dict(weights)
@@ -139,7 +140,7 @@ def read_network(path: Path) -> SuperSdfNet:
 def read_inputs(path: Path) -> str:
     """Return what the network in an exported file was trained on."""
     card = {prop.key: prop.value for prop in onnx.load(path).metadata_props}
-    return card.get("inputs", "distances")
+    return card.get("inputs", DISTANCES)
 
 
 def check_awake(net: SuperSdfNet) -> None:
@@ -159,8 +160,11 @@ def check_awake(net: SuperSdfNet) -> None:
         )
 
 
-def make_card(net: SuperSdfNet, name: str, data: str, accuracy: str) -> dict[str, Any]:
+def make_card(
+    net: SuperSdfNet, name: str, data: str, accuracy: str, inputs: str = DISTANCES
+) -> dict[str, Any]:
     """Return the metadata of the file, which the runtime shows."""
+    inputs = inputs if net.config.keeps_samples else MASKS
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
     ).stdout.strip()
@@ -177,7 +181,7 @@ def make_card(net: SuperSdfNet, name: str, data: str, accuracy: str) -> dict[str
         "trained_from_commit": commit,
         "accuracy": accuracy,
         "licence": "MIT",
-        **({} if net.config.keeps_samples else {"inputs": "masks"}),
+        **({} if inputs == DISTANCES else {"inputs": inputs}),
     }
 
 
@@ -190,13 +194,22 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="the .onnx file")
     parser.add_argument("--data", default="not given", help="what it was trained on")
     parser.add_argument("--accuracy", default="not measured", help="measured figures, in words")
+    parser.add_argument(
+        "--exact",
+        action="store_const",
+        dest="inputs",
+        const=EXACT_DISTANCES,
+        default=DISTANCES,
+        help="the network was trained on hardly any noisy samples: noisy grids are for another one",
+    )
     options = parser.parse_args()
     if options.source:
         rewrite(options.source, options.out)
         return
     net = load_run(options.run)
     check_awake(net)
-    write_model(net, options.out, make_card(net, options.out.stem, options.data, options.accuracy))
+    said = options.data, options.accuracy, options.inputs
+    write_model(net, options.out, make_card(net, options.out.stem, *said))
     difference = parity(net, options.out)
     if difference > PARITY:
         options.out.unlink()

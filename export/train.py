@@ -47,7 +47,7 @@ from export.recipe import (
     rate_factor,
     relative_weights,
 )
-from export.run_log import LOG_COLUMNS, append_line, plot_run, read_log
+from export.run_log import append_line, plot_run, read_log
 from export.sampler import Sampler
 from export.sharing import decode_shared, neighbours_with_targets
 from export.to_onnx import read_weights
@@ -305,13 +305,15 @@ def train(run: Run, store: Store, minutes: float, seed: int) -> None:
         losses.append(take_step(run, store, rng, run.seconds / (60 * minutes)))
         run.seconds += min(time.monotonic() - start, LONGEST_STEP)
         if run.step % LOG_STEPS == 0:
-            log(run, store, float(np.mean(losses)))
+            log(run, store, float(np.mean(losses)), measured=run.step % (10 * LOG_STEPS) == 0)
             losses.clear()
             store.refresh()
         if time.monotonic() - saved > CHECKPOINT_SECONDS:
             run.save()
             saved = time.monotonic()
     run.save()
+    if losses:
+        log(run, store, float(np.mean(losses)), measured=True)
 
 
 def take_step(run: Run, store: Store, rng: np.random.Generator, spent: float) -> float:
@@ -322,16 +324,16 @@ def take_step(run: Run, store: Store, rng: np.random.Generator, spent: float) ->
     return loss
 
 
-def log(run: Run, store: Store, loss: float) -> None:
-    """Append a line to the log; every tenth time measure and plot."""
+def log(run: Run, store: Store, loss: float, *, measured: bool) -> None:
+    """Append a line to the log, with the errors on held-out windows if they are to be measured."""
     line = [run.step, round(run.seconds), len(store.samples), f"{loss:.5f}"]
     path = run.path.with_name("log.csv")
-    if run.step % (10 * LOG_STEPS) == 0:
+    if measured:
         errors = measure(run.average, store.held_out)
         line += [f"{errors.everywhere:.5f}", f"{errors.near:.5f}", f"{errors.normal:.5f}"]
         line += [f"{dormant_share(run.net, [[sample] for sample in store.held_out]):.4f}"]
     append_line(path, line)
-    if len(line) == len(LOG_COLUMNS):
+    if measured:
         plot_run(read_log(path), path.with_name("loss.png"))
 
 

@@ -1,6 +1,7 @@
 """What the values of a grid are, and what becomes of masks, truncated and scaled fields."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from super_sdf.machine import memory
 from super_sdf.machine.resources import Resources
 from super_sdf.mesh import join_meshes
 from super_sdf.network.kinds import network_for
+from super_sdf.network.network import shipped_models
 from super_sdf.pipeline import reconstruct_slabs
 from super_sdf.slabs.cutting import cut
 from super_sdf.steps import spline
@@ -332,6 +334,25 @@ def test_a_network_of_the_package_is_replaced_for_masks():
     found = network_for(network, "mask")
     assert found.card["inputs"] == "masks" and found.threads == network.threads
     assert network_for(found, "mask") is found
+
+
+@pytest.mark.parametrize("precision", ["float32", "int8"])
+def test_a_network_for_exact_distances_is_replaced_where_they_are_noisy(precision):
+    network = load_network("base", device="cpu", threads=1, precision=precision)
+    assert network_for(network, "truncated") is network
+    found = network_for(network, "noisy")
+    assert found.card["name"].split("-")[0] == "noisy" and found.threads == network.threads
+    assert found.card.get("precision", "float32") == precision
+    assert network_for(found, "noisy") is found
+    assert network_for(load_network("best", device="cpu"), "noisy").symmetries == 4
+
+
+def test_a_network_that_was_trained_on_noise_and_one_of_the_users_own_refine_it(tmp_path):
+    fast = load_network("fast", device="cpu", threads=1)
+    assert network_for(fast, "noisy") is fast
+    own = shutil.copy(shipped_models()["base"], tmp_path / "own.onnx")
+    network = load_network(own, device="cpu", threads=1)
+    assert network_for(network, "noisy") is network
 
 
 def test_the_network_for_masks_is_nearer_than_marching_cubes():

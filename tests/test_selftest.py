@@ -43,11 +43,11 @@ def test_everything_is_checked_on_the_cpu():
         "versions",
         "memory",
         "network base on cpu",
-        "network best on cpu",
         "network fast on cpu",
         "network mask on cpu",
+        "network noisy on cpu",
         "network base-int8 on cpu",
-        "network best-int8 on cpu",
+        "network noisy-int8 on cpu",
         *(f"extra {name}" for name in EXTRAS),
     ]
     assert all(finding.state != "failed" for finding in findings)
@@ -169,7 +169,7 @@ def test_a_package_without_networks_says_so(models, command, tmp_path, there):
 def test_a_package_without_the_network_for_masks_says_so(models, tmp_path, command):
     models.mkdir()
     (models / "fast.onnx").write_bytes(SHIPPED["fast"].read_bytes())
-    kinds._for_masks.cache_clear()
+    kinds._load.cache_clear()
     np.save(tmp_path / "in.npy", np.linalg.norm(np.indices((9, 9, 9)) - 4, axis=0) < 3)
     code, _, err = command(
         *("upsample", tmp_path / "in.npy", tmp_path / "out.ply", "--quality", "fast")

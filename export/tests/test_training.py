@@ -68,7 +68,7 @@ from export.variants import UNet
 from super_sdf import Mesh, load_network
 from super_sdf.errors import FileError, OptionError
 from super_sdf.neighbourhood import CENTRE, NEIGHBOURHOOD
-from super_sdf.network.contract import INPUTS
+from super_sdf.network.contract import EXACT_DISTANCES, INPUTS
 from super_sdf.network.network import shipped_models
 from super_sdf.network.running import CHUNK_INPUT
 from super_sdf.steps.band import find_band, is_lipschitz, neighbour_table
@@ -234,6 +234,14 @@ def test_a_network_for_masks_corrects_every_sample_also_as_a_file(tmp_path, samp
     assert not read_network(path).config.keeps_samples
 
 
+def test_a_card_says_that_a_network_is_for_exact_distances(tmp_path):
+    net, path = small_net(), tmp_path / "exact.onnx"
+    write_model(net, path, make_card(net, "exact", "nothing", "none", EXACT_DISTANCES))
+    assert load_network(path).card["inputs"] == "exact distances"
+    assert read_network(path).config.keeps_samples
+    assert "inputs" not in make_card(net, "any", "nothing", "none")
+
+
 def test_a_store_of_masks_has_masks_held_out_and_drawn(tmp_path, samples):
     write_shard(tmp_path / "shard-0-0000.npz", samples[:1])
     write_shard(tmp_path / "shard-0-0001.npz", samples[1:])
@@ -326,6 +334,7 @@ def test_a_run_learns_and_goes_on_where_it_stopped(tmp_path, samples):
         torch.testing.assert_close(one, other)
     train(again, store, again.seconds / 60 + 0.01, seed=0)
     assert again.step > 158
+    assert read_log(tmp_path / "log.csv")["step"][-1] == again.step  # the end is measured
 
 
 def test_the_held_out_errors_of_the_truth_are_zero(samples):
@@ -341,7 +350,7 @@ def test_a_log_is_drawn(tmp_path, samples):
     run = Run(tmp_path, SuperSdfNet(SMALL))
     store = Store(tmp_path, 1)
     for run.step in (900, 1000):
-        log(run, store, 0.5)
+        log(run, store, 0.5, measured=run.step == 1000)
     columns = read_log(tmp_path / "log.csv")
     assert np.isnan(columns["held-out"][0]) and all(np.isfinite(c[1]) for c in columns.values())
     assert (tmp_path / "loss.png").stat().st_size > 1000

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import OptionError, seen
-from ..grid.sdf_grid import SdfGrid
+from ..grid.sdf_grid import SdfGrid, make_grid
 from ..machine.memory import check_fits
 from ..mesh import Mesh
 from ..steps.band import find_band, rescale
@@ -176,11 +176,12 @@ class Case:
         _, self.spacing, origin = layout
         self.fine = self.spacing / self.factor
         self.coarse = sample_grid(shape.solid, layout)
-        random = np.random.default_rng(shape.seed(NOISE))
-        reach = setting.noise * self.spacing / 2
-        noise = random.uniform(-1, 1, self.coarse.shape) * reach if reach else 0
-        values = (self.coarse + noise).astype(np.float32)
-        self.grid = SdfGrid.trusted(values, self.spacing, origin)
+        self.grid = SdfGrid.trusted(self.coarse.astype(np.float32), self.spacing, origin)
+        if setting.noise:  # the tool is not told, as by default
+            random = np.random.default_rng(shape.seed(NOISE))
+            noise = random.uniform(-1, 1, self.coarse.shape) * setting.noise * self.spacing / 2
+            values = (self.coarse + noise).astype(np.float32)
+            self.grid = make_grid(values, spacing=self.spacing, origin=origin, inside="negative")
 
     @cached_property
     def voxels(self) -> IntArray:

@@ -2,7 +2,9 @@
 
 Inputs are ``patches`` (V, 27), ``neighbours`` (V, 27), ``voxels`` (D,) and ``offsets`` (Q, 3); the
 output is ``values`` (D, Q). Distances and offsets are in half voxels. The metadata, the model card,
-holds the receptive field, the training factors, data and accuracy.
+holds the receptive field, the training factors, data and accuracy. Its entry ``inputs`` is what the
+network was trained on: ``EXACT_DISTANCES``, hardly any of them noisy; or ``MASKS``; without the
+entry, distances of which some were noisy.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from ..errors import ModelError
 from .onnx import ort
 
 FORMAT_VERSION = 1
+EXACT_DISTANCES, MASKS = "exact distances", "masks"
 INPUTS = {
     "patches": "tensor(float)",
     "neighbours": "tensor(int32)",

@@ -1,35 +1,45 @@
-"""Which network refines which kind of field: masks have one of their own."""
+"""Which network refines which kind of field: masks and noisy distances have their own."""
 
 from __future__ import annotations
 
 from functools import lru_cache
 
 from ..errors import FileError
-from ..grid.field import MASK
+from ..grid.field import MASK, NOISY
+from .contract import EXACT_DISTANCES
 from .decoder import Decoder
 from .network import NO_NETWORKS, Network, load_network, shipped_models
 
-MASK_MODEL = "mask"
+MASK_MODEL, NOISY_MODEL = "mask", "noisy"
 
 
 def network_for(network: Decoder, kind: str) -> Decoder:
-    """Return the network for a kind of field: that for masks in place of a shipped one.
+    """Return the network for a kind of field: one for that kind in place of a shipped one.
 
-    A network from another file, or any other function, is used as it is.
+    Masks have a network of their own. So have noisy distances, unless the network was itself
+    trained on them. A network from another file, or any other function, is used as it is.
 
     Raises
     ------
     FileError
-        If the network for masks is missing.
+        If the network for the kind is missing.
     """
-    if kind != MASK or not isinstance(network, Network) or not network.shipped:
+    if not isinstance(network, Network) or not network.shipped:
         return network
-    return _for_masks(network.device, network.threads, network.symmetries)
+    chosen = network.device, network.threads, network.symmetries
+    if kind == MASK:
+        return _load(MASK_MODEL, *chosen)
+    if kind == NOISY and network.card.get("inputs") == EXACT_DISTANCES:
+        return _load(NOISY_MODEL, *chosen, network.card.get("precision", "float32"))
+    return network
 
 
-@lru_cache(maxsize=2)
-def _for_masks(device: str, threads: int, symmetries: int) -> Network:
-    """Load the network for masks, once."""
-    if MASK_MODEL not in shipped_models():
-        raise FileError(f"the network {MASK_MODEL!r} is missing: {NO_NETWORKS}")
-    return load_network(MASK_MODEL, device=device, threads=threads).averaged(symmetries)
+@lru_cache(maxsize=4)
+def _load(
+    name: str, device: str, threads: int, symmetries: int, precision: str = "float32"
+) -> Network:
+    """Load a network for a kind, once."""
+    if name not in shipped_models():
+        raise FileError(f"the network {name!r} is missing: {NO_NETWORKS}")
+    loaded = load_network(name, device=device, threads=threads, precision=precision)
+    return loaded.averaged(symmetries)

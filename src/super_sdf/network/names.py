@@ -3,5 +3,5 @@
 DEVICES = ("auto", "cpu", "cuda")
 PRECISIONS = ("float32", "int8")
 DEFAULT_QUALITY = "base"
-QUALITIES = {"fast": ("fast", 1), "base": ("base", 1), "best": ("best", 4)}
+QUALITIES = {"fast": ("fast", 1), "base": ("base", 1), "best": ("base", 4)}
 """The file of a shipped network, and the number of cube symmetries that are averaged."""

@@ -17,7 +17,7 @@ from ..files.regular import check_regular_file
 from ..machine.threads import cores_of_system, useful_threads
 from ..options import check_path, check_threads
 from ..progress import ShareCallback
-from .contract import INPUTS, one_voxel, read_card
+from .contract import INPUTS, MASKS, one_voxel, read_card
 from .device import open_session
 from .names import DEFAULT_QUALITY, PRECISIONS, QUALITIES
 from .onnx import ort
@@ -281,7 +281,7 @@ def load_network(
     if opened.failure:
         raise ModelError(f"{path} does not run with its own inputs: {opened.failure}")
     notes = (*opened.notes, *_note_threads(threads, useful))
-    shipped = path.parent == MODELS and card.get("inputs") != "masks"
+    shipped = path.parent == MODELS and card.get("inputs") != MASKS
     return Network(opened.session, card, opened.device, symmetries, useful, notes, shipped=shipped)
 
 
