@@ -197,8 +197,8 @@ OPTIONS: tuple[Option, ...] = (
     ),
     _choice(
         "--quality",
-        "Network: fast is smaller and quicker than base; best is larger, averages 4 turns of the "
-        "grid, and takes 7.5 times as long as base.",
+        "Network: fast is smaller and quicker than base; best averages base over 4 turns of the "
+        "grid, and takes 4 times as long.",
         qualities,
         LazyDefault(default_quality),
     ),
