@@ -50,16 +50,17 @@ from export.recipe import (
 from export.run_log import append_line, plot_run, read_log
 from export.sampler import Sampler
 from export.sharing import decode_shared, neighbours_with_targets
-from export.to_onnx import read_weights
+from export.to_onnx import DISTANCES, read_weights
 from super_sdf.errors import FileError
 from super_sdf.files.regular import check_regular_file
+from super_sdf.network.contract import MASKS
 
 CHECKPOINT_SECONDS = 180
 LONGEST_STEP = 30.0  # seconds: the rest of a longer one is taken as a pause (SIGSTOP)
 LOG_STEPS = 100
 WATCHED = 4  # last batches: a unit that reacted to none of them is dormant
 HELD_OUT = 2  # shards, the first by name, whose errors are logged
-INPUTS = ("distances", "masks")
+INPUTS = (DISTANCES, MASKS)
 NEAR = 0.5  # half voxels from the surface: limit for normals; half of it for values
 
 
@@ -92,7 +93,7 @@ class Store:
         check_store(folder, held_out)
         self.folder, self.most, self.inputs = folder, most, inputs
         self.seen = sorted(folder.glob("shard-*.npz"))[:held_out]
-        gathered = prepare_mask if inputs == "masks" else prepare
+        gathered = prepare_mask if inputs == MASKS else prepare
         held = [gathered(s) for path in self.seen for s in read_shard(path)]
         self.held_out = [sample for sample in held if len(sample.voxels)]
         self.samples: list[Sample] = []
@@ -124,7 +125,7 @@ class Store:
 
     def _changed(self, rng: np.random.Generator, sample: Sample, recipe: Recipe) -> Prepared:
         """Return a sample as it is shown this time."""
-        if self.inputs == "masks":
+        if self.inputs == MASKS:
             return augment_mask(rng, sample)
         return augment(rng, sample, recipe.shares)
 
@@ -194,7 +195,8 @@ class Run:
         """Take one step at the rate for this share of the budget; return the loss, and each's."""
         for optimiser, peak in zip(self.optimisers, self.peaks):
             optimiser.param_groups[0]["lr"] = peak * rate_factor(spent, self.recipe)
-        losses = self.find_gradients(batch)
+        weights = relative_weights([len(sample.voxels) for sample in batch], self.recipe)
+        losses = self.find_gradients(batch, weights)
         torch.nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
         for optimiser in self.optimisers:
             optimiser.step()
@@ -203,16 +205,14 @@ class Run:
         self.recent.append(batch)
         if self.is_time_to_revive(spent):
             revive(self.net, self.optimisers, self.recent)
-        weights = window_weights(batch, self.recipe)
         return float(weights @ losses), losses.tolist()
 
-    def find_gradients(self, batch: list[Prepared]) -> Tensor:
-        """Set the gradients of the weighted loss of a batch; return the loss of each window.
+    def find_gradients(self, batch: list[Prepared], weights: Tensor) -> Tensor:
+        """Set the gradients of the weighted sum of the windows' losses; return each loss, (B,).
 
         Each thread works on some of the windows, since one product is too small to be shared.
         """
-        weights = window_weights(batch, self.recipe).to(self.device)
-        shares = divide(batch, self.threads)
+        weights, shares = weights.to(self.device), divide(batch, self.threads)
         with ThreadPoolExecutor(self.threads) as pool:
             found = list(pool.map(lambda rows: self._gradients(batch, weights, rows), shares))
         for parameter, *parts in zip(self.net.parameters(), *(grads for _, grads in found)):
@@ -249,11 +249,6 @@ class Run:
         with torch.no_grad():
             for mean, now in zip(self.average.parameters(), self.net.parameters()):
                 mean.lerp_(now, 1 - decay)
-
-
-def window_weights(batch: list[Prepared], recipe: Recipe) -> Tensor:
-    """Return the weight of each window of a batch in its loss, (B,)."""
-    return relative_weights([len(sample.voxels) for sample in batch], recipe)
 
 
 def divide(batch: Sequence[Prepared], parts: int) -> list[list[int]]:
@@ -396,7 +391,7 @@ def run_training(options: argparse.Namespace) -> None:
     config = replace(
         config,
         blocks=options.blocks or config.blocks,
-        keeps_samples=options.inputs == "distances",
+        keeps_samples=options.inputs == DISTANCES,
     )
     run = Run(options.run, SuperSdfNet(config), recipe, options.device, options.threads)
     if options.start:

@@ -42,7 +42,8 @@ from super_sdf.evaluation.runner import LeftOut, Runner, complete
 from super_sdf.evaluation.scope import Scope, find_meshes, spread
 from super_sdf.evaluation.store import KEY_TYPES, Store, is_row
 from super_sdf.machine.serving import ClockStarted
-from super_sdf.network.network import load_network
+from super_sdf.network.kinds import KIND_MODELS
+from super_sdf.network.network import load_network, shipped_models
 
 KILLED = "was killed by SIGKILL (most likely out of memory)"
 QUALITY = ("cd", "f1", "nc", "signed_nc", "p2s", "ecd", "ef1", "field_mse", "faces", "closed")
@@ -769,3 +770,13 @@ def test_with_factor_1_the_corners_of_voxels_have_values_of_the_refined_field(me
     assert apart < 0.5 * case.shape.solid.distance(coarse.vertices).max() + 0.1 * case.spacing
     quarter = methods.SIMPLIFIED_METHODS[names.simplified(name, 4)](case, network).mesh
     assert len(quarter.faces) == pytest.approx(len(one.faces) / 4, rel=0.1)
+
+
+@pytest.mark.parametrize("name", KIND_MODELS)
+def test_rows_are_measured_again_with_another_network_for_a_kind(name, tmp_path, monkeypatch):
+    files = shipped_models()
+    before = measuring.digest_of_ours("fast")
+    other = tmp_path / "other.onnx"
+    other.write_bytes(files[name].read_bytes() + b"0")
+    monkeypatch.setattr(measuring, "shipped_models", lambda: {**files, name: other})
+    assert measuring.digest_of_ours("fast") != before

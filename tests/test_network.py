@@ -11,7 +11,7 @@ from onnx_files import DOUBLE, FLOAT, INPUTS, metadata, write_network
 from super_sdf import load_network, reconstruct, upsample
 from super_sdf.errors import DeviceError, FileError, ModelError, OptionError
 from super_sdf.network.decoder import check_output, to_blocks
-from super_sdf.network.kinds import MASK_MODEL, NOISY_MODEL
+from super_sdf.network.kinds import KIND_MODELS
 from super_sdf.network.names import QUALITIES
 from super_sdf.network.network import Network, shipped_models
 from super_sdf.steps.band import find_band, gather_patches, neighbour_table, rescale
@@ -63,7 +63,7 @@ def test_a_prediction_depends_on_the_receptive_field_and_no_more():
 
 
 def test_shipped_networks_are_small_and_fulfil_the_contract():
-    names = {*(name for name, _ in QUALITIES.values()), MASK_MODEL, NOISY_MODEL}
+    names = {*(name for name, _ in QUALITIES.values()), *KIND_MODELS}
     assert {name.removesuffix("-int8") for name in shipped_models()} == names
     for name, path in shipped_models().items():
         assert path.stat().st_size < 20e6

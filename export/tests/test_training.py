@@ -561,7 +561,7 @@ def test_threads_share_a_batch_and_find_the_same_gradients(tmp_path, samples, mo
     found = []
     for threads in (1, 2):
         run = Run(tmp_path, small_net(), RECIPE, threads=threads)
-        losses = run.find_gradients(batch)
+        losses = run.find_gradients(batch, torch.full((len(batch),), 0.25))
         found.append([losses, *(parameter.grad for parameter in run.net.parameters())])
     for one, two in zip(*found, strict=True):
         torch.testing.assert_close(one, two, rtol=1e-4, atol=1e-6)

@@ -177,7 +177,7 @@ class Case:
         self.fine = self.spacing / self.factor
         self.coarse = sample_grid(shape.solid, layout)
         self.grid = SdfGrid.trusted(self.coarse.astype(np.float32), self.spacing, origin)
-        if setting.noise:  # the tool is not told, as by default
+        if setting.noise:  # recognised by the tool, as in a file of a user
             random = np.random.default_rng(shape.seed(NOISE))
             noise = random.uniform(-1, 1, self.coarse.shape) * setting.noise * self.spacing / 2
             values = (self.coarse + noise).astype(np.float32)

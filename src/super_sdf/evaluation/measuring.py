@@ -18,7 +18,8 @@ from ..files.regular import check_regular_file
 from ..machine.memory import forget_peak, held_memory
 from ..mesh import Mesh
 from ..network.decoder import Decoder
-from ..network.network import find_model, load_network
+from ..network.kinds import KIND_MODELS
+from ..network.network import find_model, load_network, shipped_models
 from ..truth.solid import Distances, Solid
 from . import edges, metrics
 from .cases import RESULT_EDGES, RESULT_POINTS, Case, Setting, Shape
@@ -287,11 +288,12 @@ def digest_of_file(path: Path) -> str:
 
 
 def digest_of_ours(model: str) -> str:
-    """Return a hash of the network's file and of the code that runs it."""
+    """Return a hash of the network's file, of those that replace it, and of the code."""
     load_network(model, device="cpu")  # raises ModelError before anything is measured
     network, symmetries = find_model(model)
     digest = hashlib.sha256(b"" if symmetries == 1 else str(symmetries).encode())
-    for path in [network, *code_of_method()]:
+    for_kinds = [path for name, path in shipped_models().items() if name in KIND_MODELS]
+    for path in [network, *for_kinds, *code_of_method()]:
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 

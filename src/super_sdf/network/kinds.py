@@ -11,6 +11,8 @@ from .decoder import Decoder
 from .network import NO_NETWORKS, Network, load_network, shipped_models
 
 MASK_MODEL, NOISY_MODEL = "mask", "noisy"
+KIND_MODELS = (MASK_MODEL, NOISY_MODEL)
+"""The shipped networks that replace others for a kind of field."""
 
 
 def network_for(network: Decoder, kind: str) -> Decoder:
