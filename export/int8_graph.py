@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import onnx
-from onnx import numpy_helper
+from onnx import TensorProto, numpy_helper
 
+from export.onnx_graph import rows_of
 from export.writer import Writer
 
 ONE = "int8_one"
@@ -60,27 +61,42 @@ class IntWriter(Writer):
 
 def replace_blocks(graph: onnx.GraphProto, blocks: list[IntBlock]) -> None:
     """Replace the blocks of a graph, its Scan nodes in order."""
-    scans = [node for node in graph.node if node.op_type == "Scan"]
+    stem, *scans, _ = [node for node in graph.node if node.op_type == "Scan"]
     graph.initializer.append(numpy_helper.from_array(np.float32(1), ONE))
     graph.initializer.append(numpy_helper.from_array(np.uint8(0), NONE))
-    for scan, block in zip(scans[1:-1], blocks, strict=True):  # between stem and head
-        body = next(attribute.g for attribute in scan.attribute if attribute.name == "body")
-        round_features(graph, body, block)
-        replace_layers(body, block)
+    for before, scan, block in zip([stem, *scans], scans, blocks):
+        rounded = add_rounded(body_of(before), block)
+        before.output.append(rounded)
+        gather_rounded(graph, scan, rounded)
+        replace_layers(body_of(scan), block)
 
 
-def round_features(graph: onnx.GraphProto, body: onnx.GraphProto, block: IntBlock) -> None:
-    """Let a block gather quantized features; absent ones, exactly 0, become its zero points."""
-    gather = body.node[1]  # body.node[0] gathers the table
-    features = gather.input[0]
-    writer = IntWriter(f"{body.name}_features_")
-    scaled = writer.op("Mul", features, writer.constant(1 / block.steps, "rates"))
+def body_of(scan: onnx.NodeProto) -> onnx.GraphProto:
+    """Return the graph that a Scan runs for each chunk."""
+    return next(attribute.g for attribute in scan.attribute if attribute.name == "body")
+
+
+def add_rounded(body: onnx.GraphProto, block: IntBlock) -> str:
+    """Let a body return its features rounded, too, for the next block; return their name.
+
+    Rounded here they are still in cache. Absent voxels, exactly 0, become its zero points.
+    """
+    features = body.output[0]
+    writer = IntWriter(f"{body.name}_rounded_")
+    scaled = writer.op("Mul", features.name, writer.constant(1 / block.steps, "rates"))
     moved = writer.op("Add", scaled, writer.constant(block.zeros.astype(np.float32), "zeros"))
-    gather.input[0] = writer.quantize(moved)
-    number = next(n for n, node in enumerate(graph.node) if features in node.output)
-    for node in reversed(writer.nodes):
-        graph.node.insert(number + 1, node)
-    graph.initializer.extend(writer.constants)
+    rounded = writer.quantize(moved)
+    body.node.extend(writer.nodes)
+    body.initializer.extend(writer.constants)
+    body.output.append(rows_of(rounded, TensorProto.UINT8, len(block.steps)))
+    return f"{rounded}_chunks"
+
+
+def gather_rounded(graph: onnx.GraphProto, scan: onnx.NodeProto, rounded: str) -> None:
+    """Let a block gather rounded features, (n, chunk, C), instead of its float32 ones."""
+    gather = body_of(scan).node[1]  # the first node gathers the table
+    flat = next(node for node in graph.node if gather.input[0] in node.output)
+    flat.input[0] = rounded
 
 
 def replace_layers(body: onnx.GraphProto, block: IntBlock) -> None:
