@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,7 +51,8 @@ def draw_samples(count: int = SAMPLES, seed: int = 0, *, masks: bool = False) ->
     rng = np.random.default_rng(seed)
     samples = fill_shard(rng, [], 1.0, THIN, count)
     if masks:
-        return [augment_mask(rng, sample) for sample in samples]
+        shown = [augment_mask(rng, sample) for sample in samples]
+        return [sample for sample in shown if len(sample.voxels)]  # thin ones may vanish
     return [augment(rng, sample, USUAL) for sample in samples]
 
 
@@ -69,9 +71,13 @@ def find_ranges(net: SuperSdfNet, samples: list[Prepared]) -> list[Ranges]:
     return ranges
 
 
-def distance_apart(one: Path, other: Path) -> np.ndarray:
-    """Return the differences between the values of two files on a ball, in voxels."""
-    sample = ball(15.0)
-    arrays = (sample.patches, sample.table, sample.voxels, sample.offsets)
-    first, second = (load_network(path, device="cpu")(*arrays) for path in (one, other))
-    return np.abs(first - second) / 2
+def distance_apart(one: Path, other: Path, samples: Sequence[Prepared] = ()) -> np.ndarray:
+    """Return the differences between the values of two files on samples or a ball, in voxels."""
+    pair = [load_network(path, device="cpu") for path in (one, other)]
+    apart = []
+    for sample in samples or [ball(15.0)]:
+        rows = (array.astype(np.int32) for array in (sample.table, sample.voxels))
+        arrays = (sample.patches, *rows, sample.offsets)
+        first, second = (network(*arrays) for network in pair)
+        apart.append(np.abs(first - second).ravel() / 2)
+    return np.concatenate(apart)
