@@ -69,7 +69,9 @@ def compare_values(device: str, sizes: Sequence[int]) -> None:
     """Print the difference between the values of CUDA and of the CPU, and both times."""
     rows = []
     for quality in QUALITIES:
-        here, there = load_network(quality, device="cpu"), load_network(quality, device=device)
+        here, there = (
+            load_network(quality, device=place, precision="float32") for place in ("cpu", device)
+        )
         for size in sizes:
             inputs = network_inputs(size)
             apart = np.abs(here(*inputs) - there(*inputs)).max() / 2

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import zipfile
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import super_sdf
 from super_sdf.cli import main as cli
 from super_sdf.cli.upsample import upsample_command
 from super_sdf.files.formats import GRID_SUFFIXES
+from super_sdf.network.network import shipped_models
 
 
 @pytest.fixture
@@ -96,14 +98,22 @@ def test_noise_is_told(here, command):
     assert " % of the band the values differ by more than distances can: they are taken" in err
 
 
-def test_the_precision_may_be_chosen(here, command):
-    code, out, _ = command("upsample", "in.npy", "out.ply", "--precision", "int8", "--json")
-    assert code == 0 and json.loads(out)["precision"] == "int8"
+@pytest.mark.parametrize("asked", ["auto", "int8", "float32"])
+def test_the_precision_may_be_chosen_and_is_reported(here, command, asked):
+    words = ("--precision", asked, "--device", "cpu", "--json")
+    code, out, _ = command("upsample", "in.npy", "out.ply", *words)
+    used = {"auto": "int8"}.get(asked, asked)
+    assert code == 0 and json.loads(out)["precision"] == used
     assert trimesh.load("out.ply").is_watertight
-    code, _, err = command(
-        "upsample", "in.npy", "fast.ply", "--quality", "fast", "--precision", "int8"
-    )
-    assert code == 2 and "fast has no int8 variant" in err
+
+
+def test_a_network_without_int8_is_refused_if_that_is_asked_for(here, command, tmp_path):
+    shutil.copy(shipped_models()["fast"], "own.onnx")
+    words = ("upsample", "in.npy", "out.ply", "--model", "own.onnx", "--json")
+    code, _, err = command(*words, "--precision", "int8")
+    assert code == 2 and "own.onnx has no int8 variant, own-int8.onnx: write one with" in err
+    code, out, _ = command(*words)
+    assert code == 0 and json.loads(out)["precision"] == "float32"
 
 
 def test_fine_values_that_contradict_the_coarse_ones_are_warned_of(here, command, monkeypatch):
@@ -371,7 +381,7 @@ def test_defaults_are_those_of_the_library(command):
         assert defaults[name] == getattr(ConvertOptions, name)
     assert (defaults["quality"], defaults["precision"], defaults["device"]) == (
         "base",
-        "float32",
+        "auto",
         "auto",
     )
 

@@ -99,6 +99,7 @@ def cuda_session(cuda_build, monkeypatch):
         if providers == [CPU]:
             return real(path, options, providers=providers)
         assert providers == [(CUDA, CUDA_OPTIONS), CPU] and more == {"enable_fallback": 0}
+        fake.path = path
         return fake
 
     def uploaded(array, place, number):
@@ -147,7 +148,8 @@ def test_cuda_options_keep_precision_and_memory():
 @pytest.mark.parametrize("requested", ["auto", "cuda"])
 def test_cuda_that_works_is_used(cuda_session, requested):
     network = load_network(device=requested)
-    assert (network.device, network.notes) == ("cuda", ())
+    assert (network.device, network.precision, network.notes) == ("cuda", "float32", ())
+    assert cuda_session.path == str(shipped_models()["base"])
     assert len(cuda_session.bindings) == 1  # the trial run
     network(*one_voxel().values())
     assert cuda_session.bindings[1].outputs == {"values": ("cuda", 0)}
@@ -209,7 +211,8 @@ def test_auto_falls_back_with_a_note_if_there_is_a_gpu(monkeypatch, gpu):
     network = load_network(device="auto")
     reason = f"{HERE} here has no CUDA provider: install onnxruntime-gpu in place of onnxruntime"
     note = f"a GPU seems to be here, but the network runs on the CPU: {reason}"
-    assert network.device == "cpu" and network.notes == (note,) * gpu
+    assert (network.device, network.precision) == ("cpu", "int8")
+    assert network.notes == (note,) * gpu
 
 
 def test_the_command_prints_the_note(tmp_path, monkeypatch, command):

@@ -22,6 +22,7 @@ from solids import cube, saved, sphere, torus
 from super_sdf import Mesh, SuperSdfError
 from super_sdf.cli.main import cli
 from super_sdf.errors import FileError, OptionError, WriteError
+from super_sdf.evaluation import evaluate as whole
 from super_sdf.evaluation import (
     experiment_tables,
     measuring,
@@ -780,3 +781,20 @@ def test_rows_are_measured_again_with_another_network_for_a_kind(name, tmp_path,
     other.write_bytes(files[name].read_bytes() + b"0")
     monkeypatch.setattr(measuring, "shipped_models", lambda: {**files, name: other})
     assert measuring.digest_of_ours("fast") != before
+
+
+def test_rows_of_one_precision_do_not_count_for_the_other(meshes):
+    default, same, other = (
+        measuring.digest_of_ours("base", precision) for precision in ("auto", "int8", "float32")
+    )
+    assert default == same != other
+    paths = (meshes / "box.ply",)
+    tasks = Scope(paths, (8,), methods=("ours",), precision="float32").tasks()
+    assert {(task.precision, task.digest) for task in tasks} == {("float32", other)}
+
+
+def test_a_process_is_timed_with_the_network_and_precision_of_the_task(meshes, monkeypatch):
+    given = []
+    monkeypatch.setattr(whole, "time_shape", lambda *words: given.append(words[2]) or {})
+    whole.time_task(task_of(meshes / "box.ply", precision="float32"))
+    assert given == [["--model", "base", "--precision", "float32"]]

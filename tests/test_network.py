@@ -1,6 +1,7 @@
 """The contract of the ONNX file, the values of a network, and the errors of bad files."""
 
 import os
+import shutil
 import warnings
 
 import numpy as np
@@ -67,7 +68,7 @@ def test_shipped_networks_are_small_and_fulfil_the_contract():
     assert {name.removesuffix("-int8") for name in shipped_models()} == names
     for name, path in shipped_models().items():
         assert path.stat().st_size < 20e6
-        assert load_network(name).card["name"] == name
+        assert load_network(name, precision="float32").card["name"] == name
 
 
 @pytest.mark.parametrize("factor", [4, 8])
@@ -75,7 +76,7 @@ def test_a_prediction_depends_neither_on_threads_nor_on_the_other_voxels_decoded
     """Bit for bit, so that a mesh does not depend on its slabs or on the number of threads."""
     patches, table, rows = network_inputs(ball())
     offsets = block_offsets(factor)
-    one, two = (load_network("fast", threads=threads) for threads in (1, 2))
+    one, two = (load_network("fast", threads=threads, precision="float32") for threads in (1, 2))
     values = one(patches, table, rows, offsets)
     for some in (rows, rows[40:], rows[100:103], rows[7:8]):
         np.testing.assert_array_equal(two(patches, table, some, offsets), values[some])
@@ -83,11 +84,21 @@ def test_a_prediction_depends_neither_on_threads_nor_on_the_other_voxels_decoded
 
 def test_int8_is_near_float32_and_its_card_has_the_precision():
     patches, table, rows = network_inputs(ball())
-    one, other = load_network(), load_network(precision="int8")
+    one, other = (load_network(precision=precision) for precision in ("float32", "int8"))
     assert other.card["precision"] == "int8" and other.device == "cpu"
     given = patches, table, rows, block_offsets(4)
     apart = np.abs(one(*given) - other(*given)) / 2  # voxels
     assert 0 < apart.mean() < 2e-3 and apart.max() < 0.05
+
+
+def test_shipped_networks_run_in_int8_on_the_cpu_and_other_files_as_they_are(tmp_path):
+    for quality in QUALITIES:
+        assert load_network(quality, device="cpu").precision == "int8"
+        assert load_network(quality, device="cpu", precision="float32").precision == "float32"
+    own = shutil.copy(shipped_models()["base"], tmp_path / "own.onnx")
+    shutil.copy(shipped_models()["base-int8"], tmp_path / "own-int8.onnx")
+    assert load_network(own, device="cpu").precision == "float32"
+    assert load_network(own, precision="int8").precision == "int8"
 
 
 def test_int8_gives_the_same_bits_for_any_part_and_any_threads():
@@ -116,7 +127,7 @@ def test_int8_without_an_int8_file_is_an_error(tmp_path):
         OptionError, match=r"none\.onnx has no int8 variant, .*none-int8\.onnx: write"
     ):
         load_network(tmp_path / "none.onnx", precision="int8")
-    with pytest.raises(OptionError, match="precision is 'int4': give one of float32, int8"):
+    with pytest.raises(OptionError, match="precision is 'int4': give one of auto, float32, int8"):
         load_network(precision="int4")
     with pytest.raises(DeviceError, match="int8 is for the CPU: use --precision float32"):
         load_network(precision="int8", device="cuda")

@@ -22,6 +22,7 @@ from .machine.extras import EXTRAS, how_to_install, missing_modules
 from .machine.memory import free_memory
 from .network.cuda import available_devices, check_cuda, describe_gpu, onnxruntime_version
 from .network.kinds import MASK_MODEL
+from .network.names import FLOAT32
 from .network.network import NO_NETWORKS, load_network, shipped_models
 from .steps.nodes import block_offsets
 from .steps.survey import survey
@@ -153,7 +154,7 @@ def check_network(name: str, devices: list[str], ball: Ball) -> Iterator[Finding
 
 def run_network(name: str, device: str, ball: Ball) -> tuple[FloatArray, float]:
     """Return a network's values, (D, Q) in voxels, and microseconds per voxel of the band."""
-    network = load_network(name, device=device)
+    network = load_network(name, device=device, precision=FLOAT32)  # its own file
     network(*ball.inputs)  # the first run is slower
     start = time.perf_counter()
     half_voxels = network(*ball.inputs)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from .. import __version__
 from ..grid.field import AUTO
+from ..network.names import AUTO_PRECISION
 from ..network.network import find_model
 from ..steps.mesher_names import MARCHING
 from .fingerprint import file_state, fingerprint, is_unchanged
@@ -48,7 +49,7 @@ class Settings:
 
     folder: Path
     model: str = "base"
-    precision: str = "float32"
+    precision: str = AUTO_PRECISION
     device: str = "auto"
     threads: int = 0
     workers: int = 0
@@ -134,7 +135,8 @@ class Planner:
     def digest(self, job: Job) -> str:
         """Return the hash of all that a mesh depends on, besides its grid.
 
-        Device, threads and memory do not count: the mesh asked for is the same.
+        Device, threads and memory do not count: the mesh asked for is the same. If the precision
+        follows the device, the network for the CPU counts.
         """
         options = asdict(replace(job.options, max_memory=None))
         if options["mesher"] == MARCHING:

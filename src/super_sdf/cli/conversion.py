@@ -18,9 +18,8 @@ from .choices import (
     default_quality,
     device_option,
     fields,
-    first,
     meshers,
-    precisions,
+    precision_option,
     qualities,
     signs_inside,
 )
@@ -202,12 +201,7 @@ OPTIONS: tuple[Option, ...] = (
         qualities,
         LazyDefault(default_quality),
     ),
-    _choice(
-        "--precision",
-        "Arithmetic of the network: int8 is quicker on the CPU and slightly less accurate.",
-        precisions,
-        first(precisions),
-    ),
+    precision_option,
     click.option(
         "--model", metavar="FILE", help="Use the network in this ONNX file instead of --quality."
     ),

@@ -14,7 +14,7 @@ import click
 from ..evaluation.names import EXPERIMENTS, FIELD_GROUPS, METHOD_LABELS, PEER_LABELS
 from ..machine.extras import check_modules
 from ..pictures.choices import AXES
-from .choices import LazyDefault, convert_default, default_quality
+from .choices import LazyDefault, convert_default, default_quality, precision_option
 from .common import CONTEXT, InterruptedCommand, one_line_errors, print_stderr, print_stdout
 from .interrupts import raising_interrupts
 
@@ -29,6 +29,7 @@ Examples:
 NUMBERS = (
     "factor",
     "model",
+    "precision",
     "experiment_shapes",
     "peer_shapes",
     "peer_size",
@@ -182,6 +183,7 @@ def accepts(option: click.Option, word: str, ctx: click.Context) -> bool:
     show_default=True,
     help="Shipped network (fast, base or best) or an ONNX file.",
 )
+@precision_option
 @click.option(
     "--jobs", type=click.IntRange(1), help="Worker processes. Default and maximum: one per core."
 )

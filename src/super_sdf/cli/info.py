@@ -148,9 +148,10 @@ def gather_facts() -> dict[str, Any]:
 def load_card(name: str) -> dict[str, Any]:
     """Return the metadata of a shipped network, or under ``fault`` why it cannot be loaded."""
     from ..errors import SuperSdfError
+    from ..network.names import FLOAT32
     from ..network.network import load_network
 
     try:
-        return dict(load_network(name, device="cpu").card)
+        return dict(load_network(name, device="cpu", precision=FLOAT32).card)  # its own file
     except SuperSdfError as error:
         return {"fault": str(error)}

@@ -264,7 +264,7 @@ class Upsampling:
             "offset": self.options["offset"],
             "mesher": self.options["mesher"],
             "model": self.model,
-            "precision": self.options["precision"],
+            "precision": self.network.precision,
             "device": self.network.device,
             "device_notes": self.device_notes(),
             **self.result.report(),

@@ -30,6 +30,7 @@ from ..machine.extras import missing_modules
 from ..machine.memory import free_memory, reuse_freed
 from ..machine.serving import settle_signals
 from ..network.cuda import onnxruntime_version
+from ..network.names import AUTO_PRECISION
 from ..network.network import find_model, shipped_models
 from .connecting import Cluster, Limits, share_of
 
@@ -59,7 +60,7 @@ class Needs:
     """
 
     model: str
-    precision: str = "float32"
+    precision: str = AUTO_PRECISION
     modules: tuple[str, ...] = ()
     files: Sequence[Path] = ()
     folder: Path | None = None

@@ -90,7 +90,7 @@ def time_processes(results: Results, on_task: OnTask | None) -> dict[int, list[M
     tasks = [task for task in tasks if task.limit is None]
     for done, task in enumerate(tasks, 1):
         if not results.store.is_final(task, PROCESS):
-            results.store.add(time_task(task, scope.model))
+            results.store.add(time_task(task))
         row = results.store.get(task, PROCESS) or {}
         if row["error"] is None:
             timings.setdefault(task.setting.size, []).append(row)
@@ -102,10 +102,11 @@ def time_processes(results: Results, on_task: OnTask | None) -> dict[int, list[M
     return timings
 
 
-def time_task(task: Task, model: str) -> Measurement:
+def time_task(task: Task) -> Measurement:
     """Return the time of the command on a task's grid, or a failure."""
     try:
-        row = time_shape(Shape.read(task.path, task.turned), task.setting, ["--model", model])
+        options = ["--model", task.model, "--precision", task.precision]
+        row = time_shape(Shape.read(task.path, task.turned), task.setting, options)
     except SuperSdfError as problem:
         return failed_row(task, PROCESS, reason_of(problem))
     return {**task.key(PROCESS), **row}

@@ -19,6 +19,7 @@ from ..machine.memory import forget_peak, held_memory
 from ..mesh import Mesh
 from ..network.decoder import Decoder
 from ..network.kinds import KIND_MODELS
+from ..network.names import AUTO_PRECISION, INT8
 from ..network.network import find_model, load_network, shipped_models
 from ..truth.solid import Distances, Solid
 from . import edges, metrics
@@ -65,7 +66,7 @@ class Task:
     setting : Setting
     methods : tuple of str
         Names of methods or peers, in the order of measuring.
-    model : str
+    model, precision : str
         The network: see ``load_network``.
     threads : int
         Threads of the network; 0: one per core.
@@ -83,6 +84,7 @@ class Task:
     methods: tuple[str, ...]
     model: str
     digest: str
+    precision: str = AUTO_PRECISION
     threads: int = 0
     limit: float | None = None
     turned: int | None = None
@@ -109,7 +111,9 @@ def measure_task(task: Task, shape: Shape) -> Iterator[Measurement]:
     """Yield a measurement for each method of a task; ``shape`` is that of the task."""
     try:
         # On the CPU, for the same results on every machine.
-        network = load_network(task.model, device="cpu", threads=task.threads)
+        network = load_network(
+            task.model, device="cpu", threads=task.threads, precision=task.precision
+        )
         case = None if task.setting == NO_SETTING else Case(shape, task.setting, task.peer_meshes)
     except Exception as problem:  # all methods of the task fail; other tasks still count
         yield from (failed_row(task, method, reason_of(problem)) for method in task.methods)
@@ -287,12 +291,13 @@ def digest_of_file(path: Path) -> str:
     return digest.hexdigest()[:16]
 
 
-def digest_of_ours(model: str) -> str:
+def digest_of_ours(model: str, precision: str = AUTO_PRECISION) -> str:
     """Return a hash of the network's file, of those that replace it, and of the code."""
-    load_network(model, device="cpu")  # raises ModelError before anything is measured
-    network, symmetries = find_model(model)
+    load_network(model, device="cpu", precision=precision)  # raises before anything is measured
+    network, symmetries = find_model(model, precision)
     digest = hashlib.sha256(b"" if symmetries == 1 else str(symmetries).encode())
-    for_kinds = [path for name, path in shipped_models().items() if name in KIND_MODELS]
+    shipped = shipped_models().items()
+    for_kinds = [path for name, path in shipped if name.removesuffix(f"-{INT8}") in KIND_MODELS]
     for path in [network, *for_kinds, *code_of_method()]:
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]

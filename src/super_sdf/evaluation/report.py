@@ -230,7 +230,7 @@ def draw_shape(scope: Scope, path: Path, target: Path, up: str) -> None:
     """Draw a picture of coarse marching cubes, ours, the reference, and the error of ours."""
     setting, shape = scope.settings()[0], Shape.read(path, scope.turned)
     case = Case(shape, setting)
-    network = load_network(scope.model, device="cpu")
+    network = load_network(scope.model, device="cpu", precision=scope.precision)
     coarse, ours = (METHODS[name](case, network).mesh for name in ("mc", OURS))
     panels = [
         Panel(coarse, titled(coarse, f"marching cubes of {setting.size}^3")),

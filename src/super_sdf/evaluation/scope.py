@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ..errors import FileError, OptionError, seen
 from ..files.regular import check_regular_file
+from ..network.names import AUTO_PRECISION
 from ..steps.mesher_names import MESHERS
 from .cases import Setting
 from .field_kinds import kinds_at, methods_on
@@ -49,8 +50,8 @@ class Scope:
         The mesh files.
     sizes, factor, methods
         Of the main table.
-    model : str
-        A shipped network or an ONNX file.
+    model, precision : str
+        A shipped network or an ONNX file, and its arithmetic: see ``load_network``.
     experiments : tuple of str
         Some of ``EXPERIMENTS``, measured on ``experiment_shapes`` of the shapes.
     kinds : tuple of str
@@ -71,6 +72,7 @@ class Scope:
     factor: int = 4
     methods: tuple[str, ...] = tuple(METHOD_LABELS)
     model: str = "base"
+    precision: str = AUTO_PRECISION
     experiments: tuple[str, ...] = ()
     experiment_shapes: int = 10
     peers: tuple[str, ...] = ()
@@ -133,7 +135,7 @@ class Scope:
 
     def _as_tasks(self, wanted: Iterable[tuple[Path, MethodsIn]]) -> list[Task]:
         """Return a task for each shape and setting."""
-        ours = digest_of_ours(self.model)
+        ours = digest_of_ours(self.model, self.precision)
         sums = {path: digest_of_file(path) for path in self.paths}
         return [
             Task(
@@ -143,6 +145,7 @@ class Scope:
                 methods,
                 self.model,
                 ours,
+                self.precision,
                 self.threads,
                 turned=self.turned,
                 peer_meshes=self.peer_meshes,

@@ -51,13 +51,15 @@ class OpenedSession:
     failure: str = ""
 
 
-def open_session(path: Path, device: str, threads: int, trial: Mapping[str, Any]) -> OpenedSession:
+def open_session(
+    paths: tuple[Path, Path], device: str, threads: int, trial: Mapping[str, Any]
+) -> OpenedSession:
     """Open an ONNX file on a device.
 
     Parameters
     ----------
-    path : path
-        The file.
+    paths : two paths
+        The file for the CPU, and that for CUDA.
     device : str
         "cuda", "cpu", or "auto": CUDA if it runs, otherwise the CPU.
     threads : int
@@ -76,11 +78,11 @@ def open_session(path: Path, device: str, threads: int, trial: Mapping[str, Any]
     if device not in DEVICES:
         raise DeviceError(f"device is {device!r}: give one of {', '.join(DEVICES)}")
     if device == "cpu":
-        return open_on_cpu(path, threads, trial)
+        return open_on_cpu(paths[0], threads, trial)
     try:
-        return OpenedSession(open_on_cuda(path, threads, trial), "cuda")
+        return OpenedSession(open_on_cuda(paths[1], threads, trial), "cuda")
     except DeviceError as error:
-        opened = open_on_cpu(path, threads, trial)  # first, since the file may be the cause
+        opened = open_on_cpu(paths[0], threads, trial)  # first, since the file may be the cause
         if device == "cuda":
             raise DeviceError(f"cuda was asked for, but {error}; or use --device cpu") from error
         note = f"a GPU seems to be here, but the network runs on the CPU: {error}"

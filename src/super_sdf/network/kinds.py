@@ -28,18 +28,16 @@ def network_for(network: Decoder, kind: str) -> Decoder:
     """
     if not isinstance(network, Network) or not network.shipped:
         return network
-    chosen = network.device, network.threads, network.symmetries
+    chosen = network.device, network.threads, network.symmetries, network.precision
     if kind == MASK:
         return _load(MASK_MODEL, *chosen)
     if kind == NOISY and network.card.get("inputs") == EXACT_DISTANCES:
-        return _load(NOISY_MODEL, *chosen, network.card.get("precision", "float32"))
+        return _load(NOISY_MODEL, *chosen)
     return network
 
 
 @lru_cache(maxsize=4)
-def _load(
-    name: str, device: str, threads: int, symmetries: int, precision: str = "float32"
-) -> Network:
+def _load(name: str, device: str, threads: int, symmetries: int, precision: str) -> Network:
     """Load a network for a kind, once."""
     if name not in shipped_models():
         raise FileError(f"the network {name!r} is missing: {NO_NETWORKS}")

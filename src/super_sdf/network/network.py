@@ -19,7 +19,7 @@ from ..options import check_path, check_threads
 from ..progress import ShareCallback
 from .contract import INPUTS, MASKS, one_voxel, read_card
 from .device import open_session
-from .names import DEFAULT_QUALITY, PRECISIONS, QUALITIES
+from .names import AUTO_PRECISION, DEFAULT_QUALITY, FLOAT32, INT8, PRECISIONS, QUALITIES
 from .onnx import ort
 from .pace import LONG_RUN, Pace, work_of
 from .running import CUDA_CHUNK, Poll, run_bound, run_on_cpu
@@ -30,7 +30,7 @@ MODELS = Path(__file__).parent.parent / "models"
 # table and, by precision, what each channel takes; and of each value. Averaging over symmetries
 # takes more: for the transformed inputs, and for the mean.
 INPUT_BYTES = 216.0
-CHANNEL_BYTES = {"float32": 7.25, "int8": 11.5}
+CHANNEL_BYTES = {FLOAT32: 7.25, INT8: 9.25}
 VALUE_BYTES = 8.0
 USUAL_CHANNELS = 64  # of a network whose card does not say
 SYMMETRY_BYTES = (600.0, 4.0)
@@ -89,10 +89,15 @@ class Network:
         return self.card.get("receptive_field")
 
     @property
+    def precision(self) -> str:
+        """The arithmetic of the file: "float32" or "int8"."""
+        return INT8 if self.card.get("precision") == INT8 else FLOAT32
+
+    @property
     def memory_bytes(self) -> tuple[float, float]:
         """Peak memory of a run: bytes per voxel that it sees, and bytes per value."""
-        each = CHANNEL_BYTES["int8" if self.card.get("precision") == "int8" else "float32"]
-        voxel = INPUT_BYTES + each * self.card.get("channels", USUAL_CHANNELS)
+        each = CHANNEL_BYTES[self.precision] * self.card.get("channels", USUAL_CHANNELS)
+        voxel = INPUT_BYTES + each
         if self.symmetries == 1:
             return voxel, VALUE_BYTES
         return voxel + SYMMETRY_BYTES[0], VALUE_BYTES + SYMMETRY_BYTES[1]
@@ -209,8 +214,11 @@ def shipped_models() -> dict[str, Path]:
     return {path.stem: path for path in sorted(MODELS.glob("*.onnx"))}
 
 
-def find_model(model: str | Path, precision: str = "float32") -> tuple[Path, int]:
-    """Return the file of a quality or path, and the number of symmetries to average over.
+def find_model(model: str | Path, precision: str = AUTO_PRECISION) -> tuple[Path, int]:
+    """Return the file for the CPU, and the number of symmetries to average over.
+
+    ``model`` is a quality, the name of a shipped network, or a file, and "auto" leaves a file as it
+    is.
 
     Raises
     ------
@@ -225,8 +233,10 @@ def find_model(model: str | Path, precision: str = "float32") -> tuple[Path, int
     if str(model) in QUALITIES and name not in shipped_models():
         raise FileError(f"the network {name!r} is missing: {NO_NETWORKS}")
     path = shipped_models().get(name, Path(model))
-    if precision == "int8":
-        path = path.with_name(f"{path.stem}-int8.onnx")  # beside the float32 file
+    if precision == AUTO_PRECISION:
+        path = shipped_models().get(f"{name}-{INT8}", path)
+    if precision == INT8:
+        path = path.with_name(f"{path.stem}-{INT8}.onnx")  # beside the float32 file
         if not os.path.lexists(path):
             raise OptionError(
                 f"{model} has no int8 variant, {path}: write one with export.quantize"
@@ -242,7 +252,7 @@ def load_network(
     *,
     device: str = "auto",
     threads: int = 0,
-    precision: str = "float32",
+    precision: str = AUTO_PRECISION,
 ) -> Network:
     """Load a network.
 
@@ -255,7 +265,8 @@ def load_network(
     threads : int
         CPU threads; 0 for one per core, which is also the maximum.
     precision : str
-        "float32", or "int8" for the quantised variant, which is faster and runs on the CPU only.
+        "float32"; "int8", the quantised variant, which is faster and runs on the CPU only; or
+        "auto": on the CPU int8, if the network is a shipped one that has it, otherwise float32.
 
     Raises
     ------
@@ -271,12 +282,14 @@ def load_network(
     threads = check_threads(threads)
     check_path(model, "model")
     path, symmetries = find_model(model, precision)
-    if precision == "int8":
+    if precision == INT8:
         device = _cpu_for_int8(device)
+    on_cuda, _ = find_model(model, FLOAT32 if precision == AUTO_PRECISION else precision)
     useful = useful_threads(threads)
     if not threads and useful == cores_of_system():
         useful = 0  # onnxruntime's default, one thread per physical core
-    opened = open_session(path, device, useful, one_voxel())
+    opened = open_session((path, on_cuda), device, useful, one_voxel())
+    path = on_cuda if opened.device == "cuda" else path
     card = read_card(opened.session, path)
     if opened.failure:
         raise ModelError(f"{path} does not run with its own inputs: {opened.failure}")
