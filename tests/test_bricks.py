@@ -24,7 +24,7 @@ from super_sdf.convert import ConvertOptions, convert
 from super_sdf.errors import ClusterError, GridError, OptionError
 from super_sdf.grid.planes import DerivedPlanes
 
-LOADING = Loading("fast", "float32", "cpu")
+LOADING = Loading("fast", "auto", "cpu")
 LAYOUTS = {"cubes": (8, 8, 8), "first axis whole": (15, 14, 3), "npy": None}
 
 

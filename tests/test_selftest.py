@@ -47,6 +47,8 @@ def test_everything_is_checked_on_the_cpu():
         "network mask on cpu",
         "network noisy on cpu",
         "network base-int8 on cpu",
+        "network fast-int8 on cpu",
+        "network mask-int8 on cpu",
         "network noisy-int8 on cpu",
         *(f"extra {name}" for name in EXTRAS),
     ]
