@@ -35,7 +35,7 @@ from super_sdf.convert import ConvertOptions, convert
 from super_sdf.evaluation.cases import Shape
 from super_sdf.evaluation.scope import find_meshes
 from super_sdf.network.names import DEFAULT_QUALITY
-from super_sdf.network.network import Network, load_network, shipped_models
+from super_sdf.network.network import Network, find_model, load_network
 from super_sdf.slabs.cutting import Slab, cut
 from super_sdf.steps.survey import Band
 from super_sdf.truth.sampling import sample_solid, unit_layout
@@ -103,7 +103,7 @@ def parse() -> argparse.Namespace:
 
 def main() -> None:
     """Write the digests, or compare them with those in a file; exit code 1 if any differs."""
-    options, network = parse(), digest(shipped_models()[DEFAULT_QUALITY])
+    options, network = parse(), digest(find_model(DEFAULT_QUALITY)[0])
     before = json.loads(options.against.read_text()) if options.against else None
     if before and before["network"] != network:
         raise SystemExit(f"{options.against} is of another network: {before['network'][:12]}...")

@@ -64,7 +64,7 @@ def replace_blocks(graph: onnx.GraphProto, blocks: list[IntBlock]) -> None:
     stem, *scans, _ = [node for node in graph.node if node.op_type == "Scan"]
     graph.initializer.append(numpy_helper.from_array(np.float32(1), ONE))
     graph.initializer.append(numpy_helper.from_array(np.uint8(0), NONE))
-    for before, scan, block in zip([stem, *scans], scans, blocks):
+    for before, scan, block in zip([stem, *scans[:-1]], scans, blocks, strict=True):
         rounded = add_rounded(body_of(before), block)
         before.output.append(rounded)
         gather_rounded(graph, scan, rounded)

@@ -107,7 +107,7 @@ def test_the_precision_may_be_chosen_and_is_reported(here, command, asked):
     assert trimesh.load("out.ply").is_watertight
 
 
-def test_a_network_without_int8_is_refused_if_that_is_asked_for(here, command, tmp_path):
+def test_a_network_without_int8_is_refused_if_that_is_asked_for(here, command):
     shutil.copy(shipped_models()["fast"], "own.onnx")
     words = ("upsample", "in.npy", "out.ply", "--model", "own.onnx", "--json")
     code, _, err = command(*words, "--precision", "int8")
