@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from batches import rows
 from conftest import ball, count_fans, trilinear, walled
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from solids import cube, joined, sphere, square, torus
 
@@ -110,8 +110,16 @@ def test_an_open_border_stays_exactly_where_it_is():
     assert border(found.mesh) == border(sheet) and len(border(sheet)) == 64
 
 
+def test_a_lost_ball_and_a_lost_hole_do_not_make_up_for_each_other():
+    apart = sphere(0.1).transformed(np.eye(3), np.array([2.0, 0, 0]))
+    for other in (sphere(0.3), torus(), joined(torus(), torus())):
+        assert not passes.same_topology(joined(torus(), apart), other)
+    assert passes.same_topology(joined(torus(), apart), joined(cube(), torus(12, 8)))
+
+
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from([0.02, 0.2, 2.0]), st.booleans())
+@example(235, 2.0, False)  # lost a component and a hole
 def test_any_field_stays_a_closed_manifold_within_the_error(seed, error, in_float32):
     values = np.random.default_rng(seed).normal(size=(9, 9, 9)).astype(np.float32)
     values = walled(values)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
+import igl
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +19,7 @@ from ..mesh import Mesh
 from ..progress import ShareCallback
 from ..topology import irregular_places, row_keys
 from ..truth.solid import Points, Solid
-from .collapsing import collapse_to, collapse_within, mean_side
+from .collapsing import collapse_to, collapse_within, mean_side, renumbered
 from .measuring import Original
 
 # Edges are collapsed while the new vertex is within this many errors of the planes around it (root
@@ -144,7 +145,7 @@ def _keeping(
         faults = new_faults(before, irregular_places(result))
         wrong = np.concatenate([faults, too_far(result)])
         if not len(wrong):
-            return result if euler(result) == euler(base) else None
+            return result if same_topology(result, base) else None
         tree = tree or Solid(base)
         kept[around(base, tree.nearest_face(wrong))] = True
     return None
@@ -169,6 +170,17 @@ def around(mesh: Mesh, faces: NDArray[np.int64]) -> BoolArray:
     return found
 
 
-def euler(mesh: Mesh) -> int:
-    """Return twice the Euler characteristic of a mesh, plus its number of open edges."""
-    return 2 * len(np.unique(mesh.faces)) - len(mesh.faces)
+def same_topology(one: Mesh, other: Mesh) -> bool:
+    """Return whether both meshes have as many components with the same Euler characteristics.
+
+    That of the whole mesh alone does not change when a ball and a hole are lost.
+    """
+    return np.array_equal(euler_numbers(one), euler_numbers(other))
+
+
+def euler_numbers(mesh: Mesh) -> NDArray[np.int64]:
+    """Return twice the Euler characteristic of each component plus its open edges, (k,), sorted."""
+    _, faces = renumbered(mesh.faces)
+    component = igl.vertex_components(faces)
+    vertices, triangles = np.bincount(component), np.bincount(component[faces[:, 0]])
+    return np.sort(2 * vertices - triangles)
