@@ -22,7 +22,7 @@ from .machine.extras import EXTRAS, how_to_install, missing_modules
 from .machine.memory import free_memory
 from .network.cuda import available_devices, check_cuda, describe_gpu, onnxruntime_version
 from .network.kinds import MASK_MODEL
-from .network.names import FLOAT32, INT8
+from .network.names import FLOAT32, float32_name
 from .network.network import NO_NETWORKS, load_network, shipped_models
 from .steps.nodes import block_offsets
 from .steps.survey import survey
@@ -79,10 +79,10 @@ def run_checks(device: str = "auto") -> Iterator[Finding]:
     if not shipped_models():
         yield Finding(FAILED, "networks", NO_NETWORKS)
     ball, mask = make_ball(), make_ball(MASK)
-    for name in sorted(shipped_models(), key=lambda name: INT8 in name):  # int8 last
-        some = ["cpu"] if INT8 in name else devices
-        kind = name.removesuffix(f"-{INT8}")
-        yield from check_network(name, some, mask if kind == MASK_MODEL else ball)
+    for name in sorted(shipped_models(), key=lambda name: name != float32_name(name)):  # int8 last
+        plain = float32_name(name)
+        some = devices if name == plain else ["cpu"]
+        yield from check_network(name, some, mask if plain == MASK_MODEL else ball)
     for name, modules in EXTRAS.items():
         yield check_extra(name, modules)
 

@@ -19,7 +19,7 @@ from ..machine.memory import forget_peak, held_memory
 from ..mesh import Mesh
 from ..network.decoder import Decoder
 from ..network.kinds import KIND_MODELS
-from ..network.names import AUTO_PRECISION, INT8
+from ..network.names import AUTO_PRECISION, float32_name
 from ..network.network import find_model, load_network, shipped_models
 from ..truth.solid import Distances, Solid
 from . import edges, metrics
@@ -297,7 +297,7 @@ def digest_of_ours(model: str, precision: str = AUTO_PRECISION) -> str:
     network, symmetries = find_model(model, precision)
     digest = hashlib.sha256(b"" if symmetries == 1 else str(symmetries).encode())
     shipped = shipped_models().items()
-    for_kinds = [path for name, path in shipped if name.removesuffix(f"-{INT8}") in KIND_MODELS]
+    for_kinds = [path for name, path in shipped if float32_name(name) in KIND_MODELS]
     for path in [network, *for_kinds, *code_of_method()]:
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]

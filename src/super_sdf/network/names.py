@@ -7,3 +7,13 @@ PRECISIONS = (AUTO_PRECISION, FLOAT32, INT8)
 DEFAULT_QUALITY = "base"
 QUALITIES = {"fast": ("fast", 1), "base": ("base", 1), "best": ("base", 4)}
 """The file of a shipped network, and the number of cube symmetries that are averaged."""
+
+
+def int8_name(name: str) -> str:
+    """Return the name of the int8 variant of a network."""
+    return f"{name}-{INT8}"
+
+
+def float32_name(name: str) -> str:
+    """Return the name of a network without what marks an int8 variant."""
+    return name.removesuffix(f"-{INT8}")

@@ -19,7 +19,7 @@ from ..options import check_path, check_threads
 from ..progress import ShareCallback
 from .contract import INPUTS, MASKS, one_voxel, read_card
 from .device import open_session
-from .names import AUTO_PRECISION, DEFAULT_QUALITY, FLOAT32, INT8, PRECISIONS, QUALITIES
+from .names import AUTO_PRECISION, DEFAULT_QUALITY, FLOAT32, INT8, PRECISIONS, QUALITIES, int8_name
 from .onnx import ort
 from .pace import LONG_RUN, Pace, work_of
 from .running import CUDA_CHUNK, Poll, run_bound, run_on_cpu
@@ -234,9 +234,9 @@ def find_model(model: str | Path, precision: str = AUTO_PRECISION) -> tuple[Path
         raise FileError(f"the network {name!r} is missing: {NO_NETWORKS}")
     path = shipped_models().get(name, Path(model))
     if precision == AUTO_PRECISION:
-        path = shipped_models().get(f"{name}-{INT8}", path)
+        path = shipped_models().get(int8_name(name), path)
     if precision == INT8:
-        path = path.with_name(f"{path.stem}-{INT8}.onnx")  # beside the float32 file
+        path = path.with_name(f"{int8_name(path.stem)}.onnx")  # beside the float32 file
         if not os.path.lexists(path):
             raise OptionError(
                 f"{model} has no int8 variant, {path}: write one with export.quantize"
