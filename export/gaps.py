@@ -1,0 +1,86 @@
+"""The gap closed on each half of the validation shapes, from the measurements of ``evaluate``.
+
+    super-sdf evaluate FOLDER --sizes 32 64 128 --out report/
+    python -m export.gaps FOLDER report/
+
+Prints a row for each size and half (``choice``): the means of F1, NC and the distance from result
+to reference, and the share of the gap between B-spline and the bound that each closes. Of several
+reports the first that has a measurement counts, so a network measured with ``--methods ours`` is
+compared by the report of another: ``python -m export.gaps FOLDER report/best report/base``.
+Within a report the last measurement counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from export.choice import draw_halves
+from super_sdf.evaluation.cases import Setting
+from super_sdf.evaluation.folder import ROWS
+from super_sdf.evaluation.measuring import Measurement
+from super_sdf.evaluation.names import OURS
+from super_sdf.evaluation.scope import find_meshes
+from super_sdf.evaluation.store import Store
+from super_sdf.evaluation.tables import gap_closed, markdown, mean_of
+
+FIGURES = (("F1", "f1", 1.0), ("NC", "nc", 1.0), ("result to reference x1e4", "p2s_back", 1e4))
+COMPARED = (OURS, "bspline", "bound")
+SIZES = (32, 64, 128)
+
+
+def read_rows(reports: Sequence[Path], size: int) -> dict[str, dict[str, Measurement]]:
+    """Return the measurements at a size, by method and shape; the first report that has one counts.
+
+    Only exact samples of whole shapes, refined once by 4: not those of experiments.
+    """
+    setting = asdict(Setting(size)).items()
+    found: dict[str, dict[str, Measurement]] = {method: {} for method in COMPARED}
+    for report in reversed(reports):
+        for row in Store(report / ROWS).rows.values():
+            if row["method"] in found and setting <= row.items() and row["error"] is None:
+                found[row["method"]][row["shape"]] = row
+    return found
+
+
+def gap_row(found: dict[str, dict[str, Measurement]], names: Sequence[str]) -> list[str]:
+    """Return the cells of the shapes that all methods were measured on."""
+    common = [name for name in names if all(name in rows for rows in found.values())]
+    ours, base, bound = ([found[method][name] for name in common] for method in COMPARED)
+    cells = [str(len(common))]
+    for _, key, scale in FIGURES:
+        share, mean = gap_closed(ours, base, bound, key), mean_of(ours, key)
+        cells.append("-" if mean is None else f"{mean * scale:.4f}")
+        cells.append("-" if share is None else f"{100 * share:.1f} %")
+    return cells
+
+
+def gap_rows(meshes: Sequence[Path], reports: Sequence[Path]) -> Iterator[list[str]]:
+    """Yield the rows of the table: all shapes and each half, at each size that was measured."""
+    halves = {"all": meshes, **draw_halves(meshes)}
+    for size in SIZES:
+        found = read_rows(reports, size)
+        if all(found.values()):
+            for half, paths in halves.items():
+                yield [f"{size}^3", half, *gap_row(found, [path.stem for path in paths])]
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("meshes", type=Path, help="folder of the shapes")
+    parser.add_argument("reports", nargs="+", type=Path, help="folders of super-sdf evaluate")
+    options = parser.parse_args()
+    titles = ["grid", "half", "shapes"]
+    for title, _, _ in FIGURES:
+        titles += [title, "gap closed"]
+    rows = list(gap_rows(find_meshes([options.meshes]), options.reports))
+    if not rows:
+        parser.error("no report has ours, bspline and bound at 32, 64 or 128: measure them first")
+    print(markdown(titles, rows))
+
+
+if __name__ == "__main__":
+    main()
