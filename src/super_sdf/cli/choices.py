@@ -142,5 +142,5 @@ precision_option = click.option(
     default=first(precisions),
     show_default=True,
     help="Arithmetic of the network: auto is int8 on the CPU if the network has it, otherwise "
-    "float32. On the CPU int8 takes about half as long, of base two fifths.",
+    "float32. On the CPU int8 takes about half as long.",
 )
