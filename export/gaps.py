@@ -12,21 +12,26 @@ Within a report the last measurement counts.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from export.arguments import Parser
 from export.choice import draw_halves
+from super_sdf.errors import FileError
 from super_sdf.evaluation.cases import Setting
 from super_sdf.evaluation.folder import ROWS
 from super_sdf.evaluation.measuring import Measurement
 from super_sdf.evaluation.names import OURS
 from super_sdf.evaluation.scope import find_meshes
 from super_sdf.evaluation.store import Store
-from super_sdf.evaluation.tables import gap_closed, markdown, mean_of
+from super_sdf.evaluation.tables import Column, gap_closed, markdown, mean_of, percent
 
-FIGURES = (("F1", "f1", 1.0), ("NC", "nc", 1.0), ("result to reference x1e4", "p2s_back", 1e4))
+FIGURES = (
+    Column("F1", "f1", digits=4),
+    Column("NC", "nc", digits=4),
+    Column("result to reference x1e4", "p2s_back", 1e4, 4),
+)
 COMPARED = (OURS, "bspline", "bound")
 SIZES = (32, 64, 128)
 
@@ -35,10 +40,17 @@ def read_rows(reports: Sequence[Path], size: int) -> dict[str, dict[str, Measure
     """Return the measurements at a size, by method and shape; the first report that has one counts.
 
     Only exact samples of whole shapes, refined once by 4: not those of experiments.
+
+    Raises
+    ------
+    FileError
+        If a folder is no report.
     """
     setting = asdict(Setting(size)).items()
     found: dict[str, dict[str, Measurement]] = {method: {} for method in COMPARED}
     for report in reversed(reports):
+        if not (report / ROWS).is_file():
+            raise FileError(f"{report} has no {ROWS}: give the --out of super-sdf evaluate")
         for row in Store(report / ROWS).rows.values():
             if row["method"] in found and setting <= row.items() and row["error"] is None:
                 found[row["method"]][row["shape"]] = row
@@ -50,10 +62,9 @@ def gap_row(found: dict[str, dict[str, Measurement]], names: Sequence[str]) -> l
     common = [name for name in names if all(name in rows for rows in found.values())]
     ours, base, bound = ([found[method][name] for name in common] for method in COMPARED)
     cells = [str(len(common))]
-    for _, key, scale in FIGURES:
-        share, mean = gap_closed(ours, base, bound, key), mean_of(ours, key)
-        cells.append("-" if mean is None else f"{mean * scale:.4f}")
-        cells.append("-" if share is None else f"{100 * share:.1f} %")
+    for column in FIGURES:
+        cells.append(column.cell(mean_of(ours, column.key)))
+        cells.append(percent(gap_closed(ours, base, bound, column.key), digits=1))
     return cells
 
 
@@ -69,14 +80,15 @@ def gap_rows(meshes: Sequence[Path], reports: Sequence[Path]) -> Iterator[list[s
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = Parser(description=__doc__.split("\n")[0])
     parser.add_argument("meshes", type=Path, help="folder of the shapes")
     parser.add_argument("reports", nargs="+", type=Path, help="folders of super-sdf evaluate")
     options = parser.parse_args()
     titles = ["grid", "half", "shapes"]
-    for title, _, _ in FIGURES:
-        titles += [title, "gap closed"]
-    rows = list(gap_rows(find_meshes([options.meshes]), options.reports))
+    for column in FIGURES:
+        titles += [column.title, "gap closed"]
+    with parser.one_line_errors():
+        rows = list(gap_rows(find_meshes([options.meshes]), options.reports))
     if not rows:
         parser.error("no report has ours, bspline and bound at 32, 64 or 128: measure them first")
     print(markdown(titles, rows))

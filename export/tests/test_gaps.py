@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
 from export import gaps
+from super_sdf.errors import FileError
 from super_sdf.evaluation.cases import Setting
 from super_sdf.evaluation.folder import ROWS
 from super_sdf.evaluation.measuring import NUMBERS, PROTOCOL
@@ -70,6 +72,12 @@ def test_only_shapes_that_all_three_have_count(baselines, tmp_path):
     two = write_report(tmp_path / "two", [row(path.stem, "bound", 0.8) for path in MESHES[:2]])
     ours = [row(path.stem, m, 0.5) for path in MESHES for m in ("ours", "bspline")]
     assert next(gaps.gap_rows(MESHES, [two, write_report(tmp_path / "rest", ours)]))[2] == "2"
+
+
+def test_a_mistyped_report_is_refused_not_left_out(baselines, tmp_path):
+    said = f"{tmp_path / 'bset'} has no results.jsonl: give the --out of super-sdf evaluate"
+    with pytest.raises(FileError, match=f"^{re.escape(said)}$"):
+        list(gaps.gap_rows(MESHES, [tmp_path / "bset", baselines]))
 
 
 def test_a_report_without_the_baselines_is_refused(tmp_path, monkeypatch, capsys):

@@ -166,9 +166,9 @@ def gap_closed(
     return (mine - start) / (end - start) if end != start else None
 
 
-def percent(share: float | None) -> str:
+def percent(share: float | None, digits: int = 0) -> str:
     """Return a share as text in percent, "-" if it is unknown."""
-    return "-" if share is None else f"{100 * share:.0f} %"
+    return "-" if share is None else f"{100 * share:.{digits}f} %"
 
 
 def gap_line(by_method: Mapping[str, Sequence[Measurement]]) -> str:
