@@ -17,7 +17,7 @@ from export.shapes.lettering import text
 from export.shapes.mechanical import gear, plate, repeated, ribs, threads
 from export.shapes.organic import blends, blobs, creature, displaced, gyroid
 from export.shapes.sculpted import sculpture
-from export.shapes.slender import frame, lattice, pipe, shell, thin
+from export.shapes.slender import frame, lattice, pipe, section, shell, thin
 
 Family = Callable[[np.random.Generator], Manifold]
 
@@ -25,7 +25,7 @@ MACHINED: tuple[Family, ...] = (
     prism, csg, lathe, rounded, facets,
     filleted, chamfered,
     plate, gear, repeated, threads, ribs,
-    shell, frame, pipe, thin, lattice, text,
+    shell, frame, pipe, thin, section, lattice, text,
 )  # fmt: skip
 GROWN: tuple[Family, ...] = (blobs, gyroid, blends, creature, displaced, sculpture)
 FAMILIES: dict[str, Family] = {family.__name__: family for family in (*MACHINED, *GROWN)}

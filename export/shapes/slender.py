@@ -1,4 +1,4 @@
-"""Families of what is much thinner than long: walls, blades, struts, tubes and letters."""
+"""Families of what is much thinner than long: walls, blades, struts, tubes and profiles."""
 
 from __future__ import annotations
 
@@ -132,6 +132,32 @@ def thin(rng: np.random.Generator) -> Manifold:
         outline -= hole.translate(list(rng.uniform(-0.4, 0.4, 2)))
     sheet = outline.extrude(wall)
     return swayed(rng, sheet.refine_to_length(0.06), 0.9) if rng.random() < 0.5 else sheet
+
+
+def section(rng: np.random.Generator) -> Manifold:
+    """Draw a long profile of sheet: a hollow section, some closed at one end, or an open one.
+
+    Its wall is a 25th to a quarter of its width, and that is a 30th to half of its length.
+    """
+    width = log_uniform(rng, 0.03, 0.5)
+    wall = width * log_uniform(rng, 0.04, 0.25)
+    if rng.random() < 0.4:
+        return open_profile(rng, wall / width).scale([width] * 2).extrude(1.0)
+    outline = draw_outline(rng) if rng.random() < 0.5 else CrossSection.circle(0.5, 48)
+    outline = outline.scale([width, width * rng.choice([1, 1, rng.uniform(0.4, 1)])])
+    hole = outline.offset(-wall).extrude(1.0)
+    return outline.extrude(1.0) - hole.translate([0, 0, rng.choice([0, 0, wall])])
+
+
+def open_profile(rng: np.random.Generator, wall: float) -> CrossSection:
+    """Draw an L, U, C, Z or hat of strips at right angles, or half a tube, about one unit wide."""
+    if rng.random() < 0.3:
+        angles = np.linspace(0, np.radians(rng.uniform(90, 330)), 32)
+        return polyline(0.5 * np.stack([np.cos(angles), np.sin(angles)], axis=1), wall, 8)
+    headings = np.cumsum(rng.choice([90, -90], int(rng.integers(2, 6))))
+    turns = np.exp(1j * np.radians(headings)) * rng.uniform(0.25, 1, len(headings))
+    corners = np.cumsum(np.concatenate([[0], turns]))
+    return polyline(np.stack([corners.real, corners.imag], axis=1), wall, 8)
 
 
 def truss(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
