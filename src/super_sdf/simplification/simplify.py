@@ -19,7 +19,7 @@ from ..options import check_goal, check_max_memory, check_mesh
 from ..progress import ShareCallback
 from .deviation import Deviation
 
-# Peak of memory beside the mesh, measured on meshes of 200,000 to 300,000 triangles: 905 to 1,246,
+# Peak of memory beside the mesh, measured on meshes of 200,000 to 300,000 triangles: 905 to 1,375,
 # of which pyfqmr keeps 300 until the process ends.
 BYTES_PER_TRIANGLE = 1400
 
