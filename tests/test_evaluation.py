@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +22,9 @@ from solids import cube, saved, sphere, torus
 
 from super_sdf import Mesh, SuperSdfError
 from super_sdf.cli.main import cli
-from super_sdf.errors import FileError, OptionError, WriteError
-from super_sdf.evaluation import evaluate as whole
+from super_sdf.errors import FileError, GridError, OptionError, WriteError
 from super_sdf.evaluation import (
+    cases,
     experiment_tables,
     measuring,
     methods,
@@ -36,6 +37,7 @@ from super_sdf.evaluation import (
     tables,
     timing,
 )
+from super_sdf.evaluation import evaluate as whole
 from super_sdf.evaluation.cases import Case, Setting, Shape, random_rotation
 from super_sdf.evaluation.measuring import Task
 from super_sdf.evaluation.results import Results
@@ -162,8 +164,6 @@ def test_a_store_keeps_rows_and_forgets_other_protocols(tmp_path):
 
 
 def test_a_row_of_another_mesh_network_or_setting_is_another_row(tmp_path):
-    from dataclasses import replace
-
     task = task_of(tmp_path / "box.ply")
     store = Store(tmp_path / "rows.jsonl")
     store.add({**task.key("ours"), "error": None})
@@ -798,3 +798,17 @@ def test_a_process_is_timed_with_the_network_and_precision_of_the_task(meshes, m
     monkeypatch.setattr(whole, "time_shape", lambda *words: given.append(words[2]) or {})
     whole.time_task(task_of(meshes / "box.ply", precision="float32"))
     assert given == [["--model", "base", "--precision", "float32"]]
+
+
+def test_a_noisy_grid_that_is_refused_costs_only_ours(meshes, monkeypatch):
+    def refuse(*values, **options):
+        raise GridError("no distances")
+
+    monkeypatch.setattr(cases, "make_grid", refuse)
+    path = meshes / "ball.ply"
+    task, shape = task_of(path, ("mc", "trilinear", "bound", "ours")), Shape.read(path)
+    noisy = replace(task, setting=Setting(8, noise=0.5))
+    *others, ours = measuring.measure_task(noisy, shape)
+    assert all(row["error"] is None and row["f1"] > 0 for row in others)
+    assert ours["error"] == "no distances"
+    assert list(measuring.measure_task(task, shape))[-1]["error"] is None

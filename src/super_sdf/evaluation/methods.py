@@ -94,7 +94,7 @@ def our_surface(case: Case, network: Decoder, *, mesher: str = DEFAULT_MESHER) -
 
     The mesh is capped where the surface leaves the grid. Without a surface it is empty.
     """
-    grid = case.grid
+    grid = case.recognised
     try:
         for _ in range(case.setting.passes - 1):
             grid = refined_grid(grid, network, case.factor)
