@@ -10,9 +10,17 @@ from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
 from super_sdf import SdfGrid, extract_mesh, load_network, reconstruct, upsample
+from super_sdf.certificate.surface import count_components
 from super_sdf.mesh import CLEARANCE
 from super_sdf.steps.band import neighbour_table
-from super_sdf.steps.cell_cases import CORNERS, EDGE_AXIS, EDGE_START, triangle_table
+from super_sdf.steps.cell_cases import (
+    CORNERS,
+    EDGE_AXIS,
+    EDGE_START,
+    FACES,
+    choices,
+    triangle_table,
+)
 from super_sdf.steps.field import FineField
 from super_sdf.steps.nodes import block_ijk, share_parts
 
@@ -33,8 +41,12 @@ def dense_field(lattice: np.ndarray, factor: int = 2) -> tuple[FineField, SdfGri
 
 def test_every_case_uses_exactly_its_crossed_edges():
     counts, table = triangle_table()
-    for case in range(256):
-        inside = np.array([bool(case >> corner & 1) for corner in range(8)])
+    number = choices().number
+    assert sorted(number[number >= 0].tolist()) == list(range(len(counts)))
+    assert number[:, 0].tolist() == list(range(256))
+    for corners, joined in np.argwhere(number >= 0):
+        case = number[corners, joined]
+        inside = np.array([bool(corners >> corner & 1) for corner in range(8)])
         ends = [(start, start + (4, 2, 1)[axis]) for start, axis in zip(EDGE_START, EDGE_AXIS)]
         crossed = {edge for edge, (a, b) in enumerate(ends) if inside[a] != inside[b]}
         assert set(table[case, : counts[case]].ravel().tolist()) == crossed
@@ -47,6 +59,36 @@ def test_one_inside_corner_gives_one_triangle_that_faces_away(corner):
     middle = CORNERS[list(EDGE_START)] + 0.5 * np.eye(3)[list(EDGE_AXIS)]
     a, b, c = middle[table[1 << corner, 0]]
     assert np.cross(b - a, c - a) @ (CORNERS[corner] - a) < 0
+
+
+@pytest.mark.parametrize("face", FACES)
+@pytest.mark.parametrize(("inner", "outer", "pieces"), [(-3, 2, 1), (-2, 3, 2), (-2, 2, 2)])
+def test_a_face_joins_its_inside_corners_where_its_saddle_is_inside(face, inner, outer, pieces):
+    """Bilinear interpolation is (a c - b d) / (a + c - b - d) at the saddle."""
+    corners = np.full(8, 9.0)
+    corners[list(face)] = inner, outer, inner, outer
+    lattice = np.full((5, 5, 5), 9.0)
+    lattice[1:3, 1:3, 1:3] = corners.reshape(2, 2, 2)
+    mesh = extract_mesh(*dense_field(lattice))
+    assert mesh.is_closed() and count_components(mesh.faces, len(mesh.vertices)) == pieces
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_negative_field_has_the_same_surface_from_inside(seed):
+    """Joined inside corners are separated outside ones; nothing prefers either side."""
+    lattice = np.random.default_rng(seed).normal(size=(13, 11, 15)).astype(np.float32)
+    mesh, reverse = extract_mesh(*dense_field(lattice)), extract_mesh(*dense_field(-lattice))
+    np.testing.assert_allclose(mesh.vertices, reverse.vertices, atol=1e-6)
+    assert len(mesh.faces) == len(reverse.faces)
+
+
+@pytest.mark.parametrize("thickness", [0.9, 1.2])
+def test_a_thin_wall_across_the_lattice_has_no_slits(thickness):
+    """Its nodes may be joined by diagonals only: separated, they would be a row of rods."""
+    x, y, _ = np.indices((21, 21, 5))
+    lattice = np.abs(x - y + 0.1) / 2**0.5 - thickness / 2
+    mesh = extract_mesh(*dense_field(lattice))
+    assert count_components(mesh.faces, len(mesh.vertices)) == 2
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -1,18 +1,26 @@
-"""The 256 cases of marching cubes, generated from one rule.
+"""The cases of marching cubes, generated from one rule.
 
-A cell has 8 corners, numbered ``4 x + 2 y + z``, and 12 edges. A case has a bit for each corner
-that is inside. The surface meets each face of the cell in segments, which always separate inside
-corners at opposite ends of a diagonal. This rule uses only the face itself, so the two cells that
-share it agree (Lorensen and Cline 1987, with a face-consistent choice in the ambiguous cases;
-Montani et al. 1994). The segments form closed loops, and each loop is triangulated by diagonals
-that do not lie on a face, so that no edge can belong to more than two triangles.
+A cell has 8 corners, numbered ``4 x + 2 y + z``, and 12 edges. The first 256 cases have a bit for
+each corner that is inside. The surface meets each face of the cell in segments. A face whose inside
+corners are the ends of a diagonal is ambiguous: in these cases its segments separate them. Further
+cases have the same corners inside and join them across some of these faces. Which it is depends on
+the values at the corners of the face (``marching``), so the two cells that share it agree.
+
+The segments form closed loops, and each loop is triangulated by diagonals that do not lie on a
+face, or on one that the cell beyond it does not use, so that no edge can belong to more than two
+triangles.
+
+References
+----------
+Lorensen and Cline, "Marching Cubes", 1987. Nielson and Hamann, "The Asymptotic Decider: Resolving
+the Ambiguity in Marching Cubes", 1991.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +31,8 @@ CORNERS: IntArray = np.indices((2, 2, 2)).reshape(3, 8).T.astype(np.int32)
 # Edge e runs from corner EDGE_START[e] one step along EDGE_AXIS[e].
 EDGE_START = (0, 1, 2, 3, 0, 1, 4, 5, 0, 2, 4, 6)
 EDGE_AXIS = (0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2)
-# The corners of each face in counter-clockwise order, seen from outside the cell.
+# The corners of each face in counter-clockwise order, seen from outside the cell: the lower and the
+# upper face along x, then along y and z.
 FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 
 _STEP = (4, 2, 1)
@@ -33,19 +42,63 @@ _EDGE_BETWEEN = {
 }
 
 
+@dataclass(frozen=True, eq=False)
+class Choices:
+    """The cases that cells with the same corners inside can have.
+
+    Attributes
+    ----------
+    ambiguous : (256,) uint8
+        A bit for each of ``FACES``: whether it is ambiguous.
+    number : (256, 64) int16
+        The case for the same bits, set where an ambiguous face joins its inside corners. Bits of
+        other faces must be 0. Where no face joins them it is the number of the row.
+    """
+
+    ambiguous: NDArray[np.uint8]
+    number: NDArray[np.int16]
+
+
+@lru_cache(maxsize=1)
+def choices() -> Choices:
+    """Return the cases by corners and joined faces."""
+    number = np.full((256, 64), -1, np.int16)
+    for case, (inside, joined) in enumerate(_cases()):
+        number[inside, joined] = case
+    return Choices(np.array([_ambiguous(inside) for inside in range(256)], np.uint8), number)
+
+
+@lru_cache(maxsize=1)
+def _cases() -> list[tuple[int, int]]:
+    """Return the corners that are inside, and the faces that join them, of every case."""
+    others = [~_ambiguous(inside) for inside in range(256)]
+    return [
+        (inside, joined)
+        for joined in range(64)
+        for inside in range(256)
+        if not joined & others[inside]
+    ]
+
+
+def _ambiguous(inside: int) -> int:
+    """Return a bit for each face: whether its inside corners are the ends of a diagonal."""
+    bits = [[inside >> corner & 1 for corner in face] for face in FACES]
+    return sum(1 << n for n, (a, b, c, d) in enumerate(bits) if a == c != b == d)
+
+
 @lru_cache(maxsize=1)
 def triangle_table() -> tuple[IntArray, IntArray]:
     """Return the triangles of every case.
 
     Returns
     -------
-    (256,) int32 and (256, T, 3) int32
+    (C,) int32 and (C, T, 3) int32
         The number of triangles of a case, and the cell edges on which their vertices lie, in
         counter-clockwise order seen from outside; unused rows are 0.
     """
-    cases = [[t for loop in _loops(case) for t in _triangulate(loop)] for case in range(256)]
+    cases = [[t for loop in _loops(*case) for t in _triangulate(loop)] for case in _cases()]
     counts = np.array([len(triangles) for triangles in cases], np.int32)
-    table = np.zeros((256, counts.max(), 3), np.int32)
+    table = np.zeros((len(cases), counts.max(), 3), np.int32)
     for case, triangles in enumerate(cases):
         if triangles:
             table[case, : len(triangles)] = triangles
@@ -58,7 +111,7 @@ class LoopTable:
 
     Attributes
     ----------
-    count, first : (256,) int64
+    count, first : (C,) int64
         How many loops a case has, and which is its first.
     sides : (L,) int64
         How many edges a loop has.
@@ -78,7 +131,7 @@ class LoopTable:
 @lru_cache(maxsize=1)
 def loop_table() -> LoopTable:
     """Return the loops of every case, in the order of ``triangle_table``."""
-    loops = [list(_loops(case)) for case in range(256)]
+    loops = [list(_loops(*case)) for case in _cases()]
     count = np.array([len(some) for some in loops])
     flat = [loop for some in loops for loop in some]
     sides = np.array([len(loop) for loop in flat])
@@ -92,42 +145,61 @@ def loop_table() -> LoopTable:
     return LoopTable(count, np.cumsum(count) - count, sides, edges, triangles)
 
 
-def _loops(case: int) -> Iterator[list[int]]:
+def _loops(inside: int, joined: int) -> Iterator[tuple[int, ...]]:
     """Yield the closed loops of cell edges that the surface crosses."""
-    after = dict(segment for face in FACES for segment in _segments(case, face))
+    after: dict[int, int] = {}
+    for n, face in enumerate(FACES):
+        bits = tuple(inside >> corner & 1 for corner in face)
+        after |= _segments(n, bits, joined >> n & 1)
     while after:
         first, edge = after.popitem()
         loop = [first]
         while edge != first:
             loop.append(edge)
             edge = after.pop(edge)
-        yield loop
+        yield tuple(loop)
 
 
-def _segments(case: int, face: tuple[int, ...]) -> Iterator[tuple[int, int]]:
-    """Yield the segments on a face: one for each run of inside corners, from its start to its end.
+@lru_cache(maxsize=192)
+def _segments(n: int, inside: tuple[int, ...], joined: int) -> dict[int, int]:
+    """Return the segments on face ``n``: the edge where one ends, by that where it begins.
 
-    A run starts where, going round counter-clockwise, an inside corner follows an outside one.
+    Going round counter-clockwise, a run of inside corners begins after an outside one, and a
+    segment begins with it. It ends where the run does; if the face joins two runs, where the other
+    one does.
     """
-    inside = [bool(case >> corner & 1) for corner in face]
-    for at in range(4):
-        if inside[at] and not inside[at - 1]:
-            end = next(n for n in range(at, at + 4) if not inside[(n + 1) % 4])
-            leaving = frozenset((face[end % 4], face[(end + 1) % 4]))
-            entering = frozenset((face[at - 1], face[at]))
-            yield _EDGE_BETWEEN[entering], _EDGE_BETWEEN[leaving]
+    begins = [at for at in range(4) if inside[at] and not inside[at - 1]]
+    ends = [next(n % 4 for n in range(at, at + 4) if not inside[(n + 1) % 4]) for at in begins]
+    edges = [_EDGE_BETWEEN[frozenset((FACES[n][at - 1], FACES[n][at]))] for at in range(4)]
+    return {
+        edges[at]: edges[(end + 1) % 4] for at, end in zip(begins, ends[::-1] if joined else ends)
+    }
 
 
-def _triangulate(loop: list[int]) -> list[tuple[int, int, int]]:
-    """Return the triangles of a loop, cut along diagonals that lie on no face of the cell."""
+@cache
+def _triangulate(loop: tuple[int, ...]) -> list[tuple[int, int, int]]:
+    """Return the triangles of a loop, cut along diagonals that lie on no face of the cell.
+
+    Some loops that cross a face twice cannot be cut so. There, a diagonal may also join opposite
+    edges of a face: along the first axis of a lower face, along the second of an upper one. A face
+    is a lower one of one cell and an upper one of the other, so both never have the same diagonal.
+    """
+    try:
+        return _cut(loop, _lie_on_no_face)
+    except _CannotCutError:
+        return _cut(loop, _may_lie_on_a_face)
+
+
+def _cut(loop: tuple[int, ...], allowed: Callable[[int, int], bool]) -> list[tuple[int, int, int]]:
+    """Return the triangles of a loop, cut along allowed diagonals."""
     if len(loop) < 3:
         return []
     first, last = loop[0], loop[-1]
     for middle in range(1, len(loop) - 1):
         left, right = loop[: middle + 1], loop[middle:]
-        if all(len(part) == 2 or not _share_face(part[0], part[-1]) for part in (left, right)):
+        if all(len(part) == 2 or allowed(part[0], part[-1]) for part in (left, right)):
             try:
-                parts = _triangulate(left) + _triangulate(right)
+                parts = _cut(left, allowed) + _cut(right, allowed)
             except _CannotCutError:
                 continue
             return [(first, loop[middle], last), *parts]
@@ -138,8 +210,24 @@ class _CannotCutError(Exception):
     """Raised for a part of a loop that cannot be triangulated; another middle may work."""
 
 
-def _share_face(a: int, b: int) -> bool:
-    """Return whether two cell edges lie on one face."""
+def _lie_on_no_face(a: int, b: int) -> bool:
+    """Return whether two cell edges lie on no common face."""
+    return _common_face(a, b) is None
+
+
+def _may_lie_on_a_face(a: int, b: int) -> bool:
+    """Return whether a diagonal may join two cell edges, if need be on a face."""
+    face = _common_face(a, b)
+    if face is None:
+        return True
+    axis, is_upper = divmod(face, 2)
+    along = [other for other in range(3) if other != axis][is_upper]
+    return EDGE_AXIS[a] == EDGE_AXIS[b] == along
+
+
+@lru_cache(maxsize=144)
+def _common_face(a: int, b: int) -> int | None:
+    """Return the face on which two cell edges lie, None if there is none."""
     ends = {EDGE_START[a], EDGE_START[a] + _STEP[EDGE_AXIS[a]]}
     ends |= {EDGE_START[b], EDGE_START[b] + _STEP[EDGE_AXIS[b]]}
-    return any(ends <= set(face) for face in FACES)
+    return next((n for n, face in enumerate(FACES) if ends <= set(face)), None)

@@ -32,7 +32,7 @@ from ..machine.index_width import check_count
 from ..machine.threads import map_chunks, map_threads, rows_in_chunk
 from ..mesh import CLEARANCE, Mesh, vertex_type
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
-from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, triangle_table
+from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, FACES, choices, triangle_table
 from .field import FineField
 from .nodes import block_ijk, part_of_node
 
@@ -59,7 +59,8 @@ def extract_pieces(
 
     References
     ----------
-    Lorensen and Cline, "Marching Cubes", 1987.
+    Lorensen and Cline, "Marching Cubes", 1987. Nielson and Hamann, "The Asymptotic Decider:
+    Resolving the Ambiguity in Marching Cubes", 1991.
     """
     core = field.own_rows
     before = field.plane_before(core).start if core.start < core.stop else core.start
@@ -89,8 +90,8 @@ class Crossings:
         Voxels, and crossed edges of their blocks that the voxel owns: each has a vertex.
     other_row, other_edge : (m,) int32, int16
         Voxels, and crossed edges of their blocks that another voxel owns.
-    cell_row, cell, case : (c,) int32, int16, uint8
-        Voxels, crossed cells of their blocks, and the marching cubes cases of these cells.
+    cell_row, cell, case : (c,) int32, int16, int16
+        Voxels, crossed cells of their blocks, and the cases of these cells (``cell_cases``).
     """
 
     own_row: IntArray
@@ -99,7 +100,7 @@ class Crossings:
     other_edge: NDArray[np.int16]
     cell_row: IntArray
     cell: NDArray[np.int16]
-    case: NDArray[np.uint8]
+    case: NDArray[np.int16]
 
     def own(self, rows: slice) -> slice:
         """Return which of the own edges belong to some voxels."""
@@ -142,10 +143,11 @@ def _crossings_of_chunk(field: FineField, start: int, stop: int) -> tuple[NDArra
     slot, edge = _split(_crossed_edges(inside), rows, 3 * len(field.blocks))
     owner = field.parts.owner[part_of_edge(field.factor)[edge], slot]
     own = owner == CENTRE
-    case = _cases(inside)
-    active = np.flatnonzero(case - np.uint8(1) < 254)  # 0 and 255 are not crossed
+    corners = _corners_inside(inside)
+    active = np.flatnonzero(corners - np.uint8(1) < 254)  # 0 and 255 are not crossed
     cell_row, cell = _split(active, rows, field.factor**3)
-    return slot[own], edge[own], slot[~own], edge[~own], cell_row, cell, case[active]
+    case = choose_cases(field, corners[active], cell_row, cell)
+    return slot[own], edge[own], slot[~own], edge[~own], cell_row, cell, case
 
 
 def _split(
@@ -171,8 +173,8 @@ def _crossed_edges(inside: BoolArray) -> NDArray[np.intp]:
     return np.flatnonzero(np.moveaxis(crossed, -1, 0))
 
 
-def _cases(inside: BoolArray) -> NDArray[np.uint8]:
-    """Return the marching cubes cases of all cells of blocks, (n K^3,), voxel by voxel.
+def _corners_inside(inside: BoolArray) -> NDArray[np.uint8]:
+    """Return a bit for each corner of all cells of blocks, (n K^3,), voxel by voxel.
 
     ``inside`` is (K+1, K+1, K+1, n), True at inside nodes.
     """
@@ -181,6 +183,29 @@ def _cases(inside: BoolArray) -> NDArray[np.uint8]:
     bits = bits[:, :-1] | bits[:, 1:] << 2
     bits = bits[:-1] | bits[1:] << 4
     return np.moveaxis(bits, -1, 0).ravel()
+
+
+def choose_cases(
+    field: FineField, corners: NDArray[np.uint8], row: IntArray, cell: NDArray[np.int16]
+) -> NDArray[np.int16]:
+    """Return the cases of cells, (c,), given a bit for each corner that is inside.
+
+    The inside corners of an ambiguous face are joined where bilinear interpolation on it is
+    negative at its saddle (Nielson and Hamann 1991).
+    """
+    table = choices()
+    case: NDArray[np.int16] = corners.astype(np.int16)
+    unsure = np.flatnonzero(table.ambiguous[corners])
+    low, row = cells_low_nodes(field.factor)[cell[unsure]], row[unsure]
+    steps = CORNERS @ _strides(field.factor)
+    values = [field.blocks[low + step, row].astype(np.float64) for step in steps]
+    joined = np.zeros(len(unsure), np.uint8)
+    for n, (a, b, c, d) in enumerate(FACES):
+        excess = values[a] * values[c] - values[b] * values[d]
+        joined |= (np.where(values[a] <= 0, excess, -excess) > 0).astype(np.uint8) << n
+    some = corners[unsure]
+    case[unsure] = table.number[some, joined & table.ambiguous[some]]
+    return case
 
 
 @lru_cache
@@ -366,7 +391,7 @@ def _flat_triangles(factor: int) -> tuple[IntArray, IntArray, NDArray[np.int64]]
 
     Returns
     -------
-    (256,) int32, (256,) int32, (n, 3) int64
+    (C,) int32, (C,) int32, (n, 3) int64
         The number of triangles of each case, its first triangle, and the edges on which the
         triangles' vertices lie, counted from the number of the cell's low node.
     """

@@ -91,8 +91,9 @@ def find_patches(
     row = crossings.cell_row[some][cell]
     low_node = cells_low_nodes(factor)[crossings.cell[some][cell]]
     first = slot[row] * (3 * len(field.blocks)) + low_node
-    at = first[:, None] + edge_steps(factor)[table.edges[loop]]
-    there = table.edges[loop] >= 0
+    edges = table.edges[loop, : table.sides[loop].max(initial=3)]  # the longest loops are rare
+    at = first[:, None] + edge_steps(factor)[edges]
+    there = edges >= 0
     crossing = edge_at.take(at, mode="clip")
     used = np.zeros(len(crossings.own_row), bool)
     used[crossing[there]] = True
