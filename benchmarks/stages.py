@@ -42,10 +42,11 @@ STAGES = {
         (pipeline, "fit_to_spheres"),
         (pipeline, "pin_to_skipped"),
     ],
+    "bounds": [(pipeline, "keep_within_bounds")],
     "isosurface": [(pipeline, "extract_pieces")],
     "write": [(spool, "write_in_chunks")],
 }
-AFTER = ("number", "average", "fit", "isosurface", "write")
+AFTER = ("number", "average", "fit", "bounds", "isosurface", "write")
 
 
 class Probe:

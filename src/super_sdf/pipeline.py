@@ -1,7 +1,8 @@
 """The method on a page: the paper's Section 4, one named step per line.
 
     grid -> cubic lattice -> band -> patches and neighbour table -> network -> averaged shared nodes
-         -> surface moved to touch the samples' spheres -> isosurface
+         -> surface moved to touch the samples' spheres -> values kept within the samples' bounds
+         -> isosurface
 
 A grid that is too large to be refined at once is refined slab by slab (see ``slabs``); the mesh is
 the same.
@@ -42,6 +43,7 @@ from .progress import STEPS, Progress, StepCounter, Stopwatch, part_of
 from .slabs.cutting import Slab, peak_bytes, plan_slabs, planes_needed
 from .slabs.footprint import NETWORK_BYTES
 from .slabs.pieces import Piece, count_input, describe_piece
+from .steps.bounds import keep_within_bounds
 from .steps.cap import close
 from .steps.exact import BandSummary
 from .steps.field import FineField, SampleSpheres
@@ -438,6 +440,7 @@ def refine(
     spheres = spheres_of_band(seen_ijk, patches, exact, band.shape, band.limits, threads)
     fit_to_spheres(blocks, parts, factor, spheres, VoxelIndex(own_ijk, band.shape), threads)
     del spheres
+    keep_within_bounds(blocks, parts, factor, own_ijk, band.trusted, threads)
     if band.kind == MASK:
         hold_sides(blocks, factor, patches, voxels)
     skipped = signs_of_skipped(parts, own_ijk, patches, voxels, band.shape)

@@ -5,7 +5,7 @@ side as its values depend on:
 
     planes of the slab                   vertices and triangles are made here
     + the mesher's planes_beside         values are final: vertices depend on them
-    + spheres.REACH_IN_VOXELS            blocks are decoded
+    + REACH_IN_VOXELS                    blocks are decoded: of the fit to spheres, and of bounds
     + the network's receptive field      voxels are given to the network
 """
 
@@ -22,13 +22,14 @@ from ..errors import OutOfMemoryError
 from ..machine import index_width
 from ..machine.memory import give_back, held_memory, in_words
 from ..machine.resources import Resources
+from ..steps import bounds, spheres
 from ..steps.mesher_names import DEFAULT_MESHER
 from ..steps.meshers import BY_NAME, Mesher
-from ..steps.spheres import REACH_IN_VOXELS
 from ..steps.survey import Band
 from .footprint import NETWORK_BYTES, slab_bytes
 
 DEFAULT = BY_NAME[DEFAULT_MESHER]
+REACH_IN_VOXELS = spheres.REACH_IN_VOXELS + bounds.REACH_IN_VOXELS
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,8 @@ def whole(band: Band) -> Slab:
 
 def planes_needed(receptive_field: int, mesher: Mesher, factor: int) -> int:
     """Return how many planes to either side of a slab its mesh depends on."""
-    return mesher.planes_beside(factor) + REACH_IN_VOXELS + receptive_field
+    seen = max(receptive_field, bounds.REACH_OF_SAMPLES)
+    return mesher.planes_beside(factor) + REACH_IN_VOXELS + seen
 
 
 def plan_slabs(

@@ -17,11 +17,12 @@ from ..steps.survey import Band
 STAGES = {
     "average": (216, 300, 5.0, 1e7, 2e7),
     "fit": (216, 1450, 4.0, 1e7, 3e7),
+    "bounds": (216, 450, 8.2, 4e7, 3e7),
     MARCHING: (216, 350, 7.5, 1e7, 3e7),
     SHARP: (216, 350, 7.5, 1e7, 3e7),
 }
 SPLINE = (216, 300, 4.5, 0, 2e7)
-BEFORE_MESHER = ("average", "fit")
+BEFORE_MESHER = ("average", "fit", "bounds")
 # Default for a network: bytes per voxel that it sees, including its row of the neighbour table, and
 # per value.
 NETWORK_BYTES = (680.0, 8.0)
@@ -68,7 +69,7 @@ def slab_bytes(
     extra = _sharp_bytes if mesher == SHARP else _lookup_bytes
     needs[mesher] += extra(band, planes, own, factor, threads)
     if band.smooth is not None and not band.exact.any():
-        del needs["fit"]  # there are no spheres
+        del needs["fit"], needs["bounds"]  # there are no spheres
     if band.smooth is not None:
         needs["spline"] = float(np.dot(SPLINE, sizes)) + spline_bytes(band.shape)
     if band.smooth is None or band.has_kinks:

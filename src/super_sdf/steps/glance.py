@@ -76,7 +76,7 @@ def _glance(grid: SdfGrid, offset: float, planes: NDArray[Any], own: tuple[int, 
     jumps: list[tuple[Jumps, Jumps]] = []
     leaving: list[bool] = []
     first, last = own
-    ijk, patches = band_of_samples(grid, offset, planes, first, last, jumps, leaving)
+    ijk, patches, _ = band_of_samples(grid, offset, planes, first, last, jumps, leaving)
     lipschitz = is_lipschitz(patches)
     band = Band(
         grid.shape, ijk, patches, lipschitz, can_hold_surface(patches, lipschitz), lipschitz

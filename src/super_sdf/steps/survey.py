@@ -1,14 +1,14 @@
 """The band of a whole grid, found plane by plane: all that the steps need of the input.
 
-The grid is read once. The band takes 123 bytes per voxel, so it grows with the surface, not with
-the grid.
+The grid is read once. The band takes 145 bytes per voxel, with the samples beyond it, so it grows
+with the surface, not with the grid.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,12 +41,16 @@ from .band import (
     plane_blocks,
     rescale_planes,
 )
+from .beyond import NONE_BEYOND, SamplesBeyond, TrustedSamples, joined, samples_beyond
 from .exact import BandSummary, exact_samples
 from .offsets import Jumps, check_not_cut_off, check_not_filled, find_jumps
 
-BYTES_PER_VOXEL = 123  # of a band
+BYTES_PER_VOXEL = 145  # of a band, with the samples beyond it: some two for a voxel
 BYTES_PER_SAMPLE = 20  # of the planes among which the band is found, measured
 FAR = 1e30  # half voxels: no sample of the band is there
+
+Found: TypeAlias = tuple[IntArray, FloatArray, SamplesBeyond]
+"""The band's voxels in some planes, their patches, and the samples beyond it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +88,8 @@ class Band:
         Half a spacing in world units, by which these are divided; and what is zero then.
     peak : int
         The memory of the process in bytes while the band was found, of samples that are made.
+    beyond : SamplesBeyond
+        The samples a few voxels beyond that may be exact distances.
     """
 
     shape: tuple[int, int, int]
@@ -101,6 +107,14 @@ class Band:
     half_voxel: float = 1.0
     level: float = 0.0
     peak: int = 0
+    beyond: SamplesBeyond = NONE_BEYOND
+
+    @cached_property
+    def trusted(self) -> TrustedSamples:
+        """The samples whose spheres can be trusted, in the band and beyond."""
+        rows = np.flatnonzero(self.exact)
+        sample = self.patches[rows, CENTRE]
+        return TrustedSamples(self.shape, self.voxel_ijk[rows], sample, self.beyond)
 
     @property
     def noisy_voxels(self) -> int:
@@ -210,7 +224,7 @@ def survey(
     leaving: list[bool] = []
     held = held_memory() or 0
 
-    def read(planes: slice) -> tuple[IntArray, FloatArray]:
+    def read(planes: slice) -> Found:
         found = _band_of_planes(
             grid, offset, planes.start, planes.stop, jumps if among is None else None, leaving
         )
@@ -222,8 +236,8 @@ def survey(
     first, last = among or (0, grid.shape[0])
     blocks = [slice(*block) for block in plane_blocks(grid.shape, first, last, planes)]
     parts = map_threads(read, blocks, resources.threads)
-    voxel_ijk = np.concatenate([ijk for ijk, _ in parts])
-    patches = [part for _, part in parts]
+    voxel_ijk = np.concatenate([ijk for ijk, _, _ in parts])
+    patches, beyond = [part for _, part, _ in parts], joined([part for _, _, part in parts])
     del parts
     if offset and among is None:
         check_jumps(jumps, grid, offset)
@@ -232,7 +246,8 @@ def survey(
         band = look_at_samples(band, grid, resources.threads)
     peak = held + reading + len(voxel_ijk) * BYTES_PER_VOXEL if reading else 0
     leaves = any(leaving) if whole is None else whole.leaves
-    return replace(limit_to_field(band, grid, offset), leaves=leaves, peak=peak)
+    band = replace(band, leaves=leaves, peak=peak, beyond=beyond)
+    return limit_to_field(band, grid, offset)
 
 
 def plan_reading(samples: SampleArray, held: int, resources: Resources) -> tuple[int, int]:
@@ -270,8 +285,11 @@ def limit_to_field(band: Band, grid: SdfGrid, offset: float) -> Band:
     low, high = ((limit - offset) * scale for limit in field.exact)
     ends = np.clip([grid.low - offset, grid.high - offset], -FAR / scale, FAR / scale) * scale
     lowest, highest = map(float, ends.astype(np.float32))  # where it may be cut off
-    if band.sampled is None:  # of a resampled grid, what is interpolated there promises little
-        band = replace(band, limits=(max(low, lowest), min(high, highest)))
+    limits = max(low, lowest), min(high, highest)
+    if band.sampled is not None:  # of a resampled grid, what is interpolated there promises little
+        limits = band.limits
+    beyond = NONE_BEYOND if field.refined else band.beyond.between(limits)
+    band = replace(band, limits=limits, beyond=beyond)
     if field.kind == EXACT:
         return band
     sample = band.patches[:, CENTRE]
@@ -336,8 +354,8 @@ def _band_of_planes(
     last: int,
     jumps: list[tuple[Jumps, Jumps]] | None,
     leaving: list[bool],
-) -> tuple[IntArray, FloatArray]:
-    """Return the band's voxels in planes ``first`` to before ``last``, and their patches.
+) -> Found:
+    """Return what is found in planes ``first`` to before ``last``.
 
     One more plane is read on either side. Whether a sample on the grid's border is inside is
     appended to ``leaving``. With an offset, the distances are checked for truncation, and their
@@ -356,7 +374,7 @@ def band_of_samples(
     last: int,
     jumps: list[tuple[Jumps, Jumps]] | None,
     leaving: list[bool],
-) -> tuple[IntArray, FloatArray]:
+) -> Found:
     """Return the same for samples of these planes and of those beside them."""
     low, high = max(first - 1, 0), min(last + 1, grid.shape[0])
     planes = negated(samples) if grid.positive_inside else samples
@@ -368,7 +386,8 @@ def band_of_samples(
     if offset and jumps is not None:  # at 0 there is no better offset to suggest
         check_not_cut_off(patches, offset, grid.voxel_size)
         jumps.append(find_jumps(rescaled))
-    return own + np.array([low, 0, 0], np.int32), patches
+    beyond = samples_beyond(rescaled[first - low : last - low], first)
+    return own + np.array([low, 0, 0], np.int32), patches, beyond
 
 
 def check_jumps(found: list[tuple[Jumps, Jumps]], grid: SdfGrid, offset: float) -> None:

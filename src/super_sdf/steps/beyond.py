@@ -1,0 +1,105 @@
+"""The samples beyond the band, a few voxels from the surface, and boxes of the samples of both.
+
+The network does not see these samples, but their spheres reach the surface (``bounds``). They are
+kept as a list, since the grid is read once and most of it is far from the surface. Lengths are in
+half voxels, as in ``band``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import FloatArray, IntArray
+from .band import HALF_BAND
+
+FARTHEST = 8.0  # four voxels
+
+
+@dataclass(frozen=True, eq=False)
+class SamplesBeyond:
+    """Samples between the band and ``FARTHEST``.
+
+    Attributes
+    ----------
+    number : (n,) int64
+        The number of each sample in C order of the grid, ascending.
+    value : (n,) float32
+        Their values.
+    """
+
+    number: NDArray[np.int64]
+    value: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.number)
+
+    def between(self, limits: tuple[float, float]) -> SamplesBeyond:
+        """Return those above the first limit and below the second."""
+        low, high = np.float32(limits[0]), np.float32(limits[1])
+        rows = np.flatnonzero((self.value > low) & (self.value < high))
+        return (
+            self if len(rows) == len(self) else SamplesBeyond(self.number[rows], self.value[rows])
+        )
+
+
+def samples_beyond(rescaled: FloatArray, first: int) -> SamplesBeyond:
+    """Return those beyond the band in some planes of samples, (m, ny, nz), from ``first`` on."""
+    size = np.abs(rescaled)
+    at = np.flatnonzero((size >= HALF_BAND) & (size < FARTHEST))
+    return SamplesBeyond(at + first * rescaled[0].size, rescaled.reshape(-1)[at])
+
+
+def joined(parts: list[SamplesBeyond]) -> SamplesBeyond:
+    """Return the samples of some parts, in order."""
+    return SamplesBeyond(
+        np.concatenate([part.number for part in parts]),
+        np.concatenate([part.value for part in parts]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class TrustedSamples:
+    """All samples whose spheres can be trusted: exact ones of the band, and those beyond it.
+
+    Attributes
+    ----------
+    shape : three ints
+        Samples of the grid along each axis.
+    voxel_ijk : (n, 3) int32
+        The exact samples of the band, in C order.
+    value : (n,) float32
+        Their values.
+    beyond : SamplesBeyond
+    """
+
+    shape: tuple[int, int, int]
+    voxel_ijk: IntArray
+    value: FloatArray
+    beyond: SamplesBeyond
+
+    def box(self, low: IntArray, high: IntArray) -> FloatArray:
+        """Return the samples from index ``low`` (3,) to before ``high``, NaN where there is none.
+
+        The box may exceed the grid.
+        """
+        box = np.full(high - low, np.nan, np.float32)
+        rows = slice(*np.searchsorted(self.voxel_ijk[:, 0], [low[0], high[0]]))
+        self._put(box, self.voxel_ijk[rows] - low, self.value[rows])
+        plane = self.shape[1] * self.shape[2]
+        ends = np.array([low[0], high[0]], np.int64) * plane
+        rows = slice(*np.searchsorted(self.beyond.number, ends))
+        ijk = np.stack(np.unravel_index(self.beyond.number[rows], self.shape), 1)
+        self._put(box, ijk - low, self.beyond.value[rows])
+        return box
+
+    @staticmethod
+    def _put(box: FloatArray, at: NDArray[np.integer], value: FloatArray) -> None:
+        """Write values at indices (n, 3), leaving out those outside the box."""
+        within = np.asarray(((at >= 0) & (at < box.shape)).all(1))
+        box[tuple(at[within].T)] = value[within]
+
+
+NONE_BEYOND = SamplesBeyond(np.zeros(0, np.int64), np.zeros(0, np.float32))

@@ -1,0 +1,166 @@
+"""The bounds that samples set on the field: closed forms, properties, and where there are none."""
+
+import numpy as np
+import pytest
+from conftest import ball, trilinear
+
+from super_sdf import SdfGrid, pipeline, reconstruct, upsample
+from super_sdf.grid.cubic import cubic_grid
+from super_sdf.steps.band import HALF_BAND, neighbour_table
+from super_sdf.steps.beyond import FARTHEST
+from super_sdf.steps.bounds import (
+    MOST_LOST,
+    REACH_OF_SAMPLES,
+    bounded_values,
+    keep_within_bounds,
+    loses_wall,
+    sample_places,
+)
+from super_sdf.steps.lattice import fine_grid
+from super_sdf.steps.nodes import average_shared, block_ijk, share_parts
+from super_sdf.steps.survey import survey
+
+CENTRE, RADIUS = 10 - 0.37, 6.0
+
+
+def blocks_of(grid, factor=4):
+    """Return the band, its decoded voxels, and their distances to the ball (n, Q), half voxels."""
+    band = survey(grid)
+    voxel_ijk = band.voxel_ijk[band.decoded]
+    node = voxel_ijk[:, None] + block_ijk(factor) / factor - 0.5
+    exact = 2 * (np.linalg.norm(node - CENTRE, axis=2) - RADIUS)
+    return band, voxel_ijk, exact.astype(np.float32)
+
+
+def clipped(limit):
+    """Return the ball with distances cut off, in spacings."""
+    return SdfGrid.trusted(np.clip(ball().values, -limit, limit), (1.0,) * 3)
+
+
+@pytest.mark.parametrize("factor", [2, 4, 8])
+@pytest.mark.parametrize("limit", [100, 3.0, 1.7])
+def test_true_distances_are_within_the_bounds_wherever_others_are_cut_off(factor, limit):
+    band, voxel_ijk, exact = blocks_of(clipped(limit), factor)
+    moved = bounded_values(exact, factor, voxel_ijk, band.trusted)
+    np.testing.assert_allclose(moved, exact, atol=2e-5)
+
+
+@pytest.mark.parametrize("factor", [2, 4, 8])
+def test_no_value_moves_away_from_the_truth_and_many_move_nearer(factor):
+    band, voxel_ijk, exact = blocks_of(ball(), factor)
+    wrong = exact + np.random.default_rng(0).normal(0, 0.3, exact.shape).astype(np.float32)
+    moved = bounded_values(wrong, factor, voxel_ijk, band.trusted)
+    before, after = np.abs(wrong - exact), np.abs(moved - exact)
+    assert (after <= before + 2e-5).all()
+    assert (after < before - 1e-3).mean() > 0.5
+    assert after.mean() < 0.5 * before.mean()
+
+
+def test_the_bound_of_one_sample_is_its_distance_less_that_to_the_node():
+    """All samples but two are unknown: that of the block, and one outside, three voxels away."""
+    values = np.full((9, 9, 9), 50.0)
+    values[4, 4, 4], values[4, 4, 7] = 0.2, 3.1  # at most 0.2 + 3
+    band = survey(SdfGrid.trusted(values, (1.0,) * 3))
+    voxel = np.array([[4, 4, 4]], np.int32)
+    rows = (band.voxel_ijk == voxel).all(1)
+    trusted = type(band.trusted)(band.shape, voxel, band.patches[rows, 13], band.beyond)
+    moved = bounded_values(np.full((1, 125), -1, np.float32), 4, voxel, trusted)
+    node = 4 + block_ijk(4) / 4 - 0.5
+    own = 0.2 - np.linalg.norm(node - 4, axis=1)
+    far = 3.1 - np.linalg.norm(node - [4, 4, 7], axis=1)
+    wanted = 2 * np.maximum(np.maximum(own, far), -0.5)
+    wanted[62] = -1  # the sample itself
+    np.testing.assert_allclose(moved[0], wanted, atol=1e-6)
+
+
+def test_the_samples_beyond_the_band_are_those_within_four_voxels():
+    grid = ball()
+    rescaled = 2 * grid.values
+    found = survey(grid).beyond
+    size = np.abs(rescaled)
+    # The largest sample may have been cut off.
+    wanted = np.flatnonzero((size >= HALF_BAND) & (size < FARTHEST) & (rescaled < rescaled.max()))
+    np.testing.assert_array_equal(found.number, wanted)
+    np.testing.assert_allclose(found.value, rescaled.ravel()[wanted], rtol=1e-6)
+
+
+def test_a_box_of_trusted_samples_is_a_part_of_the_grid_and_nan_beyond_it():
+    grid = ball()
+    trusted = survey(grid).trusted
+    low, high = np.array([-2, 3, 5]), np.array([9, 15, 30])
+    box = trusted.box(low, high)
+    known = np.full(np.array(grid.shape) + 20, np.nan)
+    known[10:-10, 10:-10, 10:-10] = 2 * grid.values
+    part = known[8:19, 13:25, 15:40]
+    kept = ~np.isnan(box)
+    np.testing.assert_allclose(box[kept], part[kept], rtol=1e-6)
+    near = np.abs(part) < 2.8
+    assert kept[near].all() and not kept[np.isnan(part)].any()
+
+
+def test_samples_that_contradict_others_set_no_bounds():
+    """Values that grow faster than distances are none."""
+    grid = ball()
+    steep = np.where(np.abs(grid.values) < 1.5, grid.values, 1.2 * grid.values)
+    band, voxel_ijk, exact = blocks_of(SdfGrid.trusted(steep, (1.0,) * 3))
+    wrong = exact + 0.3
+    own = np.abs(exact[:, exact.shape[1] // 2])
+    moved = bounded_values(wrong, 4, voxel_ijk, band.trusted)
+    np.testing.assert_array_equal(moved[own < 1.5], wrong[own < 1.5])
+
+
+def test_noisy_resampled_and_refined_fields_have_no_bounds():
+    clean = ball(24, 8.0)
+    noise = np.random.default_rng(0).uniform(-0.4, 0.4, clean.shape)
+    assert not survey(SdfGrid.trusted(clean.values + noise, clean.spacing)).trusted.value.size
+    uneven = SdfGrid.trusted(ball().values[::2], (2.0, 1.0, 1.0))
+    assert not len(survey(cubic_grid(uneven)).beyond)
+    assert not len(survey(fine_grid(upsample(ball(), trilinear, 2))).beyond)
+
+
+def test_a_wall_is_lost_where_much_of_the_inside_is():
+    inside = np.full((4, 100), -1, np.float32)
+    inside[:, 50:] = 1
+    moved = inside.copy()
+    for row, lost in enumerate([0, 7, 8, 50]):  # of 50
+        moved[row, :lost] = 0.1
+    assert pytest.approx(7.5) == MOST_LOST * 50
+    assert loses_wall(inside, moved).tolist() == [False, False, True, True]
+    assert not loses_wall(np.abs(inside), np.abs(inside)).any()
+
+
+def test_copies_of_shared_nodes_stay_equal_and_samples_keep_their_values():
+    band, voxel_ijk, exact = blocks_of(ball())
+    table = neighbour_table(band.voxel_ijk, band.shape)
+    voxels = np.flatnonzero(band.decoded)
+    parts = share_parts(pipeline.rows_among(voxels, len(table))[table[voxels]])
+    wrong = exact + np.random.default_rng(0).normal(0, 0.2, exact.shape).astype(np.float32)
+    wrong[:, 62] = exact[:, 62]
+    blocks = np.pad(wrong.T, ((0, 0), (0, 1)))
+    average_shared(blocks, parts, 4)
+    moved = blocks.copy()
+    keep_within_bounds(moved, parts, 4, voxel_ijk, band.trusted)
+    again = moved.copy()
+    average_shared(again, parts, 4)
+    np.testing.assert_array_equal(again, moved)
+    np.testing.assert_array_equal(moved[62, :-1], exact[:, 62])
+    error = [np.abs(values[:, :-1].T - exact).mean() for values in (blocks, moved)]
+    assert error[1] < 0.6 * error[0]
+
+
+def test_the_bounds_improve_an_interpolated_ball(monkeypatch):
+    def error(mesh):
+        return np.abs(np.linalg.norm(mesh.vertices - CENTRE, axis=1) - RADIUS).mean()
+
+    monkeypatch.setattr(pipeline, "fit_to_spheres", lambda *_: None)
+    bounded = error(reconstruct(ball(), trilinear))
+    monkeypatch.setattr(pipeline, "keep_within_bounds", lambda *_: None)
+    assert bounded < 0.7 * error(reconstruct(ball(), trilinear))
+
+
+def test_the_samples_round_a_block_are_those_within_the_reach():
+    steps, distance, to_nodes = sample_places(4)
+    assert len(steps) == 257 and (np.diff(distance) >= 0).all()
+    assert np.abs(steps).max() == REACH_OF_SAMPLES
+    np.testing.assert_allclose(distance, 2 * np.linalg.norm(steps, axis=1), rtol=1e-6)
+    np.testing.assert_allclose(to_nodes[:, 62], distance, rtol=1e-6)
