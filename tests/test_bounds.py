@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from conftest import ball, trilinear
 
-from super_sdf import SdfGrid, pipeline, reconstruct, upsample
+from super_sdf import SdfGrid, pipeline, reconstruct
 from super_sdf.grid.cubic import cubic_grid
 from super_sdf.steps.band import HALF_BAND, neighbour_table
 from super_sdf.steps.beyond import FARTHEST
@@ -16,7 +16,6 @@ from super_sdf.steps.bounds import (
     loses_wall,
     sample_places,
 )
-from super_sdf.steps.lattice import fine_grid
 from super_sdf.steps.nodes import average_shared, block_ijk, share_parts
 from super_sdf.steps.survey import survey
 
@@ -109,13 +108,12 @@ def test_samples_that_contradict_others_set_no_bounds():
     np.testing.assert_array_equal(moved[own < 1.5], wrong[own < 1.5])
 
 
-def test_noisy_resampled_and_refined_fields_have_no_bounds():
+def test_noisy_and_resampled_fields_have_no_bounds():
     clean = ball(24, 8.0)
     noise = np.random.default_rng(0).uniform(-0.4, 0.4, clean.shape)
     assert not survey(SdfGrid.trusted(clean.values + noise, clean.spacing)).trusted.value.size
     uneven = SdfGrid.trusted(ball().values[::2], (2.0, 1.0, 1.0))
     assert not len(survey(cubic_grid(uneven)).beyond)
-    assert not len(survey(fine_grid(upsample(ball(), trilinear, 2))).beyond)
 
 
 def test_a_wall_is_lost_where_much_of_the_inside_is():

@@ -16,7 +16,6 @@ from skimage.measure import marching_cubes
 
 from ..arrays import FloatArray, IntArray
 from ..errors import NoSurfaceError
-from ..grid.field import Field
 from ..grid.sdf_grid import SdfGrid
 from ..mesh import Mesh
 from ..network.decoder import Decoder
@@ -119,8 +118,7 @@ def refined_grid(grid: SdfGrid, network: Decoder, factor: int) -> SdfGrid:
     nearest = spread_samples(np.asarray(grid.values, np.float32), factor)
     origin = np.array(grid.origin) - grid.voxel_size / 2
     values = np.where(np.isnan(field), nearest, field)
-    spacing = grid.voxel_size / factor
-    return SdfGrid.trusted(values, spacing, origin, field=Field(refined=True))
+    return SdfGrid.trusted(values, grid.voxel_size / factor, origin)
 
 
 def mesh_corners(grid: SdfGrid, network: Decoder, mesher: str) -> Mesh:

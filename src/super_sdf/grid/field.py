@@ -49,8 +49,6 @@ class Field:
     on_lattice : bool
         Whether the values are distances on the lattice of the samples, in steps of the finest
         spacing, and not in the world. Then no axis is resampled if the spacings differ.
-    refined : bool
-        Whether the values were refined before: those away from the surface are interpolated.
     evidence : dict
         What the samples show, for ``--json``.
     """
@@ -61,7 +59,6 @@ class Field:
     smooth: SampleArray | None = None
     has_kinks: bool = False
     on_lattice: bool = False
-    refined: bool = False
     evidence: dict[str, Any] = field(default_factory=dict)
 
     def report(self) -> dict[str, Any]:

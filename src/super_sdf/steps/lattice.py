@@ -160,7 +160,7 @@ def fine_grid(field: FineField) -> SdfGrid:
     extremes = min(lowest, grid.low - field.offset), max(highest, grid.high - field.offset)
     origin = grid.to_world([-0.5, -0.5, -0.5])
     kind = Field() if grid.field.kind == EXACT else Field(NOISY, True, NONE_EXACT)
-    kind = replace(kind, on_lattice=grid.field.on_lattice, refined=True)
+    kind = replace(kind, on_lattice=grid.field.on_lattice)
     return SdfGrid.trusted(
         lattice,
         spacing,

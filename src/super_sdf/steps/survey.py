@@ -288,8 +288,7 @@ def limit_to_field(band: Band, grid: SdfGrid, offset: float) -> Band:
     limits = max(low, lowest), min(high, highest)
     if band.sampled is not None:  # of a resampled grid, what is interpolated there promises little
         limits = band.limits
-    beyond = NONE_BEYOND if field.refined else band.beyond.between(limits)
-    band = replace(band, limits=limits, beyond=beyond)
+    band = replace(band, limits=limits, beyond=band.beyond.between(limits))
     if field.kind == EXACT:
         return band
     sample = band.patches[:, CENTRE]
