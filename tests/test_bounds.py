@@ -14,7 +14,9 @@ from super_sdf.steps.bounds import (
     bounded_values,
     keep_within_bounds,
     loses_wall,
+    node_distances,
     sample_places,
+    samples_around,
 )
 from super_sdf.steps.nodes import average_shared, block_ijk, share_parts
 from super_sdf.steps.survey import survey
@@ -31,6 +33,11 @@ def blocks_of(grid, factor=4):
     return band, voxel_ijk, exact.astype(np.float32)
 
 
+def around(voxel_ijk, trusted):
+    """Return the samples round the blocks of voxels, (n, m)."""
+    return samples_around(voxel_ijk, trusted).take(slice(None))
+
+
 def clipped(limit):
     """Return the ball with distances cut off, in spacings."""
     return SdfGrid.trusted(np.clip(ball().values, -limit, limit), (1.0,) * 3)
@@ -40,7 +47,7 @@ def clipped(limit):
 @pytest.mark.parametrize("limit", [100, 3.0, 1.7])
 def test_true_distances_are_within_the_bounds_wherever_others_are_cut_off(factor, limit):
     band, voxel_ijk, exact = blocks_of(clipped(limit), factor)
-    moved = bounded_values(exact, factor, voxel_ijk, band.trusted)
+    moved = bounded_values(exact, factor, around(voxel_ijk, band.trusted))
     np.testing.assert_allclose(moved, exact, atol=2e-5)
 
 
@@ -48,7 +55,7 @@ def test_true_distances_are_within_the_bounds_wherever_others_are_cut_off(factor
 def test_no_value_moves_away_from_the_truth_and_many_move_nearer(factor):
     band, voxel_ijk, exact = blocks_of(ball(), factor)
     wrong = exact + np.random.default_rng(0).normal(0, 0.3, exact.shape).astype(np.float32)
-    moved = bounded_values(wrong, factor, voxel_ijk, band.trusted)
+    moved = bounded_values(wrong, factor, around(voxel_ijk, band.trusted))
     before, after = np.abs(wrong - exact), np.abs(moved - exact)
     assert (after <= before + 2e-5).all()
     assert (after < before - 1e-3).mean() > 0.5
@@ -63,7 +70,7 @@ def test_the_bound_of_one_sample_is_its_distance_less_that_to_the_node():
     voxel = np.array([[4, 4, 4]], np.int32)
     rows = (band.voxel_ijk == voxel).all(1)
     trusted = type(band.trusted)(band.shape, voxel, band.patches[rows, 13], band.beyond)
-    moved = bounded_values(np.full((1, 125), -1, np.float32), 4, voxel, trusted)
+    moved = bounded_values(np.full((1, 125), -1, np.float32), 4, around(voxel, trusted))
     node = 4 + block_ijk(4) / 4 - 0.5
     own = 0.2 - np.linalg.norm(node - 4, axis=1)
     far = 3.1 - np.linalg.norm(node - [4, 4, 7], axis=1)
@@ -104,7 +111,7 @@ def test_samples_that_contradict_others_set_no_bounds():
     band, voxel_ijk, exact = blocks_of(SdfGrid.trusted(steep, (1.0,) * 3))
     wrong = exact + 0.3
     own = np.abs(exact[:, exact.shape[1] // 2])
-    moved = bounded_values(wrong, 4, voxel_ijk, band.trusted)
+    moved = bounded_values(wrong, 4, around(voxel_ijk, band.trusted))
     np.testing.assert_array_equal(moved[own < 1.5], wrong[own < 1.5])
 
 
@@ -157,8 +164,8 @@ def test_the_bounds_improve_an_interpolated_ball(monkeypatch):
 
 
 def test_the_samples_round_a_block_are_those_within_the_reach():
-    steps, distance, to_nodes = sample_places(4)
+    steps, distance = sample_places()
     assert len(steps) == 257 and (np.diff(distance) >= 0).all()
     assert np.abs(steps).max() == REACH_OF_SAMPLES
     np.testing.assert_allclose(distance, 2 * np.linalg.norm(steps, axis=1), rtol=1e-6)
-    np.testing.assert_allclose(to_nodes[:, 62], distance, rtol=1e-6)
+    np.testing.assert_allclose(node_distances(4)[:, 62], distance, rtol=1e-6)

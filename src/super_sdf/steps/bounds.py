@@ -17,13 +17,15 @@ Lengths are in half voxels, as in ``band``.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
-from ..machine.threads import CHUNK, map_chunks
+from ..machine.threads import CHUNK, chunks_of, map_chunks
 from ..neighbourhood import CENTRE, STRIDES
 from .beyond import TrustedSamples
 from .nodes import SharedParts, average_shared, block_ijk, block_offsets
@@ -35,7 +37,9 @@ SLACK = 1.0
 MARGIN = 0.05  # a sphere as near to the values at 27 nodes is looked at: others lie between
 CONTRADICTION = 0.02  # that far beyond a bound, one of two samples is no distance
 MOST_LOST = 0.15  # of the nodes inside a block: more are a thin wall
-LEAST_ROWS = 512  # worked on at a time, since a step costs nearly as much for one
+BOX_ROWS = 4096  # blocks that are worked on with one box of samples
+SPHERES = 8  # about as many bound a block, of SEEN samples that might
+SEEN = 1024  # temporaries for these
 
 # A block depends on those beside it, which may have a thin wall, and shared nodes are averaged.
 REACH_IN_VOXELS = 2
@@ -75,58 +79,123 @@ def keep_within_bounds(
     bounded, thin = blocks.copy(), np.zeros(blocks.shape[1], bool)
 
     def work(rows: slice) -> None:
-        values = np.ascontiguousarray(blocks[:, rows].T)
-        moved = bounded_values(values, factor, voxel_ijk[rows], samples)
-        thin[rows] = loses_wall(values, moved)
-        bounded[:, rows] = moved.T
+        around = samples_around(voxel_ijk[rows], samples)
+        for some in chunks_of(len(around.start), max(SPHERES * len(blocks), SEEN)):
+            here = slice(rows.start + some.start, rows.start + some.stop)
+            values = np.ascontiguousarray(blocks[:, here].T)
+            moved = bounded_values(values, factor, around.take(some))
+            thin[here] = loses_wall(values, moved)
+            bounded[:, here] = moved.T
 
-    width = min(len(blocks), CHUNK // LEAST_ROWS)
-    map_chunks(work, len(voxel_ijk), width, threads)
+    map_chunks(work, len(voxel_ijk), CHUNK // BOX_ROWS, threads)
     np.copyto(blocks, bounded, where=~(thin | _any_beside(thin, parts)))
     average_shared(blocks, parts, factor, threads)
 
 
-def bounded_values(
-    values: FloatArray, factor: int, voxel_ijk: IntArray, samples: TrustedSamples
-) -> FloatArray:
-    """Return the values (n, Q) of the blocks of voxels (n, 3), moved into their bounds."""
+@dataclass(frozen=True, eq=False)
+class Around:
+    """The samples round n blocks.
+
+    Attributes
+    ----------
+    flat : (l,) float32
+        A box of samples, NaN where none is trusted.
+    start : (n,) int64
+        Where in it each block's own sample is.
+    steps : (m,) int64
+        From there to the samples around, in the order of ``sample_places``.
+    """
+
+    flat: FloatArray
+    start: NDArray[np.int64]
+    steps: NDArray[np.int64]
+
+    def take(self, rows: slice) -> FloatArray:
+        """Return the samples round some blocks, (n, m)."""
+        return self.flat.take(self.start[rows, None] + self.steps)
+
+
+def samples_around(voxel_ijk: IntArray, samples: TrustedSamples) -> Around:
+    """Return the samples round the blocks of voxels (n, 3)."""
     low = voxel_ijk.min(0) - REACH_OF_SAMPLES
     box = samples.box(low, voxel_ijk.max(0) + REACH_OF_SAMPLES + 1)
     strides = np.array([box.shape[1] * box.shape[2], box.shape[2], 1])
-    at, flat, some = (voxel_ijk - low) @ strides, box.reshape(-1), nodes_to_look_at(factor)
-    own, seen, moved = flat[at], values[:, some], values.copy()
-    contradicted = np.isnan(own)
-    for step, distance, to_nodes in zip(*sample_places(factor)):
-        sample = flat.take(at + step @ strides)
-        apart = np.abs(sample - own)
-        rows = np.flatnonzero(apart > distance - SLACK)
-        contradicted[rows] |= apart[rows] > distance + CONTRADICTION
-        for side in (np.float32(1), np.float32(-1)):
-            radius = side * sample[rows]
-            matter = radius > 0
-            matter[matter] = reaches(radius[matter], side * seen[rows[matter]], to_nodes[some])
-            chosen = rows[matter]
-            least = radius[matter, None] - to_nodes
-            moved[chosen] = side * np.maximum(side * moved[chosen], least)
-    moved[contradicted] = values[contradicted]
+    steps, _ = sample_places()
+    return Around(box.reshape(-1), (voxel_ijk - low) @ strides, steps @ strides)
+
+
+def bounded_values(values: FloatArray, factor: int, around: FloatArray) -> FloatArray:
+    """Return the values of blocks moved into their bounds.
+
+    Parameters
+    ----------
+    values : (n, Q) float32
+    factor : int
+        K.
+    around : (n, m) float32
+        The samples round each block in the order of ``sample_places``, its own first.
+
+    Returns
+    -------
+    (n, Q) float32
+    """
+    own, moved = around[:, :1], values.copy()
+    slack = sample_places()[1] - np.abs(around - own)
+    row, place = np.nonzero(slack < SLACK)
+    sample = around[row, place]
+    for side in (1, -1):
+        some = np.flatnonzero(side * sample > 0)
+        move_out(moved, factor, side, row.take(some), place.take(some), sample.take(some))
+    kept = np.isnan(own[:, 0]) | (slack < -CONTRADICTION).any(1)
+    moved[kept] = values[kept]
     middle = values.shape[1] // 2
     moved[:, middle] = values[:, middle]  # the block's own sample
     return moved
 
 
-def reaches(radius: FloatArray, values: FloatArray, to_nodes: FloatArray) -> BoolArray:
-    """Return which spheres reach beyond, or nearly to, the values at some nodes, (n,).
+def move_out(
+    values: FloatArray,
+    factor: int,
+    side: int,
+    row: NDArray[np.intp],
+    place: NDArray[np.intp],
+    sample: FloatArray,
+) -> None:
+    """Move the values in spheres on one side of the surface out of these, in place.
 
     Parameters
     ----------
-    radius : (n,) float32
-        Of the spheres.
-    values : (n, m) float32
-        Values at the nodes, positive on the side of the sphere's centre.
-    to_nodes : (m,) float32
-        Distances of the nodes to the centres.
+    values : (n, Q) float32
+    factor : int
+        K.
+    side : {1, -1}
+        Whether the spheres' centres are outside or inside.
+    row, place : (k,) int
+        The block that each sphere may reach, ascending, and where its centre is, as a row of
+        ``sample_places``.
+    sample : (k,) float32
+        The signed distance at its centre.
     """
-    return np.asarray((radius[:, None] - values > to_nodes - MARGIN).any(1))
+    looked_at, to_nodes = nodes_to_look_at(factor), node_distances(factor)
+    depth = values[:, looked_at].take(row, 0)
+    depth -= sample[:, None]
+    depth *= -side
+    depth -= to_nodes[:, looked_at].take(place, 0)
+    reaching = np.flatnonzero((depth > -MARGIN).any(1))
+    row, place, sample = row.take(reaching), place.take(reaching), sample.take(reaching)
+    beyond, tightest = (np.subtract, np.maximum) if side > 0 else (np.add, np.minimum)
+    for some in by_rank(row):  # of the blocks in these rows, no two are the same
+        chosen, bound = row.take(some), to_nodes.take(place.take(some), 0)
+        beyond(sample.take(some)[:, None], bound, out=bound)
+        values[chosen] = tightest(values.take(chosen, 0), bound, out=bound)
+
+
+def by_rank(row: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
+    """Yield where ascending numbers (k,) come first, where they come a second time, and so on."""
+    first = np.flatnonzero(np.diff(row, prepend=-1))
+    rank = np.arange(len(row)) - np.repeat(first, np.diff(first, append=len(row)))
+    order = np.argsort(rank, kind="stable")
+    yield from np.split(order, np.cumsum(np.bincount(rank))[:-1]) if len(row) else ()
 
 
 @lru_cache
@@ -136,22 +205,26 @@ def nodes_to_look_at(factor: int) -> NDArray[np.intp]:
 
 
 @lru_cache
-def sample_places(factor: int) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return where the samples round a block are, nearest first, and how far from it.
+def sample_places() -> tuple[IntArray, FloatArray]:
+    """Return the steps from a block's own sample to those around, (m, 3), and distances, (m,).
 
-    Returns
-    -------
-    (m, 3) int32, (m,) float32, (m, Q) float32
-        Steps from the block's own sample, the distances to that, and those to the block's nodes.
+    The nearest is first: the sample itself.
     """
     reach = REACH_OF_SAMPLES
-    steps = np.indices((2 * reach + 1,) * 3, np.int32).reshape(3, -1).T - reach
+    steps = np.indices((2 * reach + 1,) * 3).reshape(3, -1).T - reach
     distance = 2 * np.linalg.norm(steps, axis=1)
     order = np.argsort(distance, kind="stable")
     order = order[distance[order] <= 2 * reach]
-    apart = 2 * steps[order, None] - block_offsets(factor).astype(np.float64)
-    to_nodes = np.linalg.norm(apart, axis=2).astype(np.float32)
-    return steps[order].astype(np.int32), distance[order].astype(np.float32), to_nodes
+    return steps[order].astype(np.int32), distance[order].astype(np.float32)
+
+
+@lru_cache
+def node_distances(factor: int) -> FloatArray:
+    """Return the distances from the samples round a block to its nodes, (m, Q)."""
+    steps, _ = sample_places()
+    apart = 2 * steps[:, None] - block_offsets(factor).astype(np.float64)
+    distance: FloatArray = np.linalg.norm(apart, axis=2).astype(np.float32)
+    return distance
 
 
 def loses_wall(values: FloatArray, moved: FloatArray) -> BoolArray:
