@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import FloatArray, IntArray
+from ..arrays import BoolArray, FloatArray, IntArray
 from .band import HALF_BAND
 
 FARTHEST = 8.0  # four voxels
@@ -36,14 +36,6 @@ class SamplesBeyond:
     def __len__(self) -> int:
         return len(self.number)
 
-    def between(self, limits: tuple[float, float]) -> SamplesBeyond:
-        """Return those above the first limit and below the second."""
-        low, high = np.float32(limits[0]), np.float32(limits[1])
-        rows = np.flatnonzero((self.value > low) & (self.value < high))
-        return (
-            self if len(rows) == len(self) else SamplesBeyond(self.number[rows], self.value[rows])
-        )
-
 
 def samples_beyond(rescaled: FloatArray, first: int) -> SamplesBeyond:
     """Return those beyond the band in some planes of samples, (m, ny, nz), from ``first`` on."""
@@ -62,23 +54,29 @@ def joined(parts: list[SamplesBeyond]) -> SamplesBeyond:
 
 @dataclass(frozen=True, eq=False)
 class TrustedSamples:
-    """All samples whose spheres can be trusted: exact ones of the band, and those beyond it.
+    """All samples whose spheres can be trusted: exact ones of the band, and some beyond it.
 
     Attributes
     ----------
     shape : three ints
         Samples of the grid along each axis.
-    voxel_ijk : (n, 3) int32
-        The exact samples of the band, in C order.
-    value : (n,) float32
+    voxel_ijk : (V, 3) int32
+        The samples of the band, in C order.
+    value : (V,) float32
         Their values.
+    exact : (V,) bool
+        Which of them are exact.
     beyond : SamplesBeyond
+    limits : two floats
+        Those beyond the band are trusted if they lie between these.
     """
 
     shape: tuple[int, int, int]
     voxel_ijk: IntArray
     value: FloatArray
+    exact: BoolArray
     beyond: SamplesBeyond
+    limits: tuple[float, float]
 
     def box(self, low: IntArray, high: IntArray) -> FloatArray:
         """Return the samples from index ``low`` (3,) to before ``high``, NaN where there is none.
@@ -86,13 +84,16 @@ class TrustedSamples:
         The box may exceed the grid.
         """
         box = np.full(high - low, np.nan, np.float32)
-        rows = slice(*np.searchsorted(self.voxel_ijk[:, 0], [low[0], high[0]]))
+        planes = slice(*np.searchsorted(self.voxel_ijk[:, 0], [low[0], high[0]]))
+        rows = np.flatnonzero(self.exact[planes]) + planes.start
         self._put(box, self.voxel_ijk[rows] - low, self.value[rows])
         plane = self.shape[1] * self.shape[2]
         ends = np.array([low[0], high[0]], np.int64) * plane
         rows = slice(*np.searchsorted(self.beyond.number, ends))
+        value = self.beyond.value[rows]
         ijk = np.stack(np.unravel_index(self.beyond.number[rows], self.shape), 1)
-        self._put(box, ijk - low, self.beyond.value[rows])
+        known = (value > np.float32(self.limits[0])) & (value < np.float32(self.limits[1]))
+        self._put(box, (ijk - low)[known], value[known])
         return box
 
     @staticmethod

@@ -74,7 +74,7 @@ def keep_within_bounds(
     threads : int
         Threads to use.
     """
-    if not len(samples.beyond) or not len(samples.value):
+    if not len(samples.beyond) or not samples.exact.any():
         return
     bounded, thin = blocks.copy(), np.zeros(blocks.shape[1], bool)
 

@@ -89,7 +89,7 @@ class Band:
     peak : int
         The memory of the process in bytes while the band was found, of samples that are made.
     beyond : SamplesBeyond
-        The samples a few voxels beyond that may be exact distances.
+        The samples a few voxels farther away.
     """
 
     shape: tuple[int, int, int]
@@ -112,9 +112,10 @@ class Band:
     @cached_property
     def trusted(self) -> TrustedSamples:
         """The samples whose spheres can be trusted, in the band and beyond."""
-        rows = np.flatnonzero(self.exact)
-        sample = self.patches[rows, CENTRE]
-        return TrustedSamples(self.shape, self.voxel_ijk[rows], sample, self.beyond)
+        sample = self.patches[:, CENTRE]
+        return TrustedSamples(
+            self.shape, self.voxel_ijk, sample, self.exact, self.beyond, self.limits
+        )
 
     @property
     def noisy_voxels(self) -> int:
@@ -285,10 +286,8 @@ def limit_to_field(band: Band, grid: SdfGrid, offset: float) -> Band:
     low, high = ((limit - offset) * scale for limit in field.exact)
     ends = np.clip([grid.low - offset, grid.high - offset], -FAR / scale, FAR / scale) * scale
     lowest, highest = map(float, ends.astype(np.float32))  # where it may be cut off
-    limits = max(low, lowest), min(high, highest)
-    if band.sampled is not None:  # of a resampled grid, what is interpolated there promises little
-        limits = band.limits
-    band = replace(band, limits=limits, beyond=band.beyond.between(limits))
+    if band.sampled is None:  # of a resampled grid, what is interpolated there promises little
+        band = replace(band, limits=(max(low, lowest), min(high, highest)))
     if field.kind == EXACT:
         return band
     sample = band.patches[:, CENTRE]
