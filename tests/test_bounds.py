@@ -155,6 +155,14 @@ def test_copies_of_shared_nodes_stay_equal_and_samples_keep_their_values():
     assert error[1] < 0.6 * error[0]
 
 
+def test_with_a_factor_of_2_nothing_moves():
+    band, voxel_ijk, exact = blocks_of(ball(), 2)
+    blocks = np.pad(exact.T + np.float32(0.3), ((0, 0), (0, 1)))
+    kept = blocks.copy()
+    keep_within_bounds(blocks, None, 2, voxel_ijk, band.trusted)
+    np.testing.assert_array_equal(blocks, kept)
+
+
 def test_the_bounds_improve_an_interpolated_ball(monkeypatch):
     def error(mesh):
         return np.abs(np.linalg.norm(mesh.vertices - CENTRE, axis=1) - RADIUS).mean()

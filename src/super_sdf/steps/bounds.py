@@ -36,6 +36,9 @@ REACH_OF_SAMPLES = 4  # voxels from a block's sample to those that bound its val
 SLACK = 1.0
 MARGIN = 0.05  # a sphere as near to the values at 27 nodes is looked at: others lie between
 CONTRADICTION = 0.02  # that far beyond a bound, one of two samples is no distance
+# With larger cells the fit to the spheres makes up for what linear cells cut off, and bounds, which
+# hold for true distances, would undo half of that.
+LEAST_FACTOR = 4
 MOST_LOST = 0.15  # of the nodes inside a block: more are a thin wall
 BOX_ROWS = 4096  # blocks that are worked on with one box of samples
 SPHERES = 8  # about as many bound a block, of SEEN samples that might
@@ -56,8 +59,8 @@ def keep_within_bounds(
     """Move values to the nearest ones that the samples around allow.
 
     Samples keep their values, and so do blocks whose own sample is not trusted, but for the nodes
-    that they share with others, which are averaged again. Without samples beyond the band nothing
-    is changed.
+    that they share with others, which are averaged again. Without samples beyond the band, and with
+    a factor of 2, nothing is changed.
 
     Parameters
     ----------
@@ -74,7 +77,7 @@ def keep_within_bounds(
     threads : int
         Threads to use.
     """
-    if not len(samples.beyond) or not samples.exact.any():
+    if factor < LEAST_FACTOR or not len(samples.beyond) or not samples.exact.any():
         return
     bounded, thin = blocks.copy(), np.zeros(blocks.shape[1], bool)
 
