@@ -11,9 +11,11 @@ from super_sdf.grid.cubic import cubic_grid
 from super_sdf.steps.band import HALF_BAND, neighbour_table
 from super_sdf.steps.beyond import FARTHEST
 from super_sdf.steps.bounds import (
+    BOX_SAMPLES,
     MOST_LOST,
     REACH_OF_SAMPLES,
     bounded_values,
+    cut_to_boxes,
     keep_within_bounds,
     loses_wall,
     node_distances,
@@ -104,6 +106,15 @@ def test_a_box_of_trusted_samples_is_a_part_of_the_grid_and_nan_beyond_it():
     assert np.nanmax(box) < np.nanmax(part)  # the largest sample may have been cut off
     near = np.abs(part) < 2.8
     assert kept[near].all() and not kept[np.isnan(part)].any()
+
+
+def test_voxels_along_a_diagonal_are_cut_into_small_boxes():
+    diagonal = np.arange(2000, dtype=np.int32)[:, None].repeat(3, 1)
+    parts = list(cut_to_boxes(diagonal, slice(100, 2000)))
+    assert [part.start for part in parts] == [100, *(part.stop for part in parts[:-1])]
+    assert parts[-1].stop == 2000 and len(parts) == 16
+    assert max(part.stop - part.start + 8 for part in parts) ** 3 <= BOX_SAMPLES
+    assert list(cut_to_boxes(diagonal[:40], slice(0, 40))) == [slice(0, 40)]
 
 
 def test_samples_that_contradict_others_set_no_bounds():

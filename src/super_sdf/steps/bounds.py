@@ -40,7 +40,8 @@ CONTRADICTION = 0.02  # that far beyond a bound, one of two samples is no distan
 # hold for true distances, would undo half of that.
 LEAST_FACTOR = 4
 MOST_LOST = 0.15  # of the nodes inside a block: more are a thin wall
-BOX_ROWS = 4096  # blocks that are worked on with one box of samples
+BOX_ROWS = 4096  # blocks at most that are worked on with one box of samples ...
+BOX_SAMPLES = 1 << 22  # ... of at most this size: far fewer blocks along a diagonal
 SPHERES = 8  # about as many bound a block, of SEEN samples that might
 SEEN = 1024  # temporaries for these
 
@@ -82,13 +83,14 @@ def keep_within_bounds(
     bounded, thin = blocks.copy(), np.zeros(blocks.shape[1], bool)
 
     def work(rows: slice) -> None:
-        around = samples_around(voxel_ijk[rows], samples)
-        for some in chunks_of(len(around.start), max(SPHERES * len(blocks), SEEN)):
-            here = slice(rows.start + some.start, rows.start + some.stop)
-            values = np.ascontiguousarray(blocks[:, here].T)
-            moved = bounded_values(values, factor, around.take(some))
-            thin[here] = loses_wall(values, moved)
-            bounded[:, here] = moved.T
+        for group in cut_to_boxes(voxel_ijk, rows):
+            around = samples_around(voxel_ijk[group], samples)
+            for some in chunks_of(len(around.start), max(SPHERES * len(blocks), SEEN)):
+                here = slice(group.start + some.start, group.start + some.stop)
+                values = np.ascontiguousarray(blocks[:, here].T)
+                moved = bounded_values(values, factor, around.take(some))
+                thin[here] = loses_wall(values, moved)
+                bounded[:, here] = moved.T
 
     map_chunks(work, len(voxel_ijk), CHUNK // BOX_ROWS, threads)
     np.copyto(blocks, bounded, where=~(thin | _any_beside(thin, parts)))
@@ -116,6 +118,17 @@ class Around:
     def take(self, rows: slice) -> FloatArray:
         """Return the samples round some blocks, (n, m)."""
         return self.flat.take(self.start[rows, None] + self.steps)
+
+
+def cut_to_boxes(voxel_ijk: IntArray, rows: slice) -> Iterator[slice]:
+    """Yield the rows of voxels (D, 3), cut in halves until a box round each part is small."""
+    size = np.ptp(voxel_ijk[rows], axis=0).astype(np.int64) + 2 * REACH_OF_SAMPLES + 1
+    if size.prod() <= BOX_SAMPLES or rows.stop - rows.start == 1:
+        yield rows
+        return
+    middle = (rows.start + rows.stop) // 2
+    yield from cut_to_boxes(voxel_ijk, slice(rows.start, middle))
+    yield from cut_to_boxes(voxel_ijk, slice(middle, rows.stop))
 
 
 def samples_around(voxel_ijk: IntArray, samples: TrustedSamples) -> Around:
