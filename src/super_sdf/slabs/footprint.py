@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..machine.threads import CHUNK, rows_in_chunk
+from ..steps.bounds import LEAST_FACTOR
 from ..steps.marching import LOOKUP_BYTES, lookups_at_once
 from ..steps.mesher_names import DEFAULT_MESHER, MARCHING, SHARP
 from ..steps.meshers import BY_NAME
@@ -17,7 +18,7 @@ from ..steps.survey import Band
 STAGES = {
     "average": (216, 300, 5.0, 1e7, 2e7),
     "fit": (216, 1450, 4.0, 1e7, 3e7),
-    "bounds": (216, 450, 8.2, 4e7, 3e7),
+    "bounds": (216, 450, 8.2, 2.5e7, 2e7),
     MARCHING: (216, 350, 7.5, 1e7, 3e7),
     SHARP: (216, 350, 7.5, 1e7, 3e7),
 }
@@ -66,10 +67,13 @@ def slab_bytes(
     values = own * (factor + 1) ** 3
     sizes = np.array([voxels, own, values, min(threads, values // CHUNK + 1), 1])
     needs = {stage: float(np.dot(STAGES[stage], sizes)) for stage in (*BEFORE_MESHER, mesher)}
+    if factor < LEAST_FACTOR:
+        del needs["bounds"]
     extra = _sharp_bytes if mesher == SHARP else _lookup_bytes
     needs[mesher] += extra(band, planes, own, factor, threads)
     if band.smooth is not None and not band.exact.any():
-        del needs["fit"], needs["bounds"]  # there are no spheres
+        for stage in BEFORE_MESHER[1:]:
+            needs.pop(stage, 0)  # there are no spheres
     if band.smooth is not None:
         needs["spline"] = float(np.dot(SPLINE, sizes)) + spline_bytes(band.shape)
     if band.smooth is None or band.has_kinks:

@@ -41,7 +41,7 @@ CONTRADICTION = 0.02  # that far beyond a bound, one of two samples is no distan
 LEAST_FACTOR = 4
 MOST_LOST = 0.15  # of the nodes inside a block: more are a thin wall
 BOX_ROWS = 4096  # blocks at most that are worked on with one box of samples ...
-BOX_SAMPLES = 1 << 22  # ... of at most this size: far fewer blocks along a diagonal
+BOX_SAMPLES = 1 << 21  # ... of at most this size: far fewer blocks along a diagonal
 SPHERES = 8  # about as many bound a block, of SEEN samples that might
 SEEN = 1024  # temporaries for these
 
