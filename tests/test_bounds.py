@@ -174,6 +174,16 @@ def test_with_a_factor_of_2_nothing_moves():
     np.testing.assert_array_equal(blocks, kept)
 
 
+@pytest.mark.parametrize("limits", [(0.0, 0.0), (-HALF_BAND, HALF_BAND)])
+def test_where_no_sample_beyond_the_band_is_trusted_nothing_moves(limits):
+    """Of a resampled grid, and of one that is cut off at 1.5 voxels."""
+    band, voxel_ijk, exact = blocks_of(ball())
+    blocks = np.pad(exact.T + np.float32(0.3), ((0, 0), (0, 1)))
+    kept = blocks.copy()
+    keep_within_bounds(blocks, None, 4, voxel_ijk, replace(band.trusted, limits=limits))
+    np.testing.assert_array_equal(blocks, kept)
+
+
 def test_the_bounds_improve_an_interpolated_ball(monkeypatch):
     def error(mesh):
         return np.abs(np.linalg.norm(mesh.vertices - CENTRE, axis=1) - RADIUS).mean()

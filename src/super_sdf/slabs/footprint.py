@@ -23,7 +23,6 @@ STAGES = {
     SHARP: (216, 350, 7.5, 1e7, 3e7),
 }
 SPLINE = (216, 300, 4.5, 0, 2e7)
-BEFORE_MESHER = ("average", "fit", "bounds")
 # Default for a network: bytes per voxel that it sees, including its row of the neighbour table, and
 # per value.
 NETWORK_BYTES = (680.0, 8.0)
@@ -66,19 +65,22 @@ def slab_bytes(
     voxels, own = seen.stop - seen.start, band.count_decoded(decoded)
     values = own * (factor + 1) ** 3
     sizes = np.array([voxels, own, values, min(threads, values // CHUNK + 1), 1])
-    needs = {stage: float(np.dot(STAGES[stage], sizes)) for stage in (*BEFORE_MESHER, mesher)}
-    if factor < LEAST_FACTOR:
-        del needs["bounds"]
+    stages = *_stages_before_mesher(band, factor), mesher
+    needs = {stage: float(np.dot(STAGES[stage], sizes)) for stage in stages}
     extra = _sharp_bytes if mesher == SHARP else _lookup_bytes
     needs[mesher] += extra(band, planes, own, factor, threads)
-    if band.smooth is not None and not band.exact.any():
-        for stage in BEFORE_MESHER[1:]:
-            needs.pop(stage, 0)  # there are no spheres
     if band.smooth is not None:
         needs["spline"] = float(np.dot(SPLINE, sizes)) + spline_bytes(band.shape)
     if band.smooth is None or band.has_kinks:
         needs["network"] = _bytes_for_network(voxels, own, factor, network_bytes)
     return int(max(needs.values()))
+
+
+def _stages_before_mesher(band: Band, factor: int) -> list[str]:
+    """Return the stages between the network and the mesher."""
+    if band.smooth is not None and not band.exact.any():
+        return ["average"]  # there are no spheres
+    return ["average", "fit", "bounds"] if factor >= LEAST_FACTOR else ["average", "fit"]
 
 
 def _bytes_for_network(

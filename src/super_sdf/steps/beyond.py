@@ -33,8 +33,8 @@ class SamplesBeyond:
     number: NDArray[np.int64]
     value: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.number)
+
+NONE_BEYOND = SamplesBeyond(np.zeros(0, np.int64), np.zeros(0, np.float32))
 
 
 def samples_beyond(rescaled: FloatArray, first: int) -> SamplesBeyond:
@@ -78,6 +78,11 @@ class TrustedSamples:
     beyond: SamplesBeyond
     limits: tuple[float, float]
 
+    @property
+    def reach_beyond(self) -> bool:
+        """Whether samples beyond the band can be trusted: the same for all parts of a grid."""
+        return self.limits[0] < -HALF_BAND or self.limits[1] > HALF_BAND
+
     def box(self, low: IntArray, high: IntArray) -> FloatArray:
         """Return the samples from index ``low`` (3,) to before ``high``, NaN where there is none.
 
@@ -101,6 +106,3 @@ class TrustedSamples:
         """Write values at indices (n, 3), leaving out those outside the box."""
         within = np.asarray(((at >= 0) & (at < box.shape)).all(1))
         box[tuple(at[within].T)] = value[within]
-
-
-NONE_BEYOND = SamplesBeyond(np.zeros(0, np.int64), np.zeros(0, np.float32))

@@ -42,8 +42,8 @@ LEAST_FACTOR = 4
 MOST_LOST = 0.15  # of the nodes inside a block: more are a thin wall
 BOX_ROWS = 4096  # blocks at most that are worked on with one box of samples ...
 BOX_SAMPLES = 1 << 21  # ... of at most this size: far fewer blocks along a diagonal
-SPHERES = 8  # about as many bound a block, of SEEN samples that might
-SEEN = 1024  # temporaries for these
+SPHERES = 8  # about as many reach the values of a block
+TEMPORARIES = 1024  # numbers per block in the search for these
 
 # A block depends on those beside it, which may have a thin wall, and shared nodes are averaged.
 REACH_IN_VOXELS = 2
@@ -60,8 +60,8 @@ def keep_within_bounds(
     """Move values to the nearest ones that the samples around allow.
 
     Samples keep their values, and so do blocks whose own sample is not trusted, but for the nodes
-    that they share with others, which are averaged again. Without samples beyond the band, and with
-    a factor of 2, nothing is changed.
+    that they share with others, which are averaged again. Where no sample beyond the band can be
+    trusted, and with a factor of 2, nothing is changed.
 
     Parameters
     ----------
@@ -78,14 +78,14 @@ def keep_within_bounds(
     threads : int
         Threads to use.
     """
-    if factor < LEAST_FACTOR or not len(samples.beyond) or not samples.exact.any():
+    if factor < LEAST_FACTOR or not samples.reach_beyond or not samples.exact.any():
         return
     bounded, thin = blocks.copy(), np.zeros(blocks.shape[1], bool)
 
     def work(rows: slice) -> None:
         for group in cut_to_boxes(voxel_ijk, rows):
             around = samples_around(voxel_ijk[group], samples)
-            for some in chunks_of(len(around.start), max(SPHERES * len(blocks), SEEN)):
+            for some in chunks_of(len(around.start), max(SPHERES * len(blocks), TEMPORARIES)):
                 here = slice(group.start + some.start, group.start + some.stop)
                 values = np.ascontiguousarray(blocks[:, here].T)
                 moved = bounded_values(values, factor, around.take(some))
