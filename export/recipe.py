@@ -13,6 +13,7 @@ from torch import Tensor
 
 from export.augment import USUAL, Shares
 from export.dataset import CORNERS
+from export.muon import StackedMuon
 from export.network import SuperSdfNet
 
 
@@ -62,17 +63,22 @@ def nearness(target: Tensor, recipe: Recipe) -> Tensor:
 
 
 def loss_of(prediction: Tensor, target: Tensor, recipe: Recipe) -> Tensor:
-    """Return the loss: the weighted error of the values and of their gradient."""
+    """Return the loss of the values (D, Q) of a sample."""
+    return voxel_losses(prediction, target, recipe).mean()
+
+
+def voxel_losses(prediction: Tensor, target: Tensor, recipe: Recipe) -> Tensor:
+    """Return the loss of each voxel, (D,): the weighted error of values and of their gradient."""
     error = (prediction - target).abs() ** recipe.power
-    loss = (nearness(target, recipe) * error).mean()
+    loss = (nearness(target, recipe) * error).mean(1)
     corners = nearness(target[:, : 4 * CORNERS : 4], recipe)
     slope = differences(prediction)
     if recipe.gradient_weight:
         apart = (slope - differences(target)).abs().sum(2)
-        loss = loss + recipe.gradient_weight * (corners * apart).mean()
+        loss = loss + recipe.gradient_weight * (corners * apart).mean(1)
     if recipe.eikonal_weight:
         unit = (slope.norm(dim=2) - 1).abs()
-        loss = loss + recipe.eikonal_weight * (corners * unit).mean()
+        loss = loss + recipe.eikonal_weight * (corners * unit).mean(1)
     return loss
 
 
@@ -96,7 +102,7 @@ def make_optimisers(net: SuperSdfNet, recipe: Recipe) -> list[torch.optim.Optimi
     ]
     if hidden:
         rate = {"lr": recipe.hidden_rate, "adjust_lr_fn": "match_rms_adamw"}
-        optimisers.append(torch.optim.Muon(hidden, weight_decay=1e-3, **rate))
+        optimisers.append(StackedMuon(hidden, weight_decay=1e-3, **rate))
     return optimisers
 
 
