@@ -46,9 +46,14 @@ class Prepared:
 
 
 def augment(rng: np.random.Generator, sample: Sample, shares: Shares) -> Prepared:
+    """Change and turn a sample at random, and gather it."""
+    return turned(rng, change(rng, sample, shares))
+
+
+def change(rng: np.random.Generator, sample: Sample, shares: Shares) -> Prepared:
     """Change a sample at random and gather it."""
     changed = noisy(rng, shifted(rng, inverted(rng, sample, shares), shares), shares)
-    return turned(rng, truncated(rng, prepare(changed), shares))
+    return truncated(rng, prepare(changed), shares)
 
 
 def augment_mask(rng: np.random.Generator, sample: Sample) -> Prepared:

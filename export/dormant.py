@@ -21,8 +21,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from export.augment import Prepared
 from export.network import Block, NeighbourConv, SuperSdfNet
+from export.resident import Batch
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ def watching(layers: Sequence[Rectified]) -> Iterator[list[Tensor]]:
 
 
 @torch.no_grad()
-def reacting(net: SuperSdfNet, batches: Sequence[Sequence[Prepared]]) -> list[Tensor]:
+def reacting(net: SuperSdfNet, batches: Sequence[Batch]) -> list[Tensor]:
     """Return, for each rectified layer, which of its units react to any voxel, (units,) bool."""
     layers = rectified_layers(net)
     found = [torch.zeros_like(entry.bias, dtype=torch.bool) for entry in layers]
@@ -97,7 +97,7 @@ def reacting(net: SuperSdfNet, batches: Sequence[Sequence[Prepared]]) -> list[Te
     return found
 
 
-def dormant_share(net: SuperSdfNet, batches: Sequence[Sequence[Prepared]]) -> float:
+def dormant_share(net: SuperSdfNet, batches: Sequence[Batch]) -> float:
     """Return the share of rectified units that react to no voxel of these samples."""
     return 1 - float(torch.cat(reacting(net, batches)).float().mean())
 
@@ -106,7 +106,7 @@ def dormant_share(net: SuperSdfNet, batches: Sequence[Sequence[Prepared]]) -> fl
 def revive(
     net: SuperSdfNet,
     optimisers: Sequence[torch.optim.Optimizer],
-    batches: Sequence[Sequence[Prepared]],
+    batches: Sequence[Batch],
 ) -> int:
     """Restart the units that react to no voxel of these samples; return their number.
 

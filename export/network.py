@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -25,6 +26,9 @@ from torch import Tensor, nn
 from export.augment import Prepared, batch_table
 from super_sdf.neighbourhood import CENTRE
 from super_sdf.steps.band import MAX_DIFFERENCE
+
+if TYPE_CHECKING:
+    from export.resident import TurnedBatch
 
 
 @dataclass(frozen=True)
@@ -232,13 +236,16 @@ class SuperSdfNet(nn.Module):
 
     def encode(self, patches: Tensor, table: Tensor) -> Tensor:
         """Map patches (V, 27) and neighbours (V, 27; V where absent) to features (V, C)."""
-        features = self.stem(patches)
+        with in_float32(patches):  # then the sums of the blocks are, too
+            features = self.stem(patches)
         for block in self.blocks:
             features = block(features, table)
         return features
 
-    def encode_batch(self, batch: Sequence[Prepared]) -> Encoded:
+    def encode_batch(self, batch: Sequence[Prepared] | TurnedBatch) -> Encoded:
         """Encode a batch of samples, concatenated."""
+        if not isinstance(batch, Sequence):
+            return self.encode_all(batch.patches, batch.table)
         device = next(self.parameters()).device
         patches = torch.from_numpy(np.concatenate([sample.patches for sample in batch])).to(device)
         table = torch.from_numpy(batch_table([sample.table for sample in batch])).to(device)
@@ -253,14 +260,31 @@ class SuperSdfNet(nn.Module):
 
     def decode(self, voxels: Encoded, offsets: Tensor) -> Tensor:
         """Return the values (D, Q) of voxels at offsets (Q, 3)."""
-        correction = self.correction(voxels.features).float() * voxels.noisy
-        values = self.residual(voxels.features, offsets) + self.base(voxels.patches, offsets)
-        return values + correction
+        with in_float32(offsets):
+            correction = self.correction(voxels.features.float()) * voxels.noisy
+            residual = self.residual(voxels.features.float(), offsets)
+            return residual + self.base(voxels.patches, offsets) + correction
+
+    def decode_parts(self, voxels: Encoded, counts: list[int], offsets: Tensor) -> Tensor:
+        """Return the values (D, Q) of samples side by side, each at its offsets, (B, Q, 3).
+
+        Of the D voxels the first ``counts[0]`` are of the first sample, and so on.
+        """
+        with in_float32(offsets):
+            features, at = voxels.features.float(), offsets.flatten(0, 1)
+            inputs = torch.cat([self.coefficients(features), voxels.patches], 1)
+            functions = torch.cat([self.trunk(at), interpolation_weights(at)], 1)
+            parts = zip(inputs.split(counts), functions.view(*offsets.shape[:2], -1))
+            values = torch.cat([some @ weights.T for some, weights in parts])
+            return values + self.correction(features) * voxels.noisy
 
     def residual(self, features: Tensor, offsets: Tensor) -> Tensor:
         """Return the residual over the interpolation, (D, Q); 0 at the sample."""
-        coefficients = torch.cat([features, torch.relu(self.branch(features))], 1)
-        return coefficients.float() @ self.trunk(offsets).float().T
+        return self.coefficients(features) @ self.trunk(offsets).T
+
+    def coefficients(self, features: Tensor) -> Tensor:
+        """Return the coefficients of the functions of the offset, (D, functions)."""
+        return torch.cat([features, torch.relu(self.branch(features))], 1)
 
     def base(self, patches: Tensor, offsets: Tensor) -> Tensor:
         """Return the interpolation, (D, Q)."""
@@ -270,6 +294,14 @@ class SuperSdfNet(nn.Module):
         """Return the values (D, Q) of the voxels (D,) at the offsets (Q, 3)."""
         table = torch.where(table < 0, len(patches), table)  # index of the row of zeros
         return self.decode(self.encode_all(patches, table).some(voxels), offsets)
+
+
+def in_float32(given: Tensor) -> torch.autocast:
+    """Return the context in which nothing is cast: stem and head are small, and see distances.
+
+    In bfloat16 a distance of a voxel is right to a 250th of a voxel only.
+    """
+    return torch.autocast(given.device.type, enabled=False)
 
 
 def interpolation_weights(offsets: Tensor) -> Tensor:

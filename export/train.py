@@ -23,16 +23,27 @@ import copy
 import time
 from collections import deque
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from multiprocessing import get_context
 from pathlib import Path
+from zlib import crc32
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from export.arguments import Parser, at_least, positive, share
-from export.augment import USUAL, Prepared, augment, augment_mask, prepare, prepare_mask
+from export.augment import (
+    USUAL,
+    Prepared,
+    Shares,
+    augment,
+    augment_mask,
+    change,
+    prepare,
+    prepare_mask,
+)
 from export.dataset import CORNERS, Sample, read_shard
 from export.dormant import dormant_share, revive
 from export.grow import grow_from
@@ -46,7 +57,9 @@ from export.recipe import (
     make_optimisers,
     rate_factor,
     relative_weights,
+    voxel_losses,
 )
+from export.resident import Batch, Residents, TurnedBatch, means, predict_turned
 from export.run_log import append_line, plot_run, read_log
 from export.sampler import Sampler
 from export.sharing import decode_shared, neighbours_with_targets
@@ -59,6 +72,7 @@ CHECKPOINT_SECONDS = 180
 LONGEST_STEP = 30.0  # seconds: the rest of a longer one is taken as a pause (SIGSTOP)
 LOG_STEPS = 100
 WATCHED = 4  # last batches: a unit that reacted to none of them is dormant
+READERS = 4  # processes that gather samples for a GPU
 HELD_OUT = 2  # shards, the first by name, whose errors are logged
 INPUTS = (DISTANCES, MASKS)
 NEAR = 0.5  # half voxels from the surface: limit for normals; half of it for values
@@ -108,9 +122,11 @@ class Store:
             self.samples += list(read_shard(path))
         self.sampler.add(len(self.samples) - len(self.sampler.losses))
 
-    def draw_batch(
-        self, rng: np.random.Generator, recipe: Recipe
-    ) -> tuple[list[int], list[Prepared]]:
+    def __len__(self) -> int:
+        """Return the number of samples to train on."""
+        return len(self.samples)
+
+    def draw_batch(self, rng: np.random.Generator, recipe: Recipe) -> tuple[list[int], Batch]:
         """Return samples with about ``batch_voxels`` voxels together, and which they are."""
         drawn: list[int] = []
         batch: list[Prepared] = []
@@ -130,6 +146,54 @@ class Store:
         return augment(rng, sample, recipe.shares)
 
 
+class ResidentStore(Store):
+    """The samples of the shards in a folder on a GPU, each changed once and for all.
+
+    Other processes read and gather them, so that the GPU never waits for new ones.
+    """
+
+    def __init__(self, folder: Path, held_out: int, shares: Shares, device: str) -> None:
+        self.shares, self.residents = shares, Residents(device)
+        self.readers = ProcessPoolExecutor(READERS, get_context("spawn"))
+        self.reading: list[Future[list[Prepared]]] = []
+        super().__init__(folder, held_out)
+        while not len(self):
+            self.take_in(self.reading.pop(0).result())
+
+    def refresh(self) -> None:
+        """Have new shards read, and take in those that were."""
+        for path in sorted(set(self.folder.glob("shard-*.npz")) - set(self.seen)):
+            self.seen.append(path)
+            self.reading.append(self.readers.submit(read_changed, path, self.shares))
+        done = [future for future in self.reading if future.done()]
+        self.reading = [future for future in self.reading if future not in done]
+        for future in done:
+            self.take_in(future.result())
+
+    def take_in(self, samples: list[Prepared]) -> None:
+        """Move samples to the device."""
+        self.residents.add(samples)
+        self.sampler.add(len(samples))
+
+    def __len__(self) -> int:
+        """Return the number of samples to train on."""
+        return len(self.residents)
+
+    def draw_batch(self, rng: np.random.Generator, recipe: Recipe) -> tuple[list[int], TurnedBatch]:
+        """Return samples with about ``batch_voxels`` voxels together, and which they are."""
+        drawn: list[int] = []
+        while sum(self.residents.band_counts[index] for index in drawn) < recipe.batch_voxels:
+            drawn.append(self.sampler.draw(rng, recipe.spread))
+        return drawn, self.residents.batch(drawn, rng.integers(48, size=len(drawn)).tolist())
+
+
+def read_changed(path: Path, shares: Shares) -> list[Prepared]:
+    """Return the samples of a shard, changed at random, always in the same way."""
+    rng = np.random.default_rng(crc32(path.name.encode()))
+    changed = [change(rng, sample, shares) for sample in read_shard(path)]
+    return [sample for sample in changed if len(sample.voxels)]
+
+
 def check_store(folder: Path, held_out: int) -> None:
     """Raise FileError if a folder has no more shards than are held out."""
     if not folder.is_dir():
@@ -140,6 +204,21 @@ def check_store(folder: Path, held_out: int) -> None:
             f"--store {folder} has {count} of at least {held_out + 1} shards, since the first "
             f"{held_out} are held out: make more with export.dataset"
         )
+
+
+def target_counts(batch: Batch) -> list[int]:
+    """Return the number of voxels with targets of each sample of a batch."""
+    if isinstance(batch, TurnedBatch):
+        return batch.counts
+    return [len(sample.voxels) for sample in batch]
+
+
+def window_losses(net: SuperSdfNet, batch: Batch, recipe: Recipe) -> Tensor:
+    """Return the loss of each sample of a batch, (B,)."""
+    if isinstance(batch, TurnedBatch):
+        of_voxels = voxel_losses(predict_turned(net, batch), batch.targets, recipe)
+        return means(of_voxels, batch)
+    return torch.stack([loss_of(*pair, recipe) for pair in predict(net, batch)])
 
 
 class Run:
@@ -160,7 +239,7 @@ class Run:
         self.optimisers = make_optimisers(self.net, recipe)
         self.peaks = [optimiser.param_groups[0]["lr"] for optimiser in self.optimisers]
         self.step, self.seconds = 0, 0.0
-        self.recent: deque[list[Prepared]] = deque(maxlen=WATCHED)
+        self.recent: deque[Batch] = deque(maxlen=WATCHED)
 
     def save(self) -> None:
         """Write the checkpoint, completely or not at all."""
@@ -191,11 +270,11 @@ class Run:
         grow_from(self.net, weights)
         self.average.load_state_dict(self.net.state_dict())
 
-    def advance(self, batch: list[Prepared], spent: float) -> tuple[float, list[float]]:
+    def advance(self, batch: Batch, spent: float) -> tuple[float, list[float]]:
         """Take one step at the rate for this share of the budget; return the loss, and each's."""
         for optimiser, peak in zip(self.optimisers, self.peaks):
             optimiser.param_groups[0]["lr"] = peak * rate_factor(spent, self.recipe)
-        weights = relative_weights([len(sample.voxels) for sample in batch], self.recipe)
+        weights = relative_weights(target_counts(batch), self.recipe)
         losses = self.find_gradients(batch, weights)
         torch.nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
         for optimiser in self.optimisers:
@@ -207,14 +286,26 @@ class Run:
             revive(self.net, self.optimisers, self.recent)
         return float(weights @ losses), losses.tolist()
 
-    def find_gradients(self, batch: list[Prepared], weights: Tensor) -> Tensor:
+    def find_gradients(self, batch: Batch, weights: Tensor) -> Tensor:
         """Set the gradients of the weighted sum of the windows' losses; return each loss, (B,).
 
-        Each thread works on some of the windows, since one product is too small to be shared.
+        On a CPU each thread works on some of the windows, since one product is too small to be
+        shared.
         """
-        weights, shares = weights.to(self.device), divide(batch, self.threads)
+        weights = weights.to(self.device)
+        if isinstance(batch, TurnedBatch):
+            losses, grads = self._gradients(batch, weights)
+            for parameter, grad in zip(self.net.parameters(), grads):
+                parameter.grad = grad
+            return losses.cpu()
+        shares = divide(batch, self.threads)
         with ThreadPoolExecutor(self.threads) as pool:
-            found = list(pool.map(lambda rows: self._gradients(batch, weights, rows), shares))
+            found = list(
+                pool.map(
+                    lambda rows: self._gradients([batch[row] for row in rows], weights[rows]),
+                    shares,
+                )
+            )
         for parameter, *parts in zip(self.net.parameters(), *(grads for _, grads in found)):
             parameter.grad = sum(parts[1:], parts[0])
         losses = torch.empty(len(batch))
@@ -222,14 +313,11 @@ class Run:
             losses[rows] = some.cpu()
         return losses
 
-    def _gradients(
-        self, batch: list[Prepared], weights: Tensor, rows: list[int]
-    ) -> tuple[Tensor, Sequence[Tensor]]:
+    def _gradients(self, batch: Batch, weights: Tensor) -> tuple[Tensor, Sequence[Tensor]]:
         """Return the loss of each of some windows, and the gradients of their weighted sum."""
         with autocast(self.device):
-            pairs = predict(self.net, [batch[row] for row in rows])
-            losses = torch.stack([loss_of(*pair, self.recipe) for pair in pairs])
-        total = (weights[rows] * losses).sum()
+            losses = window_losses(self.net, batch, self.recipe)
+        total = (weights * losses).sum()
         parameters = list(self.net.parameters())
         return losses.detach(), torch.autograd.grad(total, parameters, materialize_grads=True)
 
@@ -246,9 +334,9 @@ class Run:
     def update_average(self) -> None:
         """Move the averaged weights towards the current ones."""
         decay = min(self.recipe.average_decay, self.step / (self.step + 9))
+        means, now = list(self.average.parameters()), list(self.net.parameters())
         with torch.no_grad():
-            for mean, now in zip(self.average.parameters(), self.net.parameters()):
-                mean.lerp_(now, 1 - decay)
+            torch._foreach_lerp_(means, now, 1 - decay)
 
 
 def divide(batch: Sequence[Prepared], parts: int) -> list[list[int]]:
@@ -321,7 +409,7 @@ def take_step(run: Run, store: Store, rng: np.random.Generator, spent: float) ->
 
 def log(run: Run, store: Store, loss: float, *, measured: bool) -> None:
     """Append a line to the log, with the errors on held-out windows if they are to be measured."""
-    line = [run.step, round(run.seconds), len(store.samples), f"{loss:.5f}"]
+    line = [run.step, round(run.seconds), len(store), f"{loss:.5f}"]
     path = run.path.with_name("log.csv")
     if measured:
         errors = measure(run.average, store.held_out)
@@ -370,6 +458,12 @@ def main() -> None:
         "--inputs", choices=INPUTS, default=INPUTS[0], help="what the network is trained on"
     )
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
+    parser.add_argument(
+        "--revive-steps",
+        type=at_least(0),
+        default=RECIPE.revive_steps,
+        help="steps between restarts of dormant units; 0 for none",
+    )
     parser.add_argument("--seed", type=at_least(0), default=0)
     options = parser.parse_args()
     with parser.one_line_errors():
@@ -386,7 +480,11 @@ def run_training(options: argparse.Namespace) -> None:
     shares = replace(
         USUAL, shifted=options.shifted, noisy=options.noisy, truncated=options.truncated
     )
-    recipe = replace(RECIPE.at(options.rate, shares), batch_voxels=options.batch)
+    recipe = replace(
+        RECIPE.at(options.rate, shares),
+        batch_voxels=options.batch,
+        revive_steps=options.revive_steps,
+    )
     config = SIZES[options.size]
     config = replace(
         config,
@@ -397,7 +495,10 @@ def run_training(options: argparse.Namespace) -> None:
     if options.start:
         run.start_from(read_weights(options.start))
     run.resume()
-    store = Store(options.store, HELD_OUT, inputs=options.inputs)
+    if options.device == "cuda" and options.inputs == DISTANCES:
+        store: Store = ResidentStore(options.store, HELD_OUT, recipe.shares, options.device)
+    else:
+        store = Store(options.store, HELD_OUT, inputs=options.inputs)
     train(run, store, options.minutes, options.seed)
 
 

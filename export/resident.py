@@ -1,0 +1,190 @@
+"""Samples kept in the memory of a GPU, which turns them and makes batches of them itself.
+
+On a CPU a step of training takes longer than to change, turn and gather its samples. On a GPU it
+is the other way round. So every sample is gathered once, by a process of its own, as it is and in
+some cases also changed (``augment``), and stays on the device. A batch is drawn from what is there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from export.augment import Prepared
+from export.dataset import ANYWHERE, CORNERS, FINE_NODES
+from export.network import SuperSdfNet
+from export.sharing import copies_of_queries, neighbours_with_targets
+from super_sdf.network.symmetry import cube_symmetries, turned_places
+
+# A corner and its three neighbours have at most 8 + 3 * 4 copies (``dataset.draw_offsets``).
+MOST_COPIES = 20 * CORNERS + 8 * FINE_NODES + ANYWHERE
+
+
+@dataclass(frozen=True, eq=False)
+class TurnedBatch:
+    """Samples side by side on a device, each turned by a symmetry of the cube.
+
+    A query on a face, edge or corner has copies in the voxels that share it (``sharing``); each
+    sample has M of them, of which the last ones may belong to no query.
+    """
+
+    patches: Tensor  # (V, 27) float32
+    table: Tensor  # (V, 27) rows of the band, V where absent
+    voxels: Tensor  # (D,) rows of the band that have targets
+    near: Tensor  # (D, 27) which of the D voxels are around each, D where none
+    window: Tensor  # (D,) sample that each belongs to
+    counts: list[int]  # voxels with targets of each sample, (B,)
+    query: Tensor  # (B, M) query of a copy, Q for none
+    place: Tensor  # (B, M) of the 27
+    moved: Tensor  # (B, M, 3) float32, its offset there
+    targets: Tensor  # (D, Q) float32
+
+
+Batch = list[Prepared] | TurnedBatch
+
+
+class Rows:
+    """An array on a device that rows are appended to."""
+
+    def __init__(self, device: str) -> None:
+        self.device, self.count = device, 0
+        self.held: Tensor | None = None
+
+    def append(self, rows: np.ndarray) -> None:
+        """Append rows (n, ...)."""
+        new = torch.from_numpy(np.ascontiguousarray(rows)).to(self.device)
+        if self.held is None:
+            self.held = new
+        end = self.count + len(new)
+        if end > len(self.held):
+            room = self.held.new_empty(3 * end // 2 - self.count, *self.held.shape[1:])
+            self.held = torch.cat([self.held[: self.count], room])
+        self.held[self.count : end] = new
+        self.count = end
+
+    def __getitem__(self, rows: Tensor) -> Tensor:
+        """Return some rows."""
+        assert self.held is not None
+        return self.held[rows]
+
+
+class Residents:
+    """The samples on a device."""
+
+    def __init__(self, device: str) -> None:
+        self.device = device
+        names = ["patches", "table", "voxels", "near", "targets", "query", "place", "moved"]
+        self.arrays = {name: Rows(device) for name in names}
+        self.band_counts = np.zeros(0, np.int64)  # voxels of the band of each sample
+        self.counts = np.zeros(0, np.int64)  # of them, those with targets
+        self.symmetries = torch.from_numpy(cube_symmetries()).float().to(device)
+        places = np.stack([turned_places(symmetry) for symmetry in cube_symmetries()])
+        self.places = torch.from_numpy(places).long().to(device)
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return len(self.counts)
+
+    def add(self, samples: Sequence[Prepared]) -> None:
+        """Take in samples, each with at least one voxel that has targets.
+
+        Raises
+        ------
+        ValueError
+            If queries have more copies than there is room for.
+        """
+        gathered = [arrays_of(sample) for sample in samples]
+        for name, rows in self.arrays.items():
+            rows.append(np.concatenate([arrays[name] for arrays in gathered]))
+        bands, counts = zip(*((len(sample.patches), len(sample.voxels)) for sample in samples))
+        self.band_counts = np.append(self.band_counts, bands)
+        self.counts = np.append(self.counts, counts)
+
+    def batch(self, drawn: Sequence[int], turns: Sequence[int]) -> TurnedBatch:
+        """Return some samples, each turned by one of the 48 symmetries."""
+        chosen = np.asarray(drawn)
+        band = rows_of(self.band_counts, chosen, self.device)
+        some = rows_of(self.counts, chosen, self.device)
+        which = torch.from_numpy(chosen).to(self.device)
+        turn = torch.as_tensor(np.asarray(turns), device=self.device)
+        places = self.places[turn[band.part]]
+        return TurnedBatch(
+            patches=self.arrays["patches"][band.rows].gather(1, places),
+            table=moved_to(self.arrays["table"][band.rows], band).gather(1, places),
+            voxels=self.arrays["voxels"][some.rows].long() + band.firsts[some.part],
+            near=moved_to(self.arrays["near"][some.rows], some),
+            window=some.part,
+            counts=self.counts[chosen].tolist(),
+            query=self.arrays["query"][which].long(),
+            place=self.arrays["place"][which].long(),
+            moved=self.arrays["moved"][which] @ self.symmetries[turn].mT,
+            targets=self.arrays["targets"][some.rows].float(),
+        )
+
+
+def arrays_of(sample: Prepared) -> dict[str, np.ndarray]:
+    """Return what is kept of a sample, indices within it, -1 for none."""
+    query, place, moved = copies_of_queries(sample.offsets)
+    near = neighbours_with_targets(sample)
+    room = MOST_COPIES - len(query)
+    if room < 0:
+        raise ValueError(
+            f"{len(sample.offsets)} queries have {len(query)} copies, more than {MOST_COPIES}: "
+            "draw them with dataset.draw_offsets"
+        )
+    return {
+        "patches": sample.patches,
+        "table": sample.table,
+        "voxels": sample.voxels.astype(np.int32),
+        "near": np.where(near < len(near), near, -1).astype(np.int32),
+        "targets": sample.targets.astype(np.float16),
+        "query": np.pad(query, (0, room), constant_values=len(sample.offsets))[None],
+        "place": np.pad(place, (0, room))[None],
+        "moved": np.pad(moved, ((0, room), (0, 0))).astype(np.float32)[None],
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """Rows of several samples side by side."""
+
+    rows: Tensor  # (n,) in the whole array
+    part: Tensor  # (n,) which of the samples each is of
+    firsts: Tensor  # (B,) where each sample begins among the n
+
+
+def rows_of(counts: np.ndarray, chosen: np.ndarray, device: str) -> Parts:
+    """Return the rows of chosen samples (B,) if all samples have these counts of them, (N,)."""
+    lengths, begins = counts[chosen], (np.cumsum(counts) - counts)[chosen]
+    firsts, total = np.cumsum(lengths) - lengths, int(lengths.sum())
+    length, first, shift = torch.from_numpy(np.stack([lengths, firsts, begins - firsts])).to(device)
+    part = torch.repeat_interleave(length, output_size=total)
+    return Parts(shift[part] + torch.arange(total, device=device), part, first)
+
+
+def moved_to(indices: Tensor, parts: Parts) -> Tensor:
+    """Return indices within samples as indices among all rows, their number for -1."""
+    return torch.where(indices < 0, len(indices), indices + parts.firsts[parts.part][:, None])
+
+
+def predict_turned(net: SuperSdfNet, batch: TurnedBatch) -> Tensor:
+    """Return the values (D, Q) of a batch; those of shared nodes are averaged (``sharing``)."""
+    voxels = net.encode_batch(batch).some(batch.voxels)
+    values = net.decode_parts(voxels, batch.counts, batch.moved)
+    rows = batch.near.gather(1, batch.place[batch.window])
+    query, there = batch.query[batch.window], (rows < len(values)).to(values.dtype)
+    seen = torch.cat([values, values.new_zeros(1, values.shape[1])]).gather(0, rows)
+    none = values.new_zeros(len(values), batch.targets.shape[1] + 1)
+    total = none.scatter_add(1, query, seen) / none.scatter_add(1, query, there).clamp(min=1)
+    return total[:, :-1]
+
+
+def means(values: Tensor, batch: TurnedBatch) -> Tensor:
+    """Return the mean of values (D,) of each sample of a batch, (B,)."""
+    counts = torch.tensor(batch.counts, device=values.device)
+    sums = values.new_zeros(len(batch.counts)).index_add(0, batch.window, values)
+    return sums / counts
