@@ -20,7 +20,7 @@ from .running import run_bound, run_on_cpu
 
 CPU = "CPUExecutionProvider"
 CUDA_OPTIONS = {
-    "device_id": "0",
+    # No device_id: 0 is the default, and onnxruntime 1.26 and later print a warning if it is given.
     # Take only the memory that a run needs; with SHRINK the next run finds it unfragmented.
     "arena_extend_strategy": "kSameAsRequested",
     "cudnn_conv_algo_search": "HEURISTIC",  # no timed trials, for networks with convolutions
