@@ -6,7 +6,8 @@ r"""Export a trained network as the ONNX file that the runtime loads, and check 
         --out src/super_sdf/models/base.onnx
 
 The second command rewrites a file with the same weights and metadata in the current graph, and
-keeps the result only if its values are the same, bit for bit.
+keeps the result only if its values are the same but for rounding: the graph holds the trunk's value
+at the sample, whose last bit depends on the processor that computes it.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from super_sdf.steps.nodes import block_offsets
 
 OPSET = 18
 PARITY = 2e-4  # half voxels: 1e-4 of a voxel
+ROUNDING = 2e-6  # half voxels, of values of some half voxels in float32
 DISTANCES = "distances"  # of which some were noisy: what a card without an entry says
 DORMANT = 0.01  # largest accepted share of dormant units
 
@@ -103,19 +105,22 @@ def rewrite(source: Path, target: Path) -> None:
     Raises
     ------
     SystemExit
-        If the values are not the same, bit for bit.
+        If the values differ by more than rounding.
     """
     card = {prop.key: prop.value for prop in onnx.load(source).metadata_props}
     net = read_network(source)
     want = load_network(source, device="cpu")(*noisy_ball())
     fresh = target.with_suffix(".new.onnx")  # the target may be the source
     write_model(net, fresh, card)
-    same = np.array_equal(load_network(fresh, device="cpu")(*noisy_ball()), want)
-    if not same:
+    apart = float(np.abs(load_network(fresh, device="cpu")(*noisy_ball()) - want).max())
+    if not apart <= ROUNDING:
         fresh.unlink()
-        raise SystemExit(f"{source}: the new graph gives other values; {target} was not written")
+        raise SystemExit(
+            f"{source}: the new graph gives values up to {apart / 2:.1e} voxels away; "
+            f"{target} was not written"
+        )
     fresh.replace(target)
-    print(f"{target}: the same values as {source} had, bit for bit")
+    print(f"{target}: the same values as {source} had, to {apart / 2:.1e} voxels")
 
 
 def read_network(path: Path) -> SuperSdfNet:
