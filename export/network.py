@@ -127,6 +127,10 @@ def pad(features: Tensor) -> Tensor:
 
 def columns_of(padded: Tensor, table: Tensor) -> Tensor:
     """Return the rows that a table (V, 27) names side by side, (V, 27 C)."""
+    if padded.is_cuda:
+        from export.gpu_gather import gather_rows  # only CUDA builds of PyTorch have Triton
+
+        return gather_rows(padded, table.reshape(-1)).view(len(table), -1)
     return padded.index_select(0, table.reshape(-1)).view(len(table), -1)
 
 

@@ -72,6 +72,35 @@ class Rows:
         return self.held[rows]
 
 
+@dataclass(frozen=True, eq=False)
+class Gathered:
+    """Samples one after the other, as they are kept."""
+
+    arrays: dict[str, np.ndarray]
+    band_counts: np.ndarray  # voxels of the band of each sample, (N,)
+    counts: np.ndarray  # of them, those with targets, (N,)
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return len(self.counts)
+
+
+def gather_samples(samples: Sequence[Prepared]) -> Gathered:
+    """Gather samples, each with at least one voxel that has targets.
+
+    Raises
+    ------
+    ValueError
+        If queries have more copies than there is room for.
+    """
+    each = [arrays_of(sample) for sample in samples]
+    return Gathered(
+        {name: np.concatenate([arrays[name] for arrays in each]) for name in each[0]},
+        np.array([len(sample.patches) for sample in samples], np.int64),
+        np.array([len(sample.voxels) for sample in samples], np.int64),
+    )
+
+
 class Residents:
     """The samples on a device."""
 
@@ -89,20 +118,12 @@ class Residents:
         """Return the number of samples."""
         return len(self.counts)
 
-    def add(self, samples: Sequence[Prepared]) -> None:
-        """Take in samples, each with at least one voxel that has targets.
-
-        Raises
-        ------
-        ValueError
-            If queries have more copies than there is room for.
-        """
-        gathered = [arrays_of(sample) for sample in samples]
+    def add(self, gathered: Gathered) -> None:
+        """Take in samples."""
         for name, rows in self.arrays.items():
-            rows.append(np.concatenate([arrays[name] for arrays in gathered]))
-        bands, counts = zip(*((len(sample.patches), len(sample.voxels)) for sample in samples))
-        self.band_counts = np.append(self.band_counts, bands)
-        self.counts = np.append(self.counts, counts)
+            rows.append(gathered.arrays[name])
+        self.band_counts = np.append(self.band_counts, gathered.band_counts)
+        self.counts = np.append(self.counts, gathered.counts)
 
     def batch(self, drawn: Sequence[int], turns: Sequence[int]) -> TurnedBatch:
         """Return some samples, each turned by one of the 48 symmetries."""

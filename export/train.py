@@ -59,7 +59,15 @@ from export.recipe import (
     relative_weights,
     voxel_losses,
 )
-from export.resident import Batch, Residents, TurnedBatch, means, predict_turned
+from export.resident import (
+    Batch,
+    Gathered,
+    Residents,
+    TurnedBatch,
+    gather_samples,
+    means,
+    predict_turned,
+)
 from export.run_log import append_line, plot_run, read_log
 from export.sampler import Sampler
 from export.sharing import decode_shared, neighbours_with_targets
@@ -155,7 +163,7 @@ class ResidentStore(Store):
     def __init__(self, folder: Path, held_out: int, shares: Shares, device: str) -> None:
         self.shares, self.residents = shares, Residents(device)
         self.readers = ProcessPoolExecutor(READERS, get_context("spawn"))
-        self.reading: list[Future[list[Prepared]]] = []
+        self.reading: list[Future[Gathered]] = []
         super().__init__(folder, held_out)
         while not len(self):
             self.take_in(self.reading.pop(0).result())
@@ -170,10 +178,10 @@ class ResidentStore(Store):
         for future in done:
             self.take_in(future.result())
 
-    def take_in(self, samples: list[Prepared]) -> None:
+    def take_in(self, gathered: Gathered) -> None:
         """Move samples to the device."""
-        self.residents.add(samples)
-        self.sampler.add(len(samples))
+        self.residents.add(gathered)
+        self.sampler.add(len(gathered))
 
     def __len__(self) -> int:
         """Return the number of samples to train on."""
@@ -187,11 +195,11 @@ class ResidentStore(Store):
         return drawn, self.residents.batch(drawn, rng.integers(48, size=len(drawn)).tolist())
 
 
-def read_changed(path: Path, shares: Shares) -> list[Prepared]:
+def read_changed(path: Path, shares: Shares) -> Gathered:
     """Return the samples of a shard, changed at random, always in the same way."""
     rng = np.random.default_rng(crc32(path.name.encode()))
     changed = [change(rng, sample, shares) for sample in read_shard(path)]
-    return [sample for sample in changed if len(sample.voxels)]
+    return gather_samples([sample for sample in changed if len(sample.voxels)])
 
 
 def check_store(folder: Path, held_out: int) -> None:
@@ -495,6 +503,10 @@ def run_training(options: argparse.Namespace) -> None:
     if options.start:
         run.start_from(read_weights(options.start))
     run.resume()
+    if options.device == "cuda":
+        import export.gpu_gather  # only CUDA builds of PyTorch have Triton
+
+        export.gpu_gather.check()
     if options.device == "cuda" and options.inputs == DISTANCES:
         store: Store = ResidentStore(options.store, HELD_OUT, recipe.shares, options.device)
     else:

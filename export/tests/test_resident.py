@@ -10,7 +10,14 @@ import export.train
 from export.augment import CLEAN, prepare, turn
 from export.dataset import write_shard
 from export.recipe import RECIPE
-from export.resident import MOST_COPIES, Residents, Rows, means, predict_turned
+from export.resident import (
+    MOST_COPIES,
+    Residents,
+    Rows,
+    gather_samples,
+    means,
+    predict_turned,
+)
 from export.sharing import copies_of_queries
 from export.tests.small_net import SMALL, small_net
 from export.tests.test_sharing import ball_sample
@@ -34,8 +41,8 @@ def prepared(samples):
 @pytest.fixture
 def residents(prepared):
     made = Residents("cpu")
-    made.add(prepared[:1])
-    made.add(prepared[1:])
+    made.add(gather_samples(prepared[:1]))
+    made.add(gather_samples(prepared[1:]))
     return made
 
 
@@ -77,7 +84,7 @@ def test_the_copies_of_all_queries_of_a_sample_have_room(samples):
 
 def test_a_sample_with_more_copies_is_refused():
     with pytest.raises(ValueError, match=r"125 queries have \d+ copies, more than 136"):
-        Residents("cpu").add([prepare(ball_sample())])
+        gather_samples([prepare(ball_sample())])
 
 
 def test_appended_rows_stay_in_their_order():
@@ -122,7 +129,7 @@ def test_new_shards_are_taken_in_once_they_are_read(folder, samples):
 def test_a_shard_is_changed_in_the_same_way_every_time(folder):
     path = folder / "shard-0-0000.npz"
     shares = replace(export.train.USUAL, noisy=1.0)
-    one, other = read_changed(path, shares), read_changed(path, shares)
-    for mine, theirs in zip(one, other):
-        np.testing.assert_array_equal(mine.patches, theirs.patches)
-    assert not np.array_equal(one[0].patches, read_changed(path, CLEAN)[0].patches)
+    one, other = read_changed(path, shares).arrays, read_changed(path, shares).arrays
+    for name in one:
+        np.testing.assert_array_equal(one[name], other[name])
+    assert not np.array_equal(one["patches"], read_changed(path, CLEAN).arrays["patches"])
