@@ -1,8 +1,9 @@
 """Replace the blocks of an exported graph by blocks in integer arithmetic.
 
 Only standard operators are used, in the sequence that onnxruntime fuses: dequantize, multiply,
-rectify, quantize. The gathered features are bytes, a quarter of the memory. Integer sums are exact
-in any order, so the values of a voxel depend only on its neighbours.
+quantize, which rectifies, too. With a Relu between, onnxruntime 1.21 to 1.30 fuse it with the
+product first, and then refuse their own graph. The gathered features are bytes, a quarter of the
+memory. Integer sums are exact in any order, so the values of a voxel depend only on its neighbours.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class IntWriter(Writer):
     """A part of the graph, with integer layers."""
 
     def quantize(self, value: str) -> str:
-        """Round to 0..255, saturating."""
+        """Round to 0..255, saturating: negative values become 0."""
         return self.op("QuantizeLinear", value, ONE, NONE)
 
     def layer(self, value: str, layer: IntLayer, label: str) -> str:
@@ -106,7 +107,7 @@ def replace_layers(body: onnx.GraphProto, block: IntBlock) -> None:
     writer = IntWriter(f"{body.name}_int8_")
     value = reshape.output[0]
     for label, layer in (("conv", block.conv), ("expand", block.expand)):
-        value = writer.quantize(writer.op("Relu", writer.layer(value, layer, label)))
+        value = writer.quantize(writer.layer(value, layer, label))
     writer.layer(value, block.reduce, "reduce")
     writer.nodes[-1].output[0] = layers[-1].output[0]
     nodes = [table, gather, reshape, *writer.nodes, kept, added]
