@@ -22,8 +22,12 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
+
+from super_sdf.machine.threads import count_cores
 
 ROOT = Path(__file__).parents[1]
 PYTHONS = ["3.10", "3.11", "3.12", "3.13", "3.14"]
@@ -39,7 +43,7 @@ print("Python", platform.python_version(), *(f"{name} {version(name)}" for name 
 """
 
 
-class Unavailable(Exception):
+class UnavailableError(Exception):
     """There is no such interpreter or release."""
 
 
@@ -48,7 +52,7 @@ class Trial:
     """What every environment is made from, and what runs in it."""
 
     wheel: Path
-    extras: str
+    extras: list[str]
     tests: list[str]
 
     def run(self, python: str, releases: str, folder: Path) -> str:
@@ -56,17 +60,19 @@ class Trial:
 
         Raises
         ------
-        Unavailable
+        UnavailableError
             If there is no such environment.
         RuntimeError
             If anything fails in it, with its last lines.
         """
         own = folder / "venv" / "bin" / "python"
-        what = f"{self.wheel}[{self.extras}]" if self.extras else str(self.wheel)
         uv("venv", "--python", find_python(python), str(folder / "venv"))
-        uv("pip", "install", "--python", str(own), "--only-binary", ":all:", *chosen(releases),
-           what, *FOR_TESTS)  # fmt: skip
-        print(run([own, "-c", SAYS], folder).strip(), file=sys.stderr)
+        # the dependencies by name, too: "oldest" is for what is asked for by name
+        asked = ["-r", "pyproject.toml", *(f"--extra={extra}" for extra in self.extras)]
+        asked += [str(self.wheel), *(FOR_TESTS if self.tests else ())]
+        install = ["pip", "install", "--python", str(own), "--only-binary", ":all:"]
+        uv(*install, *chosen(releases), *asked)
+        print(run([own, "-c", SAYS], folder).strip(), file=sys.stderr, flush=True)
         mesh, command = folder / "part.ply", [own, "-m", "super_sdf"]
         run([*command, "upsample", ROOT / "examples" / "part.npz", mesh, "--factor", "4"], folder)
         run([*command, "info", "--check"], folder)
@@ -86,7 +92,7 @@ def run(command: list[str | Path], folder: Path) -> str:
 
 
 def uv(*words: str) -> None:
-    """Run ``uv``, which fetches no interpreter; Unavailable if it finds no release."""
+    """Run ``uv``, which fetches no interpreter; UnavailableError if it finds no release."""
     beside = Path(sys.executable).with_name("uv")
     program = beside if beside.exists() else shutil.which("uv")
     if not program:
@@ -95,7 +101,7 @@ def uv(*words: str) -> None:
         run([program, *words, "--quiet", "--no-python-downloads"], ROOT)
     except RuntimeError as error:
         if any(reason in str(error) for reason in UNAVAILABLE):
-            raise Unavailable(str(error)) from error
+            raise UnavailableError(str(error)) from error
         raise
 
 
@@ -125,38 +131,50 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--pythons", nargs="+", default=PYTHONS)
     parser.add_argument("--releases", nargs="+", default=RELEASES)
     parser.add_argument("--only", nargs="+", help="these cells, PYTHON:RELEASES, instead of all")
-    parser.add_argument("--extras", default="", help="extras to install, such as formats,3mf")
+    parser.add_argument("--extras", nargs="+", default=[], help="to install, such as formats")
     parser.add_argument("--tests", nargs="+", default=TESTS, help="test files to run")
+    parser.add_argument("--jobs", type=int, default=count_cores(), help="environments at a time")
     parser.add_argument("--no-tests", action="store_const", const=[], dest="tests")
     return parser.parse_args()
 
 
-def main() -> None:
-    """Print the table; exit code 1 if anything failed."""
-    options, cells, failures = parse(), {}, []
-    pairs = [(python, what) for python in options.pythons for what in options.releases]
-    if options.only:
-        pairs = [tuple(pair.split(":")) for pair in options.only]
-    with tempfile.TemporaryDirectory() as name:
-        uv("build", "--wheel", "--out-dir", name, str(ROOT))
-        trial = Trial(next(Path(name).glob("*.whl")), options.extras, options.tests)
-        for python, what in pairs:
-            try:
-                with tempfile.TemporaryDirectory(dir=name) as folder:
-                    cells[python, what] = trial.run(python, what, Path(folder))[:8]
-            except Unavailable:
-                cells[python, what] = "-"
-            except RuntimeError as error:
-                cells[python, what] = "fails"
-                failures.append(f"Python {python}, {what}: {error}")
-    columns = list(dict.fromkeys(what for _, what in pairs))
+def attempt(trial: Trial, cell: tuple[str, str]) -> tuple[str, str]:
+    """Return what stands in a cell of the table, and what failed."""
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            found, failure = trial.run(*cell, Path(folder))[:8], ""
+    except UnavailableError:
+        found, failure = "-", ""
+    except RuntimeError as error:
+        found, failure = "fails", f"Python {cell[0]}, {cell[1]}: {error}"
+    print(f"{':'.join(cell)} {found}", file=sys.stderr, flush=True)
+    return found, failure
+
+
+def write_table(cells: dict[tuple[str, str], str]) -> None:
+    """Print a row a Python, a column a choice of releases."""
+    columns = list(dict.fromkeys(what for _, what in cells))
     print(f"| Python | {' | '.join(columns)} |\n| ---{' | ---' * len(columns)} |")
-    for python in dict.fromkeys(python for python, _ in pairs):
+    for python in dict.fromkeys(python for python, _ in cells):
         row = [cells.get((python, what), "") for what in columns]
         print(f"| {python} | {' | '.join(row)} |")
-    ran = [cell for cell in cells.values() if cell not in ("-", "fails")]
-    print(f"{len(ran)} passed, {len(failures)} failed; {len(set(ran))} different meshes")
-    raise SystemExit("\n".join(failures) if failures or not ran else 0)
+
+
+def main() -> None:
+    """Print the table; exit code 1 if anything failed, or if nothing could be tried."""
+    options = parse()
+    pairs = list(product(options.pythons, options.releases))
+    if options.only:
+        pairs = [tuple(pair.split(":")) for pair in options.only]
+    with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(options.jobs) as pool:
+        uv("build", "--wheel", "--out-dir", name, str(ROOT))
+        trial = Trial(next(Path(name).glob("*.whl")), options.extras, options.tests)
+        found = list(pool.map(lambda pair: attempt(trial, pair), pairs))
+    write_table({pair: cell for pair, (cell, _) in zip(pairs, found)})
+    failures = [failure for _, failure in found if failure]
+    passed = [cell for cell, _ in found if cell not in ("-", "fails")]
+    print(f"{len(passed)} passed, {len(failures)} failed; different meshes: {len(set(passed))}")
+    raise SystemExit("\n".join(failures) or int(not passed))
 
 
 if __name__ == "__main__":

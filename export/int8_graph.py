@@ -1,9 +1,9 @@
 """Replace the blocks of an exported graph by blocks in integer arithmetic.
 
 Only standard operators are used, in the sequence that onnxruntime fuses: dequantize, multiply,
-quantize, which rectifies, too. With a Relu between, onnxruntime 1.21 to 1.30 fuse it with the
-product first, and then refuse their own graph. The gathered features are bytes, a quarter of the
-memory. Integer sums are exact in any order, so the values of a voxel depend only on its neighbours.
+quantize, which rectifies, too. With a Relu between, onnxruntime 1.21 to 1.30 make two nodes of one
+name in a Scan and refuse them. The gathered features are bytes, a quarter of the memory. Integer
+sums are exact in any order, so the values of a voxel depend only on its neighbours.
 """
 
 from __future__ import annotations

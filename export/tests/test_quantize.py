@@ -100,7 +100,7 @@ def test_onnxruntime_runs_each_layer_in_whole_numbers(files, tmp_path):
 
 
 def test_nothing_stands_between_a_product_and_its_rounding(files):
-    """onnxruntime 1.21 to 1.30 refuse what they make of a rectifier there; rounding rectifies."""
+    """Rounding rectifies; with a Relu there, onnxruntime 1.21 to 1.30 refuse their own graph."""
     for path in (files[1], *(path for name, path in shipped_models().items() if "-int8" in name)):
         nodes = onnx.load(path).graph.node
         for body in (a.g for node in nodes for a in node.attribute if a.name == "body"):
