@@ -1,5 +1,8 @@
 """Faults and self-intersections of the meshes of random fields, with every mesher.
 
+Each field is meshed at once, in 2 to 6 slabs and in as many bricks: all must be the same mesh, and
+the running count of open edges must be that of the whole mesh.
+
     python -m benchmarks.random_fields --count 10000
     python -m benchmarks.random_fields --count 1000 --first 4000    # those from number 4000 on
 
@@ -47,7 +50,13 @@ def print_table(kinds: list[str], fields: Counter[str], pairs: Counter[tuple[str
 def main() -> None:
     """Mesh the fields, print their faults and a table of self-intersections."""
     sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-    from corpus.random_fields import KINDS, faults_of_mesh, make_fields, mesh_of_field
+    from corpus.random_fields import (
+        KINDS,
+        faults_of_mesh,
+        faults_of_pieces,
+        make_fields,
+        mesh_of_field,
+    )
 
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--count", type=int, default=1000)
@@ -66,6 +75,7 @@ def main() -> None:
             found = self_intersections(mesh)
             surface = examine_surface(mesh, found)
             faults = faults_of_mesh(field, mesh)
+            faults += faults_of_pieces(field, network, mesher, 2 + fields.total() % 5, mesh)
             if not surface.manifold or surface.edges.flipped_edges:
                 faults.append(f"{field.name}: {surface.faults()}")
             far = distance_from(meshes[MARCHING], mesh) * field.factor

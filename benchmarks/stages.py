@@ -28,6 +28,7 @@ from super_sdf.files import spool
 from super_sdf.machine.memory import forget_peak, held_memory
 from super_sdf.network.network import Network
 from super_sdf.steps.survey import Band
+from super_sdf.topology import OpenEdges
 
 # The function of each stage, in the module where it is looked up.
 STAGES = {
@@ -44,9 +45,10 @@ STAGES = {
     ],
     "bounds": [(pipeline, "keep_within_bounds")],
     "isosurface": [(pipeline, "extract_pieces")],
+    "edges": [(OpenEdges, "add")],
     "write": [(spool, "write_in_chunks")],
 }
-AFTER = ("number", "average", "fit", "bounds", "isosurface", "write")
+AFTER = ("number", "average", "fit", "bounds", "isosurface", "edges", "write")
 
 
 class Probe:

@@ -16,12 +16,13 @@ from test_slabs import bad_samples, rod
 from super_sdf import load_network
 from super_sdf.bricks import engine, passes, stored
 from super_sdf.bricks.engine import BricksEngine
-from super_sdf.bricks.meshing import Loading
+from super_sdf.bricks.meshing import Loading, prepare_meshing
 from super_sdf.bricks.passes import Brick, Queue, ordered
 from super_sdf.bricks.stored import Source, StoredPlanes
+from super_sdf.cluster.checking import Needs, check_workers
 from super_sdf.cluster.connecting import connect
 from super_sdf.convert import ConvertOptions, convert
-from super_sdf.errors import ClusterError, GridError, OptionError
+from super_sdf.errors import ClusterError, GridError, MeshError, OptionError
 from super_sdf.grid.planes import DerivedPlanes
 
 LOADING = Loading("fast", "auto", "cpu")
@@ -126,11 +127,64 @@ def test_a_killed_worker_costs_its_bricks(cluster, network, monkeypatch):
     assert Path("there.ply").read_bytes() == Path("here.ply").read_bytes()
 
 
+class Off:
+    """A network as a processor that rounds differently might compute it, only more so."""
+
+    def __init__(self, network):
+        self.network, self.receptive_field = network, network.receptive_field
+
+    def __call__(self, *given):
+        return self.network(*given) + np.float32(0.05)
+
+
+class OtherProcessor(Loading):
+    """Loads such a network."""
+
+    def load(self, threads):
+        return Off(super().load(threads))
+
+
+def prepare_as_one_of_two(pid, source, loading, limits):
+    """Prepare a worker; that with this number stands for another processor."""
+    chosen = OtherProcessor(*loading) if os.getpid() == pid else loading
+    return prepare_meshing(source, chosen, limits)
+
+
+def test_bricks_of_workers_that_compute_other_values_are_an_error(cluster, network, monkeypatch):
+    pid = check_workers(cluster, Needs(*LOADING)).members[0].report.pid
+    monkeypatch.setattr(engine, "prepare_meshing", partial(prepare_as_one_of_two, pid))
+    said = refusal(cluster, network, rod(), factor=2)
+    found = re.fullmatch(
+        r"the mesh is torn, with [\d,]+ open edges at plane (\d+), between planes \d+ to (\d+) "
+        r"\(\S+:(\d+)\) and planes (\d+) to \d+ \(\S+:(\d+)\): use workers with the same "
+        "processor, NumPy and onnxruntime",
+        said,
+    )
+    plane, last, one, first, other = map(int, found.groups())
+    assert plane == last + 1 == first and pid in (one, other) and one != other
+
+
+def test_a_brick_that_was_tampered_with_is_an_error(cluster, network, monkeypatch):
+    add, bricks = engine.Joining.add, []
+
+    def spoil(self, made):
+        bricks.append(made)
+        if len(bricks) == 3:
+            faces = made.pieces[0].meshes[0].faces
+            faces[np.flatnonzero((faces < 0).sum(1) == 2)[0]] = 0  # no triangle any more
+        return add(self, made)
+
+    monkeypatch.setattr(engine.Joining, "add", spoil)
+    said = refusal(cluster, network, rod(), factor=2)
+    plane = bricks[2].pieces[0].planes[0]
+    assert said.startswith(f"the mesh is torn, with 1 open edge at plane {plane}, between planes ")
+
+
 def refusal(cluster, network, values, **options):
     """Return the error for a grid that cannot be converted on a cluster."""
     store(values, None)
     chosen = ConvertOptions(**{"spacing": (1.0,), **options})
-    with pytest.raises((OptionError, GridError, ClusterError)) as caught:
+    with pytest.raises((OptionError, GridError, ClusterError, MeshError)) as caught:
         convert("a.npy", "o.ply", network, chosen, engine=BricksEngine(cluster, LOADING))
     assert not Path("o.ply").exists()
     return str(caught.value)

@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,29 @@ def ball_mesh() -> Mesh:
 
 def moved(mesh: Mesh, x: float) -> Mesh:
     return Mesh(mesh.vertices + np.array([x, 0, 0]), mesh.faces)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_open_edges_are_those_that_no_triangle_passes_the_other_way(seed):
+    """Of triangles between a few vertices, in any pieces, and of a solid with holes."""
+    random = np.random.default_rng(seed)
+    solid = torus().faces
+    for faces in random.integers(0, 9, (60, 3)), solid, solid[random.random(len(solid)) < 0.99]:
+        passed = Counter()
+        for start, end in zip(faces.ravel().tolist(), np.roll(faces, -1, 1).ravel().tolist()):
+            passed[start, end] += 1
+        want = {
+            edge: n
+            for edge, n in (passed - Counter({e[::-1]: n for e, n in passed.items()})).items()
+        }
+        edges = topology.OpenEdges()
+        for piece in np.array_split(faces.astype(np.int32) + 2**30, random.integers(1, 9)):
+            edges.add(piece)
+        start, end = edges.edges // 2**32 - 2**30, edges.edges % 2**32 - 2**30
+        assert Counter(zip(start.tolist(), end.tolist())) == want
+        assert (len(edges) == 0) == (faces is solid)
+        some = edges.before(2**30 + 5)
+        assert len(some) == sum(n for edge, n in want.items() if max(edge) < 5)
 
 
 def test_a_sphere_touches_the_balls_of_its_own_grid(ball_mesh):

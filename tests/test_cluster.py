@@ -2,12 +2,14 @@
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
 import sys
 import time
 from collections import deque
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +26,9 @@ from super_sdf.cluster import pool as cluster_pool
 from super_sdf.cluster.checking import Needs, Question, check_workers
 from super_sdf.cluster.connecting import Limits, connect, share_of
 from super_sdf.cluster.pool import ClusterPool, ClusterPoolOptions
-from super_sdf.errors import ClusterError
+from super_sdf.errors import ClusterError, DeviceError
 from super_sdf.machine.pool import Death
+from super_sdf.network.fingerprint import Fingerprint
 
 pytestmark = pytest.mark.usefixtures("grid_folder")
 LOCAL = ("--cluster", "local")
@@ -301,7 +304,7 @@ def prepare_to_wait(limits):
 
 @pytest.mark.parametrize("fault", ["", "is odd"])
 def test_a_worker_that_comes_later_is_checked_and_used_or_named(monkeypatch, fault):
-    tasks, warnings, needs = deque(range(6)), [], Needs("fast")
+    tasks, warnings, needs, pids = deque(range(6 if fault else 60)), [], Needs("fast"), set()
     with connect("local", workers=2, threads=1) as cluster:
         checked = check_workers(cluster, needs)
         first, second = checked.members
@@ -311,8 +314,12 @@ def test_a_worker_that_comes_later_is_checked_and_used_or_named(monkeypatch, fau
         known = checked._replace(members=[first])
         options = ClusterPoolOptions(warn=warnings.append)
         pool = ClusterPool(cluster, known, needs, tasks, prepare_to_wait, options)
-        pids = {pid for _, pid in pool.results()}
-    later = set() if fault else {second.report.pid}
+        later = set() if fault else {second.report.pid}
+        with closing(pool.results()) as results:
+            for _, pid in results:
+                pids.add(pid)
+                if pids == {first.report.pid} | later and not fault:
+                    break
     assert pids == {first.report.pid} | later
     assert warnings == ([f"worker {second.address} is odd; it is not used"] if fault else [])
 
@@ -373,6 +380,55 @@ def test_other_versions_of_what_computes_are_a_warning():
         f"worker tcp://a and 1 other have numpy 1.26.0, and here is {here}: results may differ in "
         "their last bits"
     ]
+
+
+OTHER_PROCESSOR = """
+from super_sdf.network.network import Network
+
+exact = Network.__call__
+Network.__call__ = lambda *given: exact(*given) * (1 + 2**-20)
+"""
+
+
+def test_workers_that_round_differently_are_refused_and_both_named(
+    command, scheduler, start_worker, tmp_path
+):
+    Path("other").mkdir()
+    Path("other/sitecustomize.py").write_text(OTHER_PROCESSOR)
+    start_worker(), start_worker(tmp_path / "other")
+    with connect(scheduler[0]) as cluster:
+        cluster.client.wait_for_workers(2)
+    code, _, err = command("batch", "in", "--out", "out", *QUICK, "--cluster", scheduler[0])
+    worker = r"worker tcp://127\.0\.0\.1:\d+ \([^()]*(\(R\)[^()]*)*, int8 on cpu, [0-9a-f]{8}\)"
+    assert code == 1 and re.fullmatch(
+        f"Error: {worker} gets other values from the network than {worker}, so that meshes would "
+        "differ or be torn: use workers with the same kind of processor\n",
+        err,
+    )
+    for differing in (r"tcp://\S+", ", ([0-9a-f]{8})"):
+        assert len(set(re.findall(differing, err))) == 2
+    assert not meshes("out")
+
+
+def test_a_worker_that_comes_later_and_rounds_differently_is_a_fault(monkeypatch):
+    with connect("local", workers=2, threads=1) as cluster:
+        first, second = check_workers(cluster, Needs("fast")).members
+        known = first._replace(values=first.values._replace(digest="0" * 64))
+        found = checking.check_some(cluster, Needs("fast"), {second.address: 1}, [known])
+    assert found.members == [] and set(found.faults) == {second.address}
+    assert f" than worker {first.address} (" in found.faults[second.address]
+
+
+def test_values_that_differ_are_said_with_what_computed_them():
+    one = Fingerprint("0123456789", "cpu", "A", "int8")
+    others = {"b": one, "c": one._replace(digest="f" * 64, device="cuda", precision="float32")}
+    assert checking.differing({"a": one, **others}) == {
+        "c": "(A, float32 on cuda, ffffffff) gets other values from the network than worker a "
+        "(A, int8 on cpu, 01234567), so that meshes would differ or be torn: give --device cpu"
+    }
+    assert checking.differing({}) == {} and checking.judge_values(one) == ""
+    want = "cannot run the network: no GPU"
+    assert checking.judge_values(DeviceError("no GPU")) == want
 
 
 def test_a_folder_that_is_not_shared_is_noticed():

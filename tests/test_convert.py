@@ -7,11 +7,25 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import ball, trilinear
+from test_slabs import in_pieces
 
+import super_sdf.convert
+from super_sdf import SdfGrid
 from super_sdf.convert import ConvertOptions, convert
-from super_sdf.errors import FileError, GridError, WriteError
+from super_sdf.errors import FileError, GridError, MeshError, WriteError
 from super_sdf.files import expectation
 from super_sdf.files.meshes import MESH_SUFFIXES
+from super_sdf.mesh import Mesh
+
+
+class Close:
+    """Trilinear interpolation, which says how far it sees."""
+
+    receptive_field = 1
+    __call__ = staticmethod(trilinear)
+
+
+CLOSE = Close()
 
 
 @pytest.fixture(autouse=True)
@@ -48,6 +62,57 @@ def test_closed_agrees_with_the_mesh(cap):
     done = convert("cut.npy", "out.ply", trilinear, ConvertOptions(2, cap=cap))
     assert done.closed == cap == trimesh.load("out.ply").is_watertight
     assert len(done.warnings) == (not cap)
+
+
+def in_slabs(monkeypatch, values, cap, spoil):
+    """Convert a grid in three slabs, of which the last is spoilt; return the error."""
+    np.save("cut.npy", values)
+    slabs = in_pieces(SdfGrid(values, 1.0), CLOSE, monkeypatch, 3, factor=2, cap=cap)
+    first = sum(slab.counts["vertices"] for slab in slabs[:2])
+    mesh = slabs[2].meshes[0]
+    slabs[2].meshes[0] = Mesh(mesh.vertices, spoil(mesh.faces, first))
+    monkeypatch.setattr(super_sdf.convert, "reconstruct_slabs", lambda *_, **__: iter(slabs))
+    with pytest.raises(MeshError) as caught:
+        convert("cut.npy", "out.ply", trilinear, ConvertOptions(2, cap=cap))
+    assert not os.path.exists("out.ply")
+    return str(caught.value), slabs
+
+
+def without_one(faces, first):
+    """Leave out a triangle that has one side on the plane between the last two slabs."""
+    return np.delete(faces, np.flatnonzero((faces < first).sum(1) == 2)[0], 0)
+
+
+def with_one_twice(faces, first):
+    """Repeat such a triangle."""
+    return np.append(faces, faces[(faces < first).sum(1) == 2][:1], 0)
+
+
+@pytest.mark.parametrize(
+    "cap, end, spoil",
+    [
+        (True, 16, without_one),
+        (True, 9, without_one),
+        (False, 16, without_one),
+        (True, 9, with_one_twice),
+        (False, 9, with_one_twice),
+    ],
+)
+def test_slabs_that_do_not_meet_are_an_error(monkeypatch, cap, end, spoil):
+    """Whether the surface ends within the grid, is capped or is left open."""
+    values = ball(16, 4.0).values[:, :end]
+    said, slabs = in_slabs(monkeypatch, values, cap, spoil)
+    (first, start), (_, stop) = slabs[1].planes, slabs[2].planes
+    assert said == (
+        f"the mesh is torn, with 1 open edge at plane {start}, between planes {first} to "
+        f"{start - 1} and planes {start} to {stop - 1}: run it again, and report it if that does "
+        "not help"
+    )
+
+
+def test_a_hole_in_a_mesh_is_an_error(monkeypatch):
+    said, slabs = in_slabs(monkeypatch, ball(16, 4.0).values, True, lambda faces, _: faces[:-1])
+    assert said.startswith("the mesh is torn, with 3 open edges in planes ")
 
 
 def test_a_failure_writes_nothing_and_a_file_is_replaced_only_by_force():

@@ -16,7 +16,7 @@ from corpus.children import Child, kept_sessions
 from corpus.judge import judge, snapshot
 from corpus.making import THEMES, make_cases, spread
 from corpus.meshes import CORNERS, FACES, binary_ply
-from corpus.random_fields import faults_of_field, make_fields
+from corpus.random_fields import faults_of_field, faults_of_pieces, make_fields, mesh_of_field
 from corpus.reading import faults_of_mesh
 from corpus.running import Run, run_here
 from corpus.trying import try_case
@@ -65,6 +65,15 @@ def test_random_fields_become_closed_manifolds(stand_in, mesher):
     network = trilinear if stand_in else load_network("fast", threads=1)
     fields = list(make_fields(FIELDS))[stand_in::2]
     assert [fault for field in fields for fault in faults_of_field(field, network, mesher)] == []
+
+
+@pytest.mark.parametrize("mesher", MESHERS)
+def test_random_fields_in_slabs_and_bricks_are_closed_where_they_are_called_so(mesher):
+    network, faults = load_network("fast", threads=1), []
+    for number, field in enumerate(make_fields(FIELDS // 2)):
+        whole = mesh_of_field(field, network, mesher)
+        faults += faults_of_pieces(field, network, mesher, 2 + number % 5, whole)
+    assert faults == []
 
 
 def test_the_corpus_is_large_and_the_same_each_time(cases):

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from .arrays import Triple
-from .errors import WriteError
+from .errors import MeshError, WriteError
 from .files.expectation import CERTAIN_SHARE, Expectation, expect
 from .files.formats import split_member
 from .files.grids import read_grid_with
@@ -46,6 +46,7 @@ from .steps.lattice import lattice_shape
 from .steps.mesher_names import DEFAULT_MESHER
 from .steps.meshers import find_mesher
 from .steps.nodes import check_factor
+from .topology import OpenEdges
 
 if TYPE_CHECKING:
     from .fields.writing import FieldFile
@@ -137,8 +138,8 @@ class Conversion:
     bounds : two Triples
         The lowest and the highest coordinates of the vertices, in world units.
     closed : bool
-        Whether the mesh has no open edge. Edges are not counted: the mesh is a closed manifold by
-        construction, unless the surface leaves the grid and is not capped.
+        Whether the mesh has no open edge, counted while it is written (``topology.OpenEdges``). If
+        not, the surface leaves the grid and is not capped.
     notes, warnings : tuple of str
         Sentences on what was inferred, and on what may be wrong with the result.
     seconds : dict
@@ -232,7 +233,8 @@ def convert(
     Raises
     ------
     SuperSdfError
-        As in ``read_grid``, ``upsample``, ``simplify_mesh`` and ``write_mesh``. Nothing is written
+        As in ``read_grid``, ``upsample``, ``simplify_mesh`` and ``write_mesh``; MeshError if slabs
+        or bricks do not meet, as those of processors that round differently. Nothing is written
         then.
     """
     watch = Stopwatch()
@@ -246,7 +248,7 @@ def convert(
     notes = (*lattice.notes, *local_origin_note(target, about))
     expected = expect(grid, total, options.offset, target, cap=options.cap)
     _check_size(expected, target, options, announce)
-    tally = Tally(expected)
+    tally = Tally(expected, cap=options.cap)
     check_not_input(save_field, source)
     with open_field(save_field, grid, options, force=force) as file:
         watch.lap("read")
@@ -371,8 +373,10 @@ def open_field(
 class Tally:
     """Counts and bounding box of a mesh, summed over its pieces while they are written."""
 
-    def __init__(self, expected: Expectation) -> None:
-        self.expected = expected
+    def __init__(self, expected: Expectation, *, cap: bool) -> None:
+        self.expected, self.cap = expected, cap
+        self.edges = OpenEdges()
+        self.last: Piece | None = None  # without its meshes
         self.counts: Counter[str] = Counter()
         self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)
         self.is_cut = self.leaves = False
@@ -383,10 +387,17 @@ class Tally:
         """Yield the meshes of the pieces, and count them.
 
         The time until the caller takes the next mesh counts as writing.
+
+        Raises
+        ------
+        MeshError
+            If the pieces do not meet.
         """
         for piece in pieces:
             watch.take(piece.seconds)
             self.is_cut |= piece.is_cut
+            self._count_edges(piece)
+            watch.lap("isosurface")
             self.leaves |= piece.leaves
             self.counts.update(piece.counts)
             self.counts |= Counter(piece.whole)
@@ -395,6 +406,25 @@ class Tally:
             yield from piece.meshes
             del piece  # before the next one is made
             watch.lap("write")
+        if self.last and self.must_be_closed and len(self.edges):
+            raise torn(len(self.edges), "in", self.last)
+
+    @property
+    def must_be_closed(self) -> bool:
+        """Whether the surface so far may end only where the next piece begins."""
+        return self.cap or not self.is_cut
+
+    def _count_edges(self, piece: Piece) -> None:
+        """Count the edges of a piece; MeshError if edges before it stay open."""
+        before, first = self.edges.edges, self.counts["vertices"]
+        for mesh in piece.meshes:
+            self.edges.add(mesh.faces)
+        left = self.edges.before(first)  # no later piece has these vertices
+        if not self.must_be_closed:
+            left = np.setdiff1d(left, before)  # the others may be on the border of the grid
+        if self.last and len(left):
+            raise torn(len(left), f"at plane {piece.planes[0]}, between", self.last, piece)
+        self.last = replace(piece, meshes=[])
 
     def simplify(
         self,
@@ -428,6 +458,20 @@ class Tally:
                 self.high[axis] = max(self.high[axis], coordinates.max())
 
 
+def torn(count: int, where: str, *pieces: Piece) -> MeshError:
+    """Return the error for edges that stay open in or between pieces."""
+    made = " and ".join(
+        f"planes {piece.planes[0]} to {piece.planes[1] - 1}"
+        + f" ({piece.worker})" * bool(piece.worker)
+        for piece in pieces
+    )
+    way = "run it again, and report it if that does not help"
+    if pieces[0].worker:
+        way = "use workers with the same processor, NumPy and onnxruntime"
+    edges = f"{count:,} open edge{'s' * (count > 1)}"
+    return MeshError(f"the mesh is torn, with {edges} {where} {made}: {way}")
+
+
 def describe(
     grid: SdfGrid,
     tally: Tally,
@@ -436,7 +480,7 @@ def describe(
     notes: tuple[str, ...],
 ) -> Conversion:
     """Return the result of a conversion."""
-    closed = options.cap or not tally.is_cut
+    closed = not len(tally.edges)
     counts = {name: tally.counts[name] for name in COUNTS}
     counts["expected_triangles"] = tally.expected.triangles
     counts["expected_bytes"] = tally.expected.size

@@ -6,7 +6,8 @@
 
     - ``NoSurfaceError``: they are, but contain no surface.
 
-  - ``MeshError`` (also ``ValueError``): a reference mesh does not bound a solid.
+  - ``MeshError`` (also ``ValueError``): a reference mesh does not bound a solid, or slabs or bricks
+    of a mesh do not meet.
   - ``OptionError`` (also ``ValueError``): an argument is invalid, such as an odd factor.
 
     - ``OptionTypeError`` (also ``TypeError``): an argument has the wrong type.
@@ -36,7 +37,7 @@ class NoSurfaceError(GridError):
 
 
 class MeshError(SuperSdfError, ValueError):
-    """A reference mesh does not bound a solid."""
+    """A reference mesh does not bound a solid, or slabs or bricks of a mesh do not meet."""
 
 
 class OptionError(SuperSdfError, ValueError):

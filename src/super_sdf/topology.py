@@ -8,7 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import IntArray
+from .machine.threads import chunks_of
 from .mesh import Mesh
+
+TEMPORARIES = 4  # for chunks of 2^17 triangles: smaller ones may span as many vertices
+END = np.int64(32)  # bits of the end of an edge; those above are of its start
+MARKS = 1 << 46  # 2^7 of them can be summed in float64 without rounding
 
 
 @dataclass(frozen=True)
@@ -91,6 +96,85 @@ def count_fans(faces: IntArray, opposite: IntArray) -> NDArray[np.int64]:
     cycles = (lowest == half) & ~ends[step]
     size = int(start.max(initial=-1)) + 1
     return np.bincount(start[ends], minlength=size) + np.bincount(start[cycles], minlength=size)
+
+
+class OpenEdges:
+    """A running count of the open edges of a mesh that comes in pieces.
+
+    An edge is open if triangles pass it more often in one direction than in the other. Only open
+    edges are held: those at the end of the triangles so far, and those that no later one closes.
+
+    To find them without sorting all edges, each vertex gets a random mark. At a vertex inside the
+    surface, every neighbour follows in one triangle and precedes in another: the marks of those
+    that follow, less those that precede, sum to 0. Edges between other vertices are paired exactly.
+    At the end of an open edge the sum is 0 by chance once in 2^46 cases. A hole has three such ends
+    at least, and is missed if two of them are.
+
+    Attributes
+    ----------
+    edges : (n,) int64
+        The open edges in the direction of their triangle: start times 2^32 plus end.
+    """
+
+    def __init__(self) -> None:
+        self.edges = np.empty(0, np.int64)
+        self._marks = np.empty(0)
+
+    def __len__(self) -> int:
+        return len(self.edges)
+
+    def add(self, faces: IntArray) -> None:
+        """Add triangles, (m, 3) int32, which number the vertices of all pieces."""
+        loose = [self._loose(faces[some]) for some in chunks_of(len(faces), TEMPORARIES)]
+        self.edges = _unpaired(np.concatenate([self.edges, *loose]))
+
+    def before(self, vertex: int) -> NDArray[np.int64]:
+        """Return the open edges between vertices with numbers below one."""
+        start, end = _ends(self.edges)
+        return self.edges[np.maximum(start, end) < vertex]
+
+    def _loose(self, faces: IntArray) -> NDArray[np.int64]:
+        """Return the edges of triangles, (n,), of which each may be open."""
+        lowest = faces.min()
+        corners = faces.T.astype(np.intp, order="C")
+        corners -= lowest
+        count = int(corners.max()) + 1
+        if count > len(self._marks):
+            self._marks = np.random.default_rng(0).integers(0, MARKS, count).astype(np.float64)
+        marks = self._marks.take(corners)
+        sides = np.stack([marks[at - 2] - marks[at - 1] for at in range(3)])
+        is_open = np.bincount(corners.ravel(), sides.ravel(), count) != 0
+        ends = is_open.take(corners)
+        loose = []
+        for at in range(3):
+            some = np.flatnonzero(ends[at] & ends[at - 2])
+            loose.append(_edge(corners[at, some] + lowest, corners[at - 2, some] + lowest))
+        return np.concatenate(loose)
+
+
+def _edge(start: NDArray[np.intp], end: NDArray[np.intp]) -> NDArray[np.int64]:
+    """Return edges as numbers, (n,): see ``OpenEdges.edges``."""
+    edges: NDArray[np.int64] = (start.astype(np.int64) << END) + end
+    return edges
+
+
+def _ends(edges: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the start and the end of edges."""
+    start = edges >> END
+    return start, edges - (start << END)
+
+
+def _unpaired(edges: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the edges, sorted, without each that another one passes in the other direction."""
+    start, end = _ends(edges)
+    edges = np.where(start < end, edges, _edge(end, start))
+    order = np.argsort(edges)
+    edges, direction = edges[order], np.sign(end - start)[order]
+    first = np.flatnonzero(np.append(True, edges[1:] != edges[:-1])[: len(edges)])
+    left = np.add.reduceat(direction, first) if len(first) else first
+    edges = edges[first]
+    start, end = _ends(edges)
+    return np.repeat(np.where(left > 0, edges, _edge(end, start)), np.abs(left))
 
 
 def row_keys(rows: NDArray[np.float64]) -> NDArray[np.uint64]:

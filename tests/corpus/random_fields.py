@@ -4,12 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from unittest import mock
 
 import numpy as np
 from conftest import count_fans
 
-from super_sdf import Mesh, SdfGrid, reconstruct
+from super_sdf import Mesh, SdfGrid, pipeline, reconstruct
+from super_sdf.bricks.engine import Joining
+from super_sdf.bricks.meshing import Meshed
+from super_sdf.convert import Tally
+from super_sdf.mesh import join_meshes
+from super_sdf.network.network import Network
 from super_sdf.pipeline import Decoder
+from super_sdf.progress import Stopwatch
+from super_sdf.slabs.cutting import cut, equal_parts
+from super_sdf.slabs.pieces import Piece
+from super_sdf.steps.glance import look_at_band
 from super_sdf.steps.marching import CAP_HEIGHT
 from super_sdf.steps.mesher_names import DEFAULT_MESHER
 
@@ -91,6 +101,55 @@ def mesh_of_field(field: RandomField, network: Decoder, mesher: str) -> Mesh:
     """Return a field's mesh."""
     grid = SdfGrid.trusted(field.values, 1.0)  # they are no distances, and need not be
     return reconstruct(grid, network, field.factor, cap=field.cap, mesher=mesher)
+
+
+def faults_of_pieces(
+    field: RandomField, network: Network, mesher: str, parts: int, whole: Mesh
+) -> list[str]:
+    """Return what is wrong with a field's mesh that is made in slabs, and in bricks.
+
+    The running count of open edges must agree with that of the ``whole`` mesh, which both are.
+    """
+    faults = []
+    for made_in, make in (("slabs", in_slabs), ("bricks", in_bricks)):
+        tally = Tally(None, cap=field.cap)
+        mesh = join_meshes(list(tally.count(make(field, network, mesher, parts), Stopwatch())))
+        if not np.array_equal(mesh.faces, whole.faces):
+            faults.append(f"{parts} {made_in} make another mesh")
+        if 2 * len(tally.edges) != mesh.open_edges():  # which counts each from both sides
+            faults.append(f"{len(tally.edges)} open edges in {parts} {made_in}: miscounted")
+    return [f"{field.name}: {fault}" for fault in faults]
+
+
+def in_slabs(field: RandomField, network: Network, mesher: str, parts: int) -> Iterator[Piece]:
+    """Yield a field's mesh in at most so many slabs."""
+
+    def plan(band, factor, reach, resources, needed, mesher):
+        return cut(band, parts, reach, mesher.planes_beside(factor))
+
+    grid = SdfGrid.trusted(field.values, 1.0)
+    with mock.patch.object(pipeline, "plan_slabs", plan):
+        yield from pipeline.reconstruct_slabs(
+            grid, network, field.factor, cap=field.cap, mesher=mesher
+        )
+
+
+def in_bricks(field: RandomField, network: Network, mesher: str, parts: int) -> Iterator[Piece]:
+    """Yield a field's mesh in at most so many bricks, as a cluster puts them together."""
+    grid = SdfGrid.trusted(field.values, 1.0)
+    seen = look_at_band(grid, 0.0)
+    joining = Joining(seen, lambda made: None)
+    for planes in equal_parts(np.append(0, np.cumsum(seen.decoded)), parts):
+        brick = pipeline.reconstruct_planes(
+            grid,
+            network,
+            field.factor,
+            planes,
+            whole=seen.summary,
+            cap=field.cap,
+            mesher=mesher,
+        )
+        yield joining.add(Meshed(list(brick), "here:1", None, None))
 
 
 def faults_of_mesh(field: RandomField, mesh: Mesh) -> list[str]:

@@ -112,7 +112,8 @@ def needs_of(jobs: Sequence[Job], settings: Settings) -> Needs:
     if any(job.options.simplifies for job in jobs):
         modules.update(all_modules("simplify"))
     here = modules.difference(missing_modules(tuple(modules)))  # without the others, files fail
-    return Needs(settings.model, settings.precision, tuple(sorted(here)), files, settings.folder)
+    network = settings.model, settings.precision, settings.device
+    return Needs(*network, tuple(sorted(here)), files, settings.folder)
 
 
 def prepare_on_cluster(settings: Settings, host: str, base: Path, limits: Limits) -> ClusterWork:

@@ -113,7 +113,7 @@ class BricksEngine:
         """Check the workers; return them."""
         file, _ = split_member(self.source.path)
         modules = () if self.source.is_npy else ("zarr",)
-        needs = Needs(self.loading.model, self.loading.precision, modules, (file,))
+        needs = Needs(*self.loading, modules, (file,))
         checked = check_workers(self.cluster, needs)
         self.told += checked.warnings
         return Team(self.cluster, checked, needs, self._warn)
@@ -258,8 +258,10 @@ class Joining:
             "slabs": self.slabs,
             "planned_bytes": max(part.whole["planned_bytes"] for part in parts),
         }
+        planes = parts[0].planes[0], parts[-1].planes[1]
         is_cut = any(part.is_cut for part in parts)
-        return Piece(meshes, counts, whole, summary.leaves, is_cut, set(self.signs))
+        seen = summary.leaves, is_cut, set(self.signs)
+        return Piece(meshes, counts, whole, planes, *seen, worker=made.worker)
 
 
 def keeping_last(workers: dict[str, Meshed]) -> Callable[[Meshed], None]:

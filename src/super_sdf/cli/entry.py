@@ -1,9 +1,13 @@
-"""The entry point: handles signals and missing streams before anything large is imported."""
+"""The entry point: what must be right before anything large is imported.
+
+That is signals, missing streams, and a processor that NumPy can run on.
+"""
 
 from __future__ import annotations
 
 import os
 
+from ..machine.processor import check_processor
 from .interrupts import ending_at_once
 from .streams import open_missing_streams
 
@@ -15,6 +19,7 @@ def main() -> None:
     """
     with ending_at_once():
         open_missing_streams()
+        check_processor()
         from .main import run
 
         code = run()

@@ -1,7 +1,8 @@
 """What workers lack, said before the work starts.
 
-They need this version of super-sdf, the same network, and the same files under the same paths.
-Other versions of numpy and onnxruntime may round differently, which is a warning.
+They need this version of super-sdf, the same network, and the same files under the same paths. All
+must get the same values from the network, or slabs would not meet. Other versions of numpy and
+onnxruntime may round differently all the same, which is a warning.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import os
 import pkgutil
-import platform
 import secrets
 import signal
 import socket
@@ -25,11 +25,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .. import __version__
-from ..errors import ClusterError, WriteError
+from ..errors import ClusterError, SuperSdfError, WriteError
 from ..machine.extras import missing_modules
 from ..machine.memory import free_memory, reuse_freed
 from ..machine.serving import settle_signals
 from ..network.cuda import onnxruntime_version
+from ..network.fingerprint import Fingerprint, fingerprint_of
 from ..network.names import AUTO_PRECISION
 from ..network.network import find_model, shipped_models
 from .connecting import Cluster, Limits, share_of
@@ -49,7 +50,7 @@ class Needs:
 
     Attributes
     ----------
-    model, precision : str
+    model, precision, device : str
         The network: see ``load_network``.
     modules : tuple of str
         Python modules beyond those that are always installed.
@@ -61,6 +62,7 @@ class Needs:
 
     model: str
     precision: str = AUTO_PRECISION
+    device: str = "auto"
     modules: tuple[str, ...] = ()
     files: Sequence[Path] = ()
     folder: Path | None = None
@@ -111,10 +113,11 @@ class Question(NamedTuple):
 
 
 class Member(NamedTuple):
-    """A worker that was checked: its address, what it said, and what it may use."""
+    """A worker that was checked: its address, what it said and computed, what it may use."""
 
     address: str
     report: Report
+    values: Fingerprint
     limits: Limits
 
 
@@ -142,8 +145,13 @@ def check_workers(cluster: Cluster, needs: Needs) -> Checked:
     return checked
 
 
-def check_some(cluster: Cluster, needs: Needs, threads: Mapping[str, int]) -> Checked:
-    """Check some workers, given by address with their threads; those that end meanwhile are out."""
+def check_some(
+    cluster: Cluster, needs: Needs, threads: Mapping[str, int], members: Sequence[Member] = ()
+) -> Checked:
+    """Check some workers, given by address with their threads; those that end meanwhile are out.
+
+    ``members`` are those that are at work already: the others must compute the same values.
+    """
     faults: dict[str, str] = {}
 
     def ask(workers: Iterable[str], judge: Judge, *call: Any) -> dict[str, Any]:
@@ -160,7 +168,13 @@ def check_some(cluster: Cluster, needs: Needs, threads: Mapping[str, int]) -> Ch
         question = Question(needs, some_of(needs.files), probe, cluster.is_local)
         own = report_here(question)
         good = ask(good, lambda r: judge_report(r, own, question), report_to, question)
-    return Checked(members_of(cluster, good, threads), faults, warnings_of(good, own))
+    network = needs.model, needs.precision, needs.device
+    values = ask(good, judge_values, fingerprint_of, *network)
+    known = {member.address: member.values for member in members}
+    faults.update(differing({**known, **values}))
+    reports = {a: report for a, report in good.items() if a in values and a not in faults}
+    found = members_of(cluster, reports, values, threads)
+    return Checked(found, faults, warnings_of(reports, own))
 
 
 def judge_version(answer: Any) -> str:
@@ -209,6 +223,39 @@ def judge_report(report: Any, own: Report, question: Question) -> str:
     return ""
 
 
+def judge_values(answer: Any) -> str:
+    """Return why a worker cannot run the network, "" if it can."""
+    if isinstance(answer, Fingerprint):
+        return ""
+    why = answer if isinstance(answer, SuperSdfError) else describe(answer)
+    return f"cannot run the network: {why}"
+
+
+def differing(values: Mapping[str, Fingerprint]) -> dict[str, str]:
+    """Return a fault for each worker whose values are not those of the first one, by address."""
+    if not values:
+        return {}
+    first, own = next(iter(values.items()))
+    return {
+        address: f"({runs_on(found)}) gets other values from the network than worker {first} "
+        f"({runs_on(own)}), so that meshes would differ or be torn: {way_to_agree(found, own)}"
+        for address, found in values.items()
+        if found.digest != own.digest
+    }
+
+
+def runs_on(found: Fingerprint) -> str:
+    """Describe what computed values, and the values."""
+    return f"{found.processor}, {found.precision} on {found.device}, {found.digest[:8]}"
+
+
+def way_to_agree(one: Fingerprint, other: Fingerprint) -> str:
+    """Return what to do so that two workers compute the same values."""
+    if one.device != other.device:
+        return "give --device cpu"
+    return "use workers with the same kind of processor"
+
+
 def warnings_of(reports: Mapping[str, Report], own: Report) -> list[str]:
     """Return a warning for each thing that workers have in another version than is here."""
     warnings = []
@@ -238,7 +285,10 @@ def first_of(addresses: Sequence[str]) -> str:
 
 
 def members_of(
-    cluster: Cluster, reports: Mapping[str, Report], threads: Mapping[str, int]
+    cluster: Cluster,
+    reports: Mapping[str, Report],
+    values: Mapping[str, Fingerprint],
+    threads: Mapping[str, int],
 ) -> list[Member]:
     """Return the workers with what each may use; the free memory of a machine is shared equally."""
     on_host = Counter(report.host for report in reports.values())
@@ -248,7 +298,7 @@ def members_of(
         limits = cluster.limits
         if not cluster.is_local:
             limits = share_of(limits, threads[address], report.limit, free)
-        members.append(Member(address, report, limits))
+        members.append(Member(address, report, values[address], limits))
     return members
 
 
@@ -274,7 +324,6 @@ def report_here(question: Question) -> Report:
         versions={
             "numpy": f"numpy {np.__version__}",
             "onnxruntime": onnxruntime_version(),
-            "machine": f"{platform.machine()} processors",
         },
         lacking=tuple(missing_modules(needs.modules)),
         sizes=tuple(map(size_of, question.files)),

@@ -279,7 +279,7 @@ class ClusterPool(Generic[Task]):
             yield from self._report_death(worker)
         new = {a: n for a, n in there.items() if a not in self.workers and a not in self.refused}
         if new and (len(self.tasks) or self.aside is not None):
-            checked = check_some(self.cluster, self.needs, new)
+            checked = check_some(self.cluster, self.needs, new, self.checked.members)
             for member in checked.members:
                 self._admit(member)
             for address, fault in checked.faults.items():

@@ -9,13 +9,14 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import SuperSdfError
+from ..machine.processor import processor_name
 from ..machine.threads import count_cores
 from .cases import Case, Setting, Shape
 from .measuring import Measurement
@@ -55,15 +56,6 @@ def describe_machine() -> str:
         f"{processor_name()}, {count_cores()} cores, {platform.system()}, Python "
         f"{platform.python_version()}, NumPy {np.__version__}, onnxruntime {version('onnxruntime')}"
     )
-
-
-def processor_name() -> str:
-    """Return the model of the processor, or its architecture if the system does not tell."""
-    with suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
 
 
 def run_command(words: Sequence[str]) -> tuple[float, float]:

@@ -14,6 +14,7 @@ import numpy as np
 from ..arrays import FloatArray, IntArray
 from ..errors import DeviceError, FileError, ModelError, OptionError
 from ..files.regular import check_regular_file
+from ..machine.processor import lacks_avx2
 from ..machine.threads import cores_of_system, useful_threads
 from ..options import check_path, check_threads
 from ..progress import ShareCallback
@@ -218,7 +219,7 @@ def find_model(model: str | Path, precision: str = AUTO_PRECISION) -> tuple[Path
     """Return the file for the CPU, and the number of symmetries to average over.
 
     ``model`` is a quality, the name of a shipped network, or a file, and "auto" leaves a file as it
-    is.
+    is. So it does with all networks on processors with AVX but without AVX2, where int8 is slower.
 
     Raises
     ------
@@ -233,7 +234,7 @@ def find_model(model: str | Path, precision: str = AUTO_PRECISION) -> tuple[Path
     if str(model) in QUALITIES and name not in shipped_models():
         raise FileError(f"the network {name!r} is missing: {NO_NETWORKS}")
     path = shipped_models().get(name, Path(model))
-    if precision == AUTO_PRECISION:
+    if precision == AUTO_PRECISION and not lacks_avx2():
         path = shipped_models().get(int8_name(name), path)
     if precision == INT8:
         path = path.with_name(f"{int8_name(path.stem)}.onnx")  # beside the float32 file
@@ -266,7 +267,8 @@ def load_network(
         CPU threads; 0 for one per core, which is also the maximum.
     precision : str
         "float32"; "int8", the quantised variant, which is faster and runs on the CPU only; or
-        "auto": on the CPU int8, if the network is a shipped one that has it, otherwise float32.
+        "auto": on the CPU int8, if the network is a shipped one that has it, otherwise float32; so
+        are processors with AVX but without AVX2 (2011 to 2013), on which int8 is slower.
 
     Raises
     ------

@@ -22,6 +22,8 @@ class Piece:
     whole : dict
         Counts of the whole run, the same in each piece: ``band_voxels``, ``noisy_voxels`` (see
         ``FineField``), ``slabs``, and ``planned_bytes``, the planned peak memory of the process.
+    planes : two ints
+        The slab's planes of voxels, from the first to before the second.
     leaves : bool
         Whether the solid leaves the grid, anywhere: a sample on the border is inside.
     is_cut : bool
@@ -30,15 +32,19 @@ class Piece:
         Which signs the slab's nodes have: True outside, False inside.
     seconds : dict
         Seconds of each step, by its name in ``progress.STEPS``; the band is in the first piece.
+    worker : str
+        Machine and number of the process that made it, if that was not this one.
     """
 
     meshes: list[Mesh]
     counts: dict[str, int]
     whole: dict[str, int]
+    planes: tuple[int, int]
     leaves: bool
     is_cut: bool
     signs: set[bool]
     seconds: dict[str, float] = field(default_factory=dict)
+    worker: str = ""
 
 
 def describe_piece(
@@ -55,7 +61,7 @@ def describe_piece(
     }
     whole = {"band_voxels": fine.band_voxels, "noisy_voxels": fine.noisy_voxels, **planned}
     is_cut = leaves and border_is_crossed(fine)
-    return Piece(meshes, counts, whole, leaves, is_cut, fine.signs())
+    return Piece(meshes, counts, whole, fine.planes, leaves, is_cut, fine.signs())
 
 
 def count_input(fine: FineField) -> dict[str, int]:
