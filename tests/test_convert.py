@@ -111,7 +111,7 @@ def test_slabs_that_do_not_meet_are_an_error(monkeypatch, cap, end, spoil):
 
 
 def test_a_hole_in_a_mesh_is_an_error(monkeypatch):
-    said, slabs = in_slabs(monkeypatch, ball(16, 4.0).values, True, lambda faces, _: faces[:-1])
+    said, _ = in_slabs(monkeypatch, ball(16, 4.0).values, True, lambda faces, _: faces[:-1])
     assert said.startswith("the mesh is torn, with 3 open edges in planes ")
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import sys
 from contextlib import suppress
-from functools import lru_cache
 
 CPUINFO = "/proc/cpuinfo"
 # What x86-64-v2 adds, as Linux and as manuals name it. NumPy and onnxruntime are built for it.
@@ -18,7 +17,6 @@ SECOND_LEVEL = {
 }
 
 
-@lru_cache(maxsize=1)
 def described() -> dict[str, str]:
     """Return what Linux says of the first processor, by name; empty on other systems."""
     with suppress(OSError):
