@@ -11,7 +11,7 @@ from .arrays import IntArray
 from .machine.threads import chunks_of
 from .mesh import Mesh
 
-TEMPORARIES = 4  # for chunks of 2^17 triangles: smaller ones may span as many vertices
+TEMPORARIES = 8  # for chunks of 2^16 triangles: smaller ones may span as many vertices
 END = np.int64(32)  # bits of the end of an edge; those above are of its start
 MARKS = 1 << 46  # 2^7 of them can be summed in float64 without rounding
 
@@ -142,7 +142,9 @@ class OpenEdges:
         if count > len(self._marks):
             self._marks = np.random.default_rng(0).integers(0, MARKS, count).astype(np.float64)
         marks = self._marks.take(corners)
-        sides = np.stack([marks[at - 2] - marks[at - 1] for at in range(3)])
+        sides = np.empty_like(marks)
+        for at in range(3):
+            np.subtract(marks[at - 2], marks[at - 1], out=sides[at])
         is_open = np.bincount(corners.ravel(), sides.ravel(), count) != 0
         ends = is_open.take(corners)
         loose = []
