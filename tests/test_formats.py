@@ -407,7 +407,7 @@ def text_sdf(affine: np.ndarray) -> str:
 def test_three_dialects_of_sdf(monkeypatch):
     affine = affine_of(np.eye(3))
     values, low = sampled(affine), affine[:3, 3].astype("<f4")
-    monkeypatch.setattr("super_sdf.files.readers.sdf.PIECE", 1001)
+    monkeypatch.setattr("super_sdf.files.readers.values.TEXT_PIECE", 1001)
     Path("text.sdf").write_text(text_sdf(affine))
     check(read_grid("text.sdf"))
     tag = "#sdf 1\ndim {} {} {}\ndata\n".format(*SIZES).encode()

@@ -1,7 +1,7 @@
-"""Members of ``.npz`` archives, decompressed in small pieces and checked against their checksum.
+"""Compressed data, decompressed in small pieces and checked against its checksum.
 
 Python's zipfile decompresses whatever some kilobytes of bzip2 or LZMA hold at once, which can be
-gigabytes. So only the compressed bytes are read with it.
+gigabytes. So only the compressed bytes of a member of an ``.npz`` archive are read with it.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any, Protocol
 
 from ..errors import FileError
 from ..grid.planes import InputFile
+from .headers import Read
 
 PIECE = 1 << 16  # compressed bytes at a time
 LARGEST_DICTIONARY = 1 << 26  # bytes that the decoder may allocate for an LZMA member
@@ -23,6 +24,16 @@ LARGEST_DICTIONARY = 1 << 26  # bytes that the decoder may allocate for an LZMA 
 
 class Codec(Protocol):
     """The interface of the decompressors of bz2 and lzma."""
+
+    @property
+    def eof(self) -> bool:
+        """Whether the compressed data has ended, with a right checksum."""
+        ...
+
+    @property
+    def unused_data(self) -> bytes:
+        """What was found after the end."""
+        ...
 
     @property
     def needs_input(self) -> bool:
@@ -37,7 +48,7 @@ class Codec(Protocol):
 class Stored:
     """A "decompressor" for data that is not compressed."""
 
-    needs_input = True
+    needs_input, eof, unused_data = True, False, b""
 
     def decompress(self, data: bytes, max_length: int) -> bytes:
         """Return the data, which is never longer than ``max_length``."""
@@ -45,10 +56,20 @@ class Stored:
 
 
 class Deflate:
-    """A decompressor for raw deflate."""
+    """A decompressor for raw deflate, or with the framing of zlib or gzip: see ``zlib``."""
 
-    def __init__(self) -> None:
-        self._inner = zlib.decompressobj(-zlib.MAX_WBITS)
+    def __init__(self, window: int = -zlib.MAX_WBITS) -> None:
+        self._inner = zlib.decompressobj(window)
+
+    @property
+    def eof(self) -> bool:
+        """Whether the compressed data has ended, with a right checksum."""
+        return self._inner.eof
+
+    @property
+    def unused_data(self) -> bytes:
+        """What was found after the end."""
+        return self._inner.unused_data
 
     @property
     def needs_input(self) -> bool:
@@ -68,8 +89,78 @@ def open_archive(file: InputFile) -> zipfile.ZipFile:
         raise FileError(f"{file.name} is not a readable .npz archive: {error}") from None
 
 
-class Member:
-    """A member of an archive, decompressed as it is read.
+class Unpacker:
+    """The bytes of compressed data, decompressed as they are read.
+
+    Parameters
+    ----------
+    packed : callable
+        Returns the next compressed bytes.
+    codec : Codec
+        Decompresses them.
+    size : int
+        How many bytes they are decompressed.
+    name : str
+        The name of the data in error messages.
+    """
+
+    def __init__(self, packed: Read, codec: Codec, size: int, name: str) -> None:
+        self._packed, self._codec, self.left, self.name = packed, codec, size, name
+
+    def read(self, count: int) -> bytes:
+        """Return the next ``count`` bytes, or fewer at the end.
+
+        Raises
+        ------
+        FileError
+            If the compressed data is damaged or ends too early.
+        """
+        count = min(count, self.left)
+        pieces = []
+        while count:
+            piece = self._unpack(count)
+            if not piece:
+                raise self._damaged(f"{self.left:,} bytes are missing")
+            pieces.append(piece)
+            count -= len(piece)
+            self.left -= len(piece)
+            self._note(piece)
+        if pieces and not self.left:
+            self._check_end()
+        return b"".join(pieces)
+
+    def _unpack(self, most: int) -> bytes:
+        """Return at least one and at most ``most`` bytes; none at the end."""
+        while not self._codec.eof:
+            data, is_fed = b"", self._codec.needs_input
+            try:
+                if is_fed:
+                    data = self._packed(min(PIECE, most))
+                piece = self._codec.decompress(data, most)
+            except FileError:
+                raise
+            except Exception as error:  # zipfile and each codec raise their own errors
+                raise self._damaged(str(error)) from None
+            if piece or (is_fed and not data):
+                return piece
+        return b""
+
+    def _note(self, piece: bytes) -> None:
+        """Take notice of bytes that were decompressed."""
+
+    def _check_end(self) -> None:
+        """Raise FileError unless the compressed data ends here, and its checksum is right."""
+        if self._unpack(PIECE) or self._codec.unused_data or self._packed(1):
+            raise self._damaged("it holds more than its header promises")
+        if not self._codec.eof:
+            raise self._damaged("its end, with the checksum, is missing")
+
+    def _damaged(self, reason: str) -> FileError:
+        return FileError(f"{self.name} is damaged: {reason}")
+
+
+class Member(Unpacker):
+    """A member of an archive.
 
     Parameters
     ----------
@@ -89,20 +180,20 @@ class Member:
     def __init__(self, archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str) -> None:
         if info.flag_bits & 1:
             raise FileError(f"{name} is encrypted: save it without a password")
-        self.name, self.left = name, info.file_size
+        self.name = name
         self._expected_checksum, self._checksum = info.CRC, 0
         packed: Any = copy.copy(info)
         packed.compress_type, packed.file_size = zipfile.ZIP_STORED, info.compress_size
         packed.CRC = None  # the checksum is of the decompressed bytes
         try:
-            self._packed = archive.open(packed)
-            self._codec = self._make_codec(info.compress_type)
+            read = archive.open(packed).read
+            super().__init__(read, self._make_codec(info.compress_type, read), info.file_size, name)
         except FileError:
             raise
         except Exception as error:  # zipfile raises many kinds of error on damaged fields
             raise self._damaged(str(error)) from None
 
-    def _make_codec(self, kind: int) -> Codec:
+    def _make_codec(self, kind: int, packed: Read) -> Codec:
         """Return the decompressor of the member."""
         if kind == zipfile.ZIP_STORED:
             return Stored()
@@ -111,14 +202,14 @@ class Member:
         if kind == zipfile.ZIP_BZIP2:
             return bz2.BZ2Decompressor()
         if kind == zipfile.ZIP_LZMA:
-            return self._make_lzma()
+            return self._make_lzma(packed)
         raise FileError(
             f"{self.name} is compressed by an unknown method ({kind}): use np.savez_compressed"
         )
 
-    def _make_lzma(self) -> Codec:
+    def _make_lzma(self, packed: Read) -> Codec:
         """Return a decompressor for LZMA; its settings precede the data."""
-        head = self._packed.read(9)
+        head = packed(9)
         size, settings, dictionary = struct.unpack("<2xHBI", head) if len(head) == 9 else (0, 0, 0)
         if size != 5 or settings >= 225 or dictionary > LARGEST_DICTIONARY:
             raise self._damaged("its LZMA settings are invalid")
@@ -131,40 +222,9 @@ class Member:
         }
         return lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=[options])
 
-    def read(self, count: int) -> bytes:
-        """Return the next ``count`` bytes, or fewer at the end.
+    def _note(self, piece: bytes) -> None:
+        self._checksum = zlib.crc32(piece, self._checksum)
 
-        Raises
-        ------
-        FileError
-            If the compressed data is damaged or ends too early.
-        """
-        count = min(count, self.left)
-        pieces = []
-        while count:
-            piece = self._unpack(count)
-            pieces.append(piece)
-            count -= len(piece)
-            self.left -= len(piece)
-            self._checksum = zlib.crc32(piece, self._checksum)
-        if pieces and not self.left and self._checksum != self._expected_checksum:
+    def _check_end(self) -> None:
+        if self._checksum != self._expected_checksum:
             raise self._damaged("its checksum is wrong")
-        return b"".join(pieces)
-
-    def _unpack(self, most: int) -> bytes:
-        """Return at least one and at most ``most`` bytes."""
-        while True:
-            data = b""
-            try:
-                if self._codec.needs_input:
-                    data = self._packed.read(min(PIECE, most))
-                piece = self._codec.decompress(data, most)
-            except Exception as error:  # zipfile and each codec raise their own errors
-                raise self._damaged(str(error)) from None
-            if piece:
-                return piece
-            if not data and self._codec.needs_input:
-                raise self._damaged(f"{self.left:,} bytes are missing")
-
-    def _damaged(self, reason: str) -> FileError:
-        return FileError(f"{self.name} is damaged: {reason}")

@@ -39,7 +39,7 @@ from .headers import ArrayHeader, Read, read_array_header
 from .output import check_free, replacing
 from .regular import check_regular_file
 from .store import check_grid_file
-from .unpacking import unpack
+from .unpacking import check_ratio, unpack
 from .volume import Request, Volume, axes_direction, take
 
 PLACE = ("spacing", "origin", "direction")
@@ -48,9 +48,6 @@ NUMBERS = "one number or three"
 MOST_NAMED = 10  # members of an archive that an error lists
 # Share of the memory left that an unpacked array may take; bytes if that is unknown.
 ROOM_SHARE, UNKNOWN_ROOM = 0.25, 1 << 28
-# No grid with a surface is compressed further than this; deflate reaches 1,030 on zeros.
-BOMB_RATIO = 500
-
 
 READ_OPTIONS = (
     *("spacing", "origin", "direction", "axes", "inside", "field", "label", "level", "scale"),
@@ -320,11 +317,7 @@ def _read_values(
     header = read_array_header(member.read, name)
     _check_size(header, member.left, name)
     check_kind(header.dtype, header.shape)
-    if header.size > room and header.size > BOMB_RATIO * info.compress_size:
-        raise OutOfMemoryError(
-            f"{name}, {header}, is compressed to {info.compress_size:,} bytes, like a zip bomb, "
-            "and does not fit in memory; if it is a grid, save it as .npy"
-        )
+    check_ratio(header, info.compress_size, name, room)
     return unpack(member.read, header, name, room)
 
 

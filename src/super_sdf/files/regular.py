@@ -8,9 +8,9 @@ from __future__ import annotations
 import errno
 import os
 import stat
-from pathlib import Path
+from pathlib import Path, PurePath
 
-from ..errors import FileError
+from ..errors import FileError, seen
 
 KINDS = {
     stat.S_IFDIR: "folder",
@@ -53,6 +53,28 @@ def check_regular_file(path: str | Path) -> Path:
     if not found.st_size:  # such as files in /proc, which the system makes up as they are read
         raise FileError(f"{path} is empty: give a file with something in it")
     return Path(path)
+
+
+def check_beside(header: Path, name: str) -> Path:
+    """Return the path of a data file that a header names: one in the header's folder, or below it.
+
+    A header that is a link may have its data beside the file that it leads to.
+
+    Raises
+    ------
+    FileError
+        If it is anywhere else, or as in ``check_regular_file``.
+    """
+    path = header.parent / name
+    if not PurePath(name).is_absolute() and ".." not in PurePath(name).parts:
+        check_regular_file(path)
+        real, homes = path.resolve(), (header.parent.resolve(), header.resolve().parent)
+        if any(home in real.parents for home in homes):
+            return path
+    raise FileError(
+        f"{header} names the data file {seen(name)}, which is not in its folder: put it beside "
+        "the header, and name it there"
+    )
 
 
 def reason_of(error: OSError) -> str:

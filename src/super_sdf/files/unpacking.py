@@ -23,10 +23,24 @@ from ..machine.memory import in_words
 from .headers import ArrayHeader, Read
 
 PIECE = 1 << 23  # bytes at a time
+# No grid with a surface is compressed further than this; deflate reaches 1,030 on zeros.
+BOMB_RATIO = 500
 ON_DISK = "/var/tmp"  # /tmp is in memory on many systems
 
 Write = Callable[[int, NDArray[np.uint8]], None]
 """Writes bytes at an offset from the beginning."""
+
+
+def check_ratio(header: ArrayHeader, packed: int, name: str, room: int) -> None:
+    """Raise OutOfMemoryError if an array is compressed as no grid is, and does not fit in ``room``.
+
+    So no scratch file takes more than ``BOMB_RATIO`` times the bytes of the input.
+    """
+    if header.size > room and header.size > BOMB_RATIO * packed:
+        raise OutOfMemoryError(
+            f"{name}, {header}, is compressed to {packed:,} bytes, like a zip bomb, and does not "
+            "fit in memory; if it is a grid, save it as .npy"
+        )
 
 
 def unpack(read: Read, header: ArrayHeader, name: str, room: int) -> SampleArray:

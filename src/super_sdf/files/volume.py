@@ -27,7 +27,7 @@ from ..grid.samples import check_kind
 from ..machine.memory import in_words
 from .boxes import Box, Layout, boxes_of, choose_layout, runs_of
 from .headers import ArrayHeader
-from .unpacking import PIECE, Write, fill
+from .unpacking import PIECE, Write, check_ratio, fill
 
 STRAIGHT = 1e-4  # an axis that is off by less than this from a world axis counts as along it
 # Of a chunked array: bytes of a box, unless little memory is left; how many times the memory of a
@@ -107,6 +107,8 @@ class Volume:
         Samples of a chunk along each axis, if the array is stored in chunks.
     read_box : callable, optional
         Returns a box of samples of such an array.
+    packed : int, optional
+        Bytes of the array as it is compressed in the file, if it is.
     notes : tuple of str
         Sentences on what the file says, for the user.
     about : dict
@@ -124,6 +126,7 @@ class Volume:
     """The array itself, if its planes can be read again and again without unpacking it."""
     chunks: tuple[int, ...] | None = None
     read_box: Callable[[Box], NDArray[Any]] | None = None
+    packed: int | None = None
     notes: tuple[str, ...] = ()
     about: dict[str, Any] = field(default_factory=dict)
 
@@ -267,6 +270,9 @@ def take(
     """
     check_kind(volume.dtype, volume.shape)
     placement = find_placement(volume, name)
+    if volume.packed is not None:
+        header = ArrayHeader(volume.shape, volume.dtype, False, 0)
+        check_ratio(header, volume.packed, name, room)
     values = volume.stored
     if values is None or placement.world_axes != (0, 1, 2) or any(placement.backwards):
         values = unpacked(volume, placement, name, (room, left))

@@ -1,66 +1,193 @@
-"""MetaImage files, with SimpleITK: arrays (z, y, x) in C order; world coordinates are LPS."""
+"""MetaImage files: arrays (z, y, x) in C order; world coordinates are LPS.
+
+Read here and not with ITK, which takes a damaged zlib stream for data, opens whatever a header
+names, and checks no size in it: what is left to do is a header of text before raw or zlib data.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+import re
+from collections.abc import Callable
 from math import prod
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import GridError
+from ...errors import FileError, GridError, seen
+from ...grid.planes import InputFile
+from ..regular import check_beside
 from ..volume import Request, Volume, reversed_axes
-from .silence import discarded_stderr
+from .values import bytes_from, packed_planes, raw_planes
+
+LONGEST = 1 << 20  # bytes of a header, with a list of files
+LAST = "ElementDataFile"  # the field after which the data begins
+TYPES = {
+    f"MET_{sign}{name}": f"{kind}{size}"
+    for name, size in {"CHAR": 1, "SHORT": 2, "INT": 4, "LONG": 4, "LONG_LONG": 8}.items()
+    for sign, kind in (("", "i"), ("U", "u"))
+} | {"MET_FLOAT": "f4", "MET_DOUBLE": "f8"}
+LINE = re.compile(rb"[^\n]*\n?")
+FIELD = re.compile(rb"([^=:]*)([=:]?)(.*)", re.S)  # matches anything
+PATTERN = re.compile(r"([^%]*)%(0?[0-9]?)d([^%]*)")
+# Names of one and the same field; of several, ITK takes the first here.
+SPACING = "ElementSpacing", "ElementSize"
+ORIGIN = "Origin", "Offset", "Position"
+DIRECTION = "TransformMatrix", "Rotation", "Orientation"
+IS_BIG = "BinaryDataByteOrderMSB", "ElementByteOrderMSB"
+
+Planes = Callable[[int, int], NDArray[Any]]
 
 
 def read_metaimage(request: Request) -> Volume:
-    """Read a ``.mha`` file, or a ``.mhd`` file and the data file that it names."""
-    import SimpleITK as sitk  # noqa: N813, its usual name is sitk
+    """Read a ``.mha`` file, or a ``.mhd`` file and the data files that it names."""
+    file = InputFile.open(request.path)
+    header = Header(file.read(0, LONGEST).tobytes())
+    size = header.whole("DimSize", ())
+    channels = header.whole("ElementNumberOfChannels", (1,))
+    if len(size) != 3 or channels != (1,):
+        more = f" of {channels[0]} numbers" * (channels != (1,))
+        raise GridError(
+            f"{request.path} has shape {size}{more}: give a file of three axes (x, y, z)"
+        )
+    if min(size) < 1 or max(size) > np.iinfo(np.int64).max:
+        raise FileError(f"its DimSize is {header.fields['DimSize']}")
+    spacing = np.array(header.numbers(SPACING, np.ones(3)))
+    matrix = np.array(header.numbers(DIRECTION, np.eye(3).ravel())).reshape(3, 3)
+    direction = matrix.T * np.where(spacing < 0, -1, 1)  # as ITK takes a spacing below 0
+    origin = tuple(header.numbers(ORIGIN, np.zeros(3)))
+    place = reversed_axes(np.abs(spacing), direction)
+    read, packed = _data(request, file, header, size[::-1])
+    return Volume(size[::-1], header.dtype, read, place[0], origin, place[1], packed=packed)
 
-    reader = sitk.ImageFileReader()
-    reader.SetFileName(str(request.path))
-    reader.SetImageIO("MetaImageIO")
-    with _quiet(sitk):
-        reader.ReadImageInformation()
-    size = reader.GetSize()
-    if len(size) != 3 or reader.GetNumberOfComponents() != 1:
-        more = f" of {reader.GetNumberOfComponents()} numbers"
-        what = f"shape {size}" + more * (reader.GetNumberOfComponents() > 1)
-        raise GridError(f"{request.path} has {what}: give a file of three axes (x, y, z)")
-    dtype = _dtype(sitk, reader.GetPixelID())
-    direction = np.reshape(reader.GetDirection(), (3, 3))
-    spacing, direction = reversed_axes(reader.GetSpacing(), direction)
+
+class Header:
+    """The fields of a header, up to the one that names the data.
+
+    Attributes
+    ----------
+    fields : dict
+        The text of each field.
+    rest : bytes
+        What follows in the beginning of the file, and ``length``, where that begins.
+    """
+
+    def __init__(self, text: bytes) -> None:
+        self.fields: dict[str, str] = {}
+        for line in LINE.finditer(text):
+            name, found, value = FIELD.fullmatch(line[0]).groups()  # type: ignore[union-attr]
+            key, said = (
+                name.decode("latin1").strip(),
+                value.decode(errors="surrogateescape").strip(),
+            )
+            if not found and key:
+                raise FileError(f"its header is damaged: the line {seen(key)} is no NAME = VALUE")
+            if self.fields.get(key, said) != said and key != "Comment":
+                raise FileError(f"its header is damaged: it states {key} twice")
+            self.fields[key] = said
+            if key == LAST:
+                self.rest, self.length = text[line.end() :], line.end()
+                return
+        raise FileError(f"its header is damaged: it has no {LAST} in {len(text):,} bytes")
+
+    def whole(self, name: str, default: tuple[int, ...]) -> tuple[int, ...]:
+        """Return the whole numbers of a field."""
+        if name not in self.fields:
+            return default
+        words = self.fields[name].split()
+        if not all(re.fullmatch("-?[0-9]{1,18}", word) for word in words):
+            raise FileError(f"its {name} is {seen(self.fields[name])}: give whole numbers")
+        return tuple(map(int, words))
+
+    def numbers(self, names: tuple[str, ...], default: NDArray[Any]) -> list[float]:
+        """Return the numbers of the first of some fields that there is."""
+        name = next((name for name in names if name in self.fields), None)
+        if name is None:
+            return default.tolist()
+        try:
+            numbers = [float(word) for word in self.fields[name].split()]
+        except ValueError:
+            numbers = []
+        if len(numbers) != len(default) or not np.isfinite(numbers).all():
+            raise FileError(f"its {name} is {seen(self.fields[name])}: give {len(default)} numbers")
+        return numbers
+
+    def flag(self, name: str, default: bool = False) -> bool:
+        """Return a field that is true or false, as ITK reads it: by its first letter."""
+        return self.fields.get(name, str(default))[:1] in ("T", "t", "1")
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the samples."""
+        kind = self.fields.get("ElementType", "")
+        if kind not in TYPES:
+            raise FileError(f"its ElementType is {seen(kind)}: give one of {', '.join(TYPES)}")
+        is_big = self.flag(next((name for name in IS_BIG if name in self.fields), ""))
+        return np.dtype(">" + TYPES[kind] if is_big else "<" + TYPES[kind])
+
+    def files(self, count: int) -> list[str]:
+        """Return the names of the data files, of which a list or a pattern has one a slice."""
+        first, *words = self.fields[LAST].split() or [""]
+        if first.startswith("LIST"):
+            if words not in ([], ["2"]):
+                raise FileError(f"its {LAST} is {seen(self.fields[LAST])}: give one file a slice")
+            names = self.rest.decode(errors="surrogateescape").split("\n", count)[:count]
+            return [name.strip() for name in names]
+        if "%" not in first:
+            return [self.fields[LAST]]
+        pattern, numbers = PATTERN.fullmatch(first), words or ["1"]
+        if not pattern or not all(re.fullmatch("-?[0-9]{1,9}", number) for number in numbers):
+            raise FileError(
+                f"its {LAST} is {seen(self.fields[LAST])}: give NAME%03d.raw 1 {count} 1"
+            )
+        low, step = int(numbers[0]), int(numbers[2]) if len(numbers) > 2 else 1
+        before, width, after = pattern.groups()
+        return [f"{before}{format(low + i * step, width + 'd')}{after}" for i in range(count)]
+
+
+def _data(
+    request: Request, file: InputFile, header: Header, shape: tuple[int, ...]
+) -> tuple[Planes, int | None]:
+    """Return a function that reads planes, and the size of compressed data."""
+    if not header.flag("BinaryData", True):
+        raise FileError("its BinaryData is False: save it as binary")
+    if header.fields[LAST].lower() == "local":
+        files, start = [file], header.length
+    else:
+        names = header.files(min(shape[0], LONGEST))
+        files = [InputFile.open(check_beside(request.path, name)) for name in names]
+        start = 0
+    skip = header.whole("HeaderSize", (0,))[0]
+    start = skip if skip > 0 else start
+    if header.flag("CompressedData"):
+        return _compressed(files, header, start, shape)
+    part = (shape[0] // len(files), *shape[1:])
+    if len(files) * part[0] != shape[0]:
+        raise FileError(f"it names {len(files)} data files for {shape[0]:,} slices")
+    if skip == -1:
+        start = max(files[0].size - prod(part) * header.dtype.itemsize, 0)
+    parts = [raw_planes(each, start, part, header.dtype) for each in files]
 
     def read(first: int, last: int) -> NDArray[Any]:
-        reader.SetExtractIndex((0, 0, first))
-        reader.SetExtractSize((size[0], size[1], last - first))
-        with _quiet(sitk):
-            planes: NDArray[Any] = sitk.GetArrayFromImage(reader.Execute())
-        return planes
+        if len(parts) == 1:
+            return parts[0].read(first, last)
+        return np.concatenate([parts[number].read(0, 1) for number in range(first, last)])
 
-    shape, at_once = size[::-1], request.planes_at_once(size[::-1], dtype)
-    if prod(shape) * dtype.itemsize > request.room:
-        at_once = max(at_once // 4, 1)  # the file's, SimpleITK's and our own copy of them
-    return Volume(shape, dtype, read, spacing, reader.GetOrigin(), direction, at_once)
+    return read, None
 
 
-def _dtype(sitk: Any, pixel: int) -> np.dtype[Any]:
-    """Return the type of the samples."""
-    return np.dtype(sitk.GetArrayViewFromImage(sitk.Image(1, 1, 1, pixel)).dtype)
-
-
-@contextmanager
-def _quiet(sitk: Any) -> Iterator[None]:
-    """Keep ITK from printing to stderr: what matters is raised.
-
-    Its parser of headers writes to the file descriptor itself, so that is redirected meanwhile.
-    """
-    shown = sitk.ProcessObject.GetGlobalWarningDisplay()
-    sitk.ProcessObject.SetGlobalWarningDisplay(False)
-    try:
-        with discarded_stderr():
-            yield
-    finally:
-        sitk.ProcessObject.SetGlobalWarningDisplay(shown)
+def _compressed(
+    files: list[InputFile], header: Header, start: int, shape: tuple[int, ...]
+) -> tuple[Planes, int]:
+    """Return a function that reads planes of zlib data, and its size."""
+    if len(files) > 1 or header.fields.get("HeaderSize", "0").startswith("-"):
+        raise FileError("it is compressed, in several files or behind others: store it as .mha")
+    follow = files[0].size - start
+    size = header.whole("CompressedDataSize", (follow,))[0]
+    if size != follow:
+        raise FileError(
+            f"{files[0].name} is damaged: its CompressedDataSize is {size:,}, but {follow:,} "
+            "bytes follow"
+        )
+    packed = bytes_from(files[0], start)
+    return packed_planes(packed, "zlib", shape, header.dtype, files[0].name), size

@@ -1,101 +1,436 @@
-"""VTK image data, with VTK: arrays (z, y, x) in C order, with extent, origin and direction.
+"""VTK image data: arrays (z, y, x) in C order, with extent, origin and direction.
 
 The extent need not begin at 0: sample (i, j, k) of the extent is at
-``origin + direction @ (spacing * (i, j, k))``.
+``origin + direction @ (spacing * (i, j, k))``. A file has pieces, each with its own extent.
+
+Read here and not with VTK, which takes samples that no piece covers as 0, the surface, and
+allocates what a damaged header asks for. VTK unpacks LZ4 alone, which Python cannot.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+import base64
+import lzma
+import re
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from math import prod
 from typing import Any
+from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import FileError
+from ...errors import FileError, GridError, seen
+from ...grid.planes import InputFile
+from ...machine.extras import check_modules
+from ..archives import Codec, Deflate, Unpacker
+from ..headers import ArrayHeader, Read
 from ..volume import ImageLattice, Request, Volume
 from .choosing import choose_member
-from .silence import discarded_stderr
+from .values import TextValues, bytes_from, next_planes
 
-ERROR = "ERROR:"  # begins each error that VTK prints
+PIECE, LONGEST_TAG = 1 << 20, 1 << 20  # bytes of XML
+MOST_CELLS = 10**7  # of the lattice that the borders of all pieces make
+LARGEST_BLOCK = 1 << 26  # bytes, of LZ4, which is unpacked block by block
+LZMA_MEMORY = 1 << 27  # bytes; xz takes 65 MB at its usual setting
+TYPES = {
+    f"{sign}{n}": f"{sign[0].lower()}{n // 8}" for sign in ("Int", "UInt") for n in (8, 16, 32, 64)
+}
+TYPES |= {"Float32": "f4", "Float64": "f8"}
+APPENDED = re.compile(rb"<AppendedData[^>]*>\s*_")
+KINDS = ("PointData", "CellData")
+
+Attributes = dict[str, str]
+Planes = Callable[[int, int], NDArray[Any]]
 
 
 def read_vti(request: Request) -> Volume:
     """Read the point data of a ``.vti`` file; cell data if there is no other."""
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkIOXML import vtkXMLImageDataReader
-
-    reader = vtkXMLImageDataReader()
-    reader.SetFileName(str(request.path))
-    with _raised_errors(request):
-        if not reader.CanReadFile(str(request.path)):
-            raise FileError(f"{request.path} is no VTK image data, or damaged")
-        reader.UpdateInformation()
-    points = _names(reader.GetPointDataArraySelection())
-    cells = _names(reader.GetCellDataArraySelection())
-    name = choose_member(request, points or cells, "array of points or cells")
-    image, of_points = reader.GetOutputInformation(0), bool(points)
-    extent = _extent(reader, image)
-    spacing, origin = np.array(image.Get(_key("SPACING"))), np.array(image.Get(_key("ORIGIN")))
-    lattice = ImageLattice(extent, spacing, origin, _direction(image), of_points)
+    file = InputFile.open(request.path)
+    outline = Outline(file)
+    kind = next((kind for kind in KINDS if any(piece.arrays[kind] for piece in outline.pieces)), "")
+    names = dict.fromkeys(name for piece in outline.pieces for name in piece.arrays.get(kind, ()))
+    name = choose_member(request, list(names), "array of points or cells")
+    of_points = kind == KINDS[0]
+    place = (_numbers(outline.image, key, 3, of) for key, of in (("Spacing", 1), ("Origin", 0)))
+    turn = _numbers(outline.image, "Direction", 9, np.eye(3).ravel()).reshape(3, 3)
+    lattice = ImageLattice(_extent(outline.image, "WholeExtent"), *place, turn, of_points)
+    parts = [Part(file, outline, piece, (kind, name), lattice) for piece in outline.pieces]
+    _check_cover(parts, lattice.shape)
+    if len({part.dtype for part in parts}) > 1:
+        raise FileError(f"its pieces hold {name} in several types: save it in one")
 
     def read(first: int, last: int) -> NDArray[Any]:
-        part = (*extent[:4], extent[4] + first, extent[4] + last - of_points)
-        with _raised_errors(request):
-            reader.UpdateExtent(part)
-        output = reader.GetOutput()
-        data = output.GetPointData() if of_points else output.GetCellData()
-        found = data.GetArray(name)
-        if found is None or found.GetNumberOfComponents() != 1:
-            raise FileError(f"{request.path}:{name} is no array of numbers")
-        # the reader may return more planes than it was asked for
-        start = output.GetExtent()[4] - extent[4]
-        values = vtk_to_numpy(found).reshape(-1, *lattice.shape[1:])
-        planes: NDArray[Any] = values[first - start : last - start]
+        planes = np.empty((last - first, *lattice.shape[1:]), parts[0].dtype)
+        for part in parts:
+            part.copy_to(planes, first)
         return planes
 
-    dtype = read(0, 1).dtype
-    return lattice.volume(dtype, read, request.planes_at_once(lattice.shape, dtype))
+    volume = lattice.volume(parts[0].dtype, read)
+    packed = [part.packed for part in parts if part.packed is not None]
+    return replace(volume, packed=min(sum(packed), file.size) if packed else None)
 
 
-def _key(name: str) -> Any:
-    """Return a key of VTK's information objects."""
-    from vtkmodules.vtkCommonDataModel import vtkDataObject
+@dataclass
+class Array:
+    """An array of a piece: the attributes of its element, and where the text in it is."""
 
-    return getattr(vtkDataObject, name)()
-
-
-def _extent(reader: Any, image: Any) -> tuple[int, ...]:
-    """Return the first and last index on each axis: x, y, z."""
-    extent: tuple[int, ...] = image.Get(reader.GetExecutive().WHOLE_EXTENT())
-    return extent
+    attributes: Attributes
+    start: int | None = None
+    end: int | None = None
 
 
-def _direction(image: Any) -> NDArray[np.float64]:
-    """Return the direction matrix; files of version 1 have none."""
-    found = image.Get(_key("DIRECTION"))
-    return np.reshape(found, (3, 3)) if found else np.eye(3)
+@dataclass
+class Piece:
+    """The attributes of a piece, and its arrays by kind and name."""
+
+    attributes: Attributes
+    arrays: dict[str, dict[str, Array]]
 
 
-def _names(selection: Any) -> list[str]:
-    """Return the names of the arrays of a selection."""
-    return [selection.GetArrayName(i) for i in range(selection.GetNumberOfArrays())]
+class Outline:
+    """What the XML of a file says, up to the data at its end.
+
+    Attributes
+    ----------
+    top, image : dict
+        Attributes of the elements VTKFile and ImageData.
+    pieces : list of Piece
+        All pieces that are not empty.
+    appended : str or None, int
+        The encoding of the data at the end, and where it begins.
+    """
+
+    def __init__(self, file: InputFile) -> None:
+        self.file = file
+        self.top: Attributes = {}
+        self.image: Attributes = {}
+        self.pieces: list[Piece] = []
+        self.appended: tuple[str | None, int] = (None, 0)
+        self.path: list[str] = []
+        self.array: Array | None = None
+        self._parse()
+        if self.top.get("type") != "ImageData" or not self.image:
+            raise FileError(f"{file.name} is no VTK image data, or damaged")
+
+    def _parse(self) -> None:
+        """Parse the XML, of which no entity is expanded."""
+        parser = self.parser = expat.ParserCreate()
+        parser.StartElementHandler = self._start
+        parser.EndElementHandler = self._end
+        parser.StartDoctypeDeclHandler = self._refuse_doctype
+        try:
+            for place in range(0, self.file.size, PIECE):
+                text = self.file.read(place, PIECE).tobytes()
+                parser.Parse(text, place + PIECE >= self.file.size)
+                if place + len(text) - parser.CurrentByteIndex > LONGEST_TAG:
+                    raise FileError(f"{self.file.name} is damaged: a tag is too long")
+        except _Found:
+            pass
+        except expat.ExpatError as error:
+            raise FileError(
+                f"{self.file.name} is no VTK image data, truncated or damaged: {error}"
+            ) from None
+
+    def _refuse_doctype(self, *_: Any) -> None:
+        raise FileError(f"{self.file.name} has a document type: VTK image data has none")
+
+    def _start(self, name: str, attributes: Attributes) -> None:
+        """Take notice of an element."""
+        self._end_text()
+        path = self.path = [*self.path, name]
+        if len(path) == 1 and name == "VTKFile":
+            self.top = attributes
+        elif path[1:] == ["ImageData"]:
+            self.image = attributes
+        elif path[1:] == ["ImageData", "Piece"]:
+            self.pieces.append(Piece(attributes, {kind: {} for kind in KINDS}))
+        elif path[1:3] == ["ImageData", "Piece"] and path[3] in KINDS and path[4:] == ["DataArray"]:
+            self._start_array(path[3], attributes)
+        elif path[1:] == ["AppendedData"]:
+            self._start_appended(attributes)
+
+    def _start_array(self, kind: str, attributes: Attributes) -> None:
+        """Take notice of an array; its text, if any, begins at the first character."""
+        arrays, name = self.pieces[-1].arrays[kind], attributes.get("Name", "")
+        if name in arrays:
+            raise FileError(f"{self.file.name} holds {name} twice in a piece: save one time step")
+        self.array = arrays[name] = Array(attributes)
+        self.parser.CharacterDataHandler = self._text
+
+    def _text(self, text: str) -> None:
+        """Note where the text of an array begins."""
+        if self.array and text.strip():
+            self.array.start = self.parser.CurrentByteIndex + len(text) - len(text.lstrip())
+            self.parser.CharacterDataHandler = None
+
+    def _end_text(self) -> None:
+        """Note that the text of an array, if there is one, ends at a tag."""
+        self.parser.CharacterDataHandler = None
+        if self.array:
+            self.array.end = self.parser.CurrentByteIndex
+            self.array = None
+
+    def _end(self, _: str) -> None:
+        self._end_text()
+        self.path = self.path[:-1]
+
+    def _start_appended(self, attributes: Attributes) -> None:
+        """Note where the data at the end begins, and parse no further."""
+        place = self.parser.CurrentByteIndex
+        found = APPENDED.match(self.file.read(place, LONGEST_TAG).tobytes())
+        if not found:
+            raise FileError(f"{self.file.name} is damaged: its appended data does not begin with _")
+        self.appended = attributes.get("encoding"), place + found.end()
+        raise _Found
 
 
-@contextmanager
-def _raised_errors(request: Request) -> Iterator[None]:
-    """Raise FileError for the first error that VTK would print to stderr; print nothing."""
-    from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
+class _Found(Exception):  # noqa: N818, it is no error
+    """The data at the end of a file begins."""
 
-    shown, window = vtkOutputWindow.GetInstance(), vtkStringOutputWindow()
-    vtkOutputWindow.SetInstance(window)
-    try:
-        with discarded_stderr():  # VTK's log
-            yield
-    finally:
-        vtkOutputWindow.SetInstance(shown)
-    text = window.GetOutput()
-    if ERROR in text:
-        reason = " ".join(text[text.index(ERROR) :].split()).split("): ")[1:2] or ["damaged"]
-        raise FileError(f"{request.path} cannot be read by VTK: {reason[0][:200]}")
+
+class Source:
+    """Bytes in a file, as they are or in base64.
+
+    Parameters
+    ----------
+    file : InputFile
+        The file.
+    start, end : int
+        Where the bytes, or their text, begin and end.
+    is_text : bool
+        Whether they are in base64.
+    """
+
+    def __init__(self, file: InputFile, start: int, end: int, is_text: bool) -> None:
+        self.file, self.start, self.end, self.is_text = file, start, end, is_text
+        self.size = max(end - start, 0)
+        if is_text:
+            self.size = self.size // 4 * 3
+
+    def read(self, offset: int, count: int) -> NDArray[np.uint8]:
+        """Return ``count`` bytes from ``offset`` on, or fewer at the end."""
+        if not self.is_text:
+            place = self.start + offset
+            return self.file.read(place, min(count, self.end - place))
+        first, last = offset // 3, -(-(offset + count) // 3)
+        place, stop = self.start + 4 * first, min(self.start + 4 * last, self.end)
+        text = self.file.read(place, stop - place).tobytes()
+        data = base64.b64decode(text.rstrip() if stop == self.end else text, validate=True)
+        return np.frombuffer(data, np.uint8)[offset - 3 * first :][:count]
+
+    def after(self, size: int) -> Source:
+        """Return what follows a section of some bytes, each of which has its own base64."""
+        text = -(-size // 3) * 4 if self.is_text else size
+        return Source(self.file, self.start + text, self.end, self.is_text)
+
+
+class Part:
+    """An array of a piece, whose planes come in order, and where it is in the whole array.
+
+    Attributes
+    ----------
+    low, high : three ints
+        Its first sample along each axis (z, y, x), and that after its last.
+    packed : int or None
+        Bytes of compressed data.
+    """
+
+    def __init__(
+        self,
+        file: InputFile,
+        outline: Outline,
+        piece: Piece,
+        which: tuple[str, str],
+        lattice: ImageLattice,
+    ) -> None:
+        extent = _extent(piece.attributes, "Extent")
+        own = replace(lattice, extent=extent)
+        self.low = tuple(extent[2 * axis] - lattice.extent[2 * axis] for axis in (2, 1, 0))
+        self.high = tuple(low + size for low, size in zip(self.low, own.shape))
+        self.packed: int | None = None
+        array = piece.arrays[which[0]].get(which[1])
+        inside = all(0 <= a and b <= n for a, b, n in zip(self.low, self.high, lattice.shape))
+        if array is None or not inside:
+            reason = "is not in the whole extent" if array else f"has no {which[1]}"
+            raise FileError(f"{file.name} is damaged: its piece {seen(extent)} {reason}")
+        about = array.attributes
+        if about.get("NumberOfComponents", "1") != "1" or about.get("type") not in TYPES:
+            raise GridError(f"{file.name}:{which[1]} is no array of one number per sample")
+        order = {"LittleEndian": "<", "BigEndian": ">"}[outline.top.get("byte_order", "")]
+        self.dtype = np.dtype(order + TYPES[about["type"]])
+        self.word = np.dtype(order + {"UInt64": "u8"}.get(outline.top.get("header_type", ""), "u4"))
+        self.header = ArrayHeader(own.shape, self.dtype, False, 0)
+        self.name = f"{file.name}:{which[1]}"
+        self.planes = self._planes(file, outline, array)
+
+    def copy_to(self, planes: NDArray[Any], first: int) -> None:
+        """Copy the planes that this part has of those from ``first`` on."""
+        start, stop = max(self.low[0], first), min(self.high[0], first + len(planes))
+        if start < stop:
+            _, rows, columns = (slice(*ends) for ends in zip(self.low, self.high))
+            own = self.planes(start - self.low[0], stop - self.low[0])
+            planes[start - first : stop - first, rows, columns] = own
+
+    def _planes(self, file: InputFile, outline: Outline, array: Array) -> Planes:
+        """Return a function that returns the next planes."""
+        form = array.attributes.get("format")
+        start, end = array.start or 0, array.end or 0
+        if form == "ascii":
+            return TextValues(file, start, end, self.dtype, self.header.shape).planes
+        if form == "appended":
+            encoding, start = outline.appended
+            source = Source(file, start, file.size, encoding == "base64")
+            offset = array.attributes.get("offset", "").strip()
+            if encoding not in ("raw", "base64") or not re.fullmatch("[0-9]{1,18}", offset):
+                raise FileError(f"{self.name} is damaged: its offset is {seen(offset)}")
+            source = Source(file, start + int(offset), file.size, encoding == "base64")
+        else:
+            source = Source(file, start, end, True)
+        compressor = outline.top.get("compressor")
+        read = self._blocks(source, compressor) if compressor else self._whole(source)
+        return next_planes(read, self.header)
+
+    def _words(self, source: Source, first: int, count: int) -> list[int]:
+        """Return some of the numbers before the data."""
+        size = self.word.itemsize
+        if (first + count) * size > source.size:
+            raise FileError(f"{self.name} is truncated: its data begins after the end of the file")
+        data = source.read(first * size, count * size)
+        return [int(number) for number in data.view(self.word)]
+
+    def _whole(self, source: Source) -> Read:
+        """Return a function that reads data that is not compressed."""
+        (size,) = self._words(source, 0, 1)
+        start = self.word.itemsize
+        self._check_size(size)
+        if source.size < start + size:
+            raise FileError(
+                f"{self.name} is truncated: {size:,} bytes are promised, {source.size:,} follow"
+            )
+        return bytes_from(source, start, start + size)
+
+    def _check_size(self, size: int) -> None:
+        """Raise FileError unless data of some bytes is the array."""
+        if size != self.header.size:
+            raise FileError(f"{self.name} is damaged: {size:,} bytes for {self.header}")
+
+    def _blocks(self, source: Source, compressor: str) -> Read:
+        """Return a function that reads compressed data: blocks of one size, the last shorter."""
+        count, size, last = self._words(source, 0, 3)
+        sizes = [size] * (count - 1) + [last or size] if count < source.size else []
+        self._check_size(sum(sizes))
+        packed = self._words(source, 3, count)
+        self.packed = sum(packed)
+        data = source.after((3 + count) * self.word.itemsize)
+
+        def blocks() -> Iterator[Unpacker]:
+            start = 0
+            for length, whole in zip(packed, sizes):
+                read = bytes_from(data, start, start + length)
+                yield Unpacker(read, _codec(compressor, whole), whole, self.name)
+                start += length
+
+        return _joined(blocks())
+
+
+def _codec(compressor: str, size: int) -> Codec:
+    """Return the decompressor of a block."""
+    if compressor == "vtkZLibDataCompressor":
+        return Deflate(zlib.MAX_WBITS)
+    if compressor == "vtkLZMADataCompressor":
+        return lzma.LZMADecompressor(memlimit=LZMA_MEMORY)
+    if compressor == "vtkLZ4DataCompressor" and size <= LARGEST_BLOCK:
+        return Lz4(size)
+    raise FileError(
+        f"its compressor is {seen(compressor)}, blocks of {size:,} bytes: save it with "
+        "vtkZLibDataCompressor"
+    )
+
+
+class Lz4:
+    """A decompressor for a block of LZ4, which has no checksum.
+
+    Parameters
+    ----------
+    size : int
+        Bytes of the block when it is unpacked.
+    """
+
+    def __init__(self, size: int) -> None:
+        check_modules("LZ4 in VTK image data", "vti")
+        self.size, self.packed, self.rest = size, b"", b""
+        self.eof, self.unused_data, self.needs_input = False, b"", True
+
+    def decompress(self, data: bytes, max_length: int) -> bytes:
+        """Take the data, or unpack the block if there is no more."""
+        from vtkmodules.vtkIOCore import vtkLZ4DataCompressor
+
+        if data:
+            self.packed += data
+            return b""
+        if self.needs_input:
+            block, self.needs_input = np.empty(self.size, np.uint8), False
+            compressor = vtkLZ4DataCompressor()
+            if compressor.Uncompress(self.packed, len(self.packed), block, self.size) != self.size:
+                raise FileError("a block of LZ4 is damaged")
+            self.rest = block.tobytes()
+        taken, self.rest = self.rest[:max_length], self.rest[max_length:]
+        self.eof = not self.rest
+        return taken
+
+
+def _joined(blocks: Iterator[Unpacker]) -> Read:
+    """Return a function that reads blocks one after the other."""
+    block = next(blocks)
+
+    def read(count: int) -> bytes:
+        nonlocal block
+        pieces = []
+        while count:
+            if not block.left:
+                block = next(blocks)
+            pieces.append(block.read(count))
+            count -= len(pieces[-1])
+        return b"".join(pieces)
+
+    return read
+
+
+def _check_cover(parts: list[Part], shape: tuple[int, ...]) -> None:
+    """Raise FileError if some samples are in no piece: VTK has 0 there, which is the surface."""
+    cuts = [sorted({end for p in parts for end in (p.low[a], p.high[a])}) for a in range(3)]
+    if prod(map(len, cuts)) > MOST_CELLS:
+        raise FileError(f"its {len(parts):,} pieces are too many, or lie anyhow: save it as one")
+    covered = np.zeros([max(len(cut) - 1, 0) for cut in cuts], bool)
+    for part in parts:
+        ends = (cut.index(end) for cut, both in zip(cuts, zip(part.low, part.high)) for end in both)
+        a, b, c, d, e, f = ends
+        covered[a:b, c:d, e:f] = True
+    lengths = [np.diff(cut).astype(object) for cut in cuts]
+    counts = np.multiply.outer(np.multiply.outer(lengths[0], lengths[1]), lengths[2])
+    missing = prod(shape) - int(counts[covered].sum() if covered.any() else 0)
+    if missing:
+        raise FileError(
+            f"{missing:,} of its {prod(shape):,} samples are in no piece: save it with all pieces"
+        )
+
+
+def _extent(attributes: Attributes, name: str) -> tuple[int, ...]:
+    """Return the first and the last point on each axis: x, y, z."""
+    words = attributes.get(name, "").split()
+    if len(words) != 6 or not all(re.fullmatch("-?[0-9]{1,10}", word) for word in words):
+        raise FileError(f"its {name} is {seen(attributes.get(name))}: give six whole numbers")
+    return tuple(map(int, words))
+
+
+def _numbers(attributes: Attributes, name: str, count: int, default: Any) -> NDArray[np.float64]:
+    """Return the numbers of an attribute, or what holds without it."""
+    if name not in attributes:
+        return np.broadcast_to(np.asarray(default, np.float64), count)
+    numbers = np.array(attributes[name].split(), np.float64)
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        raise FileError(f"its {name} is {seen(attributes[name])}: give {count} numbers")
+    return numbers
