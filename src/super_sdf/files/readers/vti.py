@@ -10,13 +10,14 @@ allocates what a damaged header asks for. VTK unpacks LZ4 alone, which Python ca
 from __future__ import annotations
 
 import base64
+import io
 import lzma
 import re
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from math import prod
-from typing import Any
+from typing import Any, NamedTuple
 from xml.parsers import expat
 
 import numpy as np
@@ -25,13 +26,14 @@ from numpy.typing import NDArray
 from ...errors import FileError, GridError, seen
 from ...grid.planes import InputFile
 from ...machine.extras import check_modules
-from ..archives import Codec, Deflate, Unpacker
+from ..archives import Deflate, Unpacker
 from ..headers import ArrayHeader, Read
 from ..volume import ImageLattice, Request, Volume
 from .choosing import choose_member
 from .values import TextValues, bytes_from, next_planes
 
 PIECE, LONGEST_TAG = 1 << 20, 1 << 20  # bytes of XML
+DEEPEST = 5  # elements from that of the file to that of an array
 MOST_CELLS = 10**7  # of the lattice that the borders of all pieces make
 LARGEST_BLOCK = 1 << 26  # bytes, of LZ4, which is unpacked block by block
 LZMA_MEMORY = 1 << 27  # bytes; xz takes 65 MB at its usual setting
@@ -78,12 +80,11 @@ class Array:
     """An array of a piece: the attributes of its element, and where the text in it is."""
 
     attributes: Attributes
-    start: int | None = None
-    end: int | None = None
+    start: int = 0
+    end: int = 0
 
 
-@dataclass
-class Piece:
+class Piece(NamedTuple):
     """The attributes of a piece, and its arrays by kind and name."""
 
     attributes: Attributes
@@ -140,16 +141,17 @@ class Outline:
     def _start(self, name: str, attributes: Attributes) -> None:
         """Take notice of an element."""
         self._end_text()
-        path = self.path = [*self.path, name]
-        if len(path) == 1 and name == "VTKFile":
+        self.path.append(name)
+        where = self.path[1:] if len(self.path) <= DEEPEST else []
+        if self.path == ["VTKFile"]:
             self.top = attributes
-        elif path[1:] == ["ImageData"]:
+        elif where == ["ImageData"]:
             self.image = attributes
-        elif path[1:] == ["ImageData", "Piece"]:
+        elif where == ["ImageData", "Piece"]:
             self.pieces.append(Piece(attributes, {kind: {} for kind in KINDS}))
-        elif path[1:3] == ["ImageData", "Piece"] and path[3] in KINDS and path[4:] == ["DataArray"]:
-            self._start_array(path[3], attributes)
-        elif path[1:] == ["AppendedData"]:
+        elif where[:2] + where[3:] == ["ImageData", "Piece", "DataArray"] and where[2] in KINDS:
+            self._start_array(where[2], attributes)
+        elif where == ["AppendedData"]:
             self._start_appended(attributes)
 
     def _start_array(self, kind: str, attributes: Attributes) -> None:
@@ -175,7 +177,7 @@ class Outline:
 
     def _end(self, _: str) -> None:
         self._end_text()
-        self.path = self.path[:-1]
+        self.path.pop()
 
     def _start_appended(self, attributes: Attributes) -> None:
         """Note where the data at the end begins, and parse no further."""
@@ -252,7 +254,7 @@ class Part:
         self.high = tuple(low + size for low, size in zip(self.low, own.shape))
         self.packed: int | None = None
         array = piece.arrays[which[0]].get(which[1])
-        inside = all(0 <= a and b <= n for a, b, n in zip(self.low, self.high, lattice.shape))
+        inside = all(a >= 0 and b <= n for a, b, n in zip(self.low, self.high, lattice.shape))
         if array is None or not inside:
             reason = "is not in the whole extent" if array else f"has no {which[1]}"
             raise FileError(f"{file.name} is damaged: its piece {seen(extent)} {reason}")
@@ -277,18 +279,15 @@ class Part:
     def _planes(self, file: InputFile, outline: Outline, array: Array) -> Planes:
         """Return a function that returns the next planes."""
         form = array.attributes.get("format")
-        start, end = array.start or 0, array.end or 0
         if form == "ascii":
-            return TextValues(file, start, end, self.dtype, self.header.shape).planes
+            return TextValues(file, array.start, array.end, self.dtype, self.header.shape).planes
+        source = Source(file, array.start, array.end, True)
         if form == "appended":
             encoding, start = outline.appended
-            source = Source(file, start, file.size, encoding == "base64")
             offset = array.attributes.get("offset", "").strip()
             if encoding not in ("raw", "base64") or not re.fullmatch("[0-9]{1,18}", offset):
                 raise FileError(f"{self.name} is damaged: its offset is {seen(offset)}")
             source = Source(file, start + int(offset), file.size, encoding == "base64")
-        else:
-            source = Source(file, start, end, True)
         compressor = outline.top.get("compressor")
         read = self._blocks(source, compressor) if compressor else self._whole(source)
         return next_planes(read, self.header)
@@ -326,63 +325,42 @@ class Part:
         self.packed = sum(packed)
         data = source.after((3 + count) * self.word.itemsize)
 
-        def blocks() -> Iterator[Unpacker]:
+        def blocks() -> Iterator[Read]:
             start = 0
             for length, whole in zip(packed, sizes):
                 read = bytes_from(data, start, start + length)
-                yield Unpacker(read, _codec(compressor, whole), whole, self.name)
+                yield _block(compressor, read, length, whole, self.name)
                 start += length
 
         return _joined(blocks())
 
 
-def _codec(compressor: str, size: int) -> Codec:
-    """Return the decompressor of a block."""
+def _block(compressor: str, packed: Read, length: int, size: int, name: str) -> Read:
+    """Return a function that reads a block of some bytes, of which ``length`` are stored."""
     if compressor == "vtkZLibDataCompressor":
-        return Deflate(zlib.MAX_WBITS)
+        return Unpacker(packed, Deflate(zlib.MAX_WBITS), size, name).read
     if compressor == "vtkLZMADataCompressor":
-        return lzma.LZMADecompressor(memlimit=LZMA_MEMORY)
-    if compressor == "vtkLZ4DataCompressor" and size <= LARGEST_BLOCK:
-        return Lz4(size)
+        return Unpacker(packed, lzma.LZMADecompressor(memlimit=LZMA_MEMORY), size, name).read
+    if compressor == "vtkLZ4DataCompressor" and max(size, length) <= LARGEST_BLOCK:
+        return io.BytesIO(_unpack_lz4(packed(length), size, name)).read
     raise FileError(
-        f"its compressor is {seen(compressor)}, blocks of {size:,} bytes: save it with "
+        f"its compressor is {seen(compressor)}, a block {size:,} bytes: save it with "
         "vtkZLibDataCompressor"
     )
 
 
-class Lz4:
-    """A decompressor for a block of LZ4, which has no checksum.
+def _unpack_lz4(packed: bytes, size: int, name: str) -> bytes:
+    """Return an unpacked block of LZ4, which has no checksum."""
+    check_modules("LZ4 in VTK image data", "vti")
+    from vtkmodules.vtkIOCore import vtkLZ4DataCompressor
 
-    Parameters
-    ----------
-    size : int
-        Bytes of the block when it is unpacked.
-    """
-
-    def __init__(self, size: int) -> None:
-        check_modules("LZ4 in VTK image data", "vti")
-        self.size, self.packed, self.rest = size, b"", b""
-        self.eof, self.unused_data, self.needs_input = False, b"", True
-
-    def decompress(self, data: bytes, max_length: int) -> bytes:
-        """Take the data, or unpack the block if there is no more."""
-        from vtkmodules.vtkIOCore import vtkLZ4DataCompressor
-
-        if data:
-            self.packed += data
-            return b""
-        if self.needs_input:
-            block, self.needs_input = np.empty(self.size, np.uint8), False
-            compressor = vtkLZ4DataCompressor()
-            if compressor.Uncompress(self.packed, len(self.packed), block, self.size) != self.size:
-                raise FileError("a block of LZ4 is damaged")
-            self.rest = block.tobytes()
-        taken, self.rest = self.rest[:max_length], self.rest[max_length:]
-        self.eof = not self.rest
-        return taken
+    block = np.empty(size, np.uint8)
+    if vtkLZ4DataCompressor().Uncompress(packed, len(packed), block, size) != size:
+        raise FileError(f"{name} is damaged: a block of LZ4 does not have {size:,} bytes")
+    return block.tobytes()
 
 
-def _joined(blocks: Iterator[Unpacker]) -> Read:
+def _joined(blocks: Iterator[Read]) -> Read:
     """Return a function that reads blocks one after the other."""
     block = next(blocks)
 
@@ -390,10 +368,11 @@ def _joined(blocks: Iterator[Unpacker]) -> Read:
         nonlocal block
         pieces = []
         while count:
-            if not block.left:
+            piece = block(count)
+            if not piece:
                 block = next(blocks)
-            pieces.append(block.read(count))
-            count -= len(pieces[-1])
+            pieces.append(piece)
+            count -= len(piece)
         return b"".join(pieces)
 
     return read
