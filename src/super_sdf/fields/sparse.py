@@ -18,7 +18,7 @@ from numpy.lib import format as npy
 from numpy.typing import DTypeLike, NDArray
 
 from ..arrays import FloatArray, IntArray
-from ..errors import FileError, OptionError
+from ..errors import FileError, GridError, OptionError
 from ..files.archives import Member, open_archive
 from ..files.headers import ArrayHeader, read_array_header
 from ..files.regular import check_regular_file
@@ -31,7 +31,7 @@ from ..options import check_path
 from ..steps.band import neighbour_table
 from ..steps.cap import find_border_inside
 from ..steps.field import FineField, SampleSpheres
-from ..steps.nodes import check_factor, share_parts
+from ..steps.nodes import check_factor, copies_agree, share_parts
 
 VERSION = 1
 CHUNK = 1 << 20  # values at a time
@@ -212,10 +212,19 @@ class _Reader:
         shape = tuple(map(int, self._array("shape", "iu", (3,))))
         if not 2 <= min(shape) <= max(shape) <= LONGEST:
             raise FileError(f"{self.name} is no refined field: its grid has the shape {shape}")
-        factor = self._checked_factor()
+        try:
+            factor, grid = check_factor(int(self._array("factor", "iu", ()))), self._grid(shape)
+        except (GridError, OptionError) as error:
+            raise FileError(f"{self.name} is no refined field: {error}") from None
         voxels = self._voxels("voxels", shape)
-        grid = self._grid(shape)
+        if not len(voxels):
+            raise FileError(f"{self.name} is no refined field: it has no blocks")
         blocks = self._blocks(len(voxels), factor, grid)
+        parts = share_parts(neighbour_table(voxels, shape))
+        if not copies_agree(blocks, parts, factor):
+            raise FileError(
+                f"{self.name}[values] is damaged: blocks differ at nodes that they share"
+            )
         samples = self._voxels("sample_voxels", shape)
         distance = self._array("sample_distances", "f", (len(samples),))
         return FineField(
@@ -223,22 +232,26 @@ class _Reader:
             factor,
             voxels,
             blocks,
-            share_parts(neighbour_table(voxels, shape)),
+            parts,
             (0, shape[0]),
             spheres=SampleSpheres(shape, samples, _in_half_voxels(distance, grid)),  # type: ignore[arg-type]
             decoded_voxels=len(voxels),
             grid=grid,
             offset=float(self._array("offset", "f", ())),
             leaves=bool(self._array("leaves", "b", ())),
-            border_inside=self._voxels("border_inside", shape),
+            border_inside=self._border_inside(voxels, shape),
         )
 
-    def _checked_factor(self) -> int:
-        """Return the factor."""
-        try:
-            return check_factor(int(self._array("factor", "iu", ())))
-        except OptionError as error:
-            raise FileError(f"{self.name} is no refined field: {error}") from None
+    def _border_inside(self, blocks: IntArray, shape: tuple[int, ...]) -> IntArray:
+        """Return the border voxels without a block."""
+        voxels = self._voxels("border_inside", shape)
+        at_border = ((voxels == 0) | (voxels == np.array(shape) - 1)).any(1)
+        numbers = (np.ravel_multi_index(tuple(ijk.T), shape) for ijk in (voxels, blocks))
+        if not at_border.all() or np.isin(*numbers).any():
+            raise FileError(
+                f"{self.name}[border_inside] is damaged: not all are border voxels without a block"
+            )
+        return voxels
 
     def _grid(self, shape: tuple[int, ...]) -> SdfGrid:
         """Return the coarse grid, without samples."""
@@ -270,14 +283,19 @@ class _Reader:
         for rows, data in _pieces(member, header, nodes):
             blocks[:, rows] = _in_half_voxels(data, grid).reshape(-1, nodes).T
         if not np.isfinite(blocks).all():
-            raise FileError(f"{self.name}[values] is damaged: not all values are finite")
+            raise self._not_finite("values")
         return blocks
+
+    def _not_finite(self, key: str) -> FileError:
+        return FileError(f"{self.name}[{key}] is damaged: not all values are finite")
 
     def _array(self, key: str, kinds: str, shape: tuple[int | None, ...]) -> NDArray[Any]:
         """Return an array of one of some kinds and of a shape, in which None is any length."""
         member, header = self._open(key, kinds, shape)
         check_fits(header.size, f"{self.name}[{key}]", "read it on a larger machine")
         array: NDArray[Any] = np.frombuffer(member.read(header.size), header.dtype)
+        if header.dtype.kind == "f" and not np.isfinite(array).all():
+            raise self._not_finite(key)
         return array.reshape(header.shape)
 
     def _open(

@@ -197,6 +197,19 @@ def average_shared(blocks: FloatArray, parts: SharedParts, factor: int, threads:
     map_threads(lambda axes: _average_group(blocks, parts.table, factor, axes), groups, threads)
 
 
+def copies_agree(blocks: FloatArray, parts: SharedParts, factor: int) -> bool:
+    """Return whether all copies of each shared node, (Q, D) values by block, are equal."""
+    nodes = nodes_of_part(factor)
+    for part, owners in enumerate(parts.owner):
+        for place in np.unique(owners[owners != CENTRE]):
+            rows = np.flatnonzero(owners == place)
+            there = parts.table[place].take(rows)
+            for own, other in zip(nodes[part], nodes[seen_from(part, place)]):
+                if (blocks[own].take(rows) != blocks[other].take(there)).any():
+                    return False
+    return True
+
+
 def _average_group(
     blocks: FloatArray, table: IntArray, factor: int, axes: tuple[bool, ...]
 ) -> None:
