@@ -254,10 +254,15 @@ def test_a_field_saved_in_slabs_is_the_same_file(name, suffix, bare_plan, monkey
     assert path.read_bytes() == Path("whole" + suffix).read_bytes()
 
 
+def good_field() -> dict[str, np.ndarray]:
+    """Return the arrays of a field's file."""
+    write_field(upsample(ball(12, 3.0), trilinear, 2), "good.npz", force=True)
+    return dict(np.load("good.npz"))
+
+
 def damage(name: str, **changed) -> str:
     """Write a field's file with some arrays changed (None: left out); return the error's text."""
-    write_field(upsample(ball(12, 3.0), trilinear, 2), "good.npz", force=True)
-    arrays = {**np.load("good.npz"), **changed}
+    arrays = {**good_field(), **changed}
     np.savez(name, **{key: value for key, value in arrays.items() if value is not None})
     with pytest.raises(FileError) as caught:
         read_field(name)
@@ -285,6 +290,28 @@ def test_files_that_are_no_fields_are_refused_in_one_line():
     spoilt[3, 1, 1, 1] = np.nan
     assert damage("a.npz", values=spoilt) == ("a.npz[values] is damaged: not all values are finite")
     assert "belongs to no refined field" in damage("a.npz", sample_distances=np.zeros(3))
+    for key in ("sample_distances", "origin", "offset"):
+        text = damage("a.npz", **{key: good[key] + np.nan})
+        assert text == f"a.npz[{key}] is damaged: not all values are finite"
+    assert damage("a.npz", spacing=np.zeros(3)) == (
+        "a.npz is no refined field: spacing is 0, 0, 0: it must be greater than 0"
+    )
+    none = {key: good[key][:0] for key in ("voxels", "values")}
+    assert damage("a.npz", **none) == "a.npz is no refined field: it has no blocks"
+
+
+def test_blocks_that_do_not_fit_together_are_refused():
+    """Their mesh would have triangles of vertices that there are not."""
+    said = "a.npz[values] is damaged: blocks differ at nodes that they share"
+    random = np.random.default_rng(0).normal(size=(len(good_field()["values"]), 3, 3, 3))
+    assert damage("a.npz", values=random) == said
+    for place in ((0, 0, 0), (0, 1, 2), (2, 1, 1)):  # a corner, an edge and a face of a block
+        values = good_field()["values"]
+        values[len(values) // 2][place] += 1
+        assert damage("a.npz", values=values) == said
+    border = "a.npz[border_inside] is damaged: not all are border voxels without a block"
+    for voxel in (good_field()["voxels"][:1], np.array([[1, 1, 1]], np.int32)):
+        assert damage("a.npz", border_inside=voxel) == border
 
 
 def test_damaged_and_foreign_files_are_refused():

@@ -20,7 +20,6 @@ READERS = {
     "fields.vti": {"vtkmodules"},
     "files.images": {"vtkmodules"},
     "files.readers.hdf5": {"h5py"},
-    "files.readers.metaimage": {"SimpleITK"},
     "files.readers.nifti": {"nibabel"},
     "files.readers.nrrd_file": {"nrrd"},
     "files.readers.tiff": {"tifffile"},

@@ -12,6 +12,7 @@ import lzma
 import struct
 import zipfile
 import zlib
+from contextlib import suppress
 from typing import Any, Protocol
 
 from ..errors import FileError
@@ -82,9 +83,13 @@ class Deflate:
 
 
 def open_archive(file: InputFile) -> zipfile.ZipFile:
-    """Open a zip archive."""
+    """Open a zip archive, each member of which has one name in its two headers."""
     try:
-        return zipfile.ZipFile(file.file)
+        archive = zipfile.ZipFile(file.file)
+        for info in archive.infolist():
+            with suppress(RuntimeError, NotImplementedError):  # one that is not read may be packed
+                archive.open(info).close()  # or encrypted as it likes
+        return archive
     except Exception as error:  # zipfile raises over ten kinds of error on damaged fields
         raise FileError(f"{file.name} is not a readable .npz archive: {error}") from None
 
