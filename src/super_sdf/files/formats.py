@@ -34,6 +34,8 @@ class GridFormat:
         The axis order of an array unless ``--axes`` gives another; None if the file states it.
     has_members : bool
         Whether a file may hold several arrays, one of which ``FILE:NAME`` names.
+    is_apart : bool
+        Whether its library, in C, reads it in a process of its own.
     """
 
     key: str
@@ -42,6 +44,7 @@ class GridFormat:
     extra: str | None = None
     axes: str | None = None
     has_members: bool = False
+    is_apart: bool = False
 
 
 FORMATS = (
@@ -50,11 +53,11 @@ FORMATS = (
     GridFormat("nifti", "NIfTI", (".nii", ".nii.gz"), "nifti"),
     GridFormat("nrrd", "NRRD", (".nrrd", ".nhdr"), "nrrd"),
     GridFormat("metaimage", "MetaImage", (".mha", ".mhd")),
-    GridFormat("vti", "VTK image data", (".vti",), has_members=True),
-    GridFormat("tiff", "TIFF stack", (".tif", ".tiff"), "tiff", axes="zyx"),
-    GridFormat("hdf5", "HDF5", (".h5", ".hdf5", ".hdf"), "hdf5", axes="zyx", has_members=True),
-    GridFormat("zarr", "Zarr", (".zarr", ".zarr.zip"), "zarr", axes="zyx", has_members=True),
-    GridFormat("vdb", "OpenVDB", (".vdb",), "vdb", has_members=True),
+    GridFormat("vti", "VTK image data", (".vti",), "vti", has_members=True),
+    GridFormat("tiff", "TIFF stack", (".tif", ".tiff"), "tiff", axes="zyx", is_apart=True),
+    GridFormat("hdf5", "HDF5", (".h5", ".hdf5", ".hdf"), "hdf5", "zyx", True, is_apart=True),
+    GridFormat("zarr", "Zarr", (".zarr", ".zarr.zip"), "zarr", "zyx", True, is_apart=True),
+    GridFormat("vdb", "OpenVDB", (".vdb",), "vdb", has_members=True, is_apart=True),
     GridFormat("sdf", "SDFGen", (".sdf",)),
 )
 GRID_SUFFIXES = tuple(suffix for format_ in FORMATS for suffix in format_.suffixes)

@@ -26,6 +26,7 @@ from ..grid.samples import check_kind
 from ..grid.sdf_grid import SdfGrid, make_grid
 from ..machine.memory import held_memory, memory_bound
 from ..options import check_path
+from .apart import volume_apart
 from .archives import Member, open_archive
 from .formats import (
     GridFormat,
@@ -183,7 +184,11 @@ def open_volume(
 
     watched = None if file.is_dir() else InputFile.open(file)
     with one_line_errors(path, format_, watched), ExitStack() as files:
-        yield READERS[format_.key](Request(file, member, axes, *memory, files))
+        request = Request(file, member, axes, *memory, files)
+        if format_.is_apart:
+            yield files.enter_context(volume_apart(format_.key, request))
+        else:
+            yield READERS[format_.key](request)
 
 
 @contextmanager

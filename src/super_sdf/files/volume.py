@@ -334,12 +334,13 @@ def unpacked(
 
 
 def check_chunk(volume: Volume, name: str, left: int | None) -> None:
-    """Raise OutOfMemoryError if not even one chunk of an array can be unpacked."""
+    """Raise OutOfMemoryError if not even one chunk, or plane, of an array can be unpacked."""
     size = prod(volume.unit) * volume.dtype.itemsize
-    if volume.chunks and left is not None and COPIES * size > left:
-        chunk = " x ".join(map(str, volume.chunks))
+    if left is not None and COPIES * size > (left if volume.chunks else max(left, BOX)):
+        parts = "chunks" if volume.chunks else "planes"
+        chunk = " x ".join(map(str, volume.unit))
         raise OutOfMemoryError(
-            f"{name} is stored in chunks of {chunk} samples, {in_words(size)} each, and to unpack "
+            f"{name} is stored in {parts} of {chunk} samples, {in_words(size)} each, and to unpack "
             f"one takes {in_words(COPIES * size)} of memory, {in_words(max(left, 0))} are left; "
             "allow more (--max-memory), or store it in smaller chunks"
         )

@@ -49,16 +49,17 @@ def memory_bound(max_memory: int | None = None) -> int | None:
     return (held_memory() or 0) + int(SHARE * free)
 
 
-def held_memory(peak: bool = False) -> int | None:
+def held_memory(peak: bool = False, pid: int | None = None) -> int | None:
     """Return the bytes of memory that this process holds, None if the system does not tell.
 
-    With ``peak``, the most that it has held since ``forget_peak``.
+    With ``peak``, the most that it has held since ``forget_peak``; with ``pid``, those of another
+    process, None once it has ended.
     """
     try:
-        sizes = _read_sizes(PROCESS)
+        sizes = _read_sizes(Path(f"/proc/{pid}/status") if pid else PROCESS)
     except OSError:
-        return _peak_by_psutil() if peak else _held_by_psutil()
-    return sizes["VmHWM" if peak else "VmRSS"]
+        return _peak_by_psutil() if peak else _held_by_psutil(pid)
+    return sizes.get("VmHWM" if peak else "VmRSS")
 
 
 def _read_sizes(path: Path) -> dict[str, int]:
@@ -75,11 +76,15 @@ def _free_by_psutil() -> int | None:
     return None
 
 
-def _held_by_psutil() -> int | None:
+def _held_by_psutil(pid: int | None) -> int | None:
     with suppress(ImportError):
         import psutil
 
-        return int(psutil.Process().memory_info().rss)
+        try:
+            process = psutil.Process(pid) if pid else psutil.Process()
+            return int(process.memory_info().rss)
+        except psutil.Error:  # it has ended
+            return None
     return None
 
 

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import os
+from math import prod
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...errors import FileError
+from ..regular import check_beside
 from ..volume import Request, Volume
 from .choosing import choose_member
-from .stored import place_of
+from .stored import place_of, without_gaps
 
 
 def read_hdf5(request: Request) -> Volume:
     """Read ``FILE.h5:/DATASET``; without a name the only dataset of three axes."""
     import h5py
 
+    # where HDF5 looks for raw data files, else in the current folder; this process reads one file
+    os.environ["HDF5_EXTFILE_PREFIX"] = str(request.path.resolve().parent)
     file = request.files.enter_context(h5py.File(request.path, "r"))
     found: list[str] = []
 
@@ -24,11 +30,33 @@ def read_hdf5(request: Request) -> Volume:
             found.append(f"/{name}")
 
     file.visititems(note)
-    values = file[choose_member(request, found, "3D dataset")]
+    values = _open(file, choose_member(request, found, "3D dataset"), request)
+    read_box = without_gaps(values.__getitem__, *_absent(values), values.fillvalue)
 
     def read(first: int, last: int) -> NDArray[Any]:
-        return np.asarray(values[first:last])
+        return np.asarray(read_box((slice(first, last), slice(None), slice(None))))
 
     place = place_of(dict(values.attrs), request.axes)
-    chunked = {"chunks": values.chunks, "read_box": values.__getitem__} if values.chunks else {}
-    return Volume(values.shape, values.dtype, read, *place, **chunked)
+    about = {"chunks": values.chunks, "read_box": read_box, "packed": values.id.get_storage_size()}
+    return Volume(values.shape, values.dtype, read, *place, **about)
+
+
+def _open(file: Any, name: str, request: Request) -> Any:
+    """Return a dataset whose raw data files, if there are any, lie beside the file."""
+    values = file[name]
+    if values.is_virtual:
+        raise FileError(
+            f"{request.path}:{name} is a virtual dataset, put together of others: save its values "
+            "as a dataset of their own"
+        )
+    for raw, _, _ in values.external or ():
+        check_beside(request.path, raw)
+    return values
+
+
+def _absent(values: Any) -> tuple[int, int]:
+    """Return how many chunks of a dataset are not stored, and how many it has."""
+    if not values.chunks:
+        return int(not values.id.get_storage_size()), 1
+    total = prod(-(-size // chunk) for size, chunk in zip(values.shape, values.chunks))
+    return total - values.id.get_num_chunks(), total

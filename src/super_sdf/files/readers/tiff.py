@@ -15,14 +15,19 @@ from numpy.typing import NDArray
 
 from ...arrays import Triple
 from ...errors import FileError, GridError
+from ..regular import check_beside
 from ..volume import Request, Volume, axes_direction, in_array_order
+from .stored import without_gaps
 
 
 def read_tiff(request: Request) -> Volume:
     """Read the first series of a ``.tif`` file: pages of one size, or an ImageJ or OME stack."""
     import tifffile
 
-    file = request.files.enter_context(tifffile.TiffFile(request.path))
+    # pages of MicroManager's other files are not looked for
+    alone = {"is_mmstack": False, "is_ndtiff": False}
+    file = request.files.enter_context(tifffile.TiffFile(request.path, **alone))
+    _check_other_files(file, request)
     series = file.series[0]
     if len(series.shape) != 3 or "S" in series.axes:
         raise GridError(
@@ -30,12 +35,30 @@ def read_tiff(request: Request) -> Volume:
             "three axes (z, y, x), without channels"
         )
     spacing = _ome_spacing(file) or _imagej_spacing(file)
+    segments = [page.databytecounts for page in series.pages if page is not None]
     if spacing is not None:
         spacing = in_array_order(spacing, request.axes)
     direction = axes_direction(request.axes)
     read = _reader(request, series)
-    dtype = np.dtype(series.dtype)
-    return Volume(series.shape, dtype, read, spacing, None, direction)
+    absent = sum(size == 0 for sizes in segments for size in sizes)
+    read_box = without_gaps(
+        lambda box: read(box[0].start, box[0].stop)[:, box[1], box[2]],
+        *(absent, sum(map(len, segments))),
+        series.keyframe.nodata,
+    )
+    packed = sum(map(sum, segments))
+    about: dict[str, Any] = {"read_box": read_box, "packed": packed}
+    return Volume(series.shape, np.dtype(series.dtype), read, spacing, None, direction, **about)
+
+
+def _check_other_files(file: Any, request: Request) -> None:
+    """Raise FileError unless the files that OME metadata names lie beside the file."""
+    if not file.is_ome:
+        return
+    for element in ElementTree.fromstring(file.ome_metadata).iter():
+        named = element.get("FileName") or element.get("MetadataFile")
+        if named and named != request.path.name:
+            check_beside(request.path, named)
 
 
 def _reader(request: Request, series: Any) -> Any:

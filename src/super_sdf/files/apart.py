@@ -1,0 +1,181 @@
+"""Reading a file in a process of its own, since libraries in C can crash on damaged files.
+
+That process answers questions for boxes of samples until its input ends. It is killed once both
+processes hold more memory than they may: only then it is known what some files unpack to.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import fields
+from multiprocessing.spawn import get_executable
+from pathlib import Path
+from subprocess import DEVNULL, PIPE, Popen
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FileError, OutOfMemoryError, SuperSdfError
+from ..machine.memory import held_memory, in_words, memory_bound
+from .boxes import Box
+from .volume import Request, Volume
+
+STEP = 0.02  # seconds between two looks at the memory
+LEAST = 1 << 27  # bytes with which the process and its library can start
+FUNCTIONS = ("read", "read_box", "stored")  # fields of a volume that stay in that process
+# Isolated (-I), Python takes nothing from the current folder.
+START = "import sys; sys.path[:0] = sys.argv[1:]; from super_sdf.files import apart; apart.serve()"
+
+
+@contextmanager
+def volume_apart(key: str, request: Request) -> Iterator[Volume]:
+    """Yield the volume that the reader of a format returns in a process of its own.
+
+    Raises
+    ------
+    FileError
+        If that process crashes.
+    OutOfMemoryError
+        If both processes hold more memory than they may.
+    """
+    reader = _Process(request)
+    try:
+        found: dict[str, Any] = reader.ask(
+            (key, request.path, request.member, request.axes, request.room, request.left)
+        )
+        _, ny, nz = found["shape"] if len(found["shape"]) == 3 else (0, 0, 0)
+
+        def read(first: int, last: int) -> NDArray[Any]:
+            return reader.box((slice(first, last), slice(0, ny), slice(0, nz)))
+
+        yield Volume(**found, read=read, read_box=reader.box)
+    finally:
+        reader.close()
+
+
+class _Process:
+    """The process that reads a file."""
+
+    def __init__(self, request: Request) -> None:
+        self.path, self.ended, self.limit = request.path, threading.Event(), 0
+        self.start = held_memory() or 0
+        bound = memory_bound(None)
+        self.left = request.left
+        if self.left is None and bound is not None:
+            self.left = bound - self.start
+        command = [get_executable(), "-I", "-c", START, *_import_path()]
+        self.process = Popen(command, stdin=PIPE, stdout=PIPE, stderr=DEVNULL)
+        threading.Thread(target=self._watch, daemon=True).start()
+
+    def ask(self, question: Any) -> Any:
+        """Return the answer to a question; an error that it meets is raised."""
+        assert self.process.stdin and self.process.stdout
+        try:
+            pickle.dump(question, self.process.stdin)
+            self.process.stdin.flush()
+            answer = pickle.load(self.process.stdout)
+        except (EOFError, OSError, pickle.UnpicklingError):
+            raise self._death() from None
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    def box(self, box: Box) -> NDArray[Any]:
+        """Return a box of samples."""
+        samples: NDArray[Any] = self.ask(box)
+        return samples
+
+    def _watch(self) -> None:
+        """Kill the process when it holds too much, together with what this one took meanwhile."""
+        if self.left is None:
+            return
+        while not self.ended.wait(STEP):
+            limit = max(self.left - (held_memory() or 0) + self.start, LEAST)
+            if (held_memory(pid=self.process.pid) or 0) > limit:
+                self.limit = limit
+                self.process.kill()
+                return
+
+    def _death(self) -> SuperSdfError:
+        """Return why the process ended."""
+        code = self.process.wait()
+        if self.limit:
+            return OutOfMemoryError(
+                f"{self.path} unpacks to more than the {in_words(self.limit)} of memory that are "
+                "left for it; allow more (--max-memory), or save it as .npy"
+            )
+        how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        return FileError(
+            f"{self.path} cannot be read: the library that reads it crashed ({how}); the file is "
+            "probably damaged, save it again"
+        )
+
+    def close(self) -> None:
+        """End the process."""
+        self.ended.set()
+        self.process.kill()
+        self.process.wait()
+        for pipe in (self.process.stdin, self.process.stdout):
+            with suppress(OSError):  # what was not sent is of no use any more
+                if pipe:
+                    pipe.close()
+
+
+def _import_path() -> list[str]:
+    """Return where the process finds modules: where this one does, but for the current folder."""
+    own = str(Path(__file__).resolve().parents[2])
+    here = os.getcwd()
+    return [own, *(path for path in sys.path if path and os.path.abspath(path) != here)]
+
+
+def serve() -> None:
+    """Read the file of the first question, and answer with the boxes of the following ones."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other process handles it
+    warnings.simplefilter("ignore")
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # libraries may print
+    with ExitStack() as files, suppress(EOFError, BrokenPipeError):
+        questions = sys.stdin.buffer
+        first = pickle.load(questions)
+        volume = _answer(answers, lambda: _opened(files, *first), _stated)
+        while volume:
+            box = pickle.load(questions)
+            _answer(answers, lambda: volume.box(box), np.ascontiguousarray)
+
+
+def _opened(files: ExitStack, key: str, *request: Any) -> Volume:
+    """Return the volume in a file."""
+    from .readers.table import READERS
+
+    return READERS[key](Request(*request, files))
+
+
+def _stated(volume: Volume) -> dict[str, Any]:
+    """Return what a volume says of itself."""
+    names = (field.name for field in fields(volume))
+    return {name: getattr(volume, name) for name in names if name not in FUNCTIONS}
+
+
+def _answer(answers: IO[bytes], make: Callable[[], Any], told: Callable[[Any], Any]) -> Any:
+    """Make something, send what is told of it or the error that it met, and return it."""
+    made, answer = None, None
+    try:
+        made = make()
+        answer = told(made)
+    except SuperSdfError as error:
+        answer = error
+    except MemoryError as error:
+        answer = OutOfMemoryError(f"it does not fit in memory: {error}")
+    except Exception as error:  # the libraries raise all kinds of errors, not all can be sent
+        answer = RuntimeError(str(error).strip() or type(error).__name__)
+    pickle.dump(answer, answers, protocol=5)
+    answers.flush()
+    return made
