@@ -55,25 +55,24 @@ def check_regular_file(path: str | Path) -> Path:
     return Path(path)
 
 
-def check_beside(header: Path, name: str) -> Path:
-    """Return the path of a data file that a header names: one in the header's folder, or below it.
+def check_beside(path: Path, name: str) -> Path:
+    """Return the file that another one, or a folder, names as part of it: in the folder, or below.
 
-    A header that is a link may have its data beside the file that it leads to.
+    A file that is a link may have its parts beside the file that it leads to.
 
     Raises
     ------
     FileError
         If it is anywhere else, or as in ``check_regular_file``.
     """
-    path = header.parent / name
+    homes = (path,) if path.is_dir() else (path.parent, path.resolve().parent)
+    other = homes[0] / name
     if not PurePath(name).is_absolute() and ".." not in PurePath(name).parts:
-        check_regular_file(path)
-        real, homes = path.resolve(), (header.parent.resolve(), header.resolve().parent)
-        if any(home in real.parents for home in homes):
-            return path
+        check_regular_file(other)
+        if any(other.resolve().is_relative_to(home.resolve()) for home in homes):
+            return other
     raise FileError(
-        f"{header} names the data file {seen(name)}, which is not in its folder: put it beside "
-        "the header, and name it there"
+        f"{path} names the file {seen(name)}, which is not in its folder: put both into one folder"
     )
 
 

@@ -5,7 +5,7 @@ Reference: https://ngff.openmicroscopy.org/0.5/, ``multiscales`` metadata.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -140,20 +140,19 @@ def images_of(attributes: dict[str, Any]) -> list[Image]:
     return [_image(scales, 0) for scales in _multiscales(attributes)]
 
 
-def find_image(group: Any, name: str, group_type: type) -> Image | None:
+def find_image(attributes: Callable[[str], dict[str, Any]], name: str) -> Image | None:
     """Return the image in whose metadata an array is a level, None if there is none.
 
     Parameters
     ----------
-    group : zarr.Group
-        The root.
+    attributes : callable
+        Returns the attributes of the group at a path.
     name : str
         Path of the array in it. The metadata is that of a group on the way there.
     """
     parts = name.strip("/").split("/")
     for depth in range(len(parts)):
-        holder = group["/".join(parts[:depth])] if depth else group
-        for scales in _multiscales(dict(holder.attrs)):
+        for scales in _multiscales(attributes("/".join(parts[:depth]))):
             below = "/".join(parts[depth:])
             paths = [str(level["path"]).strip("/") for level in scales["datasets"]]
             if below in paths:

@@ -18,58 +18,61 @@ from ..boxes import Box
 from ..volume import BOX, Request, Volume
 from .choosing import choose_member
 from .ome import MOST_AXES, Image, find_image, images_of
-from .stored import place_of
+from .stored import place_of, without_gaps
+from .zarr_files import ZarrFiles, array_shards, counts_of
 
 
 def read_zarr(request: Request) -> Volume:
     """Read ``FOLDER.zarr``, or ``FOLDER.zarr:/ARRAY`` of a group; of OME-Zarr the finest level."""
+    files = ZarrFiles(request)
+    arrays = files.arrays()
+    if "" not in arrays:
+        name = _choose(files, arrays, request)
+    elif request.member is None:
+        name = ""
+    else:
+        raise FileError(f"{request.path} is one array: give no name of another in it")
+    if name not in arrays:
+        raise FileError(f"{request.path} is damaged: its metadata names no array at {name!r}")
+    files.check_codecs(name)
+    return _volume(files, name, _open(request, name), request)
+
+
+def _open(request: Request, name: str) -> Any:
+    """Return an array in a folder or a zip file."""
     import zarr
 
-    found = _opened(request, zarr)
-    if not isinstance(found, zarr.Group):
-        if request.member is not None:
-            raise FileError(f"{request.path} is one array: give no name of another in it")
-        return _volume(found, None, request)
-    name = _choose(found, request, zarr)
-    return _volume(found[name], find_image(found, name, zarr.Group), request)
-
-
-def _opened(request: Request, zarr: Any) -> Any:
-    """Return the array or group in a folder or a zip file."""
     if request.path.is_dir():
-        return zarr.open(str(request.path), mode="r")
+        return zarr.open_array(str(request.path), path=name, mode="r")
     store = zarr.storage.ZipStore(str(request.path), mode="r")
-    found = zarr.open(store, mode="r")
+    array = zarr.open_array(store, path=name, mode="r")
     request.files.callback(store.close)  # only now is there something to close
-    return found
+    return array
 
 
-def _choose(group: Any, request: Request, zarr: Any) -> str:
+def _choose(files: ZarrFiles, arrays: dict[str, int], request: Request) -> str:
     """Return the name of the array to read: of an image the finest level, unless another is named.
 
     A name may be that of a group, such as that of one image of several.
     """
     before, asked = "", request.member
-    if asked is not None and isinstance(group.get(asked.strip("/")), zarr.Group):
-        before, asked = asked.strip("/") + "/", None
-        group = group[before.strip("/")]
-    levels = [image.levels[0] for image in images_of(dict(group.attrs))]
+    named = (asked or "").strip("/")
+    if named and any(name.startswith(f"{named}/") for name in arrays):
+        before, asked = f"{named}/", None
+    levels = [image.levels[0] for image in images_of(files.attributes(before.strip("/")))]
     if levels and asked is None:
         return before + levels[0].strip("/")
-    names = [f"/{before}{name}" for name in _names(group)]
+    names = [
+        f"/{name}"
+        for name, axes in sorted(arrays.items())
+        if name.startswith(before) and 3 <= axes <= MOST_AXES
+    ]
     return choose_member(request.named(asked), names, "3D array").strip("/")
 
 
-def _names(group: Any, before: str = "") -> list[str]:
-    """Return the names of all arrays in a group and below it that can be of three axes."""
-    names = [f"{before}{name}" for name, array in group.arrays() if 3 <= array.ndim <= MOST_AXES]
-    for name, below in group.groups():
-        names += _names(below, f"{before}{name}/")
-    return sorted(names)
-
-
-def _volume(array: Any, image: Image | None, request: Request) -> Volume:
+def _volume(files: ZarrFiles, name: str, array: Any, request: Request) -> Volume:
     """Return an array as a volume, without its axes of length 1 that are not in space."""
+    image = find_image(files.attributes, name) if name else None
     image = image or Image.of_array(array.ndim, request.axes)
     space = image.space_of(array.shape, request.axes)
     shape, chunks = ([sizes[axis] for axis in space] for sizes in (array.shape, array.chunks))
@@ -77,7 +80,11 @@ def _volume(array: Any, image: Image | None, request: Request) -> Volume:
         place = image.place(space, request.axes)
     else:
         place = place_of(dict(array.attrs), request.axes)
-    read_box = _reader(array, space)
+    stored = files.chunks_of(name, counts_of(array.shape, array_shards(array) or array.chunks))
+    if array_shards(array):
+        files.check_sums(list(stored.values()))
+    gaps = files.absent(array, name, stored)
+    read_box = without_gaps(_reader(array, space), *gaps, array.fill_value)
 
     def read(first: int, last: int) -> NDArray[Any]:
         return read_box((slice(first, last), slice(0, shape[1]), slice(0, shape[2])))
@@ -91,6 +98,7 @@ def _volume(array: Any, image: Image | None, request: Request) -> Volume:
         read_box=read_box,
         notes=image.notes,
         about=_storage(array),
+        packed=sum(files.sizes[key] for key in stored.values()),
     )
 
 
@@ -122,7 +130,7 @@ def _storage(array: Any) -> dict[str, Any]:
     """Return how an array is stored, as ``info`` prints it."""
     version = getattr(array.metadata, "zarr_format", 2) if hasattr(array, "metadata") else 2
     found: dict[str, Any] = {"zarr format": version, "chunks": list(array.chunks)}
-    shards = getattr(array, "shards", None)
+    shards = array_shards(array)
     if shards:
         found["shards"] = list(shards)
     return found
