@@ -194,7 +194,7 @@ def read_for_check(
     bound = allot(0, check_max_memory(options.max_memory))
     check_room(stated_triangles(check_regular_file(mesh)), 0, bound)
     found = read_grid_with(grid, options)
-    return read_mesh(mesh), found
+    return read_mesh(mesh, options.max_memory), found
 
 
 def check_mesh(mesh: Mesh, grid: SdfGrid, options: CheckOptions | None = None) -> Certificate:

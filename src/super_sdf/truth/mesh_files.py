@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import warnings
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, MeshError, SuperSdfError
+from ..errors import FileError, MeshError, OutOfMemoryError, SuperSdfError
 from ..files.regular import check_regular_file
+from ..machine.memory import held_memory, in_words, memory_bound
 from ..mesh import Mesh
 from .plain_ply import read_plain_ply
 
@@ -23,20 +25,26 @@ LARGEST_COORDINATE = 1e30
 MERGE_DISTANCE = 1e-8  # vertices closer than this are merged
 HASH_FACTOR = np.uint64(0x9E3779B97F4A7C15)  # odd, its bits as if random
 SMALLEST_STEP = 1e-18  # of the largest coordinate, so that multiples of it fit in 64 bits
+XML_BYTES = 20  # of memory that trimesh takes for each byte of XML in a .3mf
 
 
-def read_mesh(path: str | Path) -> Mesh:
+def read_mesh(path: str | Path, max_memory: int | None = None) -> Mesh:
     """Read any mesh file that trimesh reads, with merged float64 vertices.
+
+    ``max_memory`` is how many bytes this process may hold, by default a share of the free memory.
 
     Raises
     ------
     FileError
         If the file is missing or no mesh can be read from it.
+    OutOfMemoryError
+        If it is an archive, such as ``.3mf``, that unpacks to more than fits in memory.
     MeshError
         If it has no triangles, faces with missing vertices, or coordinates that are not finite or
         larger than ``LARGEST_COORDINATE``.
     """
     path = check_regular_file(path)
+    _check_archive(path, max_memory)
     vertices, faces = _load(path)
     if not len(faces):
         raise MeshError(f"{path} holds no triangle: give a surface mesh")
@@ -89,6 +97,27 @@ def are_distinct(rows: NDArray[np.int64]) -> bool:
         mixed ^= mixed >> np.uint64(32)
     mixed.sort()
     return not bool((mixed[1:] == mixed[:-1]).any())
+
+
+def _check_archive(path: Path, max_memory: int | None) -> None:
+    """Raise OutOfMemoryError if a zip file unpacks to more than fits in memory.
+
+    zipfile reads no more of a member than its entry says.
+    """
+    bound = memory_bound(max_memory)
+    if bound is None or not zipfile.is_zipfile(path):
+        return
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(info.file_size for info in archive.infolist())
+    except Exception as error:  # zipfile raises many kinds of error on damaged fields
+        raise FileError(f"{path} cannot be read as a mesh: {error}") from None
+    left = max(bound - (held_memory() or 0), 0)
+    if XML_BYTES * size > left:
+        raise OutOfMemoryError(
+            f"{path} unpacks to {in_words(size)}, and to read it takes {in_words(XML_BYTES * size)} "
+            f"of memory, {in_words(left)} are left; save it as binary .ply or .stl"
+        )
 
 
 def _load(path: Path) -> tuple[NDArray[np.float64], NDArray[Any]]:

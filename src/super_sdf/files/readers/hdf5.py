@@ -18,10 +18,10 @@ from .stored import place_of, without_gaps
 
 def read_hdf5(request: Request) -> Volume:
     """Read ``FILE.h5:/DATASET``; without a name the only dataset of three axes."""
+    # HDF5 asks when it is loaded where raw data files are; this process reads no other file
+    os.environ["HDF5_EXTFILE_PREFIX"] = str(request.path.resolve().parent)
     import h5py
 
-    # where HDF5 looks for raw data files, else in the current folder; this process reads one file
-    os.environ["HDF5_EXTFILE_PREFIX"] = str(request.path.resolve().parent)
     file = request.files.enter_context(h5py.File(request.path, "r"))
     found: list[str] = []
 
