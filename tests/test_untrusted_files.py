@@ -21,6 +21,7 @@ import pytest
 import tifffile
 import trimesh
 import zarr
+from batches import FAST
 from conftest import ball
 
 from super_sdf import read_grid
@@ -120,9 +121,7 @@ def test_metadata_of_an_image_names_an_array_of_the_store(values, path):
     store(values, "i.zarr/a")
     image = {"multiscales": [{"axes": list("zyx"), "datasets": [{"path": path}]}]}
     edited("i.zarr/zarr.json", lambda about: about["attributes"].update(ome=image))
-    assert refusal("i.zarr") == (
-        f"i.zarr is damaged: its metadata names no array at {path!r}"
-    )
+    assert refusal("i.zarr") == (f"i.zarr is damaged: its metadata names no array at {path!r}")
 
 
 # Other files
@@ -281,12 +280,6 @@ def test_background_of_a_mask_need_not_be_stored(values):
         assert (read_grid(path, spacing=1).values.T < 0).sum() == mask.sum()
 
 
-def test_a_dataset_that_was_never_written(values):
-    with h5py.File("a.h5", "w") as file:
-        file.create_dataset("d", values.shape, "f4")
-    assert "no surface" in refusal("a.h5", GridError) or "0" in refusal("a.h5", GridError)
-
-
 def test_strips_that_are_not_stored(values):
     tifffile.imwrite("a.tif", values, photometric="minisblack", compression="zlib")
     edit_strip("a.tif", 5, size=0)
@@ -403,11 +396,8 @@ def test_a_library_that_crashes_is_a_line(values, command, monkeypatch, start, s
     )
     assert command("upsample", "a.zarr", "a.ply") == (1, "", f"Error: {reason}\n")
     np.save("b.npy", values)
-    code, out, _ = command(
-        *("batch", "a.zarr", "b.npy", "--out", "out", "--jobs", "1", "--quality", "fast", "--json")
-    )
-    rows = {row["source"]: row for row in json.loads(out)["files"]}
-    assert code == 1 and rows["a.zarr"]["reason"] == reason and rows["b.npy"]["status"] == "ok"
+    code, _, err = command("batch", "a.zarr", "b.npy", "--out", "out", "--jobs", "1", *FAST)
+    assert code == 1 and reason in err and os.listdir("out/").count("b.ply") == 1
 
 
 def test_nothing_is_taken_from_the_current_folder(values):
@@ -444,9 +434,8 @@ def make_bomb(name, values):
     elif name == "member.zarr.zip":
         store(values, "a.zarr", compressors=None)
         with zipfile.ZipFile(name, "w", zipfile.ZIP_DEFLATED) as archive:
-            for path in filter(Path.is_file, Path("a.zarr").rglob("*")):
-                archive.write(path, path.relative_to("a.zarr"))
-            with archive.open("c/3/3/3", "w") as member:
+            archive.write("a.zarr/zarr.json", "zarr.json")
+            with archive.open("c/0/0/0", "w") as member:
                 for _ in range(BOMB >> 20):
                     member.write(bytes(1 << 20))
     elif name in ("huge.h5", "one.h5", "chunk.h5"):

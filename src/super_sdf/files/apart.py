@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import fields
+from functools import partial
 from multiprocessing.spawn import get_executable
 from pathlib import Path
 from subprocess import DEVNULL, PIPE, Popen
@@ -145,10 +146,9 @@ def serve() -> None:
     with ExitStack() as files, suppress(EOFError, BrokenPipeError):
         questions = sys.stdin.buffer
         first = pickle.load(questions)
-        volume = _answer(answers, lambda: _opened(files, *first), _stated)
+        volume = _answer(answers, partial(_opened, files, *first), _stated)
         while volume:
-            box = pickle.load(questions)
-            _answer(answers, lambda: volume.box(box), np.ascontiguousarray)
+            _answer(answers, partial(volume.box, pickle.load(questions)), np.ascontiguousarray)
 
 
 def _opened(files: ExitStack, key: str, *request: Any) -> Volume:

@@ -112,11 +112,11 @@ def _check_archive(path: Path, max_memory: int | None) -> None:
             size = sum(info.file_size for info in archive.infolist())
     except Exception as error:  # zipfile raises many kinds of error on damaged fields
         raise FileError(f"{path} cannot be read as a mesh: {error}") from None
-    left = max(bound - (held_memory() or 0), 0)
-    if XML_BYTES * size > left:
+    need, left = XML_BYTES * size, max(bound - (held_memory() or 0), 0)
+    if need > left:
         raise OutOfMemoryError(
-            f"{path} unpacks to {in_words(size)}, and to read it takes {in_words(XML_BYTES * size)} "
-            f"of memory, {in_words(left)} are left; save it as binary .ply or .stl"
+            f"{path} unpacks to {in_words(size)}, and to read it takes {in_words(need)} of memory, "
+            f"{in_words(left)} are left; save it as binary .ply or .stl"
         )
 
 

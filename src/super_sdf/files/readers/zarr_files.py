@@ -23,11 +23,12 @@ from ..volume import Request
 
 ARRAY_2, ATTRIBUTES_2, NODE_3 = ".zarray", ".zattrs", "zarr.json"
 # None of these runs what the store names, and all return numbers.
-CODECS = frozenset(
-    "adler32 astype bitround blosc bytes bz2 crc32 crc32c delta endian fixedscaleoffset fletcher32 "
-    "gzip jenkins_lookup3 lz4 lzma packbits pcodec quantize sharding_indexed shuffle transpose "
-    "zfpy zlib zstd".split()
-)
+CODECS = {
+    *("bytes", "endian", "transpose", "sharding_indexed", "crc32c"),
+    *("blosc", "bz2", "gzip", "lz4", "lzma", "pcodec", "zfpy", "zlib", "zstd"),
+    *("adler32", "crc32", "fletcher32", "jenkins_lookup3"),
+    *("astype", "bitround", "delta", "fixedscaleoffset", "packbits", "quantize", "shuffle"),
+}
 CHUNK_KEY = re.compile(r"(?:c[./])?(\d+(?:[./]\d+)*)")
 NOT_STORED = 2**64 - 1  # as the place of a chunk in the index of a shard
 CHECKSUM = 4  # bytes of CRC-32C after that index
