@@ -49,9 +49,8 @@ def volume_apart(key: str, request: Request) -> Iterator[Volume]:
     """
     reader = _Process(request)
     try:
-        found: dict[str, Any] = reader.ask(
-            (key, request.path, request.member, request.axes, request.room, request.left)
-        )
+        stated = {name: value for name, value in vars(request).items() if name != "files"}
+        found: dict[str, Any] = reader.ask((key, stated))
         _, ny, nz = found["shape"] if len(found["shape"]) == 3 else (0, 0, 0)
 
         def read(first: int, last: int) -> NDArray[Any]:
@@ -151,11 +150,11 @@ def serve() -> None:
             _answer(answers, partial(volume.box, pickle.load(questions)), np.ascontiguousarray)
 
 
-def _opened(files: ExitStack, key: str, *request: Any) -> Volume:
+def _opened(files: ExitStack, key: str, request: dict[str, Any]) -> Volume:
     """Return the volume in a file."""
     from .readers.table import READERS
 
-    return READERS[key](Request(*request, files))
+    return READERS[key](Request(**request, files=files))
 
 
 def _stated(volume: Volume) -> dict[str, Any]:

@@ -24,9 +24,9 @@ def read_tiff(request: Request) -> Volume:
     """Read the first series of a ``.tif`` file: pages of one size, or an ImageJ or OME stack."""
     import tifffile
 
-    # pages of MicroManager's other files are not looked for
-    alone = {"is_mmstack": False, "is_ndtiff": False}
-    file = request.files.enter_context(tifffile.TiffFile(request.path, **alone))
+    # not as a file of MicroManager, whose other files would be opened
+    opened = tifffile.TiffFile(request.path, is_mmstack=False, is_ndtiff=False)
+    file = request.files.enter_context(opened)
     _check_other_files(file, request)
     series = file.series[0]
     if len(series.shape) != 3 or "S" in series.axes:

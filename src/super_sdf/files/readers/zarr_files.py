@@ -133,8 +133,7 @@ class ZarrFiles:
         total = prod(counts_of(array.shape, array.chunks))
         here = len(stored)
         if array_shards(array):
-            codec = self.document(f"{path}/{NODE_3}".lstrip("/"))["codecs"][0]["configuration"]
-            here = sum(self._in_shard(array, codec, *shard) for shard in stored.items())
+            here = sum(self._in_shard(array, path, *shard) for shard in stored.items())
         if total - here > MOST_ABSENT:
             raise FileError(
                 f"{self.path} has {total:,} chunks, of which {here:,} are stored: store it in "
@@ -142,9 +141,10 @@ class ZarrFiles:
             )
         return total - here, total
 
-    def _in_shard(self, array: Any, codec: Document, indices: tuple[int, ...], key: str) -> int:
+    def _in_shard(self, array: Any, path: str, indices: tuple[int, ...], key: str) -> int:
         """Return how many chunks of a shard are stored, of those within the array."""
-        shard, chunk = array_shards(array), array.chunks
+        codec = self.document(f"{path}/{NODE_3}".lstrip("/"))["codecs"][0]["configuration"]
+        shard, chunk = array.shards, array.chunks
         left = [min(n - i * s, s) for n, i, s in zip(array.shape, indices, shard)]
         within = counts_of(left, chunk)
         names = [str(step.get("name")) for step in codec["index_codecs"]]
@@ -184,9 +184,9 @@ def _codecs_of(about: Any) -> Iterator[str]:
     """Yield the names of all codecs in the metadata of an array, also of those within others."""
     if isinstance(about, dict):
         for key in ("compressor", "filters", "codecs", "index_codecs"):
-            entries = about.get(key) or ()
-            for codec in [entries] if isinstance(entries, (dict, str)) else entries:
-                is_named = isinstance(codec, dict)
-                name = codec.get("id", codec.get("name")) if is_named else codec
+            found: Any = about.get(key) or ()
+            for codec in found if isinstance(found, list) else (found,) if found else ():
+                stated = codec if isinstance(codec, dict) else {"name": codec}
+                name = stated.get("id", stated.get("name"))
                 yield str(name).removeprefix("numcodecs.")
-                yield from _codecs_of(codec.get("configuration") if is_named else None)
+                yield from _codecs_of(stated.get("configuration"))
