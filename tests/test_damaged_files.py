@@ -368,7 +368,7 @@ def test_lists_and_patterns_of_metaimage_are_what_itk_reads():
         )
         assert np.array_equal(read_grid(name).values, VALUES)
     write("list.mhd", MHA, "ElementDataFile = LIST\n", names.replace("p004", "../p004"))
-    assert "names the data file '../p004.raw', which is not in its folder" in refusal("list.mhd")
+    assert "names the file '../p004.raw', which is not in its folder" in refusal("list.mhd")
     write("list.mhd", MHA, "ElementDataFile = LIST\n", names[:50])
     assert refusal("list.mhd").startswith("list.mhd")
     write("pattern.mhd", MHA, "ElementDataFile = p%099999d.raw 3 19 1\n")
