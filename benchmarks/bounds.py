@@ -53,8 +53,9 @@ network = load_network(precision=precision, device="cpu")
 grid = read_grid(path, spacing=1.0)
 network = network_for(network, grid.field.kind)
 resources = allot(network.threads)
-band = find_surface(grid, int(factor), 0.0, resources)
 mesher = find_mesher(name)
+plan = int(factor), network.receptive_field, resources, network.memory_bytes, mesher
+band = find_surface(grid, 0.0, *plan)
 beside = mesher.planes_beside(int(factor))
 *_, thinnest = ways_to_cut(band, network.receptive_field, beside)
 for slabs in ([whole(band)], thinnest):

@@ -14,6 +14,7 @@ the same.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -40,7 +41,7 @@ from .options import (
     check_progress,
 )
 from .progress import STEPS, Progress, StepCounter, Stopwatch, part_of
-from .slabs.cutting import Slab, peak_bytes, plan_slabs, planes_needed
+from .slabs.cutting import DEFAULT, Slab, peak_bytes, plan_slabs, planes_needed, refuse_band
 from .slabs.footprint import NETWORK_BYTES
 from .slabs.pieces import Piece, count_input, describe_piece
 from .steps.bounds import keep_within_bounds
@@ -62,7 +63,7 @@ from .steps.nodes import (
 )
 from .steps.spheres import fit_to_spheres
 from .steps.spline import spline_blocks
-from .steps.survey import Band, no_surface, survey
+from .steps.survey import Band, BandTooLargeError, no_surface, survey
 from .steps.voxel_index import VoxelIndex
 
 SaveField = Callable[[FineField], None]
@@ -125,8 +126,9 @@ def upsample(
     resources = allot(getattr(network, "threads", 0), check_max_memory(max_memory))
     steps = StepCounter(progress, [name for name in STEPS if name != "isosurface"])
     lattice = cubic_grid(grid, offset)
-    band = find_surface(lattice, factor, offset, resources)
-    (slab,) = plan_slabs(band, factor, None, resources, memory_needs(network))
+    needs = factor, None, resources, memory_needs(network)
+    band = find_surface(lattice, offset, *needs)
+    (slab,) = plan_slabs(band, *needs)
     steps.finish("band")
     field = refine(band, network, factor, slab, resources.threads, steps)
     if len(field.signs()) < 2:
@@ -278,8 +280,8 @@ def _slabs(run: Run, grid: SdfGrid, offset: float, progress: Progress | None) ->
     resources = allot(getattr(network, "threads", 0), run.max_memory)
     steps = StepCounter(progress)
     lattice = cubic_grid(grid, offset)
-    band = find_surface(lattice, factor, offset, resources)
     reach, needed = getattr(network, "receptive_field", None), memory_needs(network)
+    band = find_surface(lattice, offset, factor, reach, resources, needed, mesher)
     slabs = plan_slabs(band, factor, reach, resources, needed, mesher)
     planned = peak_bytes(band, slabs, factor, needed, resources.threads, mesher)
     steps.divide(len(slabs))
@@ -406,10 +408,26 @@ def memory_needs(network: Decoder) -> tuple[float, float]:
     return needed
 
 
-def find_surface(grid: SdfGrid, factor: int, offset: float, resources: Resources) -> Band:
-    """Return the band of a grid; GridError if no voxel can hold a surface."""
+def find_surface(
+    grid: SdfGrid,
+    offset: float,
+    factor: int,
+    receptive_field: int | None,
+    resources: Resources,
+    network_bytes: tuple[float, float],
+    mesher: Mesher = DEFAULT,
+) -> Band:
+    """Return the band of a grid; GridError if no voxel can hold a surface.
+
+    The parameters are those of ``plan_slabs``, for what is said if it does not fit in memory.
+    """
     vertex_type(grid, factor)  # raises if not even float64 resolves the vertices
-    band = survey(grid, offset, resources)  # Eqs. 2 and 4
+    band = None
+    with suppress(BandTooLargeError):  # and free what it holds
+        band = survey(grid, offset, resources)  # Eqs. 2 and 4
+    if band is None:
+        plan = factor, receptive_field, resources, network_bytes, mesher
+        raise refuse_band(grid, offset, *plan)
     if not band.decoded.any():
         raise no_surface(grid, offset)
     return band

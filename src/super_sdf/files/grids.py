@@ -24,7 +24,7 @@ from ..grid.field import Wanted
 from ..grid.planes import InputFile, PlaneFile, SampleArray
 from ..grid.samples import check_kind
 from ..grid.sdf_grid import SdfGrid, make_grid
-from ..machine.memory import held_memory, memory_bound
+from ..machine.memory import ROOM_SHARE, held_memory, memory_bound
 from ..options import check_path
 from .apart import volume_apart
 from .archives import Member, open_archive
@@ -47,8 +47,7 @@ PLACE = ("spacing", "origin", "direction")
 NPZ_KEYS = ("values", *PLACE)
 NUMBERS = "one number or three"
 MOST_NAMED = 10  # members of an archive that an error lists
-# Share of the memory left that an unpacked array may take; bytes if that is unknown.
-ROOM_SHARE, UNKNOWN_ROOM = 0.25, 1 << 28
+UNKNOWN_ROOM = 1 << 28  # bytes that an unpacked array may take if the memory left is unknown
 
 READ_OPTIONS = (
     *("spacing", "origin", "direction", "axes", "inside", "field", "label", "level", "scale"),

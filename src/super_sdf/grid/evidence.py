@@ -9,6 +9,7 @@ are apart, and is bent there.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -18,13 +19,14 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, Triple
 from .gradients import LARGEST_VALUE
-from .planes import SampleArray, over_planes
+from .planes import SampleArray, few_of, lowest, over_planes, ranks_of
 from .samples import Extremes
 from .spacing import steps_of
 
 Floats = NDArray[np.float64]
 
 PLANES = 12  # of samples beside the surface are looked at, spread evenly
+MOST_LINES = 1 << 16  # of these samples, spread evenly, if there are more
 BESIDE = 2  # planes, rows and columns to either side, for fourth differences
 SURE = 0.1  # share by which the slope of a sample may be off to count
 ENOUGH = 30  # such samples, from which a slope is known
@@ -153,22 +155,34 @@ def look(values: SampleArray, extremes: Extremes) -> Looked:
     extremes : two floats
         The smallest and the largest sample.
     """
-    found, cut, count = [np.empty((0, 3, 5))], np.zeros(2, np.int64), 0
     planes = _inner_planes(len(values)) if min(values.shape) > 2 * BESIDE else []
-    ranges = [(i - BESIDE, i + BESIDE + 1) for i in planes]
-    for lines, amid, size in over_planes(values, partial(_look_at_plane, extremes), ranges):
-        found.append(lines)
-        cut += amid
-        count += size
-    return Looked(np.concatenate(found), cut / max(count, 1), extremes)
+    plane = values.shape[1] * values.shape[2]
+    ranges = [(i - BESIDE, i + BESIDE + 1, i * plane) for i in planes]
+    cut, count = np.zeros(2, np.int64), 0
+
+    def lines_of_planes() -> Iterator[tuple[NDArray[Any], ...]]:
+        nonlocal cut, count
+        yield np.empty(0, np.uint64), np.empty((0, 3, 5))
+        for ranks, lines, amid, size in over_planes(values, look_at_plane, ranges):
+            cut, count = cut + amid, count + size
+            yield ranks, lines
+
+    look_at_plane = partial(_look_at_plane, extremes)
+    (lines,) = few_of(lines_of_planes(), MOST_LINES)
+    return Looked(lines, cut / max(count, 1), extremes)
 
 
-def _look_at_plane(extremes: Extremes, slab: NDArray[Any]) -> tuple[Floats, NDArray[np.int64], int]:
-    """Return lines of samples of the middle of five planes, how many are cut off, and of which."""
+def _look_at_plane(
+    extremes: Extremes, slab: NDArray[Any], number: int
+) -> tuple[NDArray[np.uint64], Floats, NDArray[np.int64], int]:
+    """Return ranks and lines of samples of the middle of five planes; how many are cut off, of all.
+
+    ``number`` is that of the first sample of the middle plane.
+    """
     slab = np.asarray(slab)
-    lines = np.clip(_lines_beside_surface(slab), -LARGEST_VALUE, LARGEST_VALUE)
+    ranks, lines = _lines_beside_surface(slab, number)
     inner = slab[0, BESIDE:-BESIDE, BESIDE:-BESIDE]
-    return lines, _count_amid_equal(slab, extremes), inner.size
+    return ranks, lines, _count_amid_equal(slab, extremes), inner.size
 
 
 def _inner_planes(count: int) -> list[int]:
@@ -179,10 +193,10 @@ def _inner_planes(count: int) -> list[int]:
     return [int(i) for i in np.unique(spread)]
 
 
-def _lines_beside_surface(slab: NDArray[Any]) -> Floats:
+def _lines_beside_surface(slab: NDArray[Any], number: int) -> tuple[NDArray[np.uint64], Floats]:
     """Return five samples in a row along each axis, round samples with one on the other side.
 
-    ``slab`` has five planes; the samples are those of the middle one, (n, 3, 5).
+    ``slab`` has five planes; the samples are those of the middle one, (n,) ranks and (n, 3, 5).
     """
     inside = slab[1:4] <= 0
     own = inside[1]
@@ -192,15 +206,19 @@ def _lines_beside_surface(slab: NDArray[Any]) -> Floats:
         crossed = samples[1:] != samples[:-1]
         marks[1:] |= crossed
         marks[:-1] |= crossed
-    j, k = np.nonzero(beside[BESIDE:-BESIDE, BESIDE:-BESIDE])
-    j, k = j + BESIDE, k + BESIDE
+    inner = beside[BESIDE:-BESIDE, BESIDE:-BESIDE]
+    at = np.flatnonzero(inner)
+    ranks = ranks_of(at + number)
+    some = lowest(ranks, MOST_LINES)
+    j, k = (index + BESIDE for index in np.unravel_index(at[some], inner.shape))
     steps = np.arange(-BESIDE, BESIDE + 1)
     zero = np.zeros_like(steps)
     lines = [
         slab[BESIDE + a, j[:, None] + b, k[:, None] + c]
         for a, b, c in ((steps, zero, zero), (zero, steps, zero), (zero, zero, steps))
     ]
-    return np.stack(lines, 1).astype(np.float64)
+    stacked = np.stack(lines, 1).astype(np.float64)
+    return ranks[some], np.clip(stacked, -LARGEST_VALUE, LARGEST_VALUE, out=stacked)
 
 
 def _count_amid_equal(slab: NDArray[Any], extremes: Extremes) -> NDArray[np.int64]:

@@ -8,7 +8,6 @@ there.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray
 from ..errors import GridError
-from .planes import SampleArray, over_planes
+from .planes import SampleArray, few_of, lowest, over_planes, ranks_of
 
 # Values are clamped to this, so that squares of their differences do not overflow.
 LARGEST_VALUE = 1e150
@@ -27,6 +26,7 @@ BENT = 0.6  # larger bends: lengths may agree by chance, as for the distance to 
 AGREEING, AGREEMENT = 0.9, 0.05
 UNEQUAL = 1.3  # ratio of the spacings measured along two axes from which they differ
 PLANES_AT_FIRST = 64  # read of a large grid, unless too few samples are found there
+MOST_BESIDE = 1 << 18  # samples beside the surface of which gradients are taken
 MOST_SAMPLES = 1 << 19  # of which gradients are taken, wherever they lie; all of them up to 80^3
 
 Gradients = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -36,6 +36,7 @@ def surface_gradients(values: SampleArray) -> Gradients:
     """Return gradients and bends of the field at samples next to the surface.
 
     At most 64 planes are read, spread evenly along x, unless they show too little of the surface.
+    Of more than ``MOST_BESIDE`` samples, some are taken, spread evenly.
 
     Parameters
     ----------
@@ -58,8 +59,10 @@ def surface_gradients(values: SampleArray) -> Gradients:
 
 def _gradients_in_planes(values: SampleArray, planes: list[int]) -> Gradients:
     """Return gradients and bends at samples next to the surface in some planes."""
-    ranges = [(max(i - 1, 0), min(i + 2, len(values)), min(i, 1)) for i in planes]
-    return _joined(over_planes(values, _plane_gradients, ranges))
+    plane = values.shape[1] * values.shape[2]
+    ranges = [(max(i - 1, 0), min(i + 2, len(values)), min(i, 1), i * plane) for i in planes]
+    gradients, bend = few_of(over_planes(values, _plane_gradients, ranges), MOST_BESIDE)
+    return gradients, bend
 
 
 def straight_gradients(values: SampleArray) -> Gradients:
@@ -79,7 +82,9 @@ def straight_gradients(values: SampleArray) -> Gradients:
     planes = [i for i in _spread_planes(values) if 0 < i < nx - 1] or [1]
     step = -(-len(planes) * ny * nz // MOST_SAMPLES)
     ranges = [(i - 1, i + 2, step) for i in planes]
-    return _joined(over_planes(values, _row_gradients, ranges))
+    found = over_planes(values, _row_gradients, ranges)
+    gradients, bend = (np.concatenate(parts) for parts in zip(*found))
+    return gradients, bend
 
 
 def _spread_planes(values: SampleArray) -> list[int]:
@@ -88,19 +93,13 @@ def _spread_planes(values: SampleArray) -> list[int]:
     return [int(i) for i in np.unique(spread)]
 
 
-def _joined(found: Iterable[Gradients]) -> Gradients:
-    """Concatenate gradients and bends."""
-    gradients, bend = (np.concatenate(parts) for parts in zip(*found))
-    return gradients, bend
-
-
 def _row_gradients(slab: NDArray[Any], step: int) -> Gradients:
     """Return gradients (n, 3) and bends (n,) of every ``step``-th inner row of the middle plane."""
-    slab = np.clip(slab.astype(np.float64), -LARGEST_VALUE, LARGEST_VALUE)
-    centre = slab[1, 1:-1, 1:-1][::step]
-    above = slab[2, 1:-1, 1:-1], slab[1, 2:, 1:-1], slab[1, 1:-1, 2:]
-    below = slab[0, 1:-1, 1:-1], slab[1, :-2, 1:-1], slab[1, 1:-1, :-2]
-    pairs = [(high[::step], low[::step]) for high, low in zip(above, below)]
+    inner = slice(1, -1, step), slice(1, -1)
+    above = slab[2][inner], slab[1, 2::step, 1:-1], slab[1, 1:-1:step, 2:]
+    below = slab[0][inner], slab[1, :-2:step, 1:-1], slab[1, 1:-1:step, :-2]
+    centre, *sides = (_as_float(samples) for samples in (slab[1][inner], *above, *below))
+    pairs = list(zip(sides[:3], sides[3:]))
     gradient = np.stack([(high - low) / 2 for high, low in pairs], -1).reshape(-1, 3)
     change = sum(np.abs(high - 2 * centre + low) for high, low in pairs)
     relative = _relative_bend(np.ravel(change), lengths(gradient))
@@ -115,13 +114,18 @@ def _relative_bend(change: NDArray[np.float64], length: NDArray[np.float64]) -> 
     return relative
 
 
-def _plane_gradients(slab: NDArray[Any], middle: int) -> Gradients:
-    """Return gradients (n, 3) and bends (n,) at samples next to the surface in a plane of a slab.
+def _plane_gradients(
+    slab: NDArray[Any], middle: int, number: int
+) -> tuple[NDArray[np.uint64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return ranks, gradients (n, 3) and bends (n,) at samples next to the surface in a plane.
 
-    The slab has the planes beside it, too.
+    The slab has the planes beside it, too. ``number`` is that of the plane's first sample.
     """
     slab = np.asarray(slab)
-    at = [np.full(1, middle), *np.nonzero(_beside_surface(slab <= 0, middle))]
+    beside = np.flatnonzero(_beside_surface(slab <= 0, middle))
+    ranks = ranks_of(beside + number)
+    some = lowest(ranks, MOST_BESIDE)
+    at = [np.full(1, middle), *np.unravel_index(beside[some], slab.shape[1:])]
     centre = _read(slab, at)
     gradient, change = np.empty((len(centre), 3)), np.zeros(len(centre))
     for axis in range(3):
@@ -131,7 +135,7 @@ def _plane_gradients(slab: NDArray[Any], middle: int) -> Gradients:
         below, above, steps = _read(slab, low), _read(slab, high), high[axis] - low[axis]
         gradient[:, axis] = (above - below) / steps
         change += np.where(steps == 2, np.abs(above - 2 * centre + below), 0)
-    return gradient, _relative_bend(change, lengths(gradient))
+    return ranks[some], gradient, _relative_bend(change, lengths(gradient))
 
 
 def _beside_surface(inside: BoolArray, middle: int) -> BoolArray:
@@ -150,7 +154,12 @@ def _beside_surface(inside: BoolArray, middle: int) -> BoolArray:
 
 def _read(slab: NDArray[Any], at: list[NDArray[np.intp]]) -> NDArray[np.float64]:
     """Return samples at some indices, clamped to ``LARGEST_VALUE``."""
-    return np.clip(slab[tuple(at)].astype(np.float64), -LARGEST_VALUE, LARGEST_VALUE)
+    return _as_float(slab[tuple(at)])
+
+
+def _as_float(samples: NDArray[Any]) -> NDArray[np.float64]:
+    """Return samples clamped to ``LARGEST_VALUE``."""
+    return np.clip(samples.astype(np.float64), -LARGEST_VALUE, LARGEST_VALUE)
 
 
 def typical_length(gradients: NDArray[np.float64], bend: NDArray[np.float64]) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property, partial
 from io import FileIO
 from math import prod
@@ -28,6 +28,7 @@ FAR = 1e6  # spacings
 BLOCK_BYTES = 1 << 20  # read at a time when iterating over all planes
 LEAST_AT_ONCE = 4  # planes
 WORKING_BYTES = 1 << 26  # taken at a time when planes are made of others
+EVENLY = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio: its multiples, modulo 2^64
 
 Result = TypeVar("Result")
 Ranges: TypeAlias = Sequence[tuple[Any, ...]]
@@ -244,6 +245,11 @@ class PlaneFile(SamplePlanes):
         self.file.read_into(planes, self.offset + first * self.plane_bytes)
         return planes.transpose(0, 2, 1) if self.swapped else planes
 
+    @property
+    def is_unpacked(self) -> bool:
+        """Whether the file is a temporary one, of samples that might be in memory."""
+        return isinstance(self.file.file.name, int)  # it has no name, only a number
+
 
 SampleArray: TypeAlias = NDArray[Any] | SamplePlanes
 """An array of samples in memory, or one whose planes are read or made when they are needed."""
@@ -268,6 +274,32 @@ def over_planes(
         return
     for first, last, *more in ranges:
         yield work(samples[first:last], *more)
+
+
+def ranks_of(numbers: NDArray[np.int64]) -> NDArray[np.uint64]:
+    """Return a rank for the number of each sample: the lowest ranks are spread evenly over all."""
+    return numbers.astype(np.uint64) * EVENLY
+
+
+def lowest(ranks: NDArray[np.uint64], most: int) -> NDArray[np.bool_] | slice:
+    """Return which are the ``most`` lowest of different ranks; all if there are not more."""
+    return ranks <= np.partition(ranks, most - 1)[most - 1] if len(ranks) > most else slice(None)
+
+
+def few_of(found: Iterable[tuple[NDArray[Any], ...]], most: int) -> list[NDArray[Any]]:
+    """Return what was found of samples, concatenated: of at most ``most``, those of lowest rank.
+
+    ``found`` are parts: the ranks of n samples, and arrays of n rows. The result depends on the
+    samples alone, and few are held at a time.
+    """
+    kept: list[tuple[NDArray[Any], ...]] = []
+    for part in found:
+        kept.append(part)
+        if sum(len(ranks) for ranks, *_ in kept) > most:
+            joined = [np.concatenate(arrays) for arrays in zip(*kept)]
+            some = lowest(joined[0], most)
+            kept = [tuple(array[some] for array in joined)]
+    return [np.concatenate(arrays) for arrays in zip(*kept)][1:]
 
 
 def in_blocks(samples: SampleArray) -> list[tuple[int, int]]:
@@ -391,6 +423,14 @@ class DerivedPlanes(SamplePlanes):
         own = planes * self.plane_bytes + read * rows * self.shape[2] * self.each
         stored = read * self.shape[1] * self.shape[2] * np.dtype(self.source.dtype).itemsize
         return own + max(reading_bytes(self.source, read), stored)
+
+
+def unpacked_bytes(samples: SampleArray) -> int:
+    """Return the size of the temporary file that samples are made of, 0 if there is none."""
+    while not isinstance(samples, PlaneFile):
+        if (samples := getattr(samples, "source", None)) is None:
+            return 0
+    return len(samples) * samples.plane_bytes if samples.is_unpacked else 0
 
 
 def planes_at_once(samples: SampleArray) -> int:

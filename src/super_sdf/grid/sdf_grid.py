@@ -318,4 +318,5 @@ def without_samples(grid: SdfGrid) -> SdfGrid:
 
 def negated(values: NDArray[Any]) -> NDArray[Any]:
     """Return the negated values, as floats so that unsigned integers work."""
-    return -values.astype(np.promote_types(values.dtype, np.float32))
+    found = values.astype(np.promote_types(values.dtype, np.float32))
+    return np.negative(found, out=found)

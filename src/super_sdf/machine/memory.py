@@ -21,6 +21,8 @@ M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 
 # Of the memory that is free, the share that is taken unless a bound is given.
 SHARE = 0.6
+# Of what a bound leaves, the share that an unpacked array may take.
+ROOM_SHARE = 0.25
 
 
 def free_memory() -> int | None:
@@ -133,6 +135,11 @@ def forget_peak() -> None:
 def in_words(size: int) -> str:
     """Return a number of bytes as text for users, in the form that ``--max-memory`` takes."""
     return f"{size / 1e9:,.2f} GB" if size >= 1e9 else f"{size / 1e6:,.0f} MB"
+
+
+def advised(need: int) -> str:
+    """Return how much to allow for work that needs ``need`` bytes: plans vary slightly."""
+    return in_words(int(1.03 * need) + 1_000_000)
 
 
 def check_fits(need: int, what: str, way_out: str) -> None:

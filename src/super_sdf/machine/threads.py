@@ -6,7 +6,7 @@ Pieces of work are independent of each other and may run at the same time; resul
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from math import ceil
 from typing import TypeVar
@@ -63,8 +63,16 @@ def map_threads(
     work: Callable[[Piece], Result], pieces: Sequence[Piece], threads: int = 1
 ) -> list[Result]:
     """Return ``work(piece)`` for each piece, in order, with up to ``threads`` threads."""
+    return list(over_threads(work, pieces, threads))
+
+
+def over_threads(
+    work: Callable[[Piece], Result], pieces: Sequence[Piece], threads: int = 1
+) -> Iterator[Result]:
+    """Yield the same, so that not all need to be held."""
     threads = min(threads, len(pieces))
     if threads < 2:
-        return [work(piece) for piece in pieces]
+        yield from map(work, pieces)
+        return
     with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(work, pieces))
+        yield from pool.map(work, pieces)

@@ -19,16 +19,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import OutOfMemoryError
+from ..grid.sdf_grid import SdfGrid
 from ..machine import index_width
-from ..machine.memory import give_back, held_memory, in_words
+from ..machine.memory import ROOM_SHARE, advised, give_back, held_memory, in_words
 from ..machine.resources import Resources
 from ..steps import bounds, spheres
+from ..steps.glance import look_at_band
 from ..steps.mesher_names import DEFAULT_MESHER
 from ..steps.meshers import BY_NAME, Mesher
-from ..steps.survey import Band
+from ..steps.survey import Band, band_bytes, outline
 from .footprint import NETWORK_BYTES, slab_bytes
 
 DEFAULT = BY_NAME[DEFAULT_MESHER]
+SURFACE_SHARE, DOUBT = 0.25, "is this a distance field?"  # of which few samples are
 REACH_IN_VOXELS = spheres.REACH_IN_VOXELS + bounds.REACH_IN_VOXELS
 
 
@@ -99,7 +102,6 @@ def plan_slabs(
         If the mesh will certainly have more vertices than 32-bit numbers.
     """
     check_vertices(band, factor)
-    how = "at once" if receptive_field is None else "even plane by plane"
     bound, need = resources.memory, 0
     beside = mesher.planes_beside(factor)
     for nth, slabs in enumerate(_ways(band, receptive_field, beside, planes)):
@@ -108,7 +110,33 @@ def plan_slabs(
         need = peak_bytes(band, slabs, factor, network_bytes, resources.threads, mesher)
         if bound is None or need <= bound:
             return slabs
-    raise _does_not_fit(band, factor, how, need, bound or 0)
+    raise _does_not_fit(band, factor, receptive_field, need, bound or 0)
+
+
+def refuse_band(
+    grid: SdfGrid,
+    offset: float,
+    factor: int,
+    receptive_field: int | None,
+    resources: Resources,
+    network_bytes: tuple[float, float] = NETWORK_BYTES,
+    mesher: Mesher = DEFAULT,
+) -> OutOfMemoryError:
+    """Return the error for a grid whose band does not fit in memory: the grid is read once more.
+
+    The parameters are those of ``plan_slabs`` and ``survey``.
+    """
+    give_back()
+    seen = look_at_band(grid, offset, planes=1)
+    band = outline(grid, offset, resources.threads, seen.voxels, seen.decoded)
+    *_, slabs = _ways(band, receptive_field, mesher.planes_beside(factor))
+    need = peak_bytes(band, slabs, factor, network_bytes, resources.threads, mesher)
+    need += band_bytes(seen.summary.voxels, seen.beyond)
+    share = seen.summary.voxels / np.prod(grid.shape, dtype=float)
+    error = _does_not_fit(band, factor, receptive_field, need, resources.memory or 0)
+    if share < SURFACE_SHARE:
+        return error
+    return OutOfMemoryError(f"{error}; {share:.0%} of the samples are near the surface: {DOUBT}")
 
 
 def _ways(
@@ -209,10 +237,15 @@ def _slab(band: Band, first: int, last: int, receptive_field: int, beside: int) 
     return Slab((first, last), decoded, band.rows(first - beside, last + beside))
 
 
-def _does_not_fit(band: Band, factor: int, how: str, need: int, bound: int) -> OutOfMemoryError:
-    """Return the error for work that does not fit in memory."""
+def _does_not_fit(
+    band: Band, factor: int, receptive_field: int | None, need: int, bound: int
+) -> OutOfMemoryError:
+    """Return the error for work that does not fit in memory; what it says to allow is enough."""
+    how = "at once" if receptive_field is None else "even plane by plane"
+    if band.unpacked <= ROOM_SHARE * need:  # it would be unpacked into memory then
+        need += band.unpacked
     return OutOfMemoryError(
-        f"factor {factor} on {int(band.decoded_before[-1]):,} voxels needs {in_words(need)} of "
+        f"factor {factor} on {int(band.decoded_before[-1]):,} voxels needs {advised(need)} of "
         f"memory {how}, {in_words(bound)} may be used; use a smaller factor, or allow more "
         "(--max-memory)"
     )

@@ -74,7 +74,12 @@ def rescale_planes(planes: NDArray[Any], voxel_size: float, offset: float = 0.0)
 
 
 def find_band(rescaled: FloatArray) -> IntArray:
-    """Return the active voxels, ``abs(rescaled) < 3`` (Eq. 2), as (V, 3) int32 in C order.
+    """Return the active voxels as (V, 3) int32 in C order: see ``is_active``."""
+    return np.ascontiguousarray(np.argwhere(is_active(rescaled)), np.int32)
+
+
+def is_active(rescaled: FloatArray) -> BoolArray:
+    """Return which voxels are active, ``abs(rescaled) < 3`` (Eq. 2).
 
     A distance cannot jump over the band, from beyond it on one side to beyond it on the other.
     Where the input does, both voxels are added: a surface must pass between them.
@@ -84,7 +89,7 @@ def find_band(rescaled: FloatArray) -> IntArray:
     above, below = outside & ~active, ~(outside | active)
     if (above & _dilate(below)).any():
         active |= (above & _dilate(below)) | (below & _dilate(above))
-    return np.ascontiguousarray(np.argwhere(active), np.int32)
+    return active
 
 
 def _dilate(mask: BoolArray) -> BoolArray:
@@ -122,8 +127,13 @@ def gather_patches(rescaled: FloatArray, voxel_ijk: IntArray) -> FloatArray:
     -------
     (V, 27) float32
     """
-    padded = pad_by_extrapolation(rescaled)
-    centre, steps = _flat_steps(voxel_ijk, rescaled.shape)
+    return take_patches(pad_by_extrapolation(rescaled), voxel_ijk)
+
+
+def take_patches(padded: FloatArray, voxel_ijk: IntArray) -> FloatArray:
+    """Return the same of samples from ``pad_by_extrapolation``."""
+    nx, ny, nz = padded.shape
+    centre, steps = _flat_steps(voxel_ijk, (nx - 2, ny - 2, nz - 2))
     patches = np.empty((len(voxel_ijk), 27), np.float32)
     for column, step in enumerate(steps):
         np.take(padded.ravel(), centre + step, out=patches[:, column])

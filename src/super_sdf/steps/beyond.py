@@ -20,7 +20,7 @@ FARTHEST = 8.0  # four voxels
 
 @dataclass(frozen=True, eq=False)
 class SamplesBeyond:
-    """Samples between the band and ``FARTHEST``.
+    """Samples between the band and ``FARTHEST`` that can be exact.
 
     Attributes
     ----------
@@ -37,19 +37,24 @@ class SamplesBeyond:
 NONE_BEYOND = SamplesBeyond(np.zeros(0, np.int64), np.zeros(0, np.float32))
 
 
-def samples_beyond(rescaled: FloatArray, first: int) -> SamplesBeyond:
-    """Return those beyond the band in some planes of samples, (m, ny, nz), from ``first`` on."""
-    size = np.abs(rescaled)
-    at = np.flatnonzero((size >= HALF_BAND) & (size < FARTHEST))
-    return SamplesBeyond(at + first * rescaled[0].size, rescaled.reshape(-1)[at])
+def samples_beyond(rescaled: FloatArray, first: int, limits: tuple[float, float]) -> SamplesBeyond:
+    """Return those beyond the band among samples that follow each other, from number ``first`` on.
+
+    They are those that can be exact: between ``limits``. Where a field is cut off, as most are that
+    were truncated, all of the rest of the grid is not.
+    """
+    if not reach_beyond(limits):
+        return NONE_BEYOND
+    low, high = np.float32(limits).clip(-FARTHEST, FARTHEST)
+    found = (rescaled > low) & (rescaled < high)
+    found &= ~((rescaled > -HALF_BAND) & (rescaled < HALF_BAND))
+    at = np.flatnonzero(found)
+    return SamplesBeyond(at + first, rescaled[found])
 
 
-def joined(parts: list[SamplesBeyond]) -> SamplesBeyond:
-    """Return the samples of some parts, in order."""
-    return SamplesBeyond(
-        np.concatenate([part.number for part in parts]),
-        np.concatenate([part.value for part in parts]),
-    )
+def reach_beyond(limits: tuple[float, float]) -> bool:
+    """Return whether samples beyond the band can be exact: the same for all parts of a grid."""
+    return limits[0] < -HALF_BAND or limits[1] > HALF_BAND
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +73,7 @@ class TrustedSamples:
         Which of them are exact.
     beyond : SamplesBeyond
     limits : two floats
-        Those beyond the band are trusted if they lie between these.
+        Between these, samples beyond the band can be exact.
     """
 
     shape: tuple[int, int, int]
@@ -80,8 +85,8 @@ class TrustedSamples:
 
     @property
     def reach_beyond(self) -> bool:
-        """Whether samples beyond the band can be trusted: the same for all parts of a grid."""
-        return self.limits[0] < -HALF_BAND or self.limits[1] > HALF_BAND
+        """Whether samples beyond the band can be exact."""
+        return reach_beyond(self.limits)
 
     def box(self, low: IntArray, high: IntArray) -> FloatArray:
         """Return the samples from index ``low`` (3,) to before ``high``, NaN where there is none.
@@ -95,10 +100,8 @@ class TrustedSamples:
         plane = self.shape[1] * self.shape[2]
         ends = np.array([low[0], high[0]], np.int64) * plane
         rows = slice(*np.searchsorted(self.beyond.number, ends))
-        value = self.beyond.value[rows]
         ijk = np.stack(np.unravel_index(self.beyond.number[rows], self.shape), 1)
-        known = (value > np.float32(self.limits[0])) & (value < np.float32(self.limits[1]))
-        self._put(box, (ijk - low)[known], value[known])
+        self._put(box, ijk - low, self.beyond.value[rows])
         return box
 
     @staticmethod

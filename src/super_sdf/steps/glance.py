@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..grid.planes import DerivedPlanes, over_planes, planes_at_once
+from ..grid.planes import over_planes, planes_at_once
+from ..grid.resampling import Resampled
 from ..grid.sdf_grid import SdfGrid, without_samples
 from ..neighbourhood import CENTRE
 from .band import BLOCK_PLANES, can_hold_surface, is_lipschitz, plane_blocks
@@ -24,8 +25,10 @@ class Glance(NamedTuple):
     ----------
     summary : BandSummary
         Of the voxels in these planes.
-    decoded : list of int
-        The voxels that are decoded in each plane.
+    voxels, decoded : lists of int
+        The voxels in each plane, and those that are decoded.
+    beyond : int
+        The samples beyond the band that can be exact.
     crossings : int
         See ``Band.count_crossings``.
     jumps : list of (Jumps, Jumps)
@@ -33,15 +36,18 @@ class Glance(NamedTuple):
     """
 
     summary: BandSummary
+    voxels: list[int]
     decoded: list[int]
+    beyond: int
     crossings: int
     jumps: list[tuple[Jumps, Jumps]]
 
 
-def look_at_band(grid: SdfGrid, offset: float) -> Glance:
+def look_at_band(grid: SdfGrid, offset: float, planes: int = 0) -> Glance:
     """Return what the band of a grid says without keeping it, as if ``survey`` had read it.
 
-    The planes are read where the samples are, see ``planes.over_planes``.
+    The planes are read where the samples are, see ``planes.over_planes``; by default at least as
+    many at a time as are best.
 
     Raises
     ------
@@ -49,26 +55,37 @@ def look_at_band(grid: SdfGrid, offset: float) -> Glance:
         As in ``survey``.
     """
     count, samples = grid.shape[0], grid.samples
-    least = planes_at_once(samples) if isinstance(samples, DerivedPlanes) else 0
+    planes = planes or max(planes_at_once(samples), BLOCK_PLANES)
     ranges = [
         (max(first - 1, 0), min(last + 1, count), (first, last))
-        for first, last in plane_blocks(grid.shape, least=max(least, BLOCK_PLANES))
+        for first, last in plane_blocks(grid.shape, least=planes)
     ]
-    look = partial(_glance, without_samples(grid), offset)
+    # resampled ones are made here, and say so
+    known = grid if isinstance(samples, Resampled) else without_samples(grid)
+    look = partial(_glance, known, offset)
     found = list(over_planes(samples, look, ranges))
     jumps = [jump for glance in found for jump in glance.jumps]
     if offset:
         check_jumps(jumps, grid, offset)
-    summaries = [glance.summary for glance in found]
-    summary = BandSummary(
+    return Glance(
+        _of_all([glance.summary for glance in found]),
+        [number for glance in found for number in glance.voxels],
+        [number for glance in found for number in glance.decoded],
+        sum(glance.beyond for glance in found),
+        sum(glance.crossings for glance in found),
+        jumps,
+    )
+
+
+def _of_all(summaries: list[BandSummary]) -> BandSummary:
+    """Return the summary of all parts of a band."""
+    return BandSummary(
         sum(part.voxels for part in summaries),
         sum(part.noisy for part in summaries),
         min(part.low for part in summaries),
         max(part.high for part in summaries),
         any(part.leaves for part in summaries),
     )
-    decoded = [number for glance in found for number in glance.decoded]
-    return Glance(summary, decoded, sum(glance.crossings for glance in found), jumps)
 
 
 def _glance(grid: SdfGrid, offset: float, planes: NDArray[Any], own: tuple[int, int]) -> Glance:
@@ -76,12 +93,19 @@ def _glance(grid: SdfGrid, offset: float, planes: NDArray[Any], own: tuple[int, 
     jumps: list[tuple[Jumps, Jumps]] = []
     leaving: list[bool] = []
     first, last = own
-    ijk, patches, _ = band_of_samples(grid, offset, planes, first, last, jumps, leaving)
-    lipschitz = is_lipschitz(patches)
-    band = Band(
-        grid.shape, ijk, patches, lipschitz, can_hold_surface(patches, lipschitz), lipschitz
-    )
-    decoded = limit_to_field(band, grid, offset).decoded
-    by_plane = np.bincount(ijk[decoded, 0] - first, minlength=last - first).tolist()
-    summary = summarise(patches[:, CENTRE], lipschitz, leaving[0])
-    return Glance(summary, by_plane, band.count_crossings(), jumps)
+    voxels, decoded = np.zeros((2, last - first), np.int64)
+    beyond = crossings = 0
+    summaries: list[BandSummary] = []
+    for ijk, patches, _, value in band_of_samples(grid, offset, planes, own, jumps, leaving):
+        lipschitz = is_lipschitz(patches)
+        held = can_hold_surface(patches, lipschitz)
+        band = limit_to_field(
+            Band(grid.shape, ijk, patches, lipschitz, held, lipschitz), grid, offset
+        )
+        plane = ijk[:, 0] - first
+        voxels += np.bincount(plane, minlength=last - first)
+        decoded += np.bincount(plane[band.decoded], minlength=last - first)
+        beyond, crossings = beyond + len(value), crossings + band.count_crossings()
+        summaries.append(summarise(patches[:, CENTRE], lipschitz, leaving[0]))
+    summary = _of_all(summaries)
+    return Glance(summary, voxels.tolist(), decoded.tolist(), beyond, crossings, jumps)

@@ -74,12 +74,15 @@ def is_flat(patches: FloatArray) -> BoolArray:
     return flat
 
 
-def find_jumps(rescaled: FloatArray) -> tuple[Jumps, Jumps]:
-    """Return the jumps upwards and downwards in planes (n, ny, nz), in half voxels."""
-    return _jumps_up(rescaled), _jumps_up(-rescaled)
+def find_jumps(rescaled: FloatArray, own: tuple[slice, ...]) -> tuple[Jumps, Jumps]:
+    """Return the jumps upwards and downwards in planes (n, ny, nz), in half voxels.
+
+    Samples are counted in ``own``; those beside them only show whether there is a jump.
+    """
+    return _jumps_up(rescaled, own), _jumps_up(-rescaled, own)
 
 
-def _jumps_up(rescaled: FloatArray) -> Jumps:
+def _jumps_up(rescaled: FloatArray, own: tuple[slice, ...]) -> Jumps:
     """Return the jumps upwards."""
     jumps = np.zeros(rescaled.shape, bool)
     for axis in range(3):
@@ -87,6 +90,7 @@ def _jumps_up(rescaled: FloatArray) -> Jumps:
         step = values[1:] - values[:-1]
         found[:-1] |= step > MIN_JUMP
         found[1:] |= step < -MIN_JUMP
+    rescaled, jumps = rescaled[own], jumps[own]
     near = np.abs(rescaled) < PATCH_LIMIT
     jumps &= near
     return Jumps(int(jumps.sum()), int(near.sum()), float(rescaled[jumps].max(initial=-np.inf)))

@@ -60,7 +60,9 @@ def spline_blocks(
         if rows.start == rows.stop:
             continue
         low, high = max(first - BEYOND, 0), min(last + BEYOND, nx)
-        planes = in_spacings(np.asarray(values[low:high]), unit)
+        planes = np.empty((high - low, *values.shape[1:]), np.float32)
+        for i, plane in enumerate(planes, low):  # one by one, to save memory
+            plane[...] = in_spacings(np.asarray(values[i]), unit)
         ijk = voxel_ijk[rows] - np.array([low, 0, 0], np.int32)
         for start, stop in _strips(planes.shape):
             which = np.flatnonzero((ijk[:, 1] >= start) & (ijk[:, 1] < stop))
@@ -85,7 +87,7 @@ def spline_bytes(shape: tuple[int, ...]) -> int:
     start, stop = next(plane_blocks(shape, least=2 * BEYOND))
     planes = min(stop - start + 2 * BEYOND, shape[0])
     size = max(STRIP_SAMPLES // (planes * shape[2]), 4 * BEYOND)
-    return 16 * planes * shape[1] * shape[2] + STRIP_BYTES * planes * min(size, shape[1]) * shape[2]
+    return 4 * planes * shape[1] * shape[2] + STRIP_BYTES * planes * min(size, shape[1]) * shape[2]
 
 
 def prefilter(values: FloatArray) -> FloatArray:

@@ -1,13 +1,16 @@
 """The band of a whole grid, found plane by plane: all that the steps need of the input.
 
-The grid is read once. The band takes 145 bytes per voxel, with the samples beyond it, so it grows
-with the surface, not with the grid.
+The grid is read once, in blocks of planes, and a block is worked on in windows, so that little is
+held beside the band. This takes 135 bytes per voxel, and 12 per sample beyond it, so it grows with
+the surface, not with the grid.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -17,40 +20,44 @@ from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import NoSurfaceError, OutOfMemoryError
 from ..grid.cubic import on_samples, sampled_places
 from ..grid.field import EXACT, MASK
-from ..grid.planes import (
-    DerivedPlanes,
-    SampleArray,
-    planes_at_once,
-    reading_bytes,
-)
+from ..grid.planes import SampleArray, planes_at_once, reading_bytes, unpacked_bytes
 from ..grid.resampling import Resampled
 from ..grid.sdf_grid import SdfGrid, negated
-from ..grid.unknown import KnownPlanes
 from ..machine.memory import held_memory, in_words
 from ..machine.resources import ONE_THREAD, Resources
-from ..machine.threads import map_threads
-from ..neighbourhood import CENTRE, STRIDES
+from ..machine.threads import chunks_of, over_threads
+from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 from .band import (
     BLOCK_PLANES,
     BLOCK_SAMPLES,
     can_hold_surface,
-    find_band,
-    gather_patches,
+    is_active,
     is_lipschitz,
     neighbour_table,
+    pad_by_extrapolation,
     plane_blocks,
     rescale_planes,
+    take_patches,
 )
-from .beyond import NONE_BEYOND, SamplesBeyond, TrustedSamples, joined, samples_beyond
+from .beyond import NONE_BEYOND, SamplesBeyond, TrustedSamples, samples_beyond
 from .exact import BandSummary, exact_samples
 from .offsets import Jumps, check_not_cut_off, check_not_filled, find_jumps
 
-BYTES_PER_VOXEL = 145  # of a band, with the samples beyond it: some two for a voxel
+# Of a band: patches, indices and flags; what is made of them on the way; and of samples beyond it.
+BYTES_PER_VOXEL, BYTES_BEYOND = 135, 12
 BYTES_PER_SAMPLE = 20  # of the planes among which the band is found, measured
+WINDOW_SAMPLES = 1 << 21  # among which the band is found at a time
+APPENDED = 1 << 16  # rows at a time: fewer would be moved too often
 FAR = 1e30  # half voxels: no sample of the band is there
 
-Found: TypeAlias = tuple[IntArray, FloatArray, SamplesBeyond]
-"""The band's voxels in some planes, their patches, and the samples beyond it."""
+Found: TypeAlias = tuple[IntArray, FloatArray, NDArray[np.int64], FloatArray]
+"""Some of the band's voxels and their patches; numbers and values of samples beyond it."""
+
+NONE_ACTIVE = np.empty((0, 3), np.int32), np.empty((0, 27), np.float32)
+
+
+class BandTooLargeError(OutOfMemoryError):
+    """The band of a grid does not fit in memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +94,9 @@ class Band:
     half_voxel, level : float
         Half a spacing in world units, by which these are divided; and what is zero then.
     peak : int
-        The memory of the process in bytes while the band was found, of samples that are made.
+        The memory of the process in bytes while the band was found.
+    unpacked : int
+        The bytes of the samples in a temporary file.
     beyond : SamplesBeyond
         The samples a few voxels farther away.
     """
@@ -107,6 +116,7 @@ class Band:
     half_voxel: float = 1.0
     level: float = 0.0
     peak: int = 0
+    unpacked: int = 0
     beyond: SamplesBeyond = NONE_BEYOND
 
     @cached_property
@@ -130,7 +140,7 @@ class Band:
     @property
     def all_rows(self) -> slice:
         """The rows of all voxels."""
-        return slice(0, len(self.voxel_ijk))
+        return slice(0, int(self.voxels_before[-1]))
 
     def rows(self, first: int, last: int) -> slice:
         """Return the rows of the voxels in planes ``first`` to before ``last``."""
@@ -145,7 +155,8 @@ class Band:
     @cached_property
     def decoded_before(self) -> NDArray[np.int64]:
         """The number of decoded voxels before each plane, and that of all, (nx + 1,)."""
-        return np.append(0, np.cumsum(self.decoded))[self.voxels_before]
+        counts = [self.decoded[a:b].sum() for a, b in pairwise(self.voxels_before)]
+        return np.append(0, np.cumsum(counts, dtype=np.int64))
 
     def count_decoded(self, rows: slice) -> int:
         """Return the number of decoded voxels among ``rows``, which must be whole planes."""
@@ -217,63 +228,92 @@ def survey(
     ------
     GridError
         If the distances end too near the offset.
-    OutOfMemoryError
+    BandTooLargeError
         As soon as the part of the band read so far exceeds the memory bound.
     """
     sizes: list[int] = []
     jumps: list[tuple[Jumps, Jumps]] = []
     leaving: list[bool] = []
     held = held_memory() or 0
+    planes, reading = plan_reading(grid.samples, held, resources)
 
-    def read(planes: slice) -> Found:
-        found = _band_of_planes(
-            grid, offset, planes.start, planes.stop, jumps if among is None else None, leaving
-        )
-        sizes.append(len(found[0]))
-        _check_bound(sum(sizes), planes.stop, held, resources.memory)
+    def read(block: tuple[int, int]) -> list[Found]:
+        seen = jumps if among is None else None
+        around = slice(max(block[0] - 1, 0), block[1] + 1)
+        found = list(band_of_samples(grid, offset, grid.samples[around], block, seen, leaving))
+        sizes.append(sum(band_bytes(len(ijk), len(value)) for ijk, _, _, value in found))
+        _check_bound(sum(sizes) + reading, block[1], held, resources.memory)
         return found
 
-    planes, reading = plan_reading(grid.samples, held, resources)
-    first, last = among or (0, grid.shape[0])
-    blocks = [slice(*block) for block in plane_blocks(grid.shape, first, last, planes)]
-    parts = map_threads(read, blocks, resources.threads)
-    voxel_ijk = np.concatenate([ijk for ijk, _, _ in parts])
-    patches, beyond = [part for _, part, _ in parts], joined([part for _, _, part in parts])
-    del parts
+    blocks = list(plane_blocks(grid.shape, *(among or (0, None)), planes))
+    voxel_ijk, patches, number, value = _put_together(over_threads(read, blocks, resources.threads))
     if offset and among is None:
         check_jumps(jumps, grid, offset)
-    band = make_band(grid.shape, voxel_ijk, _concatenate(patches), resources.threads, whole)
+    band = make_band(grid.shape, voxel_ijk, patches, resources.threads, whole)
     if isinstance(grid.samples, Resampled):
         band = look_at_samples(band, grid, resources.threads)
-    peak = held + reading + len(voxel_ijk) * BYTES_PER_VOXEL if reading else 0
     leaves = any(leaving) if whole is None else whole.leaves
-    band = replace(band, leaves=leaves, peak=peak, beyond=beyond)
+    beyond = SamplesBeyond(number, value)
+    peak, unpacked = held + reading + sum(sizes), unpacked_bytes(grid.samples)
+    band = replace(band, leaves=leaves, peak=peak, unpacked=unpacked, beyond=beyond)
     return limit_to_field(band, grid, offset)
 
 
-def plan_reading(samples: SampleArray, held: int, resources: Resources) -> tuple[int, int]:
-    """Return how many planes to make at a time, and the bytes that this takes, beside those held.
+def band_bytes(voxels: int, beyond: int) -> int:
+    """Return the memory of a band, with so many samples beyond it."""
+    return voxels * BYTES_PER_VOXEL + beyond * BYTES_BEYOND
 
-    It is 0 for samples that are read and not made of others, since it is little.
+
+def _put_together(blocks: Iterable[list[Found]]) -> Found:
+    """Return what was found in all blocks, as one.
+
+    The arrays grow, and each part is freed when it was taken, so that nothing is held twice.
+    """
+    empty = *NONE_ACTIVE, NONE_BEYOND.number, NONE_BEYOND.value
+    voxel_ijk, patches, number, value = (array.copy() for array in empty)
+    whole = voxel_ijk, patches, number, value
+    waiting: list[Found] = []
+    for parts in blocks:
+        while parts:
+            waiting.append(parts.pop(0))
+            if sum(len(part[0]) + len(part[2]) for part in waiting) > APPENDED:
+                _append(whole, waiting)
+    _append(whole, waiting)
+    return whole
+
+
+def _append(whole: Found, parts: list[Found]) -> None:
+    """Append parts to what was found, and empty the list."""
+    for array, rows in zip(whole, zip(*parts)):
+        count = len(array)
+        array.resize((count + sum(map(len, rows)), *array.shape[1:]), refcheck=False)
+        np.concatenate(rows, out=array[count:])
+    parts.clear()
+
+
+def plan_reading(samples: SampleArray, held: int, resources: Resources) -> tuple[int, int]:
+    """Return how many planes to read at a time, and the bytes that this takes, beside those held.
 
     Raises
     ------
     OutOfMemoryError
         If they do not fit in memory even plane by plane.
     """
-    if not isinstance(samples, (DerivedPlanes, KnownPlanes)):
-        return BLOCK_PLANES, 0
     plane, need = samples.shape[1] * samples.shape[2], 0
     for least in (planes_at_once(samples), BLOCK_PLANES, 1):
         planes = min(max(BLOCK_SAMPLES // plane, least), len(samples))
-        each = reading_bytes(samples, planes + 2) + planes * plane * BYTES_PER_SAMPLE
+        around = (planes + 2) * plane
+        copies = around * (samples.dtype.itemsize + 4)  # with another sign, and in half voxels
+        windows = min(around, WINDOW_SAMPLES) * BYTES_PER_SAMPLE
+        each = reading_bytes(samples, planes + 2) + copies + windows
         need = min(resources.threads, -(-len(samples) // planes)) * each
-        room = np.inf if resources.memory is None else resources.memory - held
+        room = _room(resources.memory, held)
         if need <= (room if least == 1 else room / 2):  # the band needs room, too
             return least, need
     raise OutOfMemoryError(
-        f"making distances of the values needs {in_words(held + need)} of memory even plane by "
-        f"plane, {in_words(resources.memory or 0)} may be used; allow more (--max-memory)"
+        f"reading {samples.shape[1]:,} x {samples.shape[2]:,} samples plane by plane needs at "
+        f"least {in_words(held + need)} of memory, {in_words(resources.memory or 0)} may be used; "
+        "allow more (--max-memory)"
     )
 
 
@@ -283,18 +323,15 @@ def limit_to_field(band: Band, grid: SdfGrid, offset: float) -> Band:
     In a mask, only the voxels round which samples lie on both sides hold the surface.
     """
     field, scale = grid.field, 2 / grid.voxel_size
-    low, high = ((limit - offset) * scale for limit in field.exact)
-    ends = np.clip([grid.low - offset, grid.high - offset], -FAR / scale, FAR / scale) * scale
-    lowest, highest = map(float, ends.astype(np.float32))  # where it may be cut off
-    if band.sampled is None:  # of a resampled grid, what is interpolated there promises little
-        band = replace(band, limits=(max(low, lowest), min(high, highest)))
+    band = replace(band, limits=limits_beyond(grid, offset))
     if field.kind == EXACT:
         return band
     sample = band.patches[:, CENTRE]
+    low, high = _exact_between(grid, offset)
     exact = band.exact & (sample > low) & (sample < high)
     decoded = band.decoded
     if field.kind == MASK:
-        decoded = ((band.patches > 0) != (sample > 0)[:, None]).any(1)
+        decoded = _has_both_sides(band.patches)
     if field.smooth is not None:  # no distances: what they say of the voxels is not certain
         decoded = np.ones_like(band.decoded)
     band = replace(band, exact=exact, decoded=decoded, kind=field.kind, smooth=field.smooth)
@@ -302,18 +339,66 @@ def limit_to_field(band: Band, grid: SdfGrid, offset: float) -> Band:
     return replace(band, has_kinks=field.has_kinks, half_voxel=1 / scale, level=level)
 
 
-def _check_bound(voxels: int, planes: int, held: int, bound: int | None) -> None:
-    """Raise if ``voxels`` of the band do not fit in the memory bound, beside the bytes ``held``.
+def _exact_between(grid: SdfGrid, offset: float) -> tuple[float, float]:
+    """Return the samples, in half voxels, between which those of a field can be exact."""
+    scale = 2 / grid.voxel_size
+    low, high = ((limit - offset) * scale for limit in grid.field.exact)
+    return low, high
 
-    If the process held more than the bound before, only the band itself is compared with the bound.
-    """
-    need = voxels * BYTES_PER_VOXEL
-    if bound is not None and need > (bound - held if held < bound else bound):
-        raise OutOfMemoryError(
-            f"the band of the first {planes:,} planes already has {voxels:,} voxels, which take "
-            f"{in_words(need)} of memory, and {in_words(bound)} may be used in all; is this a "
-            "distance field? If so, allow more (--max-memory)"
+
+def limits_beyond(grid: SdfGrid, offset: float) -> tuple[float, float]:
+    """Return between which samples those beyond the band can be exact, see ``Band.limits``."""
+    if isinstance(grid.samples, Resampled):  # what is interpolated there promises little
+        return 0.0, 0.0
+    low, high = _exact_between(grid, offset)
+    scale = 2 / grid.voxel_size
+    ends = np.clip([grid.low - offset, grid.high - offset], -FAR / scale, FAR / scale) * scale
+    lowest, highest = map(float, ends.astype(np.float32))  # where it may be cut off
+    return max(low, lowest), min(high, highest)
+
+
+def _has_both_sides(patches: FloatArray) -> BoolArray:
+    """Return in which patches (V, 27) samples lie on both sides of 0, (V,)."""
+    outside = patches[:, CENTRE] > 0
+    found = np.zeros(len(patches), bool)
+    for column in range(27):
+        found |= (patches[:, column] > 0) != outside
+    return found
+
+
+def _check_bound(need: int, planes: int, held: int, bound: int | None) -> None:
+    """Raise if the band, and what is read, do not fit in the memory bound beside the bytes held."""
+    if need > _room(bound, held):
+        raise BandTooLargeError(
+            f"the band of the first {planes:,} planes already takes {in_words(need)} of memory, "
+            f"and {in_words(bound or 0)} may be used in all; is this a distance field? If so, "
+            "allow more (--max-memory)"
         )
+
+
+def _room(bound: int | None, held: int) -> float:
+    """Return how many bytes a bound leaves; if the process holds more than it, all of the bound."""
+    if bound is None:
+        return np.inf
+    return bound - held if held < bound else bound
+
+
+def outline(
+    grid: SdfGrid, offset: float, threads: int, voxels: list[int], decoded: list[int]
+) -> Band:
+    """Return a band without its voxels, of which there are some in each plane, for a plan."""
+    none = np.zeros(0, bool)
+    band = limit_to_field(Band(grid.shape, *NONE_ACTIVE, none, none, none), grid, offset)
+    _, reading = plan_reading(grid.samples, 0, Resources(threads))
+    band = replace(
+        band,
+        exact=np.ones(1, bool),  # perhaps some are
+        peak=(held_memory() or 0) + reading,
+        unpacked=unpacked_bytes(grid.samples),
+    )
+    known = {"voxels_before": voxels, "decoded_before": decoded}
+    vars(band).update({name: np.append(0, np.cumsum(counts)) for name, counts in known.items()})
+    return band
 
 
 def make_band(
@@ -345,47 +430,71 @@ def look_at_samples(band: Band, grid: SdfGrid, threads: int = 1) -> Band:
     return replace(band, lipschitz=lipschitz, exact=exact, sampled=sampled)
 
 
-def _band_of_planes(
-    grid: SdfGrid,
-    offset: float,
-    first: int,
-    last: int,
-    jumps: list[tuple[Jumps, Jumps]] | None,
-    leaving: list[bool],
-) -> Found:
-    """Return what is found in planes ``first`` to before ``last``.
-
-    One more plane is read on either side. Whether a sample on the grid's border is inside is
-    appended to ``leaving``. With an offset, the distances are checked for truncation, and their
-    jumps are appended to ``jumps``, if it is a list.
-    """
-    low, high = max(first - 1, 0), min(last + 1, grid.shape[0])
-    samples = grid.samples[low:high]
-    return band_of_samples(grid, offset, samples, first, last, jumps, leaving)
-
-
 def band_of_samples(
     grid: SdfGrid,
     offset: float,
     samples: NDArray[Any],
-    first: int,
-    last: int,
+    planes: tuple[int, int],
     jumps: list[tuple[Jumps, Jumps]] | None,
     leaving: list[bool],
-) -> Found:
-    """Return the same for samples of these planes and of those beside them."""
-    low, high = max(first - 1, 0), min(last + 1, grid.shape[0])
-    planes = negated(samples) if grid.positive_inside else samples
-    rescaled = rescale_planes(planes, grid.voxel_size, offset)
+) -> Iterator[Found]:
+    """Yield what is found in some planes, in C order, given their samples and those beside them.
+
+    Whether a sample on the grid's border is inside is appended to ``leaving``. With an offset, the
+    distances are checked for truncation, and their jumps are appended to ``jumps``, if it is a
+    list.
+    """
+    low, high = max(planes[0] - 1, 0), min(planes[1] + 1, grid.shape[0])
+    samples = negated(samples) if grid.positive_inside else samples
+    rescaled = rescale_planes(samples, grid.voxel_size, offset)
+    del samples
     leaving.append(_has_inside_on_border(rescaled, low == 0, high == grid.shape[0]))
-    ijk = find_band(rescaled)
-    own = ijk[(ijk[:, 0] >= first - low) & (ijk[:, 0] < last - low)]
-    patches = gather_patches(rescaled, own)
-    if offset and jumps is not None:  # at 0 there is no better offset to suggest
-        check_not_cut_off(patches, offset, grid.voxel_size)
-        jumps.append(find_jumps(rescaled))
-    beyond = samples_beyond(rescaled[first - low : last - low], first)
-    return own + np.array([low, 0, 0], np.int32), patches, beyond
+    limits, start = limits_beyond(grid, offset), [low, 0, 0]
+    for block, rows in _windows(rescaled.shape, slice(planes[0] - low, planes[1] - low)):
+        corner = np.maximum([block.start - 1, rows.start - 1, 0], 0)
+        window = rescaled[corner[0] : block.stop + 1, corner[1] : rows.stop + 1]
+        inner = _shifted(block, corner[0]), _shifted(rows, corner[1])
+        if offset and jumps is not None:  # at 0 there is no better offset to suggest
+            jumps.append(find_jumps(window, inner))
+        number = ((low + block.start) * grid.shape[1] + rows.start) * grid.shape[2]
+        beyond = samples_beyond(window[inner], number, limits)
+        yield *NONE_ACTIVE, beyond.number, beyond.value
+        for ijk, patches in _patches_of(window, inner):
+            if offset and jumps is not None:
+                check_not_cut_off(patches, offset, grid.voxel_size)
+            ijk += start + corner
+            yield ijk.astype(np.int32), patches, NONE_BEYOND.number, NONE_BEYOND.value
+
+
+def _shifted(range_: slice, start: int) -> slice:
+    """Return a slice counted from ``start``."""
+    return slice(range_.start - start, range_.stop - start)
+
+
+def _windows(shape: tuple[int, ...], own: slice) -> Iterator[tuple[slice, slice]]:
+    """Yield the planes and rows of a block that are worked on at a time, in C order.
+
+    They are ``own`` planes of it, of large ones some rows of each.
+    """
+    if np.prod(shape, dtype=float) <= WINDOW_SAMPLES:
+        yield own, slice(0, shape[1])
+        return
+    step = max(WINDOW_SAMPLES // (3 * shape[2]) - 2, 1)
+    for i in range(own.start, own.stop):
+        for first in range(0, shape[1], step):
+            yield slice(i, i + 1), slice(first, min(first + step, shape[1]))
+
+
+def _patches_of(
+    window: FloatArray, own: tuple[slice, slice]
+) -> Iterator[tuple[NDArray[np.int64], FloatArray]]:
+    """Yield active voxels among some planes and rows of a window, and the samples round them."""
+    active = is_active(window)[own]
+    found, padded = np.flatnonzero(active), pad_by_extrapolation(window)
+    first = np.array([own[0].start, own[1].start, 0])
+    for rows in chunks_of(len(found), len(NEIGHBOURHOOD)):
+        ijk = np.stack(np.unravel_index(found[rows], active.shape), 1) + first
+        yield ijk, take_patches(padded, ijk)
 
 
 def check_jumps(found: list[tuple[Jumps, Jumps]], grid: SdfGrid, offset: float) -> None:
@@ -407,14 +516,3 @@ def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:
     return NoSurfaceError(
         f"no surface at {offset:g}: the values go from {grid.low:.6g} to {grid.high:.6g}"
     )
-
-
-def _concatenate(parts: list[FloatArray]) -> FloatArray:
-    """Concatenate arrays (n, 27) and empty the list on the way, so that little is held twice."""
-    joined = np.empty((sum(map(len, parts)), 27), np.float32)
-    start = len(joined)
-    while parts:
-        part = parts.pop()
-        start -= len(part)
-        joined[start : start + len(part)] = part
-    return joined
