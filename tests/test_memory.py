@@ -1,13 +1,33 @@
-"""Memory that is short: what was freed goes back to the system."""
+"""Memory that is short: what was freed goes back to the system, and little is taken."""
 
+import re
 import subprocess
 import sys
+import tracemalloc
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from conftest import ball, trilinear
 
+from super_sdf import SdfGrid
+from super_sdf.errors import OutOfMemoryError
+from super_sdf.files import unpacking
+from super_sdf.files.grids import read_grid
+from super_sdf.grid import evidence
+from super_sdf.grid.evidence import look, weigh
+from super_sdf.grid.gradients import surface_gradients, typical_length
+from super_sdf.grid.planes import changed, few_of, ranks_of
 from super_sdf.machine import memory
+from super_sdf.machine.resources import Resources
+from super_sdf.pipeline import reconstruct_slabs
+from super_sdf.steps import band as band_step
+from super_sdf.steps import spline
+from super_sdf.steps import survey as survey_step
+from super_sdf.steps.glance import look_at_band
+from super_sdf.steps.survey import survey
 
 # Arrays of 4 MB in a row, of which the last stays: the C library keeps what is freed before it.
 FREED = """
@@ -106,3 +126,159 @@ def test_where_proc_is_psutil_is_not_imported():
     script = "import sys; from super_sdf.machine import memory as m; m.free_memory();"
     script += "m.held_memory(peak=True); m.forget_peak(); assert 'psutil' not in sys.modules"
     subprocess.run([sys.executable, "-c", script], check=True)
+
+
+def noise(*shape):
+    """Return values of both signs at random: the surface is beside nearly every sample."""
+    return np.random.default_rng(0).integers(-100, 101, shape).astype(np.int8)
+
+
+def rough(*shape):
+    """Return normal noise."""
+    return np.random.default_rng(0).normal(size=shape)
+
+
+@contextmanager
+def peak_of():
+    """Yield a list that gets the most memory that is taken within, in bytes."""
+    sizes = []
+    tracemalloc.start()
+    yield sizes
+    sizes.append(tracemalloc.get_traced_memory()[1])
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize("gather", [surface_gradients, lambda values: look(values, (-100, 100))])
+def test_evidence_beside_a_surface_that_is_everywhere_takes_little_memory(gather):
+    values = noise(64, 192, 192)
+    with peak_of() as peak:
+        gather(values)
+    assert peak[0] < 7e7
+
+
+@pytest.mark.parametrize("most", [1, 100, 10**6])
+def test_the_samples_that_are_taken_do_not_depend_on_the_parts(most):
+    numbers = np.flatnonzero(np.random.default_rng(0).random(20_000) < 0.3)
+    (whole,) = few_of([(ranks_of(numbers), numbers)], most)
+    assert len(whole) == min(most, len(numbers)) and (np.diff(whole) > 0).all()
+    for count in (2, 50):
+        parts = [(ranks_of(part), part) for part in np.array_split(numbers, count)]
+        np.testing.assert_array_equal(few_of(parts, most)[0], whole)
+
+
+def test_few_samples_show_what_all_show(monkeypatch):
+    i, j, k = np.indices((40, 40, 40)) * (np.pi / 16)
+    values = np.sin(i) * np.cos(j) + np.sin(j) * np.cos(k) + np.sin(k) * np.cos(i)
+    everything = weigh(look(values, (-1.5, 1.5)), (np.pi / 16,) * 3)
+    length = typical_length(*surface_gradients(values))
+    monkeypatch.setattr(evidence, "MOST_LINES", 500)
+    monkeypatch.setattr("super_sdf.grid.gradients.MOST_BESIDE", 2000)
+    few = weigh(look(values, (-1.5, 1.5)), (np.pi / 16,) * 3)
+    assert few.samples == 500 < everything.samples
+    assert few.slope == pytest.approx(everything.slope, rel=0.03)
+    assert few.wrong == pytest.approx(everything.wrong, abs=0.06)
+    assert len(surface_gradients(values)[1]) == 2000
+    assert typical_length(*surface_gradients(values)) == pytest.approx(length, rel=0.05)
+
+
+def test_the_survey_holds_nothing_twice(monkeypatch):
+    grid = SdfGrid.trusted(noise(48, 64, 64), (100.0,) * 3)
+    for module in (survey_step, band_step):
+        monkeypatch.setattr(module, "BLOCK_SAMPLES", 1 << 14)  # four planes
+    with peak_of() as peak:
+        band = survey(grid)
+    kept = band.patches.nbytes + band.voxel_ijk.nbytes
+    assert len(band.voxel_ijk) == 48 * 64 * 64 and peak[0] < 1.3 * kept
+
+
+@pytest.mark.parametrize("values", [ball(24).values, 3 * rough(20, 12, 15)], ids=["ball", "noise"])
+@pytest.mark.parametrize("offset", [0.0, 0.7])
+def test_the_band_is_the_same_in_whatever_blocks_and_windows_it_is_found(
+    values, offset, monkeypatch
+):
+    grid = SdfGrid.trusted(values, (1.0,) * 3)
+    want, seen = survey(grid, offset), look_at_band(grid, offset)
+    for window, block in ((500, 100), (3000, 2000), (1, 1)):
+        monkeypatch.setattr(survey_step, "WINDOW_SAMPLES", window)
+        for module in (survey_step, band_step):
+            monkeypatch.setattr(module, "BLOCK_SAMPLES", block)
+        band, glance = survey(grid, offset, Resources(2)), look_at_band(grid, offset)
+        for name in ("voxel_ijk", "patches", "decoded", "exact"):
+            np.testing.assert_array_equal(getattr(band, name), getattr(want, name))
+        np.testing.assert_array_equal(band.beyond.number, want.beyond.number)
+        np.testing.assert_array_equal(band.beyond.value, want.beyond.value)
+        assert glance[:5] == seen[:5] and band.leaves == want.leaves
+        assert near_offset(glance) == near_offset(seen)
+    assert seen.voxels == np.diff(want.voxels_before).tolist()
+    assert seen.decoded == np.diff(want.decoded_before).tolist()
+    assert seen.beyond == len(want.beyond.number)
+
+
+def near_offset(seen):
+    """Return the samples near an offset, and those of them at which the field jumps."""
+    return [
+        (sum(jump.near for jump in way), sum(jump.edges for jump in way))
+        for way in zip(*seen.jumps)
+    ]
+
+
+def test_samples_that_were_cut_off_are_not_kept():
+    """Most of a grid that was truncated at three voxels is so."""
+    cut = np.clip(ball().values, -3, 3)
+    band = survey(SdfGrid.trusted(cut, (1.0,) * 3))
+    assert len(band.beyond.number) and np.abs(band.beyond.value).max() < 6
+
+
+def test_reading_for_the_spline_takes_what_is_planned():
+    values = changed(np.zeros((60, 200, 200), np.float32), lambda planes: planes)
+    with peak_of() as peak:
+        spline.spline_blocks(values, np.full((1, 3), 30, np.int32), 4, 1.0)
+    assert peak[0] < spline.spline_bytes(values.shape)
+
+
+def test_what_a_refusal_says_to_allow_is_enough():
+    grid = SdfGrid.trusted(noise(24, 60, 60), (100.0,) * 3)
+    bound = memory.held_memory() + 10_000_000
+    with pytest.raises(OutOfMemoryError) as refused:
+        next(reconstruct_slabs(grid, trilinear, 2, max_memory=bound))
+    said = re.match(
+        r"factor 2 on 86,400 voxels needs ([\d.]+) (.)B of memory at once, .* allow more "
+        r"\(--max-memory\); 100% of the samples are near the surface: is this a distance field\?$",
+        str(refused.value),
+    )
+    enough = int(float(said[1]) * {"M": 1e6, "G": 1e9}[said[2]])
+    assert next(reconstruct_slabs(grid, trilinear, 2, max_memory=enough)).meshes
+
+
+def test_planes_that_are_too_large_are_refused_before_they_are_read(tmp_path):
+    path = tmp_path / "wide.npy"
+    with path.open("wb") as file:  # sparse: its samples are 0
+        header = {"descr": "<f4", "fortran_order": False, "shape": (4, 4096, 4096)}
+        np.lib.format.write_array_header_1_0(file, header)
+        file.truncate(file.tell() + 4 * 4 * 4096**2)
+    bound = memory.held_memory() + 10**8
+    with pytest.raises(
+        OutOfMemoryError,
+        match=r"^planes of 4,096 x 4,096 samples need at least [\d.]+ GB of memory, \d+ MB may be "
+        r"used; allow more \(--max-memory\)$",
+    ):
+        read_grid(path, max_memory=bound)
+
+
+def test_what_is_unpacked_does_not_go_to_a_folder_in_memory(tmp_path, monkeypatch):
+    mounts = tmp_path / "mountinfo"
+    device = tmp_path.stat().st_dev
+    place = f"36 35 {memory.os.major(device)}:{memory.os.minor(device)} / /tmp rw,noatime"
+    np.save(tmp_path / "swapped.npy", np.asfortranarray(ball().values))
+    monkeypatch.setattr(memory, "MOUNTS", mounts)
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(unpacking.tempfile, "tempdir", None)
+    bound = memory.held_memory() // 2  # no room
+    for kind, is_memory in (("ext4", False), ("tmpfs", True)):
+        mounts.write_text(f"{place} - {kind} none rw\n")
+        assert memory.is_in_memory(str(tmp_path)) == is_memory
+    with pytest.raises(OutOfMemoryError, match=r"is in memory, too: set TMPDIR to a folder on"):
+        read_grid(tmp_path / "swapped.npy", spacing=1, max_memory=bound)
+    mounts.write_text("")
+    assert not memory.is_in_memory(str(tmp_path)) and not memory.is_in_memory("/no/folder")
+    read_grid(tmp_path / "swapped.npy", spacing=1, max_memory=bound)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, GridError, OptionError, OutOfMemoryError, SuperSdfError
 from ..grid.field import Wanted
-from ..grid.planes import InputFile, PlaneFile, SampleArray
+from ..grid.planes import InputFile, PlaneFile, SampleArray, check_planes
 from ..grid.samples import check_kind
 from ..grid.sdf_grid import SdfGrid, make_grid
 from ..machine.memory import ROOM_SHARE, held_memory, memory_bound
@@ -125,6 +125,7 @@ def read_grid(
         found = _read_numpy(check_regular_file(path), order, room, given)
     else:
         found = _read_foreign(path, format_, order, room, given, max_memory)
+    check_planes(found["values"], memory_bound(max_memory))
     grid = make_grid(
         found["values"],
         **{key: found[key] for key in PLACE},

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, OutOfMemoryError
 from ..grid.planes import InputFile, PlaneFile, SampleArray
-from ..machine.memory import in_words
+from ..machine.memory import in_words, is_in_memory
 from .headers import ArrayHeader, Read
 
 PIECE = 1 << 23  # bytes at a time
@@ -158,8 +158,13 @@ def scratch_folder() -> str:
 
 
 def _scratch_file(header: ArrayHeader, name: str) -> FileIO:
-    """Return an empty unnamed file on a disk with room for an array."""
+    """Return an empty unnamed file with room for an array, on a disk: memory would count."""
     folder = scratch_folder()
+    if is_in_memory(folder):
+        raise OutOfMemoryError(
+            f"{name}, {header}, is too large to unpack into memory, and {folder} is in memory, "
+            "too: set TMPDIR to a folder on a disk, or allow more (--max-memory)"
+        )
     free = shutil.disk_usage(folder).free
     if header.size > free:
         raise OutOfMemoryError(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, Triple
 from ..errors import GridError
+from ..machine.threads import chunks_of
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 from .planes import SampleArray
 from .samples import Extremes
@@ -113,11 +114,13 @@ def look_near_walls(values: SampleArray, scale: float, steps: Floats) -> tuple[F
     found: list[Floats] = []
     counts, near = np.zeros(2, np.int64), reach(steps)
     for i in range(1, len(values) - 1):
-        slab = np.asarray(values[i - 1 : i + 3], np.float64) * scale
+        slab = np.array(values[i - 1 : i + 3], np.float64)
+        slab *= scale
         if slab[1:3].min() <= near:
             for lines, step in zip((slab, slab[1], slab[1].T), steps):
-                thickness = find_walls(lines / step)[1]
-                counts += np.array([len(thickness), (thickness < NO_THICKNESS).sum()])
+                for part in chunks_of(lines.shape[1], lines[:, 0].size):  # to save memory
+                    thickness = find_walls(lines[:, part] / step)[1]
+                    counts += np.array([len(thickness), (thickness < NO_THICKNESS).sum()])
             found += _patches_near(slab[:3], near)
     some = np.unique(np.linspace(0, max(len(found) - 1, 0), CANDIDATES).astype(int))
     patches = np.array([found[n] for n in some] if found else []).reshape(-1, 27)
@@ -127,13 +130,14 @@ def look_near_walls(values: SampleArray, scale: float, steps: Floats) -> tuple[F
 def _patches_near(slab: Floats, limit: float) -> list[Floats]:
     """Return the patches of some inner samples near 0 of the middle one of three planes."""
     inner = slab[1, 1:-1, 1:-1]
-    near = np.argwhere(inner <= limit)
+    near = np.flatnonzero(inner <= limit)
     if not len(near):
         return []
-    order = np.argsort(inner[tuple(near.T)])
+    order = np.argsort(inner.ravel()[near])
     spread = np.linspace(0, len(order) - 1, CANDIDATES_IN_PLANE).astype(int)
     chosen = np.union1d(order[:CANDIDATES_IN_PLANE], order[spread])
-    return [slab[:, j : j + 3, k : k + 3].reshape(27) for j, k in near[chosen]]
+    at = np.stack(np.unravel_index(near[chosen], inner.shape), 1)
+    return [slab[:, j : j + 3, k : k + 3].reshape(27) for j, k in at]
 
 
 def find_walls(lines: Floats) -> tuple[BoolArray, Floats]:

@@ -21,13 +21,14 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ..arrays import FloatArray
-from ..errors import FileError, GridError
-from ..machine.memory import check_fits
+from ..errors import FileError, GridError, OutOfMemoryError
+from ..machine.memory import advised, check_fits, held_memory, in_words
 
 FAR = 1e6  # spacings
 BLOCK_BYTES = 1 << 20  # read at a time when iterating over all planes
 LEAST_AT_ONCE = 4  # planes
 WORKING_BYTES = 1 << 26  # taken at a time when planes are made of others
+LOOKED_AT, LOOKING_BYTES = 6, 40  # planes, and bytes per sample of one, to look at the samples
 EVENLY = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio: its multiples, modulo 2^64
 
 Result = TypeVar("Result")
@@ -295,11 +296,16 @@ def few_of(found: Iterable[tuple[NDArray[Any], ...]], most: int) -> list[NDArray
     kept: list[tuple[NDArray[Any], ...]] = []
     for part in found:
         kept.append(part)
-        if sum(len(ranks) for ranks, *_ in kept) > most:
-            joined = [np.concatenate(arrays) for arrays in zip(*kept)]
-            some = lowest(joined[0], most)
-            kept = [tuple(array[some] for array in joined)]
-    return [np.concatenate(arrays) for arrays in zip(*kept)][1:]
+        if sum(len(ranks) for ranks, *_ in kept) > 2 * most:
+            kept = [_lowest_of(kept, most)]
+    return list(_lowest_of(kept, most)[1:])
+
+
+def _lowest_of(parts: list[tuple[NDArray[Any], ...]], most: int) -> tuple[NDArray[Any], ...]:
+    """Return the rows of the lowest ranks of all parts."""
+    joined = [np.concatenate(arrays) for arrays in zip(*parts)]
+    some = lowest(joined[0], most)
+    return tuple(array[some] for array in joined)
 
 
 def in_blocks(samples: SampleArray) -> list[tuple[int, int]]:
@@ -431,6 +437,23 @@ def unpacked_bytes(samples: SampleArray) -> int:
         if (samples := getattr(samples, "source", None)) is None:
             return 0
     return len(samples) * samples.plane_bytes if samples.is_unpacked else 0
+
+
+def check_planes(samples: SampleArray, bound: int | None) -> None:
+    """Raise OutOfMemoryError if looking at a few planes at a time exceeds a memory bound."""
+    plane = samples.shape[1] * samples.shape[2]
+    held = held_memory() or 0
+    need = held + plane * (LOOKED_AT * samples.dtype.itemsize + LOOKING_BYTES)
+    if bound is not None and held < bound < need:
+        raise planes_too_large(samples, need, bound)
+
+
+def planes_too_large(samples: SampleArray, need: int, bound: int) -> OutOfMemoryError:
+    """Return the error for samples that cannot be worked on plane by plane."""
+    return OutOfMemoryError(
+        f"planes of {samples.shape[1]:,} x {samples.shape[2]:,} samples need at least "
+        f"{advised(need)} of memory, {in_words(bound)} may be used; allow more (--max-memory)"
+    )
 
 
 def planes_at_once(samples: SampleArray) -> int:

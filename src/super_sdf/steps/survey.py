@@ -20,7 +20,13 @@ from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import NoSurfaceError, OutOfMemoryError
 from ..grid.cubic import on_samples, sampled_places
 from ..grid.field import EXACT, MASK
-from ..grid.planes import SampleArray, planes_at_once, reading_bytes, unpacked_bytes
+from ..grid.planes import (
+    SampleArray,
+    planes_at_once,
+    planes_too_large,
+    reading_bytes,
+    unpacked_bytes,
+)
 from ..grid.resampling import Resampled
 from ..grid.sdf_grid import SdfGrid, negated
 from ..machine.memory import held_memory, in_words
@@ -310,11 +316,7 @@ def plan_reading(samples: SampleArray, held: int, resources: Resources) -> tuple
         room = _room(resources.memory, held)
         if need <= (room if least == 1 else room / 2):  # the band needs room, too
             return least, need
-    raise OutOfMemoryError(
-        f"reading {samples.shape[1]:,} x {samples.shape[2]:,} samples plane by plane needs at "
-        f"least {in_words(held + need)} of memory, {in_words(resources.memory or 0)} may be used; "
-        "allow more (--max-memory)"
-    )
+    raise planes_too_large(samples, held + need, resources.memory or 0)
 
 
 def limit_to_field(band: Band, grid: SdfGrid, offset: float) -> Band:
