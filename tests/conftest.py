@@ -14,6 +14,7 @@ from super_sdf import SdfGrid
 from super_sdf.neighbourhood import NEIGHBOURHOOD
 from super_sdf.network.onnx import ort
 from super_sdf.slabs import cutting, footprint
+from super_sdf.steps import survey
 
 
 def trilinear(
@@ -107,7 +108,8 @@ def bare_plan(monkeypatch):
     stages = {name: (*row[:3], 0, 0) for name, row in footprint.STAGES.items()}
     monkeypatch.setattr(footprint, "STAGES", stages)
     monkeypatch.setattr(footprint, "NETWORK_FIXED", 0)
-    monkeypatch.setattr(cutting, "held_memory", lambda: 10**8)
+    for module in (cutting, survey):
+        monkeypatch.setattr(module, "held_memory", lambda: 10**8)
 
 
 @pytest.fixture

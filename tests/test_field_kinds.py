@@ -28,7 +28,7 @@ from super_sdf.steps import spline
 from super_sdf.steps.holding import hold_sides
 from super_sdf.steps.nodes import block_ijk
 from super_sdf.steps.spline import network_share, node_weights, prefilter, spline_blocks
-from super_sdf.steps.survey import plan_reading, survey
+from super_sdf.steps.survey import WINDOW_SAMPLES, plan_reading, survey
 
 PLACE = {"spacing": 1.0, "origin": 0.0}
 
@@ -550,10 +550,14 @@ def test_the_spline_is_the_same_in_whatever_strips_it_is_made(monkeypatch):
 def test_making_distances_is_planned_and_refused_with_the_figure():
     samples = mask_planes(np.broadcast_to(np.False_, (64, 512, 512)), 1.0)
     least, need = plan_reading(samples, 0, Resources(2, None))
-    assert least == 8 and need == 2 * (reading_bytes(samples, 10) + 8 * 512**2 * 20)
+    around = 10 * 512**2  # with the planes beside them, more than a window
+    assert need == 2 * (reading_bytes(samples, 10) + around * (8 + 4) + WINDOW_SAMPLES * 20)
+    assert least == 8
     assert plan_reading(samples, 1000, Resources(2, 1000 + 2 * need)) == (least, need)
     fewer, less = plan_reading(samples, 1000, Resources(2, 999 + 2 * need))
     assert fewer == 4 and less < need
-    assert plan_reading(np.zeros((9, 9, 9)), 0, Resources(2, 1)) == (4, 0)
-    with pytest.raises(OutOfMemoryError, match=r"^making distances of the values needs \d+ MB of"):
+    assert plan_reading(np.zeros((9, 9, 9)), 0, Resources(2)) == (4, 11 * 9**2 * (8 + 4 + 20))
+    with pytest.raises(
+        OutOfMemoryError, match=r"^planes of 512 x 512 samples need at least \d+ MB"
+    ):
         plan_reading(samples, 0, Resources(2, 1_000_000))

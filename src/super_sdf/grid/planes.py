@@ -433,10 +433,10 @@ class DerivedPlanes(SamplePlanes):
 
 def unpacked_bytes(samples: SampleArray) -> int:
     """Return the size of the temporary file that samples are made of, 0 if there is none."""
-    while not isinstance(samples, PlaneFile):
-        if (samples := getattr(samples, "source", None)) is None:
-            return 0
-    return len(samples) * samples.plane_bytes if samples.is_unpacked else 0
+    while hasattr(samples, "source"):
+        samples = samples.source
+    is_unpacked = isinstance(samples, PlaneFile) and samples.is_unpacked
+    return len(samples) * samples.plane_bytes if is_unpacked else 0
 
 
 def check_planes(samples: SampleArray, bound: int | None) -> None:

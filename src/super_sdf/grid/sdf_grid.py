@@ -318,5 +318,6 @@ def without_samples(grid: SdfGrid) -> SdfGrid:
 
 def negated(values: NDArray[Any]) -> NDArray[Any]:
     """Return the negated values, as floats so that unsigned integers work."""
-    found = values.astype(np.promote_types(values.dtype, np.float32))
-    return np.negative(found, out=found)
+    found: NDArray[Any] = values.astype(np.promote_types(values.dtype, np.float32))
+    np.negative(found, out=found)
+    return found

@@ -45,7 +45,7 @@ def samples_beyond(rescaled: FloatArray, first: int, limits: tuple[float, float]
     """
     if not reach_beyond(limits):
         return NONE_BEYOND
-    low, high = np.float32(limits).clip(-FARTHEST, FARTHEST)
+    low, high = np.asarray(limits, np.float32).clip(-FARTHEST, FARTHEST)
     found = (rescaled > low) & (rescaled < high)
     found &= ~((rescaled > -HALF_BAND) & (rescaled < HALF_BAND))
     at = np.flatnonzero(found)
