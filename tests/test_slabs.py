@@ -182,7 +182,7 @@ def test_a_band_larger_than_memory_is_refused_while_it_is_read():
     with pytest.raises(
         OutOfMemoryError, match=r"the band of the first \d+ planes already takes \d MB of memory, "
     ):
-        survey(ball(), resources=Resources(memory=1_000_000))
+        survey(ball(), resources=Resources(memory=400_000))
 
 
 def test_the_plan_counts_how_distances_are_made_and_the_spline():
