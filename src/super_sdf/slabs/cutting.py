@@ -27,7 +27,7 @@ from ..steps import bounds, spheres
 from ..steps.glance import look_at_band
 from ..steps.mesher_names import DEFAULT_MESHER
 from ..steps.meshers import BY_NAME, Mesher
-from ..steps.survey import Band, band_bytes, outline
+from ..steps.survey import Band, band_bytes, outline, plan_reading
 from .footprint import NETWORK_BYTES, slab_bytes
 
 DEFAULT = BY_NAME[DEFAULT_MESHER]
@@ -127,7 +127,8 @@ def refuse_band(
     The parameters are those of ``plan_slabs`` and ``survey``.
     """
     give_back()
-    seen = look_at_band(grid, offset, planes=1)
+    planes, _ = plan_reading(grid.samples, held_memory() or 0, resources)
+    seen = look_at_band(grid, offset, planes)
     band = outline(grid, offset, resources.threads, seen.voxels, seen.decoded)
     *_, slabs = _ways(band, receptive_field, mesher.planes_beside(factor))
     need = peak_bytes(band, slabs, factor, network_bytes, resources.threads, mesher)
