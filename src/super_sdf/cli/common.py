@@ -13,7 +13,7 @@ from .interrupts import describe_interrupt, exit_code
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
 
-class InterruptedCommand(Exception):  # noqa: N818, not an error
+class InterruptedCommand(BaseException):  # as KeyboardInterrupt, no error
     """A signal ended the command: the message names the signal and what was kept."""
 
     def __init__(self, kept: str, interrupt: KeyboardInterrupt) -> None:

@@ -1,23 +1,26 @@
 """Signals that end a command: it prints one line and leaves no half-written file.
 
-Until a command begins to write, a signal ends the process at once: an exception raised during an
-import may come out as another error. From then on the signal raises an exception, so that files
-that were begun are removed.
+Until a command begins to write, a signal ends the process at once. From then on the signal raises an
+exception, so that files that were begun are removed. In the midst of an import it waits until that is
+over: native libraries make another error of the exception, or abort, and some libraries swallow it.
 """
 
 from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
+from typing import Any
 
 SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
 Handler = Callable[[int, FrameType | None], None]
+IMPORTING = "<frozen importlib._bootstrap>"  # the file of the frames that import
 
 
 class Interrupted(KeyboardInterrupt):
@@ -56,9 +59,24 @@ def ending_at_once() -> Iterator[None]:
 
 @contextmanager
 def raising_interrupts() -> Iterator[None]:
-    """Raise ``Interrupted`` on a signal within the block, so that it can remove its files."""
-    with _handling(_raise):
-        yield
+    """Raise ``Interrupted`` on a signal within the block, so that it can remove its files.
+
+    At the end it is raised again if code in the block swallowed it or made another error of it.
+    """
+    received: list[int] = []
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        _raise(number, frame)
+
+    try:
+        with _handling(handle):
+            yield
+    except Exception:
+        if not received:
+            raise
+    if received:
+        raise Interrupted(received[0])
 
 
 @contextmanager
@@ -79,7 +97,26 @@ def _handling(handler: Handler) -> Iterator[None]:
 
 
 def _raise(number: int, frame: FrameType | None) -> None:
-    raise Interrupted(number)
+    """Raise ``Interrupted``: now, or in the next line of the code that waits for an import."""
+
+    def raise_there(*_: Any) -> None:
+        sys.settrace(None)
+        raise Interrupted(number)
+
+    if (importer := _importer(frame)) is None:
+        raise Interrupted(number)
+    importer.f_trace = raise_there
+    sys.settrace(lambda *_: None)  # only with one are the functions of frames called
+
+
+def _importer(frame: FrameType | None) -> FrameType | None:
+    """Return the frame that waits for the outermost import in progress, None if there is none."""
+    importer = None
+    while frame is not None:
+        if frame.f_code.co_filename == IMPORTING:
+            importer = frame.f_back
+        frame = frame.f_back
+    return importer
 
 
 def _end(number: int, frame: FrameType | None) -> None:

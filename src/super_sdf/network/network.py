@@ -158,7 +158,7 @@ class Network:
         offsets: FloatArray,
         progress: ShareCallback | None,
     ) -> FloatArray:
-        """Run the session once; polled only if the run is long, since a thread costs 0.1 ms.
+        """Run the session once; only a long run is timed, and reports its progress.
 
         With fewer voxels than offsets, the order of onnxruntime's sums would depend on the number
         of threads, so voxels are repeated until there are as many as offsets.
@@ -177,7 +177,7 @@ class Network:
         self.pace.learn(work, time.perf_counter() - begun)
         return values[:count]
 
-    def _run_session(self, feeds: Mapping[str, Any], poll: Poll | None = None) -> FloatArray:
+    def _run_session(self, feeds: Mapping[str, Any], poll: Poll = lambda: None) -> FloatArray:
         """Run the session on its device."""
         run = run_bound if self.device == "cuda" else run_on_cpu
         return run(self.session, feeds, poll=poll)

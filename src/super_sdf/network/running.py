@@ -31,9 +31,9 @@ Poll = Callable[[], None]
 
 
 def run_on_cpu(
-    session: ort.InferenceSession, feeds: Mapping[str, Any], poll: Poll | None = None
+    session: ort.InferenceSession, feeds: Mapping[str, Any], poll: Poll = lambda: None
 ) -> FloatArray:
-    """Run a session on the CPU and return its output.
+    """Run a session on the CPU and return its output; an interrupt stops the run.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def run_on_cpu(
     feeds : dict
         Its inputs by name, see ``contract``.
     poll : callable, optional
-        Called during the run. With it, an exception in ``poll`` or an interrupt stops the run.
+        Called during the run; an exception in it stops the run.
 
     Returns
     -------
@@ -74,7 +74,7 @@ def run_bound(
     feeds: Mapping[str, Any],
     place: str = "cuda",
     chunk: int = CUDA_CHUNK,
-    poll: Poll | None = None,
+    poll: Poll = lambda: None,
 ) -> FloatArray:
     """Run a session with its inputs and its output on a device, and return the output.
 
@@ -110,43 +110,29 @@ def failures_on(device: str) -> Iterator[None]:
 
 
 def _run(
-    session: ort.InferenceSession,
-    binding: Any,
-    options: Any,
-    device: str,
-    poll: Poll | None,
-    keep: Any,
+    session: ort.InferenceSession, binding: Any, options: Any, device: str, poll: Poll, keep: Any
 ) -> None:
-    """Run a session, in a thread if ``poll`` is given; ``keep`` holds the bound arrays alive."""
+    """Run a session in a thread and poll; an interrupt or an exception in ``poll`` stops the run.
 
-    def work(keep: Any = keep) -> None:
-        with failures_on(device):
-            session.run_with_iobinding(binding, options)
+    Python handles no interrupt while onnxruntime runs in its own thread. onnxruntime reads
+    ``options.terminate`` between two operators, also in the loops over chunks, so a run ends within
+    milliseconds. A second interrupt waits for nothing: a loop of the file may have no end.
 
-    if poll is None:
-        work()
-    else:
-        _run_polled(work, options, poll)
-
-
-def _run_polled(work: Callable[[], None], options: Any, poll: Poll) -> None:
-    """Do ``work`` in a thread and poll; an interrupt or an exception in ``poll`` stops the run.
-
-    Python handles no interrupt while onnxruntime runs. onnxruntime reads ``options.terminate``
-    between two operators, also in the loops over chunks, so a run ends within milliseconds.
+    ``keep`` holds the bound arrays alive.
     """
     failures: list[BaseException] = []
     ended = Event()  # not Thread.join, which after an interrupt may return before the thread ends
 
-    def keep_failure() -> None:
+    def work(keep: Any = keep) -> None:
         try:
-            work()
+            with failures_on(device):
+                session.run_with_iobinding(binding, options)
         except DeviceError as error:
             failures.append(error)
         finally:
             ended.set()
 
-    thread = Thread(target=keep_failure, name="super-sdf network")
+    thread = Thread(target=work, name="super-sdf network", daemon=True)
     try:
         thread.start()
         while not ended.wait(POLL_INTERVAL):
