@@ -98,7 +98,7 @@ def check_command(mesh: Path, grid: Path, **options: Any) -> None:
     MESH is any mesh file that trimesh reads; vertices at the same position count as one. GRID is
     what upsample takes. The exit code is 1 if a limit is exceeded.
     """
-    with one_line_errors():
+    with one_line_errors(options["out"]):
         check_modules("check", "eval", CHECK_MODULES)
         exceeded = run_check(mesh, grid, options)
     for sentence in exceeded:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -22,14 +23,15 @@ class InterruptedCommand(BaseException):  # as KeyboardInterrupt, no error
 
 
 @contextmanager
-def one_line_errors(kept: str = "nothing was written") -> Iterator[None]:
+def one_line_errors(*targets: str | os.PathLike[str] | None) -> Iterator[None]:
     """Turn errors into click's, one line each.
 
-    The exit code is 2 for usage errors, 128 + n after signal n, and 1 for all others. ``kept`` says
-    which output exists if the command is interrupted.
+    The exit code is 2 for usage errors, 128 + n after signal n, and 1 for all others. If the command
+    is interrupted, the line says which of the targets, its output files, are written.
     """
     from ..errors import OptionError, SuperSdfError
 
+    before = {str(target): file_at(target) for target in targets if target is not None}
     try:
         yield
     except OptionError as error:
@@ -41,7 +43,24 @@ def one_line_errors(kept: str = "nothing was written") -> Iterator[None]:
     except OSError as error:  # the system refused something, such as another file handle: no bug
         raise click.ClickException(describe_os_error(error)) from error
     except KeyboardInterrupt as error:
-        raise InterruptedCommand(f"; {kept}", error) from None
+        raise InterruptedCommand(what_is_written(before), error) from None
+
+
+def file_at(path: str | os.PathLike[str]) -> tuple[int, int] | None:
+    """Return what tells the file at a path from one that replaces it; None without a file."""
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError):  # ValueError: a NUL in the name
+        return None
+    return found.st_dev, found.st_ino
+
+
+def what_is_written(before: dict[str, tuple[int, int] | None]) -> str:
+    """Return which files are not those of before, as the end of a sentence; "" for no files."""
+    written = [path for path, file in before.items() if file_at(path) != file]
+    if not written:
+        return "; nothing was written" if before else ""
+    return f"; {' and '.join(written)} {'is' if len(written) == 1 else 'are'} written"
 
 
 def on_one_line(error: Exception) -> str:

@@ -119,7 +119,7 @@ def run_command() -> int:
         print_stderr(f"Error: {error}")
         return error.exit_code
     except click.Abort:  # an interrupt outside of a command's work
-        print_stderr("Error: interrupted; nothing was written")
+        print_stderr("Error: interrupted")
         return 130
     except OSError as error:  # outside of a command's work, while help is printed
         print_stderr(f"Error: stdout cannot be written: {error.strerror or error}")

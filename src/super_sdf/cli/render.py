@@ -104,7 +104,7 @@ def render_command(sources: tuple[Path, ...], target: Path, **options: Any) -> N
     """
     from ..files.formats import is_grid
 
-    with one_line_errors():
+    with one_line_errors(target):
         grids = [source for source in sources if is_grid(source)]
         check_modules("render", "view", EXTRAS["eval"] if grids else None)
         check_picture(target, force=options["force"])

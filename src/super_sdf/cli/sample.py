@@ -64,7 +64,7 @@ def sample_command(source: Path, target: Path, **options: Any) -> None:
     MESH is any mesh file that trimesh reads. OUT is a .npz file (keys values, spacing, origin);
     its values are in the units of the mesh and negative inside.
     """
-    with one_line_errors():
+    with one_line_errors(target):
         check_modules("sample", "eval")
         run_sample(source, target, options)
 

@@ -80,15 +80,15 @@ Examples:
 @click.option("-v", "--verbose", is_flag=True, help="Also print counts and the time per stage.")
 def upsample_command(source: str, target: str, **options: Any) -> None:
     """Convert one grid to a mesh."""
-    with one_line_errors():
+    with one_line_errors(target, options["save_field"], options["report"]):
         run = Upsampling(source, target, options)
         run.work()
-    with one_line_errors(f"{target} is written"), raising_interrupts():
-        if options["check"]:
-            run.check()
-        if options["report"]:
-            run.write_page()
-        run.print_report()
+        with raising_interrupts():
+            if options["check"]:
+                run.check()
+            if options["report"]:
+                run.write_page()
+            run.print_report()
 
 
 class Upsampling:

@@ -195,24 +195,25 @@ def share_of(limits: Limits, threads: int, limit: int | None, free: int | None) 
 def local_cluster(count: int, killed_at: int) -> Iterator[Any]:
     """Run worker processes on this machine, each killed at some bytes of memory; 0: no limit.
 
-    They listen on the loopback interface only. Signals are held back while they start: none may
+    They listen on the loopback interface only, and open no dashboard. Signals are held back while they start: none may
     start without being known here, and what they inherit keeps a Ctrl-C in the terminal from them.
     """
-    from distributed import LocalCluster
+    from distributed import Nanny, SpecCluster
 
-    with tempfile.TemporaryDirectory(prefix="super-sdf-", ignore_cleanup_errors=True) as scratch:
+    from .quiet import QuietScheduler, QuietWorker
+
+    host, silence_logs = "127.0.0.1", logging.CRITICAL
+    scheduler = {"cls": QuietScheduler, "options": {"host": host, "port": 0, "dashboard": False}}
+    options = {"host": host, "nthreads": 1, "memory_limit": killed_at, "silence_logs": silence_logs}
+    worker = {"cls": Nanny, "options": {**options, "worker_class": QuietWorker}}
+    with (
+        tempfile.TemporaryDirectory(prefix="super-sdf-", ignore_cleanup_errors=True) as scratch,
+        config({"temporary-directory": scratch}),
+    ):
         start_quiet_tracker()
         with ending_signals_blocked():
-            cluster = LocalCluster(
-                n_workers=count,
-                threads_per_worker=1,
-                processes=True,
-                host="127.0.0.1",
-                dashboard_address=None,
-                memory_limit=killed_at,
-                local_directory=scratch,
-                silence_logs=logging.CRITICAL,
-            )
+            workers = dict.fromkeys(range(count), worker)
+            cluster = SpecCluster(workers, scheduler, silence_logs=silence_logs)
         try:
             yield cluster
         finally:
@@ -253,6 +254,8 @@ def open_client(server: Any, address: str) -> Iterator[Client]:
     from distributed import Client
 
     try:
+        if address != LOCAL:
+            asyncio.run(greet(server))
         client = Client(server, timeout=CONNECT_SECONDS, set_as_default=False)
     except Exception as error:  # of many kinds: a bad address, a refused or silent port, TLS
         raise ClusterError(no_answer(address, error)) from error
@@ -261,6 +264,16 @@ def open_client(server: Any, address: str) -> Iterator[Client]:
     finally:
         with suppress(Exception):
             client.close(timeout=CLOSE_SECONDS)
+
+
+async def greet(address: str) -> None:
+    """Raise if a scheduler does not return a greeting in time: a Client would wait for ever."""
+    from distributed.comm import connect
+    from distributed.security import Security
+
+    arguments = Security().get_connection_args("client")
+    comm = await asyncio.wait_for(connect(address, **arguments), CONNECT_SECONDS)
+    await comm.close()
 
 
 def no_answer(address: str, error: Exception) -> str:

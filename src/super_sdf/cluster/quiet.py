@@ -1,0 +1,21 @@
+"""Dask's processes of this machine without the HTTP servers that they open beside their own ports."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from distributed import Scheduler, Worker
+
+
+class QuietScheduler(Scheduler):  # type: ignore[misc]
+    """A scheduler without a dashboard; Dask's answers at port 8787 even without any page."""
+
+    def start_http_server(self, *_: Any, **__: Any) -> None:
+        """Open no port."""
+
+
+class QuietWorker(Worker):  # type: ignore[misc]
+    """A worker without a dashboard."""
+
+    def start_http_server(self, *_: Any, **__: Any) -> None:
+        """Open no port."""
