@@ -107,7 +107,7 @@ def test_samples_keep_their_values(spacing):
 
 
 @given(st.tuples(*[st.floats(-1, 1)] * 3), st.sampled_from([0.3, 1.0, 4.0]), st.integers(0, 2))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_linear_fields_of_any_slope_are_reproduced(normal, slope, axis):
     """Those steeper than distances, too, but for the border, where samples bound from one side."""
     normal = slope * np.array(normal) / max(np.linalg.norm(normal), 1)
@@ -125,7 +125,7 @@ def test_linear_fields_of_any_slope_are_reproduced(normal, slope, axis):
 
 
 @given(st.integers(0, 2), st.integers(1, 9), st.integers(0, 2**32 - 1))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_planes_are_the_same_however_they_are_read(axis, step, seed):
     """Of noise, too: every value depends on the samples round it alone."""
     values = np.random.default_rng(seed).uniform(-2, 2, (11, 12, 13))

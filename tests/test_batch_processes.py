@@ -6,16 +6,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from contextlib import suppress
 from pathlib import Path
 
-import numpy as np
 import psutil
 import pytest
 import trimesh
 from batches import CONSTANT, files, rows
-from conftest import ball
+from processes import PATIENCE, all_end, larger_grids, start_command, wait_for_lines
 
 from super_sdf.batch import job as batch_job
 from super_sdf.batch.fingerprint import fingerprint
@@ -76,46 +73,25 @@ def test_what_a_killed_batch_left_is_removed_and_nothing_else(run_batch):
 
 def start_batch(*options):
     """Start a batch as a process, and return it when its report has some lines."""
-    arguments = ["batch", "in", "--out", "out", "--jobs", 2, "--threads", 1, *options]
-    words = [sys.executable, "-m", "super_sdf", *map(str, arguments)]
-    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
-    report = Path("out/report.jsonl")
-    while not report.exists() or report.read_bytes().count(b"\n") < 2:
-        assert process.poll() is None, process.stderr.read()
-        time.sleep(0.01)
+    process = start_command("batch", "in", "--out", "out", "--jobs", 2, "--threads", 1, *options)
+    wait_for_lines(process, Path("out/report.jsonl"))
     return process
 
 
-def is_over(process):
-    """Say whether a process has ended, if only its parent has still to hear of it."""
-    with suppress(psutil.NoSuchProcess):
-        return process.status() == psutil.STATUS_ZOMBIE
-    return True
-
-
-def larger_grids(count):
-    """Write grids that take a moment."""
-    for i in range(count):
-        np.save(f"in/more{i}.npy", ball(32, 10 + i / 8).values)
-
-
 def test_killed_on_the_way_it_goes_on(command):
-    larger_grids(8)
+    larger_grids(40)
     process = start_batch("--quality", "fast")
     workers = psutil.Process(process.pid).children()
     assert len(workers) >= 2
     process.kill()
     process.communicate()
-    limit = time.monotonic() + 10
-    while not all(map(is_over, workers)) and time.monotonic() < limit:
-        time.sleep(0.01)
-    assert all(map(is_over, workers))  # no orphans
+    assert all_end(workers)  # no orphans
     for mesh in Path("out").rglob("[!.]*.ply"):
         assert len(trimesh.load(mesh).faces) > 0
     finished = Path("out/report.jsonl").read_text().count("\n")
     code, _, err = command("batch", "in", "--out", "out", "--quality", "fast")
     assert code == 1 and f", {finished} done before" in err
-    assert len(rows()) == 12 == len({row["out"] for row in rows()})
+    assert len(rows()) == 44 == len({row["out"] for row in rows()})
     assert not list(Path("out").rglob(".*.part"))
 
 
@@ -174,28 +150,27 @@ def test_what_is_locked_is_not_what_workers_read(run_batch):
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
 def test_a_signal_ends_batch_and_workers_in_a_line(name):
-    larger_grids(8)
+    larger_grids(40)
     process = start_batch("--quality", "fast")
     workers = psutil.Process(process.pid).children()
     process.send_signal(getattr(signal, name))
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=PATIENCE)
     said = "interrupted" if name == "SIGINT" else f"ended by {name}"
     assert process.returncode == 128 + getattr(signal, name)
     assert err.startswith(f"Error: {said}: ") and err.count("\n") == 1
-    assert err.endswith("of 12 are done and kept; run it again to go on\n")
-    psutil.wait_procs(workers, timeout=10)
-    assert all(map(is_over, workers)) and not list(Path("out").rglob(".*.part"))
+    assert err.endswith("of 44 are done and kept; run it again to go on\n")
+    assert all_end(workers) and not list(Path("out").rglob(".*.part"))
 
 
 def test_a_worker_that_dies_once_costs_nothing(command):
-    larger_grids(6)
+    larger_grids(30)
     process = start_batch("--quality", "fast", "--quiet")
     children = psutil.Process(process.pid).children()
     worker = next(child for child in children if "spawn_main" in " ".join(child.cmdline()))
     worker.kill()
-    _, err = process.communicate(timeout=120)
+    _, err = process.communicate(timeout=PATIENCE)
     assert err == f"Failed: {Path('in/bad.npy')}: {CONSTANT}\n"
-    assert len(rows()) == 10 and not list(Path("out").rglob(".*.part"))
+    assert len(rows()) == 34 and not list(Path("out").rglob(".*.part"))
 
 
 def test_a_file_at_which_two_processes_die_is_named(command, monkeypatch):

@@ -317,6 +317,24 @@ def test_an_interrupt_at_any_stage_leaves_nothing(here, command, monkeypatch, st
     assert os.listdir() == ["in.npy"]
 
 
+@pytest.mark.parametrize(
+    "step, options, written",
+    [
+        ("convert.describe", (), "out.ply is written"),
+        ("convert.describe", ("--save-field", "f.npz"), "out.ply and f.npz are written"),
+        ("certificate.check.check_files", ("--check",), "out.ply is written"),
+    ],
+)
+def test_an_interrupt_says_what_is_written(here, command, monkeypatch, step, options, written):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"super_sdf.{step}", interrupt)
+    code, out, err = command("upsample", "in.npy", "out.ply", "--quiet", *options)
+    assert (code, out, err) == (130, "", f"Error: interrupted; {written}\n")
+    assert trimesh.load("out.ply").is_watertight
+
+
 def test_running_out_of_memory_is_one_line(here, command, monkeypatch):
     def exhaust(*_, **__):
         raise MemoryError

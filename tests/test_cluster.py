@@ -7,16 +7,16 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections import deque
-from contextlib import closing
 from pathlib import Path
 
-import numpy as np
 import psutil
 import pytest
 from batches import CONSTANT, FAST, PLAIN, rows
-from conftest import ball
+from distributed import Client
+from processes import PATIENCE, all_end, larger_grids, start_command, wait_for_lines, wait_until
 
 from super_sdf import __version__
 from super_sdf.batch.fingerprint import fingerprint
@@ -62,9 +62,7 @@ def scheduler(tmp_path_factory):
     file = tmp_path_factory.mktemp("scheduler") / "scheduler.json"
     words = ("--host", "127.0.0.1", "--port", 0, "--scheduler-file", file, "--no-dashboard")
     process = start("scheduler", *words)
-    while not file.exists() or not file.read_text().endswith("}"):
-        assert process.poll() is None
-        time.sleep(0.02)
+    assert wait_until(lambda: file.exists() and file.read_text().endswith("}"))
     yield json.loads(file.read_text())["address"], process
     if process.poll() is None:
         end(process)
@@ -79,6 +77,8 @@ def start_worker(tmp_path_factory, scheduler):
         words = ["worker", scheduler[0], "--nthreads", 1, "--no-dashboard", "--host", "127.0.0.1"]
         words += ["--local-directory", tmp_path_factory.mktemp("worker")]
         started.append(start(*words, path=path))
+        with Client(scheduler[0], timeout=PATIENCE, set_as_default=False) as client:
+            client.wait_for_workers(len(started), timeout=PATIENCE)
         return started[-1]
 
     yield go
@@ -100,21 +100,9 @@ def outcomes(folder):
 
 def start_batch(*options, out="out", lines=2):
     """Start a batch as a process, and return it when its report has some lines."""
-    words = ["batch", "in", "--out", out, *map(str, (*QUICK, *options))]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "super_sdf", *words], stderr=subprocess.PIPE, text=True
-    )
-    report = Path(out, "report.jsonl")
-    while not report.exists() or report.read_bytes().count(b"\n") < lines:
-        assert process.poll() is None, process.stderr.read()
-        time.sleep(0.01)
+    process = start_command("batch", "in", "--out", out, *QUICK, *options)
+    wait_for_lines(process, Path(out, "report.jsonl"), lines)
     return process
-
-
-def larger_grids(count):
-    """Write grids that take a moment."""
-    for i in range(count):
-        np.save(f"in/more{i}.npy", ball(32, 10 + i / 8).values)
 
 
 def workers_of(process):
@@ -123,7 +111,10 @@ def workers_of(process):
     return [child for child in below if "spawn_main" in " ".join(child.cmdline())]
 
 
-def test_a_batch_on_a_cluster_of_this_machine_writes_what_one_without_it_writes(command):
+def test_a_batch_on_a_cluster_of_this_machine_writes_what_one_without_it_writes(
+    command, monkeypatch
+):
+    monkeypatch.setattr("super_sdf.batch.workers.count_cores", lambda: 2)
     environment = dict(os.environ)
     code, _, said = command("batch", "in", "--out", "plain", *PLAIN, *FAST)
     assert code == 1 and len(meshes("plain")) == 3
@@ -141,41 +132,39 @@ def test_a_batch_on_a_cluster_of_this_machine_writes_what_one_without_it_writes(
 
 
 def test_a_killed_worker_costs_nothing(command):
-    larger_grids(8)
+    larger_grids(30)
     process = start_batch(*LOCAL, "--jobs", 2, "--quiet")
     workers_of(process)[0].kill()
-    _, err = process.communicate(timeout=120)
+    _, err = process.communicate(timeout=PATIENCE)
     assert err == f"Failed: in/bad.npy: {CONSTANT}\n"
-    assert len(rows()) == 12 and not list(Path("out").rglob(".*.part"))
+    assert len(rows()) == 34 and not list(Path("out").rglob(".*.part"))
     command("batch", "in", "--out", "plain", *PLAIN, *FAST)
-    assert meshes("out") == meshes("plain") and len(meshes("out")) == 11
+    assert meshes("out") == meshes("plain") and len(meshes("out")) == 33
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGINT"])
 def test_a_signal_ends_batch_and_workers_in_a_line(name):
-    larger_grids(8)
+    larger_grids(40)
     process = start_batch(*LOCAL, "--jobs", 2)
     workers = workers_of(process)
     assert len(workers) >= 2
     process.send_signal(getattr(signal, name))
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=PATIENCE)
     said = "interrupted" if name == "SIGINT" else f"ended by {name}"
     assert process.returncode == 128 + getattr(signal, name)
     assert err.startswith(f"Error: {said}: ") and err.count("\n") == 1
-    assert err.endswith("of 12 are done and kept; run it again to go on\n")
-    _, alive = psutil.wait_procs(workers, timeout=10)
-    assert not alive and not list(Path("out").rglob(".*.part"))
+    assert err.endswith("of 44 are done and kept; run it again to go on\n")
+    assert all_end(workers) and not list(Path("out").rglob(".*.part"))
 
 
 def test_a_killed_batch_leaves_no_workers(monkeypatch, tmp_path):
-    larger_grids(8)
+    larger_grids(40)
     monkeypatch.setenv("TMPDIR", str(tmp_path))  # where it leaves the workers' folder
     process = start_batch(*LOCAL, "--jobs", 2)
     workers = workers_of(process)
     process.kill()
     process.communicate()
-    _, alive = psutil.wait_procs(workers, timeout=10)
-    assert not alive
+    assert all_end(workers)
 
 
 def test_workers_at_an_address_write_the_same_bytes(command, scheduler, start_worker):
@@ -193,7 +182,7 @@ def test_a_lost_scheduler_is_a_line_and_what_is_done_stays(command, scheduler, s
     address, process = scheduler
     batch = start_batch("--cluster", address)
     end(process)
-    _, err = batch.communicate(timeout=60)
+    _, err = batch.communicate(timeout=PATIENCE)
     want = f"Error: the connection to the Dask scheduler at {address} was lost: "
     assert batch.returncode == 1 and err == f"{want}run it again when the scheduler is back\n"
     finished = len(rows())
@@ -231,6 +220,24 @@ def test_an_address_where_nobody_listens_is_named(command, monkeypatch):
     assert (code, err) == (1, f"Error: {want}\n")
     code, _, err = command("batch", "in", "--out", "out", "--cluster", "nothing://here")
     assert code == 1 and err.startswith("Error: no Dask scheduler answers at nothing://here (")
+
+
+def test_a_peer_that_says_nothing_is_given_up(command, monkeypatch):
+    monkeypatch.setattr(connecting, "CONNECT_SECONDS", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        code, _, err = command("batch", "in", "--out", "out", "--cluster", address)
+    assert code == 1 and err.startswith(f"Error: no Dask scheduler answers at {address}: start one")
+
+
+def test_workers_of_this_machine_leave_no_folder_and_open_no_dashboard(monkeypatch, tmp_path):
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    with connect("local", workers=1) as cluster:
+        scheduler = cluster.client.scheduler_info()
+        assert os.listdir(tempfile.tempdir)
+        opened = [process["services"] for process in (scheduler, *scheduler["workers"].values())]
+    assert opened == [{}, {}] and not os.listdir(tempfile.tempdir)
 
 
 def test_a_missing_extra_is_named(command, monkeypatch):
@@ -304,7 +311,7 @@ def prepare_to_wait(limits):
 
 @pytest.mark.parametrize("fault", ["", "is odd"])
 def test_a_worker_that_comes_later_is_checked_and_used_or_named(monkeypatch, fault):
-    tasks, warnings, needs, pids = deque(range(6 if fault else 60)), [], Needs("fast"), set()
+    tasks, warnings, needs, pids = deque(range(6)), [], Needs("fast"), set()
     with connect("local", workers=2, threads=1) as cluster:
         checked = check_workers(cluster, needs)
         first, second = checked.members
@@ -314,12 +321,11 @@ def test_a_worker_that_comes_later_is_checked_and_used_or_named(monkeypatch, fau
         known = checked._replace(members=[first])
         options = ClusterPoolOptions(warn=warnings.append)
         pool = ClusterPool(cluster, known, needs, tasks, prepare_to_wait, options)
-        later = set() if fault else {second.report.pid}
-        with closing(pool.results()) as results:
-            for _, pid in results:
-                pids.add(pid)
-                if pids == {first.report.pid} | later and not fault:
-                    break
+        for _, pid in pool.results():
+            pids.add(pid)
+            if not warnings and second.report.pid not in pids:
+                tasks.append(0)  # until the other was looked at
+    later = set() if fault else {second.report.pid}
     assert pids == {first.report.pid} | later
     assert warnings == ([f"worker {second.address} is odd; it is not used"] if fault else [])
 

@@ -11,6 +11,10 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import ball
+from processes import PATIENCE, hear_signals
+
+from super_sdf import SuperSdfError
+from super_sdf.cli.interrupts import Interrupted, exit_code, raising_interrupts
 
 COMMAND = [sys.executable, "-m", "super_sdf"]
 QUICK = ["upsample", "in.npy", "out.ply", "--quality", "fast", "--spacing", "1", "--origin", "0"]
@@ -25,7 +29,7 @@ def here(tmp_path, monkeypatch):
 def run(*arguments, shell="", **options):
     """Run the command line, with redirections of the shell; return exit code, stdout, stderr."""
     words = ["sh", "-c", f'"$@" {shell}', "sh", *COMMAND, *arguments]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=60, **options)
+    done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE, **options)
     return done.returncode, done.stdout, done.stderr
 
 
@@ -36,7 +40,7 @@ from super_sdf import pipeline
 from super_sdf.cli import entry
 def wait(*_):
     print(sorted(__import__("os").listdir()), flush=True)
-    time.sleep(30)
+    time.sleep(600)
 pipeline.refine = wait
 entry.main()
 """
@@ -48,12 +52,39 @@ class Finder:
         if name == "numpy":
             print("importing", flush=True)
             try:
-                time.sleep(30)
+                time.sleep(600)
             except BaseException as error:
                 raise ImportError("something else") from error
 sys.meta_path.insert(0, Finder())
 from super_sdf.cli.entry import main
 main()
+"""
+# The same within the work, in a library that swallows whatever is raised while it is imported.
+LIBRARY = """
+import os, sys, time
+from importlib.machinery import ModuleSpec
+from super_sdf import pipeline
+from super_sdf.cli import entry
+class Library:
+    def find_spec(self, name, *_):
+        return ModuleSpec(name, self) if name == "library" else None
+    def create_module(self, spec):
+        pass
+    def exec_module(self, module):
+        print("importing", flush=True)
+        try:
+            while not os.path.exists("go"):
+                time.sleep(0.01)
+        except BaseException:
+            pass
+        print("imported", flush=True)
+sys.meta_path.insert(0, Library())
+right = pipeline.refine
+def refine(*arguments, **options):
+    import library
+    return right(*arguments, **options)
+pipeline.refine = refine
+entry.main()
 """
 LINES = {
     signal.SIGINT: "Error: interrupted",
@@ -67,17 +98,42 @@ LINES = {
 def test_a_signal_leaves_a_line_its_exit_code_and_no_file(number, script, more):
     words = [sys.executable, "-c", script, *QUICK]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    with subprocess.Popen(words, **pipes) as process:
+    with subprocess.Popen(words, preexec_fn=hear_signals, **pipes) as process:
         begun = process.stdout.readline()
         assert (".part" in begun) == (script == STAGE)
         process.send_signal(number)
-        _, err = process.communicate(timeout=30)
+        _, err = process.communicate(timeout=PATIENCE)
     assert (process.returncode, err) == (128 + number, f"{LINES[number]}{more}\n")
     assert os.listdir() == ["in.npy"]
 
 
+@pytest.mark.parametrize("number", LINES)
+def test_a_signal_waits_for_the_end_of_an_import(number):
+    words = [sys.executable, "-c", LIBRARY, *QUICK]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(words, preexec_fn=hear_signals, **pipes) as process:
+        assert process.stdout.readline() == "importing\n"
+        process.send_signal(number)
+        Path("go").touch()
+        out, err = process.communicate(timeout=PATIENCE)
+    want = f"{LINES[number]}; nothing was written\n"
+    assert (process.returncode, out, err) == (128 + number, "imported\n", want)
+    assert sorted(os.listdir()) == ["go", "in.npy"]
+
+
+@pytest.mark.parametrize("made_of_it", [None, ValueError("odd"), SuperSdfError("odd")])
+def test_an_interrupt_that_other_code_catches_is_raised_all_the_same(made_of_it):
+    with pytest.raises(Interrupted) as caught, raising_interrupts():
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except BaseException:
+            if made_of_it:
+                raise made_of_it from None
+    assert exit_code(caught.value) == 128 + signal.SIGTERM
+
+
 def test_an_ignored_hangup_stays_ignored():
-    script = STAGE.replace("time.sleep(30)", "raise MemoryError").replace(
+    script = STAGE.replace("time.sleep(600)", "raise MemoryError").replace(
         "    print", "    __import__('os').kill(__import__('os').getpid(), 1); print"
     )
     words = [sys.executable, "-c", script, *QUICK]

@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +17,7 @@ import numpy as np
 import psutil
 import pytest
 from click.testing import CliRunner
+from processes import all_end, wait_for_lines
 from solids import cube, saved, sphere, torus
 
 from super_sdf import Mesh, SuperSdfError
@@ -72,13 +72,6 @@ def evaluate(*words: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True)
 
 
-def is_over(process: psutil.Process) -> bool:
-    """Say whether a process has ended, if only its parent has still to hear of it."""
-    with suppress(psutil.NoSuchProcess):
-        return process.status() == psutil.STATUS_ZOMBIE
-    return True
-
-
 def quality_of(out: Path) -> dict[tuple, tuple]:
     """Return the figures of quality of each row."""
     rows = [json.loads(line) for line in (out / "results.jsonl").read_text().splitlines()]
@@ -93,7 +86,7 @@ def tables_of(out: Path) -> str:
 
 
 def test_killed_and_started_again_it_ends_with_the_same_tables(meshes, tmp_path):
-    words = [meshes, "--sizes", 12, "--methods", "mc", "--jobs", 2, "--no-pictures"]
+    words = [meshes, "--sizes", 12, 16, "--methods", "mc", "--jobs", 2, "--no-pictures"]
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     done = evaluate(*words, "--out", whole)
     assert done.returncode == 0, done.stderr
@@ -101,14 +94,11 @@ def test_killed_and_started_again_it_ends_with_the_same_tables(meshes, tmp_path)
     command = [sys.executable, "-m", "super_sdf", "evaluate", *map(str, words)]
     child = subprocess.Popen([*command, "--out", str(cut)], stderr=subprocess.DEVNULL)
     store = cut / "results.jsonl"
-    while not (store.exists() and len(store.read_text().splitlines()) > 1):
-        assert child.poll() is None
-        time.sleep(0.02)
+    wait_for_lines(child, store)
     workers = psutil.Process(child.pid).children(recursive=True)
     child.send_signal(signal.SIGKILL)
     child.wait()
-    psutil.wait_procs(workers, timeout=10)
-    assert workers and all(map(is_over, workers))  # no orphans
+    assert workers and all_end(workers)  # no orphans
     with store.open("a") as file:
         file.write('{"shape": "torn')  # as if killed while writing
     kept = len(store.read_text().splitlines())
@@ -668,7 +658,7 @@ def test_edges_have_a_table_for_each_size(meshes, tmp_path):
 def test_the_command_is_timed_as_a_process(monkeypatch):
     monkeypatch.setattr(timing, "RUNS", 1)
     figures = timing.time_shape(Shape("ring", torus()), Setting(12))
-    assert 0.05 < figures["seconds"] < 60 and 20 < figures["peak_mb"] < 2000
+    assert figures["seconds"] > 0.05 and 20 < figures["peak_mb"] < 2000
     with pytest.raises(SuperSdfError, match=r"super_sdf upsample none\.npz x\.ply ended with 1"):
         timing.run_command(["upsample", "none.npz", "x.ply"])
 
@@ -686,7 +676,7 @@ def test_on_windows_the_peak_is_read_while_the_process_runs(tmp_path, monkeypatc
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     monkeypatch.setattr(timing, "LAUNCHER", "import os; del os.wait4\n" + timing.LAUNCHER)
     seconds, peak, printed = timing.run_python(["-c", "import time; time.sleep(.1); print('hi')"])
-    assert 0.1 < seconds < 30 and peak == 7 and printed == "hi\n"
+    assert seconds > 0.1 and peak == 7 and printed == "hi\n"
     with pytest.raises(SuperSdfError, match="ended with 3"):
         timing.run_python(["-c", "raise SystemExit(3)"])
 

@@ -123,7 +123,7 @@ fields = hnp.arrays(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(fields, st.sampled_from([2, 4]))
 def test_any_field_gives_a_closed_oriented_manifold(values, factor):
     values = walled(values)
@@ -134,7 +134,7 @@ def test_any_field_gives_a_closed_oriented_manifold(values, factor):
     assert mesh.volume() > 0
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(fields)
 def test_any_field_is_closed_by_the_network_and_the_cap(values):
     values[2, 2, 2], values[3, 3, 3] = -1, 1

@@ -90,7 +90,7 @@ def test_slabs_change_nothing(network, monkeypatch, name, factor, cap):
         assert sum(part.counts["vertices"] for part in parts) == whole.counts["vertices"]
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 @given(st.integers(0, 10**6), st.integers(2, 30), st.booleans())
 def test_slabs_change_nothing_on_random_facets(network, seed, pieces, cap):
     values = facets(np.random.default_rng(seed), (36, 9, 8))

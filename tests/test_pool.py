@@ -126,7 +126,7 @@ def test_partial_results_arrive_in_order_before_the_final_one():
 
 
 def test_a_task_over_its_limit_is_ended_and_the_next_one_goes_on():
-    pool = Pool(deque([5, 3, 2]), count_up, PoolOptions(time_limit=lambda task: 0.3))
+    pool = Pool(deque([5, 3, 2]), count_up, PoolOptions(time_limit={5: 0.3}.get))
     results = list(pool.results(1))
     ends = {task: result for task, result in results if type(result) is not tuple}
     assert ends == {5: Death("over the limit of 0.3 s", is_late=True), 3: "done", 2: "done"}

@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import threading
 import time
 from types import SimpleNamespace
 
@@ -134,11 +135,41 @@ class EndlessSession:
 FEEDS = {"patches": np.zeros((1, 27)), "voxels": np.zeros(1), "offsets": np.zeros((1, 3))}
 
 
+@pytest.fixture
+def hearing():
+    """Hear SIGINT, which a shell has processes in the background ignore."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("hearing")
 def test_an_interrupt_stops_a_run_in_the_middle():
     session = EndlessSession(lambda: os.kill(os.getpid(), signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
-        running.run_on_cpu(session, FEEDS, poll=lambda: None)
+        running.run_on_cpu(session, FEEDS)
     assert session.ended
+
+
+class DeafSession(EndlessSession):
+    """A session with an operator that does not end, and a user who presses Ctrl-C twice."""
+
+    def run_with_iobinding(self, binding, options):
+        self.thread, self.released = threading.current_thread(), threading.Event()
+        for is_wanted in (lambda: True, lambda: options.terminate):
+            while not is_wanted():
+                time.sleep(0.01)
+            os.kill(os.getpid(), signal.SIGINT)
+        self.released.wait()
+
+
+@pytest.mark.usefixtures("hearing")
+def test_a_second_interrupt_does_not_wait_for_a_run():
+    session = DeafSession()
+    with pytest.raises(KeyboardInterrupt):
+        running.run_on_cpu(session, FEEDS)
+    assert session.thread.is_alive() and session.thread.daemon  # so this process can end
+    session.released.set()
 
 
 def test_an_exception_in_poll_stops_a_run_in_the_middle():

@@ -26,7 +26,7 @@ def mesh_of(values: np.ndarray, spacing: float = 1.0, *, flipped: bool = False) 
     return reconstruct(grid, trilinear, 2, cap=True)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(fields, st.integers(-100, 100), st.booleans(), st.sampled_from(["<f4", ">f4", "<f8", "g"]))
 def test_any_field_gives_the_same_mesh_in_any_unit_sign_and_type(values, power, flipped, dtype):
     values = walled(values)

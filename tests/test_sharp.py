@@ -74,7 +74,7 @@ def distance_from_edges(vertices, half, middle):
     return np.mean(apart)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(fields, st.sampled_from([2, 4]))
 def test_any_field_gives_a_closed_oriented_manifold(values, factor):
     values = walled(values)
@@ -85,7 +85,7 @@ def test_any_field_gives_a_closed_oriented_manifold(values, factor):
     assert (count_fans(mesh.faces) == 1).all()
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.integers(0, 10**6), st.sampled_from([0.05, 0.3, 1.0]))
 def test_any_lattice_gives_a_closed_manifold_with_features_everywhere(seed, least):
     """With every patch a feature: fans and turned sides, ambiguous faces among them."""

@@ -118,7 +118,7 @@ def test_a_lost_ball_and_a_lost_hole_do_not_make_up_for_each_other():
     assert passes.same_topology(joined(torus(), apart), joined(cube(), torus(12, 8)))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 10**6), st.sampled_from([0.02, 0.2, 2.0]), st.booleans())
 @example(235, 2.0, False)  # lost a component and a hole
 def test_any_field_stays_a_closed_manifold_within_the_error(seed, error, in_float32):

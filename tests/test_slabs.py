@@ -80,7 +80,7 @@ def test_slabs_change_nothing(network, monkeypatch, field, factor, cap):
         assert any(part.is_cut for part in parts) == whole.is_cut
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.integers(0, 10**6), st.integers(2, 30))
 def test_slabs_change_nothing_on_random_fields(network, seed, pieces):
     values = np.random.default_rng(seed).uniform(-3, 3, (36, 5, 6))

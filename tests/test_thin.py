@@ -114,7 +114,7 @@ def test_what_only_looks_thin_is_refused_in_one_line(name, spacing):
     assert want in message
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.floats(0.02, 0.9), st.floats(-0.04, 0.04), st.integers(0, 2))
 def test_thickness_is_what_the_distances_leave(thickness, shift, axis):
     values = np.moveaxis(np.abs(Z + shift) - thickness / 2, 2, axis)

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pages import blocks, wedge
+from processes import PATIENCE, hear_signals
 
 import super_sdf
 from super_sdf import SdfGrid, reconstruct, write_mesh
@@ -34,7 +35,7 @@ def server():
 
 def ask(server, path, method="GET", host=None):
     """Return status, headers and text of a request."""
-    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=30)
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=PATIENCE)
     host = f"127.0.0.1:{server.server_port}" if host is None else host
     connection.request(method, path, headers={"Host": host} if host else {})
     answer = connection.getresponse()
@@ -109,12 +110,13 @@ def test_the_command_serves_a_refined_grid_until_ctrl_c(tmp_path):
         text=True,
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": sources},
+        preexec_fn=hear_signals,
     ) as process:
         line = process.stderr.readline()
         port, path = re.fullmatch(
             r"http://127.0.0.1:(\d+)(/.*/) \(Ctrl-C ends it\)\n", line
         ).groups()
-        connection = http.client.HTTPConnection("127.0.0.1", int(port), timeout=60)
+        connection = http.client.HTTPConnection("127.0.0.1", int(port), timeout=PATIENCE)
         connection.request("GET", path)
         page = connection.getresponse().read().decode()
         process.send_signal(signal.SIGINT)
@@ -137,7 +139,7 @@ def test_the_browser_is_opened_at_the_address_unless_it_is_not_wanted(
     write_mesh(reconstruct(SdfGrid(wedge(), 1.0), factor=2), mesh)
     code, out, err = command("view", mesh)
     assert (code, out) == (130, "") and err.endswith("\nError: interrupted; the page is closed\n")
-    assert err.startswith(opened.get(timeout=60) + " (Ctrl-C ends it)\n")
+    assert err.startswith(opened.get(timeout=PATIENCE) + " (Ctrl-C ends it)\n")
     assert command("view", mesh, "--no-browser")[0] == 130 and opened.empty()
 
 

@@ -26,8 +26,8 @@ class InterruptedCommand(BaseException):  # as KeyboardInterrupt, no error
 def one_line_errors(*targets: str | os.PathLike[str] | None) -> Iterator[None]:
     """Turn errors into click's, one line each.
 
-    The exit code is 2 for usage errors, 128 + n after signal n, and 1 for all others. If the command
-    is interrupted, the line says which of the targets, its output files, are written.
+    The exit code is 2 for usage errors, 128 + n after signal n, and 1 for all others. After an
+    interrupt the line says which of the targets, the output files, are written.
     """
     from ..errors import OptionError, SuperSdfError
 

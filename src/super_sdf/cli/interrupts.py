@@ -1,8 +1,8 @@
 """Signals that end a command: it prints one line and leaves no half-written file.
 
-Until a command begins to write, a signal ends the process at once. From then on the signal raises an
-exception, so that files that were begun are removed. In the midst of an import it waits until that is
-over: native libraries make another error of the exception, or abort, and some libraries swallow it.
+Until a command begins to write, a signal ends the process at once. From then on the signal raises
+an exception, so that files that were begun are removed. It waits for the end of an import: native
+libraries make another error of an exception there, or abort, and others swallow it.
 """
 
 from __future__ import annotations

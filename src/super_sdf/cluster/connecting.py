@@ -195,8 +195,9 @@ def share_of(limits: Limits, threads: int, limit: int | None, free: int | None) 
 def local_cluster(count: int, killed_at: int) -> Iterator[Any]:
     """Run worker processes on this machine, each killed at some bytes of memory; 0: no limit.
 
-    They listen on the loopback interface only, and open no dashboard. Signals are held back while they start: none may
-    start without being known here, and what they inherit keeps a Ctrl-C in the terminal from them.
+    They listen on the loopback interface only, and open no dashboard. Signals are held back while
+    they start: none may start without being known here, and what they inherit keeps a Ctrl-C in the
+    terminal from them.
     """
     from distributed import Nanny, SpecCluster
 

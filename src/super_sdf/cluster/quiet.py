@@ -1,4 +1,4 @@
-"""Dask's processes of this machine without the HTTP servers that they open beside their own ports."""
+"""Dask's scheduler and workers without the HTTP servers that they open beside their own ports."""
 
 from __future__ import annotations
 

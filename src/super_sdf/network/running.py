@@ -27,7 +27,7 @@ CHUNK_INPUT, CUDA_CHUNK = "chunk", 16384
 POLL_INTERVAL = 0.1  # seconds
 
 Poll = Callable[[], None]
-"""Called every ``POLL_INTERVAL`` seconds during a run; if it raises, the run is stopped."""
+"""Called at the start of a run and every ``POLL_INTERVAL`` seconds; what it raises stops it."""
 
 
 def run_on_cpu(
@@ -42,7 +42,7 @@ def run_on_cpu(
     feeds : dict
         Its inputs by name, see ``contract``.
     poll : callable, optional
-        Called during the run; an exception in it stops the run.
+        Called when the run has begun and while it lasts; an exception in it stops the run.
 
     Returns
     -------
@@ -135,6 +135,7 @@ def _run(
     thread = Thread(target=work, name="super-sdf network", daemon=True)
     try:
         thread.start()
+        poll()
         while not ended.wait(POLL_INTERVAL):
             poll()
     except BaseException:
