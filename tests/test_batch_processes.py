@@ -12,6 +12,7 @@ import psutil
 import pytest
 import trimesh
 from batches import CONSTANT, files, rows
+from planted import COMMAND, run_beside_planted_files
 from processes import PATIENCE, all_end, larger_grids, start_command, wait_for_lines
 
 from super_sdf.batch import job as batch_job
@@ -69,6 +70,16 @@ def test_what_a_killed_batch_left_is_removed_and_nothing_else(run_batch):
     assert not stale.exists() and all(map(os.path.exists, kept))
     assert rows()[-1]["out"] == "deep/b.ply"  # last: it may be what ended the run
     assert Path("out/.super-sdf-batch").read_text() == ""
+
+
+TWO_CORES = f"from super_sdf.batch import workers\n\nworkers.count_cores = lambda: 2\n{COMMAND}"
+
+
+@pytest.mark.parametrize("code", ["", TWO_CORES])
+def test_nothing_of_the_current_folder_is_run(tmp_path, code):
+    words = ("batch", "in", "--out", "out", "--jobs", 2, "--quality", "fast", "--factor", 2)
+    done, ran = run_beside_planted_files(tmp_path, code, *words)
+    assert "3 done, 1 failed" in done.stderr and not ran
 
 
 def start_batch(*options):

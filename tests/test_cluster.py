@@ -16,6 +16,7 @@ import psutil
 import pytest
 from batches import CONSTANT, FAST, PLAIN, rows
 from distributed import Client
+from planted import COMMAND, run_beside_planted_files
 from processes import PATIENCE, all_end, larger_grids, start_command, wait_for_lines, wait_until
 
 from super_sdf import __version__
@@ -96,6 +97,13 @@ def outcomes(folder):
     changing = {"seconds", "stages", "output", "content", "planned_bytes"}
     found = [{k: v for k, v in row.items() if k not in changing} for row in rows(folder)]
     return sorted(found, key=lambda row: row["out"])
+
+
+@pytest.mark.parametrize("code", ["", COMMAND])
+def test_nothing_of_the_current_folder_is_run(tmp_path, code):
+    words = ("batch", "in", "--out", "out", *LOCAL, "--jobs", 1, *QUICK)
+    done, ran = run_beside_planted_files(tmp_path, code, *words)
+    assert "3 done, 1 failed" in done.stderr and not ran
 
 
 def start_batch(*options, out="out", lines=2):

@@ -8,6 +8,7 @@ import time
 from collections import deque
 
 import pytest
+from planted import run_beside_planted_files
 
 from super_sdf.errors import SuperSdfError
 from super_sdf.machine import serving
@@ -178,3 +179,18 @@ def test_on_windows_signals_are_not_blocked(monkeypatch):
     serving.settle_signals()
     assert heard == [(signal.SIGINT, signal.SIG_IGN)]
     assert work([2], square, 1)[0] == {2: 4}
+
+
+@pytest.mark.parametrize("flag", ["-I", serving.SAFE_PATH])
+@pytest.mark.parametrize("method", ["spawn", "forkserver"])
+def test_no_process_runs_files_of_the_current_folder(tmp_path, flag, method):
+    """Python 3.10 has no other flag than -I, which must not keep workers from ``PYTHONPATH``."""
+    code = f"""
+if __name__ == "__main__":
+    from multiprocessing import get_context
+    import test_pool
+    test_pool.serving.SAFE_PATH = {flag!r}
+    print(test_pool.work([2, 3], test_pool.square, start_method=get_context({method!r})))
+"""
+    done, ran = run_beside_planted_files(tmp_path, code)
+    assert (done.stdout, done.stderr, ran) == ("({2: 4, 3: 9}, [])\n", "", [])

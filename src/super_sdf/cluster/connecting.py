@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import signal
 import tempfile
 import threading
@@ -20,7 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from ..errors import ClusterError
 from ..machine.extras import check_modules
 from ..machine.memory import SHARE, held_memory, memory_bound
-from ..machine.serving import ending_signals_blocked
+from ..machine.serving import ending_signals_blocked, python_flags
 from ..machine.threads import count_cores
 
 if TYPE_CHECKING:
@@ -210,6 +209,7 @@ def local_cluster(count: int, killed_at: int) -> Iterator[Any]:
     with (
         tempfile.TemporaryDirectory(prefix="super-sdf-", ignore_cleanup_errors=True) as scratch,
         config({"temporary-directory": scratch}),
+        python_flags(),  # as long as workers may be started again
     ):
         start_quiet_tracker()
         with ending_signals_blocked():
@@ -229,18 +229,14 @@ def start_quiet_tracker() -> None:
     """
     from multiprocessing import resource_tracker
 
-    warnings_before = os.environ.get("PYTHONWARNINGS")
     hears = threading.current_thread() is threading.main_thread() and hasattr(signal, "SIGHUP")
     handler = signal.signal(signal.SIGHUP, signal.SIG_IGN) if hears else None
-    os.environ["PYTHONWARNINGS"] = "ignore:resource_tracker"
     try:
-        resource_tracker.ensure_running()
+        with python_flags("-Wignore:resource_tracker"):
+            resource_tracker.ensure_running()
     finally:
         if hears:
             signal.signal(signal.SIGHUP, handler)
-        del os.environ["PYTHONWARNINGS"]
-        if warnings_before is not None:
-            os.environ["PYTHONWARNINGS"] = warnings_before
 
 
 @contextmanager

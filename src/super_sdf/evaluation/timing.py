@@ -27,6 +27,7 @@ RUNS = 5
 # Windows has no wait4: there the peak is read while the process runs.
 LAUNCHER = """
 import os, sys, time
+sys.path[:] = filter(None, sys.path)  # nothing from the current folder
 command = [sys.executable, *sys.argv[1:]]
 if hasattr(os, "wait4"):
     start = time.perf_counter()

@@ -26,6 +26,7 @@ from .serving import (
     PrepareFailed,
     Ready,
     ending_signals_blocked,
+    python_flags,
     serve,
 )
 
@@ -156,7 +157,8 @@ class Pool(Generic[Task]):
             target=serve, args=(theirs, self.prepare), daemon=True
         )
         try:
-            with ending_signals_blocked():  # no process may start without being noted here
+            # no process may start without being noted here
+            with python_flags(), ending_signals_blocked():
                 process.start()
                 self.workers[ours] = Worker(process, ours)
         except OSError:

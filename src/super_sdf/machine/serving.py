@@ -5,14 +5,19 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from multiprocessing import util
 from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple
 
 from ..errors import SuperSdfError
 
+# ``python -c``, which multiprocessing starts, imports from the current folder unless told not to.
+# Python 3.10 knows only -I: what that leaves out, multiprocessing hands over with the path.
+SAFE_PATH = "-P" if sys.version_info >= (3, 11) else "-I"
 Tell = Callable[[Any], None]
 """Sends a partial result of the current task to the parent, or ``ClockStarted``."""
 
@@ -101,6 +106,17 @@ def ending_signals_blocked() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def python_flags(*flags: str) -> Iterator[None]:
+    """Start Pythons within the block with ``SAFE_PATH`` and other flags, from whatever thread."""
+    usual = util._args_from_interpreter_flags  # type: ignore[attr-defined]
+    util._args_from_interpreter_flags = lambda: [*usual(), SAFE_PATH, *flags]  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        util._args_from_interpreter_flags = usual  # type: ignore[attr-defined]
 
 
 def ending_signals() -> set[signal.Signals]:
