@@ -1,5 +1,6 @@
 """Many files: each as by itself, bad ones named, and a rerun goes on where the last one ended."""
 
+import hashlib
 import json
 import os
 import shutil
@@ -10,6 +11,7 @@ import pytest
 import trimesh
 from batches import CONSTANT, FAST, LONE, PLAIN, files, rows
 from conftest import ball
+from onnx_files import entry
 
 from super_sdf.batch import job as batch_job
 from super_sdf.batch.fingerprint import fingerprint, is_unchanged
@@ -17,6 +19,7 @@ from super_sdf.batch.job import Result
 from super_sdf.batch.plan import Batch, Settings
 from super_sdf.cli.batch_report import describe_progress, duration
 from super_sdf.convert import convert
+from super_sdf.files.store import files_of
 
 pytestmark = pytest.mark.usefixtures("grid_folder")
 
@@ -90,16 +93,126 @@ def test_what_has_changed_is_done_again(run_batch, monkeypatch):
     assert redone(run_batch) == []
     Path("out/deep/b.ply").unlink()
     assert redone(run_batch) == ["deep/b.ply"]
-    mesh = bytearray(Path("out/a.ply").read_bytes())
-    mesh[-1] ^= 1
-    Path("out/a.ply").write_bytes(mesh)
-    assert redone(run_batch) == ["a.ply"]
     assert redone(run_batch, "--retry") == ["bad.ply"]
     assert len(redone(run_batch, "--offset", 0.5)) == 4
     assert redone(run_batch, "--offset", 0.5, "--threads", 1) == []
     assert len(redone(run_batch, "--offset", 0.5, "--force")) == 4
     monkeypatch.setattr("super_sdf.batch.plan.__version__", "next")
     assert len(redone(run_batch, "--offset", 0.5)) == 4
+
+
+@pytest.mark.parametrize("options", [(), ("--offset", 0.5), ("--retry",)])
+def test_a_mesh_that_was_changed_is_replaced_by_force_only(run_batch, options):
+    run_batch("in/a.npy")
+    made = Path("out/a.ply").read_bytes()
+    os.utime("out/a.ply")
+    assert "nothing to do: 1 done before" in run_batch("in/a.npy")[2]  # as it was made
+    Path("out/a.ply").write_bytes(made[:-1] + b"x")
+    why = "out/a.ply exists and was changed after a batch made it: remove it or use --force"
+    for _ in range(2):
+        code, _, err = run_batch("in/a.npy", *options)
+        assert code == 1 and err.startswith(f"Failed: in/a.npy: {why}\n") and "1 refused" in err
+        assert Path("out/a.ply").read_bytes() == made[:-1] + b"x"
+    assert "1 to do" in run_batch("in/a.npy", *options, "--dry-run", "--force")[2]
+    assert run_batch("in/a.npy", "--force")[0] == 0 and Path("out/a.ply").read_bytes() == made
+    assert "nothing to do: 1 done before" in run_batch("in/a.npy")[2]
+
+
+def test_a_mesh_of_other_options_is_replaced_also_after_a_failure_between(run_batch):
+    run_batch("in/a.npy")
+    assert run_batch("in/a.npy", "--offset", 100)[0] == 1
+    assert run_batch("in/a.npy", "--offset", 0.5)[0] == 0
+
+
+def test_each_label_has_a_mesh_of_its_own(run_batch):
+    labels = np.where(ball(12, 4.0).values < 0, 2**64 - 1, 0).astype(np.uint64)
+    labels[5:7, 5:7, 5:7] = 7
+    np.save("labels.npy", labels)
+    for label in (2**64 - 1, 7):
+        assert run_batch("labels.npy", "--label", label)[0] == 0
+    assert sorted(files()) == [f"labels-label{2**64 - 1}.ply", "labels-label7.ply", "report.jsonl"]
+    Path("list.jsonl").write_text(
+        "\n".join(f'{{"in": "labels.npy", "label": {label}}}' for label in (2**64 - 1, 7))
+    )
+    want = "nothing to do: 2 done before; 2 meshes closed, 0 open\n"
+    assert run_batch("list.jsonl") == (0, "", want)
+
+
+def write_raw(path, radius=3.0):
+    """Write the samples of a ball alone; keep the time of a file that was there."""
+    before = os.stat(path).st_mtime_ns if os.path.exists(path) else None
+    ball(12, radius).values.astype("<f4").transpose().tofile(path)
+    if before:
+        os.utime(path, ns=(before + 1, before + 1))
+
+
+MHD = "ObjectType = Image\nNDims = 3\nDimSize = 12 12 12\nElementType = MET_FLOAT\n"
+NRRD = "NRRD0004\ntype: float\ndimension: 3\nsizes: 12 12 12\nendian: little\nencoding: raw\n"
+SLICES = "\n".join(f"part {z}.raw" for z in range(12))
+HEADERS = {
+    "x.mhd": (f"{MHD}ElementDataFile = part of it.raw\n", ["part of it.raw"]),
+    "list.mhd": (f"{MHD}ElementDataFile = LIST\n{SLICES}\n", SLICES.split("\n")),
+    "pattern.mhd": (
+        f"{MHD}ElementDataFile = p[%02d.raw 0 11 1\n",
+        [f"p[{z:02}.raw" for z in range(12)],
+    ),
+    "x.nhdr": (f"{NRRD}data file: x.raw\n", ["x.raw"]),
+    "x.nrrd": (f"{NRRD}datafile:x.raw\n", ["x.raw"]),
+    "list.nhdr": (f"{NRRD}data file: LIST\n{SLICES}\n", SLICES.split("\n")),
+}
+
+
+@pytest.mark.parametrize("name", HEADERS)
+def test_the_fingerprint_of_a_header_covers_its_data(name):
+    text, parts = HEADERS[name]
+    Path(name).write_text(text)
+    alone = fingerprint(Path(name))
+    Path("other.raw").write_text("of no header")
+    assert alone["sha256"] == hashlib.sha256(text.encode()).hexdigest()
+    for part in parts:
+        Path(part).write_text("x")
+    known = fingerprint(Path(name))
+    assert known["size"] == alone["size"] + len(parts) and is_unchanged(Path(name), known)
+    assert files_of(name) == [Path(name), *sorted(map(Path, parts))]
+    for part in parts:
+        before = os.stat(part).st_mtime_ns
+        Path(part).write_text("y")
+        os.utime(part, ns=(before + 1, before + 1))  # such as a copy that keeps its time
+        assert not is_unchanged(Path(name), known)
+        Path(part).write_text("x")
+        assert is_unchanged(Path(name), known)
+
+
+def test_changed_data_beside_a_header_is_converted_again(run_batch):
+    Path("scans").mkdir()
+    Path("scans/x.mhd").write_text(HEADERS["x.mhd"][0])
+    assert run_batch("scans")[0] == 1  # no data
+    write_raw("scans/part of it.raw")
+    assert run_batch("scans")[0] == 0
+    before = Path("out/x.ply").read_bytes()
+    assert "nothing to do" in run_batch("scans")[2]
+    write_raw("scans/part of it.raw", 4.0)
+    assert run_batch("scans")[0] == 0 and Path("out/x.ply").read_bytes() != before
+
+
+def test_the_fingerprint_of_a_network_covers_weights_beside_it():
+    """Their names are those of entries "location" of its tensors; see onnx.proto."""
+    names = ["weights.bin", "more weights.bin"]
+    found = [entry(1, "location") + entry(2, name) for name in (*names, "not there.bin")]
+    Path("own.onnx").write_bytes(b"".join(entry(13, each) for each in found))
+    for name in names:
+        Path(name).write_text("x")
+    assert files_of("own.onnx") == [Path("own.onnx"), *sorted(map(Path, names))]
+
+
+@pytest.mark.parametrize("link", [os.link, os.symlink])
+def test_an_input_is_never_written_over(run_batch, link):
+    Path("out").mkdir()
+    link(Path("in/deep/b.npz").absolute(), "out/a.ply")
+    before = Path("in/deep/b.npz").read_bytes()
+    code, _, err = run_batch("in", "--force")
+    want = "Failed: in/a.npy: out/a.ply is the same file as in/deep/b.npz: remove that link\n"
+    assert code == 1 and want in err and Path("in/deep/b.npz").read_bytes() == before
 
 
 def test_another_network_file_is_another_option(run_batch, command):

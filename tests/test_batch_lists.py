@@ -101,6 +101,8 @@ LISTS = {
     "sys.set_int_max_str_digits() to increase the limit",
     '{"in": "a.npy", "offset": 1e999}': "list.jsonl, line 1: 'offset' is inf: give a finite number",
     '{"in": "a.npy", "offset": NaN}': "list.jsonl, line 1: NaN is no number: give a finite one",
+    '{"in": "a.npy", "label": 0.5}': "list.jsonl, line 1: 'label' is 0.5: give a whole number, "
+    "-2^63 to 2^64 - 1",
     '{"in": "a.npy", "in": "b.npy"}': "list.jsonl, line 1: 'in' is there twice: give it once",
     100_000 * "[": 'list.jsonl, line 1 is nested too deeply: give an object, {"in": "a.npy"}',
     f'"{10_000_000 * "x"}"': 'list.jsonl, line 1 is "'

@@ -5,7 +5,6 @@ The browser is the distribution's; Playwright only drives it.
 
 import os
 import shutil
-import threading
 from io import BytesIO
 from pathlib import Path
 
@@ -23,8 +22,7 @@ from super_sdf.cli.main import cli
 from super_sdf.convert import ConvertOptions
 from super_sdf.pages.entries import entry_of
 from super_sdf.pages.html import make_page, write_page
-from super_sdf.pages.server import PageServer
-from super_sdf.pages.viewing import viewed_texts
+from super_sdf.pages.viewing import viewed_page
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 WITHOUT_GPU = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
@@ -277,21 +275,17 @@ def test_a_phone_shows_all_of_it_in_either_scheme(visit, report, scheme):
     assert (sum(map(int, colour[4:-1].split(","))) > 380) == (scheme == "light")
 
 
-def test_view_shows_meshes_and_refined_grids_from_the_server(visit, report, tmp_path):
+def test_view_shows_meshes_and_refined_grids_from_one_file(visit, report, tmp_path):
     np.save(tmp_path / "a.npy", wedge())
     mesh = Path(report.removeprefix("file://")).with_suffix(".ply")
     options = ConvertOptions(factor=2, spacing=(1.0,))
-    texts = viewed_texts(
-        [str(tmp_path / "a.npy"), str(mesh)], lambda: load_network("fast", device="cpu"), options
-    )
-    with PageServer(texts) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        page = visit(server.address)
-        for name, count in (("a.npy", 2), ("a.ply", 1)):
-            page.locator("summary", has_text=name).click()
-            page.locator(".file", has_text=name).locator("canvas").first.wait_for()
-            shots = pictures(page)
-            assert len(shots) == count and all(silhouette(shot).mean() > 0.1 for shot in shots)
-        paths = [url.removeprefix(server.address) for url in page.requested]
-        server.shutdown()
-    assert paths == ["", "meshes/0.js", "meshes/1.js"] and page.complaints == []
+    sources = [str(tmp_path / "a.npy"), str(mesh)]
+    text = viewed_page(sources, lambda: load_network("fast", device="cpu"), options)
+    write_page(text, tmp_path / "view.html")
+    page = visit((tmp_path / "view.html").as_uri())
+    for name, count in (("a.npy", 2), ("a.ply", 1)):
+        page.locator("summary", has_text=name).click()
+        page.locator(".file", has_text=name).locator("canvas").first.wait_for()
+        shots = pictures(page)
+        assert len(shots) == count and all(silhouette(shot).mean() > 0.1 for shot in shots)
+    assert page.requested == [(tmp_path / "view.html").as_uri()] and page.complaints == []

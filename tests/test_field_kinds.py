@@ -217,6 +217,46 @@ def test_a_label_that_no_sample_has_is_refused_with_those_there_are():
         make_grid(np.full((8, 8, 8), 7), **PLACE, label=7)
 
 
+LARGEST = 2**64 - 1
+
+
+@pytest.mark.parametrize(
+    ("dtype", "label", "other"),
+    [
+        ("u8", LARGEST, LARGEST - 1),
+        (">u8", 2**63 + 1, 2**63),
+        ("i8", 2**53 + 1, 2**53),
+        ("i8", -(2**63), 1 - 2**63),
+        ("i1", -1, 1),
+        ("f4", 2**24, 2**24 - 1),
+        ("f8", 3.0, 2),
+        ("?", 1, 0),
+    ],
+)
+def test_labels_are_whole_numbers_of_up_to_64_bits(dtype, label, other):
+    labels = np.where(MASK, np.array(label, dtype), np.array(other, dtype))
+    grid = make_grid(labels, **PLACE, label=label)
+    np.testing.assert_array_equal(grid.values, make_grid(MASK, **PLACE).values)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "values", "label", "listed"),
+    [
+        ("u8", (LARGEST, 2**53 + 1), LARGEST - 1, f"{2**53 + 1}, {LARGEST}"),
+        ("u8", (LARGEST, 0), -1, f"0, {LARGEST}"),
+        ("i8", (2**63 - 1, 0), 2**63, f"0, {2**63 - 1}"),
+        ("u1", (44, 0), 300, "0, 44"),
+        ("f4", (2**24, 0.5), 2**24 + 1, f"0.5, {2**24}"),
+        ("f2", (60000, 0), LARGEST, "0, 60000"),
+    ],
+)
+def test_a_label_is_never_rounded(dtype, values, label, listed):
+    labels = np.where(MASK, *np.array(values, dtype))
+    with pytest.raises(GridError) as caught:
+        make_grid(labels, **PLACE, label=label)
+    assert str(caught.value) == f"no sample has the label {label}: the labels are {listed}"
+
+
 def test_densities_have_their_surface_at_a_level():
     density = 40 - 10 * torus(48).astype(np.float32)
     grid = make_grid(density, **PLACE, level=40, scale=0.1)
@@ -265,7 +305,11 @@ def test_the_scale_is_the_unit_of_the_values():
 
 BAD = {
     "field is 'wrong': give one of auto, exact, truncated, mask, scaled, noisy": {"field": "wrong"},
-    "label is 'a': give a number": {"label": "a"},
+    "label is 'a': give a whole number, -2^63 to 2^64 - 1": {"label": "a"},
+    "label is 1.5: give a whole number, -2^63 to 2^64 - 1": {"label": 1.5},
+    "label is True: give a whole number, -2^63 to 2^64 - 1": {"label": True},
+    f"label is {2**64}: give a whole number, -2^63 to 2^64 - 1": {"label": 2**64},
+    f"label {2**53 + 1} and level 2: give only one of them": {"label": 2**53 + 1, "level": 2},
     "level is nan: give a number": {"level": float("nan")},
     "scale is -1: it must be greater than 0": {"scale": -1},
     "label 1 and level 2: give only one of them": {"label": 1, "level": 2},
@@ -487,6 +531,10 @@ def test_the_command_takes_labels_levels_and_scales(tmp_path, command):
     base = ["upsample", "--spacing", "1", "--force"]
     labels, grid, out = (str(tmp_path / name) for name in ("labels.npy", "grid.npy", "out.ply"))
     assert command(*base, labels, out, "--label", "3")[0] == 0
+    for words, shown in (("3.0", "'3.0'"), (str(2**64), str(2**64))):
+        code, _, err = command(*base, labels, out, "--label", words)
+        want = f"Error: --label is {shown}: give a whole number, -2^63 to 2^64 - 1"
+        assert (code, err.splitlines()[-1]) == (2, want)
     assert command(*base, grid, out, "--level", "100", "--scale", "0.025")[0] == 0
     code, _, err = command(*base, grid, out, "--level", "100", "--scale", "0")
     assert (code, err.splitlines()[-1]) == (2, "Error: scale is 0: it must be greater than 0")
@@ -502,7 +550,7 @@ def test_a_list_of_batch_takes_what_the_values_are(tmp_path, command):
     run = "batch", str(tmp_path / "list.jsonl"), "--out", str(tmp_path / "out")
     assert command(*run)[0] == 0
     row = json.loads((tmp_path / "out" / "report.jsonl").read_text())
-    assert row["field"]["kind"] == "mask" and row["closed"]
+    assert row["field"]["kind"] == "mask" and row["closed"] and row["out"] == "labels-label3.ply"
 
 
 def test_values_on_one_side_of_0_are_a_mask_only_with_zeros():

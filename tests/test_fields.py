@@ -464,7 +464,7 @@ REFUSED = {
     ("--save-field", "a.txt"): "a.txt is not a field file: give one of .npz, .npy, .vti",
     ("--save-field", "no/a.npz"): "no is not a folder: make it first",
     ("--save-field", "grid.npz", "--force"): (
-        "grid.npz is the grid that is read: give another file for the field"
+        "grid.npz is the same file as grid.npz: give another file"
     ),
     ("--iterations", "0"): "iterations is 0: give 1 or more",
 }

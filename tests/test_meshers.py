@@ -1,8 +1,7 @@
 """The choice of a mesher: names, and the same mesh for any slabs, groups, threads and memory."""
 
-import hashlib
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_slabs import in_pieces, rod
 
-from super_sdf import SdfGrid, __version__, extract_mesh, load_network, reconstruct, upsample
-from super_sdf.batch.plan import Planner
+from super_sdf import SdfGrid, extract_mesh, load_network, reconstruct, upsample
 from super_sdf.convert import ConvertOptions
 from super_sdf.evaluation import names
 from super_sdf.machine import threads
@@ -186,22 +184,6 @@ def test_a_batch_with_another_mesher_is_made_again(run_batch):
     Path("list.jsonl").write_text('{"in": "in/a.npy", "out": "a.ply", "mesher": "marching"}')
     assert "nothing to do" not in run_batch("list.jsonl", "--mesher", "sharp")[2]
     assert [row["mesher"] for row in rows()] == ["marching", "sharp", "marching"]
-
-
-def test_batches_from_before_the_option_still_hold():
-    from super_sdf.batch.job import Job
-
-    planner = Planner.__new__(Planner)
-    planner.network = ("abc", 1)
-    options = ConvertOptions(2, mesher="marching")
-    new = {"axes", "direction", "iterations", "mesher", "simplify", "triangles"}
-    new |= {"field", "label", "level", "scale"}
-    before = {name: value for name, value in asdict(options).items() if name not in new}
-    text = json.dumps([before, planner.network, __version__])
-    digest = planner.digest(Job(Path("a.npy"), "a.ply", options))
-    assert digest == hashlib.sha256(text.encode()).hexdigest()
-    sharp = replace(options, mesher="sharp")
-    assert planner.digest(Job(Path("a.npy"), "a.ply", sharp)) != digest
 
 
 def test_a_ball_has_no_edges_for_either(network):

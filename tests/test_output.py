@@ -2,6 +2,7 @@
 
 import errno
 import os
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 
 from super_sdf.errors import FileError, GridError, SuperSdfError, WriteError
 from super_sdf.files import output, parts
-from super_sdf.files.output import check_free, replacing
+from super_sdf.files.output import check_apart, check_free, replacing
 from super_sdf.files.parts import part_path, remove_abandoned_parts
 
 
@@ -67,6 +68,41 @@ def test_by_force_a_link_stays_one_and_what_it_leads_to_is_replaced():
     make("out.ply", force=True)
     assert os.readlink("out.ply") == "disk/there.ply"
     assert Path("disk/there.ply").read_text() == "mine" and os.listdir("disk") == ["there.ply"]
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o664, 0o755])
+def test_a_file_that_is_replaced_keeps_its_mode(mode):
+    Path("out.ply").write_text("old")
+    os.chmod("out.ply", mode)
+    make("out.ply", force=True)
+    assert Path("out.ply").read_text() == "mine"
+    assert stat.S_IMODE(os.stat("out.ply").st_mode) == mode
+
+
+def test_a_file_that_is_write_protected_is_kept():
+    """Also by root, whom the system lets write to it, and if it is protected meanwhile."""
+    Path("out.ply").write_text("old")
+    want = "out.ply is write-protected: allow writing to it, or give another name"
+    with pytest.raises(WriteError, match=f"^{want}$"):
+        make("out.ply", force=True, meanwhile=lambda: os.chmod("out.ply", 0o444))
+    os.symlink("out.ply", "link.ply")
+    assert refusal("out.ply", force=True) == want
+    assert refusal("link.ply", force=True) == want.replace("out.ply", "link.ply")
+    assert Path("out.ply").read_text() == "old" and len(os.listdir()) == 2
+
+
+def test_a_file_is_apart_from_another_only_if_it_is_another():
+    Path("grid.npy").write_text("grid")
+    os.symlink("grid.npy", "soft.ply")
+    os.link("grid.npy", "hard.ply")
+    Path("own.ply").write_text("grid")
+    check_apart("own.ply", ["grid.npy", "none.npy"])
+    check_apart("none.npy", ["none.npy"])
+    for name in ("soft.ply", "hard.ply", "../" + Path.cwd().name + "/grid.npy"):
+        with pytest.raises(WriteError) as caught:
+            check_apart(name, ["own.ply", "grid.npy"])
+        want = f"{name} is the same file as grid.npy: give another file"
+        assert str(caught.value) == want
 
 
 def test_a_link_that_appears_meanwhile_is_not_followed():

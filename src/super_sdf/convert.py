@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
@@ -19,12 +18,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from .arrays import Triple
-from .errors import MeshError, WriteError
+from .errors import MeshError
 from .files.expectation import CERTAIN_SHARE, Expectation, expect
-from .files.formats import split_member
 from .files.grids import read_grid_with
 from .files.meshes import write_pieces
+from .files.output import check_apart
 from .files.precision import check_format_holds, local_origin_note
+from .files.store import files_of
 from .grid.cubic import cubic_grid
 from .grid.direction import Direction
 from .grid.field import EXACT, MASK, SCALED
@@ -80,7 +80,7 @@ class ConvertOptions:
     iterations: int = 1
     direction: tuple[float, ...] | None = None
     field: str = "auto"
-    label: float | None = None
+    label: int | None = None
     level: float | None = None
     scale: float | None = None
 
@@ -242,6 +242,10 @@ def convert(
         check_goal(options.simplify, options.triangles, ("simplify", "triangles"))
         check_can_simplify()
     grid = engine.read(source, options) if engine else read_grid_with(source, options)
+    inputs = files_of(source)
+    check_apart(target, inputs)
+    if save_field is not None:
+        check_apart(save_field, inputs)
     total = _check_work(options)
     lattice = cubic_grid(grid, options.offset)
     about = check_format_holds(target, lattice, total)
@@ -249,7 +253,6 @@ def convert(
     expected = expect(grid, total, options.offset, target, cap=options.cap)
     _check_size(expected, target, options, announce)
     tally = Tally(expected, cap=options.cap)
-    check_not_input(save_field, source)
     with open_field(save_field, grid, options, force=force) as file:
         watch.lap("read")
         maker = Maker(grid, network, options, engine, file)
@@ -339,13 +342,6 @@ def _complete_field(
         check_field_target(file.path, force=force)
     if then:
         then(part)
-
-
-def check_not_input(path: str | Path | None, source: str | Path) -> None:
-    """Raise WriteError if the field would replace the grid that is read."""
-    grid_file, _ = split_member(Path(source))
-    if path is not None and os.path.exists(path) and os.path.samefile(path, grid_file):
-        raise WriteError(f"{path} is the grid that is read: give another file for the field")
 
 
 def open_field(

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..files.formats import split_member
-from ..files.store import is_store
+from ..files.store import files_of, is_store
 
 CHUNK = 1 << 20  # bytes read at a time
 Fingerprint = dict[str, Any]
@@ -21,38 +21,35 @@ Fingerprint = dict[str, Any]
 
 
 def file_state(path: Path) -> tuple[int, int]:
-    """Return size and time of the last change, in ns; of a Zarr folder those of all its files.
+    """Return size and time of the last change, in ns; of several files the sums.
 
     ``path`` may name an array in the file.
     """
-    file, _ = split_member(path)
-    states = [part.stat() for part in (_parts(file) if is_store(file) else [file])]
-    return sum(s.st_size for s in states), max((s.st_mtime_ns for s in states), default=0)
+    return _state_of(files_of(path))
 
 
-def _parts(folder: Path) -> list[Path]:
-    """Return all files below a folder, sorted."""
-    found = [Path(path, name) for path, _, names in os.walk(folder) for name in names]
-    return sorted(found)
+def _state_of(files: list[Path]) -> tuple[int, int]:
+    states = [file.stat() for file in files]
+    return sum(s.st_size for s in states), sum(s.st_mtime_ns for s in states)
 
 
 def fingerprint(path: Path) -> Fingerprint | None:
     """Return the fingerprint of a file, None if it cannot be read or is no regular file.
 
-    Of a Zarr folder it covers the names and contents of all files in it.
+    Of a Zarr folder it covers the names and contents of all files in it; of a header or a network
+    also those of the files that it names.
     """
     file, _ = split_member(path)
     digest = hashlib.sha256()
     try:
-        size, changed = file_state(file)  # before reading, so that a change meanwhile shows
-        if is_store(file):
-            for part in _parts(file):
-                digest.update(str(part.relative_to(file)).encode() + b"\0")
-                _add(digest, part)
-        elif file.is_file():  # opening a pipe would block
-            _add(digest, file)
-        else:
+        if not (is_store(file) or file.is_file()):  # opening a pipe would block
             return None
+        files = files_of(path)
+        size, changed = _state_of(files)  # before reading, so that a change meanwhile shows
+        for part in files:
+            if part != file:
+                digest.update(os.fsencode(os.path.relpath(part, file)) + b"\0")
+            _add(digest, part)
     except OSError:
         return None
     return {"sha256": digest.hexdigest(), "size": size, "mtime_ns": changed}

@@ -113,7 +113,7 @@ class Search:
         return [Job(p, self._target(p.relative_to(root)), self.options) for p in grids]
 
     def _target(self, path: Path) -> str:
-        return mesh_path(path, self.suffix).as_posix()
+        return mesh_path(path, self.suffix, self.options.label).as_posix()
 
     def _note(self, error: OSError) -> None:
         self.unread.append((str(error.filename), reason_of(error)))

@@ -13,7 +13,7 @@ from typing import Any
 
 from ..errors import FileError, WriteError
 from ..machine.records import RecordFile, parse_line
-from .fingerprint import is_fingerprint
+from .fingerprint import Fingerprint, is_fingerprint
 from .job import Row
 
 NAME = "report.jsonl"
@@ -35,8 +35,8 @@ class Ledger:
     ----------
     rows : dict
         The last row of each output.
-    written : set of str
-        The outputs that were ever written by a batch, so that it may write them again.
+    written : dict
+        The fingerprint of the last mesh that a batch wrote of each output.
 
     Raises
     ------
@@ -47,7 +47,7 @@ class Ledger:
     def __init__(self, folder: Path) -> None:
         self.path = folder / NAME
         self.rows: dict[str, Row] = {}
-        self.written: set[str] = set()
+        self.written: dict[str, Fingerprint] = {}
         self.file = RecordFile(self.path)
         if os.path.exists(self.path):
             self._read()
@@ -78,7 +78,7 @@ class Ledger:
     def _take(self, row: Row) -> None:
         self.rows[row["out"]] = row
         if row["status"] == "ok":
-            self.written.add(row["out"])
+            self.written[row["out"]] = row["output"]
 
 
 def is_unfinished_row(text: bytes) -> bool:

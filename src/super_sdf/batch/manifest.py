@@ -21,7 +21,7 @@ from ..convert import ConvertOptions
 from ..errors import FileError, OptionError
 from ..files.formats import AXES, mesh_path
 from ..files.meshes import MESH_SUFFIXES
-from ..grid.field import FIELDS
+from ..grid.field import FIELDS, check_label
 from ..grid.sides import INSIDE
 from ..options import check_error, check_goal, check_iterations, check_triangles
 from ..steps.mesher_names import MESHERS
@@ -113,18 +113,19 @@ def _job(entry: Entry, home: Path, suffix: str, options: ConvertOptions) -> Job:
     if unknown:
         raise OptionError(f"{unknown[0]!r} is unknown: give in, out, {', '.join(CHECKS)}")
     asked = {name: CHECKS[name](name, value) for name, value in entry.items()}
-    name = _default_target(source, suffix) if target is None else _check_target(target)
+    label = asked.get("label", options.label)
+    name = _default_target(source, suffix, label) if target is None else _check_target(target)
     if asked.keys() & {"simplify", "triangles"}:  # one of them replaces the other
         asked = {"simplify": None, "triangles": None, **asked}
         check_goal(asked["simplify"], asked["triangles"], ("'simplify'", "'triangles'"))
     return Job(home / source, name.as_posix(), replace(options, **asked))
 
 
-def _default_target(source: str, suffix: str) -> PurePath:
+def _default_target(source: str, suffix: str, label: int | None) -> PurePath:
     """Return the path of a mesh in the output folder: that of the grid below the manifest."""
     if PurePath(source).name in ("", ".."):
         raise OptionError(f"'in' is {source!r}: give the path of a grid")
-    path = mesh_path(PurePath(source), suffix)
+    path = mesh_path(PurePath(source), suffix, label)
     return PurePath(path.name) if path.is_absolute() or ".." in path.parts else path
 
 
@@ -228,6 +229,10 @@ def _error(name: str, value: Any) -> float:
     return check_error(_number(name, value), repr(name))
 
 
+def _label(name: str, value: Any) -> int:
+    return check_label(value, repr(name))
+
+
 def _triangles(name: str, value: Any) -> int:
     return check_triangles(value, repr(name))
 
@@ -241,7 +246,7 @@ CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "axes": _axes,
     "inside": _inside,
     "field": _field,
-    "label": _number,
+    "label": _label,
     "level": _number,
     "scale": _scale,
     "offset": _number,

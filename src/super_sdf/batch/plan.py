@@ -7,13 +7,13 @@ import json
 import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 from .. import __version__
-from ..grid.field import AUTO
+from ..files.store import files_of
 from ..network.names import AUTO_PRECISION
 from ..network.network import find_model
-from ..steps.mesher_names import MARCHING
 from .fingerprint import file_state, fingerprint, is_unchanged
 from .job import Job, Result, Row, failed_row
 from .journal import Journal, read_journal
@@ -33,7 +33,7 @@ class Settings:
     threads, workers : int
         Threads of each worker process, and worker processes; 0: chosen by the number of cores.
     force : bool
-        Convert everything again; replace files that no batch made.
+        Convert everything again; replace files that are not as a batch made them.
     retry : bool
         Try inputs again that failed before.
     fail_fast : bool
@@ -109,6 +109,7 @@ class Planner:
 
     def __init__(self, settings: Settings, ledger: Ledger, journal: Journal) -> None:
         self.settings, self.ledger, self.journal = settings, ledger, journal
+        self.jobs: Sequence[Job] = ()
         path, symmetries = find_model(settings.model, settings.precision)
         network = fingerprint(path)
         self.network = network and network["sha256"], symmetries
@@ -120,6 +121,7 @@ class Planner:
         that an earlier run started and never finished come last: they may have killed it.
         """
         batch = Batch(self.settings)
+        self.jobs = jobs
         for job in jobs:
             row = self._known(job) or self._refused(job)
             if row is None:
@@ -127,7 +129,7 @@ class Planner:
             else:
                 before = batch.done_before if row["status"] == "ok" else batch.failed_before
                 before.append(Result(job, row))
-        last = self.journal.started - self.ledger.written
+        last = self.journal.started.difference(self.ledger.written)
         batch.waiting.sort(key=lambda job: (job.target in last, -expected_work(job)))
         batch.work = sum(map(expected_work, batch.waiting))
         return batch
@@ -139,17 +141,6 @@ class Planner:
         follows the device, the network for the CPU counts.
         """
         options = asdict(replace(job.options, max_memory=None))
-        if options["mesher"] == MARCHING:
-            del options["mesher"]  # so that rows of versions without this option still hold
-        for name in ("axes", "direction", "label", "level", "scale"):
-            if options[name] is None:
-                del options[name]
-        if options["iterations"] == 1:
-            del options["iterations"]
-        if options["field"] == AUTO:
-            del options["field"]
-        if not job.options.simplifies:
-            del options["simplify"], options["triangles"]
         settings = [options, self.network, __version__]
         return hashlib.sha256(json.dumps(settings).encode()).hexdigest()
 
@@ -170,26 +161,47 @@ class Planner:
         return row
 
     def _refused(self, job: Job) -> Row | None:
-        """Return a failed row if the output exists and no batch made it, else None."""
-        if not os.path.lexists(self._path(job)) or self.may_replace(job):
+        """Return a failed row if the output exists and may not be replaced, else None."""
+        path = self._path(job)
+        if not os.path.lexists(path):
             return None
-        reason = f"{self._path(job)} exists and was not made by a batch: remove it or use --force"
+        if os.path.exists(path) and (read := self.inputs.get(_identity(path))):
+            reason = f"{path} is the same file as {read}: remove that link"
+        elif self.may_replace(job):
+            return None
+        else:
+            made = job.target in self.ledger.written
+            why = "was changed after a batch made it" if made else "was not made by a batch"
+            reason = f"{path} exists and {why}: remove it or use --force"
         return {**failed_row(job, reason), "options": self.digest(job)}
 
     def may_replace(self, job: Job) -> bool:
         """Return whether a job may replace the existing file.
 
-        It may if a batch made that file: it has a row in the ledger, or its hash is in the journal
+        It may if a batch made that file as it is: its hash is in the ledger, or in the journal
         because the process was killed before the row was written.
         """
-        if self.settings.force or job.target in self.ledger.written:
+        known, path = self.ledger.written.get(job.target), self._path(job)
+        if self.settings.force or (known and is_unchanged(path, known)):
             return True
         digests = self.journal.made.get(job.target)
-        now = fingerprint(self._path(job)) if digests else None
+        now = fingerprint(path) if digests else None
         return digests is not None and now is not None and now["sha256"] in digests
+
+    @cached_property
+    def inputs(self) -> dict[tuple[int, int], Path]:
+        """The files that the jobs read, by their identity."""
+        files = (file for job in self.jobs for file in files_of(job.source))
+        return {_identity(file): file for file in files if file.is_file()}
 
     def _path(self, job: Job) -> Path:
         return self.settings.folder / job.target
+
+
+def _identity(path: Path) -> tuple[int, int]:
+    """Return what two names of one file have in common."""
+    state = path.stat()
+    return state.st_dev, state.st_ino
 
 
 def preview(jobs: Sequence[Job], settings: Settings) -> Batch:

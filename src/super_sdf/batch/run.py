@@ -48,7 +48,7 @@ class Run:
     def __init__(self, jobs: Sequence[Job], settings: Settings, lock: FolderLock) -> None:
         self.settings, self.lock = settings, lock
         self.ledger = Ledger(settings.folder)
-        lock.started -= self.ledger.written
+        lock.started.difference_update(self.ledger.written)
         self.planner = Planner(settings, self.ledger, read_journal(settings.folder))
         self.batch = self.planner.plan(jobs)
         self.died: set[str] = set()  # outputs whose worker died once

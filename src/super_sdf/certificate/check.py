@@ -62,7 +62,7 @@ class CheckOptions:
     axes: str | None = None
     direction: tuple[float, ...] | None = None
     field: str = "auto"
-    label: float | None = None
+    label: int | None = None
     level: float | None = None
     scale: float | None = None
 

@@ -26,7 +26,7 @@ from .conversion import (
     make_options,
 )
 from .interrupts import describe_interrupt, raising_interrupts
-from .reporting import check_report, report_option
+from .reporting import check_page, report_option
 
 if TYPE_CHECKING:
     from ..batch.job import Job
@@ -92,7 +92,7 @@ Examples:
 @click.option(
     "--force",
     is_flag=True,
-    help="Convert everything again; replace files that no batch wrote.",
+    help="Convert everything again; replace files that are not as a batch wrote them.",
 )
 @click.option("--dry-run", is_flag=True, help="Show what would be done; write nothing.")
 @click.option("--json", "as_json", is_flag=True, help="Print the summary, or the plan, as JSON.")
@@ -119,7 +119,7 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
     jobs, unread = find_jobs(sources, f".{options['kind']}", make_options(options))
     check_jobs_can_be_simplified(jobs)
     if options["report"]:
-        check_page(options["report"], jobs, folder, force=options["force"])
+        check_batch_page(options["report"], jobs, folder, force=options["force"])
     model = chosen_model(options)
     find_model(model, options["precision"])
     flags = {name: options[name] for name in ("force", "retry", "fail_fast", "check")}
@@ -154,18 +154,18 @@ def check_jobs_can_be_simplified(jobs: list[Job]) -> None:
         check_can_simplify("simplify")
 
 
-def check_page(page: Path, jobs: list[Job], folder: Path, *, force: bool) -> None:
+def check_batch_page(page: Path, jobs: list[Job], folder: Path, *, force: bool) -> None:
     """Raise if the page or the folder beside it cannot be written.
 
     A page that super-sdf wrote may be replaced, so that a batch can be resumed.
     """
     from ..batch.items import items_folder
-    from ..files.formats import split_member
+    from ..files.store import files_of
     from ..pages.html import is_page
 
     check_modules("--report", "report")
-    files = [path for job in jobs for path in (split_member(job.source)[0], folder / job.target)]
-    check_report(page, files, force=force or is_page(page))
+    files = (path for job in jobs for path in (*files_of(job.source), folder / job.target))
+    check_page("--report", page, files, force=force or is_page(page))
     beside = items_folder(page)
     if beside.exists() and not beside.is_dir():
         raise WriteError(f"{beside}, for the meshes of the page, is no folder: move it")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,7 @@ from .choices import (
     qualities,
     signs_inside,
 )
+from .common import one_line_errors
 
 if TYPE_CHECKING:
     from ..convert import ConvertOptions
@@ -64,6 +66,17 @@ def parse_direction(
     if len(numbers) != 9:
         raise click.BadParameter(f"{value!r}: give nine numbers separated by commas, row by row")
     return numbers
+
+
+def parse_label(ctx: click.Context, param: click.Parameter, value: str | None) -> int | None:
+    """Parse a whole number of up to 64 bits, never as a float."""
+    if value is None:
+        return None
+    from ..grid.field import check_label
+
+    with one_line_errors():
+        is_whole = re.fullmatch("[-+]?[0-9]{1,20}", value)
+        return check_label(int(value) if is_whole else value, "--label")
 
 
 UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9}
@@ -147,7 +160,7 @@ GRID_OPTIONS: tuple[Option, ...] = (
         "distances; auto goes by what the samples show.",
         type=LazyChoice(fields),
     ),
-    _number("--label", "N", "Mesh the samples with the value N of a label image."),
+    _parsed("--label", "N", "Mesh the samples with the value N of a label image.", parse_label),
     _number(
         "--level",
         "L",

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 from pathlib import Path
 
 import click
 
 from ..errors import OptionError
-from ..machine.extras import check_modules
 
 PAGES = (".html", ".htm")
 
@@ -22,23 +20,18 @@ report_option = click.option(
 )
 
 
-def check_report(page: Path, others: Iterable[str | Path], *, force: bool) -> None:
+def check_page(option: str, page: Path, others: Iterable[str | Path], *, force: bool) -> None:
     """Raise if a page cannot be written; called before the work starts.
-
-    ``others`` are the inputs and outputs, which it must not replace.
 
     Raises
     ------
     SuperSdfError
-        If the extra is missing, the suffix is another, the file exists and ``force`` is not set, or
-        it is one of the others.
+        If the suffix is another, the file exists and ``force`` is not set, or it is one of
+        the others, the inputs and outputs.
     """
-    from ..files.output import check_free
+    from ..files.output import check_apart, check_free
 
-    check_modules("--report", "report")
     if page.suffix.lower() not in PAGES:
-        raise OptionError(f"{page} is not a page: give --report a file {' or '.join(PAGES)}")
+        raise OptionError(f"{page} is not a page: give {option} a file {' or '.join(PAGES)}")
     check_free(page, force=force)
-    for other in others if page.exists() else ():
-        if os.path.exists(other) and os.path.samefile(page, other):
-            raise OptionError(f"--report {page} is {other}: give another file")
+    check_apart(page, others)

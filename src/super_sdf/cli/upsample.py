@@ -14,6 +14,7 @@ import click
 
 from ..errors import OptionError
 from ..files.formats import NAMED, list_formats
+from ..machine.extras import check_modules
 from .common import CONTEXT, one_line_errors, print_stderr, print_stdout, progress_bar
 from .conversion import (
     check_can_check,
@@ -26,7 +27,7 @@ from .conversion import (
     make_options,
 )
 from .interrupts import raising_interrupts
-from .reporting import check_report, report_option
+from .reporting import check_page, report_option
 
 if TYPE_CHECKING:
     from ..certificate.check import Certificate
@@ -201,11 +202,12 @@ class Upsampling:
 
     def check_page(self) -> None:
         """Raise if the page cannot be written, or would replace what is read or written."""
-        from ..files.formats import split_member
+        from ..files.store import files_of
 
+        check_modules("--report", "report")
         field = [self.options["save_field"]] if self.options["save_field"] else []
-        files = split_member(Path(self.source))[0], self.target, *field
-        check_report(self.options["report"], files, force=self.options["force"])
+        files = *files_of(self.source), self.target, *field
+        check_page("--report", self.options["report"], files, force=self.options["force"])
 
     def write_page(self) -> None:
         """Write the page; what cannot be shown in it is said there."""

@@ -1,21 +1,23 @@
-"""The command ``view``: meshes and grids in the browser, from a server on this machine."""
+"""The command ``view``: meshes and grids in the browser, from a page in a file."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import click
 
 from ..machine.extras import EXTRAS, check_modules
-from .common import CONTEXT, InterruptedCommand, one_line_errors, print_stderr
+from .common import CONTEXT, one_line_errors, print_stderr
 from .conversion import check_simplification, chosen_model, conversion_options, make_options
 from .interrupts import raising_interrupts
+from .reporting import check_page
 
 NEEDED = (*EXTRAS["eval"], *EXTRAS["simplify"])  # of the extra report: nothing is drawn here
 EXAMPLES = """\b
 Examples:
   super-sdf view part.npz
-  super-sdf view part.ply other.stl --port 8000 --no-browser
+  super-sdf view part.ply other.stl --out page.html --no-browser
 """
 
 
@@ -27,12 +29,12 @@ Examples:
 )
 @click.argument("sources", metavar="MESH|GRID...", nargs=-1, required=True)
 @click.option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    default=0,
-    show_default=True,
-    help="Port of the server; 0 means any that is free.",
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="PAGE.html",
+    help="File for the page. Default: one in the temporary folder that only you can read.",
 )
+@click.option("--force", is_flag=True, help="Replace PAGE.html if it exists.")
 @click.option("--no-browser", is_flag=True, help="Print the address and open no browser.")
 @conversion_options
 def view_command(sources: tuple[str, ...], **options: Any) -> None:
@@ -40,21 +42,28 @@ def view_command(sources: tuple[str, ...], **options: Any) -> None:
 
     MESH is any mesh file that trimesh reads. GRID is what upsample takes; its refined mesh is shown
     beside coarse marching cubes of the samples, from one camera, with the residuals of its samples
-    as colours. Nothing is written; the options below apply to grids.
+    as colours. The options below apply to grids.
 
-    The page comes from a server that only this machine can reach, at an address with a secret
-    token. Ctrl-C ends it. Needs the extra report.
+    The page is one file, which shows all of it without a server; its address is printed. Needs the
+    extra report.
     """
-    with one_line_errors(), raising_interrupts():
-        check_modules("view", "report", NEEDED)
-        serve(viewed(sources, options), options)
+    with one_line_errors():
+        page = write_view(sources, options)
+    print_stderr(page.as_uri())
+    if not options["no_browser"]:
+        open_browser(page)
 
 
-def viewed(sources: tuple[str, ...], options: dict[str, Any]) -> dict[str, str]:
-    """Read and refine the files; return the texts to serve."""
+def write_view(sources: tuple[str, ...], options: dict[str, Any]) -> Path:
+    """Read and refine the files and write their page; return its absolute path."""
     from ..network.network import Network, load_network
-    from ..pages.viewing import viewed_texts
+    from ..pages.html import write_page
+    from ..pages.viewing import viewed_page
 
+    check_modules("view", "report", NEEDED)
+    page, force = options["out"], options["force"]
+    if page:
+        check_page("--out", page, sources, force=force)
     check_simplification(options)
     model = chosen_model(options)
 
@@ -62,23 +71,23 @@ def viewed(sources: tuple[str, ...], options: dict[str, Any]) -> dict[str, str]:
         chosen = {name: options[name] for name in ("device", "threads", "precision")}
         return load_network(model, **chosen)
 
-    return viewed_texts(sources, load, make_options(options))
+    with raising_interrupts():
+        text = viewed_page(sources, load, make_options(options))
+        page = page or private_file()
+        write_page(text, page, force=force)
+    return Path(page).absolute()
 
 
-def serve(texts: dict[str, str], options: dict[str, Any]) -> None:
-    """Serve the texts until a signal ends it."""
-    import threading
+def private_file() -> Path:
+    """Return the path of a file in a temporary folder that only this user can read."""
+    from tempfile import mkdtemp
+
+    return Path(mkdtemp(prefix="super-sdf-"), "view.html")
+
+
+def open_browser(page: Path) -> None:
+    """Open a page in the browser of this user, or say that there is none."""
     import webbrowser
 
-    from ..pages.server import PageServer
-
-    with PageServer(texts, options["port"]) as server:
-        print_stderr(f"{server.address} (Ctrl-C ends it)")
-        if not options["no_browser"]:
-            open_beside = threading.Thread(target=webbrowser.open, args=[server.address])
-            open_beside.daemon = True  # a browser in the terminal returns when it is closed
-            open_beside.start()
-        try:
-            server.serve_forever()
-        except KeyboardInterrupt as error:
-            raise InterruptedCommand("; the page is closed", error) from None
+    if not webbrowser.open(page.as_uri()):
+        print_stderr("Note: no browser can be started here: open that address in yours")

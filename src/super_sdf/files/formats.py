@@ -103,17 +103,20 @@ def split_member(path: str | PurePath) -> tuple[Path, str | None]:
     return (Path(found["file"]), found["member"]) if found else (Path(path), None)
 
 
-def mesh_path(path: PurePath, suffix: str) -> PurePath:
+def mesh_path(path: PurePath, suffix: str, label: int | None = None) -> PurePath:
     """Return the path of a grid with the suffix of a mesh.
 
-    The name of an array in the file becomes a part of it: ``a.h5:/b/c`` becomes ``a-b-c.ply``.
+    The name of an array in the file becomes a part of it, and the label whose mesh it is:
+    ``a.h5:/b/c`` becomes ``a-b-c.ply``, and with the label 3 ``a-b-c-label3.ply``.
     """
     file, member = split_member(path)
-    ending = _ending(file)
+    ending = _ending(file) or file.suffix
     stem = file.name[: len(file.name) - len(ending)]
     if member:
         stem += "-" + member.strip("/").replace("/", "-")
-    return PurePath(file).with_name(stem + suffix) if ending else PurePath(path).with_suffix(suffix)
+    if label is not None:
+        stem += f"-label{label}"
+    return PurePath(file).with_name(stem + suffix)
 
 
 def check_library(format_: GridFormat) -> None:

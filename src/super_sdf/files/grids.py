@@ -70,7 +70,7 @@ def read_grid(
     axes: str | None = None,
     inside: str = "auto",
     field: str = "auto",
-    label: float | None = None,
+    label: int | None = None,
     level: float | None = None,
     scale: float | None = None,
     max_memory: int | None = None,

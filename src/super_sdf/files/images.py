@@ -23,7 +23,7 @@ def grid_from_image(
     *,
     inside: str = "auto",
     field: str = "auto",
-    label: float | None = None,
+    label: int | None = None,
     level: float | None = None,
     scale: float | None = None,
     max_memory: int | None = None,

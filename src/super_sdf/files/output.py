@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import shutil
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from ..errors import SuperSdfError, WriteError
 from .parts import reserved_part
+
+WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 
 
 def check_free(path: Path, *, force: bool = False) -> Path:
@@ -30,12 +32,20 @@ def check_free(path: Path, *, force: bool = False) -> Path:
         raise WriteError(f"{path} exists: remove it or use --force")
     if kind is not None and not stat.S_ISREG(kind):
         raise WriteError(f"{path} is not a regular file: give another name")
+    _check_not_protected(path, kind)
     folder = _behind_links(path).parent
     if not folder.is_dir():
         raise WriteError(f"{folder} is not a folder: make it first")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise WriteError(f"{path} cannot be written: no permission in {folder}")
     return path
+
+
+def check_apart(path: str | Path, others: Iterable[str | Path]) -> None:
+    """Raise WriteError if writing a file would replace another one, by whatever name or link."""
+    for other in others if os.path.exists(path) else ():
+        if os.path.exists(other) and os.path.samefile(path, other):
+            raise WriteError(f"{path} is the same file as {other}: give another file")
 
 
 def _kind_at(path: Path) -> int | None:
@@ -46,6 +56,15 @@ def _kind_at(path: Path) -> int | None:
         return None
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise _cannot_be_written(path, error) from error
+
+
+def _check_not_protected(path: Path, mode: int | None) -> None:
+    """Raise WriteError if the file at a path, of some mode, may not be written to.
+
+    A rename would replace it all the same; and root may write to it, but it was protected.
+    """
+    if mode is not None and not (mode & WRITABLE and os.access(path, os.W_OK)):
+        raise WriteError(f"{path} is write-protected: allow writing to it, or give another name")
 
 
 def _behind_links(path: Path) -> Path:
@@ -71,8 +90,8 @@ def replacing(
 ) -> Iterator[Path]:
     """Yield a temporary path beside the target, renamed to the target if the block succeeds.
 
-    A link stays, and the file it points to is replaced. Temporary files of the same target that
-    killed processes left are removed.
+    A link stays, and the file it points to is replaced and keeps its mode. Temporary files of the
+    same target that killed processes left are removed.
 
     Parameters
     ----------
@@ -94,7 +113,10 @@ def replacing(
             yield part
             if before_rename:
                 before_rename(part)
-            (os.replace if force else _rename_if_free)(part, target)
+            if force:
+                _replace(part, target)
+            else:
+                _rename_if_free(part, target)
     except _NameTakenError:
         raise WriteError(
             f"{path} was created by another program meanwhile: remove it or use --force"
@@ -114,6 +136,15 @@ def naming(path: Path) -> Iterator[None]:
         raise
     except OSError as error:
         raise _cannot_be_written(path, error) from error
+
+
+def _replace(part: Path, target: Path) -> None:
+    """Rename a file to a target, whose mode it takes over if that exists."""
+    mode = _kind_at(target)
+    _check_not_protected(target, mode)
+    if mode is not None:
+        part.chmod(stat.S_IMODE(mode))
+    os.replace(part, target)
 
 
 def _rename_if_free(part: Path, target: Path) -> None:

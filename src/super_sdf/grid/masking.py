@@ -5,12 +5,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import GridError
 from .evidence import ENOUGH, Looked
-from .field import AUTO, MASK, NONE_EXACT, Field
+from .field import AUTO, MASK, NONE_EXACT, Field, check_label
 from .masks import extremes_of_masks, has_both_sides, mask_planes
 from .planes import SampleArray, changed
 from .request import Interpreted, Request
@@ -25,16 +27,29 @@ MOST_LABELS = 64  # whole numbers up to this look like labels
 MOST_NAMED = 8  # labels that a message lists
 
 
-def labelled(samples: SampleArray, label: float) -> SampleArray:
+def labelled(samples: SampleArray, label: int) -> SampleArray:
     """Return which samples have a label; GridError if none or all have."""
-    found = changed(samples, lambda planes: planes == label, np.bool_)
-    if not has_both_sides(found):
-        labels = sorted({float(x) for plane in samples for x in np.unique(plane)[: MOST_NAMED + 1]})
-        named = ", ".join(f"{x:g}" for x in labels[:MOST_NAMED])
-        named += ", ..." if len(labels) > MOST_NAMED else ""
-        which = "every sample" if (np.asarray(samples[0]) == label).any() else "no sample"
-        raise GridError(f"{which} has the label {label:g}: the labels are {named}")
-    return found
+    label = check_label(label)
+    value = as_sample(label, samples.dtype)
+    if value is not None:
+        found = changed(samples, lambda planes: planes == value, np.bool_)
+        if has_both_sides(found):
+            return found
+    labels = sorted({x.item() for plane in samples for x in np.unique(plane)[: MOST_NAMED + 1]})
+    named = ", ".join(f"{x:g}" if x % 1 else str(int(x)) for x in labels[:MOST_NAMED])
+    named += ", ..." if len(labels) > MOST_NAMED else ""
+    which = "every sample" if value is not None and labels == [value] else "no sample"
+    raise GridError(f"{which} has the label {label}: the labels are {named}")
+
+
+def as_sample(label: int, dtype: np.dtype[Any]) -> Any:
+    """Return the sample that is exactly a label, None if the type has none."""
+    if dtype.kind == "f":
+        with np.errstate(over="ignore"):
+            value = dtype.type(label)
+        return value if np.isfinite(value) and int(value) == label else None
+    low, high = (0, 1) if dtype.kind == "b" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
+    return dtype.type(label) if low <= label <= high else None
 
 
 def above(samples: SampleArray, level: float) -> SampleArray:

@@ -227,7 +227,7 @@ def make_grid(
     direction: ArrayLike | None = None,
     inside: str = "auto",
     field: str = AUTO,
-    label: float | None = None,
+    label: int | None = None,
     level: float | None = None,
     scale: float | None = None,
 ) -> SdfGrid:
@@ -255,8 +255,8 @@ def make_grid(
     field : {"auto", "exact", "truncated", "mask", "scaled", "noisy"}
         What the values are; "auto" goes by what the samples show. A mask is known to half a voxel,
         and scaled is a field of another slope than 1.
-    label : number, optional
-        The samples with this value are the solid.
+    label : int, optional
+        The samples with this value are the solid; from -2^63 to 2^64 - 1.
     level : number, optional
         The values are densities, and the surface is where they have this value; what is above is
         inside, unless ``inside`` is "negative".

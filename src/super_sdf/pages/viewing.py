@@ -14,16 +14,14 @@ from ..network.decoder import Decoder
 from ..truth.mesh_files import read_mesh
 from .entries import Entry, entry_of, entry_of_report, numbers
 from .html import make_page
-from .items import Item, add_mesh, item_call, item_of_files
+from .items import Item, add_mesh, item_of_files
 from .shown import shown_result
 
-FOLDER = "meshes"  # of the address, where the page finds them
 
-
-def viewed_texts(
+def viewed_page(
     sources: Sequence[str], load: Callable[[], Decoder], options: ConvertOptions
-) -> dict[str, str]:
-    """Return the page of some meshes and grids, under "", and the script of each one's meshes.
+) -> str:
+    """Return the page of some meshes and grids; all that it shows is within it.
 
     Parameters
     ----------
@@ -40,16 +38,16 @@ def viewed_texts(
         If a file cannot be read or refined.
     """
     network = load() if any(map(is_grid, sources)) else None
-    entries, texts = [], {}
+    entries, meshes = [], {}
     for number, source in enumerate(sources):
         seen = view_grid(source, network, options) if network and is_grid(source) else None
         entry, item = seen or view_mesh(source, options.max_memory)
-        path = f"{FOLDER}/{number}.js"
-        entries.append(entry | {"id": str(number), "meshes": path if item.meshes else None})
-        texts[path] = item_call(item, str(number))
+        meshes[str(number)] = item.meshes
+        within = "page" if item.meshes else None
+        entries.append(entry | {"id": str(number), "meshes": within})
     title = Path(sources[0]).name if len(sources) == 1 else f"{len(sources)} files"
     facts = {"title": title, "lead": "", "alert": "", "summary": [], "notes": [], "files": entries}
-    return {"": make_page(facts, beside=True), **texts}
+    return make_page(facts, meshes)
 
 
 def view_grid(source: str, network: Decoder, options: ConvertOptions) -> tuple[Entry, Item]:
