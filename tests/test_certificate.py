@@ -343,6 +343,7 @@ def test_the_coloured_mesh_is_a_mesh_with_residuals(here, command):
         ("ball.ply ball.npz --out c.stl", 2, "c.stl is not a coloured mesh file: give .ply"),
         ("ball.ply ball.npz --out no/c.ply", 1, "no is not a folder: make it first"),
         ("ball.ply ball.npz --out off.ply", 1, "off.ply exists: remove it or use --force"),
+        ("ball.ply ball.npz --out ball.ply --force", 1, "ball.ply is the same file as ball.ply:"),
         ("ball.ply ball.npz --max-share 2", 2, "--max-share is 2: give a share from 0 to 1"),
         ("ball.ply ball.npz --max-mean nan", 2, "--max-mean is nan: give 0 voxels or more"),
         ("ball.ply ball.npz --max-residual -1", 2, "--max-residual is -1: give 0 voxels or more"),

@@ -11,9 +11,10 @@ import click
 import numpy as np
 import pytest
 import trimesh
-from conftest import ball
+from conftest import ball, trilinear
 
 import super_sdf
+from super_sdf import reconstruct, write_mesh
 from super_sdf.cli import main as cli
 from super_sdf.cli.upsample import upsample_command
 from super_sdf.files.formats import GRID_SUFFIXES
@@ -279,6 +280,35 @@ def test_a_factor_beyond_memory_is_refused_before_the_work(here, command, monkey
     assert code == 1 and err.startswith("Error: factor 16 on ")
     assert re.search(r" [MG]B of memory even plane by plane, ", err)
     assert err.endswith("(--max-memory)\n")
+
+
+OWN_INPUTS = {
+    "upsample in.npy out.ply --factor 2 --quality fast": ("in.npy", "out.ply"),
+    "upsample in.npy new.ply --factor 2 --quality fast --save-field out.npy": ("in.npy", "out.npy"),
+    "upsample raw.mhd out.ply --factor 2 --quality fast": ("raw.bin", "out.ply"),
+    "check ball.ply in.npy --out out.ply": ("ball.ply", "out.ply"),
+    "sample ball.ply out.npz -n 9": ("ball.ply", "out.npz"),
+    "render ball.ply out.png": ("ball.ply", "out.png"),
+}
+
+
+@pytest.mark.parametrize("words", OWN_INPUTS)
+@pytest.mark.parametrize("link", [os.link, os.symlink])
+def test_no_command_writes_over_its_own_input(here, command, words, link):
+    values = np.load("in.npy").astype("<f4")
+    values.tofile("raw.bin")
+    size = " ".join(map(str, values.shape[::-1]))
+    Path("raw.mhd").write_text(
+        f"ObjectType = Image\nNDims = 3\nDimSize = {size}\nElementType = MET_FLOAT\n"
+        "ElementDataFile = raw.bin\n"
+    )
+    write_mesh(reconstruct(ball(12, 3.0), trilinear, 2), "ball.ply")
+    source, target = OWN_INPUTS[words]
+    link(source, target)
+    before, names = Path(source).read_bytes(), sorted(os.listdir())
+    want = f"Error: {target} is the same file as {source}: give another file\n"
+    assert command(*words.split(), "--force") == (1, "", want)
+    assert Path(source).read_bytes() == before and sorted(os.listdir()) == names
 
 
 TARGETS = {

@@ -112,12 +112,15 @@ def run_check(mesh: Path, grid: Path, options: dict[str, Any]) -> list[str]:
     from ..certificate.check import check_files
     from ..certificate.coloured import check_coloured, write_coloured
     from ..certificate.limits import Limits
+    from ..files.output import check_apart
+    from ..files.store import files_of
 
     names = ("max_residual", "max_mean", "max_share", "no_faults")
     limits = Limits(**{name: options[name] for name in names})
     limits.check()
     if options["out"]:
         check_coloured(options["out"], force=options["force"])
+        check_apart(options["out"], [mesh, *files_of(grid)])
     certificate = check_files(mesh, grid, make_check_options(options))
     if options["out"]:
         with raising_interrupts():

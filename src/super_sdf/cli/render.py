@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +108,8 @@ def render_command(sources: tuple[Path, ...], target: Path, **options: Any) -> N
     with one_line_errors(target):
         grids = [source for source in sources if is_grid(source)]
         check_modules("render", "view", EXTRAS["eval"] if grids else None)
-        check_picture(target, force=options["force"])
+        inputs = [*sources, *filter(None, [options["reference"]])]
+        check_picture(target, inputs, force=options["force"])
         if grids and len(sources) > 1:
             raise OptionError(f"{grids[0]} is a grid: give it alone, or meshes only")
         check_given(FOR_MESHES if grids else FOR_GRIDS, "a grid" if grids else "meshes")
@@ -122,13 +124,15 @@ def check_given(others: tuple[str, ...], drawn: str) -> None:
             raise OptionError(f"--{name} does not apply to {drawn}: leave it out")
 
 
-def check_picture(target: Path, *, force: bool) -> None:
+def check_picture(target: Path, inputs: Iterable[Path], *, force: bool) -> None:
     """Raise if the picture cannot be written; called before the work starts."""
-    from ..files.output import check_free
+    from ..files.output import check_apart, check_free
+    from ..files.store import files_of
 
     if target.suffix.lower() != ".png":
         raise OptionError(f"{target} is not a picture file: give .png")
     check_free(target, force=force)
+    check_apart(target, [file for each in inputs for file in files_of(each)])
 
 
 def render_meshes(sources: tuple[Path, ...], target: Path, options: dict[str, Any]) -> None:
