@@ -212,7 +212,7 @@ class Upsampling:
     def write_page(self) -> None:
         """Write the page; what cannot be shown in it is said there."""
         from ..certificate.check import CheckOptions
-        from ..pages.single import write_single
+        from ..pages.viewing import write_single
         from ..progress import Stopwatch
 
         watch, page = Stopwatch(), self.options["report"]

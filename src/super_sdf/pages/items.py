@@ -114,13 +114,9 @@ def write_item(item: Item, path: Path) -> None:
     """Write the file of an item, complete or not at all; its stem is the id that the page uses."""
     size = sum(len(mesh["data"]) for mesh in item.meshes)
     head = json.dumps({**vars(item), "meshes": [], "size": size})
+    call = f"{CALL}({json.dumps(path.stem)}, {json.dumps(item.meshes)});"
     with replacing(path) as part:
-        part.write_bytes(COMMENT + f"{head}\n{item_call(item, path.stem)}\n".encode("ascii"))
-
-
-def item_call(item: Item, name: str) -> str:
-    """Return the line of script that hands the meshes of an item to the page."""
-    return f"{CALL}({json.dumps(name)}, {json.dumps(item.meshes)});"
+        part.write_bytes(COMMENT + f"{head}\n{call}\n".encode("ascii"))
 
 
 def read_head(path: Path) -> Item | None:

@@ -1,21 +1,56 @@
-"""The page of ``super-sdf view``: meshes, and grids that are refined for it."""
+"""Pages that hold all that they show: of one conversion, and of ``super-sdf view``."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
-from ..certificate.check import CheckOptions
+from ..certificate.check import Certificate, CheckOptions
 from ..convert import ConvertOptions, convert
 from ..files.formats import is_grid
 from ..network.decoder import Decoder
 from ..truth.mesh_files import read_mesh
-from .entries import Entry, entry_of, entry_of_report, numbers
-from .html import make_page
+from .entries import Entry, entry_of, entry_of_report, numbers, tiles
+from .html import make_page, write_page
 from .items import Item, add_mesh, item_of_files
 from .shown import shown_result
+
+
+def write_single(
+    path: Path,
+    report: Mapping[str, Any],
+    options: CheckOptions,
+    certificate: Certificate | None = None,
+    *,
+    force: bool = False,
+) -> None:
+    """Write the page of a conversion.
+
+    Parameters
+    ----------
+    path : Path
+        The page.
+    report : dict
+        As ``upsample --json`` prints it: with ``input`` and ``output``.
+    options : CheckOptions
+        How the grid is read again.
+    certificate : Certificate, optional
+        If there is one already.
+    force : bool
+        Replace the page if it exists.
+
+    Raises
+    ------
+    WriteError
+        If it cannot be written.
+    """
+    item = item_of_files(report["output"], report["input"], options, certificate)
+    name = Path(report["output"]).name
+    entry = entry_of_report(name, report, item)
+    write_page(whole_page(name, [(entry, item)], tiles(entry)), path, force=force)
 
 
 def viewed_page(
@@ -38,16 +73,25 @@ def viewed_page(
         If a file cannot be read or refined.
     """
     network = load() if any(map(is_grid, sources)) else None
-    entries, meshes = [], {}
-    for number, source in enumerate(sources):
+    shown = []
+    for source in sources:
         seen = view_grid(source, network, options) if network and is_grid(source) else None
-        entry, item = seen or view_mesh(source, options.max_memory)
+        shown.append(seen or view_mesh(source, options.max_memory))
+    title = Path(sources[0]).name if len(sources) == 1 else f"{len(sources)} files"
+    return whole_page(title, shown)
+
+
+def whole_page(
+    title: str, shown: Sequence[tuple[Entry, Item]], summary: Sequence[Sequence[str]] = ()
+) -> str:
+    """Return a page with the meshes of its entries; ``summary`` are rows of label and text."""
+    entries, meshes = [], {}
+    for number, (entry, item) in enumerate(shown):
         meshes[str(number)] = item.meshes
         within = "page" if item.meshes else None
         entries.append(entry | {"id": str(number), "meshes": within})
-    title = Path(sources[0]).name if len(sources) == 1 else f"{len(sources)} files"
-    facts = {"title": title, "lead": "", "alert": "", "summary": [], "notes": [], "files": entries}
-    return make_page(facts, meshes)
+    facts = {"title": title, "lead": "", "alert": "", "notes": [], "files": entries}
+    return make_page({**facts, "summary": summary}, meshes)
 
 
 def view_grid(source: str, network: Decoder, options: ConvertOptions) -> tuple[Entry, Item]:
