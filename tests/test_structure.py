@@ -23,7 +23,7 @@ READERS = {
     "files.readers.nifti": {"nibabel"},
     "files.readers.nrrd_file": {"nrrd"},
     "files.readers.tiff": {"tifffile"},
-    "files.readers.vdb": {"tinyvdb"},
+    "files.readers.vdb_tree": {"numcodecs"},
     "files.readers.vti": {"vtkmodules"},
     "files.readers.zarr_store": {"zarr"},
     "pyvista": {"pyvista"},

@@ -14,7 +14,7 @@ EXTRAS = {
     "tiff": ("tifffile",),
     "hdf5": ("h5py",),
     "zarr": ("zarr",),
-    "vdb": ("tinyvdb",),
+    "vdb": ("numcodecs",),
     "3mf": ("lxml", "networkx"),
     "pyvista": ("pyvista",),
     "simplify": ("igl", "pyfqmr"),

@@ -1,96 +1,207 @@
-"""OpenVDB level sets, with tinyvdb: the active voxels, and the sign of all others.
+"""OpenVDB level sets and densities: every voxel of the box round those that are not background.
 
-Voxel (i, j, k) is the sample at the grid's transform of (i, j, k).
+Voxel (i, j, k) is the sample at the grid's transform of (i, j, k). What a file has of a grid:
+flags of its compression, metadata, the transform and the tree (``vdb_tree``).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import GridError
+from ...errors import FileError, GridError
+from ...grid.planes import InputFile
+from ..boxes import Box
 from ..volume import Request, Volume, from_affine
 from .choosing import choose_member
+from .vdb_tree import LEAF, Coding, Cursor, Tree, read_tree
 
-MARGIN = 2  # voxels of background around the active ones, so that the border is outside
-DENSITIES = ("fog volume", "staggered")
+MAGIC = 0x56444220
+OLDEST = 222  # version of the file format, of OpenVDB 3
+MARGIN = 2  # voxels of background around the others, so that the border is outside
+TYPES: dict[str, np.dtype[Any]] = {
+    "Tree_float_5_4_3": np.dtype("<f4"),
+    "Tree_double_5_4_3": np.dtype("<f8"),
+}
+HALF = "_HalfFloat"  # ends the type of a grid whose values are stored in 16 bits
+NUMBERS = {"float": "f", "double": "d", "int32": "i", "int64": "q", "bool": "?"}  # of metadata
+# How many vectors a map has, and which are the translation and the scale.
+MAPS = {
+    "TranslationMap": (1, 0, None),
+    "ScaleMap": (5, None, 0),
+    "UniformScaleMap": (5, None, 0),
+    "ScaleTranslateMap": (6, 0, 1),
+    "UniformScaleTranslateMap": (6, 0, 1),
+}
+MATRICES = ("AffineMap", "UnitaryMap")
+PICOGK_MM = 1000  # PicoGK states the size of a voxel in metres, and works in millimetres
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A grid of a file: its name, the type of its tree, and where it begins."""
+
+    name: str
+    type: str
+    parent: str
+    place: int
 
 
 def read_vdb(request: Request) -> Volume:
-    """Read a level set of a ``.vdb`` file.
+    """Read a grid of floating-point values of a ``.vdb`` file.
 
-    Inactive voxels become the background, negative where the next active voxel before them on their
-    line is inside.
+    Every voxel has the value that OpenVDB gives it, inactive ones too. A background of 0 is no
+    distance: where values are signed, voxels that have it and are not active are unknown.
+
+    Raises
+    ------
+    FileError
+        If the file is no ``.vdb`` file, is damaged, or is of before OpenVDB 3.
+    GridError
+        If the grid has no voxel that is not background, or its transform is not affine.
     """
-    import tinyvdb
-
-    with tinyvdb.open(str(request.path)) as file:
-        grid = _choose(file, request)
-        metadata = grid.metadata
-        if metadata.get("class") in DENSITIES:
-            raise GridError(
-                f"{request.path} holds a {metadata['class']}, which is no signed distance: give a "
-                "level set"
-            )
-        sparse = grid.to_sparse()
-        ijk = np.frombuffer(sparse["coords"], np.int32).reshape(-1, 3)
-        values = np.frombuffer(sparse["values"], np.float32)
-        background = abs(float(grid.float_background()))
-        affine = _affine(grid.transform)
-    if not len(ijk):
-        raise GridError(f"{request.path} has no active voxel: it holds no surface")
-    level_set = _LevelSet(ijk, values, background)
-    spacing, _, direction = from_affine(affine)
-    first = affine[:, :3] @ level_set.first + affine[:, 3]
-    shape = level_set.shape
-    dtype = np.dtype(np.float32)
-    return Volume(shape, dtype, level_set.read, spacing, tuple(first), direction)
+    file = InputFile.open(request.path)
+    entries = _entries(file)
+    usable = [entry for entry in entries if entry.type.removesuffix(HALF) in TYPES]
+    names = [entry.name for entry in usable]
+    entry = usable[names.index(choose_member(request, names, "grid of floating-point values"))]
+    flags, metadata, affine, place = _read_head(file, entry.place)
+    if entry.parent:
+        flags, _, _, place = _read_head(file, _parent(entries, entry, file).place)
+    dtype = TYPES[entry.type.removesuffix(HALF)]
+    stored = np.dtype("<f2") if entry.type.endswith(HALF) else dtype
+    tree = read_tree(file, place, partial(Coding, dtype, stored, flags))
+    _check_count(file, tree, metadata)
+    return _volume(file, tree, metadata, affine)
 
 
-def _choose(file: Any, request: Request) -> Any:
-    """Return the grid asked for, or the only one of float values."""
-    numbers = range(file.grid_count)
-    floats = [n for n in numbers if str(file.grid_type_name(n)).startswith("Tree_float")]
-    names = [str(file.grid_name(n)) for n in floats]
-    name = choose_member(request, names, "grid of float values")
-    file.read_grids()
-    return file.grid(floats[names.index(name)])
+def _entries(file: InputFile) -> list[_Entry]:
+    """Return the grids of a file."""
+    cursor = Cursor(file)
+    if file.size < 12 or cursor.number("q") != MAGIC:
+        raise FileError(f"{file.name} is no .vdb file: its first bytes are not OpenVDB's")
+    version = cursor.number("I")
+    if version < OLDEST:
+        raise FileError(
+            f"{file.name} has version {version} of the format: save it with OpenVDB 3 or later, "
+            f"whose files have {OLDEST} at least"
+        )
+    cursor.skip(8)  # the library's version
+    seekable = cursor.number("?")
+    cursor.skip(36)  # the file's own number
+    _read_metadata(cursor)
+    count = cursor.number("I")
+    if not seekable and count > 1:
+        raise FileError(
+            f"{file.name} holds {count} grids one after the other, as a stream: save it with "
+            "openvdb.write"
+        )
+    return list(_read_entries(cursor, count))
 
 
-def _affine(transform: dict[str, Any]) -> NDArray[np.float64]:
+def _read_entries(cursor: Cursor, count: int) -> Iterator[_Entry]:
+    """Yield the grids that follow, each of which states where it ends."""
+    for _ in range(count):
+        name, type_, parent = (cursor.text().replace("\x1e", "#") for _ in range(3))
+        _, _, end = cursor.unpack("qqq")
+        yield _Entry(name, type_, parent, cursor.place)
+        if count > 1:
+            cursor.place = end
+            cursor.skip(0)
+
+
+def _parent(entries: list[_Entry], entry: _Entry, file: InputFile) -> _Entry:
+    """Return the grid whose tree another one shares."""
+    for other in entries:
+        if other.name == entry.parent:
+            return other
+    raise FileError(f"{file.name} is damaged: it lacks the grid {entry.parent!r}")
+
+
+def _read_head(file: InputFile, place: int) -> tuple[int, dict[str, Any], NDArray[np.float64], int]:
+    """Return compression, metadata and transform of a grid, and where its tree begins."""
+    cursor = Cursor(file, place)
+    flags = cursor.number("I")
+    metadata = _read_metadata(cursor)
+    return flags, metadata, _read_transform(cursor), cursor.place
+
+
+def _read_metadata(cursor: Cursor) -> dict[str, Any]:
+    """Return the numbers and texts of metadata."""
+    found: dict[str, Any] = {}
+    for _ in range(cursor.number("I")):
+        name, type_ = cursor.text(), cursor.text()
+        data = Cursor(cursor.file, cursor.place + 4)
+        cursor.skip(cursor.number("I"))
+        if type_ == "string":
+            found[name] = data.take(cursor.place - data.place).decode("utf-8", "replace")
+        elif type_ in NUMBERS:
+            found[name] = data.number(NUMBERS[type_])
+    return found
+
+
+def _read_transform(cursor: Cursor) -> NDArray[np.float64]:
     """Return the matrix (3, 4) from indices to world coordinates."""
-    kind = str(transform["type"])
-    if "scale" in kind or kind == "translation":
-        scale = np.asarray(transform["scale"], np.float64)
-        return np.column_stack([np.diag(scale), transform["translation"]])
-    rows = np.asarray(transform["matrix"], np.float64)  # OpenVDB multiplies rows by it
-    return rows.T[:3]
+    kind = cursor.text()
+    if kind in MATRICES:
+        return cursor.array("<f8", 16).reshape(4, 4).T[:3]  # OpenVDB multiplies rows by it
+    if kind not in MAPS:
+        raise GridError(
+            f"{cursor.file.name} has a transform that is not affine, {kind}: resample the grid to "
+            "a linear transform"
+        )
+    count, translation, scale = MAPS[kind]
+    vectors = cursor.array("<f8", 3 * count).reshape(count, 3)
+    moved = np.zeros(3) if translation is None else vectors[translation]
+    return np.column_stack([np.diag(np.ones(3) if scale is None else vectors[scale]), moved])
 
 
-class _LevelSet:
-    """The active voxels of a narrow band, and planes of the dense grid around them."""
+def _check_count(file: InputFile, tree: Tree, metadata: dict[str, Any]) -> None:
+    """Raise FileError if not all voxels that the file states were found."""
+    stated = metadata.get("file_voxel_count", tree.active_count)
+    if stated != tree.active_count:
+        raise FileError(
+            f"{file.name} is damaged: it has {tree.active_count:,} active voxels and states "
+            f"{stated:,}"
+        )
 
-    def __init__(
-        self, ijk: NDArray[np.int32], values: NDArray[np.float32], background: float
-    ) -> None:
-        self.first = ijk.min(0).astype(np.int64) - MARGIN
-        nx, ny, nz = (int(n) for n in ijk.max(0) - self.first + 1 + MARGIN)
-        self.shape, self.background = (nx, ny, nz), np.float32(background)
-        order = np.argsort(ijk[:, 0], kind="stable")
-        self.ijk, self.values = ijk[order], values[order]
 
-    def read(self, first: int, last: int) -> NDArray[np.float32]:
-        """Return the planes first <= i < last, all voxels known."""
-        ends = np.searchsorted(self.ijk[:, 0], (first + self.first[0], last + self.first[0]))
-        part = slice(*ends)
-        i, j, k = (self.ijk[part] - self.first).T
-        known = np.zeros((last - first, *self.shape[1:]), bool)
-        planes = np.full(known.shape, self.background)
-        known[i - first, j, k] = True
-        planes[i - first, j, k] = self.values[part]
-        before = np.maximum.accumulate(np.where(known, np.arange(self.shape[2]), 0), axis=2)
-        inside = np.take_along_axis(planes, before, axis=2) < 0
-        planes[inside & ~known] = -self.background
-        return planes
+def _volume(
+    file: InputFile, tree: Tree, metadata: dict[str, Any], affine: NDArray[np.float64]
+) -> Volume:
+    """Return the voxels at their place in the world."""
+    bounds = tree.bounds()
+    if bounds is None:
+        raise GridError(f"{file.name} has no active voxel: it holds no surface")
+    unknown = not tree.coding.background and tree.is_signed(file)
+    margin = 0 if unknown else MARGIN
+    low, high = bounds[0] - margin, bounds[1] + margin
+    size = PICOGK_MM * float(metadata.get("PicoGK.VoxelSize", 1 / PICOGK_MM))
+    notes = f"voxels of {size:.6g} mm, as PicoGK states: the mesh is in millimetres"
+
+    def read_box(box: Box) -> NDArray[Any]:
+        start = low + [part.start for part in box]
+        shape = tuple(part.stop - part.start for part in box)
+        found = tree.read(file, start, shape, unknown=unknown)
+        return found if size == 1 else found * found.dtype.type(size)
+
+    nx, ny, nz = map(int, high - low)
+    spacing, origin, direction = from_affine(
+        size * np.column_stack([affine[:, :3], affine[:, :3] @ low + affine[:, 3]])
+    )
+    return Volume(
+        (nx, ny, nz),
+        tree.coding.dtype.newbyteorder("="),
+        lambda first, last: read_box((slice(first, last), slice(0, ny), slice(0, nz))),
+        spacing,
+        origin,
+        direction,
+        chunks=(LEAF, LEAF, LEAF),
+        read_box=read_box,
+        notes=(notes,) if "PicoGK.VoxelSize" in metadata else (),
+    )

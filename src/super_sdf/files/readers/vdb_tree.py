@@ -1,0 +1,349 @@
+"""The tree of a grid in a ``.vdb`` file, as OpenVDB's source describes it (versions 222 and later).
+
+A root maps corners to nodes of 4096^3 voxels, those hold nodes of 128^3, and those leaves of 8^3.
+Where a node has no child it has a tile: one value for the whole cube. The file has the topology
+first, then the values of the leaves, packed one by one. Only where each leaf's values lie is kept;
+they are unpacked when a box of voxels is read.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...arrays import BoolArray
+from ...errors import FileError
+from ...grid.planes import InputFile
+
+Ints = NDArray[np.int64]
+
+ZIP, ACTIVE_MASK, BLOSC = 1, 2, 4  # flags of a grid's compression
+# How the inactive values of a node are stored, besides the active ones. The first three have one
+# inactive value; a mask chooses between two in the next three; the last stores every value.
+MINUS_BACKGROUND, ONE_VALUE, MASKED, MASKED_ONE, MASKED_TWO, ALL = 1, 2, 3, 4, 5, 6
+EDGES = (4096, 128)  # voxels along a child of the root, and along a child of that
+LEAF = 8
+PIECE = 1 << 20  # bytes read at a time
+ONES = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(1)  # bits of a byte
+
+
+class Cursor:
+    """The bytes of a file, one after the other."""
+
+    def __init__(self, file: InputFile, place: int = 0) -> None:
+        self.file, self.place = file, place
+        self._start, self._held = 0, b""
+
+    def take(self, count: int) -> bytes:
+        """Return the next bytes.
+
+        Raises
+        ------
+        FileError
+            If the file ends before.
+        """
+        if not 0 <= count <= self.file.size - self.place:
+            raise FileError(
+                f"{self.file.name} is truncated or damaged: {count:,} bytes are to follow byte "
+                f"{self.place:,} of {self.file.size:,}"
+            )
+        if not self._start <= self.place <= self.place + count <= self._start + len(self._held):
+            size = min(max(count, PIECE), self.file.size - self.place)
+            self._start, self._held = self.place, self.file.read(self.place, size).tobytes()
+        first = self.place - self._start
+        self.place += count
+        return self._held[first : first + count]
+
+    def skip(self, count: int) -> None:
+        """Pass over bytes."""
+        self.take(0)
+        self.place += count
+
+    def unpack(self, layout: str) -> tuple[Any, ...]:
+        """Return the next numbers, little-endian, of a layout of ``struct``."""
+        return struct.unpack("<" + layout, self.take(struct.calcsize("<" + layout)))
+
+    def number(self, layout: str) -> Any:
+        """Return the next number."""
+        return self.unpack(layout)[0]
+
+    def text(self) -> str:
+        """Return the next string, which follows its length."""
+        return self.take(self.number("I")).decode("utf-8", "replace")
+
+    def array(self, dtype: Any, count: int) -> NDArray[Any]:
+        """Return the next array."""
+        return np.frombuffer(self.take(np.dtype(dtype).itemsize * count), dtype)
+
+
+@dataclass(frozen=True)
+class Coding:
+    """How the values of a tree are stored: their type, its packing, and the background."""
+
+    dtype: np.dtype[Any]
+    stored: np.dtype[Any]
+    flags: int
+    background: float
+
+    def read(self, cursor: Cursor, active: BoolArray) -> NDArray[Any]:
+        """Return the next values, one for each bit of a mask, inactive ones as they are meant."""
+        values, selection, state = self._inactive(cursor, len(active))
+        packed = state != ALL and self.flags & ACTIVE_MASK
+        numbers = self._numbers(cursor, int(active.sum()) if packed else len(active))
+        if not packed:
+            return numbers
+        found = np.full(len(active), values[0], self.dtype)
+        if selection is not None:
+            found[selection] = values[1]
+        found[active] = numbers
+        return found
+
+    def skip(self, cursor: Cursor, active: int) -> int:
+        """Pass over the values of a leaf with so many active ones; return how its others are."""
+        _, _, state = self._inactive(cursor, LEAF**3)
+        partly = state != ALL and self.flags & ACTIVE_MASK
+        cursor.skip(self._length(cursor, active if partly else LEAF**3)[0])
+        return state
+
+    def _inactive(self, cursor: Cursor, count: int) -> tuple[list[float], BoolArray | None, int]:
+        """Return the inactive values, which voxels have the second one, and how they are stored."""
+        state = cursor.number("B")
+        if state > ALL:
+            raise FileError(f"{cursor.file.name} is damaged: a node's values are of kind {state}")
+        values = [-self.background if state else self.background, self.background]
+        stated = {ONE_VALUE: 1, MASKED_ONE: 1, MASKED_TWO: 2}.get(state, 0)
+        values[:stated] = cursor.array(self.dtype, stated).tolist()
+        masked = state in (MASKED, MASKED_ONE, MASKED_TWO)
+        return values, bits(cursor.array("u1", count // 8)) if masked else None, state
+
+    def _length(self, cursor: Cursor, count: int) -> tuple[int, bool]:
+        """Return how many bytes the next numbers take, and whether they are packed."""
+        if not self.flags & (ZIP | BLOSC) or (not count and self.stored != self.dtype):
+            return count * self.stored.itemsize, False
+        length = cursor.number("q")
+        return abs(length), length > 0
+
+    def _numbers(self, cursor: Cursor, count: int) -> NDArray[Any]:
+        """Return the next numbers."""
+        length, packed = self._length(cursor, count)
+        data, size = cursor.take(length), count * self.stored.itemsize
+        if packed:
+            data = (_from_blosc if self.flags & BLOSC else _from_zip)(data, size)
+        if len(data) != size:
+            raise FileError(f"{cursor.file.name} is damaged: a node's values cannot be unpacked")
+        return np.frombuffer(data, self.stored).astype(self.dtype)
+
+
+def bits(mask: NDArray[np.uint8]) -> BoolArray:
+    """Return the bits of a mask, the lowest of each byte first."""
+    return np.unpackbits(mask, bitorder="little").astype(bool)
+
+
+def _from_zip(data: bytes, size: int) -> bytes:
+    """Unpack at most so many bytes; none if they are no whole stream."""
+    stream = zlib.decompressobj()
+    try:
+        unpacked = stream.decompress(data, size + 1)
+    except zlib.error:
+        return b""
+    return unpacked if stream.eof else b""
+
+
+def _from_blosc(data: bytes, size: int) -> bytes:
+    """Unpack so many bytes; none if their header states others, or they are damaged."""
+    from numcodecs import blosc
+
+    # the header: four bytes, then the sizes unpacked, of a block, and packed
+    if len(data) < 16 or struct.unpack_from("<I4xI", data, 4) != (size, len(data)):
+        return b""
+    try:
+        return bytes(blosc.decompress(data))
+    except (RuntimeError, ValueError):
+        return b""
+
+
+@dataclass
+class Tree:
+    """Where the tiles and leaves of a grid are.
+
+    Attributes
+    ----------
+    corners, edges, values, active : (T, 3), (T,), (T,), (T,) arrays
+        First voxel, voxels along an edge, value and state of each tile that is active or has
+        another value than the background.
+    leaves, masks : (L, 3) int64, (L, 64) uint8
+        First voxel of each leaf, and which of its voxels are active.
+    places : (L,) int64
+        Where the values of each leaf begin in the file.
+    whole : (L,) bool
+        Whether a leaf's inactive voxels may have other values than the background.
+    """
+
+    coding: Coding
+    corners: Ints
+    edges: Ints
+    values: NDArray[Any]
+    active: BoolArray
+    leaves: Ints
+    masks: NDArray[np.uint8]
+    places: Ints = field(default_factory=lambda: np.empty(0, np.int64))
+    whole: BoolArray = field(default_factory=lambda: np.empty(0, bool))
+
+    @property
+    def active_count(self) -> int:
+        """Number of active voxels, those of tiles included."""
+        return int(ONES[self.masks].sum()) + int((self.edges[self.active] ** 3).sum())
+
+    def bounds(self) -> tuple[Ints, Ints] | None:
+        """Return the first voxel and the one after the last that is no inactive background."""
+        firsts, ends = _extents(self.masks)
+        firsts[self.whole], ends[self.whole] = 0, LEAF
+        some = ends[:, 0] > 0
+        low = np.concatenate([self.corners, (self.leaves + firsts)[some]])
+        high = np.concatenate([self.corners + self.edges[:, None], (self.leaves + ends)[some]])
+        return (low.min(0), high.max(0)) if len(low) else None
+
+    def is_signed(self, file: InputFile) -> bool:
+        """Return whether any tile, or any value of a leaf, is negative."""
+        leaves = range(len(self.leaves))
+        cursor = Cursor(file)
+        negative = any((self._values(cursor, leaf)[0] < 0).any() for leaf in leaves)
+        return negative or bool((self.values < 0).any())
+
+    def read(
+        self, file: InputFile, first: Ints, shape: tuple[int, ...], *, unknown: bool = False
+    ) -> NDArray[Any]:
+        """Return a box of voxels from ``first`` on; inactive background may be unknown, NaN."""
+        background = np.nan if unknown else self.coding.background
+        box = np.full(shape, background, self.coding.dtype)
+        for tile in np.flatnonzero(_touch(self.corners, self.edges[:, None], first, shape)):
+            edges = (int(self.edges[tile]),) * 3
+            _put(box, np.broadcast_to(self.values[tile], edges), self.corners[tile] - first)
+        cursor = Cursor(file)
+        for leaf in np.flatnonzero(_touch(self.leaves, LEAF, first, shape)).tolist():
+            values, active = self._values(cursor, leaf)
+            if unknown:
+                values[~active & (values == self.coding.background)] = np.nan
+            _put(box, values.reshape(LEAF, LEAF, LEAF), self.leaves[leaf] - first)
+        return box
+
+    def _values(self, cursor: Cursor, leaf: int) -> tuple[NDArray[Any], BoolArray]:
+        """Return the values of a leaf, and which are active, both (512,)."""
+        cursor.place = int(self.places[leaf])
+        active = bits(self.masks[leaf])
+        return self.coding.read(cursor, active), active
+
+
+def _extents(masks: NDArray[np.uint8]) -> tuple[Ints, Ints]:
+    """Return the first active voxel of each leaf and the one after the last, (L, 3), else 0."""
+    by_axis = masks.reshape(-1, LEAF, LEAF)  # the bits of a byte are along z
+    z = np.bitwise_or.reduce(masks, axis=1)[:, None]
+    lines = [by_axis.any(2), by_axis.any(1), np.unpackbits(z, axis=1, bitorder="little")]
+    along = np.stack(lines, axis=1).astype(bool)
+    first, after = along.argmax(2), LEAF - along[:, :, ::-1].argmax(2)
+    return first, np.where(along.any(2), after, 0)
+
+
+def _touch(corners: Ints, edges: Any, first: Ints, shape: tuple[int, ...]) -> BoolArray:
+    """Return which cubes have voxels in a box."""
+    overlap = (corners < first + np.array(shape)) & (corners + edges > first)
+    return np.asarray(overlap.all(1))
+
+
+def _put(box: NDArray[Any], values: NDArray[Any], start: Ints) -> None:
+    """Copy what lies within the box of an array that starts at ``start`` there."""
+    low = np.maximum(start, 0)
+    high = np.minimum(start + values.shape, box.shape)
+    there = tuple(slice(a, b) for a, b in zip(low, high))
+    box[there] = values[tuple(slice(a, b) for a, b in zip(low - start, high - start))]
+
+
+class _Topology:
+    """The tiles and leaves of a tree while its topology is read."""
+
+    def __init__(self, cursor: Cursor, coding: Coding) -> None:
+        self.cursor, self.coding = cursor, coding
+        self.tiles: list[tuple[Ints, int, NDArray[Any], BoolArray]] = []
+        self.leaves: list[Ints] = [np.empty((0, 3), np.int64)]
+        self.masks = [np.empty((0, LEAF**3 // 8), np.uint8)]
+
+    def read_root(self) -> None:
+        """Read the topology from the root on."""
+        cursor = self.cursor
+        tiles, children = cursor.unpack("II")
+        for _ in range(tiles):
+            corner = cursor.array("<i4", 3).astype(np.int64)[None]
+            value = cursor.array(self.coding.dtype, 1)
+            self._add_tiles(corner, EDGES[0], value, bits(cursor.array("u1", 1))[:1])
+        for _ in range(children):
+            self._read_node(cursor.array("<i4", 3).astype(np.int64), EDGES)
+
+    def _read_node(self, corner: Ints, edges: tuple[int, ...]) -> None:
+        """Read a node whose children have the second edge, or are leaves, and all below it."""
+        edge = edges[1] if len(edges) > 1 else LEAF
+        count = edges[0] // edge
+        child, active = (bits(self.cursor.array("u1", count**3 // 8)) for _ in range(2))
+        values = self.coding.read(self.cursor, active)
+        corners = corner + edge * np.argwhere(np.ones((count,) * 3, bool))
+        self._add_tiles(corners[~child], edge, values[~child], active[~child])
+        if edge == LEAF:
+            self.leaves.append(corners[child])
+            masks = self.cursor.array("u1", 64 * int(child.sum()))
+            self.masks.append(masks.reshape(-1, LEAF**3 // 8))
+            return
+        for place in corners[child]:
+            self._read_node(place, edges[1:])
+
+    def _add_tiles(self, corners: Ints, edge: int, values: NDArray[Any], active: BoolArray) -> None:
+        """Keep the tiles that are active, or have another value than the background."""
+        kept = active | (values != self.coding.background)
+        self.tiles.append((corners[kept], edge, values[kept], active[kept]))
+
+
+def read_tree(file: InputFile, place: int, coding: Callable[[float], Coding]) -> Tree:
+    """Read the topology of the tree that begins at a byte of a file, and find its leaves' values.
+
+    ``coding`` makes the coding of a background.
+
+    Raises
+    ------
+    FileError
+        If the file is truncated or damaged.
+    """
+    cursor = Cursor(file, place)
+    buffers = cursor.number("I")
+    if buffers != 1:
+        raise FileError(f"{file.name} is damaged: its tree has {buffers} buffers, not one")
+    dtype = coding(0.0).dtype
+    topology = _Topology(cursor, coding(float(cursor.array(dtype, 1)[0])))
+    topology.read_root()
+    corners, edges, values, active = zip(*topology.tiles) if topology.tiles else ((), (), (), ())
+    tree = Tree(
+        topology.coding,
+        np.concatenate([np.empty((0, 3), np.int64), *corners]),
+        np.repeat(np.array(edges, np.int64), [len(each) for each in values]),
+        np.concatenate([np.empty(0, dtype), *values]),
+        np.concatenate([np.empty(0, bool), *active]),
+        np.concatenate(topology.leaves),
+        np.concatenate(topology.masks),
+    )
+    _find_values(cursor, tree)
+    return tree
+
+
+def _find_values(cursor: Cursor, tree: Tree) -> None:
+    """Find where the values of each leaf are; they follow the topology, each after its mask."""
+    counts = ONES[tree.masks].sum(1)
+    tree.places = np.empty(len(counts), np.int64)
+    tree.whole = np.empty(len(counts), bool)
+    for leaf, count in enumerate(counts.tolist()):
+        cursor.skip(LEAF**3 // 8)
+        tree.places[leaf] = cursor.place
+        tree.whole[leaf] = tree.coding.skip(cursor, count) != 0
+    cursor.skip(0)

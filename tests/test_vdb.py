@@ -1,0 +1,204 @@
+"""OpenVDB files: those in ``data`` were written by OpenVDB 10.0.1, others here, byte by byte."""
+
+import shutil
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from super_sdf import read_grid
+from super_sdf.errors import FileError, GridError
+from super_sdf.files.formats import find_format
+from super_sdf.files.grids import open_volume
+from super_sdf.files.readers.vdb_tree import ACTIVE_MASK, ZIP
+
+DATA = Path(__file__).parent / "data"
+
+
+def voxels(path):
+    """Return the values of a file, before anything is made of them, and where the first one is."""
+    with open_volume(path, find_format(path), "xyz", (1 << 30, None)) as volume:
+        return volume.read(0, volume.shape[0]), np.array(volume.origin), volume.spacing[0]
+
+
+def distance(values, origin, spacing, balls):
+    """Return the distance to the nearest of some balls (centre, radius) at each sample."""
+    places = np.moveaxis(np.indices(values.shape), 0, -1) * spacing + origin
+    return np.min([np.linalg.norm(places - centre, axis=-1) - r for centre, r in balls], axis=0)
+
+
+@pytest.mark.parametrize(("name", "error"), [("far-balls", 2e-4), ("far-balls-half", 1e-3)])
+def test_balls_in_two_nodes_of_the_root_and_in_many_of_the_next(name, error):
+    """Of radius 6 at (4096, 0, 0) and 5 at (4406, 40, 130), voxels of 0.5, 310 voxels apart."""
+    values, *place = voxels(DATA / f"{name}.vdb")
+    exact = distance(values, *place, [((2048, 0, 0), 3.0), ((2203, 20, 65), 2.5)])
+    assert len(values) > 310 and place[1] == 0.5
+    assert np.abs(values - exact.clip(-1.5, 1.5)).max() < error
+
+
+def test_a_band_that_is_narrower_inside():
+    """A ball of radius 20 voxels about 27.5, from -1 to 3; inside are inactive tiles of -1."""
+    values, *place = voxels(DATA / "narrow-inside.vdb")
+    exact = distance(values, *place, [((27.5,) * 3, 20.0)])
+    np.testing.assert_allclose(values, exact.clip(-1, 3), atol=1e-5)
+
+
+def test_a_level_set_that_was_cut_keeps_its_inside():
+    """The same, with the background from i = 28 on: half of the ball, and no hollow one."""
+    values, origin, spacing = voxels(DATA / "cut.vdb")
+    exact = distance(values, origin, spacing, [((27.5,) * 3, 20.0)]).clip(-1, 3)
+    exact[int(28 - origin[0]) :] = 3
+    np.testing.assert_allclose(values, exact, atol=1e-5)
+
+
+def test_a_density_keeps_its_tiles_and_is_meshed_at_a_level():
+    """40 x 32 x 24 voxels of 1, all but one leaf of them in tiles; a corner of 4^3 is 0.25."""
+    grid = read_grid(DATA / "density.vdb", level=0.125)
+    solid = np.zeros(grid.shape, bool)
+    solid[2:-2, 2:-2, 2:-2] = True
+    np.testing.assert_array_equal(grid.values < 0, solid)
+    assert grid.shape == (44, 36, 28)
+
+
+def test_where_the_background_is_0_inactive_voxels_are_unknown():
+    """A dense array of the distance to a ball of radius 6 about 9.5, as copyFromArray keeps it."""
+    values, *place = voxels(DATA / "dense.vdb")
+    exact = distance(values, *place, [((9.5,) * 3, 6.0)])
+    np.testing.assert_allclose(values, exact, atol=1e-5)
+    assert values.shape == (20, 20, 20)
+
+
+def test_the_voxels_of_picogk_have_their_size_and_place():
+    """A ball of radius 6 voxels at index (3, 4, 5); its metadata says 0.0005 m, so 0.5 mm."""
+    values, *place = voxels(DATA / "picogk.vdb")
+    exact = distance(values, *place, [((1.5, 2.0, 2.5), 3.0)])
+    np.testing.assert_allclose(values, exact.clip(-1.5, 1.5), atol=1e-5)
+    grid = read_grid(DATA / "picogk.vdb")
+    assert "voxels of 0.5 mm, as PicoGK states: the mesh is in millimetres" in grid.notes
+
+
+def text(words: str) -> bytes:
+    return struct.pack("<I", len(words)) + words.encode()
+
+
+def metadata(count: int | None) -> bytes:
+    """Return metadata with the number of active voxels, or none."""
+    if count is None:
+        return struct.pack("<I", 0)
+    entry = text("file_voxel_count") + text("int64") + struct.pack("<Iq", 8, count)
+    return struct.pack("<I", 1) + entry
+
+
+def mask(*on: int, size: int) -> bytes:
+    chosen = np.zeros(size, bool)
+    chosen[list(on)] = True
+    return np.packbits(chosen, bitorder="little").tobytes()
+
+
+def packed(data: bytes, flags: int) -> bytes:
+    """Return numbers as they follow in the file: with their length if the grid is zipped."""
+    if not flags & ZIP:
+        return data
+    short = zlib.compress(data)
+    return struct.pack("<q", len(short)) + short
+
+
+def one_leaf(leaf: bytes, active: bytes, *, flags: int, count: int | None = None) -> bytes:
+    """Return a file whose only leaf begins at voxel 0; its values are ``leaf``, background 3."""
+    head = struct.pack("<qIII?", 0x56444220, 224, 10, 0, True) + b"0" * 36 + metadata(None)
+    head += struct.pack("<I", 1) + text("surface") + text("Tree_float_5_4_3") + text("")
+    place = len(head) + 24
+    grid = struct.pack("<I", flags) + metadata(count)
+    grid += text("ScaleMap") + struct.pack("<15d", *(0.5,) * 15)
+    tree = struct.pack("<IfII", 1, 3.0, 0, 1) + struct.pack("<iii", 0, 0, 0)
+    for size in (32**3, 16**3):
+        values = b"" if flags & ACTIVE_MASK else np.full(size, 3.0, "<f4").tobytes()
+        state = 0 if flags & ACTIVE_MASK else 6
+        tree += mask(0, size=size) + mask(size=size) + bytes([state]) + packed(values, flags)
+    tree += active
+    return head + struct.pack("<qqq", place, 0, 0) + grid + tree + active + leaf
+
+
+@pytest.mark.parametrize("flags", [ACTIVE_MASK, ACTIVE_MASK | ZIP])
+@pytest.mark.parametrize(
+    ("state", "stated", "selected", "inactive"),
+    [
+        (0, (), False, (3.0, 3.0)),
+        (1, (), False, (-3.0, -3.0)),
+        (2, (-2.0,), False, (-2.0, -2.0)),
+        (3, (), True, (-3.0, 3.0)),
+        (4, (-2.0,), True, (-2.0, 3.0)),
+        (5, (-2.0, 1.5), True, (-2.0, 1.5)),
+    ],
+)
+def test_inactive_values_as_a_leaf_states_them(tmp_path, flags, state, stated, selected, inactive):
+    """Voxels 0 to 99 are active, 1 to 100 in value; of the others those from 300 on are masked."""
+    numbers = np.arange(1, 101, dtype="<f4")
+    leaf = bytes([state]) + np.array(stated, "<f4").tobytes()
+    leaf += mask(*range(300, 512), size=512) if selected else b""
+    leaf += packed(numbers.tobytes(), flags)
+    (tmp_path / "a.vdb").write_bytes(
+        one_leaf(leaf, mask(*range(100), size=512), flags=flags, count=100)
+    )
+    values, origin, _ = voxels(tmp_path / "a.vdb")
+    expected = np.full(512, inactive[0])
+    expected[300:] = inactive[1]
+    expected[:100] = numbers
+    whole = np.full((12, 12, 12), 3.0)  # two voxels of background on each side
+    whole[2:-2, 2:-2, 2:-2] = expected.reshape(8, 8, 8)
+    held = [slice(int(2 * x + 2), int(2 * x + 2) + n) for x, n in zip(origin, values.shape)]
+    np.testing.assert_array_equal(values, whole[tuple(held)])
+
+
+def test_values_that_are_not_packed(tmp_path):
+    """Without any compression a leaf has all 512 values, whatever their state."""
+    values = np.linspace(-4, 4, 512).astype("<f4")
+    leaf = bytes([6]) + values.tobytes()
+    (tmp_path / "a.vdb").write_bytes(one_leaf(leaf, mask(size=512), flags=0))
+    np.testing.assert_array_equal(voxels(tmp_path / "a.vdb")[0][2:-2, 2:-2, 2:-2].ravel(), values)
+
+
+def test_active_voxels_that_the_file_states_and_lacks_are_an_error(tmp_path):
+    leaf = bytes([0]) + np.ones(100, "<f4").tobytes()
+    found = one_leaf(leaf, mask(*range(100), size=512), flags=ACTIVE_MASK, count=188574)
+    (tmp_path / "a.vdb").write_bytes(found)
+    with pytest.raises(
+        FileError, match=r"a\.vdb is damaged: it has 100 active voxels and states 188,574$"
+    ):
+        read_grid(tmp_path / "a.vdb")
+
+
+def test_a_file_that_ends_early_or_is_another_one(tmp_path):
+    whole = (DATA / "far-balls.vdb").read_bytes()
+    path = tmp_path / "a.vdb"
+    for size in (4, 60, 700, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:size])
+        with pytest.raises(FileError, match=r"a\.vdb is (truncated or damaged|no \.vdb file): "):
+            read_grid(path)
+    path.write_bytes(whole[:8] + struct.pack("<I", 220) + whole[12:])
+    with pytest.raises(FileError, match=r"has version 220 of the format: save it with OpenVDB 3"):
+        read_grid(path)
+
+
+def test_a_length_beyond_the_file_is_an_error_before_it_is_read(tmp_path):
+    """A string of 4 GB, in a file of some hundred bytes."""
+    leaf = bytes([0]) + np.ones(100, "<f4").tobytes()
+    whole = one_leaf(leaf, mask(*range(100), size=512), flags=ACTIVE_MASK)
+    damaged = whole.replace(text("surface"), struct.pack("<I", 2**32 - 1) + b"surface")
+    (tmp_path / "a.vdb").write_bytes(damaged)
+    with pytest.raises(FileError, match=r"4,294,967,295 bytes are to follow byte 69 of \d"):
+        read_grid(tmp_path / "a.vdb")
+
+
+def test_a_grid_of_background_alone_holds_no_surface(tmp_path):
+    (tmp_path / "a.vdb").write_bytes(one_leaf(b"\0", mask(size=512), flags=ACTIVE_MASK))
+    with pytest.raises(GridError, match=r"a\.vdb has no active voxel: it holds no surface"):
+        read_grid(tmp_path / "a.vdb")
+
+
+def test_a_grid_is_named_where_there_are_several(tmp_path):
+    shutil.copy(DATA / "picogk.vdb", tmp_path / "a.vdb")
+    with pytest.raises(FileError, match="has no grid of floating-point values 'b': it holds surf"):
+        read_grid(tmp_path / "a.vdb:b")
