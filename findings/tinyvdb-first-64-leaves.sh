@@ -12,6 +12,7 @@ python3 -m venv "$folder/env"
 cd "$folder"
 env/bin/python - << 'PYTHON'
 import struct
+import uuid
 
 import numpy as np
 import tinyvdb
@@ -30,7 +31,7 @@ def mask(on, size):
 
 
 # OpenVDB's format, version 224, flag 2: of each node only active values are stored.
-head = struct.pack("<qIII?", 0x56444220, 224, 10, 0, True) + b"0" * 36
+head = struct.pack("<qIII?", 0x56444220, 224, 10, 0, True) + str(uuid.UUID(int=0)).encode()
 head += struct.pack("<II", 0, 1) + text("ball") + text("Tree_float_5_4_3") + text("")
 place = len(head) + 24
 count = text("file_voxel_count") + text("int64") + struct.pack("<Iq", 8, 512 * LEAVES)

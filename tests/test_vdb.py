@@ -2,6 +2,7 @@
 
 import shutil
 import struct
+import uuid
 import zlib
 from pathlib import Path
 
@@ -107,7 +108,8 @@ def packed(data: bytes, flags: int) -> bytes:
 
 def one_leaf(leaf: bytes, active: bytes, *, flags: int, count: int | None = None) -> bytes:
     """Return a file whose only leaf begins at voxel 0; its values are ``leaf``, background 3."""
-    head = struct.pack("<qIII?", 0x56444220, 224, 10, 0, True) + b"0" * 36 + metadata(None)
+    head = struct.pack("<qIII?", 0x56444220, 224, 10, 0, True)
+    head += str(uuid.UUID(int=0)).encode() + metadata(None)
     head += struct.pack("<I", 1) + text("surface") + text("Tree_float_5_4_3") + text("")
     place = len(head) + 24
     grid = struct.pack("<I", flags) + metadata(count)
