@@ -62,6 +62,9 @@ def rectified_layers(net: SuperSdfNet) -> list[Rectified]:
         if type(block) is Block:  # other kinds may have other rectifiers, or none
             layers.append(Rectified(block.conv, block.conv.weight, block.expand.weight, False))
             layers.append(Rectified(block.expand, block.expand.weight, block.reduce.weight, False))
+    if net.config.gated:
+        first, _, second = net.gate.layers
+        layers.append(Rectified(first, first.weight, second.weight, False))
     if type(net).residual is SuperSdfNet.residual:
         functions, channels = net.trunk.layers[-1].weight, net.config.channels
         layers.append(Rectified(net.branch, net.branch.weight, functions, True, channels))

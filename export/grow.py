@@ -12,6 +12,8 @@ idea; there units are copied, here they are new.
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import torch
 from torch import Tensor
 
@@ -54,6 +56,19 @@ def check_blocks(net: SuperSdfNet, weights: dict[str, Tensor]) -> None:
             f"--start has a network of {blocks} blocks, more than the {net.config.blocks} of this "
             f"size: give --blocks {blocks}"
         )
+
+
+def without_blocks(weights: dict[str, Tensor], left_out: Collection[int]) -> dict[str, Tensor]:
+    """Return weights without some blocks, counted from 0; those after them move up."""
+    kept = {}
+    for name, array in weights.items():
+        kind, number, *rest = name.split(".")
+        if kind != "blocks":
+            kept[name] = array
+        elif int(number) not in left_out:
+            moved = int(number) - sum(block < int(number) for block in left_out)
+            kept[".".join([kind, str(moved), *rest])] = array
+    return kept
 
 
 def place_units(new: Tensor, old: Tensor, name: str) -> None:

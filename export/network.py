@@ -8,6 +8,10 @@ the 27 neighbours (a gather and a matrix product) and a pointwise layer. The hea
 a trunk: coefficients per voxel times functions of the offset. It adds a residual to the quadratic
 interpolation of the patch. All lengths are in half voxels (Eqs. 4 and 5).
 
+A network may be gated: its last blocks run only on the voxels on which the first ones still lose
+much, as a gate says that reads their features. All others stay as they are, also as neighbours.
+The decision is local, so a voxel's values depend on nothing beyond the receptive field.
+
 Interpolation and functions keep the value of the sample (Sec. 4.1). A noisy sample should not be
 kept, so there is also a correction of the whole voxel. It is 0 where all samples around the voxel
 can be distances. The distances of a mask are right to half a voxel only, and none is kept.
@@ -16,7 +20,7 @@ can be distances. The distances of a mask are right to half a voxel only, and no
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,7 +29,7 @@ from torch import Tensor, nn
 
 from export.augment import Prepared, batch_table
 from super_sdf.neighbourhood import CENTRE
-from super_sdf.steps.band import MAX_DIFFERENCE
+from super_sdf.steps.band import DECODE_LIMIT, MAX_DIFFERENCE
 
 if TYPE_CHECKING:
     from export.resident import TurnedBatch
@@ -42,6 +46,7 @@ class NetworkConfig:
     trunk: int = 128
     frequencies: int = 4
     keeps_samples: bool = True  # the sample's value, where it can be a distance; not with masks
+    gated: int = 0  # of the blocks, the last ones, that run only where the gate is open
 
     @property
     def receptive_field(self) -> int:
@@ -61,7 +66,7 @@ SIZES = {
 """The sizes of networks, by name."""
 
 
-CHUNK = 256  # voxels gathered at a time on a CPU: their columns stay in cache
+CHUNK = 1024  # voxels gathered at a time on a CPU, so that their columns stay in cache
 
 
 class GatherMatMul(torch.autograd.Function):
@@ -70,22 +75,26 @@ class GatherMatMul(torch.autograd.Function):
     If u is v's neighbour at place k, then v is u's neighbour at place 26 - k. So the gradient is a
     convolution, too, with the places reversed, and no scatter-add is needed. The columns are
     gathered again for it: at 27 times the features they would fill the memory.
+
+    The table may also name voxels after the V of its rows: those that are given as ``around``,
+    which get no gradient.
     """
 
     @staticmethod
-    def forward(ctx, features: Tensor, weight: Tensor, table: Tensor) -> Tensor:
+    def forward(ctx, features: Tensor, weight: Tensor, table: Tensor, around: Tensor) -> Tensor:
         """Map features (V, C), weight (27 C, C_out) and table (V, 27) to (V, C_out)."""
-        ctx.save_for_backward(features, weight, table)
-        return convolve(features, weight, table)
+        ctx.save_for_backward(features, weight, table, around)
+        return convolve(torch.cat([features, around]), weight, table)
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, None]:
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, None, None]:
         """Map the gradient (V, C_out) to the gradients of features and weight."""
-        features, weight, table = ctx.saved_tensors
+        features, weight, table, around = ctx.saved_tensors
         places, channels_out = table.shape[1], weight.shape[1]
         reversed_weight = weight.view(places, -1, channels_out).flip(0).transpose(1, 2)
         rows = reversed_weight.reshape(places * channels_out, -1)
-        return convolve(grad, rows, table), weight_gradient(features, grad, table), None
+        of_weight = weight_gradient(torch.cat([features, around]), grad, table)
+        return convolve(grad, rows, table.clamp(max=len(grad))), of_weight, None, None
 
 
 def convolve(features: Tensor, weight: Tensor, table: Tensor) -> Tensor:
@@ -143,10 +152,11 @@ class NeighbourConv(nn.Module):
         self.weight = nn.Parameter(torch.randn(rows, channels) / rows**0.5)
         self.bias = nn.Parameter(torch.zeros(channels))
 
-    def forward(self, features: Tensor, table: Tensor) -> Tensor:
-        """Map (V, C) to (V, C)."""
+    def forward(self, features: Tensor, table: Tensor, around: Tensor | None = None) -> Tensor:
+        """Map (V, C) to (V, C); ``around`` (N, C) are other voxels that the table names."""
         dtype = torch.bfloat16 if torch.is_autocast_enabled(features.device.type) else torch.float32
-        mixed = GatherMatMul.apply(features.to(dtype), self.weight.to(dtype), table)
+        others = (features[:0] if around is None else around).detach().to(dtype)
+        mixed = GatherMatMul.apply(features.to(dtype), self.weight.to(dtype), table, others)
         return mixed + self.bias.to(dtype)
 
 
@@ -161,13 +171,13 @@ class Block(nn.Module):
         nn.init.normal_(self.reduce.weight, std=0.02)
         nn.init.zeros_(self.reduce.bias)
 
-    def forward(self, features: Tensor, table: Tensor) -> Tensor:
+    def forward(self, features: Tensor, table: Tensor, *around: Tensor) -> Tensor:
         """Map (V, C) to (V, C)."""
-        return features + self.reduce(self.activate(self.expand(self.mix(features, table))))
+        return features + self.reduce(self.activate(self.expand(self.mix(features, table, *around))))
 
-    def mix(self, features: Tensor, table: Tensor) -> Tensor:
+    def mix(self, features: Tensor, table: Tensor, *around: Tensor) -> Tensor:
         """Apply the neighbour convolution and its rectifier."""
-        return self.activate(self.conv(features, table))
+        return self.activate(self.conv(features, table, *around))
 
     def activate(self, values: Tensor) -> Tensor:
         """Apply the rectifier that follows both layers."""
@@ -200,17 +210,60 @@ class Trunk(nn.Module):
         return self.layers(torch.cat([offsets, angles.sin(), angles.cos()], 1))
 
 
+class Gate(nn.Module):
+    """Says how much is lost on a voxel after the first blocks: the logarithm of its loss.
+
+    It is open where that is more than the threshold, unless the voxel cannot hold the surface.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Linear(config.channels, config.hidden), nn.ReLU(), nn.Linear(config.hidden, 1)
+        )
+        self.register_buffer("threshold", torch.zeros(1))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Map (V, C) to (V,)."""
+        with in_float32(features):
+            return self.layers(features.float())[:, 0]
+
+    @torch.no_grad()
+    def rows(self, doubts: Tensor, patches: Tensor, share: float | None = None) -> Tensor:
+        """Return the rows of the voxels where it is open, (n,).
+
+        With ``share`` the threshold is that which this share of these voxels exceeds, and the
+        kept one moves a little to that which ``USUAL_SHARE`` exceeds.
+        """
+        near = patches[:, CENTRE].abs() <= DECODE_LIMIT
+        threshold = self.threshold
+        if share is not None:
+            shares = doubts.new_tensor([1 - share, 1 - USUAL_SHARE])
+            threshold, usual = doubts[near].quantile(shares)
+            self.threshold.lerp_(usual, 0.01)
+        return torch.nonzero(near & (doubts > threshold))[:, 0]
+
+
+USUAL_SHARE = 0.3  # of the voxels that can hold the surface: those that the last blocks run on
+
+
 @dataclass(frozen=True)
 class Encoded:
-    """The inputs of the head for each voxel."""
+    """The inputs of the head for each voxel; of a gated network also what the first blocks say."""
 
     features: Tensor  # (V, C)
     patches: Tensor  # (V, 27)
     noisy: Tensor  # (V, 1) of 0 and 1
+    first: Tensor | None = None  # (V, C) features after the first blocks
+    doubts: Tensor | None = None  # (V,) logarithm of what is lost with these
 
     def some(self, rows: Tensor) -> Encoded:
         """Return some of the voxels."""
-        return Encoded(self.features[rows], self.patches[rows], self.noisy[rows])
+        return Encoded(*(None if all_ is None else all_[rows] for all_ in vars(self).values()))
+
+    def after_first(self) -> Encoded:
+        """Return the voxels as they are after the first blocks."""
+        return replace(self, features=self.first)
 
 
 def is_noisy(patches: Tensor, table: Tensor) -> Tensor:
@@ -234,33 +287,55 @@ class SuperSdfNet(nn.Module):
             nn.Linear(27, config.hidden), nn.ReLU(), nn.Linear(config.hidden, config.channels)
         )
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.blocks))
+        if config.gated:
+            self.gate = Gate(config)
         self.branch = nn.Linear(config.channels, config.functions - config.channels)
         self.correction = nn.Linear(config.channels, 1)
         self.trunk = Trunk(config)
 
     def encode(self, patches: Tensor, table: Tensor) -> Tensor:
-        """Map patches (V, 27) and neighbours (V, 27; V where absent) to features (V, C)."""
+        """Map patches (V, 27) and neighbours (V, 27; V where absent) to features (V, C).
+
+        Of a gated network these are the features after the first blocks.
+        """
         with in_float32(patches):  # then the sums of the blocks are, too
             features = self.stem(patches)
-        for block in self.blocks:
+        for block in self.blocks[: self.config.blocks - self.config.gated]:
             features = block(features, table)
         return features
 
-    def encode_batch(self, batch: Sequence[Prepared] | TurnedBatch) -> Encoded:
-        """Encode a batch of samples, concatenated."""
+    def deepen(self, features: Tensor, table: Tensor, rows: Tensor) -> Tensor:
+        """Run the last blocks on some voxels, (n,); the others stay as they are, (V, C)."""
+        count = len(features)
+        place = torch.arange(count + 1, device=rows.device) + len(rows)
+        place[rows] = torch.arange(len(rows), device=rows.device)
+        near, some = place[table[rows]], features[rows]
+        for block in self.blocks[self.config.blocks - self.config.gated :]:
+            some = block(some, near, features)
+        return features.index_copy(0, rows, some)
+
+    def encode_batch(
+        self, batch: Sequence[Prepared] | TurnedBatch, share: float | None = None
+    ) -> Encoded:
+        """Encode a batch of samples, concatenated; for ``share`` see ``Gate.rows``."""
         if not isinstance(batch, Sequence):
-            return self.encode_all(batch.patches, batch.table)
+            return self.encode_all(batch.patches, batch.table, share)
         device = next(self.parameters()).device
         patches = torch.from_numpy(np.concatenate([sample.patches for sample in batch])).to(device)
         table = torch.from_numpy(batch_table([sample.table for sample in batch])).to(device)
-        return self.encode_all(patches, table)
+        return self.encode_all(patches, table, share)
 
-    def encode_all(self, patches: Tensor, table: Tensor) -> Encoded:
+    def encode_all(self, patches: Tensor, table: Tensor, share: float | None = None) -> Encoded:
         """Encode voxels; return all inputs of the head."""
         noisy = is_noisy(patches, table)
         if not self.config.keeps_samples:
             noisy = torch.ones_like(noisy)
-        return Encoded(self.encode(patches, table), patches, noisy)
+        first = self.encode(patches, table)
+        if not self.config.gated:
+            return Encoded(first, patches, noisy)
+        doubts = self.gate(first.detach())
+        features = self.deepen(first, table, self.gate.rows(doubts, patches, share))
+        return Encoded(features, patches, noisy, first, doubts)
 
     def decode(self, voxels: Encoded, offsets: Tensor) -> Tensor:
         """Return the values (D, Q) of voxels at offsets (Q, 3)."""

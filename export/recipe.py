@@ -34,6 +34,9 @@ class Recipe:
     far_weight: float = 0.25  # ... to this
     gradient_weight: float = 0.5
     eikonal_weight: float = 0.0
+    first_weight: float = 0.2  # of the loss after the first blocks of a gated network
+    gate_weight: float = 0.01  # of the error of what its gate says of that loss
+    shares_gated: tuple[float, float] = (0.05, 0.5)  # of a batch's voxels, drawn between these
     revive_steps: int = 300  # between restarts of dormant units; 0 for never
     revive_until: float = 0.8  # share of the budget: restarted units need time to learn
     shares: Shares = USUAL
@@ -60,11 +63,6 @@ def differences(values: Tensor) -> Tensor:
 def nearness(target: Tensor, recipe: Recipe) -> Tensor:
     """Return the weight of an error: larger near the surface, where it moves the mesh."""
     return recipe.far_weight + torch.exp(-target.abs() / recipe.reach)
-
-
-def loss_of(prediction: Tensor, target: Tensor, recipe: Recipe) -> Tensor:
-    """Return the loss of the values (D, Q) of a sample."""
-    return voxel_losses(prediction, target, recipe).mean()
 
 
 def voxel_losses(prediction: Tensor, target: Tensor, recipe: Recipe) -> Tensor:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from export.augment import Prepared
 from export.dataset import ANYWHERE, CORNERS, FINE_NODES
-from export.network import SuperSdfNet
+from export.network import Encoded, SuperSdfNet
 from export.sharing import copies_of_queries, neighbours_with_targets
 from super_sdf.network.symmetry import cube_symmetries, turned_places
 
@@ -192,9 +192,9 @@ def moved_to(indices: Tensor, parts: Parts) -> Tensor:
     return torch.where(indices < 0, len(indices), indices + parts.firsts[parts.part][:, None])
 
 
-def predict_turned(net: SuperSdfNet, batch: TurnedBatch) -> Tensor:
+def predict_turned(net: SuperSdfNet, batch: TurnedBatch, encoded: Encoded) -> Tensor:
     """Return the values (D, Q) of a batch; those of shared nodes are averaged (``sharing``)."""
-    voxels = net.encode_batch(batch).some(batch.voxels)
+    voxels = encoded.some(batch.voxels)
     values = net.decode_parts(voxels, batch.counts, batch.moved)
     rows = batch.near.gather(1, batch.place[batch.window])
     query, there = batch.query[batch.window], (rows < len(values)).to(values.dtype)
@@ -204,7 +204,7 @@ def predict_turned(net: SuperSdfNet, batch: TurnedBatch) -> Tensor:
     return total[:, :-1]
 
 
-def means(values: Tensor, batch: TurnedBatch) -> Tensor:
+def means_turned(values: Tensor, batch: TurnedBatch) -> Tensor:
     """Return the mean of values (D,) of each sample of a batch, (B,)."""
     counts = torch.tensor(batch.counts, device=values.device)
     sums = values.new_zeros(len(batch.counts)).index_add(0, batch.window, values)

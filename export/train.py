@@ -46,14 +46,13 @@ from export.augment import (
 )
 from export.dataset import CORNERS, Sample, read_shard
 from export.dormant import dormant_share, revive
-from export.grow import grow_from
-from export.network import SIZES, SuperSdfNet
+from export.grow import grow_from, without_blocks
+from export.network import SIZES, Encoded, SuperSdfNet
 from export.precision import autocast
 from export.recipe import (
     RECIPE,
     Recipe,
     differences,
-    loss_of,
     make_optimisers,
     rate_factor,
     relative_weights,
@@ -65,7 +64,7 @@ from export.resident import (
     Residents,
     TurnedBatch,
     gather_samples,
-    means,
+    means_turned,
     predict_turned,
 )
 from export.run_log import append_line, plot_run, read_log
@@ -88,8 +87,14 @@ NEAR = 0.5  # half voxels from the surface: limit for normals; half of it for va
 
 def predict(net: SuperSdfNet, batch: list[Prepared]) -> list[tuple[Tensor, Tensor]]:
     """Return prediction and target, (D, Q), of each sample; shared nodes are averaged."""
+    return predict_encoded(net, batch, net.encode_batch(batch))
+
+
+def predict_encoded(
+    net: SuperSdfNet, batch: list[Prepared], encoded: Encoded
+) -> list[tuple[Tensor, Tensor]]:
+    """Return prediction and target, (D, Q), of each sample of a batch that was encoded."""
     device = next(net.parameters()).device
-    encoded = net.encode_batch(batch)
     starts = np.cumsum([0] + [len(sample.patches) for sample in batch])
     pairs = []
     for sample, start in zip(batch, starts[:-1]):
@@ -222,11 +227,42 @@ def target_counts(batch: Batch) -> list[int]:
 
 
 def window_losses(net: SuperSdfNet, batch: Batch, recipe: Recipe) -> Tensor:
-    """Return the loss of each sample of a batch, (B,)."""
+    """Return the loss of each sample of a batch, (B,).
+
+    Of a gated network, at a share of voxels drawn at random, it is also that after the first
+    blocks, and the error of what the gate says of this.
+    """
+    if not net.config.gated:
+        return means(batch_losses(net, batch, net.encode_batch(batch), recipe), batch)
+    low, high = recipe.shares_gated
+    encoded = net.encode_batch(batch, low + (high - low) * float(torch.rand(())))
+    of_first = batch_losses(net, batch, encoded.after_first(), recipe)
+    apart = encoded.doubts[rows_with_targets(batch)] - of_first.detach().log()
+    loss = batch_losses(net, batch, encoded, recipe) + recipe.first_weight * of_first
+    return means(loss + recipe.gate_weight * apart.abs(), batch)
+
+
+def batch_losses(net: SuperSdfNet, batch: Batch, encoded: Encoded, recipe: Recipe) -> Tensor:
+    """Return the loss of each voxel with targets of a batch, (D,)."""
     if isinstance(batch, TurnedBatch):
-        of_voxels = voxel_losses(predict_turned(net, batch), batch.targets, recipe)
-        return means(of_voxels, batch)
-    return torch.stack([loss_of(*pair, recipe) for pair in predict(net, batch)])
+        return voxel_losses(predict_turned(net, batch, encoded), batch.targets, recipe)
+    pairs = predict_encoded(net, batch, encoded)
+    return torch.cat([voxel_losses(*pair, recipe) for pair in pairs])
+
+
+def rows_with_targets(batch: Batch) -> Tensor:
+    """Return the rows of a batch's voxels that have targets, (D,)."""
+    if isinstance(batch, TurnedBatch):
+        return batch.voxels
+    starts = np.cumsum([0] + [len(sample.patches) for sample in batch])
+    return torch.from_numpy(np.concatenate([s.voxels + at for s, at in zip(batch, starts)]))
+
+
+def means(values: Tensor, batch: Batch) -> Tensor:
+    """Return the mean of values (D,) of each sample of a batch, (B,)."""
+    if isinstance(batch, TurnedBatch):
+        return means_turned(values, batch)
+    return torch.stack([part.mean() for part in values.split(target_counts(batch))])
 
 
 class Run:
@@ -342,9 +378,11 @@ class Run:
     def update_average(self) -> None:
         """Move the averaged weights towards the current ones."""
         decay = min(self.recipe.average_decay, self.step / (self.step + 9))
-        means, now = list(self.average.parameters()), list(self.net.parameters())
+        average, now = list(self.average.parameters()), list(self.net.parameters())
         with torch.no_grad():
-            torch._foreach_lerp_(means, now, 1 - decay)
+            torch._foreach_lerp_(average, now, 1 - decay)
+        for kept, buffer in zip(self.average.buffers(), self.net.buffers()):
+            kept.copy_(buffer)
 
 
 def divide(batch: Sequence[Prepared], parts: int) -> list[list[int]]:
@@ -440,6 +478,20 @@ def main() -> None:
     parser.add_argument(
         "--blocks", type=at_least(1), help="number of blocks, if not that of the size"
     )
+    parser.add_argument(
+        "--gated",
+        type=at_least(0),
+        default=0,
+        help="number of blocks, the last ones, that run only where much is lost",
+    )
+    parser.add_argument(
+        "--without",
+        type=at_least(0),
+        nargs="+",
+        default=(),
+        metavar="BLOCK",
+        help="blocks of --start to leave out, counted from 0",
+    )
     parser.add_argument("--minutes", type=positive, default=90.0, help="training time in all")
     parser.add_argument("--rate", type=positive, default=1.0, help="factor on the learning rates")
     parser.add_argument("--noisy", type=share, default=USUAL.noisy, help="share of noisy samples")
@@ -498,10 +550,11 @@ def run_training(options: argparse.Namespace) -> None:
         config,
         blocks=options.blocks or config.blocks,
         keeps_samples=options.inputs == DISTANCES,
+        gated=options.gated,
     )
     run = Run(options.run, SuperSdfNet(config), recipe, options.device, options.threads)
     if options.start:
-        run.start_from(read_weights(options.start))
+        run.start_from(without_blocks(read_weights(options.start), options.without))
     run.resume()
     if options.device == "cuda":
         import export.gpu_gather  # only CUDA builds of PyTorch have Triton

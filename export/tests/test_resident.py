@@ -15,7 +15,7 @@ from export.resident import (
     Residents,
     Rows,
     gather_samples,
-    means,
+    means_turned,
     predict_turned,
 )
 from export.sharing import copies_of_queries
@@ -57,7 +57,7 @@ def turned_one_by_one(prepared):
 def test_a_batch_predicts_what_samples_turned_one_by_one_do(prepared, residents):
     batch, net = residents.batch(DRAWN, TURNS), small_net()
     singly = predict(net, list(turned_one_by_one(prepared)))
-    got = predict_turned(net, batch).split(batch.counts)
+    got = predict_turned(net, batch, net.encode_batch(batch)).split(batch.counts)
     for mine, targets, (want, wanted) in zip(got, batch.targets.split(batch.counts), singly):
         torch.testing.assert_close(mine, want, atol=1e-5, rtol=0)
         torch.testing.assert_close(targets, wanted)
@@ -74,7 +74,7 @@ def test_a_mean_is_that_of_the_sample(residents):
     batch = residents.batch([1, 0], [3, 4])
     values = torch.arange(sum(batch.counts), dtype=torch.float32)
     want = [part.mean() for part in values.split(batch.counts)]
-    torch.testing.assert_close(means(values, batch), torch.stack(want))
+    torch.testing.assert_close(means_turned(values, batch), torch.stack(want))
 
 
 def test_the_copies_of_all_queries_of_a_sample_have_room(samples):

@@ -290,7 +290,7 @@ def test_the_gradient_of_the_neighbour_convolution(chunk, monkeypatch):
     features = torch.randn(len(voxels), 3, dtype=torch.double, requires_grad=True)
     weight = torch.randn(81, 2, dtype=torch.double, requires_grad=True)
     assert torch.autograd.gradcheck(
-        lambda f, w: GatherMatMul.apply(f, w, table), (features, weight)
+        lambda f, w: GatherMatMul.apply(f, w, table, features[:0]), (features, weight)
     )
 
 
@@ -300,7 +300,7 @@ def test_a_convolution_gathers_some_voxels_after_others(dtype, monkeypatch):
     features, weight = torch.randn(100, 4).to(dtype), torch.randn(108, 3).to(dtype)
     whole = gather(features, table) @ weight
     monkeypatch.setattr("export.network.CHUNK", 7)
-    torch.testing.assert_close(GatherMatMul.apply(features, weight, table), whole)
+    torch.testing.assert_close(GatherMatMul.apply(features, weight, table, features[:0]), whole)
 
 
 def test_an_untrained_network_keeps_samples_and_planes():
