@@ -5,15 +5,16 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from export.augment import USUAL, Prepared, augment, augment_mask, batch_table
+from export.augment import USUAL, Prepared, augment, augment_mask
 from export.dataset import fill_shard
 from export.latency import ball
 from export.network import Block, SuperSdfNet
@@ -38,12 +39,26 @@ class Ranges:
         zeros = torch.zeros(block.expand.in_features)
         return cls(zeros, zeros, zeros, torch.zeros(block.expand.out_features))
 
-    def widen(self, features: Tensor, mixed: Tensor, expanded: Tensor) -> None:
-        """Extend the ranges by the inputs of one sample."""
-        self.low = torch.minimum(self.low, features.amin(0))
-        self.high = torch.maximum(self.high, features.amax(0))
-        self.mixed = torch.maximum(self.mixed, mixed.amax(0))
-        self.expanded = torch.maximum(self.expanded, expanded.amax(0))
+    def watch(self, block: Block) -> None:
+        """Extend the ranges whenever the block runs on some voxels."""
+
+        def see_conv(module: nn.Module, given: tuple[Tensor, ...], made: Tensor) -> None:
+            for features in (given[0], *given[2:]):  # of its voxels, and of those around
+                self.low = torch.minimum(self.low, features.amin(0))
+                self.high = torch.maximum(self.high, features.amax(0))
+            self.mixed = torch.maximum(self.mixed, made.amax(0))
+
+        def see_expand(module: nn.Module, given: tuple[Tensor, ...], made: Tensor) -> None:
+            self.expanded = torch.maximum(self.expanded, made.amax(0))
+
+        block.conv.register_forward_hook(lambda *seen: see_conv(*seen) if len(seen[2]) else None)
+        block.expand.register_forward_hook(lambda *seen: see_expand(*seen) if len(seen[2]) else None)
+
+    def join(self, others: Sequence[Ranges]) -> Ranges:
+        """Return the ranges with those of the features widened to contain others'."""
+        low = torch.stack([other.low for other in others]).amin(0)
+        high = torch.stack([other.high for other in others]).amax(0)
+        return replace(self, low=low, high=high)
 
 
 def draw_samples(count: int = SAMPLES, seed: int = 0, *, masks: bool = False) -> list[Prepared]:
@@ -58,17 +73,18 @@ def draw_samples(count: int = SAMPLES, seed: int = 0, *, masks: bool = False) ->
 
 @torch.no_grad()
 def find_ranges(net: SuperSdfNet, samples: list[Prepared]) -> list[Ranges]:
-    """Return the ranges of each block on these samples."""
-    ranges = [Ranges.of_zeros(block) for block in net.blocks]
+    """Return the ranges of each block on these samples.
+
+    Blocks behind a gate read features that others wrote: they have the same ranges.
+    """
+    watched = copy.deepcopy(net)
+    ranges = [Ranges.of_zeros(block) for block in watched.blocks]
+    for block, block_ranges in zip(watched.blocks, ranges):
+        block_ranges.watch(block)
     for sample in samples:
-        table = torch.from_numpy(batch_table([sample.table]))
-        features = net.stem(torch.from_numpy(sample.patches))
-        for block, block_ranges in zip(net.blocks, ranges):
-            mixed = block.mix(features, table)
-            expanded = torch.relu(block.expand(mixed))
-            block_ranges.widen(features, mixed, expanded)
-            features = features + block.reduce(expanded)
-    return ranges
+        watched.encode_batch([sample])
+    first = net.config.blocks - net.config.gated
+    return ranges[:first] + [each.join(ranges[first:]) for each in ranges[first:]]
 
 
 def distance_apart(one: Path, other: Path, samples: Sequence[Prepared] = ()) -> np.ndarray:

@@ -62,7 +62,8 @@ class IntWriter(Writer):
 
 def replace_blocks(graph: onnx.GraphProto, blocks: list[IntBlock]) -> None:
     """Replace the blocks of a graph, its Scan nodes in order."""
-    stem, *scans, _ = [node for node in graph.node if node.op_type == "Scan"]
+    scans = [node for node in graph.node if node.op_type == "Scan"]
+    stem, *scans = [node for node in scans if body_of(node).name not in ("gate", "head")]
     graph.initializer.append(numpy_helper.from_array(np.float32(1), ONE))
     graph.initializer.append(numpy_helper.from_array(np.uint8(0), NONE))
     for before, scan, block in zip([stem, *scans[:-1]], scans, blocks, strict=True):
@@ -94,9 +95,14 @@ def add_rounded(body: onnx.GraphProto, block: IntBlock) -> str:
 
 
 def gather_rounded(graph: onnx.GraphProto, scan: onnx.NodeProto, rounded: str) -> None:
-    """Let a block gather rounded features, (n, chunk, C), instead of its float32 ones."""
-    gather = body_of(scan).node[1]  # the first node gathers the table
-    flat = next(node for node in graph.node if gather.input[0] in node.output)
+    """Let a block gather rounded features, (n, chunk, C), instead of its float32 ones.
+
+    Those of some voxels only are written onto the rounded ones of all.
+    """
+    made_by = {name: node for node in graph.node for name in node.output}
+    flat = made_by[body_of(scan).node[1].input[0]]  # the first node gathers the table
+    if flat.op_type == "ScatterND":
+        flat = made_by[flat.input[2]]
     flat.input[0] = rounded
 
 

@@ -7,6 +7,9 @@ kept at 0: index -1 of the neighbour table refers to the last of them. So a bloc
 features and writes the next, and there is no other array of that size. Only standard operators are
 used.
 
+The last blocks of a gated network get their voxels from NonZero. Their features stand in an array
+of their own and, for the next block to gather, in a copy of all features.
+
 A chunk that fits a processor's cache is too small for a GPU. So its size is an initializer that is
 also an input, which the runtime may override.
 """
@@ -22,9 +25,10 @@ from export.network import SuperSdfNet
 from export.writer import Writer
 from super_sdf.neighbourhood import CENTRE
 from super_sdf.network.running import CHUNK_INPUT
-from super_sdf.steps.band import MAX_DIFFERENCE
+from super_sdf.steps.band import DECODE_LIMIT, MAX_DIFFERENCE
 
 CHUNK = 512  # voxels at a time; on a CPU 256 to 2048 differ by a few percent
+THRESHOLD = "gate.threshold"  # an input with a default, like the chunk
 
 
 class Graph(Writer):
@@ -32,7 +36,8 @@ class Graph(Writer):
 
     def __init__(self, net: SuperSdfNet, prefix: str = "") -> None:
         super().__init__(prefix)
-        self.names = {id(tensor): name for name, tensor in net.named_parameters()}
+        named = [*net.named_parameters(), *net.named_buffers()]
+        self.names = {id(tensor): name for name, tensor in named}
 
     def integers(self, *numbers: int) -> str:
         """Add an int64 constant."""
@@ -67,17 +72,25 @@ def build_graph(net: SuperSdfNet) -> onnx.GraphProto:
     rows = graph.op("Shape", "patches", start=0, end=1)
     numbers, there = chunked_voxels(graph, rows)
     features, excess = scan_stem(graph, net, numbers, there)
-    for number in range(len(net.blocks)):
-        features = scan_block(graph, net, number, features, numbers, there)
+    channels, first = net.config.channels, len(net.blocks) - net.config.gated
+    for number in range(first):
+        everywhere = flat(graph, features, channels)
+        features = scan_block(graph, net, number, features, everywhere, numbers, there)
+    features = flat(graph, features, channels)
+    if net.config.gated:
+        features = deepen(graph, net, features, rows)
     per_offset = graph.op("Concat", trunk(graph, net), interpolation(graph), axis=1)
     transposed = graph.op("Transpose", per_offset, perm=[1, 0])
-    scan_head(graph, net, flat(graph, features, net.config.channels), excess, transposed)
+    scan_head(graph, net, features, excess, transposed)
     graph.constants.append(numpy_helper.from_array(np.array([CHUNK], np.int64), CHUNK_INPUT))
-    return helper.make_graph(graph.nodes, "super_sdf", inputs(), [output()], graph.constants)
+    given = inputs()
+    if net.config.gated:
+        given.append(helper.make_tensor_value_info(THRESHOLD, TensorProto.FLOAT, [1]))
+    return helper.make_graph(graph.nodes, "super_sdf", given, [output()], graph.constants)
 
 
 def inputs() -> list[onnx.ValueInfoProto]:
-    """Return the declared inputs; the last has a default."""
+    """Return the declared inputs of every network; the last has a default."""
     return [
         helper.make_tensor_value_info("patches", TensorProto.FLOAT, ["V", 27]),
         helper.make_tensor_value_info("neighbours", TensorProto.INT32, ["V", 27]),
@@ -105,12 +118,17 @@ def chunked_voxels(graph: Graph, rows: str) -> tuple[str, str]:
     zero, one = (graph.constant(np.array(number, np.int64)) for number in (0, 1))
     count = graph.op("Squeeze", rows)
     end = graph.op("Squeeze", graph.op("Add", rows, fill_up(graph, rows, CHUNK_INPUT)))
-    numbers = graph.op("Range", zero, end, one)
+    return in_chunks(graph, graph.op("Range", zero, end, one), count)
+
+
+def in_chunks(graph: Graph, numbers: str, count: str) -> tuple[str, str]:
+    """Return indices of voxels in chunks, and a mask: see ``chunked_voxels``."""
     there = graph.op("Cast", graph.op("Less", numbers, count), to=TensorProto.FLOAT)
-    present = graph.op("Min", numbers, graph.op("Sub", count, one))
+    last = graph.op("Sub", count, graph.constant(np.array(1, np.int64)))
     shape = graph.op("Concat", graph.integers(-1), CHUNK_INPUT, axis=0)
     column = graph.op("Concat", shape, graph.integers(1), axis=0)
-    return graph.op("Reshape", present, shape), graph.op("Reshape", there, column)
+    present = graph.op("Reshape", graph.op("Min", numbers, last), shape)
+    return present, graph.op("Reshape", there, column)
 
 
 def flat(graph: Graph, chunks: str, *width: int) -> str:
@@ -151,11 +169,19 @@ def scan_stem(graph: Graph, net: SuperSdfNet, numbers: str, there: str) -> tuple
 
 
 def scan_block(
-    graph: Graph, net: SuperSdfNet, number: int, features: str, numbers: str, there: str
+    graph: Graph,
+    net: SuperSdfNet,
+    number: int,
+    features: str,
+    everywhere: str,
+    numbers: str,
+    there: str,
 ) -> str:
-    """Add a residual block; return its features (n, chunk, C)."""
+    """Add a residual block on chunks of voxels; return their features (n, chunk, C).
+
+    Their neighbours' are gathered from those of all voxels, ``everywhere``.
+    """
     block, channels = net.blocks[number], net.config.channels
-    everywhere = flat(graph, features, channels)
     body = Graph(net, f"block{number}_")
     table = body.op("Gather", "neighbours", "some", axis=0)
     gathered = body.op("Gather", everywhere, table, axis=0)
@@ -172,6 +198,51 @@ def scan_block(
     results = [rows_of(result, TensorProto.FLOAT, channels)]
     subgraph = helper.make_graph(body.nodes, f"block{number}", given, results, body.constants)
     return graph.op("Scan", numbers, features, there, body=subgraph, num_scan_inputs=3)
+
+
+def deepen(graph: Graph, net: SuperSdfNet, features: str, rows: str) -> str:
+    """Add the blocks that run where the gate is open; return the features of all voxels (N, C).
+
+    Rows are filled up with the last one of the padding, which stays 0.
+    """
+    channels, blocks = net.config.channels, range(len(net.blocks))[-net.config.gated :]
+    open_rows = gate(graph, net, features, rows)
+    fill = fill_up(graph, graph.op("Shape", open_rows), CHUNK_INPUT)
+    end = graph.op("Sub", graph.op("Shape", features, start=0, end=1), graph.integers(1))
+    pads = graph.op("Concat", graph.integers(0), fill, axis=0)
+    chosen = graph.op("Pad", open_rows, pads, graph.op("Squeeze", end))
+    some, there = in_chunks(graph, chosen, graph.op("Squeeze", rows))
+    shape = graph.op("Concat", graph.integers(-1), CHUNK_INPUT, graph.integers(channels), axis=0)
+    deep = graph.op("Reshape", graph.op("Gather", features, chosen, axis=0), shape)
+    places = graph.op("Unsqueeze", chosen, graph.integers(1))
+    everywhere = flat(graph, features, channels)  # of its own, since int8 reads bytes there
+    for number in blocks:
+        deep = scan_block(graph, net, number, deep, everywhere, some, there)
+        onto = features if number == blocks[-1] else everywhere
+        everywhere = graph.op("ScatterND", onto, places, flat(graph, deep, channels))
+    return everywhere
+
+
+def gate(graph: Graph, net: SuperSdfNet, features: str, rows: str) -> str:
+    """Add the gate, in chunks; return the rows (n,) of the voxels where it is open."""
+    channels = net.config.channels
+    shape = graph.op("Concat", graph.integers(-1), CHUNK_INPUT, graph.integers(channels), axis=0)
+    body, layers = Graph(net, "gate_"), net.gate.layers
+    made = body.layer(body.relu(body.layer("features_of_some", layers[0])), layers[2])
+    given, result = (
+        rows_of(name, TensorProto.FLOAT, width)
+        for name, width in (("features_of_some", channels), (made, 1))
+    )
+    subgraph = helper.make_graph(body.nodes, "gate", [given], [result], body.constants)
+    chunks = graph.op("Reshape", features, shape)
+    doubts = flat(graph, graph.op("Scan", chunks, body=subgraph, num_scan_inputs=1))
+    doubts = graph.op("Slice", doubts, graph.integers(0), rows)
+    above = graph.op("Greater", doubts, graph.parameter(net.gate.threshold))
+    sample = graph.op("Gather", "patches", graph.constant(np.array(CENTRE, np.int64)), axis=1)
+    limit = graph.constant(np.float32(DECODE_LIMIT))
+    near = graph.op("LessOrEqual", graph.op("Abs", sample), limit)
+    both = graph.op("NonZero", graph.op("And", above, near))
+    return graph.op("Squeeze", both, graph.integers(0))
 
 
 def scan_head(graph: Graph, net: SuperSdfNet, features: str, excess: str, per_offset: str) -> None:

@@ -14,7 +14,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import onnx
 import torch
 from torch import nn
 
@@ -25,16 +24,19 @@ from export.calibration import (
     find_ranges,
 )
 from export.network import SuperSdfNet
-from export.to_onnx import PARITY, read_network, write_model
+from export.to_onnx import PARITY, read_card, read_network, write_model
 
 
 @torch.no_grad()
 def without_idle_blocks(net: SuperSdfNet, ranges: list[Ranges]) -> SuperSdfNet:
-    """Return the network without the blocks whose first rectifier is always 0."""
+    """Return the network without the blocks whose first rectifier is always 0.
+
+    Those behind a gate stay: what they add is not added to every voxel.
+    """
     pruned = copy.deepcopy(net)
     before, kept = pruned.stem[2], []
-    for block, block_ranges in zip(pruned.blocks, ranges):
-        if block_ranges.mixed.any():
+    for number, (block, block_ranges) in enumerate(zip(pruned.blocks, ranges)):
+        if block_ranges.mixed.any() or number >= net.config.blocks - net.config.gated:
             before = block.reduce
             kept.append(block)
         else:
@@ -46,10 +48,9 @@ def without_idle_blocks(net: SuperSdfNet, ranges: list[Ranges]) -> SuperSdfNet:
 
 def card_of(source: Path, net: SuperSdfNet, **changed: str) -> dict[str, Any]:
     """Return the metadata of a file, updated for a network that was made from it."""
-    card = {prop.key: prop.value for prop in onnx.load(source).metadata_props}
     size = sum(parameter.numel() for parameter in net.parameters())
     field = net.config.receptive_field
-    return {**card, "parameters": size, "receptive_field": field, **changed}
+    return {**read_card(source), "parameters": size, "receptive_field": field, **changed}
 
 
 def main() -> None:

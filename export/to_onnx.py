@@ -107,8 +107,7 @@ def rewrite(source: Path, target: Path) -> None:
     SystemExit
         If the values differ by more than rounding.
     """
-    card = {prop.key: prop.value for prop in onnx.load(source).metadata_props}
-    net = read_network(source)
+    card, net = read_card(source), read_network(source)
     want = load_network(source, device="cpu")(*noisy_ball())
     fresh = target.with_suffix(".new.onnx")  # the target may be the source
     write_model(net, fresh, card)
@@ -136,6 +135,7 @@ def read_network(path: Path) -> SuperSdfNet:
         trunk=trunk,
         frequencies=(inputs - 3) // 6,
         keeps_samples=read_inputs(path) != MASKS,
+        gated=int(read_card(path).get("gated", 0)),
     )
     net = SuperSdfNet(config)
     net.load_state_dict(weights)
@@ -144,8 +144,12 @@ def read_network(path: Path) -> SuperSdfNet:
 
 def read_inputs(path: Path) -> str:
     """Return what the network in an exported file was trained on."""
-    card = {prop.key: prop.value for prop in onnx.load(path).metadata_props}
-    return card.get("inputs", DISTANCES)
+    return read_card(path).get("inputs", DISTANCES)
+
+
+def read_card(path: Path) -> dict[str, str]:
+    """Return the metadata of an exported file."""
+    return {prop.key: prop.value for prop in onnx.load(path).metadata_props}
 
 
 def check_awake(net: SuperSdfNet) -> None:
@@ -187,6 +191,7 @@ def make_card(
         "accuracy": accuracy,
         "licence": "MIT",
         **({} if inputs == DISTANCES else {"inputs": inputs}),
+        **({"gated": net.config.gated} if net.config.gated else {}),
     }
 
 

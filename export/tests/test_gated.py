@@ -1,0 +1,222 @@
+"""Networks whose last blocks run only where much is lost: training, as files, in whole numbers."""
+
+from dataclasses import replace
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from export.augment import CLEAN, prepare
+from export.calibration import distance_apart, draw_samples
+from export.dormant import dormant_share, rectified_layers
+from export.grow import grow_from, without_blocks
+from export.network import GatherMatMul, SuperSdfNet
+from export.onnx_graph import THRESHOLD
+from export.quantize import quantize
+from export.recipe import RECIPE
+from export.resident import Residents, gather_samples
+from export.tests.small_net import SMALL
+from export.tests.test_resident import turned_one_by_one
+from export.tests.test_training import some_samples
+from export.to_onnx import make_card, noisy_ball, parity, read_network, write_model
+from export.train import Run, Store, take_step, window_losses
+from super_sdf.network.contract import INPUTS
+from super_sdf.network.network import load_network
+from super_sdf.network.onnx import ort
+from super_sdf.network.running import CHUNK_INPUT
+from super_sdf.neighbourhood import CENTRE
+from super_sdf.steps.band import DECODE_LIMIT
+
+CONFIG = replace(SMALL, channels=16, hidden=32, blocks=4, gated=2)
+ALWAYS, NEVER = -1e9, 1e9
+
+
+def ball_tensors():
+    """The noisy ball as the blocks get it: patches and table."""
+    patches, table, *_ = map(torch.from_numpy, noisy_ball())
+    return patches, torch.where(table < 0, len(patches), table)
+
+
+@pytest.fixture
+def net():
+    """A network away from the start; its gate is open for half of the noisy ball."""
+    torch.manual_seed(0)
+    net = SuperSdfNet(CONFIG)
+    for parameter in net.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    with torch.no_grad():
+        net.gate.threshold.fill_(net.encode_all(*ball_tensors()).doubts.median())
+    return net.eval()
+
+
+def plain_net(net, blocks):
+    """The first blocks of a network, on all voxels."""
+    plain = SuperSdfNet(replace(CONFIG, blocks=blocks, gated=0))
+    weights = {name: array for name, array in net.state_dict().items() if "gate" not in name}
+    grow_from(plain, without_blocks(weights, range(blocks, CONFIG.blocks)))
+    return plain
+
+
+@torch.no_grad()
+def test_the_last_blocks_on_all_voxels_are_those_of_a_plain_network(net):
+    patches, table = ball_tensors()
+    first, everywhere = net.encode(patches, table), torch.arange(len(patches))
+    torch.testing.assert_close(first, plain_net(net, 2).encode(patches, table))
+    deep = net.deepen(first, table, everywhere)
+    torch.testing.assert_close(deep, plain_net(net, 4).encode(patches, table))
+    torch.testing.assert_close(net.deepen(first, table, everywhere[:0]), first)
+
+
+@torch.no_grad()
+def test_voxels_that_do_not_go_deeper_stay_as_they_are_also_as_neighbours(net):
+    patches, table = ball_tensors()
+    first = net.encode(patches, table)
+    alone = net.deepen(first, table, torch.tensor([7]))
+    others = torch.arange(len(patches)) != 7
+    torch.testing.assert_close(alone[others], first[others])
+    want = first[7:8]
+    for block in net.blocks[2:]:  # the voxel itself is at the centre of its table
+        rows = first.clone()
+        rows[7:8] = want
+        want = block(rows, table)[7:8]
+    torch.testing.assert_close(alone[7:8], want)
+
+
+def test_the_gradient_of_a_convolution_with_voxels_around():
+    patches, table = ball_tensors()
+    rows = torch.arange(40, 52)
+    place = torch.arange(len(patches) + 1) + len(rows)
+    place[rows] = torch.arange(len(rows))
+    features = torch.randn(len(rows), 3, dtype=torch.double, requires_grad=True)
+    weight = torch.randn(81, 2, dtype=torch.double, requires_grad=True)
+    around = torch.randn(len(patches), 3, dtype=torch.double)
+    assert torch.autograd.gradcheck(
+        lambda f, w: GatherMatMul.apply(f, w, place[table[rows]], around), (features, weight)
+    )
+
+
+def test_the_gate_opens_for_a_share_of_the_voxels_that_can_hold_the_surface(net):
+    patches, _ = ball_tensors()
+    doubts = torch.randn(len(patches))
+    near = patches[:, CENTRE].abs() <= DECODE_LIMIT
+    before = float(net.gate.threshold)
+    rows = net.gate.rows(doubts, patches, 0.25)
+    assert near[rows].all() and not near.all()
+    assert len(rows) == pytest.approx(0.25 * int(near.sum()), abs=1)
+    assert doubts[rows].min() > torch.tensor(sorted(doubts[near]))[: -len(rows)].max()
+    usual = float(doubts[near].quantile(0.7))
+    assert float(net.gate.threshold) == pytest.approx(before + 0.01 * (usual - before))
+    net.gate.threshold.fill_(ALWAYS)
+    assert net.gate.rows(doubts, patches).tolist() == torch.nonzero(near)[:, 0].tolist()
+
+
+@pytest.fixture
+def file(net, tmp_path):
+    path = tmp_path / "gated.onnx"
+    write_model(net, path, make_card(net, "gated", "nothing", "none"))
+    return path
+
+
+def test_the_file_agrees_with_torch_and_is_read_back(net, file):
+    open_ = net.gate.rows(net.encode_all(*ball_tensors()).doubts, noisy_tensor())
+    assert 0.2 < len(open_) / len(noisy_tensor()) < 0.6
+    assert parity(net, file) < 2e-5
+    again = read_network(file)
+    assert again.config == CONFIG
+    assert load_network(file).card["receptive_field"] == CONFIG.blocks + 1
+    for name, array in net.state_dict().items():
+        torch.testing.assert_close(again.state_dict()[name], array)
+
+
+def noisy_tensor():
+    return ball_tensors()[0]
+
+
+def test_who_runs_the_file_may_set_the_threshold_and_the_chunk(net, file):
+    session, feeds = load_network(file, device="cpu").session, dict(zip(INPUTS, noisy_ball()))
+    found = []
+    for threshold in (ALWAYS, float(net.gate.threshold), NEVER):
+        given = {**feeds, THRESHOLD: np.array([threshold], np.float32)}
+        net.gate.threshold.fill_(threshold)
+        with torch.no_grad():
+            want = net(*map(torch.from_numpy, noisy_ball())).numpy()
+        for rows in (7, 512):
+            found.append(session.run(None, {**given, CHUNK_INPUT: np.array([rows])})[0])
+            np.testing.assert_allclose(found[-1], want, atol=2e-5)
+    apart = [np.abs(found[0] - other).max() for other in found[2::2]]
+    assert 1e-3 < apart[0] and 1e-3 < apart[1]
+
+
+def test_a_voxel_sees_no_farther_than_the_receptive_field(net, file):
+    network, (patches, table, voxels, offsets) = load_network(file), noisy_ball()
+    whole = network(patches, table, voxels, offsets)
+    x = np.argwhere(np.ones(1))  # noqa: F841
+    reached = np.zeros(len(patches), bool)
+    reached[voxels[0]] = True
+    for _ in range(CONFIG.receptive_field - 1):  # a patch itself reaches one voxel
+        around = table[reached]
+        reached[around[around >= 0]] = True
+    assert not reached.all()
+    changed = np.where(reached[:, None], patches, patches + 0.3).astype(np.float32)
+    np.testing.assert_array_equal(network(changed, table, voxels, offsets)[0], whole[0])
+
+
+def test_the_int8_file_is_near_and_runs_every_layer_in_whole_numbers(net, file, tmp_path):
+    samples = draw_samples(6)
+    small = file.with_name("gated-int8.onnx")
+    quantize(file, small, samples)
+    apart = distance_apart(file, small, samples)
+    assert 0 < apart.mean() < 3e-3
+    options = ort.SessionOptions()
+    options.optimized_model_filepath = str(tmp_path / "optimised.onnx")
+    ort.InferenceSession(str(small), options, providers=["CPUExecutionProvider"])
+    nodes = onnx.load(tmp_path / "optimised.onnx").graph.node
+    bodies = [a.g for node in nodes for a in node.attribute if a.name == "body"]
+    kinds = {body.name: [node.op_type for node in body.node] for body in bodies}
+    layers = ["QGemm"] * 3 + ["Mul", "Add"]
+    for number in range(CONFIG.blocks):
+        rounding = ["Mul", "Add", "QuantizeLinear"] * (number < CONFIG.blocks - 1)
+        assert kinds[f"block{number}"] == ["Gather", "Gather", "Reshape", *layers, *rounding]
+
+
+def test_blocks_of_the_start_are_left_out():
+    weights = {f"blocks.{n}.conv.bias": torch.tensor([n]) for n in range(5)}
+    kept = without_blocks({**weights, "branch.bias": torch.tensor([9])}, [1, 3])
+    assert {name: int(array) for name, array in kept.items()} == {
+        "blocks.0.conv.bias": 0,
+        "blocks.1.conv.bias": 2,
+        "blocks.2.conv.bias": 4,
+        "branch.bias": 9,
+    }
+
+
+@pytest.fixture(scope="module")
+def samples():
+    return [prepare(sample) for sample in some_samples()]
+
+
+def test_samples_on_a_device_have_the_same_losses_and_the_gate_learns(net, samples):
+    residents = Residents("cpu")
+    residents.add(gather_samples(samples))
+    found = []
+    for batch in (
+        residents.batch([2, 0, 1, 2], [0, 5, 17, 40]),
+        list(turned_one_by_one(samples)),
+    ):
+        torch.manual_seed(3)
+        found.append(window_losses(net, batch, RECIPE))
+    torch.testing.assert_close(*found)
+    found[0].sum().backward()
+    for part in (net.gate.layers[2], net.blocks[0].conv, net.blocks[3].conv):
+        assert part.weight.grad.abs().max() > 0
+
+
+def test_units_behind_the_gate_and_of_it_may_be_dormant(net, samples):
+    layers = rectified_layers(net)
+    assert [entry.layer for entry in layers if entry.layer is net.gate.layers[0]]
+    with torch.no_grad():
+        for entry in layers:
+            entry.bias[:4] = -1e4
+    units = sum(len(entry.bias) for entry in layers)
+    assert dormant_share(net, [samples[:1]]) >= 4 * len(layers) / units
