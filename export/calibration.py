@@ -43,16 +43,19 @@ class Ranges:
         """Extend the ranges whenever the block runs on some voxels."""
 
         def see_conv(module: nn.Module, given: tuple[Tensor, ...], made: Tensor) -> None:
+            if not len(made):
+                return
             for features in (given[0], *given[2:]):  # of its voxels, and of those around
                 self.low = torch.minimum(self.low, features.amin(0))
                 self.high = torch.maximum(self.high, features.amax(0))
             self.mixed = torch.maximum(self.mixed, made.amax(0))
 
         def see_expand(module: nn.Module, given: tuple[Tensor, ...], made: Tensor) -> None:
-            self.expanded = torch.maximum(self.expanded, made.amax(0))
+            if len(made):
+                self.expanded = torch.maximum(self.expanded, made.amax(0))
 
-        block.conv.register_forward_hook(lambda *seen: see_conv(*seen) if len(seen[2]) else None)
-        block.expand.register_forward_hook(lambda *seen: see_expand(*seen) if len(seen[2]) else None)
+        block.conv.register_forward_hook(see_conv)
+        block.expand.register_forward_hook(see_expand)
 
     def join(self, others: Sequence[Ranges]) -> Ranges:
         """Return the ranges with those of the features widened to contain others'."""

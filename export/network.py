@@ -173,7 +173,9 @@ class Block(nn.Module):
 
     def forward(self, features: Tensor, table: Tensor, *around: Tensor) -> Tensor:
         """Map (V, C) to (V, C)."""
-        return features + self.reduce(self.activate(self.expand(self.mix(features, table, *around))))
+        return features + self.reduce(
+            self.activate(self.expand(self.mix(features, table, *around)))
+        )
 
     def mix(self, features: Tensor, table: Tensor, *around: Tensor) -> Tensor:
         """Apply the neighbour convolution and its rectifier."""

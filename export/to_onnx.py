@@ -212,11 +212,16 @@ def main() -> None:
         default=DISTANCES,
         help="the network was trained on hardly any noisy samples: noisy grids are for another one",
     )
+    parser.add_argument(
+        "--threshold", type=float, help="of the gate, if not that of the run: see export.gates"
+    )
     options = parser.parse_args()
     if options.source:
         rewrite(options.source, options.out)
         return
     net = load_run(options.run)
+    if options.threshold is not None:
+        net.gate.threshold.fill_(options.threshold)
     check_awake(net)
     said = options.data, options.accuracy, options.inputs
     write_model(net, options.out, make_card(net, options.out.stem, *said))
