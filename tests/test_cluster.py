@@ -405,8 +405,9 @@ Network.__call__ = lambda *given: exact(*given) * (1 + 2**-20)
 
 
 def test_workers_that_round_differently_are_refused_and_both_named(
-    command, scheduler, start_worker, tmp_path
+    command, scheduler, start_worker, tmp_path, monkeypatch
 ):
+    monkeypatch.setattr(connecting, "FIRST_WORKER_SECONDS", 60)
     Path("other").mkdir()
     Path("other/sitecustomize.py").write_text(OTHER_PROCESSOR)
     start_worker(), start_worker(tmp_path / "other")
