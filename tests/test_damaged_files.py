@@ -169,10 +169,7 @@ def test_sizes_that_no_file_has_are_refused_at_once(size, first):
     write("a.sdf", f"{huge}\n0 0 0\n1\n1 2 3\n")
     write("b.sdf", f"#sdf 1\ndim {huge}\ndata\n1234")
     save_vti("a.vti", AFFINE)
-    text = Path("a.vti").read_bytes()
-    for last in (b"26", b"17", b"23"):
-        text = text.replace(last + b" ", b"2147483646 ").replace(last + b'"', b'2147483646"')
-    write("a.vti", text)
+    write("a.vti", Path("a.vti").read_bytes().replace(b"7 23", b"7 99999999"))
     forget_peak()
     held = held_memory()
     for name in ("a.mha", "a.nrrd", "b.nrrd", "a.sdf", "b.sdf", "a.vti"):
@@ -203,8 +200,8 @@ def test_a_type_that_is_no_number_is_refused():
 
 
 def test_skips_of_nrrd_are_bounded():
-    said = "a.nrrd: it has no 1,000,000,000 lines to skip (line skip)"
-    assert refusal(nrrd_file("encoding: raw", "line skip: 1000000000")) == said
+    said = "a.nrrd: it has no 1,000,000 lines to skip (line skip)"
+    assert refusal(nrrd_file("encoding: raw", "line skip: 1000000")) == said
     assert "truncated" in refusal(nrrd_file("encoding: raw", "byte skip: 1000000000"))
     said = "a.nrrd: its encoding is 'gzip', byte skip 8: save it as raw"
     assert refusal(nrrd_file("encoding: gzip", "byte skip: 8")) == said
