@@ -55,10 +55,10 @@ def read_metaimage(request: Request) -> Volume:
     spacing = np.array(header.numbers(SPACING, np.ones(3)))
     matrix = np.array(header.numbers(DIRECTION, np.eye(3).ravel())).reshape(3, 3)
     direction = matrix.T * np.where(spacing < 0, -1, 1)  # as ITK takes a spacing below 0
-    origin = tuple(header.numbers(ORIGIN, np.zeros(3)))
+    x, y, z = header.numbers(ORIGIN, np.zeros(3))
     place = reversed_axes(np.abs(spacing), direction)
     read, packed = _data(request, file, header, size[::-1])
-    return Volume(size[::-1], header.dtype, read, place[0], origin, place[1], packed=packed)
+    return Volume(size[::-1], header.dtype, read, place[0], (x, y, z), place[1], packed=packed)
 
 
 class Header:

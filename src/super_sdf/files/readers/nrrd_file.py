@@ -57,7 +57,7 @@ def _dtype(nrrd: Any, header: dict[str, Any]) -> np.dtype[Any]:
     said = {key: header[key] for key in ("type", "endian") if key in header}
     if header["encoding"].lower() in TEXT:
         said["endian"] = "little"  # which text need not state
-    one = {**said, "encoding": "raw", "dimension": 1, "sizes": np.array([1])}
+    one: dict[str, Any] = {**said, "encoding": "raw", "dimension": 1, "sizes": np.array([1])}
     return np.dtype(nrrd.read_data(one, io.BytesIO(bytes(8))).dtype)
 
 

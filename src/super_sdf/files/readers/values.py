@@ -6,7 +6,7 @@ import bz2
 import zlib
 from collections.abc import Callable
 from math import prod
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +43,17 @@ def raw_planes(
     return PlaneFile(file, offset, shape, dtype)
 
 
-def bytes_from(file: InputFile, offset: int, end: int | None = None) -> Read:
+class Positional(Protocol):
+    """What can be read at any offset, such as an ``InputFile``."""
+
+    size: int
+
+    def read(self, offset: int, count: int) -> NDArray[np.uint8]:
+        """Return ``count`` bytes from ``offset`` on, or fewer at the end."""
+        ...
+
+
+def bytes_from(file: Positional, offset: int, end: int | None = None) -> Read:
     """Return a function that reads a file from an offset on, up to its end or another one."""
     stop = file.size if end is None else min(end, file.size)
 

@@ -56,9 +56,10 @@ def read_vti(request: Request) -> Volume:
     names = dict.fromkeys(name for piece in outline.pieces for name in piece.arrays.get(kind, ()))
     name = choose_member(request, list(names), "array of points or cells")
     of_points = kind == KINDS[0]
-    place = (_numbers(outline.image, key, 3, of) for key, of in (("Spacing", 1), ("Origin", 0)))
+    spacing = _numbers(outline.image, "Spacing", 3, 1)
+    origin = _numbers(outline.image, "Origin", 3, 0)
     turn = _numbers(outline.image, "Direction", 9, np.eye(3).ravel()).reshape(3, 3)
-    lattice = ImageLattice(_extent(outline.image, "WholeExtent"), *place, turn, of_points)
+    lattice = ImageLattice(_extent(outline.image, "WholeExtent"), spacing, origin, turn, of_points)
     parts = [Part(file, outline, piece, (kind, name), lattice) for piece in outline.pieces]
     _check_cover(parts, lattice.shape)
     if len({part.dtype for part in parts}) > 1:
@@ -354,8 +355,8 @@ def _unpack_lz4(packed: bytes, size: int, name: str) -> bytes:
     check_modules("LZ4 in VTK image data", "vti")
     from vtkmodules.vtkIOCore import vtkLZ4DataCompressor
 
-    block = np.empty(size, np.uint8)
-    if vtkLZ4DataCompressor().Uncompress(packed, len(packed), block, size) != size:
+    block, compressor = np.empty(size, np.uint8), vtkLZ4DataCompressor()  # type: Any, Any
+    if compressor.Uncompress(packed, len(packed), block, size) != size:
         raise FileError(f"{name} is damaged: a block of LZ4 does not have {size:,} bytes")
     return block.tobytes()
 
