@@ -54,10 +54,10 @@ def _plain(name: str) -> str:
 
 def _dtype(nrrd: Any, header: dict[str, Any]) -> np.dtype[Any]:
     """Return the type that pynrrd makes of the header: it reads one sample that is 0."""
-    said = {key: header[key] for key in ("type", "endian") if key in header}
+    said: dict[str, Any] = {key: header[key] for key in ("type", "endian") if key in header}
     if header["encoding"].lower() in TEXT:
         said["endian"] = "little"  # which text need not state
-    one: dict[str, Any] = {**said, "encoding": "raw", "dimension": 1, "sizes": np.array([1])}
+    one = {**said, "encoding": "raw", "dimension": 1, "sizes": np.array([1])}
     return np.dtype(nrrd.read_data(one, io.BytesIO(bytes(8))).dtype)
 
 
