@@ -76,11 +76,6 @@ class Request:
                 f"and {in_words(max(self.left, 0))} are left; save it as .npy in C order"
             )
 
-    def planes_at_once(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> int:
-        """Return how many planes to read at once if reading many is much quicker."""
-        plane = max(prod(shape[1:]) * dtype.itemsize, 1)
-        return max(min(max(self.room, PIECE) // plane, shape[0]), 1)
-
 
 @dataclass(frozen=True)
 class Volume:
@@ -101,8 +96,6 @@ class Volume:
         World position of sample (0, 0, 0).
     direction : (3, 3) array
         The columns are the world directions (unit vectors) of the axes of the array.
-    planes_at_once : int
-        Planes that are read together.
     chunks : three ints, optional
         Samples of a chunk along each axis, if the array is stored in chunks.
     read_box : callable, optional
@@ -121,7 +114,6 @@ class Volume:
     spacing: Triple | None = None
     origin: Triple | None = None
     direction: NDArray[np.float64] | None = None
-    planes_at_once: int = 1
     stored: SampleArray | None = None
     """The array itself, if its planes can be read again and again without unpacking it."""
     chunks: tuple[int, ...] | None = None
@@ -133,7 +125,7 @@ class Volume:
     @property
     def unit(self) -> tuple[int, ...]:
         """Samples along each axis that are read together at least."""
-        return self.chunks or (self.planes_at_once, *self.shape[1:])
+        return self.chunks or (1, *self.shape[1:])
 
     def box(self, box: Box) -> NDArray[Any]:
         """Return a box of samples, of the array's own type."""
@@ -192,14 +184,12 @@ class ImageLattice:
         low, high = self.extent[::2], self.extent[1::2]
         return tuple(high[axis] - low[axis] + self.of_points for axis in (2, 1, 0))
 
-    def volume(
-        self, dtype: Any, read: Callable[[int, int], NDArray[Any]], planes_at_once: int = 1
-    ) -> Volume:
+    def volume(self, dtype: Any, read: Callable[[int, int], NDArray[Any]]) -> Volume:
         """Return the samples, whose planes of z ``read`` returns, at their place in the world."""
         first = np.array(self.extent[::2]) + (0 if self.of_points else 0.5)
         start = _triple(self.origin + self.direction @ (self.spacing * first))
         spacing, direction = reversed_axes(self.spacing, self.direction)
-        return Volume(self.shape, np.dtype(dtype), read, spacing, start, direction, planes_at_once)
+        return Volume(self.shape, np.dtype(dtype), read, spacing, start, direction)
 
 
 def axes_direction(axes: str) -> NDArray[np.float64]:
