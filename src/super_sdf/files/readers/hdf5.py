@@ -19,7 +19,7 @@ from .stored import place_of, without_gaps
 def read_hdf5(request: Request) -> Volume:
     """Read ``FILE.h5:/DATASET``; without a name the only dataset of three axes."""
     # HDF5 asks when it is loaded where raw data files are; this process reads no other file
-    os.environ["HDF5_EXTFILE_PREFIX"] = str(request.path.resolve().parent)
+    os.environ["HDF5_EXTFILE_PREFIX"] = str(request.path.absolute().parent)
     import h5py
 
     file = request.files.enter_context(h5py.File(request.path, "r"))
