@@ -435,8 +435,9 @@ def unpacked_bytes(samples: SampleArray) -> int:
     """Return the size of the temporary file that samples are made of, 0 if there is none."""
     while hasattr(samples, "source"):
         samples = samples.source
-    is_unpacked = isinstance(samples, PlaneFile) and samples.is_unpacked
-    return len(samples) * samples.plane_bytes if is_unpacked else 0
+    if isinstance(samples, PlaneFile) and samples.is_unpacked:
+        return len(samples) * samples.plane_bytes
+    return 0
 
 
 def check_planes(samples: SampleArray, bound: int | None) -> None:
