@@ -59,7 +59,7 @@ FAR = 1e30  # half voxels: no sample of the band is there
 Found: TypeAlias = tuple[IntArray, FloatArray, NDArray[np.int64], FloatArray]
 """Some of the band's voxels and their patches; numbers and values of samples beyond it."""
 
-NONE_ACTIVE = np.empty((0, 3), np.int32), np.empty((0, 27), np.float32)
+NONE_ACTIVE: tuple[IntArray, FloatArray] = np.empty((0, 3), np.int32), np.empty((0, 27), np.float32)
 
 
 class BandTooLargeError(OutOfMemoryError):
@@ -251,7 +251,8 @@ def survey(
         _check_bound(sum(sizes) + reading, block[1], held, resources.memory)
         return found
 
-    blocks = list(plane_blocks(grid.shape, *(among or (0, None)), planes))
+    first, last = among or (0, grid.shape[0])
+    blocks = list(plane_blocks(grid.shape, first, last, planes))
     voxel_ijk, patches, number, value = _put_together(over_threads(read, blocks, resources.threads))
     if offset and among is None:
         check_jumps(jumps, grid, offset)
@@ -275,9 +276,9 @@ def _put_together(blocks: Iterable[list[Found]]) -> Found:
 
     The arrays grow, and each part is freed when it was taken, so that nothing is held twice.
     """
-    empty = *NONE_ACTIVE, NONE_BEYOND.number, NONE_BEYOND.value
-    voxel_ijk, patches, number, value = (array.copy() for array in empty)
-    whole = voxel_ijk, patches, number, value
+    voxel_ijk, patches = NONE_ACTIVE
+    number, value = NONE_BEYOND.number, NONE_BEYOND.value
+    whole: Found = (voxel_ijk.copy(), patches.copy(), number.copy(), value.copy())
     waiting: list[Found] = []
     for parts in blocks:
         while parts:
@@ -290,7 +291,8 @@ def _put_together(blocks: Iterable[list[Found]]) -> Found:
 
 def _append(whole: Found, parts: list[Found]) -> None:
     """Append parts to what was found, and empty the list."""
-    for array, rows in zip(whole, zip(*parts)):
+    arrays: tuple[NDArray[Any], ...] = whole
+    for array, rows in zip(arrays, zip(*parts)):
         count = len(array)
         array.resize((count + sum(map(len, rows)), *array.shape[1:]), refcheck=False)
         np.concatenate(rows, out=array[count:])
@@ -451,9 +453,9 @@ def band_of_samples(
     rescaled = rescale_planes(samples, grid.voxel_size, offset)
     del samples
     leaving.append(_has_inside_on_border(rescaled, low == 0, high == grid.shape[0]))
-    limits, start = limits_beyond(grid, offset), [low, 0, 0]
+    limits, start = limits_beyond(grid, offset), np.array([low, 0, 0], np.int64)
     for block, rows in _windows(rescaled.shape, slice(planes[0] - low, planes[1] - low)):
-        corner = np.maximum([block.start - 1, rows.start - 1, 0], 0)
+        corner = np.array([max(block.start - 1, 0), max(rows.start - 1, 0), 0], np.int64)
         window = rescaled[corner[0] : block.stop + 1, corner[1] : rows.stop + 1]
         inner = _shifted(block, corner[0]), _shifted(rows, corner[1])
         if offset and jumps is not None:  # at 0 there is no better offset to suggest
