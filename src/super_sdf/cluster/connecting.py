@@ -265,7 +265,7 @@ def open_client(server: Any, address: str) -> Iterator[Client]:
 
 async def greet(address: str) -> None:
     """Raise if a scheduler does not return a greeting in time: a Client would wait for ever."""
-    from distributed.comm import connect
+    from distributed.comm.core import connect
     from distributed.security import Security
 
     arguments = Security().get_connection_args("client")
