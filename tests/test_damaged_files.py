@@ -321,7 +321,7 @@ def test_data_is_read_beside_its_header_alone(name, tmp_path):
     os.symlink("/dev/zero", "zero.raw")
     os.symlink("../out.raw", "link.raw")
     os.symlink("..", "up")
-    elsewhere = ": put it beside the header, and name it there"
+    elsewhere = ": put both into one folder"
     for data, said in {
         str(tmp_path / "out.raw"): elsewhere,
         "../out.raw": elsewhere,

@@ -259,8 +259,8 @@ def test_planes_that_are_too_large_are_refused_before_they_are_read(tmp_path):
     bound = memory.held_memory() + 10**8
     with pytest.raises(
         OutOfMemoryError,
-        match=r"^planes of 4,096 x 4,096 samples need at least [\d.]+ GB of memory, \d+ MB may be "
-        r"used; allow more \(--max-memory\)$",
+        match=r"^planes of 4,096 x 4,096 samples need at least [\d.]+ GB of memory, [\d.]+ [MG]B "
+        r"may be used; allow more \(--max-memory\)$",
     ):
         read_grid(path, max_memory=bound)
 

@@ -16,8 +16,6 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import fields
 from functools import partial
-from multiprocessing.spawn import get_executable
-from pathlib import Path
 from subprocess import DEVNULL, PIPE, Popen
 from typing import IO, Any
 
@@ -26,14 +24,14 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, OutOfMemoryError, SuperSdfError
 from ..machine.memory import held_memory, in_words, memory_bound
+from ..machine.serving import isolated_python
 from .boxes import Box
 from .volume import Request, Volume
 
 STEP = 0.02  # seconds between two looks at the memory
 LEAST = 1 << 27  # bytes with which the process and its library can start
 FUNCTIONS = ("read", "read_box", "stored")  # fields of a volume that stay in that process
-# Isolated (-I), Python takes nothing from the current folder.
-START = "import sys; sys.path[:0] = sys.argv[1:]; from super_sdf.files import apart; apart.serve()"
+START = "from super_sdf.files import apart; apart.serve()"
 
 
 @contextmanager
@@ -71,8 +69,7 @@ class _Process:
         self.left = request.left
         if self.left is None and bound is not None:
             self.left = bound - self.start
-        command = [get_executable(), "-I", "-c", START, *_import_path()]
-        self.process = Popen(command, stdin=PIPE, stdout=PIPE, stderr=DEVNULL)
+        self.process = Popen(isolated_python(START), stdin=PIPE, stdout=PIPE, stderr=DEVNULL)
         threading.Thread(target=self._watch, daemon=True).start()
 
     def ask(self, question: Any) -> Any:
@@ -127,13 +124,6 @@ class _Process:
             with suppress(OSError):  # what was not sent is of no use any more
                 if pipe:
                     pipe.close()
-
-
-def _import_path() -> list[str]:
-    """Return where the process finds modules: where this one does, but for the current folder."""
-    own = str(Path(__file__).resolve().parents[2])
-    here = os.getcwd()
-    return [own, *(path for path in sys.path if path and os.path.abspath(path) != here)]
 
 
 def serve() -> None:

@@ -53,7 +53,7 @@ FORMATS = (
     GridFormat("nifti", "NIfTI", (".nii", ".nii.gz"), "nifti"),
     GridFormat("nrrd", "NRRD", (".nrrd", ".nhdr"), "nrrd"),
     GridFormat("metaimage", "MetaImage", (".mha", ".mhd")),
-    GridFormat("vti", "VTK image data", (".vti",), "vti", has_members=True),
+    GridFormat("vti", "VTK image data", (".vti",), has_members=True),
     GridFormat("tiff", "TIFF stack", (".tif", ".tiff"), "tiff", axes="zyx", is_apart=True),
     GridFormat("hdf5", "HDF5", (".h5", ".hdf5", ".hdf"), "hdf5", "zyx", True, is_apart=True),
     GridFormat("zarr", "Zarr", (".zarr", ".zarr.zip"), "zarr", "zyx", True, is_apart=True),

@@ -260,9 +260,6 @@ def take(
     """
     check_kind(volume.dtype, volume.shape)
     placement = find_placement(volume, name)
-    if volume.packed is not None:
-        header = ArrayHeader(volume.shape, volume.dtype, False, 0)
-        check_ratio(header, volume.packed, name, room)
     values = volume.stored
     if values is None or placement.world_axes != (0, 1, 2) or any(placement.backwards):
         values = unpacked(volume, placement, name, (room, left))
@@ -315,6 +312,9 @@ def unpacked(
     """
     room, left = memory
     check_chunk(volume, name, left)
+    if volume.packed is not None:
+        whole = ArrayHeader(volume.shape, volume.dtype, False, 0)
+        check_ratio(whole, volume.packed, name, room)
     layout = layout_of(volume, placement, left)
     nx, ny, nz = (volume.shape[placement.world_axes.index(w)] for w in range(3))
     first, last = planes or (0, nx)

@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing import util
 from multiprocessing.connection import Connection, wait
+from multiprocessing.spawn import get_executable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..errors import SuperSdfError
@@ -117,6 +119,17 @@ def python_flags(*flags: str) -> Iterator[None]:
         yield
     finally:
         util._args_from_interpreter_flags = usual  # type: ignore[attr-defined]
+
+
+def isolated_python(code: str) -> list[str]:
+    """Return the command of a Python that runs ``code`` and finds modules where this one does.
+
+    It takes nothing from the current folder.
+    """
+    own, here = str(Path(__file__).resolve().parents[2]), os.getcwd()
+    folders = [own, *(path for path in sys.path if path and os.path.abspath(path) != here)]
+    start = f"import sys; sys.path[:0] = sys.argv[1:]; {code}"
+    return [get_executable(), "-I", "-c", start, *folders]
 
 
 def ending_signals() -> set[signal.Signals]:

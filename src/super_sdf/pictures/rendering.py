@@ -5,17 +5,20 @@ All meshes of a picture share one parallel projection, so lengths can be compare
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import OptionError
+from ..errors import DeviceError, OptionError
 from ..machine.extras import EXTRAS, check_modules, missing_modules
+from ..machine.serving import isolated_python
 from ..mesh import Mesh
 from ..truth.solid import Distances, Points, Solid
 from .choices import AXES, COLOURS
@@ -36,6 +39,11 @@ LARGEST_TOP = 1e30  # of the colour bar; the smallest is its inverse: VTK comput
 MARGIN = 1.06  # size of the frame over the size of the meshes
 NARROWEST = 0.5  # least ratio of a panel's short side to its long one: titles need room
 SUPERSAMPLING = 2  # pixels drawn per pixel of the picture, along each axis
+DRAW = (  # what VTK does before it draws anything
+    "from vtkmodules.vtkRenderingOpenGL2 import vtkOpenGLRenderer;"
+    "from vtkmodules.vtkRenderingCore import vtkRenderWindow;"
+    "window = vtkRenderWindow(); window.SetOffScreenRendering(1); window.Render()"
+)
 FOOT = {"shaded": 0.0, "normal": 2.0, "error": 5.0}  # height of the legend, in lines of text
 
 
@@ -117,6 +125,12 @@ class Frame:
 def can_render() -> bool:
     """Return whether PyVista is installed."""
     return not missing_modules(EXTRAS["view"])
+
+
+@cache
+def can_draw() -> bool:
+    """Return whether VTK finds OpenGL: where it does not, as on a bare Debian, it crashes."""
+    return not subprocess.run(isolated_python(DRAW), capture_output=True).returncode
 
 
 def vertex_errors(mesh: Mesh, reference: Solid) -> Distances:
@@ -261,8 +275,19 @@ def _top_of(values: NDArray[Any]) -> float:
 
 
 def _pyvista() -> Any:
-    """Import PyVista, which takes a second."""
+    """Import PyVista, which takes a second.
+
+    Raises
+    ------
+    DeviceError
+        If there is no OpenGL to draw with.
+    """
     check_modules("drawing meshes", "view")
+    if not can_draw():
+        raise DeviceError(
+            "drawing meshes needs OpenGL, and VTK finds none here: on Debian and Ubuntu, "
+            "apt-get install libegl1 libgl1-mesa-dri"
+        )
     import pyvista
 
     return pyvista
