@@ -30,7 +30,7 @@ PATIENCE = 120_000  # milliseconds: without a GPU, on a busy machine
 MARKUP = "<b>bold<img src=x onerror=document.title='ran'>"
 OCHRE = (219, 158, 84)  # the inside of a mesh that is cut
 FAST = ("--quality", "fast", "--factor", "2", "--spacing", "1", "--device", "cpu")
-pytestmark = pytest.mark.browser
+pytestmark = pytest.mark.graphics
 
 
 @pytest.fixture(scope="module")

@@ -114,6 +114,7 @@ def test_bad_samples_are_one_line(here, command, words, code, message):
     assert not (here / "box.npz").exists() and not list(here.glob(".*"))
 
 
+@pytest.mark.graphics
 @pytest.mark.parametrize("colour", ["shaded", "normal", "error"])
 def test_meshes_become_a_picture(here, command, colour):
     saved(torus(), here / "ring.ply")

@@ -128,6 +128,7 @@ def test_a_bad_shape_is_named_and_the_others_are_measured(meshes, tmp_path):
     assert (out / "plots" / "time.png").stat().st_size > 5000
 
 
+@pytest.mark.graphics
 def test_pictures_of_the_best_and_worst(meshes, tmp_path):
     out = tmp_path / "out"
     done = evaluate(meshes, "--sizes", 8, "--methods", "mc", "ours", "--out", out)

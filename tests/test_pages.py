@@ -127,6 +127,7 @@ def test_an_item_has_the_residuals_of_both_meshes_and_the_certificate():
     assert item.thumbnail is None and item.remarks == []
 
 
+@pytest.mark.graphics
 def test_the_file_of_an_item_is_read_back(tmp_path):
     path, item = tmp_path / "0123456789abcdef.js", Item(remarks=["a\u2028b"], made_of="digest")
     add_mesh(item, lambda: Shown(NASTY, icosphere(1), 80), draw=True)
@@ -147,6 +148,7 @@ def test_a_file_that_is_no_item_is_none(tmp_path, text):
     assert read_head(tmp_path / "missing.js") is None
 
 
+@pytest.mark.graphics
 def test_a_thumbnail_is_a_small_picture_of_something():
     kind, data = thumbnail(icosphere()).split(",")
     assert kind == "data:image/webp;base64" and len(data) < 8000

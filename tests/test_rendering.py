@@ -15,7 +15,7 @@ from matplotlib.image import imread
 from solids import cube, sphere
 
 from super_sdf import Mesh, SdfGrid, upsample
-from super_sdf.errors import FileError, OptionError
+from super_sdf.errors import DeviceError, FileError, OptionError
 from super_sdf.machine import extras
 from super_sdf.pictures import rendering
 from super_sdf.pictures.rendering import (
@@ -58,6 +58,7 @@ def stretched(mesh: Mesh, *factors: float) -> Mesh:
     return Mesh(mesh.vertices * np.array(factors), mesh.faces)
 
 
+@pytest.mark.graphics
 def test_every_mesh_is_drawn_whole_under_its_title(tmp_path: Path):
     image = picture(tmp_path, Panel(cube(), "a cube"), Panel(sphere(), "a sphere"))
     halves = np.array_split(drawn(image), 2, axis=1)
@@ -69,6 +70,7 @@ def test_every_mesh_is_drawn_whole_under_its_title(tmp_path: Path):
         assert (np.diff(rows) == 1).sum() == 2
 
 
+@pytest.mark.graphics
 @pytest.mark.parametrize("factors", [(1, 1, 1), (1, 1, 5), (5, 1, 1)])
 def test_a_mesh_stays_clear_of_its_panel_s_edge(tmp_path: Path, factors: tuple[float, ...]):
     image = picture(tmp_path, Panel(stretched(cube(), *factors)))
@@ -79,12 +81,14 @@ def test_a_mesh_stays_clear_of_its_panel_s_edge(tmp_path: Path, factors: tuple[f
     assert not border(panel).any()
 
 
+@pytest.mark.graphics
 def test_panels_have_one_scale(tmp_path: Path):
     image = picture(tmp_path, Panel(cube()), Panel(stretched(cube(), 0.5, 0.5, 0.5)))
     left, right = (half.sum() for half in np.array_split(drawn(image), 2, axis=1))
     assert right == pytest.approx(left / 4, rel=0.03)
 
 
+@pytest.mark.graphics
 def test_a_mesh_far_from_the_origin_is_drawn_as_one_near_it(tmp_path: Path):
     shift = np.array([4e6, -5e6, 1e6])
     near = picture(tmp_path, Panel(cube()), colour="normal")
@@ -92,6 +96,7 @@ def test_a_mesh_far_from_the_origin_is_drawn_as_one_near_it(tmp_path: Path):
     assert (near != far).any(-1).mean() < 0.002
 
 
+@pytest.mark.graphics
 def test_panels_wrap(tmp_path: Path):
     row = picture(tmp_path, *[Panel(cube())] * 3)
     wrapped = picture(tmp_path, *[Panel(cube())] * 3, columns=2)
@@ -100,12 +105,14 @@ def test_panels_wrap(tmp_path: Path):
     assert not drawn(wrapped)[wrapped.shape[0] // 2 :, wrapped.shape[1] // 2 :].any()
 
 
+@pytest.mark.graphics
 def test_a_long_title_is_not_cut_off_and_dollars_are_no_formula(tmp_path: Path):
     title = "a_file_with_a_$long_{$_name_" * 5 + ".ply"
     image = picture(tmp_path, Panel(cube(), title))
     assert not border(drawn(image)).any()
 
 
+@pytest.mark.graphics
 def test_normal_colours_are_those_of_the_faces(tmp_path: Path):
     image = picture(tmp_path, Panel(cube()), colour="normal")
     colours, times = np.unique(image.reshape(-1, 3), axis=0, return_counts=True)
@@ -113,12 +120,14 @@ def test_normal_colours_are_those_of_the_faces(tmp_path: Path):
     assert common == {*SHOWN.values(), (255, 255, 255)}
 
 
+@pytest.mark.graphics
 def test_normal_colours_are_in_world_axes_whatever_the_view(tmp_path: Path):
     image = picture(tmp_path, Panel(cube()), colour="normal", view=(0, 0, 1))
     middle = image[image.shape[0] // 2, image.shape[1] // 2]
     assert tuple(middle) == SHOWN["z"]
 
 
+@pytest.mark.graphics
 @pytest.mark.parametrize("up", "xyz")
 def test_the_chosen_axis_points_up(tmp_path: Path, up: str):
     image = picture(tmp_path, Panel(cube()), colour="normal", up=up)
@@ -156,6 +165,7 @@ def test_vertex_errors_of_a_smaller_sphere():
     np.testing.assert_allclose(vertex_errors(small, Solid(sphere(0.4))), 0.1, atol=2e-3)
 
 
+@pytest.mark.graphics
 def test_an_error_picture_has_one_colour_bar(tmp_path: Path):
     shaded = picture(tmp_path, Panel(cube()), Panel(cube()))
     values = np.linspace(0, 1, 8)
@@ -168,6 +178,7 @@ def test_an_error_picture_has_one_colour_bar(tmp_path: Path):
     assert drawn(foot).any(1).sum() > drawn(foot).any(1).argmax()  # a title, the bar, numbers
 
 
+@pytest.mark.graphics
 def test_panels_without_values_are_shaded_in_an_error_picture(tmp_path: Path):
     shaded = picture(tmp_path, Panel(sphere()))
     both = [Panel(sphere(), values=np.ones(len(sphere().vertices))), Panel(sphere())]
@@ -178,6 +189,7 @@ def test_panels_without_values_are_shaded_in_an_error_picture(tmp_path: Path):
     assert left[left.shape[0] // 2, left.shape[1] // 2].max() < 60  # all at the dark end
 
 
+@pytest.mark.graphics
 def test_values_are_seen_where_they_are(tmp_path: Path):
     values = sphere().vertices[:, 2] + 0.4
     image = picture(tmp_path, Panel(sphere(), values=values), colour="error", top=0.8)
@@ -187,6 +199,7 @@ def test_values_are_seen_where_they_are(tmp_path: Path):
     assert upper.sum() < 0.7 * lower.sum()
 
 
+@pytest.mark.graphics
 def test_no_values_no_bar_and_empty_meshes_leave_their_place_white(tmp_path: Path):
     empty = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
     image = picture(tmp_path, Panel(cube()), Panel(empty, values=np.zeros(0)), colour="error")
@@ -228,6 +241,7 @@ def test_without_pyvista_it_says_what_to_install(tmp_path: Path, monkeypatch: py
         picture(tmp_path, Panel(cube()))
 
 
+@pytest.mark.graphics
 def test_a_picture_that_cannot_be_written_leaves_nothing(tmp_path: Path):
     with pytest.raises(FileError, match="cannot be written"):
         render_panels([Panel(cube())], tmp_path / "none" / "picture.png")
@@ -235,6 +249,7 @@ def test_a_picture_that_cannot_be_written_leaves_nothing(tmp_path: Path):
     assert [path.name for path in tmp_path.iterdir()] == ["picture.png"]
 
 
+@pytest.mark.graphics
 def test_no_display_is_needed_and_nothing_is_said(tmp_path: Path):
     script = (
         "import numpy as np, sys; from pathlib import Path; from super_sdf import Mesh;"
@@ -358,3 +373,16 @@ def test_a_section_without_surface_is_drawn_without_complaint(tmp_path: Path):
         warnings.simplefilter("error")
         render_section(ball(), tmp_path / "section.png", at=0.0, size=200)
     assert drawn(pixels(tmp_path / "section.png")).any()
+
+
+def test_without_opengl_a_picture_is_refused_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(rendering, "DRAW", "import os; os.abort()")
+    rendering.can_draw.cache_clear()
+    with pytest.raises(
+        DeviceError,
+        match=r"^drawing meshes needs OpenGL, and VTK finds none here: on Debian and Ubuntu, "
+        r"apt-get install libegl1 libgl1-mesa-dri$",
+    ):
+        render_panels([Panel(cube())], tmp_path / "a.png")
+    rendering.can_draw.cache_clear()
+    assert not list(tmp_path.iterdir())

@@ -25,6 +25,7 @@ def files_of(page):
     return blocks(Path(page))["facts"]["files"]
 
 
+@pytest.mark.graphics
 def test_the_page_of_a_conversion_holds_all_of_it(command, folder):
     code, _, err = command(*UPSAMPLE, "--report", "a.html")
     assert code == 0 and err.endswith("\nReport: a.html\n")
@@ -90,6 +91,7 @@ def test_a_mesh_without_room_for_the_check_has_a_page_that_says_so(command, fold
 BATCH = ("in", "--report", "page.html")
 
 
+@pytest.mark.graphics
 def test_the_page_of_a_batch_names_failures_first(run_batch, grid_folder):
     code, _, err = run_batch(*BATCH)
     assert code == 1 and "Check: mean residual" in err
@@ -120,6 +122,7 @@ def test_many_meshes_are_beside_the_page(run_batch, grid_folder, monkeypatch):
     assert len(files_of("page.html")) == 4
 
 
+@pytest.mark.graphics
 def test_a_batch_made_without_a_page_is_drawn_and_checked_when_one_is_asked_for(
     run_batch, grid_folder
 ):
