@@ -70,7 +70,7 @@ def test_random_fields_become_closed_manifolds(stand_in, mesher):
 @pytest.mark.parametrize("mesher", MESHERS)
 def test_random_fields_in_slabs_and_bricks_are_closed_where_they_are_called_so(mesher):
     network, faults = load_network("fast", threads=1), []
-    for number, field in enumerate(make_fields(FIELDS // 10)):
+    for number, field in enumerate(make_fields(FIELDS // 20)):
         whole = mesh_of_field(field, network, mesher)
         faults += faults_of_pieces(field, network, mesher, 2 + number % 5, whole)
     assert faults == []
