@@ -121,7 +121,7 @@ class _Process:
         self.process.kill()
         self.process.wait()
         for pipe in (self.process.stdin, self.process.stdout):
-            with suppress(OSError):  # what was not sent is of no use any more
+            with suppress(OSError):  # nobody reads what was not sent
                 if pipe:
                     pipe.close()
 
@@ -148,7 +148,7 @@ def _opened(files: ExitStack, key: str, request: dict[str, Any]) -> Volume:
 
 
 def _stated(volume: Volume) -> dict[str, Any]:
-    """Return what a volume says of itself."""
+    """Return the fields of a volume that are sent to the other process."""
     names = (field.name for field in fields(volume))
     return {name: getattr(volume, name) for name in names if name not in FUNCTIONS}
 

@@ -267,7 +267,7 @@ def survey(
 
 
 def band_bytes(voxels: int, beyond: int) -> int:
-    """Return the memory of a band, with so many samples beyond it."""
+    """Return the bytes of a band of ``voxels`` voxels and ``beyond`` samples beyond it."""
     return voxels * BYTES_PER_VOXEL + beyond * BYTES_BEYOND
 
 

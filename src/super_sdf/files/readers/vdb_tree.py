@@ -105,7 +105,7 @@ class Coding:
         return found
 
     def skip(self, cursor: Cursor, active: int) -> int:
-        """Pass over the values of a leaf with so many active ones; return how its others are."""
+        """Skip the values of a leaf of ``active`` active voxels; return how others are stored."""
         _, _, state = self._inactive(cursor, LEAF**3)
         partly = state != ALL and self.flags & ACTIVE_MASK
         cursor.skip(self._length(cursor, active if partly else LEAF**3)[0])
@@ -146,7 +146,7 @@ def bits(mask: NDArray[np.uint8]) -> BoolArray:
 
 
 def _from_zip(data: bytes, size: int) -> bytes:
-    """Unpack at most so many bytes; none if they are no whole stream."""
+    """Return the ``size`` bytes of a zlib stream; empty if it is damaged."""
     stream = zlib.decompressobj()
     try:
         unpacked = stream.decompress(data, size + 1)
@@ -156,7 +156,7 @@ def _from_zip(data: bytes, size: int) -> bytes:
 
 
 def _from_blosc(data: bytes, size: int) -> bytes:
-    """Unpack so many bytes; none if their header states others, or they are damaged."""
+    """Return the ``size`` bytes of a Blosc buffer; empty if it states other sizes or is damaged."""
     from numcodecs import blosc
 
     # the header: four bytes, then the sizes unpacked, of a block, and packed
