@@ -471,27 +471,7 @@ def main() -> None:
     parser = Parser(description=__doc__.split("\n")[0])
     parser.add_argument("--store", type=Path, required=True, help="folder of shards")
     parser.add_argument("--run", type=Path, required=True, help="folder of the run")
-    parser.add_argument("--size", choices=SIZES, default="base", help="size of the network")
-    parser.add_argument(
-        "--start", type=Path, help="an .onnx file of that size, or smaller, to start from"
-    )
-    parser.add_argument(
-        "--blocks", type=at_least(1), help="number of blocks, if not that of the size"
-    )
-    parser.add_argument(
-        "--gated",
-        type=at_least(0),
-        default=0,
-        help="number of blocks, the last ones, that run only where much is lost",
-    )
-    parser.add_argument(
-        "--without",
-        type=at_least(0),
-        nargs="+",
-        default=(),
-        metavar="BLOCK",
-        help="blocks of --start to leave out, counted from 0",
-    )
+    add_network_options(parser)
     parser.add_argument("--minutes", type=positive, default=90.0, help="training time in all")
     parser.add_argument("--rate", type=positive, default=1.0, help="factor on the learning rates")
     parser.add_argument("--noisy", type=share, default=USUAL.noisy, help="share of noisy samples")
@@ -528,6 +508,31 @@ def main() -> None:
     options = parser.parse_args()
     with parser.one_line_errors():
         run_training(options)
+
+
+def add_network_options(parser: Parser) -> None:
+    """Add the options that say which network is trained, and from which it starts."""
+    parser.add_argument("--size", choices=SIZES, default="base", help="size of the network")
+    parser.add_argument(
+        "--start", type=Path, help="an .onnx file of that size, or smaller, to start from"
+    )
+    parser.add_argument(
+        "--blocks", type=at_least(1), help="number of blocks, if not that of the size"
+    )
+    parser.add_argument(
+        "--gated",
+        type=at_least(0),
+        default=0,
+        help="number of blocks, the last ones, that run only where much is lost",
+    )
+    parser.add_argument(
+        "--without",
+        type=at_least(0),
+        nargs="+",
+        default=(),
+        metavar="BLOCK",
+        help="blocks of --start to leave out, counted from 0",
+    )
 
 
 def run_training(options: argparse.Namespace) -> None:

@@ -122,7 +122,7 @@ def faults_of_pieces(
 
 
 def in_slabs(field: RandomField, network: Network, mesher: str, parts: int) -> Iterator[Piece]:
-    """Yield a field's mesh in at most so many slabs."""
+    """Yield a field's mesh in at most ``parts`` slabs."""
 
     def plan(band, factor, reach, resources, needed, mesher):
         return cut(band, parts, reach, mesher.planes_beside(factor))
@@ -135,7 +135,7 @@ def in_slabs(field: RandomField, network: Network, mesher: str, parts: int) -> I
 
 
 def in_bricks(field: RandomField, network: Network, mesher: str, parts: int) -> Iterator[Piece]:
-    """Yield a field's mesh in at most so many bricks, as a cluster puts them together."""
+    """Yield a field's mesh in at most ``parts`` bricks, as a cluster puts them together."""
     grid = SdfGrid.trusted(field.values, 1.0)
     seen = look_at_band(grid, 0.0)
     joining = Joining(seen, lambda made: None)

@@ -72,7 +72,7 @@ def raising_interrupts() -> Iterator[None]:
     try:
         with _handling(handle):
             yield
-    except Exception:
+    except Exception:  # after a signal it is what some code made of the interrupt
         if not received:
             raise
     if received:

@@ -37,7 +37,7 @@ class VtiWriter:
         from vtkmodules.vtkCommonMisc import vtkErrorCode
         from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
-        from ..files.readers.silence import discarded_stderr
+        from .silence import discarded_stderr
 
         image = vtkImageData()
         image.SetDimensions(*self.values.shape[::-1])
