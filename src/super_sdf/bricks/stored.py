@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +20,7 @@ from ..files.grids import one_line_errors, open_volume, reader_of
 from ..files.headers import read_array_header
 from ..files.regular import check_regular_file
 from ..files.unpacking import PIECE
-from ..files.volume import Volume, axes_direction, find_placement, place_in_world, unpacked
+from ..files.volume import Volume, find_placement, place_in_world, unpacked
 from ..grid.planes import InputFile, PlaneFile, SampleArray, SamplePlanes
 from ..machine.memory import held_memory
 
@@ -151,7 +150,7 @@ class Store:
         axes = choose_axes(self.format, self.source.axes)
         volume = self.files.enter_context(open_volume(path, self.format, axes, (0, None)))
         if self.source.has_direction:
-            volume = replace(volume, direction=axes_direction(axes))
+            volume = volume.turned(axes)
         self.volume: Volume = volume
         self.placement = find_placement(self.volume, str(path))
         nx, ny, nz = (self.volume.shape[self._axis(w)] for w in range(3))

@@ -11,7 +11,6 @@ import warnings
 import zipfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -164,7 +163,7 @@ def _read_foreign(
     left = None if bound is None else bound - (held_memory() or 0)
     with open_volume(path, format_, axes, (room, left)) as volume:
         if given["direction"] is not None:
-            volume = replace(volume, direction=axes_direction(axes))
+            volume = volume.turned(axes)
         found = take(volume, str(path), room, given, left)
         return found | {"notes": volume.notes}
 

@@ -106,6 +106,8 @@ class Volume:
         Sentences on what the file says, for the user.
     about : dict
         What else the file says of how the array is stored, for ``info``.
+    axes : str, optional
+        The order of x, y and z along the array, if the file or the user names it.
     """
 
     shape: tuple[int, ...]
@@ -121,6 +123,11 @@ class Volume:
     packed: int | None = None
     notes: tuple[str, ...] = ()
     about: dict[str, Any] = field(default_factory=dict)
+    axes: str | None = None
+
+    def turned(self, axes: str) -> Volume:
+        """Return it for a user who gives the direction of x, y and z: the array's is their order."""
+        return replace(self, direction=axes_direction(self.axes or axes))
 
     @property
     def unit(self) -> tuple[int, ...]:
@@ -193,14 +200,13 @@ class ImageLattice:
 
 
 def axes_direction(axes: str) -> NDArray[np.float64]:
-    """Return the direction of an array whose axes are the world's in an order: "xyz", "zyx"."""
-    return XYZ if axes == "xyz" else ZYX
+    """Return the direction of an array whose axes are the world's in an order, such as "zyx"."""
+    return XYZ[:, ["xyz".index(name) for name in axes]]
 
 
 def in_array_order(xyz: Any, axes: str) -> Triple:
     """Return three numbers given as x, y, z in the order of the array's axes."""
-    triple = _triple(xyz)
-    return triple if axes == "xyz" else (triple[2], triple[1], triple[0])
+    return _triple(xyz["xyz".index(name)] for name in axes)
 
 
 def _triple(numbers: Any) -> Triple:

@@ -100,7 +100,7 @@ def _at_coordinates(array: Any, spacing: ArrayLike | None, origin: ArrayLike | N
             f"dimension {missing!r} has no coordinates, but {names[0]!r} has: give those of all "
             "axes, or of none (array.drop_vars(...))"
         )
-    firsts, steps = zip(*(_even(name, array.coords[name].values) for name in names))
+    firsts, steps = zip(*(even_steps(name, array.coords[name].values) for name in names))
     samples = samples[tuple(slice(None, None, -1 if step < 0 else 1) for step in steps)]
     lowest = [first + min(step, 0) * (n - 1) for first, step, n in zip(firsts, steps, array.shape)]
     return Placed(
@@ -123,7 +123,7 @@ def _loaded(array: Any) -> NDArray[Any]:
     return samples
 
 
-def _even(name: str, coordinates: NDArray[Any]) -> tuple[float, float]:
+def even_steps(name: str, coordinates: NDArray[Any]) -> tuple[float, float]:
     """Return the first of some coordinates, and the step from one to the next.
 
     Raises

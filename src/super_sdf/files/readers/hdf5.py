@@ -1,7 +1,11 @@
-"""HDF5 files, with h5py: a dataset of three axes, (z, y, x) unless ``--axes`` says otherwise."""
+"""HDF5 files, with h5py: a dataset of three axes, besides some of length 1.
+
+They are (z, y, x) unless dimension labels, scales, ``axistags`` or ``--axes`` say otherwise.
+"""
 
 from __future__ import annotations
 
+import json
 import os
 from math import prod
 from typing import Any
@@ -10,10 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import FileError
+from ..boxes import Box
 from ..regular import check_beside
 from ..volume import Request, Volume
+from .axes import Axes
 from .choosing import choose_member
-from .stored import place_of, without_gaps
+from .stored import along, placed, without_gaps
+
+NO_COORDINATES = b"This is a netCDF dimension but not a netCDF variable"
 
 
 def read_hdf5(request: Request) -> Volume:
@@ -25,20 +33,59 @@ def read_hdf5(request: Request) -> Volume:
     file = request.files.enter_context(h5py.File(request.path, "r"))
     found: list[str] = []
 
+    asked = (request.member or "").strip("/")
+
     def note(name: str, entry: Any) -> None:
-        if isinstance(entry, h5py.Dataset) and (entry.ndim == 3 or name == request.member):
+        if isinstance(entry, h5py.Dataset) and (name == asked or _may_be_grid(entry.shape)):
             found.append(f"/{name}")
 
     file.visititems(note)
     values = _open(file, choose_member(request, found, "3D dataset"), request)
-    read_box = without_gaps(values.__getitem__, *_absent(values), values.fillvalue)
+    space, place = placed(_axes(values), dict(values.attrs), values.shape, request.axes)
+    shape = tuple(values.shape[axis] for axis in space)
+
+    def stored(box: Box) -> NDArray[Any]:
+        return np.asarray(values[along(space, box, values.ndim)])
+
+    read_box = without_gaps(stored, *_absent(values), values.fillvalue)
 
     def read(first: int, last: int) -> NDArray[Any]:
-        return np.asarray(read_box((slice(first, last), slice(None), slice(None))))
+        return read_box((slice(first, last), slice(0, shape[1]), slice(0, shape[2])))
 
-    place = place_of(dict(values.attrs), request.axes)
-    about = {"chunks": values.chunks, "read_box": read_box, "packed": values.id.get_storage_size()}
-    return Volume(values.shape, values.dtype, read, *place, **about)
+    chunks = tuple(values.chunks[axis] for axis in space) if values.chunks else None
+    about = {"chunks": chunks, "read_box": read_box, "packed": values.id.get_storage_size()}
+    return Volume(shape, values.dtype, read, **place, **about)
+
+
+def _may_be_grid(shape: tuple[int, ...] | None) -> bool:
+    """Return whether a dataset has three axes, besides some of length 1."""
+    return bool(shape) and len(shape) >= 3 >= sum(count > 1 for count in shape)
+
+
+def _axes(values: Any) -> Axes:
+    """Return what a dataset says of its axes: by ``axistags``, as ilastik writes them, or scales.
+
+    An axis has the name of its label, or of the first scale that is attached to it.
+    """
+    tags = json.loads(values.attrs.get("axistags", "{}")).get("axes", ())
+    if len(tags) == values.ndim:
+        keys = [str(tag.get("key", "")) for tag in tags]
+        steps = tuple(float(tag.get("resolution") or 0) or None for tag in tags)
+        return Axes.named(keys, steps=steps)
+    scales = [dim[0] if len(dim) else None for dim in values.dims]
+    names = [
+        dim.label or ("" if scale is None else (scale.name or "").rsplit("/", 1)[-1])
+        for dim, scale in zip(values.dims, scales)
+    ]
+    return Axes.of_coordinates(names, lambda axis: _coordinates(scales[axis], values.shape[axis]))
+
+
+def _coordinates(scale: Any, count: int) -> tuple[NDArray[Any] | None, dict[str, Any]]:
+    """Return the coordinates in a dimension scale, None if it has only a name, and attributes."""
+    if scale is None or scale.shape != (count,):
+        return None, {}
+    about = dict(scale.attrs)
+    return (None if NO_COORDINATES in bytes(about.get("NAME", b"")) else scale[:]), about
 
 
 def _open(file: Any, name: str, request: Request) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,25 +11,56 @@ from numpy.typing import NDArray
 from ...arrays import Triple
 from ...errors import FileError, GridError
 from ..boxes import Box
-from ..volume import axes_direction, in_array_order
+from ..volume import in_array_order
+from .axes import Axes
 
 ReadBox = Callable[[Box], NDArray[Any]]
 
 
-def place_of(
-    attributes: dict[str, Any], axes: str
-) -> tuple[Triple | None, Triple | None, NDArray[np.float64]]:
-    """Return spacing and direction of the array's axes, and the origin.
+def placed(
+    axes: Axes, attributes: dict[str, Any], shape: tuple[int, ...], order: str
+) -> tuple[list[int], dict[str, Any]]:
+    """Return the axes of an array that are in space, and what a ``Volume`` says of their place.
 
-    ``element_size_um``, as ImageJ and ilastik write it, has the order of the array's axes;
-    ``spacing`` and ``origin`` are x, y, z. The columns of ``direction``, nine numbers row by row,
-    are the world directions of the array's axes x, y and z.
+    Attributes replace what else is said: ``element_size_um``, as the HDF5 plugin of ImageJ writes
+    it, has the order of the array's axes; ``spacing`` and ``origin`` are x, y, z. The columns of
+    ``direction``, nine numbers row by row, are the world directions of the axes x, y and z.
+
+    Parameters
+    ----------
+    axes : Axes
+        What the file says of the array's axes.
+    attributes : dict
+        Those of the array.
+    shape : tuple of int
+        Its shape.
+    order : {"zyx", "xyz"}
+        The order of axes that have no names.
     """
-    spacing = _triple(attributes, "element_size_um")
-    if spacing is None:
-        spacing = _triple(attributes, "spacing")
-        spacing = None if spacing is None else in_array_order(spacing, axes)
-    return spacing, _triple(attributes, "origin"), _direction(attributes) @ axes_direction(axes)
+    space = axes.in_space(shape)
+    (spacing, origin, direction), notes = axes.place(space, order)
+    named = axes.order(space, order)
+    stated = _triple(attributes, "spacing")
+    if "element_size_um" in attributes:
+        spacing = _triple(attributes, "element_size_um")
+    elif stated is not None:
+        spacing = in_array_order(stated, named)
+    found = {
+        "spacing": spacing,
+        "origin": _triple(attributes, "origin") or origin,
+        "direction": _direction(attributes) @ direction,
+        "notes": notes,
+        "axes": named,
+    }
+    return space, found
+
+
+def along(space: list[int], box: Sequence[slice], count: int) -> tuple[Any, ...]:
+    """Return the index of a box along some axes of an array, at 0 of its others."""
+    where: list[Any] = [0] * count
+    for axis, part in zip(space, box):
+        where[axis] = part
+    return tuple(where)
 
 
 def _direction(attributes: dict[str, Any]) -> NDArray[np.float64]:

@@ -1,6 +1,7 @@
 """TIFF stacks, with tifffile: arrays (z, y, x), a page per z.
 
-Spacing and origin are read where ImageJ or OME metadata states them for all three axes.
+Spacing is read where ImageJ's metadata, or its like by tifffile, or OME's states it for all three
+axes; ImageJ states an origin, too.
 """
 
 from __future__ import annotations
@@ -13,11 +14,13 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Triple
 from ...errors import FileError, GridError
 from ..regular import check_beside
-from ..volume import Request, Volume, axes_direction, in_array_order
-from .stored import without_gaps
+from ..volume import Request, Volume
+from .axes import Axes
+from .stored import placed, without_gaps
+
+Stated = tuple[str, float | None, float | None]  # of an axis: unit, step, start
 
 
 def read_tiff(request: Request) -> Volume:
@@ -34,11 +37,10 @@ def read_tiff(request: Request) -> Volume:
             f"{request.path} has axes {series.axes} of shape {series.shape}: give a stack of "
             "three axes (z, y, x), without channels"
         )
-    spacing = _ome_spacing(file) or _imagej_spacing(file)
+    axes, notes = _axes(file, series, request.axes)
+    _, place = placed(axes, {}, series.shape, request.axes)
     segments = [page.databytecounts for page in series.pages if page is not None]
-    if spacing is not None:
-        spacing = in_array_order(spacing, request.axes)
-    direction = axes_direction(request.axes)
+    place["notes"] += notes
     read = _reader(request, series)
     absent = sum(size == 0 for sizes in segments for size in sizes)
     read_box = without_gaps(
@@ -47,8 +49,8 @@ def read_tiff(request: Request) -> Volume:
         series.keyframe.nodata,
     )
     packed = sum(map(sum, segments))
-    about: dict[str, Any] = {"read_box": read_box, "packed": packed}
-    return Volume(series.shape, np.dtype(series.dtype), read, spacing, None, direction, **about)
+    about: dict[str, Any] = {"read_box": read_box, "packed": packed, **place}
+    return Volume(series.shape, np.dtype(series.dtype), read, **about)
 
 
 def _check_other_files(file: Any, request: Request) -> None:
@@ -88,15 +90,45 @@ def _check_pages(request: Request, series: Any, first: int, last: int) -> None:
         raise FileError(f"{request.path} has no page {missing[0]}: it is damaged")
 
 
-def _imagej_spacing(file: Any) -> Triple | None:
-    """Return the spacing x, y, z of an ImageJ stack, in its unit; None if it is not stated."""
-    found = file.imagej_metadata or {}
+def _axes(file: Any, series: Any, order: str) -> tuple[Axes, tuple[str, ...]]:
+    """Return what a file says of the axes of an array, and a note on what is not taken of it."""
+    is_named = order == "zyx" and sorted(series.axes) == ["X", "Y", "Z"]
+    names = series.axes.lower() if is_named else order
+    found = _ome_axes(file) or _imagej_axes(file) or {}
+    units, steps, starts = zip(*(found.get(name, ("", None, None)) for name in names))
+    return Axes.named(names, units, steps, starts), () if found else _pixel_note(file)
+
+
+def _imagej_axes(file: Any) -> dict[str, Stated] | None:
+    """Return unit, step and start of the axes of an ImageJ stack; None if it is not calibrated.
+
+    What is not stated holds as in ImageJ: a spacing of z of 1, the unit of the resolution, that of
+    x for all axes, and origins of 0 beside others, which are in pixels.
+    """
+    found = file.imagej_metadata or (file.shaped_metadata or ({},))[0]
+    sizes = _pixel_sizes(file)
+    if not sizes or not (file.is_imagej or "spacing" in found):
+        return None
+    unit = str(found.get("unit") or _resolution_unit(file))
+    if "spacing" not in found and "unit" not in found and unit:
+        return None  # x and y may be those of a print
+    units = [_unescaped(str(found.get(f"{axis}unit") or unit)) for axis in "xyz"]
+    steps = [*sizes, abs(float(found.get("spacing") or 1))]
+    is_bare = not any(unit and not unit.startswith("pixel") for unit in units)
+    if is_bare and "spacing" not in found and sizes == (1, 1):
+        return None
+    starts = [float(found.get(f"{axis}origin") or 0) for axis in "xyz"]
+    placed = [-start * step if any(starts) else None for start, step in zip(starts, steps)]
+    return dict(zip("xyz", zip(units, steps, placed)))
+
+
+def _pixel_sizes(file: Any) -> tuple[float, float] | None:
+    """Return the size of a pixel along x and y by the resolution; None if it is not stated."""
     tags = file.pages[0].tags
-    if "spacing" not in found or "XResolution" not in tags or "YResolution" not in tags:
+    if "XResolution" not in tags or "YResolution" not in tags:
         return None
     x, y = (_per_pixel(tags[name].value) for name in ("XResolution", "YResolution"))
-    z = abs(float(found["spacing"]))
-    return (x, y, z) if x > 0 and y > 0 and z > 0 else None
+    return (x, y) if x > 0 and y > 0 else None
 
 
 def _per_pixel(resolution: tuple[int, int]) -> float:
@@ -105,17 +137,40 @@ def _per_pixel(resolution: tuple[int, int]) -> float:
     return units / pixels if pixels else 0.0
 
 
-def _ome_spacing(file: Any) -> Triple | None:
-    """Return the spacing x, y, z of an OME stack, in its unit; None if it is not stated."""
+def _resolution_unit(file: Any) -> str:
+    """Return the unit of the resolution, "" if it has none."""
+    tag = file.pages[0].tags.get("ResolutionUnit")
+    number = 2 if tag is None else int(tag.value)  # inches, by the standard
+    return {2: "inch", 3: "cm", 4: "mm", 5: "µm"}.get(number, "")
+
+
+def _unescaped(unit: str) -> str:
+    """Return a unit as ImageJ shows it: it writes what is not ASCII as \\u00B5."""
+    return re.sub(r"\\u([0-9a-fA-F]{4})", lambda found: chr(int(found[1], 16)), unit)
+
+
+def _pixel_note(file: Any) -> tuple[str, ...]:
+    """Return a sentence on a resolution that states x and y, but nothing of z; none without one."""
+    sizes, unit = _pixel_sizes(file), _resolution_unit(file)
+    if file.is_ome or not sizes or not unit:
+        return ()
+    return (
+        f"its pixels are {sizes[0]:.6g} x {sizes[1]:.6g} {unit}, but it does not state how far its "
+        "pages are apart: no spacing is taken from it (give --spacing X,Y,Z)",
+    )
+
+
+def _ome_axes(file: Any) -> dict[str, Stated] | None:
+    """Return unit and step of the axes of an OME stack; None if it states none."""
     if not file.is_ome:
         return None
     text = re.sub(r'\sxmlns(:\w+)?="[^"]*"', "", file.ome_metadata)
     pixels = ElementTree.fromstring(re.sub(r"\s\w+:(?=\w+=)", " ", text)).find(".//Pixels")
-    sizes = [] if pixels is None else [pixels.get(f"PhysicalSize{axis}") for axis in "XYZ"]
-    if len(sizes) < 3 or pixels is None or None in sizes:
+    if pixels is None:
         return None
-    units = {pixels.get(f"PhysicalSize{axis}Unit", "µm") for axis in "XYZ"}
-    if len(units) > 1:
-        raise GridError(f"its axes have sizes in different units, {', '.join(sorted(units))}")
-    x, y, z = (float(size or 0) for size in sizes)
-    return x, y, z
+    found: dict[str, Stated] = {}
+    for axis in "XYZ":
+        size, unit = pixels.get(f"PhysicalSize{axis}"), pixels.get(f"PhysicalSize{axis}Unit", "µm")
+        if size and float(size) > 0:
+            found[axis.lower()] = unit, float(size), None
+    return found

@@ -180,6 +180,11 @@ def array_shards(array: Any) -> tuple[int, ...] | None:
     return getattr(array, "shards", None)
 
 
+def array_version(array: Any) -> int:
+    """Return the Zarr format of an array, 2 or 3. Arrays of zarr 2 have no such metadata."""
+    return getattr(getattr(array, "metadata", None), "zarr_format", 2)
+
+
 def _codecs_of(about: Any) -> Iterator[str]:
     """Yield the names of all codecs in the metadata of an array, also of those within others."""
     if isinstance(about, dict):

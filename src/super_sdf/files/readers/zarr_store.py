@@ -1,6 +1,7 @@
 """Zarr arrays in folders and zip files, with zarr.
 
-They are (z, y, x) unless ``--axes`` or OME metadata say otherwise.
+They are (z, y, x) unless OME metadata, names of dimensions as xarray writes them, or ``--axes`` say
+otherwise.
 """
 
 from __future__ import annotations
@@ -13,13 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import FileError
+from ...errors import FileError, GridError
 from ..boxes import Box
 from ..volume import BOX, Request, Volume
+from .axes import Axes
 from .choosing import choose_member
-from .ome import MOST_AXES, Image, find_image, images_of
-from .stored import place_of, without_gaps
-from .zarr_files import ZarrFiles, array_shards, counts_of
+from .ome import MOST_AXES, find_image, images_of
+from .stored import along, placed, without_gaps
+from .zarr_files import ZarrFiles, array_shards, array_version, counts_of
 
 
 def read_zarr(request: Request) -> Volume:
@@ -73,13 +75,15 @@ def _choose(files: ZarrFiles, arrays: dict[str, int], request: Request) -> str:
 def _volume(files: ZarrFiles, name: str, array: Any, request: Request) -> Volume:
     """Return an array as a volume, without its axes of length 1 that are not in space."""
     image = find_image(files.attributes, name) if name else None
-    image = image or Image.of_array(array.ndim, request.axes)
-    space = image.space_of(array.shape, request.axes)
+    attributes = dict(array.attrs)
+    axes = image.axes if image else _named_axes(files, name, array, request)
+    if image and (not axes.are_in_space or len(axes.names) != array.ndim):
+        raise GridError(
+            f"an array of {array.ndim} axes has the axes {', '.join(axes.names)}: give an image "
+            "of z, y, x"
+        )
+    space, place = placed(axes, {} if image else attributes, array.shape, request.axes)
     shape, chunks = ([sizes[axis] for axis in space] for sizes in (array.shape, array.chunks))
-    if image.is_placed:
-        place = image.place(space, request.axes)
-    else:
-        place = place_of(dict(array.attrs), request.axes)
     stored = files.chunks_of(name, counts_of(array.shape, array_shards(array) or array.chunks))
     if array_shards(array):
         files.check_sums(list(stored.values()))
@@ -93,13 +97,35 @@ def _volume(files: ZarrFiles, name: str, array: Any, request: Request) -> Volume
         tuple(shape),
         array.dtype,
         read,
-        *place,
+        **place,
         chunks=tuple(chunks),
         read_box=read_box,
-        notes=image.notes,
         about=_storage(array),
         packed=sum(files.sizes[key] for key in stored.values()),
     )
+
+
+def _named_axes(files: ZarrFiles, name: str, array: Any, request: Request) -> Axes:
+    """Return the axes of an array by the names of its dimensions, and by arrays of these names.
+
+    xarray writes the names as an attribute in format 2, in the metadata in format 3.
+    """
+    stated = getattr(array.metadata, "dimension_names", None) if array_version(array) > 2 else None
+    names = stated or array.attrs.get("_ARRAY_DIMENSIONS") or ()
+    if len(names) != array.ndim:
+        names = ("",) * array.ndim
+    group = name.rpartition("/")[0]
+
+    def coordinates(axis: int) -> tuple[NDArray[Any] | None, dict[str, Any]]:
+        path = f"{group}/{names[axis]}".lstrip("/")
+        if not name or not names[axis] or files.arrays().get(path) != 1:
+            return None, {}
+        files.check_codecs(path)
+        places = _open(request, path)
+        is_whole = places.shape == (array.shape[axis],)
+        return (np.asarray(places[:]) if is_whole else None), files.attributes(path)
+
+    return Axes.of_coordinates([str(each or "") for each in names], coordinates)
 
 
 def _reader(array: Any, space: list[int]) -> Callable[[Box], NDArray[Any]]:
@@ -107,11 +133,8 @@ def _reader(array: Any, space: list[int]) -> Callable[[Box], NDArray[Any]]:
     at_once = max(int(BOX // max(prod(array.chunks) * array.dtype.itemsize, 1)), 1)
 
     def read_box(box: Box) -> NDArray[Any]:
-        where: list[Any] = [0] * array.ndim
-        for axis, part in zip(space, box):
-            where[axis] = part
         with _chunks_at_once(at_once):
-            return np.asarray(array[tuple(where)])
+            return np.asarray(array[along(space, box, array.ndim)])
 
     return read_box
 
@@ -128,8 +151,7 @@ def _chunks_at_once(most: int) -> Any:
 
 def _storage(array: Any) -> dict[str, Any]:
     """Return how an array is stored, as ``info`` prints it."""
-    version = getattr(array.metadata, "zarr_format", 2) if hasattr(array, "metadata") else 2
-    found: dict[str, Any] = {"zarr format": version, "chunks": list(array.chunks)}
+    found: dict[str, Any] = {"zarr format": array_version(array), "chunks": list(array.chunks)}
     shards = array_shards(array)
     if shards:
         found["shards"] = list(shards)
