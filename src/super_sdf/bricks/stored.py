@@ -136,7 +136,7 @@ class Store:
         """Open an .npy file in C order."""
         path = check_regular_file(Path(self.source.path))
         file = InputFile.open(path)
-        header = read_array_header(reader_of(file), str(path))
+        header = read_array_header(reader_of(file), str(path)).squeezed()
         if header.fortran_order:
             raise FileError(f"{path} is in Fortran order: save it in C order, or {WAY_OUT}")
         self.shape, self.dtype = header.shape, header.dtype

@@ -43,7 +43,7 @@ def describe_grid_file(path: str | Path) -> dict[str, Any]:
 
 def _of_npy(path: Path) -> dict[str, Any]:
     """Return what the header of an .npy file says."""
-    header = read_array_header(reader_of(InputFile.open(path)), str(path))
+    header = read_array_header(reader_of(InputFile.open(path)), str(path)).squeezed()
     return {**_of_header(header), "spacing": None, "origin": None}
 
 
@@ -54,7 +54,7 @@ def _of_npz(path: Path) -> dict[str, Any]:
         members = find_members(archive, path)
         header = read_array_header(
             npz_member(archive, members["values"], path).read, f"{path}[values]"
-        )
+        ).squeezed()
         place: dict[str, Any] = {
             key: read_small(archive, members[key], f"{path}[{key}]").ravel().tolist()
             for key in ("spacing", "origin", "direction")

@@ -51,7 +51,7 @@ FORMATS = (
     GridFormat("npy", "NumPy", (".npy",), axes="xyz"),
     GridFormat("npz", "NumPy", (".npz",), axes="xyz"),
     GridFormat("nifti", "NIfTI", (".nii", ".nii.gz"), "nifti"),
-    GridFormat("nrrd", "NRRD", (".nrrd", ".nhdr"), "nrrd"),
+    GridFormat("nrrd", "NRRD", (".nrrd", ".nhdr"), "nrrd", has_members=True),
     GridFormat("metaimage", "MetaImage", (".mha", ".mhd")),
     GridFormat("vti", "VTK image data", (".vti",), has_members=True),
     GridFormat("tiff", "TIFF stack", (".tif", ".tiff"), "tiff", axes="zyx", is_apart=True),

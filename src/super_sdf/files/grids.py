@@ -238,7 +238,7 @@ def _read_npy(path: Path, room: int) -> dict[str, Any]:
     """Return the array of an .npy file: a ``PlaneFile``, or unpacked if in Fortran order."""
     file = InputFile.open(path)
     read = reader_of(file)
-    header = read_array_header(read, str(path))
+    header = read_array_header(read, str(path)).squeezed()
     _check_size(header, file.size - header.length, str(path))
     check_kind(header.dtype, header.shape)
     if header.fortran_order:
@@ -318,7 +318,7 @@ def _read_values(
     """Unpack the array of samples."""
     name = f"{path}[values]"
     member = npz_member(archive, info, path)
-    header = read_array_header(member.read, name)
+    header = read_array_header(member.read, name).squeezed()
     _check_size(header, member.left, name)
     check_kind(header.dtype, header.shape)
     check_ratio(header, info.compress_size, name, room)

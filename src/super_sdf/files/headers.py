@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from math import prod
 from typing import Any
 
@@ -48,8 +48,18 @@ class ArrayHeader:
         """Size of the array in bytes."""
         return prod(self.shape) * self.dtype.itemsize
 
+    def squeezed(self) -> ArrayHeader:
+        """Return the header without axes of length 1 beside three others, of the same bytes."""
+        return replace(self, shape=tuple(self.shape[axis] for axis in kept_axes(self.shape)))
+
     def __str__(self) -> str:
         return f"{' x '.join(map(str, self.shape))} {self.dtype}, {self.size:,} bytes"
+
+
+def kept_axes(shape: Sequence[int]) -> list[int]:
+    """Return the axes of an array without those of length 1 that are beside three others."""
+    single = [axis for axis, count in enumerate(shape) if count == 1][: max(len(shape) - 3, 0)]
+    return [axis for axis in range(len(shape)) if axis not in single]
 
 
 def read_array_header(read: Read, name: str) -> ArrayHeader:

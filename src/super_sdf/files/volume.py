@@ -126,7 +126,7 @@ class Volume:
     axes: str | None = None
 
     def turned(self, axes: str) -> Volume:
-        """Return it for a user who gives the direction of x, y and z: the array's is their order."""
+        """Return it without its direction, for a user who gives that of x, y and z."""
         return replace(self, direction=axes_direction(self.axes or axes))
 
     @property

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ...arrays import Triple
 from ...errors import GridError
 from ...grid.named_axes import UNNAMED, even_steps
+from ..headers import kept_axes
 from ..volume import axes_direction
 
 SPACE = "xyz"
@@ -20,14 +21,14 @@ PREFIXES = {"k": 1e3, "": 1.0, "d": 1e-1, "c": 1e-2, "m": 1e-3, "u": 1e-6, "n": 
 WORDS = {"kilo": "k", "deci": "d", "centi": "c", "milli": "m", "micro": "u", "nano": "n"}
 METRES = {f"{prefix}m": factor for prefix, factor in PREFIXES.items()} | {
     **{"inch": 0.0254, "in": 0.0254, '"': 0.0254, "ft": 0.3048, "foot": 0.3048, "feet": 0.3048},
-    **{"angstrom": 1e-10, "å": 1e-10, "Å": 1e-10, "Å": 1e-10, "mil": 2.54e-5, "thou": 2.54e-5},
+    **{"angstrom": 1e-10, "å": 1e-10, "mil": 2.54e-5, "thou": 2.54e-5},
 }
 Place = tuple[Triple | None, Triple | None, NDArray[np.float64]]
 
 
 def in_metres(unit: str) -> float | None:
     """Return how many metres a unit is; None if it is no unit of length that is known here."""
-    plain = re.sub("[µμ]", "u", unit.strip())
+    plain = re.sub("[\u00b5\u03bc]", "u", unit.strip())  # both letters are in use for micro
     if plain in METRES:
         return METRES[plain]
     word = re.sub(r"(?<=.)(?<!inche)s$|(?<=inch)es$", "", plain.lower())
@@ -117,10 +118,10 @@ class Axes:
         """
         if len(shape) < len(SPACE):
             raise GridError(f"values have shape {tuple(shape)}: give three axes (x, y, z)")
+        space = kept_axes(shape)
         if self.are_in_space:
             space = [axis for axis, name in enumerate(self.names) if name in tuple(SPACE)]
-        else:  # the longest, of equal ones the last
-            space = sorted(sorted(range(len(shape)), key=lambda axis: (shape[axis], axis))[-3:])
+        space = sorted(sorted(space, key=lambda axis: (shape[axis], axis))[-len(SPACE) :])
         for axis, count in enumerate(shape):
             if axis not in space and count != 1:
                 raise GridError(

@@ -59,7 +59,7 @@ def read_hdf5(request: Request) -> Volume:
 
 def _may_be_grid(shape: tuple[int, ...] | None) -> bool:
     """Return whether a dataset has three axes, besides some of length 1."""
-    return bool(shape) and len(shape) >= 3 >= sum(count > 1 for count in shape)
+    return shape is not None and len(shape) >= 3 >= sum(count > 1 for count in shape)
 
 
 def _axes(values: Any) -> Axes:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from itertools import zip_longest
 from math import prod
 from typing import Any
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from ...errors import FileError, GridError, seen
 from ...grid.planes import InputFile
+from ..headers import kept_axes
 from ..regular import check_beside
 from ..volume import Request, Volume, reversed_axes
 from .values import bytes_from, packed_planes, raw_planes
@@ -36,6 +38,10 @@ ORIGIN = "Origin", "Offset", "Position"
 DIRECTION = "TransformMatrix", "Rotation", "Orientation"
 IS_BIG = "BinaryDataByteOrderMSB", "ElementByteOrderMSB"
 
+KNOWN = (*SPACING, *ORIGIN, *DIRECTION, *IS_BIG, "DimSize", "CompressedData", "BinaryData")
+MERGED = re.compile(rf"({'|'.join(KNOWN)}) *=")  # a line whose end is damaged
+NO_UNIT = ("", "?", "mm", "UNKNOWN")
+
 Planes = Callable[[int, int], NDArray[Any]]
 
 
@@ -45,20 +51,24 @@ def read_metaimage(request: Request) -> Volume:
     header = Header(file.read(0, LONGEST).tobytes())
     size = header.whole("DimSize", ())
     channels = header.whole("ElementNumberOfChannels", (1,))
-    if len(size) != 3 or channels != (1,):
+    space = kept_axes(size)
+    if len(space) != 3 or channels != (1,):
         more = f" of {channels[0]} numbers" * (channels != (1,))
         raise GridError(
             f"{request.path} has shape {size}{more}: give a file of three axes (x, y, z)"
         )
     if min(size) < 1 or max(size) > np.iinfo(np.int64).max:
         raise FileError(f"its DimSize is {header.fields['DimSize']}")
-    spacing = np.array(header.numbers(SPACING, np.ones(3)))
-    matrix = np.array(header.numbers(DIRECTION, np.eye(3).ravel())).reshape(3, 3)
-    direction = matrix.T * np.where(spacing < 0, -1, 1)  # as ITK takes a spacing below 0
-    x, y, z = header.numbers(ORIGIN, np.zeros(3))
+    count = len(size)
+    spacing = np.array(header.numbers(SPACING, np.ones(count)))[space]
+    matrix = np.array(header.numbers(DIRECTION, np.eye(count).ravel())).reshape(count, count)
+    direction = matrix.T[np.ix_(space, space)] * np.where(spacing < 0, -1, 1)  # as ITK takes it
+    x, y, z = np.array(header.numbers(ORIGIN, np.zeros(count)))[space].tolist()
     place = reversed_axes(np.abs(spacing), direction)
+    size = tuple(size[axis] for axis in space)
     read, packed = _data(request, file, header, size[::-1])
-    return Volume(size[::-1], header.dtype, read, place[0], (x, y, z), place[1], packed=packed)
+    about: dict[str, Any] = {"packed": packed, "notes": header.notes()}
+    return Volume(size[::-1], header.dtype, read, place[0], (x, y, z), place[1], **about)
 
 
 class Header:
@@ -85,6 +95,12 @@ class Header:
             if self.fields.get(key, said) != said and key != "Comment":
                 raise FileError(f"its header is damaged: it states {key} twice")
             self.fields[key] = said
+            near = next((name for name in KNOWN if _are_one_letter_apart(key, name)), None)
+            if near or (key != "Comment" and MERGED.search(said)):
+                raise FileError(
+                    f"its header is damaged: the line {seen(line[0].decode('latin1').strip())} is "
+                    f"no {near or 'single field'}"
+                )
             if key == LAST:
                 self.rest, self.length = text[line.end() :], line.end()
                 return
@@ -111,6 +127,16 @@ class Header:
         if len(numbers) != len(default) or not np.isfinite(numbers).all():
             raise FileError(f"its {name} is {seen(self.fields[name])}: give {len(default)} numbers")
         return numbers
+
+    def notes(self) -> tuple[str, ...]:
+        """Return sentences on the unit, and on a spacing that is not stated."""
+        unit = self.fields.get("DistanceUnits", "?").strip()
+        found: tuple[str, ...] = ()
+        if unit not in NO_UNIT:
+            found = (f"lengths are in the unit that it states, {unit}",)
+        if not any(name in self.fields for name in SPACING):
+            found += ("it states no ElementSpacing: taken as 1, as ITK does",)
+        return found
 
     def flag(self, name: str, default: bool = False) -> bool:
         """Return a field that is true or false, as ITK reads it: by its first letter."""
@@ -143,6 +169,11 @@ class Header:
         low, step = int(numbers[0]), int(numbers[2]) if len(numbers) > 2 else 1
         before, width, after = pattern.groups()
         return [f"{before}{format(low + i * step, width + 'd')}{after}" for i in range(count)]
+
+
+def _are_one_letter_apart(a: str, b: str) -> bool:
+    """Return whether one letter differs between two names, or is missing at the end."""
+    return abs(len(a) - len(b)) <= 1 and sum(x != y for x, y in zip_longest(a, b)) == 1
 
 
 def _data(

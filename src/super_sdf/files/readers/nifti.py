@@ -6,6 +6,7 @@ The extensions after the header are passed over: nibabel loads as much as they c
 from __future__ import annotations
 
 import gzip
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -14,24 +15,27 @@ from numpy.typing import NDArray
 from ...errors import FileError, GridError
 from ..headers import ArrayHeader
 from ..unpacking import PIECE
-from ..volume import Request, Volume, from_affine, reversed_axes
+from ..volume import XYZ, Request, Volume, from_affine, reversed_axes
 
-HEADER = 348  # bytes
+SIZES = 348, 540  # bytes of the headers of NIfTI-1 and NIfTI-2
+UNITS = {"meter": "metre", "micron": "micrometre"}  # but for millimetres, by nibabel's names
+ASTRAY = 0.1  # of a voxel: how far sform and qform may place a corner apart without a note
 MOST_DEFLATED = 1100  # deflate reaches 1,030 on zeros
 
 
 def read_nifti(request: Request) -> Volume:
-    """Read a ``.nii`` or ``.nii.gz`` file.
+    """Read a ``.nii`` or ``.nii.gz`` file, of NIfTI-1 or NIfTI-2.
 
-    The affine is nibabel's: the sform if there is one, else the qform. Values are scaled by the
-    slope and intercept of the header.
+    The affine is nibabel's: the sform if there is one, else the qform. Without both the axes of the
+    array are x, y and z, as ITK and method 1 of the standard have it; nibabel mirrors x. Values are
+    scaled by the slope and intercept of the header.
     """
     import nibabel
 
     size, is_packed = request.path.stat().st_size, request.path.suffix.lower() == ".gz"
     opened: Any = gzip.open if is_packed else open
     stream = request.files.enter_context(opened(request.path, "rb"))
-    header = nibabel.Nifti1Header(stream.read(HEADER))
+    header = _header(nibabel, stream)
     shape, start = header.get_data_shape(), header.get_data_offset()
     proxy = nibabel.arrayproxy.ArrayProxy(stream, header, mmap=False)
     if len(shape) < 3 or any(size != 1 for size in shape[3:]):
@@ -50,7 +54,39 @@ def read_nifti(request: Request) -> Volume:
             raise FileError(f"{request.path} goes on after the samples that its header promises")
         return planes
 
-    spacing, origin, direction = from_affine(header.get_best_affine())
-    spacing, direction = reversed_axes(spacing, direction)
-    place, dtype = (spacing, origin, direction), read(0, 1).dtype
-    return Volume(shape[2::-1], dtype, read, *place, packed=size if is_packed else None)
+    (spacing, origin, direction), notes = _place(header, shape[:3])
+    place, dtype = reversed_axes(spacing, direction), read(0, 1).dtype
+    packed = size if is_packed else None
+    place = place[0], origin, place[1]
+    return Volume(shape[2::-1], dtype, read, *place, packed=packed, notes=notes)
+
+
+def _header(nibabel: Any, stream: Any) -> Any:
+    """Return the header of either version, in either order of bytes."""
+    start = stream.read(SIZES[0])
+    sizes = [int.from_bytes(start[:4], order) for order in ("little", "big")]
+    if SIZES[1] in sizes:
+        return nibabel.Nifti2Header(start + stream.read(SIZES[1] - SIZES[0]))
+    return nibabel.Nifti1Header(start)
+
+
+def _place(header: Any, shape: tuple[int, ...]) -> tuple[Any, tuple[str, ...]]:
+    """Return spacing, origin and direction of the axes x, y, z, and notes on what was chosen."""
+    unit = UNITS.get(header.get_xyzt_units()[0])
+    notes = (f"lengths are in the unit that it states, {unit}",) if unit else ()
+    codes = int(header["sform_code"]), int(header["qform_code"])
+    if codes == (0, 0):
+        said = (
+            "it states no place (sform_code and qform_code are 0): its axes are taken as x, y and "
+            "z, as ITK does; nibabel would mirror x"
+        )
+        return (header.get_zooms()[:3], None, XYZ), (*notes, said)
+    if min(codes) > 0:
+        corners = np.array(list(product(*((0, size - 1) for size in shape), [1])))
+        off = np.abs(corners @ (header.get_sform() - header.get_qform()).T).max()
+        if not off <= ASTRAY * min(header.get_zooms()[:3]):
+            notes += (
+                f"its sform (code {codes[0]}) and qform (code {codes[1]}) place a corner {off:.3g} "
+                "apart: the sform is taken, as nibabel does; ITK may take the qform",
+            )
+    return from_affine(header.get_best_affine()), notes

@@ -7,6 +7,7 @@ would load the whole array, whatever its size, from wherever the header says.
 from __future__ import annotations
 
 import io
+import re
 from typing import Any
 
 import numpy as np
@@ -17,10 +18,13 @@ from ...grid.planes import InputFile
 from ..headers import ArrayHeader
 from ..regular import check_beside
 from ..volume import XYZ, Request, Volume, from_affine, reversed_axes
+from .axes import Axes, in_one_unit
+from .choosing import MOST_NAMED
 from .values import TextValues, bytes_from, packed_planes, raw_planes
 
 LONGEST = 1 << 20  # bytes of a header
 TEXT = ("ascii", "text", "txt")
+IN_SPACE = ("domain", "space", "???", "none")  # kinds of axes; others are lists, vectors, time
 CODECS = {"gzip": "gzip", "gz": "gzip", "bzip2": "bz2", "bz2": "bz2"}
 
 
@@ -32,24 +36,81 @@ def read_nrrd(request: Request) -> Volume:
     beginning = io.BytesIO(file.read(0, LONGEST).tobytes())
     header = {_plain(name): value for name, value in nrrd.read_header(beginning).items()}
     sizes = tuple(int(size) for size in header["sizes"])
-    if len(sizes) != 3 or header["dimension"] != 3:
+    if len(sizes) < 3 or header["dimension"] != len(sizes):
         raise GridError(f"{request.path} has shape {sizes}: give a file of three axes (x, y, z)")
     if min(sizes) < 1:
         raise FileError(f"its sizes are {sizes}")
+    layer = _layer(request, header, sizes)
+    rest = sizes if layer is None else (1, *sizes[1:])
+    space = _axes(header).in_space(rest)
+    shape = [rest[axis] for axis in space[::-1]]
     start = beginning.tell()
     if "datafile" in header:
         file, start = InputFile.open(check_beside(request.path, header["datafile"])), 0
     elif start >= LONGEST:
         raise FileError(f"its header has more than {LONGEST:,} bytes")
-    array = ArrayHeader(sizes[::-1], _dtype(nrrd, header), False, 0)
-    read, packed = _data(file, header, start, array)
-    place = _place(header)
-    return Volume(array.shape, array.dtype, read, *place, packed=packed)
+    layers = 1 if layer is None else sizes[0]
+    stored = (*shape[:2], shape[2] * layers)  # layers are the fastest axis
+    array = ArrayHeader(stored, _dtype(nrrd, header), False, 0)
+    read_all, packed = _data(file, header, start, array)
+
+    def read(first: int, last: int) -> NDArray[Any]:
+        planes: NDArray[Any] = read_all(first, last)[..., layer or 0 :: layers]
+        return planes
+
+    place, notes = _place(header, space)
+    return Volume(tuple(shape), array.dtype, read, *place, packed=packed, notes=notes)
+
+
+def _axes(header: dict[str, Any]) -> Axes:
+    """Return the axes of a file, the fastest first, named if it says which three are in space."""
+    count = len(header["sizes"])
+    kinds = header.get("kinds", ["???"] * count)
+    directions = header.get("space directions")
+    is_in_space = [kind in IN_SPACE for kind in kinds]
+    if directions is not None:
+        along = np.nan_to_num(np.asarray(directions, np.float64)[:, :3])
+        is_in_space = (along != 0).any(1).tolist()
+    if sum(is_in_space) != 3 or len(is_in_space) != count:
+        return Axes.named([""] * count)
+    names = iter("xyz")
+    return Axes.named([next(names) if each else "" for each in is_in_space])
+
+
+def _layer(request: Request, header: dict[str, Any], sizes: tuple[int, ...]) -> int | None:
+    """Return which layer of a segmentation is read: the fastest of four axes; None without any."""
+    count = sizes[0]
+    if request.member is None and (count == 1 or len(sizes) < 4 or _axes(header).names[0]):
+        return None
+    if len(sizes) < 4:
+        raise FileError(f"{request.path} holds one array: give no name of another in it")
+    asked = (request.member or "").strip("/")
+    if asked in map(str, range(count)):
+        return int(asked)
+    layers = ", ".join(f"{i}{_segments(header, i)}" for i in range(min(count, MOST_NAMED)))
+    wrong = f", and none of them is {seen(asked)}" if asked else ""
+    raise FileError(
+        f"{request.path} holds {count:,} layers, {layers}{wrong}: give {request.path}:0, say, and "
+        "--label for one of several segments in it"
+    )
+
+
+def _segments(header: dict[str, Any], layer: int) -> str:
+    """Return names and labels of the segments in a layer, as 3D Slicer writes them."""
+    found = [
+        f"{header.get(key.replace('_Layer', '_Name'), '?')} "
+        f"{header.get(key.replace('_Layer', '_LabelValue'), '?')}"
+        for key, value in header.items()
+        if re.fullmatch(r"Segment\d+_Layer", key) and value.strip() == str(layer)
+    ]
+    return f" ({seen(', '.join(found))})" if found else ""
 
 
 def _plain(name: str) -> str:
-    """Return the name of a field without the spaces in those that may be written either way."""
-    return name.replace(" ", "") if name in ("data file", "line skip", "byte skip") else name
+    """Return the name of a field in one spelling of those that the format allows."""
+    spelt = {"centers": "centerings", "axismins": "axis mins", "axismaxs": "axis maxs"}
+    spelt |= {each: each.replace(" ", "") for each in ("data file", "line skip", "byte skip")}
+    return spelt.get(name, name)
 
 
 def _dtype(nrrd: Any, header: dict[str, Any]) -> np.dtype[Any]:
@@ -92,26 +153,63 @@ def _after_lines(file: InputFile, start: int, lines: int) -> int:
     return start + place
 
 
-def _place(header: dict[str, Any]) -> tuple[Any, Any, NDArray[np.float64]]:
-    """Return spacing, origin and direction of the array in C order; None for what is not stated."""
-    directions = header.get("space directions")
-    if directions is not None:
-        columns = np.asarray(directions, np.float64).T
+def _place(
+    header: dict[str, Any], space: list[int]
+) -> tuple[tuple[Any, Any, NDArray[np.float64]], tuple[str, ...]]:
+    """Return spacing, origin and direction of the array in C order, and notes on the unit.
+
+    None stands for what is not stated. A ``space origin`` holds beside ``spacings``, too.
+    """
+    origin = header.get("space origin")
+    directions, units = header.get("space directions"), header.get("space units", ())
+    if directions is None:
+        steps, low = _steps(header, space)
+        columns = None if steps is None else np.diag(steps)
+        units = units or _of_axes(header.get("units"), space, ())
+        origin = low if origin is None else origin
+    else:
+        columns = np.asarray(directions, np.float64)[space, :3].T
         if columns.shape != (3, 3) or not np.isfinite(columns).all():
             raise FileError(f"its space directions are {columns.T.tolist()}: give three of three")
-        lengths, _, direction = from_affine(np.column_stack([columns, np.zeros(3)]))
-        spacing, direction = reversed_axes(lengths, direction)
-        return spacing, _numbers(header.get("space origin")), direction
-    spacings, least = header.get("spacings"), header.get("axis mins")
-    spacing, direction = reversed_axes(XYZ[0] if spacings is None else spacings, XYZ)
-    if spacings is None or not np.isfinite(spacings).all():
-        return None, None, direction
-    if least is None or not np.isfinite(least).all():
-        return spacing, None, direction
-    cells = [kind == "cell" for kind in header.get("centerings", ("node",) * 3)]
-    origin = np.asarray(least, np.float64) + np.where(cells, np.asarray(spacings) / 2, 0)
-    return spacing, _numbers(origin), direction
+    factors, notes = in_one_unit([unit.strip('"') for unit in units[:3]] or [""] * 3)
+    if factors is None:
+        return (None, None, XYZ[:, ::-1]), notes
+    origin = None if origin is None else np.asarray(origin, np.float64)[:3] * factors
+    if columns is None:
+        return (None, _numbers(origin), XYZ[:, ::-1]), notes
+    lengths, _, direction = from_affine(np.column_stack([np.diag(factors) @ columns, np.zeros(3)]))
+    spacing, direction = reversed_axes(lengths, direction)
+    return (spacing, _numbers(origin), direction), notes
+
+
+def _steps(header: dict[str, Any], space: list[int]) -> tuple[Any, Any]:
+    """Return the steps and the first position along the axes by ``spacings`` and ``axis mins``.
+
+    The mins of cells are their borders: their first sample is half a step further.
+    """
+    none = np.full(3, np.nan)
+    steps, low, high = (
+        np.asarray(_of_axes(header.get(name), space, none), np.float64)
+        for name in ("spacings", "axis mins", "axis maxs")
+    )
+    said = header.get("centerings", ())
+    said = said.split() if isinstance(said, str) else said  # pynrrd does not split "centers"
+    is_cell = np.array([each == "cell" for each in _of_axes(said, space, ("node",) * 3)])
+    counts = np.asarray(header["sizes"])[space] - ~is_cell
+    steps = np.where(np.isfinite(steps), steps, (high - low) / np.maximum(counts, 1))
+    if not (np.isfinite(steps) & (steps != 0)).all():
+        return None, None
+    low = low + np.where(is_cell, steps / 2, 0)
+    return steps, low if np.isfinite(low).all() else None
+
+
+def _of_axes(values: Any, space: list[int], default: Any) -> Any:
+    """Return the values of a field for the axes in space; others if it is not stated for all."""
+    is_stated = values is not None and len(values) > max(space)
+    return [values[axis] for axis in space] if is_stated else default
 
 
 def _numbers(numbers: Any) -> tuple[float, ...] | None:
-    return None if numbers is None else tuple(float(number) for number in numbers)
+    if numbers is None or not np.isfinite(numbers).all():
+        return None
+    return tuple(float(number) for number in numbers)

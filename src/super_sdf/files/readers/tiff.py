@@ -94,7 +94,7 @@ def _axes(file: Any, series: Any, order: str) -> tuple[Axes, tuple[str, ...]]:
     """Return what a file says of the axes of an array, and a note on what is not taken of it."""
     is_named = order == "zyx" and sorted(series.axes) == ["X", "Y", "Z"]
     names = series.axes.lower() if is_named else order
-    found = _ome_axes(file) or _imagej_axes(file) or {}
+    found: dict[str, Stated] = _ome_axes(file) or _imagej_axes(file) or {}
     units, steps, starts = zip(*(found.get(name, ("", None, None)) for name in names))
     return Axes.named(names, units, steps, starts), () if found else _pixel_note(file)
 
@@ -145,7 +145,7 @@ def _resolution_unit(file: Any) -> str:
 
 
 def _unescaped(unit: str) -> str:
-    """Return a unit as ImageJ shows it: it writes what is not ASCII as \\u00B5."""
+    """Return a unit whose letters beyond ASCII are written as ImageJ does, by their numbers."""
     return re.sub(r"\\u([0-9a-fA-F]{4})", lambda found: chr(int(found[1], 16)), unit)
 
 

@@ -43,18 +43,23 @@ TYPES = {
 TYPES |= {"Float32": "f4", "Float64": "f8"}
 APPENDED = re.compile(rb"<AppendedData[^>]*>\s*_")
 KINDS = ("PointData", "CellData")
+MARKS = ("vtkGhostType", "vtkValidPointMask")
 
 Attributes = dict[str, str]
 Planes = Callable[[int, int], NDArray[Any]]
 
 
 def read_vti(request: Request) -> Volume:
-    """Read the point data of a ``.vti`` file; cell data if there is no other."""
+    """Read an array of points or of cells of a ``.vti`` file: the named one, else the only one.
+
+    What has several numbers a sample, and VTK's own marks, is read only if it is named.
+    """
     file = InputFile.open(request.path)
     outline = Outline(file)
-    kind = next((kind for kind in KINDS if any(piece.arrays[kind] for piece in outline.pieces)), "")
-    names = dict.fromkeys(name for piece in outline.pieces for name in piece.arrays.get(kind, ()))
-    name = choose_member(request, list(names), "array of points or cells")
+    arrays = outline.arrays()
+    scalar = [name for name in arrays if arrays[name][2] or name == request.member]
+    name = choose_member(request, scalar or list(arrays), "array of points or cells")
+    kind, name = arrays[name][:2]
     of_points = kind == KINDS[0]
     spacing = _numbers(outline.image, "Spacing", 3, 1)
     origin = _numbers(outline.image, "Origin", 3, 0)
@@ -116,6 +121,21 @@ class Outline:
         self._parse()
         if self.top.get("type") != "ImageData" or not self.image:
             raise FileError(f"{file.name} is no VTK image data, or damaged")
+
+    def arrays(self) -> dict[str, tuple[str, str, bool]]:
+        """Return kind, name, and whether it has one number a sample, of each array by its name.
+
+        That of an array of cells beside one of points of the same name begins with ``CellData/``.
+        """
+        found: dict[str, tuple[str, str, bool]] = {}
+        for kind in KINDS:
+            for name, array in (
+                (n, a) for piece in self.pieces for n, a in piece.arrays[kind].items()
+            ):
+                is_scalar = array.attributes.get("NumberOfComponents", "1") == "1"
+                key = name if found.get(name, (kind,))[0] == kind else f"{kind}/{name}"
+                found[key] = kind, name, is_scalar and name not in MARKS
+        return found
 
     def _parse(self) -> None:
         """Parse the XML, of which no entity is expanded."""
