@@ -208,7 +208,7 @@ def test_axes_in_another_order(values):
     np.testing.assert_array_equal(grid.values, values)
 
 
-def test_axes_with_different_units_state_no_spacing(values):
+def test_axes_with_different_units_have_that_of_x(values):
     image("i.zarr", [(values.T, [scale(1000, 1, 1)])], unit=None)
     group = zarr.open_group("i.zarr", mode="a")
     about = dict(group.attrs)["ome"]
@@ -217,9 +217,11 @@ def test_axes_with_different_units_state_no_spacing(values):
     ):
         axis["unit"] = unit
     group.attrs["ome"] = about
-    assert read_grid("i.zarr", spacing=1).notes[0] == (
-        "its axes have different units (x micrometer, y micrometer, z nanometer): spacing and "
-        "origin are not taken from its metadata (give --spacing)"
+    grid = read_grid("i.zarr")
+    assert grid.spacing == (1, 1, 1) and grid.origin == (0, 0, 0)
+    assert grid.notes[0] == (
+        "its axes have different units (x micrometer, y micrometer, z nanometer): lengths are in "
+        "micrometer"
     )
 
 

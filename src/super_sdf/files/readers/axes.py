@@ -18,7 +18,8 @@ from ..volume import axes_direction
 
 SPACE = "xyz"
 PREFIXES = {"k": 1e3, "": 1.0, "d": 1e-1, "c": 1e-2, "m": 1e-3, "u": 1e-6, "n": 1e-9, "p": 1e-12}
-WORDS = {"kilo": "k", "deci": "d", "centi": "c", "milli": "m", "micro": "u", "nano": "n"}
+WORDS = {"kilo": "k", "deci": "d", "centi": "c", "milli": "m", "micro": "u"}
+WORDS |= {"nano": "n", "pico": "p"}
 METRES = {f"{prefix}m": factor for prefix, factor in PREFIXES.items()} | {
     **{"inch": 0.0254, "in": 0.0254, '"': 0.0254, "ft": 0.3048, "foot": 0.3048, "feet": 0.3048},
     **{"angstrom": 1e-10, "å": 1e-10, "mil": 2.54e-5, "thou": 2.54e-5},
@@ -82,26 +83,30 @@ class Axes:
 
     @classmethod
     def of_coordinates(
-        cls, names: Sequence[str], found: Callable[[int], tuple[NDArray[Any] | None, Any]]
+        cls,
+        names: Sequence[str],
+        shape: Sequence[int],
+        found: Callable[[int], tuple[NDArray[Any] | None, dict[str, Any]]],
     ) -> Axes:
-        """Return axes with coordinates; of each, ``found`` returns them and their attributes.
+        """Return the axes of an array by their coordinates.
+
+        ``found`` returns those of an axis in space, or None, and their attributes.
 
         Raises
         ------
         GridError
-            If coordinates are not evenly spaced numbers.
+            If coordinates are not evenly spaced numbers, or as in ``in_space``.
         """
-        units, firsts, steps = [], [], []
-        for axis, name in enumerate(names):
+        axes = cls.named(names)
+        units, steps, starts = (list(each) for each in (axes.units, axes.steps, axes.starts))
+        for axis in axes.in_space(shape):
             places, about = found(axis)
-            first, step = None, None
-            if places is not None and len(places) > 1 and name.lower() not in ("time", "t"):
-                first, step = even_steps(name, places)
-            stated = about.get("units", "") if places is not None else ""
-            units.append(stated.decode() if isinstance(stated, bytes) else str(stated))
-            firsts.append(first)
-            steps.append(step)
-        return cls.named(names, tuple(units), tuple(steps), tuple(firsts))
+            if places is None or len(places) < 2:
+                continue
+            starts[axis], steps[axis] = even_steps(names[axis], places)
+            unit = about.get("units", "")
+            units[axis] = unit.decode() if isinstance(unit, bytes) else str(unit)
+        return cls.named(names, tuple(units), tuple(steps), tuple(starts))
 
     @property
     def are_in_space(self) -> bool:

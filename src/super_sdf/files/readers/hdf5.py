@@ -77,7 +77,11 @@ def _axes(values: Any) -> Axes:
         dim.label or ("" if scale is None else (scale.name or "").rsplit("/", 1)[-1])
         for dim, scale in zip(values.dims, scales)
     ]
-    return Axes.of_coordinates(names, lambda axis: _coordinates(scales[axis], values.shape[axis]))
+
+    def coordinates(axis: int) -> tuple[NDArray[Any] | None, dict[str, Any]]:
+        return _coordinates(scales[axis], values.shape[axis])
+
+    return Axes.of_coordinates(names, values.shape, coordinates)
 
 
 def _coordinates(scale: Any, count: int) -> tuple[NDArray[Any] | None, dict[str, Any]]:

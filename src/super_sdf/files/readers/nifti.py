@@ -55,9 +55,9 @@ def read_nifti(request: Request) -> Volume:
         return planes
 
     (spacing, origin, direction), notes = _place(header, shape[:3])
-    place, dtype = reversed_axes(spacing, direction), read(0, 1).dtype
+    spacing, direction = reversed_axes(spacing, direction)
+    place, dtype = (spacing, origin, direction), read(0, 1).dtype
     packed = size if is_packed else None
-    place = place[0], origin, place[1]
     return Volume(shape[2::-1], dtype, read, *place, packed=packed, notes=notes)
 
 
@@ -73,7 +73,9 @@ def _header(nibabel: Any, stream: Any) -> Any:
 def _place(header: Any, shape: tuple[int, ...]) -> tuple[Any, tuple[str, ...]]:
     """Return spacing, origin and direction of the axes x, y, z, and notes on what was chosen."""
     unit = UNITS.get(header.get_xyzt_units()[0])
-    notes = (f"lengths are in the unit that it states, {unit}",) if unit else ()
+    notes: tuple[str, ...] = ()
+    if unit:
+        notes = (f"lengths are in the unit that it states, {unit}",)
     codes = int(header["sform_code"]), int(header["qform_code"])
     if codes == (0, 0):
         said = (

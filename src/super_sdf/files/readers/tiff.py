@@ -96,7 +96,7 @@ def _axes(file: Any, series: Any, order: str) -> tuple[Axes, tuple[str, ...]]:
     names = series.axes.lower() if is_named else order
     found: dict[str, Stated] = _ome_axes(file) or _imagej_axes(file) or {}
     units, steps, starts = zip(*(found.get(name, ("", None, None)) for name in names))
-    return Axes.named(names, units, steps, starts), () if found else _pixel_note(file)
+    return Axes.named(names, units, steps, starts), (() if found else _pixel_note(file))
 
 
 def _imagej_axes(file: Any) -> dict[str, Stated] | None:
@@ -105,7 +105,7 @@ def _imagej_axes(file: Any) -> dict[str, Stated] | None:
     What is not stated holds as in ImageJ: a spacing of z of 1, the unit of the resolution, that of
     x for all axes, and origins of 0 beside others, which are in pixels.
     """
-    found = file.imagej_metadata or (file.shaped_metadata or ({},))[0]
+    found: dict[str, Any] = file.imagej_metadata or (file.shaped_metadata or ({},))[0]
     sizes = _pixel_sizes(file)
     if not sizes or not (file.is_imagej or "spacing" in found):
         return None

@@ -125,7 +125,7 @@ def _named_axes(files: ZarrFiles, name: str, array: Any, request: Request) -> Ax
         is_whole = places.shape == (array.shape[axis],)
         return (np.asarray(places[:]) if is_whole else None), files.attributes(path)
 
-    return Axes.of_coordinates([str(each or "") for each in names], coordinates)
+    return Axes.of_coordinates([str(each or "") for each in names], array.shape, coordinates)
 
 
 def _reader(array: Any, space: list[int]) -> Callable[[Box], NDArray[Any]]:

@@ -1,0 +1,686 @@
+"""Units, places and names of axes that files of other programs state, and axes of length 1.
+
+A part without any symmetry is sampled at the positions that the file states; each sample of the
+grid that is read is then its distance there. Files are written by the format's own library.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import nibabel
+import nrrd
+import numpy as np
+import pytest
+import pyvista
+import SimpleITK as sitk  # noqa: N813
+import tifffile
+import xarray
+import zarr
+from numpy.typing import ArrayLike
+
+from super_sdf import SdfGrid, read_grid
+from super_sdf.errors import FileError, GridError
+from super_sdf.files.description import describe_grid_file
+from super_sdf.files.readers.axes import in_metres
+
+SIZES = 24, 20, 17  # along x, y, z
+FIRST = np.array([10.0, -4.0, 30.0])
+STEPS = np.array([0.3, 0.4, 0.6])
+CENTRE = FIRST + np.array([3.2, 3.9, 4.4])
+
+
+pytestmark = pytest.mark.filterwarnings("ignore:Consolidated metadata")
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def part(points: np.ndarray) -> np.ndarray:
+    """Return the distances of points (..., 3) from a large ball and a small one beside it."""
+    large = np.linalg.norm(points - CENTRE, axis=-1) - 2.4
+    small = np.linalg.norm(points - CENTRE - [1.6, 0.7, 1.2], axis=-1) - 1.2
+    return np.minimum(large, small)
+
+
+def coordinates(steps: ArrayLike = STEPS, first: ArrayLike = FIRST) -> dict[str, np.ndarray]:
+    """Return the positions of the samples along x, y and z."""
+    numbers = zip("xyz", SIZES, np.broadcast_to(first, 3), np.broadcast_to(steps, 3))
+    return {name: start + step * np.arange(count) for name, count, start, step in numbers}
+
+
+def sampled(steps: ArrayLike = STEPS, first: ArrayLike = FIRST) -> np.ndarray:
+    """Return the samples (nx, ny, nz) of the part."""
+    places = np.meshgrid(*coordinates(steps, first).values(), indexing="ij")
+    return part(np.stack(places, axis=-1)).astype(np.float32)
+
+
+def check(grid: SdfGrid, steps: ArrayLike = STEPS, first: ArrayLike | None = FIRST) -> None:
+    """Check that each sample is at its place; ``first`` None is for a file that states none."""
+    assert np.allclose(grid.spacing, steps, rtol=1e-5)
+    shift = np.zeros(3) if first is not None else FIRST
+    places = grid.to_world(np.moveaxis(np.indices(grid.shape), 0, -1)) + shift
+    assert np.abs(grid.values - part(places)).max() < 2e-5
+    assert grid.origin == ((0, 0, 0) if first is None else tuple(np.float64(grid.origin)))
+
+
+def line(error: type[Exception], name: str, **options: object) -> str:
+    """Return the one line with which a file is refused."""
+    with pytest.raises(error) as caught:
+        read_grid(name, **options)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+# TIFF
+
+
+def imagej(name: str, steps: ArrayLike, units: dict[str, object]) -> None:
+    """Write an ImageJ stack; its resolution is that of x and y."""
+    x, y, z = steps
+    about = {"axes": "ZYX", **({} if z == 1 else {"spacing": z}), **units}
+    options = {"imagej": True, "resolution": (1 / x, 1 / y), "metadata": about}
+    tifffile.imwrite(name, sampled((x, y, z)).T, **options)
+
+
+@pytest.mark.parametrize(
+    "unit, shown", [("um", "um"), ("micron", "micron"), ("\\u00B5m", "µm"), ("inch", "inch")]
+)
+def test_imagej_leaves_out_a_depth_of_1(unit, shown):
+    imagej("a.tif", (0.3, 0.4, 1), {"unit": unit})
+    assert "spacing" not in tifffile.TiffFile("a.tif").imagej_metadata
+    grid = read_grid("a.tif")
+    check(grid, (0.3, 0.4, 1), None)
+    assert grid.notes[0] == f"lengths are in the unit of its axes, {shown}"
+
+
+@pytest.mark.parametrize(
+    "units, factors",
+    [
+        ({"unit": "cm", "zunit": "mm"}, (1, 1, 10)),
+        ({"unit": "\\u00B5m", "zunit": "nm"}, (1, 1, 1000)),
+        ({"unit": "micron", "zunit": "um"}, (1, 1, 1)),
+        ({"unit": "um", "yunit": "nm", "zunit": "mm"}, (1, 1000, 0.001)),
+        ({"unit": "inch", "zunit": "mm"}, (1, 1, 25.4)),
+    ],
+)
+def test_imagej_has_a_unit_for_each_axis(units, factors):
+    """Lengths come out in that of x."""
+    x, y, z = STEPS * factors
+    about = {"axes": "ZYX", "spacing": z, **units}
+    options = {"imagej": True, "resolution": (1 / x, 1 / y), "metadata": about}
+    tifffile.imwrite("a.tif", sampled().T, **options)
+    check(read_grid("a.tif"), first=None)
+
+
+def test_imagej_origins_are_in_pixels():
+    starts = {f"{name}origin": -first / step for name, first, step in zip("xyz", FIRST, STEPS)}
+    imagej("a.tif", STEPS, {"unit": "mm", **starts})
+    check(read_grid("a.tif"))
+
+
+def test_a_stack_without_calibration_states_no_spacing():
+    tifffile.imwrite("a.tif", sampled(0.5).T, imagej=True, metadata={"axes": "ZYX"})
+    tifffile.imwrite("b.tif", sampled(0.5).T, photometric="minisblack")
+    for name in ("a.tif", "b.tif"):
+        assert describe_grid_file(name)["spacing"] is None
+        assert not describe_grid_file(name)["notes"]
+
+
+@pytest.mark.parametrize("options", [{}, {"imagej": True, "metadata": {"axes": "ZYX"}}])
+def test_a_resolution_of_x_and_y_alone_is_told(options):
+    options = {"resolution": (100, 50), "resolutionunit": "CENTIMETER", **options}
+    tifffile.imwrite("a.tif", sampled(0.5).T, **{"photometric": "minisblack", **options})
+    found = describe_grid_file("a.tif")
+    assert found["spacing"] is None
+    assert found["notes"] == [
+        "its pixels are 0.01 x 0.02 cm, but it does not state how far its pages are apart: no "
+        "spacing is taken from it (give --spacing X,Y,Z)"
+    ]
+
+
+def test_a_spacing_in_the_metadata_of_tifffile():
+    about = {"axes": "ZYX", "spacing": 0.6, "unit": "mm"}
+    options = {"resolution": (1 / 0.3, 1 / 0.4), "photometric": "minisblack"}
+    tifffile.imwrite("a.tif", sampled().T, metadata=about, **options)
+    check(read_grid("a.tif"), first=None)
+
+
+OME = {
+    "nm": ("µm", "µm", "nm", (1, 1, 1000)),
+    "mm": ("mm", "mm", "µm", (1, 1, 1000)),
+    "all": ("nm", "µm", "mm", (1, 1e-3, 1e-6)),
+    "cm": ("cm", "mm", "m", (1, 10, 0.01)),
+    "angstrom": ("nm", "nm", "Å", (1, 1, 10)),
+    "pixel": ("pixel", "pixel", "pixel", (1, 1, 1)),
+}
+
+
+@pytest.mark.parametrize("case", OME)
+def test_ome_has_a_unit_for_each_axis(case):
+    *units, factors = OME[case]
+    sizes = {f"PhysicalSize{a}": s * f for a, s, f in zip("XYZ", STEPS, factors)}
+    named = {f"PhysicalSize{a}Unit": unit for a, unit in zip("XYZ", units)}
+    tifffile.imwrite("a.ome.tif", sampled().T, metadata={"axes": "ZYX", **sizes, **named})
+    grid = read_grid("a.ome.tif")
+    check(grid, first=None)
+    listed = ", ".join(f"{a} {unit}" for a, unit in zip("xyz", units))
+    assert grid.notes[0] in (
+        f"its axes have different units ({listed}): lengths are in {units[0]}",
+        f"lengths are in the unit of its axes, {units[0]}",
+    )
+
+
+def test_units_that_cannot_be_compared_are_told():
+    sizes = {f"PhysicalSize{a}": 0.5 for a in "XYZ"} | {"PhysicalSizeZUnit": "pixel"}
+    tifffile.imwrite("a.ome.tif", sampled(0.5).T, metadata={"axes": "ZYX", **sizes})
+    grid = read_grid("a.ome.tif", spacing=0.5)
+    assert grid.notes[0] == (
+        "its axes have different units (x µm, y µm, z pixel): spacing and origin are not taken "
+        "from its metadata (give --spacing)"
+    )
+    del sizes["PhysicalSizeZ"], sizes["PhysicalSizeZUnit"]
+    tifffile.imwrite("b.ome.tif", sampled(0.5).T, metadata={"axes": "ZYX", **sizes})
+    assert read_grid("b.ome.tif", spacing=0.5).notes[:2] == (
+        "lengths are in the unit of its axes, µm",
+        "it states no spacing along z: none is taken from it (give --spacing)",
+    )
+
+
+def test_names_of_units():
+    for unit, metres in {
+        **{"m": 1, "Meters": 1, "metre": 1, "mm": 1e-3, "millimetres": 1e-3, "centimeter": 0.01},
+        **{"µm": 1e-6, "\u03bcm": 1e-6, "um": 1e-6, "microns": 1e-6, "micrometer": 1e-6},
+        **{"nm": 1e-9, "Nanometre": 1e-9, "km": 1e3, "inch": 0.0254, "inches": 0.0254, '"': 0.0254},
+        **{"Å": 1e-10, "\u212b": 1e-10, "angstroms": 1e-10, "pm": 1e-12},
+    }.items():
+        assert in_metres(unit) == pytest.approx(metres), unit
+    for unit in ("pixel", "s", "degrees_east", "", "reference frame"):
+        assert in_metres(unit) is None
+
+
+# xarray, in Zarr
+
+
+def placed(order: str = "xyz", down: str = "", **more: ArrayLike) -> xarray.DataArray:
+    """Return the part with named axes in an order, along falling coordinates in ``down``."""
+    found = {**coordinates(), **more}
+    array = xarray.DataArray(sampled(), coordinates(), ["x", "y", "z"], name="sdf")
+    array = array.assign_coords(found)
+    return array.isel(dict.fromkeys(down, slice(None, None, -1))).transpose(*order)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("order, down", [("xyz", ""), ("zyx", "y"), ("yzx", "xz"), ("xyz", "xyz")])
+def test_zarr_by_xarray_has_names_and_coordinates(order, down, version):
+    placed(order, down).to_dataset().to_zarr("a.zarr", zarr_format=version)
+    check(read_grid("a.zarr"))
+    check(read_grid("a.zarr:/sdf"))
+    bare = placed(order).drop_vars(["x", "y", "z"]).to_dataset()
+    bare.to_zarr("b.zarr", zarr_format=version)
+    check(read_grid("b.zarr", spacing=STEPS, origin=FIRST))
+
+
+def test_a_group_in_zarr_and_axes_of_length_1():
+    array = placed("xyz", "y").expand_dims(time=[3.0]).expand_dims(band=["a"], axis=-1)
+    array.to_dataset().to_zarr("a.zarr", group="deep/er", zarr_format=2)
+    check(read_grid("a.zarr"))
+
+
+def test_units_of_coordinates():
+    array = placed(z=coordinates()["z"] * 1000).transpose("z", "x", "y")
+    for name, unit in zip("xyz", ("m", "metre", "mm")):
+        array[name].attrs["units"] = unit
+    array.to_dataset().to_zarr("a.zarr", zarr_format=2)
+    grid = read_grid("a.zarr")
+    check(grid)
+    assert grid.notes[0] == ("its axes have different units (x m, y metre, z mm): lengths are in m")
+
+
+def test_coordinates_that_are_no_grid_are_refused():
+    uneven = np.array(coordinates()["y"])
+    uneven[7] += 0.1
+    placed(y=uneven).to_dataset().to_zarr("a.zarr", zarr_format=2)
+    assert line(GridError, "a.zarr") == (
+        "a.zarr: coordinates of 'y' are not evenly spaced: -1.6 is followed by -1.1, a step of 0.5 "
+        "among steps of 0.4; resample the array (array.interp(y=...))"
+    )
+    placed().drop_vars("z").to_dataset().to_zarr("b.zarr", zarr_format=2)
+    assert read_grid("b.zarr", spacing=STEPS).notes[0] == (
+        "it states no spacing along z: none is taken from it (give --spacing)"
+    )
+
+
+def test_names_that_are_not_x_y_z_are_told():
+    array = placed("zyx").rename(x="column", y="row", z="slice").to_dataset()
+    array.to_zarr("a.zarr", zarr_format=3)
+    grid = read_grid("a.zarr")
+    check(grid)
+    assert grid.notes[0] == "its axes are named slice, row, column: taken as z, y, x"
+
+
+def test_a_direction_that_is_given_holds_for_named_axes():
+    turn = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    options = {"spacing": STEPS, "origin": FIRST, "direction": turn}
+    np.save("a.npy", sampled())
+    bare = placed("yxz").drop_vars(["x", "y", "z"])
+    bare.to_dataset().to_zarr("a.zarr", zarr_format=2)
+    want, grid = read_grid("a.npy", **options), read_grid("a.zarr", **options)
+    assert np.array_equal(grid.values, want.values)
+    assert (grid.origin, grid.spacing) == (want.origin, want.spacing)
+
+
+# HDF5
+
+
+def attach(
+    file: h5py.File, order: str, steps: dict[str, np.ndarray], units: dict[str, str]
+) -> None:
+    """Attach scales with coordinates to the axes of the dataset ``m``."""
+    for axis, name in enumerate(order):
+        scale = file.create_dataset(f"scales/{name}", data=steps[name])
+        if name in units:
+            scale.attrs["units"] = units[name]
+        scale.make_scale(name)
+        file["m"].dims[axis].attach_scale(scale)
+
+
+@pytest.mark.parametrize("order", ["xyz", "zyx", "yxz", "zxy"])
+def test_hdf5_labels_and_scales(order):
+    axes = ["xyz".index(name) for name in order]
+    with h5py.File("a.h5", "w") as file:
+        file["m"] = sampled().transpose(axes)
+        for axis, name in enumerate(order):
+            file["m"].dims[axis].label = name.upper()
+    check(read_grid("a.h5", spacing=STEPS, origin=FIRST))
+    with h5py.File("b.h5", "w") as file:
+        file["m"] = sampled().transpose(axes)
+        millimetres = {**coordinates(), "y": coordinates()["y"] * 10}
+        attach(file, order, millimetres, {"x": "cm", "y": "mm", "z": "cm"})
+    check(read_grid("b.h5"))
+    with h5py.File("c.h5", "w") as file:
+        file["m"] = sampled().transpose(axes)[::-1]
+        falling = coordinates()
+        falling[order[0]] = falling[order[0]][::-1]
+        attach(file, order, falling, {})
+    check(read_grid("c.h5:/m"))
+
+
+def test_netcdf_names_without_coordinates_are_no_coordinates():
+    """As the netCDF library writes a dimension that has none: zeros under a name that says so."""
+    with h5py.File("a.h5", "w") as file:
+        file["m"] = sampled()
+        attach(file, "xyz", {name: np.zeros(n) for name, n in zip("xyz", SIZES)}, {})
+        for name, count in zip("xyz", SIZES):
+            text = f"This is a netCDF dimension but not a netCDF variable.{count:10d}"
+            file[f"scales/{name}"].attrs["NAME"] = np.bytes_(text)
+    check(read_grid("a.h5", spacing=STEPS, origin=FIRST))
+
+
+@pytest.mark.parametrize("order", ["zyxc", "xyzc", "tzyxc", "cyzx"])
+@pytest.mark.parametrize("resolution", [0.0, 1.0])
+def test_axistags_of_ilastik(order, resolution):
+    """The program writes no element_size_um; where vigra knows a resolution, it is in the tags."""
+    values = sampled().transpose(["xyz".index(name) for name in order if name in "xyz"])
+    values = np.expand_dims(values, [a for a, name in enumerate(order) if name in "tc"])
+    steps = dict(zip("xyz", STEPS * resolution))
+    flags = {"c": 1, "t": 8}
+    tags = [
+        {
+            "key": key,
+            "typeFlags": flags.get(key, 2),
+            "resolution": steps.get(key, 0),
+            "description": "",
+        }
+        for key in order
+    ]
+    with h5py.File("a.h5", "w") as file:
+        file["exported_data"] = values
+        file["exported_data"].attrs["axistags"] = json.dumps({"axes": tags})
+    given = {} if resolution else {"spacing": STEPS}
+    check(read_grid("a.h5", origin=FIRST, **given))
+
+
+def test_several_channels_are_refused_by_the_name_of_the_axis():
+    tags = {"axes": [{"key": key} for key in "zyxc"]}
+    with h5py.File("a.h5", "w") as file:
+        file["m"] = np.repeat(sampled().T[..., None], 3, axis=3)
+        file["m"].attrs["axistags"] = json.dumps(tags)
+        file["flat"] = np.zeros((4, 5))
+    assert line(GridError, "a.h5:/m") == (
+        "a.h5:/m: its axis c has 3 entries, and a grid has three axes in space: store one of them "
+        "as an array of its own"
+    )
+    assert line(GridError, "a.h5:flat") == (
+        "a.h5:flat: values have shape (4, 5): give three axes (x, y, z)"
+    )
+
+
+def test_a_size_of_elements_is_in_the_order_of_the_axes():
+    with h5py.File("a.h5", "w") as file:
+        file["m"] = sampled().T[None]
+        file["m"].attrs["element_size_um"] = STEPS[::-1]
+    check(read_grid("a.h5"), first=None)
+
+
+# Axes of length 1
+
+
+def write_ones(name: str, shape: tuple[int, ...]) -> None:
+    """Write the part with axes of length 1 among its own."""
+    array = sampled() if name[0] == "n" else sampled().T
+    array = array.reshape(shape)
+    if name.endswith(".npy"):
+        np.save(name, np.asfortranarray(array) if name == "nf.npy" else array)
+    elif name.endswith(".npz"):
+        np.savez(name, values=array)
+    elif name.endswith(".h5"):
+        with h5py.File(name, "w") as file:
+            file.create_dataset("m", data=array, chunks=tuple(min(n, 7) for n in shape))
+    else:
+        made = zarr.create_array(name, shape=shape, dtype="f4", chunks=(5,) * len(shape))
+        made[...] = array
+
+
+@pytest.mark.parametrize("where", [(0,), (3,), (1,), (0, 4), (0, 1, 5)])
+@pytest.mark.parametrize("name", ["n.npy", "nf.npy", "n.npz", "a.h5", "a.zarr"])
+def test_axes_of_length_1_are_dropped(name, where):
+    sizes = SIZES if name[0] == "n" else SIZES[::-1]
+    shape = np.expand_dims(np.empty(sizes), where).shape
+    write_ones(name, shape)
+    check(read_grid(name, spacing=STEPS, origin=FIRST))
+    assert describe_grid_file(name)["shape"] == list(SIZES)
+
+
+def test_more_than_three_longer_axes_are_refused():
+    for name, shape in (("n.npy", (4, 6, *SIZES[1:])), ("a.h5", (17, 20, 6, 4))):
+        write_ones(name, shape)
+    assert line(GridError, "n.npy") == "values have shape (4, 6, 20, 17): give three axes (x, y, z)"
+    assert line(FileError, "a.h5") == "a.h5 holds no 3D dataset"
+    assert "its axis 3 has 4 entries, and a grid" in line(GridError, "a.h5:m")
+
+
+def test_metaimage_of_four_axes_keeps_its_place():
+    for k, packed in enumerate((False, True)):
+        image = sitk.GetImageFromArray(sampled().T)
+        image.SetSpacing(STEPS.tolist())
+        image.SetOrigin(FIRST.tolist())
+        series = sitk.JoinSeries([image], 7.0, 2.0)
+        assert series.GetDimension() == 4
+        sitk.WriteImage(series, f"{k}.mha", packed)
+        check(read_grid(f"{k}.mha"))
+    turned = sitk.Flip(image, [True, False, True])
+    sitk.WriteImage(sitk.JoinSeries([turned]), "t.mha")
+    check(read_grid("t.mha"))
+
+
+def header_of(**fields: object) -> dict[str, object]:
+    """Return an NRRD header with the place of the part, and further fields."""
+    place = {"space directions": np.diag(STEPS), "space origin": FIRST}
+    return {"space": "left-posterior-superior", **place, **fields}
+
+
+def beside(directions: np.ndarray, axis: int) -> np.ndarray:
+    """Return space directions with none for another axis."""
+    return np.insert(directions, axis, np.nan, axis=0)
+
+
+@pytest.mark.parametrize("axis, kind", [(0, "list"), (3, "time"), (1, "vector")])
+def test_nrrd_axes_of_length_1_are_dropped(axis, kind):
+    kinds = ["domain"] * 3
+    kinds.insert(axis, kind)
+    directions = beside(np.diag(STEPS), axis)
+    header = header_of(kinds=kinds) | {"space directions": directions}
+    nrrd.write("a.nrrd", np.expand_dims(sampled(), axis), header)
+    check(read_grid("a.nrrd"))
+    spacings = np.insert(STEPS, axis, np.nan)
+    least = np.insert(FIRST, axis, np.nan)
+    about = {"spacings": spacings, "axis mins": least, "kinds": kinds}
+    nrrd.write("b.nrrd", np.expand_dims(sampled(), axis), about)
+    check(read_grid("b.nrrd"))
+
+
+def test_layers_of_a_segmentation():
+    """As 3D Slicer writes segments that overlap: the first axis of the file has the layers."""
+    other = np.ones_like(sampled())
+    segments = {}
+    for number, (name, layer, value) in enumerate((("Liver", 0, 1), ("Tumour", 1, 1))):
+        about = {"Name": name, "Layer": layer, "LabelValue": value}
+        segments |= {f"Segment{number}_{key}": str(each) for key, each in about.items()}
+    header = header_of(kinds=["list"] + ["domain"] * 3, **segments)
+    header["space directions"] = beside(np.diag(STEPS), 0)
+    for encoding in ("raw", "gzip", "ascii"):
+        name = f"{encoding}.seg.nrrd"
+        nrrd.write(name, np.stack([other, sampled()]), {**header, "encoding": encoding})
+        check(read_grid(f"{name}:1"))
+        layers = f"{name} holds 2 layers, 0 ('Liver 1'), 1 ('Tumour 1')"
+        way_out = f": give {name}:0, say, and --label for one of several segments in it"
+        assert line(FileError, name) == layers + way_out
+        assert line(FileError, f"{name}:x") == f"{layers}, and none of them is 'x'{way_out}"
+    nrrd.write("a.nrrd", sampled(), header_of())
+    want = "a.nrrd holds one array: give no name of another in it"
+    assert line(FileError, "a.nrrd:0") == want
+
+
+# NRRD
+
+
+def test_nrrd_places_without_directions():
+    cells = {"centerings": ["cell"] * 3}
+    high = FIRST + STEPS * (np.array(SIZES) - 1)
+    cases = {
+        "origin": {"spacings": STEPS, "space": "left-posterior-superior", "space origin": FIRST},
+        "mins": {"spacings": STEPS, "axis mins": FIRST},
+        "both": {"axis mins": FIRST, "axis maxs": high},
+        "cells": {"axis mins": FIRST - STEPS / 2, "axis maxs": high + STEPS / 2, **cells},
+    }
+    for name, header in cases.items():
+        nrrd.write(f"{name}.nrrd", sampled(), header)
+        check(read_grid(f"{name}.nrrd"))
+    text = Path("cells.nrrd").read_bytes().replace(b"centerings:", b"centers:")
+    Path("c.nrrd").write_bytes(text.replace(b"axis mins:", b"axismins:"))
+    assert b"centers: cell" in text
+    check(read_grid("c.nrrd"))
+    falling = {"axis mins": [high[0], *FIRST[1:]], "axis maxs": [FIRST[0], *high[1:]]}
+    nrrd.write("f.nrrd", sampled()[::-1], falling)
+    check(read_grid("f.nrrd"))
+
+
+def test_units_of_an_nrrd_space():
+    factors = np.array([1, 1, 1000])
+    header = header_of() | {"space directions": np.diag(STEPS * factors)}
+    header |= {"space origin": FIRST * factors, "space units": ["mm", "mm", "um"]}
+    nrrd.write("a.nrrd", sampled(), header)
+    grid = read_grid("a.nrrd")
+    check(grid)
+    assert grid.notes[0] == ("its axes have different units (x mm, y mm, z um): lengths are in mm")
+    nrrd.write("b.nrrd", sampled(), header_of(**{"space units": ["um"] * 3}))
+    assert read_grid("b.nrrd").notes[0] == "lengths are in the unit of its axes, um"
+
+
+# NIfTI
+
+
+def affine() -> np.ndarray:
+    """Return the affine of the part."""
+    found = np.diag([*STEPS, 1.0])
+    found[:3, 3] = FIRST
+    return found
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("name", ["a.nii", "a.nii.gz"])
+@pytest.mark.parametrize("version", [nibabel.Nifti1Image, nibabel.Nifti2Image])
+def test_both_versions_of_nifti_in_both_orders_of_bytes(version, name, order):
+    image = version(sampled(), affine())
+    header = version.header_class(endianness=order)
+    for key in image.header:
+        header[key] = image.header[key]
+    image = version(sampled().astype(f"{order}f4"), affine(), header)
+    nibabel.save(image, name)
+    opened = gzip.open if name.endswith(".gz") else open
+    with opened(name, "rb") as file:
+        size = int.from_bytes(file.read(4), {"<": "little", ">": "big"}[order])
+    assert size == {nibabel.Nifti1Image: 348, nibabel.Nifti2Image: 540}[version]
+    check(read_grid(name))
+
+
+def test_a_truncated_nifti_2_is_refused():
+    nibabel.save(nibabel.Nifti2Image(sampled(), affine()), "a.nii")
+    whole = Path("a.nii").read_bytes()
+    Path("a.nii").write_bytes(whole[:-1])
+    assert line(FileError, "a.nii").startswith("a.nii is truncated: its header promises 24 x 20 x")
+    Path("a.nii").write_bytes(whole[:400])
+    assert line(FileError, "a.nii").startswith("a.nii cannot be read as NIfTI: ")
+
+
+def test_nifti_without_a_place_is_not_mirrored():
+    """Like ITK, whose direction is the identity, and method 1 of the standard."""
+    image = nibabel.Nifti1Image(sampled(), None)
+    image.header.set_zooms(STEPS)
+    image.set_sform(None, 0)
+    image.set_qform(None, 0)
+    nibabel.save(image, "a.nii")
+    assert sitk.ReadImage("a.nii").GetDirection() == (1, 0, 0, 0, 1, 0, 0, 0, 1)
+    grid = read_grid("a.nii")
+    check(grid, first=None)
+    assert grid.notes[0] == (
+        "it states no place (sform_code and qform_code are 0): its axes are taken as x, y and z, "
+        "as ITK does; nibabel would mirror x"
+    )
+    check(read_grid("a.nii", origin=FIRST))
+
+
+@pytest.mark.parametrize("codes", [(1, 1), (2, 1), (4, 1), (1, 2)])
+def test_sform_and_qform_that_disagree_are_told(codes):
+    image = nibabel.Nifti1Image(sampled(), affine())
+    image.set_sform(affine(), codes[0])
+    moved = affine()
+    moved[:3, 3] += [0, 5, 0]
+    image.set_qform(moved, codes[1])
+    nibabel.save(image, "a.nii")
+    grid = read_grid("a.nii")
+    check(grid)
+    assert grid.notes[0] == (
+        f"its sform (code {codes[0]}) and qform (code {codes[1]}) place a corner 5 apart: the "
+        "sform is taken, as nibabel does; ITK may take the qform"
+    )
+    image.set_qform(affine(), codes[1])
+    nibabel.save(image, "a.nii")
+    assert not [note for note in read_grid("a.nii").notes if "form" in note]
+
+
+@pytest.mark.parametrize(
+    "unit, named", [("micron", "micrometre"), ("meter", "metre"), ("mm", ""), ("unknown", "")]
+)
+def test_the_unit_of_nifti_is_told(unit, named):
+    image = nibabel.Nifti1Image(sampled(), affine())
+    image.header.set_xyzt_units(unit)
+    nibabel.save(image, "a.nii")
+    told = [note for note in read_grid("a.nii").notes if "unit" in note]
+    assert told == ([f"lengths are in the unit that it states, {named}"] if named else [])
+
+
+# MetaImage
+
+
+def metaimage(packed: bool = True) -> bytes:
+    """Return the bytes of a file by ITK."""
+    image = sitk.GetImageFromArray(sampled().T)
+    image.SetSpacing(STEPS.tolist())
+    image.SetOrigin(FIRST.tolist())
+    sitk.WriteImage(image, "itk.mha", packed)
+    return Path("itk.mha").read_bytes()
+
+
+@pytest.mark.parametrize("change", ["none", "no size"])
+def test_a_flipped_bit_in_a_packed_metaimage_is_found(change):
+    """In its data all; in the names of its fields all that would change the place."""
+    whole = metaimage()
+    if change == "no size":
+        whole = re.sub(rb"CompressedDataSize = \d+\n", b"", whole)
+    start = whole.index(b"LOCAL\n") + 6
+    right = read_grid("itk.mha")
+    rng = np.random.default_rng(3)
+    places = [(p, 1 << int(rng.integers(8))) for p in rng.integers(start, len(whole), 40)]
+    for name in (b"Offset", b"ElementSpacing", b"TransformMatrix", b"DimSize", b"CompressedData ="):
+        at = whole.index(name)
+        places += [(at + int(rng.integers(len(name))), 1 << int(rng.integers(7))) for _ in range(6)]
+    found = 0
+    for place, bit in places:
+        damaged = bytearray(whole)
+        damaged[place] ^= bit
+        Path("a.mha").write_bytes(damaged)
+        try:
+            grid = read_grid("a.mha")
+        except (FileError, GridError) as error:
+            assert str(error).startswith("a.mha") and "\n" not in str(error)
+            found += 1
+            continue
+        assert np.array_equal(grid.values, right.values)
+        assert (grid.spacing, grid.origin) == (right.spacing, right.origin)
+    assert found > len(places) / 2
+
+
+def test_what_a_metaimage_may_leave_out_or_call_otherwise():
+    whole = metaimage(packed=False)
+    for name in (b"Offset", b"Origin", b"Position"):
+        Path("a.mha").write_bytes(whole.replace(b"Offset", name))
+        check(read_grid("a.mha"))
+        assert np.allclose(sitk.ReadImage("a.mha").GetOrigin(), FIRST)
+    Path("b.mha").write_bytes(whole.replace(b"ElementSpacing", b"ElementSize"))
+    check(read_grid("b.mha"))
+    Path("c.mha").write_bytes(re.sub(rb"ElementSpacing.*\n", b"", whole))
+    assert sitk.ReadImage("c.mha").GetSpacing() == (1, 1, 1)
+    grid = read_grid("c.mha", spacing=STEPS)
+    check(grid)
+    assert grid.notes[0] == "it states no ElementSpacing: taken as 1, as ITK does"
+    Path("d.mha").write_bytes(whole.replace(b"DimSize", b"DistanceUnits = um\nDimSize"))
+    assert read_grid("d.mha").notes[0] == "lengths are in the unit that it states, um"
+    Path("e.mha").write_bytes(whole.replace(b"Offset", b"Offsat"))
+    assert line(FileError, "e.mha") == (
+        "e.mha: its header is damaged: the line 'Offsat = 10 -4 30' is no Offset"
+    )
+
+
+# VTK image data
+
+
+def image_of_both(names: dict[str, Callable[[np.ndarray], np.ndarray]]) -> pyvista.ImageData:
+    """Return image data whose cells have the part at their centres, and points with arrays."""
+    image = pyvista.ImageData(
+        dimensions=tuple(n + 1 for n in SIZES), spacing=STEPS, origin=FIRST - STEPS / 2
+    )
+    image.cell_data["field"] = part(image.cell_centers().points).astype(np.float32)
+    for name, values in names.items():
+        image.point_data[name] = values(image.points)
+    return image
+
+
+def test_arrays_of_cells_beside_those_of_points():
+    image = image_of_both({"temperature": lambda points: points[:, 0]})
+    image.save("a.vti")
+    check(read_grid("a.vti:field"))
+    said = "a.vti holds several arrays, temperature, field: give a.vti:temperature, say"
+    assert line(FileError, "a.vti") == said
+    said = "a.vti has no array of points or cells 'no': it holds temperature, field"
+    assert line(FileError, "a.vti:no") == said
+    image_of_both({"field": part}).save("b.vti")
+    check(read_grid("b.vti:CellData/field"))
+    assert "it holds field, CellData/field" in line(FileError, "b.vti:no")
+    assert read_grid("b.vti:field").shape == tuple(n + 1 for n in SIZES)
+
+
+def test_vectors_and_marks_are_read_only_by_name():
+    image = image_of_both({"normal": lambda points: points})
+    image.cell_data["vtkGhostType"] = np.zeros(image.n_cells, np.uint8)
+    image.save("a.vti")
+    check(read_grid("a.vti"))
+    assert line(GridError, "a.vti:normal") == "a.vti:normal is no array of one number per sample"
