@@ -27,6 +27,8 @@ from numpy.typing import ArrayLike
 from super_sdf import SdfGrid, read_grid
 from super_sdf.errors import FileError, GridError
 from super_sdf.files.description import describe_grid_file
+from super_sdf.files.formats import find_format
+from super_sdf.files.grids import open_volume
 from super_sdf.files.readers.axes import in_metres
 
 SIZES = 24, 20, 17  # along x, y, z
@@ -244,6 +246,25 @@ def test_units_of_coordinates():
     assert grid.notes[0] == ("its axes have different units (x m, y metre, z mm): lengths are in m")
 
 
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("dtype, offset", [("i2", 0.0), ("u2", -40.0), ("i4", 0.5)])
+def test_numbers_that_stand_for_values(dtype, offset, version):
+    """As xarray packs values: whole numbers, with a scale and an offset, one of them NaN."""
+    array = placed("zxy").where(placed("zxy") < 2.5)
+    packed = {"dtype": dtype, "scale_factor": 0.002, "add_offset": offset, "_FillValue": 0}
+    about = {"encoding": {"sdf": packed}, "zarr_format": version}
+    array.to_dataset().to_zarr("a.zarr", **about)
+    want = xarray.open_zarr("a.zarr").sdf.values
+    path = Path("a.zarr")
+    with open_volume(path, find_format(path), "zyx", (10**9, None)) as volume:
+        values = volume.read(0, volume.shape[0])
+    assert 1000 < np.isnan(want).sum() < want.size - 1000
+    np.testing.assert_allclose(values, want, rtol=0, atol=1e-6)
+    placed("zxy").to_dataset().to_zarr("b.zarr", **about)
+    grid = read_grid("b.zarr")
+    assert np.abs(grid.values - sampled()).max() < 0.0011 and np.allclose(grid.spacing, STEPS)
+
+
 def test_coordinates_that_are_no_grid_are_refused():
     uneven = np.array(coordinates()["y"])
     uneven[7] += 0.1
@@ -264,6 +285,11 @@ def test_names_that_are_not_x_y_z_are_told():
     grid = read_grid("a.zarr")
     check(grid)
     assert grid.notes[0] == "its axes are named slice, row, column: taken as z, y, x"
+    some = {"dimension_names": ["z", None, None], "zarr_format": 3, "dtype": "f4"}
+    zarr.create_array("b.zarr", shape=SIZES[::-1], **some)[...] = sampled().T
+    grid = read_grid("b.zarr", spacing=STEPS, origin=FIRST)
+    check(grid)
+    assert grid.notes[0] == "its axes are named z, ?, ?: taken as z, y, x"
 
 
 def test_a_direction_that_is_given_holds_for_named_axes():

@@ -146,7 +146,8 @@ GRID_OPTIONS: tuple[Option, ...] = (
         "--axes",
         type=LazyChoice(axis_orders),
         help="Axis order of the array in a NumPy, TIFF, HDF5 or Zarr file. Default: the names "
-        "of the axes in the file, else xyz for NumPy, zyx for the others. Files of other formats state it.",
+        "of the axes in the file, else xyz for NumPy, zyx for the others. Files of other formats "
+        "state it.",
     ),
     _usual(
         "--inside",

@@ -148,7 +148,8 @@ class Axes:
         factors, notes = in_one_unit([self.units[axis] for axis in world])
         named = [self.names[axis] for axis in space]
         if any(named) and not self.are_in_space:
-            notes += (f"its axes are named {', '.join(named)}: taken as {', '.join(axes)}",)
+            listed = ", ".join(name or "?" for name in named)
+            notes += (f"its axes are named {listed}: taken as {', '.join(axes)}",)
         steps = [self.steps[axis] for axis in space]
         direction *= [-1 if step and step < 0 else 1 for step in steps]
         missing = [SPACE[i] for i, axis in enumerate(world) if not self.steps[axis]]

@@ -19,7 +19,7 @@ from ..regular import check_beside
 from ..volume import Request, Volume
 from .axes import Axes
 from .choosing import choose_member
-from .stored import along, placed, without_gaps
+from .stored import along, placed, unscaled, without_gaps
 
 NO_COORDINATES = b"This is a netCDF dimension but not a netCDF variable"
 
@@ -47,14 +47,15 @@ def read_hdf5(request: Request) -> Volume:
     def stored(box: Box) -> NDArray[Any]:
         return np.asarray(values[along(space, box, values.ndim)])
 
-    read_box = without_gaps(stored, *_absent(values), values.fillvalue)
+    whole = without_gaps(stored, *_absent(values), values.fillvalue)
+    read_box, dtype = unscaled(whole, values.dtype, dict(values.attrs))
 
     def read(first: int, last: int) -> NDArray[Any]:
         return read_box((slice(first, last), slice(0, shape[1]), slice(0, shape[2])))
 
     chunks = tuple(values.chunks[axis] for axis in space) if values.chunks else None
     about = {"chunks": chunks, "read_box": read_box, "packed": values.id.get_storage_size()}
-    return Volume(shape, values.dtype, read, **place, **about)
+    return Volume(shape, dtype, read, **place, **about)
 
 
 def _may_be_grid(shape: tuple[int, ...] | None) -> bool:

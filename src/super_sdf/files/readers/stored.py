@@ -1,4 +1,4 @@
-"""What arrays in HDF5, Zarr and TIFF share: place by attributes, and parts that are not stored."""
+"""What arrays in HDF5, Zarr and TIFF share: place and scale by attributes, parts not stored."""
 
 from __future__ import annotations
 
@@ -123,3 +123,28 @@ def without_gaps(read_box: ReadBox, absent: int, total: int, fill: Any) -> ReadB
         return samples
 
     return read if absent and fill == 0 else read_box
+
+
+def unscaled(
+    read_box: ReadBox, dtype: np.dtype[Any], attributes: dict[str, Any], missing: Any = None
+) -> tuple[ReadBox, np.dtype[Any]]:
+    """Return ``read_box`` for values that are stored as other numbers, and their type.
+
+    By the conventions for climate and forecast data a value is ``scale_factor`` times the number,
+    plus ``add_offset``; ``missing``, or ``_FillValue``, is no value.
+    """
+    names = "scale_factor", "add_offset"
+    if not any(name in attributes for name in names):
+        return read_box, dtype
+    numbers = (np.ravel(attributes.get(name, i)) for name, i in zip(names, (1, 0)))
+    factor, offset = (float(number[0]) for number in numbers)
+    none = np.ravel(attributes.get("_FillValue", missing))
+    kind = np.dtype("f4" if dtype.itemsize <= 2 else "f8")
+
+    def read(box: Box) -> NDArray[Any]:
+        stored = read_box(box)
+        values = (stored * factor + offset).astype(kind)
+        values[np.isin(stored, none)] = np.nan
+        return values
+
+    return read, kind

@@ -20,7 +20,7 @@ from ..volume import BOX, Request, Volume
 from .axes import Axes
 from .choosing import choose_member
 from .ome import MOST_AXES, find_image, images_of
-from .stored import along, placed, without_gaps
+from .stored import along, placed, unscaled, without_gaps
 from .zarr_files import ZarrFiles, array_shards, array_version, counts_of
 
 
@@ -88,14 +88,16 @@ def _volume(files: ZarrFiles, name: str, array: Any, request: Request) -> Volume
     if array_shards(array):
         files.check_sums(list(stored.values()))
     gaps = files.absent(array, name, stored)
-    read_box = without_gaps(_reader(array, space), *gaps, array.fill_value)
+    whole = without_gaps(_reader(array, space), *gaps, array.fill_value)
+    missing = array.fill_value if array_version(array) == 2 else None  # as xarray takes it
+    read_box, dtype = unscaled(whole, array.dtype, attributes, missing)
 
     def read(first: int, last: int) -> NDArray[Any]:
         return read_box((slice(first, last), slice(0, shape[1]), slice(0, shape[2])))
 
     return Volume(
         tuple(shape),
-        array.dtype,
+        dtype,
         read,
         **place,
         chunks=tuple(chunks),
