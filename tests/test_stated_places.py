@@ -468,7 +468,8 @@ def test_nrrd_axes_of_length_1_are_dropped(axis, kind):
     check(read_grid("a.nrrd"))
     spacings = np.insert(STEPS, axis, np.nan)
     least = np.insert(FIRST, axis, np.nan)
-    about = {"spacings": spacings, "axis mins": least, "kinds": kinds}
+    centres = ["node"] * 4
+    about = {"spacings": spacings, "axis mins": least, "kinds": kinds, "centerings": centres}
     nrrd.write("b.nrrd", np.expand_dims(sampled(), axis), about)
     check(read_grid("b.nrrd"))
 
@@ -499,22 +500,28 @@ def test_layers_of_a_segmentation():
 
 
 def test_nrrd_places_without_directions():
-    cells = {"centerings": ["cell"] * 3}
+    cells, nodes = ({"centerings": [each] * 3} for each in ("cell", "node"))
     high = FIRST + STEPS * (np.array(SIZES) - 1)
     cases = {
         "origin": {"spacings": STEPS, "space": "left-posterior-superior", "space origin": FIRST},
-        "mins": {"spacings": STEPS, "axis mins": FIRST},
-        "both": {"axis mins": FIRST, "axis maxs": high},
+        "mins": {"spacings": STEPS, "axis mins": FIRST, **nodes},
+        "unstated": {"spacings": STEPS, "axis mins": FIRST - STEPS / 2},
+        "both": {"axis mins": FIRST, "axis maxs": high, **nodes},
         "cells": {"axis mins": FIRST - STEPS / 2, "axis maxs": high + STEPS / 2, **cells},
     }
     for name, header in cases.items():
         nrrd.write(f"{name}.nrrd", sampled(), header)
         check(read_grid(f"{name}.nrrd"))
+    assert read_grid("unstated.nrrd").notes[0] == (
+        "it states axis mins, but no centerings: its samples are taken as cells, half a spacing "
+        "from them, as ITK does"
+    )
+    assert np.allclose(sitk.ReadImage("unstated.nrrd").GetOrigin(), FIRST)
     text = Path("cells.nrrd").read_bytes().replace(b"centerings:", b"centers:")
     Path("c.nrrd").write_bytes(text.replace(b"axis mins:", b"axismins:"))
     assert b"centers: cell" in text
     check(read_grid("c.nrrd"))
-    falling = {"axis mins": [high[0], *FIRST[1:]], "axis maxs": [FIRST[0], *high[1:]]}
+    falling = {"axis mins": [high[0], *FIRST[1:]], "axis maxs": [FIRST[0], *high[1:]], **nodes}
     nrrd.write("f.nrrd", sampled()[::-1], falling)
     check(read_grid("f.nrrd"))
 

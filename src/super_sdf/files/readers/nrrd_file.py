@@ -160,18 +160,20 @@ def _place(
 
     None stands for what is not stated. A ``space origin`` holds beside ``spacings``, too.
     """
-    origin = header.get("space origin")
+    origin, notes = header.get("space origin"), ()
     directions, units = header.get("space directions"), header.get("space units", ())
     if directions is None:
         steps, low = _steps(header, space)
         columns = None if steps is None else np.diag(steps)
         units = units or _of_axes(header.get("units"), space, ())
-        origin = low if origin is None else origin
+        if origin is None and low is not None:
+            origin, notes = low, _centering_note(header)
     else:
         columns = np.asarray(directions, np.float64)[space, :3].T
         if columns.shape != (3, 3) or not np.isfinite(columns).all():
             raise FileError(f"its space directions are {columns.T.tolist()}: give three of three")
-    factors, notes = in_one_unit([unit.strip('"') for unit in units[:3]] or [""] * 3)
+    factors, told = in_one_unit([unit.strip('"') for unit in units[:3]] or [""] * 3)
+    notes += told
     if factors is None:
         return (None, None, XYZ[:, ::-1]), notes
     origin = None if origin is None else np.asarray(origin, np.float64)[:3] * factors
@@ -185,7 +187,8 @@ def _place(
 def _steps(header: dict[str, Any], space: list[int]) -> tuple[Any, Any]:
     """Return the steps and the first position along the axes by ``spacings`` and ``axis mins``.
 
-    The mins of cells are their borders: their first sample is half a step further.
+    The mins of cells are their borders: their first sample is half a step further. Samples whose
+    centering is not stated are cells, as for ITK and teem.
     """
     none = np.full(3, np.nan)
     steps, low, high = (
@@ -194,13 +197,23 @@ def _steps(header: dict[str, Any], space: list[int]) -> tuple[Any, Any]:
     )
     said = header.get("centerings", ())
     said = said.split() if isinstance(said, str) else said  # pynrrd does not split "centers"
-    is_cell = np.array([each == "cell" for each in _of_axes(said, space, ("node",) * 3)])
+    is_cell = np.array([each != "node" for each in _of_axes(said, space, ("cell",) * 3)])
     counts = np.asarray(header["sizes"])[space] - ~is_cell
     steps = np.where(np.isfinite(steps), steps, (high - low) / np.maximum(counts, 1))
     if not (np.isfinite(steps) & (steps != 0)).all():
         return None, None
     low = low + np.where(is_cell, steps / 2, 0)
     return steps, low if np.isfinite(low).all() else None
+
+
+def _centering_note(header: dict[str, Any]) -> tuple[str, ...]:
+    """Return a sentence on how axis mins are taken without centerings."""
+    if "centerings" in header:
+        return ()
+    return (
+        "it states axis mins, but no centerings: its samples are taken as cells, half a spacing "
+        "from them, as ITK does",
+    )
 
 
 def _of_axes(values: Any, space: list[int], default: Any) -> Any:
