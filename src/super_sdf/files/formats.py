@@ -14,6 +14,17 @@ from ..machine.extras import check_modules
 
 # What people give by mistake: surfaces, which have to be sampled first.
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf", ".3mf", ".step", ".stp")
+# What is no grid file here, and the way out: {0} is the file, {1} its name without the suffix.
+WAYS_OUT = {
+    ".nvdb": "is NanoVDB: make OpenVDB of it with OpenVDB's tool nanovdb_convert {0} {1}.vdb",
+    ".dcm": "is a DICOM image: give the folder that holds its series",
+    ".img": "holds the samples of an Analyze file: give its header {1}.hdr",
+    ".bin": (
+        "states no format; of tsdf-fusion make .npz with python -c \"import numpy as n; a = "
+        "n.fromfile('{0}', '<f4'); s = a[:3].astype(int); n.savez('{1}.npz', values=a[8:].reshape("
+        "s[::-1]).T, origin=a[3:6], spacing=a[6])\""
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -59,7 +70,16 @@ FORMATS = (
     GridFormat("zarr", "Zarr", (".zarr", ".zarr.zip"), "zarr", "zyx", True, is_apart=True),
     GridFormat("vdb", "OpenVDB", (".vdb",), "vdb", has_members=True, is_apart=True),
     GridFormat("sdf", "SDFGen", (".sdf",)),
+    GridFormat("mgh", "FreeSurfer", (".mgz", ".mgh"), "nifti"),
+    GridFormat("analyze", "Analyze", (".hdr",), "nifti"),
+    GridFormat("mrc", "MRC", (".mrc", ".map", ".ccp4", ".mrc.gz", ".map.gz", ".ccp4.gz"), "mrc"),
+    GridFormat("vtk", "legacy VTK", (".vtk",), "vti", has_members=True, is_apart=True),
+    GridFormat("vtkhdf", "VTKHDF", (".vtkhdf",), "vti", has_members=True, is_apart=True),
+    GridFormat("mat", "MATLAB", (".mat",), "mat", "xyz", True, is_apart=True),
 )
+DICOM = GridFormat("dicom", "DICOM", ("a folder",), "dicom", has_members=True, is_apart=True)
+"""A folder that is no Zarr store: the names of slices end in anything."""
+
 GRID_SUFFIXES = tuple(suffix for format_ in FORMATS for suffix in format_.suffixes)
 AXES = ("xyz", "zyx")
 _MEMBERS = "|".join(re.escape(s[1:]) for f in FORMATS if f.has_members for s in f.suffixes)
@@ -74,9 +94,14 @@ def find_format(path: str | Path) -> GridFormat:
     OptionError
         If it is none of the table, such as a mesh.
     """
-    ending = _ending(split_member(path)[0])
+    file, _ = split_member(path)
+    ending = _ending(file)
     if ending:
         return next(format_ for format_ in FORMATS if ending in format_.suffixes)
+    if file.is_dir():
+        return DICOM
+    if file.suffix.lower() in WAYS_OUT:
+        raise OptionError(f"{path} {WAYS_OUT[file.suffix.lower()].format(file, file.stem)}")
     if str(path).lower().endswith(MESH_SUFFIXES):
         raise OptionError(
             f"{path} is a mesh, not a grid: sample it first with "
@@ -86,8 +111,9 @@ def find_format(path: str | Path) -> GridFormat:
 
 
 def is_grid(path: str | Path) -> bool:
-    """Return whether a name is that of a grid file, by its end."""
-    return bool(_ending(split_member(path)[0]))
+    """Return whether a name is that of a grid file, by its end, or a folder."""
+    file, _ = split_member(path)
+    return bool(_ending(file)) or file.is_dir()
 
 
 def _ending(path: PurePath) -> str:
@@ -100,7 +126,12 @@ def _ending(path: PurePath) -> str:
 def split_member(path: str | PurePath) -> tuple[Path, str | None]:
     """Split ``FILE:NAME`` into the file and the name of an array in it, None if none is named."""
     found = _WITH_MEMBER.fullmatch(str(path))
-    return (Path(found["file"]), found["member"]) if found else (Path(path), None)
+    if found:
+        return Path(found["file"]), found["member"]
+    folder, _, series = str(path).rpartition(":")
+    if series and Path(folder).is_dir() and not Path(path).exists():
+        return Path(folder), series
+    return Path(path), None
 
 
 def mesh_path(path: PurePath, suffix: str, label: int | None = None) -> PurePath:
@@ -158,10 +189,11 @@ def _listed(names: list[str]) -> str:
 
 def list_formats() -> str:
     """Return the formats and their suffixes for help texts, in one sentence."""
-    names = dict.fromkeys(format_.name for format_ in FORMATS)
-    suffixes = {n: [s for f in FORMATS if f.name == n for s in f.suffixes] for n in names}
-    return _listed([f"{name} ({', '.join(suffixes[name])})" for name in names])
+    suffixes: dict[str, tuple[str, ...]] = {}
+    for format_ in (*FORMATS, DICOM):
+        suffixes[format_.name] = (*suffixes.get(format_.name, ()), *format_.suffixes)
+    return _listed([f"{name} ({', '.join(suffixes[name])})" for name in suffixes])
 
 
-NAMED = _listed([format_.name for format_ in FORMATS if format_.has_members])
+NAMED = _listed([format_.name for format_ in (*FORMATS, DICOM) if format_.has_members])
 """The formats whose files may hold several arrays, for help texts."""

@@ -63,7 +63,7 @@ def grid_from_image(
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     array, of_points = _choose_array(image, scalars)
-    lattice = _lattice_of(image, of_points)
+    lattice = lattice_of(image, of_points)
     _check_array(array, prod(lattice.shape))
     values = vtk_to_numpy(array).reshape(lattice.shape)
     volume = lattice.volume(values.dtype, lambda first, last: values[first:last])
@@ -71,7 +71,7 @@ def grid_from_image(
     return make_grid(**found, inside=inside, field=field, label=label, level=level, scale=scale)
 
 
-def _lattice_of(image: Any, of_points: bool) -> ImageLattice:
+def lattice_of(image: Any, of_points: bool) -> ImageLattice:
     """Return where the samples of an image lie."""
     matrix = image.GetDirectionMatrix()
     direction = [[matrix.GetElement(row, column) for column in range(3)] for row in range(3)]

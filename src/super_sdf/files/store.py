@@ -49,9 +49,10 @@ def is_store(path: str | Path) -> bool:
 def check_grid_file(path: str | Path) -> None:
     """Raise FileError unless the file that ``FILE`` or ``FILE:NAME`` names can be read."""
     file, _ = split_member(path)
-    if find_format(path).key == "zarr" and not file.name.lower().endswith(".zip"):
+    key = find_format(path).key
+    if key == "zarr" and not file.name.lower().endswith(".zip"):
         check_store(file)
-    else:
+    elif key != "dicom":
         check_regular_file(file)
 
 
@@ -74,6 +75,8 @@ def files_of(path: str | Path) -> list[Path]:
 def _names_in(file: Path) -> Iterator[str]:
     """Yield what may be the names of other files in a header or a network."""
     kind = file.suffix.lower()
+    if kind == ".hdr":
+        yield from (f"{file.stem}.img", f"{file.stem}.img.gz")
     if kind == ".onnx":
         content = file.read_bytes()
         for found in WEIGHTS.finditer(content):

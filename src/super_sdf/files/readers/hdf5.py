@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...errors import FileError
 from ..boxes import Box
 from ..regular import check_beside
-from ..volume import Request, Volume
+from ..volume import Request, Volume, reversed_axes
 from .axes import Axes
 from .choosing import choose_member
 from .stored import along, placed, unscaled, without_gaps
@@ -40,8 +40,24 @@ def read_hdf5(request: Request) -> Volume:
             found.append(f"/{name}")
 
     file.visititems(note)
-    values = _open(file, choose_member(request, found, "3D dataset"), request)
-    space, place = placed(_axes(values), dict(values.attrs), values.shape, request.axes)
+    if "ITKImage" in file:
+        return _read_itk(file, request)
+    values = open_dataset(file, choose_member(request, found, "3D dataset"), request)
+    return volume_of(values, *placed(_axes(values), dict(values.attrs), values.shape, request.axes))
+
+
+def _read_itk(file: Any, request: Request) -> Volume:
+    """Read an image that ITK wrote: in LPS, with a direction a row."""
+    image = file["ITKImage/0"]
+    values = open_dataset(file, "/ITKImage/0/VoxelData", request)
+    spacing, direction = reversed_axes(image["Spacing"][:], image["Directions"][:].T)
+    origin = tuple(image["Origin"][:].tolist())
+    place = {"spacing": spacing, "origin": origin, "direction": direction}
+    return volume_of(values, list(range(3)), place)
+
+
+def volume_of(values: Any, space: list[int], place: dict[str, Any]) -> Volume:
+    """Return the volume of a dataset whose axes in space are at a place; the others have length 1."""
     shape = tuple(values.shape[axis] for axis in space)
 
     def stored(box: Box) -> NDArray[Any]:
@@ -93,7 +109,7 @@ def _coordinates(scale: Any, count: int) -> tuple[NDArray[Any] | None, dict[str,
     return (None if NO_COORDINATES in bytes(about.get("NAME", b"")) else scale[:]), about
 
 
-def _open(file: Any, name: str, request: Request) -> Any:
+def open_dataset(file: Any, name: str, request: Request) -> Any:
     """Return a dataset whose raw data files, if there are any, lie beside the file."""
     values = file[name]
     if values.is_virtual:

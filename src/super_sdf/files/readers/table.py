@@ -5,14 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from ..volume import Request, Volume
+from .dicom import read_dicom
 from .hdf5 import read_hdf5
+from .matlab import read_mat
 from .metaimage import read_metaimage
+from .mrc import read_mrc
+from .nibabel_files import read_analyze, read_mgh
 from .nifti import read_nifti
 from .nrrd_file import read_nrrd
 from .sdf import read_sdf
 from .tiff import read_tiff
 from .vdb import read_vdb
 from .vti import read_vti
+from .vtk_files import read_vtk, read_vtkhdf
 from .zarr_store import read_zarr
 
 READERS: dict[str, Callable[[Request], Volume]] = {
@@ -25,4 +30,11 @@ READERS: dict[str, Callable[[Request], Volume]] = {
     "zarr": read_zarr,
     "vdb": read_vdb,
     "sdf": read_sdf,
+    "mgh": read_mgh,
+    "analyze": read_analyze,
+    "mrc": read_mrc,
+    "vtk": read_vtk,
+    "vtkhdf": read_vtkhdf,
+    "mat": read_mat,
+    "dicom": read_dicom,
 }

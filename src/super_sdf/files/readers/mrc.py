@@ -1,0 +1,104 @@
+"""MRC and CCP4 maps: mrcfile parses the header, the values are read here.
+
+Columns, rows and sections run along the world's axes in the order of ``mapc``, ``mapr`` and
+``maps``. Lengths are in angstrom.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...arrays import Triple
+from ...errors import FileError, GridError
+from ...grid.planes import InputFile
+from ..archives import Unpacker
+from ..headers import ArrayHeader
+from ..volume import XYZ, Request, Volume
+from .values import CODECS, bytes_from, next_planes, raw_planes
+
+MAIN_HEADER = 1024  # bytes
+VOLUME_STACKS = 401  # space groups from here on are of stacks of volumes
+RIGHT = 0.01  # degrees
+
+
+def read_mrc(request: Request) -> Volume:
+    """Read a ``.mrc``, ``.map`` or ``.ccp4`` file, or one that is packed with gzip."""
+    import mrcfile
+    from mrcfile.utils import data_dtype_from_header
+
+    with mrcfile.open(request.path, permissive=True, header_only=True) as opened:
+        header = opened.header
+    sizes = tuple(int(header[f"n{axis}"]) for axis in "zyx")
+    if min(sizes) < 1:
+        raise FileError(f"its sizes are {sizes[::-1]}")
+    if header.ispg >= VOLUME_STACKS and header.mz != header.nz:
+        raise GridError(f"it is a stack of volumes of {header.mz} sections: save one of them")
+    place, notes = _place(header)
+    start = MAIN_HEADER + max(int(header.nsymbt), 0)
+    array = ArrayHeader(sizes, data_dtype_from_header(header), False, start)
+    file = InputFile.open(request.path)
+    if request.path.suffix.lower() != ".gz":
+        read = raw_planes(file, start, sizes, array.dtype).read
+        return Volume(sizes, array.dtype, read, *place, notes=notes)
+    unpacked = Unpacker(bytes_from(file, 0), CODECS["gzip"](), start + array.size, file.name).read
+    unpacked(start)
+    read = next_planes(unpacked, array)
+    return Volume(sizes, array.dtype, read, *place, notes=notes, packed=file.size)
+
+
+def _place(
+    header: Any,
+) -> tuple[tuple[Triple | None, Triple, NDArray[np.float64]], tuple[str, ...]]:
+    """Return spacing, origin and direction of the sections, rows and columns, and a note.
+
+    The origin is the field of this name, in angstrom; if it is 0 the place of the first sample in
+    the unit cell, in samples.
+    """
+    order = [int(header[name]) - 1 for name in ("maps", "mapr", "mapc")]
+    order = [2, 1, 0] if order == [-1] * 3 else order
+    if sorted(order) != [0, 1, 2]:
+        raise FileError(f"its axes mapc, mapr, maps are {[axis + 1 for axis in order[::-1]]}")
+    angles = _numbers(header.cellb, ("alpha", "beta", "gamma"))
+    if angles.any() and np.abs(angles - 90).max() > RIGHT:
+        raise GridError(
+            f"the angles of its unit cell are {', '.join(f'{a:g}' for a in angles)} degrees, not "
+            "90: resample it on a grid with right angles"
+        )
+    counts = np.array([int(header[name]) for name in ("mx", "my", "mz")])
+    cell = _numbers(header.cella, "xyz")
+    steps = cell / np.maximum(counts, 1)
+    is_stated = bool((cell > 0).all() and (counts > 0).all())
+    starts = np.zeros(3)
+    starts[order] = [int(header[f"n{axis}start"]) for axis in "zyx"]
+    stated, in_cell = _numbers(header.origin, "xyz"), starts * steps
+    notes: tuple[str, ...] = ()
+    if stated.any() and in_cell.any() and not np.allclose(stated, in_cell, atol=steps.max() / 100):
+        notes = (
+            f"its origin is {stated.tolist()} and its nstart means {in_cell.tolist()}: the origin "
+            "is taken",
+        )
+    x, y, z = (stated if stated.any() else in_cell).tolist()
+    spacing = _triple(steps[order]) if is_stated else None
+    return (spacing, (x, y, z), XYZ[:, order]), notes
+
+
+def _numbers(fields: Any, names: Any) -> NDArray[np.float64]:
+    """Return three fields of the header.
+
+    Raises
+    ------
+    FileError
+        If they are not finite.
+    """
+    numbers = np.array([fields[name] for name in names], np.float64)
+    if not np.isfinite(numbers).all():
+        raise FileError(f"its header is damaged: {', '.join(names)} are {numbers.tolist()}")
+    return numbers
+
+
+def _triple(numbers: Any) -> Triple:
+    x, y, z = (float(number) for number in numbers)
+    return x, y, z

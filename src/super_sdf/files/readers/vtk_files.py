@@ -1,0 +1,86 @@
+"""Legacy ``.vtk`` and ``.vtkhdf`` files, with VTK: image data, or rectilinear with even steps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...errors import FileError, GridError
+from ..images import lattice_of
+from ..volume import XYZ, ImageLattice, Request, Volume
+from .choosing import choose_member
+
+RESAMPLE = "resample it on a lattice (vtkResampleToImage), and write that as .vti"
+EVEN = 1e-4  # share of a step by which steps may differ
+
+
+def read_vtk(request: Request) -> Volume:
+    """Read a legacy file, in text or binary."""
+    from vtkmodules.vtkIOLegacy import vtkDataSetReader
+
+    reader = vtkDataSetReader()
+    for each in ("Scalars", "Fields"):
+        getattr(reader, f"ReadAll{each}On")()
+    return _read(request, reader)
+
+
+def read_vtkhdf(request: Request) -> Volume:
+    """Read a ``.vtkhdf`` file."""
+    from vtkmodules.vtkIOHDF import vtkHDFReader
+
+    return _read(request, vtkHDFReader())
+
+
+def _read(request: Request, reader: Any) -> Volume:
+    """Return the array that a reader of VTK finds in a file."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    request.check_loads(request.path.stat().st_size, "VTK")
+    failed: list[str] = []
+    reader.AddObserver("ErrorEvent", lambda *event: failed.append("VTK finds it damaged"))
+    reader.SetFileName(str(request.path))
+    reader.Update()
+    image = reader.GetOutputDataObject(0)
+    if failed or image is None:
+        raise FileError(failed[0] if failed else "VTK finds no data in it")
+    data = image.GetPointData(), image.GetCellData()
+    names = [[each.GetArrayName(i) for i in range(each.GetNumberOfArrays())] for each in data]
+    name = choose_member(request, [n for each in names for n in each], "array")
+    of_points = name in names[0]
+    lattice = _lattice(image, of_points)
+    array = data[0 if of_points else 1].GetArray(name)
+    values = vtk_to_numpy(array)
+    if values.shape != (np.prod(lattice.shape),):
+        raise GridError(
+            f"its array {name!r} has shape {values.shape} for {lattice.shape} samples: give one of "
+            "a number each"
+        )
+    values = values.reshape(lattice.shape)
+    return lattice.volume(values.dtype, lambda first, last: values[first:last])
+
+
+def _lattice(image: Any, of_points: bool) -> ImageLattice:
+    """Return where the samples lie.
+
+    Raises
+    ------
+    GridError
+        If they are no lattice, with the command that makes one.
+    """
+    if image.IsA("vtkImageData"):
+        return lattice_of(image, of_points)
+    if not image.IsA("vtkRectilinearGrid"):
+        raise GridError(f"it holds a {image.GetClassName()}, no image data: {RESAMPLE}")
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    firsts, steps = [], []
+    for axis in "XYZ":
+        places = vtk_to_numpy(getattr(image, f"Get{axis}Coordinates")()).astype(np.float64)
+        step = (places[-1] - places[0]) / max(len(places) - 1, 1)
+        even = places[0] + step * np.arange(len(places))
+        if not np.allclose(places, even, rtol=0, atol=EVEN * abs(step)):
+            raise GridError(f"its coordinates along {axis.lower()} are uneven: {RESAMPLE}")
+        firsts.append(places[0])
+        steps.append(step)
+    return ImageLattice(image.GetExtent(), np.array(steps), np.array(firsts), XYZ, of_points)
