@@ -129,7 +129,7 @@ def split_member(path: str | PurePath) -> tuple[Path, str | None]:
     if found:
         return Path(found["file"]), found["member"]
     folder, _, series = str(path).rpartition(":")
-    if series and Path(folder).is_dir() and not Path(path).exists():
+    if folder and Path(folder).is_dir() and not Path(path).exists():
         return Path(folder), series
     return Path(path), None
 

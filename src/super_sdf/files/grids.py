@@ -44,6 +44,7 @@ from .volume import Request, Volume, axes_direction, take
 
 PLACE = ("spacing", "origin", "direction")
 NPZ_KEYS = ("values", *PLACE)
+OPEN3D = {"key.npy", "voxel_size.npy", "block_resolution.npy", "attr_name_tsdf.npy"}
 NUMBERS = "one number or three"
 MOST_NAMED = 10  # members of an archive that an error lists
 UNKNOWN_ROOM = 1 << 28  # bytes that an unpacked array may take if the memory left is unknown
@@ -264,6 +265,8 @@ def _read_npz(path: Path, room: int) -> dict[str, Any]:
     file = InputFile.open(path)
     try:
         with open_archive(file) as archive:
+            if OPEN3D <= {info.filename for info in archive.infolist()}:
+                return _read_blocks(archive, path, room)
             members = find_members(archive, path)
             found = {
                 key: read_small(archive, members[key], f"{path}[{key}]")
@@ -273,6 +276,24 @@ def _read_npz(path: Path, room: int) -> dict[str, Any]:
             return found | {"values": _read_values(archive, members["values"], path, room)}
     finally:
         file.check_unchanged()  # a change explains whatever else went wrong
+
+
+def _read_blocks(archive: zipfile.ZipFile, path: Path, room: int) -> dict[str, Any]:
+    """Return the dense values and place of a ``VoxelBlockGrid`` that Open3D saved."""
+    from .readers.open3d import volume_of_blocks
+
+    def array(key: str) -> NDArray[Any]:
+        if f"{key}.npy" not in archive.namelist():
+            raise FileError(f"{path} is Open3D's VoxelBlockGrid, but has no key {key!r}")
+        name = f"{path}[{key}]"
+        member = Member(archive, archive.getinfo(f"{key}.npy"), name)
+        header = read_array_header(member.read, name)
+        if header.size > room:
+            raise OutOfMemoryError(f"{name}, {header}, does not fit: allow more (--max-memory)")
+        _check_size(header, member.left, name)
+        return np.frombuffer(member.read(header.size), header.dtype).reshape(header.shape)
+
+    return take(volume_of_blocks(array), str(path), room, dict.fromkeys(PLACE))
 
 
 def find_members(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.ZipInfo]:
