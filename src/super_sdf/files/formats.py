@@ -20,9 +20,9 @@ WAYS_OUT = {
     ".dcm": "is a DICOM image: give the folder that holds its series",
     ".img": "holds the samples of an Analyze file: give its header {1}.hdr",
     ".bin": (
-        "states no format; of tsdf-fusion make .npz with python -c \"import numpy as n; a = "
-        "n.fromfile('{0}', '<f4'); s = a[:3].astype(int); n.savez('{1}.npz', values=a[8:].reshape("
-        "s[::-1]).T, origin=a[3:6], spacing=a[6])\""
+        'states no format; of tsdf-fusion make .npz with python -c "import numpy as n; a = '
+        "n.fromfile('{0}', '<f4'); s = a[:3].astype(int); n.savez('{1}.npz', values=(a[7] * a[8:]).reshape("
+        's[::-1]).T, origin=a[3:6], spacing=a[6])"'
     ),
 }
 
@@ -75,6 +75,7 @@ FORMATS = (
     GridFormat("mrc", "MRC", (".mrc", ".map", ".ccp4", ".mrc.gz", ".map.gz", ".ccp4.gz"), "mrc"),
     GridFormat("vtk", "legacy VTK", (".vtk",), "vti", has_members=True, is_apart=True),
     GridFormat("vtkhdf", "VTKHDF", (".vtkhdf",), "vti", has_members=True, is_apart=True),
+    GridFormat("netcdf", "NetCDF", (".nc", ".nc4", ".cdf"), "netcdf", "zyx", True, is_apart=True),
     GridFormat("mat", "MATLAB", (".mat",), "mat", "xyz", True, is_apart=True),
 )
 DICOM = GridFormat("dicom", "DICOM", ("a folder",), "dicom", has_members=True, is_apart=True)

@@ -265,7 +265,7 @@ def _read_npz(path: Path, room: int) -> dict[str, Any]:
     file = InputFile.open(path)
     try:
         with open_archive(file) as archive:
-            if OPEN3D <= {info.filename for info in archive.infolist()}:
+            if OPEN3D.issubset(archive.namelist()):
                 return _read_blocks(archive, path, room)
             members = find_members(archive, path)
             found = {

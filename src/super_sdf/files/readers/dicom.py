@@ -15,13 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import FileError, GridError
+from ...errors import GridError
 from ..regular import check_beside
 from ..volume import Request, Volume
 from .choosing import choose_member
 
 EVEN = 0.01  # share of the spacing by which slices may be off
-SCALE = ("Slope", "Intercept")
 PARALLEL = 1e-4  # by which components of directions may differ
 
 
@@ -58,9 +57,11 @@ def read_dicom(request: Request) -> Volume:
     dtype = first.read().dtype if is_plain else np.dtype(np.int32 if is_whole else np.float32)
 
     def read(start: int, stop: int) -> NDArray[Any]:
-        planes = [each.read() for each in slices[start:stop]]
-        scaled = planes if is_plain else [p * s + i for p, (s, i) in zip(planes, scales[start:stop])]
-        return np.stack(scaled).astype(dtype, copy=False)
+        planes = np.stack([each.read() for each in slices[start:stop]])
+        if not is_plain:
+            slopes, intercepts = scales[start:stop].T[..., None, None]
+            planes = planes * slopes + intercepts
+        return planes.astype(dtype, copy=False)
 
     row, column = first.across
     direction = np.column_stack([_normal(first), column, row])
@@ -80,7 +81,8 @@ def _series_in(folder: Path) -> dict[str, list[tuple[Path, Any]]]:
         with suppress(pydicom.errors.InvalidDicomError):
             header = pydicom.dcmread(path, stop_before_pixels=True)
             if "Rows" in header:
-                found.setdefault(str(header.get("SeriesInstanceUID", "")), []).append((path, header))
+                uid = str(header.get("SeriesInstanceUID", ""))
+                found.setdefault(uid, []).append((path, header))
     return found
 
 
@@ -90,7 +92,7 @@ def _slices(images: list[tuple[Path, Any]]) -> Iterator[Slice]:
     Raises
     ------
     GridError
-        If an image is in colour, or states no place.
+        If an image is in colour, or has frames without a place each.
     """
     for path, header in images:
         if header.get("SamplesPerPixel", 1) != 1 or "ModalityLUTSequence" in header:
@@ -101,28 +103,40 @@ def _slices(images: list[tuple[Path, Any]]) -> Iterator[Slice]:
                 f"{path.name} has {header.NumberOfFrames} frames without a place each: save it as "
                 "an enhanced image, or as NIfTI"
             )
-        shared = (header.get("SharedFunctionalGroupsSequence") or [header])[0]
+        shared = list(header.get("SharedFunctionalGroupsSequence") or ())
         for index, frame in enumerate(frames):
+            yield _slice(path, index, header, [frame, *shared, header])
 
-            def stated(group: str, name: str, frame: Any = frame, shared: Any = shared) -> Any:
-                groups = [*frame.get(group, ()), *shared.get(group, ()), frame, header]
-                return next((g[name].value for g in groups if name in g), None)
 
-            corner = stated("PlanePositionSequence", "ImagePositionPatient")
-            across = stated("PlaneOrientationSequence", "ImageOrientationPatient")
-            spacing = stated("PixelMeasuresSequence", "PixelSpacing")
-            if not (corner and across and spacing):
-                raise GridError(f"{path.name} states no place: it is no slice of a volume")
-            scale = [stated("PixelValueTransformationSequence", f"Rescale{n}") for n in SCALE]
-            yield Slice(
-                path,
-                index,
-                (header.Rows, header.Columns),
-                np.array(corner, np.float64),
-                np.array(across, np.float64).reshape(2, 3),
-                (float(spacing[0]), float(spacing[1])),
-                (1.0 if scale[0] is None else float(scale[0]), float(scale[1] or 0)),
-            )
+def _slice(path: Path, index: int, header: Any, groups: list[Any]) -> Slice:
+    """Return a frame of an image; what is stated of it is in the first of the groups that has it.
+
+    Raises
+    ------
+    GridError
+        If it states no place.
+    """
+    corner = _stated(groups, "PlanePositionSequence", "ImagePositionPatient")
+    across = _stated(groups, "PlaneOrientationSequence", "ImageOrientationPatient")
+    steps = _stated(groups, "PixelMeasuresSequence", "PixelSpacing")
+    if not (corner and across and steps):
+        raise GridError(f"{path.name} states no place: it is no slice of a volume")
+    slope, intercept = (
+        _stated(groups, "PixelValueTransformationSequence", f"Rescale{name}")
+        for name in ("Slope", "Intercept")
+    )
+    return Slice(
+        *(path, index, (header.Rows, header.Columns), np.array(corner, np.float64)),
+        np.array(across, np.float64).reshape(2, 3),
+        (float(steps[0]), float(steps[1])),
+        (1.0 if slope is None else float(slope), float(intercept or 0)),
+    )
+
+
+def _stated(groups: list[Any], sequence: str, name: str) -> Any:
+    """Return an element of the first group that has it, in a sequence or plainly; else None."""
+    among = (each for group in groups for each in (*group.get(sequence, ()), group))
+    return next((each[name].value for each in among if name in each), None)
 
 
 def _normal(each: Slice) -> NDArray[np.float64]:
@@ -170,16 +184,18 @@ def _check_steps(slices: list[Slice], steps: NDArray[np.float64], step: float) -
         raise GridError(f"{slices[0].path.name} is its only slice: give the folder of a series")
     off = np.abs(steps - step)
     worst = int(off.argmax())
-    between = f"{slices[worst].path.name} and {slices[worst + 1].path.name}"
-    same = int((steps < EVEN * step).sum())
-    if step <= 0 or same:
-        twice = int((steps <= EVEN * max(step, 0)).argmax())
+    nearest = int(steps.argmin())
+    if steps[nearest] <= EVEN * step:
         raise GridError(
-            f"{slices[twice].path.name} and {slices[twice + 1].path.name} are at one place: put "
-            "the slices of one volume (time, echo) into a folder"
+            f"{_named(slices, nearest)} are at one place: put the slices of one volume (one time, "
+            "one echo) into a folder"
         )
     if off[worst] > EVEN * step:
         raise GridError(
-            f"between {between} is a step of {steps[worst]:.6g} mm, elsewhere of {step:.6g}: slices "
-            "are missing, or resample the series in even steps"
+            f"{_named(slices, worst)} are {steps[worst]:.6g} mm apart, others {step:.6g}: add the "
+            "slices that are missing, or resample the series in even steps"
         )
+
+
+def _named(slices: list[Slice], first: int) -> str:
+    return f"{slices[first].path.name} and {slices[first + 1].path.name}"

@@ -57,7 +57,7 @@ def _read_itk(file: Any, request: Request) -> Volume:
 
 
 def volume_of(values: Any, space: list[int], place: dict[str, Any]) -> Volume:
-    """Return the volume of a dataset whose axes in space are at a place; the others have length 1."""
+    """Return the volume of a dataset: its axes in space and their place; others have length 1."""
     shape = tuple(values.shape[axis] for axis in space)
 
     def stored(box: Box) -> NDArray[Any]:

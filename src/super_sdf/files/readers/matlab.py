@@ -17,10 +17,11 @@ from .hdf5 import open_dataset, volume_of
 from .stored import placed
 
 PLACE = ("spacing", "origin", "direction")
-NUMBERS = ("double", "single", "logical", *(f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64)))
+INTEGERS = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))
+NUMBERS = ("double", "single", "logical", *INTEGERS)
 ORDER = (
-    "its axes are taken as x, y, z, the order of ndgrid; save permute(V, [2 1 3]) of an array in the "
-    "order of meshgrid, which is y, x, z"
+    "its axes are taken as x, y, z, the order of ndgrid; of an array in the order of meshgrid, "
+    "which is y, x, z, save permute(V, [2 1 3])"
 )
 
 

@@ -40,13 +40,16 @@ def read_mrc(request: Request) -> Volume:
     start = MAIN_HEADER + max(int(header.nsymbt), 0)
     array = ArrayHeader(sizes, data_dtype_from_header(header), False, start)
     file = InputFile.open(request.path)
-    if request.path.suffix.lower() != ".gz":
-        read = raw_planes(file, start, sizes, array.dtype).read
-        return Volume(sizes, array.dtype, read, *place, notes=notes)
-    unpacked = Unpacker(bytes_from(file, 0), CODECS["gzip"](), start + array.size, file.name).read
-    unpacked(start)
-    read = next_planes(unpacked, array)
-    return Volume(sizes, array.dtype, read, *place, notes=notes, packed=file.size)
+    about: dict[str, Any] = {"notes": notes}
+    if request.path.suffix.lower() == ".gz":
+        packed, size = bytes_from(file, 0), start + array.size
+        unpacked = Unpacker(packed, CODECS["gzip"](), size, file.name).read
+        unpacked(start)
+        return Volume(
+            sizes, array.dtype, next_planes(unpacked, array), *place, packed=file.size, **about
+        )
+    planes = raw_planes(file, start, sizes, array.dtype)
+    return Volume(sizes, array.dtype, planes.read, *place, **about)
 
 
 def _place(

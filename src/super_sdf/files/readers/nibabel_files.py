@@ -41,13 +41,13 @@ def read_analyze(request: Request) -> Volume:
     import nibabel
 
     head = request.path.read_bytes()[:HEADER]
-    stem = request.path.stem
-    name = next((n for s in PAIRS if (request.path.parent / (n := stem + s)).exists()), f"{stem}.img")
-    path = check_beside(request.path, name)
+    beside = [request.path.with_suffix(end) for end in PAIRS]
+    path = next((other for other in beside if other.exists()), beside[0])
+    path = check_beside(request.path, path.name)
     stream = _open(request, path, path.suffix == ".gz")
     if head[344:347] == b"ni1":
-        header = nibabel.nifti1.Nifti1PairHeader(head)
-        return _volume(path, stream, header, from_affine(header.get_best_affine()))
+        pair = nibabel.nifti1.Nifti1PairHeader(head)
+        return _volume(path, stream, pair, from_affine(pair.get_best_affine()))
     header = nibabel.Spm2AnalyzeHeader(head)
     spacing = tuple(float(step) for step in header.get_zooms()[:3])
     return _volume(path, stream, header, (spacing, None, XYZ), (NO_PLACE,))

@@ -41,12 +41,11 @@ def volume_of_blocks(array: Callable[[str], NDArray[Any]]) -> Volume:
         planes = np.full((last - first, *shape[1:]), np.nan, samples.dtype)
         met = (starts[:, 0] < last) & (starts[:, 0] + resolution > first)
         for (z, y, x), block in zip(starts[met], samples[met]):
-            a, b = max(z, first), min(z + resolution, last)
-            planes[a - first : b - first, y : y + resolution, x : x + resolution] = block[a - z : b - z]
+            cut = block[max(first - z, 0) : last - z]
+            a = max(z - first, 0)
+            planes[a : a + len(cut), y : y + resolution, x : x + resolution] = cut
         return planes
 
     x, y, z = (float(step * resolution * corner) for corner in low)
     sizes = tuple(shape.tolist())
-    return Volume(
-        sizes, samples.dtype, read, (step,) * 3, (x, y, z), ZYX, packed=values.nbytes
-    )
+    return Volume(sizes, samples.dtype, read, (step,) * 3, (x, y, z), ZYX, packed=values.nbytes)

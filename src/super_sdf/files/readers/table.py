@@ -10,6 +10,7 @@ from .hdf5 import read_hdf5
 from .matlab import read_mat
 from .metaimage import read_metaimage
 from .mrc import read_mrc
+from .netcdf import read_netcdf
 from .nibabel_files import read_analyze, read_mgh
 from .nifti import read_nifti
 from .nrrd_file import read_nrrd
@@ -36,5 +37,6 @@ READERS: dict[str, Callable[[Request], Volume]] = {
     "vtk": read_vtk,
     "vtkhdf": read_vtkhdf,
     "mat": read_mat,
+    "netcdf": read_netcdf,
     "dicom": read_dicom,
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,11 @@ from ..images import lattice_of
 from ..volume import XYZ, ImageLattice, Request, Volume
 from .choosing import choose_member
 
-RESAMPLE = "resample it on a lattice (vtkResampleToImage), and write that as .vti"
+RESAMPLE = (
+    "resample it with python -c \"import numpy as n, pyvista as v; m = v.read('{0}'); d = n.array("
+    "m.dimensions); b = n.reshape(m.bounds, (3, 2)); v.ImageData(dimensions=d, spacing=(b[:, 1] - "
+    "b[:, 0]) / (d - 1), origin=b[:, 0]).sample(m).save('{1}.vti')\", and give {1}.vti:{2}"
+)
 EVEN = 1e-4  # share of a step by which steps may differ
 
 
@@ -48,7 +53,7 @@ def _read(request: Request, reader: Any) -> Volume:
     names = [[each.GetArrayName(i) for i in range(each.GetNumberOfArrays())] for each in data]
     name = choose_member(request, [n for each in names for n in each], "array")
     of_points = name in names[0]
-    lattice = _lattice(image, of_points)
+    lattice = _lattice(image, of_points, name, request.path)
     array = data[0 if of_points else 1].GetArray(name)
     values = vtk_to_numpy(array)
     if values.shape != (np.prod(lattice.shape),):
@@ -60,7 +65,7 @@ def _read(request: Request, reader: Any) -> Volume:
     return lattice.volume(values.dtype, lambda first, last: values[first:last])
 
 
-def _lattice(image: Any, of_points: bool) -> ImageLattice:
+def _lattice(image: Any, of_points: bool, name: str, path: Path) -> ImageLattice:
     """Return where the samples lie.
 
     Raises
@@ -71,16 +76,20 @@ def _lattice(image: Any, of_points: bool) -> ImageLattice:
     if image.IsA("vtkImageData"):
         return lattice_of(image, of_points)
     if not image.IsA("vtkRectilinearGrid"):
-        raise GridError(f"it holds a {image.GetClassName()}, no image data: {RESAMPLE}")
+        raise GridError(
+            f"it holds {image.GetClassName()}, no image data: sample its distances on a lattice, "
+            "and write that as .vti"
+        )
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
+    resample = RESAMPLE.format(path, path.stem, name)
     firsts, steps = [], []
     for axis in "XYZ":
         places = vtk_to_numpy(getattr(image, f"Get{axis}Coordinates")()).astype(np.float64)
         step = (places[-1] - places[0]) / max(len(places) - 1, 1)
         even = places[0] + step * np.arange(len(places))
         if not np.allclose(places, even, rtol=0, atol=EVEN * abs(step)):
-            raise GridError(f"its coordinates along {axis.lower()} are uneven: {RESAMPLE}")
+            raise GridError(f"its coordinates along {axis.lower()} are uneven: {resample}")
         firsts.append(places[0])
         steps.append(step)
     return ImageLattice(image.GetExtent(), np.array(steps), np.array(firsts), XYZ, of_points)
