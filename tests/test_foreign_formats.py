@@ -1,0 +1,663 @@
+"""Files of medicine, microscopy, simulation and scanning: place, size, side, values, refusals.
+
+Each is written by the library that is common for it. ``python -m benchmarks.readers`` compares the
+readings of a second library.
+"""
+
+from __future__ import annotations
+
+import gzip
+import itertools
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import hdf5storage
+import mrcfile
+import nibabel
+import numpy as np
+import pydicom
+import pytest
+import pyvista
+import scipy.io
+import xarray as xr
+from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
+from test_formats import (
+    CENTRE,
+    DATA,
+    OBLIQUE,
+    SIZES,
+    TURNS,
+    affine_of,
+    check,
+    part,
+    sampled,
+    save_itk,
+)
+from vtkmodules.vtkIOHDF import vtkHDFWriter
+
+from super_sdf import read_grid
+from super_sdf.errors import SuperSdfError
+from super_sdf.files.formats import DICOM, FORMATS, find_format, is_grid, split_member
+
+STEPS = np.array([0.5, 0.7, 0.9])
+AFFINE = affine_of(np.diag([1, 1.4, 1.8]))
+CORNER = AFFINE[:3, 3]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def refusal(path: str, **options: Any) -> str:
+    """Return the one line with which a file is refused."""
+    with pytest.raises(SuperSdfError) as caught:
+        read_grid(path, **options)
+    said = str(caught.value)
+    assert len(said.splitlines()) == 1
+    return said
+
+
+def run_line(said: str) -> None:
+    """Run the Python command in a message."""
+    line = re.search(r'python (-c "[^"]+")', said)
+    assert line
+    subprocess.run([sys.executable, *shlex.split(line[1])], check=True)
+
+
+# Places
+
+
+def save_mgh(path: str, affine: np.ndarray) -> None:
+    nibabel.save(nibabel.MGHImage(sampled(affine), affine), path)
+
+
+def save_pair(path: str, affine: np.ndarray) -> None:
+    nibabel.save(nibabel.Nifti1Pair(sampled(affine), affine), path)
+
+
+def image_of(affine: np.ndarray) -> pyvista.ImageData:
+    steps = np.linalg.norm(affine[:3, :3], axis=0)
+    place = {"origin": affine[:3, 3], "direction_matrix": affine[:3, :3] / steps}
+    image = pyvista.ImageData(dimensions=SIZES, spacing=steps, **place)
+    image["distance"] = part(image.points).astype(np.float32)
+    return image
+
+
+def save_vtkhdf(path: str, affine: np.ndarray) -> None:
+    writer = vtkHDFWriter()
+    writer.SetFileName(path)
+    writer.SetInputData(image_of(affine))
+    assert writer.Write()
+
+
+def slices_of(affine: np.ndarray, **about: Any) -> list[pydicom.Dataset]:
+    """Return the images of a series, in the order of their places."""
+    steps = np.linalg.norm(affine[:3, :3], axis=0)
+    stored = np.rint(sampled(affine) / 0.001).astype(np.int16)
+    common = {
+        "SeriesInstanceUID": "1.2.3",
+        "Rows": SIZES[1],
+        "Columns": SIZES[0],
+        "SamplesPerPixel": 1,
+        "PhotometricInterpretation": "MONOCHROME2",
+        **{"BitsAllocated": 16, "BitsStored": 16, "HighBit": 15, "PixelRepresentation": 1},
+        "PixelSpacing": [steps[1], steps[0]],
+        "ImageOrientationPatient": np.round(affine[:3, :2] / steps[:2], 10).T.ravel().tolist(),
+        "RescaleSlope": 0.001,
+        "RescaleIntercept": 0,
+        **about,
+    }
+    images = []
+    for k in range(SIZES[2]):
+        image = pydicom.Dataset()
+        for name, value in common.items():
+            setattr(image, name, value)
+        place = affine[:3, 3] + affine[:3, 2] * k
+        image.ImagePositionPatient = np.round(place, 8).tolist()
+        image.PixelData = stored[:, :, k].T.tobytes()
+        images.append(image)
+    return images
+
+
+def save_slices(path: str, images: list[pydicom.Dataset], start: str = "IM") -> None:
+    """Write images to a folder, in names that are not in their order."""
+    os.makedirs(path, exist_ok=True)
+    for number, image in enumerate(images):
+        image.file_meta = pydicom.dataset.FileMetaDataset()
+        image.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+        image.SOPClassUID = image.file_meta.MediaStorageSOPClassUID = CTImageStorage
+        uid = generate_uid(entropy_srcs=[start, str(number)])
+        image.SOPInstanceUID = image.file_meta.MediaStorageSOPInstanceUID = uid
+        name = f"{path}/{start}{number * 7 % 31:03d}"
+        pydicom.dcmwrite(name, image, enforce_file_format=True)
+
+
+def save_dicom(path: str, affine: np.ndarray) -> None:
+    save_slices(path, slices_of(affine))
+
+
+PLACED = {
+    "a.mgh": save_mgh,
+    "a.mgz": save_mgh,
+    "a.hdr": save_pair,
+    "a.vtkhdf": save_vtkhdf,
+    "itk.h5": save_itk,
+    "itk.hdf5": save_itk,
+    "series": save_dicom,
+}
+
+
+@pytest.mark.parametrize("turn", [0, 5, 9, 14, 18, 23])
+@pytest.mark.parametrize("name", PLACED)
+def test_turned_and_mirrored_axes_with_three_spacings(name, turn):
+    order = np.abs(TURNS[turn]).argmax(1)
+    PLACED[name](name, affine_of(TURNS[turn] @ np.diag([1, 1.4, 1.8])))
+    check(read_grid(name), STEPS[order], 6e-4 if name == "series" else 2e-5)
+    PLACED[name](name, affine_of(OBLIQUE @ np.diag([1, 1.4, 1.8])))
+    grid = read_grid(name)
+    check(grid, STEPS, 6e-4 if name == "series" else 2e-5)
+    assert np.allclose(grid.direction, OBLIQUE, atol=1e-5)
+
+
+def test_analyze_states_its_spacing_and_no_place():
+    nibabel.save(nibabel.AnalyzeImage(sampled(AFFINE), np.diag([*STEPS, 1])), "a.hdr")
+    grid = read_grid("a.hdr", origin=CORNER)
+    check(grid, STEPS)
+    assert (
+        "Analyze files state no place and not which side is left: x, y and z are taken as"
+        in (grid.notes[0])
+    )
+    assert read_grid("a.hdr").origin == (0, 0, 0)
+    os.rename("a.img", "b.img")
+    assert refusal("a.hdr") == "a.img does not exist"
+    assert refusal("b.img") == "b.img holds the samples of an Analyze file: give its header b.hdr"
+
+
+@pytest.mark.parametrize("order", itertools.permutations(range(3)))
+def test_sections_rows_and_columns_of_mrc_along_any_axes(order):
+    """The place is the origin in angstrom, else that of the first sample in the unit cell."""
+    first = np.array([20, -70, 30])
+    for by_origin in (True, False):
+        affine = AFFINE.copy()
+        affine[:3, 3] = CORNER if by_origin else first * STEPS
+        save_mrc("a.mrc", affine, order, by_origin, first)
+        grid = read_grid("a.mrc")
+        places = grid.to_world(np.moveaxis(np.indices(grid.shape), 0, -1))
+        assert np.allclose(grid.spacing, STEPS) and grid.notes == ()
+        assert np.abs(grid.values - part(places)).max() < 2e-5
+    Path("a.map.gz").write_bytes(gzip.compress(Path("a.mrc").read_bytes()))
+    packed = read_grid("a.map.gz")
+    assert np.array_equal(packed.values, grid.values) and packed.origin == grid.origin
+
+
+def save_mrc(
+    path: str, affine: np.ndarray, order: Any = (2, 1, 0), by_origin: bool = True, first: Any = None
+) -> None:
+    """Write an MRC file whose sections, rows and columns are along some axes."""
+    with mrcfile.new(path, overwrite=True) as file:
+        file.set_data(np.ascontiguousarray(sampled(affine).transpose(order)))
+        header = file.header
+        header.maps, header.mapr, header.mapc = (axis + 1 for axis in order)
+        header.mx, header.my, header.mz = SIZES
+        header.cella = tuple((STEPS * SIZES).tolist())
+        if by_origin:
+            header.origin = tuple(affine[:3, 3].tolist())
+        else:
+            header.nzstart, header.nystart, header.nxstart = first[list(order)].tolist()
+
+
+def test_what_mrc_files_say_that_no_grid_has():
+    save_mrc("a.mrc", AFFINE)
+    with mrcfile.open("a.mrc", "r+") as file:
+        file.header.nxstart = 4
+    said = "its origin is [97.1, -58.9, 9.45] and its nstart means [2.0, 0.0, 0.0]: the origin is"
+    assert said in re.sub(r"(\.\d*?[1-9])0{3}\d*", r"\1", read_grid("a.mrc").notes[0])
+    with mrcfile.open("a.mrc", "r+") as file:
+        file.header.cellb = (90, 101.5, 90)
+    said = "a.mrc: the angles of its unit cell are 90, 101.5, 90 degrees, not 90: resample it on a"
+    assert refusal("a.mrc").startswith(said)
+    with mrcfile.open("a.mrc", "r+") as file:
+        file.header.cellb, file.header.cella = (0, 0, 0), (0, 0, 0)
+    check(read_grid("a.mrc", spacing=STEPS), STEPS)
+    with mrcfile.open("a.mrc", "r+") as file:
+        file.header.mapc = 3
+    assert "its axes mapc, mapr, maps are [3, 2, 3]" in refusal("a.mrc")
+    volumes = np.zeros((2, 5, 6, 7), np.float32)
+    mrcfile.write("stack.mrc", volumes, overwrite=True)
+    assert "it is a stack of volumes of 5 sections: save one of them" in refusal("stack.mrc")
+
+
+@pytest.mark.parametrize("kind", [np.int8, np.int16, np.uint16, np.float16])
+def test_modes_and_byte_orders_of_mrc(kind):
+    mask = (sampled(AFFINE) < 0).astype(kind)
+    for order in "<>":
+        with mrcfile.new("a.mrc", overwrite=True) as file:
+            file.set_data(np.ascontiguousarray(mask.T))
+            file.voxel_size = tuple(STEPS.tolist())
+        whole = mrcfile.read("a.mrc")
+        assert np.array_equal(read_grid("a.mrc", field="mask").values < 0, whole.T > 0), order
+
+
+# VTK
+
+
+@pytest.mark.parametrize("name", ["binary", "text", "rectilinear", "cells", "itk"])
+def test_legacy_vtk(name):
+    path = f"{name}.vtk"
+    image = image_of(AFFINE)
+    if name == "itk":
+        save_itk(path, AFFINE)
+    elif name == "rectilinear":
+        image.cast_to_rectilinear_grid().save(path)
+    elif name == "cells":
+        cells = pyvista.ImageData(
+            dimensions=np.add(SIZES, 1), spacing=STEPS, origin=CORNER - STEPS / 2
+        )
+        cells.cell_data["distance"] = image["distance"]
+        cells.save(path)
+    else:
+        image.save(path, binary=name == "binary")
+    check(read_grid(path), STEPS)
+
+
+def test_one_of_several_arrays_of_vtk():
+    image = image_of(AFFINE)
+    image["other"] = image["distance"] + 1
+    image["vector"] = image.points
+    image.save("a.vtk")
+    check(read_grid("a.vtk:distance"), STEPS)
+    said = "a.vtk holds several arrays, distance, other, vector: give a.vtk:distance, say"
+    assert refusal("a.vtk") == said
+    assert "its array 'vector' has shape (8160, 3) for (17, 20, 24) samples" in refusal(
+        "a.vtk:vector"
+    )
+
+
+def test_uneven_coordinates_are_refused_with_a_line_that_resamples():
+    x, y, z = (CORNER[a] + STEPS[a] * np.arange(SIZES[a]) for a in range(3))
+    y = np.linspace(0, 1, len(y)) ** 1.3 * (y[-1] - y[0]) + y[0]
+    image = pyvista.RectilinearGrid(x, y, z)
+    image["distance"] = part(image.points)
+    image.save("a.vtk")
+    said = refusal("a.vtk")
+    assert said.startswith("a.vtk: its coordinates along y are uneven: resample it with python -c ")
+    assert said.endswith(", and give a.vti:distance")
+    run_line(said)
+    check(read_grid("a.vti:distance"), STEPS, 0.1)
+
+
+def test_meshes_in_vtk_files_are_no_grids():
+    pyvista.Sphere().save("a.vtk")
+    said = "a.vtk: it holds vtkPolyData, no image data: sample its distances on a lattice, and"
+    assert refusal("a.vtk").startswith(said) or "holds no array" in refusal("a.vtk")
+
+
+# NetCDF
+
+
+def array_of(order: str = "zyx", falling: str = "") -> xr.DataArray:
+    """Return the part as an array whose axes are in an order, some of them falling."""
+    places = {name: CORNER[a] + STEPS[a] * np.arange(SIZES[a]) for a, name in enumerate("xyz")}
+    array = xr.DataArray(sampled(AFFINE), places, list("xyz"), "distance")
+    turned = array.isel({name: slice(None, None, -1) for name in falling})
+    return turned.transpose(*order)
+
+
+@pytest.mark.parametrize("order", ["zyx", "xyz", "yxz", "zxy"])
+@pytest.mark.parametrize("version", ["NETCDF4", "NETCDF3_CLASSIC", "NETCDF3_64BIT"])
+def test_netcdf_at_its_coordinates(version, order):
+    for falling in ("", "y", "xz"):
+        array_of(order, falling).to_netcdf("a.nc", format=version, engine="netcdf4")
+        check(read_grid("a.nc"), STEPS)
+
+
+def test_netcdf_packed_with_units_a_time_and_named_axes():
+    array = array_of()
+    packing = {"dtype": "i2", "scale_factor": 0.001, "_FillValue": -32768, "zlib": True}
+    array.where(array < 7).expand_dims("time").to_netcdf("a.nc", encoding={"distance": packing})
+    grid = read_grid("a.nc")
+    assert "NaN" in grid.notes[0]
+    known = grid.values < 6.9
+    places = grid.to_world(np.moveaxis(np.indices(grid.shape), 0, -1))
+    assert np.abs(grid.values - part(places))[known].max() < 6e-4
+    array = array.assign_coords(z=array["z"] / 10)
+    for name, unit in {"x": "mm", "y": "mm", "z": "cm"}.items():
+        array[name].attrs["units"] = unit
+    array.to_netcdf("b.nc")
+    check(read_grid("b.nc"), STEPS)
+    names = {"x": "east", "y": "north", "z": "height"}
+    array = array_of("yxz").rename(names)
+    for axis, name in names.items():
+        array[name].attrs["axis"] = axis.upper()
+    array.to_netcdf("c.nc")
+    check(read_grid("c.nc"), STEPS)
+
+
+def test_one_of_several_variables_and_uneven_ones():
+    array = array_of()
+    xr.Dataset({"a": array, "b": array + 1, "flat": array[0]}).to_netcdf("a.nc")
+    check(read_grid("a.nc:a"), STEPS)
+    assert refusal("a.nc") == "a.nc holds several arrays, /a, /b: give a.nc:/a, say"
+    array = array.assign_coords(z=array["z"] ** 2)
+    array.to_netcdf("uneven.nc")
+    assert "coordinates of 'z' are not evenly spaced" in refusal("uneven.nc")
+    array = array_of().drop_vars("xyz")
+    array.to_netcdf("bare.nc")
+    check(read_grid("bare.nc", spacing=STEPS, origin=CORNER), STEPS)
+
+
+def test_a_mask_in_netcdf_keeps_its_type():
+    (array_of() < 0).astype(np.uint8).to_netcdf("a.nc")
+    grid = read_grid("a.nc")
+    assert grid.spacing == pytest.approx(STEPS) and any("mask" in note for note in grid.notes)
+
+
+# MATLAB
+
+
+def save_mat(name: str, **variables: Any) -> None:
+    """Write variables in version 7.3 if the name says so, else 5."""
+    if "73" in name:
+        hdf5storage.savemat(name, variables, format="7.3")
+    else:
+        scipy.io.savemat(name, variables, do_compression="packed" in name)
+
+
+@pytest.mark.parametrize("name", ["a.mat", "packed.mat", "v73.mat"])
+def test_arrays_of_matlab(name):
+    affine = affine_of(OBLIQUE @ np.diag([1, 1.4, 1.8]))
+    place = {"spacing": STEPS, "origin": affine[:3, 3], "direction": OBLIQUE}
+    save_mat(name, d=sampled(affine), **place)
+    grid = read_grid(name)
+    check(grid, STEPS)
+    assert np.allclose(grid.direction, OBLIQUE)
+    assert grid.notes[0].startswith("its axes are taken as x, y, z, the order of ndgrid; ")
+    save_mat(name, d=sampled(AFFINE).T, e=sampled(AFFINE), text="hello", flat=np.zeros((3, 4)))
+    check(read_grid(f"{name}:d", axes="zyx", spacing=STEPS, origin=CORNER), STEPS)
+    check(read_grid(f"{name}:e", spacing=STEPS, origin=CORNER, direction=np.eye(3)), STEPS)
+    assert refusal(name) == f"{name} holds several arrays, d, e: give {name}:d, say"
+    assert f"{name} has no array of three axes 'flat'" in refusal(f"{name}:flat")
+
+
+def test_the_order_of_meshgrid_is_permuted_as_the_note_says():
+    """Permute(V, [2 1 3]) of the array that meshgrid and isosurface want."""
+    save_mat("a.mat", V=np.swapaxes(np.swapaxes(sampled(AFFINE), 0, 1), 0, 1))
+    check(read_grid("a.mat", spacing=STEPS, origin=CORNER), STEPS)
+
+
+# DICOM
+
+
+def test_one_of_several_series_in_a_folder():
+    save_dicom("in", AFFINE)
+    shifted = affine_of(np.eye(3))
+    save_slices("in", slices_of(shifted, SeriesInstanceUID="1.2.4"), "b")
+    Path("in/notes.txt").write_text("no image")
+    os.mkdir("in/deeper")
+    check(read_grid("in:1.2.3"), STEPS, 6e-4)
+    check(read_grid("in:1.2.4"), tolerance=6e-4)
+    assert refusal("in") == "in holds several arrays, 1.2.3, 1.2.4: give in:1.2.3, say"
+    assert "in has no series of DICOM images '9'" in refusal("in:9")
+    os.mkdir("empty")
+    assert refusal("empty") == "empty holds no series of DICOM images"
+
+
+def test_missing_doubled_tilted_and_unplaced_slices_are_refused():
+    images = slices_of(AFFINE)
+    save_slices("gap", [image for k, image in enumerate(images) if k != 6])
+    said = "gap: IM035 and IM011 are 1.8 mm apart, others 0.9: add the slices that are missing"
+    assert said in refusal("gap")
+    save_slices("twice", images)
+    save_slices("twice", images[3:5], "b")
+    assert "twice: IM021 and b000 are at one place: put the slices of one volume" in refusal(
+        "twice"
+    )
+    save_slices("one", images[:1])
+    assert "one: IM000 is its only slice: give the folder of a series" in refusal("one")
+    assert find_format("one") is DICOM and is_grid("one")
+    assert refusal("one/IM000.dcm") == (
+        "one/IM000.dcm is a DICOM image: give the folder that holds its series"
+    )
+    for k, image in enumerate(images):
+        image.ImagePositionPatient[1] += 0.2 * k
+    save_slices("tilted", images)
+    said = (
+        "tilted: its slices lie up to 3.2 mm beside one another, as with a tilted gantry: resample"
+    )
+    assert said in refusal("tilted")
+    images[4].PixelSpacing = [1, 1]
+    save_slices("mixed", images)
+    assert "has another size, spacing or direction than" in refusal("mixed")
+    del images[4].PixelSpacing
+    save_slices("unplaced", images)
+    assert "unplaced: IM028 states no place: it is no slice of a volume" in refusal("unplaced")
+    images[4].SamplesPerPixel = 3
+    save_slices("colours", images)
+    assert "colours: IM028 has colours or a table of values: give grey images" in refusal("colours")
+
+
+def test_slope_and_intercept_of_each_slice():
+    """Whole numbers stay whole; each slice has its own scale, as of PET."""
+    images = slices_of(AFFINE, RescaleSlope=1, RescaleIntercept=-1024)
+    save_slices("hounsfield", images)
+    grid = read_grid("hounsfield", level=-1024 + 100, field="density")
+    assert grid.spacing == pytest.approx(STEPS)
+    for k, image in enumerate(slices_of(AFFINE)):
+        image.RescaleSlope = 0.001 * (1 + k % 3)
+        stored = np.frombuffer(image.PixelData, np.int16) / (1 + k % 3)
+        image.PixelData = np.rint(stored).astype(np.int16).tobytes()
+        images[k] = image
+    save_slices("pet", images)
+    check(read_grid("pet"), STEPS, 2e-3)
+
+
+def test_an_image_of_several_frames():
+    """An enhanced image: the place of each frame in a sequence, the rest shared."""
+    slices = slices_of(AFFINE)
+    image = slices[0]
+    image.PixelData = b"".join(each.PixelData for each in slices[::-1])
+    image.NumberOfFrames = len(slices)
+    frames, shared = [], pydicom.Dataset()
+    for each in slices[::-1]:
+        place, frame = pydicom.Dataset(), pydicom.Dataset()
+        place.ImagePositionPatient = each.ImagePositionPatient
+        frame.PlanePositionSequence = [place]
+        frames.append(frame)
+    for group, names in (
+        ("PlaneOrientationSequence", ["ImageOrientationPatient"]),
+        ("PixelMeasuresSequence", ["PixelSpacing"]),
+        ("PixelValueTransformationSequence", ["RescaleSlope", "RescaleIntercept"]),
+    ):
+        inner = pydicom.Dataset()
+        for name in names:
+            setattr(inner, name, image[name].value)
+            delattr(image, name)
+        setattr(shared, group, [inner])
+    del image.ImagePositionPatient
+    save_slices("plain", [image])
+    assert "IM000 has 17 frames without a place each" in refusal("plain")
+    image.PerFrameFunctionalGroupsSequence = frames
+    image.SharedFunctionalGroupsSequence = [shared]
+    save_slices("frames", [image])
+    check(read_grid("frames"), STEPS, 6e-4)
+
+
+# Open3D, and what is converted first
+
+
+def test_blocks_that_open3d_saved():
+    """By Open3D 0.19: 300 of its voxels, their places, values and weights, as it says them."""
+    said = np.load(DATA / "open3d-voxels.npz")
+    grid = read_grid(DATA / "open3d-blocks.npz", field="sdf")
+    assert grid.spacing == pytest.approx((0.06,) * 3)
+    index = grid.to_index(said["places"].astype(float))
+    assert np.abs(index - np.rint(index)).max() < 1e-4
+    found = grid.values[tuple(np.rint(index).astype(int).T)]
+    seen = said["weight"] > 0
+    assert 100 < seen.sum() < 300
+    ratio = found[seen] / said["tsdf"][seen]
+    assert np.ptp(ratio) < 1e-4 * ratio.mean()
+    assert "samples are unknown" in grid.notes[0]
+
+
+def test_blocks_that_open3d_did_not_save_whole():
+    whole = dict(np.load(DATA / "open3d-blocks.npz"))
+    for key in ("value_001", "attr_name_weight"):
+        np.savez("a.npz", **{name: value for name, value in whole.items() if name != key})
+        want = f"a.npz is Open3D's VoxelBlockGrid, but has no key {key!r}"
+        assert refusal("a.npz") == want
+    np.savez("a.npz", **{**whole, "key": whole["key"][:5]})
+    assert "a.npz: its keys have shape (5, 3), its values (138, 4, 4, 4, 1)" in refusal("a.npz")
+    far = whole["key"].copy()
+    far[0] += 10**6
+    np.savez("a.npz", **{**whole, "key": far})
+    assert "a.npz" in refusal("a.npz", max_memory=10**9)
+
+
+def test_files_of_other_programs_are_refused_with_the_line_that_converts_them():
+    affine = affine_of(np.eye(3))
+    head = np.array([*SIZES, *affine[:3, 3], 0.5, 2.5], "<f4")
+    truncated = np.clip(sampled(affine) / 2.5, -1, 1).astype("<f4")
+    Path("tsdf.bin").write_bytes(head.tobytes() + truncated.T.tobytes())
+    said = refusal("tsdf.bin")
+    assert said.startswith("tsdf.bin states no format; of tsdf-fusion make .npz with python -c ")
+    run_line(said)
+    found = np.load("tsdf.npz")
+    places = np.moveaxis(np.indices(SIZES), 0, -1) * found["spacing"] + found["origin"]
+    assert np.abs(found["values"] - np.clip(part(places), -2.5, 2.5)).max() < 1e-5
+    assert read_grid("tsdf.npz").spacing == (0.5, 0.5, 0.5)
+    assert refusal("a/b.nvdb") == (
+        "a/b.nvdb is NanoVDB: make OpenVDB of it with OpenVDB's tool nanovdb_convert a/b.nvdb b.vdb"
+    )
+
+
+# Damage
+
+
+def save_any(name: str) -> None:
+    """Write the part in the format of the name."""
+    if name in PLACED:
+        PLACED[name](name, AFFINE)
+    elif ".mrc" in name or ".map" in name:
+        save_mrc("plain.mrc", AFFINE)
+        data = Path("plain.mrc").read_bytes()
+        Path(name).write_bytes(gzip.compress(data) if name.endswith(".gz") else data)
+    elif name.endswith(".vtk"):
+        image_of(AFFINE).save(name, binary="text" not in name)
+    elif name.endswith(".nc"):
+        old = {"format": "NETCDF3_CLASSIC"} if "3" in name else {}
+        array_of().to_netcdf(name, engine="netcdf4", **old)
+    else:
+        save_mat(name, d=sampled(AFFINE))
+
+
+FILES = [
+    *("a.mgh", "a.mgz", "a.vtkhdf", "itk.h5", "a.mrc", "a.map.gz", "a.vtk", "text.vtk"),
+    *("a.nc", "v3.nc", "a.mat", "packed.mat", "v73.mat"),
+]
+
+
+@pytest.mark.parametrize("share", [0.02, 0.5, 0.9])
+@pytest.mark.parametrize("name", FILES)
+def test_a_truncated_file_is_refused_in_one_line(name, share, capfd):
+    save_any(name)
+    whole = Path(name).read_bytes()
+    Path(name).write_bytes(whole[: int(share * len(whole))])
+    capfd.readouterr()
+    said = refusal(name)
+    assert said.startswith(name) and len(said) < 400
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("name", [*FILES, "a.hdr"])
+def test_another_kind_of_file_is_refused_in_one_line(name, capfd):
+    Path(name).write_bytes(b"hello, this is no grid at all\n" * 20)
+    Path("a.img").write_bytes(b"hello")
+    said = refusal(name)
+    assert said.startswith(name) and len(said) < 400
+    assert capfd.readouterr() == ("", "")
+
+
+def test_truncated_slices_and_samples():
+    save_dicom("in", AFFINE)
+    Path("in/IM021").write_bytes(Path("in/IM021").read_bytes()[:-100])
+    assert refusal("in").startswith("in ")
+    save_pair("a.hdr", AFFINE)
+    Path("a.img").write_bytes(Path("a.img").read_bytes()[:-1])
+    assert "a.img is truncated: its header promises 24 x 20 x 17 float32" in refusal("a.hdr")
+
+
+def test_headers_that_state_too_much_are_refused_before_anything_is_unpacked():
+    save_mrc("a.mrc", AFFINE)
+    whole = bytearray(Path("a.mrc").read_bytes())
+    whole[:12] = np.array([30000] * 3, "<i4").tobytes()
+    Path("a.mrc").write_bytes(whole)
+    assert "is truncated" in refusal("a.mrc")
+    Path("a.mrc.gz").write_bytes(gzip.compress(whole))
+    assert "a.mrc.gz" in refusal("a.mrc.gz")
+    save_mgh("a.mgh", AFFINE)
+    whole = bytearray(Path("a.mgh").read_bytes())
+    whole[4:16] = np.array([30000] * 3, ">i4").tobytes()
+    Path("a.mgh").write_bytes(whole)
+    assert "is truncated: its header promises 30000 x 30000 x 30000" in refusal("a.mgh")
+    Path("a.mgz").write_bytes(gzip.compress(whole))
+    assert "is truncated: its header promises" in refusal("a.mgz")
+
+
+def test_a_wrong_checksum_of_freesurfer_and_mrc_is_found():
+    for name in ("a.mgz", "a.map.gz"):
+        save_any(name)
+        data = bytearray(Path(name).read_bytes())
+        data[-8] ^= 1
+        Path(name).write_bytes(data)
+        assert refusal(name).startswith(name)
+
+
+# Commands
+
+
+def test_a_folder_of_slices_becomes_a_mesh_at_its_place(command):
+    save_dicom("in", AFFINE)
+    code, _, err = command("upsample", "in", "out.ply", "--quality", "fast")
+    assert code == 0, err
+    vertices = pyvista.read("out.ply").points
+    assert np.abs(part(vertices)).max() < 0.1 and abs(vertices - CENTRE).max() < 5
+    code, out, _ = command("info", "in", "--json")
+    assert code == 0 and "DICOM" in out
+    code, _, err = command("batch", "in", "--out", "out")
+    assert code == 2 and err.startswith("Error: in holds no grid (")
+
+
+def test_a_changed_pair_of_files_is_converted_again(command):
+    save_pair("a.hdr", AFFINE)
+    run = ("batch", "a.hdr", "--out", "out", "--quality", "fast", "--jobs", "1")
+    assert command(*run)[0] == 0
+    before = Path("out/a.ply").read_bytes()
+    nibabel.save(nibabel.Nifti1Pair(sampled(AFFINE) + 0.2, AFFINE), "a.hdr")
+    assert command(*run)[0] == 0
+    assert Path("out/a.ply").read_bytes() != before
+
+
+def test_a_missing_library_is_named_with_the_command_that_installs_it(monkeypatch):
+    for name in (*FILES, "series"):
+        save_any(name)
+        format_ = find_format(name)
+        with monkeypatch.context() as patch:
+            patch.setattr("super_sdf.machine.extras.find_spec", lambda module: None)
+            said = refusal(name)
+        wanted = f"pip install -e '.[{format_.extra}]' in a clone of super-sdf"
+        assert said.startswith(f"{format_.name} (") and said.endswith(wanted)
+
+
+def test_names_of_series_and_of_files():
+    os.mkdir("in")
+    assert split_member("in:1.2") == (Path("in"), "1.2")
+    assert split_member("no:1.2") == (Path("no:1.2"), None)
+    assert split_member("a.nc:/g/v") == (Path("a.nc"), "/g/v")
+    assert len({format_.key for format_ in (*FORMATS, DICOM)}) == len(FORMATS) + 1
