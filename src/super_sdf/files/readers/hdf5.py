@@ -19,7 +19,7 @@ from ..regular import check_beside
 from ..volume import Request, Volume, reversed_axes
 from .axes import Axes
 from .choosing import choose_member
-from .stored import along, placed, unscaled, without_gaps
+from .stored import along, axis_name, placed, unscaled, without_gaps
 
 NO_COORDINATES = b"This is a netCDF dimension but not a netCDF variable"
 
@@ -36,7 +36,7 @@ def read_hdf5(request: Request) -> Volume:
     asked = (request.member or "").strip("/")
 
     def note(name: str, entry: Any) -> None:
-        if isinstance(entry, h5py.Dataset) and (name == asked or _may_be_grid(entry.shape)):
+        if isinstance(entry, h5py.Dataset) and (name == asked or may_be_grid(entry.shape)):
             found.append(f"/{name}")
 
     file.visititems(note)
@@ -74,7 +74,7 @@ def volume_of(values: Any, space: list[int], place: dict[str, Any]) -> Volume:
     return Volume(shape, dtype, read, **place, **about)
 
 
-def _may_be_grid(shape: tuple[int, ...] | None) -> bool:
+def may_be_grid(shape: tuple[int, ...] | None) -> bool:
     """Return whether a dataset has three axes, besides some of length 1."""
     return shape is not None and len(shape) >= 3 >= sum(count > 1 for count in shape)
 
@@ -93,6 +93,10 @@ def _axes(values: Any) -> Axes:
     names = [
         dim.label or ("" if scale is None else (scale.name or "").rsplit("/", 1)[-1])
         for dim, scale in zip(values.dims, scales)
+    ]
+    names = [
+        name if scale is None else axis_name(dict(scale.attrs), name)
+        for name, scale in zip(names, scales)
     ]
 
     def coordinates(axis: int) -> tuple[NDArray[Any] | None, dict[str, Any]]:

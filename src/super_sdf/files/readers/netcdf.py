@@ -1,8 +1,10 @@
-"""NetCDF files, with netCDF4: a variable of three axes, placed by the coordinates of its axes."""
+"""NetCDF files: version 4, which is HDF5, with h5py; the classic versions with SciPy.
+
+A variable of three axes, besides some of length 1, is placed by the coordinates of its axes.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -12,72 +14,48 @@ from ..boxes import Box
 from ..volume import Request, Volume
 from .axes import Axes
 from .choosing import choose_member
-from .stored import along, placed
-
-PACKING = ("scale_factor", "add_offset", "_FillValue", "missing_value", "valid_range")
+from .hdf5 import may_be_grid, read_hdf5
+from .stored import along, axis_name, placed, unscaled
 
 
 def read_netcdf(request: Request) -> Volume:
-    """Read ``FILE.nc:/GROUP/VARIABLE``; without a name the only variable of three axes.
+    """Read ``FILE.nc:/VARIABLE``; without a name the only variable of three axes."""
+    import h5py
 
-    Values are scaled as the file says, and missing ones unknown.
-    """
-    import netCDF4
+    return read_hdf5(request) if h5py.is_hdf5(request.path) else _read_classic(request)
 
-    file = request.files.enter_context(netCDF4.Dataset(request.path))
-    found = dict(_variables(file))
-    values = found[choose_member(request, list(found), "variable of three axes")]
-    is_plain = values.dtype.kind in "iu" and not set(PACKING) & set(values.ncattrs())
-    values.set_auto_maskandscale(not is_plain)
-    about = {name: values.getncattr(name) for name in values.ncattrs()}
-    space, place = placed(_axes(values), about, values.shape, request.axes)
-    dtype = values.dtype if is_plain else np.result_type(values[(0,) * values.ndim], np.float32)
 
-    def read_box(box: Box) -> NDArray[Any]:
-        samples: Any = values[along(space, box, values.ndim)]
-        if np.ma.isMaskedArray(samples):
-            samples = samples.astype(dtype).filled(np.nan)
-        return np.asarray(samples, dtype)
+def _read_classic(request: Request) -> Volume:
+    """Read a file of version 3 or before, whose samples are mapped into memory."""
+    from scipy.io import netcdf_file
+
+    variables = request.files.enter_context(netcdf_file(request.path, mmap=True)).variables
+    names = [f"/{name}" for name, values in variables.items() if may_be_grid(values.shape)]
+    values = variables[choose_member(request, names, "variable of three axes")[1:]]
+    about = vars(values)["_attributes"]
+    scales = [variables.get(name) for name in values.dimensions]
+    space, place = placed(_axes(values, scales), about, values.shape, request.axes)
+    shape = tuple(values.shape[axis] for axis in space)
+
+    def stored(box: Box) -> NDArray[Any]:
+        samples: NDArray[Any] = values.data[along(space, box, len(values.shape))]
+        return samples
+
+    read_box, dtype = unscaled(stored, values.data.dtype, about)
 
     def read(first: int, last: int) -> NDArray[Any]:
         return read_box((slice(first, last), slice(0, shape[1]), slice(0, shape[2])))
 
-    shape, chunks = tuple(values.shape[axis] for axis in space), values.chunking()
-    return Volume(
-        *(shape, np.dtype(dtype), read),
-        chunks=tuple(chunks[axis] for axis in space) if isinstance(chunks, list) else None,
-        read_box=read_box,
-        packed=request.path.stat().st_size,
-        **place,
-    )
+    return Volume(shape, dtype, read, read_box=read_box, **place)
 
 
-def _variables(group: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the variables that may be grids, by their paths, those of groups last."""
-    for name, values in group.variables.items():
-        if values.ndim >= 3 >= sum(count > 1 for count in values.shape):
-            yield f"{group.path.rstrip('/')}/{name}", values
-    for below in group.groups.values():
-        yield from _variables(below)
-
-
-def _axes(values: Any) -> Axes:
-    """Return the axes of a variable; those whose coordinates state an ``axis`` have its name."""
-    scales = [_coordinates(values.group(), name) for name in values.dimensions]
-    names = [getattr(s, "axis", name) for s, name in zip(scales, values.dimensions)]
+def _axes(values: Any, scales: list[Any]) -> Axes:
+    """Return the axes of a variable, with those that hold their coordinates, or None."""
+    about = [{} if scale is None else vars(scale)["_attributes"] for scale in scales]
 
     def found(axis: int) -> tuple[NDArray[Any] | None, dict[str, Any]]:
         scale = scales[axis]
-        if scale is None:
-            return None, {}
-        return np.asarray(scale[:]), {name: scale.getncattr(name) for name in scale.ncattrs()}
+        return (None if scale is None else np.array(scale.data)), about[axis]
 
-    return Axes.of_coordinates(names, found)
-
-
-def _coordinates(group: Any, name: str) -> Any:
-    """Return the coordinates of a dimension, which are in its group or one above; else None."""
-    while group is not None and name not in group.variables:
-        group = group.parent
-    scale = None if group is None else group.variables[name]
-    return scale if scale is not None and scale.dimensions == (name,) else None
+    names = [axis_name(a, name) for a, name in zip(about, values.dimensions)]
+    return Axes.of_coordinates(names, values.shape, found)

@@ -63,6 +63,12 @@ def along(space: list[int], box: Sequence[slice], count: int) -> tuple[Any, ...]
     return tuple(where)
 
 
+def axis_name(attributes: dict[str, Any], name: str) -> str:
+    """Return the name of an axis: ``axis`` of its coordinates (X, Y or Z), else its own."""
+    stated = attributes.get("axis", name)
+    return stated.decode() if isinstance(stated, bytes) else str(stated)
+
+
 def _direction(attributes: dict[str, Any]) -> NDArray[np.float64]:
     """Return the attribute ``direction``, the identity if there is none."""
     if "direction" not in attributes:
@@ -134,12 +140,13 @@ def unscaled(
     plus ``add_offset``; ``missing``, or ``_FillValue``, is no value.
     """
     names = "scale_factor", "add_offset"
-    if not any(name in attributes for name in names):
+    has_gaps = dtype.kind == "f" and "_FillValue" in attributes
+    if not has_gaps and not any(name in attributes for name in names):
         return read_box, dtype
     numbers = (np.ravel(attributes.get(name, i)) for name, i in zip(names, (1, 0)))
     factor, offset = (float(number[0]) for number in numbers)
     none = np.ravel(attributes.get("_FillValue", missing))
-    kind = np.dtype("f4" if dtype.itemsize <= 2 else "f8")
+    kind = np.result_type(dtype, np.float32)
 
     def read(box: Box) -> NDArray[Any]:
         stored = read_box(box)
