@@ -175,14 +175,14 @@ def test_analyze_states_its_spacing_and_no_place():
     )
     assert read_grid("a.hdr").origin == (0, 0, 0)
     os.rename("a.img", "b.img")
-    assert refusal("a.hdr") == "a.img does not exist"
+    assert refusal("a.hdr") == "a.hdr: a.img does not exist"
     assert refusal("b.img") == "b.img holds the samples of an Analyze file: give its header b.hdr"
 
 
-@pytest.mark.parametrize("order", itertools.permutations(range(3)))
+@pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
 def test_sections_rows_and_columns_of_mrc_along_any_axes(order):
     """The place is the origin in angstrom, else that of the first sample in the unit cell."""
-    first = np.array([20, -70, 30])
+    first = np.array([194, -84, 10])
     for by_origin in (True, False):
         affine = AFFINE.copy()
         affine[:3, 3] = CORNER if by_origin else first * STEPS
@@ -216,8 +216,8 @@ def test_what_mrc_files_say_that_no_grid_has():
     save_mrc("a.mrc", AFFINE)
     with mrcfile.open("a.mrc", "r+") as file:
         file.header.nxstart = 4
-    said = "its origin is [97.1, -58.9, 9.45] and its nstart means [2.0, 0.0, 0.0]: the origin is"
-    assert said in re.sub(r"(\.\d*?[1-9])0{3}\d*", r"\1", read_grid("a.mrc").notes[0])
+    said = "its origin is 97.1, -58.9, 9.45 and its nstart means 2, 0, 0: the origin is taken"
+    assert read_grid("a.mrc").notes == (said,)
     with mrcfile.open("a.mrc", "r+") as file:
         file.header.cellb = (90, 101.5, 90)
     said = "a.mrc: the angles of its unit cell are 90, 101.5, 90 degrees, not 90: resample it on a"
@@ -347,7 +347,7 @@ def test_one_of_several_variables_and_uneven_ones():
     array = array.assign_coords(z=array["z"] ** 2)
     array.to_netcdf("uneven.nc")
     assert "coordinates of 'z' are not evenly spaced" in refusal("uneven.nc")
-    array = array_of().drop_vars("xyz")
+    array = array_of().drop_vars(list("xyz"))
     array.to_netcdf("bare.nc")
     check(read_grid("bare.nc", spacing=STEPS, origin=CORNER), STEPS)
 
@@ -378,7 +378,13 @@ def test_arrays_of_matlab(name):
     check(grid, STEPS)
     assert np.allclose(grid.direction, OBLIQUE)
     assert grid.notes[0].startswith("its axes are taken as x, y, z, the order of ndgrid; ")
-    save_mat(name, d=sampled(AFFINE).T, e=sampled(AFFINE), text="hello", flat=np.zeros((3, 4)))
+    save_mat(
+        name,
+        d=np.ascontiguousarray(sampled(AFFINE).T),
+        e=sampled(AFFINE),
+        text="hello",
+        flat=np.zeros((3, 4)),
+    )
     check(read_grid(f"{name}:d", axes="zyx", spacing=STEPS, origin=CORNER), STEPS)
     check(read_grid(f"{name}:e", spacing=STEPS, origin=CORNER, direction=np.eye(3)), STEPS)
     assert refusal(name) == f"{name} holds several arrays, d, e: give {name}:d, say"
@@ -411,7 +417,7 @@ def test_one_of_several_series_in_a_folder():
 def test_missing_doubled_tilted_and_unplaced_slices_are_refused():
     images = slices_of(AFFINE)
     save_slices("gap", [image for k, image in enumerate(images) if k != 6])
-    said = "gap: IM035 and IM011 are 1.8 mm apart, others 0.9: add the slices that are missing"
+    said = "gap: IM004 and IM011 are 1.8 mm apart, others 0.9: add the slices that are missing"
     assert said in refusal("gap")
     save_slices("twice", images)
     save_slices("twice", images[3:5], "b")
@@ -426,11 +432,11 @@ def test_missing_doubled_tilted_and_unplaced_slices_are_refused():
     )
     for k, image in enumerate(images):
         image.ImagePositionPatient[1] += 0.2 * k
-    save_slices("tilted", images)
+    save_slices("gantry", images)
     said = (
         "tilted: its slices lie up to 3.2 mm beside one another, as with a tilted gantry: resample"
     )
-    assert said in refusal("tilted")
+    assert said in refusal("gantry")
     images[4].PixelSpacing = [1, 1]
     save_slices("mixed", images)
     assert "has another size, spacing or direction than" in refusal("mixed")
@@ -446,7 +452,7 @@ def test_slope_and_intercept_of_each_slice():
     """Whole numbers stay whole; each slice has its own scale, as of PET."""
     images = slices_of(AFFINE, RescaleSlope=1, RescaleIntercept=-1024)
     save_slices("hounsfield", images)
-    grid = read_grid("hounsfield", level=-1024 + 100, field="density")
+    grid = read_grid("hounsfield", level=-1024 + 1000)
     assert grid.spacing == pytest.approx(STEPS)
     for k, image in enumerate(slices_of(AFFINE)):
         image.RescaleSlope = 0.001 * (1 + k % 3)
@@ -494,7 +500,7 @@ def test_an_image_of_several_frames():
 def test_blocks_that_open3d_saved():
     """By Open3D 0.19: 300 of its voxels, their places, values and weights, as it says them."""
     said = np.load(DATA / "open3d-voxels.npz")
-    grid = read_grid(DATA / "open3d-blocks.npz", field="sdf")
+    grid = read_grid(DATA / "open3d-blocks.npz")
     assert grid.spacing == pytest.approx((0.06,) * 3)
     index = grid.to_index(said["places"].astype(float))
     assert np.abs(index - np.rint(index)).max() < 1e-4
@@ -513,7 +519,7 @@ def test_blocks_that_open3d_did_not_save_whole():
         want = f"a.npz is Open3D's VoxelBlockGrid, but has no key {key!r}"
         assert refusal("a.npz") == want
     np.savez("a.npz", **{**whole, "key": whole["key"][:5]})
-    assert "a.npz: its keys have shape (5, 3), its values (138, 4, 4, 4, 1)" in refusal("a.npz")
+    assert "its keys have shape (5, 3), its values (138, 4, 4, 4, 1)" in refusal("a.npz")
     far = whole["key"].copy()
     far[0] += 10**6
     np.savez("a.npz", **{**whole, "key": far})
@@ -605,7 +611,7 @@ def test_headers_that_state_too_much_are_refused_before_anything_is_unpacked():
     whole = bytearray(Path("a.mgh").read_bytes())
     whole[4:16] = np.array([30000] * 3, ">i4").tobytes()
     Path("a.mgh").write_bytes(whole)
-    assert "is truncated: its header promises 30000 x 30000 x 30000" in refusal("a.mgh")
+    assert "a.mgh is truncated: its header promises 30000 x 30000 x 30000" in refusal("a.mgh")
     Path("a.mgz").write_bytes(gzip.compress(whole))
     assert "is truncated: its header promises" in refusal("a.mgz")
 

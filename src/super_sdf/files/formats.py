@@ -21,8 +21,8 @@ WAYS_OUT = {
     ".img": "holds the samples of an Analyze file: give its header {1}.hdr",
     ".bin": (
         'states no format; of tsdf-fusion make .npz with python -c "import numpy as n; a = '
-        "n.fromfile('{0}', '<f4'); s = a[:3].astype(int); n.savez('{1}.npz', values=(a[7] * a[8:]).reshape("
-        's[::-1]).T, origin=a[3:6], spacing=a[6])"'
+        "n.fromfile('{0}', '<f4'); s = a[2::-1].astype(int); n.savez('{1}.npz', values=(a[7] * "
+        'a[8:]).reshape(s).T, origin=a[3:6], spacing=a[6])"'
     ),
 }
 

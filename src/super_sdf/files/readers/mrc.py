@@ -67,7 +67,7 @@ def _place(
     angles = _numbers(header.cellb, ("alpha", "beta", "gamma"))
     if angles.any() and np.abs(angles - 90).max() > RIGHT:
         raise GridError(
-            f"the angles of its unit cell are {', '.join(f'{a:g}' for a in angles)} degrees, not "
+            f"the angles of its unit cell are {_listed(angles)} degrees, not "
             "90: resample it on a grid with right angles"
         )
     counts = np.array([int(header[name]) for name in ("mx", "my", "mz")])
@@ -80,7 +80,7 @@ def _place(
     notes: tuple[str, ...] = ()
     if stated.any() and in_cell.any() and not np.allclose(stated, in_cell, atol=steps.max() / 100):
         notes = (
-            f"its origin is {stated.tolist()} and its nstart means {in_cell.tolist()}: the origin "
+            f"its origin is {_listed(stated)} and its nstart means {_listed(in_cell)}: the origin "
             "is taken",
         )
     x, y, z = (stated if stated.any() else in_cell).tolist()
@@ -100,6 +100,10 @@ def _numbers(fields: Any, names: Any) -> NDArray[np.float64]:
     if not np.isfinite(numbers).all():
         raise FileError(f"its header is damaged: {', '.join(names)} are {numbers.tolist()}")
     return numbers
+
+
+def _listed(numbers: NDArray[np.float64]) -> str:
+    return ", ".join(f"{number:g}" for number in numbers)
 
 
 def _triple(numbers: Any) -> Triple:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gzip
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,33 +33,63 @@ def read_nifti(request: Request) -> Volume:
     """
     import nibabel
 
-    size, is_packed = request.path.stat().st_size, request.path.suffix.lower() == ".gz"
-    opened: Any = gzip.open if is_packed else open
-    stream = request.files.enter_context(opened(request.path, "rb"))
+    stream = opened(request, request.path)
     header = _header(nibabel, stream)
-    shape, start = header.get_data_shape(), header.get_data_offset()
-    proxy = nibabel.arrayproxy.ArrayProxy(stream, header, mmap=False)
+    place, notes = place_of(header)
+    return proxied(request.path, stream, header, place, notes)
+
+
+def opened(request: Request, path: Path) -> Any:
+    """Return the stream of a file, unpacked if its name says that it is packed with gzip."""
+    way: Any = gzip.open if path.suffix.lower() in (".gz", ".mgz") else open
+    return request.files.enter_context(way(path, "rb"))
+
+
+def proxied(
+    path: Path, stream: Any, header: Any, place: Any, notes: tuple[str, ...] = ()
+) -> Volume:
+    """Return the array that a header of nibabel describes, read from a stream.
+
+    Parameters
+    ----------
+    path : path
+        The file of the samples.
+    stream, header
+        That file, unpacked, and what nibabel made of the header.
+    place : tuple
+        Spacing, origin and direction of the axes x, y, z.
+    notes : tuple of str
+        What the file says of the place.
+    """
+    from nibabel.arrayproxy import ArrayProxy
+
+    size, is_packed = path.stat().st_size, isinstance(stream, gzip.GzipFile)
+    shape, start = tuple(map(int, header.get_data_shape())), int(header.get_data_offset())
+    proxy = ArrayProxy(stream, header, mmap=False)
     if len(shape) < 3 or any(size != 1 for size in shape[3:]):
-        raise GridError(f"{request.path} has shape {shape}: give a file of three axes (x, y, z)")
+        raise GridError(f"{path} has shape {shape}: give a file of three axes (x, y, z)")
     stored = ArrayHeader(shape, header.get_data_dtype(), True, start)
     if min(shape) < 1 or start + stored.size > size * (MOST_DEFLATED if is_packed else 1):
         raise FileError(
-            f"{request.path} is truncated: its header promises {stored} from byte {start:,} on, "
-            f"but the file has {size:,}"
+            f"{path} is truncated: its header promises {stored} from byte {start:,} on, but the "
+            f"file has {size:,}"
         )
     rest = (0,) * (len(shape) - 3)
 
     def read(first: int, last: int) -> NDArray[Any]:
         planes = np.asarray(proxy[(..., slice(first, last), *rest)]).T
         if last == shape[2] and len(stream.read(PIECE)) == PIECE:  # gzip compares the checksum
-            raise FileError(f"{request.path} goes on after the samples that its header promises")
+            raise FileError(f"{path} goes on after the samples that its header promises")
         return planes
 
-    (spacing, origin, direction), notes = _place(header, shape[:3])
+    spacing, origin, direction = place
     spacing, direction = reversed_axes(spacing, direction)
-    place, dtype = (spacing, origin, direction), read(0, 1).dtype
     packed = size if is_packed else None
-    return Volume(shape[2::-1], dtype, read, *place, packed=packed, notes=notes)
+    return Volume(
+        *(shape[2::-1], read(0, 1).dtype, read, spacing, origin, direction),
+        packed=packed,
+        notes=notes,
+    )
 
 
 def _header(nibabel: Any, stream: Any) -> Any:
@@ -70,7 +101,7 @@ def _header(nibabel: Any, stream: Any) -> Any:
     return nibabel.Nifti1Header(start)
 
 
-def _place(header: Any, shape: tuple[int, ...]) -> tuple[Any, tuple[str, ...]]:
+def place_of(header: Any) -> tuple[Any, tuple[str, ...]]:
     """Return spacing, origin and direction of the axes x, y, z, and notes on what was chosen."""
     unit = UNITS.get(header.get_xyzt_units()[0])
     notes: tuple[str, ...] = ()
@@ -84,7 +115,9 @@ def _place(header: Any, shape: tuple[int, ...]) -> tuple[Any, tuple[str, ...]]:
         )
         return (header.get_zooms()[:3], None, XYZ), (*notes, said)
     if min(codes) > 0:
-        corners = np.array(list(product(*((0, size - 1) for size in shape), [1])))
+        corners = np.array(
+            list(product(*((0, size - 1) for size in header.get_data_shape()[:3]), [1]))
+        )
         off = np.abs(corners @ (header.get_sform() - header.get_qform()).T).max()
         if not off <= ASTRAY * min(header.get_zooms()[:3]):
             notes += (
