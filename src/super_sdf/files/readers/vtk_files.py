@@ -115,7 +115,7 @@ def _lattice(image: Any, of_points: bool, name: str, path: Path) -> ImageLattice
         step = (places[-1] - places[0]) / max(len(places) - 1, 1)
         even = places[0] + step * np.arange(len(places))
         if not np.allclose(places, even, rtol=0, atol=EVEN * abs(step)):
-            raise GridError(f"its coordinates along {axis.lower()} are uneven: {resample}")
+            raise GridError(f"{path}: its coordinates along {axis.lower()} are uneven: {resample}")
         firsts.append(places[0])
         steps.append(step)
     return ImageLattice(image.GetExtent(), np.array(steps), np.array(firsts), XYZ, of_points)
