@@ -89,6 +89,49 @@ def write_nibabel(path: Path, affine: np.ndarray) -> None:
     )
 
 
+def write_second_nifti(path: Path, affine: np.ndarray) -> None:
+    """Write NIfTI-2."""
+    import nibabel
+
+    nibabel.save(nibabel.Nifti2Image(sampled(affine), affine), path)
+
+
+def write_unplaced_nifti(path: Path, affine: np.ndarray) -> None:
+    """Write NIfTI whose sform and qform have code 0."""
+    import nibabel
+
+    image = nibabel.Nifti1Image(sampled(affine), None)
+    image.header.set_zooms(STEPS)
+    image.set_sform(None, 0)
+    image.set_qform(None, 0)
+    nibabel.save(image, path)
+
+
+def write_spaced_nrrd(path: Path, affine: np.ndarray) -> None:
+    """Write NRRD without a space, or with a leading list axis of length 1."""
+    import nrrd
+
+    if "list" in path.name:
+        steps = np.vstack([[np.nan] * 3, affine[:3, :3].T])
+        about = {"space": "left-posterior-superior", "space directions": steps}
+        about |= {"kinds": ["list"] + ["domain"] * 3, "space origin": affine[:3, 3]}
+        nrrd.write(str(path), sampled(affine)[None], about)
+    else:
+        nrrd.write(str(path), sampled(affine), {"spacings": STEPS, "axis mins": CORNER})
+
+
+def write_cells(path: Path, affine: np.ndarray) -> None:
+    """Write image data of cells, whose centres are the samples."""
+    import pyvista
+
+    steps = np.linalg.norm(affine[:3, :3], axis=0)
+    corner = affine[:3, 3] - affine[:3, :3].sum(1) / 2
+    place = {"origin": corner, "direction_matrix": affine[:3, :3] / steps}
+    image = pyvista.ImageData(dimensions=np.add(SIZES, 1), spacing=steps, **place)
+    image.cell_data["distance"] = sampled(affine).ravel("F")
+    image.save(path)
+
+
 def write_nrrd(path: Path, affine: np.ndarray) -> None:
     """Write NRRD in LPS."""
     import nrrd
@@ -237,6 +280,8 @@ def read_itk(path: Path) -> Reading:
     if path.is_dir():
         names = sitk.ImageSeriesReader.GetGDCMSeriesFileNames(names)
     image = sitk.ReadImage(names)
+    while image.GetDimension() > 3:
+        image = image[..., 0]
     direction = np.array(image.GetDirection()).reshape(3, 3)
     affine = affine_of(direction, image.GetSpacing(), image.GetOrigin())
     return sitk.GetArrayFromImage(image).T, affine
@@ -249,12 +294,23 @@ def read_itk_ras(path: Path) -> Reading:
 
 
 def read_vtk(path: Path) -> Reading:
-    """Return image data."""
+    """Return image data of points or cells."""
     import pyvista
 
     image = pyvista.read(path)
     affine = affine_of(np.array(image.direction_matrix), image.spacing, image.origin)
-    return image["distance"].reshape(image.dimensions, order="F"), affine
+    of_cells = len(image.cell_data)
+    affine[:3, 3] = image.cell_centers().points[0] if of_cells else image.points[0]
+    sizes = tuple(np.array(image.dimensions) - of_cells)
+    return np.asarray(image["distance"]).reshape(sizes, order="F"), affine
+
+
+def read_nibabel(path: Path) -> Reading:
+    """Return what nibabel makes of a file."""
+    import nibabel
+
+    image = nibabel.load(path)
+    return np.asarray(image.dataobj), image.affine.copy()
 
 
 def read_h5py_vtk(path: Path) -> Reading:
@@ -372,11 +428,26 @@ FROM, PLACED, ORDER = {"origin": CORNER}, {"origin": CORNER, "spacing": STEPS}, 
 ROWS = [
     Row("turned.nii", "nibabel", ITK, write_nibabel, read_itk_ras),
     Row("turned.nii.gz", "nibabel", ITK, write_nibabel, read_itk_ras),
+    Row("second-turned.nii", "nibabel", "nibabel", write_second_nifti, read_nibabel),
+    Row(
+        "codes-0.nii",
+        "nibabel",
+        ITK,
+        write_unplaced_nifti,
+        read_analyze,
+        STRAIGHT,
+        FROM,
+        ASPECTS[1:],
+    ),
     Row("turned.nrrd", "pynrrd", ITK, write_nrrd, read_itk),
     Row("turned.nhdr", "pynrrd", ITK, write_nrrd, read_itk),
+    Row("mins.nrrd", "pynrrd", ITK, write_spaced_nrrd, read_itk, STRAIGHT),
+    Row("list-turned.nrrd", "pynrrd", ITK, write_spaced_nrrd, read_itk),
+    Row("turned-itk.nrrd", ITK, ITK, write_itk, read_itk),
     Row("turned.mha", ITK, ITK, write_itk, read_itk),
     Row("turned.mhd", ITK, ITK, write_itk, read_itk),
     Row("turned.vti", "VTK", "VTK", write_vtk, read_vtk),
+    Row("cells-turned.vti", "VTK", "VTK", write_cells, read_vtk),
     Row("imagej.tif", "tifffile", ITK, write_tiff, read_tiff, STRAIGHT, FROM, ORDER),
     Row("stack.ome.tif", "tifffile", ITK, write_tiff, read_tiff, STRAIGHT, FROM, ORDER),
     Row("turned-itk.h5", ITK, ITK, write_itk, read_itk),

@@ -19,12 +19,18 @@ MODULES = {
 READERS = {
     "fields.vti": {"vtkmodules"},
     "files.images": {"vtkmodules"},
+    "files.readers.dicom": {"pydicom"},
     "files.readers.hdf5": {"h5py"},
+    "files.readers.matlab": {"h5py", "scipy"},
+    "files.readers.mrc": {"mrcfile"},
+    "files.readers.netcdf": {"h5py", "scipy"},
+    "files.readers.nibabel_files": {"nibabel"},
     "files.readers.nifti": {"nibabel"},
     "files.readers.nrrd_file": {"nrrd"},
     "files.readers.tiff": {"tifffile"},
     "files.readers.vdb_tree": {"numcodecs"},
     "files.readers.vti": {"vtkmodules"},
+    "files.readers.vtk_files": {"vtkmodules"},
     "files.readers.zarr_store": {"zarr"},
     "pyvista": {"pyvista"},
 }

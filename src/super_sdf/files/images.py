@@ -5,8 +5,6 @@ from __future__ import annotations
 from math import prod
 from typing import Any
 
-import numpy as np
-
 from ..errors import GridError, OptionTypeError, seen
 from ..grid.field import Wanted
 from ..grid.sdf_grid import SdfGrid, make_grid
@@ -63,25 +61,12 @@ def grid_from_image(
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     array, of_points = _choose_array(image, scalars)
-    lattice = lattice_of(image, of_points)
+    lattice = ImageLattice.of_image(image, of_points)
     _check_array(array, prod(lattice.shape))
     values = vtk_to_numpy(array).reshape(lattice.shape)
     volume = lattice.volume(values.dtype, lambda first, last: values[first:last])
     found = take(volume, NAME, unpacking_room(max_memory), PLACE_OF_FILE)
     return make_grid(**found, inside=inside, field=field, label=label, level=level, scale=scale)
-
-
-def lattice_of(image: Any, of_points: bool) -> ImageLattice:
-    """Return where the samples of an image lie."""
-    matrix = image.GetDirectionMatrix()
-    direction = [[matrix.GetElement(row, column) for column in range(3)] for row in range(3)]
-    return ImageLattice(
-        image.GetExtent(),
-        np.array(image.GetSpacing()),
-        np.array(image.GetOrigin()),
-        np.array(direction),
-        of_points,
-    )
 
 
 def _choose_array(image: Any, scalars: str | None) -> tuple[Any, bool]:

@@ -185,6 +185,14 @@ class ImageLattice:
     direction: NDArray[np.float64]
     of_points: bool
 
+    @classmethod
+    def of_image(cls, image: Any, of_points: bool) -> ImageLattice:
+        """Return where the samples of VTK's image data lie, at its points or in its cells."""
+        matrix = image.GetDirectionMatrix()
+        direction = [[matrix.GetElement(row, column) for column in range(3)] for row in range(3)]
+        spacing, origin = np.array(image.GetSpacing()), np.array(image.GetOrigin())
+        return cls(image.GetExtent(), spacing, origin, np.array(direction), of_points)
+
     @property
     def shape(self) -> tuple[int, ...]:
         """Shape (nz, ny, nx) of the array of samples: x is the fastest."""

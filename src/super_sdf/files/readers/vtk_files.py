@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 
 from ...errors import FileError, GridError
-from ..images import lattice_of
 from ..volume import XYZ, ImageLattice, Request, Volume
 from .choosing import choose_member
 
 RESAMPLE = (
-    "resample it with python -c \"import numpy as n, pyvista as v; m = v.read('{0}'); d = n.array("
-    "m.dimensions); b = n.reshape(m.bounds, (3, 2)); v.ImageData(dimensions=d, spacing=(b[:, 1] - "
-    "b[:, 0]) / (d - 1), origin=b[:, 0]).sample(m).save('{1}.vti')\", and give {1}.vti:{2}"
+    'make .npz with python -c "import numpy as n, pyvista as v; from scipy.interpolate import '
+    "interpn as f; m = v.read('{0}'); a = m.x, m.y, m.z; e = [n.linspace(c[0], c[-1], len(c)) for "
+    "c in a]; w = m['{2}'].reshape(m.dimensions, order='F'); n.savez('{1}.npz', values=f(a, w, "
+    "tuple(n.meshgrid(*e, indexing='ij'))), spacing=[c[1] - c[0] for c in e], origin=[c[0] for c "
+    'in e])"'
 )
 # Lines of text between the values of arrays: keywords, or name, counts and type of an array.
 BETWEEN = re.compile(rb"^(?:[A-Z_]{4,}.*|\S+ \d+ \d+ [a-zA-Z_]+\s*)$", re.M)
@@ -100,7 +101,7 @@ def _lattice(image: Any, of_points: bool, name: str, path: Path) -> ImageLattice
         If they are no lattice, with the command that makes one.
     """
     if image.IsA("vtkImageData"):
-        return lattice_of(image, of_points)
+        return ImageLattice.of_image(image, of_points)
     if not image.IsA("vtkRectilinearGrid"):
         raise GridError(
             f"it holds {image.GetClassName()}, no image data: sample its distances on a lattice, "
