@@ -40,8 +40,9 @@ def read_hdf5(request: Request) -> Volume:
             found.append(f"/{name}")
 
     file.visititems(note)
-    values = _open(file, choose_member(request, found, "3D dataset"), request)
-    space, place = placed(_axes(values), dict(values.attrs), values.shape, request.axes)
+    values = file[choose_member(request, found, "3D dataset")]
+    _check_stored(values, request)
+    space, place = placed(_axes(values, request), dict(values.attrs), values.shape, request.axes)
     shape = tuple(values.shape[axis] for axis in space)
 
     def stored(box: Box) -> NDArray[Any]:
@@ -63,7 +64,7 @@ def _may_be_grid(shape: tuple[int, ...] | None) -> bool:
     return shape is not None and len(shape) >= 3 >= sum(count > 1 for count in shape)
 
 
-def _axes(values: Any) -> Axes:
+def _axes(values: Any, request: Request) -> Axes:
     """Return what a dataset says of its axes: by ``axistags``, as ilastik writes them, or scales.
 
     An axis has the name of its label, or of the first scale that is attached to it.
@@ -80,30 +81,31 @@ def _axes(values: Any) -> Axes:
     ]
 
     def coordinates(axis: int) -> tuple[NDArray[Any] | None, dict[str, Any]]:
-        return _coordinates(scales[axis], values.shape[axis])
+        return _coordinates(scales[axis], values.shape[axis], request)
 
     return Axes.of_coordinates(names, values.shape, coordinates)
 
 
-def _coordinates(scale: Any, count: int) -> tuple[NDArray[Any] | None, dict[str, Any]]:
+def _coordinates(
+    scale: Any, count: int, request: Request
+) -> tuple[NDArray[Any] | None, dict[str, Any]]:
     """Return the coordinates in a dimension scale, None if it has only a name, and attributes."""
     if scale is None or scale.shape != (count,):
         return None, {}
+    _check_stored(scale, request)
     about = dict(scale.attrs)
     return (None if NO_COORDINATES in bytes(about.get("NAME", b"")) else scale[:]), about
 
 
-def _open(file: Any, name: str, request: Request) -> Any:
-    """Return a dataset whose raw data files, if there are any, lie beside the file."""
-    values = file[name]
+def _check_stored(values: Any, request: Request) -> None:
+    """Raise FileError if the numbers of a dataset come from files that lie elsewhere."""
     if values.is_virtual:
         raise FileError(
-            f"{request.path}:{name} is a virtual dataset, put together of others: save its values "
-            "as a dataset of their own"
+            f"{request.path}:{values.name} is a virtual dataset, put together of others: save its "
+            "values as a dataset of their own"
         )
     for raw, _, _ in values.external or ():
         check_beside(request.path, raw)
-    return values
 
 
 def _absent(values: Any) -> tuple[int, int]:
