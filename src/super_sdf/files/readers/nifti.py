@@ -86,10 +86,10 @@ def _place(header: Any, shape: tuple[int, ...]) -> tuple[Any, tuple[str, ...]]:
         return (np.abs(header.get_zooms()[:3]), None, XYZ), (*notes, said)
     if min(codes) > 0:
         corners = np.array(list(product(*((0, size - 1) for size in shape), [1])))
-        off = np.inf
+        off = 0.0
         with suppress(ValueError):  # if the qform is no rotation
             off = np.abs(corners @ (header.get_sform() - header.get_qform()).T).max()
-        if not off <= ASTRAY * min(header.get_zooms()[:3]):
+        if off > ASTRAY * min(header.get_zooms()[:3]):
             notes += (
                 f"its sform (code {codes[0]}) and qform (code {codes[1]}) place a corner {off:.3g} "
                 "apart: the sform is taken, as nibabel does; ITK may take the qform",
