@@ -292,6 +292,19 @@ def test_names_that_are_not_x_y_z_are_told():
     assert grid.notes[0] == "its axes are named z, ?, ?: taken as z, y, x"
 
 
+@pytest.mark.parametrize("version", [2, 3])
+def test_an_attribute_says_which_axis_coordinates_are_of(version):
+    """As in climate and forecast data."""
+    names = {"x": "lon", "y": "lat", "z": "lev"}
+    array = placed("yxz", "y").rename(names)
+    for name, other in names.items():
+        array[other].attrs["axis"] = name.upper()
+    array.to_dataset().to_zarr("a.zarr", zarr_format=version)
+    grid = read_grid("a.zarr")
+    check(grid)
+    assert not [note for note in grid.notes if "named" in note]
+
+
 def test_a_direction_that_is_given_holds_for_named_axes():
     turn = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
     options = {"spacing": STEPS, "origin": FIRST, "direction": turn}

@@ -150,6 +150,20 @@ def test_raw_data_of_hdf5_is_read_beside_the_file(values, tmp_path, monkeypatch)
     assert refusal("deep/a.h5").endswith("deep/a.raw is a named pipe: give a file")
 
 
+def test_coordinates_in_other_files_lie_beside_the_file(values):
+    os.mkdir("deep")
+    np.arange(float(values.shape[2])).tofile("z.raw")
+    with h5py.File("deep/a.h5", "w") as file:
+        file["d"] = values.T
+        raw = [("../z.raw", 0, 8 * values.shape[2])]
+        scale = file.create_dataset("z", (values.shape[2],), "f8", external=raw)
+        scale.make_scale("z")
+        file["d"].dims[0].attach_scale(scale)
+    assert refusal("deep/a.h5") == (
+        "deep/a.h5 names the file '../z.raw', which is not in its folder: put both into one folder"
+    )
+
+
 def test_virtual_datasets_are_refused(values):
     with h5py.File("b.h5", "w") as file:
         file["d"] = values

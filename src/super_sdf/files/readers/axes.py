@@ -90,23 +90,25 @@ class Axes:
     ) -> Axes:
         """Return the axes of an array by their coordinates.
 
-        ``found`` returns those of an axis in space, or None, and their attributes.
+        ``found`` returns those of an axis in space, or None, and their attributes, of which
+        ``axis`` names an axis that has another name, and ``units`` states the unit.
 
         Raises
         ------
         GridError
             If coordinates are not evenly spaced numbers, or as in ``in_space``.
         """
-        axes = cls.named(names)
+        axes, called = cls.named(names), list(names)
         units, steps, starts = (list(each) for each in (axes.units, axes.steps, axes.starts))
         for axis in axes.in_space(shape):
             places, about = found(axis)
             if places is None or len(places) < 2:
                 continue
             starts[axis], steps[axis] = even_steps(names[axis], places)
-            unit = about.get("units", "")
-            units[axis] = unit.decode() if isinstance(unit, bytes) else str(unit)
-        return cls.named(names, tuple(units), tuple(steps), tuple(starts))
+            units[axis], called[axis] = _text(about, "units"), _text(about, "axis") or names[axis]
+        stated = tuple(units), tuple(steps), tuple(starts)
+        made = cls.named(called, *stated)
+        return made if made.are_in_space and not axes.are_in_space else cls.named(names, *stated)
 
     @property
     def are_in_space(self) -> bool:
@@ -165,6 +167,12 @@ class Axes:
         origin = None if None in starts else _triple(known * factors)
         lengths = np.abs(np.array([self.steps[axis] for axis in space], np.float64))
         return (_triple(lengths * (np.abs(direction).T @ factors)), origin, direction), notes
+
+
+def _text(attributes: dict[str, Any], name: str) -> str:
+    """Return an attribute as text, "" if there is none."""
+    found = attributes.get(name, "")
+    return found.decode() if isinstance(found, bytes) else str(found)
 
 
 def _triple(numbers: Any) -> Triple:

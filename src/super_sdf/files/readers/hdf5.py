@@ -19,7 +19,7 @@ from ..regular import check_beside
 from ..volume import Request, Volume, reversed_axes
 from .axes import Axes
 from .choosing import choose_member
-from .stored import along, axis_name, placed, unscaled, without_gaps
+from .stored import along, placed, unscaled, without_gaps
 
 NO_COORDINATES = b"This is a netCDF dimension but not a netCDF variable"
 
@@ -42,18 +42,21 @@ def read_hdf5(request: Request) -> Volume:
     file.visititems(note)
     if "ITKImage" in file:
         return _read_itk(file, request)
-    values = open_dataset(file, choose_member(request, found, "3D dataset"), request)
-    return volume_of(values, *placed(_axes(values), dict(values.attrs), values.shape, request.axes))
+    values = file[choose_member(request, found, "3D dataset")]
+    check_stored(values, request)
+    return volume_of(
+        values, *placed(_axes(values, request), dict(values.attrs), values.shape, request.axes)
+    )
 
 
 def _read_itk(file: Any, request: Request) -> Volume:
     """Read an image that ITK wrote: in LPS, with a direction a row."""
     image = file["ITKImage/0"]
-    values = open_dataset(file, "/ITKImage/0/VoxelData", request)
+    check_stored(image["VoxelData"], request)
     spacing, direction = reversed_axes(image["Spacing"][:], image["Directions"][:].T)
     origin = tuple(image["Origin"][:].tolist())
     place = {"spacing": spacing, "origin": origin, "direction": direction}
-    return volume_of(values, list(range(3)), place)
+    return volume_of(image["VoxelData"], list(range(3)), place)
 
 
 def volume_of(values: Any, space: list[int], place: dict[str, Any]) -> Volume:
@@ -79,7 +82,7 @@ def may_be_grid(shape: tuple[int, ...] | None) -> bool:
     return shape is not None and len(shape) >= 3 >= sum(count > 1 for count in shape)
 
 
-def _axes(values: Any) -> Axes:
+def _axes(values: Any, request: Request) -> Axes:
     """Return what a dataset says of its axes: by ``axistags``, as ilastik writes them, or scales.
 
     An axis has the name of its label, or of the first scale that is attached to it.
@@ -94,36 +97,33 @@ def _axes(values: Any) -> Axes:
         dim.label or ("" if scale is None else (scale.name or "").rsplit("/", 1)[-1])
         for dim, scale in zip(values.dims, scales)
     ]
-    names = [
-        name if scale is None else axis_name(dict(scale.attrs), name)
-        for name, scale in zip(names, scales)
-    ]
 
     def coordinates(axis: int) -> tuple[NDArray[Any] | None, dict[str, Any]]:
-        return _coordinates(scales[axis], values.shape[axis])
+        return _coordinates(scales[axis], values.shape[axis], request)
 
     return Axes.of_coordinates(names, values.shape, coordinates)
 
 
-def _coordinates(scale: Any, count: int) -> tuple[NDArray[Any] | None, dict[str, Any]]:
+def _coordinates(
+    scale: Any, count: int, request: Request
+) -> tuple[NDArray[Any] | None, dict[str, Any]]:
     """Return the coordinates in a dimension scale, None if it has only a name, and attributes."""
     if scale is None or scale.shape != (count,):
         return None, {}
+    check_stored(scale, request)
     about = dict(scale.attrs)
     return (None if NO_COORDINATES in bytes(about.get("NAME", b"")) else scale[:]), about
 
 
-def open_dataset(file: Any, name: str, request: Request) -> Any:
-    """Return a dataset whose raw data files, if there are any, lie beside the file."""
-    values = file[name]
+def check_stored(values: Any, request: Request) -> None:
+    """Raise FileError if the numbers of a dataset come from files that lie elsewhere."""
     if values.is_virtual:
         raise FileError(
-            f"{request.path}:{name} is a virtual dataset, put together of others: save its values "
-            "as a dataset of their own"
+            f"{request.path}:{values.name} is a virtual dataset, put together of others: save its "
+            "values as a dataset of their own"
         )
     for raw, _, _ in values.external or ():
         check_beside(request.path, raw)
-    return values
 
 
 def _absent(values: Any) -> tuple[int, int]:

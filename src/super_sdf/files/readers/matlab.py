@@ -13,7 +13,7 @@ import numpy as np
 from ..volume import Request, Volume
 from .axes import Axes
 from .choosing import choose_member
-from .hdf5 import open_dataset, volume_of
+from .hdf5 import check_stored, volume_of
 from .stored import placed
 
 PLACE = ("spacing", "origin", "direction")
@@ -57,7 +57,8 @@ def _read_73(request: Request) -> Volume:
         return kind in map(str.encode, NUMBERS) and len(file[name].shape) == 3
 
     names = [name for name in file if isinstance(file[name], h5py.Dataset) and is_array(name)]
-    values = open_dataset(file, choose_member(request, names, "array of three axes"), request)
+    values = file[choose_member(request, names, "array of three axes")]
+    check_stored(values, request)
     stated = {key: np.transpose(file[key][()]) for key in PLACE if key in file}
     return volume_of(values, *_placed(stated, values.shape, request))
 

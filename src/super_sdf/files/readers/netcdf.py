@@ -15,7 +15,7 @@ from ..volume import Request, Volume
 from .axes import Axes
 from .choosing import choose_member
 from .hdf5 import may_be_grid, read_hdf5
-from .stored import along, axis_name, placed, unscaled
+from .stored import along, placed, unscaled
 
 
 def read_netcdf(request: Request) -> Volume:
@@ -57,5 +57,4 @@ def _axes(values: Any, scales: list[Any]) -> Axes:
         scale = scales[axis]
         return (None if scale is None else np.array(scale.data)), about[axis]
 
-    names = [axis_name(a, name) for a, name in zip(about, values.dimensions)]
-    return Axes.of_coordinates(names, values.shape, found)
+    return Axes.of_coordinates(values.dimensions, values.shape, found)

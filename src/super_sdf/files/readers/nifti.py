@@ -6,6 +6,7 @@ The extensions after the header are passed over: nibabel loads as much as they c
 from __future__ import annotations
 
 import gzip
+from contextlib import suppress
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from ..unpacking import PIECE
 from ..volume import XYZ, Request, Volume, from_affine, reversed_axes
 
 SIZES = 348, 540  # bytes of the headers of NIfTI-1 and NIfTI-2
-UNITS = {"meter": "metre", "micron": "micrometre"}  # but for millimetres, by nibabel's names
+UNITS = {1: "metre", 3: "micrometre"}  # of lengths, but for millimetres
 ASTRAY = 0.1  # of a voxel: how far sform and qform may place a corner apart without a note
 MOST_DEFLATED = 1100  # deflate reaches 1,030 on zeros
 
@@ -103,7 +104,7 @@ def _header(nibabel: Any, stream: Any) -> Any:
 
 def place_of(header: Any) -> tuple[Any, tuple[str, ...]]:
     """Return spacing, origin and direction of the axes x, y, z, and notes on what was chosen."""
-    unit = UNITS.get(header.get_xyzt_units()[0])
+    unit = UNITS.get(int(header["xyzt_units"]) & 7)
     notes: tuple[str, ...] = ()
     if unit:
         notes = (f"lengths are in the unit that it states, {unit}",)
@@ -113,13 +114,14 @@ def place_of(header: Any) -> tuple[Any, tuple[str, ...]]:
             "it states no place (sform_code and qform_code are 0): its axes are taken as x, y and "
             "z, as ITK does; nibabel would mirror x"
         )
-        return (header.get_zooms()[:3], None, XYZ), (*notes, said)
+        return (np.abs(header.get_zooms()[:3]), None, XYZ), (*notes, said)
     if min(codes) > 0:
-        corners = np.array(
-            list(product(*((0, size - 1) for size in header.get_data_shape()[:3]), [1]))
-        )
-        off = np.abs(corners @ (header.get_sform() - header.get_qform()).T).max()
-        if not off <= ASTRAY * min(header.get_zooms()[:3]):
+        sizes = header.get_data_shape()[:3]
+        corners = np.array(list(product(*((0, size - 1) for size in sizes), [1])))
+        off = 0.0
+        with suppress(ValueError):  # if the qform is no rotation
+            off = np.abs(corners @ (header.get_sform() - header.get_qform()).T).max()
+        if off > ASTRAY * min(header.get_zooms()[:3]):
             notes += (
                 f"its sform (code {codes[0]}) and qform (code {codes[1]}) place a corner {off:.3g} "
                 "apart: the sform is taken, as nibabel does; ITK may take the qform",

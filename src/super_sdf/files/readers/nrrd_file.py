@@ -160,7 +160,8 @@ def _place(
 
     None stands for what is not stated. A ``space origin`` holds beside ``spacings``, too.
     """
-    origin, notes = header.get("space origin"), ()
+    notes: tuple[str, ...] = ()
+    origin = header.get("space origin")
     directions, units = header.get("space directions"), header.get("space units", ())
     if directions is None:
         steps, low = _steps(header, space)

@@ -63,12 +63,6 @@ def along(space: list[int], box: Sequence[slice], count: int) -> tuple[Any, ...]
     return tuple(where)
 
 
-def axis_name(attributes: dict[str, Any], name: str) -> str:
-    """Return the name of an axis: ``axis`` of its coordinates (X, Y or Z), else its own."""
-    stated = attributes.get("axis", name)
-    return stated.decode() if isinstance(stated, bytes) else str(stated)
-
-
 def _direction(attributes: dict[str, Any]) -> NDArray[np.float64]:
     """Return the attribute ``direction``, the identity if there is none."""
     if "direction" not in attributes:

@@ -98,6 +98,11 @@ class ZarrFiles:
                     found[path] = len(about.get("shape", ()))
         return found
 
+    def axes_of(self, path: str) -> int:
+        """Return the number of axes of an array, 0 if there is none at a path."""
+        documents = (self.document(f"{path}/{name}") for name in (ARRAY_2, NODE_3))
+        return max(len(about.get("shape", ())) for about in documents)
+
     def attributes(self, path: str) -> Document:
         """Return the attributes of an array or a group."""
         before = f"{path}/" if path else ""

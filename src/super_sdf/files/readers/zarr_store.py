@@ -120,7 +120,7 @@ def _named_axes(files: ZarrFiles, name: str, array: Any, request: Request) -> Ax
 
     def coordinates(axis: int) -> tuple[NDArray[Any] | None, dict[str, Any]]:
         path = f"{group}/{names[axis]}".lstrip("/")
-        if not name or not names[axis] or files.arrays().get(path) != 1:
+        if not name or not names[axis] or files.axes_of(path) != 1:
             return None, {}
         files.check_codecs(path)
         places = _open(request, path)
