@@ -1,0 +1,273 @@
+"""Distance transforms of masks: what tells them from exact distances.
+
+The values of a transform follow from the sides of the samples: each is the distance to the nearest
+sample of another side, in the world or on the lattice, by whatever measure, perhaps squared, less
+half a voxel or a whole one, or clipped. Exact distances know where between two samples the surface
+is, so they are others. Only those to a solid with all its faces on samples are the same, in which
+the samples on the surface are 0. Then the surface of a mask shows by its steps: they are one sample
+high wherever it is not along the axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from itertools import combinations, product
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import BoolArray, Triple
+from .evidence import BESIDE, Floats, Looked
+from .spacing import is_cubic
+
+LEAST = 20  # samples from which shares of them are evidence
+MOST, MOST_APART = 0.98, 0.95  # shares of the samples that follow from the sides
+ERROR = 2e-3  # of values
+ZERO = 1e-3  # of the step: up to this, values are 0
+# Share of the samples beside the surface from which on they are at the steps of a mask, and ways in
+# which those of stairs may go.
+STEPPED, MOST_FLIGHTS = 0.05, 2
+
+AROUND = np.array(list(product(range(-BESIDE, BESIDE + 1), repeat=3)))
+INNER = slice(1, -1)
+Measure: TypeAlias = Callable[[NDArray[np.int64]], Floats]
+"""From offsets between samples, (n, 3), to their lengths, (n,); 1 to the nearest sample."""
+
+
+@dataclass(frozen=True)
+class Transform:
+    """A distance transform of a mask.
+
+    Attributes
+    ----------
+    step : float
+        The spacing of the finest axis, in the unit of the values.
+    zeros : int
+        The sign of the side to which samples that are 0 belong; 0 if it is the inside.
+    """
+
+    step: float
+    zeros: int
+
+
+def find_transform(looked: Looked, spacing: Triple | None) -> Transform | None:
+    """Return what transform of a mask values are, None if they cannot be one.
+
+    Parameters
+    ----------
+    looked : Looked
+        Samples beside the surface.
+    spacing : three floats, optional
+        The spacing of each axis, if it is known.
+    """
+    steps = np.ones(3) if spacing is None or is_cubic(spacing) else np.array(spacing)
+    steps = steps / steps.min()
+    either = (_beside(looked.patches, side, steps) for side in (looked.patches <= 0, looked.patches < 0))
+    ends = next((ends for ends in either if ends), None)
+    if ends is None:
+        return None
+    low, high = ends
+    unit = max(low, high)
+    patches = looked.patches / unit
+    patches[np.abs(patches) < ZERO] = 0
+    clipped = [abs(end) / unit for end in looked.extremes]
+    if min(low, high) > ZERO * unit:
+        return _of_both_sides(patches, steps, clipped, unit)
+    units = [1, 3] if spacing is None else [1, 3, min(spacing), min(spacing) ** 2]
+    is_usual = bool(np.isclose(unit, units, rtol=ERROR).any())
+    return _with_zeros(patches, steps, clipped, unit, low < high, is_usual)
+
+
+def _beside(patches: Floats, inside: BoolArray, steps: Floats) -> tuple[float, float] | None:
+    """Return how far samples below and above 0 beside the other side are from it, if all alike.
+
+    No sample of the other side is nearer than that along the finest axes.
+    """
+    beside = np.zeros(len(patches), bool)
+    for axis in np.flatnonzero(steps < 1 + ZERO):
+        line = np.moveaxis(inside, axis + 1, 1)[:, 1:4, BESIDE, BESIDE]
+        beside |= (line != line[:, 1:2]).any(1)
+    centre, is_in = (x[beside, BESIDE, BESIDE, BESIDE] for x in (patches, inside))
+    ends = []
+    for side in (-centre[is_in], centre[~is_in]):
+        middle = float(np.median(side)) if len(side) else 0.0
+        alike = np.abs(side - middle) <= ERROR * np.abs(centre).max(initial=0)
+        if len(side) < LEAST // 2 or alike.mean() < MOST:
+            return None
+        ends.append(middle)
+    is_one = max(ends) > 0 and (min(ends) <= ZERO * max(ends) or np.isclose(*ends, rtol=ERROR))
+    return (ends[0], ends[1]) if is_one else None
+
+
+def _of_both_sides(
+    patches: Floats, steps: Floats, clipped: list[float], unit: float
+) -> Transform | None:
+    """Return the transform if values jump from one side to the other, by a voxel or by two."""
+    for measure in (*_euclidean(steps), *_squared(steps), *_of_weights()):
+        if _follow(patches, np.sign(patches), measure, (0, 0), clipped, surely=False):
+            return Transform(unit, 0)
+    patches, clipped = patches / 2, [end / 2 for end in clipped]
+    for measure in _euclidean(steps):
+        if _follow(patches, np.sign(patches), measure, (0.5, 0.5), clipped):
+            return Transform(2 * unit, 0)
+    return None
+
+
+def _with_zeros(
+    patches: Floats,
+    steps: Floats,
+    clipped: list[float],
+    unit: float,
+    below: bool,
+    is_usual: bool,
+) -> Transform | None:
+    """Return the transform if the samples beside the surface are 0 on one side.
+
+    ``below`` says whether it is that of the negative values, ``is_usual`` whether the unit is one
+    of measures that are not Euclidean.
+    """
+    own, sign = np.sign(patches), -1 if below else 1
+    one_sided = not (clipped[0] and clipped[1])
+    for measure in _euclidean(steps):
+        joined = np.where(own == 0, sign, own)
+        less = (1.0, 0.0) if below else (0.0, 1.0)
+        nearest_zero = _follow(patches, own, measure, (0, 0), clipped, surely=False)
+        if nearest_zero and (_is_filled(own) or _is_stepped(own)):
+            return Transform(unit, _side_of_zeros(own) if not one_sided else sign)
+        if not nearest_zero and _follow(patches, joined, measure, less, clipped):
+            return Transform(unit, sign)
+    others = (*_squared(steps), *(_of_weights() if one_sided else ())) if is_usual else ()
+    for measure in others:
+        if _follow(patches, own, measure, (0, 0), clipped) and (_is_filled(own) or _is_stepped(own)):
+            return Transform(unit, _side_of_zeros(own) if not one_sided else sign)
+    return None
+
+
+def _euclidean(steps: Floats) -> Iterator[Measure]:
+    """Yield the Euclidean measures: in the world, and on the lattice if it is another one."""
+    yield partial(_length, steps)
+    if steps.max() > 1 + ZERO:
+        yield partial(_length, np.ones(3))
+
+
+def _squared(steps: Floats) -> Iterator[Measure]:
+    """Yield their squares."""
+    for length in _euclidean(steps):
+        yield lambda offsets, length=length: length(offsets) ** 2  # type: ignore[misc]
+
+
+def _of_weights() -> Iterator[Measure]:
+    """Yield the chessboard, city-block, and 3-4-5 chamfer measures."""
+    for weight in (0, 1, 1 / 3):
+        yield partial(_weighted, weight)
+
+
+def _length(steps: Floats, offsets: NDArray[np.int64]) -> Floats:
+    lengths: Floats = np.linalg.norm(offsets * steps, axis=1)
+    return lengths
+
+
+def _weighted(weight: float, offsets: NDArray[np.int64]) -> Floats:
+    """Return the largest part of each offset, and the others by weight."""
+    size = np.abs(offsets)
+    lengths: Floats = size.max(1) * (1 - weight) + size.sum(1) * weight
+    return lengths
+
+
+def _follow(
+    patches: Floats,
+    sides: Floats,
+    measure: Measure,
+    less: tuple[float, float],
+    clipped: list[float],
+    *,
+    surely: bool = True,
+) -> bool:
+    """Return whether values follow from the sides, ``less`` something on either side.
+
+    ``clipped`` are the largest values. ``surely`` asks for samples whose nearest ones of another
+    side are not along an axis: there exact distances half-way between samples are others.
+    """
+    nearest, straight = _nearest(sides, measure)
+    values = patches[:, INNER, INNER, INNER].reshape(nearest.shape)
+    nearest = nearest - np.where(values < 0, *less)
+    expected = np.minimum(nearest, np.where(values < 0, *clipped))
+    known = np.isfinite(expected) & (values != 0)
+    agree = np.abs(np.abs(values) - expected) <= ERROR * np.maximum(expected, 1)
+    apart = known & ~straight & (expected > nearest - ERROR)
+    if surely and apart.sum() < LEAST:
+        return False
+    return all(
+        which.sum() < LEAST or agree[which].mean() >= share
+        for which, share in ((known, MOST), (apart, MOST_APART))
+    )
+
+
+def _nearest(sides: Floats, measure: Measure) -> tuple[Floats, BoolArray]:
+    """Return how far the nearest sample of another side is, NaN if it may be out of the patch.
+
+    It is that of the inner samples, (m, 27); and whether it is along an axis.
+    """
+    flat = sides.reshape(len(sides), -1)
+    inner = AROUND[np.abs(AROUND).max(1) < BESIDE]
+    nearest, straight = np.full((2, len(sides), len(inner)), np.nan)
+    for number, place in enumerate(inner):
+        outermost = measure(np.diag(BESIDE + 1 - np.abs(place))).min()
+        lengths = measure(AROUND - place)
+        order = np.argsort(lengths, kind="stable")
+        order = order[lengths[order] < outermost * (1 + ERROR)]
+        other = flat[:, order] != flat[:, (AROUND == place).all(1)]
+        first = other.argmax(1)
+        nearest[:, number] = np.where(other.any(1), lengths[order][first], np.nan)
+        straight[:, number] = ((AROUND - place)[order] != 0).sum(1)[first] < 2
+    return nearest, straight != 0
+
+
+def _is_filled(sides: Floats) -> bool:
+    """Return whether there are zeros amid zeros, as on the other side of one-sided transforms."""
+    return int((~_windows(sides).any((-3, -2, -1))).sum()) >= LEAST
+
+
+def _windows(sides: Floats) -> Floats:
+    """Return the neighbours of inner samples and these, (m, 3, 3, 3, 3, 3, 3)."""
+    return np.lib.stride_tricks.sliding_window_view(sides, (3, 3, 3), axis=(1, 2, 3))
+
+
+def _is_stepped(sides: Floats) -> bool:
+    """Return whether the surface, where samples are 0, has the steps of a mask all round.
+
+    Beside a step, a sample is next to zeros along two axes, of which one does not go on. Of the
+    twelve ways in which these may lie, a flight of stairs has one.
+    """
+    centre = sides[:, BESIDE, BESIDE, BESIDE]
+    near = (sides == 0)[:, INNER, INNER, INNER]
+    zero = np.concatenate([near[centre > 0], near[centre < 0][:, ::-1, ::-1, ::-1]])
+    ways = [*np.eye(3, dtype=int), *-np.eye(3, dtype=int)]
+    next_to = [_at(zero, way) for way in ways]
+    stepped = [
+        next_to[i] & next_to[j] & ~(_at(zero, ways[i] - ways[j]) & _at(zero, ways[j] - ways[i]))
+        for i, j in combinations(range(6), 2)
+        if j != i + 3
+    ]
+    least = STEPPED * max(np.any(next_to, 0).sum(), LEAST)
+    sides_of_steps = sum(bool(way.sum() > least / 12) for way in stepped)
+    return bool(np.any(stepped, 0).sum() > least) and sides_of_steps > MOST_FLIGHTS
+
+
+def _at(patches: BoolArray, offset: NDArray[np.int64]) -> BoolArray:
+    """Return the samples at an offset from the middle of patches (m, 3, 3, 3)."""
+    found: BoolArray = patches[(..., *(1 + offset))]
+    return found
+
+
+def _side_of_zeros(sides: Floats) -> int:
+    """Return the sign of the side that zeros are the border of, 0 if that does not show.
+
+    Each of them has a neighbour of the other side then, but not of its own side.
+    """
+    zero = sides[:, INNER, INNER, INNER] == 0
+    lone = [int((zero & ~(_windows(sides) == sign).any((-3, -2, -1))).sum()) for sign in (-1, 1)]
+    return int(np.sign(lone[1] - lone[0]))
