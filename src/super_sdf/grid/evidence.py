@@ -182,7 +182,7 @@ def look(values: SampleArray, extremes: Extremes) -> Looked:
 def _look_at_plane(
     extremes: Extremes, slab: NDArray[Any], number: int
 ) -> tuple[NDArray[np.uint64], Floats, Floats, NDArray[np.int64], int]:
-    """Return ranks, lines and patches of samples of the middle of five planes; how many are cut off.
+    """Return ranks, lines and patches of the middle of five planes; how many are cut off, of all.
 
     ``number`` is that of the first sample of the middle plane.
     """
@@ -200,9 +200,7 @@ def _inner_planes(count: int) -> list[int]:
     return [int(i) for i in np.unique(spread)]
 
 
-def _round_surface(
-    slab: NDArray[Any], number: int
-) -> tuple[NDArray[np.uint64], Floats, Floats]:
+def _round_surface(slab: NDArray[Any], number: int) -> tuple[NDArray[np.uint64], Floats, Floats]:
     """Return five samples in a row along each axis, round samples beside one of another sign.
 
     ``slab`` has five planes; the samples are those of the middle one, (n,) ranks and (n, 3, 5).

@@ -50,8 +50,8 @@ def interpret(
     samples, extremes = _known(samples, request, notes)
     check_not_constant(extremes)
     if has_two_values(samples, extremes):
-        middle = 0.0 if request.is_density else sum(extremes) / 2
-        return masking.of_mask(masking.above(samples, middle), request, notes)
+        lower = 0.0 if request.is_density else extremes[0]
+        return masking.of_mask(masking.above(samples, lower), request, notes)
     if wanted.field == MASK:
         return masking.of_signs(samples, extremes, request, notes)
     if wanted.field in (EXACT, NOISY):

@@ -29,7 +29,7 @@ ERROR = 2e-3  # of values
 ZERO = 1e-3  # of the step: up to this, values are 0
 # Share of the samples beside the surface from which on they are at the steps of a mask, and ways in
 # which those of stairs may go.
-STEPPED, MOST_FLIGHTS = 0.05, 2
+STEPPED, MOST_FLIGHTS = 0.04, 2
 
 AROUND = np.array(list(product(range(-BESIDE, BESIDE + 1), repeat=3)))
 INNER = slice(1, -1)
@@ -53,6 +53,24 @@ class Transform:
     zeros: int
 
 
+@dataclass(frozen=True)
+class Found:
+    """What was seen of values that follow from the sides, where exact distances may not.
+
+    Attributes
+    ----------
+    apart : bool
+        Whether there are samples whose nearest one of another side is not along an axis. Exact
+        distances to planes half-way between samples are others there.
+    beyond : bool
+        Whether it is along an axis for some, but not next to them: other than of planes at 45
+        degrees.
+    """
+
+    apart: bool
+    beyond: bool
+
+
 def find_transform(looked: Looked, spacing: Triple | None) -> Transform | None:
     """Return what transform of a mask values are, None if they cannot be one.
 
@@ -65,20 +83,18 @@ def find_transform(looked: Looked, spacing: Triple | None) -> Transform | None:
     """
     steps = np.ones(3) if spacing is None or is_cubic(spacing) else np.array(spacing)
     steps = steps / steps.min()
-    either = (_beside(looked.patches, side, steps) for side in (looked.patches <= 0, looked.patches < 0))
-    ends = next((ends for ends in either if ends), None)
+    sides = looked.patches <= 0, looked.patches < 0
+    ends = next(filter(None, (_beside(looked.patches, side, steps) for side in sides)), None)
     if ends is None:
         return None
-    low, high = ends
-    unit = max(low, high)
-    patches = looked.patches / unit
+    unit = max(ends)
+    patches, clipped = looked.patches / unit, np.abs(looked.extremes) / unit
     patches[np.abs(patches) < ZERO] = 0
-    clipped = [abs(end) / unit for end in looked.extremes]
-    if min(low, high) > ZERO * unit:
+    if clipped.max() < 1 + ERROR:  # two values, perhaps of labels
+        return None
+    if min(ends) > ZERO * unit:
         return _of_both_sides(patches, steps, clipped, unit)
-    units = [1, 3] if spacing is None else [1, 3, min(spacing), min(spacing) ** 2]
-    is_usual = bool(np.isclose(unit, units, rtol=ERROR).any())
-    return _with_zeros(patches, steps, clipped, unit, low < high, is_usual)
+    return _with_zeros(patches, steps, clipped, unit, -1 if ends[0] < ends[1] else 1)
 
 
 def _beside(patches: Floats, inside: BoolArray, steps: Floats) -> tuple[float, float] | None:
@@ -103,66 +119,63 @@ def _beside(patches: Floats, inside: BoolArray, steps: Floats) -> tuple[float, f
 
 
 def _of_both_sides(
-    patches: Floats, steps: Floats, clipped: list[float], unit: float
+    patches: Floats, steps: Floats, clipped: Floats, unit: float
 ) -> Transform | None:
-    """Return the transform if values jump from one side to the other, by a voxel or by two."""
-    for measure in (*_euclidean(steps), *_squared(steps), *_of_weights()):
-        if _follow(patches, np.sign(patches), measure, (0, 0), clipped, surely=False):
-            return Transform(unit, 0)
-    patches, clipped = patches / 2, [end / 2 for end in clipped]
-    for measure in _euclidean(steps):
-        if _follow(patches, np.sign(patches), measure, (0.5, 0.5), clipped):
-            return Transform(2 * unit, 0)
+    """Return the transform if values jump from one side to the other, by two voxels or by one."""
+    sides = np.sign(patches)
+    for measure, step in (*_euclidean(steps, unit), *_others(steps, unit, weighted=True)):
+        if _follow(patches, sides, measure, (0, 0), clipped):
+            return Transform(step, 0)
+    for measure, step in _euclidean(steps, 2 * unit):
+        if (found := _follow(patches / 2, sides, measure, (0.5, 0.5), clipped / 2)) and found.apart:
+            return Transform(step, 0)
     return None
 
 
 def _with_zeros(
-    patches: Floats,
-    steps: Floats,
-    clipped: list[float],
-    unit: float,
-    below: bool,
-    is_usual: bool,
+    patches: Floats, steps: Floats, clipped: Floats, unit: float, side: int
 ) -> Transform | None:
-    """Return the transform if the samples beside the surface are 0 on one side.
+    """Return the transform if samples beside the surface are 0 on one side.
 
-    ``below`` says whether it is that of the negative values, ``is_usual`` whether the unit is one
-    of measures that are not Euclidean.
+    ``side`` is the sign of the others there.
     """
-    own, sign = np.sign(patches), -1 if below else 1
-    one_sided = not (clipped[0] and clipped[1])
-    for measure in _euclidean(steps):
-        joined = np.where(own == 0, sign, own)
-        less = (1.0, 0.0) if below else (0.0, 1.0)
-        nearest_zero = _follow(patches, own, measure, (0, 0), clipped, surely=False)
-        if nearest_zero and (_is_filled(own) or _is_stepped(own)):
-            return Transform(unit, _side_of_zeros(own) if not one_sided else sign)
-        if not nearest_zero and _follow(patches, joined, measure, less, clipped):
-            return Transform(unit, sign)
-    others = (*_squared(steps), *(_of_weights() if one_sided else ())) if is_usual else ()
-    for measure in others:
-        if _follow(patches, own, measure, (0, 0), clipped) and (_is_filled(own) or _is_stepped(own)):
-            return Transform(unit, _side_of_zeros(own) if not one_sided else sign)
+    own = np.sign(patches)
+    one_sided = clipped.min() == 0
+    euclidean = list(_euclidean(steps, unit))
+    for measure, step in (*euclidean, *_others(steps, unit, weighted=one_sided)):
+        found = _follow(patches, own, measure, (0, 0), clipped)
+        if found and (found.beyond or (measure, step) in euclidean):
+            is_mask = _is_filled(own) or _is_stepped(own)
+            return Transform(step, side if one_sided else _side_of_zeros(own)) if is_mask else None
+    joined = np.where(own == 0, side, own)
+    for measure, step in euclidean:
+        found = _follow(patches, joined, measure, (side < 0, side > 0), clipped)
+        if found and found.apart:
+            return Transform(step, side)
     return None
 
 
-def _euclidean(steps: Floats) -> Iterator[Measure]:
-    """Yield the Euclidean measures: in the world, and on the lattice if it is another one."""
-    yield partial(_length, steps)
+def _euclidean(steps: Floats, unit: float) -> Iterator[tuple[Measure, float]]:
+    """Yield the Euclidean measures, in the world, and on the lattice if that is another one.
+
+    ``unit`` is the least value. With each is the spacing that it shows.
+    """
+    yield partial(_length, steps), unit
     if steps.max() > 1 + ZERO:
-        yield partial(_length, np.ones(3))
+        yield partial(_length, np.ones(3)), unit
 
 
-def _squared(steps: Floats) -> Iterator[Measure]:
-    """Yield their squares."""
-    for length in _euclidean(steps):
-        yield lambda offsets, length=length: length(offsets) ** 2  # type: ignore[misc]
+def _others(steps: Floats, unit: float, *, weighted: bool) -> Iterator[tuple[Measure, float]]:
+    """Yield the squares of these, and ``weighted`` measures: chessboard, city-block and 3-4-5."""
+    for length, _ in _euclidean(steps, unit):
+        yield partial(_squared, length), unit**0.5
+    if weighted:
+        yield from ((partial(_weighted, weight), unit) for weight in (0.0, 1.0))
+        yield partial(_weighted, 1 / 3), unit / 3
 
 
-def _of_weights() -> Iterator[Measure]:
-    """Yield the chessboard, city-block, and 3-4-5 chamfer measures."""
-    for weight in (0, 1, 1 / 3):
-        yield partial(_weighted, weight)
+def _squared(length: Measure, offsets: NDArray[np.int64]) -> Floats:
+    return length(offsets) ** 2
 
 
 def _length(steps: Floats, offsets: NDArray[np.int64]) -> Floats:
@@ -182,28 +195,27 @@ def _follow(
     sides: Floats,
     measure: Measure,
     less: tuple[float, float],
-    clipped: list[float],
-    *,
-    surely: bool = True,
-) -> bool:
-    """Return whether values follow from the sides, ``less`` something on either side.
+    clipped: Floats,
+) -> Found | None:
+    """Return what shows that values follow from the sides, less something on either; None if not.
 
-    ``clipped`` are the largest values. ``surely`` asks for samples whose nearest ones of another
-    side are not along an axis: there exact distances half-way between samples are others.
+    ``clipped`` are the largest values.
     """
     nearest, straight = _nearest(sides, measure)
     values = patches[:, INNER, INNER, INNER].reshape(nearest.shape)
-    nearest = nearest - np.where(values < 0, *less)
+    nearest -= np.where(values < 0, *less)
     expected = np.minimum(nearest, np.where(values < 0, *clipped))
     known = np.isfinite(expected) & (values != 0)
     agree = np.abs(np.abs(values) - expected) <= ERROR * np.maximum(expected, 1)
-    apart = known & ~straight & (expected > nearest - ERROR)
-    if surely and apart.sum() < LEAST:
-        return False
-    return all(
-        which.sum() < LEAST or agree[which].mean() >= share
-        for which, share in ((known, MOST), (apart, MOST_APART))
+    free = known & (expected > nearest - ERROR)
+    groups = known, free & ~straight, free & straight & (expected > 1 + ERROR)
+    enough = [bool(group.sum() >= LEAST) for group in groups]
+    follow = all(
+        agree[group].mean() >= share
+        for group, share, is_enough in zip(groups, (MOST, MOST_APART, MOST_APART), enough)
+        if is_enough
     )
+    return Found(*enough[1:]) if enough[0] and follow else None
 
 
 def _nearest(sides: Floats, measure: Measure) -> tuple[Floats, BoolArray]:
@@ -219,7 +231,7 @@ def _nearest(sides: Floats, measure: Measure) -> tuple[Floats, BoolArray]:
         lengths = measure(AROUND - place)
         order = np.argsort(lengths, kind="stable")
         order = order[lengths[order] < outermost * (1 + ERROR)]
-        other = flat[:, order] != flat[:, (AROUND == place).all(1)]
+        other = flat[:, order] != flat[:, (place == AROUND).all(1)]
         first = other.argmax(1)
         nearest[:, number] = np.where(other.any(1), lengths[order][first], np.nan)
         straight[:, number] = ((AROUND - place)[order] != 0).sum(1)[first] < 2
