@@ -140,11 +140,13 @@ def has_two_values(values: SampleArray, extremes: Extremes) -> bool:
 def _are_layers(values: SampleArray) -> bool:
     """Return whether values differ along an axis of two samples only: a plane is between them."""
     first = values[0]
-    along = (lambda plane: plane[:1, :1], lambda _: first[:, :1], lambda _: first[:1])
-    return any(
-        count == 2 and all(bool((plane == same(plane)).all()) for plane in values)
-        for count, same in zip(values.shape, along)
-    )
+    for axis, count in enumerate(values.shape):
+        same = first[:1] if axis == 2 else first[:, :1]
+        if count == 2 and all(
+            (plane == (same if axis else plane[:1, :1])).all() for plane in values
+        ):
+            return True
+    return False
 
 
 def _are_extreme(extremes: Extremes, planes: NDArray[Any]) -> bool:

@@ -92,7 +92,7 @@ def find_transform(looked: Looked, spacing: Triple | None) -> Transform | None:
     patches[np.abs(patches) < ZERO] = 0
     if clipped.max() < 1 + ERROR:  # two values, perhaps of labels
         return None
-    if min(ends) > ZERO * unit:
+    if min(ends) > unit / 2:
         return _of_both_sides(patches, steps, clipped, unit)
     return _with_zeros(patches, steps, clipped, unit, -1 if ends[0] < ends[1] else 1)
 
@@ -107,15 +107,16 @@ def _beside(patches: Floats, inside: BoolArray, steps: Floats) -> tuple[float, f
         line = np.moveaxis(inside, axis + 1, 1)[:, 1:4, BESIDE, BESIDE]
         beside |= (line != line[:, 1:2]).any(1)
     centre, is_in = (x[beside, BESIDE, BESIDE, BESIDE] for x in (patches, inside))
-    ends = []
+    ends: list[float] = []
     for side in (-centre[is_in], centre[~is_in]):
         middle = float(np.median(side)) if len(side) else 0.0
         alike = np.abs(side - middle) <= ERROR * np.abs(centre).max(initial=0)
         if len(side) < LEAST // 2 or alike.mean() < MOST:
             return None
         ends.append(middle)
-    is_one = max(ends) > 0 and (min(ends) <= ZERO * max(ends) or np.isclose(*ends, rtol=ERROR))
-    return (ends[0], ends[1]) if is_one else None
+    low, high = ends
+    share = min(ends) / max(ends) if max(ends) > 0 else 0.5
+    return (low, high) if share <= ZERO or share >= 1 - ERROR else None
 
 
 def _of_both_sides(
@@ -229,12 +230,13 @@ def _nearest(sides: Floats, measure: Measure) -> tuple[Floats, BoolArray]:
     for number, place in enumerate(inner):
         outermost = measure(np.diag(BESIDE + 1 - np.abs(place))).min()
         lengths = measure(AROUND - place)
-        order = np.argsort(lengths, kind="stable")
+        parts = ((AROUND - place) != 0).sum(1)
+        order = np.lexsort((parts, lengths.round(6)))
         order = order[lengths[order] < outermost * (1 + ERROR)]
         other = flat[:, order] != flat[:, (place == AROUND).all(1)]
         first = other.argmax(1)
         nearest[:, number] = np.where(other.any(1), lengths[order][first], np.nan)
-        straight[:, number] = ((AROUND - place)[order] != 0).sum(1)[first] < 2
+        straight[:, number] = parts[order][first] < 2
     return nearest, straight != 0
 
 
