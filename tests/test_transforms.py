@@ -193,15 +193,18 @@ def test_labels_are_refused_whatever_the_spacing(spacing):
             make_grid(labels, spacing=spacing, origin=0)
 
 
-@pytest.mark.parametrize(("dtype", "unit"), [(np.uint8, 1), (np.int16, 8), (np.float64, 1e-3)])
-def test_densities_of_thick_slices_have_their_spline(dtype, unit):
+@pytest.mark.parametrize(
+    ("dtype", "unit", "metre"), [(np.uint8, 1, 1), (np.int16, 8, 1), (np.float64, 1, 1e-3)]
+)
+def test_densities_of_thick_slices_have_their_spline(dtype, unit, metre):
     x, y, z = (axis * h for axis, h in zip(np.indices((40, 40, 16)), (0.2, 0.2, 0.5)))
     distances = np.sqrt((x - 3.9) ** 2 + (y - 3.9) ** 2 + (z - 3.9) ** 2) - 2.4
-    values = np.clip(127 - 100 * distances, 10, 245) * unit
-    values = (np.rint(values) if unit >= 1 else values).astype(dtype)
-    grid = make_grid(values, spacing=(0.2, 0.2, 0.5), origin=0, level=127.5 * unit)
+    values = np.rint(np.clip(127 - 100 * distances, 10, 245) * unit).astype(dtype)
+    spacing = np.array([0.2, 0.2, 0.5]) * metre
+    grid = make_grid(values, spacing=spacing, origin=0, level=127.5 * unit)
     assert grid.field.kind in ("scaled", "truncated")
-    off = np.linalg.norm(reconstruct(grid, trilinear).vertices - 3.9, axis=1) - 2.4
+    vertices = reconstruct(grid, trilinear).vertices / metre
+    off = np.linalg.norm(vertices - 3.9, axis=1) - 2.4
     assert np.abs(off).mean() < 0.08 * 0.2
 
 

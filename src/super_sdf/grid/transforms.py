@@ -25,7 +25,7 @@ from .spacing import is_cubic
 
 LEAST = 20  # samples from which shares of them are evidence
 MOST, MOST_APART = 0.98, 0.95  # shares of the samples that follow from the sides
-ERROR = 2e-3  # of values
+ERROR = 0.01  # of values: they may have two decimals
 ZERO = 1e-3  # of the step: up to this, values are 0
 # Share of the samples beside the surface from which on they are at the steps of a mask, and ways in
 # which those of stairs may go.
