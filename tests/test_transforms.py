@@ -134,6 +134,9 @@ ONE, L, STAIRS = np.ones((1, 1, 1), bool), np.ones((2, 2, 1), bool), np.zeros((3
 L[1, 1] = False
 for step in range(3):
     STAIRS[step, 0, : 3 - step] = True
+PYRAMID = np.zeros((5, 5, 3), bool)
+for step in range(3):
+    PYRAMID[step : 5 - step, step : 5 - step, step] = True
 SOLIDS = {
     "box": (ONE, (10, 12, 6)),
     "plate": (ONE, (12, 10, 1)),
@@ -142,6 +145,7 @@ SOLIDS = {
     "L of a plate": (L, (6, 6, 1)),
     "stairs": (STAIRS, (4, 9, 3)),
     "stairs of one sample": (STAIRS, (3, 9, 1)),
+    "pyramid of one sample": (PYRAMID, (3, 3, 1)),
 }
 SHIFTS = [(0, 0, 0), (0.5, 0.5, 0.5), (0.5, 0, 0), (0.3, 0.1, 0.4)]
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from itertools import combinations, product
+from itertools import permutations, product
 from typing import TypeAlias
 
 import numpy as np
@@ -27,9 +27,7 @@ LEAST = 20  # samples from which shares of them are evidence
 MOST, MOST_APART = 0.98, 0.95  # shares of the samples that follow from the sides
 ERROR = 0.01  # of values: they may have two decimals
 ZERO = 1e-3  # of the step: up to this, values are 0
-# Share of the samples beside the surface from which on they are at the steps of a mask, and ways in
-# which those of stairs may go.
-STEPPED, MOST_FLIGHTS = 0.04, 2
+STEPPED = 0.03  # share of the samples beside the surface from which it has steps
 
 AROUND = np.array(list(product(range(-BESIDE, BESIDE + 1), repeat=3)))
 INNER = slice(1, -1)
@@ -251,24 +249,26 @@ def _windows(sides: Floats) -> Floats:
 
 
 def _is_stepped(sides: Floats) -> bool:
-    """Return whether the surface, where samples are 0, has the steps of a mask all round.
+    """Return whether the surface, where samples are 0, has the steps of a mask.
 
-    Beside a step, a sample is next to zeros along two axes, of which one does not go on. Of the
-    twelve ways in which these may lie, a flight of stairs has one.
+    Beside a step, a sample is next to zeros along two axes, of which one does not go on. Stairs go
+    up one way, or two that are not opposite; what is curved or turned has steps the other way, too.
     """
     centre = sides[:, BESIDE, BESIDE, BESIDE]
     near = (sides == 0)[:, INNER, INNER, INNER]
     zero = np.concatenate([near[centre > 0], near[centre < 0][:, ::-1, ::-1, ::-1]])
     ways = [*np.eye(3, dtype=int), *-np.eye(3, dtype=int)]
     next_to = [_at(zero, way) for way in ways]
-    stepped = [
-        next_to[i] & next_to[j] & ~(_at(zero, ways[i] - ways[j]) & _at(zero, ways[j] - ways[i]))
-        for i, j in combinations(range(6), 2)
-        if j != i + 3
-    ]
-    least = STEPPED * max(np.any(next_to, 0).sum(), LEAST)
-    sides_of_steps = sum(bool(way.sum() > least / 12) for way in stepped)
-    return bool(np.any(stepped, 0).sum() > least) and sides_of_steps > MOST_FLIGHTS
+    stepped, counts = np.zeros(len(zero), bool), np.zeros((6, 6), int)
+    for i, j in permutations(range(6), 2):
+        if i % 3 != j % 3:
+            goes_on = _at(zero, ways[i] - ways[j]) & _at(zero, ways[j] - ways[i])
+            found = next_to[i] & next_to[j] & ~goes_on
+            stepped |= found
+            counts[i, j] = found.sum()
+    share = stepped.sum() / max(np.any(next_to, 0).sum(), LEAST)
+    both_ways = np.minimum(counts, np.roll(counts, (3, 3), (0, 1)))
+    return bool(share > STEPPED and both_ways.any())
 
 
 def _at(patches: BoolArray, offset: NDArray[np.int64]) -> BoolArray:
