@@ -13,9 +13,10 @@ from super_sdf.errors import GridError, OptionError, OutOfMemoryError
 from super_sdf.grid import planes
 from super_sdf.grid.evidence import look, weigh
 from super_sdf.grid.field import FIELDS
-from super_sdf.grid.masks import is_distance_transform, mask_distances, mask_planes
+from super_sdf.grid.masks import mask_distances, mask_planes
 from super_sdf.grid.planes import reading_bytes
 from super_sdf.grid.slopes import local_slopes
+from super_sdf.grid.transforms import find_transform
 from super_sdf.grid.truncation import fill_in
 from super_sdf.machine import memory
 from super_sdf.machine.resources import Resources
@@ -180,8 +181,8 @@ def test_distances_of_a_mask_are_those_of_scipy():
 @pytest.mark.parametrize("name", transforms(MASK))
 def test_a_distance_transform_gives_its_step_away(name):
     values = transforms(MASK)[name]
-    lines = look(values, (values.min(), values.max())).lines
-    assert is_distance_transform(lines) == pytest.approx(0.37 if "units" in name else 1)
+    transform = find_transform(look(values, (values.min(), values.max())), None)
+    assert transform.step == pytest.approx(0.37 if "units" in name else 1)
 
 
 def test_all_forms_of_a_mask_give_the_same_mesh():

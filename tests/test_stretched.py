@@ -18,7 +18,6 @@ from super_sdf import (
     write_field,
 )
 from super_sdf.errors import GridError
-from super_sdf.grid.masks import is_distance_transform
 
 SPACING = np.array([1.0, 1.0, 2.5])
 SHAPE = (48, 44, 20)
@@ -125,8 +124,6 @@ def test_distances_between_samples_are_no_exact_distances(spacing):
         grid = make_grid(values, spacing=spacing, origin=0)
         np.testing.assert_array_equal(grid.values < 0, inside)
         assert grid.field.kind == "mask"
-    lines = np.array([[[2.0, 1, 0, -1, -2]] * 3] * 40)
-    assert is_distance_transform(lines, (1.0, 1.0, 2.5)) == 0
 
 
 @pytest.mark.parametrize("name", ["mask", "scaled"])

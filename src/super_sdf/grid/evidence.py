@@ -27,6 +27,7 @@ Floats = NDArray[np.float64]
 
 PLANES = 12  # of samples beside the surface are looked at, spread evenly
 MOST_LINES = 1 << 16  # of these samples, spread evenly, if there are more
+MOST_PATCHES = 256  # of these samples of each plane, of which all round them is kept
 BESIDE = 2  # planes, rows and columns to either side, for fourth differences
 SURE = 0.1  # share by which the slope of a sample may be off to count
 ENOUGH = 30  # such samples, from which a slope is known
@@ -127,11 +128,14 @@ class Looked:
         Share of the samples that are, as their six neighbours, the lowest, and the highest.
     extremes : two floats
         The smallest and the largest sample.
+    patches : (m, 5, 5, 5) float64
+        All samples round some of those.
     """
 
     lines: Floats
     cut: Floats
     extremes: Extremes
+    patches: Floats
 
     @property
     def is_cut(self) -> BoolArray:
@@ -142,7 +146,8 @@ class Looked:
     def divided(self, slope: float) -> Looked:
         """Return what would have been seen of the values divided by a slope."""
         low, high = self.extremes
-        return Looked(self.lines / slope, self.cut, (low / slope, high / slope))
+        ends = low / slope, high / slope
+        return Looked(self.lines / slope, self.cut, ends, self.patches / slope)
 
 
 def look(values: SampleArray, extremes: Extremes) -> Looked:
@@ -159,30 +164,32 @@ def look(values: SampleArray, extremes: Extremes) -> Looked:
     plane = values.shape[1] * values.shape[2]
     ranges = [(i - BESIDE, i + BESIDE + 1, i * plane) for i in planes]
     cut, count = np.zeros(2, np.int64), 0
+    patches = [np.empty((0, 5, 5, 5))]
 
     def lines_of_planes() -> Iterator[tuple[NDArray[Any], ...]]:
         nonlocal cut, count
         yield np.empty(0, np.uint64), np.empty((0, 3, 5))
-        for ranks, lines, amid, size in over_planes(values, look_at_plane, ranges):
+        for ranks, lines, some, amid, size in over_planes(values, look_at_plane, ranges):
             cut, count = cut + amid, count + size
+            patches.append(some)
             yield ranks, lines
 
     look_at_plane = partial(_look_at_plane, extremes)
     (lines,) = few_of(lines_of_planes(), MOST_LINES)
-    return Looked(lines, cut / max(count, 1), extremes)
+    return Looked(lines, cut / max(count, 1), extremes, np.concatenate(patches))
 
 
 def _look_at_plane(
     extremes: Extremes, slab: NDArray[Any], number: int
-) -> tuple[NDArray[np.uint64], Floats, NDArray[np.int64], int]:
-    """Return ranks and lines of samples of the middle of five planes; how many are cut off, of all.
+) -> tuple[NDArray[np.uint64], Floats, Floats, NDArray[np.int64], int]:
+    """Return ranks, lines and patches of the middle of five planes; how many are cut off, of all.
 
     ``number`` is that of the first sample of the middle plane.
     """
     slab = np.asarray(slab)
-    ranks, lines = _lines_beside_surface(slab, number)
+    ranks, lines, patches = _round_surface(slab, number)
     inner = slab[0, BESIDE:-BESIDE, BESIDE:-BESIDE]
-    return ranks, lines, _count_amid_equal(slab, extremes), inner.size
+    return ranks, lines, patches, _count_amid_equal(slab, extremes), inner.size
 
 
 def _inner_planes(count: int) -> list[int]:
@@ -193,14 +200,16 @@ def _inner_planes(count: int) -> list[int]:
     return [int(i) for i in np.unique(spread)]
 
 
-def _lines_beside_surface(slab: NDArray[Any], number: int) -> tuple[NDArray[np.uint64], Floats]:
-    """Return five samples in a row along each axis, round samples with one on the other side.
+def _round_surface(slab: NDArray[Any], number: int) -> tuple[NDArray[np.uint64], Floats, Floats]:
+    """Return five samples in a row along each axis, round samples beside one of another sign.
 
     ``slab`` has five planes; the samples are those of the middle one, (n,) ranks and (n, 3, 5).
+    Of some, all samples round them, (m, 5, 5, 5).
     """
-    inside = slab[1:4] <= 0
-    own = inside[1]
-    beside = (inside[0] != own) | (inside[2] != own)
+    near = slab[1:4]
+    sides = (near > 0).astype(np.int8) - (near < 0)
+    own = sides[1]
+    beside = (sides[0] != own) | (sides[2] != own)
     for axis in range(2):
         marks, samples = np.moveaxis(beside, axis, 0), np.moveaxis(own, axis, 0)
         crossed = samples[1:] != samples[:-1]
@@ -210,6 +219,7 @@ def _lines_beside_surface(slab: NDArray[Any], number: int) -> tuple[NDArray[np.u
     at = np.flatnonzero(inner)
     ranks = ranks_of(at + number)
     some = lowest(ranks, MOST_LINES)
+    ranks = ranks[some]
     j, k = (index + BESIDE for index in np.unravel_index(at[some], inner.shape))
     steps = np.arange(-BESIDE, BESIDE + 1)
     zero = np.zeros_like(steps)
@@ -217,8 +227,16 @@ def _lines_beside_surface(slab: NDArray[Any], number: int) -> tuple[NDArray[np.u
         slab[BESIDE + a, j[:, None] + b, k[:, None] + c]
         for a, b, c in ((steps, zero, zero), (zero, steps, zero), (zero, zero, steps))
     ]
-    stacked = np.stack(lines, 1).astype(np.float64)
-    return ranks[some], np.clip(stacked, -LARGEST_VALUE, LARGEST_VALUE, out=stacked)
+    few = lowest(ranks, MOST_PATCHES)
+    j, k = (index[few][:, None, None, None] for index in (j, k))
+    patches = slab[steps[:, None, None] + BESIDE, j + steps[:, None], k + steps]
+    return ranks, _as_floats(np.stack(lines, 1)), _as_floats(patches)
+
+
+def _as_floats(values: NDArray[Any]) -> Floats:
+    """Return values as float64 with which one can reckon."""
+    floats = values.astype(np.float64)
+    return np.clip(floats, -LARGEST_VALUE, LARGEST_VALUE, out=floats)
 
 
 def _count_amid_equal(slab: NDArray[Any], extremes: Extremes) -> NDArray[np.int64]:

@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from . import distances, masking
 from .evidence import Looked, is_normalised, look, weigh
 from .field import AUTO, EXACT, MASK, NOISY, SCALED, TRUNCATED, Wanted
-from .masks import is_distance_transform
 from .planes import SampleArray, changed
 from .request import Interpreted, Request
 from .samples import (
@@ -24,6 +23,7 @@ from .samples import (
     has_two_values,
     not_finite,
 )
+from .transforms import find_transform
 from .unknown import filled
 
 
@@ -50,8 +50,8 @@ def interpret(
     samples, extremes = _known(samples, request, notes)
     check_not_constant(extremes)
     if has_two_values(samples, extremes):
-        middle = 0.0 if request.is_density else sum(extremes) / 2
-        return masking.of_mask(masking.above(samples, middle), request, notes)
+        lower = 0.0 if request.is_density else extremes[0]
+        return masking.of_mask(masking.above(samples, lower), request, notes)
     if wanted.field == MASK:
         return masking.of_signs(samples, extremes, request, notes)
     if wanted.field in (EXACT, NOISY):
@@ -109,11 +109,11 @@ def _mask_shown(
     samples: SampleArray, looked: Looked, request: Request, notes: list[str]
 ) -> Interpreted | None:
     """Return the distances of a mask if the samples show one: a transform, or steep densities."""
-    step = is_distance_transform(looked.lines, request.spacing)
-    if step:
-        request = request.with_spacing(step, "the step of the transform", notes)
+    transform = find_transform(looked, request.spacing)
+    if transform is not None:
+        request = request.with_spacing(transform.step, "the step of the transform", notes)
         notes.append("the values are a distance transform, so only their sign says something")
-        return masking.of_signs(samples, looked.extremes, request, notes)
+        return masking.of_signs(samples, looked.extremes, request, notes, transform.zeros)
     if request.is_density and masking.is_step(looked):
         notes.append("the densities jump from one side of the level to the other")
         return masking.of_mask(masking.above(samples, 0), request, notes)

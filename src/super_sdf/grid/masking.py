@@ -87,11 +87,12 @@ def is_step(looked: Looked) -> bool:
 
 
 def of_signs(
-    samples: SampleArray, extremes: Extremes, request: Request, notes: list[str]
+    samples: SampleArray, extremes: Extremes, request: Request, notes: list[str], zeros: int = 0
 ) -> Interpreted:
-    """Return the distances of the mask that the signs of numbers make; 0 is the one side or other.
+    """Return the distances of the mask that the signs of numbers make.
 
-    ``extremes`` are the smallest and the largest sample.
+    ``extremes`` are the smallest and the largest sample. Samples that are 0 have the sign
+    ``zeros``; if that is 0, that of the one side or, of both sides, that of the inside.
     """
     low, high = extremes
     if low > 0 or high < 0:
@@ -100,10 +101,16 @@ def of_signs(
             f"{high:.6g}), so their signs make no mask: choose the solid with --label, or what is "
             "above a value with --level"
         )
-    if high > 0:
-        return of_mask(above(samples, 0), request, notes)
-    below = changed(samples, lambda planes: planes < 0, np.bool_)
-    return of_mask(below, request.other_side(), notes)
+    if high == 0 or zeros > 0 or (low < 0 and zeros == 0 and _is_positive(samples, request)):
+        return of_mask(changed(samples, lambda planes: planes >= 0, np.bool_), request, notes)
+    return of_mask(above(samples, 0), request, notes)
+
+
+def _is_positive(samples: SampleArray, request: Request) -> bool:
+    """Return whether positive numbers are inside."""
+    if request.inside != AUTO:
+        return request.inside == "positive"
+    return is_mostly_negative(*count_border(samples))
 
 
 def of_mask(mask: SampleArray, request: Request, notes: list[str]) -> Interpreted:

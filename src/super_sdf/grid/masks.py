@@ -14,15 +14,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, Triple
+from ..arrays import BoolArray, FloatArray
 from .planes import DerivedPlanes, SampleArray, in_blocks, over_planes
 from .samples import Extremes
-from .spacing import is_cubic
 
-LEAST_LINES = 20  # samples beside the surface from which a distance transform is recognised
-MOST_SQUARE = 50  # up to this, squares of rounded distances are still near whole numbers
-# How far apart samples are whose distances are looked at, and the error of these, in spacings.
-NEAR_SAMPLES, LATTICE_ERROR = 4, 1e-3
 MASK_BYTES = 10  # per sample, measured
 REACH = 4  # voxels; patches are clipped to 3 (``steps.band.PATCH_LIMIT``), and half of one goes off
 
@@ -88,71 +83,3 @@ def has_both_sides(inside: SampleArray) -> bool:
 def _sides_of(planes: BoolArray) -> tuple[bool, bool]:
     """Return whether some samples are outside, and some inside."""
     return not planes.all(), bool(planes.any())
-
-
-def is_distance_transform(lines: NDArray[np.float64], spacing: Triple | None = None) -> float:
-    """Return the spacing of a distance transform of a mask, 0 if values cannot be one.
-
-    Beside the surface all samples of a side have the same value: 1 spacing to the nearest sample of
-    the other side, or half a one to the boundary; on one side it may be 0. All other values lie on
-    the lattice of the square roots of whole numbers.
-
-    Parameters
-    ----------
-    lines : (n, 3, 5) float64
-        Five samples in a row along each axis, round samples beside the surface.
-    spacing : three floats, optional
-        The spacing of each axis, if it is known. If they differ, distances between samples are
-        recognised, too; the finest spacing is returned.
-    """
-    if len(lines) < LEAST_LINES:
-        return 0.0
-    if spacing is not None and not is_cubic(spacing) and _are_between_samples(lines, spacing):
-        return min(spacing)
-    centre = lines[:, 0, 2]
-    above, below = centre[centre > 0], centre[centre <= 0]
-    if not len(above) or not len(below) or not (_are_equal(above) and _are_equal(below)):
-        return 0.0
-    high, low = float(above.mean()), -float(below.mean())
-    apart = high + low
-    # d_out - d_in: 1 and 1; half a voxel less: 1/2 and 1/2; one side only: 1 and 0
-    for h, less in ((apart / 2, 0.0), (apart, 0.5), (apart, 0.0)):
-        starts = (1 - less, 1 - less) if low > 1e-3 * apart else (1.0, 0.0)
-        if np.allclose([high / h, low / h], starts, atol=1e-3) and _on_lattice(lines / h, less):
-            return h
-    return 0.0
-
-
-def _are_between_samples(lines: NDArray[np.float64], spacing: Triple) -> bool:
-    """Return whether values are distances between samples with unequal spacings, or 0 on one side.
-
-    No sample is nearer to one of the other side than the finest spacing.
-    """
-    steps = np.array(spacing) / min(spacing)
-    size = np.abs(lines) / min(spacing)
-    signed = bool((lines < 0).any() and (lines > 0).any())
-    if not size.any() or (signed and not size.all()) or size[size > 0].min() < 1 - LATTICE_ERROR:
-        return False
-    whole = np.indices((NEAR_SAMPLES + 1,) * 3).reshape(3, -1).T
-    between = np.sort(np.sqrt(((whole * steps) ** 2).sum(1)))
-    near = size[size <= NEAR_SAMPLES]
-    after = np.searchsorted(between, near).clip(1)
-    apart = np.minimum(np.abs(between[after] - near), np.abs(near - between[after - 1]))
-    return bool((apart <= LATTICE_ERROR).all())
-
-
-def _are_equal(values: NDArray[np.float64]) -> bool:
-    """Return whether all values are the same, but for rounding."""
-    return bool(np.ptp(values) <= 1e-4 * np.abs(values).max())
-
-
-def _on_lattice(spacings: NDArray[np.float64], less: float) -> bool:
-    """Return whether distances, plus ``less``, are roots of whole numbers, and not all whole."""
-    squares = (np.abs(spacings) + less * (spacings != 0)) ** 2
-    same_side = np.sign(spacings[..., 1:]) * np.sign(spacings[..., :-1]) > 0
-    if np.abs(np.diff(spacings))[same_side].max(initial=0) > 1 + 1e-3:
-        return False  # exact distances to planes half-way between samples, in half spacings
-    near = squares[squares < MOST_SQUARE]
-    whole = bool((np.abs(near - np.rint(near)) < 2e-3 * np.maximum(near, 1)).all())
-    roots = np.sqrt(np.unique(np.rint(near)))
-    return whole and bool((np.abs(roots - np.rint(roots)) > 1e-6).any())

@@ -53,11 +53,6 @@ class Request:
         """Return the request with what is above a level inside, unless the user says otherwise."""
         return replace(self, inside="positive") if self.inside == AUTO else self
 
-    def other_side(self) -> Request:
-        """Return the request for values whose sides are swapped."""
-        swapped = {"positive": "negative", "negative": "positive"}
-        return replace(self, inside=swapped.get(self.inside, self.inside))
-
     def with_spacing(self, spacing: float, why: str, notes: list[str]) -> Request:
         """Return the request with a spacing if none is given, and why in a note."""
         if self.spacing is not None:

@@ -94,8 +94,9 @@ def find_extremes(values: SampleArray) -> Extremes | None:
 def _extremes_of(planes: NDArray[Any]) -> Extremes | None:
     """Return the smallest and the largest of some samples, None if one is not finite."""
     extremes = []
+    number = int if planes.dtype.kind in "iu" else float  # floats do not tell large ones apart
     for plane in planes:
-        low, high = float(plane.min()), float(plane.max())
+        low, high = number(plane.min()), number(plane.max())
         if not (isfinite(low) and isfinite(high)):
             return None
         extremes.append((low, high))
@@ -129,12 +130,23 @@ def check_not_constant(extremes: Extremes) -> None:
 
 
 def has_two_values(values: SampleArray, extremes: Extremes) -> bool:
-    """Return whether there are only two different values; False for grids of 2 samples an axis."""
+    """Return whether there are only two different values, and not as beside a plane."""
     are_two = partial(_are_extreme, extremes)
     first, rest = in_blocks(values)[:1], in_blocks(values)[1:]  # the first mostly shows it
-    return min(values.shape) > 2 and all(
-        all(over_planes(values, are_two, ranges)) for ranges in (first, rest)
-    )
+    are = all(all(over_planes(values, are_two, ranges)) for ranges in (first, rest))
+    return are and (values.dtype.kind in "iu" or not _are_layers(values))
+
+
+def _are_layers(values: SampleArray) -> bool:
+    """Return whether values differ along an axis of two samples only: a plane is between them."""
+    first = values[0]
+    for axis, count in enumerate(values.shape):
+        same = first[:1] if axis == 2 else first[:, :1]
+        if count == 2 and all(
+            (plane == (same if axis else plane[:1, :1])).all() for plane in values
+        ):
+            return True
+    return False
 
 
 def _are_extreme(extremes: Extremes, planes: NDArray[Any]) -> bool:

@@ -1,0 +1,240 @@
+"""Distance transforms of masks, as SciPy, ITK and edt make them, and what is none.
+
+SciPy 1.17.1 and SimpleITK 2.5.7 make the maps here. ``edt.sdf`` and ``edt.edtsq`` of edt 3.1.2 are,
+to float32, SciPy's distances inside less those outside and the squares of the former, as is
+``mahotas.distance`` of mahotas 1.4.19.
+"""
+
+from itertools import product
+
+import numpy as np
+import pytest
+import SimpleITK
+from conftest import trilinear
+from scipy import ndimage
+
+from super_sdf import make_grid, reconstruct
+from super_sdf.errors import GridError
+
+THICK = (0.5, 0.5, 1.5)
+
+
+def organ(spacing: tuple[float, float, float], n: int = 26) -> np.ndarray:
+    """Return a mask of a bent tube and a ball, which are along no axis."""
+    steps = np.array(spacing) / min(spacing)
+    lines = [np.arange(0, n, step) - n * at for step, at in zip(steps, (0.487, 0.51, 0.46))]
+    x, y, z = np.meshgrid(*lines, indexing="ij")
+    tube = np.hypot(np.hypot(x, y + 0.1 * z) - 0.27 * n, z + 0.2 * x) - 0.12 * n
+    ball = np.sqrt((x - 5) ** 2 + y**2 + z**2) - 0.22 * n
+    inside: np.ndarray = np.minimum(tube, ball) < 0
+    return inside
+
+
+def of_scipy(inside, spacing):
+    """Return SciPy's transforms of both sides and of one, and what people make of them."""
+    euclidean = ndimage.distance_transform_edt
+    out, into = (euclidean(side, sampling=spacing) for side in (~inside, inside))
+    h = min(spacing)
+    maps = {
+        "signed": out - into,
+        "positive inside": into - out,
+        "less half a voxel": np.where(inside, h / 2 - into, out - h / 2),
+        "inside starts at 0": np.where(inside, h - into, out),
+        "inside starts at 0, positive": np.where(inside, into - h, -out),
+        "outside starts at 0": np.where(inside, -into, out - h),
+        "outside": out,
+        "inside": into,
+        "negative outside": -out,
+        "negative inside": -into,
+        "squared": np.where(inside, -(into**2), out**2),
+        "squared outside": out**2,
+        "squared inside, float32": (into**2).astype(np.float32),
+        "float16": (out - into).astype(np.float16),
+        "another unit": 1e-3 * (out - into),
+        "clipped": np.clip(out - into, -2.5 * h, 2.5 * h),
+        "clipped outside": np.minimum(out, 3 * h),
+        "in samples": euclidean(~inside) - euclidean(inside),
+        "outside, in samples": euclidean(~inside),
+    }
+    for metric in ("taxicab", "chessboard"):
+        far, deep = (ndimage.distance_transform_cdt(side, metric) for side in (~inside, inside))
+        maps |= {metric: far - deep, f"{metric} outside": far, f"{metric} inside": deep}
+    return maps
+
+
+def of_itk(inside, spacing):
+    """Return ITK's signed maps, whose zeros are the border of the object, and Danielsson's map."""
+    image = SimpleITK.GetImageFromArray(inside.T.astype(np.uint8))
+    image.SetSpacing(spacing)
+    signed = {
+        "Maurer": SimpleITK.SignedMaurerDistanceMap,
+        "Danielsson": SimpleITK.SignedDanielssonDistanceMap,
+    }
+    maps = {}
+    for (name, work), squared, world, positive in product(signed.items(), *[(False, True)] * 3):
+        options = {"squaredDistance": squared, "useImageSpacing": world}
+        made = work(image, insideIsPositive=positive, **options)
+        title = f"{name}{' squared' * squared}{' world' * world}{' positive' * positive}"
+        maps[title] = SimpleITK.GetArrayFromImage(made).T
+    outside = SimpleITK.DanielssonDistanceMap(image, inputIsBinary=True, useImageSpacing=True)
+    return {**maps, "outside": SimpleITK.GetArrayFromImage(outside).T}
+
+
+@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.7, 0.7, 0.7), THICK, (1.2, 1.0, 4.0)])
+@pytest.mark.parametrize("library", [of_scipy, of_itk])
+def test_of_a_distance_transform_only_the_sides_are_used(library, spacing):
+    inside = organ(spacing)
+    for name, values in library(inside, spacing).items():
+        grid = make_grid(values, spacing=spacing, origin=0)
+        assert grid.field.kind == "mask", name
+        np.testing.assert_array_equal(grid.values < 0, inside, name)
+
+
+def test_a_transform_of_thick_slices_has_the_mesh_of_its_mask():
+    inside = organ(THICK)
+    mesh = reconstruct(make_grid(inside, spacing=THICK, origin=0), trilinear, factor=2)
+    for name in ("Maurer world", "Maurer world positive", "Danielsson squared"):
+        grid = make_grid(of_itk(inside, THICK)[name], spacing=THICK, origin=0)
+        found = reconstruct(grid, trilinear, factor=2)
+        np.testing.assert_array_equal(found.vertices, mesh.vertices, name)
+        np.testing.assert_array_equal(found.faces, mesh.faces, name)
+
+
+def test_zeros_of_signed_numbers_are_inside():
+    inside = organ(THICK)
+    for name in ("Maurer world", "Maurer world positive"):
+        values = of_itk(inside, THICK)[name]
+        grid = make_grid(values, spacing=THICK, origin=0, field="mask")
+        np.testing.assert_array_equal(grid.values < 0, inside)
+
+
+def blocks(cells: np.ndarray, size: tuple[int, int, int], shift, spacing) -> np.ndarray:
+    """Return distances to a solid of equal blocks, found from all faces of these.
+
+    ``size`` is that of a block in samples, ``shift`` how far samples are from its corners.
+    """
+    shape = np.array(cells.shape) * size + 9
+    lines = [(np.arange(n) - 4 + off) * h for n, off, h in zip(shape, shift, spacing)]
+    points = np.stack(np.meshgrid(*lines, indexing="ij"), -1)
+    size = np.array(size) * spacing
+    squared, inside = np.full(points.shape[:3], np.inf), np.zeros(points.shape[:3], bool)
+    for cell in np.argwhere(cells):
+        inside |= ((points >= cell * size) & (points <= (cell + 1) * size)).all(-1)
+    for axis in range(3):
+        padded = np.moveaxis(np.pad(cells, 1), axis, 0)
+        for i, *others in np.argwhere(padded[1:] != padded[:-1]):
+            low = np.insert(np.array(others, float) - 1, axis, i) * size
+            high = low + size * (np.arange(3) != axis)
+            off = np.maximum(np.maximum(low - points, points - high), 0)
+            squared = np.minimum(squared, (off**2).sum(-1))
+    return np.where(inside, -1, 1) * np.sqrt(squared)
+
+
+ONE, L, STAIRS = np.ones((1, 1, 1), bool), np.ones((2, 2, 1), bool), np.zeros((3, 1, 3), bool)
+L[1, 1] = False
+for step in range(3):
+    STAIRS[step, 0, : 3 - step] = True
+PYRAMID = np.zeros((5, 5, 3), bool)
+for step in range(3):
+    PYRAMID[step : 5 - step, step : 5 - step, step] = True
+SOLIDS = {
+    "box": (ONE, (10, 12, 6)),
+    "plate": (ONE, (12, 10, 1)),
+    "bar": (ONE, (2, 2, 12)),
+    "L": (L, (6, 6, 6)),
+    "L of a plate": (L, (6, 6, 1)),
+    "stairs": (STAIRS, (4, 9, 3)),
+    "stairs of one sample": (STAIRS, (3, 9, 1)),
+    "pyramid of one sample": (PYRAMID, (3, 3, 1)),
+}
+SHIFTS = [(0, 0, 0), (0.5, 0.5, 0.5), (0.5, 0, 0), (0.3, 0.1, 0.4)]
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_exact_distances_to_boxes_are_no_transform_wherever_their_faces_are(name):
+    for shift, spacing in product(SHIFTS, [(1, 1, 1), (1, 1, 1.5)]):
+        distances = blocks(*SOLIDS[name], shift, spacing)
+        for values, scale in (
+            (distances, 1),
+            (-distances, 1),
+            (distances.astype(np.float16), 1),
+            (np.where(distances == 0, -0.0, distances), 1),
+            (np.rot90(distances, axes=(0, 1)), 1),
+            (1e-3 * distances.astype(np.float32), 1e-3),
+        ):
+            grid = make_grid(values, spacing=np.array(spacing) * scale, origin=0)
+            assert grid.field.kind == "exact", (shift, spacing)
+
+
+@pytest.mark.parametrize(("name", "volume"), [("box", 720), ("L", 648), ("plate", 120)])
+def test_exact_distances_with_faces_on_samples_have_the_volume_of_the_solid(name, volume):
+    grid = make_grid(blocks(*SOLIDS[name], (0, 0, 0), (1, 1, 1)), spacing=1.0, origin=0)
+    assert reconstruct(grid, trilinear).volume() == pytest.approx(volume, rel=0.02)
+
+
+def test_exact_distances_at_45_degrees_are_no_city_block_distances():
+    x, y, z = np.indices((24, 24, 24)) - 12
+    for values in ((x + y) / 2**0.5, (x + y - 0.5) / 2**0.5, (x + y + z) / 3**0.5):
+        grid = make_grid(values, spacing=1.0, origin=0, inside="negative")
+        assert grid.field.kind == "exact"
+
+
+def two_labels() -> np.ndarray:
+    """Return a label image of two balls that are apart, with slices thrice as thick."""
+    x, y, z = (axis * h for axis, h in zip(np.indices((40, 24, 12)), (1, 1, 3)))
+    labels = np.zeros(x.shape, np.uint8)
+    for label, at in ((1, 11), (2, 29)):
+        labels[(x - at) ** 2 + (y - 12) ** 2 + (z - 17) ** 2 < 64] = label
+    return labels
+
+
+@pytest.mark.parametrize("spacing", [(1, 1, 1), (1, 1, 3), (0.5, 1, 1)])
+def test_labels_are_refused_whatever_the_spacing(spacing):
+    nested = two_labels()
+    nested[ndimage.binary_erosion(nested == 1, iterations=3)] = 3
+    for labels in (two_labels(), nested, two_labels().astype(np.int64)):
+        with pytest.raises(GridError, match="as of labels: choose the solid with --label"):
+            make_grid(labels, spacing=spacing, origin=0)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "unit", "metre"), [(np.uint8, 1, 1), (np.int16, 8, 1), (np.float64, 1, 1e-3)]
+)
+def test_densities_of_thick_slices_have_their_spline(dtype, unit, metre):
+    x, y, z = (axis * h for axis, h in zip(np.indices((40, 40, 16)), (0.2, 0.2, 0.5)))
+    distances = np.sqrt((x - 3.9) ** 2 + (y - 3.9) ** 2 + (z - 3.9) ** 2) - 2.4
+    values = np.rint(np.clip(127 - 100 * distances, 10, 245) * unit).astype(dtype)
+    spacing = np.array([0.2, 0.2, 0.5]) * metre
+    grid = make_grid(values, spacing=spacing, origin=0, level=127.5 * unit)
+    assert grid.field.kind in ("scaled", "truncated")
+    vertices = reconstruct(grid, trilinear).vertices / metre
+    off = np.linalg.norm(vertices - 3.9, axis=1) - 2.4
+    assert np.abs(off).mean() < 0.08 * 0.2
+
+
+def test_large_labels_are_not_merged():
+    ids = 864691135000000000, 864691135000000001
+    labels = np.zeros((20, 20, 20), np.uint64)
+    labels[4:12, 4:12, 4:12] = ids[0]
+    labels[13:17, 13:17, 13:17] = ids[1]
+    for label in ids:
+        found = make_grid(labels, spacing=1.0, origin=0, label=label).values < 0
+        np.testing.assert_array_equal(found, labels == np.uint64(label))
+    with pytest.raises(GridError):
+        make_grid(labels, spacing=1.0, origin=0)
+    two = np.where(labels == ids[0], *np.array(ids[::-1], np.uint64))
+    grid = make_grid(two, spacing=1.0, origin=0)
+    np.testing.assert_array_equal(grid.values < 0, labels == np.uint64(ids[0]))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.float32, np.float64, bool])
+def test_two_slices_are_a_mask(dtype):
+    mask = np.zeros((20, 18, 2), bool)
+    mask[5:15, 4:14] = True
+    for axis in range(3):
+        turned = np.moveaxis(mask, 2, axis)
+        spacing = np.where(np.arange(3) == axis, 5.0, 1.0)
+        grid = make_grid(turned.astype(dtype), spacing=spacing, origin=0)
+        np.testing.assert_array_equal(grid.values < 0, turned)
+        plane = np.moveaxis(np.broadcast_to([-0.5, 0.5], (9, 8, 2)), 2, axis)
+        assert make_grid(plane, spacing=1, inside="negative").field.kind == "exact"
