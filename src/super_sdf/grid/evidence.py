@@ -3,7 +3,9 @@
 A distance field has slope 1 wherever it is smooth, in units of the spacing. It is bent only where
 its third and fourth differences show it: at a kink between samples, or where it is curved. So a
 slope that is off by more than these differences can explain belongs to a field that is no distance.
-A truncated field is constant away from the surface. A noisy one changes by more than the samples
+So do samples that differ by more than they are apart, along diagonals too: no noise of the size that
+the fourth differences show makes many of them do so, but fast marching and other schemes that solve
+for distances sample by sample do. A truncated field is constant away from the surface. A noisy one changes by more than the samples
 are apart, and is bent there.
 """
 
@@ -26,10 +28,15 @@ from .spacing import steps_of
 Floats = NDArray[np.float64]
 
 PLANES = 12  # of samples beside the surface are looked at, spread evenly
-MOST_LINES = 1 << 16  # of these samples, spread evenly, if there are more
+MOST_LOOKED_AT = 1 << 13  # of these samples, spread evenly, if there are more
 BESIDE = 2  # planes, rows and columns to either side, for fourth differences
-SURE = 0.1  # share by which the slope of a sample may be off to count
-ENOUGH = 30  # such samples, from which a slope is known
+ENOUGH = 30  # samples, from which a slope is known
+# Slopes whose fourth differences are this small are known: of exact distances half of them are 1.
+KNOWN = 0.2
+UNEVEN = 0.025  # by which they differ near the surface and farther away if the field is no distance
+# Two samples of a distance differ by no more than they are apart; those of others by more than that
+# and this, or this many times the roughness, at this share of the samples.
+APART, BY_ROUGHNESS, CONTRADICTING = 0.02, 2.0, 0.15
 # A slope may be off by the third and fourth differences, and by this.
 ROUNDING = 0.015
 # Share of slopes that are off from which the field is no distance: where it is smooth enough for a
@@ -42,7 +49,7 @@ LEAST_SAMPLES = 100  # from which shares are evidence
 # standard deviation: up to 2.6 per spacing were measured, up to 4 on planes along the axes. It
 # hardly makes a slope wrong that is known.
 MOST_BY_NOISE = 3.0
-OFF = 0.1  # from 1: typical slopes further off show another unit
+OFF = 0.012  # from 1: typical slopes further off show another unit
 SLOPE_OFF = 0.25  # from 1: truncated distances have another unit
 
 
@@ -59,6 +66,10 @@ class Evidence:
         if too few samples are straight.
     wrong : float
         Share of the samples at which the slope cannot be that of a distance, whatever its unit.
+    uneven : float
+        By how much the typical slope farther from the surface differs from that near it, over it.
+    contradicting : float
+        Share of the samples that differ from others by more than distances and noise can.
     noisy : float
         Share of the samples at which the values change by more than distances can, beside others.
     roughness : float
@@ -70,6 +81,8 @@ class Evidence:
     samples: int
     slope: float
     wrong: float
+    uneven: float
+    contradicting: float
     noisy: float
     roughness: float
     cut_low: bool
@@ -84,7 +97,13 @@ class Evidence:
     def is_bent(self) -> bool:
         """Whether the slope differs from place to place, so that no unit makes distances of it."""
         allowed = WRONG_SLOPES if np.isfinite(self.slope) else WRONG_IF_ROUGH
-        return self.is_enough and (self.wrong > allowed or self.is_too_steep)
+        is_wrong = self.wrong > allowed or abs(self.uneven) > UNEVEN
+        return self.is_enough and (is_wrong or self.is_too_steep or self.is_contradictory)
+
+    @property
+    def is_contradictory(self) -> bool:
+        """Whether samples contradict each other's distances, and noise does not explain it."""
+        return self.contradicting > CONTRADICTING and self.noisy <= NOISY
 
     @property
     def is_too_steep(self) -> bool:
@@ -109,6 +128,8 @@ class Evidence:
             "samples": self.samples,
             "slope": round(self.slope, 4) if known else None,
             "wrong_slopes": round(self.wrong, 4),
+            "uneven": round(self.uneven, 4),
+            "contradicting": round(self.contradicting, 4),
             "noisy": round(self.noisy, 4),
             "roughness": round(self.roughness, 4),
             "cut_off": [self.cut_low, self.cut_high],
@@ -121,17 +142,23 @@ class Looked:
 
     Attributes
     ----------
-    lines : (n, 3, 5) float64
-        Five samples in a row along each axis, round samples with one on the other side.
+    around : (n, 5, 5, 5) float64
+        The samples round samples that have one on the other side beside them.
     cut : (2,) float64
         Share of the samples that are, as their six neighbours, the lowest, and the highest.
     extremes : two floats
         The smallest and the largest sample.
     """
 
-    lines: Floats
+    around: Floats
     cut: Floats
     extremes: Extremes
+
+    @property
+    def lines(self) -> Floats:
+        """Five samples in a row along each axis, (n, 3, 5)."""
+        a = self.around
+        return np.stack([a[:, :, BESIDE, BESIDE], a[:, BESIDE, :, BESIDE], a[:, BESIDE, BESIDE]], 1)
 
     @property
     def is_cut(self) -> BoolArray:
@@ -142,7 +169,7 @@ class Looked:
     def divided(self, slope: float) -> Looked:
         """Return what would have been seen of the values divided by a slope."""
         low, high = self.extremes
-        return Looked(self.lines / slope, self.cut, (low / slope, high / slope))
+        return Looked(self.around / slope, self.cut, (low / slope, high / slope))
 
 
 def look(values: SampleArray, extremes: Extremes) -> Looked:
@@ -160,29 +187,29 @@ def look(values: SampleArray, extremes: Extremes) -> Looked:
     ranges = [(i - BESIDE, i + BESIDE + 1, i * plane) for i in planes]
     cut, count = np.zeros(2, np.int64), 0
 
-    def lines_of_planes() -> Iterator[tuple[NDArray[Any], ...]]:
+    def found_in_planes() -> Iterator[tuple[NDArray[Any], ...]]:
         nonlocal cut, count
-        yield np.empty(0, np.uint64), np.empty((0, 3, 5))
-        for ranks, lines, amid, size in over_planes(values, look_at_plane, ranges):
+        yield np.empty(0, np.uint64), np.empty((0, 5, 5, 5))
+        for ranks, around, amid, size in over_planes(values, look_at_plane, ranges):
             cut, count = cut + amid, count + size
-            yield ranks, lines
+            yield ranks, around
 
     look_at_plane = partial(_look_at_plane, extremes)
-    (lines,) = few_of(lines_of_planes(), MOST_LINES)
-    return Looked(lines, cut / max(count, 1), extremes)
+    (around,) = few_of(found_in_planes(), MOST_LOOKED_AT)
+    return Looked(around, cut / max(count, 1), extremes)
 
 
 def _look_at_plane(
     extremes: Extremes, slab: NDArray[Any], number: int
 ) -> tuple[NDArray[np.uint64], Floats, NDArray[np.int64], int]:
-    """Return ranks and lines of samples of the middle of five planes; how many are cut off, of all.
+    """Return ranks of samples of the middle of five planes, those around; how many are cut off.
 
     ``number`` is that of the first sample of the middle plane.
     """
     slab = np.asarray(slab)
-    ranks, lines = _lines_beside_surface(slab, number)
+    ranks, around = _around_surface(slab, number)
     inner = slab[0, BESIDE:-BESIDE, BESIDE:-BESIDE]
-    return ranks, lines, _count_amid_equal(slab, extremes), inner.size
+    return ranks, around, _count_amid_equal(slab, extremes), inner.size
 
 
 def _inner_planes(count: int) -> list[int]:
@@ -193,10 +220,10 @@ def _inner_planes(count: int) -> list[int]:
     return [int(i) for i in np.unique(spread)]
 
 
-def _lines_beside_surface(slab: NDArray[Any], number: int) -> tuple[NDArray[np.uint64], Floats]:
-    """Return five samples in a row along each axis, round samples with one on the other side.
+def _around_surface(slab: NDArray[Any], number: int) -> tuple[NDArray[np.uint64], Floats]:
+    """Return the samples round those that have one on the other side beside them.
 
-    ``slab`` has five planes; the samples are those of the middle one, (n,) ranks and (n, 3, 5).
+    ``slab`` has five planes; the samples are those of the middle one: (n,) ranks, (n, 5, 5, 5).
     """
     inside = slab[1:4] <= 0
     own = inside[1]
@@ -209,16 +236,11 @@ def _lines_beside_surface(slab: NDArray[Any], number: int) -> tuple[NDArray[np.u
     inner = beside[BESIDE:-BESIDE, BESIDE:-BESIDE]
     at = np.flatnonzero(inner)
     ranks = ranks_of(at + number)
-    some = lowest(ranks, MOST_LINES)
-    j, k = (index + BESIDE for index in np.unravel_index(at[some], inner.shape))
-    steps = np.arange(-BESIDE, BESIDE + 1)
-    zero = np.zeros_like(steps)
-    lines = [
-        slab[BESIDE + a, j[:, None] + b, k[:, None] + c]
-        for a, b, c in ((steps, zero, zero), (zero, steps, zero), (zero, zero, steps))
-    ]
-    stacked = np.stack(lines, 1).astype(np.float64)
-    return ranks[some], np.clip(stacked, -LARGEST_VALUE, LARGEST_VALUE, out=stacked)
+    some = lowest(ranks, MOST_LOOKED_AT)
+    j, k = np.unravel_index(at[some], inner.shape)
+    boxes = np.lib.stride_tricks.sliding_window_view(slab, (2 * BESIDE + 1,) * 3)[0]
+    around = boxes[j, k].astype(np.float64)
+    return ranks[some], np.clip(around, -LARGEST_VALUE, LARGEST_VALUE, out=around)
 
 
 def _count_amid_equal(slab: NDArray[Any], extremes: Extremes) -> NDArray[np.int64]:
@@ -238,24 +260,56 @@ def _count_amid_equal(slab: NDArray[Any], extremes: Extremes) -> NDArray[np.int6
 
 def weigh(looked: Looked, spacing: Triple) -> Evidence:
     """Return the evidence of what was looked at, with the spacing of each axis."""
-    is_cut = looked.is_cut
+    is_cut, steps = looked.is_cut, np.array(steps_of(spacing))
     limits = [x if c else s * np.inf for x, c, s in zip(looked.extremes, is_cut, (-1, 1))]
-    whole = ((looked.lines > limits[0]) & (looked.lines < limits[1])).all((1, 2))
-    lines = looked.lines[whole] / np.array(steps_of(spacing))[:, None]
-    lines = np.clip(lines, -LARGEST_VALUE, LARGEST_VALUE)
+    lines = looked.lines
+    whole = ((lines > limits[0]) & (lines < limits[1])).all((1, 2))
+    around = looked.around[whole]
+    lines = np.clip(lines[whole] / steps[:, None], -LARGEST_VALUE, LARGEST_VALUE)
     second, third, fourth = differences(lines)
-    slope = np.sqrt((((lines[..., 3] - lines[..., 1]) / 2) ** 2).sum(1))
-    unsure = (third + fourth).sum(1) / 2
-    sure = unsure < SURE * slope
-    typical = float(np.median(slope[sure])) if sure.sum() >= ENOUGH else float("nan")
+    typical, uneven = known_slopes(lines, fourth.sum(1))
     unit = typical if np.isfinite(typical) else 1.0
-    wrong = np.abs(slope / unit - 1) > unsure / unit + ROUNDING
+    slope = np.sqrt((((lines[..., 3] - lines[..., 1]) / 2) ** 2).sum(1))
+    wrong = np.abs(slope / unit - 1) > (third + fourth).sum(1) / 2 / unit + ROUNDING
     apart = np.abs(np.diff(lines[..., 1:4], axis=-1)).max((1, 2), initial=0)
     noisy = (apart > LIPSCHITZ * unit) & (second.max(1, initial=0) > BENT * unit)
     rough = float(np.median(fourth)) / 70**0.5 / 0.6745 if len(fourth) else 0.0
-    shares = [float(x.mean()) if len(x) else 0.0 for x in (wrong, noisy)]
+    beyond = differ_beyond(around / unit, steps) / max(steps)
+    contradicting = beyond > max(APART, BY_ROUGHNESS * rough / unit)
+    shares = [float(x.mean()) if len(x) else 0.0 for x in (wrong, contradicting, noisy)]
     low, high = bool(is_cut[0]), bool(is_cut[1])
-    return Evidence(len(lines), typical, shares[0], shares[1], rough, low, high)
+    return Evidence(len(lines), typical, shares[0], uneven, *shares[1:], rough, low, high)
+
+
+def known_slopes(lines: Floats, bend: Floats) -> tuple[float, float]:
+    """Return the typical slope of lines (n, 3, 5), and how it changes away from the surface.
+
+    Slopes are exact but for fifth derivatives, and known where fourth differences, ``bend`` (n,) in
+    sum, are small: no kink is among the samples. The first is NaN if too few are known.
+    """
+    a, b, middle, d, e = np.moveaxis(lines, -1, 0)
+    slope = np.sqrt((((8 * (d - b) - (e - a)) / 12) ** 2).sum(1))
+    known = bend < KNOWN * slope
+    slope, far = slope[known], np.abs(middle[known, 0])
+    if len(slope) < ENOUGH:
+        return float("nan"), 0.0
+    near = far <= np.median(far)
+    typical = float(np.median(slope))
+    beyond = float(np.median(slope[~near])) if not near.all() else typical
+    return typical, (beyond - float(np.median(slope[near]))) / typical
+
+
+def differ_beyond(around: Floats, steps: Floats) -> Floats:
+    """Return by how much samples differ at most from those around beyond the way between, (n,).
+
+    ``around`` (n, 5, 5, 5) has each sample in the middle; ``steps`` are the spacings.
+    """
+    places = np.indices(around.shape[1:]).reshape(3, -1).T - BESIDE
+    boxes = around.reshape(len(around), len(places))
+    beyond = np.abs(boxes - boxes[:, len(places) // 2, None])
+    beyond -= np.linalg.norm(places * steps, axis=1)
+    most: Floats = beyond.max(1, initial=-np.inf)
+    return most
 
 
 def slope_within(looked: Looked, spacing: Triple) -> float:
