@@ -3,10 +3,10 @@
 A distance field has slope 1 wherever it is smooth, in units of the spacing. It is bent only where
 its third and fourth differences show it: at a kink between samples, or where it is curved. So a
 slope that is off by more than these differences can explain belongs to a field that is no distance.
-So do samples that differ by more than they are apart, along diagonals too: no noise of the size that
-the fourth differences show makes many of them do so, but fast marching and other schemes that solve
-for distances sample by sample do. A truncated field is constant away from the surface. A noisy one changes by more than the samples
-are apart, and is bent there.
+So do samples that differ by more than they are apart, along diagonals too, and by more than noise
+of the size that fourth differences show: fast marching and other schemes make such fields. A
+truncated field is constant away from the surface. A noisy one changes by more than the samples are
+apart, and is bent there.
 """
 
 from __future__ import annotations
@@ -34,9 +34,10 @@ ENOUGH = 30  # samples, from which a slope is known
 # Slopes whose fourth differences are this small are known: of exact distances half of them are 1.
 KNOWN = 0.2
 UNEVEN = 0.025  # by which they differ near the surface and farther away if the field is no distance
-# Two samples of a distance differ by no more than they are apart; those of others by more than that
-# and this, or this many times the roughness, at this share of the samples.
-APART, BY_ROUGHNESS, CONTRADICTING = 0.02, 2.0, 0.15
+# Two samples of a distance differ by no more than they are apart. In other fields this share of the
+# samples differ from several by more: by this, by more than noise, and than their last digit.
+CONTRADICTING, SEVERAL, APART, BY_NOISE = 0.05, 2, 0.02, 2.5
+MATTERS = 3.0  # spacings from the surface, beyond which values may be anything
 # A slope may be off by the third and fourth differences, and by this.
 ROUNDING = 0.015
 # Share of slopes that are off from which the field is no distance: where it is smooth enough for a
@@ -274,8 +275,8 @@ def weigh(looked: Looked, spacing: Triple) -> Evidence:
     apart = np.abs(np.diff(lines[..., 1:4], axis=-1)).max((1, 2), initial=0)
     noisy = (apart > LIPSCHITZ * unit) & (second.max(1, initial=0) > BENT * unit)
     rough = float(np.median(fourth)) / 70**0.5 / 0.6745 if len(fourth) else 0.0
-    beyond = differ_beyond(around / unit, steps) / max(steps)
-    contradicting = beyond > max(APART, BY_ROUGHNESS * rough / unit)
+    h = max(steps)
+    contradicting = contradict(around / (h * unit), steps / h, noise_at_least(fourth) / unit)
     shares = [float(x.mean()) if len(x) else 0.0 for x in (wrong, contradicting, noisy)]
     low, high = bool(is_cut[0]), bool(is_cut[1])
     return Evidence(len(lines), typical, shares[0], uneven, *shares[1:], rough, low, high)
@@ -299,17 +300,27 @@ def known_slopes(lines: Floats, bend: Floats) -> tuple[float, float]:
     return typical, (beyond - float(np.median(slope[near]))) / typical
 
 
-def differ_beyond(around: Floats, steps: Floats) -> Floats:
-    """Return by how much samples differ at most from those around beyond the way between, (n,).
+def noise_at_least(fourth: Floats) -> float:
+    """Return the standard deviation of the noise that the smaller fourth differences can show."""
+    return float(np.quantile(fourth, 0.25)) / 70**0.5 / 0.3186 if len(fourth) else 0.0
 
-    ``around`` (n, 5, 5, 5) has each sample in the middle; ``steps`` are the spacings.
+
+def contradict(around: Floats, steps: Floats, noise: float) -> BoolArray:
+    """Return which samples differ from several others by more than distances can, (n,).
+
+    ``around`` (n, 5, 5, 5) has each sample in the middle, ``steps`` are the spacings, and ``noise``
+    is its standard deviation, all in the largest spacing. Rounding explains its last digit.
     """
-    places = np.indices(around.shape[1:]).reshape(3, -1).T - BESIDE
-    boxes = around.reshape(len(around), len(places))
-    beyond = np.abs(boxes - boxes[:, len(places) // 2, None])
-    beyond -= np.linalg.norm(places * steps, axis=1)
-    most: Floats = beyond.max(1, initial=-np.inf)
-    return most
+    matters = MATTERS * min(steps)
+    boxes = np.clip(around.reshape(len(around), 5**3), -matters, matters)
+    middle = boxes[:, 5**3 // 2]
+    digits = np.diff(np.unique(middle.astype(np.float32)))
+    digit = float(np.median(digits)) if len(digits) else 0.0
+    places = np.indices((5,) * 3).reshape(3, -1).T - BESIDE
+    beyond = np.abs(boxes - middle[:, None]) - np.linalg.norm(places * steps, axis=1)
+    allowed = max(APART, BY_NOISE * noise, digit * (1 + ROUNDING))
+    found: BoolArray = (beyond > allowed).sum(1) >= SEVERAL
+    return found
 
 
 def slope_within(looked: Looked, spacing: Triple) -> float:
