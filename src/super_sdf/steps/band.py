@@ -26,7 +26,7 @@ DECODE_LIMIT = 3**0.5 + 0.5
 # Two distances differ by no more than their samples are apart (Lipschitz); slack for rounding.
 LIPSCHITZ_SLACK = 0.1
 
-JUMP = 0.5  # by which values differ more than noise makes distances differ
+JUMP = 0.3  # by which values differ more than noise makes distances differ
 
 # Planes are worked on in blocks of about this many samples, to save memory, but of at least this
 # many planes, since a block also reads one plane more on either side.
@@ -34,7 +34,7 @@ BLOCK_SAMPLES = 1 << 18
 BLOCK_PLANES = 4
 
 # The largest difference between a voxel's sample and that at each place of its patch, (27,).
-MAX_STEP = 2 + LIPSCHITZ_SLACK + JUMP  # between neighbours along an axis, with noise
+MAX_STEP = 2 + LIPSCHITZ_SLACK  # between neighbours along an axis
 MAX_DIFFERENCE = (2 * np.linalg.norm(NEIGHBOURHOOD, axis=1) + LIPSCHITZ_SLACK).astype(np.float32)
 
 
