@@ -277,9 +277,9 @@ def weigh(looked: Looked, spacing: Triple) -> Evidence:
     rough = float(np.median(fourth)) / 70**0.5 / 0.6745 if len(fourth) else 0.0
     h = max(steps)
     contradicting = contradict(around / (h * unit), steps / h, noise_at_least(fourth) / unit)
-    shares = [float(x.mean()) if len(x) else 0.0 for x in (wrong, contradicting, noisy)]
+    off, beyond, steep = (float(x.mean()) if len(x) else 0.0 for x in (wrong, contradicting, noisy))
     low, high = bool(is_cut[0]), bool(is_cut[1])
-    return Evidence(len(lines), typical, shares[0], uneven, *shares[1:], rough, low, high)
+    return Evidence(len(lines), typical, off, uneven, beyond, steep, rough, low, high)
 
 
 def known_slopes(lines: Floats, bend: Floats) -> tuple[float, float]:

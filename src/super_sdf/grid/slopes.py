@@ -39,7 +39,8 @@ def normalised_planes(values: SampleArray, h: float, change: float) -> DerivedPl
     def make(planes: NDArray[Any]) -> FloatArray:
         scaled = in_spacings(planes, change)
         off = local_slopes(scaled) - 1
-        return np.divide(scaled, 1 + np.sign(off) * np.maximum(np.abs(off) - NEARLY, 0))
+        far: FloatArray = np.sign(off) * np.maximum(np.abs(off) - NEARLY, 0)
+        return np.divide(scaled, 1 + far)
 
     return DerivedPlanes(values, make, AROUND + 2, unit=h, each=SLOPE_BYTES)
 

@@ -26,7 +26,7 @@ DECODE_LIMIT = 3**0.5 + 0.5
 # Two distances differ by no more than their samples are apart (Lipschitz); slack for rounding.
 LIPSCHITZ_SLACK = 0.1
 
-JUMP = 0.3  # by which values differ more than noise makes distances differ
+JUMP = 0.2  # by which values differ more than noise makes distances differ
 
 # Planes are worked on in blocks of about this many samples, to save memory, but of at least this
 # many planes, since a block also reads one plane more on either side.
