@@ -92,13 +92,13 @@ class Evidence:
     @property
     def is_scaled(self) -> bool:
         """Whether the values are no distances in the unit of the spacing."""
-        return self.is_bent or abs(self.slope - 1) > OFF
+        return self.is_bent or abs(self.slope - 1) > max(OFF, self.roughness)
 
     @property
     def is_bent(self) -> bool:
         """Whether the slope differs from place to place, so that no unit makes distances of it."""
         allowed = WRONG_SLOPES if np.isfinite(self.slope) else WRONG_IF_ROUGH
-        is_wrong = self.wrong > allowed or abs(self.uneven) > UNEVEN
+        is_wrong = self.wrong > allowed or abs(self.uneven) > max(UNEVEN, self.roughness)
         return self.is_enough and (is_wrong or self.is_too_steep or self.is_contradictory)
 
     @property
