@@ -67,8 +67,9 @@ def test_no_value_moves_away_from_the_truth_and_many_move_nearer(factor):
 
 
 def test_the_bound_of_one_sample_is_its_distance_less_that_to_the_node():
-    """All samples but two are unknown: that of the block, and one outside, three voxels away."""
+    """Two samples are trusted: that of the block, and one outside, three voxels away."""
     values = np.full((9, 9, 9), 50.0)
+    values[4, 4, 5] = 0.05  # a sample from which the field rises to all others was filled in
     values[4, 4, 4], values[4, 4, 7] = 0.2, 3.1  # at most 0.2 + 3
     band = survey(SdfGrid.trusted(values, (1.0,) * 3))
     voxel = np.array([[4, 4, 4]], np.int32)

@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from super_sdf import SdfGrid, load_network, make_grid, pipeline, reconstruct
 from super_sdf.errors import GridError, OptionError, OutOfMemoryError
+from super_sdf.evaluation.methods import isosurface
 from super_sdf.grid import planes
 from super_sdf.grid.evidence import look, weigh
 from super_sdf.grid.field import FIELDS
@@ -610,3 +611,99 @@ def test_making_distances_is_planned_and_refused_with_the_figure():
         OutOfMemoryError, match=r"^planes of 512 x 512 samples need at least \d+ MB"
     ):
         plan_reading(samples, 0, Resources(2, 1_000_000))
+
+
+def torus_at(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Return distances to a torus that stands askew in a grid of 24^3, in voxels."""
+    x, y, z = x - 11.6, y - 11.3, z - 11.7
+    x, z = 0.8 * x + 0.6 * z, 0.8 * z - 0.6 * x
+    y, z = 0.96 * y + 0.28 * z, 0.96 * z - 0.28 * y
+    return np.hypot(np.hypot(x, y) - 6.7, z) - 2.8
+
+
+def marched(values: np.ndarray) -> np.ndarray:
+    """Return what first-order fast marching makes of values (as scikit-fmm 2025.6.23 does)."""
+    padded = np.pad(values, 1, mode="edge")
+    beside = [
+        np.stack([np.roll(padded, s, a)[(slice(1, -1),) * 3] for s in (1, -1)]) for a in range(3)
+    ]
+    crossed = [np.where(b * values < 0, np.abs(values), np.inf) for b in beside]
+    crossed = [(c / (np.abs(values) + np.abs(b))).min(0) for c, b in zip(crossed, beside)]
+    inverse = sum(1 / cross**2 for cross in crossed)
+    known = inverse > 0
+    far = np.where(known, 1 / np.sqrt(np.maximum(inverse, 1e-9)), 99.0)
+    for _ in range(40):
+        padded = np.pad(far, 1, constant_values=99.0)
+        low = np.sort(
+            [
+                np.minimum(*(np.roll(padded, s, a)[(slice(1, -1),) * 3] for s in (1, -1)))
+                for a in range(3)
+            ],
+            axis=0,
+        )
+        solved = low[0] + 1
+        for count in (2, 3):
+            total, squares = low[:count].sum(0), (low[:count] ** 2).sum(0)
+            root = np.sqrt(np.maximum(total**2 - count * (squares - 1), 0))
+            solved = np.where(solved > low[count - 1], (total + root) / count, solved)
+        far = np.where(known, far, np.minimum(far, solved))
+    return np.copysign(far, values)
+
+
+NEARLY = {
+    "fast marching": marched,
+    "saturated at 1.5 voxels": lambda d: 1.5 * np.tanh(d / 1.5),
+    "saturated at 3 voxels": lambda d: 3 * np.tanh(d / 3),
+    "slopes of .9 to 1.1": lambda d: d * (1 + 0.1 * np.sin(np.indices(d.shape).sum(0) / 4)),
+    "another unit, .91": lambda d: 0.91 * d,
+    "another unit, 1.06": lambda d: 1.06 * d,
+    "half floats": lambda d: d.astype(np.float16),
+    "rounded": lambda d: np.round(d, 1),
+    "8 bits": lambda d: np.clip(np.round(d * 25), -127, 127) / 25,
+}
+
+
+@pytest.mark.parametrize("name", NEARLY)
+def test_what_is_nearly_a_distance_is_no_worse_than_marching_cubes(name):
+    values = np.asarray(NEARLY[name](torus_at(*np.indices((24,) * 3))), np.float64)
+    mesh = reconstruct(make_grid(values, **PLACE), load_network())
+    plain = isosurface(values.astype(np.float32), 1.0, 0.0)
+    ours, theirs = (np.abs(torus_at(*m.vertices.T)).mean() for m in (mesh, plain))
+    assert mesh.is_closed() and ours < 0.8 * theirs
+
+
+def test_samples_that_contradict_each_other_are_told_from_noise_and_exact_ones():
+    exact = torus_at(*np.indices((24,) * 3))
+    corner = np.maximum(exact, np.indices((24,) * 3)[0] - 12.2)  # no distance beyond the edge
+    for values in (exact, corner, noisy(exact, 0.05), np.round(exact, 1), exact.astype(np.float16)):
+        assert not weigh(look(values, (-9.0, 30.0)), (1.0, 1.0, 1.0)).is_contradictory
+    assert weigh(look(marched(exact), (-9.0, 30.0)), (1.0, 1.0, 1.0)).is_contradictory
+
+
+@pytest.mark.parametrize("unit", [0.91, 0.97, 1.04, 1.09])
+def test_distances_of_a_slope_near_1_are_divided_by_it(unit):
+    exact = torus_at(*np.indices((24,) * 3))
+    grid = make_grid(unit * exact, **PLACE)
+    assert grid.field.kind == "exact" and "in another unit" in grid.notes[0]
+    np.testing.assert_allclose(grid.values, exact, rtol=0.003)
+
+
+@pytest.mark.parametrize("filled", [0.1, 0.5, 1.0, 1.4])
+def test_padding_near_the_surface_makes_no_surface(filled):
+    plain = ball(24, 8.0).values
+    meshes = [
+        reconstruct(
+            make_grid(np.pad(plain, 1, constant_values=pad), spacing=1, origin=-1), trilinear
+        )
+        for pad in (filled, 5.0)
+    ]
+    assert meshes[0].is_closed()
+    np.testing.assert_allclose(meshes[0].volume(), meshes[1].volume(), rtol=1e-3)
+
+
+@pytest.mark.parametrize("added", [0.0, 0.001, 0.01, 0.05, 0.1])
+@pytest.mark.parametrize("shape", [torus, box])
+@pytest.mark.parametrize("n", [16, 24, 32])
+def test_unsigned_distances_of_thick_solids_are_refused(shape, n, added):
+    with pytest.raises(GridError, match="unsigned"):
+        make_grid(np.abs(shape(n)) + added, **PLACE)

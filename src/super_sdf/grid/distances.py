@@ -26,6 +26,7 @@ from .truncation import filled_planes, without_plateaus
 # Voxels from which on values may be cut off without a loss; up to which the rest is filled in; and
 # below which too few are left for that.
 HARMLESS, FILLED, TOO_NEAR = 3.0, 1.75, 0.85
+ALIKE = 0.02  # slopes beside the surface and elsewhere, of distances in another unit
 BENT = 0.1  # share of wrong slopes from which the network has no say in a field
 
 
@@ -66,7 +67,11 @@ def _in_another_unit(found: Interpreted, looked: Looked, notes: list[str]) -> In
     """Return distances that only have another unit than the spacing, in the spacing's."""
     if not is_cubic(found.spacing):
         return None
-    unit = measure_spacing(found.samples) / found.spacing[0]
+    unit, beside = measure_spacing(found.samples) / found.spacing[0], weigh(looked, found.spacing)
+    if np.isfinite(beside.slope) and np.isfinite(unit):
+        if abs(beside.slope / unit - 1) > ALIKE:
+            return None
+        unit = beside.slope
     evidence = weigh(looked.divided(unit), found.spacing)
     if not np.isfinite(unit) or evidence.is_scaled or evidence.is_noisy:
         return None
@@ -199,7 +204,8 @@ def _scaled(
 
 def _has_distances(evidence: Evidence) -> bool:
     """Return whether a field has the slope of a distance almost everywhere, as next to kinks."""
-    return evidence.wrong < BENT and not evidence.is_too_steep
+    contradictory = evidence.is_too_steep or evidence.is_contradictory
+    return evidence.wrong < BENT and not contradictory
 
 
 def _wrong_slope(slope: float, evidence: Evidence) -> str:

@@ -3,8 +3,10 @@
 A distance field has slope 1 wherever it is smooth, in units of the spacing. It is bent only where
 its third and fourth differences show it: at a kink between samples, or where it is curved. So a
 slope that is off by more than these differences can explain belongs to a field that is no distance.
-A truncated field is constant away from the surface. A noisy one changes by more than the samples
-are apart, and is bent there.
+So do samples that differ by more than they are apart, along diagonals too, and by more than noise
+of the size that fourth differences show: fast marching and other schemes make such fields. A
+truncated field is constant away from the surface. A noisy one changes by more than the samples are
+apart, and is bent there.
 """
 
 from __future__ import annotations
@@ -26,11 +28,16 @@ from .spacing import steps_of
 Floats = NDArray[np.float64]
 
 PLANES = 12  # of samples beside the surface are looked at, spread evenly
-MOST_LINES = 1 << 16  # of these samples, spread evenly, if there are more
-MOST_PATCHES = 256  # of these samples of each plane, of which all round them is kept
+MOST_LOOKED_AT = 1 << 13  # of these samples, spread evenly, if there are more
 BESIDE = 2  # planes, rows and columns to either side, for fourth differences
-SURE = 0.1  # share by which the slope of a sample may be off to count
-ENOUGH = 30  # such samples, from which a slope is known
+ENOUGH = 30  # samples, from which a slope is known
+# Slopes whose fourth differences are this small are known: of exact distances half of them are 1.
+KNOWN = 0.2
+UNEVEN = 0.025  # by which they differ near the surface and farther away if the field is no distance
+# Two samples of a distance differ by no more than they are apart. In other fields this share of the
+# samples differ from several by more: by this, by more than noise, and than their last digit.
+CONTRADICTING, SEVERAL, APART, BY_NOISE = 0.05, 2, 0.02, 2.5
+MATTERS = 3.0  # spacings from the surface, beyond which values may be anything
 # A slope may be off by the third and fourth differences, and by this.
 ROUNDING = 0.015
 # Share of slopes that are off from which the field is no distance: where it is smooth enough for a
@@ -43,7 +50,7 @@ LEAST_SAMPLES = 100  # from which shares are evidence
 # standard deviation: up to 2.6 per spacing were measured, up to 4 on planes along the axes. It
 # hardly makes a slope wrong that is known.
 MOST_BY_NOISE = 3.0
-OFF = 0.1  # from 1: typical slopes further off show another unit
+OFF = 0.012  # from 1: typical slopes further off show another unit
 SLOPE_OFF = 0.25  # from 1: truncated distances have another unit
 
 
@@ -60,6 +67,10 @@ class Evidence:
         if too few samples are straight.
     wrong : float
         Share of the samples at which the slope cannot be that of a distance, whatever its unit.
+    uneven : float
+        By how much the typical slope farther from the surface differs from that near it, over it.
+    contradicting : float
+        Share of the samples that differ from others by more than distances and noise can.
     noisy : float
         Share of the samples at which the values change by more than distances can, beside others.
     roughness : float
@@ -71,6 +82,8 @@ class Evidence:
     samples: int
     slope: float
     wrong: float
+    uneven: float
+    contradicting: float
     noisy: float
     roughness: float
     cut_low: bool
@@ -79,13 +92,19 @@ class Evidence:
     @property
     def is_scaled(self) -> bool:
         """Whether the values are no distances in the unit of the spacing."""
-        return self.is_bent or abs(self.slope - 1) > OFF
+        return self.is_bent or abs(self.slope - 1) > max(OFF, self.roughness)
 
     @property
     def is_bent(self) -> bool:
         """Whether the slope differs from place to place, so that no unit makes distances of it."""
         allowed = WRONG_SLOPES if np.isfinite(self.slope) else WRONG_IF_ROUGH
-        return self.is_enough and (self.wrong > allowed or self.is_too_steep)
+        is_wrong = self.wrong > allowed or abs(self.uneven) > max(UNEVEN, self.roughness)
+        return self.is_enough and (is_wrong or self.is_too_steep or self.is_contradictory)
+
+    @property
+    def is_contradictory(self) -> bool:
+        """Whether samples contradict each other's distances, and noise does not explain it."""
+        return self.contradicting > CONTRADICTING and self.noisy <= NOISY
 
     @property
     def is_too_steep(self) -> bool:
@@ -110,6 +129,8 @@ class Evidence:
             "samples": self.samples,
             "slope": round(self.slope, 4) if known else None,
             "wrong_slopes": round(self.wrong, 4),
+            "uneven": round(self.uneven, 4),
+            "contradicting": round(self.contradicting, 4),
             "noisy": round(self.noisy, 4),
             "roughness": round(self.roughness, 4),
             "cut_off": [self.cut_low, self.cut_high],
@@ -122,20 +143,23 @@ class Looked:
 
     Attributes
     ----------
-    lines : (n, 3, 5) float64
-        Five samples in a row along each axis, round samples with one on the other side.
+    around : (n, 5, 5, 5) float64
+        The samples round samples that have one on the other side beside them.
     cut : (2,) float64
         Share of the samples that are, as their six neighbours, the lowest, and the highest.
     extremes : two floats
         The smallest and the largest sample.
-    patches : (m, 5, 5, 5) float64
-        All samples round some of those.
     """
 
-    lines: Floats
+    around: Floats
     cut: Floats
     extremes: Extremes
-    patches: Floats
+
+    @property
+    def lines(self) -> Floats:
+        """Five samples in a row along each axis, (n, 3, 5)."""
+        a = self.around
+        return np.stack([a[:, :, BESIDE, BESIDE], a[:, BESIDE, :, BESIDE], a[:, BESIDE, BESIDE]], 1)
 
     @property
     def is_cut(self) -> BoolArray:
@@ -146,8 +170,7 @@ class Looked:
     def divided(self, slope: float) -> Looked:
         """Return what would have been seen of the values divided by a slope."""
         low, high = self.extremes
-        ends = low / slope, high / slope
-        return Looked(self.lines / slope, self.cut, ends, self.patches / slope)
+        return Looked(self.around / slope, self.cut, (low / slope, high / slope))
 
 
 def look(values: SampleArray, extremes: Extremes) -> Looked:
@@ -164,32 +187,30 @@ def look(values: SampleArray, extremes: Extremes) -> Looked:
     plane = values.shape[1] * values.shape[2]
     ranges = [(i - BESIDE, i + BESIDE + 1, i * plane) for i in planes]
     cut, count = np.zeros(2, np.int64), 0
-    patches = [np.empty((0, 5, 5, 5))]
 
-    def lines_of_planes() -> Iterator[tuple[NDArray[Any], ...]]:
+    def found_in_planes() -> Iterator[tuple[NDArray[Any], ...]]:
         nonlocal cut, count
-        yield np.empty(0, np.uint64), np.empty((0, 3, 5))
-        for ranks, lines, some, amid, size in over_planes(values, look_at_plane, ranges):
+        yield np.empty(0, np.uint64), np.empty((0, 5, 5, 5))
+        for ranks, around, amid, size in over_planes(values, look_at_plane, ranges):
             cut, count = cut + amid, count + size
-            patches.append(some)
-            yield ranks, lines
+            yield ranks, around
 
     look_at_plane = partial(_look_at_plane, extremes)
-    (lines,) = few_of(lines_of_planes(), MOST_LINES)
-    return Looked(lines, cut / max(count, 1), extremes, np.concatenate(patches))
+    (around,) = few_of(found_in_planes(), MOST_LOOKED_AT)
+    return Looked(around, cut / max(count, 1), extremes)
 
 
 def _look_at_plane(
     extremes: Extremes, slab: NDArray[Any], number: int
-) -> tuple[NDArray[np.uint64], Floats, Floats, NDArray[np.int64], int]:
-    """Return ranks, lines and patches of the middle of five planes; how many are cut off, of all.
+) -> tuple[NDArray[np.uint64], Floats, NDArray[np.int64], int]:
+    """Return ranks of samples of the middle of five planes, those around; how many are cut off.
 
     ``number`` is that of the first sample of the middle plane.
     """
     slab = np.asarray(slab)
-    ranks, lines, patches = _round_surface(slab, number)
+    ranks, around = _around_surface(slab, number)
     inner = slab[0, BESIDE:-BESIDE, BESIDE:-BESIDE]
-    return ranks, lines, patches, _count_amid_equal(slab, extremes), inner.size
+    return ranks, around, _count_amid_equal(slab, extremes), inner.size
 
 
 def _inner_planes(count: int) -> list[int]:
@@ -200,11 +221,10 @@ def _inner_planes(count: int) -> list[int]:
     return [int(i) for i in np.unique(spread)]
 
 
-def _round_surface(slab: NDArray[Any], number: int) -> tuple[NDArray[np.uint64], Floats, Floats]:
-    """Return five samples in a row along each axis, round samples beside one of another sign.
+def _around_surface(slab: NDArray[Any], number: int) -> tuple[NDArray[np.uint64], Floats]:
+    """Return the samples round those that have one on the other side beside them.
 
-    ``slab`` has five planes; the samples are those of the middle one, (n,) ranks and (n, 3, 5).
-    Of some, all samples round them, (m, 5, 5, 5).
+    ``slab`` has five planes; the samples are those of the middle one: (n,) ranks, (n, 5, 5, 5).
     """
     near = slab[1:4]
     sides = (near > 0).astype(np.int8) - (near < 0)
@@ -218,25 +238,11 @@ def _round_surface(slab: NDArray[Any], number: int) -> tuple[NDArray[np.uint64],
     inner = beside[BESIDE:-BESIDE, BESIDE:-BESIDE]
     at = np.flatnonzero(inner)
     ranks = ranks_of(at + number)
-    some = lowest(ranks, MOST_LINES)
-    ranks = ranks[some]
-    j, k = (index + BESIDE for index in np.unravel_index(at[some], inner.shape))
-    steps = np.arange(-BESIDE, BESIDE + 1)
-    zero = np.zeros_like(steps)
-    lines = [
-        slab[BESIDE + a, j[:, None] + b, k[:, None] + c]
-        for a, b, c in ((steps, zero, zero), (zero, steps, zero), (zero, zero, steps))
-    ]
-    few = lowest(ranks, MOST_PATCHES)
-    j, k = (index[few][:, None, None, None] for index in (j, k))
-    patches = slab[steps[:, None, None] + BESIDE, j + steps[:, None], k + steps]
-    return ranks, _as_floats(np.stack(lines, 1)), _as_floats(patches)
-
-
-def _as_floats(values: NDArray[Any]) -> Floats:
-    """Return values as float64 with which one can reckon."""
-    floats = values.astype(np.float64)
-    return np.clip(floats, -LARGEST_VALUE, LARGEST_VALUE, out=floats)
+    some = lowest(ranks, MOST_LOOKED_AT)
+    j, k = np.unravel_index(at[some], inner.shape)
+    boxes = np.lib.stride_tricks.sliding_window_view(slab, (2 * BESIDE + 1,) * 3)[0]
+    around = boxes[j, k].astype(np.float64)
+    return ranks[some], np.clip(around, -LARGEST_VALUE, LARGEST_VALUE, out=around)
 
 
 def _count_amid_equal(slab: NDArray[Any], extremes: Extremes) -> NDArray[np.int64]:
@@ -256,24 +262,66 @@ def _count_amid_equal(slab: NDArray[Any], extremes: Extremes) -> NDArray[np.int6
 
 def weigh(looked: Looked, spacing: Triple) -> Evidence:
     """Return the evidence of what was looked at, with the spacing of each axis."""
-    is_cut = looked.is_cut
+    is_cut, steps = looked.is_cut, np.array(steps_of(spacing))
     limits = [x if c else s * np.inf for x, c, s in zip(looked.extremes, is_cut, (-1, 1))]
-    whole = ((looked.lines > limits[0]) & (looked.lines < limits[1])).all((1, 2))
-    lines = looked.lines[whole] / np.array(steps_of(spacing))[:, None]
-    lines = np.clip(lines, -LARGEST_VALUE, LARGEST_VALUE)
+    lines = looked.lines
+    whole = ((lines > limits[0]) & (lines < limits[1])).all((1, 2))
+    around = looked.around[whole]
+    lines = np.clip(lines[whole] / steps[:, None], -LARGEST_VALUE, LARGEST_VALUE)
     second, third, fourth = differences(lines)
-    slope = np.sqrt((((lines[..., 3] - lines[..., 1]) / 2) ** 2).sum(1))
-    unsure = (third + fourth).sum(1) / 2
-    sure = unsure < SURE * slope
-    typical = float(np.median(slope[sure])) if sure.sum() >= ENOUGH else float("nan")
+    typical, uneven = known_slopes(lines, fourth.sum(1))
     unit = typical if np.isfinite(typical) else 1.0
-    wrong = np.abs(slope / unit - 1) > unsure / unit + ROUNDING
+    slope = np.sqrt((((lines[..., 3] - lines[..., 1]) / 2) ** 2).sum(1))
+    wrong = np.abs(slope / unit - 1) > (third + fourth).sum(1) / 2 / unit + ROUNDING
     apart = np.abs(np.diff(lines[..., 1:4], axis=-1)).max((1, 2), initial=0)
     noisy = (apart > LIPSCHITZ * unit) & (second.max(1, initial=0) > BENT * unit)
     rough = float(np.median(fourth)) / 70**0.5 / 0.6745 if len(fourth) else 0.0
-    shares = [float(x.mean()) if len(x) else 0.0 for x in (wrong, noisy)]
+    h = max(steps)
+    contradicting = contradict(around / (h * unit), steps / h, noise_at_least(fourth) / unit)
+    off, beyond, steep = (float(x.mean()) if len(x) else 0.0 for x in (wrong, contradicting, noisy))
     low, high = bool(is_cut[0]), bool(is_cut[1])
-    return Evidence(len(lines), typical, shares[0], shares[1], rough, low, high)
+    return Evidence(len(lines), typical, off, uneven, beyond, steep, rough, low, high)
+
+
+def known_slopes(lines: Floats, bend: Floats) -> tuple[float, float]:
+    """Return the typical slope of lines (n, 3, 5), and how it changes away from the surface.
+
+    Slopes are exact but for fifth derivatives, and known where fourth differences, ``bend`` (n,) in
+    sum, are small: no kink is among the samples. The first is NaN if too few are known.
+    """
+    a, b, middle, d, e = np.moveaxis(lines, -1, 0)
+    slope = np.sqrt((((8 * (d - b) - (e - a)) / 12) ** 2).sum(1))
+    known = bend < KNOWN * slope
+    slope, far = slope[known], np.abs(middle[known, 0])
+    if len(slope) < ENOUGH:
+        return float("nan"), 0.0
+    near = far <= np.median(far)
+    typical = float(np.median(slope))
+    beyond = float(np.median(slope[~near])) if not near.all() else typical
+    return typical, (beyond - float(np.median(slope[near]))) / typical
+
+
+def noise_at_least(fourth: Floats) -> float:
+    """Return the standard deviation of the noise that the smaller fourth differences can show."""
+    return float(np.quantile(fourth, 0.25)) / 70**0.5 / 0.3186 if len(fourth) else 0.0
+
+
+def contradict(around: Floats, steps: Floats, noise: float) -> BoolArray:
+    """Return which samples differ from several others by more than distances can, (n,).
+
+    ``around`` (n, 5, 5, 5) has each sample in the middle, ``steps`` are the spacings, and ``noise``
+    is its standard deviation, all in the largest spacing. Rounding explains its last digit.
+    """
+    matters = MATTERS * min(steps)
+    boxes = np.clip(around.reshape(len(around), 5**3), -matters, matters)
+    middle = boxes[:, 5**3 // 2]
+    digits = np.diff(np.unique(middle.astype(np.float32)))
+    digit = float(np.median(digits)) if len(digits) else 0.0
+    places = np.indices((5,) * 3).reshape(3, -1).T - BESIDE
+    beyond = np.abs(boxes - middle[:, None]) - np.linalg.norm(places * steps, axis=1)
+    allowed = max(APART, BY_NOISE * noise, digit * (1 + ROUNDING))
+    found: BoolArray = (beyond > allowed).sum(1) >= SEVERAL
+    return found
 
 
 def slope_within(looked: Looked, spacing: Triple) -> float:

@@ -30,7 +30,8 @@ STEEP = 0.25
 # Where walls cut off a region that holds a sample as deep as this, either it is the inside of a
 # solid in an unsigned field, and the walls have no thickness, or the walls are thin and enclose it.
 FREE, DEEP = 1.001, 0.75
-NO_THICKNESS, UNSIGNED_SHARE = 0.03, 0.05
+# To unsigned distances a constant may have been added: then most walls are thinner than nothing.
+NO_THICKNESS, UNSIGNED_SHARE, LEAST_THICKNESS = 0.03, 0.05, 0.05
 MOST_FLOODED = 1 << 21  # samples; of a larger grid every second one, or third, is as exact
 CANDIDATES_IN_PLANE, CANDIDATES = 8, 512  # samples near 0 whose neighbours are looked at
 LIPSCHITZ, LIPSCHITZ_SHARE = 1.05, 0.9  # distances change by no more, at most samples
@@ -67,13 +68,15 @@ def check_thin(values: SampleArray, spacing: Triple, extremes: Extremes) -> None
     scale = (1 if extremes[0] >= 0 else -1) / max(spacing)
     if min(map(abs, extremes)) * abs(scale) > reach(steps):
         raise _refusal(extremes, FAR)
-    patches, walls, unsigned_walls = look_near_walls(values, scale, steps)
+    patches, walls, thickness = look_near_walls(values, scale, steps)
     if not len(patches):
         raise _refusal(extremes, BEYOND)
     if not (_are_distances(patches, steps) and _touch_walls(patches, steps)):
         raise _refusal(extremes, UNSIGNED)
-    if unsigned_walls > UNSIGNED_SHARE * walls and _is_cut_off(values, scale, steps):
-        raise _refusal(extremes, UNSIGNED)
+    if len(thickness) > UNSIGNED_SHARE * walls:
+        beyond = max(-float(np.quantile(thickness, LEAST_THICKNESS)), 0.0)
+        if _is_cut_off(values, scale, steps, FREE + beyond):
+            raise _refusal(extremes, UNSIGNED)
 
 
 def _refusal(extremes: Extremes, reason: str) -> GridError:
@@ -92,8 +95,8 @@ def reach(steps: Floats) -> float:
     return float(np.linalg.norm(steps)) / 2 * MARGIN
 
 
-def look_near_walls(values: SampleArray, scale: float, steps: Floats) -> tuple[Floats, int, int]:
-    """Return patches near 0, and how many walls pass between samples, and without thickness.
+def look_near_walls(values: SampleArray, scale: float, steps: Floats) -> tuple[Floats, int, Floats]:
+    """Return patches near 0, how many walls pass between samples, and how thick the thinnest are.
 
     Parameters
     ----------
@@ -108,11 +111,14 @@ def look_near_walls(values: SampleArray, scale: float, steps: Floats) -> tuple[F
     -------
     patches : (n, 27) float64
         Distances round some of the inner samples near 0, in the order of ``NEIGHBOURHOOD``.
-    walls, without : int
-        Of all lines along the axes; and those of them with less than ``NO_THICKNESS``.
+    walls : int
+        Of all lines along the axes.
+    thickness : (w,) float64
+        Of those of them with less than ``NO_THICKNESS``; below 0 if a constant was added.
     """
     found: list[Floats] = []
-    counts, near = np.zeros(2, np.int64), reach(steps)
+    walls, near = 0, reach(steps)
+    thin: list[Floats] = [np.empty(0)]
     for i in range(1, len(values) - 1):
         slab = np.array(values[i - 1 : i + 3], np.float64)
         slab *= scale
@@ -120,11 +126,12 @@ def look_near_walls(values: SampleArray, scale: float, steps: Floats) -> tuple[F
             for lines, step in zip((slab, slab[1], slab[1].T), steps):
                 for part in chunks_of(lines.shape[1], lines[:, 0].size):  # to save memory
                     thickness = find_walls(lines[:, part] / step)[1]
-                    counts += np.array([len(thickness), (thickness < NO_THICKNESS).sum()])
+                    walls += len(thickness)
+                    thin.append(thickness[thickness < NO_THICKNESS])
             found += _patches_near(slab[:3], near)
     some = np.unique(np.linspace(0, max(len(found) - 1, 0), CANDIDATES).astype(int))
     patches = np.array([found[n] for n in some] if found else []).reshape(-1, 27)
-    return patches, int(counts[0]), int(counts[1])
+    return patches, walls, np.concatenate(thin)
 
 
 def _patches_near(slab: Floats, limit: float) -> list[Floats]:
@@ -187,8 +194,11 @@ def _touch_walls(patches: Floats, steps: Floats) -> bool:
     return bool((rises & (np.abs(deepest) <= TOUCHING)).mean() >= TOUCHING_SHARE)
 
 
-def _is_cut_off(values: SampleArray, scale: float, steps: Floats) -> bool:
-    """Return whether walls cut deep samples off from the farthest sample of the border."""
+def _is_cut_off(values: SampleArray, scale: float, steps: Floats, free: float) -> bool:
+    """Return whether walls cut deep samples off from the farthest sample of the border.
+
+    No wall passes between samples that add up to more than ``free`` times their spacing.
+    """
     coarse = _every_nth(values, scale)
     border = coarse.copy()
     border[1:-1, 1:-1, 1:-1] = -np.inf
@@ -197,7 +207,7 @@ def _is_cut_off(values: SampleArray, scale: float, steps: Floats) -> bool:
     before = 0
     while before != (before := int(reached.sum())):
         for axis, step in enumerate(steps):
-            _spread(np.moveaxis(reached, axis, 0), np.moveaxis(coarse, axis, 0), FREE * step)
+            _spread(np.moveaxis(reached, axis, 0), np.moveaxis(coarse, axis, 0), free * step)
     return bool((coarse[~reached] >= DEEP).any())
 
 

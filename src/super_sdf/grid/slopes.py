@@ -20,6 +20,7 @@ TYPICAL_ERROR = 0.1  # of a slope, relative: half the weight
 LEAST_WEIGHT = 1e-3
 SLOPE_BYTES = 60  # per sample, measured
 FLAT, STEEP = 0.25, 4.0  # local slopes over the typical one
+NEARLY = 0.2  # from 1: slopes nearer to it count as 1, since dividing by them overshoots
 
 
 def normalised_planes(values: SampleArray, h: float, change: float) -> DerivedPlanes:
@@ -37,7 +38,9 @@ def normalised_planes(values: SampleArray, h: float, change: float) -> DerivedPl
 
     def make(planes: NDArray[Any]) -> FloatArray:
         scaled = in_spacings(planes, change)
-        return np.divide(scaled, local_slopes(scaled))
+        off = local_slopes(scaled) - 1
+        far: FloatArray = np.sign(off) * np.maximum(np.abs(off) - NEARLY, 0)
+        return np.divide(scaled, 1 + far)
 
     return DerivedPlanes(values, make, AROUND + 2, unit=h, each=SLOPE_BYTES)
 

@@ -23,6 +23,7 @@ from ..arrays import BoolArray, Triple
 from .evidence import BESIDE, Floats, Looked
 from .spacing import is_cubic
 
+MOST_PATCHES = 1 << 12  # samples that are compared with all round them
 LEAST = 20  # samples from which shares of them are evidence
 MOST, MOST_APART = 0.98, 0.95  # shares of the samples that follow from the sides
 ERROR = 0.01  # of values: they may have two decimals
@@ -81,12 +82,13 @@ def find_transform(looked: Looked, spacing: Triple | None) -> Transform | None:
     """
     steps = np.ones(3) if spacing is None or is_cubic(spacing) else np.array(spacing)
     steps = steps / steps.min()
-    sides = looked.patches <= 0, looked.patches < 0
-    ends = next(filter(None, (_beside(looked.patches, side, steps) for side in sides)), None)
+    patches = looked.around[:: len(looked.around) // MOST_PATCHES + 1]
+    sides = patches <= 0, patches < 0
+    ends = next(filter(None, (_beside(patches, side, steps) for side in sides)), None)
     if ends is None:
         return None
     unit = max(ends)
-    patches, clipped = looked.patches / unit, np.abs(looked.extremes) / unit
+    patches, clipped = patches / unit, np.abs(looked.extremes) / unit
     patches[np.abs(patches) < ZERO] = 0
     if clipped.max() < 1 + ERROR:  # two values, perhaps of labels
         return None

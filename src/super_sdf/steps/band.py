@@ -26,12 +26,15 @@ DECODE_LIMIT = 3**0.5 + 0.5
 # Two distances differ by no more than their samples are apart (Lipschitz); slack for rounding.
 LIPSCHITZ_SLACK = 0.1
 
+JUMP = 0.2  # by which values differ more than noise makes distances differ
+
 # Planes are worked on in blocks of about this many samples, to save memory, but of at least this
 # many planes, since a block also reads one plane more on either side.
 BLOCK_SAMPLES = 1 << 18
 BLOCK_PLANES = 4
 
 # The largest difference between a voxel's sample and that at each place of its patch, (27,).
+MAX_STEP = 2 + LIPSCHITZ_SLACK  # between neighbours along an axis
 MAX_DIFFERENCE = (2 * np.linalg.norm(NEIGHBOURHOOD, axis=1) + LIPSCHITZ_SLACK).astype(np.float32)
 
 
@@ -104,12 +107,17 @@ def _dilate(mask: BoolArray) -> BoolArray:
 
 
 def pad_by_extrapolation(rescaled: FloatArray) -> FloatArray:
-    """Return the grid padded by one sample on every side, extrapolated linearly, clipped to 3 h."""
+    """Return the grid padded by one sample on every side, extrapolated linearly, clipped to 3 h.
+
+    Steps that no distance makes are not continued: a grid that was padded has such on its border.
+    """
     padded = np.pad(np.clip(rescaled, -2 * PATCH_LIMIT, 2 * PATCH_LIMIT), 1)
     for axis in range(3):
         planes = np.moveaxis(padded, axis, 0)
-        planes[0] = 2 * planes[1] - planes[2]
-        planes[-1] = 2 * planes[-2] - planes[-3]
+        for outer, border, inner in ((0, 1, 2), (-1, -2, -3)):
+            planes[outer] = 2 * planes[border] - planes[inner]
+            steep = np.abs(planes[border] - planes[inner]) > MAX_STEP
+            planes[outer][steep] = planes[border][steep]
     return np.clip(padded, -PATCH_LIMIT, PATCH_LIMIT, out=padded)
 
 
@@ -203,6 +211,29 @@ def is_lipschitz(patches: FloatArray, places: Iterable[int] = range(27)) -> Bool
     for column in places:
         keeps &= np.abs(patches[:, column] - centre) <= MAX_DIFFERENCE[column]
     return keeps
+
+
+def has_both_sides(patches: FloatArray) -> BoolArray:
+    """Return in which patches (V, 27) samples lie on both sides of 0, (V,)."""
+    outside = patches[:, CENTRE] > 0
+    found = np.zeros(len(patches), bool)
+    for column in range(27):
+        found |= (patches[:, column] > 0) != outside
+    return found
+
+
+def is_filled_in(patches: FloatArray) -> BoolArray:
+    """Return which samples were filled in, as by padding with a constant, (V,) bool.
+
+    They are small, so that the surface should be near, but the field falls to none of the samples
+    around, and rises to one by more than distances and noise do.
+    """
+    size = np.abs(patches)
+    rise = size - size[:, CENTRE, None]
+    found: BoolArray = (rise > MAX_DIFFERENCE + JUMP).any(1)
+    at = np.flatnonzero(found)
+    found[at] = (rise[at] > -JUMP / 2).all(1) & ~has_both_sides(patches[at])
+    return found
 
 
 def can_hold_surface(patches: FloatArray, lipschitz: BoolArray) -> BoolArray:

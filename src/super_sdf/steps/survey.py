@@ -37,7 +37,9 @@ from .band import (
     BLOCK_PLANES,
     BLOCK_SAMPLES,
     can_hold_surface,
+    has_both_sides,
     is_active,
+    is_filled_in,
     is_lipschitz,
     neighbour_table,
     pad_by_extrapolation,
@@ -335,7 +337,7 @@ def limit_to_field(band: Band, grid: SdfGrid, offset: float) -> Band:
     exact = band.exact & (sample > low) & (sample < high)
     decoded = band.decoded
     if field.kind == MASK:
-        decoded = _has_both_sides(band.patches)
+        decoded = has_both_sides(band.patches)
     if field.smooth is not None:  # no distances: what they say of the voxels is not certain
         decoded = np.ones_like(band.decoded)
     band = replace(band, exact=exact, decoded=decoded, kind=field.kind, smooth=field.smooth)
@@ -359,15 +361,6 @@ def limits_beyond(grid: SdfGrid, offset: float) -> tuple[float, float]:
     ends = np.clip([grid.low - offset, grid.high - offset], -FAR / scale, FAR / scale) * scale
     lowest, highest = map(float, ends.astype(np.float32))  # where it may be cut off
     return max(low, lowest), min(high, highest)
-
-
-def _has_both_sides(patches: FloatArray) -> BoolArray:
-    """Return in which patches (V, 27) samples lie on both sides of 0, (V,)."""
-    outside = patches[:, CENTRE] > 0
-    found = np.zeros(len(patches), bool)
-    for column in range(27):
-        found |= (patches[:, column] > 0) != outside
-    return found
 
 
 def _check_bound(need: int, planes: int, held: int, bound: int | None) -> None:
@@ -492,13 +485,18 @@ def _windows(shape: tuple[int, ...], own: slice) -> Iterator[tuple[slice, slice]
 def _patches_of(
     window: FloatArray, own: tuple[slice, slice]
 ) -> Iterator[tuple[NDArray[np.int64], FloatArray]]:
-    """Yield active voxels among some planes and rows of a window, and the samples round them."""
+    """Yield active voxels among some planes and rows of a window, and the samples round them.
+
+    Values that were filled in are left out.
+    """
     active = is_active(window)[own]
     found, padded = np.flatnonzero(active), pad_by_extrapolation(window)
     first = np.array([own[0].start, own[1].start, 0])
     for rows in chunks_of(len(found), len(NEIGHBOURHOOD)):
         ijk = np.stack(np.unravel_index(found[rows], active.shape), 1) + first
-        yield ijk, take_patches(padded, ijk)
+        patches = take_patches(padded, ijk)
+        kept = ~is_filled_in(patches)
+        yield ijk[kept], patches[kept]
 
 
 def check_jumps(found: list[tuple[Jumps, Jumps]], grid: SdfGrid, offset: float) -> None:
