@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import distances, masking
-from .evidence import Looked, is_normalised, look, weigh
+from .evidence import Looked, is_normalised, is_projective, look, weigh
 from .field import AUTO, EXACT, MASK, NOISY, SCALED, TRUNCATED, Wanted
 from .masks import is_distance_transform
 from .planes import SampleArray, changed
@@ -81,8 +81,7 @@ def _known(
     extremes = find_extremes(samples)
     if extremes is not None:
         return samples, extremes
-    is_long = samples.dtype.itemsize > 8  # long doubles may be infinite as float64 only
-    if is_long or request.wanted.field not in (AUTO, TRUNCATED):
+    if samples.dtype.itemsize > 8:  # long doubles may be infinite as float64 only
         raise not_finite(samples)
     return filled(samples, notes)
 
@@ -126,7 +125,7 @@ def _has_other_slope(looked: Looked, request: Request) -> bool:
         return True
     if request.spacing is None:
         return False
-    if is_normalised(looked, request.spacing):
+    if is_normalised(looked, request.spacing) or is_projective(looked, request.spacing):
         return True
     evidence = weigh(looked, request.spacing)
     return request.is_density and (not np.isfinite(evidence.slope) or evidence.is_scaled)
