@@ -25,6 +25,7 @@ from .samples import (
     not_finite,
 )
 from .unknown import filled
+from .unseen import without_unseen
 
 
 def interpret(
@@ -52,6 +53,9 @@ def interpret(
     if has_two_values(samples, extremes):
         middle = 0.0 if request.is_density else sum(extremes) / 2
         return masking.of_mask(masking.above(samples, middle), request, notes)
+    seen = samples if request.is_density else without_unseen(samples, extremes, notes)
+    if seen is not samples:
+        samples, extremes = filled(seen, notes)
     if wanted.field == MASK:
         return masking.of_signs(samples, extremes, request, notes)
     if wanted.field in (EXACT, NOISY):

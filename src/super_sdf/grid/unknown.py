@@ -8,7 +8,7 @@ NaN along z begin is kept in memory.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from .planes import SampleArray, SamplePlanes
 from .samples import Extremes, not_finite
 
 Ints = NDArray[np.int64]
+IsMarked = Callable[[NDArray[Any]], BoolArray]
 
 RUN_BYTES = 32  # per sample of a plane, to number its runs
 WAY_OUT = "replace each by a distance of the right sign (the cut-off value of its side)"
@@ -62,25 +63,32 @@ class KnownPlanes(SamplePlanes):
 
 
 class Regions:
-    """The connected regions of samples that are NaN, made of their runs along z.
+    """The connected regions of samples that are NaN, or marked, made of their runs along z.
+
+    Parameters
+    ----------
+    samples : (nx, ny, nz) array or Planes
+    is_marked : callable
+        Returns which samples of a plane are.
 
     Attributes
     ----------
     before : (nx + 1,) int64
         How many runs there are before each plane, and in all.
-    start, size : (n,) int64
-        The first sample of each run, in C order, and its length.
+    start, size, root : (n,) int64
+        The first sample of each run, in C order, its length, and the first run of its region.
     positive, negative : (n,) bool
         Whether the region of a run has known samples beside it that are positive, and negative or
         0.
     """
 
-    def __init__(self, samples: SampleArray) -> None:
+    def __init__(self, samples: SampleArray, is_marked: IsMarked = np.isnan) -> None:
+        self.is_marked = is_marked
         self.before = np.zeros(len(samples) + 1, np.int64)
-        found = [self._look(i, *planes) for i, planes in enumerate(_with_the_one_before(samples))]
+        found = [self._look(i, *planes) for i, planes in enumerate(with_the_one_before(samples))]
         starts, sizes, joined, positive, negative = zip(*found)
         self.start, self.size = np.concatenate(starts), np.concatenate(sizes)
-        root = components(len(self.start), np.concatenate(joined, axis=1))
+        self.root = root = components(len(self.start), np.concatenate(joined, axis=1))
         self.positive = _of_regions(root, np.concatenate(positive))
         self.negative = _of_regions(root, np.concatenate(negative))
 
@@ -96,14 +104,14 @@ class Regions:
 
         The pairs, (2, n), and the runs beside positive and others may be of the plane before, too.
         """
-        unknown = np.isnan(plane)
+        unknown = self.is_marked(plane)
         runs, start = self.runs_of(i, unknown), np.flatnonzero(_begins(unknown))
         size = np.bincount(runs[unknown] - self.before[i], minlength=len(start))
         self.before[i + 1] = self.before[i] + len(start)
         sides = [(runs[:, 1:], runs[:, :-1], plane[:, 1:], plane[:, :-1])]
         sides += [(runs[1:], runs[:-1], plane[1:], plane[:-1])]
         if former is not None:
-            sides += [(runs, self.runs_of(i - 1, np.isnan(former)), plane, former)]
+            sides += [(runs, self.runs_of(i - 1, self.is_marked(former)), plane, former)]
         pairs, positive, negative = zip(*(_beside(*side) for side in sides))
         joined = np.concatenate(pairs, axis=1)
         return (
@@ -153,7 +161,7 @@ def _look_at_numbers(samples: SampleArray) -> tuple[float, float, int]:
     """
     low, high, infinite = np.inf, -np.inf, 0
     beside: list[Ints] = []
-    for i, (plane, former) in enumerate(_with_the_one_before(samples)):
+    for i, (plane, former) in enumerate(with_the_one_before(samples)):
         finite = plane[np.isfinite(plane)]
         low = min(low, float(finite.min(initial=np.inf)))
         high = max(high, float(finite.max(initial=-np.inf)))
@@ -190,7 +198,7 @@ def _check_infinite(beside: Ints, samples: SampleArray) -> None:
         raise GridError(
             f"values[{i}, {j}, {k}] is {samples[i][j, k]!s}, and a sample beside it has the other "
             f"sign, as at {len(np.unique(beside, axis=0)):,} infinite samples: where the surface "
-            f"passes between them is unknown; {WAY_OUT}"
+            f"passes between them is unknown; {WAY_OUT}, or by NaN where nothing was seen"
         )
 
 
@@ -201,7 +209,7 @@ def _check_sides(regions: Regions, shape: tuple[int, ...]) -> None:
         at = np.unravel_index(int(regions.start[unsure][0]), shape)
         first = ", ".join(str(int(index)) for index in at)
         raise GridError(
-            f"{int(regions.size[unsure].sum()):,} samples are NaN, values[{first}] the first, in "
+            f"{int(regions.size[unsure].sum()):,} samples are unknown, values[{first}] the first, in "
             "regions that touch samples on both sides of the surface, so whether they are inside "
             f"is unknown; {WAY_OUT}"
         )
@@ -214,7 +222,7 @@ def _begins(unknown: BoolArray) -> BoolArray:
     return begins
 
 
-def _with_the_one_before(
+def with_the_one_before(
     samples: SampleArray,
 ) -> Iterator[tuple[NDArray[Any], NDArray[Any] | None]]:
     """Yield each plane with the one before it."""
