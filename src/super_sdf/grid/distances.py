@@ -159,7 +159,8 @@ def _projective(
         "values taken as truncated (--field truncated), and none as exact, since their slope is "
         "uneven, as that of fused depth images: the surface is that of their cubic spline"
     )
-    field = Field(TRUNCATED, request.wanted.field == TRUNCATED, NONE_EXACT)
+    given = request.wanted.field == TRUNCATED
+    field = Field(TRUNCATED, given, NONE_EXACT, is_uneven=True)
     return _as_spline(replace(found, field=replace(field, evidence=evidence.report())))
 
 

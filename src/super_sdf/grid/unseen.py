@@ -18,7 +18,7 @@ from .planes import SampleArray, SamplePlanes
 from .samples import Extremes
 from .unknown import RUN_BYTES, Ints, Regions, with_the_one_before
 
-MOST_PLANES, MOST_LOOKED = 64, 1 << 18  # planes and samples that show which values are tried
+MOST_PLANES, MOST_LOOKED = 32, 1 << 15  # planes and samples that show which values are tried
 FREQUENT, LEAST_VALUES = 8, 6  # values that are tried, and different ones that tell steepness
 # From sample to sample values change by at most ``JUMP`` times the steepest typical change, but
 # beside unseen ones: nearly all changes there are larger.
@@ -40,8 +40,10 @@ class SeenPlanes(SamplePlanes):
     name = "the grid"
     dtype = np.dtype(np.float64)
 
-    def __init__(self, source: SampleArray, regions: Regions, unseen: BoolArray) -> None:
-        self.source, self.regions, self.unseen = source, regions, unseen
+    def __init__(
+        self, source: SampleArray, regions: Regions, unseen: BoolArray, value: float
+    ) -> None:
+        self.source, self.regions, self.unseen, self.value = source, regions, unseen, value
         self.shape = tuple(source.shape)
 
     def read(self, first: int, last: int) -> NDArray[Any]:
@@ -58,8 +60,13 @@ class SeenPlanes(SamplePlanes):
         return 2 * planes * self.plane_bytes + RUN_BYTES * self.shape[1] * self.shape[2]
 
 
-def without_unseen(samples: SampleArray, extremes: Extremes, notes: list[str]) -> SampleArray:
+def without_unseen(
+    samples: SampleArray, extremes: Extremes, notes: list[str], *, all_known: bool
+) -> SampleArray:
     """Return samples that are NaN where they have a value that stands for unseen ones.
+
+    Of samples that are not ``all_known`` by their user, those with an extreme value may be beside
+    any others: few views leave such edges.
 
     Raises
     ------
@@ -76,8 +83,8 @@ def without_unseen(samples: SampleArray, extremes: Extremes, notes: list[str]) -
                 f"{int(regions.size[unseen].sum()):,} samples are exactly {value:g}, where no "
                 "distance is: they are taken as unknown (write NaN where nothing was seen)"
             )
-            samples = SeenPlanes(samples, regions, unseen)
-        elif value in extremes:
+            samples, all_known = SeenPlanes(samples, regions, unseen, value), False
+        elif all_known and value in extremes:
             _check_jumps(samples, value, steepest, extremes)
     return samples
 
@@ -86,7 +93,7 @@ def _suspects(samples: SampleArray, extremes: Extremes) -> list[tuple[float, flo
     """Return values that may stand for unseen samples, and the steepest change of the others."""
     pairs = _some_pairs(samples)
     values, counts = np.unique(pairs[0], return_counts=True)
-    often = values[np.argsort(counts)[-FREQUENT:]]
+    often = values[counts >= ENOUGH][np.argsort(counts[counts >= ENOUGH])[-FREQUENT:]]
     found = []
     for value in np.unique([0.0, *extremes, *often]):
         steepest = _steepest(pairs, value, extremes)
@@ -107,24 +114,18 @@ def _steepest(pairs: Floats, value: float, extremes: Extremes) -> float:
     return float(np.quantile(np.abs(np.diff(pairs[:, others], axis=0)), STEEPEST))
 
 
-def _check_jumps(
-    samples: SampleArray, value: float, steepest: float, extremes: Extremes
-) -> None:
+def _check_jumps(samples: SampleArray, value: float, steepest: float, extremes: Extremes) -> None:
     """Raise GridError if the sign changes mostly by jumps from where values are cut off."""
     pairs = _some_pairs(samples)
     pairs = pairs[:, (pairs[0] > 0) != (pairs[1] > 0)]
     jumps = _are_jumps(pairs, JUMP * steepest, extremes) & (pairs == value).any(0)
     filled_in = np.isin(pairs, extremes).all(0).mean() > FILLED_IN
     if not filled_in and jumps.mean() > MIXED and jumps.sum() >= LEAST_JUMPS:
-        raise _may_be_unseen(int(sum(np.count_nonzero(plane == value) for plane in samples)), value)
-
-
-def _may_be_unseen(count: int, value: float) -> GridError:
-    """Return the error for a value that may stand for unseen samples, but not everywhere."""
-    return GridError(
-        f"{count:,} samples are exactly {value:g}, and beside some the values jump as no distance "
-        "does: write NaN where nothing was seen"
-    )
+        count = sum(np.count_nonzero(plane == value) for plane in samples)
+        raise GridError(
+            f"{count:,} samples are exactly {value:g}, and beside some the values jump as no "
+            "distance does: write NaN where nothing was seen"
+        )
 
 
 def _some_pairs(samples: SampleArray) -> Floats:
@@ -139,7 +140,8 @@ def _some_pairs(samples: SampleArray) -> Floats:
         beside = slab[1, rows], slab[0, 1:][rows]
         parts += [np.stack([here, other]).reshape(2, -1) for other in beside]
         parts.append(np.stack([here[:, :-1], here[:, 1:]]).reshape(2, -1))
-    return np.concatenate(parts, axis=1).astype(np.float64)
+    pairs = np.concatenate(parts, axis=1).astype(np.float64)
+    return pairs[:, np.isfinite(pairs).all(0)]
 
 
 def _are_jumps(pairs: Floats, limit: float, extremes: Extremes) -> BoolArray:
@@ -154,16 +156,13 @@ def _are_jumps(pairs: Floats, limit: float, extremes: Extremes) -> BoolArray:
 def _unseen_runs(
     samples: SampleArray, regions: Regions, value: float, steepest: float, extremes: Extremes
 ) -> BoolArray:
-    """Return which runs of a value were never seen, (n,); GridError if some may be."""
+    """Return which runs of a value were never seen, (n,)."""
     beside, jumps, above, amid = _beside_regions(samples, regions, JUMP * steepest, extremes)
     unseen = (jumps > UNSEEN * beside) & (jumps > 0)
-    if value == 0:  # no distance is 0 throughout; it is on surfaces, with samples on both sides
-        one_sided = (above == 0) | (above == beside)
-        unseen |= one_sided & (amid > 0)
-        unseen |= one_sided & unseen.any()
-        mixed = ~one_sided & (amid > 0) & ~unseen
-        if mixed.any():
-            raise _may_be_unseen(int(regions.size[mixed[regions.root]].sum()), value)
+    unseen |= (beside == 0) & unseen.any()
+    if value == 0:  # no distance is 0 throughout; on surfaces it is, with samples on both sides
+        unseen |= amid > 0
+        unseen |= ((above == 0) | (above == beside)) & unseen.any()
     return unseen[regions.root]
 
 
@@ -172,8 +171,8 @@ def _beside_regions(
 ) -> tuple[Ints, Ints, Ints, Ints]:
     """Count, by the first run of each region, the pairs of its samples with others, (n,) each.
 
-    All but those of both extremes; those that differ by more than a limit; those with one above 0; and samples that have only
-    others of the region beside them along the axes.
+    All but those of both extremes; those that differ by more than a limit; those with one above 0;
+    and samples that have only others of the region beside them along the axes.
     """
     counts = np.zeros((4, len(regions.root)), np.int64)
 
@@ -181,7 +180,7 @@ def _beside_regions(
         counts[which] += np.bincount(regions.root[runs], minlength=counts.shape[1])
 
     def look(runs: Ints, values: NDArray[Any], other_runs: Ints, others: NDArray[Any]) -> None:
-        at = (runs >= 0) & (other_runs < 0)
+        at = (runs >= 0) & (other_runs < 0) & np.isfinite(others)
         pairs = np.stack([values[at], others[at]]).astype(np.float64)
         count(0, runs[at][~np.isin(pairs, extremes).all(0)])
         count(1, runs[at][_are_jumps(pairs, limit, extremes)])
@@ -203,7 +202,7 @@ def _beside_regions(
 
 
 def _amid(runs: Ints, after: Ints) -> Ints:
-    """Return the runs of samples that are marked as are those beside them, and in the next plane."""
+    """Return the runs of samples that are marked, as those beside and in the next plane."""
     marked = runs >= 0
     amid = marked & (after >= 0)
     inner = amid[1:-1, 1:-1]
