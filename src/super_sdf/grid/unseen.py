@@ -97,6 +97,8 @@ def _suspects(samples: SampleArray, extremes: Extremes) -> list[tuple[float, flo
     found = []
     for value in np.unique([0.0, *extremes, *often]):
         steepest = _steepest(pairs, value, extremes)
+        if value in extremes and _is_cut_near(pairs, value, steepest, extremes):
+            continue
         has = pairs == value
         jumps = _are_jumps(pairs, JUMP * steepest, extremes) & (has[0] != has[1])
         if jumps.sum() >= LEAST_JUMPS or (value == 0 and has.all(0).sum() >= ENOUGH):
@@ -104,14 +106,27 @@ def _suspects(samples: SampleArray, extremes: Extremes) -> list[tuple[float, flo
     return found
 
 
+def _is_cut_near(pairs: Floats, value: float, steepest: float, extremes: Extremes) -> bool:
+    """Return whether the sign changes from one extreme to the other, and others are near a value.
+
+    So it does where values are cut off near the surface, or what is unseen was filled in by hand.
+    """
+    crossing = pairs[:, (pairs[0] > 0) != (pairs[1] > 0)]
+    others = pairs[~np.isin(pairs, extremes)]
+    near = np.abs(others - value).min(initial=np.inf) < JUMP * steepest
+    return bool(near and np.isin(crossing, extremes).all(0).mean() > FILLED_IN)
+
+
 def _steepest(pairs: Floats, value: float, extremes: Extremes) -> float:
     """Return the steepest change of samples without a value, or all that they span, if few tell."""
-    others = ~np.isin(pairs, [value, *extremes]).any(0) & (pairs[0] != pairs[1])
-    if others.sum() < ENOUGH or len(np.unique(pairs[:, others])) < LEAST_VALUES:
-        rest = pairs[pairs != value]
+    rest, inner = pairs[pairs != value], pairs[~np.isin(pairs, [value, *extremes])]
+    changes = np.abs(pairs[1] - pairs[0])[(pairs != value).all(0)]
+    span = np.ptp(inner) if len(inner) else 0.0  # larger changes are those to another such value
+    changes = changes[(changes > 0) & (changes <= span)]
+    if len(changes) < ENOUGH or len(np.unique(inner)) < LEAST_VALUES:
         low, high = rest.min(initial=0), rest.max(initial=0)
         return FEW_SPANS * float(high - low) if low < 0 < high else np.inf
-    return float(np.quantile(np.abs(np.diff(pairs[:, others], axis=0)), STEEPEST))
+    return float(np.quantile(changes, STEEPEST))
 
 
 def _check_jumps(samples: SampleArray, value: float, steepest: float, extremes: Extremes) -> None:
@@ -119,8 +134,7 @@ def _check_jumps(samples: SampleArray, value: float, steepest: float, extremes: 
     pairs = _some_pairs(samples)
     pairs = pairs[:, (pairs[0] > 0) != (pairs[1] > 0)]
     jumps = _are_jumps(pairs, JUMP * steepest, extremes) & (pairs == value).any(0)
-    filled_in = np.isin(pairs, extremes).all(0).mean() > FILLED_IN
-    if not filled_in and jumps.mean() > MIXED and jumps.sum() >= LEAST_JUMPS:
+    if jumps.mean() > MIXED and jumps.sum() >= LEAST_JUMPS:
         count = sum(np.count_nonzero(plane == value) for plane in samples)
         raise GridError(
             f"{count:,} samples are exactly {value:g}, and beside some the values jump as no "
