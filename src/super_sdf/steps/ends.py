@@ -58,4 +58,5 @@ def octant_of_cells(factor: int) -> NDArray[np.uint8]:
     """Return the octant of the voxel, 0 to 7, in which each cell of a block lies, (K^3,)."""
     low = block_ijk(factor)
     low = low[(low < factor).all(1)]
-    return ((low >= factor // 2) @ np.array([4, 2, 1])).astype(np.uint8)
+    octant: NDArray[np.uint8] = ((low >= factor // 2) @ np.array([4, 2, 1])).astype(np.uint8)
+    return octant

@@ -27,7 +27,7 @@ STRIP_SAMPLES, STRIP_BYTES = 1 << 20, 60  # worked on at a time, and bytes of ea
 SIDE = 5  # coefficients along an axis on which the spline within half a voxel of a sample depends
 # Sums of fourth differences, in voxels, up to which a field is smooth, and from which it is not.
 SMOOTH, KINKED = 0.6, 1.3
-JUMPING, JUMPED = 3.0, 6.0  # the same for a field of uneven slope, which is linear there
+JUMPING, JUMPED = 5.0, 9.0  # the same for a field of uneven slope, which is linear there
 WRONG_SLOPE = 0.05  # from 1: local slopes so far off are not those of distances
 
 
@@ -154,7 +154,8 @@ def node_weights(factor: int) -> NDArray[np.float32]:
 def linear_weights(factor: int) -> NDArray[np.float32]:
     """Return the weights of samples at -2 to 2 for nodes that are interpolated linearly."""
     at = np.arange(factor + 1)[:, None] / factor - 0.5 - np.arange(-2, 3)
-    return np.clip(1 - np.abs(at), 0, None).astype(np.float32)
+    weights: NDArray[np.float32] = np.clip(1 - np.abs(at), 0, None).astype(np.float32)
+    return weights
 
 
 def _evaluate(coefficients: FloatArray, ijk: IntArray, weights: NDArray[np.float32]) -> FloatArray:
