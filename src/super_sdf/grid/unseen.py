@@ -28,6 +28,7 @@ STEEPEST, JUMP, UNSEEN = 0.95, 1.5, 0.9
 # there the unseen was filled in, and the sign changes as often from one extreme to the other.
 MIXED, FILLED_IN = 0.1, 0.03
 FEW_SPANS = 3.0  # times what few values span is more than they change by
+MANY = 4096  # samples among which different values are counted
 ENOUGH = 30  # changes from which the steepest is known
 LEAST_JUMPS = 6  # beside one sample
 
@@ -112,18 +113,18 @@ def _is_cut_near(pairs: Floats, value: float, steepest: float, extremes: Extreme
     So it does where values are cut off near the surface, or what is unseen was filled in by hand.
     """
     crossing = pairs[:, (pairs[0] > 0) != (pairs[1] > 0)]
-    others = pairs[~np.isin(pairs, extremes)]
+    others = pairs[~_are_any(pairs, extremes)]
     near = np.abs(others - value).min(initial=np.inf) < JUMP * steepest
-    return bool(near and np.isin(crossing, extremes).all(0).mean() > FILLED_IN)
+    return bool(near and _are_any(crossing, extremes).all(0).mean() > FILLED_IN)
 
 
 def _steepest(pairs: Floats, value: float, extremes: Extremes) -> float:
     """Return the steepest change of samples without a value, or all that they span, if few tell."""
-    rest, inner = pairs[pairs != value], pairs[~np.isin(pairs, [value, *extremes])]
+    rest, inner = pairs[pairs != value], pairs[~_are_any(pairs, (value, *extremes))]
     changes = np.abs(pairs[1] - pairs[0])[(pairs != value).all(0)]
     span = np.ptp(inner) if len(inner) else 0.0  # larger changes are those to another such value
     changes = changes[(changes > 0) & (changes <= span)]
-    if len(changes) < ENOUGH or len(np.unique(inner)) < LEAST_VALUES:
+    if len(changes) < ENOUGH or len(np.unique(inner[:MANY])) < LEAST_VALUES:
         low, high = rest.min(initial=0), rest.max(initial=0)
         return FEW_SPANS * float(high - low) if low < 0 < high else np.inf
     return float(np.quantile(changes, STEEPEST))
@@ -158,13 +159,21 @@ def _some_pairs(samples: SampleArray) -> Floats:
     return pairs[:, np.isfinite(pairs).all(0)]
 
 
+def _are_any(values: Floats, some: tuple[float, ...]) -> BoolArray:
+    """Return which values are one of some."""
+    found = np.zeros(values.shape, bool)
+    for one in some:
+        found |= values == one
+    return found
+
+
 def _are_jumps(pairs: Floats, limit: float, extremes: Extremes) -> BoolArray:
     """Return which pairs (2, n) differ by more than a limit, but for those of both extremes.
 
     Values that are cut off near the surface, or filled in by hand, go from one to the other.
     """
     large: BoolArray = np.abs(pairs[1] - pairs[0]) > limit
-    return large & ~np.isin(pairs, extremes).all(0)
+    return large & ~_are_any(pairs, extremes).all(0)
 
 
 def _unseen_runs(
@@ -196,7 +205,7 @@ def _beside_regions(
     def look(runs: Ints, values: NDArray[Any], other_runs: Ints, others: NDArray[Any]) -> None:
         at = (runs >= 0) & (other_runs < 0) & np.isfinite(others)
         pairs = np.stack([values[at], others[at]]).astype(np.float64)
-        count(0, runs[at][~np.isin(pairs, extremes).all(0)])
+        count(0, runs[at][~_are_any(pairs, extremes).all(0)])
         count(1, runs[at][_are_jumps(pairs, limit, extremes)])
         count(2, runs[at][pairs[1] > 0])
 
