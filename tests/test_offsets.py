@@ -92,13 +92,14 @@ def test_the_suggested_offset_works(network):
 def test_fill_values_end_the_distances_too(network, fill):
     values = np.where(np.abs(cube()) > 3, np.copysign(fill, cube()), cube())
     grid = make_grid(values, spacing=1)
+    assert f"samples are exactly {fill:g}, where no distance is: they are taken" in grid.notes[1]
     with pytest.raises(GridError) as caught:
         reconstruct(grid, network, 2, offset=1.5)
-    assert "needs distances 2.5 spacings (2.5) to either side of it, but they end at 2.99" in str(
+    assert "needs distances 1.5 spacings (1.5) to either side of it, but they end at 2.99" in str(
         caught.value
     )
-    mesh = reconstruct(grid, network, 2, offset=0.49)
-    assert mesh.volume() == pytest.approx(cube_volume(0.49), rel=0.02)
+    mesh = reconstruct(grid, network, 2, offset=1.49)
+    assert mesh.volume() == pytest.approx(cube_volume(1.49), rel=0.02)
 
 
 def test_fields_truncated_near_the_surface_have_only_the_surface_at_0(network):
@@ -120,9 +121,11 @@ def test_truncated_distances_are_filled_in_for_an_offset(network):
 @pytest.mark.parametrize("fill", [3, 1000])
 def test_an_offset_beyond_all_values_has_no_surface(network, fill):
     values = np.where(np.abs(cube()) > 3, np.copysign(fill, cube()), cube())
+    near = values[np.abs(values) < 3]
     with pytest.raises(GridError) as caught:
         reconstruct(make_grid(values, spacing=1), network, 2, offset=99)
-    assert str(caught.value) == f"no surface at 99: the values go from -{fill} to {fill}"
+    ends = "-3 to 3" if fill == 3 else f"{near.min():.6g} to {near.max():.6g}"
+    assert str(caught.value) == f"no surface at 99: the values go from {ends}"
 
 
 def test_noisy_distances_may_be_moved(network):

@@ -2,13 +2,27 @@
 
 import numpy as np
 import pytest
+import trimesh
 from conftest import trilinear
 from scipy import ndimage
-from test_field_kinds import PLACE, box
+from skimage.measure import marching_cubes
+from test_field_kinds import PLACE, box, thin_frame, torus
+from test_slabs import in_pieces
+from trimesh import grouping
 
-from super_sdf import SdfGrid, make_grid, read_grid, reconstruct
+from super_sdf import (
+    SdfGrid,
+    extract_mesh,
+    load_network,
+    make_grid,
+    read_grid,
+    reconstruct,
+    upsample,
+)
 from super_sdf.errors import GridError
+from super_sdf.grid.field import FIELDS
 from super_sdf.grid.unknown import Regions, components, filled
+from super_sdf.mesh import join_meshes
 
 FACES = ndimage.generate_binary_structure(3, 1)
 
@@ -76,16 +90,108 @@ def test_densities_may_be_unknown_outside_what_was_seen():
     np.testing.assert_array_equal(grid.values, want.values)
 
 
-def test_an_unknown_region_between_inside_and_outside_is_refused():
+def split() -> np.ndarray:
+    """Return distances that are unknown in a slot through the surface."""
     values = truncated()
     values[14:17, :, 20] = np.nan
-    with pytest.raises(GridError) as caught:
-        make_grid(values, **PLACE)
-    assert str(caught.value) == (
-        "96 samples are NaN, values[14, 0, 20] the first, in regions that touch samples on both "
-        "sides of the surface, so whether they are inside is unknown; replace each by a distance "
-        "of the right sign (the cut-off value of its side)"
+    return values
+
+
+def test_an_unknown_region_between_inside_and_outside_cannot_be_closed():
+    grid = make_grid(split(), **PLACE)
+    assert grid.notes[1] == (
+        "96 of the unknown samples are in regions that touch both sides of the surface: it is open "
+        "there"
     )
+    with pytest.raises(GridError) as caught:
+        reconstruct(grid, trilinear, cap=True)
+    assert str(caught.value) == (
+        "96 samples are unknown, values[14, 0, 20] the first, in regions that touch samples on "
+        "both sides of the surface, so whether they are inside is unknown; end the surface there "
+        "(--open), or replace each by a distance of the right sign (the cut-off value of its side)"
+    )
+
+
+def cells(known: np.ndarray) -> np.ndarray:
+    """Return which cells have eight known samples."""
+    for axis in range(3):
+        lines = np.moveaxis(known, axis, 0)
+        known = np.moveaxis(lines[1:] & lines[:-1], 0, axis)
+    return known
+
+
+def half_seen(seen: float = 9) -> np.ndarray:
+    """Return distances to a ball that are known between two planes."""
+    off = np.indices((28,) * 3) - np.array([13.6, 13.3, 13.8])[:, None, None, None]
+    return np.where(np.abs(off[0]) > seen, np.nan, np.linalg.norm(off, axis=0) - 10.8)
+
+
+@pytest.mark.parametrize("mesher", ["marching", "sharp"])
+@pytest.mark.parametrize("make", [split, half_seen])
+def test_the_surface_ends_where_that_of_marching_cubes_of_the_known_cells_does(make, mesher):
+    values = make()
+    grid, known = make_grid(values, **PLACE), ~np.isnan(values)
+    mesh = reconstruct(grid, trilinear, mesher=mesher)
+    corners, faces = marching_cubes(np.where(known, values, 1), 0)[:2]
+    faces = faces[cells(known)[tuple(corners[faces].mean(1).astype(int).T)]]
+    want, found = trimesh.Trimesh(corners, faces), trimesh.Trimesh(mesh.vertices, mesh.faces)
+    assert len(found.vertices) == len(mesh.vertices) == mesh.faces.max() + 1
+    assert cells(known)[tuple(found.triangles_center.astype(int).T)].all()
+    edges = [grouping.group_rows(m.edges_sorted, require_count=1) for m in (found, want)]
+    ends = [m.edges_sorted[e] for m, e in zip((found, want), edges)]
+    lengths = [
+        np.linalg.norm(np.diff(m.vertices[e], axis=1)[:, 0], axis=1).sum()
+        for m, e in zip((found, want), ends)
+    ]
+    assert found.area == pytest.approx(want.area, rel=0.03)
+    assert lengths[0] == pytest.approx(lengths[1], rel=0.04)
+
+
+@pytest.mark.parametrize("options", [{}, {"field": "scaled"}, {"field": "noisy"}])
+def test_slabs_and_threads_change_nothing_where_a_surface_ends(options, monkeypatch):
+    network = load_network("fast", device="cpu", threads=1)
+    grid = make_grid(half_seen(), **PLACE, **options)
+    want = reconstruct(grid, load_network("fast", device="cpu", threads=2))
+    field = upsample(grid, network)
+    pieces = in_pieces(grid, network, monkeypatch, 4)
+    mesh = join_meshes([mesh for piece in pieces for mesh in piece.meshes])
+    assert len(pieces) > 2 and not want.is_closed()
+    np.testing.assert_array_equal(mesh.vertices, want.vertices)
+    np.testing.assert_array_equal(mesh.faces, want.faces)
+    np.testing.assert_array_equal(extract_mesh(field).faces, want.faces)
+    with pytest.raises(GridError, match=r"so whether they are inside is unknown; end the surface"):
+        extract_mesh(field, cap=True)
+
+
+def test_what_needs_the_whole_surface_is_refused(tmp_path, command, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    np.save("seen.npy", half_seen())
+    said = "Error: samples beside the surface are unknown, so it is open there: "
+    run = ["upsample", "seen.npy", "out.ply", "--spacing", 1, "--factor", 2, "--quality", "fast"]
+    refused = [
+        ((), "so whether they are inside is unknown; end the surface there (--open)"),
+        (("--open", "--iterations", 2), f"{said}refine once, by a larger factor (--iterations 1)"),
+        (("--open", "--save-field", "f.npz"), f"{said}write the mesh alone, without its field"),
+    ]
+    for options, message in refused:
+        code, _, err = command(*run, *options)
+        assert code == 1 and message in err and err.count("\n") == 1
+        assert [path.name for path in tmp_path.iterdir()] == ["seen.npy"]
+    code, _, err = command(*run, "--open")
+    assert code == 0
+    assert "Warning: the surface ends where samples are unknown, and is open there\n" in err
+    assert not trimesh.load("out.ply").is_watertight
+
+
+def test_unequal_spacings_of_distances_that_end_need_the_spline():
+    values = half_seen()[:, :, ::2]
+    grid = make_grid(values, spacing=(1, 1, 2), origin=0)
+    with pytest.raises(GridError, match=r"mesh the spline of the values \(--field scaled\)$"):
+        reconstruct(grid, trilinear)
+    scaled = make_grid(values, spacing=(1, 1, 2), origin=0, field="scaled")
+    mesh = reconstruct(scaled, trilinear)
+    off = np.linalg.norm(mesh.vertices - np.array([13.6, 13.3, 13.8]), axis=1) - 10.8
+    assert np.abs(off).mean() < 0.05 and np.abs(mesh.vertices[:, 0] - 13.6).max() < 9
 
 
 def test_an_infinite_sample_beside_the_surface_is_refused():
@@ -98,17 +204,101 @@ def test_an_infinite_sample_beside_the_surface_is_refused():
     assert str(caught.value) == (
         f"values[{first}] is -inf, and a sample beside it has the other sign, as at "
         f"{beside.sum():,} infinite samples: where the surface passes between them is unknown; "
-        "replace each by a distance of the right sign (the cut-off value of its side)"
+        "replace each by a distance of the right sign (the cut-off value of its side), or by NaN "
+        "where nothing was seen"
     )
 
 
-@pytest.mark.parametrize("field", ["exact", "mask", "scaled", "noisy"])
-def test_only_truncated_fields_have_unknown_samples(field):
-    values = truncated()
-    values[0, 1, 2] = np.nan
-    for make in (lambda: make_grid(values, **PLACE, field=field), lambda: SdfGrid(values, 1.0)):
-        with pytest.raises(GridError, match=r"^values\[0, 1, 2\] is nan: every sample must be"):
-            make()
+@pytest.mark.parametrize("field", FIELDS[1:])
+def test_fields_of_all_kinds_have_unknown_samples(field):
+    known = truncated(4.0)
+    values = np.where(np.abs(known) < 4, known, np.nan)
+    want, grid = (make_grid(v, **PLACE, field=field) for v in (known, values))
+    mesh, same = (reconstruct(g, trilinear) for g in (grid, want))
+    assert grid.field.kind == field and mesh.is_closed()
+    assert mesh.volume() == pytest.approx(same.volume(), rel=1e-3)
+    with pytest.raises(GridError, match=r"is nan: every sample must be"):
+        SdfGrid(values, 1.0)
+
+
+@pytest.mark.parametrize("unit", [1.5, 2, 3])
+def test_a_band_over_its_truncation_is_the_same_with_nan_elsewhere(unit):
+    """Its extremes are a little less than 1 then."""
+    distances = box() / unit
+    filled, seen = (
+        make_grid(np.where(np.abs(distances) < 1, distances, far), **PLACE)
+        for far in (np.sign(distances), np.nan)
+    )
+    said = "the values are divided by their slope, 0."
+    for grid in (filled, seen):
+        assert grid.field.kind == "truncated" and any(n.startswith(said) for n in grid.notes)
+
+
+NEVER = [0, 1, -1, -1000, 100, 255, 1e10, -32768]
+
+
+@pytest.mark.parametrize("value", NEVER)
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_a_value_where_nothing_was_seen_is_told_by_its_jumps(value, dtype):
+    distances = np.linalg.norm(np.indices((28,) * 3).T - 13.3, axis=-1) - 8.2
+    far = np.abs(distances) >= 3.2
+    values = np.where(far, value, distances).astype(dtype)
+    grid = make_grid(values, **PLACE)
+    assert f"samples are exactly {value:g}, where no distance is: they are taken" in grid.notes[0]
+    want = make_grid(np.where(far, np.nan, distances).astype(dtype), **PLACE)
+    np.testing.assert_array_equal(grid.values, want.values)
+    mesh, same = (reconstruct(g, trilinear, cap=True) for g in (grid, want))
+    assert mesh.volume() == pytest.approx(same.volume(), rel=1e-3)
+
+
+@pytest.mark.parametrize("cut", [0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1, 2, 3])
+@pytest.mark.parametrize("make", [box, torus, thin_frame])
+def test_values_that_are_cut_off_were_seen(cut, make):
+    for low in (-cut, -2 * cut):
+        for noise in (0, 0.05):
+            random = np.random.default_rng(0).normal(size=(32,) * 3)
+            grid = make_grid(np.clip(make() + noise * random, low, cut), **PLACE)
+            assert not any("exactly" in note for note in grid.notes)
+
+
+def test_zeros_on_the_surface_were_seen():
+    place = np.abs(np.indices((24,) * 3) - 12) - np.array([7, 6, 4])[:, None, None, None]
+    whole = np.linalg.norm(np.maximum(place, 0), axis=0) + np.minimum(place.max(0), 0)
+    grid = make_grid(whole, **PLACE)
+    assert not any("exactly" in note for note in grid.notes)
+
+
+def fused(cut: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return what twelve depth images say of two balls, over the cut-off, and how many saw it.
+
+    The distance is that along the line of sight.
+    """
+    at = np.moveaxis(np.indices((32,) * 3) - 15.7, 0, -1)
+    total, count = np.zeros((32,) * 3), np.zeros((32,) * 3)
+    for sight in trimesh.creation.icosahedron().vertices:
+        top = np.full(count.shape, -np.inf)
+        for centre, radius in (((-4, 0, 0), 6.2), ((5.5, 1, 2), 4.1)):
+            aside = np.linalg.norm(np.cross(at - centre, sight), axis=-1)
+            height = np.sqrt(np.maximum(radius**2 - aside**2, 0)) + np.dot(centre, sight)
+            top = np.where(aside < radius, np.maximum(top, height), top)
+        ahead = at @ sight - top
+        seen = ahead > -cut
+        total += np.where(seen, np.minimum(ahead / cut, 1), 0)
+        count += seen
+    return np.divide(total, count, out=np.ones_like(total), where=count > 0), count
+
+
+@pytest.mark.parametrize("unseen", [-1, np.nan, 0, 1, -1000])
+@pytest.mark.parametrize("scale", [1, 3, 32767])
+def test_fused_depth_images_are_meshed_by_their_spline(unseen, scale):
+    values, count = fused(3.0)
+    values = np.where(count > 0, values, unseen) * scale
+    if scale > 3 and np.isfinite(values).all() and unseen != -1000:
+        values = np.rint(values).astype(np.int16)
+    grid = make_grid(values, **PLACE)
+    assert grid.field.kind == "truncated" and grid.field.is_uneven
+    assert grid.field.exact == (0, 0) and "their slope is uneven" in grid.notes[-1]
+    assert reconstruct(grid, trilinear, 2, cap=True).is_closed()
 
 
 def test_filling_in_reads_planes_one_by_one():

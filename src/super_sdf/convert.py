@@ -42,6 +42,7 @@ from .simplification.simplify import (
     simplify_mesh,
 )
 from .slabs.pieces import Piece
+from .steps.ends import check_all_seen, check_can_close
 from .steps.lattice import lattice_shape
 from .steps.mesher_names import DEFAULT_MESHER
 from .steps.meshers import find_mesher
@@ -242,6 +243,9 @@ def convert(
         check_goal(options.simplify, options.triangles, ("simplify", "triangles"))
         check_can_simplify()
     grid = engine.read(source, options) if engine else read_grid_with(source, options)
+    check_can_close(grid, cap=options.cap)
+    if engine:
+        check_all_seen(grid, "convert it on one machine (without --cluster)")
     inputs = files_of(source)
     check_apart(target, inputs)
     if save_field is not None:
@@ -480,7 +484,9 @@ def describe(
     counts = {name: tally.counts[name] for name in COUNTS}
     counts["expected_triangles"] = tally.expected.triangles
     counts["expected_bytes"] = tally.expected.size
-    warnings = find_warnings(counts, closed, thin=grid.low >= options.offset, kind=grid.field.kind)
+    ends = grid.field.unseen is not None
+    thin = grid.low >= options.offset
+    warnings = find_warnings(counts, closed, thin=thin, kind=grid.field.kind, ends=ends)
     simplified = None
     if tally.simplified:
         simplified = tally.simplified.report(tally.voxel_size)
@@ -496,15 +502,21 @@ def describe(
 
 
 def find_warnings(
-    counts: dict[str, int], closed: bool, thin: bool = False, kind: str = EXACT
+    counts: dict[str, int],
+    closed: bool,
+    thin: bool = False,
+    kind: str = EXACT,
+    ends: bool = False,
 ) -> tuple[str, ...]:
     """Return a sentence on each thing that may be wrong with the result.
 
     ``thin`` says that no sample lies inside the solid, ``kind`` what the field is: only distances
-    can be noisy, or contradict each other.
+    can be noisy, or contradict each other. ``ends``: the surface ends at unknown samples.
     """
     warnings = []
-    if not closed:
+    if not closed and ends:
+        warnings.append("the surface ends where samples are unknown, and is open there")
+    elif not closed:
         warnings.append("the surface runs out of the grid and is open there (close it with --cap)")
     if thin:
         warnings.append(

@@ -46,6 +46,7 @@ from .slabs.footprint import NETWORK_BYTES
 from .slabs.pieces import Piece, count_input, describe_piece
 from .steps.bounds import keep_within_bounds
 from .steps.cap import close
+from .steps.ends import check_all_seen, check_can_close, seen_octants
 from .steps.exact import BandSummary
 from .steps.field import FineField, SampleSpheres
 from .steps.foot_points import spheres_of_band
@@ -224,7 +225,9 @@ def reconstruct_slabs(
         save,
     )
     offset = check_distance(offset)
+    check_can_close(grid, cap=cap)
     if check_iterations(iterations) > 1:
+        check_all_seen(grid, "refine once, by a larger factor (--iterations 1)")
         return _iterated(run, grid, offset, iterations, progress)
     return _slabs(run, grid, offset, progress)
 
@@ -474,6 +477,7 @@ def refine(
         spheres=touching,
         decoded_voxels=int(band.decoded_before[-1]),
         leaves=band.leaves,
+        octants=None if band.unseen is None else seen_octants(band.unseen, own_ijk),
     )
 
 
@@ -492,7 +496,7 @@ def interpolate(
     """
     patches, table, voxels = inputs
     own_ijk = band.voxel_ijk[slab.seen][voxels]
-    blocks, share = spline_blocks(smooth, own_ijk, factor, band.half_voxel)
+    blocks, share = spline_blocks(smooth, own_ijk, factor, band.half_voxel, uneven=band.is_uneven)
     blocks[:, :-1] -= np.float32(band.level)
     some = np.flatnonzero(share)
     if band.has_kinks and len(some):

@@ -200,7 +200,8 @@ OPTIONS: tuple[Option, ...] = (
         "--cap/--open",
         default=convert_default("cap"),
         help="Where the solid runs out of the grid, close the surface along the border, which is "
-        "the default, or leave it open.",
+        "the default, or leave it open. A surface that ends where samples are unknown needs "
+        "--open.",
     ),
     _usual(
         "--mesher",

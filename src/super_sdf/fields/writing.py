@@ -14,6 +14,7 @@ from ..files.output import check_free, free_space, naming, replacing
 from ..machine.extras import check_modules
 from ..machine.memory import held_memory, in_words, memory_bound
 from ..options import check_path
+from ..steps.ends import check_all_seen
 from ..steps.field import FineField
 from ..steps.lattice import fine_grid, lattice_shape
 from .dense import BYTES, NpyWriter
@@ -138,6 +139,7 @@ class FieldFile:
     def add(self, field: FineField) -> None:
         """Write the own planes of a slab's field."""
         if not self.place:
+            check_all_seen(field.placed, "write the mesh alone, without its field")
             fine = fine_grid(field)
             self.place = {"spacing": list(fine.spacing), "origin": list(fine.origin)}
         with naming(self.path):

@@ -46,6 +46,11 @@ def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
     if grid.is_cubic or grid.field.on_lattice:
         check_has_offsets(grid, offset)
         return grid
+    if grid.field.unseen is not None:
+        raise GridError(
+            "samples beside the surface are unknown, and the spacing differs between axes: mesh "
+            "the spline of the values (--field scaled)"
+        )
     level = -offset if grid.positive_inside else offset
     samples, spacing = resample(grid.samples, grid.spacing, level)
     extremes = (-grid.high, -grid.low) if grid.positive_inside else (grid.low, grid.high)

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import Triple
-from .evidence import SLOPE_OFF, Evidence, Looked, slope_within, weigh
+from .evidence import SLOPE_OFF, Evidence, Looked, is_projective, slope_within, weigh
 from .field import NOISY, NONE_EXACT, SCALED, TRUNCATED, Field
 from .gradients import surface_gradients, typical_length
 from .one_sided import check_thin, is_one_sided
@@ -52,7 +52,10 @@ def as_distances(
 def by_kind(found: Interpreted, looked: Looked, request: Request, notes: list[str]) -> Interpreted:
     """Return values that were taken as distances with the kind that the samples show."""
     evidence = weigh(looked, found.spacing)
-    is_cut = _cut_at(found, evidence) < HARMLESS and not evidence.is_bent
+    near = _cut_at(found, evidence) < HARMLESS
+    if is_projective(looked, found.spacing) or (near and evidence.is_noisy):
+        return _projective(found, evidence, request, notes)
+    is_cut = near and not evidence.is_bent
     if is_cut or request.wanted.field == TRUNCATED:
         return _truncated(found, evidence, request, notes)
     if evidence.is_noisy:
@@ -96,6 +99,8 @@ def of_slope(
         slope = _slope_beside(samples, spacing)
     divided = _divided(found, slope)
     shown = weigh(looked.divided(slope), spacing)
+    if is_cut and (shown.is_noisy or is_projective(looked, spacing)):
+        return _projective(divided, shown, request, notes)
     # densities that fade out over voxels are blurred, not cut off
     fades = request.is_density and _cut_at(divided, shown) > TOO_NEAR
     if not is_cut or shown.is_bent or fades:
@@ -149,6 +154,19 @@ def _truncated(
         filled = filled_planes(found.samples, steps_of(found.spacing), found.extremes)
         return replace(found, samples=filled)
     return found
+
+
+def _projective(
+    found: Interpreted, evidence: Evidence, request: Request, notes: list[str]
+) -> Interpreted:
+    """Return values of uneven slope, as fused depth images have: their spline has the surface."""
+    notes.append(
+        "values taken as truncated (--field truncated), and none as exact, since their slope is "
+        "uneven, as that of fused depth images: the surface is that of their cubic spline"
+    )
+    given = request.wanted.field == TRUNCATED
+    field = Field(TRUNCATED, given, NONE_EXACT, is_uneven=True)
+    return _as_spline(replace(found, field=replace(field, evidence=evidence.report())))
 
 
 def _exact_within(found: Interpreted, evidence: Evidence) -> Extremes:

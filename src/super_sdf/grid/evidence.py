@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, Triple
+from .gradients import BENT as STRAIGHT
 from .gradients import LARGEST_VALUE
 from .planes import SampleArray, few_of, lowest, over_planes, ranks_of
 from .samples import Extremes
@@ -52,6 +53,13 @@ LEAST_SAMPLES = 100  # from which shares are evidence
 MOST_BY_NOISE = 3.0
 OFF = 0.012  # from 1: typical slopes further off show another unit
 SLOPE_OFF = 0.25  # from 1: truncated distances have another unit
+# Ends of values that were divided by the truncation; where the rest is unknown, the last known
+# samples are a little nearer to 0.
+ENDS_ALIKE = 0.05
+# Of truncated distances the steepest slopes where they are straight are hardly more than the
+# typical one: up to 1.06 were measured. Along lines of sight they differ with the angle to the
+# surface: 1.08 and more were.
+STEEPEST, MOST_STEEP, FEW = 0.95, 1.07, 10
 
 
 @dataclass(frozen=True)
@@ -263,9 +271,8 @@ def _count_amid_equal(slab: NDArray[Any], extremes: Extremes) -> NDArray[np.int6
 def weigh(looked: Looked, spacing: Triple) -> Evidence:
     """Return the evidence of what was looked at, with the spacing of each axis."""
     is_cut, steps = looked.is_cut, np.array(steps_of(spacing))
-    limits = [x if c else s * np.inf for x, c, s in zip(looked.extremes, is_cut, (-1, 1))]
     lines = looked.lines
-    whole = ((lines > limits[0]) & (lines < limits[1])).all((1, 2))
+    whole = _are_whole(lines, looked)
     around = looked.around[whole]
     lines = np.clip(lines[whole] / steps[:, None], -LARGEST_VALUE, LARGEST_VALUE)
     second, third, fourth = differences(lines)
@@ -339,6 +346,33 @@ def slope_within(looked: Looked, spacing: Triple) -> float:
     return float(np.median(lengths)) if len(lengths) >= ENOUGH else float("nan")
 
 
+def is_projective(looked: Looked, spacing: Triple) -> bool:
+    """Return whether values that are cut off were measured along lines of sight.
+
+    So are the fused depth images of a scan: beside the surface their slope is that of a distance
+    only where it was seen straight on, whatever their unit.
+    """
+    if not looked.is_cut.any():
+        return False
+    lines = looked.lines[..., 1:4]
+    low, middle, high = np.moveaxis(lines[_are_whole(lines, looked)], -1, 0)
+    steps = np.array(steps_of(spacing))
+    slope = np.sqrt((((high - low) / steps / 2) ** 2).sum(1))
+    bend = (np.abs(high - 2 * middle + low) / steps).sum(1)
+    straight = slope[bend < STRAIGHT * slope]
+    return len(straight) >= FEW and bool(
+        np.quantile(straight, STEEPEST) > MOST_STEEP * np.median(straight)
+    )
+
+
+def _are_whole(lines: Floats, looked: Looked) -> BoolArray:
+    """Return of which lines, (n, 3, m), no sample is cut off, (n,)."""
+    ends = zip(looked.extremes, looked.is_cut, (-1, 1))
+    low, high = (end if is_cut else sign * np.inf for end, is_cut, sign in ends)
+    whole: BoolArray = ((lines > low) & (lines < high)).all((1, 2))
+    return whole
+
+
 def is_normalised(looked: Looked, spacing: Triple) -> bool:
     """Return whether values are cut off at -T and T, or at 1, and their slope is not 1.
 
@@ -349,8 +383,8 @@ def is_normalised(looked: Looked, spacing: Triple) -> bool:
     evidence = weigh(looked, spacing)
     cuts = evidence.cut_low, evidence.cut_high
     ends = [abs(end) for end, is_cut in zip(looked.extremes, cuts) if is_cut]
-    alike = all(cuts) and bool(np.isclose(ends[0], ends[-1], rtol=1e-3))
-    at_one = bool(ends) and bool(np.allclose(ends, 1, rtol=1e-6))
+    alike = all(cuts) and bool(np.isclose(ends[0], ends[-1], rtol=ENDS_ALIKE))
+    at_one = bool(ends) and bool(np.allclose(ends, 1, rtol=ENDS_ALIKE))
     return (alike or at_one) and abs(slope_within(looked, spacing) - 1) > SLOPE_OFF
 
 

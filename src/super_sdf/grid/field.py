@@ -47,11 +47,15 @@ class Field:
         Of a scaled field: the values whose cubic spline has the surface, negative inside.
     has_kinks : bool
         Whether a scaled field is mostly a distance, so that the network may refine its kinks.
+    is_uneven : bool
+        Whether the slope of that field jumps, as that of fused depth images.
     on_lattice : bool
         Whether the values are distances on the lattice of the samples, in steps of the finest
         spacing, and not in the world. Then no axis is resampled if the spacings differ.
     evidence : dict
         What the samples show, for ``--json``.
+    unseen : bool array or Planes, optional
+        Samples that are unknown and may hide the surface: it ends there, and cannot be closed.
     """
 
     kind: str = EXACT
@@ -59,8 +63,10 @@ class Field:
     exact: Extremes = (-np.inf, np.inf)
     smooth: SampleArray | None = None
     has_kinks: bool = False
+    is_uneven: bool = False
     on_lattice: bool = False
     evidence: dict[str, Any] = field(default_factory=dict)
+    unseen: SampleArray | None = None
 
     def report(self) -> dict[str, Any]:
         """Return kind and evidence as a dictionary that can be written as JSON."""

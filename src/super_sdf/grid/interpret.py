@@ -5,14 +5,15 @@ The evidence is gathered once (``evidence``); the user may overrule it. The zero
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from . import distances, masking
-from .evidence import Looked, is_normalised, look, weigh
-from .field import AUTO, EXACT, MASK, NOISY, SCALED, TRUNCATED, Wanted
+from .evidence import Looked, is_normalised, is_projective, look, weigh
+from .field import EXACT, MASK, NOISY, SCALED, Wanted
 from .planes import SampleArray, changed
 from .request import Interpreted, Request
 from .samples import (
@@ -24,7 +25,8 @@ from .samples import (
     not_finite,
 )
 from .transforms import find_transform
-from .unknown import filled
+from .unknown import KnownPlanes, filled, finite_extremes
+from .unseen import without_unseen
 
 
 def interpret(
@@ -41,22 +43,32 @@ def interpret(
     """
     request = Request.checked(wanted, spacing, inside)
     check_kind(samples.dtype, samples.shape)
+    found, known = _interpreted(samples, request, notes)
+    unseen = known.unseen if isinstance(known, KnownPlanes) else None
+    return replace(found, field=replace(found.field, unseen=unseen)) if unseen else found
+
+
+def _interpreted(
+    samples: SampleArray, request: Request, notes: list[str]
+) -> tuple[Interpreted, SampleArray]:
+    """Return distances, and the samples of which they were made, the unknown ones filled in."""
+    wanted = request.wanted
     if wanted.label is not None:
         chosen = masking.labelled(samples, wanted.label)
-        return masking.of_mask(chosen, request.above_is_inside(), notes)
+        return masking.of_mask(chosen, request.above_is_inside(), notes), samples
     if samples.dtype == np.bool_:
-        return masking.of_mask(samples, request, notes)
+        return masking.of_mask(samples, request, notes), samples
     samples, request = _about_zero(samples, request, notes)
     samples, extremes = _known(samples, request, notes)
     check_not_constant(extremes)
     if has_two_values(samples, extremes):
         lower = 0.0 if request.is_density else extremes[0]
-        return masking.of_mask(masking.above(samples, lower), request, notes)
+        return masking.of_mask(masking.above(samples, lower), request, notes), samples
     if wanted.field == MASK:
-        return masking.of_signs(samples, extremes, request, notes)
+        return masking.of_signs(samples, extremes, request, notes), samples
     if wanted.field in (EXACT, NOISY):
-        return distances.as_distances(samples, extremes, request, notes)
-    return _by_evidence(samples, extremes, request, notes)
+        return distances.as_distances(samples, extremes, request, notes), samples
+    return _by_evidence(samples, extremes, request, notes), samples
 
 
 def _about_zero(
@@ -79,19 +91,20 @@ def _known(
 ) -> tuple[SampleArray, Extremes]:
     """Return samples, those that are unknown filled in, and the smallest and the largest."""
     extremes = find_extremes(samples)
-    if extremes is not None:
-        return samples, extremes
-    is_long = samples.dtype.itemsize > 8  # long doubles may be infinite as float64 only
-    if is_long or request.wanted.field not in (AUTO, TRUNCATED):
+    if extremes is None and samples.dtype.itemsize > 8:  # long doubles, infinite as float64 only
         raise not_finite(samples)
-    return filled(samples, notes)
+    ends = extremes or finite_extremes(samples)
+    seen = samples
+    if not request.is_density:
+        seen = without_unseen(samples, ends, notes, all_known=extremes is not None)
+    return (samples, extremes) if extremes and seen is samples else filled(seen, notes)
 
 
 def _by_evidence(
     samples: SampleArray, extremes: Extremes, request: Request, notes: list[str]
 ) -> Interpreted:
     """Return distances for values that are no mask at first sight, by what the samples show."""
-    looked = look(samples, extremes)
+    looked = look(samples.not_continued if isinstance(samples, KnownPlanes) else samples, extremes)
     if request.is_auto and (mask := _mask_shown(samples, looked, request, notes)):
         return mask
     if request.inside == "auto" and masking.are_labels(samples, extremes):
@@ -126,7 +139,7 @@ def _has_other_slope(looked: Looked, request: Request) -> bool:
         return True
     if request.spacing is None:
         return False
-    if is_normalised(looked, request.spacing):
+    if is_normalised(looked, request.spacing) or is_projective(looked, request.spacing):
         return True
     evidence = weigh(looked, request.spacing)
     return request.is_density and (not np.isfinite(evidence.slope) or evidence.is_scaled)

@@ -24,7 +24,7 @@ def as_samples(values: ArrayLike | SamplePlanes) -> SampleArray:
     Raises
     ------
     GridError
-        If they make no array, or some are masked.
+        If they make no array.
     """
     if isinstance(values, SamplePlanes):
         return values
@@ -38,15 +38,13 @@ def as_samples(values: ArrayLike | SamplePlanes) -> SampleArray:
 
 
 def _unmasked(samples: NDArray[Any]) -> NDArray[Any]:
-    """Return the data of a masked array, if nothing in it is masked."""
-    masked = np.argwhere(np.ma.getmaskarray(samples))
-    if len(masked):
-        first = ", ".join(map(str, masked[0]))
-        raise GridError(
-            f"{len(masked):,} values are masked, values[{first}] the first: every sample must be "
-            "known; fill unknown far ones with a large distance of the right sign (filled())"
-        )
-    return np.asarray(samples.data)
+    """Return the data of a masked array, NaN where it is masked: unknown."""
+    masked = np.ma.getmaskarray(samples)
+    if not masked.any() or samples.dtype.kind not in "fiu":
+        return np.asarray(np.ma.filled(samples, False) if masked.any() else samples.data)
+    data = np.array(samples.data, np.result_type(samples.dtype, np.float32))
+    data[masked] = np.nan
+    return data
 
 
 def check_values(values: SampleArray) -> Extremes:

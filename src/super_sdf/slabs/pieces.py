@@ -27,7 +27,7 @@ class Piece:
     leaves : bool
         Whether the solid leaves the grid, anywhere: a sample on the border is inside.
     is_cut : bool
-        Whether the surface leaves the grid in this slab.
+        Whether the surface leaves the grid in this slab, or may end at unknown samples.
     signs : set of bool
         Which signs the slab's nodes have: True outside, False inside.
     seconds : dict
@@ -60,7 +60,7 @@ def describe_piece(
         "triangles": sum(len(mesh.faces) for mesh in meshes),
     }
     whole = {"band_voxels": fine.band_voxels, "noisy_voxels": fine.noisy_voxels, **planned}
-    is_cut = leaves and border_is_crossed(fine)
+    is_cut = fine.octants is not None or (leaves and border_is_crossed(fine))
     return Piece(meshes, counts, whole, fine.planes, leaves, is_cut, fine.signs())
 
 

@@ -28,6 +28,8 @@ def close(field: FineField, *, cap: bool, beside: int = 1) -> FineField:
     Where the solid leaves the grid, it is closed along the border if ``cap`` is set. ``beside`` is
     as in ``close_at_border``.
     """
+    if field.octants is not None:  # it ends where samples are unknown, and cannot be closed
+        return field
     if not field.leaves:
         return close_if_crossed(field, beside)
     return close_at_border(field, beside) if cap else field

@@ -85,6 +85,9 @@ class FineField:
     border_inside : (n, 3) int32, optional
         The voxels on the grid's border that are inside and have no block: what a cap needs of the
         samples. None if they are to be found in ``grid``.
+    octants : (D,) uint8, optional
+        A bit for each octant of each voxel: whether all eight samples round it are known. Where
+        one is not, the surface ends. None if all are known.
     """
 
     shape: tuple[int, int, int]
@@ -102,6 +105,7 @@ class FineField:
     offset: float = 0.0
     leaves: bool = True
     border_inside: IntArray | None = None
+    octants: NDArray[np.uint8] | None = None
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.shape))

@@ -33,6 +33,7 @@ from ..machine.threads import map_chunks, map_threads, rows_in_chunk
 from ..mesh import CLEARANCE, Mesh, vertex_type
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, FACES, choices, triangle_table
+from .ends import octant_of_cells
 from .field import FineField
 from .nodes import block_ijk, part_of_node
 
@@ -146,8 +147,30 @@ def _crossings_of_chunk(field: FineField, start: int, stop: int) -> tuple[NDArra
     corners = _corners_inside(inside)
     active = np.flatnonzero(corners - np.uint8(1) < 254)  # 0 and 255 are not crossed
     cell_row, cell = _split(active, rows, field.factor**3)
+    if field.octants is not None:
+        seen = (field.octants[cell_row] >> octant_of_cells(field.factor)[cell] & 1).astype(bool)
+        cell_row, cell, active = cell_row[seen], cell[seen], active[seen]
+        kept = _are_edges_of(cell_row, cell, slot, edge, field.factor)
+        slot, edge, own = slot[kept], edge[kept], own[kept]
     case = choose_cases(field, corners[active], cell_row, cell)
     return slot[own], edge[own], slot[~own], edge[~own], cell_row, cell, case
+
+
+def _are_edges_of(
+    cell_row: IntArray,
+    cell: NDArray[np.int16],
+    row: IntArray,
+    edge: NDArray[np.int16],
+    factor: int,
+) -> BoolArray:
+    """Return which edges of voxels' blocks belong to some cells of these blocks.
+
+    On the faces of a block this is so in all blocks that share the edge: the cells on either side
+    of a face lie between the same samples.
+    """
+    edges = 3 * (factor + 1) ** 3
+    low = cell_row * np.int64(edges) + cells_low_nodes(factor)[cell]
+    return np.isin(row * np.int64(edges) + edge, low[:, None] + edge_steps(factor))
 
 
 def _split(

@@ -15,6 +15,7 @@ from ..mesh import Mesh, join_meshes
 from ..options import check_cap, check_grid
 from . import marching
 from .cap import close
+from .ends import check_can_close
 from .field import FineField
 from .mesher_names import DEFAULT_MESHER, MARCHING, MESHERS, SHARP
 
@@ -126,6 +127,7 @@ def extract_mesh(
     grid = field.placed if grid is None else grid
     check_grid(grid)
     chosen = find_mesher(mesher)
+    check_can_close(grid, cap=cap)
     whole = close(field, cap=check_cap(cap), beside=chosen.planes_beside(field.factor))
     return join_meshes(extract_pieces(whole, cubic_grid(grid), first_vertex, 1, chosen))
 

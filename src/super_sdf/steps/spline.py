@@ -27,11 +27,12 @@ STRIP_SAMPLES, STRIP_BYTES = 1 << 20, 60  # worked on at a time, and bytes of ea
 SIDE = 5  # coefficients along an axis on which the spline within half a voxel of a sample depends
 # Sums of fourth differences, in voxels, up to which a field is smooth, and from which it is not.
 SMOOTH, KINKED = 0.6, 1.3
+JUMPING, JUMPED = 5.0, 9.0  # the same for a field of uneven slope, which is linear there
 WRONG_SLOPE = 0.05  # from 1: local slopes so far off are not those of distances
 
 
 def spline_blocks(
-    values: SampleArray, voxel_ijk: IntArray, factor: int, unit: float
+    values: SampleArray, voxel_ijk: IntArray, factor: int, unit: float, *, uneven: bool = False
 ) -> tuple[FloatArray, FloatArray]:
     """Return the cubic spline at the nodes of voxels' blocks, and the network's share there.
 
@@ -45,6 +46,9 @@ def spline_blocks(
         K.
     unit : float
         The values are divided by this.
+    uneven : bool
+        Whether the slope is uneven: where the samples jump, a spline would swing, and nodes are
+        interpolated linearly.
 
     Returns
     -------
@@ -71,7 +75,12 @@ def spline_blocks(
                 strip = planes[:, around : stop + BEYOND]
                 at = ijk[which] - np.array([0, around, 0], np.int32)
                 share[rows][which] = network_share(strip * np.float32(0.5))[tuple(at.T)]
-                blocks[:, rows.start + which] = _evaluate(prefilter(strip), at + 2, factor)
+                found = _evaluate(prefilter(strip), at + 2, node_weights(factor))
+                if uneven:
+                    jumps = (roughness(strip * np.float32(0.5)) - JUMPING) / (JUMPED - JUMPING)
+                    linear = _evaluate(_continued_all(strip), at + 2, linear_weights(factor))
+                    found += np.clip(jumps, 0, 1)[tuple(at.T)] * (linear - found)
+                blocks[:, rows.start + which] = found
     return blocks, share
 
 
@@ -110,6 +119,11 @@ def _continued(lines: FloatArray, beyond: int) -> FloatArray:
     return np.pad(lines, [(beyond, beyond), (0, 0), (0, 0)], mode="reflect", reflect_type="odd")
 
 
+def _continued_all(values: FloatArray) -> FloatArray:
+    """Return values continued by two samples on every side."""
+    return np.pad(values, 2, mode="reflect", reflect_type="odd")
+
+
 def roughness(values: FloatArray) -> FloatArray:
     """Return the sum of the absolute fourth differences, the largest in each neighbourhood."""
     total = np.zeros_like(values)
@@ -137,10 +151,16 @@ def node_weights(factor: int) -> NDArray[np.float32]:
     return weights.astype(np.float32)
 
 
-def _evaluate(coefficients: FloatArray, ijk: IntArray, factor: int) -> FloatArray:
-    """Return the spline at the nodes of the blocks of voxels (n, 3), (Q, n)."""
-    out = np.empty(((factor + 1) ** 3, len(ijk)), np.float32)
-    weights = node_weights(factor)
+def linear_weights(factor: int) -> NDArray[np.float32]:
+    """Return the weights of samples at -2 to 2 for nodes that are interpolated linearly."""
+    at = np.arange(factor + 1)[:, None] / factor - 0.5 - np.arange(-2, 3)
+    weights: NDArray[np.float32] = np.clip(1 - np.abs(at), 0, None).astype(np.float32)
+    return weights
+
+
+def _evaluate(coefficients: FloatArray, ijk: IntArray, weights: NDArray[np.float32]) -> FloatArray:
+    """Return what weights make at the nodes of the blocks of voxels (n, 3), (Q, n)."""
+    out = np.empty((len(weights) ** 3, len(ijk)), np.float32)
     step = np.array([coefficients.shape[1] * coefficients.shape[2], coefficients.shape[2], 1])
     around = (np.indices((SIDE,) * 3).reshape(3, -1).T - 2) @ step
     centre = ijk.astype(np.int64) @ step
@@ -151,7 +171,7 @@ def _evaluate(coefficients: FloatArray, ijk: IntArray, factor: int) -> FloatArra
         block = values.reshape(SIDE, SIDE, SIDE, -1)
         for axis in range(3):
             lines = np.moveaxis(block, axis, 0)
-            nodes = np.zeros((factor + 1, *lines.shape[1:]), np.float32)
+            nodes = np.zeros((len(weights), *lines.shape[1:]), np.float32)
             for node, weight in zip(nodes, weights):
                 for line, share in zip(lines, weight):
                     if share:

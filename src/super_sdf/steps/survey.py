@@ -97,6 +97,8 @@ class Band:
         What the field is, see ``grid.field``.
     smooth : array or Planes, optional
         Values whose cubic spline has the surface where they are smooth, in world units.
+    is_uneven : bool
+        Whether that field is interpolated linearly where it jumps.
     has_kinks : bool
         Whether the network may refine that field where it is not smooth.
     half_voxel, level : float
@@ -107,6 +109,8 @@ class Band:
         The bytes of the samples in a temporary file.
     beyond : SamplesBeyond
         The samples a few voxels farther away.
+    unseen : bool array or Planes, optional
+        The samples at which the surface ends, see ``Field``.
     """
 
     shape: tuple[int, int, int]
@@ -120,12 +124,14 @@ class Band:
     leaves: bool = False
     kind: str = EXACT
     smooth: SampleArray | None = None
+    is_uneven: bool = False
     has_kinks: bool = False
     half_voxel: float = 1.0
     level: float = 0.0
     peak: int = 0
     unpacked: int = 0
     beyond: SamplesBeyond = NONE_BEYOND
+    unseen: SampleArray | None = None
 
     @cached_property
     def trusted(self) -> TrustedSamples:
@@ -329,7 +335,7 @@ def limit_to_field(band: Band, grid: SdfGrid, offset: float) -> Band:
     In a mask, only the voxels round which samples lie on both sides hold the surface.
     """
     field, scale = grid.field, 2 / grid.voxel_size
-    band = replace(band, limits=limits_beyond(grid, offset))
+    band = replace(band, limits=limits_beyond(grid, offset), unseen=field.unseen)
     if field.kind == EXACT:
         return band
     sample = band.patches[:, CENTRE]
@@ -342,7 +348,8 @@ def limit_to_field(band: Band, grid: SdfGrid, offset: float) -> Band:
         decoded = np.ones_like(band.decoded)
     band = replace(band, exact=exact, decoded=decoded, kind=field.kind, smooth=field.smooth)
     level = offset * scale
-    return replace(band, has_kinks=field.has_kinks, half_voxel=1 / scale, level=level)
+    band = replace(band, has_kinks=field.has_kinks, is_uneven=field.is_uneven)
+    return replace(band, half_voxel=1 / scale, level=level)
 
 
 def _exact_between(grid: SdfGrid, offset: float) -> tuple[float, float]:
@@ -447,6 +454,7 @@ def band_of_samples(
     del samples
     leaving.append(_has_inside_on_border(rescaled, low == 0, high == grid.shape[0]))
     limits, start = limits_beyond(grid, offset), np.array([low, 0, 0], np.int64)
+    unseen = None if grid.field.unseen is None else np.asarray(grid.field.unseen[low:high])
     for block, rows in _windows(rescaled.shape, slice(planes[0] - low, planes[1] - low)):
         corner = np.array([max(block.start - 1, 0), max(rows.start - 1, 0), 0], np.int64)
         window = rescaled[corner[0] : block.stop + 1, corner[1] : rows.stop + 1]
@@ -454,9 +462,14 @@ def band_of_samples(
         if offset and jumps is not None:  # at 0 there is no better offset to suggest
             jumps.append(find_jumps(window, inner))
         number = ((low + block.start) * grid.shape[1] + rows.start) * grid.shape[2]
-        beyond = samples_beyond(window[inner], number, limits)
+        mine = window[inner]
+        hidden = None
+        if unseen is not None:
+            hidden = unseen[corner[0] :, corner[1] :][inner]
+            mine = np.where(hidden, np.float32(FAR), mine)
+        beyond = samples_beyond(mine, number, limits)
         yield *NONE_ACTIVE, beyond.number, beyond.value
-        for ijk, patches in _patches_of(window, inner):
+        for ijk, patches in _patches_of(window, inner, hidden):
             if offset and jumps is not None:
                 check_not_cut_off(patches, offset, grid.voxel_size)
             ijk += start + corner
@@ -483,13 +496,16 @@ def _windows(shape: tuple[int, ...], own: slice) -> Iterator[tuple[slice, slice]
 
 
 def _patches_of(
-    window: FloatArray, own: tuple[slice, slice]
+    window: FloatArray, own: tuple[slice, slice], hidden: BoolArray | None = None
 ) -> Iterator[tuple[NDArray[np.int64], FloatArray]]:
     """Yield active voxels among some planes and rows of a window, and the samples round them.
 
-    Values that were filled in are left out.
+    Those that are ``hidden``, of these planes and rows, and values that were filled in are left
+    out.
     """
     active = is_active(window)[own]
+    if hidden is not None:
+        active &= ~hidden
     found, padded = np.flatnonzero(active), pad_by_extrapolation(window)
     first = np.array([own[0].start, own[1].start, 0])
     for rows in chunks_of(len(found), len(NEIGHBOURHOOD)):
