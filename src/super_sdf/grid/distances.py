@@ -14,10 +14,10 @@ from ..arrays import Triple
 from .evidence import SLOPE_OFF, Evidence, Looked, slope_within, weigh
 from .field import NOISY, NONE_EXACT, SCALED, TRUNCATED, Field
 from .gradients import surface_gradients, typical_length
-from .one_sided import check_thin, is_one_sided
+from .one_sided import check_thin, refusal
 from .planes import SampleArray, changed
 from .request import Interpreted, Request
-from .samples import Extremes
+from .samples import Extremes, is_one_sided
 from .sides import is_positive_inside
 from .slopes import normalised_planes
 from .spacing import choose_spacing, in_finest, is_cubic, measure_spacing, steps_of
@@ -26,6 +26,7 @@ from .truncation import filled_planes, without_plateaus
 # Voxels from which on values may be cut off without a loss; up to which the rest is filled in; and
 # below which too few are left for that.
 HARMLESS, FILLED, TOO_NEAR = 3.0, 1.75, 0.85
+SAME_SLOPE = 5e-5  # from 1: in words it is 1
 BENT = 0.1  # share of wrong slopes from which the network has no say in a field
 
 
@@ -81,6 +82,8 @@ def of_slope(
     samples: SampleArray, looked: Looked, request: Request, notes: list[str]
 ) -> Interpreted:
     """Return distances for a field of another slope; the given spacing is believed."""
+    if is_one_sided(looked.extremes):
+        raise refusal(samples, looked.extremes, request.spacing)
     positive = is_positive_inside(samples, request.inside, looked.extremes, notes)
     spacing = request.spacing or choose_spacing(samples, None, notes)
     found = Interpreted(samples, looked.extremes, spacing, positive, Field())
@@ -167,7 +170,7 @@ def _as_spline(found: Interpreted) -> Interpreted:
 def _noisy(found: Interpreted, evidence: Evidence, notes: list[str]) -> Interpreted:
     """Return noisy distances, and say how noisy they are."""
     notes.append(
-        f"values taken as noisy (--field noisy): at {100 * evidence.noisy:.2g} % of the "
+        f"values taken as noisy (--field noisy): at {evidence.noisy:.1%} of the "
         "samples beside the surface they change by more than distances can; the noise is at "
         f"most about {evidence.roughness:.2g} voxels"
     )
@@ -204,10 +207,11 @@ def _has_distances(evidence: Evidence) -> bool:
 
 def _wrong_slope(slope: float, evidence: Evidence) -> str:
     """Return a clause that says how the slope of a field is wrong."""
-    why = f"beside the surface their slope is {slope:.4g} instead of 1"
-    if evidence.is_bent:
-        why += f", and wrong at {100 * evidence.wrong:.2g} % of the samples"
-    return why
+    typical = f"beside the surface their slope is {slope:.4g} instead of 1"
+    bent = f"that of a distance at {evidence.wrong:.1%} of the samples"
+    if abs(slope - 1) < SAME_SLOPE:
+        return f"beside the surface their slope is not {bent}"
+    return f"{typical}, and not {bent}" if evidence.is_bent else typical
 
 
 def _on_lattice(found: Interpreted, slope: float) -> SampleArray:

@@ -10,7 +10,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..errors import GridError
 from . import distances, masking
+from .advice import are_labels, choose_label, choose_level
 from .evidence import Looked, is_normalised, look, weigh
 from .field import AUTO, EXACT, MASK, NOISY, SCALED, TRUNCATED, Wanted
 from .masks import is_distance_transform
@@ -46,8 +48,11 @@ def interpret(
         return masking.of_mask(chosen, request.above_is_inside(), notes)
     if samples.dtype == np.bool_:
         return masking.of_mask(samples, request, notes)
+    given = samples
     samples, request = _about_zero(samples, request, notes)
     samples, extremes = _known(samples, request, notes)
+    if request.is_density and (extremes[0] > 0 or extremes[1] < 0):
+        raise _no_level(given, extremes, wanted)
     check_not_constant(extremes)
     if has_two_values(samples, extremes):
         middle = 0.0 if request.is_density else sum(extremes) / 2
@@ -74,6 +79,16 @@ def _about_zero(
     return samples, request
 
 
+def _no_level(given: SampleArray, extremes: Extremes, wanted: Wanted) -> GridError:
+    """Return the error for a level that no value is above, or none below."""
+    level = float(wanted.level or 0)
+    low, high = (x / (wanted.scale or 1) + level for x in extremes)
+    return GridError(
+        f"no value is {'above' if high < level else 'below'} the level {level:g} (they go from "
+        f"{low:.6g} to {high:.6g}): {choose_level(given, (low, high))}"
+    )
+
+
 def _known(
     samples: SampleArray, request: Request, notes: list[str]
 ) -> tuple[SampleArray, Extremes]:
@@ -94,8 +109,8 @@ def _by_evidence(
     looked = look(samples, extremes)
     if request.is_auto and (mask := _mask_shown(samples, looked, request, notes)):
         return mask
-    if request.inside == "auto" and masking.are_labels(samples, extremes):
-        raise masking.refuse_labels(extremes)
+    if not request.is_density and are_labels(samples):
+        raise GridError(f"no solid is chosen: {choose_label(samples)}")
     if request.is_density:
         request = request.with_spacing(1, "since densities show none (give --spacing)", notes)
     if _has_other_slope(looked, request):

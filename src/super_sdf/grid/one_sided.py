@@ -16,6 +16,7 @@ from ..arrays import BoolArray, Triple
 from ..errors import GridError
 from ..machine.threads import chunks_of
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
+from .advice import way_out
 from .planes import SampleArray
 from .samples import Extremes
 
@@ -40,15 +41,6 @@ TOUCHING, TOUCHING_SHARE, LEAST_RISE, MOST_RISE = 0.1, 0.5, 0.75, 3**0.5
 
 FAR = "every wall is nearer to some sample than that, so there is no surface"
 BEYOND = "only samples on the border of the grid are near 0, so no surface lies in it"
-UNSIGNED = (
-    "an unsigned field has no inside; if the solid is thinner than the spacing, use --inside "
-    "negative"
-)
-
-
-def is_one_sided(extremes: Extremes) -> bool:
-    """Return whether no value is below 0, or none above."""
-    return extremes[0] >= 0 or extremes[1] <= 0
 
 
 def check_thin(values: SampleArray, spacing: Triple, extremes: Extremes) -> None:
@@ -66,25 +58,27 @@ def check_thin(values: SampleArray, spacing: Triple, extremes: Extremes) -> None
     steps = np.array(spacing) / max(spacing)
     scale = (1 if extremes[0] >= 0 else -1) / max(spacing)
     if min(map(abs, extremes)) * abs(scale) > reach(steps):
-        raise _refusal(extremes, FAR)
+        raise refusal(values, extremes, spacing, FAR)
     patches, walls, unsigned_walls = look_near_walls(values, scale, steps)
     if not len(patches):
-        raise _refusal(extremes, BEYOND)
+        raise refusal(values, extremes, spacing, BEYOND)
     if not (_are_distances(patches, steps) and _touch_walls(patches, steps)):
-        raise _refusal(extremes, UNSIGNED)
+        raise refusal(values, extremes, spacing)
     if unsigned_walls > UNSIGNED_SHARE * walls and _is_cut_off(values, scale, steps):
-        raise _refusal(extremes, UNSIGNED)
+        raise refusal(values, extremes, spacing)
 
 
-def _refusal(extremes: Extremes, reason: str) -> GridError:
-    """Return the error for values that are no distances to a thin solid."""
+def refusal(
+    values: SampleArray, extremes: Extremes, spacing: Triple | None, no_surface: str = ""
+) -> GridError:
+    """Return the error for values without both sides; see ``way_out``."""
     low, high = extremes
-    if low >= 0:
-        return GridError(f"no value is below 0 (the smallest is {low:.6g}): {reason}")
-    return GridError(
-        f"no value is above 0 (the largest is {high:.6g}): the grid lies within the solid; if "
-        "that is outside and the solid thin, use --inside positive"
+    end = (
+        f"below 0 (the smallest is {low:.6g})"
+        if low >= 0
+        else f"above 0 (the largest is {high:.6g})"
     )
+    return GridError(f"no value is {end}: {way_out(values, spacing, no_surface)}")
 
 
 def reach(steps: Floats) -> float:

@@ -1,0 +1,212 @@
+"""What values that are refused may be, and the one option to try next.
+
+All refusals of values end with it, so it is found once, from the values: labels, densities,
+unsigned distances, distances in another unit, or a field of another slope.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Triple
+from .gradients import (
+    ENOUGH,
+    are_consistent,
+    spacing_of_axes,
+    straight_gradients,
+    typical_length,
+)
+from .planes import SampleArray, changed
+from .samples import Extremes, find_extremes, is_one_sided
+from .sides import count_border, is_mostly_negative
+
+PLANES = 12  # that are looked at, spread evenly
+MOST_BETWEEN = 0.4  # share of the samples at a boundary of labels that lie between two others
+MOST_NAMED = 8  # labels that a message lists
+ALIKE = 1.1  # ratio up to which the spacings that the axes show are one unit's
+SNAP = 0.02  # a scale this close to a power of ten, or to the spacing, is replaced by it
+FULL = (1, 255, 2**16 - 1)  # largest values of densities and images: the level is half of it
+ROUNDS, FEW = 20, 1 << 16  # of the search for a level; samples of a plane
+
+
+def way_out(samples: SampleArray, spacing: Triple | None = None, no_surface: str = "") -> str:
+    """Return a clause that names the option to try next for values that are refused.
+
+    Parameters
+    ----------
+    samples : (nx, ny, nz) array or Planes
+        Finite values.
+    spacing : three floats, optional
+        Of each axis, if it is given.
+    no_surface : str
+        What to say instead of unsigned distances: why they have no surface.
+    """
+    if are_labels(samples):
+        return choose_label(samples)
+    extremes, steps = _extremes(samples), _steps(samples)
+    if is_one_sided(extremes):
+        if steps is None or not (no_surface or _has_walls(samples, extremes, float(steps.max()))):
+            return choose_level(samples, extremes)
+        unit = _unit(steps, spacing) if spacing is not None else ""
+        return unit or no_surface or _shell(extremes, max(spacing or steps))
+    if spacing is None:
+        return "give --spacing X,Y,Z"
+    if steps is None and samples.dtype.kind in "iu":
+        return _level(samples, 0.0)
+    unit = _unit(steps, spacing) if steps is not None else ""
+    return unit or "values that are no distances need --field scaled"
+
+
+def _has_walls(samples: SampleArray, extremes: Extremes, step: float) -> bool:
+    """Return whether values rise to both sides where they are next to 0, as unsigned distances."""
+    low, high = extremes
+    sign, least = (1, low) if low >= 0 else (-1, -high)
+    rising = near = 0
+    for i in _spread(len(samples) - 2, 1):
+        slab = sign * np.asarray(samples[i - 1 : i + 2], np.float64)
+        centre = slab[1, 1:-1, 1:-1]
+        sides = np.array(_neighbours(slab))
+        close = centre <= least + step
+        near += int(close.sum())
+        rising += int((close & (np.minimum(sides[::2], sides[1::2]) > centre).any(0)).sum())
+    return 2 * rising > near
+
+
+def _neighbours(slab: NDArray[Any]) -> list[NDArray[Any]]:
+    """Return the six neighbours of the inner samples of the middle one of three planes."""
+    inner = slab[1]
+    pairs = [slab[0, 1:-1, 1:-1], slab[2, 1:-1, 1:-1], inner[:-2, 1:-1], inner[2:, 1:-1]]
+    return [*pairs, inner[1:-1, :-2], inner[1:-1, 2:]]
+
+
+def _extremes(samples: SampleArray) -> Extremes:
+    """Return the smallest and the largest of values that are all finite."""
+    extremes = find_extremes(samples)
+    assert extremes is not None
+    return extremes
+
+
+def _unit(steps: NDArray[np.float64], spacing: Triple) -> str:
+    """Return the advice for distances that show other spacings than those given, if they do."""
+    ratio = np.array(spacing) / steps
+    if ratio.max() > ALIKE * ratio.min():
+        each = ",".join(f"{step:.4g}" for step in steps)
+        return f"give the spacing of each axis (they show --spacing {each})"
+    if 1 / ALIKE <= ratio.mean() <= ALIKE:
+        return ""
+    scale = _usual(float(ratio.mean()), spacing[0])
+    return f"distances and spacing must have the same unit: give --scale {scale:.6g}"
+
+
+def are_labels(samples: SampleArray) -> bool:
+    """Return whether values look like labels: whole numbers of which regions jump to others.
+
+    At the boundary of a region, a sample hardly ever lies between a lower and a higher neighbour;
+    those of images and distances do.
+    """
+    if min(samples.shape) < 3:
+        return False
+    places = _spread(len(samples) - 2, 1)
+    low, high = np.inf, -np.inf
+    for i in places:
+        plane = np.asarray(samples[i])
+        if plane.dtype.kind == "f" and (plane != np.rint(plane)).any():
+            return False
+        low, high = min(low, plane.min().item()), max(high, plane.max().item())
+    found = np.array([_at_boundaries(samples[i - 1 : i + 2], low, high) for i in places]).sum(0)
+    return bool(found[1] >= ENOUGH and found[0] <= MOST_BETWEEN * found[1])
+
+
+def _at_boundaries(slab: NDArray[Any], low: float, high: float) -> tuple[int, int]:
+    """Count samples between a lower and a higher neighbour, and all with another neighbour.
+
+    Of three planes, inner samples of the middle one count, but for the lowest and the highest.
+    """
+    slab = np.asarray(slab)
+    centre, sides = slab[1, 1:-1, 1:-1], _neighbours(slab)
+    lower = np.logical_or.reduce([side < centre for side in sides])
+    higher = np.logical_or.reduce([side > centre for side in sides])
+    amid = (centre > low) & (centre < high)
+    return int((amid & lower & higher).sum()), int((amid & (lower | higher)).sum())
+
+
+def choose_label(samples: SampleArray) -> str:
+    """Return the advice to choose a label: the most frequent one that is not the border's."""
+    counts: dict[Any, int] = {}
+    for plane in samples:
+        for label, count in zip(*(x.tolist() for x in np.unique(plane, return_counts=True))):
+            counts[label] = counts.get(label, 0) + count
+    ends = np.concatenate([np.asarray(samples[i]).ravel() for i in (0, -1)])
+    most = np.unique(ends, return_counts=True)
+    outside = most[0][most[1].argmax()].item()
+    best = max((label for label in counts if label != outside), key=lambda x: counts[x])
+    return f"they look like labels ({named(counts)}): choose one with --label {int(best)}"
+
+
+def named(labels: Any) -> str:
+    """Return labels in words, the first few in order."""
+    ordered = sorted(labels)
+    words = ", ".join(f"{x:g}" if x % 1 else str(int(x)) for x in ordered[:MOST_NAMED])
+    return words + (", ..." if len(ordered) > MOST_NAMED else "")
+
+
+def choose_level(samples: SampleArray, extremes: Extremes) -> str:
+    """Return the advice to choose a level of densities: half of the full range, or between two."""
+    low, high = extremes
+    full = next((full for full in FULL if low >= 0 and full / 2 < high <= full), 0)
+    return _level(samples, full / 2 if low < full / 2 else _between(samples))
+
+
+def _level(samples: SampleArray, level: float) -> str:
+    """Return the advice to try a level, with what is on the border outside."""
+    above = is_mostly_negative(*count_border(changed(samples, partial(np.add, -level))))
+    option = f"--level {level:.6g}" + ("" if above else " --inside negative")
+    return f"densities need the level of their surface, such as {option}"
+
+
+def _between(samples: SampleArray) -> float:
+    """Return a level half-way between the means of what is below and above (Ridler and Calvard)."""
+    planes = [np.ravel(samples[i]) for i in _spread(len(samples))]
+    some = np.concatenate([plane[:: 1 + plane.size // FEW] for plane in planes]).astype(np.float64)
+    some = some[np.isfinite(some)]
+    level = float(some.mean())
+    for _ in range(ROUNDS):
+        above = some > level
+        if above.all() or not above.any():
+            break
+        level = float(some[above].mean() + some[~above].mean()) / 2
+    return float(f"{level:.3g}")
+
+
+def _shell(extremes: Extremes, offset: float) -> str:
+    """Return the advice for unsigned distances."""
+    inside = "negative" if extremes[0] >= 0 else "positive"
+    return (
+        "unsigned distances have no inside: mesh the shell round the surface with --inside "
+        f"{inside} --offset {offset:.4g}"
+    )
+
+
+def _steps(samples: SampleArray) -> NDArray[np.float64] | None:
+    """Return the spacing of each axis with which values are distances; None if with none."""
+    gradients = straight_gradients(samples)
+    found = spacing_of_axes(*gradients) if len(gradients[0]) else None
+    if found is None and len(gradients[0]):
+        step = typical_length(*gradients)
+        found = np.full(3, step) if are_consistent(step, *gradients) else None
+    return found
+
+
+def _usual(scale: float, step: float) -> float:
+    """Return a power of ten or the spacing if that is close to a scale, else the scale."""
+    usual = [10.0 ** round(np.log10(scale)), step]
+    return next((x for x in usual if abs(scale / x - 1) <= SNAP), scale)
+
+
+def _spread(count: int, first: int = 0) -> list[int]:
+    """Return a few of so many planes, spread evenly, from ``first`` on."""
+    return [int(i) + first for i in np.unique(np.linspace(0, count - 1, PLANES).astype(int))]
