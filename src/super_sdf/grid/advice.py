@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Triple
+from ..errors import GridError
 from .gradients import (
     ENOUGH,
     are_consistent,
@@ -20,8 +21,9 @@ from .gradients import (
     straight_gradients,
     typical_length,
 )
+from .one_sided import UNSIGNED, find_walls, is_one_sided
 from .planes import SampleArray, changed
-from .samples import Extremes, find_extremes, is_one_sided
+from .samples import Extremes, find_extremes
 from .sides import count_border, is_mostly_negative
 
 PLANES = 12  # that are looked at, spread evenly
@@ -29,11 +31,13 @@ MOST_BETWEEN = 0.4  # share of the samples at a boundary of labels that lie betw
 MOST_NAMED = 8  # labels that a message lists
 ALIKE = 1.1  # ratio up to which the spacings that the axes show are one unit's
 SNAP = 0.02  # a scale this close to a power of ten, or to the spacing, is replaced by it
+NEAR = 0.25  # of a step from the lowest value: there unsigned distances rise to both sides
+CLOSE = 0.95  # share of the full range that values reach, if it is theirs
 FULL = (1, 255, 2**16 - 1)  # largest values of densities and images: the level is half of it
 ROUNDS, FEW = 20, 1 << 16  # of the search for a level; samples of a plane
 
 
-def way_out(samples: SampleArray, spacing: Triple | None = None, no_surface: str = "") -> str:
+def way_out(samples: SampleArray, spacing: Triple | None = None, fault: str = UNSIGNED) -> str:
     """Return a clause that names the option to try next for values that are refused.
 
     Parameters
@@ -42,17 +46,17 @@ def way_out(samples: SampleArray, spacing: Triple | None = None, no_surface: str
         Finite values.
     spacing : three floats, optional
         Of each axis, if it is given.
-    no_surface : str
-        What to say instead of unsigned distances: why they have no surface.
+    fault : str
+        Of distances on one side of 0; see ``one_sided.find_fault``.
     """
     if are_labels(samples):
         return choose_label(samples)
     extremes, steps = _extremes(samples), _steps(samples)
     if is_one_sided(extremes):
-        if steps is None or not (no_surface or _has_walls(samples, extremes, float(steps.max()))):
+        if steps is None or (fault == UNSIGNED and not _has_walls(samples, extremes, steps.max())):
             return choose_level(samples, extremes)
         unit = _unit(steps, spacing) if spacing is not None else ""
-        return unit or no_surface or _shell(extremes, max(spacing or steps))
+        return unit or (fault if fault != UNSIGNED else _shell(extremes, max(spacing or steps)))
     if spacing is None:
         return "give --spacing X,Y,Z"
     if steps is None and samples.dtype.kind in "iu":
@@ -61,19 +65,33 @@ def way_out(samples: SampleArray, spacing: Triple | None = None, no_surface: str
     return unit or "values that are no distances need --field scaled"
 
 
+def refusal(
+    samples: SampleArray, extremes: Extremes, spacing: Triple | None, fault: str = UNSIGNED
+) -> GridError:
+    """Return the error for values without both sides; ``fault`` is that of ``one_sided``."""
+    low, high = extremes
+    end = (
+        f"below 0 (the smallest is {low:.6g})"
+        if low >= 0
+        else f"above 0 (the largest is {high:.6g})"
+    )
+    return GridError(f"no value is {end}: {way_out(samples, spacing, fault)}")
+
+
+def is_no_distance(samples: SampleArray) -> bool:
+    """Return whether values are distances with no spacing."""
+    return _steps(samples) is None
+
+
 def _has_walls(samples: SampleArray, extremes: Extremes, step: float) -> bool:
     """Return whether values rise to both sides where they are next to 0, as unsigned distances."""
-    low, high = extremes
-    sign, least = (1, low) if low >= 0 else (-1, -high)
-    rising = near = 0
-    for i in _spread(len(samples) - 2, 1):
-        slab = sign * np.asarray(samples[i - 1 : i + 2], np.float64)
-        centre = slab[1, 1:-1, 1:-1]
-        sides = np.array(_neighbours(slab))
-        close = centre <= least + step
-        near += int(close.sum())
-        rising += int((close & (np.minimum(sides[::2], sides[1::2]) > centre).any(0)).sum())
-    return 2 * rising > near
+    sign, least = (1, extremes[0]) if extremes[0] >= 0 else (-1, -extremes[1])
+    walls = near = 0
+    for i in _spread(len(samples) - 3, 1):
+        slab = (sign * np.asarray(samples[i - 1 : i + 3], np.float64) - least) / step
+        walls += sum(int(find_walls(x)[0].sum()) for x in (slab, slab[1], slab[1].T))
+        near += int((slab[1] <= NEAR).sum())
+    return 4 * walls > near
 
 
 def _neighbours(slab: NDArray[Any]) -> list[NDArray[Any]]:
@@ -157,7 +175,8 @@ def named(labels: Any) -> str:
 def choose_level(samples: SampleArray, extremes: Extremes) -> str:
     """Return the advice to choose a level of densities: half of the full range, or between two."""
     low, high = extremes
-    full = next((full for full in FULL if low >= 0 and full / 2 < high <= full), 0)
+    least = 0.5 if samples.dtype.kind in "iu" else CLOSE
+    full = next((full for full in FULL if low >= 0 and least * full < high <= full), 0)
     return _level(samples, full / 2 if low < full / 2 else _between(samples))
 
 
@@ -186,8 +205,7 @@ def _shell(extremes: Extremes, offset: float) -> str:
     """Return the advice for unsigned distances."""
     inside = "negative" if extremes[0] >= 0 else "positive"
     return (
-        "unsigned distances have no inside: mesh the shell round the surface with --inside "
-        f"{inside} --offset {offset:.4g}"
+        f"{UNSIGNED}: mesh the shell round the surface with --inside {inside} --offset {offset:.4g}"
     )
 
 

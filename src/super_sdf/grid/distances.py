@@ -11,13 +11,14 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import Triple
+from .advice import is_no_distance, refusal
 from .evidence import SLOPE_OFF, Evidence, Looked, slope_within, weigh
-from .field import NOISY, NONE_EXACT, SCALED, TRUNCATED, Field
+from .field import AUTO, NOISY, NONE_EXACT, SCALED, TRUNCATED, Field
 from .gradients import surface_gradients, typical_length
-from .one_sided import check_thin, refusal
+from .one_sided import UNSIGNED, find_fault, is_one_sided
 from .planes import SampleArray, changed
 from .request import Interpreted, Request
-from .samples import Extremes, is_one_sided
+from .samples import Extremes
 from .sides import is_positive_inside
 from .slopes import normalised_planes
 from .spacing import choose_spacing, in_finest, is_cubic, measure_spacing, steps_of
@@ -42,11 +43,26 @@ def as_distances(
     wanted = request.wanted.field
     positive = is_positive_inside(samples, request.inside, extremes, notes)
     spacing = choose_spacing(samples, request.spacing, notes, is_cut=is_cut)
-    if request.inside == "auto" and is_one_sided(extremes):
-        check_thin(samples, steps_of(spacing), extremes)
+    if is_one_sided(extremes):
+        _check_thin(samples, extremes, spacing, request)
     field = Field(NOISY, exact=NONE_EXACT) if wanted == NOISY else Field()
     field = replace(field, given=not request.is_auto)
     return Interpreted(samples, extremes, spacing, positive, field)
+
+
+def _check_thin(
+    samples: SampleArray, extremes: Extremes, spacing: Triple, request: Request
+) -> None:
+    """Raise GridError unless values on one side of 0 can be distances to a thin solid.
+
+    If the user says which side is inside, they only must be distances: there may be an offset.
+    """
+    if request.inside == AUTO:
+        fault = find_fault(samples, steps_of(spacing), extremes)
+    else:
+        fault = UNSIGNED if is_no_distance(samples) else ""
+    if fault:
+        raise refusal(samples, extremes, spacing, fault)
 
 
 def by_kind(found: Interpreted, looked: Looked, request: Request, notes: list[str]) -> Interpreted:

@@ -13,10 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, Triple
-from ..errors import GridError
 from ..machine.threads import chunks_of
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
-from .advice import way_out
 from .planes import SampleArray
 from .samples import Extremes
 
@@ -41,10 +39,16 @@ TOUCHING, TOUCHING_SHARE, LEAST_RISE, MOST_RISE = 0.1, 0.5, 0.75, 3**0.5
 
 FAR = "every wall is nearer to some sample than that, so there is no surface"
 BEYOND = "only samples on the border of the grid are near 0, so no surface lies in it"
+UNSIGNED = "unsigned distances have no inside"
 
 
-def check_thin(values: SampleArray, spacing: Triple, extremes: Extremes) -> None:
-    """Raise GridError unless values on one side of 0 can be distances to a thin solid.
+def is_one_sided(extremes: Extremes) -> bool:
+    """Return whether no value is below 0, or none above."""
+    return extremes[0] >= 0 or extremes[1] <= 0
+
+
+def find_fault(values: SampleArray, spacing: Triple, extremes: Extremes) -> str:
+    """Return why values on one side of 0 cannot be distances to a thin solid; empty if they can.
 
     Parameters
     ----------
@@ -54,31 +58,24 @@ def check_thin(values: SampleArray, spacing: Triple, extremes: Extremes) -> None
         Along each axis.
     extremes : two floats
         The smallest and the largest sample.
+
+    Returns
+    -------
+    str
+        ``FAR``, ``BEYOND``, ``UNSIGNED`` or nothing.
     """
     steps = np.array(spacing) / max(spacing)
     scale = (1 if extremes[0] >= 0 else -1) / max(spacing)
     if min(map(abs, extremes)) * abs(scale) > reach(steps):
-        raise refusal(values, extremes, spacing, FAR)
+        return FAR
     patches, walls, unsigned_walls = look_near_walls(values, scale, steps)
     if not len(patches):
-        raise refusal(values, extremes, spacing, BEYOND)
+        return BEYOND
     if not (_are_distances(patches, steps) and _touch_walls(patches, steps)):
-        raise refusal(values, extremes, spacing)
+        return UNSIGNED
     if unsigned_walls > UNSIGNED_SHARE * walls and _is_cut_off(values, scale, steps):
-        raise refusal(values, extremes, spacing)
-
-
-def refusal(
-    values: SampleArray, extremes: Extremes, spacing: Triple | None, no_surface: str = ""
-) -> GridError:
-    """Return the error for values without both sides; see ``way_out``."""
-    low, high = extremes
-    end = (
-        f"below 0 (the smallest is {low:.6g})"
-        if low >= 0
-        else f"above 0 (the largest is {high:.6g})"
-    )
-    return GridError(f"no value is {end}: {way_out(values, spacing, no_surface)}")
+        return UNSIGNED
+    return ""
 
 
 def reach(steps: Floats) -> float:

@@ -128,11 +128,6 @@ def check_not_constant(extremes: Extremes) -> None:
         raise GridError(f"every value is {low:.6g}: a constant field has no surface")
 
 
-def is_one_sided(extremes: Extremes) -> bool:
-    """Return whether no value is below 0, or none above."""
-    return extremes[0] >= 0 or extremes[1] <= 0
-
-
 def has_two_values(values: SampleArray, extremes: Extremes) -> bool:
     """Return whether there are only two different values; False for grids of 2 samples an axis."""
     are_two = partial(_are_extreme, extremes)

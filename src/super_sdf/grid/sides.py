@@ -7,8 +7,9 @@ from typing import Any
 from numpy.typing import NDArray
 
 from ..errors import GridError, OptionError, seen
+from .one_sided import is_one_sided
 from .planes import SampleArray, in_blocks, over_planes
-from .samples import Extremes, is_one_sided
+from .samples import Extremes
 
 INSIDE = ("auto", "negative", "positive")
 
