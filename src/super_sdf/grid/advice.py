@@ -28,6 +28,7 @@ from .sides import count_border, is_mostly_negative
 
 PLANES = 12  # that are looked at, spread evenly
 MOST_BETWEEN = 0.4  # share of the samples at a boundary of labels that lie between two others
+LEAST_JUMP = 0.3  # of the range of labels: so far some neighbours are apart
 MOST_NAMED = 8  # labels that a message lists
 ALIKE = 1.1  # ratio up to which the spacings that the axes show are one unit's
 SNAP = 0.02  # a scale this close to a power of ten, or to the spacing, is replaced by it
@@ -62,7 +63,7 @@ def way_out(samples: SampleArray, spacing: Triple | None = None, fault: str = UN
     if steps is None and samples.dtype.kind in "iu":
         return _level(samples, 0.0)
     unit = _unit(steps, spacing) if steps is not None else ""
-    return unit or "values that are no distances need --field scaled"
+    return unit or "they are distances in no unit: give --field scaled"
 
 
 def refusal(
@@ -70,16 +71,13 @@ def refusal(
 ) -> GridError:
     """Return the error for values without both sides; ``fault`` is that of ``one_sided``."""
     low, high = extremes
-    end = (
-        f"below 0 (the smallest is {low:.6g})"
-        if low >= 0
-        else f"above 0 (the largest is {high:.6g})"
-    )
-    return GridError(f"no value is {end}: {way_out(samples, spacing, fault)}")
+    side, end, at = ("below", "smallest", low) if low >= 0 else ("above", "largest", high)
+    advice = way_out(samples, spacing, fault)
+    return GridError(f"no value is {side} 0 (the {end} is {at:.6g}): {advice}")
 
 
 def is_no_distance(samples: SampleArray) -> bool:
-    """Return whether values are distances with no spacing."""
+    """Return whether there is no spacing with which values are distances."""
     return _steps(samples) is None
 
 
@@ -117,7 +115,7 @@ def _unit(steps: NDArray[np.float64], spacing: Triple) -> str:
     if 1 / ALIKE <= ratio.mean() <= ALIKE:
         return ""
     scale = _usual(float(ratio.mean()), spacing[0])
-    return f"distances and spacing must have the same unit: give --scale {scale:.6g}"
+    return f"distances need the unit of the spacing: multiply the values, --scale {scale:.6g}"
 
 
 def are_labels(samples: SampleArray) -> bool:
@@ -135,21 +133,26 @@ def are_labels(samples: SampleArray) -> bool:
         if plane.dtype.kind == "f" and (plane != np.rint(plane)).any():
             return False
         low, high = min(low, plane.min().item()), max(high, plane.max().item())
-    found = np.array([_at_boundaries(samples[i - 1 : i + 2], low, high) for i in places]).sum(0)
-    return bool(found[1] >= ENOUGH and found[0] <= MOST_BETWEEN * found[1])
+    found = [_at_boundaries(samples[i - 1 : i + 2], low, high) for i in places]
+    between, among, jumps = zip(*found)
+    if LEAST_JUMP * (high - low) > max(jumps) or sum(among) < ENOUGH:
+        return False
+    return sum(between) <= MOST_BETWEEN * sum(among)
 
 
-def _at_boundaries(slab: NDArray[Any], low: float, high: float) -> tuple[int, int]:
+def _at_boundaries(slab: NDArray[Any], low: float, high: float) -> tuple[int, int, float]:
     """Count samples between a lower and a higher neighbour, and all with another neighbour.
 
-    Of three planes, inner samples of the middle one count, but for the lowest and the highest.
+    Of three planes, inner samples of the middle one count, but for the lowest and the highest. The
+    third number is the largest difference between neighbours.
     """
     slab = np.asarray(slab)
     centre, sides = slab[1, 1:-1, 1:-1], _neighbours(slab)
     lower = np.logical_or.reduce([side < centre for side in sides])
     higher = np.logical_or.reduce([side > centre for side in sides])
     amid = (centre > low) & (centre < high)
-    return int((amid & lower & higher).sum()), int((amid & (lower | higher)).sum())
+    jump = max(float(np.abs(np.subtract(x, centre, dtype=np.float64)).max()) for x in sides)
+    return int((amid & lower & higher).sum()), int((amid & (lower | higher)).sum()), jump
 
 
 def choose_label(samples: SampleArray) -> str:
@@ -177,14 +180,14 @@ def choose_level(samples: SampleArray, extremes: Extremes) -> str:
     low, high = extremes
     least = 0.5 if samples.dtype.kind in "iu" else CLOSE
     full = next((full for full in FULL if low >= 0 and least * full < high <= full), 0)
-    return _level(samples, full / 2 if low < full / 2 else _between(samples))
+    return _level(samples, full / 2 if low < full / 2 and full else _between(samples))
 
 
 def _level(samples: SampleArray, level: float) -> str:
     """Return the advice to try a level, with what is on the border outside."""
     above = is_mostly_negative(*count_border(changed(samples, partial(np.add, -level))))
     option = f"--level {level:.6g}" + ("" if above else " --inside negative")
-    return f"densities need the level of their surface, such as {option}"
+    return f"they look like densities: give the level of their surface, such as {option}"
 
 
 def _between(samples: SampleArray) -> float:

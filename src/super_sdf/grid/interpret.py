@@ -59,6 +59,8 @@ def interpret(
         return masking.of_mask(masking.above(samples, middle), request, notes)
     if wanted.field == MASK:
         return masking.of_signs(samples, extremes, request, notes)
+    if not request.is_density and are_labels(samples):
+        raise GridError(f"no solid is chosen: {choose_label(samples)}")
     if wanted.field in (EXACT, NOISY):
         return distances.as_distances(samples, extremes, request, notes)
     return _by_evidence(samples, extremes, request, notes)
@@ -109,8 +111,6 @@ def _by_evidence(
     looked = look(samples, extremes)
     if request.is_auto and (mask := _mask_shown(samples, looked, request, notes)):
         return mask
-    if not request.is_density and are_labels(samples):
-        raise GridError(f"no solid is chosen: {choose_label(samples)}")
     if request.is_density:
         request = request.with_spacing(1, "since densities show none (give --spacing)", notes)
     if _has_other_slope(looked, request):
