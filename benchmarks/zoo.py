@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -37,7 +37,7 @@ SIZES = (24, 32, 48)
 H = 0.05  # world units from sample to sample
 WORSE, MARGIN = 1.1, 0.004  # times marching cubes' error, and voxels
 ESTIMATE = 0.03  # by which an estimated spacing may be off
-POINTS, FACTOR, TRIES = 3000, 4, 4
+POINTS, FACTOR, TRIES = 2000, 4, 4
 VOLUME_OFF = 0.15  # of the volume, beyond marching cubes' own error: inside out, or crumbs
 TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
 
@@ -300,9 +300,11 @@ kind("image of 8 bits", form=lambda d: 255 * (0.5 - d / 12), level=127.5, above=
 kind("image of 8 bits, steep", form=lambda d: 255 * sigmoid(d), level=127.5, above=True,
      change=lambda d: np.rint(255 * sigmoid(d)).astype(np.uint8))  # fmt: skip
 kind("image of 8 bits, share of the voxel", block, form=lambda d: 255 * (0.5 - d), level=127.5,
-     above=True, change=lambda d: np.rint(255 * np.clip(0.5 - d, 0, 1)).astype(np.uint8))  # fmt: skip
-kind("image of 16 bits, blurred", form=lambda d: 300 + 3000 * sigmoid(d), level=1800, above=True,
-     change=lambda d: (300 + 3000 * sigmoid(d) + 30 * _noise(d.shape)).astype(np.uint16))  # fmt: skip
+     above=True,
+     change=lambda d: np.rint(255 * np.clip(0.5 - d, 0, 1)).astype(np.uint8))  # fmt: skip
+kind("image of 16 bits, with noise", form=lambda d: 300 + 3000 * sigmoid(d), level=1800,
+     above=True, change=lambda d: (300 + 3000 * sigmoid(d) + 30 * _noise(d.shape)).astype(
+         np.uint16))  # fmt: skip
 kind("CT, int16, of bone in air", form=lambda d: -1000 + 2000 * sigmoid(d), level=0, above=True,
      change=lambda d: np.rint(-1000 + 2000 * sigmoid(d)).astype(np.int16), unit=0.7)  # fmt: skip
 kind("CT, int16, of bone in water, level given", change=lambda d: np.rint(
@@ -336,7 +338,8 @@ kind("transform, Maurer's of ITK", **SIGNS, **MM, change=lambda d: _itk(
      lambda x: sitk.SignedMaurerDistanceMap(x, squaredDistance=False, useImageSpacing=True),
      (d <= 0).astype(np.uint8)))  # fmt: skip
 kind("transform, squared, Maurer's of ITK", **SIGNS, **MM, change=lambda d: _itk(
-     lambda x: sitk.SignedMaurerDistanceMap(x, squaredDistance=True), (d <= 0).astype(np.uint8)))  # fmt: skip
+     lambda x: sitk.SignedMaurerDistanceMap(x, squaredDistance=True),
+     (d <= 0).astype(np.uint8)))  # fmt: skip
 kind("transform, Danielsson's of ITK", **SIGNS, **MM, change=lambda d: _itk(
      lambda x: sitk.SignedDanielssonDistanceMap(x), (d <= 0).astype(np.uint8)))  # fmt: skip
 kind("transform, blurred", form=lambda d: d, **MM,
@@ -451,7 +454,7 @@ kind("fast-marched by ITK", block, form=lambda d: d, **MM, change=lambda d: _itk
      else sitk.ApproximateSignedDistanceMap(x), (d <= 0).astype(np.float32)))  # fmt: skip
 
 # small and odd grids
-kind("two slices of a mask", lambda p, n: np.hypot(*np.moveaxis(_about_middle(p, n)[..., :2], -1, 0))
+kind("two slices of a mask", lambda p, n: np.linalg.norm(_about_middle(p, n)[..., :2], axis=-1)
      - n * 0.3, lambda d: (d <= 0)[..., :2], **MASK, ends="either")  # fmt: skip
 kind("Fortran order", change=lambda d: np.asfortranarray(d * H))
 kind("big-endian", change=lambda d: (d * H).astype(">f4"), **IN_UNIT)
@@ -492,7 +495,7 @@ def slope(form: Form, p: Array, step: float = 1e-3) -> Array:
 
 def on_surface(form: Form, top: Array) -> Array:
     """Return points on the zero set of a form, in the box from 0 to ``top``, in voxels."""
-    p = np.random.default_rng(1).uniform(0, 1, (40 * POINTS, 3)) * top
+    p = np.random.default_rng(1).uniform(0, 1, (15 * POINTS, 3)) * top
     p = p[np.argsort(off(form, p))[: 2 * POINTS]]
     for _ in range(8):
         g = slope(form, p)

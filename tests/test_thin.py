@@ -109,7 +109,9 @@ def test_what_only_looks_thin_is_refused_in_one_line(name, spacing):
     elif name in beyond:
         want = BEYOND
     else:
-        want = {"slow": "multiply the values, --scale 10" if spacing else f"{FAR}"}.get(name, DENSITY)
+        want = {"slow": "multiply the values, --scale 10" if spacing else f"{FAR}"}.get(
+            name, DENSITY
+        )
         if "unsigned" in name or "shrank" in name:
             want = "mesh the shell round the surface with --inside negative --offset 1"
     assert want in message
