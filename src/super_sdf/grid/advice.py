@@ -137,7 +137,7 @@ def are_labels(samples: SampleArray) -> bool:
     between, among, jumps = zip(*found)
     if LEAST_JUMP * (high - low) > max(jumps) or sum(among) < ENOUGH:
         return False
-    return sum(between) <= MOST_BETWEEN * sum(among)
+    return bool(sum(between) <= MOST_BETWEEN * sum(among))
 
 
 def _at_boundaries(slab: NDArray[Any], low: float, high: float) -> tuple[int, int, float]:
