@@ -218,7 +218,9 @@ def _scaled(
 
 def _has_distances(evidence: Evidence) -> bool:
     """Return whether a field has the slope of a distance almost everywhere, as next to kinks."""
-    return evidence.is_enough and evidence.wrong < BENT and not evidence.is_too_steep
+    is_cut = evidence.cut_low or evidence.cut_high
+    known = evidence.is_enough and not is_cut
+    return known and evidence.wrong < BENT and not evidence.is_too_steep
 
 
 def _wrong_slope(slope: float, evidence: Evidence) -> str:
