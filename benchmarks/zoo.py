@@ -292,6 +292,11 @@ kind("density, share, of a box along the axes", bar, lambda d: np.clip(0.5 - d, 
 kind("density, share, level given", block, lambda d: np.clip(0.5 - d, 0, 1), **SHARE,
      options={"level": 0.5})  # fmt: skip
 kind("density, 1 outside", change=lambda d: 1 - sigmoid(d), level=0.5)
+kind("density, the inside given", change=sigmoid, **ABOVE, options={"inside": "negative"})
+kind("density, blurred over five voxels", ball, lambda d: np.clip(0.5 - d / 5, 0, 1), **ABOVE,
+     form=lambda d: 0.5 - d / 5)  # fmt: skip
+kind("density, 0 to 100", block, lambda d: 100 * np.clip(0.5 - d / 2, 0, 1), level=50.0,
+     above=True, form=lambda d: 100 * (0.5 - d / 2))  # fmt: skip
 kind("density, slices 3 apart", ball, sigmoid, **ABOVE, steps=(1, 1, 3))
 kind("probability with noise", ball, form=sigmoid, **ABOVE,
      change=lambda d: np.clip(sigmoid(d) + 0.02 * _noise(d.shape), 0, 1))  # fmt: skip

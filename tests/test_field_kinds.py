@@ -562,7 +562,7 @@ def test_values_on_one_side_of_0_are_a_mask_only_with_zeros():
     np.testing.assert_array_equal(grid.values < 0, depth < 0)
     for values, side, level in (
         (depth - 1, "below", "-2.39 --inside negative"),
-        (1 - depth, "above", "2.39"),
+        (1 - depth, "above", "2.39 --inside positive"),
     ):
         with pytest.raises(GridError) as caught:
             make_grid(values, **PLACE, field="mask")

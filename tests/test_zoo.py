@@ -27,10 +27,11 @@ def test_a_mesh_is_no_worse_than_marching_cubes_or_refused_with_a_way_there(name
 
 
 ADVICE = {
-    "density, sigmoid": {"level": 0.5},
+    "density, sigmoid": {"level": 0.5, "inside": "positive"},
     "density, 1 outside": {"level": 0.5, "inside": "negative"},
-    "image of 8 bits": {"level": 127.5},
-    "CT, int16, of bone in air": {"level": 0.0},
+    "density, the inside given": {"level": 0.5, "inside": "positive"},
+    "image of 8 bits": {"level": 127.5, "inside": "positive"},
+    "CT, int16, of bone in air": {"level": 0.0, "inside": "positive"},
     "labels 0, 100, 117": {"label": 100},
     "labels 0, 1, 2, float32": {"label": 1},
     "labels 1, 2, 3": {"label": 2},
@@ -39,7 +40,7 @@ ADVICE = {
     "exact, int16 in thousandths": {"scale": 0.001},
     "CSG of quadrics": {"field": "scaled"},
     "quadric": {"field": "scaled"},
-    "level out of reach": {"level": 0.5},
+    "level out of reach": {"level": 0.5, "inside": "positive"},
 }
 
 

@@ -33,6 +33,7 @@ MOST_NAMED = 8  # labels that a message lists
 ALIKE = 1.1  # ratio up to which the spacings that the axes show are one unit's
 SNAP = 0.02  # a scale this close to a power of ten, or to the spacing, is replaced by it
 NEAR = 0.25  # of a step from the lowest value: there unsigned distances rise to both sides
+CUT_OFF = 0.01  # share of samples at the lowest, and at the highest value, that are cut off
 CLOSE = 0.95  # share of the full range that values reach, if it is theirs
 FULL = (1, 255, 2**16 - 1)  # largest values of densities and images: the level is half of it
 ROUNDS, FEW = 20, 1 << 16  # of the search for a level; samples of a plane
@@ -186,15 +187,21 @@ def choose_level(samples: SampleArray, extremes: Extremes) -> str:
 def _level(samples: SampleArray, level: float) -> str:
     """Return the advice to try a level, with what is on the border outside."""
     above = is_mostly_negative(*count_border(changed(samples, partial(np.add, -level))))
-    option = f"--level {level:.6g}" + ("" if above else " --inside negative")
+    option = f"--level {level:.6g} --inside {'positive' if above else 'negative'}"
     return f"they look like densities: give the level of their surface, such as {option}"
 
 
 def _between(samples: SampleArray) -> float:
-    """Return a level half-way between the means of what is below and above (Ridler and Calvard)."""
+    """Return the middle of values that are cut off at both ends, else a level between two groups.
+
+    That is half-way between the means of what is below and above it (Ridler and Calvard).
+    """
     planes = [np.ravel(samples[i]) for i in _spread(len(samples))]
     some = np.concatenate([plane[:: 1 + plane.size // FEW] for plane in planes]).astype(np.float64)
     some = some[np.isfinite(some)]
+    ends = float(some.min()), float(some.max())
+    if min(float((some == end).mean()) for end in ends) > CUT_OFF:
+        return sum(ends) / 2
     level = float(some.mean())
     for _ in range(ROUNDS):
         above = some > level
