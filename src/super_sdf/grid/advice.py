@@ -77,9 +77,13 @@ def refusal(
     return GridError(f"no value is {side} 0 (the {end} is {at:.6g}): {advice}")
 
 
-def is_no_distance(samples: SampleArray) -> bool:
-    """Return whether there is no spacing with which values are distances."""
-    return _steps(samples) is None
+def is_density(samples: SampleArray, extremes: Extremes) -> bool:
+    """Return whether values on one side of 0 are no distances, or cut off at 0."""
+    steps = _steps(samples)
+    if steps is None or _has_walls(samples, extremes, steps.max()):
+        return steps is None
+    at_zero = [float((np.asarray(samples[i]) == 0).mean()) for i in _spread(len(samples))]
+    return sum(at_zero) > CUT_OFF * len(at_zero)
 
 
 def _has_walls(samples: SampleArray, extremes: Extremes, step: float) -> bool:

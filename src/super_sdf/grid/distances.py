@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import Triple
-from .advice import is_no_distance, refusal
+from .advice import is_density, refusal
 from .evidence import SLOPE_OFF, Evidence, Looked, slope_within, weigh
 from .field import AUTO, NOISY, NONE_EXACT, SCALED, TRUNCATED, Field
 from .gradients import surface_gradients, typical_length
@@ -60,7 +60,7 @@ def _check_thin(
     if request.inside == AUTO:
         fault = find_fault(samples, steps_of(spacing), extremes)
     else:
-        fault = UNSIGNED if is_no_distance(samples) else ""
+        fault = UNSIGNED if is_density(samples, extremes) else ""
     if fault:
         raise refusal(samples, extremes, spacing, fault)
 
