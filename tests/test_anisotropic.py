@@ -288,7 +288,7 @@ def test_thin_parts_without_a_sample_inside(network):
 
 @pytest.mark.parametrize("spacing", SPACINGS)
 def test_unsigned_fields_are_refused(spacing):
-    with pytest.raises(GridError, match="an unsigned field has no inside"):
+    with pytest.raises(GridError, match="unsigned distances have no inside: mesh the shell"):
         make_grid(np.abs(sampled(spacing)), spacing=spacing)
 
 

@@ -208,8 +208,8 @@ CASES = {
     ("constant.npy",): (1, "every value is 1: a constant field has no surface"),
     ("unsigned.npy",): (
         1,
-        "no value is below 0 (the smallest is 0.255889): an unsigned field has no inside; if the "
-        "solid is thinner than the spacing, use --inside negative",
+        "no value is below 0 (the smallest is 0.255889): unsigned distances have no inside: "
+        "mesh the shell round the surface with --inside negative --offset 1",
     ),
     ("in.npy", "--offset", "99"): (
         1,

@@ -204,12 +204,12 @@ def test_a_label_is_a_mask_of_its_samples():
 
 
 def test_labels_without_a_choice_are_refused():
-    with pytest.raises(GridError) as caught:
-        make_grid(MASK * 2 + (box() < 0), **PLACE)
-    assert str(caught.value) == (
-        "the values are whole numbers from 0 to 3, as of labels: choose the solid with --label, "
-        "or with --level if they are densities"
-    )
+    for field in ("auto", "exact", "scaled"):
+        with pytest.raises(GridError) as caught:
+            make_grid(MASK * 2 + (box() < 0), **PLACE, field=field)
+        assert str(caught.value) == (
+            "no solid is chosen: they look like labels (0, 1, 2, 3): choose one with --label 1"
+        )
 
 
 def test_a_label_that_no_sample_has_is_refused_with_those_there_are():
@@ -562,13 +562,16 @@ def test_values_on_one_side_of_0_are_a_mask_only_with_zeros():
         np.testing.assert_array_equal(grid.values < 0, depth < 0)
     grid = make_grid(depth, **PLACE, field="mask", inside="negative")
     np.testing.assert_array_equal(grid.values < 0, depth < 0)
-    for values, side in ((depth - 1, "below"), (1 - depth, "above")):
+    for values, side, level in (
+        (depth - 1, "below", "-2.39 --inside negative"),
+        (1 - depth, "above", "2.39 --inside positive"),
+    ):
         with pytest.raises(GridError) as caught:
             make_grid(values, **PLACE, field="mask")
         assert str(caught.value) == (
             f"every value is {side} 0 (they go from {values.min():.6g} to {values.max():.6g}), so "
-            "their signs make no mask: choose the solid with --label, or what is above a value "
-            "with --level"
+            "their signs make no mask: they look like densities: give the level of their surface, "
+            f"such as --level {level}"
         )
 
 

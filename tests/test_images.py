@@ -231,7 +231,7 @@ def test_other_mistakes_are_one_line():
         "quality 'best' and a network are given: give only one"
     )
     image.spacing = (0.2, 0.2, 0.2)
-    assert refusal(contour).endswith("values that are no distances need --field scaled")
+    assert refusal(contour).endswith("multiply the values, --scale 0.40123")
     image.spacing = (0.5, 0.5, 0.5)
     flat = image.extract_subset((0, 19, 0, 21, 4, 4))
     assert refusal(flat.super_sdf.contour) == (

@@ -40,10 +40,12 @@ def test_values_of_the_other_sign_are_refused():
 @pytest.mark.parametrize("unit, spacing", [(1.5, 1.0), (1.0, 1.5 / 2), (40, 1.0)])
 def test_a_spacing_that_the_values_contradict_is_refused(make, unit, spacing):
     for values in (VALUES, np.abs(np.indices((20, 20, 20)) - 9.3).max(0) - 5.1):
-        with pytest.raises(
-            GridError, match="distances and spacing must be in the same unit; scale the"
-        ):
+        with pytest.raises(GridError) as caught:
             make(values * unit, spacing)
+        want = "distances need the unit of the spacing: multiply the values, --scale "
+        advice, scale = str(caught.value).rsplit(maxsplit=1)
+        assert advice.endswith(want.strip())
+        assert make(values * unit * float(scale), spacing).notes[:-1] == ()
 
 
 def test_grid_and_make_grid_are_the_same_grid():

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from super_sdf.errors import GridError
 from super_sdf.grid.gradients import straight_gradients, typical_length
-from super_sdf.grid.one_sided import MOST_FLOODED, find_walls
+from super_sdf.grid.one_sided import BEYOND, FAR, MOST_FLOODED, find_walls
 from super_sdf.grid.sdf_grid import make_grid
 
 N = 32
@@ -92,6 +92,7 @@ NO_SURFACE = {
     "steps": np.maximum(R - 9, 0) + 0.5,
     "slow": 0.1 * R + 0.05,
 }
+DENSITY = "they look like densities: give the level of their surface, such as --level "
 FIELDS = {f"unsigned {name}": values for name, values in UNSIGNED.items()} | NO_SURFACE
 
 
@@ -104,13 +105,15 @@ def test_what_only_looks_thin_is_refused_in_one_line(name, spacing):
     assert message.startswith("no value is below 0 (the smallest is ") and "\n" not in message
     far, beyond = "a ball that grew away never near", "off the border a ball beyond the border"
     if name in far:
-        want = "every wall is nearer to some sample than that, so there is no surface"
+        want = FAR
     elif name in beyond:
-        want = "only samples on the border of the grid are near 0, so no surface lies in it"
+        want = BEYOND
     else:
-        want = "an unsigned field has no inside"
-        if spacing is None:  # in the spacing that they seem to have, they may be far from 0
-            message = message.replace("every wall is nearer to some sample", want)
+        want = {"slow": "multiply the values, --scale 10" if spacing else f"{FAR}"}.get(
+            name, DENSITY
+        )
+        if "unsigned" in name or "shrank" in name:
+            want = "mesh the shell round the surface with --inside negative --offset 1"
     assert want in message
 
 
@@ -127,7 +130,7 @@ def test_large_unsigned_fields_are_told_from_fewer_samples():
     x, y, z = (np.arange(160, dtype=np.float32) - 79.3)[:, None, None], *np.ogrid[:160, :160]
     values = np.abs(np.sqrt(x**2 + (y - 80) ** 2 + (z - 80) ** 2) - 50)
     assert values.size > MOST_FLOODED
-    with pytest.raises(GridError, match="an unsigned field has no inside"):
+    with pytest.raises(GridError, match="unsigned distances have no inside: mesh the shell"):
         make_grid(values, spacing=1)
 
 

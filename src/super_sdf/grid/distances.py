@@ -11,10 +11,11 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import Triple
+from .advice import is_density, refusal
 from .evidence import SLOPE_OFF, Evidence, Looked, is_projective, slope_within, weigh
-from .field import NOISY, NONE_EXACT, SCALED, TRUNCATED, Field
+from .field import AUTO, NOISY, NONE_EXACT, SCALED, TRUNCATED, Field
 from .gradients import surface_gradients, typical_length
-from .one_sided import check_thin, is_one_sided
+from .one_sided import UNSIGNED, find_fault, is_one_sided
 from .planes import SampleArray, changed
 from .request import Interpreted, Request
 from .samples import Extremes
@@ -27,6 +28,7 @@ from .truncation import filled_planes, without_plateaus
 # below which too few are left for that.
 HARMLESS, FILLED, TOO_NEAR = 3.0, 1.75, 0.85
 ALIKE = 0.02  # slopes beside the surface and elsewhere, of distances in another unit
+SAME_SLOPE = 5e-5  # from 1: in words it is 1
 BENT = 0.1  # share of wrong slopes from which the network has no say in a field
 
 
@@ -42,11 +44,26 @@ def as_distances(
     wanted = request.wanted.field
     positive = is_positive_inside(samples, request.inside, extremes, notes)
     spacing = choose_spacing(samples, request.spacing, notes, is_cut=is_cut)
-    if request.inside == "auto" and is_one_sided(extremes):
-        check_thin(samples, steps_of(spacing), extremes)
+    if is_one_sided(extremes):
+        _check_thin(samples, extremes, spacing, request)
     field = Field(NOISY, exact=NONE_EXACT) if wanted == NOISY else Field()
     field = replace(field, given=not request.is_auto)
     return Interpreted(samples, extremes, spacing, positive, field)
+
+
+def _check_thin(
+    samples: SampleArray, extremes: Extremes, spacing: Triple, request: Request
+) -> None:
+    """Raise GridError unless values on one side of 0 can be distances to a thin solid.
+
+    If the user says which side is inside, they only must be distances: there may be an offset.
+    """
+    if request.inside == AUTO:
+        fault = find_fault(samples, steps_of(spacing), extremes)
+    else:
+        fault = UNSIGNED if is_density(samples, extremes) else ""
+    if fault:
+        raise refusal(samples, extremes, spacing, fault)
 
 
 def by_kind(found: Interpreted, looked: Looked, request: Request, notes: list[str]) -> Interpreted:
@@ -89,6 +106,8 @@ def of_slope(
     samples: SampleArray, looked: Looked, request: Request, notes: list[str]
 ) -> Interpreted:
     """Return distances for a field of another slope; the given spacing is believed."""
+    if is_one_sided(looked.extremes):
+        raise refusal(samples, looked.extremes, request.spacing)
     positive = is_positive_inside(samples, request.inside, looked.extremes, notes)
     spacing = request.spacing or choose_spacing(samples, None, notes)
     found = Interpreted(samples, looked.extremes, spacing, positive, Field())
@@ -190,7 +209,7 @@ def _as_spline(found: Interpreted) -> Interpreted:
 def _noisy(found: Interpreted, evidence: Evidence, notes: list[str]) -> Interpreted:
     """Return noisy distances, and say how noisy they are."""
     notes.append(
-        f"values taken as noisy (--field noisy): at {100 * evidence.noisy:.2g} % of the "
+        f"values taken as noisy (--field noisy): at {evidence.noisy:.1%} of the "
         "samples beside the surface they change by more than distances can; the noise is at "
         f"most about {evidence.roughness:.2g} voxels"
     )
@@ -222,16 +241,19 @@ def _scaled(
 
 def _has_distances(evidence: Evidence) -> bool:
     """Return whether a field has the slope of a distance almost everywhere, as next to kinks."""
+    is_cut = evidence.cut_low or evidence.cut_high
+    known = evidence.is_enough and not is_cut
     contradictory = evidence.is_too_steep or evidence.is_contradictory
-    return evidence.wrong < BENT and not contradictory
+    return known and evidence.wrong < BENT and not contradictory
 
 
 def _wrong_slope(slope: float, evidence: Evidence) -> str:
     """Return a clause that says how the slope of a field is wrong."""
-    why = f"beside the surface their slope is {slope:.4g} instead of 1"
-    if evidence.is_bent:
-        why += f", and wrong at {100 * evidence.wrong:.2g} % of the samples"
-    return why
+    typical = f"beside the surface their slope is {slope:.4g} instead of 1"
+    bent = f"that of a distance at {evidence.wrong:.1%} of the samples"
+    if abs(slope - 1) < SAME_SLOPE:
+        return f"beside the surface their slope is not {bent}"
+    return f"{typical}, and not {bent}" if evidence.is_bent else typical
 
 
 def _on_lattice(found: Interpreted, slope: float) -> SampleArray:

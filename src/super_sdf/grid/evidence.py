@@ -369,8 +369,7 @@ def _are_whole(lines: Floats, looked: Looked) -> BoolArray:
     """Return of which lines, (n, 3, m), no sample is cut off, (n,)."""
     ends = zip(looked.extremes, looked.is_cut, (-1, 1))
     low, high = (end if is_cut else sign * np.inf for end, is_cut, sign in ends)
-    whole: BoolArray = ((lines > low) & (lines < high)).all((1, 2))
-    return whole
+    return np.asarray(((lines > low) & (lines < high)).all((1, 2)))
 
 
 def is_normalised(looked: Looked, spacing: Triple) -> bool:

@@ -11,7 +11,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..errors import GridError
 from . import distances, masking
+from .advice import are_labels, choose_label, choose_level
 from .evidence import Looked, is_normalised, is_projective, look, weigh
 from .field import EXACT, MASK, NOISY, SCALED, Wanted
 from .planes import SampleArray, changed
@@ -58,14 +60,19 @@ def _interpreted(
         return masking.of_mask(chosen, request.above_is_inside(), notes), samples
     if samples.dtype == np.bool_:
         return masking.of_mask(samples, request, notes), samples
+    given = samples
     samples, request = _about_zero(samples, request, notes)
     samples, extremes = _known(samples, request, notes)
+    if request.is_density and (extremes[0] > 0 or extremes[1] < 0):
+        raise _no_level(given, extremes, wanted)
     check_not_constant(extremes)
     if has_two_values(samples, extremes):
         lower = 0.0 if request.is_density else extremes[0]
         return masking.of_mask(masking.above(samples, lower), request, notes), samples
     if wanted.field == MASK:
         return masking.of_signs(samples, extremes, request, notes), samples
+    if not request.is_density and are_labels(samples):
+        raise GridError(f"no solid is chosen: {choose_label(samples)}")
     if wanted.field in (EXACT, NOISY):
         return distances.as_distances(samples, extremes, request, notes), samples
     return _by_evidence(samples, extremes, request, notes), samples
@@ -84,6 +91,16 @@ def _about_zero(
     if scale is not None:
         samples = changed(samples, partial(np.multiply, float(scale)))
     return samples, request
+
+
+def _no_level(given: SampleArray, extremes: Extremes, wanted: Wanted) -> GridError:
+    """Return the error for a level that no value is above, or none below."""
+    level = float(wanted.level or 0)
+    low, high = (x / (wanted.scale or 1) + level for x in extremes)
+    return GridError(
+        f"no value is {'above' if high < level else 'below'} the level {level:g} (they go from "
+        f"{low:.6g} to {high:.6g}): {choose_level(given, (low, high))}"
+    )
 
 
 def _known(
@@ -107,8 +124,6 @@ def _by_evidence(
     looked = look(samples.not_continued if isinstance(samples, KnownPlanes) else samples, extremes)
     if request.is_auto and (mask := _mask_shown(samples, looked, request, notes)):
         return mask
-    if request.inside == "auto" and masking.are_labels(samples, extremes):
-        raise masking.refuse_labels(extremes)
     if request.is_density:
         request = request.with_spacing(1, "since densities show none (give --spacing)", notes)
     if _has_other_slope(looked, request):

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import GridError
+from .advice import MOST_NAMED, named, way_out
 from .evidence import ENOUGH, Looked
 from .field import AUTO, MASK, NONE_EXACT, Field, check_label
 from .masks import extremes_of_masks, has_both_sides, mask_planes
@@ -23,8 +24,6 @@ from .spacing import is_cubic, steps_of
 # Densities have no ramp if half of the changes across the level are this share of all there is to
 # change, the lowest and the highest values left out.
 STEP, STEP_TAIL = 0.85, 0.05
-MOST_LABELS = 64  # whole numbers up to this look like labels
-MOST_NAMED = 8  # labels that a message lists
 
 
 def labelled(samples: SampleArray, label: int) -> SampleArray:
@@ -35,11 +34,9 @@ def labelled(samples: SampleArray, label: int) -> SampleArray:
         found = changed(samples, lambda planes: planes == value, np.bool_)
         if has_both_sides(found):
             return found
-    labels = sorted({x.item() for plane in samples for x in np.unique(plane)[: MOST_NAMED + 1]})
-    named = ", ".join(f"{x:g}" if x % 1 else str(int(x)) for x in labels[:MOST_NAMED])
-    named += ", ..." if len(labels) > MOST_NAMED else ""
-    which = "every sample" if value is not None and labels == [value] else "no sample"
-    raise GridError(f"{which} has the label {label}: the labels are {named}")
+    labels = {x.item() for plane in samples for x in np.unique(plane)[: MOST_NAMED + 1]}
+    which = "every sample" if value is not None and labels == {value} else "no sample"
+    raise GridError(f"{which} has the label {label}: the labels are {named(labels)}")
 
 
 def as_sample(label: int, dtype: np.dtype[Any]) -> Any:
@@ -55,21 +52,6 @@ def as_sample(label: int, dtype: np.dtype[Any]) -> Any:
 def above(samples: SampleArray, level: float) -> SampleArray:
     """Return which samples are above a level."""
     return changed(samples, lambda planes: planes > level, np.bool_)
-
-
-def are_labels(samples: SampleArray, extremes: Extremes) -> bool:
-    """Return whether values look like labels: small whole numbers from 0 on."""
-    whole = samples.dtype.kind in "iu" and extremes[0] == 0
-    return whole and extremes[1] <= MOST_LABELS
-
-
-def refuse_labels(extremes: Extremes) -> GridError:
-    """Return the error for labels of which none is chosen."""
-    low, high = extremes
-    return GridError(
-        f"the values are whole numbers from {low:g} to {high:g}, as of labels: choose the solid "
-        "with --label, or with --level if they are densities"
-    )
 
 
 def is_step(looked: Looked) -> bool:
@@ -98,8 +80,7 @@ def of_signs(
     if low > 0 or high < 0:
         raise GridError(
             f"every value is {'above' if low > 0 else 'below'} 0 (they go from {low:.6g} to "
-            f"{high:.6g}), so their signs make no mask: choose the solid with --label, or what is "
-            "above a value with --level"
+            f"{high:.6g}), so their signs make no mask: {way_out(samples)}"
         )
     if high == 0 or zeros > 0 or (low < 0 and zeros == 0 and _is_positive(samples, request)):
         return of_mask(changed(samples, lambda planes: planes >= 0, np.bool_), request, notes)

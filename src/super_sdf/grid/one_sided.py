@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, Triple
-from ..errors import GridError
 from ..machine.threads import chunks_of
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 from .planes import SampleArray
@@ -41,10 +40,7 @@ TOUCHING, TOUCHING_SHARE, LEAST_RISE, MOST_RISE = 0.1, 0.5, 0.75, 3**0.5
 
 FAR = "every wall is nearer to some sample than that, so there is no surface"
 BEYOND = "only samples on the border of the grid are near 0, so no surface lies in it"
-UNSIGNED = (
-    "an unsigned field has no inside; if the solid is thinner than the spacing, use --inside "
-    "negative"
-)
+UNSIGNED = "unsigned distances have no inside"
 
 
 def is_one_sided(extremes: Extremes) -> bool:
@@ -52,8 +48,8 @@ def is_one_sided(extremes: Extremes) -> bool:
     return extremes[0] >= 0 or extremes[1] <= 0
 
 
-def check_thin(values: SampleArray, spacing: Triple, extremes: Extremes) -> None:
-    """Raise GridError unless values on one side of 0 can be distances to a thin solid.
+def find_fault(values: SampleArray, spacing: Triple, extremes: Extremes) -> str:
+    """Return why values on one side of 0 cannot be distances to a thin solid; empty if they can.
 
     Parameters
     ----------
@@ -63,31 +59,26 @@ def check_thin(values: SampleArray, spacing: Triple, extremes: Extremes) -> None
         Along each axis.
     extremes : two floats
         The smallest and the largest sample.
+
+    Returns
+    -------
+    str
+        ``FAR``, ``BEYOND``, ``UNSIGNED`` or nothing.
     """
     steps = np.array(spacing) / max(spacing)
     scale = (1 if extremes[0] >= 0 else -1) / max(spacing)
     if min(map(abs, extremes)) * abs(scale) > reach(steps):
-        raise _refusal(extremes, FAR)
+        return FAR
     patches, walls, thickness = look_near_walls(values, scale, steps)
     if not len(patches):
-        raise _refusal(extremes, BEYOND)
+        return BEYOND
     if not (_are_distances(patches, steps) and _touch_walls(patches, steps)):
-        raise _refusal(extremes, UNSIGNED)
+        return UNSIGNED
     if len(thickness) > UNSIGNED_SHARE * walls:
         beyond = max(-float(np.quantile(thickness, LEAST_THICKNESS)), 0.0)
         if _is_cut_off(values, scale, steps, FREE + beyond):
-            raise _refusal(extremes, UNSIGNED)
-
-
-def _refusal(extremes: Extremes, reason: str) -> GridError:
-    """Return the error for values that are no distances to a thin solid."""
-    low, high = extremes
-    if low >= 0:
-        return GridError(f"no value is below 0 (the smallest is {low:.6g}): {reason}")
-    return GridError(
-        f"no value is above 0 (the largest is {high:.6g}): the grid lies within the solid; if "
-        "that is outside and the solid thin, use --inside positive"
-    )
+            return UNSIGNED
+    return ""
 
 
 def reach(steps: Floats) -> float:

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Triple
 from ..errors import GridError, seen
+from .advice import way_out
 from .gradients import (
     ENOUGH,
     Gradients,
@@ -108,7 +109,7 @@ def choose_spacing(
         return given
     if given:
         if not is_cut:
-            _check_axes(in_finest(beside, given), given)
+            _check_axes(values, in_finest(beside, given), given)
         _check_unit(values, beside, given, notes, is_cut)
         return given
     everywhere = straight_gradients(values)
@@ -121,7 +122,7 @@ def choose_spacing(
         steps = ", ".join(f"{step:.4g} along {name}" for name, step in unequal.items())
         raise GridError(
             f"spacing not given: the values change by {steps} from sample to sample, and do not "
-            "show it for all axes; give --spacing X,Y,Z"
+            f"show it for all axes; {way_out(values)}"
         )
     return _infer_spacing(_measure(everywhere, beside), values.shape, notes)
 
@@ -138,7 +139,7 @@ def in_finest(gradients: Gradients, spacing: Triple) -> Gradients:
     return gradients[0] * (min(spacing) / np.array(spacing)), gradients[1]
 
 
-def _check_axes(gradients: Gradients, spacing: Triple) -> None:
+def _check_axes(values: SampleArray, gradients: Gradients, spacing: Triple) -> None:
     """Raise GridError if gradients, scaled to one spacing, show different ones along the axes."""
     found, h = unequal_axes(*gradients), dict(zip("xyz", spacing))
     if found:
@@ -147,7 +148,7 @@ def _check_axes(gradients: Gradients, spacing: Triple) -> None:
         )
         raise GridError(
             f"the values change by {steps} from sample to sample, but spacing is "
-            f"{_join(spacing)}: give that of each axis (--spacing X,Y,Z)"
+            f"{_join(spacing[:1] if is_cubic(spacing) else spacing)}: {way_out(values, spacing)}"
         )
 
 
@@ -223,17 +224,13 @@ def _check_unit(
     observed = f"the values change by {measured:.6g} from sample to sample, but spacing is {named}"
     allowed = REFUSED if are_consistent(measured, *beside) else REFUSED_IF_UNSURE
     if measured > allowed * h:
-        raise GridError(
-            f"{observed}: distances and spacing must be in the same unit; "
-            f"scale the values by {h / measured:.6g} or give another --spacing; values that are no "
-            "distances need --field scaled"
-        )
+        raise GridError(f"{observed}: {way_out(values, spacing)}")
     if _agree(measured, h):
         return
     if measured < h:
         everywhere = in_finest(straight_gradients(values), spacing)
         if not is_cut:
-            _check_axes(everywhere, spacing)
+            _check_axes(values, everywhere, spacing)
         if _agree(_measure(everywhere, beside), h):
             return
     notes.append(f"{observed}: they are not exact distances, or the unit is wrong")
@@ -244,5 +241,5 @@ def _agree(measured: float, h: float) -> bool:
     return h / TOLERATED <= measured <= h * TOLERATED
 
 
-def _join(triple: Triple) -> str:
+def _join(triple: tuple[float, ...]) -> str:
     return ", ".join(f"{number:g}" for number in triple)
