@@ -26,9 +26,8 @@ from .interpolation import CELL
 from .nodes import BARELY_INSIDE, BARELY_OUTSIDE, SharedParts, block_ijk
 from .voxel_index import VoxelIndex
 
-TOLERANCE = 0.5  # a sphere whose distance to the surface is less wrong touches it
+TOLERANCE = 0.2  # a sphere is touched by surfaces up to so far from it
 LARGEST_SPHERE = 2.0  # farther samples say little of a small piece
-BESIDE = 0.5  # how far behind the surface a node is looked for that shows where it is
 SEEDS = 4096  # pieces that are looked at together
 
 # Planes of voxels to either side that a value depends on: a piece, a sample whose sphere touches
@@ -291,15 +290,30 @@ def is_supported(
     if np.abs(values).max() <= BARELY_OUTSIDE:
         return False  # it has no volume
     inside = bool(values[0] <= 0)
+    own = _vertices(lattice, node, values)
     for centre, radius in zip(*_spheres_beside(lattice.factor, node, inside, spheres)):
-        if _gap(centre, radius, node, values, lattice.factor) <= TOLERANCE:
-            around = centre + _ball(radius + TOLERANCE + BESIDE, lattice.factor)
+        reach = (radius + TOLERANCE) * lattice.factor / 2
+        if np.linalg.norm(own - centre, axis=1).min() <= reach:
+            around = centre + _ball(reach + 1)
             at = lattice.find(around)
-            others = lattice.values(at)
-            rest = (at >= 0) & ((others <= 0) == inside) & ~_is_among(at, loose)
-            if _gap(centre, radius, around[rest], others[rest], lattice.factor) > TOLERANCE:
+            beside = lattice.values(at)
+            rest = (at >= 0) & ((beside <= 0) == inside) & ~_is_among(at, loose)
+            others = _vertices(lattice, around[rest], beside[rest])
+            if np.linalg.norm(others - centre, axis=1).min(initial=np.inf) > reach:
                 return True
     return False
+
+
+def _vertices(lattice: Lattice, node: Nodes, values: FloatArray) -> NDArray[np.float64]:
+    """Return where the surface crosses the lattice edges from nodes (n, 3), (m, 3)."""
+    at = lattice.find((node[:, None] + NEIGHBOURHOOD[ALONG]).reshape(-1, 3))
+    high = lattice.values(at).reshape(-1, len(ALONG)).astype(np.float64)
+    low = values[:, None].astype(np.float64)
+    crossed = (at >= 0).reshape(high.shape) & ((high <= 0) != (low <= 0))
+    row, along = np.nonzero(crossed)
+    share = (low / np.where(crossed, low - high, 1))[row, along]
+    vertices: NDArray[np.float64] = node[row] + share[:, None] * NEIGHBOURHOOD[ALONG[along]]
+    return vertices
 
 
 def _spheres_beside(
@@ -316,17 +330,11 @@ def _spheres_beside(
     return factor * around[some] + factor // 2, radius[some]
 
 
-def _gap(centre: Nodes, radius: float, node: Nodes, values: FloatArray, factor: int) -> float:
-    """Return how far a sphere is from the nearest of the balls that nodes' distances make."""
-    apart = np.linalg.norm((node - centre) * (2 / factor), axis=1)
-    return float((apart - np.abs(values)).min(initial=np.inf)) - radius
-
-
-def _ball(radius: float, factor: int) -> Nodes:
-    """Return the steps to the nodes within a radius, (n, 3)."""
-    reach = int(radius * factor / 2)
+def _ball(radius: float) -> Nodes:
+    """Return the steps to the nodes within a radius in fine spacings, (n, 3)."""
+    reach = int(radius)
     steps = np.indices((2 * reach + 1,) * 3).reshape(3, -1).T - reach
-    return steps[np.linalg.norm(steps, axis=1) <= radius * factor / 2]
+    return steps[np.linalg.norm(steps, axis=1) <= radius]
 
 
 def _is_among(numbers: Nodes, ascending: Nodes) -> BoolArray:
