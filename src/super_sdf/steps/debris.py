@@ -5,7 +5,7 @@ or bubbles within the solid. Such a piece is a set of nodes of one sign, joined 
 that extends over less than a voxel. It stays
 
 - if a sample lies in it, and is not 0;
-- if the sphere of an exact sample touches it, and no larger piece of the surface.
+- if it touches the sphere of an exact sample, and nothing else that stays does.
 
 Of the others all nodes get the opposite sign. Whether they do depends on values a few voxels away
 at most, so that slabs agree. Lengths are in half voxels, as in ``band``.
@@ -93,9 +93,9 @@ class Pieces:
     def __len__(self) -> int:
         return len(self.start) - 1
 
-    def of(self, values: NDArray[np.generic]) -> list[NDArray[np.generic]]:
-        """Cut an array of one row a node into those of the pieces."""
-        return np.split(values, self.start[1:-1])
+    def spread(self, values: BoolArray) -> BoolArray:
+        """Return for each node the value of its piece."""
+        return np.repeat(values, np.diff(self.start))
 
 
 def drop_debris(
@@ -124,20 +124,26 @@ def drop_debris(
     """
     lattice = Lattice(blocks, factor, index)
     pieces = small_pieces(lattice, find_seeds(blocks, factor, parts))
+    first = (np.maximum(pieces.node[pieces.start[:-1], 0] - 1, 0) // factor).astype(np.int32)
     at = lattice.find(pieces.node)
     values = lattice.values(at)
-    solid = (np.abs(values) > BARELY_OUTSIDE) & ((pieces.node - factor // 2) % factor == 0).all(1)
-    held = np.logical_or.reduceat(solid, pieces.start[:-1]) if len(pieces) else np.zeros(0, bool)
-    loose = np.sort(at[np.repeat(~held, np.diff(pieces.start))])
-    first = np.maximum(pieces.node[pieces.start[:-1], 0] - 1, 0) // factor
+    held = _hold_samples(pieces, values, factor)
+    loose = np.sort(at[pieces.spread(~held)])
     dropped = np.zeros(len(pieces), bool)
     for n in np.flatnonzero(~held):
         some = slice(pieces.start[n], pieces.start[n + 1])
         dropped[n] = not is_supported(lattice, pieces.node[some], values[some], loose, spheres)
-    gone = np.repeat(dropped, np.diff(pieces.start))
-    other = np.where(values <= 0, BARELY_OUTSIDE, BARELY_INSIDE)
-    lattice.set(pieces.node[gone], other[gone])
-    return first[dropped].astype(np.int32), first[held].astype(np.int32)
+    gone = pieces.spread(dropped)
+    lattice.set(pieces.node[gone], np.where(values[gone] <= 0, BARELY_OUTSIDE, BARELY_INSIDE))
+    return first[dropped], first[held]
+
+
+def _hold_samples(pieces: Pieces, values: FloatArray, factor: int) -> BoolArray:
+    """Return in which pieces a sample lies that is not 0, (n,); ``values`` are those of nodes."""
+    if not len(pieces):
+        return np.zeros(0, bool)
+    held = ((pieces.node - factor // 2) % factor == 0).all(1) & (np.abs(values) > BARELY_OUTSIDE)
+    return np.logical_or.reduceat(held, pieces.start[:-1])
 
 
 def count_between(plane: IntArray, planes: tuple[int, int]) -> int:
@@ -148,12 +154,14 @@ def count_between(plane: IntArray, planes: tuple[int, int]) -> int:
 def find_seeds(blocks: FloatArray, factor: int, parts: SharedParts) -> Nodes:
     """Return the nodes, as voxel and place in its block (n, 2), at which a small piece may begin.
 
-    The nodes before such a node, along each axis, have the other sign, and so has one of the next K.
+    The nodes before such a node have the other sign, along each axis, and so has one of the next K.
     """
     side, count = factor + 1, blocks.shape[1] - 1
 
     def seeds_of(rows: slice) -> Nodes:
-        inside = (blocks[:, rows] <= 0) if rows.stop <= count else (blocks[:, rows.start:count] <= 0)
+        inside = (
+            (blocks[:, rows] <= 0) if rows.stop <= count else (blocks[:, rows.start : count] <= 0)
+        )
         inside = inside.reshape(side, side, side, -1)
         here = inside[1:, 1:, 1:]
         first = here != inside[:-1, 1:, 1:]
@@ -189,9 +197,7 @@ def _ends_soon(
 def small_pieces(lattice: Lattice, seeds: Nodes) -> Pieces:
     """Return the pieces of at most K nodes along each axis that begin at seeds."""
     start = lattice.factor * _voxels(lattice, seeds[:, 0]) + block_ijk(lattice.factor)[seeds[:, 1]]
-    found = [
-        _grow(lattice, start[some : some + SEEDS]) for some in range(0, len(start), SEEDS)
-    ]
+    found = [_grow(lattice, start[some : some + SEEDS]) for some in range(0, len(start), SEEDS)]
     nodes = np.concatenate([np.empty((0, 3), np.int64), *(node for node, _ in found)])
     sizes = np.concatenate([np.empty(0, np.int64), *(size for _, size in found)])
     return Pieces(nodes, np.append(0, np.cumsum(sizes)))
@@ -203,14 +209,13 @@ def _voxels(lattice: Lattice, rows: Nodes) -> Nodes:
 
 
 def _grow(lattice: Lattice, start: Nodes) -> tuple[Nodes, Nodes]:
-    """Return the nodes (m, 3) of the small pieces whose first nodes in C order are given, and sizes.
+    """Return the nodes (m, 3) of the small pieces of which ``start`` are the first, and sizes.
 
     A node of a piece is numbered by its seed, and within it by the step from there.
     """
     reach = lattice.factor
     width = 2 * reach + 1
     box = width**3
-    inside = lattice.values(lattice.find(start)) <= 0
     small = np.ones(len(start), bool)
     front = np.arange(len(start)) * box + box // 2
     known = front
@@ -246,7 +251,7 @@ def joined_nodes(values: FloatArray, known: BoolArray) -> BoolArray:
     """
     here = values[:, CENTRE]
     same = ((values <= 0) == (here <= 0)[:, None]) | ~known
-    joined = np.zeros_like(same)
+    joined: BoolArray = np.zeros(same.shape, bool)
     joined[:, ALONG] = same[:, ALONG]
     for place, one, other in ACROSS:
         across = here.astype(np.float64) * values[:, place]
@@ -334,7 +339,8 @@ def _ball(radius: float) -> Nodes:
     """Return the steps to the nodes within a radius in fine spacings, (n, 3)."""
     reach = int(radius)
     steps = np.indices((2 * reach + 1,) * 3).reshape(3, -1).T - reach
-    return steps[np.linalg.norm(steps, axis=1) <= radius]
+    near: Nodes = steps[np.linalg.norm(steps, axis=1) <= radius]
+    return near
 
 
 def _is_among(numbers: Nodes, ascending: Nodes) -> BoolArray:
