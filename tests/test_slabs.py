@@ -50,7 +50,6 @@ FIELDS = {
     "cut off": np.clip(rod(), -0.4, 0.4),
     "leaves the grid": rod()[8:44, :10],
     "ends before the border": rod()[:, :13] - 0.3,
-    "crumbs": rod() + 3,  # thinner than the fine lattice
 }
 
 
