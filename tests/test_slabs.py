@@ -27,11 +27,11 @@ def network():
     return load_network("fast")
 
 
-def rod(seed=0):
+def rod(planes=56):
     """Return distances to a bent rod along x, longer than the planes that a slab depends on."""
-    i, j, k = np.indices((56, 14, 15)).astype(np.float64)
+    i, j, k = np.indices((planes, 14, 15)).astype(np.float64)
     middle = np.hypot(j - 6.6 - 1.5 * np.sin(i / 6), k - 7.2)
-    return np.maximum(middle - 3.4, np.abs(i - 27.6) - 24.3)
+    return np.maximum(middle - 3.4, np.abs(i - planes / 2 + 0.4) - planes / 2 + 3.7)
 
 
 def bad_samples(values):
@@ -167,7 +167,7 @@ def test_the_thinnest_slabs_all_decode_something():
 
 
 def test_less_memory_makes_more_slabs_and_too_little_is_refused(bare_plan):
-    band = survey(SdfGrid.trusted(rod(), (1.0,) * 3))
+    band = survey(SdfGrid.trusted(rod(112), (1.0,) * 3))
     need = peak_bytes(band, [cutting.whole(band)], 4)
     assert len(plan_slabs(band, 4, 2, Resources(memory=need))) == 1
     less = [Resources(memory=10**8 + int(share * (need - 10**8))) for share in (0.9, 0.7)]

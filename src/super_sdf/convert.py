@@ -52,6 +52,8 @@ from .topology import OpenEdges
 if TYPE_CHECKING:
     from .fields.writing import FieldFile
 
+DROPPED = "pieces smaller than a voxel that no sample supports, and so left out: {}"
+LONE = "voxels of the mask without a neighbour on their side, each meshed as a piece: {}"
 CAPPED = (
     "the solid runs out of the grid: its surface is closed along the border (leave it open with "
     "--open)"
@@ -99,6 +101,8 @@ COUNTS = (
     "vertices",
     "triangles",
     "pinned_nodes",
+    "dropped_pieces",
+    "lone_samples",
     "slabs",
     "planned_bytes",
 )
@@ -172,6 +176,16 @@ class Conversion:
     field: dict[str, Any] = dataclass_field(default_factory=dict)
     saved_field: dict[str, Any] | None = None
     engine: dict[str, Any] = dataclass_field(default_factory=dict)
+
+    def remarks(self) -> list[str]:
+        """Return sentences on what the mesh has that the samples do not show, or lacks."""
+        dropped, lone = self.counts["dropped_pieces"], self.counts["lone_samples"]
+        remarks = [CAPPED] if self.capped else []
+        if dropped:
+            remarks.append(DROPPED.format(dropped))
+        if lone and self.field.get("kind") == MASK:
+            remarks.append(LONE.format(lone))
+        return remarks
 
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""

@@ -46,6 +46,7 @@ from .slabs.footprint import NETWORK_BYTES
 from .slabs.pieces import Piece, count_input, describe_piece
 from .steps.bounds import keep_within_bounds
 from .steps.cap import close
+from .steps.debris import count_between, drop_debris
 from .steps.ends import check_all_seen, check_can_close, seen_octants
 from .steps.exact import BandSummary
 from .steps.field import FineField, SampleSpheres
@@ -459,21 +460,25 @@ def refine(
     seen_ijk, exact = band.voxel_ijk[slab.seen], np.flatnonzero(band.exact[slab.seen])
     own_ijk = seen_ijk[voxels]
     spheres = spheres_of_band(seen_ijk, patches, exact, band.shape, band.limits, threads)
-    fit_to_spheres(blocks, parts, factor, spheres, VoxelIndex(own_ijk, band.shape), threads)
+    index = VoxelIndex(own_ijk, band.shape)
+    fit_to_spheres(blocks, parts, factor, spheres, index, threads)
     del spheres
     keep_within_bounds(blocks, parts, factor, own_ijk, band.trusted, threads)
     if band.kind == MASK:
         hold_sides(blocks, factor, patches, voxels)
     skipped = signs_of_skipped(parts, own_ijk, patches, voxels, band.shape)
     pinned = pin_to_skipped(blocks[:, :-1], parts, factor, skipped)
+    touching = SampleSpheres(band.shape, seen_ijk[exact], patches[exact, CENTRE].copy())
+    dropped, lone = drop_debris(blocks, factor, parts, index, touching)
     steps.finish("nodes")
     field = FineField(band.shape, factor, own_ijk, blocks[:, :-1], parts, slab.planes)
-    touching = SampleSpheres(band.shape, seen_ijk[exact], patches[exact, CENTRE].copy())
     return replace(
         field,
         band_voxels=len(band.voxel_ijk),
         noisy_voxels=band.noisy_voxels,
         pinned=int(pinned[field.own_rows].sum()),
+        dropped=count_between(dropped, slab.planes),
+        lone=count_between(lone, slab.planes),
         spheres=touching,
         decoded_voxels=int(band.decoded_before[-1]),
         leaves=band.leaves,

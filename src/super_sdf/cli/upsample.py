@@ -219,7 +219,7 @@ class Upsampling:
         options = replace(
             CheckOptions.of(make_options(self.options)), processes=self.options["threads"]
         )
-        notes = [*self.cap_notes(), *self.device_notes()]
+        notes = [*self.result.remarks(), *self.device_notes()]
         report = {**self.report(), "notes": notes}
         write_single(page, report, options, self.certificate, force=self.options["force"])
         watch.lap("page")
@@ -237,7 +237,7 @@ class Upsampling:
             print_stdout(json.dumps(report, indent=2), f"{self.target} is written")
         if self.options["quiet"]:
             return
-        for note in (*self.result.notes, *self.cap_notes(), *self.device_notes()):
+        for note in (*self.result.notes, *self.result.remarks(), *self.device_notes()):
             print_stderr(f"Note: {note}")
         for warning in self.result.warnings:
             print_stderr(f"Warning: {warning}")
@@ -273,12 +273,6 @@ class Upsampling:
             **({"check": self.certificate.report()} if self.certificate else {}),
             "seconds": {stage: round(seconds, 4) for stage, seconds in self.seconds.items()},
         }
-
-    def cap_notes(self) -> list[str]:
-        """Return the note on a surface that was closed along the border of the grid."""
-        from ..convert import CAPPED
-
-        return [CAPPED] if self.result.capped else []
 
     def device_notes(self) -> list[str]:
         """Return notes on the device of the network."""

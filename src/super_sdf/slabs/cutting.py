@@ -5,7 +5,7 @@ side as its values depend on:
 
     planes of the slab                   vertices and triangles are made here
     + the mesher's planes_beside         values are final: vertices depend on them
-    + REACH_IN_VOXELS                    blocks are decoded: of the fit to spheres, and of bounds
+    + REACH_IN_VOXELS                    blocks are decoded: of the fit to spheres, bounds, debris
     + the network's receptive field      voxels are given to the network
 """
 
@@ -23,7 +23,7 @@ from ..grid.sdf_grid import SdfGrid
 from ..machine import index_width
 from ..machine.memory import ROOM_SHARE, advised, give_back, held_memory, in_words
 from ..machine.resources import Resources
-from ..steps import bounds, spheres
+from ..steps import bounds, debris, spheres
 from ..steps.glance import look_at_band
 from ..steps.mesher_names import DEFAULT_MESHER
 from ..steps.meshers import BY_NAME, Mesher
@@ -32,7 +32,7 @@ from .footprint import NETWORK_BYTES, slab_bytes
 
 DEFAULT = BY_NAME[DEFAULT_MESHER]
 SURFACE_SHARE, DOUBT = 0.25, "is this a distance field?"  # of which few samples are
-REACH_IN_VOXELS = spheres.REACH_IN_VOXELS + bounds.REACH_IN_VOXELS
+REACH_IN_VOXELS = spheres.REACH_IN_VOXELS + bounds.REACH_IN_VOXELS + debris.REACH_IN_VOXELS
 
 
 @dataclass(frozen=True)

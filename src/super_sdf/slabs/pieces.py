@@ -17,8 +17,8 @@ class Piece:
     meshes : list of Mesh
         Vertices and triangles of the slab. Faces index the vertices of all slabs so far.
     counts : dict
-        Counts of the slab: ``decoded_voxels``, ``nodes``, ``pinned_nodes``, ``vertices``,
-        ``triangles``.
+        Counts of the slab: ``decoded_voxels``, ``nodes``, ``pinned_nodes``, ``dropped_pieces``,
+        ``lone_samples`` (see ``FineField``), ``vertices``, ``triangles``.
     whole : dict
         Counts of the whole run, the same in each piece: ``band_voxels``, ``noisy_voxels`` (see
         ``FineField``), ``slabs``, and ``planned_bytes``, the planned peak memory of the process.
@@ -56,6 +56,8 @@ def describe_piece(
         "decoded_voxels": own.stop - own.start,
         "nodes": fine.parts.count_nodes(fine.factor, own),
         "pinned_nodes": fine.pinned,
+        "dropped_pieces": fine.dropped,
+        "lone_samples": fine.lone,
         "vertices": sum(len(mesh.vertices) for mesh in meshes),
         "triangles": sum(len(mesh.faces) for mesh in meshes),
     }

@@ -71,6 +71,9 @@ class FineField:
     pinned : int
         Nodes in ``planes`` whose sign had to be changed to that of a voxel that holds no surface.
         If there are any, the input is not a distance field there, or the network failed.
+    dropped, lone : int
+        Small pieces that begin in ``planes``: dropped since nothing supports them (``debris``), and
+        kept since a sample lies in them.
     spheres : SampleSpheres, optional
         The exact samples in and beside the slab, for a mesher that leans on them.
     decoded_voxels : int
@@ -99,6 +102,8 @@ class FineField:
     band_voxels: int = 0
     noisy_voxels: int = 0
     pinned: int = 0
+    dropped: int = 0
+    lone: int = 0
     spheres: SampleSpheres | None = None
     decoded_voxels: int = 0
     grid: SdfGrid | None = None

@@ -41,7 +41,7 @@ class Slice:
 
     def read(self) -> NDArray[Any]:
         """Return its values as they are stored."""
-        from pydicom.pixels import pixel_array
+        from pydicom.pixels.utils import pixel_array
 
         return np.asarray(pixel_array(self.path, index=self.frame))
 
