@@ -1,0 +1,281 @@
+"""All labels of an image in one run: closed meshes whose shared walls coincide.
+
+Each label is refined as the mask of its samples, and so is what is beside all of them; ``walls``
+makes the surfaces of these fields. The work is done in slabs of all labels.
+
+>>> from super_sdf import reconstruct_labels
+>>> meshes = reconstruct_labels(image, spacing=(1, 1, 3))         # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .arrays import IntArray
+from .errors import OutOfMemoryError
+from .files.grids import read_array
+from .grid.field import MASK
+from .grid.labels import ALL, LabelImage, check_labels, make_labels
+from .machine.index_width import check_count
+from .machine.memory import advised, give_back, held_memory, in_words
+from .machine.resources import Resources, allot
+from .mesh import Mesh, join_meshes, vertex_type
+from .network.decoder import Decoder
+from .network.kinds import network_for
+from .options import check_max_memory, check_network, check_progress
+from .pipeline import memory_needs, refine
+from .progress import Progress, StepCounter, part_of
+from .slabs.cutting import Slab, equal_parts, slab_of, whole
+from .slabs.footprint import slab_bytes
+from .steps.field import FineField
+from .steps.nodes import check_factor
+from .steps.survey import Band, survey
+from .steps.walls import extract_walls, put_together
+
+BAND_SHARE = 0.05  # of the time
+# Memory of the walls in bytes: per node of a block and label, per cell of a side of a voxel.
+NODE_BYTES, CELL_BYTES = 14, 1500
+
+LabelMeshes = list[tuple[int, Mesh]]
+"""Labels and pieces of their meshes; faces number the vertices of all pieces of the label."""
+
+
+def reconstruct_labels(
+    values: ArrayLike | str | PathLike[str],
+    labels: str | Sequence[int] = ALL,
+    network: Decoder | None = None,
+    factor: int = 4,
+    *,
+    spacing: Any = None,
+    origin: Any = None,
+    direction: Any = None,
+    axes: str | None = None,
+    max_memory: int | None = None,
+    progress: Progress | None = None,
+) -> dict[int, Mesh]:
+    """Turn a label image into a closed mesh of each label, which share the walls between them.
+
+    Where two labels touch, both have the same vertices and triangles, in opposite directions: there
+    is neither gap nor overlap. Labels that run out of the grid are closed along its border.
+
+    Parameters
+    ----------
+    values : (nx, ny, nz) array_like or path
+        Whole numbers, of any integer or floating-point type; or a file, see ``read_grid``.
+    labels : "all" or sequence of ints
+        The labels to mesh; all are those of the image but 0. Others count as 0.
+    network : Network, optional
+        By default a shipped one. In place of any shipped network, that for masks is used.
+    factor : int
+        How many times finer per axis the meshes are than the samples: 2, 4, 8 or 16.
+    spacing, origin, direction
+        Where the samples lie in the world, as in ``make_grid``; by default as the file says.
+    axes : {"xyz", "zyx"}, optional
+        The axis order of a file that does not state it.
+    max_memory : int, optional
+        Bytes that the process may hold in all, besides the meshes; by default a share of the free
+        memory.
+    progress : callable, optional
+        Called with (done, total), see ``progress.Progress``; an exception in it ends the work.
+
+    Returns
+    -------
+    dict of int to Mesh
+        The meshes by label, in ascending order, in world units.
+
+    Raises
+    ------
+    GridError
+        If a value is no whole number, a label is missing, or there is no surface.
+    OptionError
+        If an argument is invalid, or there are too many labels.
+    OutOfMemoryError
+        If not even a plane of the image can be worked on in memory.
+    """
+    check_labels(labels)
+    if isinstance(values, (str, PathLike)):
+        image = read_labels(values, labels, spacing, origin, direction, axes, max_memory)
+    else:
+        image = make_labels(values, labels, spacing=spacing, origin=origin, direction=direction)
+    if network is None:
+        from .network.network import load_network
+
+        network = load_network()
+    found: dict[int, list[Mesh]] = {label: [] for label in image.names()}
+    for meshes in label_slabs(image, network, factor, max_memory=max_memory, progress=progress):
+        for label, mesh in meshes:
+            found[label].append(mesh)
+    return {label: join_meshes(pieces) for label, pieces in found.items()}
+
+
+def read_labels(
+    path: str | PathLike[str],
+    labels: str | Sequence[int],
+    spacing: Any = None,
+    origin: Any = None,
+    direction: Any = None,
+    axes: str | None = None,
+    max_memory: int | None = None,
+) -> LabelImage:
+    """Return the label image in a file; the parameters are those of ``reconstruct_labels``."""
+    given = {"spacing": spacing, "origin": origin, "direction": direction}
+    found = read_array(path, given, axes, max_memory)
+    return make_labels(found.pop("values"), labels, **found)
+
+
+def label_slabs(
+    image: LabelImage,
+    network: Decoder,
+    factor: int = 4,
+    *,
+    max_memory: int | None = None,
+    progress: Progress | None = None,
+) -> Iterator[LabelMeshes]:
+    """Yield the meshes of ``reconstruct_labels`` slab by slab, in as few as fit in memory.
+
+    Joined, the pieces of a label are the same mesh, bit for bit, for any number of slabs.
+    """
+    check_network(network)
+    check_progress(progress)
+    factor = check_factor(factor)
+    network = network_for(network, MASK)
+    vertex_type(image.grid, factor)  # raises if not even float64 resolves the vertices
+    resources = allot(getattr(network, "threads", 0), check_max_memory(max_memory))
+    work = Work(image, network, factor, resources, list(_bands(image, resources)))
+    if progress:
+        progress(round(1000 * BAND_SHARE), 1000)
+    slabs = work.plan()
+    written = np.zeros(len(image.labels) + 1, np.int64)  # vertices of each label so far
+    for nth, planes in enumerate(slabs):
+        give_back()
+        share = [BAND_SHARE + (1 - BAND_SHARE) * (nth + n) / len(slabs) for n in (0, 1)]
+        yield list(work.meshes(planes, written, part_of(progress, *share)))
+
+
+def _bands(image: LabelImage, resources: Resources) -> Iterator[Band | None]:
+    """Yield the band of each label in its box, first that beside all of them, if there is any."""
+    for number in range(len(image.labels) + 1):
+        band = survey(image.mask(number), 0.0, resources)
+        yield band if band.decoded.any() else None
+
+
+@dataclass(frozen=True, eq=False)
+class Work:
+    """What the slabs of an image have in common; ``bands`` are those of ``_bands``."""
+
+    image: LabelImage
+    network: Decoder
+    factor: int
+    resources: Resources
+    bands: list[Band | None]
+
+    @property
+    def reach(self) -> int | None:
+        """The receptive field of the network, if it states one."""
+        reach: int | None = getattr(self.network, "receptive_field", None)
+        return reach
+
+    def plan(self) -> list[tuple[int, int]]:
+        """Return the planes of each slab, the fewest slabs that fit in memory.
+
+        Raises
+        ------
+        OutOfMemoryError
+            If not even slabs of one plane fit.
+        """
+        count = self.image.grid.shape[0]
+        before = np.zeros(count + 1, np.int64)
+        for band, box in zip(self.bands, self.image.boxes):
+            if band:
+                planes = np.clip(np.arange(count + 1) - box[0].start, 0, band.shape[0])
+                before += band.decoded_before[planes]
+        bound, need = self.resources.memory, 0
+        for pieces in range(1, count + 1 if self.reach is not None else 2):
+            slabs = equal_parts(before, pieces)
+            need = (held_memory() or 0) + max(map(self.bytes_of, slabs))
+            if bound is None or need <= bound:
+                return slabs
+        raise OutOfMemoryError(
+            f"factor {self.factor} on {int(before[-1]):,} voxels of {len(self.bands) - 1} labels "
+            f"needs {advised(need)} of memory, {in_words(bound or 0)} may be used; use a smaller "
+            "factor, or allow more (--max-memory)"
+        )
+
+    def bytes_of(self, planes: tuple[int, int]) -> int:
+        """Return about how much memory the work on some planes takes."""
+        most = own = 0
+        for _, band, low, high in self.parts(planes):
+            slab = self.slab(band, low, high)
+            args = slab.seen, slab.decoded, slab.planes, self.factor, memory_needs(self.network)
+            most = max(most, slab_bytes(band, *args, self.resources.threads))
+            own += band.count_decoded(band.rows(low, high))
+        return most + own * (NODE_BYTES * (self.factor + 1) ** 3 + CELL_BYTES * self.factor**2)
+
+    def parts(self, planes: tuple[int, int]) -> Iterator[tuple[int, Band, int, int]]:
+        """Yield number and band of each label with voxels in some planes, and these in the band."""
+        for number, (band, box) in enumerate(zip(self.bands, self.image.boxes)):
+            if band:
+                low, high = (min(max(at - box[0].start, 0), band.shape[0]) for at in planes)
+                if band.count_decoded(band.rows(low, high)):
+                    yield number, band, low, high
+
+    def meshes(
+        self, planes: tuple[int, int], written: NDArray[np.int64], progress: Progress | None
+    ) -> Iterator[tuple[int, Mesh]]:
+        """Yield the labels in some planes, and the pieces of their meshes.
+
+        ``written``, (L + 1,), has the vertices of each label so far; those here are added.
+        """
+        grid = self.image.grid
+        fields = self._fields(planes, progress)
+        field = put_together(fields, grid.shape, self.factor, planes, len(self.bands))
+        places, faces, sides, before = extract_walls(field, self._border(planes))
+        del field
+        world = grid.to_world(places / self.factor - 0.5).astype(vertex_type(grid, self.factor))
+        both = np.concatenate([faces, faces[:, ::-1]])
+        label = sides.T.ravel()
+        order = np.argsort(2 * len(faces) * label.astype(np.int64) + np.tile(np.arange(len(faces)), 2))
+        ends = np.searchsorted(label[order], np.arange(1, len(self.bands) + 1))
+        for number, some in enumerate(np.split(order, ends)[1:-1], 1):
+            used, own = np.unique(both[some], return_inverse=True)
+            shared = int(np.searchsorted(used, before))  # the slab before has them
+            first, written[number] = written[number] - shared, written[number] + len(used) - shared
+            check_count(int(written[number]), "vertices")
+            own = (own.reshape(-1, 3) + first).astype(np.int32)
+            turned = np.ascontiguousarray(own[:, ::-1]) if grid.is_mirrored else own
+            yield self.image.names()[number - 1], Mesh(world[used[shared:]], turned)
+
+    def _fields(
+        self, planes: tuple[int, int], progress: Progress | None
+    ) -> Iterator[tuple[int, FineField]]:
+        """Yield the fine field of each label that has voxels in some planes, in order."""
+        parts = list(self.parts(planes))
+        for nth, (number, band, low, high) in enumerate(parts):
+            shown = part_of(progress, nth / len(parts), (nth + 1) / len(parts))
+            steps = StepCounter(shown, ["network", "nodes"])
+            slab, threads = self.slab(band, low, high), self.resources.threads
+            field = refine(band, self.network, self.factor, slab, threads, steps)
+            corner = np.array([side.start for side in self.image.boxes[number]], np.int32)
+            place = {"shape": self.image.grid.shape, "planes": planes}
+            yield number, replace(field, voxel_ijk=field.voxel_ijk + corner, **place)
+
+    def slab(self, band: Band, low: int, high: int) -> Slab:
+        """Return what the planes ``low`` to before ``high`` of a band need of it."""
+        if self.reach is None:
+            return replace(whole(band), planes=(low, high))
+        return slab_of(band, low, high, self.reach, 1)
+
+    def _border(self, planes: tuple[int, int]) -> IntArray:
+        """Return the voxels of some planes on the border that have a label, and which (b, 4)."""
+        numbers = self.image.numbers(slice(*planes))
+        first, last = int(planes[0] == 0), len(numbers) - int(planes[1] == self.image.grid.shape[0])
+        numbers[first:last, 1:-1, 1:-1] = 0
+        found = np.argwhere(numbers)
+        label = numbers[tuple(found.T)][:, None]
+        return np.concatenate([found + [planes[0], 0, 0], label], axis=1).astype(np.int32)

@@ -1,0 +1,378 @@
+"""Surfaces of several labels that share their walls, made of the labels' fine fields.
+
+At every node of the fine lattice the label whose field is lowest holds the node, the lower label in
+a tie. A label cannot hold a node of a voxel round which no sample has it. Where two neighbouring
+nodes have different labels, the wall crosses the edge between them where the difference of the two
+fields is 0, by linear interpolation: both labels get the very same vertex. ``wall_cases`` says how
+the walls run in a cell. So the surface of each label is closed, and there is neither gap nor
+overlap between two.
+
+A vertex is named by its place in the lattice of half the fine spacing, which tells points on edges,
+on faces and in cells apart. They are in the order of these names, and triangles in that of the
+cells, so a surface made slab by slab is the same as one made at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import BoolArray, FloatArray, IntArray
+from ..mesh import CLEARANCE
+from ..neighbourhood import NEIGHBOURHOOD
+from .band import neighbour_table
+from .cap import outer_voxels, set_blocks
+from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, FACES
+from .field import FineField
+from .marching import CAP_HEIGHT, cells_low_nodes, strides
+from .nodes import SHARING, block_ijk, part_of_node, share_parts
+from .voxel_index import VoxelIndex
+from .wall_cases import PLACES, walls
+
+Keys = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Labelled:
+    """The fields of some labels at the nodes of voxels in which the walls can be.
+
+    Attributes
+    ----------
+    shape : three ints
+        Samples of the coarse grid along each axis.
+    factor : int
+        K.
+    planes : two ints
+        Planes of voxels, from the first to before the second.
+    voxel_ijk : (D, 3) int32
+        The voxels, in C order.
+    values : (Q, S) float32
+        Their blocks, label by label.
+    column : (S,) int64
+        ``voxel * labels + label``, in ascending order, of each column ``order`` of the values.
+    order : (S,) int64
+    labels : int
+        Number of labels, 0 included, which is beside all others.
+    holder : (Q, D) int32
+        The label of each node.
+    """
+
+    shape: tuple[int, int, int]
+    factor: int
+    planes: tuple[int, int]
+    voxel_ijk: IntArray
+    values: FloatArray
+    column: Keys
+    order: NDArray[np.intp]
+    labels: int
+    holder: IntArray
+
+    @cached_property
+    def index(self) -> VoxelIndex:
+        """Finds the row of a voxel."""
+        return VoxelIndex(self.voxel_ijk, self.shape)
+
+    def apart(
+        self, low: Keys, node: Keys, between: IntArray, holder: IntArray
+    ) -> NDArray[np.float64]:
+        """Return by how much the field of a node's holder is lower than that of another, (n,).
+
+        Parameters
+        ----------
+        low, node : (n, 3) int64
+            The low nodes of cells, and a node of each, that lies in the grid.
+        between : (2, n) int32
+            Two labels at corners of the cell.
+        holder : (n,) int32
+            Which of them is that of the node.
+        """
+        voxel = np.clip(low // self.factor, 0, np.array(self.shape) - 1)
+        row, place = self.index.find(voxel), (node - self.factor * voxel) @ strides(self.factor)
+        values = []
+        for label in between:
+            at = np.searchsorted(self.column, row * self.labels + label)
+            values.append(self.values[place, self.order[at]].astype(np.float64))
+        apart = np.where(holder == between[0], values[1] - values[0], values[0] - values[1])
+        return np.maximum(apart, 0)  # the other may be lower where it cannot hold the node
+
+
+def put_together(
+    fields: Iterable[tuple[int, FineField]],
+    shape: tuple[int, int, int],
+    factor: int,
+    planes: tuple[int, int],
+    labels: int,
+) -> Labelled:
+    """Return the fields of labels, in ascending order, in some planes; their voxels are the grid's.
+
+    They are taken one by one, so that only their own values are held.
+    """
+    size = (factor + 1) ** 3
+    blocks, absent, places, label = [np.empty((size, 0), np.float32)], [], [], []
+    for number, field in fields:
+        own = field.own_rows
+        blocks.append(field.blocks[:, own].copy())
+        absent.append(cannot_hold(field, own))
+        places.append(field.voxel_ijk[own])
+        label.append(np.full(own.stop - own.start, number))
+    every = np.concatenate([np.empty((0, 3), np.int32), *places])
+    keys, row = np.unique(VoxelIndex(every, shape).keys, return_inverse=True)
+    voxel_ijk = np.stack(np.unravel_index(keys, shape), 1).astype(np.int32)
+    values = np.concatenate(blocks, axis=1)
+    holder = _holders(values, absent, np.split(row, np.cumsum(list(map(len, places)))[:-1]), label)
+    column = row * labels + np.concatenate([np.empty(0, np.int64), *label])
+    order = np.argsort(column)
+    return Labelled(
+        shape, factor, planes, voxel_ijk, values, column[order], order, labels, holder
+    )
+
+
+def cannot_hold(field: FineField, rows: slice) -> BoolArray:
+    """Return which parts of voxels' blocks, (27, n), touch a voxel that is all of other labels.
+
+    Round a voxel of the grid without a block all samples are on one side: that of its neighbours.
+    """
+    absent = field.parts.table[:, rows] < 0
+    for place, step in enumerate(NEIGHBOURHOOD):
+        beside = field.voxel_ijk[rows] + step
+        absent[place] &= ((beside >= 0) & (beside < field.shape)).all(1)
+    absent &= field.blocks[len(field.blocks) // 2, rows] > 0
+    return np.array([absent[sharing].any(0) for sharing in SHARING])
+
+
+def _holders(
+    values: FloatArray,
+    absent: list[BoolArray],
+    rows: list[NDArray[np.intp]],
+    label: list[NDArray[np.int64]],
+) -> IntArray:
+    """Return the label that holds each node, (Q, D)."""
+    count = max((int(row.max(initial=-1)) for row in rows), default=-1) + 1
+    lowest = np.full((len(values), count), np.inf, np.float32)
+    holder = np.zeros(lowest.shape, np.int32)
+    part = part_of_node(round(len(values) ** (1 / 3)) - 1)[0]
+    start = 0
+    for row, gone, number in zip(rows, absent, label):
+        for node, at in enumerate(part):
+            value = np.where(gone[at], np.inf, values[node, start : start + len(row)])
+            lower = np.flatnonzero(value < lowest[node, row])
+            lowest[node, row[lower]] = value[lower]
+            holder[node, row[lower]] = number[lower]
+        start += len(row)
+    return holder
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Cells of the fine lattice in which walls are.
+
+    Attributes
+    ----------
+    low : (n, 3) int64
+        Their low nodes.
+    label : (n, 8) int32
+        The labels at their corners.
+    """
+
+    low: Keys
+    label: IntArray
+
+
+def extract_walls(
+    field: Labelled, border: IntArray
+) -> tuple[NDArray[np.float64], IntArray, IntArray, int]:
+    """Return the walls in the planes of fields.
+
+    Parameters
+    ----------
+    field : Labelled
+        From ``put_together``.
+    border : (b, 4) int32
+        The voxels on the border of the grid in its planes, and the label of each: walls close all
+        labels there.
+
+    Returns
+    -------
+    (v, 3) float64
+        The vertices in fine spacings from node 0. Those on the first face of the planes come first.
+    (m, 3) int32, (m, 2) int32
+        The triangles, and the labels on both sides: counter-clockwise seen from the second, which
+        is higher.
+    int
+        The number of vertices on that face, which the planes before have, too.
+    """
+    cells = _cells(field, border)
+    lattice = Halves(field.shape, field.factor)
+    base = lattice.keys(2 * cells.low)
+    faces, sides = _connect(field, cells, base, lattice)
+    keys, places = _edge_points(field, cells, base, lattice)
+    keys, places = _inner_points(keys, places, np.unique(faces), lattice)
+    end = lattice.keys(np.array([2 * field.factor * field.planes[0] + 1, -2, -2]))
+    before = int(np.searchsorted(keys, end)) if field.planes[0] else 0
+    return places, np.searchsorted(keys, faces).astype(np.int32), sides, before
+
+
+class Halves:
+    """The lattice of half the fine spacing, one coarse voxel larger than the grid on all sides."""
+
+    def __init__(self, shape: tuple[int, int, int], factor: int) -> None:
+        self.beyond = 2 * factor
+        _, ny, nz = (2 * factor * (n + 2) + 1 for n in shape)
+        self.strides = np.array([ny * nz, nz, 1], np.int64)
+
+    def keys(self, place: NDArray[Any]) -> Keys:
+        """Return a number for each place (..., 3), in C order."""
+        keys: Keys = (place.astype(np.int64) + self.beyond) @ self.strides
+        return keys
+
+    def is_odd(self, keys: Keys) -> BoolArray:
+        """Return along which axes places are between nodes, (n, 3)."""
+        i, rest = np.divmod(keys, self.strides[0])
+        j, k = np.divmod(rest, self.strides[1])
+        return np.stack([i, j, k], 1) % 2 == 1
+
+
+def _cells(field: Labelled, border: IntArray) -> Cells:
+    """Return the cells in which walls are, those beyond the border included, in order."""
+    voxel_ijk, holder = _closed(field, border)
+    corners = holder.reshape(*(field.factor + 1,) * 3, -1)
+    low, high = corners, corners
+    for axis in range(3):
+        some, more = (slice(None),) * axis + (slice(-1),), (slice(None),) * axis + (slice(1, None),)
+        low, high = np.minimum(low[some], low[more]), np.maximum(high[some], high[more])
+    active = np.flatnonzero(np.moveaxis(low != high, -1, 0))
+    row, cell = np.divmod(active, field.factor**3)
+    node = cells_low_nodes(field.factor)[cell]
+    steps = CORNERS @ strides(field.factor)
+    label = holder[node[:, None] + steps, row[:, None]]
+    low_ijk = field.factor * voxel_ijk[row].astype(np.int64) + block_ijk(field.factor)[node]
+    return Cells(low_ijk, label)
+
+
+def _closed(field: Labelled, border: IntArray) -> tuple[IntArray, IntArray]:
+    """Return voxels and the labels of their nodes, with those beyond the border, which have none.
+
+    See ``cap``: the voxels on the border that are all of one label are added, too.
+    """
+    known = VoxelIndex(field.voxel_ijk, field.shape)
+    filled = border[(border[:, 3] > 0) & (known.find(border[:, :3]) < 0)]
+    inside = np.concatenate([field.voxel_ijk, filled[:, :3]])
+    voxel_ijk = np.concatenate([inside, outer_voxels(inside, field.shape)])
+    low, high = (field.planes[0] or -1), field.planes[1] + (field.planes[1] == field.shape[0])
+    own = (voxel_ijk[:, 0] >= low) & (voxel_ijk[:, 0] < high)  # others belong to other planes
+    order = np.flatnonzero(own)
+    order = order[np.lexsort(voxel_ijk[order].T[::-1])]
+    place = np.empty(len(voxel_ijk), np.int32)
+    place[order] = np.arange(len(order), dtype=np.int32)
+    voxel_ijk = voxel_ijk[order]
+    nx, ny, nz = (n + 2 for n in field.shape)
+    parts = share_parts(neighbour_table(voxel_ijk + 1, (nx, ny, nz)))
+    holder = np.zeros((len(field.holder), len(order)), np.int32)
+    count = len(field.voxel_ijk)
+    set_blocks(filled[:, 3], place[count : len(inside)], holder, parts, field.factor)
+    set_blocks(field.holder, place[:count], holder, parts, field.factor)  # last: these win
+    return voxel_ijk, holder
+
+
+def _connect(
+    field: Labelled, cells: Cells, base: Keys, lattice: Halves
+) -> tuple[Keys, IntArray]:
+    """Return the triangles of cells as names of points, and the labels on both sides."""
+    case, of_cell = np.unique(_cases(field, cells), return_inverse=True)
+    tables = [walls(int(number) & (1 << 24) - 1, int(number) >> 24) for number in case]
+    counts = np.array([len(table) for table in tables], np.int64)
+    first, times = (np.cumsum(counts) - counts)[of_cell], counts[of_cell]
+    cell = np.repeat(np.arange(len(base)), times)
+    nth = np.arange(len(cell)) - np.repeat(np.cumsum(times) - times, times) + first[cell]
+    table = np.concatenate([np.empty((0, 5), np.int32), *tables])[nth]
+    steps = PLACES.astype(np.int64) @ lattice.strides
+    return base[cell, None] + steps[table[:, :3]], cells.label[cell[:, None], table[:, 3:]]
+
+
+def _cases(field: Labelled, cells: Cells) -> Keys:
+    """Return the case of each cell: the ranks of its labels, and which faces join (``walls``)."""
+    label, ordered = cells.label, np.sort(cells.label, axis=1)
+    rank = np.zeros(label.shape, np.int64)
+    for nth in range(1, 8):
+        is_next = ordered[:, nth] > ordered[:, nth - 1]
+        rank += is_next[:, None] & (label >= ordered[:, nth, None])
+    case: Keys = rank @ (1 << 3 * np.arange(8))
+    for n, face in enumerate(FACES):
+        a, b, c, d = label[:, face].T
+        unsure = np.flatnonzero((a == c) & (b == d) & (a != b))
+        case[unsure] |= _joins(field, cells, unsure, face).astype(np.int64) << (24 + n)
+    return case
+
+
+def _joins(
+    field: Labelled, cells: Cells, some: NDArray[np.intp], face: tuple[int, ...]
+) -> BoolArray:
+    """Return whether a face of some cells joins its corners with the lower label.
+
+    It does where the difference of the labels' fields, interpolated bilinearly, is so at its
+    saddle: see ``marching.choose_cases``.
+    """
+    low, label = cells.low[some], cells.label[some[:, None], list(face[:2])].T
+    between = np.sort(label, axis=0)
+    saddle = [
+        np.prod([field.apart(low, low + CORNERS[at], between, holder) for at in corners], axis=0)
+        for corners, holder in zip((face[::2], face[1::2]), label)
+    ]
+    joined: BoolArray = np.where(label[0] < label[1], saddle[0] > saddle[1], saddle[1] > saddle[0])
+    return joined
+
+
+def _edge_points(
+    field: Labelled, cells: Cells, base: Keys, lattice: Halves
+) -> tuple[Keys, NDArray[np.float64]]:
+    """Return the points on crossed edges of cells: names, in order, and places in fine spacings."""
+    keys, found = [np.empty(0, np.int64)], [np.empty((0, 3), np.int64)]
+    for edge, (start, axis) in enumerate(zip(EDGE_START, EDGE_AXIS)):
+        end = start + (4, 2, 1)[axis]
+        cell = np.flatnonzero(cells.label[:, start] != cells.label[:, end])
+        keys.append(base[cell] + PLACES[edge].astype(np.int64) @ lattice.strides)
+        found.append(np.stack([cell, np.full_like(cell, start), np.full_like(cell, end)], 1))
+    names, first = np.unique(np.concatenate(keys), return_index=True)
+    cell, *corners = np.concatenate(found)[first].T
+    low = cells.low[cell]
+    ends = [low + CORNERS[corner] for corner in corners]
+    labels = [cells.label[cell, corner] for corner in corners]
+    last = field.factor * np.array(field.shape)
+    share = np.full(len(cell), 0.5)  # half-way, if an end is beyond the border
+    within = np.flatnonzero(((np.minimum(*ends) >= 0) & (np.maximum(*ends) <= last)).all(1))
+    between = np.stack(labels)[:, within]
+    one, other = (
+        field.apart(low[within], end[within], between, label[within])
+        for end, label in zip(ends, labels)
+    )
+    none = one + other == 0
+    share[within] = np.where(none, 0.5, one / np.where(none, 1, one + other))
+    share = np.clip(share, CLEARANCE, 1 - CLEARANCE)
+    begin, stop = (np.clip(end.astype(float), -CAP_HEIGHT, last + CAP_HEIGHT) for end in ends)
+    return names, begin + share[:, None] * (stop - begin)
+
+
+def _inner_points(
+    keys: Keys, places: NDArray[np.float64], used: Keys, lattice: Halves
+) -> tuple[Keys, NDArray[np.float64]]:
+    """Return points with those on faces, and then those in cells: means of the ones beside them."""
+    odd = lattice.is_odd(used)
+    for axes in (2, 3):
+        some = odd.sum(1) == axes
+        total, times = np.zeros((np.count_nonzero(some), 3)), np.zeros(np.count_nonzero(some))
+        for axis, step in product(range(3), (-1, 1)):
+            near = used[some] + step * lattice.strides[axis]
+            at = np.searchsorted(keys, near).clip(max=len(keys) - 1)
+            there = np.flatnonzero(odd[some, axis] & (keys[at] == near))
+            total[there] += places[at[there]]
+            times[there] += 1
+        keys = np.concatenate([keys, used[some]])
+        order = np.argsort(keys)
+        keys, places = keys[order], np.concatenate([places, total / times[:, None]])[order]
+    return keys, places
