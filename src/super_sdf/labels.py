@@ -21,11 +21,12 @@ from .arrays import IntArray
 from .errors import OutOfMemoryError
 from .files.grids import read_array
 from .grid.field import MASK
-from .grid.labels import ALL, LabelImage, check_labels, make_labels
+from .grid.labels import ALL, Box, LabelImage, check_labels, make_labels
 from .machine.index_width import check_count
 from .machine.memory import advised, give_back, held_memory, in_words
 from .machine.resources import Resources, allot
 from .mesh import Mesh, join_meshes, vertex_type
+from .neighbourhood import CENTRE
 from .network.decoder import Decoder
 from .network.kinds import network_for
 from .options import check_max_memory, check_network, check_progress
@@ -33,10 +34,10 @@ from .pipeline import memory_needs, refine
 from .progress import Progress, StepCounter, part_of
 from .slabs.cutting import Slab, equal_parts, slab_of, whole
 from .slabs.footprint import slab_bytes
-from .steps.field import FineField
 from .steps.nodes import check_factor
 from .steps.survey import Band, survey
-from .steps.walls import extract_walls, put_together
+from .steps.voxel_index import VoxelIndex
+from .steps.walls import Part, absent_parts, extract_walls, put_together
 
 BAND_SHARE = 0.05  # of the time
 # Memory of the walls in bytes: per node of a block and label, per cell of a side of a voxel.
@@ -147,7 +148,7 @@ def label_slabs(
     network = network_for(network, MASK)
     vertex_type(image.grid, factor)  # raises if not even float64 resolves the vertices
     resources = allot(getattr(network, "threads", 0), check_max_memory(max_memory))
-    work = Work(image, network, factor, resources, list(_bands(image, resources)))
+    work = Work(image, network, factor, resources, _bands(image, resources))
     if progress:
         progress(round(1000 * BAND_SHARE), 1000)
     slabs = work.plan()
@@ -158,11 +159,24 @@ def label_slabs(
         yield list(work.meshes(planes, written, part_of(progress, *share)))
 
 
-def _bands(image: LabelImage, resources: Resources) -> Iterator[Band | None]:
-    """Yield the band of each label in its box, first that beside all of them, if there is any."""
-    for number in range(len(image.labels) + 1):
-        band = survey(image.mask(number), 0.0, resources)
-        yield band if band.decoded.any() else None
+def _bands(image: LabelImage, resources: Resources) -> list[Band]:
+    """Return the band of each label in its box; first, that of what is beside all of them.
+
+    Of that, only those voxels are decoded that two labels or more have in their bands, too.
+    """
+    bands = [survey(image.mask(nth), 0.0, resources) for nth in range(len(image.labels) + 1)]
+    keys = [
+        VoxelIndex(band.voxel_ijk + corner(box), image.grid.shape).keys
+        for band, box in zip(bands, image.boxes)
+    ]
+    found, times = np.unique(np.concatenate(keys[1:]), return_counts=True)
+    several = np.isin(keys[0], found[times > 1])
+    return [replace(bands[0], decoded=several), *bands[1:]]
+
+
+def corner(box: Box) -> IntArray:
+    """Return the lowest indices of a box."""
+    return np.array([side.start for side in box], np.int32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +187,7 @@ class Work:
     network: Decoder
     factor: int
     resources: Resources
-    bands: list[Band | None]
+    bands: list[Band]
 
     @property
     def reach(self) -> int | None:
@@ -192,9 +206,8 @@ class Work:
         count = self.image.grid.shape[0]
         before = np.zeros(count + 1, np.int64)
         for band, box in zip(self.bands, self.image.boxes):
-            if band:
-                planes = np.clip(np.arange(count + 1) - box[0].start, 0, band.shape[0])
-                before += band.decoded_before[planes]
+            planes = np.clip(np.arange(count + 1) - box[0].start, 0, band.shape[0])
+            before += band.voxels_before[planes]
         bound, need = self.resources.memory, 0
         for pieces in range(1, count + 1 if self.reach is not None else 2):
             slabs = equal_parts(before, pieces)
@@ -210,20 +223,19 @@ class Work:
     def bytes_of(self, planes: tuple[int, int]) -> int:
         """Return about how much memory the work on some planes takes."""
         most = own = 0
-        for _, band, low, high in self.parts(planes):
-            slab = self.slab(band, low, high)
+        for number, band in enumerate(self.bands):
+            low, high = self.within(number, planes)
+            slab, rows = self.slab(band, low, high), band.rows(low, high)
             args = slab.seen, slab.decoded, slab.planes, self.factor, memory_needs(self.network)
             most = max(most, slab_bytes(band, *args, self.resources.threads))
-            own += band.count_decoded(band.rows(low, high))
+            own += rows.stop - rows.start
         return most + own * (NODE_BYTES * (self.factor + 1) ** 3 + CELL_BYTES * self.factor**2)
 
-    def parts(self, planes: tuple[int, int]) -> Iterator[tuple[int, Band, int, int]]:
-        """Yield number and band of each label with voxels in some planes, and these in the band."""
-        for number, (band, box) in enumerate(zip(self.bands, self.image.boxes)):
-            if band:
-                low, high = (min(max(at - box[0].start, 0), band.shape[0]) for at in planes)
-                if band.count_decoded(band.rows(low, high)):
-                    yield number, band, low, high
+    def within(self, number: int, planes: tuple[int, int]) -> tuple[int, int]:
+        """Return some planes as those of a label's band."""
+        start, count = self.image.boxes[number][0].start, self.bands[number].shape[0]
+        low, high = (min(max(plane - start, 0), count) for plane in planes)
+        return low, high
 
     def meshes(
         self, planes: tuple[int, int], written: NDArray[np.int64], progress: Progress | None
@@ -233,8 +245,8 @@ class Work:
         ``written``, (L + 1,), has the vertices of each label so far; those here are added.
         """
         grid = self.image.grid
-        fields = self._fields(planes, progress)
-        field = put_together(fields, grid.shape, self.factor, planes, len(self.bands))
+        parts = self._parts(planes, progress)
+        field = put_together(parts, next(parts)[1], grid.shape, self.factor, planes)
         places, faces, sides, before = extract_walls(field, self._border(planes))
         del field
         world = grid.to_world(places / self.factor - 0.5).astype(vertex_type(grid, self.factor))
@@ -251,19 +263,29 @@ class Work:
             turned = np.ascontiguousarray(own[:, ::-1]) if grid.is_mirrored else own
             yield self.image.names()[number - 1], Mesh(world[used[shared:]], turned)
 
-    def _fields(
+    def _parts(
         self, planes: tuple[int, int], progress: Progress | None
-    ) -> Iterator[tuple[int, FineField]]:
-        """Yield the fine field of each label that has voxels in some planes, in order."""
-        parts = list(self.parts(planes))
-        for nth, (number, band, low, high) in enumerate(parts):
-            shown = part_of(progress, nth / len(parts), (nth + 1) / len(parts))
-            steps = StepCounter(shown, ["network", "nodes"])
-            slab, threads = self.slab(band, low, high), self.resources.threads
-            field = refine(band, self.network, self.factor, slab, threads, steps)
-            corner = np.array([side.start for side in self.image.boxes[number]], np.int32)
-            place = {"shape": self.image.grid.shape, "planes": planes}
-            yield number, replace(field, voxel_ijk=field.voxel_ijk + corner, **place)
+    ) -> Iterator[tuple[int, Part]]:
+        """Yield the fields of all labels that have voxels in some planes, in order; always of 0."""
+        for number, band in enumerate(self.bands):
+            low, high = self.within(number, planes)
+            own = band.rows(low, high)
+            if number and own.start == own.stop:
+                continue
+            around = band.rows(low - 1, high + 1)
+            rows = slice(own.start - around.start, own.stop - around.start)
+            table = band.network_inputs(around)[1][rows].T if around.start < around.stop else np.empty((27,0),np.int32)
+            voxel_ijk = band.voxel_ijk[own] + corner(self.image.boxes[number])
+            inside = band.patches[own, CENTRE] <= 0
+            absent = absent_parts(table, voxel_ijk, inside, self.image.grid.shape)
+            blocks = np.full(((self.factor + 1) ** 3, len(voxel_ijk)), np.nan, np.float32)
+            if band.count_decoded(own):
+                share = number / len(self.bands), (number + 1) / len(self.bands)
+                steps = StepCounter(part_of(progress, *share), ["network", "nodes"])
+                slab, threads = self.slab(band, low, high), self.resources.threads
+                field = refine(band, self.network, self.factor, slab, threads, steps)
+                blocks[:, band.decoded[own]] = field.blocks[:, field.own_rows]
+            yield number, Part(voxel_ijk, absent, blocks)
 
     def slab(self, band: Band, low: int, high: int) -> Slab:
         """Return what the planes ``low`` to before ``high`` of a band need of it."""

@@ -53,7 +53,7 @@ class Labelled:
     voxel_ijk : (D, 3) int32
         The voxels, in C order.
     values : (Q, S) float32
-        Their blocks, label by label.
+        Their blocks, label by label; NaN where that of label 0 is minus that of any other.
     column : (S,) int64
         ``voxel * labels + label``, in ascending order, of each column ``order`` of the values.
     order : (S,) int64
@@ -88,7 +88,7 @@ class Labelled:
         low, node : (n, 3) int64
             The low nodes of cells, and a node of each, that lies in the grid.
         between : (2, n) int32
-            Two labels at corners of the cell.
+            Two labels at corners of the cell, in ascending order.
         holder : (n,) int32
             Which of them is that of the node.
         """
@@ -98,73 +98,108 @@ class Labelled:
         for label in between:
             at = np.searchsorted(self.column, row * self.labels + label)
             values.append(self.values[place, self.order[at]].astype(np.float64))
+        values[0] = np.where(np.isnan(values[0]), -values[1], values[0])  # of label 0, the lower
         apart = np.where(holder == between[0], values[1] - values[0], values[0] - values[1])
         return np.maximum(apart, 0)  # the other may be lower where it cannot hold the node
 
 
+@dataclass(frozen=True, eq=False)
+class Part:
+    """The field of one label in some planes.
+
+    Attributes
+    ----------
+    voxel_ijk : (n, 3) int32
+        The voxels round which some samples have the label, and others do not, in C order.
+    absent : (27, n) bool
+        Which parts of their blocks touch a voxel round which no sample has the label.
+    blocks : (Q, n) float32
+        Their values; NaN where they are not known.
+    """
+
+    voxel_ijk: IntArray
+    absent: BoolArray
+    blocks: FloatArray
+
+
+def absent_parts(
+    table: IntArray, voxel_ijk: IntArray, inside: BoolArray, shape: tuple[int, int, int]
+) -> BoolArray:
+    """Return ``Part.absent``.
+
+    Parameters
+    ----------
+    table : (27, n) int32
+        The voxels of the label at the places round each, -1 where there is none: there, all samples
+        are on the side of those beside them.
+    voxel_ijk : (n, 3) int32
+        The voxels.
+    inside : (n,) bool
+        Whether their own sample has the label.
+    shape : three ints
+        Samples of the grid along each axis.
+    """
+    none = table < 0
+    for place, step in enumerate(NEIGHBOURHOOD):
+        beside = voxel_ijk + step
+        none[place] &= ((beside >= 0) & (beside < shape)).all(1) & ~inside
+    return np.array([none[sharing].any(0) for sharing in SHARING])
+
+
 def put_together(
-    fields: Iterable[tuple[int, FineField]],
+    parts: Iterable[tuple[int, Part]],
+    ground: Part,
     shape: tuple[int, int, int],
     factor: int,
     planes: tuple[int, int],
-    labels: int,
 ) -> Labelled:
-    """Return the fields of labels, in ascending order, in some planes; their voxels are the grid's.
+    """Return the fields of labels in some planes.
 
-    They are taken one by one, so that only their own values are held.
+    Parameters
+    ----------
+    parts : iterable
+        Of the labels, in ascending order; they are taken one by one.
+    ground : Part
+        Of what is beside all labels. Where at most one label can hold a node, the value is not
+        used: it is minus that of the label.
+    shape, factor, planes
+        See ``Labelled``.
     """
-    size = (factor + 1) ** 3
-    blocks, absent, places, label = [np.empty((size, 0), np.float32)], [], [], []
-    for number, field in fields:
-        own = field.own_rows
-        blocks.append(field.blocks[:, own].copy())
-        absent.append(cannot_hold(field, own))
-        places.append(field.voxel_ijk[own])
-        label.append(np.full(own.stop - own.start, number))
-    every = np.concatenate([np.empty((0, 3), np.int32), *places])
-    keys, row = np.unique(VoxelIndex(every, shape).keys, return_inverse=True)
+    number, every = [0], [ground]
+    for label, part in parts:
+        number.append(label)
+        every.append(part)
+    counts = [len(part.voxel_ijk) for part in every]
+    places = np.concatenate([part.voxel_ijk for part in every])
+    keys, row = np.unique(VoxelIndex(places, shape).keys, return_inverse=True)
     voxel_ijk = np.stack(np.unravel_index(keys, shape), 1).astype(np.int32)
-    values = np.concatenate(blocks, axis=1)
-    holder = _holders(values, absent, np.split(row, np.cumsum(list(map(len, places)))[:-1]), label)
-    column = row * labels + np.concatenate([np.empty(0, np.int64), *label])
+    rows = np.split(row, np.cumsum(counts)[:-1])
+    holder = _holders(number, every, rows, len(voxel_ijk))
+    labels = max(number) + 1
+    column = row * labels + np.repeat(number, counts)
     order = np.argsort(column)
-    return Labelled(
-        shape, factor, planes, voxel_ijk, values, column[order], order, labels, holder
-    )
-
-
-def cannot_hold(field: FineField, rows: slice) -> BoolArray:
-    """Return which parts of voxels' blocks, (27, n), touch a voxel that is all of other labels.
-
-    Round a voxel of the grid without a block all samples are on one side: that of its neighbours.
-    """
-    absent = field.parts.table[:, rows] < 0
-    for place, step in enumerate(NEIGHBOURHOOD):
-        beside = field.voxel_ijk[rows] + step
-        absent[place] &= ((beside >= 0) & (beside < field.shape)).all(1)
-    absent &= field.blocks[len(field.blocks) // 2, rows] > 0
-    return np.array([absent[sharing].any(0) for sharing in SHARING])
+    values = np.concatenate([part.blocks for part in every], axis=1)
+    return Labelled(shape, factor, planes, voxel_ijk, values, column[order], order, labels, holder)
 
 
 def _holders(
-    values: FloatArray,
-    absent: list[BoolArray],
-    rows: list[NDArray[np.intp]],
-    label: list[NDArray[np.int64]],
+    number: list[int], parts: list[Part], rows: list[NDArray[np.intp]], count: int
 ) -> IntArray:
-    """Return the label that holds each node, (Q, D)."""
-    count = max((int(row.max(initial=-1)) for row in rows), default=-1) + 1
-    lowest = np.full((len(values), count), np.inf, np.float32)
+    """Return the label that holds each node of ``count`` voxels, (Q, D); forget unused values."""
+    size = len(parts[0].blocks)
+    lowest, able = np.full((size, count), np.inf, np.float32), np.zeros((size, count), np.int8)
     holder = np.zeros(lowest.shape, np.int32)
-    part = part_of_node(round(len(values) ** (1 / 3)) - 1)[0]
-    start = 0
-    for row, gone, number in zip(rows, absent, label):
-        for node, at in enumerate(part):
-            value = np.where(gone[at], np.inf, values[node, start : start + len(row)])
-            lower = np.flatnonzero(value < lowest[node, row])
-            lowest[node, row[lower]] = value[lower]
-            holder[node, row[lower]] = number[lower]
-        start += len(row)
+    of_block = part_of_node(round(size ** (1 / 3)) - 1)[0]
+    for label, part, row in [*zip(number, parts, rows)][1:] + [(0, parts[0], rows[0])]:
+        for node, place in enumerate(of_block):
+            value, able_here = part.blocks[node], able[node, row]
+            if label == 0:
+                value[able_here < 2] = np.nan
+                value = np.where(np.isnan(value), -lowest[node, row], value)
+            can = ~part.absent[place]
+            lower = np.flatnonzero(can & (value < lowest[node, row]))
+            lowest[node, row[lower]], holder[node, row[lower]] = value[lower], label
+            able[node, row] = np.minimum(able_here + can, 2)
     return holder
 
 
@@ -346,7 +381,7 @@ def _edge_points(
     last = field.factor * np.array(field.shape)
     share = np.full(len(cell), 0.5)  # half-way, if an end is beyond the border
     within = np.flatnonzero(((np.minimum(*ends) >= 0) & (np.maximum(*ends) <= last)).all(1))
-    between = np.stack(labels)[:, within]
+    between = np.sort(np.stack(labels)[:, within], axis=0)
     one, other = (
         field.apart(low[within], end[within], between, label[within])
         for end, label in zip(ends, labels)
