@@ -43,8 +43,17 @@ BAND_SHARE = 0.05  # of the time
 # Memory of the walls in bytes: per node of a block and label, per cell of a side of a voxel.
 NODE_BYTES, CELL_BYTES = 14, 1500
 
-LabelMeshes = list[tuple[int, Mesh]]
-"""Labels and pieces of their meshes; faces number the vertices of all pieces of the label."""
+
+@dataclass(frozen=True, eq=False)
+class LabelPiece:
+    """A piece of the mesh of a label; ``volume`` is its share of what all pieces enclose.
+
+    Faces number the vertices of all pieces of the label so far.
+    """
+
+    label: int
+    mesh: Mesh
+    volume: float
 
 
 def reconstruct_labels(
@@ -109,9 +118,8 @@ def reconstruct_labels(
 
         network = load_network()
     found: dict[int, list[Mesh]] = {label: [] for label in image.names()}
-    for meshes in label_slabs(image, network, factor, max_memory=max_memory, progress=progress):
-        for label, mesh in meshes:
-            found[label].append(mesh)
+    for piece in label_slabs(image, network, factor, max_memory=max_memory, progress=progress):
+        found[piece.label].append(piece.mesh)
     return {label: join_meshes(pieces) for label, pieces in found.items()}
 
 
@@ -137,7 +145,7 @@ def label_slabs(
     *,
     max_memory: int | None = None,
     progress: Progress | None = None,
-) -> Iterator[LabelMeshes]:
+) -> Iterator[LabelPiece]:
     """Yield the meshes of ``reconstruct_labels`` slab by slab, in as few as fit in memory.
 
     Joined, the pieces of a label are the same mesh, bit for bit, for any number of slabs.
@@ -156,7 +164,7 @@ def label_slabs(
     for nth, planes in enumerate(slabs):
         give_back()
         share = [BAND_SHARE + (1 - BAND_SHARE) * (nth + n) / len(slabs) for n in (0, 1)]
-        yield list(work.meshes(planes, written, part_of(progress, *share)))
+        yield from work.pieces(planes, written, part_of(progress, *share))
 
 
 def _bands(image: LabelImage, resources: Resources) -> list[Band]:
@@ -172,6 +180,13 @@ def _bands(image: LabelImage, resources: Resources) -> list[Band]:
     found, times = np.unique(np.concatenate(keys[1:]), return_counts=True)
     several = np.isin(keys[0], found[times > 1])
     return [replace(bands[0], decoded=several), *bands[1:]]
+
+
+def volumes(vertices: NDArray[np.float64], faces: IntArray) -> NDArray[np.float64]:
+    """Return the volumes between triangles (m, 3) and the origin, (m,), positive if seen inside."""
+    a, b, c = (vertices[corner] for corner in faces.T)
+    found: NDArray[np.float64] = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
+    return found
 
 
 def corner(box: Box) -> IntArray:
@@ -237,31 +252,37 @@ class Work:
         low, high = (min(max(plane - start, 0), count) for plane in planes)
         return low, high
 
-    def meshes(
+    def pieces(
         self, planes: tuple[int, int], written: NDArray[np.int64], progress: Progress | None
-    ) -> Iterator[tuple[int, Mesh]]:
-        """Yield the labels in some planes, and the pieces of their meshes.
+    ) -> Iterator[LabelPiece]:
+        """Yield the meshes of labels in some planes.
 
         ``written``, (L + 1,), has the vertices of each label so far; those here are added.
         """
-        grid = self.image.grid
+        grid, names = self.image.grid, self.image.names()
         parts = self._parts(planes, progress)
         field = put_together(parts, next(parts)[1], grid.shape, self.factor, planes)
         places, faces, sides, before = extract_walls(field, self._border(planes))
         del field
+        middle = grid.to_world((np.array(grid.shape) - 1) / 2)
         world = grid.to_world(places / self.factor - 0.5).astype(vertex_type(grid, self.factor))
-        both = np.concatenate([faces, faces[:, ::-1]])
-        label = sides.T.ravel()
-        order = np.argsort(2 * len(faces) * label.astype(np.int64) + np.tile(np.arange(len(faces)), 2))
+        volume = volumes(world - middle, faces)
+        if grid.is_mirrored:
+            faces, volume = faces[:, ::-1], -volume
+        both, label = np.concatenate([faces, faces[:, ::-1]]), sides.T.ravel()
+        rank = label.astype(np.int64) * len(label) + np.tile(np.arange(len(faces)), 2)
+        order = np.argsort(rank)
         ends = np.searchsorted(label[order], np.arange(1, len(self.bands) + 1))
         for number, some in enumerate(np.split(order, ends)[1:-1], 1):
             used, own = np.unique(both[some], return_inverse=True)
             shared = int(np.searchsorted(used, before))  # the slab before has them
-            first, written[number] = written[number] - shared, written[number] + len(used) - shared
+            own += written[number] - shared
+            written[number] += len(used) - shared
             check_count(int(written[number]), "vertices")
-            own = (own.reshape(-1, 3) + first).astype(np.int32)
-            turned = np.ascontiguousarray(own[:, ::-1]) if grid.is_mirrored else own
-            yield self.image.names()[number - 1], Mesh(world[used[shared:]], turned)
+            mesh = Mesh(world[used[shared:]], own.reshape(-1, 3).astype(np.int32))
+            if len(some):
+                signs = np.where(some < len(faces), 1.0, -1.0)
+                yield LabelPiece(names[number - 1], mesh, float(signs @ volume[some % len(faces)]))
 
     def _parts(
         self, planes: tuple[int, int], progress: Progress | None
@@ -274,7 +295,11 @@ class Work:
                 continue
             around = band.rows(low - 1, high + 1)
             rows = slice(own.start - around.start, own.stop - around.start)
-            table = band.network_inputs(around)[1][rows].T if around.start < around.stop else np.empty((27,0),np.int32)
+            table = (
+                band.network_inputs(around)[1][rows].T
+                if around.start < around.stop
+                else np.empty((27, 0), np.int32)
+            )
             voxel_ijk = band.voxel_ijk[own] + corner(self.image.boxes[number])
             inside = band.patches[own, CENTRE] <= 0
             absent = absent_parts(table, voxel_ijk, inside, self.image.grid.shape)

@@ -29,11 +29,10 @@ from ..neighbourhood import NEIGHBOURHOOD
 from .band import neighbour_table
 from .cap import outer_voxels, set_blocks
 from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, FACES
-from .field import FineField
 from .marching import CAP_HEIGHT, cells_low_nodes, strides
 from .nodes import SHARING, block_ijk, part_of_node, share_parts
 from .voxel_index import VoxelIndex
-from .wall_cases import PLACES, walls
+from .wall_cases import FACE_POINTS, PLACES, walls
 
 Keys = NDArray[np.int64]
 
@@ -245,9 +244,9 @@ def extract_walls(
     cells = _cells(field, border)
     lattice = Halves(field.shape, field.factor)
     base = lattice.keys(2 * cells.low)
-    faces, sides = _connect(field, cells, base, lattice)
+    faces, sides, inner = _connect(field, cells, base, lattice)
     keys, places = _edge_points(field, cells, base, lattice)
-    keys, places = _inner_points(keys, places, np.unique(faces), lattice)
+    keys, places = _inner_points(keys, places, np.unique(faces[inner]), lattice)
     end = lattice.keys(np.array([2 * field.factor * field.planes[0] + 1, -2, -2]))
     before = int(np.searchsorted(keys, end)) if field.planes[0] else 0
     return places, np.searchsorted(keys, faces).astype(np.int32), sides, before
@@ -317,8 +316,11 @@ def _closed(field: Labelled, border: IntArray) -> tuple[IntArray, IntArray]:
 
 def _connect(
     field: Labelled, cells: Cells, base: Keys, lattice: Halves
-) -> tuple[Keys, IntArray]:
-    """Return the triangles of cells as names of points, and the labels on both sides."""
+) -> tuple[Keys, IntArray, BoolArray]:
+    """Return the triangles of cells as names of points, and the labels on both sides.
+
+    The last array, (m, 3), says which points are not on edges.
+    """
     case, of_cell = np.unique(_cases(field, cells), return_inverse=True)
     tables = [walls(int(number) & (1 << 24) - 1, int(number) >> 24) for number in case]
     counts = np.array([len(table) for table in tables], np.int64)
@@ -327,7 +329,9 @@ def _connect(
     nth = np.arange(len(cell)) - np.repeat(np.cumsum(times) - times, times) + first[cell]
     table = np.concatenate([np.empty((0, 5), np.int32), *tables])[nth]
     steps = PLACES.astype(np.int64) @ lattice.strides
-    return base[cell, None] + steps[table[:, :3]], cells.label[cell[:, None], table[:, 3:]]
+    points = table[:, :3]
+    label = cells.label[cell[:, None], table[:, 3:]]
+    return base[cell, None] + steps[points], label, points >= FACE_POINTS
 
 
 def _cases(field: Labelled, cells: Cells) -> Keys:
