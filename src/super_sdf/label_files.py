@@ -124,8 +124,9 @@ def convert_labels(
         meshes = {
             label: LabelMesh(label, path, waiting) for label, path in zip(image.names(), paths)
         }
-        given = {"max_memory": options.max_memory, "progress": progress}
-        for piece in label_slabs(image, network, options.factor, **given):
+        bound = options.max_memory
+        slabs = label_slabs(image, network, options.factor, max_memory=bound, progress=progress)
+        for piece in slabs:
             meshes[piece.label].add(piece)
         torn = [label for label, mesh in meshes.items() if len(mesh.edges)]
         if torn:

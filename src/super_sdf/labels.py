@@ -182,7 +182,7 @@ def _bands(image: LabelImage, resources: Resources) -> list[Band]:
     return [replace(bands[0], decoded=several), *bands[1:]]
 
 
-def volumes(vertices: NDArray[np.float64], faces: IntArray) -> NDArray[np.float64]:
+def volumes(vertices: NDArray[Any], faces: IntArray) -> NDArray[np.float64]:
     """Return the volumes between triangles (m, 3) and the origin, (m,), positive if seen inside."""
     a, b, c = (vertices[corner] for corner in faces.T)
     found: NDArray[np.float64] = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
@@ -264,8 +264,9 @@ class Work:
         field = put_together(parts, next(parts)[1], grid.shape, self.factor, planes)
         places, faces, sides, before = extract_walls(field, self._border(planes))
         del field
+        world: NDArray[Any] = grid.to_world(places / self.factor - 0.5)
+        world = world.astype(vertex_type(grid, self.factor))
         middle = grid.to_world((np.array(grid.shape) - 1) / 2)
-        world = grid.to_world(places / self.factor - 0.5).astype(vertex_type(grid, self.factor))
         volume = volumes(world - middle, faces)
         if grid.is_mirrored:
             faces, volume = faces[:, ::-1], -volume
@@ -295,14 +296,12 @@ class Work:
                 continue
             around = band.rows(low - 1, high + 1)
             rows = slice(own.start - around.start, own.stop - around.start)
-            table = (
-                band.network_inputs(around)[1][rows].T
-                if around.start < around.stop
-                else np.empty((27, 0), np.int32)
-            )
+            table = np.empty((0, 27), np.int32)
+            if own.start < own.stop:
+                table = band.network_inputs(around)[1][rows]
             voxel_ijk = band.voxel_ijk[own] + corner(self.image.boxes[number])
             inside = band.patches[own, CENTRE] <= 0
-            absent = absent_parts(table, voxel_ijk, inside, self.image.grid.shape)
+            absent = absent_parts(table.T.copy(), voxel_ijk, inside, self.image.grid.shape)
             blocks = np.full(((self.factor + 1) ** 3, len(voxel_ijk)), np.nan, np.float32)
             if band.count_decoded(own):
                 share = number / len(self.bands), (number + 1) / len(self.bands)
@@ -325,4 +324,5 @@ class Work:
         numbers[first:last, 1:-1, 1:-1] = 0
         found = np.argwhere(numbers)
         label = numbers[tuple(found.T)][:, None]
-        return np.concatenate([found + [planes[0], 0, 0], label], axis=1).astype(np.int32)
+        found[:, 0] += planes[0]
+        return np.concatenate([found, label], axis=1).astype(np.int32)

@@ -130,9 +130,9 @@ def read_grid(
 
 
 def read_array(
-    path: str | Path, given: dict[str, Any], axes: str | None, max_memory: int | None
+    path: Any, given: dict[str, Any], axes: str | None, max_memory: int | None
 ) -> dict[str, Any]:
-    """Return the values in a file, ``PLACE``, which may be ``given``, and notes; see ``read_grid``."""
+    """Return values, place (``PLACE``, unless ``given``) and notes of a file: see ``read_grid``."""
     path = check_path(path, "path")
     format_ = find_format(path)
     order = choose_axes(format_, axes)

@@ -7,7 +7,7 @@ of the others is cut off. This depends on the face alone, so both cells beside i
 
 The segments on all faces bound the walls. A loop of them between the same two labels is cut into
 triangles as in ``cell_cases``; all that hang together by points on faces are joined to one point in
-the cell. So each label is bounded by a closed surface, and each triangle has a label on either side.
+the cell. So the surface of each label is closed, and each triangle has a label on either side.
 """
 
 from __future__ import annotations

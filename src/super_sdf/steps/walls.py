@@ -99,7 +99,8 @@ class Labelled:
             values.append(self.values[place, self.order[at]].astype(np.float64))
         values[0] = np.where(np.isnan(values[0]), -values[1], values[0])  # of label 0, the lower
         apart = np.where(holder == between[0], values[1] - values[0], values[0] - values[1])
-        return np.maximum(apart, 0)  # the other may be lower where it cannot hold the node
+        least: NDArray[np.float64] = np.maximum(apart, 0)
+        return least  # the other may be lower where it cannot hold the node
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +190,8 @@ def _holders(
     lowest, able = np.full((size, count), np.inf, np.float32), np.zeros((size, count), np.int8)
     holder = np.zeros(lowest.shape, np.int32)
     of_block = part_of_node(round(size ** (1 / 3)) - 1)[0]
-    for label, part, row in [*zip(number, parts, rows)][1:] + [(0, parts[0], rows[0])]:
+    for nth in (*range(1, len(parts)), 0):
+        label, part, row = number[nth], parts[nth], rows[nth]
         for node, place in enumerate(of_block):
             value, able_here = part.blocks[node], able[node, row]
             if label == 0:
@@ -269,7 +271,8 @@ class Halves:
         """Return along which axes places are between nodes, (n, 3)."""
         i, rest = np.divmod(keys, self.strides[0])
         j, k = np.divmod(rest, self.strides[1])
-        return np.stack([i, j, k], 1) % 2 == 1
+        odd: BoolArray = np.stack([i, j, k], 1) % 2 == 1
+        return odd
 
 
 def _cells(field: Labelled, border: IntArray) -> Cells:
