@@ -41,7 +41,7 @@ from .steps.walls import Part, absent_parts, extract_walls, put_together
 
 BAND_SHARE = 0.05  # of the time
 # Memory of the walls in bytes: per node of a block and label, per cell of a side of a voxel.
-NODE_BYTES, CELL_BYTES = 14, 1500
+NODE_BYTES, CELL_BYTES = 14, 250
 
 
 @dataclass(frozen=True, eq=False)

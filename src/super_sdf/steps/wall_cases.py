@@ -31,7 +31,7 @@ PLACES: IntArray = np.concatenate(
 ).astype(np.int32)
 
 Segment = tuple[int, int, int, int]
-"""Two points, and the labels inside and outside: the lower is inside, counter-clockwise."""
+"""Two points, and the labels inside and outside: the higher is inside, counter-clockwise."""
 
 
 @lru_cache(maxsize=1 << 14)
@@ -44,29 +44,29 @@ def walls(ranks: int, joined: int) -> IntArray:
         Three bits for each corner of the cell: how many labels at its corners are lower.
     joined : int
         A bit for each face with two labels at the ends of its diagonals: whether the corners with
-        the lower one are joined.
+        the higher one are joined.
 
     Returns
     -------
     (n, 5) int32
-        Counter-clockwise seen from the side of the second corner, whose label is higher.
+        Counter-clockwise seen from the side of the second corner, whose label is lower.
     """
     label = [ranks >> 3 * corner & 7 for corner in range(8)]
     rows: list[Segment] = []
     for n, face in enumerate(FACES):
         rows += _on_face(n, [label[corner] for corner in face], joined >> n & 1)
-    faces = [(*abc, label.index(low), label.index(high)) for *abc, low, high in _triangles(rows)]
+    faces = [(*abc, label.index(high), label.index(low)) for *abc, high, low in _triangles(rows)]
     return np.array(faces, np.int32).reshape(-1, 5)
 
 
 def _on_face(n: int, label: list[int], joined: int) -> Iterator[Segment]:
     """Yield the segments on face ``n`` with these labels at its corners."""
-    low, kinds = min(label), len(set(label))
+    high, kinds = max(label), len(set(label))
     edge = [EDGE_BETWEEN[frozenset((FACES[n][at - 1], FACES[n][at]))] for at in range(4)]
     if kinds == 2:
-        inside = tuple(int(x == low) for x in label)
+        inside = tuple(int(x == high) for x in label)
         for start, end in segments(n, inside, joined).items():
-            yield start, end, low, max(label)
+            yield start, end, high, min(label)
     elif kinds > 2 and (label[0] == label[2] or label[1] == label[3]):
         first = int(label[0] == label[2])  # the first corner that is cut off
         for at in (first, first + 2):
@@ -78,14 +78,14 @@ def _on_face(n: int, label: list[int], joined: int) -> Iterator[Segment]:
 
 
 def _turned(start: int, end: int, inside: int, outside: int) -> Segment:
-    """Return a segment with the lower label inside."""
-    return (start, end, inside, outside) if inside < outside else (end, start, outside, inside)
+    """Return a segment with the higher label inside."""
+    return (start, end, inside, outside) if inside > outside else (end, start, outside, inside)
 
 
 def _triangles(rows: list[Segment]) -> Iterator[tuple[int, ...]]:
     """Yield triangles, and the labels inside and outside, of the segments on a cell."""
     while rows:
-        points, some = {rows[0][0]}, []
+        loop, points, some = [rows[-1][0]], {rows[-1][0]}, []
         while more := [row for row in rows if points & set(row[:2])]:  # all that hang together
             some += more
             points |= {point for row in more for point in row[:2]}
@@ -94,7 +94,6 @@ def _triangles(rows: list[Segment]) -> Iterator[tuple[int, ...]]:
             yield from ((start, end, CELL_POINT, *sides) for start, end, *sides in some)
             continue
         after = {start: end for start, end, *_ in some}
-        loop = [some[0][0]]
         while (point := after[loop[-1]]) != loop[0]:
             loop.append(point)
         yield from ((*triangle, *some[0][2:]) for triangle in triangulate(tuple(loop)))

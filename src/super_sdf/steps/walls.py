@@ -239,7 +239,7 @@ def extract_walls(
         The vertices in fine spacings from node 0. Those on the first face of the planes come first.
     (m, 3) int32, (m, 2) int32
         The triangles, and the labels on both sides: counter-clockwise seen from the second, which
-        is higher.
+        is lower.
     int
         The number of vertices on that face, which the planes before have, too.
     """
@@ -355,7 +355,7 @@ def _cases(field: Labelled, cells: Cells) -> Keys:
 def _joins(
     field: Labelled, cells: Cells, some: NDArray[np.intp], face: tuple[int, ...]
 ) -> BoolArray:
-    """Return whether a face of some cells joins its corners with the lower label.
+    """Return whether a face of some cells joins its corners with the higher label.
 
     It does where the difference of the labels' fields, interpolated bilinearly, is so at its
     saddle: see ``marching.choose_cases``.
@@ -366,7 +366,7 @@ def _joins(
         np.prod([field.apart(low, low + CORNERS[at], between, holder) for at in corners], axis=0)
         for corners, holder in zip((face[::2], face[1::2]), label)
     ]
-    joined: BoolArray = np.where(label[0] < label[1], saddle[0] > saddle[1], saddle[1] > saddle[0])
+    joined: BoolArray = np.where(label[0] > label[1], saddle[0] > saddle[1], saddle[1] > saddle[0])
     return joined
 
 
