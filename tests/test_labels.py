@@ -7,6 +7,7 @@ import random
 from collections import Counter
 from pathlib import Path
 
+import igl
 import nibabel
 import numpy as np
 import pytest
@@ -181,9 +182,10 @@ def test_a_label_beside_no_other_has_the_mesh_that_it_has_alone(network):
 def test_every_sample_lies_in_the_mesh_of_its_label(network):
     labels = IMAGES["nested"]
     for label, mesh in reconstruct_labels(labels, network=network, spacing=1).items():
-        solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-        assert solid.contains(np.argwhere(labels == label)).all()
-        assert not solid.contains(np.argwhere(labels != label)).any()
+        turns = igl.winding_number(
+            mesh.vertices, mesh.faces, np.argwhere(labels >= -3).astype(float)
+        )
+        np.testing.assert_allclose(turns, (labels == label).ravel(), atol=1e-3)
 
 
 ONE, TWO = ball((10.3, 10.6, 10.2), 7), ball((19.8, 10.9, 10.4), 6.2)
@@ -246,7 +248,8 @@ def test_labels_of_any_type_are_compared_as_whole_numbers(dtype, low, high):
     labels[2:4, 2:4, 2:4], labels[4:6, 2:4, 2:4] = low, high
     meshes = reconstruct_labels(labels, network=trilinear, factor=2, spacing=1)
     assert list(meshes) == sorted([low, high])
-    assert meshes[low].volume() == pytest.approx(meshes[high].volume(), rel=1e-3)
+    assert meshes[low].volume() == pytest.approx(6, rel=0.1)
+    assert meshes[high].volume() == pytest.approx(6, rel=0.1)
     only = reconstruct_labels(labels, [high], trilinear, 2, spacing=1)
     assert list(only) == [high]
     assert list(reconstruct_labels(labels, [0, low], trilinear, 2, spacing=1)) == sorted([0, low])
@@ -272,7 +275,7 @@ UNFIT = {
     "no sample has the label 5: the labels are 0, 1, 2, 3": (IMAGES["noise"], [1, 5]),
     "every sample has the label 0: there is no surface": (np.zeros((4, 4, 4), int), "all"),
     "every sample has the label 4: there is no surface": (np.full((4, 4, 4), 4), "all"),
-    "a value is 0.5: labels are whole numbers; choose what is above a value with --level if they "
+    "a value is 1.5: labels are whole numbers; choose what is above a value with --level if they "
     "are densities": (IMAGES["noise"] / 2, "all"),
     "a value is nan: labels are whole numbers; choose what is above a value with --level if they "
     "are densities": (np.full((4, 4, 4), np.nan), "all"),
@@ -291,20 +294,22 @@ def test_values_that_are_no_labels_are_one_line(message):
     assert str(caught.value) == message
 
 
-def test_less_memory_makes_more_slabs_and_too_little_is_an_error(monkeypatch):
+def test_less_memory_makes_more_slabs_and_too_little_is_an_error(bare_plan, monkeypatch):
     cuts = []
     plan = Work.plan
     monkeypatch.setattr(Work, "plan", lambda work: cuts.append(plan(work)) or cuts[-1])
     monkeypatch.setattr("super_sdf.labels.held_memory", lambda: 10**8)
     trilinear.receptive_field = 1
     try:
-        for bound in (4 * 10**9, 22 * 10**7):
+        for bound in (10**9, 112 * 10**6):
             reconstruct_labels(IMAGES["no ground"], network=trilinear, spacing=1, max_memory=bound)
         assert len(cuts[0]) == 1 < len(cuts[1])
         with pytest.raises(
             OutOfMemoryError, match=r"^factor 4 on [\d,]+ voxels of 8 labels needs "
         ):
-            reconstruct_labels(IMAGES["no ground"], network=trilinear, spacing=1, max_memory=10**8)
+            reconstruct_labels(
+                IMAGES["no ground"], network=trilinear, spacing=1, max_memory=105 * 10**6
+            )
     finally:
         del trilinear.receptive_field
 
@@ -340,7 +345,7 @@ def test_the_command_writes_a_file_for_each_label(image, command):
         assert f"{path}: label {row['label']}, {len(mesh.vertices):,} vertices, " in err
         command("upsample", image, "alone.ply", "--label", row["label"], "--force", *PLAIN)
         alone = trimesh.load("alone.ply", process=False)
-        np.testing.assert_allclose(mesh.bounds, alone.bounds, atol=0.2)
+        np.testing.assert_allclose(mesh.bounds, alone.bounds, atol=0.5)
     assert command("upsample", image, "organ.ply", "--labels", "12,1", "--force", *PLAIN)[0] == 0
 
 
@@ -375,7 +380,7 @@ REFUSED = {
     "label 1": "--label 1",
     "level 0.5": "--level 0.5",
     "offset 1.0": "--offset 1",
-    "cap False": "--open",
+    "open": "--open",
     "iterations 2": "--iterations 2",
     "inside 'negative'": "--inside negative",
     "scale 2.0": "--scale 2",

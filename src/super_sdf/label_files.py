@@ -173,7 +173,8 @@ def check_options(options: Any, more: Sequence[str] = ()) -> None:
     given = [option.name for option in others if getattr(options, option.name) != option.default]
     for name in (*given, *more):
         value = f" {seen(getattr(options, name))}" if name in given else ""
+        text = "open" if name == "cap" else f"{name.replace('_', '-')}{value}"
         raise OptionError(
-            f"{name.replace('_', '-')}{value} does not go with labels, which share their walls: "
+            f"{text} does not go with labels, which share their walls: "
             "leave it out, or mesh one label (--label)"
         )
