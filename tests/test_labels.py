@@ -299,19 +299,12 @@ def test_less_memory_makes_more_slabs_and_too_little_is_an_error(bare_plan, monk
     plan = Work.plan
     monkeypatch.setattr(Work, "plan", lambda work: cuts.append(plan(work)) or cuts[-1])
     monkeypatch.setattr("super_sdf.labels.held_memory", lambda: 10**8)
-    trilinear.receptive_field = 1
-    try:
-        for bound in (10**9, 112 * 10**6):
-            reconstruct_labels(IMAGES["no ground"], network=trilinear, spacing=1, max_memory=bound)
-        assert len(cuts[0]) == 1 < len(cuts[1])
-        with pytest.raises(
-            OutOfMemoryError, match=r"^factor 4 on [\d,]+ voxels of 8 labels needs "
-        ):
-            reconstruct_labels(
-                IMAGES["no ground"], network=trilinear, spacing=1, max_memory=105 * 10**6
-            )
-    finally:
-        del trilinear.receptive_field
+    labels = IMAGES["no ground"]
+    for bound in (10**9, 112 * 10**6):
+        reconstruct_labels(labels, network=trilinear, spacing=1, max_memory=bound)
+    assert len(cuts[0]) == 1 < len(cuts[1])
+    with pytest.raises(OutOfMemoryError, match=r"^factor 4 on [\d,]+ voxels of 8 labels needs "):
+        reconstruct_labels(labels, network=trilinear, spacing=1, max_memory=105 * 10**6)
 
 
 @pytest.fixture

@@ -32,7 +32,7 @@ from .network.kinds import network_for
 from .options import check_max_memory, check_network, check_progress
 from .pipeline import memory_needs, refine
 from .progress import Progress, StepCounter, part_of
-from .slabs.cutting import Slab, equal_parts, slab_of, whole
+from .slabs.cutting import Slab, equal_parts, slab_of
 from .slabs.footprint import slab_bytes
 from .steps.nodes import check_factor
 from .steps.survey import Band, survey
@@ -40,6 +40,7 @@ from .steps.voxel_index import VoxelIndex
 from .steps.walls import Part, absent_parts, extract_walls, put_together
 
 BAND_SHARE = 0.05  # of the time
+NO_ROWS = np.empty((0, 27), np.int32)
 # Memory of the walls in bytes: per node of a block and label, per cell of a side of a voxel.
 NODE_BYTES, CELL_BYTES = 14, 250
 
@@ -204,14 +205,8 @@ class Work:
     resources: Resources
     bands: list[Band]
 
-    @property
-    def reach(self) -> int | None:
-        """The receptive field of the network, if it states one."""
-        reach: int | None = getattr(self.network, "receptive_field", None)
-        return reach
-
     def plan(self) -> list[tuple[int, int]]:
-        """Return the planes of each slab, the fewest slabs that fit in memory.
+        """Return the planes of each slab, of few slabs that fit in memory.
 
         Raises
         ------
@@ -224,7 +219,7 @@ class Work:
             planes = np.clip(np.arange(count + 1) - box[0].start, 0, band.shape[0])
             before += band.voxels_before[planes]
         bound, need = self.resources.memory, 0
-        for pieces in range(1, count + 1 if self.reach is not None else 2):
+        for pieces in (*(2**n for n in range((count - 1).bit_length())), count):
             slabs = equal_parts(before, pieces)
             need = (held_memory() or 0) + max(map(self.bytes_of, slabs))
             if bound is None or need <= bound:
@@ -237,20 +232,22 @@ class Work:
 
     def bytes_of(self, planes: tuple[int, int]) -> int:
         """Return about how much memory the work on some planes takes."""
-        most = own = 0
+        most = count = 0
         for number, band in enumerate(self.bands):
-            low, high = self.within(number, planes)
-            slab, rows = self.slab(band, low, high), band.rows(low, high)
-            args = slab.seen, slab.decoded, slab.planes, self.factor, memory_needs(self.network)
-            most = max(most, slab_bytes(band, *args, self.resources.threads))
-            own += rows.stop - rows.start
-        return most + own * (NODE_BYTES * (self.factor + 1) ** 3 + CELL_BYTES * self.factor**2)
+            slab, own = self.slab(number, planes)
+            if own.start < own.stop:
+                args = slab.seen, slab.decoded, slab.planes, self.factor, memory_needs(self.network)
+                most = max(most, slab_bytes(band, *args, self.resources.threads))
+                count += own.stop - own.start
+        return most + count * (NODE_BYTES * (self.factor + 1) ** 3 + CELL_BYTES * self.factor**2)
 
-    def within(self, number: int, planes: tuple[int, int]) -> tuple[int, int]:
-        """Return some planes as those of a label's band."""
+    def slab(self, number: int, planes: tuple[int, int]) -> tuple[Slab, slice]:
+        """Return what some planes need of the band of a label, and which rows are their own."""
         start, count = self.image.boxes[number][0].start, self.bands[number].shape[0]
         low, high = (min(max(plane - start, 0), count) for plane in planes)
-        return low, high
+        reach = getattr(self.network, "receptive_field", None)  # all planes if it states none
+        slab = slab_of(self.bands[number], low, high, count if reach is None else reach, 1)
+        return slab, self.bands[number].rows(low, high)
 
     def pieces(
         self, planes: tuple[int, int], written: NDArray[np.int64], progress: Progress | None
@@ -262,7 +259,7 @@ class Work:
         grid, names = self.image.grid, self.image.names()
         parts = self._parts(planes, progress)
         field = put_together(parts, next(parts)[1], grid.shape, self.factor, planes)
-        places, faces, sides, before = extract_walls(field, self._border(planes))
+        places, faces, sides, before = extract_walls(field, self.image.border(planes))
         del field
         world: NDArray[Any] = grid.to_world(places / self.factor - 0.5)
         world = world.astype(vertex_type(grid, self.factor))
@@ -290,15 +287,12 @@ class Work:
     ) -> Iterator[tuple[int, Part]]:
         """Yield the fields of all labels that have voxels in some planes, in order; always of 0."""
         for number, band in enumerate(self.bands):
-            low, high = self.within(number, planes)
-            own = band.rows(low, high)
+            slab, own = self.slab(number, planes)
             if number and own.start == own.stop:
                 continue
-            around = band.rows(low - 1, high + 1)
-            rows = slice(own.start - around.start, own.stop - around.start)
-            table = np.empty((0, 27), np.int32)
-            if own.start < own.stop:
-                table = band.network_inputs(around)[1][rows]
+            around = slab.decoded
+            table = band.network_inputs(around)[1] if own.start < own.stop else NO_ROWS
+            table = table[own.start - around.start : own.stop - around.start]
             voxel_ijk = band.voxel_ijk[own] + corner(self.image.boxes[number])
             inside = band.patches[own, CENTRE] <= 0
             absent = absent_parts(table.T.copy(), voxel_ijk, inside, self.image.grid.shape)
@@ -306,23 +300,7 @@ class Work:
             if band.count_decoded(own):
                 share = number / len(self.bands), (number + 1) / len(self.bands)
                 steps = StepCounter(part_of(progress, *share), ["network", "nodes"])
-                slab, threads = self.slab(band, low, high), self.resources.threads
+                threads = self.resources.threads
                 field = refine(band, self.network, self.factor, slab, threads, steps)
                 blocks[:, band.decoded[own]] = field.blocks[:, field.own_rows]
             yield number, Part(voxel_ijk, absent, blocks)
-
-    def slab(self, band: Band, low: int, high: int) -> Slab:
-        """Return what the planes ``low`` to before ``high`` of a band need of it."""
-        if self.reach is None:
-            return replace(whole(band), planes=(low, high))
-        return slab_of(band, low, high, self.reach, 1)
-
-    def _border(self, planes: tuple[int, int]) -> IntArray:
-        """Return the voxels of some planes on the border that have a label, and which (b, 4)."""
-        numbers = self.image.numbers(slice(*planes))
-        first, last = int(planes[0] == 0), len(numbers) - int(planes[1] == self.image.grid.shape[0])
-        numbers[first:last, 1:-1, 1:-1] = 0
-        found = np.argwhere(numbers)
-        label = numbers[tuple(found.T)][:, None]
-        found[:, 0] += planes[0]
-        return np.concatenate([found, label], axis=1).astype(np.int32)

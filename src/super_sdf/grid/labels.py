@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import BoolArray
+from ..arrays import BoolArray, IntArray
 from ..errors import GridError, OptionError, seen
 from .field import MASK, NONE_EXACT, Field, Wanted, check_label
 from .masking import as_sample, labelled
@@ -83,11 +83,21 @@ class LabelImage:
         """Return the labels as whole numbers."""
         return [int(label) for label in self.labels]
 
-    def numbers(self, planes: slice) -> NDArray[np.int32]:
-        """Return for each sample of some planes which of the labels it has, from 1 on, or 0."""
-        values = np.asarray(self.samples[planes])
-        at = np.searchsorted(self.labels, values).clip(max=len(self.labels) - 1)
-        return np.where(self.labels[at] == values, at + 1, 0).astype(np.int32)
+    def border(self, planes: tuple[int, int]) -> IntArray:
+        """Return the samples on the grid's border in some planes, and the number of their label.
+
+        The result is (b, 4) int32; numbers are those of ``mask``.
+        """
+        found = [np.empty((0, 4), np.int64)]
+        for plane in range(*planes):
+            some = np.ones(self.grid.shape[1:], bool)
+            some[1:-1, 1:-1] = plane in (0, self.grid.shape[0] - 1)
+            values = np.asarray(self.samples[plane])[some]
+            at = np.searchsorted(self.labels, values).clip(max=len(self.labels) - 1)
+            number = np.where(self.labels[at] == values, at + 1, 0)
+            place = np.full(len(values), plane)
+            found.append(np.column_stack([place, np.argwhere(some), number]))
+        return np.concatenate(found).astype(np.int32)
 
 
 def make_labels(

@@ -35,6 +35,7 @@ from .voxel_index import VoxelIndex
 from .wall_cases import FACE_POINTS, PLACES, walls
 
 Keys = NDArray[np.int64]
+Cells = tuple[Keys, IntArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,22 +205,6 @@ def _holders(
     return holder
 
 
-@dataclass(frozen=True, eq=False)
-class Cells:
-    """Cells of the fine lattice in which walls are.
-
-    Attributes
-    ----------
-    low : (n, 3) int64
-        Their low nodes.
-    label : (n, 8) int32
-        The labels at their corners.
-    """
-
-    low: Keys
-    label: IntArray
-
-
 def extract_walls(
     field: Labelled, border: IntArray
 ) -> tuple[NDArray[np.float64], IntArray, IntArray, int]:
@@ -230,8 +215,8 @@ def extract_walls(
     field : Labelled
         From ``put_together``.
     border : (b, 4) int32
-        The voxels on the border of the grid in its planes, and the label of each: walls close all
-        labels there.
+        The voxels on the border of the grid in its planes, and the label of each, which is closed
+        there.
 
     Returns
     -------
@@ -243,9 +228,9 @@ def extract_walls(
     int
         The number of vertices on that face, which the planes before have, too.
     """
-    cells = _cells(field, border)
+    cells = low, _ = _cells(field, border)
     lattice = Halves(field.shape, field.factor)
-    base = lattice.keys(2 * cells.low)
+    base = lattice.keys(2 * low)
     faces, sides, inner = _connect(field, cells, base, lattice)
     keys, places = _edge_points(field, cells, base, lattice)
     keys, places = _inner_points(keys, places, np.unique(faces[inner]), lattice)
@@ -276,7 +261,10 @@ class Halves:
 
 
 def _cells(field: Labelled, border: IntArray) -> Cells:
-    """Return the cells in which walls are, those beyond the border included, in order."""
+    """Return the cells in which walls are, those beyond the border included, in order.
+
+    They are the low nodes, (n, 3) int64, and the labels at the corners, (n, 8) int32.
+    """
     voxel_ijk, holder = _closed(field, border)
     corners = holder.reshape(*(field.factor + 1,) * 3, -1)
     low, high = corners, corners
@@ -289,7 +277,7 @@ def _cells(field: Labelled, border: IntArray) -> Cells:
     steps = CORNERS @ strides(field.factor)
     label = holder[node[:, None] + steps, row[:, None]]
     low_ijk = field.factor * voxel_ijk[row].astype(np.int64) + block_ijk(field.factor)[node]
-    return Cells(low_ijk, label)
+    return low_ijk, label
 
 
 def _closed(field: Labelled, border: IntArray) -> tuple[IntArray, IntArray]:
@@ -333,13 +321,13 @@ def _connect(
     table = np.concatenate([np.empty((0, 5), np.int32), *tables])[nth]
     steps = PLACES.astype(np.int64) @ lattice.strides
     points = table[:, :3]
-    label = cells.label[cell[:, None], table[:, 3:]]
+    label = cells[1][cell[:, None], table[:, 3:]]
     return base[cell, None] + steps[points], label, points >= FACE_POINTS
 
 
 def _cases(field: Labelled, cells: Cells) -> Keys:
     """Return the case of each cell: the ranks of its labels, and which faces join (``walls``)."""
-    label, ordered = cells.label, np.sort(cells.label, axis=1)
+    label, ordered = cells[1], np.sort(cells[1], axis=1)
     rank = np.zeros(label.shape, np.int64)
     for nth in range(1, 8):
         is_next = ordered[:, nth] > ordered[:, nth - 1]
@@ -360,7 +348,7 @@ def _joins(
     It does where the difference of the labels' fields, interpolated bilinearly, is so at its
     saddle: see ``marching.choose_cases``.
     """
-    low, label = cells.low[some], cells.label[some[:, None], list(face[:2])].T
+    low, label = cells[0][some], cells[1][some[:, None], list(face[:2])].T
     between = np.sort(label, axis=0)
     saddle = [
         np.prod([field.apart(low, low + CORNERS[at], between, holder) for at in corners], axis=0)
@@ -377,14 +365,14 @@ def _edge_points(
     keys, found = [np.empty(0, np.int64)], [np.empty((0, 3), np.int64)]
     for edge, (start, axis) in enumerate(zip(EDGE_START, EDGE_AXIS)):
         end = start + (4, 2, 1)[axis]
-        cell = np.flatnonzero(cells.label[:, start] != cells.label[:, end])
+        cell = np.flatnonzero(cells[1][:, start] != cells[1][:, end])
         keys.append(base[cell] + PLACES[edge].astype(np.int64) @ lattice.strides)
         found.append(np.stack([cell, np.full_like(cell, start), np.full_like(cell, end)], 1))
     names, first = np.unique(np.concatenate(keys), return_index=True)
     cell, *corners = np.concatenate(found)[first].T
-    low = cells.low[cell]
+    low = cells[0][cell]
     ends = [low + CORNERS[corner] for corner in corners]
-    labels = [cells.label[cell, corner] for corner in corners]
+    labels = [cells[1][cell, corner] for corner in corners]
     last = field.factor * np.array(field.shape)
     share = np.full(len(cell), 0.5)  # half-way, if an end is beyond the border
     within = np.flatnonzero(((np.minimum(*ends) >= 0) & (np.maximum(*ends) <= last)).all(1))
