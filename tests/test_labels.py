@@ -250,7 +250,7 @@ def test_labels_of_any_type_are_compared_as_whole_numbers(dtype, low, high):
     assert list(meshes) == sorted([low, high])
     assert meshes[low].volume() == pytest.approx(6, rel=0.1)
     assert meshes[high].volume() == pytest.approx(6, rel=0.1)
-    only = reconstruct_labels(labels, [high], trilinear, 2, spacing=1)
+    only = reconstruct_labels(labels, iter([high]), trilinear, 2, spacing=1)
     assert list(only) == [high]
     assert list(reconstruct_labels(labels, [0, low], trilinear, 2, spacing=1)) == sorted([0, low])
 
@@ -269,6 +269,12 @@ def test_wrong_labels_are_one_line(message):
     with pytest.raises(OptionError) as caught:
         reconstruct_labels(IMAGES["noise"], WRONG[message], trilinear)
     assert str(caught.value) == message
+
+
+def test_an_array_has_no_order_of_axes_to_choose():
+    message = "^axes is 'zyx': that is for files; transpose the array$"
+    with pytest.raises(OptionError, match=message):
+        reconstruct_labels(IMAGES["noise"], network=trilinear, axes="zyx")
 
 
 UNFIT = {
@@ -335,6 +341,7 @@ def test_the_command_writes_a_file_for_each_label(image, command):
         assert row["output"] == path and row["closed"] and mesh.is_watertight
         assert row["triangles"] == len(mesh.faces) and row["vertices"] == len(mesh.vertices)
         assert row["volume"] == pytest.approx(mesh.volume, rel=1e-5) and mesh.volume > 0
+        assert "Note: solids of labels run out of the grid: closed along the border (3)\n" in err
         assert f"{path}: label {row['label']}, {len(mesh.vertices):,} vertices, " in err
         command("upsample", image, "alone.ply", "--label", row["label"], "--force", *PLAIN)
         alone = trimesh.load("alone.ply", process=False)

@@ -12,7 +12,7 @@ import numpy as np
 
 from .convert import ConvertOptions
 from .errors import MeshError, OptionError, seen
-from .files.meshes import check_target, format_of, write_together
+from .files.meshes import check_mesh_suffix, check_target, format_of, write_together
 from .files.output import check_apart, naming
 from .files.precision import check_format_holds, local_origin_note
 from .files.store import files_of
@@ -21,6 +21,7 @@ from .labels import LabelPiece, label_slabs, read_labels
 from .mesh import Mesh
 from .network.decoder import Decoder
 from .progress import Progress
+from .steps.nodes import check_factor
 from .topology import OpenEdges
 
 USED = ("factor", "spacing", "origin", "direction", "axes", "max_memory")
@@ -110,9 +111,10 @@ def convert_labels(
         labels. Nothing is written then.
     """
     options = options or ConvertOptions()
-    check_labels(labels)
+    labels = check_labels(labels)
     check_options(options)
-    check_target(target, force=force or not format_of(target).write_parts)
+    check_mesh_suffix(Path(target))
+    check_factor(options.factor)
     place = options.spacing, options.origin, options.direction, options.axes
     image = read_labels(source, labels, *place, options.max_memory)
     grid, paths = image.grid, label_paths(target, image.names())

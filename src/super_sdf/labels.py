@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .arrays import IntArray
-from .errors import OutOfMemoryError
+from .errors import OptionError, OutOfMemoryError, seen
 from .files.grids import read_array
 from .grid.field import MASK
 from .grid.labels import ALL, Box, LabelImage, check_labels, make_labels
@@ -109,10 +109,12 @@ def reconstruct_labels(
     OutOfMemoryError
         If not even a plane of the image can be worked on in memory.
     """
-    check_labels(labels)
+    labels = check_labels(labels)
     if isinstance(values, (str, PathLike)):
         image = read_labels(values, labels, spacing, origin, direction, axes, max_memory)
     else:
+        if axes is not None:
+            raise OptionError(f"axes is {seen(axes)}: that is for files; transpose the array")
         image = make_labels(values, labels, spacing=spacing, origin=origin, direction=direction)
     if network is None:
         from .network.network import load_network

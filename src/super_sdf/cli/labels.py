@@ -14,15 +14,11 @@ OTHERS = ("save_field", "check", "report", "cluster", "jobs")
 
 def run_labels(source: str, target: str, options: dict[str, Any]) -> None:
     """Convert the labels of an image to meshes, and print what was made."""
-    from pathlib import Path
-
-    from ..files.meshes import check_mesh_suffix
     from ..label_files import check_options, convert_labels
     from ..network.network import load_network
     from ..progress import Stopwatch
 
     watch, model, given = Stopwatch(), chosen_model(options), make_options(options)
-    check_mesh_suffix(Path(target))
     check_options(given, [name for name in OTHERS if options[name]])
     chosen = {name: options[name] for name in ("device", "threads", "precision")}
     network = load_network(model, **chosen)
@@ -50,7 +46,7 @@ def run_labels(source: str, target: str, options: dict[str, Any]) -> None:
         "seconds": {stage: round(seconds, 4) for stage, seconds in watch.seconds.items()},
     }
     if options["as_json"]:
-        print_stdout(json.dumps(report, indent=2), f"{target} is written")
+        print_stdout(json.dumps(report, indent=2), "the meshes are written")
     if options["quiet"]:
         return
     for note in (*found["inferred"], *network.notes):

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..arrays import BoolArray, IntArray
 from ..errors import GridError, OptionError, seen
 from .field import MASK, NONE_EXACT, Field, Wanted, check_label
-from .masking import as_sample, labelled
+from .masking import MOST_NAMED, as_sample, labelled
 from .masks import REACH, extremes_of_masks, mask_planes
 from .named_axes import placed
 from .planes import NoPlanes, SampleArray, SamplePlanes, changed
@@ -122,13 +122,17 @@ def make_labels(
     given = placed(values, spacing, origin)
     samples = as_samples(given.values)
     check_kind(samples.dtype, samples.shape)
-    found = find_labels(samples, wanted)
+    found = find_labels(samples, None if isinstance(wanted, str) else wanted)
     added: list[str] = []
     request = Request.checked(Wanted(), given.spacing, "auto")
     request = request.with_spacing(1, "since labels show none (give --spacing)", added)
     assert request.spacing is not None
     if given.origin is None:
         added.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
+    cut = [str(int(x)) for x, (low, high) in found.items() if _is_cut(low, high, samples.shape)]
+    if cut:
+        named = ", ".join(cut[:MOST_NAMED]) + ", ..." * (len(cut) > MOST_NAMED)
+        added.append(f"solids of labels run out of the grid: closed along the border ({named})")
     around = [_with_margin(box, samples.shape) for box in found.values()]
     ends = np.array([[(s.start, s.stop) for s in box] for box in around])
     whole = [slice(int(a), int(b)) for a, b in zip(ends[..., 0].min(0), ends[..., 1].max(0))]
@@ -145,8 +149,8 @@ def make_labels(
     return LabelImage(samples, known, [(whole[0], whole[1], whole[2]), *around], grid)
 
 
-def check_labels(labels: Any) -> list[int] | None:
-    """Return labels in ascending order, each once; None for all.
+def check_labels(labels: Any) -> str | list[int]:
+    """Return labels in ascending order, each once; "all" for all.
 
     Raises
     ------
@@ -154,7 +158,7 @@ def check_labels(labels: Any) -> list[int] | None:
         If they are none, or too many.
     """
     if isinstance(labels, str) and labels == ALL:
-        return None
+        return ALL
     if isinstance(labels, (str, bytes)) or not hasattr(labels, "__iter__"):
         raise OptionError(f"labels is {seen(labels)}: give all, or some labels such as 1,2,3")
     chosen = sorted({check_label(label, "labels") for label in labels})
@@ -223,6 +227,11 @@ def _check_whole(values: NDArray[Any]) -> None:
             f"a value is {wrong[0]:g}: labels are whole numbers; choose what is above a value with "
             "--level if they are densities"
         )
+
+
+def _is_cut(low: NDArray[np.int64], high: NDArray[np.int64], shape: tuple[int, ...]) -> bool:
+    """Return whether a box reaches the border of an array."""
+    return bool((low == 0).any() or (high == np.array(shape) - 1).any())
 
 
 def _with_margin(box: NDArray[np.int64], shape: tuple[int, ...]) -> Box:
