@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import IntArray
+from ..arrays import FloatArray, IntArray
 from ..grid.sdf_grid import SdfGrid
 from ..neighbourhood import NEIGHBOURHOOD
 from .band import neighbour_table, plane_blocks, rescale
@@ -99,9 +97,9 @@ def _close(field: FineField, filled: IntArray, beside: int) -> FineField:
 
 
 def set_blocks(
-    values: NDArray[Any] | np.float32,
+    values: FloatArray | np.float32,
     columns: IntArray,
-    blocks: NDArray[Any],
+    blocks: FloatArray,
     parts: SharedParts,
     factor: int,
 ) -> None:

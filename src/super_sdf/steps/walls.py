@@ -1,11 +1,12 @@
 """Surfaces of several labels that share their walls, made of the labels' fine fields.
 
-At every node of the fine lattice the label whose field is lowest holds the node, the lower label in
-a tie. A label cannot hold a node of a voxel round which no sample has it. Where two neighbouring
-nodes have different labels, the wall crosses the edge between them where the difference of the two
-fields is 0, by linear interpolation: both labels get the very same vertex. ``wall_cases`` says how
-the walls run in a cell. So the surface of each label is closed, and there is neither gap nor
-overlap between two.
+At every node of the fine lattice the label whose field is lowest holds the node: in a tie the lower
+label, 0 last. Label 0 is what is beside all others; its field is minus that of a label, unless two
+others or more could hold the node. A label cannot hold a node of a voxel round which no sample has
+it. Where two neighbouring nodes have different labels, the wall crosses the edge between them where
+the difference of the two fields is 0, by linear interpolation: both labels get the very same
+vertex. ``wall_cases`` says how the walls run in a cell. So the surface of each label is closed, and
+there is neither gap nor overlap between two.
 
 A vertex is named by its place in the lattice of half the fine spacing, which tells points on edges,
 on faces and in cells apart. They are in the order of these names, and triangles in that of the
@@ -26,16 +27,16 @@ from numpy.typing import NDArray
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..mesh import CLEARANCE
 from ..neighbourhood import NEIGHBOURHOOD
-from .band import neighbour_table
-from .cap import outer_voxels, set_blocks
+from .cap import outer_voxels
 from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, FACES
 from .marching import CAP_HEIGHT, cells_low_nodes, strides
-from .nodes import SHARING, block_ijk, part_of_node, share_parts
+from .nodes import SHARING, block_ijk, part_of_node
 from .voxel_index import VoxelIndex
 from .wall_cases import FACE_POINTS, PLACES, walls
 
 Keys = NDArray[np.int64]
-Cells = tuple[Keys, IntArray]
+Labels = NDArray[np.int16]
+Cells = tuple[Keys, Labels]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +60,7 @@ class Labelled:
     order : (S,) int64
     labels : int
         Number of labels, 0 included, which is beside all others.
-    holder : (Q, D) int32
+    holder : (Q, D) int16
         The label of each node.
     """
 
@@ -71,25 +72,23 @@ class Labelled:
     column: Keys
     order: NDArray[np.intp]
     labels: int
-    holder: IntArray
+    holder: Labels
 
     @cached_property
     def index(self) -> VoxelIndex:
         """Finds the row of a voxel."""
         return VoxelIndex(self.voxel_ijk, self.shape)
 
-    def apart(
-        self, low: Keys, node: Keys, between: IntArray, holder: IntArray
-    ) -> NDArray[np.float64]:
+    def apart(self, low: Keys, node: Keys, between: Labels, holder: Labels) -> NDArray[np.float64]:
         """Return by how much the field of a node's holder is lower than that of another, (n,).
 
         Parameters
         ----------
         low, node : (n, 3) int64
             The low nodes of cells, and a node of each, that lies in the grid.
-        between : (2, n) int32
+        between : (2, n) int16
             Two labels at corners of the cell, in ascending order.
-        holder : (n,) int32
+        holder : (n,) int16
             Which of them is that of the node.
         """
         voxel = np.clip(low // self.factor, 0, np.array(self.shape) - 1)
@@ -185,11 +184,11 @@ def put_together(
 
 def _holders(
     number: list[int], parts: list[Part], rows: list[NDArray[np.intp]], count: int
-) -> IntArray:
+) -> Labels:
     """Return the label that holds each node of ``count`` voxels, (Q, D); forget unused values."""
     size = len(parts[0].blocks)
     lowest, able = np.full((size, count), np.inf, np.float32), np.zeros((size, count), np.int8)
-    holder = np.zeros(lowest.shape, np.int32)
+    holder = np.zeros(lowest.shape, np.int16)
     of_block = part_of_node(round(size ** (1 / 3)) - 1)[0]
     for nth in (*range(1, len(parts)), 0):
         label, part, row = number[nth], parts[nth], rows[nth]
@@ -207,7 +206,7 @@ def _holders(
 
 def extract_walls(
     field: Labelled, border: IntArray
-) -> tuple[NDArray[np.float64], IntArray, IntArray, int]:
+) -> tuple[NDArray[np.float64], IntArray, Labels, int]:
     """Return the walls in the planes of fields.
 
     Parameters
@@ -222,7 +221,7 @@ def extract_walls(
     -------
     (v, 3) float64
         The vertices in fine spacings from node 0. Those on the first face of the planes come first.
-    (m, 3) int32, (m, 2) int32
+    (m, 3) int32, (m, 2) int16
         The triangles, and the labels on both sides: counter-clockwise seen from the second, which
         is lower.
     int
@@ -234,8 +233,8 @@ def extract_walls(
     faces, sides, inner = _connect(field, cells, base, lattice)
     keys, places = _edge_points(field, cells, base, lattice)
     keys, places = _inner_points(keys, places, np.unique(faces[inner]), lattice)
-    end = lattice.keys(np.array([2 * field.factor * field.planes[0] + 1, -2, -2]))
-    before = int(np.searchsorted(keys, end)) if field.planes[0] else 0
+    after = np.array([2 * field.factor * field.planes[0] + 1, -lattice.beyond, -lattice.beyond])
+    before = int(np.searchsorted(keys, lattice.keys(after))) if field.planes[0] else 0
     return places, np.searchsorted(keys, faces).astype(np.int32), sides, before
 
 
@@ -263,7 +262,7 @@ class Halves:
 def _cells(field: Labelled, border: IntArray) -> Cells:
     """Return the cells in which walls are, those beyond the border included, in order.
 
-    They are the low nodes, (n, 3) int64, and the labels at the corners, (n, 8) int32.
+    They are the low nodes, (n, 3) int64, and the labels at the corners, (n, 8) int16.
     """
     voxel_ijk, holder = _closed(field, border)
     corners = holder.reshape(*(field.factor + 1,) * 3, -1)
@@ -280,34 +279,35 @@ def _cells(field: Labelled, border: IntArray) -> Cells:
     return low_ijk, label
 
 
-def _closed(field: Labelled, border: IntArray) -> tuple[IntArray, IntArray]:
+def _closed(field: Labelled, border: IntArray) -> tuple[IntArray, Labels]:
     """Return voxels and the labels of their nodes, with those beyond the border, which have none.
 
-    See ``cap``: the voxels on the border that are all of one label are added, too.
+    See ``cap``: the voxels on the border that are all of one label count, too.
     """
-    known = VoxelIndex(field.voxel_ijk, field.shape)
-    filled = border[(border[:, 3] > 0) & (known.find(border[:, :3]) < 0)]
-    inside = np.concatenate([field.voxel_ijk, filled[:, :3]])
-    voxel_ijk = np.concatenate([inside, outer_voxels(inside, field.shape)])
-    low, high = (field.planes[0] or -1), field.planes[1] + (field.planes[1] == field.shape[0])
-    own = (voxel_ijk[:, 0] >= low) & (voxel_ijk[:, 0] < high)  # others belong to other planes
-    order = np.flatnonzero(own)
-    order = order[np.lexsort(voxel_ijk[order].T[::-1])]
-    place = np.empty(len(voxel_ijk), np.int32)
-    place[order] = np.arange(len(order), dtype=np.int32)
-    voxel_ijk = voxel_ijk[order]
-    nx, ny, nz = (n + 2 for n in field.shape)
-    parts = share_parts(neighbour_table(voxel_ijk + 1, (nx, ny, nz)))
-    holder = np.zeros((len(field.holder), len(order)), np.int32)
-    count = len(field.voxel_ijk)
-    set_blocks(filled[:, 3], place[count : len(inside)], holder, parts, field.factor)
-    set_blocks(field.holder, place[:count], holder, parts, field.factor)  # last: these win
-    return voxel_ijk, holder
+    shape, factor = np.array(field.shape), field.factor
+    filled = border[(border[:, 3] > 0) & (field.index.find(border[:, :3]) < 0)]
+    of_filled = np.broadcast_to(filled[:, 3].astype(np.int16), (len(field.holder), len(filled)))
+    voxel_ijk = np.concatenate([field.voxel_ijk, filled[:, :3]])
+    holder, order = np.concatenate([field.holder, of_filled], axis=1), np.lexsort(voxel_ijk.T[::-1])
+    outer = outer_voxels(voxel_ijk, field.shape)
+    ends = [-1 if at == 0 else at + (at == field.shape[0]) for at in field.planes]
+    outer = outer[(outer[:, 0] >= ends[0]) & (outer[:, 0] < ends[1])]  # others are of other planes
+    beside = np.clip(outer, 0, shape - 1)
+    row = VoxelIndex(voxel_ijk[order], field.shape).find(beside)
+    of_outer = np.zeros((len(holder), len(outer)), holder.dtype)
+    for nth, step in enumerate(block_ijk(factor)):  # one by one, to save memory
+        node = factor * outer + step
+        some = np.flatnonzero(((node >= 0) & (node <= factor * shape)).all(1) & (row >= 0))
+        place = (node - factor * beside)[some] @ strides(factor)
+        of_outer[nth, some] = holder[place, order[row[some]]]
+    voxel_ijk = np.concatenate([voxel_ijk, outer])
+    order = np.lexsort(voxel_ijk.T[::-1])
+    return voxel_ijk[order], np.concatenate([holder, of_outer], axis=1)[:, order]
 
 
 def _connect(
     field: Labelled, cells: Cells, base: Keys, lattice: Halves
-) -> tuple[Keys, IntArray, BoolArray]:
+) -> tuple[Keys, Labels, BoolArray]:
     """Return the triangles of cells as names of points, and the labels on both sides.
 
     The last array, (m, 3), says which points are not on edges.
