@@ -25,6 +25,7 @@ __all__ = [
     "read_field",
     "read_grid",
     "reconstruct",
+    "reconstruct_labels",
     "simplify_mesh",
     "upsample",
     "write_field",

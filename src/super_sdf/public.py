@@ -8,6 +8,7 @@ from .files.images import grid_from_image as grid_from_image
 from .files.meshes import write_mesh as write_mesh
 from .grid.sdf_grid import SdfGrid as SdfGrid
 from .grid.sdf_grid import make_grid as make_grid
+from .labels import reconstruct_labels as reconstruct_labels
 from .mesh import Mesh as Mesh
 from .network.network import load_network as load_network
 from .pipeline import reconstruct as reconstruct

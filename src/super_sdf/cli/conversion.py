@@ -76,7 +76,17 @@ def parse_label(ctx: click.Context, param: click.Parameter, value: str | None) -
 
     with one_line_errors():
         is_whole = re.fullmatch("[-+]?[0-9]{1,20}", value)
-        return check_label(int(value) if is_whole else value, "--label")
+        return check_label(int(value) if is_whole else value, str(param.opts[0]))
+
+
+def parse_labels(
+    ctx: click.Context, param: click.Parameter, value: str | None
+) -> str | list[int] | None:
+    """Parse "all", or labels separated by commas."""
+    if value is None or value == "all":
+        return value
+    found = [parse_label(ctx, param, part.strip()) for part in value.split(",")]
+    return [label for label in found if label is not None]
 
 
 UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9}
@@ -261,6 +271,15 @@ check_option = click.option(
     help="Check each mesh against its samples, as check does. Needs the extra eval.",
 )
 
+
+labels_option = _parsed(
+    "--labels",
+    "all|N,N",
+    "Mesh all labels of a label image but 0, or those listed, each with a closed mesh; neighbours "
+    "share their walls. OUT.glb and OUT.3mf hold all as parts; for OUT.ply and others each label N "
+    "has its own file, OUT-N.ply.",
+    parse_labels,
+)
 
 cluster_option = click.option(
     "--cluster",

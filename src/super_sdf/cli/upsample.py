@@ -24,6 +24,7 @@ from .conversion import (
     chosen_model,
     cluster_option,
     conversion_options,
+    labels_option,
     make_options,
 )
 from .interrupts import raising_interrupts
@@ -46,6 +47,7 @@ Examples:
   super-sdf upsample part.npz part.ply
   super-sdf upsample field.npy part.stl --spacing 0.5 --factor 8
   super-sdf upsample scan.h5:/distance part.ply --spacing 0.5
+  super-sdf upsample organs.nii.gz organs.glb --labels all
 """
 
 
@@ -59,6 +61,7 @@ Examples:
 @click.argument("source", metavar="IN")
 @click.argument("target", metavar="OUT")
 @conversion_options
+@labels_option
 @check_option
 @click.option(
     "--save-field",
@@ -81,6 +84,11 @@ Examples:
 @click.option("-v", "--verbose", is_flag=True, help="Also print counts and the time per stage.")
 def upsample_command(source: str, target: str, **options: Any) -> None:
     """Convert one grid to a mesh."""
+    if options["labels"] is not None:
+        from .labels import run_labels
+
+        with one_line_errors(target):
+            return run_labels(source, target, options)
     with one_line_errors(target, options["save_field"], options["report"]):
         run = Upsampling(source, target, options)
         run.work()

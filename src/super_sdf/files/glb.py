@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,35 +14,46 @@ from numpy.typing import NDArray
 from ..arrays import Triple
 from ..errors import FileError
 from ..mesh import Mesh
-from .spool import append_spool, little_endian, spool_beside, write_split
+from .spool import Written, append_spool, little_endian, spool_beside, write_split
 
-JSON_BYTES = 1200  # of the scene, padded
+JSON_BYTES = 1200  # of the scene, padded, per part
 MOST_BYTES = 2**32 - 1  # the length in the header has 32 bits
 FLOAT, UNSIGNED_INT, VERTICES, INDICES = 5126, 5125, 34962, 34963  # constants of glTF
 
 
 def write_glb(pieces: Iterable[Mesh], path: Path, about: Triple = (0.0, 0.0, 0.0)) -> None:
-    """Write binary glTF; its header, padded to a fixed length, is written last.
+    """Write a mesh as binary glTF: see ``write_glb_parts``."""
+    write_glb_parts({"": pieces}, path, about)
 
-    Vertices are stored relative to the point ``about``, the translation of the node.
+
+def write_glb_parts(
+    parts: Mapping[str, Iterable[Mesh]], path: Path, about: Triple = (0.0, 0.0, 0.0)
+) -> None:
+    """Write meshes by their names as binary glTF; its header, of fixed length, is written last.
+
+    Vertices are stored relative to the point ``about``, the translation of the nodes.
 
     Raises
     ------
     FileError
-        If there is no triangle, which glTF does not allow, or the file exceeds 4.29 GB.
+        If one has no triangle, which glTF does not allow, or the file exceeds 4.29 GB.
     """
-    box = Box(about)
-    with path.open("wb") as file, spool_beside(path) as waiting:
-        file.write(bytes(_header_bytes()))
-        written = write_split(pieces, (file, waiting), (box.shift, _indices))
-        if not written.faces:
-            raise FileError("a mesh without triangles cannot be .glb: give .ply")
-        append_spool(waiting, file)
+    scene, size = Scene(about), JSON_BYTES * len(parts)
+    with path.open("wb") as file:
+        file.write(bytes(_header_bytes(size)))
+        for name, pieces in parts.items():
+            box = Box(about)
+            with spool_beside(path) as waiting:
+                written = write_split(pieces, (file, waiting), (box.shift, _indices))
+                if not written.faces:
+                    raise FileError("a mesh without triangles cannot be .glb: give .ply")
+                append_spool(waiting, file)
+            scene.add(name, written, box)
         length = file.tell()
         if length > MOST_BYTES:
             raise FileError(f"the mesh takes {length:,} bytes, .glb holds 4,294,967,295: give .ply")
         file.seek(0)
-        file.write(_header(length, _describe(written.vertices, written.faces, box)))
+        file.write(_header(length, size, scene.described))
 
 
 class Box:
@@ -70,53 +81,50 @@ def _indices(faces: NDArray[Any]) -> bytes:
     return little_endian(faces.astype(np.uint32))
 
 
-def _header_bytes() -> int:
-    return 12 + 8 + JSON_BYTES + 8
+def _header_bytes(size: int) -> int:
+    return 12 + 8 + size + 8
 
 
-def _header(length: int, scene: dict[str, Any]) -> bytes:
+def _header(length: int, size: int, scene: dict[str, Any]) -> bytes:
     """Return all that precedes the vertices; its length does not depend on the numbers."""
-    text = json.dumps(scene, separators=(",", ":")).ljust(JSON_BYTES).encode("ascii")
+    text = json.dumps(scene, separators=(",", ":")).ljust(size).encode("ascii")
     whole = struct.pack("<4sII", b"glTF", 2, length)
-    first = struct.pack("<I4s", JSON_BYTES, b"JSON") + text
-    return whole + first + struct.pack("<I4s", length - _header_bytes(), b"BIN\0")
+    first = struct.pack("<I4s", size, b"JSON") + text
+    return whole + first + struct.pack("<I4s", length - _header_bytes(size), b"BIN\0")
 
 
-def _describe(vertices: int, faces: int, box: Box) -> dict[str, Any]:
-    """Return the scene: one node, one mesh, and the layout of the buffer."""
-    node: dict[str, Any] = {"mesh": 0}
-    if box.about.any():
-        node["translation"] = box.about.tolist()
-    return {
-        "asset": {"version": "2.0", "generator": "super-sdf"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [node],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
-        "accessors": [
-            {
-                "bufferView": 0,
-                "componentType": FLOAT,
-                "type": "VEC3",
-                "count": vertices,
-                "min": box.low.tolist(),
-                "max": box.high.tolist(),
-            },
-            {
-                "bufferView": 1,
-                "componentType": UNSIGNED_INT,
-                "type": "SCALAR",
-                "count": 3 * faces,
-            },
-        ],
-        "bufferViews": [
-            {"buffer": 0, "byteLength": 12 * vertices, "target": VERTICES},
-            {
-                "buffer": 0,
-                "byteOffset": 12 * vertices,
-                "byteLength": 12 * faces,
-                "target": INDICES,
-            },
-        ],
-        "buffers": [{"byteLength": 12 * (vertices + faces)}],
-    }
+class Scene:
+    """The scene: a node and a mesh for each part, and the layout of the buffer."""
+
+    def __init__(self, about: Triple) -> None:
+        self.place = {"translation": list(about)} if any(about) else {}
+        self.buffer = {"byteLength": 0}
+        self.described: dict[str, Any] = {
+            "asset": {"version": "2.0", "generator": "super-sdf"},
+            "scene": 0,
+            "scenes": [{"nodes": []}],
+            **{key: [] for key in ("nodes", "meshes", "accessors", "bufferViews")},
+            "buffers": [self.buffer],
+        }
+
+    def add(self, name: str, written: Written, box: Box) -> None:
+        """Add a part, whose vertices and indices follow those before."""
+        scene, named = self.described, {"name": name} if name else {}
+        mesh, first = len(scene["meshes"]), len(scene["accessors"])
+        scene["scenes"][0]["nodes"].append(mesh)
+        scene["nodes"].append({"mesh": mesh, **named, **self.place})
+        primitive = {"attributes": {"POSITION": first}, "indices": first + 1}
+        scene["meshes"].append({"primitives": [primitive], **named})
+        positions = {"componentType": FLOAT, "type": "VEC3", "count": written.vertices}
+        ends = {"min": box.low.tolist(), "max": box.high.tolist()}
+        indices = {"componentType": UNSIGNED_INT, "type": "SCALAR", "count": 3 * written.faces}
+        scene["accessors"] += [
+            {"bufferView": first, **positions, **ends},
+            {"bufferView": first + 1, **indices},
+        ]
+        for size, target in ((12 * written.vertices, VERTICES), (12 * written.faces, INDICES)):
+            start = self.buffer["byteLength"]
+            offset = {"byteOffset": start} if start else {}
+            view = {"buffer": 0, **offset, "byteLength": size, "target": target}
+            scene["bufferViews"].append(view)
+            self.buffer["byteLength"] += size

@@ -115,17 +115,8 @@ def read_grid(
         files of the format state it.
     """
     Wanted(field, label, level, scale).check()
-    path = check_path(path, "path")
-    format_ = find_format(path)
-    order = choose_axes(format_, axes)
-    check_direction_given(format_, direction)
-    given = {"spacing": spacing, "origin": origin, "direction": direction}
-    room = unpacking_room(max_memory)
-    if format_.key in ("npy", "npz"):
-        found = _read_numpy(check_regular_file(path), order, room, given)
-    else:
-        found = _read_foreign(path, format_, order, room, given, max_memory)
-    check_planes(found["values"], memory_bound(max_memory))
+    place = {"spacing": spacing, "origin": origin, "direction": direction}
+    found = read_array(path, place, axes, max_memory)
     grid = make_grid(
         found["values"],
         **{key: found[key] for key in PLACE},
@@ -135,7 +126,24 @@ def read_grid(
         level=level,
         scale=scale,
     )
-    return grid.noted(found.get("notes", ()))
+    return grid.noted(found["notes"])
+
+
+def read_array(
+    path: Any, given: dict[str, Any], axes: str | None, max_memory: int | None
+) -> dict[str, Any]:
+    """Return values, place (``PLACE``, unless ``given``) and notes of a file: see ``read_grid``."""
+    path = check_path(path, "path")
+    format_ = find_format(path)
+    order = choose_axes(format_, axes)
+    check_direction_given(format_, given["direction"])
+    room = unpacking_room(max_memory)
+    if format_.key in ("npy", "npz"):
+        found = _read_numpy(check_regular_file(path), order, room, given)
+    else:
+        found = _read_foreign(path, format_, order, room, given, max_memory)
+    check_planes(found["values"], memory_bound(max_memory))
+    return {key: found[key] for key in ("values", *PLACE)} | {"notes": found.get("notes", ())}
 
 
 def _read_numpy(path: Path, axes: str, room: int, given: dict[str, Any]) -> dict[str, Any]:

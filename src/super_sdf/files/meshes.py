@@ -6,7 +6,8 @@ in ``FORMATS``. All write a mesh piece by piece and hold no more than one piece 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,12 +19,12 @@ from ..arrays import Triple
 from ..errors import FileError, OptionError, OptionTypeError, seen
 from ..mesh import Mesh
 from ..options import check_path
-from .glb import write_glb
+from .glb import write_glb, write_glb_parts
 from .output import check_free, replacing
 from .ply import write_ply
 from .stl import write_stl
 from .text_meshes import write_obj, write_off
-from .threemf import write_3mf
+from .threemf import write_3mf, write_3mf_parts
 
 WORLD_ORIGIN = (0.0, 0.0, 0.0)
 CHUNK = 1 << 16  # triangles checked at a time
@@ -43,12 +44,15 @@ class MeshFormat:
         Whether coordinates are float32.
     local_origin : bool
         Whether coordinates may be relative to a point, ``write``'s third argument.
+    write_parts : callable, optional
+        Writes several meshes, by their names, to one file.
     """
 
     write: Callable[..., None]
     bytes_per_triangle: int
     single_precision: bool = False
     local_origin: bool = False
+    write_parts: Callable[..., None] | None = None
 
 
 FORMATS = {
@@ -56,8 +60,10 @@ FORMATS = {
     ".stl": MeshFormat(write_stl, 50, single_precision=True),
     ".obj": MeshFormat(write_obj, 40),
     ".off": MeshFormat(write_off, 39),
-    ".glb": MeshFormat(write_glb, 18, single_precision=True, local_origin=True),
-    ".3mf": MeshFormat(write_3mf, 13),
+    ".glb": MeshFormat(
+        write_glb, 18, single_precision=True, local_origin=True, write_parts=write_glb_parts
+    ),
+    ".3mf": MeshFormat(write_3mf, 13, write_parts=write_3mf_parts),
 }
 MESH_SUFFIXES = tuple(FORMATS)
 
@@ -151,6 +157,30 @@ def write_pieces(
             mesh_format.write(pieces, part, about)
         else:
             mesh_format.write(pieces, part)
+
+
+def write_together(
+    meshes: Mapping[Path, Mapping[str, Iterable[Mesh]]],
+    *,
+    force: bool = False,
+    about: Triple = WORLD_ORIGIN,
+) -> None:
+    """Write files of meshes in pieces, by path and name: all of them, or none.
+
+    A file of several meshes must have a format with parts. Otherwise as ``write_pieces``.
+    """
+    with ExitStack() as files:
+        for path, named in meshes.items():
+            part = files.enter_context(replacing(check_target(path, force=force), force=force))
+            mesh_format = format_of(path)
+            origin = (about,) if mesh_format.local_origin else ()
+            if mesh_format.write_parts:
+                mesh_format.write_parts(named, part, *origin)
+                continue
+            for pieces in named.values():
+                mesh_format.write(pieces, part, *origin)
+        for path in meshes:
+            check_target(path, force=force)  # before the first of them appears
 
 
 def _local_origin(mesh: Mesh, path: Path) -> Triple:

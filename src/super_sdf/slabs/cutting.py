@@ -199,7 +199,7 @@ def cut(
     first, last = planes or (0, band.shape[0])
     before = band.decoded_before[first : last + 1] - band.decoded_before[first]
     return [
-        _slab(band, first + low, first + high, receptive_field, beside)
+        slab_of(band, first + low, first + high, receptive_field, beside)
         for low, high in equal_parts(before, pieces)
     ]
 
@@ -227,10 +227,10 @@ def ways_to_cut(
         yield cut(band, pieces, receptive_field, beside, planes)
     decoding = np.flatnonzero(np.diff(band.decoded_before[first : last + 1])) + first
     bounds = [first, *decoding.tolist()[1:], last]  # each slab decodes something
-    yield [_slab(band, low, high, receptive_field, beside) for low, high in pairwise(bounds)]
+    yield [slab_of(band, low, high, receptive_field, beside) for low, high in pairwise(bounds)]
 
 
-def _slab(band: Band, first: int, last: int, receptive_field: int, beside: int) -> Slab:
+def slab_of(band: Band, first: int, last: int, receptive_field: int, beside: int) -> Slab:
     """Return the slab of planes ``first`` to before ``last``, with the rows it depends on."""
     beside += REACH_IN_VOXELS
     decoded = band.rows(first - beside, last + beside)

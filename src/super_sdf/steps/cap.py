@@ -79,7 +79,7 @@ def _close(field: FineField, filled: IntArray, beside: int) -> FineField:
     rows = field.rows(*_planes_beside(field, beside))
     known = field.voxel_ijk[rows]
     border = np.concatenate([known, filled])
-    voxel_ijk = np.concatenate([border, _outer_voxels(border, field.shape)])
+    voxel_ijk = np.concatenate([border, outer_voxels(border, field.shape)])
     order = np.lexsort(voxel_ijk.T[::-1])
     voxel_ijk = voxel_ijk[order]
 
@@ -145,7 +145,7 @@ def _filled_border(
     return np.concatenate([np.empty((0, 3)), *found]).astype(np.int32)
 
 
-def _outer_voxels(voxel_ijk: IntArray, shape: tuple[int, int, int]) -> IntArray:
+def outer_voxels(voxel_ijk: IntArray, shape: tuple[int, int, int]) -> IntArray:
     """Return the neighbours (n, 3) of these voxels that lie beyond the grid."""
     last = np.array(shape, np.int32) - 1
     border = voxel_ijk[((voxel_ijk == 0) | (voxel_ijk == last)).any(1)]

@@ -36,7 +36,7 @@ EDGE_AXIS = (0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2)
 FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 
 _STEP = (4, 2, 1)
-_EDGE_BETWEEN = {
+EDGE_BETWEEN = {
     frozenset((start, start + _STEP[axis])): edge
     for edge, (start, axis) in enumerate(zip(EDGE_START, EDGE_AXIS))
 }
@@ -96,7 +96,7 @@ def triangle_table() -> tuple[IntArray, IntArray]:
         The number of triangles of a case, and the cell edges on which their vertices lie, in
         counter-clockwise order seen from outside; unused rows are 0.
     """
-    cases = [[t for loop in _loops(*case) for t in _triangulate(loop)] for case in _cases()]
+    cases = [[t for loop in _loops(*case) for t in triangulate(loop)] for case in _cases()]
     counts = np.array([len(triangles) for triangles in cases], np.int32)
     table = np.zeros((len(cases), counts.max(), 3), np.int32)
     for case, triangles in enumerate(cases):
@@ -140,7 +140,7 @@ def loop_table() -> LoopTable:
     for row, loop in enumerate(flat):
         edges[row, : len(loop)] = loop
         place = {edge: nth for nth, edge in enumerate(loop)}
-        cut = [[place[edge] for edge in triangle] for triangle in _triangulate(loop)]
+        cut = [[place[edge] for edge in triangle] for triangle in triangulate(loop)]
         triangles[row, : len(cut)] = cut
     return LoopTable(count, np.cumsum(count) - count, sides, edges, triangles)
 
@@ -150,7 +150,7 @@ def _loops(inside: int, joined: int) -> Iterator[tuple[int, ...]]:
     after: dict[int, int] = {}
     for n, face in enumerate(FACES):
         bits = tuple(inside >> corner & 1 for corner in face)
-        after |= _segments(n, bits, joined >> n & 1)
+        after |= segments(n, bits, joined >> n & 1)
     while after:
         first, edge = after.popitem()
         loop = [first]
@@ -161,7 +161,7 @@ def _loops(inside: int, joined: int) -> Iterator[tuple[int, ...]]:
 
 
 @lru_cache(maxsize=192)
-def _segments(n: int, inside: tuple[int, ...], joined: int) -> dict[int, int]:
+def segments(n: int, inside: tuple[int, ...], joined: int) -> dict[int, int]:
     """Return the segments on face ``n``: the edge where one ends, by that where it begins.
 
     Going round counter-clockwise, a run of inside corners begins after an outside one, and a
@@ -170,14 +170,14 @@ def _segments(n: int, inside: tuple[int, ...], joined: int) -> dict[int, int]:
     """
     begins = [at for at in range(4) if inside[at] and not inside[at - 1]]
     ends = [next(n % 4 for n in range(at, at + 4) if not inside[(n + 1) % 4]) for at in begins]
-    edges = [_EDGE_BETWEEN[frozenset((FACES[n][at - 1], FACES[n][at]))] for at in range(4)]
+    edges = [EDGE_BETWEEN[frozenset((FACES[n][at - 1], FACES[n][at]))] for at in range(4)]
     return {
         edges[at]: edges[(end + 1) % 4] for at, end in zip(begins, ends[::-1] if joined else ends)
     }
 
 
 @cache
-def _triangulate(loop: tuple[int, ...]) -> list[tuple[int, int, int]]:
+def triangulate(loop: tuple[int, ...]) -> list[tuple[int, int, int]]:
     """Return the triangles of a loop, cut along diagonals that lie on no face of the cell.
 
     Some loops that cross a face twice cannot be cut so. There, a diagonal may also join opposite

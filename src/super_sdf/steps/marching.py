@@ -220,7 +220,7 @@ def choose_cases(
     case: NDArray[np.int16] = corners.astype(np.int16)
     unsure = np.flatnonzero(table.ambiguous[corners])
     low, row = cells_low_nodes(field.factor)[cell[unsure]], row[unsure]
-    steps = CORNERS @ _strides(field.factor)
+    steps = CORNERS @ strides(field.factor)
     values = [field.blocks[low + step, row].astype(np.float64) for step in steps]
     joined = np.zeros(len(unsure), np.uint8)
     for n, (a, b, c, d) in enumerate(FACES):
@@ -304,7 +304,7 @@ def edge_ends(factor: int) -> NDArray[np.intp]:
 
     Edges that leave the block have a number here too, which is not used.
     """
-    return (np.arange((factor + 1) ** 3) + _strides(factor)[:, None]).ravel()
+    return (np.arange((factor + 1) ** 3) + strides(factor)[:, None]).ravel()
 
 
 def _crossing(low: FloatArray, high: FloatArray) -> NDArray[np.float64]:
@@ -386,11 +386,11 @@ def number_edges(
 @lru_cache
 def edge_shifts(factor: int) -> NDArray[np.int64]:
     """Return an edge's number in a block minus its number in each neighbouring block, (27,)."""
-    shifts: NDArray[np.int64] = factor * NEIGHBOURHOOD.astype(np.int64) @ _strides(factor)
+    shifts: NDArray[np.int64] = factor * NEIGHBOURHOOD.astype(np.int64) @ strides(factor)
     return shifts
 
 
-def _strides(factor: int) -> NDArray[np.int64]:
+def strides(factor: int) -> NDArray[np.int64]:
     """Return the steps from a node of a block to the next one along each axis, (3,)."""
     return np.array([(factor + 1) ** 2, factor + 1, 1])
 
@@ -403,7 +403,7 @@ def cells_low_nodes(factor: int) -> NDArray[np.intp]:
 
 def edge_steps(factor: int) -> NDArray[np.int64]:
     """Return the number of each edge of a cell, counted from that of its low node, (12,)."""
-    start = (CORNERS @ _strides(factor))[np.array(EDGE_START)]
+    start = (CORNERS @ strides(factor))[np.array(EDGE_START)]
     steps: NDArray[np.int64] = start + np.array(EDGE_AXIS) * (factor + 1) ** 3
     return steps
 

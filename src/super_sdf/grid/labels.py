@@ -1,0 +1,241 @@
+"""Label images: which labels there are, and the part of the grid in which each lies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..arrays import BoolArray, IntArray
+from ..errors import GridError, OptionError, seen
+from .field import MASK, NONE_EXACT, Field, Wanted, check_label
+from .masking import MOST_NAMED, as_sample, labelled
+from .masks import REACH, extremes_of_masks, mask_planes
+from .named_axes import placed
+from .planes import NoPlanes, SampleArray, SamplePlanes, changed
+from .request import Request
+from .samples import as_samples, check_kind
+from .sdf_grid import SdfGrid
+from .spacing import as_triple, is_cubic
+
+ALL = "all"
+MOST_LABELS = 1000  # more values than these are densities
+MARGIN = REACH + 1  # samples beside a label on which its distances, and those beside them, depend
+
+Box = tuple[slice, slice, slice]
+
+
+class PartOfPlanes(SamplePlanes):
+    """The samples in a box of another array."""
+
+    def __init__(self, source: SampleArray, box: Box) -> None:
+        self.source, self.box, self.name = source, box, "the grid"
+        self.shape, self.dtype = tuple(s.stop - s.start for s in box), np.dtype(source.dtype)
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
+        start = self.box[0].start
+        planes: NDArray[Any] = np.asarray(self.source[start + first : start + last])
+        return planes[:, self.box[1], self.box[2]]
+
+
+@dataclass(frozen=True, eq=False)
+class LabelImage:
+    """Samples with labels, of which some are to be meshed.
+
+    Attributes
+    ----------
+    samples : array or SamplePlanes
+        The label of each sample.
+    labels : (L,) array
+        The labels to be meshed, in ascending order, in the type of the samples.
+    boxes : list of L + 1 boxes
+        The samples on which each of them depends; first, those of what is beside all of them.
+    grid : SdfGrid
+        Their place in the world, without samples.
+    """
+
+    samples: SampleArray
+    labels: NDArray[Any]
+    boxes: list[Box]
+    grid: SdfGrid
+
+    def mask(self, number: int) -> SdfGrid:
+        """Return distances to label ``labels[number - 1]``, in its box; 0 is beside all labels."""
+        part = PartOfPlanes(self.samples, self.boxes[number])
+        labels, label = self.labels, self.labels[number - 1]
+
+        def chosen(planes: NDArray[Any]) -> BoolArray:
+            return planes == label if number else ~np.isin(planes, labels)
+
+        h = self.grid.voxel_size
+        return SdfGrid.trusted(
+            mask_planes(changed(part, chosen, np.bool_), h),
+            self.grid.spacing,
+            extremes=extremes_of_masks(h),
+            field=self.grid.field,
+        )
+
+    def names(self) -> list[int]:
+        """Return the labels as whole numbers."""
+        return [int(label) for label in self.labels]
+
+    def border(self, planes: tuple[int, int]) -> IntArray:
+        """Return the samples on the grid's border in some planes, and the number of their label.
+
+        The result is (b, 4) int32; numbers are those of ``mask``.
+        """
+        found = [np.empty((0, 4), np.int64)]
+        for plane in range(*planes):
+            some = np.ones(self.grid.shape[1:], bool)
+            some[1:-1, 1:-1] = plane in (0, self.grid.shape[0] - 1)
+            values = np.asarray(self.samples[plane])[some]
+            at = np.searchsorted(self.labels, values).clip(max=len(self.labels) - 1)
+            number = np.where(self.labels[at] == values, at + 1, 0)
+            place = np.full(len(values), plane)
+            found.append(np.column_stack([place, np.argwhere(some), number]))
+        return np.concatenate(found).astype(np.int32)
+
+
+def make_labels(
+    values: ArrayLike | SamplePlanes,
+    labels: str | Sequence[int] = ALL,
+    *,
+    spacing: ArrayLike | None = None,
+    origin: ArrayLike | None = None,
+    direction: ArrayLike | None = None,
+    notes: tuple[str, ...] = (),
+) -> LabelImage:
+    """Return the label image of an array; the parameters are those of ``reconstruct_labels``.
+
+    Raises
+    ------
+    GridError
+        If the values are no whole numbers, or a label is missing.
+    OptionError
+        If ``labels`` are no labels, or too many.
+    """
+    wanted = check_labels(labels)
+    given = placed(values, spacing, origin)
+    samples = as_samples(given.values)
+    check_kind(samples.dtype, samples.shape)
+    found = find_labels(samples, None if isinstance(wanted, str) else wanted)
+    added: list[str] = []
+    request = Request.checked(Wanted(), given.spacing, "auto")
+    request = request.with_spacing(1, "since labels show none (give --spacing)", added)
+    assert request.spacing is not None
+    if given.origin is None:
+        added.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
+    cut = [str(int(x)) for x, (low, high) in found.items() if _is_cut(low, high, samples.shape)]
+    if cut:
+        named = ", ".join(cut[:MOST_NAMED]) + ", ..." * (len(cut) > MOST_NAMED)
+        added.append(f"solids of labels run out of the grid: closed along the border ({named})")
+    around = [_with_margin(box, samples.shape) for box in found.values()]
+    ends = np.array([[(s.start, s.stop) for s in box] for box in around])
+    whole = [slice(int(a), int(b)) for a, b in zip(ends[..., 0].min(0), ends[..., 1].max(0))]
+    grid = SdfGrid.trusted(
+        NoPlanes(samples.shape, samples.dtype),
+        request.spacing,
+        as_triple(0.0 if given.origin is None else given.origin, "origin"),
+        (*notes, *added),
+        direction=direction,
+        extremes=extremes_of_masks(min(request.spacing)),
+        field=Field(MASK, True, NONE_EXACT, on_lattice=not is_cubic(request.spacing)),
+    )
+    known = np.array(list(found), samples.dtype)
+    return LabelImage(samples, known, [(whole[0], whole[1], whole[2]), *around], grid)
+
+
+def check_labels(labels: Any) -> str | list[int]:
+    """Return labels in ascending order, each once; "all" for all.
+
+    Raises
+    ------
+    OptionError
+        If they are none, or too many.
+    """
+    if isinstance(labels, str) and labels == ALL:
+        return ALL
+    if isinstance(labels, (str, bytes)) or not hasattr(labels, "__iter__"):
+        raise OptionError(f"labels is {seen(labels)}: give all, or some labels such as 1,2,3")
+    chosen = sorted({check_label(label, "labels") for label in labels})
+    if not 0 < len(chosen) <= MOST_LABELS:
+        raise OptionError(f"labels are {len(chosen):,}: give 1 to {MOST_LABELS:,} at a time")
+    return chosen
+
+
+def find_labels(samples: SampleArray, wanted: list[int] | None) -> dict[Any, NDArray[np.int64]]:
+    """Return the box of each label, (2, 3) lowest and highest indices, by its sample, in order.
+
+    ``wanted`` are some labels; None are all but 0. The samples are read once.
+
+    Raises
+    ------
+    GridError
+        If one is missing, or if there are none or too many.
+    """
+    keep = [as_sample(label, samples.dtype) for label in wanted or ()]
+    listed = np.array([value for value in keep if value is not None], samples.dtype)
+    boxes: dict[Any, NDArray[np.int64]] = {}
+    others = False
+    for plane, values in enumerate(samples):
+        runs, low, high = _runs(values)
+        _check_whole(runs)
+        some = runs != 0 if wanted is None else np.isin(runs, listed)
+        others |= not some.all()
+        kinds, of_run = np.unique(runs[some], return_inverse=True)
+        low, high = low[some], high[some]
+        for number, value in enumerate(kinds[: MOST_LABELS + 1].tolist()):
+            mine = of_run == number
+            ends = np.array([[plane, *low[mine].min(0)], [plane, *high[mine].max(0)]])
+            box = boxes.setdefault(value, ends)
+            box[0], box[1] = np.minimum(box[0], ends[0]), np.maximum(box[1], ends[1])
+        if len(boxes) > MOST_LABELS:
+            raise GridError(
+                f"the values are more than {MOST_LABELS:,} different whole numbers: choose some of "
+                "them (--labels 1,2,3) if they are labels, or a --level if they are densities"
+            )
+    for label in wanted or ():
+        if label not in boxes:
+            labelled(samples, label)  # raises
+    if not boxes or (len(boxes) == 1 and not others):
+        only = int(next(iter(boxes), 0))
+        raise GridError(f"every sample has the label {only}: there is no surface")
+    return dict(sorted(boxes.items()))
+
+
+def _runs(plane: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.intp], NDArray[np.intp]]:
+    """Return the runs of equal samples in the rows of a plane: values, and both ends (n, 2)."""
+    begins = np.ones(plane.shape, bool)
+    np.not_equal(plane[:, 1:], plane[:, :-1], out=begins[:, 1:])
+    low = np.argwhere(begins)
+    ends = np.ones(plane.shape, bool)
+    ends[:, :-1] = begins[:, 1:]
+    return plane[begins], low, np.argwhere(ends)
+
+
+def _check_whole(values: NDArray[Any]) -> None:
+    """Raise GridError if a value is no whole number."""
+    if values.dtype.kind != "f":
+        return
+    wrong = values[(np.rint(values) != values) | ~np.isfinite(values)]
+    if len(wrong):
+        raise GridError(
+            f"a value is {wrong[0]:g}: labels are whole numbers; choose what is above a value with "
+            "--level if they are densities"
+        )
+
+
+def _is_cut(low: NDArray[np.int64], high: NDArray[np.int64], shape: tuple[int, ...]) -> bool:
+    """Return whether a box reaches the border of an array."""
+    return bool((low == 0).any() or (high == np.array(shape) - 1).any())
+
+
+def _with_margin(box: NDArray[np.int64], shape: tuple[int, ...]) -> Box:
+    """Return a box and what is beside it in an array."""
+    low, high = np.maximum(box[0] - MARGIN, 0), np.minimum(box[1] + MARGIN + 1, shape)
+    i, j, k = (slice(int(a), int(b)) for a, b in zip(low, high))
+    return i, j, k

@@ -1,0 +1,182 @@
+"""Conversion of a label image to the meshes of its labels, in one run: all files, or none."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from .convert import ConvertOptions
+from .errors import MeshError, OptionError, seen
+from .files.meshes import check_mesh_suffix, check_target, format_of, write_together
+from .files.output import check_apart, naming
+from .files.precision import check_format_holds, local_origin_note
+from .files.store import files_of
+from .grid.labels import ALL, check_labels
+from .labels import LabelPiece, label_slabs, read_labels
+from .mesh import Mesh
+from .network.decoder import Decoder
+from .progress import Progress
+from .steps.nodes import check_factor
+from .topology import OpenEdges
+
+USED = ("factor", "spacing", "origin", "direction", "axes", "max_memory")
+MOST_FILES = 500  # each is held open until all are complete
+
+
+@dataclass(eq=False)
+class LabelMesh:
+    """What is known of the mesh of a label, and where its pieces wait in a file."""
+
+    label: int
+    path: Path
+    waiting: IO[bytes]
+    places: list[tuple[int, int, int]] = field(default_factory=list)
+    edges: OpenEdges = field(default_factory=OpenEdges)
+    volume: float = 0.0
+    dtype: type[Any] | np.dtype[Any] = np.float32
+
+    def add(self, piece: LabelPiece) -> None:
+        """Add a piece of the mesh."""
+        vertices, faces = piece.mesh.vertices, piece.mesh.faces
+        self.places.append((self.waiting.tell(), len(vertices), len(faces)))
+        self.waiting.write(vertices.tobytes() + faces.tobytes())
+        self.edges.add(faces)
+        self.volume, self.dtype = self.volume + piece.volume, vertices.dtype
+
+    def pieces(self) -> Iterator[Mesh]:
+        """Yield the mesh piece by piece."""
+        for place, vertices, faces in self.places:
+            self.waiting.seek(place)
+            size = 3 * vertices * np.dtype(self.dtype).itemsize
+            data = self.waiting.read(size + 12 * faces)
+            points = np.frombuffer(data[:size], self.dtype).reshape(-1, 3)
+            yield Mesh(points, np.frombuffer(data[size:], np.int32).reshape(-1, 3))
+
+    def report(self) -> dict[str, Any]:
+        """Return the row of the label as it can be written as JSON."""
+        _, vertices, triangles = np.sum(self.places, axis=0).tolist()
+        return {
+            "label": self.label,
+            "output": str(self.path),
+            "vertices": vertices,
+            "triangles": triangles,
+            "volume": self.volume,
+            "closed": not len(self.edges),
+        }
+
+
+def convert_labels(
+    source: str | Path,
+    target: str | Path,
+    network: Decoder,
+    labels: str | Sequence[int] = ALL,
+    options: ConvertOptions | None = None,
+    *,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Convert a file with a label image to closed meshes of its labels, which share their walls.
+
+    Parameters
+    ----------
+    source : path
+        The file, see ``read_grid``.
+    target : path
+        A ``.glb`` or ``.3mf`` gets all labels as its parts; of another mesh file, ``part.ply`` say,
+        each label has its own, ``part-1.ply``.
+    network, labels
+        See ``reconstruct_labels``.
+    options : ConvertOptions, optional
+        Those named in ``USED``; others must have their defaults.
+    force : bool
+        Replace files that exist.
+    progress : callable, optional
+        Called with (done, total), see ``progress.Progress``; an exception in it ends the work.
+
+    Returns
+    -------
+    dict
+        Shape, spacing, origin and direction of the grid, a row for each label (``labels``), and
+        ``inferred``: sentences on what was inferred.
+
+    Raises
+    ------
+    SuperSdfError
+        As in ``reconstruct_labels`` and ``write_mesh``; OptionError if an option does not go with
+        labels. Nothing is written then.
+    """
+    options = options or ConvertOptions()
+    labels = check_labels(labels)
+    check_options(options)
+    check_mesh_suffix(Path(target))
+    check_factor(options.factor)
+    place = options.spacing, options.origin, options.direction, options.axes
+    image = read_labels(source, labels, *place, options.max_memory)
+    grid, paths = image.grid, label_paths(target, image.names())
+    for path in dict.fromkeys(paths):
+        check_target(path, force=force)
+        check_apart(path, files_of(source))
+    about = check_format_holds(target, grid, options.factor)
+    with naming(paths[0]), tempfile.TemporaryFile(dir=paths[0].parent) as waiting:
+        meshes = {
+            label: LabelMesh(label, path, waiting) for label, path in zip(image.names(), paths)
+        }
+        bound = options.max_memory
+        slabs = label_slabs(image, network, options.factor, max_memory=bound, progress=progress)
+        for piece in slabs:
+            meshes[piece.label].add(piece)
+        torn = [label for label, mesh in meshes.items() if len(mesh.edges)]
+        if torn:
+            raise MeshError(f"the mesh of label {torn[0]} is torn: run it again, and report it")
+        files: dict[Path, dict[str, Iterator[Mesh]]] = {path: {} for path in paths}
+        for label, mesh in meshes.items():
+            files[mesh.path][f"label {label}"] = mesh.pieces()
+        write_together(files, force=force, about=about)
+    return {
+        "shape": list(grid.shape),
+        "spacing": list(grid.spacing),
+        "origin": list(grid.origin),
+        "direction": [list(row) for row in grid.direction],
+        "labels": [mesh.report() for mesh in meshes.values()],
+        "inferred": [*grid.notes, *local_origin_note(target, about)],
+    }
+
+
+def label_paths(target: str | Path, labels: list[int]) -> list[Path]:
+    """Return the file of each label: the target itself, if it can have parts.
+
+    Raises
+    ------
+    OptionError
+        If they are too many.
+    """
+    path = Path(target)
+    if format_of(path).write_parts:
+        return [path] * len(labels)
+    if len(labels) > MOST_FILES:
+        raise OptionError(
+            f"{path} would be {len(labels):,} files, one for each label: give .glb or .3mf, which "
+            f"hold all as parts, or at most {MOST_FILES} labels (--labels 1,2,3)"
+        )
+    return [path.with_name(f"{path.stem}-{label}{path.suffix}") for label in labels]
+
+
+def check_options(options: Any, more: Sequence[str] = ()) -> None:
+    """Raise OptionError if an option is given that does not go with labels.
+
+    ``more`` are names of given options besides those of ``ConvertOptions``.
+    """
+    others = [option for option in fields(ConvertOptions) if option.name not in USED]
+    given = [option.name for option in others if getattr(options, option.name) != option.default]
+    for name in (*given, *more):
+        value = f" {seen(getattr(options, name))}" if name in given else ""
+        text = "open" if name == "cap" else f"{name.replace('_', '-')}{value}"
+        raise OptionError(
+            f"{text} does not go with labels, which share their walls: "
+            "leave it out, or mesh one label (--label)"
+        )

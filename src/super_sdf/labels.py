@@ -1,0 +1,308 @@
+"""All labels of an image in one run: closed meshes whose shared walls coincide.
+
+Each label is refined as the mask of its samples, and so is what is beside all of them; ``walls``
+makes the surfaces of these fields. The work is done in slabs of all labels.
+
+>>> from super_sdf import reconstruct_labels
+>>> meshes = reconstruct_labels(image, spacing=(1, 1, 3))         # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .arrays import IntArray
+from .errors import OptionError, OutOfMemoryError, seen
+from .files.grids import read_array
+from .grid.field import MASK
+from .grid.labels import ALL, Box, LabelImage, check_labels, make_labels
+from .machine.index_width import check_count
+from .machine.memory import advised, give_back, held_memory, in_words
+from .machine.resources import Resources, allot
+from .mesh import Mesh, join_meshes, vertex_type
+from .neighbourhood import CENTRE
+from .network.decoder import Decoder
+from .network.kinds import network_for
+from .options import check_max_memory, check_network, check_progress
+from .pipeline import memory_needs, refine
+from .progress import Progress, StepCounter, part_of
+from .slabs.cutting import Slab, equal_parts, slab_of
+from .slabs.footprint import slab_bytes
+from .steps.nodes import check_factor
+from .steps.survey import Band, survey
+from .steps.voxel_index import VoxelIndex
+from .steps.walls import Part, absent_parts, extract_walls, put_together
+
+BAND_SHARE = 0.05  # of the time
+NO_ROWS = np.empty((0, 27), np.int32)
+# Memory of the walls in bytes: per node of a block and label, per cell of a side of a voxel.
+NODE_BYTES, CELL_BYTES = 14, 250
+
+
+@dataclass(frozen=True, eq=False)
+class LabelPiece:
+    """A piece of the mesh of a label; ``volume`` is its share of what all pieces enclose.
+
+    Faces number the vertices of all pieces of the label so far.
+    """
+
+    label: int
+    mesh: Mesh
+    volume: float
+
+
+def reconstruct_labels(
+    values: ArrayLike | str | PathLike[str],
+    labels: str | Sequence[int] = ALL,
+    network: Decoder | None = None,
+    factor: int = 4,
+    *,
+    spacing: Any = None,
+    origin: Any = None,
+    direction: Any = None,
+    axes: str | None = None,
+    max_memory: int | None = None,
+    progress: Progress | None = None,
+) -> dict[int, Mesh]:
+    """Turn a label image into a closed mesh of each label, which share the walls between them.
+
+    Where two labels touch, both have the same vertices and triangles, in opposite directions: there
+    is neither gap nor overlap. Labels that run out of the grid are closed along its border.
+
+    Parameters
+    ----------
+    values : (nx, ny, nz) array_like or path
+        Whole numbers, of any integer or floating-point type; or a file, see ``read_grid``.
+    labels : "all" or sequence of ints
+        The labels to mesh; all are those of the image but 0. Others count as 0.
+    network : Network, optional
+        By default a shipped one. In place of any shipped network, that for masks is used.
+    factor : int
+        How many times finer per axis the meshes are than the samples: 2, 4, 8 or 16.
+    spacing, origin, direction
+        Where the samples lie in the world, as in ``make_grid``; by default as the file says.
+    axes : {"xyz", "zyx"}, optional
+        The axis order of a file that does not state it.
+    max_memory : int, optional
+        Bytes that the process may hold in all, besides the meshes; by default a share of the free
+        memory.
+    progress : callable, optional
+        Called with (done, total), see ``progress.Progress``; an exception in it ends the work.
+
+    Returns
+    -------
+    dict of int to Mesh
+        The meshes by label, in ascending order, in world units.
+
+    Raises
+    ------
+    GridError
+        If a value is no whole number, a label is missing, or there is no surface.
+    OptionError
+        If an argument is invalid, or there are too many labels.
+    OutOfMemoryError
+        If not even a plane of the image can be worked on in memory.
+    """
+    labels = check_labels(labels)
+    if isinstance(values, (str, PathLike)):
+        image = read_labels(values, labels, spacing, origin, direction, axes, max_memory)
+    else:
+        if axes is not None:
+            raise OptionError(f"axes is {seen(axes)}: that is for files; transpose the array")
+        image = make_labels(values, labels, spacing=spacing, origin=origin, direction=direction)
+    if network is None:
+        from .network.network import load_network
+
+        network = load_network()
+    found: dict[int, list[Mesh]] = {label: [] for label in image.names()}
+    for piece in label_slabs(image, network, factor, max_memory=max_memory, progress=progress):
+        found[piece.label].append(piece.mesh)
+    return {label: join_meshes(pieces) for label, pieces in found.items()}
+
+
+def read_labels(
+    path: str | PathLike[str],
+    labels: str | Sequence[int],
+    spacing: Any = None,
+    origin: Any = None,
+    direction: Any = None,
+    axes: str | None = None,
+    max_memory: int | None = None,
+) -> LabelImage:
+    """Return the label image in a file; the parameters are those of ``reconstruct_labels``."""
+    given = {"spacing": spacing, "origin": origin, "direction": direction}
+    found = read_array(path, given, axes, max_memory)
+    return make_labels(found.pop("values"), labels, **found)
+
+
+def label_slabs(
+    image: LabelImage,
+    network: Decoder,
+    factor: int = 4,
+    *,
+    max_memory: int | None = None,
+    progress: Progress | None = None,
+) -> Iterator[LabelPiece]:
+    """Yield the meshes of ``reconstruct_labels`` slab by slab, in as few as fit in memory.
+
+    Joined, the pieces of a label are the same mesh, bit for bit, for any number of slabs.
+    """
+    check_network(network)
+    check_progress(progress)
+    factor = check_factor(factor)
+    network = network_for(network, MASK)
+    vertex_type(image.grid, factor)  # raises if not even float64 resolves the vertices
+    resources = allot(getattr(network, "threads", 0), check_max_memory(max_memory))
+    work = Work(image, network, factor, resources, _bands(image, resources))
+    if progress:
+        progress(round(1000 * BAND_SHARE), 1000)
+    slabs = work.plan()
+    written = np.zeros(len(image.labels) + 1, np.int64)  # vertices of each label so far
+    for nth, planes in enumerate(slabs):
+        give_back()
+        share = [BAND_SHARE + (1 - BAND_SHARE) * (nth + n) / len(slabs) for n in (0, 1)]
+        yield from work.pieces(planes, written, part_of(progress, *share))
+
+
+def _bands(image: LabelImage, resources: Resources) -> list[Band]:
+    """Return the band of each label in its box; first, that of what is beside all of them.
+
+    Of that, only those voxels are decoded that two labels or more have in their bands, too.
+    """
+    bands = [survey(image.mask(nth), 0.0, resources) for nth in range(len(image.labels) + 1)]
+    keys = [
+        VoxelIndex(band.voxel_ijk + corner(box), image.grid.shape).keys
+        for band, box in zip(bands, image.boxes)
+    ]
+    found, times = np.unique(np.concatenate(keys[1:]), return_counts=True)
+    several = np.isin(keys[0], found[times > 1])
+    return [replace(bands[0], decoded=several), *bands[1:]]
+
+
+def volumes(vertices: NDArray[Any], faces: IntArray) -> NDArray[np.float64]:
+    """Return the volumes between triangles (m, 3) and the origin, (m,), positive if seen inside."""
+    a, b, c = (vertices[corner] for corner in faces.T)
+    found: NDArray[np.float64] = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
+    return found
+
+
+def corner(box: Box) -> IntArray:
+    """Return the lowest indices of a box."""
+    return np.array([side.start for side in box], np.int32)
+
+
+@dataclass(frozen=True, eq=False)
+class Work:
+    """What the slabs of an image have in common; ``bands`` are those of ``_bands``."""
+
+    image: LabelImage
+    network: Decoder
+    factor: int
+    resources: Resources
+    bands: list[Band]
+
+    def plan(self) -> list[tuple[int, int]]:
+        """Return the planes of each slab, of few slabs that fit in memory.
+
+        Raises
+        ------
+        OutOfMemoryError
+            If not even slabs of one plane fit.
+        """
+        count = self.image.grid.shape[0]
+        before = np.zeros(count + 1, np.int64)
+        for band, box in zip(self.bands, self.image.boxes):
+            planes = np.clip(np.arange(count + 1) - box[0].start, 0, band.shape[0])
+            before += band.voxels_before[planes]
+        bound, need = self.resources.memory, 0
+        for pieces in (*(2**n for n in range((count - 1).bit_length())), count):
+            slabs = equal_parts(before, pieces)
+            need = (held_memory() or 0) + max(map(self.bytes_of, slabs))
+            if bound is None or need <= bound:
+                return slabs
+        raise OutOfMemoryError(
+            f"factor {self.factor} on {int(before[-1]):,} voxels of {len(self.bands) - 1} labels "
+            f"needs {advised(need)} of memory, {in_words(bound or 0)} may be used; use a smaller "
+            "factor, or allow more (--max-memory)"
+        )
+
+    def bytes_of(self, planes: tuple[int, int]) -> int:
+        """Return about how much memory the work on some planes takes."""
+        most = count = 0
+        for number, band in enumerate(self.bands):
+            slab, own = self.slab(number, planes)
+            if own.start < own.stop:
+                args = slab.seen, slab.decoded, slab.planes, self.factor, memory_needs(self.network)
+                most = max(most, slab_bytes(band, *args, self.resources.threads))
+                count += own.stop - own.start
+        return most + count * (NODE_BYTES * (self.factor + 1) ** 3 + CELL_BYTES * self.factor**2)
+
+    def slab(self, number: int, planes: tuple[int, int]) -> tuple[Slab, slice]:
+        """Return what some planes need of the band of a label, and which rows are their own."""
+        start, count = self.image.boxes[number][0].start, self.bands[number].shape[0]
+        low, high = (min(max(plane - start, 0), count) for plane in planes)
+        reach = getattr(self.network, "receptive_field", None)  # all planes if it states none
+        slab = slab_of(self.bands[number], low, high, count if reach is None else reach, 1)
+        return slab, self.bands[number].rows(low, high)
+
+    def pieces(
+        self, planes: tuple[int, int], written: NDArray[np.int64], progress: Progress | None
+    ) -> Iterator[LabelPiece]:
+        """Yield the meshes of labels in some planes.
+
+        ``written``, (L + 1,), has the vertices of each label so far; those here are added.
+        """
+        grid, names = self.image.grid, self.image.names()
+        parts = self._parts(planes, progress)
+        field = put_together(parts, next(parts)[1], grid.shape, self.factor, planes)
+        places, faces, sides, before = extract_walls(field, self.image.border(planes))
+        del field
+        world: NDArray[Any] = grid.to_world(places / self.factor - 0.5)
+        world = world.astype(vertex_type(grid, self.factor))
+        middle = grid.to_world((np.array(grid.shape) - 1) / 2)
+        volume = volumes(world - middle, faces)
+        if grid.is_mirrored:
+            faces, volume = faces[:, ::-1], -volume
+        both, label = np.concatenate([faces, faces[:, ::-1]]), sides.T.ravel()
+        rank = label.astype(np.int64) * len(label) + np.tile(np.arange(len(faces)), 2)
+        order = np.argsort(rank)
+        ends = np.searchsorted(label[order], np.arange(1, len(self.bands) + 1))
+        for number, some in enumerate(np.split(order, ends)[1:-1], 1):
+            used, own = np.unique(both[some], return_inverse=True)
+            shared = int(np.searchsorted(used, before))  # the slab before has them
+            own += written[number] - shared
+            written[number] += len(used) - shared
+            check_count(int(written[number]), "vertices")
+            mesh = Mesh(world[used[shared:]], own.reshape(-1, 3).astype(np.int32))
+            if len(some):
+                signs = np.where(some < len(faces), 1.0, -1.0)
+                yield LabelPiece(names[number - 1], mesh, float(signs @ volume[some % len(faces)]))
+
+    def _parts(
+        self, planes: tuple[int, int], progress: Progress | None
+    ) -> Iterator[tuple[int, Part]]:
+        """Yield the fields of all labels that have voxels in some planes, in order; always of 0."""
+        for number, band in enumerate(self.bands):
+            slab, own = self.slab(number, planes)
+            if number and own.start == own.stop:
+                continue
+            around = slab.decoded
+            table = band.network_inputs(around)[1] if own.start < own.stop else NO_ROWS
+            table = table[own.start - around.start : own.stop - around.start]
+            voxel_ijk = band.voxel_ijk[own] + corner(self.image.boxes[number])
+            inside = band.patches[own, CENTRE] <= 0
+            absent = absent_parts(table.T.copy(), voxel_ijk, inside, self.image.grid.shape)
+            blocks = np.full(((self.factor + 1) ** 3, len(voxel_ijk)), np.nan, np.float32)
+            if band.count_decoded(own):
+                share = number / len(self.bands), (number + 1) / len(self.bands)
+                steps = StepCounter(part_of(progress, *share), ["network", "nodes"])
+                threads = self.resources.threads
+                field = refine(band, self.network, self.factor, slab, threads, steps)
+                blocks[:, band.decoded[own]] = field.blocks[:, field.own_rows]
+            yield number, Part(voxel_ijk, absent, blocks)

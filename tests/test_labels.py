@@ -1,0 +1,411 @@
+"""Labels of an image in one run: closed meshes, walls that coincide, no worse than one by one."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections import Counter
+from pathlib import Path
+
+import igl
+import nibabel
+import numpy as np
+import pytest
+import trimesh
+from conftest import trilinear
+from skimage.measure import marching_cubes
+
+from super_sdf import load_network, make_grid, reconstruct
+from super_sdf.errors import GridError, OptionError, OutOfMemoryError
+from super_sdf.label_files import MOST_FILES, label_paths
+from super_sdf.labels import Work, reconstruct_labels
+from super_sdf.slabs.cutting import equal_parts
+from super_sdf.steps.cell_cases import FACES
+from super_sdf.steps.wall_cases import walls
+
+CAP = 0.02 / 4  # of a voxel, at most: how far outside the border a surface is closed
+
+
+@pytest.fixture(scope="module")
+def network():
+    """The shipped network, in place of which that for masks is used."""
+    return load_network("fast", threads=1)
+
+
+def places(shape, spacing=(1, 1, 1)):
+    """Return the positions of the samples of a grid."""
+    return np.moveaxis(np.indices(shape), 0, -1) * np.array(spacing, float)
+
+
+def ball(centre, radius):
+    """Return the distance to a ball as a function of points."""
+    return lambda p: np.linalg.norm(p - np.array(centre), axis=-1) - radius
+
+
+def beyond(normal, distance):
+    """Return the distance to a half-space as a function of points."""
+    unit = np.array(normal) / np.linalg.norm(normal)
+    return lambda p: p @ unit - distance
+
+
+def painted(shape, spacing, solids):
+    """Return the labels of solids, the first on top, and the distance to what is seen of each."""
+    at, labels, seen = places(shape, spacing), np.zeros(shape, np.int16), []
+    for nth, solid in enumerate(solids):
+        labels[(solid(at) <= 0) & (labels == 0)] = nth + 1
+        above = solids[:nth]
+        seen.append(lambda p, s=solid, a=above: np.max([s(p), *(-f(p) for f in a)], axis=0))
+    return labels, seen
+
+
+def quarters():
+    """Return four labels that meet at a line, eight that meet at a point."""
+    labels = np.ones((8, 8, 8), int)
+    for axis in range(3):
+        labels += (np.indices(labels.shape)[axis] >= 4) << axis
+    return labels
+
+
+def nested():
+    """Return a label inside another, with two voxels of a third and a single one of a fourth."""
+    labels = np.zeros((12, 11, 13), int)
+    labels[2:10, 2:9, 2:11] = 7
+    labels[4:8, 4:7, 4:8] = -3
+    labels[5, 5, 5:7] = 40
+    labels[10, 9, 11] = 9
+    return labels
+
+
+NOISE = np.random.default_rng(0)
+IMAGES = {
+    "noise": NOISE.integers(0, 4, (6, 7, 5)),
+    "no ground": NOISE.integers(1, 9, (5, 6, 7)),
+    "one label": NOISE.integers(0, 2, (6, 5, 6)),
+    "quarters": quarters(),
+    "nested": nested(),
+    "layers": np.arange(6)[:, None, None] // 2 * np.ones((6, 4, 5), int),
+}
+
+
+def corners_of(mesh):
+    """Return the triangles of a mesh by the bytes of their corners, from the lowest corner on."""
+    found = Counter()
+    for triangle in mesh.vertices[mesh.faces]:
+        corners = [corner.tobytes() for corner in triangle]
+        first = corners.index(min(corners))
+        found[tuple(corners[first:] + corners[:first])] += 1
+    return found
+
+
+def test_the_walls_in_a_cell_bound_each_label_once():
+    draw = random.Random(0)
+    for _ in range(2000):
+        label = [draw.randrange(draw.choice([2, 3, 4, 8])) for _ in range(8)]
+        rank = [sorted(set(label)).index(x) for x in label]
+        joined = 0
+        for n, face in enumerate(FACES):
+            a, b, c, d = (rank[corner] for corner in face)
+            joined |= int(a == c != b == d and draw.random() < 0.5) << n
+        rows = walls(sum(x << 3 * corner for corner, x in enumerate(rank)), joined)
+        for one in set(rank):
+            edges = Counter()
+            for *points, low, high in rows.tolist():
+                if one in (rank[low], rank[high]):
+                    turned = points if one == rank[low] else points[::-1]
+                    edges.update(zip(turned, turned[1:] + turned[:1]))
+            assert set(edges.values()) <= {1}
+            loose = [edge for edge in edges if edge[::-1] not in edges]
+            assert Counter(start for start, _ in loose) == Counter(end for _, end in loose)
+            assert 18 not in {point for edge in loose for point in edge}  # the point in the cell
+
+
+@pytest.mark.parametrize("name", IMAGES)
+@pytest.mark.parametrize("factor", [2, 4])
+def test_meshes_are_closed_and_share_their_walls(name, factor):
+    labels, spacing = IMAGES[name], (1.0, 0.75, 2.5)
+    meshes = reconstruct_labels(labels, network=trilinear, factor=factor, spacing=spacing)
+    assert list(meshes) == sorted(set(np.unique(labels)) - {0})
+    triangles = {label: corners_of(mesh) for label, mesh in meshes.items()}
+    seen = sum(triangles.values(), Counter())
+    for label, mesh in meshes.items():
+        assert mesh.is_closed() and mesh.volume() > 0
+        assert set(triangles[label].values()) == {1}
+    for a, b, c in seen:  # no two labels are on the same side of a triangle, nor three beside it
+        assert seen[a, b, c] == 1
+    whole = sum(mesh.volume() for mesh in meshes.values())
+    outside = [
+        t
+        for t in seen
+        if min((t[0], t[2], t[1]), (t[2], t[1], t[0]), (t[1], t[0], t[2])) not in seen
+    ]
+    rim = np.frombuffer(b"".join(b"".join(t) for t in outside), np.float32).reshape(-1, 3, 3)
+    a, b, c = np.moveaxis(rim.astype(float), 1, 0)
+    assert whole == pytest.approx(np.einsum("ij,ij->", a, np.cross(b, c)) / 6, rel=1e-5)
+
+
+@pytest.mark.parametrize("name", ["no ground", "quarters", "layers"])
+def test_labels_that_fill_the_grid_fill_its_box(name):
+    labels = IMAGES[name] + (name == "layers")
+    meshes = reconstruct_labels(labels, network=trilinear, spacing=(1, 2, 3), origin=5)
+    low = np.min([mesh.vertices.min(0) for mesh in meshes.values()], axis=0)
+    high = np.max([mesh.vertices.max(0) for mesh in meshes.values()], axis=0)
+    ends = 5 - np.array([1, 2, 3]) / 2, 5 + (np.array(labels.shape) - 0.5) * [1, 2, 3]
+    np.testing.assert_allclose([low, high], ends, atol=3 * CAP)
+    whole = sum(mesh.volume() for mesh in meshes.values())
+    assert whole == pytest.approx(6 * labels.size, rel=0.01)
+    assert whole >= 6 * labels.size
+
+
+@pytest.mark.parametrize("name", IMAGES)
+def test_slabs_and_threads_make_the_same_meshes(name, network, monkeypatch):
+    labels = IMAGES[name]
+    meshes = reconstruct_labels(labels, network=network, spacing=1)
+    for slabs in (2, 3, len(labels)):
+        before = np.arange(len(labels) + 1)
+        monkeypatch.setattr(Work, "plan", lambda _, b=before, n=slabs: equal_parts(b, n))
+        for label, mesh in reconstruct_labels(labels, network=network, spacing=1).items():
+            assert mesh.vertices.tobytes() == meshes[label].vertices.tobytes()
+            assert mesh.faces.tobytes() == meshes[label].faces.tobytes()
+
+
+def test_a_label_beside_no_other_has_the_mesh_that_it_has_alone(network):
+    labels = np.where(ball((7.3, 8.1, 7.7), 4.2)(places((16, 17, 15))) < 0, 5, 0)
+    alone = reconstruct(make_grid(labels, label=5, spacing=0.5, origin=3), network)
+    mesh = reconstruct_labels(labels, network=network, spacing=0.5, origin=3)[5]
+    assert mesh.vertices.dtype == alone.vertices.dtype
+    assert len(mesh.faces) == len(alone.faces)
+    ours, theirs = (np.unique(some.vertices, axis=0) for some in (mesh, alone))
+    np.testing.assert_allclose(ours, theirs, atol=1e-6)
+    assert mesh.volume() == pytest.approx(alone.volume(), rel=1e-6)
+
+
+def test_every_sample_lies_in_the_mesh_of_its_label(network):
+    labels = IMAGES["nested"]
+    for label, mesh in reconstruct_labels(labels, network=network, spacing=1).items():
+        turns = igl.winding_number(
+            mesh.vertices, mesh.faces, np.argwhere(labels >= -3).astype(float)
+        )
+        np.testing.assert_allclose(turns, (labels == label).ravel(), atol=1e-3)
+
+
+ONE, TWO = ball((10.3, 10.6, 10.2), 7), ball((19.8, 10.9, 10.4), 6.2)
+SCENES = {
+    "touching balls": [ONE, TWO],
+    "a ball cut in two": [lambda p: np.maximum(ONE(p), beyond((1, 0.3, 0.2), 14)(p)), ONE],
+    "a ball in a ball": [ball((13.2, 10.6, 10.2), 4), ball((13, 10.4, 10.6), 8)],
+    "three parts of a ball": [
+        lambda p: np.maximum(ONE(p), beyond((1, 0.2, 0.1), 13)(p)),
+        lambda p: np.maximum(ONE(p), beyond((0.1, 1, 0.3), 14)(p)),
+        ONE,
+    ],
+    "at the border": [ball((2, 10, 10), 8), ball((15, 21, 10), 8), beyond((-1, 0, 0), -20.3)],
+}
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("thick", [1, 3])
+def test_the_error_is_that_of_labels_one_by_one_or_less(scene, thick, network):
+    shape, spacing = (28, 22, 22 // thick), (1, 1, thick)
+    labels, seen = painted(shape, spacing, SCENES[scene])
+    end = (np.array(shape) - 1) * spacing
+
+    def error(vertices, faces, truth):
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        points = trimesh.sample.sample_surface(mesh, 20000, seed=0)[0]
+        within = ((points > 0) & (points < end)).all(1)
+        return np.abs(truth(points[within])).mean()
+
+    found = []
+    for label, mesh in reconstruct_labels(labels, network=network, spacing=spacing).items():
+        alone = reconstruct(make_grid(labels, label=label, spacing=spacing), network)
+        padded = np.pad(labels == label, 1).astype(float)
+        corners, faces, *_ = marching_cubes(padded, 0.5, spacing=spacing)
+        meshes = (
+            (mesh.vertices, mesh.faces),
+            (alone.vertices, alone.faces),
+            (corners - spacing, faces),
+        )
+        found.append([error(*some, seen[label - 1]) for some in meshes])
+    together, apart, usual = np.mean(found, axis=0)
+    assert together < 1.03 * apart
+    assert together < 0.7 * usual
+
+
+@pytest.mark.parametrize(
+    ("dtype", "low", "high"),
+    [
+        (np.uint8, 1, 255),
+        (np.int16, -5, 300),
+        (np.uint64, 2**53 + 1, 2**53),
+        (np.uint64, 2**64 - 1, 2**64 - 2),
+        (np.int64, -(2**63), 2**62 + 1),
+        (np.float32, 1, 2),
+        (np.float64, -1, 2**40),
+    ],
+)
+def test_labels_of_any_type_are_compared_as_whole_numbers(dtype, low, high):
+    labels = np.zeros((7, 6, 6), dtype)
+    labels[2:4, 2:4, 2:4], labels[4:6, 2:4, 2:4] = low, high
+    meshes = reconstruct_labels(labels, network=trilinear, factor=2, spacing=1)
+    assert list(meshes) == sorted([low, high])
+    assert meshes[low].volume() == pytest.approx(6, rel=0.1)
+    assert meshes[high].volume() == pytest.approx(6, rel=0.1)
+    only = reconstruct_labels(labels, iter([high]), trilinear, 2, spacing=1)
+    assert list(only) == [high]
+    assert list(reconstruct_labels(labels, [0, low], trilinear, 2, spacing=1)) == sorted([0, low])
+
+
+WRONG = {
+    "labels is 3: give all, or some labels such as 1,2,3": 3,
+    "labels is 'most': give all, or some labels such as 1,2,3": "most",
+    "labels are 0: give 1 to 1,000 at a time": [],
+    "labels are 1,001: give 1 to 1,000 at a time": range(1001),
+    "labels is 1.5: give a whole number, -2^63 to 2^64 - 1": [1, 1.5],
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_wrong_labels_are_one_line(message):
+    with pytest.raises(OptionError) as caught:
+        reconstruct_labels(IMAGES["noise"], WRONG[message], trilinear)
+    assert str(caught.value) == message
+
+
+def test_an_array_has_no_order_of_axes_to_choose():
+    message = "^axes is 'zyx': that is for files; transpose the array$"
+    with pytest.raises(OptionError, match=message):
+        reconstruct_labels(IMAGES["noise"], network=trilinear, axes="zyx")
+
+
+UNFIT = {
+    "no sample has the label 5: the labels are 0, 1, 2, 3": (IMAGES["noise"], [1, 5]),
+    "every sample has the label 0: there is no surface": (np.zeros((4, 4, 4), int), "all"),
+    "every sample has the label 4: there is no surface": (np.full((4, 4, 4), 4), "all"),
+    "a value is 1.5: labels are whole numbers; choose what is above a value with --level if they "
+    "are densities": (IMAGES["noise"] / 2, "all"),
+    "a value is nan: labels are whole numbers; choose what is above a value with --level if they "
+    "are densities": (np.full((4, 4, 4), np.nan), "all"),
+    "the values are more than 1,000 different whole numbers: choose some of them (--labels 1,2,3) "
+    "if they are labels, or a --level if they are densities": (
+        np.arange(11**3).reshape(11, 11, 11),
+        "all",
+    ),
+}
+
+
+@pytest.mark.parametrize("message", UNFIT)
+def test_values_that_are_no_labels_are_one_line(message):
+    with pytest.raises(GridError) as caught:
+        reconstruct_labels(*UNFIT[message], trilinear)
+    assert str(caught.value) == message
+
+
+def test_less_memory_makes_more_slabs_and_too_little_is_an_error(bare_plan, monkeypatch):
+    cuts = []
+    plan = Work.plan
+    monkeypatch.setattr(Work, "plan", lambda work: cuts.append(plan(work)) or cuts[-1])
+    monkeypatch.setattr("super_sdf.labels.held_memory", lambda: 10**8)
+    labels = IMAGES["no ground"]
+    for bound in (10**9, 112 * 10**6):
+        reconstruct_labels(labels, network=trilinear, spacing=1, max_memory=bound)
+    assert len(cuts[0]) == 1 < len(cuts[1])
+    with pytest.raises(OutOfMemoryError, match=r"^factor 4 on [\d,]+ voxels of 8 labels needs "):
+        reconstruct_labels(labels, network=trilinear, spacing=1, max_memory=105 * 10**6)
+
+
+@pytest.fixture
+def image(tmp_path, monkeypatch):
+    """A turned NIfTI file with three labels and thick slices, in a folder to work in."""
+    monkeypatch.chdir(tmp_path)
+    labels = painted((18, 14, 6), (1, 1, 2.5), [ball((6, 6, 6), 4), ball((11, 7, 7), 4)])[0]
+    labels[labels == 2] = 12
+    labels[0, 0] = 3
+    affine = np.eye(4)
+    affine[:3, :3] = np.array([[0, -1, 0], [1, 0, 0], [0, 0, -1]]) @ np.diag([1, 1, 2.5])
+    affine[:3, 3] = 10, -20, 30
+    nibabel.save(nibabel.Nifti1Image(labels.astype(np.int16), affine), "three.nii.gz")
+    return "three.nii.gz"
+
+
+PLAIN = "--quality", "fast", "--threads", "1"
+
+
+def test_the_command_writes_a_file_for_each_label(image, command):
+    code, out, err = command("upsample", image, "organ.ply", "--labels", "all", "--json", *PLAIN)
+    assert code == 0
+    rows = json.loads(out)["labels"]
+    assert [row["label"] for row in rows] == [1, 3, 12]
+    for row in rows:
+        path = f"organ-{row['label']}.ply"
+        mesh = trimesh.load(path, process=False)
+        assert row["output"] == path and row["closed"] and mesh.is_watertight
+        assert row["triangles"] == len(mesh.faces) and row["vertices"] == len(mesh.vertices)
+        assert row["volume"] == pytest.approx(mesh.volume, rel=1e-5) and mesh.volume > 0
+        assert "Note: solids of labels run out of the grid: closed along the border (3)\n" in err
+        assert f"{path}: label {row['label']}, {len(mesh.vertices):,} vertices, " in err
+        command("upsample", image, "alone.ply", "--label", row["label"], "--force", *PLAIN)
+        alone = trimesh.load("alone.ply", process=False)
+        np.testing.assert_allclose(mesh.bounds, alone.bounds, atol=0.5)
+    assert command("upsample", image, "organ.ply", "--labels", "12,1", "--force", *PLAIN)[0] == 0
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".3mf"])
+def test_one_file_holds_all_labels_as_parts(image, suffix, command):
+    assert command("upsample", image, f"all{suffix}", "--labels", "1,12", *PLAIN)[0] == 0
+    scene = trimesh.load(f"all{suffix}", process=False)
+    assert sorted(scene.geometry) == ["label 1", "label 12"]
+    for label in (1, 12):
+        assert command("upsample", image, "one.stl", "--labels", label, "--force", *PLAIN)[0] == 0
+        mesh = scene.geometry[f"label {label}"]
+        assert mesh.is_watertight and mesh.volume > 0
+    both = [
+        set(map(bytes, scene.geometry[f"label {n}"].vertices.astype(np.float32))) for n in (1, 12)
+    ]
+    assert len(both[0] & both[1]) > 100  # the vertices of the wall
+
+
+def test_all_files_are_written_or_none(image, command):
+    Path("organ-12.ply").write_text("mine")
+    for _ in range(2):
+        code, _, err = command("upsample", image, "organ.ply", "--labels", "all", *PLAIN)
+        assert (code, err) == (1, "Error: organ-12.ply exists: remove it or use --force\n")
+        assert sorted(path.name for path in Path().iterdir()) == ["organ-12.ply", image]
+
+
+REFUSED = {
+    "simplify 0.1": "--simplify 0.1",
+    "triangles 100": "--triangles 100",
+    "mesher 'sharp'": "--mesher sharp",
+    "field 'mask'": "--field mask",
+    "label 1": "--label 1",
+    "level 0.5": "--level 0.5",
+    "offset 1.0": "--offset 1",
+    "open": "--open",
+    "iterations 2": "--iterations 2",
+    "inside 'negative'": "--inside negative",
+    "scale 2.0": "--scale 2",
+    "save-field": "--save-field f.npz",
+    "check": "--check",
+    "report": "--report page.html",
+    "cluster": "--cluster local",
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_options_that_would_tear_the_walls_are_refused(name, image, command):
+    code, _, err = command(
+        "upsample", image, "a.ply", "--labels", "all", *REFUSED[name].split(), *PLAIN
+    )
+    assert code == 2
+    assert err.splitlines()[-1] == (
+        f"Error: {name} does not go with labels, which share their walls: leave it out, or mesh "
+        "one label (--label)"
+    )
+    assert not Path("a-1.ply").exists()
+
+
+def test_too_many_files_are_refused_and_parts_are_not():
+    many = list(range(MOST_FILES + 1))
+    with pytest.raises(OptionError, match=r"^a.ply would be 501 files, one for each label: give "):
+        label_paths("a.ply", many)
+    assert set(label_paths("a.glb", many)) == {Path("a.glb")}
