@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import BoolArray, IntArray
 from ..errors import GridError, OptionError, seen
+from .advice import MOST_NAMED
 from .field import MASK, NONE_EXACT, Field, Wanted, check_label
-from .masking import MOST_NAMED, as_sample, labelled
+from .masking import as_sample, labelled
 from .masks import REACH, extremes_of_masks, mask_planes
 from .named_axes import placed
 from .planes import NoPlanes, SampleArray, SamplePlanes, changed
