@@ -169,3 +169,12 @@ def test_solids_with_samples_inside_are_meshed_without_a_warning(tmp_path, monke
     monkeypatch.chdir(tmp_path)
     np.save("ball.npy", ball().values)
     assert json.loads(command("upsample", "ball.npy", "a.ply", "--json")[1])["warnings"] == []
+
+
+@pytest.mark.parametrize("options", [{}, {"scale": 0.08}, {"inside": "negative"}])
+@pytest.mark.parametrize("width", [0.3, 1.0])
+def test_the_level_that_is_named_for_densities_is_one_of_the_values(width, options):
+    steps = np.indices((28, 28, 28)) - np.reshape([15.0, 14.6, 14.3], (3, 1, 1, 1))
+    values = 1 / (1 + np.exp((np.linalg.norm(steps, axis=0) - 8) / width))
+    with pytest.raises(GridError, match=rf"{DENSITY}0\.5 --inside positive"):
+        make_grid(values, spacing=1.0, **options)

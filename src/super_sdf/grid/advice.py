@@ -33,6 +33,7 @@ MOST_NAMED = 8  # labels that a message lists
 ALIKE = 1.1  # ratio up to which the spacings that the axes show are one unit's
 SNAP = 0.02  # a scale this close to a power of ten, or to the spacing, is replaced by it
 NEAR = 0.25  # of a step from the lowest value: there unsigned distances rise to both sides
+VANISHING = 1e-6  # of the largest value: as good as 0
 CUT_OFF = 0.01  # share of samples at the lowest, and at the highest value, that are cut off
 CLOSE = 0.95  # share of the full range that values reach, if it is theirs
 FULL = (1, 255, 2**16 - 1)  # largest values of densities and images: the level is half of it
@@ -82,7 +83,9 @@ def is_density(samples: SampleArray, extremes: Extremes) -> bool:
     steps = _steps(samples)
     if steps is None or _has_walls(samples, extremes, steps.max()):
         return steps is None
-    at_zero = [float((np.asarray(samples[i]) == 0).mean()) for i in _spread(len(samples))]
+    small = VANISHING * max(map(abs, extremes))
+    planes = [np.abs(np.asarray(samples[i])) for i in _spread(len(samples))]
+    at_zero = [float((plane <= small).mean()) for plane in planes]
     return sum(at_zero) > CUT_OFF * len(at_zero)
 
 

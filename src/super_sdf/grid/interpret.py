@@ -13,9 +13,10 @@ from numpy.typing import ArrayLike
 
 from ..errors import GridError
 from . import distances, masking
-from .advice import are_labels, choose_label, choose_level
+from .advice import are_labels, choose_label, choose_level, is_density, refusal
 from .evidence import Looked, is_normalised, is_projective, look, weigh
 from .field import EXACT, MASK, NOISY, SCALED, Wanted
+from .one_sided import is_one_sided
 from .planes import SampleArray, changed
 from .request import Interpreted, Request
 from .samples import (
@@ -89,8 +90,17 @@ def _about_zero(
         notes.append(f"values {which} {level:g} are taken as inside (see --inside)")
         request = request.above_is_inside()
     if scale is not None:
+        if level is None:
+            _check_no_densities(samples)
         samples = changed(samples, partial(np.multiply, float(scale)))
     return samples, request
+
+
+def _check_no_densities(samples: SampleArray) -> None:
+    """Raise GridError for values on one side of 0 that have no unit; a level is one of theirs."""
+    extremes = find_extremes(samples)
+    if extremes and is_one_sided(extremes) and is_density(samples, extremes):
+        raise refusal(samples, extremes, None)
 
 
 def _no_level(given: SampleArray, extremes: Extremes, wanted: Wanted) -> GridError:
