@@ -276,7 +276,7 @@ def weigh(looked: Looked, spacing: Triple) -> Evidence:
     around = looked.around[whole]
     lines = np.clip(lines[whole] / steps[:, None], -LARGEST_VALUE, LARGEST_VALUE)
     second, third, fourth = differences(lines)
-    typical, uneven = known_slopes(lines, fourth.sum(1))
+    typical, uneven = known_slopes(lines, third, fourth)
     unit = typical if np.isfinite(typical) else 1.0
     slope = np.sqrt((((lines[..., 3] - lines[..., 1]) / 2) ** 2).sum(1))
     wrong = np.abs(slope / unit - 1) > (third + fourth).sum(1) / 2 / unit + ROUNDING
@@ -290,15 +290,15 @@ def weigh(looked: Looked, spacing: Triple) -> Evidence:
     return Evidence(len(lines), typical, off, uneven, beyond, steep, rough, low, high)
 
 
-def known_slopes(lines: Floats, bend: Floats) -> tuple[float, float]:
+def known_slopes(lines: Floats, third: Floats, fourth: Floats) -> tuple[float, float]:
     """Return the typical slope of lines (n, 3, 5), and how it changes away from the surface.
 
-    Slopes are exact but for fifth derivatives, and known where fourth differences, ``bend`` (n,) in
-    sum, are small: no kink is among the samples. The first is NaN if too few are known.
+    Slopes are exact but for fifth derivatives, and known where third and fourth differences (n, 3)
+    are small: no kink is among the samples. The first is NaN if too few are known.
     """
     a, b, middle, d, e = np.moveaxis(lines, -1, 0)
     slope = np.sqrt((((8 * (d - b) - (e - a)) / 12) ** 2).sum(1))
-    known = bend < KNOWN * slope
+    known = (fourth.sum(1) < KNOWN * slope) & (third.max(1, initial=0) < BENT * slope)
     slope, far = slope[known], np.abs(middle[known, 0])
     if len(slope) < ENOUGH:
         return float("nan"), 0.0

@@ -218,16 +218,16 @@ def _beside_regions(
         for one, values, other, others in sides:
             look(one, values, other, others)
             look(other, others, one, values)
-        before = [*before[-1:], (runs, plane)]
-        if len(before) == 2:
-            count(3, _amid(before[0][0], runs))
+        before = [*before[-2:], (runs, plane)]
+        if len(before) == 3:
+            count(3, _amid(*(runs for runs, _ in before)))
     return counts[0], counts[1], counts[2], counts[3]
 
 
-def _amid(runs: Ints, after: Ints) -> Ints:
-    """Return the runs of samples that are marked, as those beside and in the next plane."""
+def _amid(before: Ints, runs: Ints, after: Ints) -> Ints:
+    """Return the runs of samples of a plane that are marked, as the six beside them."""
     marked = runs >= 0
-    amid = marked & (after >= 0)
+    amid = marked & (before >= 0) & (after >= 0)
     inner = amid[1:-1, 1:-1]
     inner &= marked[2:, 1:-1] & marked[:-2, 1:-1] & marked[1:-1, 2:] & marked[1:-1, :-2]
     return runs[1:-1, 1:-1][inner]
