@@ -111,7 +111,7 @@ def _known(
 ) -> tuple[SampleArray, Looked, Transform | None]:
     """Return samples, those that are unknown filled in, what they show, and of which transform.
 
-    The zeros of a transform are known, though they may be beside each other as if never seen.
+    All of a transform, and all labels, are known, though they may jump beside many equal ones.
     """
     extremes = find_extremes(samples)
     if extremes is None and samples.dtype.itemsize > 8:  # long doubles, infinite as float64 only
@@ -119,7 +119,7 @@ def _known(
     if extremes:
         looked = look(samples, extremes)
         transform = find_transform(looked, request.spacing)
-        if transform or request.is_density:
+        if transform or request.is_density or are_labels(samples):
             return samples, looked, transform
     seen = samples
     if not request.is_density:
