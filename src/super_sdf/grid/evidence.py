@@ -33,7 +33,8 @@ MOST_LOOKED_AT = 1 << 13  # of these samples, spread evenly, if there are more
 BESIDE = 2  # planes, rows and columns to either side, for fourth differences
 ENOUGH = 30  # samples, from which a slope is known
 # Slopes whose fourth differences are this small are known: of exact distances half of them are 1.
-KNOWN = 0.2
+# Where two kinks make them so, a third difference is half of the slope or more.
+KNOWN, KINKED = 0.2, 0.45
 UNEVEN = 0.025  # by which they differ near the surface and farther away if the field is no distance
 # Two samples of a distance differ by no more than they are apart. In other fields this share of the
 # samples differ from several by more: by this, by more than noise, and than their last digit.
@@ -298,7 +299,7 @@ def known_slopes(lines: Floats, third: Floats, fourth: Floats) -> tuple[float, f
     """
     a, b, middle, d, e = np.moveaxis(lines, -1, 0)
     slope = np.sqrt((((8 * (d - b) - (e - a)) / 12) ** 2).sum(1))
-    known = (fourth.sum(1) < KNOWN * slope) & (third.max(1, initial=0) < BENT * slope)
+    known = (fourth.sum(1) < KNOWN * slope) & (third.max(1, initial=0) < KINKED * slope)
     slope, far = slope[known], np.abs(middle[known, 0])
     if len(slope) < ENOUGH:
         return float("nan"), 0.0
