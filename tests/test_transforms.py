@@ -193,7 +193,9 @@ def test_labels_are_refused_whatever_the_spacing(spacing):
     nested = two_labels()
     nested[ndimage.binary_erosion(nested == 1, iterations=3)] = 3
     for labels in (two_labels(), nested, two_labels().astype(np.int64)):
-        with pytest.raises(GridError, match="as of labels: choose the solid with --label"):
+        with pytest.raises(
+            GridError, match=r"they look like labels \(0, 1, 2.*\): choose one with --label"
+        ):
             make_grid(labels, spacing=spacing, origin=0)
 
 

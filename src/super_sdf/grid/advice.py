@@ -78,15 +78,18 @@ def refusal(
     return GridError(f"no value is {side} 0 (the {end} is {at:.6g}): {advice}")
 
 
-def is_density(samples: SampleArray, extremes: Extremes) -> bool:
-    """Return whether values on one side of 0 are no distances, or cut off at 0."""
+def is_density(samples: SampleArray, extremes: Extremes, spacing: Triple) -> bool:
+    """Return whether values on one side of 0 are no distances, or cut off at 0.
+
+    Distances to walls may be rounded so that they show no spacing.
+    """
     steps = _steps(samples)
-    if steps is None or _has_walls(samples, extremes, steps.max()):
-        return steps is None
+    if _has_walls(samples, extremes, max(spacing if steps is None else steps)):
+        return False
     small = VANISHING * max(map(abs, extremes))
     planes = [np.abs(np.asarray(samples[i])) for i in _spread(len(samples))]
     at_zero = [float((plane <= small).mean()) for plane in planes]
-    return sum(at_zero) > CUT_OFF * len(at_zero)
+    return steps is None or sum(at_zero) > CUT_OFF * len(at_zero)
 
 
 def _has_walls(samples: SampleArray, extremes: Extremes, step: float) -> bool:

@@ -61,7 +61,7 @@ def _check_thin(
     if request.inside == AUTO:
         fault = find_fault(samples, steps_of(spacing), extremes)
     else:
-        fault = UNSIGNED if is_density(samples, extremes) else ""
+        fault = UNSIGNED if is_density(samples, extremes, spacing) else ""
     if fault:
         raise refusal(samples, extremes, spacing, fault)
 
@@ -113,7 +113,9 @@ def of_slope(
     found = Interpreted(samples, looked.extremes, spacing, positive, Field())
     evidence = weigh(looked, spacing)
     is_cut = (evidence.cut_low or evidence.cut_high) and request.wanted.field != SCALED
-    slope = slope_within(looked, spacing) if is_cut else evidence.slope
+    slope = evidence.slope
+    if is_cut and not np.isfinite(slope):
+        slope = slope_within(looked, spacing)
     if not np.isfinite(slope):
         slope = _slope_beside(samples, spacing)
     divided = _divided(found, slope)

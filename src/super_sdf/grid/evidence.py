@@ -33,7 +33,8 @@ MOST_LOOKED_AT = 1 << 13  # of these samples, spread evenly, if there are more
 BESIDE = 2  # planes, rows and columns to either side, for fourth differences
 ENOUGH = 30  # samples, from which a slope is known
 # Slopes whose fourth differences are this small are known: of exact distances half of them are 1.
-KNOWN = 0.2
+# Where two kinks make them so, a third difference is half of the slope or more.
+KNOWN, KINKED = 0.2, 0.45
 UNEVEN = 0.025  # by which they differ near the surface and farther away if the field is no distance
 # Two samples of a distance differ by no more than they are apart. In other fields this share of the
 # samples differ from several by more: by this, by more than noise, and than their last digit.
@@ -276,7 +277,7 @@ def weigh(looked: Looked, spacing: Triple) -> Evidence:
     around = looked.around[whole]
     lines = np.clip(lines[whole] / steps[:, None], -LARGEST_VALUE, LARGEST_VALUE)
     second, third, fourth = differences(lines)
-    typical, uneven = known_slopes(lines, fourth.sum(1))
+    typical, uneven = known_slopes(lines, third, fourth)
     unit = typical if np.isfinite(typical) else 1.0
     slope = np.sqrt((((lines[..., 3] - lines[..., 1]) / 2) ** 2).sum(1))
     wrong = np.abs(slope / unit - 1) > (third + fourth).sum(1) / 2 / unit + ROUNDING
@@ -290,15 +291,15 @@ def weigh(looked: Looked, spacing: Triple) -> Evidence:
     return Evidence(len(lines), typical, off, uneven, beyond, steep, rough, low, high)
 
 
-def known_slopes(lines: Floats, bend: Floats) -> tuple[float, float]:
+def known_slopes(lines: Floats, third: Floats, fourth: Floats) -> tuple[float, float]:
     """Return the typical slope of lines (n, 3, 5), and how it changes away from the surface.
 
-    Slopes are exact but for fifth derivatives, and known where fourth differences, ``bend`` (n,) in
-    sum, are small: no kink is among the samples. The first is NaN if too few are known.
+    Slopes are exact but for fifth derivatives, and known where third and fourth differences (n, 3)
+    are small: no kink is among the samples. The first is NaN if too few are known.
     """
     a, b, middle, d, e = np.moveaxis(lines, -1, 0)
     slope = np.sqrt((((8 * (d - b) - (e - a)) / 12) ** 2).sum(1))
-    known = bend < KNOWN * slope
+    known = (fourth.sum(1) < KNOWN * slope) & (third.max(1, initial=0) < KINKED * slope)
     slope, far = slope[known], np.abs(middle[known, 0])
     if len(slope) < ENOUGH:
         return float("nan"), 0.0

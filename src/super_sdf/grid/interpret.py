@@ -27,7 +27,7 @@ from .samples import (
     has_two_values,
     not_finite,
 )
-from .transforms import find_transform
+from .transforms import Transform, find_transform
 from .unknown import KnownPlanes, filled, finite_extremes
 from .unseen import without_unseen
 
@@ -63,7 +63,8 @@ def _interpreted(
         return masking.of_mask(samples, request, notes), samples
     given = samples
     samples, request = _about_zero(samples, request, notes)
-    samples, extremes = _known(samples, request, notes)
+    samples, looked, transform = _known(samples, request, notes)
+    extremes = looked.extremes
     if request.is_density and (extremes[0] > 0 or extremes[1] < 0):
         raise _no_level(given, extremes, wanted)
     check_not_constant(extremes)
@@ -72,11 +73,13 @@ def _interpreted(
         return masking.of_mask(masking.above(samples, lower), request, notes), samples
     if wanted.field == MASK:
         return masking.of_signs(samples, extremes, request, notes), samples
+    if transform is not None and request.is_auto:
+        return _of_transform(samples, extremes, transform, request, notes), samples
     if not request.is_density and are_labels(samples):
         raise GridError(f"no solid is chosen: {choose_label(samples)}")
     if wanted.field in (EXACT, NOISY):
         return distances.as_distances(samples, extremes, request, notes), samples
-    return _by_evidence(samples, extremes, request, notes), samples
+    return _by_evidence(samples, looked, request, notes), samples
 
 
 def _about_zero(
@@ -91,15 +94,16 @@ def _about_zero(
         request = request.above_is_inside()
     if scale is not None:
         if level is None:
-            _check_no_densities(samples)
+            _check_no_densities(samples, request, float(scale))
         samples = changed(samples, partial(np.multiply, float(scale)))
     return samples, request
 
 
-def _check_no_densities(samples: SampleArray) -> None:
+def _check_no_densities(samples: SampleArray, request: Request, scale: float) -> None:
     """Raise GridError for values on one side of 0 that have no unit; a level is one of theirs."""
     extremes = find_extremes(samples)
-    if extremes and is_one_sided(extremes) and is_density(samples, extremes):
+    x, y, z = (step / abs(scale) for step in request.spacing or (1.0, 1.0, 1.0))
+    if extremes and is_one_sided(extremes) and is_density(samples, extremes, (x, y, z)):
         raise refusal(samples, extremes, None)
 
 
@@ -115,47 +119,57 @@ def _no_level(given: SampleArray, extremes: Extremes, wanted: Wanted) -> GridErr
 
 def _known(
     samples: SampleArray, request: Request, notes: list[str]
-) -> tuple[SampleArray, Extremes]:
-    """Return samples, those that are unknown filled in, and the smallest and the largest."""
+) -> tuple[SampleArray, Looked, Transform | None]:
+    """Return samples, those that are unknown filled in, what they show, and of which transform.
+
+    All of a transform, and all labels, are known, though they may jump beside many equal ones.
+    """
     extremes = find_extremes(samples)
     if extremes is None and samples.dtype.itemsize > 8:  # long doubles, infinite as float64 only
         raise not_finite(samples)
-    ends = extremes or finite_extremes(samples)
+    if extremes:
+        looked = look(samples, extremes)
+        transform = find_transform(looked, request.spacing)
+        if transform or request.is_density or are_labels(samples):
+            return samples, looked, transform
     seen = samples
     if not request.is_density:
+        ends = extremes or finite_extremes(samples)
         seen = without_unseen(samples, ends, notes, all_known=extremes is not None)
-    return (samples, extremes) if extremes and seen is samples else filled(seen, notes)
+    if extremes and seen is samples:
+        return samples, looked, None
+    known, extremes = filled(seen, notes)
+    looked = look(known.not_continued if isinstance(known, KnownPlanes) else known, extremes)
+    return known, looked, find_transform(looked, request.spacing)
+
+
+def _of_transform(
+    samples: SampleArray,
+    extremes: Extremes,
+    transform: Transform,
+    request: Request,
+    notes: list[str],
+) -> Interpreted:
+    """Return the distances of the mask of which values are a distance transform."""
+    request = request.with_spacing(transform.step, "the step of the transform", notes)
+    notes.append("the values are a distance transform, so only their sign says something")
+    return masking.of_signs(samples, extremes, request, notes, transform.zeros)
 
 
 def _by_evidence(
-    samples: SampleArray, extremes: Extremes, request: Request, notes: list[str]
+    samples: SampleArray, looked: Looked, request: Request, notes: list[str]
 ) -> Interpreted:
     """Return distances for values that are no mask at first sight, by what the samples show."""
-    looked = look(samples.not_continued if isinstance(samples, KnownPlanes) else samples, extremes)
-    if request.is_auto and (mask := _mask_shown(samples, looked, request, notes)):
-        return mask
+    if request.is_auto and request.is_density and masking.is_step(looked):
+        notes.append("the densities jump from one side of the level to the other")
+        return masking.of_mask(masking.above(samples, 0), request, notes)
     if request.is_density:
         request = request.with_spacing(1, "since densities show none (give --spacing)", notes)
     if _has_other_slope(looked, request):
         return distances.of_slope(samples, looked, request, notes)
     is_cut = bool(looked.is_cut.any())
-    found = distances.as_distances(samples, extremes, request, notes, is_cut=is_cut)
+    found = distances.as_distances(samples, looked.extremes, request, notes, is_cut=is_cut)
     return distances.by_kind(found, looked, request, notes)
-
-
-def _mask_shown(
-    samples: SampleArray, looked: Looked, request: Request, notes: list[str]
-) -> Interpreted | None:
-    """Return the distances of a mask if the samples show one: a transform, or steep densities."""
-    transform = find_transform(looked, request.spacing)
-    if transform is not None:
-        request = request.with_spacing(transform.step, "the step of the transform", notes)
-        notes.append("the values are a distance transform, so only their sign says something")
-        return masking.of_signs(samples, looked.extremes, request, notes, transform.zeros)
-    if request.is_density and masking.is_step(looked):
-        notes.append("the densities jump from one side of the level to the other")
-        return masking.of_mask(masking.above(samples, 0), request, notes)
-    return None
 
 
 def _has_other_slope(looked: Looked, request: Request) -> bool:

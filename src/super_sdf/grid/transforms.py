@@ -94,7 +94,9 @@ def find_transform(looked: Looked, spacing: Triple | None) -> Transform | None:
         return None
     if min(ends) > unit / 2:
         return _of_both_sides(patches, steps, clipped, unit)
-    return _with_zeros(patches, steps, clipped, unit, -1 if ends[0] < ends[1] else 1)
+    is_flat = clipped.max() < 2 + ERROR and looked.cut[clipped.argmax()] > 0
+    side = -1 if ends[0] < ends[1] else 1
+    return _with_zeros(patches, steps, clipped, unit, side, is_flat=bool(is_flat))
 
 
 def _beside(patches: Floats, inside: BoolArray, steps: Floats) -> tuple[float, float] | None:
@@ -134,17 +136,26 @@ def _of_both_sides(
 
 
 def _with_zeros(
-    patches: Floats, steps: Floats, clipped: Floats, unit: float, side: int
+    patches: Floats,
+    steps: Floats,
+    clipped: Floats,
+    unit: float,
+    side: int,
+    *,
+    is_flat: bool,
 ) -> Transform | None:
     """Return the transform if samples beside the surface are 0 on one side.
 
-    ``side`` is the sign of the others there.
+    ``side`` is the sign of the others there. Values that are ``is_flat`` beyond the second sample
+    may be the shares of voxels that are inside, 0, 1/2 and 1.
     """
     own = np.sign(patches)
     one_sided = clipped.min() == 0
     euclidean = list(_euclidean(steps, unit))
     for measure, step in (*euclidean, *_others(steps, unit, weighted=one_sided)):
         found = _follow(patches, own, measure, (0, 0), clipped)
+        if found and one_sided and is_flat and not found.apart:
+            return None
         if found and (found.beyond or (measure, step) in euclidean):
             is_mask = _is_filled(own) or _is_stepped(own)
             return Transform(step, side if one_sided else _side_of_zeros(own)) if is_mask else None

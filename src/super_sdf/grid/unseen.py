@@ -183,7 +183,7 @@ def _unseen_runs(
     beside, jumps, above, amid = _beside_regions(samples, regions, JUMP * steepest, extremes)
     unseen = (jumps > UNSEEN * beside) & (jumps > 0)
     unseen |= (beside == 0) & unseen.any()
-    if value == 0:  # no distance is 0 throughout; on surfaces it is, with samples on both sides
+    if value == 0:  # no distance is 0 throughout, though on a surface it is at corners of steps
         unseen |= amid > 0
         unseen |= ((above == 0) | (above == beside)) & unseen.any()
     return unseen[regions.root]
@@ -195,7 +195,7 @@ def _beside_regions(
     """Count, by the first run of each region, the pairs of its samples with others, (n,) each.
 
     All but those of both extremes; those that differ by more than a limit; those with one above 0;
-    and samples that have only others of the region beside them along the axes.
+    and samples that have only others of the region round them.
     """
     counts = np.zeros((4, len(regions.root)), np.int64)
 
@@ -218,16 +218,14 @@ def _beside_regions(
         for one, values, other, others in sides:
             look(one, values, other, others)
             look(other, others, one, values)
-        before = [*before[-1:], (runs, plane)]
-        if len(before) == 2:
-            count(3, _amid(before[0][0], runs))
+        before = [*before[-2:], (runs, plane)]
+        if len(before) == 3:
+            count(3, _amid(*(runs for runs, _ in before)))
     return counts[0], counts[1], counts[2], counts[3]
 
 
-def _amid(runs: Ints, after: Ints) -> Ints:
-    """Return the runs of samples that are marked, as those beside and in the next plane."""
-    marked = runs >= 0
-    amid = marked & (after >= 0)
-    inner = amid[1:-1, 1:-1]
-    inner &= marked[2:, 1:-1] & marked[:-2, 1:-1] & marked[1:-1, 2:] & marked[1:-1, :-2]
-    return runs[1:-1, 1:-1][inner]
+def _amid(before: Ints, runs: Ints, after: Ints) -> Ints:
+    """Return the runs of samples of a plane that are marked, as the 26 round them."""
+    amid = (before >= 0) & (runs >= 0) & (after >= 0)
+    amid = amid[2:] & amid[1:-1] & amid[:-2]
+    return runs[1:-1, 1:-1][amid[:, 2:] & amid[:, 1:-1] & amid[:, :-2]]
