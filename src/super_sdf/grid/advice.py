@@ -132,12 +132,11 @@ def are_labels(samples: SampleArray) -> bool:
     if min(samples.shape) < 3:
         return False
     places = _spread(len(samples) - 2, 1)
-    ends: list[Extremes] = []
-    for found in over_planes(samples, _whole_ends, [(i, i + 1) for i in places]):
-        if found is None:
-            return False
-        ends.append(found)
-    low, high = min(low for low, _ in ends), max(high for _, high in ends)
+    ends = list(over_planes(samples, _whole_ends, [(i, i + 1) for i in places]))
+    if None in ends:
+        return False
+    lows, highs = zip(*filter(None, ends))
+    low, high = min(lows), max(highs)
     count = partial(_at_boundaries, low, high)
     counts = over_planes(samples, count, [(i - 1, i + 2) for i in places])
     between, among, jumps = zip(*counts)

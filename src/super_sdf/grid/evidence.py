@@ -295,7 +295,8 @@ def weigh(looked: Looked, spacing: Triple) -> Evidence:
     contradicting = contradict(around / (h * unit), steps / h, noise_at_least(fourth) / unit)
     off, beyond, steep = (float(x.mean()) if len(x) else 0.0 for x in (wrong, contradicting, noisy))
     low, high = bool(is_cut[0]), bool(is_cut[1])
-    return Evidence(len(lines), typical, off, uneven, beyond, steep, rough, low, high, last_digit(lines))
+    digit = last_digit(lines)
+    return Evidence(len(lines), typical, off, uneven, beyond, steep, rough, low, high, digit)
 
 
 def known_slopes(lines: Floats, bend: Floats) -> tuple[float, float]:

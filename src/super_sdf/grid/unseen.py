@@ -154,7 +154,7 @@ def _some_pairs(samples: SampleArray) -> Floats:
 
 
 def _pairs_of(rows: slice, slab: NDArray[Any]) -> Floats:
-    """Return pairs of samples of the first of two planes with those beside, (2, n), in some rows."""
+    """Return samples of some rows of the first of two planes with those beside them, (2, n)."""
     here = slab[0, rows]
     beside = slab[1, rows], slab[0, 1:][rows]
     parts = [np.stack([here, other]).reshape(2, -1) for other in beside]
