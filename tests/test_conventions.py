@@ -74,6 +74,16 @@ def test_small_integers_are_turned_without_overflow():
     assert make_grid(values, origin=0).values.max() == 128
 
 
+@pytest.mark.parametrize("rounded", [np.trunc, np.rint, np.floor])
+@pytest.mark.parametrize("steps", [16, 32, 64])
+def test_distances_in_whole_steps_are_exact_ones(rounded, steps):
+    values = rounded(torus(32) * 32 * steps)
+    for given in (values.astype(np.int16), (values / steps).astype(np.float32)):
+        grid = make_grid(given, spacing=steps if given.dtype == np.int16 else 1, origin=0)
+        assert grid.field.kind == "exact" and grid.notes == ()
+        np.testing.assert_array_equal(grid.values, given)
+
+
 REFUSED = {
     "every value is 3: a constant field has no surface": np.full((4, 4, 4), 3.0),
     "no value is below 0 (the smallest is 0.5): every wall is nearer to some sample than "
