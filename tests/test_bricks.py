@@ -199,13 +199,16 @@ def test_fields_that_need_the_whole_grid_are_refused(cluster, network, tmp_path)
         "the spacing 1, 1, 0.99 differs between axes, and the whole grid is resampled for that: "
         "convert it on one machine (without --cluster)"
     )
-    unknown = rod()
+    unknown, stands, labels = rod(), rod(), np.zeros(rod().shape, np.uint8)
     unknown[0, 0, 0] = np.nan
-    for values in (unknown, np.abs(rod())):
+    stands[:4] = -1000
+    labels[4:-4, 4:-4, 4:-4] = 7
+    labels[4:9, 4:-4, 4:-4] = 200
+    for values in (unknown, stands, labels, np.abs(rod())):
         assert refusal(cluster, network, values) == (
-            f"{tmp_path}/a.npy has unknown samples (NaN), none inside, or not the label that is "
-            "asked for: to look into that takes the whole grid, so convert it on one machine "
-            "(without --cluster)"
+            f"{tmp_path}/a.npy has unknown samples (NaN, or numbers that may stand for them), "
+            "labels, none inside, or not the label that is asked for: to look into that takes the "
+            "whole grid, so convert it on one machine (without --cluster)"
         )
 
 

@@ -74,12 +74,22 @@ def test_small_integers_are_turned_without_overflow():
     assert make_grid(values, origin=0).values.max() == 128
 
 
+@pytest.mark.parametrize("rounded", [np.trunc, np.rint, np.floor])
+@pytest.mark.parametrize("steps", [16, 32, 64])
+def test_distances_in_whole_steps_are_exact_ones(rounded, steps):
+    values = rounded(torus(32) * 32 * steps)
+    for given in (values.astype(np.int16), (values / steps).astype(np.float32)):
+        grid = make_grid(given, spacing=steps if given.dtype == np.int16 else 1, origin=0)
+        assert grid.field.kind == "exact" and grid.notes == ()
+        np.testing.assert_array_equal(grid.values, given)
+
+
 REFUSED = {
     "every value is 3: a constant field has no surface": np.full((4, 4, 4), 3.0),
     "no value is below 0 (the smallest is 0.5): every wall is nearer to some sample than "
     "that, so there is no surface": np.abs(torus(8)) + 0.5 - np.abs(torus(8)).min(),
-    "no value is above 0 (the largest is -1): the grid lies within the solid; if that is "
-    "outside and the solid thin, use --inside positive": (-1 - np.indices((3, 3, 3)).sum(0)),
+    "no value is above 0 (the largest is -1): they look like densities: give the level of their "
+    "surface, such as --level -4 --inside negative": (-1 - np.indices((3, 3, 3)).sum(0)),
     "values[0, 0, 0] is nan: every sample must be finite; replace unknown far samples by a large "
     "distance of the right sign": np.full((3, 3, 3), np.nan),
     "values have shape (4, 4): give three axes (x, y, z)": np.zeros((4, 4)),
@@ -100,11 +110,11 @@ def test_what_is_no_signed_distance_grid_is_refused(message):
 def test_a_wrong_unit_is_refused_with_the_way_out():
     with pytest.raises(GridError) as caught:
         make_grid(ball(24, 8.0).values, spacing=0.1)
-    assert str(caught.value).startswith("the values change by ")
-    want = (
-        "from sample to sample, but spacing is 0.1: distances and spacing must be in the same unit"
+    assert str(caught.value) == (
+        "the values change by 0.9972 from sample to sample, but spacing is 0.1: distances need the "
+        "unit of the spacing: multiply the values, --scale 0.1"
     )
-    assert want in str(caught.value)
+    assert make_grid(ball(24, 8.0).values, spacing=0.1, scale=0.1, origin=0).notes == ()
 
 
 @pytest.mark.parametrize("spacing", [2.5, 1000])
@@ -170,9 +180,10 @@ def test_a_spacing_that_the_values_contradict_on_one_axis_is_refused():
         make_grid(box_with_unequal_spacing(), spacing=1)
     assert str(caught.value) == (
         "the values change by 1 along x, 1 along y, 2 along z from sample to sample, but spacing "
-        "is 1, 1, 1: give that of each axis (--spacing X,Y,Z)"
+        "is 1: give the spacing of each axis (they show --spacing 1,1,1.995)"
     )
-    assert make_grid(box_with_unequal_spacing(), spacing=(1, 1, 2), origin=0).notes == ()
+    for each in (2, 1.995):
+        assert make_grid(box_with_unequal_spacing(), spacing=(1, 1, each), origin=0).notes == ()
 
 
 def test_axes_that_show_no_spacing_are_asked_for():

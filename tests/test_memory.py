@@ -171,7 +171,7 @@ def test_few_samples_show_what_all_show(monkeypatch):
     values = np.sin(i) * np.cos(j) + np.sin(j) * np.cos(k) + np.sin(k) * np.cos(i)
     everything = weigh(look(values, (-1.5, 1.5)), (np.pi / 16,) * 3)
     length = typical_length(*surface_gradients(values))
-    monkeypatch.setattr(evidence, "MOST_LINES", 500)
+    monkeypatch.setattr(evidence, "MOST_LOOKED_AT", 500)
     monkeypatch.setattr("super_sdf.grid.gradients.MOST_BESIDE", 2000)
     few = weigh(look(values, (-1.5, 1.5)), (np.pi / 16,) * 3)
     assert few.samples == 500 < everything.samples

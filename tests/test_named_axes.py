@@ -181,9 +181,11 @@ def test_a_step_is_even_up_to_a_thousandth():
 
 
 def test_coordinates_that_the_values_contradict_are_refused():
-    message = refusal(sphere() * 3)
-    assert "from sample to sample, but spacing is 0.5: distances and" in message
-    assert message.startswith("the values change by 1.4")
+    assert refusal(sphere() * 3) == (
+        "the values change by 1.49572 from sample to sample, but spacing is 0.5: distances need "
+        "the unit of the spacing: multiply the values, --scale 0.334567"
+    )
+    assert make_grid(sphere() * 3, scale=0.334567).notes == ()
 
 
 def test_xarray_is_not_imported():

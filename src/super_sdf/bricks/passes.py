@@ -198,9 +198,9 @@ class TeamPlanes(StoredPlanes):
     def read(self, first: int, last: int) -> Any:
         """Raise ClusterError: what reads planes here needs the whole grid."""
         raise ClusterError(
-            f"{self.name} has unknown samples (NaN), none inside, or not the label that is asked "
-            "for: to look into that takes the whole grid, so convert it on one machine (without "
-            "--cluster)"
+            f"{self.name} has unknown samples (NaN, or numbers that may stand for them), labels, "
+            "none inside, or not the label that is asked for: to look into that takes the whole "
+            "grid, so convert it on one machine (without --cluster)"
         )
 
     @property

@@ -22,7 +22,7 @@ from .gradients import (
     typical_length,
 )
 from .one_sided import UNSIGNED, find_walls, is_one_sided
-from .planes import SampleArray, changed
+from .planes import SampleArray, changed, over_planes
 from .samples import Extremes, find_extremes
 from .sides import count_border, is_mostly_negative
 
@@ -138,20 +138,27 @@ def are_labels(samples: SampleArray) -> bool:
     if min(samples.shape) < 3:
         return False
     places = _spread(len(samples) - 2, 1)
-    low, high = np.inf, -np.inf
-    for i in places:
-        plane = np.asarray(samples[i])
-        if plane.dtype.kind == "f" and (plane != np.rint(plane)).any():
-            return False
-        low, high = min(low, plane.min().item()), max(high, plane.max().item())
-    found = [_at_boundaries(samples[i - 1 : i + 2], low, high) for i in places]
-    between, among, jumps = zip(*found)
+    ends = list(over_planes(samples, _whole_ends, [(i, i + 1) for i in places]))
+    if None in ends:
+        return False
+    lows, highs = zip(*filter(None, ends))
+    low, high = min(lows), max(highs)
+    count = partial(_at_boundaries, low, high)
+    counts = over_planes(samples, count, [(i - 1, i + 2) for i in places])
+    between, among, jumps = zip(*counts)
     if LEAST_JUMP * (high - low) > max(jumps) or sum(among) < ENOUGH:
         return False
     return bool(sum(between) <= MOST_BETWEEN * sum(among))
 
 
-def _at_boundaries(slab: NDArray[Any], low: float, high: float) -> tuple[int, int, float]:
+def _whole_ends(planes: NDArray[Any]) -> Extremes | None:
+    """Return the lowest and the highest of some whole numbers; None if some are not whole."""
+    if planes.dtype.kind == "f" and (planes != np.rint(planes)).any():
+        return None
+    return planes.min().item(), planes.max().item()
+
+
+def _at_boundaries(low: float, high: float, slab: NDArray[Any]) -> tuple[int, int, float]:
     """Count samples between a lower and a higher neighbour, and all with another neighbour.
 
     Of three planes, inner samples of the middle one count, but for the lowest and the highest. The

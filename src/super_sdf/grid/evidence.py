@@ -52,6 +52,7 @@ LEAST_SAMPLES = 100  # from which shares are evidence
 # standard deviation: up to 2.6 per spacing were measured, up to 4 on planes along the axes. It
 # hardly makes a slope wrong that is known.
 MOST_BY_NOISE = 3.0
+MOST_DIGIT = 0.1  # spacings, of rounded values
 OFF = 0.012  # from 1: typical slopes further off show another unit
 SLOPE_OFF = 0.25  # from 1: truncated distances have another unit
 # Ends of values that were divided by the truncation; where the rest is unknown, the last known
@@ -86,6 +87,8 @@ class Evidence:
         Standard deviation of the noise, in spacings, if the fourth differences were all noise.
     cut_low, cut_high : bool
         Whether values are cut off at the lowest, and at the highest.
+    digit : float
+        The last digit of the values, in spacings: slopes are known no better.
     """
 
     samples: int
@@ -97,17 +100,19 @@ class Evidence:
     roughness: float
     cut_low: bool
     cut_high: bool
+    digit: float
 
     @property
     def is_scaled(self) -> bool:
         """Whether the values are no distances in the unit of the spacing."""
-        return self.is_bent or abs(self.slope - 1) > max(OFF, self.roughness)
+        return self.is_bent or abs(self.slope - 1) > max(OFF, self.roughness, self.digit)
 
     @property
     def is_bent(self) -> bool:
         """Whether the slope differs from place to place, so that no unit makes distances of it."""
         allowed = WRONG_SLOPES if np.isfinite(self.slope) else WRONG_IF_ROUGH
-        is_wrong = self.wrong > allowed or abs(self.uneven) > max(UNEVEN, self.roughness)
+        uneven = abs(self.uneven) > max(UNEVEN, self.roughness, self.digit)
+        is_wrong = self.wrong > allowed or uneven
         return self.is_enough and (is_wrong or self.is_too_steep or self.is_contradictory)
 
     @property
@@ -172,9 +177,12 @@ class Looked:
 
     @property
     def is_cut(self) -> BoolArray:
-        """Whether values are cut off at the lowest, and at the highest, (2,)."""
+        """Whether values are cut off at the lowest, and at the highest, (2,).
+
+        In a narrow grid the one is seen only; if the other is as large, it is where they were, too.
+        """
         cut: BoolArray = self.cut > CUT_OFF
-        return cut
+        return cut | (cut.any() and bool(np.isclose(-self.extremes[0], self.extremes[1], atol=0)))
 
     def divided(self, slope: float) -> Looked:
         """Return what would have been seen of the values divided by a slope."""
@@ -288,7 +296,8 @@ def weigh(looked: Looked, spacing: Triple) -> Evidence:
     contradicting = contradict(around / (h * unit), steps / h, noise_at_least(fourth) / unit)
     off, beyond, steep = (float(x.mean()) if len(x) else 0.0 for x in (wrong, contradicting, noisy))
     low, high = bool(is_cut[0]), bool(is_cut[1])
-    return Evidence(len(lines), typical, off, uneven, beyond, steep, rough, low, high)
+    digit = last_digit(lines)
+    return Evidence(len(lines), typical, off, uneven, beyond, steep, rough, low, high, digit)
 
 
 def known_slopes(lines: Floats, third: Floats, fourth: Floats) -> tuple[float, float]:
@@ -307,6 +316,12 @@ def known_slopes(lines: Floats, third: Floats, fourth: Floats) -> tuple[float, f
     typical = float(np.median(slope))
     beyond = float(np.median(slope[~near])) if not near.all() else typical
     return typical, (beyond - float(np.median(slope[near]))) / typical
+
+
+def last_digit(values: Floats) -> float:
+    """Return by how much rounded values differ at least; 0 if by so much that none were rounded."""
+    least = float(np.diff(np.unique(values)).min(initial=np.inf))
+    return least if least < MOST_DIGIT else 0.0
 
 
 def noise_at_least(fourth: Floats) -> float:

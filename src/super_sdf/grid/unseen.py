@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray
 from ..errors import GridError
-from .planes import SampleArray, SamplePlanes
+from .planes import SampleArray, SamplePlanes, over_planes
 from .samples import Extremes
 from .unknown import RUN_BYTES, Ints, Regions, with_the_one_before
 
@@ -148,15 +148,18 @@ def _some_pairs(samples: SampleArray) -> Floats:
     nx, ny, nz = samples.shape
     planes = np.unique(np.linspace(0, nx - 2, MOST_PLANES).astype(int))
     rows = slice(0, ny - 1, -(-len(planes) * ny * nz // MOST_LOOKED))
-    parts = []
-    for i in planes:
-        slab = np.asarray(samples[int(i) : int(i) + 2])
-        here = slab[0, rows]
-        beside = slab[1, rows], slab[0, 1:][rows]
-        parts += [np.stack([here, other]).reshape(2, -1) for other in beside]
-        parts.append(np.stack([here[:, :-1], here[:, 1:]]).reshape(2, -1))
-    pairs = np.concatenate(parts, axis=1).astype(np.float64)
+    ranges = [(int(i), int(i) + 2) for i in planes]
+    pairs = np.concatenate(list(over_planes(samples, partial(_pairs_of, rows), ranges)), axis=1)
     return pairs[:, np.isfinite(pairs).all(0)]
+
+
+def _pairs_of(rows: slice, slab: NDArray[Any]) -> Floats:
+    """Return samples of some rows of the first of two planes with those beside them, (2, n)."""
+    here = slab[0, rows]
+    beside = slab[1, rows], slab[0, 1:][rows]
+    parts = [np.stack([here, other]).reshape(2, -1) for other in beside]
+    parts.append(np.stack([here[:, :-1], here[:, 1:]]).reshape(2, -1))
+    return np.concatenate(parts, axis=1).astype(np.float64)
 
 
 def _are_any(values: Floats, some: tuple[float, ...]) -> BoolArray:
