@@ -94,6 +94,8 @@ def is_density(samples: SampleArray, extremes: Extremes, spacing: Triple) -> boo
 
 def _has_walls(samples: SampleArray, extremes: Extremes, step: float) -> bool:
     """Return whether values rise to both sides where they are next to 0, as unsigned distances."""
+    if min(samples.shape) < 4:  # two samples on either side of a wall
+        return False
     sign, least = (1, extremes[0]) if extremes[0] >= 0 else (-1, -extremes[1])
     walls = near = 0
     for i in _spread(len(samples) - 3, 1):
