@@ -78,11 +78,11 @@ def draw_samples(count: int = SAMPLES, seed: int = 0, *, masks: bool = False) ->
 def find_ranges(net: SuperSdfNet, samples: list[Prepared]) -> list[Ranges]:
     """Return the ranges of each block on these samples.
 
-    Blocks behind a gate read features that others wrote: they have the same ranges.
+    Blocks beside and behind a gate read the same features: they have the same ranges.
     """
     watched = copy.deepcopy(net)
-    ranges = [Ranges.of_zeros(block) for block in watched.blocks]
-    for block, block_ranges in zip(watched.blocks, ranges):
+    ranges = [Ranges.of_zeros(block) for block in watched.all_blocks()]
+    for block, block_ranges in zip(watched.all_blocks(), ranges):
         block_ranges.watch(block)
     for sample in samples:
         watched.encode_batch([sample])

@@ -9,7 +9,6 @@ can hold the surface, those on which the gate says that most is lost. So a thres
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -65,7 +64,7 @@ def measure_at(
     for sample, first in zip(samples, encoded):
         rows = net.gate.rows(first.doubts, first.patches)
         table = torch.from_numpy(batch_table([sample.table]))
-        deep = replace(first, features=net.deepen(first.features, table, rows))
+        deep = net.blend(first, table, rows)
         errors.append(sample_errors(*predict_encoded(net, [sample], deep)[0]))
         count += len(rows)
     band = sum(len(sample.patches) for sample in samples)

@@ -14,7 +14,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, numpy_helper
 
-from export.onnx_graph import rows_of
+from export.onnx_graph import EARLY, rows_of
 from export.writer import Writer
 
 ONE = "int8_one"
@@ -63,13 +63,19 @@ class IntWriter(Writer):
 def replace_blocks(graph: onnx.GraphProto, blocks: list[IntBlock]) -> None:
     """Replace the blocks of a graph, its Scan nodes in order."""
     scans = [node for node in graph.node if node.op_type == "Scan"]
-    stem, *scans = [node for node in scans if body_of(node).name not in ("gate", "head")]
+    scans = [node for node in scans if body_of(node).name not in ("stem", "gate", "head")]
+    scans.sort(key=lambda scan: body_of(scan).name == f"block{EARLY}")  # it is the last one
     graph.initializer.append(numpy_helper.from_array(np.float32(1), ONE))
     graph.initializer.append(numpy_helper.from_array(np.uint8(0), NONE))
-    for before, scan, block in zip([stem, *scans[:-1]], scans, blocks, strict=True):
-        rounded = add_rounded(body_of(before), block)
-        before.output.append(rounded)
-        gather_rounded(graph, scan, rounded)
+    made_by = {name: node for node in graph.node for name in node.output}
+    rounded: dict[str, str] = {}
+    for scan, block in zip(scans, blocks, strict=True):
+        gathered = gathered_by(scan, made_by)
+        source = gathered.input[0]
+        if source not in rounded:  # two blocks may read the same features
+            rounded[source] = add_rounded(body_of(made_by[source]), block)
+            made_by[source].output.append(rounded[source])
+        gathered.input[0] = rounded[source]
         replace_layers(body_of(scan), block)
 
 
@@ -94,16 +100,13 @@ def add_rounded(body: onnx.GraphProto, block: IntBlock) -> str:
     return f"{rounded}_chunks"
 
 
-def gather_rounded(graph: onnx.GraphProto, scan: onnx.NodeProto, rounded: str) -> None:
-    """Let a block gather rounded features, (n, chunk, C), instead of its float32 ones.
+def gathered_by(scan: onnx.NodeProto, made_by: dict[str, onnx.NodeProto]) -> onnx.NodeProto:
+    """Return the node that flattens the features, (n, chunk, C), that a block gathers.
 
-    Those of some voxels only are written onto the rounded ones of all.
+    Those of some voxels only are written onto those of all.
     """
-    made_by = {name: node for node in graph.node for name in node.output}
     flat = made_by[body_of(scan).node[1].input[0]]  # the first node gathers the table
-    if flat.op_type == "ScatterND":
-        flat = made_by[flat.input[2]]
-    flat.input[0] = rounded
+    return made_by[flat.input[2]] if flat.op_type == "ScatterND" else flat
 
 
 def replace_layers(body: onnx.GraphProto, block: IntBlock) -> None:

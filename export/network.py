@@ -8,8 +8,9 @@ the 27 neighbours (a gather and a matrix product) and a pointwise layer. The hea
 a trunk: coefficients per voxel times functions of the offset. It adds a residual to the quadratic
 interpolation of the patch. All lengths are in half voxels (Eqs. 4 and 5).
 
-A network may be gated: its last blocks run only on the voxels on which the first ones still lose
-much, as a gate says that reads their features. All others stay as they are, also as neighbours.
+A network may be gated: its last blocks run only on the voxels on which much is still lost after the
+first ones, as a gate says. Neighbours stay as they are there. The head gets all other voxels from a
+block of their own, so that the first blocks need not please both.
 The decision is local, so a voxel's values depend on nothing beyond the receptive field.
 
 Interpolation and functions keep the value of the sample (Sec. 4.1). A noisy sample should not be
@@ -256,7 +257,8 @@ class Encoded:
     features: Tensor  # (V, C)
     patches: Tensor  # (V, 27)
     noisy: Tensor  # (V, 1) of 0 and 1
-    first: Tensor | None = None  # (V, C) features after the first blocks
+    first: Tensor | None = None  # (V, C) features after the first blocks ...
+    early: Tensor | None = None  # ... and after the block for voxels that go no deeper
     doubts: Tensor | None = None  # (V,) logarithm of what is lost with these
 
     def some(self, rows: Tensor) -> Encoded:
@@ -264,8 +266,8 @@ class Encoded:
         return Encoded(*(None if all_ is None else all_[rows] for all_ in vars(self).values()))
 
     def after_first(self) -> Encoded:
-        """Return the voxels as they are after the first blocks."""
-        return replace(self, features=self.first)
+        """Return the voxels as if none went deeper."""
+        return replace(self, features=self.early)
 
 
 def is_noisy(patches: Tensor, table: Tensor) -> Tensor:
@@ -290,6 +292,7 @@ class SuperSdfNet(nn.Module):
         )
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.blocks))
         if config.gated:
+            self.early = Block(config)
             self.gate = Gate(config)
         self.branch = nn.Linear(config.channels, config.functions - config.channels)
         self.correction = nn.Linear(config.channels, 1)
@@ -307,14 +310,17 @@ class SuperSdfNet(nn.Module):
         return features
 
     def deepen(self, features: Tensor, table: Tensor, rows: Tensor) -> Tensor:
-        """Run the last blocks on some voxels, (n,); the others stay as they are, (V, C)."""
+        """Return the features of some voxels, (n,), after the last blocks, (n, C).
+
+        All others stay as they are in ``features`` (V, C).
+        """
         count = len(features)
         place = torch.arange(count + 1, device=rows.device) + len(rows)
         place[rows] = torch.arange(len(rows), device=rows.device)
         near, some = place[table[rows]], features[rows]
         for block in self.blocks[self.config.blocks - self.config.gated :]:
             some = block(some, near, features)
-        return features.index_copy(0, rows, some)
+        return some
 
     def encode_batch(
         self, batch: Sequence[Prepared] | TurnedBatch, share: float | None = None
@@ -335,9 +341,29 @@ class SuperSdfNet(nn.Module):
         first = self.encode(patches, table)
         if not self.config.gated:
             return Encoded(first, patches, noisy)
-        doubts = self.gate(first.detach())
-        features = self.deepen(first, table, self.gate.rows(doubts, patches, share))
-        return Encoded(features, patches, noisy, first, doubts)
+        early = self.early(first, table)
+        doubts = self.gate(early.detach())
+        encoded = Encoded(early, patches, noisy, first, early, doubts)
+        return self.blend(encoded, table, self.gate.rows(doubts, patches, share))
+
+    def blend(self, encoded: Encoded, table: Tensor, rows: Tensor) -> Encoded:
+        """Return voxels of which some, (n,), have been through the last blocks."""
+        deep = self.deepen(encoded.first, table, rows)
+        return replace(encoded, features=encoded.early.index_copy(0, rows, deep))
+
+    def train_only_gate(self) -> None:
+        """Keep all values but those of the gate and of the block before it."""
+        self.requires_grad_(requires_grad=False)
+        for part in (self.early, self.gate):
+            part.requires_grad_(requires_grad=True)
+
+    def all_blocks(self) -> nn.ModuleList:
+        """Return all blocks, also the one before the gate."""
+        return nn.ModuleList([*self.blocks, *([self.early] if self.config.gated else [])])
+
+    def trained(self) -> list[nn.Parameter]:
+        """Return the parameters that training changes."""
+        return [p for p in self.parameters() if p.requires_grad]
 
     def decode(self, voxels: Encoded, offsets: Tensor) -> Tensor:
         """Return the values (D, Q) of voxels at offsets (Q, 3)."""

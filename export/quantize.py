@@ -50,7 +50,7 @@ def quantize(
     changed = {"name": target.stem, "precision": "int8", "accuracy": accuracy}
     write_model(net, target, card_of(source, net, **changed))
     model = onnx.load(target)
-    blocks = [whole_block(*pair) for pair in zip(net.blocks, find_ranges(net, samples))]
+    blocks = [whole_block(*pair) for pair in zip(net.all_blocks(), find_ranges(net, samples))]
     replace_blocks(model.graph, blocks)
     onnx.checker.check_model(model)
     onnx.save(model, target)

@@ -92,9 +92,9 @@ def relative_weights(voxels: list[int], recipe: Recipe) -> Tensor:
 
 def make_optimisers(net: SuperSdfNet, recipe: Recipe) -> list[torch.optim.Optimizer]:
     """Return Muon for the matrices of the blocks, AdamW for all other parameters."""
-    hidden = [p for p in net.blocks.parameters() if p.ndim == 2 and recipe.muon]
-    chosen = {id(p) for p in hidden}
-    others = [p for p in net.parameters() if id(p) not in chosen]
+    blocks = {id(p) for p in net.all_blocks().parameters() if p.ndim == 2 and recipe.muon}
+    hidden = [p for p in net.trained() if id(p) in blocks]
+    others = [p for p in net.trained() if id(p) not in blocks]
     optimisers: list[torch.optim.Optimizer] = [
         torch.optim.AdamW(others, lr=recipe.outer_rate, weight_decay=1e-3)
     ]

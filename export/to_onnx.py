@@ -129,7 +129,7 @@ def read_network(path: Path) -> SuperSdfNet:
     channels = len(weights["correction.weight"][0])
     config = NetworkConfig(
         channels=channels,
-        blocks=sum(name.endswith("conv.bias") for name in weights),
+        blocks=sum(name.startswith("blocks.") and name.endswith("conv.bias") for name in weights),
         hidden=len(weights["stem.0.bias"]),
         functions=channels + len(weights["branch.bias"]),
         trunk=trunk,

@@ -238,8 +238,10 @@ def window_losses(net: SuperSdfNet, batch: Batch, recipe: Recipe) -> Tensor:
     encoded = net.encode_batch(batch, low + (high - low) * float(torch.rand(())))
     of_first = batch_losses(net, batch, encoded.after_first(), recipe)
     apart = encoded.doubts[rows_with_targets(batch)] - of_first.detach().log()
-    loss = batch_losses(net, batch, encoded, recipe) + recipe.first_weight * of_first
-    return means(loss + recipe.gate_weight * apart.abs(), batch)
+    loss = recipe.first_weight * of_first + recipe.gate_weight * apart.abs()
+    if high:
+        loss = loss + batch_losses(net, batch, encoded, recipe)
+    return means(loss, batch)
 
 
 def batch_losses(net: SuperSdfNet, batch: Batch, encoded: Encoded, recipe: Recipe) -> Tensor:
@@ -339,7 +341,7 @@ class Run:
         weights = weights.to(self.device)
         if isinstance(batch, TurnedBatch):
             losses, grads = self._gradients(batch, weights)
-            for parameter, grad in zip(self.net.parameters(), grads):
+            for parameter, grad in zip(self.net.trained(), grads):
                 parameter.grad = grad
             return losses.cpu()
         shares = divide(batch, self.threads)
@@ -350,7 +352,7 @@ class Run:
                     shares,
                 )
             )
-        for parameter, *parts in zip(self.net.parameters(), *(grads for _, grads in found)):
+        for parameter, *parts in zip(self.net.trained(), *(grads for _, grads in found)):
             parameter.grad = sum(parts[1:], parts[0])
         losses = torch.empty(len(batch))
         for rows, (some, _) in zip(shares, found):
@@ -362,8 +364,8 @@ class Run:
         with autocast(self.device):
             losses = window_losses(self.net, batch, self.recipe)
         total = (weights * losses).sum()
-        parameters = list(self.net.parameters())
-        return losses.detach(), torch.autograd.grad(total, parameters, materialize_grads=True)
+        grads = torch.autograd.grad(total, self.net.trained(), materialize_grads=True)
+        return losses.detach(), grads
 
     def is_time_to_revive(self, spent: float) -> bool:
         """Return whether dormant units are restarted after this step."""
@@ -526,6 +528,11 @@ def add_network_options(parser: Parser) -> None:
         help="number of blocks, the last ones, that run only where much is lost",
     )
     parser.add_argument(
+        "--only-gate",
+        action="store_true",
+        help="train the gate and the block before it; all else stays as in --start",
+    )
+    parser.add_argument(
         "--without",
         type=at_least(0),
         nargs="+",
@@ -557,7 +564,11 @@ def run_training(options: argparse.Namespace) -> None:
         keeps_samples=options.inputs == DISTANCES,
         gated=options.gated,
     )
-    run = Run(options.run, SuperSdfNet(config), recipe, options.device, options.threads)
+    net = SuperSdfNet(config)
+    if options.only_gate:
+        net.train_only_gate()
+        recipe = replace(recipe, shares_gated=(0.0, 0.0), revive_steps=0, first_weight=1.0)
+    run = Run(options.run, net, recipe, options.device, options.threads)
     if options.start:
         run.start_from(without_blocks(read_weights(options.start), options.without))
     run.resume()
