@@ -37,7 +37,7 @@ from .slabs.footprint import slab_bytes
 from .steps.nodes import check_factor
 from .steps.survey import Band, survey
 from .steps.voxel_index import VoxelIndex
-from .steps.walls import Part, absent_parts, extract_walls, put_together
+from .steps.walls import Labels, Part, absent_parts, extract_walls, put_together
 
 BAND_SHARE = 0.05  # of the time
 NO_ROWS = np.empty((0, 27), np.int32)
@@ -258,7 +258,7 @@ class Work:
 
         ``written``, (L + 1,), has the vertices of each label so far; those here are added.
         """
-        grid, names = self.image.grid, self.image.names()
+        grid = self.image.grid
         parts = self._parts(planes, progress)
         field = put_together(parts, next(parts)[1], grid.shape, self.factor, planes)
         places, faces, sides, before = extract_walls(field, self.image.border(planes))
@@ -269,6 +269,22 @@ class Work:
         volume = volumes(world - middle, faces)
         if grid.is_mirrored:
             faces, volume = faces[:, ::-1], -volume
+        yield from self._by_label(world, faces, volume, sides, before, written)
+
+    def _by_label(
+        self,
+        world: NDArray[Any],
+        faces: IntArray,
+        volume: NDArray[np.float64],
+        sides: Labels,
+        before: int,
+        written: NDArray[np.int64],
+    ) -> Iterator[LabelPiece]:
+        """Yield the mesh of each label: the walls on either side of which it lies.
+
+        The slab before has the first ``before`` vertices (n, 3); see ``extract_walls``.
+        """
+        names = self.image.names()
         both, label = np.concatenate([faces, faces[:, ::-1]]), sides.T.ravel()
         rank = label.astype(np.int64) * len(label) + np.tile(np.arange(len(faces)), 2)
         order = np.argsort(rank)

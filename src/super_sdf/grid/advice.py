@@ -22,7 +22,7 @@ from .gradients import (
     typical_length,
 )
 from .one_sided import UNSIGNED, find_walls, is_one_sided
-from .planes import SampleArray, changed, over_planes
+from .planes import SampleArray, changed, over_planes, spread_planes
 from .samples import Extremes, find_extremes
 from .sides import count_border, is_mostly_negative
 
@@ -87,7 +87,7 @@ def is_density(samples: SampleArray, extremes: Extremes, spacing: Triple) -> boo
     if _has_walls(samples, extremes, max(spacing if steps is None else steps)):
         return False
     small = VANISHING * max(map(abs, extremes))
-    planes = [np.abs(np.asarray(samples[i])) for i in _spread(len(samples))]
+    planes = [np.abs(np.asarray(samples[i])) for i in spread_planes(0, len(samples) - 1, PLANES)]
     at_zero = [float((plane <= small).mean()) for plane in planes]
     return steps is None or sum(at_zero) > CUT_OFF * len(at_zero)
 
@@ -98,7 +98,7 @@ def _has_walls(samples: SampleArray, extremes: Extremes, step: float) -> bool:
         return False
     sign, least = (1, extremes[0]) if extremes[0] >= 0 else (-1, -extremes[1])
     walls = near = 0
-    for i in _spread(len(samples) - 3, 1):
+    for i in spread_planes(1, len(samples) - 3, PLANES):
         slab = (sign * np.asarray(samples[i - 1 : i + 3], np.float64) - least) / step
         walls += sum(int(find_walls(x)[0].sum()) for x in (slab, slab[1], slab[1].T))
         near += int((slab[1] <= NEAR).sum())
@@ -139,7 +139,7 @@ def are_labels(samples: SampleArray) -> bool:
     """
     if min(samples.shape) < 3:
         return False
-    places = _spread(len(samples) - 2, 1)
+    places = spread_planes(1, len(samples) - 2, PLANES)
     ends = list(over_planes(samples, _whole_ends, [(i, i + 1) for i in places]))
     if None in ends:
         return False
@@ -215,7 +215,7 @@ def _between(samples: SampleArray) -> float:
 
     That is half-way between the means of what is below and above it (Ridler and Calvard).
     """
-    planes = [np.ravel(samples[i]) for i in _spread(len(samples))]
+    planes = [np.ravel(samples[i]) for i in spread_planes(0, len(samples) - 1, PLANES)]
     some = np.concatenate([plane[:: 1 + plane.size // FEW] for plane in planes]).astype(np.float64)
     some = some[np.isfinite(some)]
     ends = float(some.min()), float(some.max())
@@ -252,8 +252,3 @@ def _usual(scale: float, step: float) -> float:
     """Return a power of ten or the spacing if that is close to a scale, else the scale."""
     usual = [10.0 ** round(np.log10(scale)), step]
     return next((x for x in usual if abs(scale / x - 1) <= SNAP), scale)
-
-
-def _spread(count: int, first: int = 0) -> list[int]:
-    """Return a few of so many planes, spread evenly, from ``first`` on."""
-    return [int(i) + first for i in np.unique(np.linspace(0, count - 1, PLANES).astype(int))]

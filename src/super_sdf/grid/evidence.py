@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..arrays import BoolArray, Triple
 from .gradients import BENT as STRAIGHT
 from .gradients import LARGEST_VALUE
-from .planes import SampleArray, few_of, lowest, over_planes, ranks_of
+from .planes import SampleArray, few_of, lowest, over_planes, ranks_of, spread_planes
 from .samples import Extremes
 from .spacing import steps_of
 
@@ -200,7 +200,9 @@ def look(values: SampleArray, extremes: Extremes) -> Looked:
     extremes : two floats
         The smallest and the largest sample.
     """
-    planes = _inner_planes(len(values)) if min(values.shape) > 2 * BESIDE else []
+    planes: list[int] = []
+    if min(values.shape) > 2 * BESIDE:  # those with enough beside them
+        planes = spread_planes(BESIDE, len(values) - 1 - BESIDE, PLANES)
     plane = values.shape[1] * values.shape[2]
     ranges = [(i - BESIDE, i + BESIDE + 1, i * plane) for i in planes]
     cut, count = np.zeros(2, np.int64), 0
@@ -228,14 +230,6 @@ def _look_at_plane(
     ranks, around = _around_surface(slab, number)
     inner = slab[0, BESIDE:-BESIDE, BESIDE:-BESIDE]
     return ranks, around, _count_amid_equal(slab, extremes), inner.size
-
-
-def _inner_planes(count: int) -> list[int]:
-    """Return planes that have enough planes beside them, spread evenly."""
-    if count <= 2 * BESIDE:
-        return []
-    spread = np.linspace(BESIDE, count - 1 - BESIDE, PLANES).astype(int)
-    return [int(i) for i in np.unique(spread)]
 
 
 def _around_surface(slab: NDArray[Any], number: int) -> tuple[NDArray[np.uint64], Floats]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray
 from ..errors import GridError
-from .planes import SampleArray, few_of, lowest, over_planes, ranks_of
+from .planes import SampleArray, few_of, lowest, over_planes, ranks_of, spread_planes
 
 # Values are clamped to this, so that squares of their differences do not overflow.
 LARGEST_VALUE = 1e150
@@ -51,7 +51,9 @@ def surface_gradients(values: SampleArray) -> Gradients:
         Sum of the absolute second differences over the length of the gradient: 0 for a linear
         field.
     """
-    gradients, bend = _gradients_in_planes(values, _spread_planes(values))
+    gradients, bend = _gradients_in_planes(
+        values, spread_planes(0, len(values) - 1, PLANES_AT_FIRST)
+    )
     if (bend < STRAIGHT).sum() < ENOUGH and len(values) > PLANES_AT_FIRST:
         return _gradients_in_planes(values, list(range(len(values))))
     return gradients, bend
@@ -79,18 +81,12 @@ def straight_gradients(values: SampleArray) -> Gradients:
     nx, ny, nz = values.shape
     if min(nx, ny, nz) < 3:
         return np.empty((0, 3)), np.empty(0)
-    planes = [i for i in _spread_planes(values) if 0 < i < nx - 1] or [1]
+    planes = [i for i in spread_planes(0, nx - 1, PLANES_AT_FIRST) if 0 < i < nx - 1] or [1]
     step = -(-len(planes) * ny * nz // MOST_SAMPLES)
     ranges = [(i - 1, i + 2, step) for i in planes]
     found = over_planes(values, _row_gradients, ranges)
     gradients, bend = (np.concatenate(parts) for parts in zip(*found))
     return gradients, bend
-
-
-def _spread_planes(values: SampleArray) -> list[int]:
-    """Return at most 64 planes, spread evenly along x."""
-    spread = np.linspace(0, len(values) - 1, PLANES_AT_FIRST).astype(int)
-    return [int(i) for i in np.unique(spread)]
 
 
 def _row_gradients(slab: NDArray[Any], step: int) -> Gradients:

@@ -308,6 +308,11 @@ def _lowest_of(parts: list[tuple[NDArray[Any], ...]], most: int) -> tuple[NDArra
     return tuple(array[some] for array in joined)
 
 
+def spread_planes(first: int, last: int, most: int) -> list[int]:
+    """Return at most so many planes from ``first`` to ``last`` (inclusive), spread evenly."""
+    return [int(i) for i in np.unique(np.linspace(first, last, most).astype(int))]
+
+
 def in_blocks(samples: SampleArray) -> list[tuple[int, int]]:
     """Return ranges of all planes, those together that are read together."""
     step = samples.block if isinstance(samples, SamplePlanes) else 1

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray
 from ..errors import GridError
-from .planes import SampleArray, SamplePlanes, over_planes
+from .planes import SampleArray, SamplePlanes, over_planes, spread_planes
 from .samples import Extremes
 from .unknown import RUN_BYTES, Ints, Regions, with_the_one_before
 
@@ -146,9 +146,9 @@ def _check_jumps(samples: SampleArray, value: float, steepest: float, extremes: 
 def _some_pairs(samples: SampleArray) -> Floats:
     """Return pairs of samples beside each other along an axis, (2, n), in some rows and planes."""
     nx, ny, nz = samples.shape
-    planes = np.unique(np.linspace(0, nx - 2, MOST_PLANES).astype(int))
+    planes = spread_planes(0, nx - 2, MOST_PLANES)
     rows = slice(0, ny - 1, -(-len(planes) * ny * nz // MOST_LOOKED))
-    ranges = [(int(i), int(i) + 2) for i in planes]
+    ranges = [(i, i + 2) for i in planes]
     pairs = np.concatenate(list(over_planes(samples, partial(_pairs_of, rows), ranges)), axis=1)
     return pairs[:, np.isfinite(pairs).all(0)]
 
