@@ -2,10 +2,10 @@
 
     python -m export.train --store training/store --run training/run --minutes 90
     python -m export.train --store training/store --run training/run --minutes 90     # resumes
-    python -m export.train --store training/store --run training/run --device cuda    # a GPU
+    python -m export.train --store training/store --run training/run --device cuda --by-clock
     python -m export.train ... --start src/super_sdf/models/base.onnx --rate 0.7   # its weights
     python -m export.train ... --start src/super_sdf/models/base.onnx --blocks 12  # more blocks
-    python -m export.train ... --start src/super_sdf/models/base.onnx --size wide  # more units
+    python -m export.train ... --start src/super_sdf/models/noisy.onnx --size base # more units
     python -m export.train ... --inputs masks      # the network for masks
     OMP_NUM_THREADS=1 python -m export.train ... --threads 2   # each works on a part of a batch
 
@@ -378,13 +378,17 @@ def sample_errors(prediction: Tensor, target: Tensor) -> list[float]:
     return [float(error.mean()), float(near.mean()), float(1 - cosine.mean())]
 
 
-def train(run: Run, store: Store, minutes: float, seed: int) -> None:
-    """Train until the budget is spent."""
+def train(run: Run, store: Store, minutes: float, seed: int, began: float | None = None) -> None:
+    """Train until the budget is spent.
+
+    That is counted in time spent on steps, so that a run may be paused and resumed; or, with
+    ``began`` (of ``time.monotonic``), by the clock since then, as on a machine that is lent.
+    """
     rng = np.random.default_rng([seed, run.step])
     saved, losses = time.monotonic(), []
-    while run.seconds < 60 * minutes:
+    while (spent := share_spent(run, minutes, began)) < 1:
         start = time.monotonic()
-        losses.append(take_step(run, store, rng, run.seconds / (60 * minutes)))
+        losses.append(take_step(run, store, rng, spent))
         run.seconds += min(time.monotonic() - start, LONGEST_STEP)
         if run.step % LOG_STEPS == 0:
             log(run, store, float(np.mean(losses)), measured=run.step % (10 * LOG_STEPS) == 0)
@@ -396,6 +400,12 @@ def train(run: Run, store: Store, minutes: float, seed: int) -> None:
     run.save()
     if losses:
         log(run, store, float(np.mean(losses)), measured=True)
+
+
+def share_spent(run: Run, minutes: float, began: float | None) -> float:
+    """Return the share of the budget that is spent."""
+    seconds = run.seconds if began is None else time.monotonic() - began
+    return seconds / (60 * minutes)
 
 
 def take_step(run: Run, store: Store, rng: np.random.Generator, spent: float) -> float:
@@ -426,6 +436,11 @@ def main() -> None:
     parser.add_argument("--run", type=Path, required=True, help="folder of the run")
     add_network_options(parser)
     parser.add_argument("--minutes", type=positive, default=90.0, help="training time in all")
+    parser.add_argument(
+        "--by-clock",
+        action="store_true",
+        help="count the minutes from the start of this call, reading and pauses included",
+    )
     parser.add_argument("--rate", type=positive, default=1.0, help="factor on the learning rates")
     parser.add_argument("--noisy", type=share, default=USUAL.noisy, help="share of noisy samples")
     parser.add_argument(
@@ -495,6 +510,7 @@ def add_network_options(parser: Parser) -> None:
 
 def run_training(options: argparse.Namespace) -> None:
     """Check the store before anything is written, then train."""
+    began = time.monotonic() if options.by_clock else None
     check_store(options.store, HELD_OUT)
     if options.start:
         check_regular_file(options.start)
@@ -531,7 +547,7 @@ def run_training(options: argparse.Namespace) -> None:
         store: Store = ResidentStore(options.store, HELD_OUT, recipe.shares, options.device)
     else:
         store = Store(options.store, HELD_OUT, None, options.inputs, options.device)
-    train(run, store, options.minutes, options.seed)
+    train(run, store, options.minutes, options.seed, began)
 
 
 if __name__ == "__main__":

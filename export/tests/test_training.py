@@ -1,5 +1,6 @@
 """From a mesh to an ONNX file in small: distances, samples, gradients, resuming, parity."""
 
+import time
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -334,6 +335,10 @@ def test_a_run_learns_and_goes_on_where_it_stopped(tmp_path, samples):
     train(again, store, again.seconds / 60 + 0.01, seed=0)
     assert again.step > 158
     assert read_log(tmp_path / "log.csv")["step"][-1] == again.step  # the end is measured
+    train(again, store, 0.01, seed=0)  # spent
+    step = again.step
+    train(again, store, 0.01, seed=0, began=time.monotonic())
+    assert again.step > step and step == read_log(tmp_path / "log.csv")["step"][-2]
 
 
 def test_the_held_out_errors_of_the_truth_are_zero(samples):
