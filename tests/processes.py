@@ -16,9 +16,9 @@ from conftest import ball
 
 # The command line where there are two cores, however few there are.
 COMMAND = """
-from super_sdf.batch import workers
+from super_sdf.batch import run
 from super_sdf.cli.entry import main
-workers.count_cores = lambda: 2
+run.count_cores = lambda: 2
 main()
 """
 PATIENCE = 600  # seconds, after which something hangs, however busy the machine is

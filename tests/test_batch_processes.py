@@ -21,7 +21,7 @@ from super_sdf.batch.inputs import find_jobs
 from super_sdf.batch.lock import FolderLock
 from super_sdf.batch.plan import Settings
 from super_sdf.batch.run import Queue, Run
-from super_sdf.batch.workers import choose_workers, useful_workers
+from super_sdf.batch.run import choose_workers, useful_workers
 from super_sdf.convert import ConvertOptions
 from super_sdf.errors import FileError
 from super_sdf.machine.memory import held_memory
@@ -72,7 +72,7 @@ def test_what_a_killed_batch_left_is_removed_and_nothing_else(run_batch):
     assert Path("out/.super-sdf-batch").read_text() == ""
 
 
-TWO_CORES = f"from super_sdf.batch import workers\n\nworkers.count_cores = lambda: 2\n{COMMAND}"
+TWO_CORES = f"from super_sdf.batch import run\n\nrun.count_cores = lambda: 2\n{COMMAND}"
 
 
 @pytest.mark.parametrize("code", ["", TWO_CORES])
@@ -107,10 +107,10 @@ def test_killed_on_the_way_it_goes_on(command):
 
 
 def test_as_many_processes_as_cores_and_memory_allow(monkeypatch):
-    monkeypatch.setattr("super_sdf.batch.workers.count_cores", lambda: 8)
-    monkeypatch.setattr("super_sdf.batch.workers.free_memory", lambda: 3_500_000_000)
+    monkeypatch.setattr("super_sdf.batch.run.count_cores", lambda: 8)
+    monkeypatch.setattr("super_sdf.batch.run.free_memory", lambda: 3_500_000_000)
     assert choose_workers("cpu", 100) == 3
-    monkeypatch.setattr("super_sdf.batch.workers.free_memory", lambda: None)
+    monkeypatch.setattr("super_sdf.batch.run.free_memory", lambda: None)
     assert [choose_workers("cpu", jobs) for jobs in (0, 5, 100)] == [1, 5, 8]
     assert choose_workers("cuda", 100) == 1 and count_cores() >= 1
 
@@ -195,7 +195,7 @@ def test_a_file_at_which_two_processes_die_is_named(command, monkeypatch):
             yield job, Death("was killed by SIGKILL") if job.source.name == "a.npy" else row
 
     monkeypatch.setattr(Pool, "results", deaths)
-    monkeypatch.setattr("super_sdf.batch.workers.count_cores", lambda: 2)
+    monkeypatch.setattr("super_sdf.batch.run.count_cores", lambda: 2)
     code, _, err = command("batch", "in", "--out", "out", "--quality", "fast", "--jobs", 2)
     reason = "the process that converted it was killed by SIGKILL, twice"
     assert code == 1 and err.startswith(f"Failed: in/a.npy: {reason}\n3 done, 1 failed")
@@ -228,7 +228,7 @@ def test_the_bound_is_read_once_and_shared_by_those_that_run(monkeypatch):
 
 
 def test_no_more_processes_than_are_of_use(monkeypatch):
-    monkeypatch.setattr("super_sdf.batch.workers.count_cores", lambda: 4)
+    monkeypatch.setattr("super_sdf.batch.run.count_cores", lambda: 4)
     assert useful_workers(4, 10) == (4, None)
     assert useful_workers(8, 2) == (2, "--jobs 8 is cut to 2: there is no more to do")
     note = "--jobs 200 is cut to 4: this process may use no more cores"

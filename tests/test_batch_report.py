@@ -13,7 +13,6 @@ from batches import LONE, rows
 
 from super_sdf.batch import job as batch_job
 from super_sdf.batch.fingerprint import fingerprint
-from super_sdf.batch.journal import read_journal
 
 pytestmark = pytest.mark.usefixtures("grid_folder")
 

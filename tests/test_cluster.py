@@ -122,7 +122,7 @@ def workers_of(process):
 def test_a_batch_on_a_cluster_of_this_machine_writes_what_one_without_it_writes(
     command, monkeypatch
 ):
-    monkeypatch.setattr("super_sdf.batch.workers.count_cores", lambda: 2)
+    monkeypatch.setattr("super_sdf.batch.run.count_cores", lambda: 2)
     environment = dict(os.environ)
     code, _, said = command("batch", "in", "--out", "plain", *PLAIN, *FAST)
     assert code == 1 and len(meshes("plain")) == 3

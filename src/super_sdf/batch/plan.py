@@ -13,10 +13,9 @@ from pathlib import Path
 from .. import __version__
 from ..files.store import files_of
 from ..network.names import AUTO_PRECISION
-from ..network.network import find_model
+from ..network.network import Network, find_model, load_network
 from .fingerprint import file_state, fingerprint, is_unchanged
 from .job import Job, Result, Row, failed_row
-from .journal import Journal, read_journal
 from .ledger import Ledger
 
 
@@ -59,6 +58,12 @@ class Settings:
     check: bool = False
     items: Path | None = None
     cluster: str | None = None
+
+    def load_network(self, threads: int) -> Network:
+        """Return the network of a worker."""
+        return load_network(
+            self.model, device=self.device, threads=threads, precision=self.precision
+        )
 
 
 @dataclass
@@ -107,8 +112,8 @@ class Batch:
 class Planner:
     """Decides which jobs are to be done: those not done with the same content and options."""
 
-    def __init__(self, settings: Settings, ledger: Ledger, journal: Journal) -> None:
-        self.settings, self.ledger, self.journal = settings, ledger, journal
+    def __init__(self, settings: Settings, ledger: Ledger) -> None:
+        self.settings, self.ledger = settings, ledger
         self.jobs: Sequence[Job] = ()
         path, symmetries = find_model(settings.model, settings.precision)
         network = fingerprint(path)
@@ -129,7 +134,7 @@ class Planner:
             else:
                 before = batch.done_before if row["status"] == "ok" else batch.failed_before
                 before.append(Result(job, row))
-        last = self.journal.started.difference(self.ledger.written)
+        last = self.ledger.started.difference(self.ledger.written)
         batch.waiting.sort(key=lambda job: (job.target in last, -expected_work(job)))
         batch.work = sum(map(expected_work, batch.waiting))
         return batch
@@ -167,7 +172,7 @@ class Planner:
             return None
         if os.path.exists(path) and (read := self.inputs.get(_identity(path))):
             reason = f"{path} is the same file as {read}: remove that link"
-        elif self.may_replace(job):
+        elif job.target in self.ledger.started or self.may_replace(job):
             return None
         else:
             made = job.target in self.ledger.written
@@ -176,17 +181,9 @@ class Planner:
         return {**failed_row(job, reason), "options": self.digest(job)}
 
     def may_replace(self, job: Job) -> bool:
-        """Return whether a job may replace the existing file.
-
-        It may if a batch made that file as it is: its hash is in the ledger, or in the journal
-        because the process was killed before the row was written.
-        """
-        known, path = self.ledger.written.get(job.target), self._path(job)
-        if self.settings.force or (known and is_unchanged(path, known)):
-            return True
-        digests = self.journal.made.get(job.target)
-        now = fingerprint(path) if digests else None
-        return digests is not None and now is not None and now["sha256"] in digests
+        """Return whether a job may replace the existing file: if a batch made it as it is."""
+        known = self.ledger.written.get(job.target)
+        return self.settings.force or bool(known and is_unchanged(self._path(job), known))
 
     @cached_property
     def inputs(self) -> dict[tuple[int, int], Path]:
@@ -206,8 +203,7 @@ def _identity(path: Path) -> tuple[int, int]:
 
 def preview(jobs: Sequence[Job], settings: Settings) -> Batch:
     """Return the plan of a batch, writing nothing."""
-    folder = settings.folder
-    return Planner(settings, Ledger(folder), read_journal(folder)).plan(jobs)
+    return Planner(settings, Ledger(settings.folder)).plan(jobs)
 
 
 def expected_work(job: Job) -> float:

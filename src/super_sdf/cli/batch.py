@@ -184,11 +184,11 @@ def complete(
     jobs: list[Job], settings: Settings, options: dict[str, Any], unread: list[tuple[str, str]]
 ) -> Batch:
     """Run the batch and write its page; an interrupt reports how many files are done."""
-    from ..batch.lock import FolderLock
+    from ..batch.lock import folder_lock
     from ..batch.run import Run
 
-    with raising_interrupts(), FolderLock(settings.folder) as lock:
-        run = Run(jobs, settings, lock)
+    with raising_interrupts(), folder_lock(settings.folder):
+        run = Run(jobs, settings)
         run.batch.unread = unread
         total = len(run.batch.waiting)
         try:

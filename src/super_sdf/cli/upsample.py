@@ -170,7 +170,7 @@ class Upsampling:
                 )
             return
         check_cluster(options)
-        from ..bricks.engine import check_can_brick
+        from ..cluster.bricks import check_can_brick
 
         check_can_brick(self.source, make_options(options), options["save_field"])
 
@@ -181,8 +181,7 @@ class Upsampling:
         if options["cluster"] is None:
             yield None
             return
-        from ..bricks.engine import BricksEngine
-        from ..bricks.meshing import Loading
+        from ..cluster.bricks import BricksEngine, Loading
         from ..cluster.connecting import connect
 
         loading = Loading(absolute_model(self.model), options["precision"], options["device"])

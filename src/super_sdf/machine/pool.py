@@ -71,9 +71,6 @@ class PoolOptions(Generic[Task]):
 
     Attributes
     ----------
-    clean_up : callable
-        Called with a task that was not finished and its worker's process ID, to remove what the
-        worker left behind.
     time_limit : callable
         Returns the seconds that a task may take from ``ClockStarted`` on; None: no limit.
     start_method : multiprocessing context
@@ -83,24 +80,16 @@ class PoolOptions(Generic[Task]):
         Whether a worker takes one task after another, or each task gets a process of its own.
     """
 
-    clean_up: Callable[[Task, int], None] = lambda task, pid: None
     time_limit: Callable[[Task], float | None] = lambda task: None
     start_method: BaseContext = SPAWN
     is_reused: bool = True
 
 
 class Pool(Generic[Task]):
-    """Worker processes that share a queue of tasks.
+    """Worker processes that share a queue of tasks; each is taken when a worker starts it.
 
-    Parameters
-    ----------
-    tasks : Tasks
-        The queue. A task is taken from it when a worker starts it.
-    prepare : callable
-        Called without arguments in each worker; returns the function that works at a task. Tasks
-        and results are pickled.
-    options : PoolOptions
-        How the workers are run.
+    ``prepare`` is called in each worker, and returns the function that works at a task. Tasks and
+    results are pickled.
     """
 
     def __init__(
@@ -126,7 +115,9 @@ class Pool(Generic[Task]):
         """
         try:
             while self._start_workers(count):
-                for pipe in wait(list(self.workers), self._seconds_to_deadline()):
+                deadlines = [w.deadline for w in self.workers.values() if w.deadline is not None]
+                left = max(min(deadlines) - time.monotonic(), 0) if deadlines else None
+                for pipe in wait(list(self.workers), left):
                     yield from self._receive(self.workers[pipe])  # type: ignore[index]
                 yield from self._kill_late_workers()
         finally:
@@ -135,7 +126,9 @@ class Pool(Generic[Task]):
 
     def _start_workers(self, count: int) -> bool:
         """Start the workers that are missing; return whether there is anything to wait for."""
-        while len(self.workers) < count and self._count_preparing() < len(self.tasks):
+        while len(self.workers) < count:
+            if sum(not worker.is_ready for worker in self.workers.values()) >= len(self.tasks):
+                break
             try:
                 self._start_worker()
             except OSError as error:  # too many open files or processes: make do with fewer
@@ -146,9 +139,6 @@ class Pool(Generic[Task]):
                 break
         is_busy = any(worker.task is not None for worker in self.workers.values())
         return is_busy or len(self.tasks) > 0
-
-    def _count_preparing(self) -> int:
-        return sum(not worker.is_ready for worker in self.workers.values())
 
     def _start_worker(self) -> None:
         context = self.options.start_method
@@ -171,12 +161,10 @@ class Pool(Generic[Task]):
         """Take a message from a worker; yield the result that it brings, if any."""
         try:
             message = worker.pipe.recv()
-        except (EOFError, OSError):  # it has ended, perhaps while it was sending
-            worker.process.join(EXIT_SECONDS)  # killed at once, it would lose its exit code
-            yield from self._report_death(worker)
-            return
-        except Exception:  # what it sent cannot be unpickled
-            yield from self._report_death(worker)
+        except Exception as error:
+            if isinstance(error, (EOFError, OSError)):  # it has ended, perhaps while it was sending
+                worker.process.join(EXIT_SECONDS)  # killed at once, it would lose its exit code
+            yield from self._report_death(worker)  # else what it sent cannot be unpickled
             return
         if isinstance(message, PrepareFailed):
             raise message.error
@@ -212,11 +200,6 @@ class Pool(Generic[Task]):
         with suppress(OSError):  # it has died: the next read from its pipe will show that
             worker.pipe.send(worker.task)
 
-    def _seconds_to_deadline(self) -> float | None:
-        """Return the seconds until the first deadline, None if there is none."""
-        deadlines = [w.deadline for w in self.workers.values() if w.deadline is not None]
-        return max(min(deadlines) - time.monotonic(), 0) if deadlines else None
-
     def _kill_late_workers(self) -> Iterator[tuple[Task, Death]]:
         """Kill the workers whose tasks are over their time limits; yield those tasks."""
         now = time.monotonic()
@@ -241,13 +224,11 @@ class Pool(Generic[Task]):
             yield worker.task, Death(cause)
 
     def _stop(self, worker: Worker[Task]) -> None:
-        """Kill a worker if it still runs, and clean up after its unfinished task."""
+        """Kill a worker if it still runs."""
         worker.process.kill()
         worker.process.join()
         if self.workers.pop(worker.pipe, None):
             worker.pipe.close()
-        if worker.process.pid and worker.task is not None:
-            self.options.clean_up(worker.task, worker.process.pid)
 
 
 def describe_exit(code: int | None) -> str:
