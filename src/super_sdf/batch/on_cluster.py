@@ -10,12 +10,13 @@ from functools import partial
 from pathlib import Path
 
 from ..cluster.checking import Needs
-from ..cluster.connecting import Limits, connect
+from ..cluster.connecting import connect
 from ..cluster.crew import Crew
 from ..cluster.serving import CheckWanted, ClusterWork
 from ..files.formats import find_format, split_member
 from ..machine.extras import EXTRAS, all_modules, missing_modules
 from ..machine.pool import Death, Tasks
+from ..machine.resources import Resources
 from ..network.network import find_model, shipped_models
 from .job import Job, Outputs, Row, attempt, failed_row
 from .plan import Settings
@@ -80,7 +81,7 @@ def needs_of(jobs: Sequence[Job], settings: Settings) -> Needs:
     return Needs(*network, tuple(sorted(here)), files, settings.folder)
 
 
-def prepare_on_cluster(settings: Settings, base: Path, limits: Limits) -> ClusterWork:
+def prepare_on_cluster(settings: Settings, base: Path, limits: Resources) -> ClusterWork:
     """Load the network in a worker; return the function that converts a job and returns its row.
 
     Paths of settings are absolute, those of jobs relative to ``base``.

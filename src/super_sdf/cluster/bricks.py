@@ -30,6 +30,7 @@ from ..grid.sdf_grid import SdfGrid, make_grid
 from ..machine.index_width import check_count
 from ..machine.memory import give_back, held_memory, memory_bound
 from ..machine.pool import Death
+from ..machine.resources import Resources
 from ..mesh import vertex_type
 from ..network.network import Network, load_network
 from ..pipeline import reconstruct_planes
@@ -40,7 +41,7 @@ from ..steps.exact import BandSummary
 from ..steps.glance import Glance, look_at_band
 from ..steps.survey import BYTES_PER_VOXEL, no_surface
 from .checking import Needs
-from .connecting import Cluster, Limits
+from .connecting import Cluster
 from .stored import WAY_OUT, Source, Store, StoredPlanes, check_source, close_stores, opened
 
 if TYPE_CHECKING:
@@ -109,7 +110,7 @@ class BrickWork:
 
     source: Source
     loading: Loading
-    limits: Limits
+    limits: Resources
 
     def __call__(self, task: RangesTask | MeshTask, check: CheckWanted) -> Any:
         """Return the result of each range of planes, or the mesh of a brick."""

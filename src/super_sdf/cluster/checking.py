@@ -28,12 +28,13 @@ from .. import __version__
 from ..errors import ClusterError, SuperSdfError, WriteError
 from ..machine.extras import missing_modules
 from ..machine.memory import free_memory, reuse_freed
+from ..machine.resources import Resources
 from ..machine.serving import settle_signals
 from ..network.cuda import onnxruntime_version
 from ..network.fingerprint import Fingerprint, fingerprint_of
 from ..network.names import AUTO_PRECISION
 from ..network.network import find_model, shipped_models
-from .connecting import Cluster, Limits, share_of
+from .connecting import Cluster, share_of
 
 MOST_FILES = 100  # whose presence each worker checks
 VERSION = "super_sdf:__version__"
@@ -107,7 +108,7 @@ class Checked:
     ``values`` are those of the first worker, which all others have to compute, too.
     """
 
-    members: dict[str, Limits]
+    members: dict[str, Resources]
     values: tuple[str, Fingerprint] | None
     faults: dict[str, str]
     warnings: list[str]
@@ -247,7 +248,7 @@ def first_of(addresses: Sequence[str]) -> str:
 
 def members_of(
     cluster: Cluster, reports: Mapping[str, Report], threads: Mapping[str, int]
-) -> dict[str, Limits]:
+) -> dict[str, Resources]:
     """Return what each worker may use; the free memory of a machine is shared equally."""
     if cluster.is_local:
         return dict.fromkeys(reports, cluster.limits)

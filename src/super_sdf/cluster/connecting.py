@@ -14,11 +14,12 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..errors import ClusterError
 from ..machine.extras import check_modules
 from ..machine.memory import SHARE, held_memory, memory_bound
+from ..machine.resources import Resources
 from ..machine.serving import ending_signals_blocked, python_flags
 from ..machine.threads import count_cores
 
@@ -51,20 +52,16 @@ CONFIG = {
 Answer = TypeVar("Answer")
 
 
-class Limits(NamedTuple):
-    """What a worker may use: threads, 0 for Dask's, and bytes that it may hold, None for any."""
-
-    threads: int = 0
-    memory: int | None = None
-
-
 @dataclass(frozen=True)
 class Cluster:
-    """A cluster that is connected: Dask's client, the address asked for, each worker's limits."""
+    """A cluster that is connected: Dask's client, the address asked for, what each worker may use.
+
+    0 threads are those that Dask gave it.
+    """
 
     client: Client
     address: str
-    limits: Limits
+    limits: Resources
 
     @property
     def is_local(self) -> bool:
@@ -132,22 +129,22 @@ def connect(
             hard = max(int(HARD_LIMIT * (limits.memory or 0)), LEAST_HARD_LIMIT)
             server = stack.enter_context(local_cluster(count, hard if max_memory else 0))
         else:
-            limits, server = Limits(threads, max_memory), address
+            limits, server = Resources(threads, max_memory), address
         client = stack.enter_context(open_client(server, address))
         cluster = Cluster(client, address, limits)
         wait_for_a_worker(cluster)
         yield cluster
 
 
-def share_equally(count: int, threads: int, max_memory: int | None) -> Limits:
+def share_equally(count: int, threads: int, max_memory: int | None) -> Resources:
     """Return the share of each of some processes in the threads and memory of this machine."""
     bound = memory_bound(max_memory)
     if bound is not None:
         bound = max(1, bound - (held_memory() or 0)) // count
-    return Limits(threads or max(1, count_cores() // count), bound)
+    return Resources(threads or max(1, count_cores() // count), bound)
 
 
-def share_of(limits: Limits, threads: int, limit: int | None, free: int | None) -> Limits:
+def share_of(limits: Resources, threads: int, limit: int | None, free: int | None) -> Resources:
     """Return what a worker at an address may use, given what was asked for.
 
     Dask gave it ``threads`` and kills it at ``limit`` bytes; ``free`` is its part of the memory
@@ -156,7 +153,7 @@ def share_of(limits: Limits, threads: int, limit: int | None, free: int | None) 
     rooms = [int(share * size) for share, size in ((PAUSE_SHARE, limit), (SHARE, free)) if size]
     if limits.memory is not None:
         rooms = [limits.memory, *(rooms[:1] if limit else [])]
-    return Limits(limits.threads or threads, min(rooms, default=None))
+    return Resources(limits.threads or threads, min(rooms, default=None))
 
 
 @contextmanager

@@ -21,8 +21,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..errors import ClusterError, SuperSdfError
 from ..machine.pool import Death, Tasks
+from ..machine.resources import Resources
 from .checking import Needs, check_some, check_workers, first_of
-from .connecting import Cluster, Limits
+from .connecting import Cluster
 from .serving import ClusterPrepare, admit, forget, work_here
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ class Crew:
     ) -> None:
         self.cluster, self.needs, self.prepare, self.warn = cluster, needs, prepare, warn
         self.run = f"super-sdf-{secrets.token_hex(8)}"
-        self.members: dict[str, Limits] = {}
+        self.members: dict[str, Resources] = {}
         self.refused: set[str] = set()
         self.submitted = 0
         self.looked = self.seen = time.monotonic()
@@ -84,7 +85,7 @@ class Crew:
             if not self.cluster.is_local:
                 self.cluster.run(forget, self.run, workers=list(self.members))
 
-    def _admit(self, members: dict[str, Limits]) -> None:
+    def _admit(self, members: dict[str, Resources]) -> None:
         for address, limits in members.items():
             self.cluster.run(admit, self.run, limits, workers=[address])
         self.members.update(members)

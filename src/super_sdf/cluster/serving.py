@@ -13,7 +13,7 @@ from distributed import Scheduler, Worker, get_worker
 from distributed.core import Status
 
 from ..errors import SuperSdfError
-from .connecting import Limits
+from ..machine.resources import Resources
 
 CheckWanted = Callable[[], None]
 """Raises ``UnwantedError`` if nobody wants the result of the task any more; cheap."""
@@ -21,10 +21,10 @@ CheckWanted = Callable[[], None]
 ClusterWork = Callable[[Any, CheckWanted], Any]
 """Works at a task; what it returns is the result, which is pickled."""
 
-ClusterPrepare = Callable[[Limits], ClusterWork]
+ClusterPrepare = Callable[[Resources], ClusterWork]
 """Called once in each worker, to load a network, say; returns what works at the tasks."""
 
-_limits: dict[str, Limits] = {}  # of this process, by run
+_limits: dict[str, Resources] = {}  # of this process, by run
 _prepared: dict[str, ClusterWork] = {}
 
 
@@ -46,7 +46,7 @@ class QuietWorker(Worker):
         """Open no port."""
 
 
-async def admit(run: str, limits: Limits, dask_worker: Worker) -> None:
+async def admit(run: str, limits: Resources, dask_worker: Worker) -> None:
     """Let this worker take the tasks of a run, one at a time: they ask for the run as a resource.
 
     A pause makes the scheduler look again which of the waiting tasks this worker can take.
