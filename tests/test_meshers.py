@@ -18,7 +18,7 @@ from super_sdf.convert import ConvertOptions
 from super_sdf.evaluation import names
 from super_sdf.machine import threads
 from super_sdf.mesh import join_meshes
-from super_sdf.slabs import cutting, footprint
+from super_sdf.slabs import cutting
 from super_sdf.steps import mesher_names, meshers, sharp_groups
 from super_sdf.steps.marching import extract_pieces
 from super_sdf.steps.survey import survey
@@ -59,7 +59,6 @@ def joined(pieces):
 def test_there_is_one_list_of_names_and_one_default():
     assert tuple(meshers.BY_NAME) == names.MESHERS == mesher_names.MESHERS
     assert all(mesher.name == name for name, mesher in meshers.BY_NAME.items())
-    assert set(mesher_names.MESHERS) <= set(footprint.STAGES)
     assert ConvertOptions.mesher == mesher_names.DEFAULT_MESHER
     assert cutting.DEFAULT.name == mesher_names.DEFAULT_MESHER
 
