@@ -19,6 +19,7 @@ from super_sdf.cli import main as cli
 from super_sdf.cli.upsample import upsample_command
 from super_sdf.files.formats import GRID_SUFFIXES
 from super_sdf.network.network import shipped_models
+from super_sdf.options import parse_size
 
 
 @pytest.fixture
@@ -350,8 +351,12 @@ def test_an_interrupt_at_any_stage_leaves_nothing(here, command, monkeypatch, st
 @pytest.mark.parametrize(
     "step, options, written",
     [
-        ("convert.describe", (), "out.ply is written"),
-        ("convert.describe", ("--save-field", "f.npz"), "out.ply and f.npz are written"),
+        ("cli.upsampling.Upsampling.print_report", (), "out.ply is written"),
+        (
+            "cli.upsampling.Upsampling.print_report",
+            ("--save-field", "f.npz"),
+            "out.ply and f.npz are written",
+        ),
         ("certificate.check.check_files", ("--check",), "out.ply is written"),
     ],
 )
@@ -394,9 +399,7 @@ def test_a_size_that_is_none_is_named(here, command, size):
 
 @pytest.mark.parametrize("size, want", [("1500M", 1_500_000_000), ("4g", 4 * 10**9), ("123", 123)])
 def test_sizes_are_numbers_with_a_unit(size, want):
-    from super_sdf.cli.conversion import parse_size
-
-    assert parse_size(None, None, size) == want
+    assert parse_size(size) == want
 
 
 def test_usage_errors_exit_with_2(command):

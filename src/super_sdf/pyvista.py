@@ -23,11 +23,10 @@ from .grid.sdf_grid import SdfGrid
 from .machine.extras import check_modules, how_to_install
 from .mesh import Mesh
 from .network.decoder import Decoder
-from .network.names import DEFAULT_QUALITY
 from .network.network import load_network
+from .options import DEFAULT_MESHER, DEFAULT_QUALITY
 from .pipeline import reconstruct
 from .progress import Progress
-from .steps.mesher_names import DEFAULT_MESHER
 
 RESIDUAL = "residual"  # the name of the array at the points of a surface
 

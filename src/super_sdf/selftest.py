@@ -22,8 +22,8 @@ from .machine.extras import EXTRAS, how_to_install, missing_modules
 from .machine.memory import free_memory
 from .network.cuda import available_devices, check_cuda, describe_gpu, onnxruntime_version
 from .network.kinds import MASK_MODEL
-from .network.names import FLOAT32, float32_name
-from .network.network import NO_NETWORKS, load_network, shipped_models
+from .network.network import NO_NETWORKS, float32_name, load_network, shipped_models
+from .options import FLOAT32
 from .steps.nodes import block_offsets
 from .steps.survey import survey
 

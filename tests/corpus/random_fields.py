@@ -15,13 +15,13 @@ from super_sdf.bricks.meshing import Meshed
 from super_sdf.convert import Tally
 from super_sdf.mesh import join_meshes
 from super_sdf.network.network import Network
+from super_sdf.options import DEFAULT_MESHER
 from super_sdf.pipeline import Decoder
 from super_sdf.progress import Stopwatch
 from super_sdf.slabs.cutting import cut, equal_parts
 from super_sdf.slabs.pieces import Piece
 from super_sdf.steps.glance import look_at_band
 from super_sdf.steps.marching import CAP_HEIGHT
-from super_sdf.steps.mesher_names import DEFAULT_MESHER
 
 from .case import ball, rng_of
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,7 @@ import numpy as np
 
 from ..cluster.checking import Needs, check_workers
 from ..cluster.connecting import Cluster
-from ..convert import ConvertOptions
+from ..convert import Conversion, ConvertOptions, convert_grid
 from ..errors import OptionError, SuperSdfError
 from ..files.expectation import Expectation
 from ..files.formats import split_member
@@ -31,6 +31,7 @@ from ..mesh import vertex_type
 from ..progress import TOTAL, Progress, Stopwatch
 from ..slabs.cutting import check_crossings, equal_parts
 from ..slabs.pieces import Piece
+from ..steps.ends import check_all_seen
 from ..steps.glance import Glance, look_at_band
 from ..steps.survey import BYTES_PER_VOXEL, no_surface
 from .meshing import Loading, Meshed, MeshTask, prepare_meshing
@@ -58,9 +59,44 @@ def check_can_brick(source: str, options: ConvertOptions, save_field: Any = None
         raise OptionError(f"--save-field writes one file from the first plane on: {WAY_OUT}")
 
 
+def convert_on_cluster(
+    source: str | Path,
+    target: str | Path,
+    cluster: Cluster,
+    loading: Loading,
+    options: ConvertOptions,
+    *,
+    force: bool = False,
+    progress: Progress | None = None,
+    announce: Callable[[str], None] | None = None,
+) -> Conversion:
+    """Convert a grid file to a mesh file on the workers of a cluster; see ``convert``."""
+    watch = Stopwatch()
+    with closing(BricksEngine(cluster, loading, announce or (lambda text: None))) as engine:
+        grid = engine.read(source, options)
+        check_all_seen(grid, "convert it on one machine (without --cluster)")
+
+        def make(expected: Expectation, shown: Progress | None) -> Iterator[Piece]:
+            return engine.pieces(grid, options, expected, shown)
+
+        done = convert_grid(
+            grid,
+            source,
+            target,
+            make,
+            options,
+            force=force,
+            progress=progress,
+            announce=announce,
+            watch=watch,
+        )
+        warnings = (*done.warnings, *engine.warnings())
+        return replace(done, warnings=warnings, engine=engine.report())
+
+
 @dataclass
 class BricksEngine:
-    """An engine for ``convert``: the workers of a cluster.
+    """The workers of a cluster, which read a grid and make its mesh.
 
     Attributes
     ----------

@@ -12,14 +12,13 @@ import click
 from ..errors import SuperSdfError, WriteError
 from ..files.formats import NAMED, list_formats
 from ..machine.extras import check_modules
+from ..options import MESH_FORMATS
 from .batch_report import print_plan, print_summary, progress_line, sentence
-from .choices import LazyChoice, mesh_formats
 from .common import CONTEXT, InterruptedCommand, one_line_errors, print_stderr, print_warning
 from .conversion import (
     check_can_check,
     check_cluster,
     check_option,
-    check_simplification,
     chosen_model,
     cluster_option,
     conversion_options,
@@ -70,8 +69,8 @@ Examples:
 @click.option(
     "--format",
     "kind",
-    type=LazyChoice(mesh_formats),
-    default="ply",
+    type=click.Choice(MESH_FORMATS),
+    default=MESH_FORMATS[0],
     show_default=True,
     help="Mesh file format.",
 )
@@ -108,15 +107,13 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
     from ..batch.inputs import find_jobs
     from ..batch.plan import Settings, preview
     from ..network.network import find_model
-    from ..steps.nodes import check_factor
 
     start = time.perf_counter()
-    check_factor(options["factor"])
+    chosen = make_options(options)
     if options["check"]:
         check_can_check(f".{options['kind']}")
-    check_simplification(options)
     check_cluster(options)
-    jobs, unread = find_jobs(sources, f".{options['kind']}", make_options(options))
+    jobs, unread = find_jobs(sources, f".{options['kind']}", chosen)
     check_jobs_can_be_simplified(jobs)
     if options["report"]:
         check_batch_page(options["report"], jobs, folder, force=options["force"])

@@ -10,7 +10,7 @@ import click
 
 from .. import __version__
 from ..errors import OptionError
-from .choices import LazyChoice, devices, first
+from ..options import DEVICES, FLOAT32, MESHERS
 from .common import CONTEXT, one_line_errors
 
 EXAMPLES = """\b
@@ -31,8 +31,8 @@ Examples:
 @click.option("--check", is_flag=True, help="Test the installation; exit code 1 if a check fails.")
 @click.option(
     "--device",
-    type=LazyChoice(devices),
-    default=first(devices),
+    type=click.Choice(DEVICES),
+    default=DEVICES[0],
     show_default=True,
     help="With --check: cpu skips CUDA; cuda makes it a failure if CUDA does not work.",
 )
@@ -131,7 +131,6 @@ def gather_facts() -> dict[str, Any]:
     from ..network.cuda import available_devices
     from ..network.network import NO_NETWORKS, shipped_models
     from ..network.onnx import ort
-    from ..steps.mesher_names import MESHERS
 
     models = {name: load_card(name) for name in shipped_models()}
     facts = {
@@ -148,7 +147,6 @@ def gather_facts() -> dict[str, Any]:
 def load_card(name: str) -> dict[str, Any]:
     """Return the metadata of a shipped network, or under ``fault`` why it cannot be loaded."""
     from ..errors import SuperSdfError
-    from ..network.names import FLOAT32
     from ..network.network import load_network
 
     try:

@@ -31,8 +31,8 @@ from ..machine.memory import free_memory, reuse_freed
 from ..machine.serving import settle_signals
 from ..network.cuda import onnxruntime_version
 from ..network.fingerprint import Fingerprint, fingerprint_of
-from ..network.names import AUTO_PRECISION
 from ..network.network import find_model, shipped_models
+from ..options import AUTO_PRECISION
 from .connecting import Cluster, Limits, share_of
 
 Judge = Callable[[Any], str]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from ..machine.threads import CHUNK, rows_in_chunk
+from ..options import DEFAULT_MESHER, MARCHING, SHARP
 from ..steps.bounds import LEAST_FACTOR
 from ..steps.marching import LOOKUP_BYTES, lookups_at_once
-from ..steps.mesher_names import DEFAULT_MESHER, MARCHING, SHARP
 from ..steps.meshers import BY_NAME
 from ..steps.spline import spline_bytes
 from ..steps.survey import Band
