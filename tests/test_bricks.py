@@ -15,7 +15,7 @@ from test_slabs import bad_samples, rod
 
 from super_sdf import load_network
 from super_sdf.bricks import engine, passes, stored
-from super_sdf.bricks.engine import BricksEngine
+from super_sdf.bricks.engine import convert_on_cluster
 from super_sdf.bricks.meshing import Loading, prepare_meshing
 from super_sdf.bricks.passes import Brick, Queue, ordered
 from super_sdf.bricks.stored import Source, StoredPlanes
@@ -57,19 +57,18 @@ def store(values, chunks):
 
 
 def both(cluster, network, values, chunks, **options):
-    """Convert on one machine and on a cluster; return both results and the engine."""
+    """Convert on one machine and on a cluster; return both results."""
     source = store(values, chunks)
     chosen = ConvertOptions(**{"spacing": (1.0,), "factor": 2, **options})
-    bricks = BricksEngine(cluster, LOADING)
     here = convert("a.npy", "here.ply", network, chosen)
-    there = convert(source, "there.ply", network, chosen, engine=bricks)
-    return here, there, bricks
+    there = convert_on_cluster(source, "there.ply", cluster, LOADING, chosen)
+    return here, there
 
 
-def check_same(here, there, bricks):
+def check_same(here, there):
     """Check that files, counts, notes and warnings are the same."""
     assert Path("there.ply").read_bytes() == Path("here.ply").read_bytes()
-    assert bricks.bricks > 2
+    assert there.engine["bricks"] > 2
     left_out = {"slabs", "planned_bytes", "bricks", "workers"}
     here, there = here.report(), there.report()
     for name in here.keys() - left_out:
@@ -109,7 +108,7 @@ def test_other_fields_and_options(cluster, network, field):
 def test_a_killed_worker_costs_its_bricks(cluster, network, monkeypatch):
     source, chosen = store(rod(), (8, 8, 8)), ConvertOptions(spacing=(1.0,), factor=2)
     convert("a.npy", "here.ply", network, chosen)
-    bricks, killed, lost = BricksEngine(cluster, LOADING), [], []
+    killed, lost = [], []
     monkeypatch.setattr(
         Queue,
         "take_back",
@@ -118,10 +117,10 @@ def test_a_killed_worker_costs_its_bricks(cluster, network, monkeypatch):
 
     def kill(done, total):
         if done > 300 and not killed:
-            killed.append(bricks.team.checked.members[0].report.pid)
+            killed.append(min(cluster.run(os.getpid, workers=list(cluster.workers())).values()))
             os.kill(killed[0], signal.SIGKILL)
 
-    convert(source, "there.ply", network, chosen, engine=bricks, progress=kill)
+    convert_on_cluster(source, "there.ply", cluster, LOADING, chosen, progress=kill)
     assert killed and len(lost) <= 2
     assert Path("there.ply").read_bytes() == Path("here.ply").read_bytes()
 
@@ -184,7 +183,7 @@ def refusal(cluster, network, values, **options):
     store(values, None)
     chosen = ConvertOptions(**{"spacing": (1.0,), **options})
     with pytest.raises((OptionError, GridError, ClusterError, MeshError)) as caught:
-        convert("a.npy", "o.ply", network, chosen, engine=BricksEngine(cluster, LOADING))
+        convert_on_cluster("a.npy", "o.ply", cluster, LOADING, chosen)
     assert not Path("o.ply").exists()
     return str(caught.value)
 
@@ -231,7 +230,7 @@ def test_a_grid_that_the_workers_do_not_see(cluster, network):
     store(rod(), None)
     path = Path("/proc/self/cwd/a.npy")
     with pytest.raises(ClusterError) as caught:
-        convert(path, "o.ply", network, ConvertOptions(), engine=BricksEngine(cluster, LOADING))
+        convert_on_cluster(path, "o.ply", cluster, LOADING, ConvertOptions())
     assert re.fullmatch(
         r"worker tcp://127.0.0.1:\d+( and 1 other)? does not see /proc/self/cwd/a.npy: put the "
         r"inputs where all machines see them by this path",
@@ -327,8 +326,7 @@ def test_spacing_origin_and_direction_of_the_store(cluster, network):
     made.attrs.update(spacing=0.5, origin=[1, 2, 3], direction=[-1, 0, 0, 0, -1, 0, 0, 0, 1])
     chosen = ConvertOptions(factor=2, scale=0.5)
     here = convert("b.zarr", "here.ply", network, chosen)
-    bricks = BricksEngine(cluster, LOADING)
-    check_same(here, convert("b.zarr", "there.ply", network, chosen, engine=bricks), bricks)
+    check_same(here, convert_on_cluster("b.zarr", "there.ply", cluster, LOADING, chosen))
 
 
 def test_a_file_that_changed_since_the_last_conversion(cluster, network):
@@ -340,6 +338,5 @@ def test_a_file_that_changed_since_the_last_conversion(cluster, network):
         made[:] = values.T
         chosen = ConvertOptions(factor=2, spacing=(1.0,))
         here = convert("b.zarr", "here.ply", network, chosen, force=True)
-        bricks = BricksEngine(cluster, LOADING)
-        there = convert("b.zarr", "there.ply", network, chosen, engine=bricks, force=True)
-        check_same(here, there, bricks)
+        there = convert_on_cluster("b.zarr", "there.ply", cluster, LOADING, chosen, force=True)
+        check_same(here, there)

@@ -408,7 +408,8 @@ def test_usage_errors_exit_with_2(command):
 
 
 def test_every_option_has_help():
-    for subcommand in (load() for load in cli.COMMANDS.values()):
+    for name in cli.COMMANDS:
+        subcommand = cli.cli.get_command(None, name)
         for parameter in subcommand.params:
             if isinstance(parameter, click.Option):
                 assert parameter.help, parameter.name

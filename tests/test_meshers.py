@@ -163,14 +163,14 @@ def meshed_in(grid, network, max_memory):
 def test_the_command_takes_a_mesher_and_says_which(tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)
     np.save("in.npy", FIELDS["bar"])
-    options = ("--spacing", 1, "--quality", "fast", "--json", "--quiet")
-    code, out, _ = command("upsample", "in.npy", "sharp.ply", "--mesher", "sharp", *options)
+    words = ("--spacing", 1, "--quality", "fast", "--json", "--quiet")
+    code, out, _ = command("upsample", "in.npy", "sharp.ply", "--mesher", "sharp", *words)
     assert code == 0 and json.loads(out)["mesher"] == "sharp"
-    code, out, _ = command("upsample", "in.npy", "plain.ply", *options)
+    code, out, _ = command("upsample", "in.npy", "plain.ply", *words)
     assert code == 0 and json.loads(out)["mesher"] == options.DEFAULT_MESHER
     sizes = [Path(name).stat().st_size for name in ("sharp.ply", "plain.ply")]
     assert sizes[0] > sizes[1]
-    code, out, err = command("upsample", "in.npy", "x.ply", "--mesher", "dual", *options)
+    code, out, err = command("upsample", "in.npy", "x.ply", "--mesher", "dual", *words)
     assert code == 2 and not Path("x.ply").exists()
     assert err.endswith("'--mesher': 'dual' is not one of 'marching', 'sharp'.\n")
 
