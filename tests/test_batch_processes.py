@@ -20,8 +20,7 @@ from super_sdf.batch.fingerprint import fingerprint
 from super_sdf.batch.inputs import find_jobs
 from super_sdf.batch.lock import FolderLock
 from super_sdf.batch.plan import Settings
-from super_sdf.batch.run import Queue, Run
-from super_sdf.batch.run import choose_workers, useful_workers
+from super_sdf.batch.run import Queue, Run, choose_workers, useful_workers
 from super_sdf.convert import ConvertOptions
 from super_sdf.errors import FileError
 from super_sdf.machine.memory import held_memory

@@ -4,7 +4,6 @@ import os
 import pickle
 import re
 import signal
-from contextlib import closing
 from functools import partial
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from test_slabs import bad_samples, rod
 
 from super_sdf import load_network
 from super_sdf.cluster import bricks, stored
-from super_sdf.cluster.bricks import BricksEngine, BrickWork, Loading
+from super_sdf.cluster.bricks import BrickWork, Loading, convert_on_cluster
 from super_sdf.cluster.connecting import connect
 from super_sdf.cluster.stored import Source, StoredPlanes
 from super_sdf.convert import ConvertOptions, convert
@@ -65,8 +64,7 @@ def both(cluster, network, values, chunks, **options):
 
 def on_cluster(cluster, source, chosen, target="there.ply", **more):
     """Convert on a cluster."""
-    with closing(BricksEngine(cluster, LOADING)) as engine:
-        return convert(source, target, None, chosen, engine=engine, force=True, **more)
+    return convert_on_cluster(source, target, cluster, LOADING, chosen, force=True, **more)
 
 
 def check_same(here, there):

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from .. import __version__
 from ..files.store import files_of
-from ..network.names import AUTO_PRECISION
 from ..network.network import Network, find_model, load_network
+from ..options import AUTO_PRECISION
 from .fingerprint import file_state, fingerprint, is_unchanged
 from .job import Job, Result, Row, failed_row
 from .ledger import Ledger

@@ -11,8 +11,8 @@ import os
 import secrets
 import socket
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import groupby
 from pathlib import Path
@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..convert import ConvertOptions
+from ..convert import Conversion, convert_grid
 from ..errors import ClusterError, OptionError, SuperSdfError
 from ..files.expectation import Expectation
 from ..files.formats import split_member
@@ -33,10 +33,12 @@ from ..machine.pool import Death
 from ..machine.resources import Resources
 from ..mesh import vertex_type
 from ..network.network import Network, load_network
+from ..options import ConvertOptions
 from ..pipeline import reconstruct_planes
 from ..progress import TOTAL, Progress, Stopwatch
 from ..slabs.cutting import check_crossings, equal_parts
 from ..slabs.pieces import Piece
+from ..steps.ends import check_all_seen
 from ..steps.exact import BandSummary
 from ..steps.glance import Glance, look_at_band
 from ..steps.survey import BYTES_PER_VOXEL, no_surface
@@ -209,89 +211,100 @@ def check_can_brick(source: str, options: ConvertOptions, save_field: Any = None
         raise OptionError(f"--save-field writes one file from the first plane on: {WAY_OUT}")
 
 
-class BricksEngine:
-    """The workers of a cluster, which read a grid and make the mesh of it for ``convert``.
+def convert_on_cluster(
+    source: str | Path,
+    target: str | Path,
+    cluster: Cluster,
+    loading: Loading,
+    options: ConvertOptions,
+    *,
+    force: bool = False,
+    progress: Progress | None = None,
+    announce: Callable[[str], None] | None = None,
+) -> Conversion:
+    """Convert a grid file to a mesh file on the workers of a cluster; see ``convert``.
 
-    ``warn`` is called with sentences about workers, while the work goes on.
+    ``announce`` also gets sentences about workers, while the work goes on.
+
+    Raises
+    ------
+    ClusterError
+        If a worker lacks something, such as the file, or if the cluster is lost.
+    SuperSdfError
+        As in ``convert``; OptionError if the values need the whole grid at once.
     """
+    from .crew import Crew
 
-    def __init__(
-        self, cluster: Cluster, loading: Loading, warn: Callable[[str], None] = lambda text: None
-    ) -> None:
-        self.cluster, self.loading, self.warn = cluster, loading, warn
-        self.told: dict[str, None] = {}
-        self.bricks = 0
-        self.workers: dict[str, dict[str, Any]] = {}
-        self.stack = ExitStack()
+    watch, told = Stopwatch(), dict[str, None]()
 
-    def read(self, source: str | Path, options: ConvertOptions) -> SdfGrid:
-        """Return the grid in a file, whose samples the workers read.
+    def warn(text: str) -> None:
+        told[text] = None
+        if announce:
+            announce(text)
 
-        Raises
-        ------
-        ClusterError
-            If a worker lacks something, such as the file.
-        SuperSdfError
-            As in ``read_grid``; OptionError if the values need the whole grid at once.
-        """
-        from .crew import Crew
+    file, member = split_member(Path(source))
+    path = f"{file.absolute()}" + (f":{member}" if member is not None else "")
+    placed = Source(path, options.axes, options.direction is not None, secrets.token_hex(8))
+    needs = Needs(*loading, () if placed.is_npy else ("zarr",), (file.absolute(),))
+    opened(placed)  # what cannot be read is said before the workers are checked
+    with Crew(cluster, needs, partial(BrickWork, placed, loading), warn) as crew:
+        bricks = Bricks(crew, read_stored(placed, crew, options), options)
+        try:
+            done = convert_grid(
+                bricks.grid,
+                source,
+                target,
+                bricks.pieces,
+                options,
+                force=force,
+                progress=progress,
+                announce=announce,
+                watch=watch,
+            )
+        finally:
+            with suppress(SuperSdfError):  # the connection may be lost
+                if not cluster.is_local:
+                    cluster.run(close_stores, workers=list(crew.members))
+    workers = [{"process": name, **bricks.workers[name]} for name in sorted(bricks.workers)]
+    engine = {"bricks": bricks.count, "workers": workers}
+    return replace(done, warnings=(*done.warnings, *told), engine=engine)
 
-        file, member = split_member(Path(source))
-        path = f"{file.absolute()}" + (f":{member}" if member is not None else "")
-        has_direction = options.direction is not None
-        placed = Source(path, options.axes, has_direction, secrets.token_hex(8))
-        given = {name: getattr(options, name) for name in ("spacing", "origin", "direction")}
-        store = opened(placed)
-        place, notes = store.place(given)
-        close_stores()
-        needs = Needs(*self.loading, () if placed.is_npy else ("zarr",), (file.absolute(),))
-        prepare = partial(BrickWork, placed, self.loading)
-        self.crew = self.stack.enter_context(Crew(self.cluster, needs, prepare, self._warn))
-        grid = make_grid(
-            ClusterPlanes(placed, store, self.crew),
-            **place,
-            inside=options.inside,
-            field=options.field,
-            label=options.label,
-            level=options.level,
-            scale=options.scale,
-        )
-        check_is_local(grid)
-        check_has_offsets(grid, options.offset)
-        return grid.noted(notes)
 
-    def _warn(self, text: str) -> None:
-        self.told[text] = None
-        self.warn(text)
+def read_stored(source: Source, crew: Crew, options: ConvertOptions) -> SdfGrid:
+    """Return the grid in a file, whose samples the workers read."""
+    store = opened(source)
+    given = {name: getattr(options, name) for name in ("spacing", "origin", "direction")}
+    place, notes = store.place(given)
+    close_stores()
+    grid = make_grid(
+        ClusterPlanes(source, store, crew),
+        **place,
+        inside=options.inside,
+        field=options.field,
+        label=options.label,
+        level=options.level,
+        scale=options.scale,
+    )
+    check_is_local(grid)
+    check_has_offsets(grid, options.offset)
+    check_all_seen(grid, WAY_OUT)
+    return grid.noted(notes)
 
-    def close(self) -> None:
-        """Let the workers close the store, and free what they have unpacked of it."""
-        with suppress(SuperSdfError):  # the connection may be lost
-            if not self.cluster.is_local:
-                self.cluster.run(close_stores, workers=list(self.cluster.workers()))
-        self.stack.close()
 
-    def warnings(self) -> tuple[str, ...]:
-        """Return sentences on workers."""
-        return tuple(self.told)
+class Bricks:
+    """The mesh of a grid, made by the workers; ``workers`` has the most that each has held."""
 
-    def report(self) -> dict[str, Any]:
-        """Return bricks and workers, with the most memory that each has held, in bytes."""
-        workers = [{"process": process, **self.workers[process]} for process in sorted(self.workers)]
-        return {"bricks": self.bricks, "workers": workers}
+    def __init__(self, crew: Crew, grid: SdfGrid, options: ConvertOptions) -> None:
+        self.crew, self.grid, self.options = crew, grid, options
+        self.count = 0
+        self.workers: dict[str, dict[str, int | None]] = {}
 
-    def pieces(
-        self,
-        grid: SdfGrid,
-        options: ConvertOptions,
-        expected: Expectation,
-        progress: Progress | None,
-    ) -> Iterator[Piece]:
+    def pieces(self, expected: Expectation, progress: Progress | None) -> Iterator[Piece]:
         """Yield the mesh brick by brick, in order; see ``reconstruct_slabs``."""
         watch, show = Stopwatch(), progress or (lambda done, total: None)
-        seen = look_at_band(grid, options.offset)
-        tasks = self._tasks(grid, options, expected, seen)
-        self.bricks = len(tasks)
+        seen = look_at_band(self.grid, self.options.offset)
+        tasks = self._tasks(expected, seen)
+        self.count = len(tasks)
         watch.lap("band")
         show(round(LOOKED * TOTAL), TOTAL)
         signs: set[bool] = set()
@@ -305,11 +318,9 @@ class BricksEngine:
             del piece  # before the next one is taken
             watch.start()  # the time since the yield was the caller's
         if len(signs) < 2:
-            raise no_surface(grid, options.offset)
+            raise no_surface(self.grid, self.options.offset)
 
-    def _tasks(
-        self, grid: SdfGrid, options: ConvertOptions, expected: Expectation, seen: Glance
-    ) -> list[MeshTask]:
+    def _tasks(self, expected: Expectation, seen: Glance) -> list[MeshTask]:
         """Cut the grid into bricks with about the same number of decoded voxels.
 
         Raises
@@ -319,6 +330,7 @@ class BricksEngine:
         OptionError
             If the mesh will certainly have too many vertices.
         """
+        grid, options = self.grid, self.options
         vertex_type(grid, options.factor)
         if not any(seen.decoded):
             raise no_surface(grid, options.offset)

@@ -32,8 +32,8 @@ from ..machine.resources import Resources
 from ..machine.serving import settle_signals
 from ..network.cuda import onnxruntime_version
 from ..network.fingerprint import Fingerprint, fingerprint_of
-from ..network.names import AUTO_PRECISION
 from ..network.network import find_model, shipped_models
+from ..options import AUTO_PRECISION
 from .connecting import Cluster, share_of
 
 MOST_FILES = 100  # whose presence each worker checks

@@ -6,8 +6,8 @@ The numbers are measured by ``python -m lab figures --only memory``, as the peak
 from __future__ import annotations
 
 from ..machine.threads import CHUNK, rows_in_chunk
+from ..options import DEFAULT_MESHER, SHARP
 from ..steps.marching import LOOKUP_BYTES, lookups_at_once
-from ..steps.mesher_names import DEFAULT_MESHER, SHARP
 from ..steps.meshers import BY_NAME
 from ..steps.spline import spline_bytes
 from ..steps.survey import Band
