@@ -1,9 +1,9 @@
 """The checked workers of a cluster, which share tasks.
 
 Dask distributes the tasks, and gives those of a worker that died to another one, as often as its
-scheduler allows (``allowed-failures``). Each task asks for the run as a resource, which only workers
-have that were checked, and only one of each: so a worker has one task at a time, and a worker that
-comes later is checked before it gets one.
+scheduler allows (``allowed-failures``). Each task asks for the run as a resource, of which each
+worker has one once it was checked: so it works at one task at a time, and a worker that comes later
+is checked before it gets one.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import concurrent.futures
 import secrets
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import suppress
 from itertools import islice
 from types import TracebackType
@@ -90,7 +90,7 @@ class Crew:
             self.cluster.run(admit, self.run, limits, workers=[address])
         self.members.update(members)
 
-    def completed(self, tasks: Tasks[Task]) -> Iterator[tuple[Task, Any]]:
+    def completed(self, tasks: Tasks[Task]) -> Generator[tuple[Task, Any], None, None]:
         """Yield the tasks of a queue with their results as they are completed.
 
         A task is taken from the queue when a worker is free for it. The result is a Death if the
@@ -166,7 +166,7 @@ class Crew:
                 raise self.cluster.lost() from None
             except KilledWorker as error:
                 times = error.allowed_failures + 1
-                return Death(f"was lost by the cluster {times} times (most likely out of memory)")
+                return Death(f"was lost {times} times by the cluster (most likely out of memory)")
             except Exception as error:
                 if future.status == "error":
                     if isinstance(error, SuperSdfError):
