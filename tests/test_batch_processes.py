@@ -11,12 +11,11 @@ from pathlib import Path
 import psutil
 import pytest
 import trimesh
-from batches import CONSTANT, files, rows
+from batches import CONSTANT, FAST, PLAIN, files, rows
 from planted import COMMAND, run_beside_planted_files
 from processes import PATIENCE, all_end, larger_grids, start_command, wait_for_lines
 
 from super_sdf.batch import job as batch_job
-from super_sdf.batch.fingerprint import fingerprint
 from super_sdf.batch.inputs import find_jobs
 from super_sdf.batch.plan import Settings
 from super_sdf.batch.run import Queue, Run, choose_workers, useful_workers
@@ -43,30 +42,21 @@ def test_an_interrupt_is_one_line_and_keeps_what_is_done(run_batch, monkeypatch)
     assert len(files()) == 2 and len(rows()) == 1
 
 
-def test_a_folder_belongs_to_one_batch_at_a_time(run_batch):
-    with FolderLock(Path("out")):
-        want = "Error: out is in use by another batch: wait for it, or give another\n"
-        assert run_batch("in") == (1, "", want)
-        assert run_batch("in", "--dry-run")[0] == 0
-    assert run_batch("in")[0] == 1 and rows()
-
-
-def test_what_a_killed_batch_left_is_removed_and_nothing_else(run_batch):
+def test_what_a_killed_batch_left_is_removed_and_nothing_else(run_batch, command):
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
     Path("out/deep").mkdir(parents=True)
-    stale = Path(f"out/deep/.b.ply.{ended.pid}.part")
-    kept = [f"out/.x.ply.{ended.pid}.part", "out/b.part"]
-    for path in (stale, *map(Path, kept)):
+    mesh = Path("out/deep/b.ply")
+    command("upsample", "in/deep/b.npz", mesh, *FAST, *PLAIN[2:])  # in place, and has no row yet
+    stale, kept = Path(f"out/deep/.b.ply.{ended.pid}.part"), Path(f"out/.x.ply.{ended.pid}.part")
+    for path in (stale, kept):
         path.write_text("half")
-    Path("out/deep/b.ply").write_text("was moved into place, and not yet in the report")
-    made = {"out": "deep/b.ply", "sha256": fingerprint(Path("out/deep/b.ply"))["sha256"]}
-    Path("out/.super-sdf-batch").write_text(f'\n"deep/b.ply"\n\n{json.dumps(made)}\n"to')
+    started = {"in": os.path.abspath("in/deep/b.npz"), "out": "deep/b.ply", "status": "started"}
+    Path("out/report.jsonl").write_text(f"{json.dumps(started)}\n{{to")
     assert run_batch("in/", "--dry-run")[2].startswith("4 to do") and stale.exists()
     assert run_batch("in")[2].endswith("3 done, 1 failed; 3 meshes closed, 0 open\n")
-    assert not stale.exists() and all(map(os.path.exists, kept))
+    assert not stale.exists() and kept.exists()
     assert rows()[-1]["out"] == "deep/b.ply"  # last: it may be what ended the run
-    assert Path("out/.super-sdf-batch").read_text() == ""
 
 
 TWO_CORES = f"from super_sdf.batch import run\n\nrun.count_cores = lambda: 2\n{COMMAND}"
@@ -121,6 +111,7 @@ def test_a_lock_is_exclusive_among_processes_and_ends_with_its_own(run_batch):
         assert holder.stdout.readline() == b"held\n"
         want = "Error: out is in use by another batch: wait for it, or give another\n"
         assert run_batch("in/a.npy") == (1, "", want)
+        assert run_batch("in/a.npy", "--dry-run")[0] == 0
         holder.kill()
         holder.wait()
         assert run_batch("in/a.npy")[0] == 0
