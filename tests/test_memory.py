@@ -76,7 +76,9 @@ def elsewhere(monkeypatch):
     def go(platform, **figures):
         process = SimpleNamespace(memory_info=lambda: SimpleNamespace(rss=3_000_000, **figures))
         system = SimpleNamespace(available=7_000_000)
-        module = SimpleNamespace(Process=lambda: process, virtual_memory=lambda: system)
+        module = SimpleNamespace(
+            Process=lambda: process, virtual_memory=lambda: system, Error=ProcessLookupError
+        )
         monkeypatch.setitem(sys.modules, "psutil", module)
         monkeypatch.setattr(sys, "platform", platform)
         for name in ("SYSTEM", "PROCESS"):
