@@ -21,43 +21,20 @@ from .ledger import Ledger
 
 @dataclass(frozen=True)
 class Settings:
-    """How a batch is run.
+    """How a batch is run; the network is named as for ``load_network``."""
 
-    Attributes
-    ----------
-    folder : Path
-        The output folder.
-    model, precision, device : str
-        The network and where it runs: see ``load_network``.
-    threads, workers : int
-        Threads of each worker process, and worker processes; 0: chosen by the number of cores.
-    force : bool
-        Convert everything again; replace files that are not as a batch made them.
-    retry : bool
-        Try inputs again that failed before.
-    fail_fast : bool
-        Start nothing more after the first failure.
-    check : bool
-        Check each mesh against its samples; meshes without a certificate are made again.
-    items : Path, optional
-        The folder for what a page shows of each mesh; see ``pages.items``.
-    cluster : str, optional
-        Where the files are converted instead: "local" for workers of Dask on this machine, or the
-        address of a scheduler.
-    """
-
-    folder: Path
+    folder: Path  # of the outputs
     model: str = "base"
     precision: str = AUTO_PRECISION
     device: str = "auto"
-    threads: int = 0
+    threads: int = 0  # of each worker process; 0: chosen by the number of cores
     workers: int = 0
-    force: bool = False
-    retry: bool = False
-    fail_fast: bool = False
-    check: bool = False
-    items: Path | None = None
-    cluster: str | None = None
+    force: bool = False  # convert everything again; replace files that are not as a batch made them
+    retry: bool = False  # try inputs again that failed before
+    fail_fast: bool = False  # start nothing more after the first failure
+    check: bool = False  # against the samples; meshes without a certificate are made again
+    items: Path | None = None  # the folder for what a page shows of each mesh
+    cluster: str | None = None  # "local", or the address of a scheduler: where files are converted
 
     def load_network(self, threads: int) -> Network:
         """Return the network of a worker."""
@@ -70,35 +47,21 @@ class Settings:
 class Batch:
     """The state of a batch: jobs to be done, and the results so far.
 
-    Attributes
-    ----------
-    waiting : list of Job
-        Jobs that were not started yet, in their order.
-    done_before, failed_before : list of Result
-        Results of earlier runs that still hold; also outputs that may not be replaced.
-    done, failed : list of Result
-        Results of this run.
-    work, work_done : float
-        Estimated work, of all jobs and of those finished, in arbitrary units.
-    seconds : float
-        Time since the start of the run.
-    unread : list of (str, str)
-        Folders that could not be read, and why.
-    notes : list of str
-        Notes for the user on how the batch is run.
+    Results of earlier runs that still hold are ``done_before`` and ``failed_before``, also outputs
+    that may not be replaced.
     """
 
     settings: Settings
-    waiting: list[Job] = field(default_factory=list)
+    waiting: list[Job] = field(default_factory=list)  # not started yet, in their order
     done_before: list[Result] = field(default_factory=list)
     failed_before: list[Result] = field(default_factory=list)
     done: list[Result] = field(default_factory=list)
     failed: list[Result] = field(default_factory=list)
-    work: float = 0.0
+    work: float = 0.0  # estimated, of all jobs, in arbitrary units
     work_done: float = 0.0
-    seconds: float = 0.0
-    unread: list[tuple[str, str]] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
+    seconds: float = 0.0  # since the start of the run
+    unread: list[tuple[str, str]] = field(default_factory=list)  # folders, and why
+    notes: list[str] = field(default_factory=list)  # for the user, on how the batch is run
 
     def failures(self) -> list[Result]:
         """Return the failures of this run and of earlier ones."""

@@ -88,16 +88,10 @@ class MeshTask(NamedTuple):
 
 @dataclass(eq=False)
 class Meshed:
-    """The mesh of a brick.
+    """The mesh of a brick: the pieces of its slabs, in which vertices are counted from its first.
 
-    Attributes
-    ----------
-    pieces : list of Piece
-        Those of its slabs. Vertices are counted from the first of the brick.
-    worker : str
-        Machine and number of the process that made it.
-    peak, bound : int or None
-        The most memory that this process has held so far, and that it might hold, in bytes.
+    The ``worker`` is machine and number of the process that made it; ``peak`` and ``bound`` are the
+    bytes that it has held at most so far, and that it might hold.
     """
 
     pieces: list[Piece]

@@ -38,19 +38,11 @@ AHEAD = 2  # tasks for each worker, where results are taken in order
 
 
 class Crew:
-    """The workers of a cluster, checked and admitted while it is entered.
+    """The workers of a cluster, admitted when it is entered; ClusterError if one lacks something.
 
-    Parameters
-    ----------
-    cluster : Cluster
-        The connection.
-    needs : Needs
-        What workers are checked for; ClusterError if one of them lacks something.
-    prepare : callable
-        Called in each worker with what it may use; returns the function that works at a task. It,
-        the tasks and the results are pickled.
-    warn : callable
-        Called with a sentence about a worker that may round differently, or is not used.
+    ``prepare`` is called in each worker with what it may use, and returns the function that works
+    at a task. It, the tasks and the results are pickled. ``warn`` is called with a sentence about a
+    worker that may round differently, or is not used.
     """
 
     def __init__(

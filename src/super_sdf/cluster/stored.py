@@ -29,18 +29,10 @@ WAY_OUT = "convert it on one machine (without --cluster)"
 
 
 class Source(NamedTuple):
-    """A grid file as all processes open it.
+    """A grid file as all processes open it, by its absolute path; ``axes`` as in ``read_grid``.
 
-    Attributes
-    ----------
-    path : str
-        Absolute, perhaps with the name of an array in it.
-    axes : str or None
-        See ``read_grid``.
-    has_direction : bool
-        Whether the user gives a direction, which replaces that in the file.
-    run : str
-        Differs from run to run: the file may have changed since the one before.
+    A direction that the user gives replaces that in the file. ``run`` differs from run to run: the
+    file may have changed since the one before.
     """
 
     path: str
@@ -93,14 +85,9 @@ class StoredPlanes(SamplePlanes):
 
 
 class Store:
-    """An open store in this process, with the layers that it has unpacked.
+    """An open store in this process, with the layers (planes that share chunks) it has unpacked.
 
-    Attributes
-    ----------
-    layer : int
-        Planes that share chunks.
-    bound : int, optional
-        Bytes that this process may hold.
+    ``bound`` are the bytes that this process may hold, if that is known.
     """
 
     shape: tuple[int, ...]

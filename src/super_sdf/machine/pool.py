@@ -21,7 +21,6 @@ from ..errors import SuperSdfError
 from .serving import (
     ClockStarted,
     Final,
-    Partial,
     Prepare,
     PrepareFailed,
     Ready,
@@ -69,15 +68,9 @@ class Worker(Generic[Task]):
 class PoolOptions(Generic[Task]):
     """How a pool runs its workers.
 
-    Attributes
-    ----------
-    time_limit : callable
-        Returns the seconds that a task may take from ``ClockStarted`` on; None: no limit.
-    start_method : multiprocessing context
-        How processes are started. Spawning works on every system and is safe beside the threads of
-        onnxruntime, unlike forking this process.
-    is_reused : bool
-        Whether a worker takes one task after another, or each task gets a process of its own.
+    ``time_limit`` returns the seconds that a task may take from ``ClockStarted`` on. Spawning works
+    on every system and is safe beside the threads of onnxruntime, unlike forking this process. A
+    worker that is not reused takes one task alone.
     """
 
     time_limit: Callable[[Task], float | None] = lambda task: None
@@ -103,15 +96,8 @@ class Pool(Generic[Task]):
     def results(self, count: int) -> Generator[tuple[Task, Any], None, None]:
         """Run the tasks in ``count`` workers.
 
-        Yields
-        ------
-        task, result
-            The partial results of each task as they arrive, then its final result or a Death.
-
-        Raises
-        ------
-        SuperSdfError
-            If no worker can be started, or what ``prepare`` raised.
+        Yields the partial results of each task as they arrive, then its final result or a Death;
+        SuperSdfError if no worker can be started, or what ``prepare`` raised.
         """
         try:
             while self._start_workers(count):
@@ -172,24 +158,16 @@ class Pool(Generic[Task]):
             worker.is_ready, self.failed_starts = True, 0
             self._assign_task(worker)
         elif worker.task is not None:
-            yield from self._take_result(worker, worker.task, message)
-
-    def _take_result(
-        self, worker: Worker[Task], task: Task, message: Partial | Final
-    ) -> Iterator[tuple[Task, Any]]:
-        """Yield a result; after a final one, give the worker its next task."""
-        if isinstance(message.value, ClockStarted):
-            limit = self.options.time_limit(task)
-            worker.deadline = None if limit is None else time.monotonic() + limit
-        if isinstance(message, Partial):
-            yield task, message.value
-            return
-        worker.task = worker.deadline = None
-        yield task, message.value
-        if self.options.is_reused:
-            self._assign_task(worker)
-        else:
-            self._stop(worker)
+            if isinstance(message.value, ClockStarted):
+                limit = self.options.time_limit(worker.task)
+                worker.deadline = None if limit is None else time.monotonic() + limit
+            yield worker.task, message.value
+            if isinstance(message, Final):
+                worker.task = worker.deadline = None
+                if self.options.is_reused:
+                    self._assign_task(worker)
+                else:
+                    self._stop(worker)
 
     def _assign_task(self, worker: Worker[Task]) -> None:
         """Give a worker the next task, or stop it if there is none."""
