@@ -25,6 +25,7 @@ from super_sdf.machine.pool import Death, Pool
 from super_sdf.machine.threads import count_cores
 
 pytestmark = pytest.mark.usefixtures("grid_folder")
+SMALL = (*FAST, "--factor", 2, "--spacing", 1)
 
 
 def test_an_interrupt_is_one_line_and_keeps_what_is_done(run_batch, monkeypatch):
@@ -70,14 +71,14 @@ def test_nothing_of_the_current_folder_is_run(tmp_path):
 
 def start_batch(*options):
     """Start a batch as a process, and return it when its report has some lines."""
-    process = start_command("batch", "in", "--out", "out", "--jobs", 2, "--threads", 1, *options)
+    process = start_command("batch", "in", "--out", "out", "--jobs", 2, "--threads", 1, *SMALL, *options)
     wait_for_lines(process, Path("out/report.jsonl"))
     return process
 
 
 def test_killed_on_the_way_it_goes_on(command):
     larger_grids(16)
-    process = start_batch("--quality", "fast")
+    process = start_batch()
     workers = psutil.Process(process.pid).children()
     assert len(workers) >= 2
     process.kill()
@@ -86,7 +87,7 @@ def test_killed_on_the_way_it_goes_on(command):
     for mesh in Path("out").rglob("[!.]*.ply"):
         assert len(trimesh.load(mesh).faces) > 0
     finished = len(rows())
-    code, _, err = command("batch", "in", "--out", "out", "--quality", "fast")
+    code, _, err = command("batch", "in", "--out", "out", *SMALL)
     assert code == 1 and f", {finished} done before" in err
     assert len(rows()) == 20 == len({row["out"] for row in rows()})
     assert not list(Path("out").rglob(".*.part"))
@@ -136,7 +137,7 @@ def test_a_lock_file_that_cannot_be_written_is_named(run_batch, monkeypatch):
 @pytest.mark.parametrize("name", ["SIGHUP", "SIGINT"])
 def test_a_signal_ends_batch_and_workers_in_a_line(name):
     larger_grids(16)
-    process = start_batch("--quality", "fast")
+    process = start_batch()
     workers = psutil.Process(process.pid).children()
     process.send_signal(getattr(signal, name))
     _, err = process.communicate(timeout=PATIENCE)
@@ -149,7 +150,7 @@ def test_a_signal_ends_batch_and_workers_in_a_line(name):
 
 def test_a_worker_that_dies_once_costs_nothing(command):
     larger_grids(12)
-    process = start_batch("--quality", "fast", "--quiet")
+    process = start_batch("--quiet")
     children = psutil.Process(process.pid).children()
     worker = next(child for child in children if "spawn_main" in " ".join(child.cmdline()))
     worker.kill()
