@@ -111,6 +111,7 @@ def test_no_string_names_a_module(module):
 @pytest.mark.parametrize("module", [m for m in MODULES if room_of(m) not in WITH_EXTRAS])
 def test_the_runtime_needs_few_packages(module):
     allowed = {"click", "numpy", "onnxruntime", "trimesh"} | set(sys.stdlib_module_names)
+    allowed.add("typing_extensions")  # for type checkers alone, which have it
     others = {"batch.lock": {"filelock"}, "machine.memory": {"psutil"}, **READERS}
     allowed |= others.get(module, set())
     foreign = imported(MODULES[module])[1]

@@ -19,9 +19,8 @@ from ..files.meshes import check_mesh_suffix
 from ..files.regular import reason_of
 from ..files.store import is_store
 from .job import Job
-from .journal import LOCK_NAME, is_journal
-from .journal import NAME as JOURNAL
 from .ledger import NAME as LEDGER
+from .lock import LOCK_NAME
 from .manifest import read_manifest
 from .walking import files_below, fixed_part, matches
 
@@ -60,7 +59,7 @@ def find_jobs(arguments: Sequence[str], suffix: str, options: ConvertOptions) ->
         check_mesh_suffix(Path(f"*{kind}"))
     for job in jobs:
         first = PurePath(job.target).parts[0].casefold()
-        if first in (JOURNAL, LOCK_NAME, LEDGER) or is_journal(first):
+        if first in (LOCK_NAME, LEDGER):
             raise OptionError(
                 f"{job.source} would become {job.target}, but the first of these names is the "
                 "batch's own: rename it"

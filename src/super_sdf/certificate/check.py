@@ -11,9 +11,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from ..convert import ConvertOptions
 from ..errors import OutOfMemoryError
-from ..files.grids import READ_OPTIONS, read_grid_with
+from ..files.grids import read_grid
 from ..files.regular import check_regular_file
 from ..grid.cubic import cubic_grid
 from ..grid.sdf_grid import SdfGrid
@@ -21,7 +20,7 @@ from ..machine.memory import give_back, held_memory, in_words
 from ..machine.resources import Resources, allot
 from ..machine.threads import useful_threads
 from ..mesh import Mesh
-from ..options import check_distance, check_max_memory
+from ..options import ConvertOptions, ReadOptions, check_distance, check_max_memory
 from ..steps.survey import no_surface, survey
 from ..truth.mesh_files import read_mesh
 from .slabs import search
@@ -33,43 +32,31 @@ from .touching import NOTICEABLE, Touching, exact_samples, touch
 BYTES_PER_TRIANGLE = 420
 BYTES_PER_SAMPLE = 150
 REACH = 2.0  # voxels: how far slabs look; the samples near the surface are within 1.4 of it
-# The options of a conversion that say how its grid is read, and where its surface is.
-SHARED = (*READ_OPTIONS, "offset")
 HEADER_BYTES = 4096  # of a PLY file, in which the number of faces is looked for
 
 
-@dataclass(frozen=True)
-class CheckOptions:
+@dataclass(frozen=True, kw_only=True)
+class CheckOptions(ReadOptions):
     """How the grid of a mesh is read, and what is counted; see ``ConvertOptions``.
 
     Attributes
     ----------
-    spacing, origin, direction, axes, inside, field, label, level, scale, offset, max_memory
-        As given when the mesh was made.
+    offset : float
+        As given when the mesh was made, like how its grid was read.
     intersections : bool
         Count self-intersections, which takes up to half of the time.
     processes : int
         How many may search large meshes at the same time; 0: one per core.
     """
 
-    spacing: tuple[float, ...] | None = None
-    origin: tuple[float, ...] | None = None
-    inside: str = "auto"
     offset: float = 0.0
-    max_memory: int | None = None
     intersections: bool = True
     processes: int = 1
-    axes: str | None = None
-    direction: tuple[float, ...] | None = None
-    field: str = "auto"
-    label: int | None = None
-    level: float | None = None
-    scale: float | None = None
 
     @classmethod
     def of(cls, options: ConvertOptions) -> CheckOptions:
         """Return how a grid is read that was converted with these options."""
-        return cls(**{name: getattr(options, name) for name in SHARED})
+        return cls(**options.reading(), offset=options.offset)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +180,7 @@ def read_for_check(
     """Return a mesh and the grid that it was made from; raise OutOfMemoryError before both."""
     bound = allot(0, check_max_memory(options.max_memory))
     check_room(stated_triangles(check_regular_file(mesh)), 0, bound)
-    found = read_grid_with(grid, options)
+    found = read_grid(grid, **options.reading())
     return read_mesh(mesh, options.max_memory), found
 
 

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..machine.extras import check_modules
+from ..options import GRID, parse_size
 from .common import CONTEXT, one_line_errors, print_stderr, print_stdout
-from .conversion import CHECK_MODULES, grid_options, parse_size
+from .conversion import CHECK_MODULES, Parsed, table_options
 from .interrupts import raising_interrupts
 
 if TYPE_CHECKING:
@@ -67,7 +68,7 @@ Examples:
     is_flag=True,
     help="Do not count self-intersections, which takes up to half of the time.",
 )
-@grid_options
+@table_options(*GRID)
 @click.option(
     "--offset",
     type=float,
@@ -78,7 +79,7 @@ Examples:
 )
 @click.option(
     "--max-memory",
-    callback=parse_size,
+    type=Parsed(parse_size),
     metavar="SIZE",
     help="Memory limit of the process, such as 1500M or 4G. Default: 60 % of the free memory. "
     "Larger meshes are refused.",
@@ -132,9 +133,9 @@ def run_check(mesh: Path, grid: Path, options: dict[str, Any]) -> list[str]:
 
 def make_check_options(options: dict[str, Any]) -> CheckOptions:
     """Return the options of the check, picked from all options of a command."""
-    from ..certificate.check import SHARED, CheckOptions
+    from ..certificate.check import CheckOptions
 
-    chosen = {name: options[name] for name in SHARED}
+    chosen = {name: options[name] for name in (*GRID, "offset", "max_memory")}
     count = not options["skip_intersections"]
     return CheckOptions(**chosen, intersections=count, processes=0)
 

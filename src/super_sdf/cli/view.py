@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import click
 
 from ..machine.extras import EXTRAS, check_modules
 from .common import CONTEXT, one_line_errors, print_stderr
-from .conversion import check_simplification, chosen_model, conversion_options, make_options
+from .conversion import conversion_options, load_chosen, make_options
 from .interrupts import raising_interrupts
 from .reporting import check_page
 
@@ -56,7 +57,6 @@ def view_command(sources: tuple[str, ...], **options: Any) -> None:
 
 def write_view(sources: tuple[str, ...], options: dict[str, Any]) -> Path:
     """Read and refine the files and write their page; return its absolute path."""
-    from ..network.network import Network, load_network
     from ..pages.html import write_page
     from ..pages.viewing import viewed_page
 
@@ -64,15 +64,10 @@ def write_view(sources: tuple[str, ...], options: dict[str, Any]) -> Path:
     page, force = options["out"], options["force"]
     if page:
         check_page("--out", page, sources, force=force)
-    check_simplification(options)
-    model = chosen_model(options)
-
-    def load() -> Network:
-        chosen = {name: options[name] for name in ("device", "threads", "precision")}
-        return load_network(model, **chosen)
+    chosen = make_options(options)
 
     with raising_interrupts():
-        text = viewed_page(sources, load, make_options(options))
+        text = viewed_page(sources, partial(load_chosen, options), chosen)
         page = page or private_file()
         write_page(text, page, force=force)
     return Path(page).absolute()

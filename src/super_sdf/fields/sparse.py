@@ -27,11 +27,11 @@ from ..grid.field import Field
 from ..grid.planes import InputFile, SamplePlanes
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import check_fits
-from ..options import check_path
+from ..options import check_factor, check_path
 from ..steps.band import neighbour_table
 from ..steps.cap import find_border_inside
 from ..steps.field import FineField, SampleSpheres
-from ..steps.nodes import check_factor, copies_agree, share_parts
+from ..steps.nodes import copies_agree, share_parts
 
 VERSION = 1
 CHUNK = 1 << 20  # values at a time

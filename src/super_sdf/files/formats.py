@@ -11,6 +11,7 @@ from pathlib import Path, PurePath
 
 from ..errors import OptionError
 from ..machine.extras import check_modules
+from ..options import OPTIONS
 
 # What people give by mistake: surfaces, which have to be sampled first.
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf", ".3mf", ".step", ".stp")
@@ -82,7 +83,6 @@ DICOM = GridFormat("dicom", "DICOM", ("a folder",), "dicom", has_members=True, i
 """A folder that is no Zarr store: the names of slices end in anything."""
 
 GRID_SUFFIXES = tuple(suffix for format_ in FORMATS for suffix in format_.suffixes)
-AXES = ("xyz", "zyx")
 _MEMBERS = "|".join(re.escape(s[1:]) for f in FORMATS if f.has_members for s in f.suffixes)
 _WITH_MEMBER = re.compile(rf"(?P<file>.*\.(?:{_MEMBERS})):(?P<member>.+)", re.I | re.S)
 
@@ -167,8 +167,7 @@ def choose_axes(format_: GridFormat, given: str | None) -> str:
     """
     if given is None:
         return format_.axes or "xyz"
-    if given not in AXES:
-        raise OptionError(f"axes is {given!r}: give one of {', '.join(AXES)}")
+    OPTIONS["axes"].check(given)
     if format_.axes is None:
         raise OptionError(
             f"axes is {given!r}, but {format_.name} files state their axes: leave it out"

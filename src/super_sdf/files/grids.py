@@ -13,18 +13,17 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, GridError, OptionError, OutOfMemoryError, SuperSdfError
-from ..grid.field import Wanted
 from ..grid.planes import InputFile, PlaneFile, SampleArray, check_planes
 from ..grid.samples import check_kind
 from ..grid.sdf_grid import SdfGrid, make_grid
 from ..machine.memory import ROOM_SHARE, held_memory, memory_bound
-from ..options import check_path
+from ..options import ReadOptions, Values, check_path
 from .apart import volume_apart
 from .archives import Member, open_archive
 from .formats import (
@@ -42,23 +41,15 @@ from .store import check_grid_file
 from .unpacking import check_ratio, unpack
 from .volume import Request, Volume, axes_direction, take
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
 PLACE = ("spacing", "origin", "direction")
 NPZ_KEYS = ("values", *PLACE)
 OPEN3D = {"key.npy", "voxel_size.npy", "block_resolution.npy", "attr_name_tsdf.npy"}
 NUMBERS = "one number or three"
 MOST_NAMED = 10  # members of an archive that an error lists
 UNKNOWN_ROOM = 1 << 28  # bytes that an unpacked array may take if the memory left is unknown
-
-READ_OPTIONS = (
-    *("spacing", "origin", "direction", "axes", "inside", "field", "label", "level", "scale"),
-    "max_memory",
-)
-"""What ``read_grid`` takes besides the path."""
-
-
-def read_grid_with(path: str | Path, options: Any) -> SdfGrid:
-    """Read a grid as an object with the attributes ``READ_OPTIONS`` says; see ``read_grid``."""
-    return read_grid(path, **{name: getattr(options, name) for name in READ_OPTIONS})
 
 
 def read_grid(
@@ -68,12 +59,8 @@ def read_grid(
     origin: Any = None,
     direction: Any = None,
     axes: str | None = None,
-    inside: str = "auto",
-    field: str = "auto",
-    label: int | None = None,
-    level: float | None = None,
-    scale: float | None = None,
     max_memory: int | None = None,
+    **values: Unpack[Values],
 ) -> SdfGrid:
     """Read a grid from a file of any format in ``formats.FORMATS``; docs/formats.md describes them.
 
@@ -114,18 +101,10 @@ def read_grid(
         If the suffix, ``axes``, ``inside`` or ``field`` is unknown; if a direction is given, but
         files of the format state it.
     """
-    Wanted(field, label, level, scale).check()
+    ReadOptions(**values)  # checks them
     place = {"spacing": spacing, "origin": origin, "direction": direction}
     found = read_array(path, place, axes, max_memory)
-    grid = make_grid(
-        found["values"],
-        **{key: found[key] for key in PLACE},
-        inside=inside,
-        field=field,
-        label=label,
-        level=level,
-        scale=scale,
-    )
+    grid = make_grid(found["values"], **{key: found[key] for key in PLACE}, **values)
     return grid.noted(found["notes"])
 
 

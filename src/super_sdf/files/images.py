@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from math import prod
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import GridError, OptionTypeError, seen
-from ..grid.field import Wanted
 from ..grid.sdf_grid import SdfGrid, make_grid
+from ..options import ReadOptions, Values
 from .grids import unpacking_room
 from .volume import ImageLattice, take
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 NAME = "the image"  # in error messages
 PLACE_OF_FILE = {"spacing": None, "origin": None, "direction": None}  # nothing replaces its own
@@ -19,12 +22,8 @@ def grid_from_image(
     image: Any,
     scalars: str | None = None,
     *,
-    inside: str = "auto",
-    field: str = "auto",
-    label: int | None = None,
-    level: float | None = None,
-    scale: float | None = None,
     max_memory: int | None = None,
+    **values: Unpack[Values],
 ) -> SdfGrid:
     """Make a grid of VTK image data: the one that ``read_grid`` makes of it as a ``.vti`` file.
 
@@ -55,7 +54,7 @@ def grid_from_image(
     OptionError
         If ``inside`` or ``field`` is unknown, or ``image`` is no image data (``OptionTypeError``).
     """
-    Wanted(field, label, level, scale).check()
+    ReadOptions(**values)  # checks them
     if not (hasattr(image, "IsA") and image.IsA("vtkImageData")):
         raise OptionTypeError(f"image is {seen(image)}: give VTK image data")
     from vtkmodules.util.numpy_support import vtk_to_numpy
@@ -63,10 +62,10 @@ def grid_from_image(
     array, of_points = _choose_array(image, scalars)
     lattice = ImageLattice.of_image(image, of_points)
     _check_array(array, prod(lattice.shape))
-    values = vtk_to_numpy(array).reshape(lattice.shape)
-    volume = lattice.volume(values.dtype, lambda first, last: values[first:last])
+    samples = vtk_to_numpy(array).reshape(lattice.shape)
+    volume = lattice.volume(samples.dtype, lambda first, last: samples[first:last])
     found = take(volume, NAME, unpacking_room(max_memory), PLACE_OF_FILE)
-    return make_grid(**found, inside=inside, field=field, label=label, level=level, scale=scale)
+    return make_grid(**found, **values)
 
 
 def _choose_array(image: Any, scalars: str | None) -> tuple[Any, bool]:

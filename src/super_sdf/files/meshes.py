@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Triple
-from ..errors import FileError, OptionError, OptionTypeError, seen
-from ..mesh import Mesh
+from ..errors import FileError, OptionError
+from ..mesh import Mesh, check_mesh
 from ..options import check_path
 from .glb import write_glb, write_glb_parts
 from .output import check_free, replacing
@@ -116,8 +116,7 @@ def write_mesh(mesh: Mesh, path: str | Path, *, force: bool = False) -> None:
         If the file exists and ``force`` is not set, or cannot be written; or if the format cannot
         hold the mesh: a coordinate is not finite, or corners of a triangle would coincide.
     """
-    if not isinstance(mesh, Mesh):
-        raise OptionTypeError(f"mesh is {seen(mesh)}: give one from reconstruct(grid)")
+    check_mesh(mesh)
     path = check_target(check_path(path, "path"), force=force)
     about = _local_origin(mesh, path)
     _check_mesh_holds(mesh, path, about)

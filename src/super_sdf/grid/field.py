@@ -10,24 +10,20 @@ noisy      distances with noise
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from numbers import Integral
 from typing import Any
 
 import numpy as np
 
-from ..errors import OptionError, seen
+from ..options import AUTO as AUTO
+from ..options import EXACT as EXACT
+from ..options import FIELDS as FIELDS
+from ..options import MASK as MASK
+from ..options import NOISY as NOISY
+from ..options import SCALED as SCALED
+from ..options import TRUNCATED as TRUNCATED
 from .planes import SampleArray
 from .samples import Extremes
 
-AUTO, EXACT, TRUNCATED, MASK, SCALED, NOISY = (
-    "auto",
-    "exact",
-    "truncated",
-    "mask",
-    "scaled",
-    "noisy",
-)
-FIELDS = (AUTO, EXACT, TRUNCATED, MASK, SCALED, NOISY)
 NONE_EXACT: Extremes = (0.0, 0.0)
 
 
@@ -71,55 +67,3 @@ class Field:
     def report(self) -> dict[str, Any]:
         """Return kind and evidence as a dictionary that can be written as JSON."""
         return {"kind": self.kind, "given": self.given, **self.evidence}
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """What the user says about the values; see ``make_grid``."""
-
-    field: str = AUTO
-    label: int | None = None
-    level: float | None = None
-    scale: float | None = None
-
-    def check(self) -> None:
-        """Raise OptionError if an option is unknown, not a number, or contradicts another."""
-        if not isinstance(self.field, str) or self.field not in FIELDS:
-            raise OptionError(f"field is {seen(self.field)}: give one of {', '.join(FIELDS)}")
-        if self.label is not None:
-            check_label(self.label)
-        for name in ("level", "scale"):
-            number = getattr(self, name)
-            if number is not None and not _is_finite(number):
-                raise OptionError(f"{name} is {seen(number)}: give a number")
-        if self.scale is not None and self.scale <= 0:
-            raise OptionError(f"scale is {self.scale:g}: it must be greater than 0")
-        if self.label is not None and self.level is not None:
-            raise OptionError(f"label {self.label} and level {self.level:g}: give only one of them")
-        if self.label is not None and self.field not in (AUTO, MASK):
-            raise OptionError(
-                f"label {self.label} and field {self.field}: the samples of a label are a mask"
-            )
-
-
-def check_label(label: Any, name: str = "label") -> int:
-    """Return a label; ``name`` is the argument's in messages.
-
-    Raises
-    ------
-    OptionError
-        If it is no whole number that an integer of 64 bits can be, signed or not.
-    """
-    is_whole = isinstance(label, Integral) and not isinstance(label, bool)
-    is_whole |= isinstance(label, (float, np.floating)) and float(label).is_integer()
-    if not (is_whole and -(2**63) <= int(label) < 2**64):
-        raise OptionError(f"{name} is {seen(label)}: give a whole number, -2^63 to 2^64 - 1")
-    return int(label)
-
-
-def _is_finite(number: Any) -> bool:
-    """Return whether something is a finite number, and no bool."""
-    try:
-        return not isinstance(number, (bool, np.bool_, str)) and bool(np.isfinite(float(number)))
-    except (TypeError, ValueError):
-        return False

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import GridError
+from ..options import ReadOptions
 from . import distances, masking
 from .advice import are_labels, choose_label, choose_level, is_density, refusal
 from .evidence import Looked, is_normalised, is_projective, look, weigh
-from .field import EXACT, MASK, NOISY, SCALED, Wanted
+from .field import EXACT, MASK, NOISY, SCALED
 from .one_sided import is_one_sided
 from .planes import SampleArray, changed
 from .request import Interpreted, Request
@@ -33,7 +34,11 @@ from .unseen import without_unseen
 
 
 def interpret(
-    samples: SampleArray, wanted: Wanted, spacing: ArrayLike | None, inside: str, notes: list[str]
+    samples: SampleArray,
+    wanted: ReadOptions,
+    spacing: ArrayLike | None,
+    inside: str,
+    notes: list[str],
 ) -> Interpreted:
     """Return distances for the values of a grid; ``notes`` gets sentences on what was inferred.
 
@@ -107,7 +112,7 @@ def _check_no_densities(samples: SampleArray, request: Request, scale: float) ->
         raise refusal(samples, extremes, None)
 
 
-def _no_level(given: SampleArray, extremes: Extremes, wanted: Wanted) -> GridError:
+def _no_level(given: SampleArray, extremes: Extremes, wanted: ReadOptions) -> GridError:
     """Return the error for a level that no value is above, or none below."""
     level = float(wanted.level or 0)
     low, high = (x / (wanted.scale or 1) + level for x in extremes)

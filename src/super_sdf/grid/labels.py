@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import BoolArray, IntArray
 from ..errors import GridError, OptionError, seen
+from ..options import ReadOptions, check_label
 from .advice import MOST_NAMED
-from .field import MASK, NONE_EXACT, Field, Wanted, check_label
+from .field import MASK, NONE_EXACT, Field
 from .masking import as_sample, labelled
 from .masks import REACH, extremes_of_masks, mask_planes
 from .named_axes import placed
@@ -125,7 +126,7 @@ def make_labels(
     check_kind(samples.dtype, samples.shape)
     found = find_labels(samples, None if isinstance(wanted, str) else wanted)
     added: list[str] = []
-    request = Request.checked(Wanted(), given.spacing, "auto")
+    request = Request.checked(ReadOptions(), given.spacing, "auto")
     request = request.with_spacing(1, "since labels show none (give --spacing)", added)
     assert request.spacing is not None
     if given.origin is None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..errors import GridError
 from .advice import MOST_NAMED, named, way_out
 from .evidence import ENOUGH, Looked
-from .field import AUTO, MASK, NONE_EXACT, Field, check_label
+from .field import AUTO, MASK, NONE_EXACT, Field
 from .masks import extremes_of_masks, has_both_sides, mask_planes
 from .planes import SampleArray, changed
 from .request import Interpreted, Request
@@ -28,7 +28,6 @@ STEP, STEP_TAIL = 0.85, 0.05
 
 def labelled(samples: SampleArray, label: int) -> SampleArray:
     """Return which samples have a label; GridError if none or all have."""
-    label = check_label(label)
     value = as_sample(label, samples.dtype)
     if value is not None:
         found = changed(samples, lambda planes: planes == value, np.bool_)

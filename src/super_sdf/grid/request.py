@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from numpy.typing import ArrayLike
 
 from ..arrays import Triple
-from .field import AUTO, Field, Wanted
+from ..options import ReadOptions, check_inside
+from .field import AUTO, Field
 from .planes import SampleArray
 from .samples import Extremes
-from .sides import check_inside
 from .spacing import check_spacing
 
 
@@ -20,22 +20,21 @@ class Request:
 
     Attributes
     ----------
-    wanted : Wanted
+    wanted : ReadOptions
         What they are.
     spacing : three floats, optional
         World distance between neighbouring samples along each axis, if it is known.
     inside : str
-        One of ``sides.INSIDE``.
+        One of ``options.INSIDE``.
     """
 
-    wanted: Wanted
+    wanted: ReadOptions
     spacing: Triple | None
     inside: str
 
     @classmethod
-    def checked(cls, wanted: Wanted, spacing: ArrayLike | None, inside: str) -> Request:
+    def checked(cls, wanted: ReadOptions, spacing: ArrayLike | None, inside: str) -> Request:
         """Return a request whose parts have been checked; OptionError or GridError if one fails."""
-        wanted.check()
         check_inside(inside)
         return cls(wanted, None if spacing is None else check_spacing(spacing), inside)
 

@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Triple
+from ..errors import OptionTypeError, seen
+from ..options import ReadOptions
 from .direction import STRAIGHT, Direction, check_direction, in_rows, is_mirrored
-from .field import AUTO, Field, Wanted
+from .field import AUTO, Field
 from .interpret import interpret
 from .named_axes import placed
 from .planes import NoPlanes, SampleArray, SamplePlanes
@@ -277,7 +279,7 @@ def make_grid(
         If ``inside`` or ``field`` is not one of these, or another option is no number.
     """
     notes: list[str] = []
-    wanted = Wanted(field, label, level, scale)
+    wanted = ReadOptions(inside=inside, field=field, label=label, level=level, scale=scale)
     given = placed(values, spacing, origin)
     found = interpret(as_samples(given.values), wanted, given.spacing, inside, notes)
     origin = given.origin
@@ -294,6 +296,15 @@ def make_grid(
         extremes=found.extremes,
         field=found.field,
     )
+
+
+def check_grid(grid: Any) -> None:
+    """Raise OptionTypeError if ``grid`` is not an ``SdfGrid``, but an array or a path, say."""
+    if not isinstance(grid, SdfGrid):
+        what = f"an array of shape {grid.shape}" if isinstance(grid, np.ndarray) else seen(grid)
+        raise OptionTypeError(
+            f"grid is {what}: make one with make_grid(values, spacing=...) or read_grid(path)"
+        )
 
 
 def _checked(values: ArrayLike | SamplePlanes) -> tuple[SampleArray, Extremes]:

@@ -6,12 +6,11 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from ..errors import GridError, OptionError, seen
+from ..errors import GridError
+from ..options import check_inside
 from .one_sided import is_one_sided
 from .planes import SampleArray, in_blocks, over_planes
 from .samples import Extremes
-
-INSIDE = ("auto", "negative", "positive")
 
 
 def is_positive_inside(
@@ -24,7 +23,7 @@ def is_positive_inside(
     values : (nx, ny, nz) array or Planes
         Samples.
     inside : str
-        One of ``INSIDE``.
+        One of ``options.INSIDE``.
     extremes : two floats
         The smallest and the largest sample.
     notes : list of str
@@ -50,12 +49,6 @@ def is_positive_inside(
             "sign (if that is wrong, use --inside)"
         )
     return positive
-
-
-def check_inside(inside: str) -> None:
-    """Raise OptionError if ``inside`` is unknown."""
-    if not isinstance(inside, str) or inside not in INSIDE:
-        raise OptionError(f"inside is {seen(inside)}: give one of {', '.join(INSIDE)}")
 
 
 def check_negative_inside(values: SampleArray) -> None:

@@ -20,28 +20,19 @@ from ..files.grids import one_line_errors, open_volume, reader_of
 from ..files.headers import read_array_header
 from ..files.regular import check_regular_file
 from ..files.unpacking import PIECE
-from ..files.volume import Volume, find_placement, place_in_world, unpacked
+from ..files.volume import find_placement, place_in_world, unpacked
 from ..grid.planes import InputFile, PlaneFile, SampleArray, SamplePlanes
-from ..machine.memory import held_memory
+from ..machine.memory import ROOM_SHARE, held_memory
 
-ROOM_SHARE = 0.25  # of the memory that a process may hold, for layers that stay unpacked
-ROOM = 1 << 28  # bytes, if there is no bound
+ROOM = 1 << 28  # bytes for layers that stay unpacked, if there is no bound
 WAY_OUT = "convert it on one machine (without --cluster)"
 
 
 class Source(NamedTuple):
-    """A grid file as all processes open it.
+    """A grid file as all processes open it, by its absolute path; ``axes`` as in ``read_grid``.
 
-    Attributes
-    ----------
-    path : str
-        Absolute, perhaps with the name of an array in it.
-    axes : str or None
-        See ``read_grid``.
-    has_direction : bool
-        Whether the user gives a direction, which replaces that in the file.
-    run : str
-        Differs from run to run: the file may have changed since the one before.
+    A direction that the user gives replaces that in the file. ``run`` differs from run to run: the
+    file may have changed since the one before.
     """
 
     path: str
@@ -57,8 +48,7 @@ class Source(NamedTuple):
 
 def check_source(source: Source) -> None:
     """Raise OptionError if workers cannot read the planes of such a file for themselves."""
-    key = find_format(source.path).key
-    if key not in ("npy", "zarr"):
+    if find_format(source.path).key not in ("npy", "zarr"):
         raise OptionError(
             f"{source.path} cannot be read by several workers at once: --cluster takes .zarr and "
             f".npy; {WAY_OUT}, or save it as .zarr"
@@ -74,13 +64,6 @@ class StoredPlanes(SamplePlanes):
     """The samples of a store, whose planes along x any process reads for itself.
 
     Pickled, it is the path: another process opens the store when it reads the first plane.
-
-    Parameters
-    ----------
-    source : Source
-        The file.
-    shape, dtype
-        Shape (nx, ny, nz) and type of the array.
     """
 
     travels = True
@@ -101,26 +84,15 @@ class StoredPlanes(SamplePlanes):
         return StoredPlanes, (self.source, self.shape, self.dtype)
 
 
-class Facts(NamedTuple):
-    """What a store says of its grid: shape, type, and place in the world.
+class Store:
+    """An open store in this process, with the layers (planes that share chunks) it has unpacked.
 
-    Attributes
-    ----------
-    layer : int
-        Planes that share chunks.
-    place : dict
-        Spacing, origin and direction, as ``make_grid`` takes them.
+    ``bound`` are the bytes that this process may hold, if that is known.
     """
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
-    layer: int
-    place: dict[str, Any]
-    notes: tuple[str, ...]
-
-
-class Store:
-    """An open store in this process, with the layers that it has unpacked."""
+    layer = 1
 
     def __init__(self, source: Source) -> None:
         self.source = source
@@ -141,7 +113,6 @@ class Store:
             raise FileError(f"{path} is in Fortran order: save it in C order, or {WAY_OUT}")
         self.shape, self.dtype = header.shape, header.dtype
         self.planes = PlaneFile(file, header.length, header.shape, header.dtype)
-        self.layer = 1
 
     def _open_volume(self) -> None:
         """Open a store that a library reads."""
@@ -149,61 +120,54 @@ class Store:
         self.format = find_format(path)
         axes = choose_axes(self.format, self.source.axes)
         volume = self.files.enter_context(open_volume(path, self.format, axes, (0, None)))
-        if self.source.has_direction:
-            volume = volume.turned(axes)
-        self.volume: Volume = volume
+        self.volume = volume.turned(axes) if self.source.has_direction else volume
         self.placement = find_placement(self.volume, str(path))
-        nx, ny, nz = (self.volume.shape[self._axis(w)] for w in range(3))
-        self.shape, self.dtype = (nx, ny, nz), self.volume.dtype
-        unit = min(self.volume.unit[self._axis(0)], nx)
-        least = PIECE // (ny * nz * self.dtype.itemsize * unit)
-        self.layer = unit * max(least, 1)
+        order = [self.placement.world_axes.index(world) for world in range(3)]
+        self.shape, self.dtype = tuple(self.volume.shape[axis] for axis in order), volume.dtype
+        nx, ny, nz = self.shape
+        unit = min(self.volume.unit[order[0]], nx)
+        self.layer = unit * max(PIECE // (ny * nz * self.dtype.itemsize * unit), 1)
 
-    def _axis(self, world: int) -> int:
-        """Return the axis of the array along a world axis."""
-        return self.placement.world_axes.index(world)
+    def place(self, given: dict[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
+        """Return the place in the world as ``make_grid`` takes it, and notes.
 
-    def facts(self, given: dict[str, Any]) -> Facts:
-        """Return what the store says; ``given`` holds what replaces its place, or None."""
+        ``given`` holds what replaces that of the file, or None.
+        """
         if self.source.is_npy:
-            return Facts(self.shape, self.dtype, self.layer, given, ())
-        place = place_in_world(self.volume, self.placement, given)
-        return Facts(self.shape, self.dtype, self.layer, place, self.volume.notes)
+            return given, ()
+        return place_in_world(self.volume, self.placement, given), self.volume.notes
 
     def read(self, first: int, last: int) -> NDArray[Any]:
         """Return planes ``first`` to before ``last``."""
         if self.source.is_npy:
             return self.planes.read(first, last)
-        parts = []
+        parts = [np.empty((0, *self.shape[1:]), self.dtype)]
         for start in range(first - first % self.layer, last, self.layer):
             low, high = max(first - start, 0), min(last - start, self.layer)
             parts.append(np.asarray(self._layer(start)[low:high]))
-        if not parts:
-            return np.empty((0, *self.shape[1:]), self.dtype)
-        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+        return parts[-1] if len(parts) <= 2 else np.concatenate(parts)
 
     def _layer(self, start: int) -> SampleArray:
         """Return the layer that begins at a plane, unpacked once if there is room for it."""
         if start not in self.layers:
-            planes = start, min(start + self.layer, self.shape[0])
             try:
-                self.layers[start] = self._unpacked(planes)
+                self.layers[start] = self._unpacked(start)
             except OutOfMemoryError:
                 if not self.layers:
                     raise
                 self.layers.clear()  # make room on the disk
-                self.layers[start] = self._unpacked(planes)
+                self.layers[start] = self._unpacked(start)
         return self.layers[start]
 
-    def _unpacked(self, planes: tuple[int, int]) -> SampleArray:
-        """Return some planes unpacked, in memory or in a temporary file."""
+    def _unpacked(self, start: int) -> SampleArray:
+        """Return a layer unpacked, in memory or in a temporary file."""
+        planes = start, min(start + self.layer, self.shape[0])
         held = sum(layer.nbytes for layer in self.layers.values() if isinstance(layer, np.ndarray))
         room = ROOM if self.bound is None else int(ROOM_SHARE * self.bound)
         left = None if self.bound is None else max(self.bound - (held_memory() or 0), 0)
-        with one_line_errors(Path(self.source.path), self.format, None):
-            return unpacked(
-                self.volume, self.placement, self.source.path, (room - held, left), planes
-            )
+        path = self.source.path
+        with one_line_errors(Path(path), self.format, None):
+            return unpacked(self.volume, self.placement, path, (room - held, left), planes)
 
 
 _stores: dict[Source, Store] = {}
