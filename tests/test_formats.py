@@ -148,7 +148,6 @@ def test_the_file_is_read_slab_by_slab_into_a_temporary_file(name, monkeypatch):
         ORIENTED[name](name, affine_of(turn))
         with monkeypatch.context() as patch:
             patch.setattr("super_sdf.files.grids.ROOM_SHARE", 0)
-            patch.setattr("super_sdf.files.volume.PIECE", 3000)
             patch.setattr(unpacking, "PIECE", 3000)
             grid = read_grid(name)
         assert isinstance(grid.samples, PlaneFile)
@@ -407,7 +406,7 @@ def text_sdf(affine: np.ndarray) -> str:
 def test_three_dialects_of_sdf(monkeypatch):
     affine = affine_of(np.eye(3))
     values, low = sampled(affine), affine[:3, 3].astype("<f4")
-    monkeypatch.setattr("super_sdf.files.readers.values.TEXT_PIECE", 1001)
+    monkeypatch.setattr("super_sdf.files.streams.TEXT_PIECE", 1001)
     Path("text.sdf").write_text(text_sdf(affine))
     check(read_grid("text.sdf"))
     tag = "#sdf 1\ndim {} {} {}\ndata\n".format(*SIZES).encode()

@@ -11,9 +11,14 @@ import numpy as np
 import pytest
 
 from super_sdf.errors import FileError, GridError, SuperSdfError, WriteError
-from super_sdf.files import output, parts
-from super_sdf.files.output import check_apart, check_free, replacing
-from super_sdf.files.parts import part_path, remove_abandoned_parts
+from super_sdf.files import output
+from super_sdf.files.output import (
+    check_apart,
+    check_free,
+    part_path,
+    remove_abandoned_parts,
+    replacing,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -143,7 +148,7 @@ def leave_part(target, pid):
 @pytest.mark.parametrize("has_locks", [True, False])
 def test_what_a_killed_process_left_goes_with_the_next_run(monkeypatch, target, has_locks):
     if not has_locks:
-        monkeypatch.setattr(parts, "take_lock", lambda file: None)
+        monkeypatch.setattr(output, "take_lock", lambda file: None)
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
     leave_part(target, gone.pid)
@@ -157,8 +162,8 @@ def test_what_a_killed_process_left_goes_with_the_next_run(monkeypatch, target, 
 def test_what_is_being_written_is_not_touched():
     with replacing(Path("out.ply")) as part:
         part.write_text("mine")
-        script = "import sys; from pathlib import Path; from super_sdf.files import parts; "
-        script += "parts.remove_abandoned_parts([Path('out.ply')])"
+        script = "import sys; from pathlib import Path; from super_sdf.files import output; "
+        script += "output.remove_abandoned_parts([Path('out.ply')])"
         subprocess.run([sys.executable, "-c", script], check=True)
         remove_abandoned_parts([Path("out.ply")])
         assert part.read_text() == "mine"

@@ -27,7 +27,7 @@ from conftest import ball
 from super_sdf import read_grid
 from super_sdf.errors import FileError, GridError, OutOfMemoryError, SuperSdfError, seen
 from super_sdf.files import apart, grids
-from super_sdf.files.readers.table import READERS
+from super_sdf.files.readers import READERS
 from super_sdf.files.readers.zarr_files import CODECS
 from super_sdf.truth.mesh_files import read_mesh
 

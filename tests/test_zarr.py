@@ -11,7 +11,7 @@ from conftest import ball
 
 from super_sdf import read_grid
 from super_sdf.errors import FileError, GridError, OutOfMemoryError
-from super_sdf.files import boxes, grids, unpacking, volume
+from super_sdf.files import grids, unpacking, volume
 
 SHAPE = (30, 26, 22)  # x, y, z
 LAYOUTS = {
@@ -67,8 +67,7 @@ def test_each_chunk_is_read_once(monkeypatch, values, axes, room, layout):
         volume.Volume, "box", lambda own, box: read.append(box) or original(own, box)
     )
     monkeypatch.setattr(grids, "unpacking_room", lambda bound: room)
-    monkeypatch.setattr(volume, "BOX", 4096)
-    monkeypatch.setattr(volume, "PIECE", 4096)
+    monkeypatch.setattr(unpacking, "BOX", 4096)
     array = values if axes == "xyz" else values.T
     chunks = [min(*pair) for pair in zip(LAYOUTS[layout]["chunks"], array.shape)]
     store("a.zarr", array, chunks=tuple(chunks))
@@ -84,11 +83,11 @@ def test_each_chunk_is_read_once(monkeypatch, values, axes, room, layout):
 
 def test_boxes_are_long_where_the_copy_is_contiguous():
     orders = ((2, 1, 0), (2, 0, 1))  # of an array (z, y, x): x y z and x z y
-    planes = boxes.choose_layout((64, 64, 64), (1, 64, 64), orders, 64 * 64 * 4)
-    assert planes == boxes.Layout((2, 0, 1), (4, 64, 64), 4 * 64)
-    rows = boxes.choose_layout((64, 64, 64), (64, 1, 64), orders, 64 * 64 * 4)
-    assert rows == boxes.Layout((2, 1, 0), (64, 4, 64), 4 * 64)
-    cubes = boxes.choose_layout((64, 64, 64), (16, 16, 16), orders, 64 * 64 * 16)
+    planes = unpacking.choose_layout((64, 64, 64), (1, 64, 64), orders, 64 * 64 * 4)
+    assert planes == unpacking.Layout((2, 0, 1), (4, 64, 64), 4 * 64)
+    rows = unpacking.choose_layout((64, 64, 64), (64, 1, 64), orders, 64 * 64 * 4)
+    assert rows == unpacking.Layout((2, 1, 0), (64, 4, 64), 4 * 64)
+    cubes = unpacking.choose_layout((64, 64, 64), (16, 16, 16), orders, 64 * 64 * 16)
     assert cubes.box == (64, 64, 16) and cubes.run == 64**3 // 4
 
 

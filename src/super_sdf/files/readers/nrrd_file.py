@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import re
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,19 @@ from numpy.typing import NDArray
 
 from ...errors import FileError, GridError, seen
 from ...grid.planes import InputFile
-from ..headers import ArrayHeader
 from ..regular import check_beside
-from ..volume import XYZ, Request, Volume, from_affine, reversed_axes
+from ..streams import TextValues, bytes_from, packed_planes, raw_planes
+from ..volume import (
+    MOST_NAMED,
+    XYZ,
+    Planes,
+    Request,
+    Volume,
+    from_affine,
+    in_words_of,
+    reversed_axes,
+)
 from .axes import Axes, in_one_unit
-from .choosing import MOST_NAMED
-from .values import TextValues, bytes_from, packed_planes, raw_planes
 
 LONGEST = 1 << 20  # bytes of a header
 TEXT = ("ascii", "text", "txt")
@@ -51,15 +59,15 @@ def read_nrrd(request: Request) -> Volume:
         raise FileError(f"its header has more than {LONGEST:,} bytes")
     layers = 1 if layer is None else sizes[0]
     stored = (*shape[:2], shape[2] * layers)  # layers are the fastest axis
-    array = ArrayHeader(stored, _dtype(nrrd, header), False, 0)
-    read_all, packed = _data(file, header, start, array)
+    dtype = _dtype(nrrd, header)
+    read_all, packed = _data(file, header, start, stored, dtype)
 
     def read(first: int, last: int) -> NDArray[Any]:
         planes: NDArray[Any] = read_all(first, last)[..., layer or 0 :: layers]
         return planes
 
     place, notes = _place(header, space)
-    return Volume(tuple(shape), array.dtype, read, *place, packed=packed, notes=notes)
+    return Volume(tuple(shape), dtype, read, *place, packed=packed, notes=notes)
 
 
 def _axes(header: dict[str, Any]) -> Axes:
@@ -123,22 +131,29 @@ def _dtype(nrrd: Any, header: dict[str, Any]) -> np.dtype[Any]:
 
 
 def _data(
-    file: InputFile, header: dict[str, Any], start: int, array: ArrayHeader
-) -> tuple[Any, int | None]:
+    file: InputFile,
+    header: dict[str, Any],
+    start: int,
+    shape: tuple[int, ...],
+    dtype: np.dtype[Any],
+) -> tuple[Planes, int | None]:
     """Return a function that reads planes, and the size of compressed data."""
     encoding, skip = header["encoding"], header.get("byteskip", 0)
     start = _after_lines(file, start, header.get("lineskip", 0))
     if encoding == "raw":
-        start = file.size - array.size if skip == -1 else start + skip
+        start = file.size - prod(shape) * dtype.itemsize if skip == -1 else start + skip
         if start < 0:
-            raise FileError(f"{file.name} is truncated: {array} are promised, it has {file.size:,}")
-        return raw_planes(file, start, array.shape, array.dtype).read, None
+            raise FileError(
+                f"{file.name} is truncated: {in_words_of(shape, dtype)} are promised, it has "
+                f"{file.size:,}"
+            )
+        return raw_planes(file, start, shape, dtype).read, None
     if skip or encoding.lower() not in (*TEXT, *CODECS):
         raise FileError(f"its encoding is {seen(encoding)}, byte skip {skip}: save it as raw")
     if encoding.lower() in TEXT:
-        return TextValues(file, start, file.size, array.dtype, array.shape).planes, None
+        return TextValues(file, start, file.size, dtype, shape).planes, None
     packed = bytes_from(file, start)
-    read = packed_planes(packed, CODECS[encoding], array.shape, array.dtype, file.name)
+    read = packed_planes(packed, CODECS[encoding], shape, dtype, file.name)
     return read, file.size - start
 
 

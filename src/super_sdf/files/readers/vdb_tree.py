@@ -41,13 +41,7 @@ class Cursor:
         self._start, self._held = 0, b""
 
     def take(self, count: int) -> bytes:
-        """Return the next bytes.
-
-        Raises
-        ------
-        FileError
-            If the file ends before.
-        """
+        """Return the next bytes."""
         if not 0 <= count <= self.file.size - self.place:
             raise FileError(
                 f"{self.file.name} is truncated or damaged: {count:,} bytes are to follow byte "
@@ -170,28 +164,21 @@ def _from_blosc(data: bytes, size: int) -> bytes:
 
 @dataclass
 class Tree:
-    """Where the tiles and leaves of a grid are.
+    """Where the T tiles and L leaves of a grid are.
 
-    Attributes
-    ----------
-    corners, edges, values, active : (T, 3), (T,), (T,), (T,) arrays
-        First voxel, voxels along an edge, value and state of each tile that is active or has
-        another value than the background.
-    leaves, masks : (L, 3) int64, (L, 64) uint8
-        First voxel of each leaf, and which of its voxels are active.
-    places : (L,) int64
-        Where the values of each leaf begin in the file.
-    whole : (L,) bool
-        Whether a leaf's inactive voxels may have other values than the background.
+    ``corners``, ``edges``, ``values`` and ``active`` are of tiles that are active or have another
+    value than the background; ``leaves`` has the first voxel of each leaf, ``masks`` which of its
+    voxels are active. Filled last: where the values of each leaf begin in the file (``places``),
+    and whether its inactive voxels may have other values than the background (``whole``).
     """
 
     coding: Coding
-    corners: Ints
+    corners: Ints  # (T, 3)
     edges: Ints
     values: NDArray[Any]
     active: BoolArray
-    leaves: Ints
-    masks: NDArray[np.uint8]
+    leaves: Ints  # (L, 3)
+    masks: NDArray[np.uint8]  # (L, 64)
     places: Ints = field(default_factory=lambda: np.empty(0, np.int64))
     whole: BoolArray = field(default_factory=lambda: np.empty(0, bool))
 
@@ -310,11 +297,6 @@ def read_tree(file: InputFile, place: int, coding: Callable[[float], Coding]) ->
     """Read the topology of the tree that begins at a byte of a file, and find its leaves' values.
 
     ``coding`` makes the coding of a background.
-
-    Raises
-    ------
-    FileError
-        If the file is truncated or damaged.
     """
     cursor = Cursor(file, place)
     buffers = cursor.number("I")

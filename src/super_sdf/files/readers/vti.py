@@ -13,8 +13,7 @@ import base64
 import io
 import lzma
 import re
-import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import prod
 from typing import Any, NamedTuple
@@ -26,11 +25,8 @@ from numpy.typing import NDArray
 from ...errors import FileError, GridError, seen
 from ...grid.planes import InputFile
 from ...machine.extras import check_modules
-from ..archives import Deflate, Unpacker
-from ..headers import ArrayHeader, Read
-from ..volume import ImageLattice, Request, Volume
-from .choosing import choose_member
-from .values import TextValues, bytes_from, next_planes
+from ..streams import Deflate, Read, TextValues, Unpacker, bytes_from, next_planes
+from ..volume import Planes, Request, Volume, in_words_of, reversed_axes, triple
 
 PIECE, LONGEST_TAG = 1 << 20, 1 << 20  # bytes of XML
 DEEPEST = 5  # elements from that of the file to that of an array
@@ -46,7 +42,42 @@ KINDS = ("PointData", "CellData")
 MARKS = ("vtkGhostType", "vtkValidPointMask")
 
 Attributes = dict[str, str]
-Planes = Callable[[int, int], NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class ImageLattice:
+    """Where the samples of VTK image data lie: at its points, or at the centres of its cells.
+
+    Point (i, j, k) of the extent is at ``origin + direction @ (spacing * (i, j, k))``. The extent,
+    the first and the last point on each axis, need not begin at 0.
+    """
+
+    extent: tuple[int, ...]
+    spacing: NDArray[np.float64]
+    origin: NDArray[np.float64]
+    direction: NDArray[np.float64]
+    of_points: bool
+
+    @classmethod
+    def of_image(cls, image: Any, of_points: bool) -> ImageLattice:
+        """Return where the samples of VTK's image data lie, at its points or in its cells."""
+        matrix = image.GetDirectionMatrix()
+        direction = [[matrix.GetElement(row, column) for column in range(3)] for row in range(3)]
+        spacing, origin = np.array(image.GetSpacing()), np.array(image.GetOrigin())
+        return cls(image.GetExtent(), spacing, origin, np.array(direction), of_points)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape (nz, ny, nx) of the array of samples: x is the fastest."""
+        low, high = self.extent[::2], self.extent[1::2]
+        return tuple(high[axis] - low[axis] + self.of_points for axis in (2, 1, 0))
+
+    def volume(self, dtype: Any, read: Planes) -> Volume:
+        """Return the samples, whose planes of z ``read`` returns, at their place in the world."""
+        first = np.array(self.extent[::2]) + (0 if self.of_points else 0.5)
+        start = triple(self.origin + self.direction @ (self.spacing * first))
+        spacing, direction = reversed_axes(self.spacing, self.direction)
+        return Volume(self.shape, np.dtype(dtype), read, spacing, start, direction)
 
 
 def read_vti(request: Request) -> Volume:
@@ -58,7 +89,7 @@ def read_vti(request: Request) -> Volume:
     outline = Outline(file)
     arrays = outline.arrays()
     scalar = [name for name in arrays if arrays[name][2] or name == request.member]
-    name = choose_member(request, scalar or list(arrays), "array of points or cells")
+    name = request.choose(scalar or list(arrays), "array of points or cells")
     kind, name = arrays[name][:2]
     of_points = kind == KINDS[0]
     spacing = _numbers(outline.image, "Spacing", 3, 1)
@@ -100,14 +131,8 @@ class Piece(NamedTuple):
 class Outline:
     """What the XML of a file says, up to the data at its end.
 
-    Attributes
-    ----------
-    top, image : dict
-        Attributes of the elements VTKFile and ImageData.
-    pieces : list of Piece
-        All pieces that are not empty.
-    appended : str or None, int
-        The encoding of the data at the end, and where it begins.
+    ``top`` and ``image`` are the attributes of the elements VTKFile and ImageData; ``appended`` is
+    the encoding of the data at the end, and where it begins.
     """
 
     def __init__(self, file: InputFile) -> None:
@@ -129,9 +154,8 @@ class Outline:
         """
         found: dict[str, tuple[str, str, bool]] = {}
         for kind in KINDS:
-            for name, array in (
-                (n, a) for piece in self.pieces for n, a in piece.arrays[kind].items()
-            ):
+            pairs = (pair for piece in self.pieces for pair in piece.arrays[kind].items())
+            for name, array in pairs:
                 is_scalar = array.attributes.get("NumberOfComponents", "1") == "1"
                 key = name if found.get(name, (kind,))[0] == kind else f"{kind}/{name}"
                 found[key] = kind, name, is_scalar and name not in MARKS
@@ -215,17 +239,7 @@ class _Found(Exception):  # noqa: N818, it is no error
 
 
 class Source:
-    """Bytes in a file, as they are or in base64.
-
-    Parameters
-    ----------
-    file : InputFile
-        The file.
-    start, end : int
-        Where the bytes, or their text, begin and end.
-    is_text : bool
-        Whether they are in base64.
-    """
+    """Bytes between two places in a file, as they are or in base64."""
 
     def __init__(self, file: InputFile, start: int, end: int, is_text: bool) -> None:
         self.file, self.start, self.end, self.is_text = file, start, end, is_text
@@ -253,12 +267,8 @@ class Source:
 class Part:
     """An array of a piece, whose planes come in order, and where it is in the whole array.
 
-    Attributes
-    ----------
-    low, high : three ints
-        Its first sample along each axis (z, y, x), and that after its last.
-    packed : int or None
-        Bytes of compressed data.
+    ``low`` and ``high`` are its first sample along each axis (z, y, x), and that after its last;
+    ``packed`` is the size of compressed data.
     """
 
     def __init__(
@@ -285,7 +295,7 @@ class Part:
         order = {"LittleEndian": "<", "BigEndian": ">"}[outline.top.get("byte_order", "")]
         self.dtype = np.dtype(order + TYPES[about["type"]])
         self.word = np.dtype(order + {"UInt64": "u8"}.get(outline.top.get("header_type", ""), "u4"))
-        self.header = ArrayHeader(own.shape, self.dtype, False, 0)
+        self.shape = own.shape
         self.name = f"{file.name}:{which[1]}"
         self.planes = self._planes(file, outline, array)
 
@@ -301,7 +311,7 @@ class Part:
         """Return a function that returns the next planes."""
         form = array.attributes.get("format")
         if form == "ascii":
-            return TextValues(file, array.start, array.end, self.dtype, self.header.shape).planes
+            return TextValues(file, array.start, array.end, self.dtype, self.shape).planes
         source = Source(file, array.start, array.end, True)
         if form == "appended":
             encoding, start = outline.appended
@@ -311,7 +321,7 @@ class Part:
             source = Source(file, start + int(offset), file.size, encoding == "base64")
         compressor = outline.top.get("compressor")
         read = self._blocks(source, compressor) if compressor else self._whole(source)
-        return next_planes(read, self.header)
+        return next_planes(read, self.shape, self.dtype)
 
     def _words(self, source: Source, first: int, count: int) -> list[int]:
         """Return some of the numbers before the data."""
@@ -334,8 +344,9 @@ class Part:
 
     def _check_size(self, size: int) -> None:
         """Raise FileError unless data of some bytes is the array."""
-        if size != self.header.size:
-            raise FileError(f"{self.name} is damaged: {size:,} bytes for {self.header}")
+        if size != prod(self.shape) * self.dtype.itemsize:
+            promised = in_words_of(self.shape, self.dtype)
+            raise FileError(f"{self.name} is damaged: {size:,} bytes for {promised}")
 
     def _blocks(self, source: Source, compressor: str) -> Read:
         """Return a function that reads compressed data: blocks of one size, the last shorter."""
@@ -359,7 +370,7 @@ class Part:
 def _block(compressor: str, packed: Read, length: int, size: int, name: str) -> Read:
     """Return a function that reads a block of some bytes, of which ``length`` are stored."""
     if compressor == "vtkZLibDataCompressor":
-        return Unpacker(packed, Deflate(zlib.MAX_WBITS), size, name).read
+        return Unpacker(packed, Deflate(), size, name).read
     if compressor == "vtkLZMADataCompressor":
         return Unpacker(packed, lzma.LZMADecompressor(memlimit=LZMA_MEMORY), size, name).read
     if compressor == "vtkLZ4DataCompressor" and max(size, length) <= LARGEST_BLOCK:

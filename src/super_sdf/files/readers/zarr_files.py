@@ -38,17 +38,9 @@ Document = dict[str, Any]
 
 
 class ZarrFiles:
-    """The files of a Zarr store in a folder or a zip file.
+    """The files of a Zarr store in a folder or a zip file, which may not lead out of it.
 
-    Attributes
-    ----------
-    sizes : dict
-        The bytes that each file takes, by its key.
-
-    Raises
-    ------
-    FileError
-        If one is no regular file, or leads out of the store.
+    ``sizes`` has the bytes that each file takes, by its key.
     """
 
     def __init__(self, request: Request) -> None:

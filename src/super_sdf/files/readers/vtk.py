@@ -1,17 +1,22 @@
-"""Legacy ``.vtk`` and ``.vtkhdf`` files, with VTK: image data, or rectilinear with even steps."""
+"""Image data that VTK holds: read from legacy ``.vtk`` and ``.vtkhdf`` files, or in memory.
+
+Rectilinear grids are read, too, if their steps are even.
+"""
 
 from __future__ import annotations
 
 import re
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...errors import FileError, GridError
-from ..volume import XYZ, ImageLattice, Request, Volume
-from .choosing import choose_member
+from ...errors import FileError, GridError, OptionTypeError, seen
+from ..volume import XYZ, Request, Volume
+from .vti import ImageLattice
 
+NAME = "the image"  # in memory, in error messages
 RESAMPLE = (
     'make .npz with python -c "import numpy as n, pyvista as v; from scipy.interpolate import '
     "interpn as f; m = v.read('{0}'); a = m.x, m.y, m.z; e = [n.linspace(c[0], c[-1], len(c)) for "
@@ -29,8 +34,8 @@ def read_vtk(request: Request) -> Volume:
     from vtkmodules.vtkIOLegacy import vtkDataSetReader
 
     reader = vtkDataSetReader()
-    for each in ("Scalars", "Fields"):
-        getattr(reader, f"ReadAll{each}On")()
+    reader.ReadAllScalarsOn()
+    reader.ReadAllFieldsOn()
     return _read(request, reader)
 
 
@@ -41,9 +46,57 @@ def read_vtkhdf(request: Request) -> Volume:
     return _read(request, vtkHDFReader())
 
 
+def volume_of_image(image: Any, scalars: str | None) -> Volume:
+    """Return an array of image data in memory: see ``files.grids.grid_from_image``."""
+    if not (hasattr(image, "IsA") and image.IsA("vtkImageData")):
+        raise OptionTypeError(f"image is {seen(image)}: give VTK image data")
+    data = image.GetPointData(), image.GetCellData()
+    if scalars is not None:
+        arrays = [each.GetArray(scalars) for each in data]
+    else:
+        arrays = [each.GetScalars() for each in data]
+        if not any(arrays):
+            arrays = [each.GetArray(names[0]) if len(names := _names(each)) == 1 else None
+                      for each in data]  # fmt: skip
+    if not any(arrays):
+        raise GridError(_no_array(data, scalars))
+    array, lattice = arrays[0] or arrays[1], ImageLattice.of_image(image, bool(arrays[0]))
+    components, length = array.GetNumberOfComponents(), array.GetNumberOfTuples()
+    what, samples = f"the array {array.GetName()!r} of {NAME}", prod(lattice.shape)
+    if components != 1:
+        raise GridError(f"{what} has {components} numbers per sample: give an array of one")
+    if length != samples:
+        raise GridError(f"{what} has {length:,} values for {samples:,} samples")
+    return _volume_of(lattice, array)
+
+
+def _volume_of(lattice: ImageLattice, array: Any) -> Volume:
+    """Return an array of VTK with a number for each sample."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    values = vtk_to_numpy(array).reshape(lattice.shape)
+    return lattice.volume(values.dtype, lambda first, last: values[first:last])
+
+
+def _names(data: Any) -> list[str]:
+    """Return the names of the arrays of numbers."""
+    arrays = (data.GetArray(number) for number in range(data.GetNumberOfArrays()))
+    return [str(array.GetName()) for array in arrays if array]
+
+
+def _no_array(data: tuple[Any, Any], scalars: str | None) -> str:
+    """Return what is wrong if no array was found."""
+    points, cells = map(_names, data)
+    listed = ", ".join([*points, *(f"{name} (cells)" for name in cells)])
+    if not listed:
+        return f"{NAME} holds no array of points or cells"
+    if scalars is None:
+        return f"{NAME} holds several arrays, {listed}: give scalars={(points or cells)[0]!r}, say"
+    return f"{NAME} has no array {seen(scalars)}: it holds {listed}"
+
+
 def _read(request: Request, reader: Any) -> Volume:
     """Return the array that a reader of VTK finds in a file."""
-    from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
 
     request.check_loads(request.path.stat().st_size, "VTK")
@@ -56,27 +109,19 @@ def _read(request: Request, reader: Any) -> Volume:
         raise FileError("VTK finds it damaged, or truncated")
     data = image.GetPointData(), image.GetCellData()
     names = [[each.GetArrayName(i) for i in range(each.GetNumberOfArrays())] for each in data]
-    name = choose_member(request, [n for each in names for n in each], "array")
+    name = request.choose([n for each in names for n in each], "array")
+    arrays = [each.GetArray(n) for each, listed in zip(data, names) for n in listed]
+    _check_text(request.path, sum(each.GetNumberOfValues() for each in arrays if each))
     of_points = name in names[0]
-    _check_text(
-        request.path,
-        sum(
-            each.GetArray(n).GetNumberOfValues()
-            for each, listed in zip(data, names)
-            for n in listed
-            if each.GetArray(n)
-        ),
-    )
     lattice = _lattice(image, of_points, name, request.path)
     array = data[0 if of_points else 1].GetArray(name)
-    values = vtk_to_numpy(array)
-    if values.shape != (np.prod(lattice.shape),):
+    shape = (array.GetNumberOfTuples(), array.GetNumberOfComponents())
+    if shape != (prod(lattice.shape), 1):
         raise GridError(
-            f"its array {name!r} has shape {values.shape} for {lattice.shape} samples: give one of "
+            f"its array {name!r} has shape {shape} for {lattice.shape} samples: give one of "
             "a number each"
         )
-    values = values.reshape(lattice.shape)
-    return lattice.volume(values.dtype, lambda first, last: values[first:last])
+    return _volume_of(lattice, array)
 
 
 def _check_text(path: Path, promised: int) -> None:
@@ -93,13 +138,7 @@ def _check_text(path: Path, promised: int) -> None:
 
 
 def _lattice(image: Any, of_points: bool, name: str, path: Path) -> ImageLattice:
-    """Return where the samples lie.
-
-    Raises
-    ------
-    GridError
-        If they are no lattice, with the command that makes one.
-    """
+    """Return where the samples lie; raise GridError with a way out if they are no lattice."""
     if image.IsA("vtkImageData"):
         return ImageLattice.of_image(image, of_points)
     if not image.IsA("vtkRectilinearGrid"):
@@ -109,13 +148,13 @@ def _lattice(image: Any, of_points: bool, name: str, path: Path) -> ImageLattice
         )
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
-    resample = RESAMPLE.format(path, path.stem, name)
     firsts, steps = [], []
     for axis in "XYZ":
         places = vtk_to_numpy(getattr(image, f"Get{axis}Coordinates")()).astype(np.float64)
         step = (places[-1] - places[0]) / max(len(places) - 1, 1)
         even = places[0] + step * np.arange(len(places))
         if not np.allclose(places, even, rtol=0, atol=EVEN * abs(step)):
+            resample = RESAMPLE.format(path, path.stem, name)
             raise GridError(f"{path}: its coordinates along {axis.lower()} are uneven: {resample}")
         firsts.append(places[0])
         steps.append(step)
