@@ -21,10 +21,9 @@ from .arrays import Triple
 from .errors import MeshError
 from .files.expectation import CERTAIN_SHARE, Expectation, expect
 from .files.grids import read_grid_with
-from .files.meshes import write_pieces
+from .files.meshes import check_format_holds, local_origin_note, write_pieces
 from .files.output import check_apart
-from .files.precision import check_format_holds, local_origin_note
-from .files.store import files_of
+from .files.regular import files_of
 from .grid.cubic import cubic_grid
 from .grid.direction import Direction
 from .grid.field import EXACT, MASK, SCALED

@@ -14,7 +14,7 @@ from types import TracebackType
 from filelock import FileLock, Timeout
 
 from ..errors import FileError, WriteError
-from ..files.parts import remove_abandoned_parts
+from ..files.output import remove_abandoned_parts
 from .journal import LOCK_NAME, NAME, clear_journal, note_started, read_journal
 
 # What the system answers where the file system has no locks, as some of networks: a batch runs

@@ -15,7 +15,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from ..files.parts import remove_abandoned_parts
+from ..files.output import remove_abandoned_parts
 from ..machine.memory import held_memory, memory_bound
 from ..machine.pool import Death, Pool, PoolOptions
 from ..machine.threads import count_cores

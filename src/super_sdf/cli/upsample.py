@@ -210,7 +210,7 @@ class Upsampling:
 
     def check_page(self) -> None:
         """Raise if the page cannot be written, or would replace what is read or written."""
-        from ..files.store import files_of
+        from ..files.regular import files_of
 
         check_modules("--report", "report")
         field = [self.options["save_field"]] if self.options["save_field"] else []
