@@ -26,9 +26,8 @@ from numpy.typing import ArrayLike
 
 from super_sdf import SdfGrid, read_grid
 from super_sdf.errors import FileError, GridError
-from super_sdf.files.grids import describe_grid_file
 from super_sdf.files.formats import find_format
-from super_sdf.files.grids import open_volume
+from super_sdf.files.grids import describe_grid_file, open_volume
 from super_sdf.files.readers.axes import in_metres
 
 SIZES = 24, 20, 17  # along x, y, z

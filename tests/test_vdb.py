@@ -21,7 +21,11 @@ DATA = Path(__file__).parent / "data"
 def voxels(path):
     """Return the values of a file, before anything is made of them, and where the first one is."""
     with open_volume(path, find_format(path), "xyz", (1 << 30, None)) as volume:
-        return volume.box(tuple(slice(0, n) for n in volume.shape)), np.array(volume.origin), volume.spacing[0]
+        return (
+            volume.box(tuple(slice(0, n) for n in volume.shape)),
+            np.array(volume.origin),
+            volume.spacing[0],
+        )
 
 
 def distance(values, origin, spacing, balls):

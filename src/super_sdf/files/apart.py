@@ -109,28 +109,22 @@ class _Process:
 
 def serve() -> None:
     """Read the file of the first question, and answer with the boxes of the following ones."""
+    from .readers import READERS
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other process handles it
     warnings.simplefilter("ignore")
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # libraries may print
     with ExitStack() as files, suppress(EOFError, BrokenPipeError):
         questions = sys.stdin.buffer
-        first = pickle.load(questions)
-        volume = _answer(answers, partial(_opened, files, *first), _stated)
+        key, request = pickle.load(questions)
+        volume = _answer(
+            answers,
+            lambda: READERS[key](Request(**request, files=files)),
+            lambda found: {n: value for n, value in vars(found).items() if n not in FUNCTIONS},
+        )
         while volume:
             _answer(answers, partial(volume.box, pickle.load(questions)), np.ascontiguousarray)
-
-
-def _opened(files: ExitStack, key: str, request: dict[str, Any]) -> Volume:
-    """Return the volume in a file."""
-    from .readers import READERS
-
-    return READERS[key](Request(**request, files=files))
-
-
-def _stated(volume: Volume) -> dict[str, Any]:
-    """Return the fields of a volume that are sent to the other process."""
-    return {name: value for name, value in vars(volume).items() if name not in FUNCTIONS}
 
 
 def _answer(answers: IO[bytes], make: Callable[[], Any], told: Callable[[Any], Any]) -> Any:

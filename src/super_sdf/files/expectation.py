@@ -55,10 +55,7 @@ def expect(
 ) -> Expectation:
     """Estimate the size of the mesh of a grid, and of its file; ``cap`` is as in ``reconstruct``.
 
-    Raises
-    ------
-    WriteError
-        If half of that is more than the free disk space.
+    Raises WriteError if half of that is more than the free disk space.
     """
     by_plane = count_by_plane(grid, offset, cap=cap)
     triangles = 2 * factor**2 * round(count_on_lattice(grid, by_plane))

@@ -29,33 +29,15 @@ WAYS_OUT = {
 
 
 class GridFormat(NamedTuple):
-    """A grid file format.
+    """A grid file format."""
 
-    Attributes
-    ----------
-    key : str
-        Its name in code: the key of its reader.
-    name : str
-        Its name in texts.
-    suffixes : tuple of str
-        How its file names end, in lower case.
-    extra : str or None
-        The extra that installs its library; None if none is needed.
-    axes : str or None
-        The axis order of an array unless ``--axes`` gives another; None if the file states it.
-    has_members : bool
-        Whether a file may hold several arrays, one of which ``FILE:NAME`` names.
-    is_apart : bool
-        Whether its library, in C, reads it in a process of its own.
-    """
-
-    key: str
-    name: str
-    suffixes: tuple[str, ...]
-    extra: str | None = None
-    axes: str | None = None
-    has_members: bool = False
-    is_apart: bool = False
+    key: str  # of its reader
+    name: str  # in texts
+    suffixes: tuple[str, ...]  # how its file names end, in lower case
+    extra: str | None = None  # that installs its library
+    axes: str | None = None  # the order of axes without --axes; None if the file states it
+    has_members: bool = False  # whether a file may hold several arrays: FILE:NAME
+    is_apart: bool = False  # whether its library, in C, reads it in a process of its own
 
 
 FORMATS = (
@@ -152,10 +134,7 @@ def check_library(format_: GridFormat) -> None:
 
 
 def choose_axes(format_: GridFormat, given: str | None) -> str:
-    """Return the axis order of an array file: as given, else the convention of the format.
-
-    Raises OptionError if the format's files state their axes, or the order is unknown.
-    """
+    """Return the axis order of an array file: as given, else the convention of the format."""
     if given is None:
         return format_.axes or "xyz"
     if given not in AXES:

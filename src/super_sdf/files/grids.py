@@ -155,9 +155,13 @@ def open_volume(
 @contextmanager
 def one_line_errors(path: Path, format_: GridFormat, watched: InputFile | None) -> Iterator[None]:
     """Turn whatever a library raises into a FileError of one line, and silence it meanwhile."""
+    import logging
+
+    logs = logging.root.manager.disable
     try:
-        with warnings.catch_warnings(), _silent_logs():
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore")
+            logging.disable(logging.CRITICAL)  # what matters is raised
             yield
     except MemoryError as error:
         if isinstance(error, OutOfMemoryError):
@@ -173,6 +177,8 @@ def one_line_errors(path: Path, format_: GridFormat, watched: InputFile | None) 
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         reason = lines[-1][:200] if lines else type(error).__name__
         raise FileError(f"{path} cannot be read as {format_.name}: {reason}") from error
+    finally:
+        logging.disable(logs)
     _check_unchanged(watched)
 
 
@@ -180,19 +186,6 @@ def _check_unchanged(watched: InputFile | None) -> None:
     """Raise FileError if a file changed, which explains whatever else went wrong."""
     if watched:
         watched.check_unchanged()
-
-
-@contextmanager
-def _silent_logs() -> Iterator[None]:
-    """Keep libraries from logging to stderr: what matters is raised."""
-    import logging
-
-    disabled = logging.root.manager.disable
-    logging.disable(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        logging.disable(disabled)
 
 
 def unpacking_room(max_memory: int | None) -> int:
@@ -256,12 +249,7 @@ def describe_grid_file(path: str | Path) -> dict[str, Any]:
     """Return format, shape (x, y, z), type, place and storage of the array in a grid file.
 
     No sample is read where the format allows it. What the file does not state is None or missing.
-    Chunks and shards are in the order of the array's own axes.
-
-    Raises
-    ------
-    SuperSdfError
-        As in ``read_grid``.
+    Chunks and shards are in the order of the array's own axes. Raises as ``read_grid``.
     """
     path = check_path(path, "path")
     format_ = find_format(path)
@@ -304,15 +292,7 @@ def check_grid_target(path: str | Path, *, force: bool = False) -> Path:
 
 
 def write_grid(grid: SdfGrid, path: str | Path, *, force: bool = False) -> None:
-    """Write a grid as ``.npz``: the keys values, spacing, origin and, if it is turned, direction.
-
-    Raises
-    ------
-    OptionError
-        If the suffix is not ``.npz``.
-    FileError
-        If the file exists and ``force`` is not set, or cannot be written.
-    """
+    """Write a grid as ``.npz``: values, spacing, origin and, if it is turned, direction."""
     path = check_grid_target(path, force=force)
     arrays: dict[str, Any] = {"spacing": grid.spacing, "origin": grid.origin}
     if not grid.is_straight:

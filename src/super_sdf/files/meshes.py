@@ -37,23 +37,14 @@ CHUNK = 1 << 16  # triangles checked at a time
 class MeshFormat(NamedTuple):
     """A mesh file format.
 
-    Attributes
-    ----------
-    write : callable
-        Writes pieces of a mesh to a path; of a format that ``has_parts``, several meshes by their
-        names.
-    bytes_per_triangle : int
-        Size of a triangle in the file with its half of a vertex; approximate for text and archives.
-    single_precision : bool
-        Whether coordinates are float32.
-    local_origin : bool
-        Whether coordinates may be relative to a point, ``write``'s third argument.
+    ``write`` writes pieces of a mesh to a path; of a format that ``has_parts``, several meshes by
+    their names.
     """
 
     write: Callable[..., None]
-    bytes_per_triangle: int
-    single_precision: bool = False
-    local_origin: bool = False
+    bytes_per_triangle: int  # with its half of a vertex; approximate for text and archives
+    single_precision: bool = False  # whether coordinates are float32
+    local_origin: bool = False  # whether coordinates may be relative to a point
     has_parts: bool = False
 
     def write_named(
@@ -208,13 +199,19 @@ def check_format_holds(path: str | Path, grid: SdfGrid, factor: int) -> Triple:
         return WORLD_ORIGIN
     reach = grid.reach
     if mesh_format.local_origin:
-        reach = _reach_from_middle(grid)
+        sides = np.array(grid.spacing) * grid.shape / 2  # from its middle on
+        reach = float((np.abs(grid.direction) @ sides).max())
         if tells_vertices_apart(np.float32, reach, grid, factor):
-            return _middle(grid)
+            return as_triple(grid.to_world((np.array(grid.shape) - 1) / 2), "middle")
     apart, suffix = CLEARANCE * grid.voxel_size / factor, Path(path).suffix.lower()
+    limits = np.finfo(np.float32)
+    step = max(math.ulp(reach) * 2**29, float(limits.smallest_subnormal))  # 29 bits fewer
+    limit = f"in steps of {step:.2g} at {reach:.6g}"
+    if reach > float(limits.max):
+        limit = f"numbers up to {limits.max:.2g}, the mesh reaches {reach:.2g}"
     raise FileError(
-        f"{path} cannot hold the mesh: {suffix} has single precision, {_limit_at(reach)}, and "
-        f"vertices are down to {apart:.2g} apart; write .ply or .obj"
+        f"{path} cannot hold the mesh: {suffix} has single precision, {limit}, and vertices are "
+        f"down to {apart:.2g} apart; write .ply or .obj"
     )
 
 
@@ -227,29 +224,3 @@ def local_origin_note(path: str | Path, about: Triple) -> tuple[str, ...]:
         f"{path} has single precision: its vertices are relative to {point}, "
         "the translation of its node",
     )
-
-
-def _middle(grid: SdfGrid) -> Triple:
-    """Return the middle of a grid, in world units."""
-    axes = zip(grid.origin, grid.spacing, grid.shape)
-    if grid.is_straight:
-        x, y, z = (origin + spacing * (samples - 1) / 2 for origin, spacing, samples in axes)
-        return x, y, z
-    return as_triple(grid.to_world((np.array(grid.shape) - 1) / 2), "middle")
-
-
-def _reach_from_middle(grid: SdfGrid) -> float:
-    """Return the largest coordinate of the grid from its middle on, about."""
-    if grid.is_straight:
-        return max(spacing * samples / 2 for spacing, samples in zip(grid.spacing, grid.shape))
-    sides = np.array(grid.spacing) * grid.shape / 2
-    return float((np.abs(grid.direction) @ sides).max())
-
-
-def _limit_at(reach: float) -> str:
-    """Describe the limit of float32 at a coordinate: its largest number, or its resolution."""
-    limits = np.finfo(np.float32)
-    if reach > float(limits.max):
-        return f"numbers up to {limits.max:.2g}, the mesh reaches {reach:.2g}"
-    step = max(math.ulp(reach) * 2**29, float(limits.smallest_subnormal))  # 29 bits fewer
-    return f"in steps of {step:.2g} at {reach:.6g}"

@@ -138,13 +138,7 @@ def open_archive(path: Path) -> zipfile.ZipFile:
 
 
 class Member:
-    """An array of an archive: its header, and its values as they are unpacked, in order.
-
-    Raises
-    ------
-    FileError
-        If it is damaged, encrypted, or compressed by a method that unpacks to gigabytes at once.
-    """
+    """An array of an archive: its header, and its values as they are unpacked, in order."""
 
     def __init__(self, archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str) -> None:
         self.name, self.packed, self.left = name, info.compress_size, info.file_size
@@ -248,13 +242,7 @@ def volume_of_blocks(array: Callable[[str], NDArray[Any]]) -> Volume:
     """Return the truncated distances in cubes of voxels, at the keys of a hash map.
 
     Voxel (x, y, z) of the block with key k is at ``voxel_size * (k * resolution + (x, y, z))``;
-    voxels without weight, and blocks that are missing, are unknown. ``array`` returns one of the
-    file's arrays.
-
-    Raises
-    ------
-    GridError
-        If it has arrays that do not fit together.
+    voxels without weight, and blocks that are missing, are unknown. ``array`` reads a key.
     """
     keys = array("key").astype(np.int64)
     resolution, step = (array(name).item() for name in ("block_resolution", "voxel_size"))

@@ -93,21 +93,8 @@ def replacing(
     """Yield a temporary path beside the target, renamed to the target if the block succeeds.
 
     A link stays, and the file it points to is replaced and keeps its mode. Temporary files of the
-    same target that killed processes left are removed.
-
-    Parameters
-    ----------
-    path : Path
-        The target.
-    force : bool
-        Replace a file that exists at the end; otherwise that is an error, and the file stays.
-    before_rename : callable, optional
-        Called with the path of the complete file before it is renamed.
-
-    Raises
-    ------
-    WriteError
-        If the file cannot be written, for whatever reason the system gives.
+    same target that killed processes left are removed. Without ``force`` a file that exists at the
+    end stays, which is an error. ``before_rename`` is called with the path of the complete file.
     """
     target = _behind_links(path) if force else path
     with naming(path), _reserved_part(target) as part:

@@ -26,6 +26,7 @@ from .plain_meshes import (
 )
 
 JSON_BYTES = 1200  # of the scene, padded, per part
+HEADER_BYTES = 12 + 8 + 8  # without the scene
 MOST_BYTES = 2**32 - 1  # the length in the header has 32 bits
 FLOAT, UNSIGNED_INT, VERTICES, INDICES = 5126, 5125, 34962, 34963  # constants of glTF
 
@@ -63,11 +64,11 @@ def write_glb(
     """
     scene, size = Scene(about), JSON_BYTES * len(parts)
     with path.open("wb") as file:
-        file.write(bytes(_header_bytes(size)))
+        file.write(bytes(HEADER_BYTES + size))
         for name, pieces in parts.items():
-            box = Box(about)
+            box = _Shift(about)
             with spool_beside(path) as waiting:
-                written = write_split(pieces, (file, waiting), (box.shift, _indices))
+                written = write_split(pieces, (file, waiting), (box.shift, _unsigned))
                 if not written.faces:
                     raise FileError("a mesh without triangles cannot be .glb: give .ply")
                 append_spool(waiting, file)
@@ -79,7 +80,7 @@ def write_glb(
         file.write(_header(length, size, scene.described))
 
 
-class Box:
+class _Shift:
     """Shifts vertices to a local origin, and keeps their bounding box."""
 
     def __init__(self, about: Triple) -> None:
@@ -94,12 +95,8 @@ class Box:
         return little_endian(shifted)
 
 
-def _indices(faces: NDArray[Any]) -> bytes:
+def _unsigned(faces: NDArray[Any]) -> bytes:
     return little_endian(faces.astype(np.uint32))
-
-
-def _header_bytes(size: int) -> int:
-    return 12 + 8 + size + 8
 
 
 def _header(length: int, size: int, scene: dict[str, Any]) -> bytes:
@@ -107,7 +104,7 @@ def _header(length: int, size: int, scene: dict[str, Any]) -> bytes:
     text = json.dumps(scene, separators=(",", ":")).ljust(size).encode("ascii")
     whole = struct.pack("<4sII", b"glTF", 2, length)
     first = struct.pack("<I4s", size, b"JSON") + text
-    return whole + first + struct.pack("<I4s", length - _header_bytes(size), b"BIN\0")
+    return whole + first + struct.pack("<I4s", length - HEADER_BYTES - size, b"BIN\0")
 
 
 class Scene:
@@ -124,7 +121,7 @@ class Scene:
             "buffers": [self.buffer],
         }
 
-    def add(self, name: str, written: Written, box: Box) -> None:
+    def add(self, name: str, written: Written, box: _Shift) -> None:
         """Add a part, whose vertices and indices follow those before."""
         scene, named = self.described, {"name": name} if name else {}
         mesh, first = len(scene["meshes"]), len(scene["accessors"])
@@ -171,13 +168,9 @@ def write_3mf(parts: Mapping[str, Iterable[Mesh]], path: Path) -> None:
 def _write_mesh(pieces: Iterable[Mesh], file: IO[bytes], waiting: IO[bytes]) -> None:
     """Write a mesh; its triangles wait as binary numbers, which take half as much as text."""
     vertices = number_lines('<vertex x="%s" y="%s" z="%s"/>\n')
-    write_split(pieces, (file, waiting), (vertices, _wide), TEXT_CHUNK)
+    write_split(pieces, (file, waiting), (vertices, _unsigned), TEXT_CHUNK)
     file.write(BETWEEN.encode("ascii"))
     waiting.seek(0)
     triangles = index_lines('<triangle v1="%d" v2="%d" v3="%d"/>\n')
-    while rows := waiting.read(24 * TEXT_CHUNK):
-        write_in_chunks(file, np.frombuffer(rows, "<i8").reshape(-1, 3), triangles, TEXT_CHUNK)
-
-
-def _wide(faces: NDArray[Any]) -> bytes:
-    return little_endian(faces.astype(np.int64))
+    while rows := waiting.read(12 * TEXT_CHUNK):
+        write_in_chunks(file, np.frombuffer(rows, "<u4").reshape(-1, 3), triangles, TEXT_CHUNK)

@@ -6,7 +6,7 @@ import bz2
 import zlib
 from collections.abc import Callable
 from math import prod
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,23 +24,13 @@ Read: TypeAlias = Callable[[int], bytes]
 """Returns the next ``count`` bytes, or fewer at the end."""
 
 
-class Positional(Protocol):
-    """What can be read at any offset, such as an ``InputFile``."""
-
-    size: int
-
-    def read(self, offset: int, count: int) -> NDArray[np.uint8]:
-        """Return ``count`` bytes from ``offset`` on, or fewer at the end."""
-        ...
-
-
-def bytes_from(file: Positional, offset: int, end: int | None = None) -> Read:
-    """Return a function that reads a file from an offset on, up to its end or another one."""
+def bytes_from(file: Any, offset: int, end: int | None = None) -> Read:
+    """Return a function that reads on in an InputFile, or its like, up to its end or another."""
     stop = file.size if end is None else min(end, file.size)
 
     def read(count: int) -> bytes:
         nonlocal offset
-        data = file.read(offset, min(count, stop - offset)).tobytes()
+        data: bytes = file.read(offset, min(count, stop - offset)).tobytes()
         offset += len(data)
         return data
 
@@ -113,18 +103,9 @@ CODECS: dict[str, Callable[[], Any]] = {
 
 
 class Unpacker:
-    """The bytes of compressed data, decompressed in small pieces and checked to their end.
+    """The ``size`` bytes of compressed data, decompressed in small pieces and checked to their end.
 
-    Parameters
-    ----------
-    packed : callable
-        Returns the next compressed bytes.
-    codec : Deflate, BZ2Decompressor or LZMADecompressor
-        Decompresses them.
-    size : int
-        How many bytes they are decompressed.
-    name : str
-        The name of the data in error messages.
+    ``packed`` returns the next compressed bytes, ``codec`` decompresses them.
     """
 
     def __init__(self, packed: Read, codec: Any, size: int, name: str) -> None:

@@ -44,15 +44,8 @@ def take(
 ) -> dict[str, Any]:
     """Return values (nx, ny, nz), spacing, origin and direction of a volume, for ``make_grid``.
 
-    ``given`` holds what replaces these of the file, or None. ``left`` is how many bytes of memory
-    the process may still take, None if unknown.
-
-    Raises
-    ------
-    GridError
-        If the array is no grid, or its axes are not at right angles.
-    OutOfMemoryError
-        If there is no room to unpack it, or not even for one of its chunks.
+    ``given`` replaces what the file says of its place. ``left`` is how many bytes of memory the
+    process may still take, None if unknown.
     """
     check_kind(volume.dtype, volume.shape)
     placement = find_placement(volume, name)
@@ -69,14 +62,9 @@ def unpacked(
     memory: tuple[int, int | None],
     planes: tuple[int, int] | None = None,
 ) -> SampleArray:
-    """Return the samples as an array (nx, ny, nz), in memory or in a temporary file.
+    """Return the samples, or some planes of x, as an array in memory or in a temporary file.
 
-    Parameters
-    ----------
-    memory : two ints
-        Bytes that the array may take, and that the process may still take, None if unknown.
-    planes : two ints, optional
-        Only the planes of x from the first to before the second.
+    ``memory`` is how many bytes the array may take, and the process in all, None if unknown.
     """
     room, left = memory
     name += volume.part

@@ -40,28 +40,14 @@ Planes: TypeAlias = Callable[[int, int], NDArray[Any]]
 
 @dataclass(frozen=True)
 class Request:
-    """What a reader is asked for.
-
-    Attributes
-    ----------
-    member : str or None
-        The name of an array in the file.
-    axes : str
-        The axis order of a file that does not state one: "xyz" or "zyx".
-    room : int
-        Bytes of memory that the unpacked array may take.
-    left : int or None
-        Bytes of memory that the process may still take; None if unknown.
-    files : ExitStack
-        Closes the files that the reader opens, once the volume is copied.
-    """
+    """What a reader is asked for."""
 
     path: Path
-    member: str | None
-    axes: str
-    room: int
-    left: int | None
-    files: ExitStack
+    member: str | None  # the name of an array in the file
+    axes: str  # the order in a file that does not state one: "xyz" or "zyx"
+    room: int  # bytes of memory that the unpacked array may take
+    left: int | None  # bytes that the process may still take; None if unknown
+    files: ExitStack  # closes what the reader opens, once the volume is copied
 
     def check_loads(self, size: int, library: str) -> None:
         """Raise OutOfMemoryError if an array that is loaded whole would not fit in memory."""
@@ -72,10 +58,7 @@ class Request:
             )
 
     def choose(self, names: Sequence[str], what: str) -> str:
-        """Return the name of the array to read: the one asked for, else the only one.
-
-        Raises FileError if there is none, none of this name, or several and none is named.
-        """
+        """Return the name of the array to read: the one asked for, else the only one."""
         if not names:
             raise FileError(f"{self.path} holds no {what}")
         if self.member is not None:
@@ -102,37 +85,9 @@ def in_short(names: Sequence[str]) -> str:
 class Volume:
     """An array of samples in a file, and where they are in the world.
 
-    Sample (a, b, c) of the array is at ``origin + direction @ (spacing * (a, b, c))``.
-
-    Attributes
-    ----------
-    read : callable, optional
-        Reads planes of an array that is not stored in chunks.
-    spacing : three floats or None
-        Distance of neighbouring samples along each axis of the array, in world units.
-    origin : three floats or None
-        World position of sample (0, 0, 0).
-    direction : (3, 3) array
-        The columns are the world directions (unit vectors) of the axes of the array.
-    stored : SampleArray, optional
-        The array itself, if its planes can be read again and again without unpacking it.
-    chunks : three ints, optional
-        Samples of a chunk along each axis, if the array is stored in chunks.
-    read_box : callable, optional
-        Reads a box of samples, instead of ``read``.
-    packed : int, optional
-        Bytes of the array as it is compressed in the file, if it is.
-    notes : tuple of str
-        Sentences on what the file says, for the user.
-    about : dict
-        What else the file says of how the array is stored, for ``info``.
-    axes : str, optional
-        The order of x, y and z along the array, if the file or the user names it.
-    place : dict
-        Spacing, origin and direction of x, y and z as the file has them, not yet checked; they
-        replace those above.
-    part : str
-        What follows the name of the file in messages, such as "[values]".
+    Sample (a, b, c) of the array is at ``origin + direction @ (spacing * (a, b, c))``: spacings are
+    those along the axes of the array, and the columns of ``direction`` (unit vectors) their world
+    directions.
     """
 
     shape: tuple[int, ...]
@@ -141,15 +96,16 @@ class Volume:
     spacing: Triple | None = None
     origin: Triple | None = None
     direction: NDArray[np.float64] | None = None
-    stored: SampleArray | None = None
-    chunks: tuple[int, ...] | None = None
-    read_box: ReadBox | None = None
-    packed: int | None = None
-    notes: tuple[str, ...] = ()
-    about: dict[str, Any] = field(default_factory=dict)
-    axes: str | None = None
+    stored: SampleArray | None = None  # the array itself, if it need not be unpacked
+    chunks: tuple[int, ...] | None = None  # samples of a chunk along each axis, if there are any
+    read_box: ReadBox | None = None  # instead of ``read``
+    packed: int | None = None  # bytes of the array as it is compressed in the file, if it is
+    notes: tuple[str, ...] = ()  # sentences on what the file says, for the user
+    about: dict[str, Any] = field(default_factory=dict)  # how it is stored, for ``info``
+    axes: str | None = None  # order of x, y and z along the array, if the file or user names it
+    # spacing, origin, direction of x, y, z as the file has them, unchecked, instead of those above
     place: dict[str, Any] = field(default_factory=dict)
-    part: str = ""
+    part: str = ""  # follows the name of the file in messages, such as "[values]"
 
     def turned(self, axes: str) -> Volume:
         """Return it without its direction, for a user who gives that of x, y and z."""
@@ -250,10 +206,7 @@ def find_placement(volume: Volume, name: str) -> Placement:
 
 
 def place_in_world(volume: Volume, placement: Placement, given: dict[str, Any]) -> dict[str, Any]:
-    """Return spacing, origin and direction of a volume whose axes are brought into a placement.
-
-    ``given`` holds what replaces these of the file, or None.
-    """
+    """Return the place of a volume in a placement; ``given`` replaces what the file says of it."""
     place = {k: volume.place.get(k) if given.get(k) is None else given[k] for k in PLACE}
     spacing, origin, direction = place.values()
     if spacing is None and volume.spacing is not None:

@@ -61,19 +61,12 @@ def in_one_unit(units: Sequence[str]) -> tuple[NDArray[np.float64] | None, tuple
 
 @dataclass(frozen=True)
 class Axes:
-    """The axes of an array, in order; for each what the file says, "" or None where it does not.
-
-    Attributes
-    ----------
-    names, units : tuple of str
-    steps, starts : tuple of floats or None
-        Distance from a sample to the next, below 0 along a falling axis, and position of the first.
-    """
+    """The axes of an array, in order; for each what the file says, "" or None where it does not."""
 
     names: tuple[str, ...]
     units: tuple[str, ...]
-    steps: tuple[float | None, ...]
-    starts: tuple[float | None, ...]
+    steps: tuple[float | None, ...]  # from a sample to the next, below 0 along a falling axis
+    starts: tuple[float | None, ...]  # positions of the first sample
 
     @classmethod
     def named(

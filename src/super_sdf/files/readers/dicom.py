@@ -131,11 +131,7 @@ def _normal(each: Slice) -> NDArray[np.float64]:
 
 
 def _sorted(slices: list[Slice]) -> tuple[list[Slice], float]:
-    """Return slices in the order of their places along their normal, and the step.
-
-    Raises GridError if they are not parallel, of one size and one above the other, or some are
-    missing.
-    """
+    """Return slices in the order of their places along their normal, and the step."""
     first = slices[0]
     normal = _normal(first)
     slices = sorted(slices, key=lambda each: float(each.corner @ normal))

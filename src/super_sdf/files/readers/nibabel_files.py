@@ -86,10 +86,7 @@ def _opened(request: Request, path: Path) -> Any:
 def _proxied(
     path: Path, stream: Any, header: Any, place: Any, notes: tuple[str, ...] = ()
 ) -> Volume:
-    """Return the array that a header of nibabel describes, read from the stream of its file.
-
-    ``place`` is spacing, origin and direction of the axes x, y, z.
-    """
+    """Return the array that a header of nibabel describes; ``place`` is that of x, y and z."""
     from nibabel.arrayproxy import ArrayProxy
 
     size, is_packed = path.stat().st_size, isinstance(stream, gzip.GzipFile)

@@ -31,6 +31,10 @@ from ..volume import (
 from .axes import Axes, in_one_unit
 
 LONGEST = 1 << 20  # bytes of a header
+CENTERING = (
+    "it states axis mins, but no centerings: its samples are taken as cells, half a spacing from "
+    "them, as ITK does"
+)
 TEXT = ("ascii", "text", "txt")
 IN_SPACE = ("domain", "space", "???", "none")  # kinds of axes; others are lists, vectors, time
 CODECS = {"gzip": "gzip", "gz": "gzip", "bzip2": "bz2", "bz2": "bz2"}
@@ -183,7 +187,9 @@ def _place(
         columns = None if steps is None else np.diag(steps)
         units = units or _of_axes(header.get("units"), space, ())
         if origin is None and low is not None:
-            origin, notes = low, _centering_note(header)
+            origin = low
+            if "centerings" not in header:
+                notes = (CENTERING,)
     else:
         columns = np.asarray(directions, np.float64)[space, :3].T
         if columns.shape != (3, 3) or not np.isfinite(columns).all():
@@ -220,16 +226,6 @@ def _steps(header: dict[str, Any], space: list[int]) -> tuple[Any, Any]:
         return None, None
     low = low + np.where(is_cell, steps / 2, 0)
     return steps, low if np.isfinite(low).all() else None
-
-
-def _centering_note(header: dict[str, Any]) -> tuple[str, ...]:
-    """Return a sentence on how axis mins are taken without centerings."""
-    if "centerings" in header:
-        return ()
-    return (
-        "it states axis mins, but no centerings: its samples are taken as cells, half a spacing "
-        "from them, as ITK does",
-    )
 
 
 def _of_axes(values: Any, space: list[int], default: Any) -> Any:

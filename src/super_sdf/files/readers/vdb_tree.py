@@ -294,10 +294,7 @@ class _Topology:
 
 
 def read_tree(file: InputFile, place: int, coding: Callable[[float], Coding]) -> Tree:
-    """Read the topology of the tree that begins at a byte of a file, and find its leaves' values.
-
-    ``coding`` makes the coding of a background.
-    """
+    """Read the topology of a tree, and find its leaves' values; ``coding`` takes the background."""
     cursor = Cursor(file, place)
     buffers = cursor.number("I")
     if buffers != 1:

@@ -13,8 +13,8 @@ import base64
 import io
 import lzma
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from math import prod
 from typing import Any, NamedTuple
 from xml.parsers import expat
@@ -29,7 +29,6 @@ from ..streams import Deflate, Read, TextValues, Unpacker, bytes_from, next_plan
 from ..volume import Planes, Request, Volume, in_words_of, reversed_axes, triple
 
 PIECE, LONGEST_TAG = 1 << 20, 1 << 20  # bytes of XML
-DEEPEST = 5  # elements from that of the file to that of an array
 MOST_CELLS = 10**7  # of the lattice that the borders of all pieces make
 LARGEST_BLOCK = 1 << 26  # bytes, of LZ4, which is unpacked block by block
 LZMA_MEMORY = 1 << 27  # bytes; xz takes 65 MB at its usual setting
@@ -128,6 +127,10 @@ class Piece(NamedTuple):
     arrays: dict[str, dict[str, Array]]
 
 
+class _FoundError(Exception):
+    """The data at the end of a file begins."""
+
+
 class Outline:
     """What the XML of a file says, up to the data at its end.
 
@@ -162,7 +165,7 @@ class Outline:
         return found
 
     def _parse(self) -> None:
-        """Parse the XML, of which no entity is expanded."""
+        """Parse the XML; document types, and so entities, are refused."""
         parser = self.parser = expat.ParserCreate()
         parser.StartElementHandler = self._start
         parser.EndElementHandler = self._end
@@ -173,7 +176,7 @@ class Outline:
                 parser.Parse(text, place + PIECE >= self.file.size)
                 if place + len(text) - parser.CurrentByteIndex > LONGEST_TAG:
                     raise FileError(f"{self.file.name} is damaged: a tag is too long")
-        except _Found:
+        except _FoundError:
             pass
         except expat.ExpatError as error:
             raise FileError(
@@ -187,28 +190,33 @@ class Outline:
         """Take notice of an element."""
         self._end_text()
         self.path.append(name)
-        where = self.path[1:] if len(self.path) <= DEEPEST else []
-        if self.path == ["VTKFile"]:
-            self.top = attributes
-        elif where == ["ImageData"]:
-            self.image = attributes
-        elif where == ["ImageData", "Piece"]:
-            self.pieces.append(Piece(attributes, {kind: {} for kind in KINDS}))
-        elif where[:2] + where[3:] == ["ImageData", "Piece", "DataArray"] and where[2] in KINDS:
-            self._start_array(where[2], attributes)
-        elif where == ["AppendedData"]:
-            self._start_appended(attributes)
-
-    def _start_array(self, kind: str, attributes: Attributes) -> None:
-        """Take notice of an array; its text, if any, begins at the first character."""
-        arrays, name = self.pieces[-1].arrays[kind], attributes.get("Name", "")
-        if name in arrays:
-            raise FileError(f"{self.file.name} holds {name} twice in a piece: save one time step")
-        self.array = arrays[name] = Array(attributes)
-        self.parser.CharacterDataHandler = self._text
+        match self.path:
+            case ["VTKFile"]:
+                self.top = attributes
+            case [_, "ImageData"]:
+                self.image = attributes
+            case [_, "ImageData", "Piece"]:
+                self.pieces.append(Piece(attributes, {kind: {} for kind in KINDS}))
+            case [_, "ImageData", "Piece", ("PointData" | "CellData") as kind, "DataArray"]:
+                arrays, own = self.pieces[-1].arrays[kind], attributes.get("Name", "")
+                if own in arrays:
+                    raise FileError(
+                        f"{self.file.name} holds {own} twice in a piece: save one time step"
+                    )
+                self.array = arrays[own] = Array(attributes)
+                self.parser.CharacterDataHandler = self._text
+            case [_, "AppendedData"]:
+                place = self.parser.CurrentByteIndex
+                tag = APPENDED.match(self.file.read(place, LONGEST_TAG).tobytes())
+                if not tag:
+                    raise FileError(
+                        f"{self.file.name} is damaged: its appended data does not begin with _"
+                    )
+                self.appended = attributes.get("encoding"), place + tag.end()
+                raise _FoundError
 
     def _text(self, text: str) -> None:
-        """Note where the text of an array begins."""
+        """Note where the text of an array begins: at the first character."""
         if self.array and text.strip():
             self.array.start = self.parser.CurrentByteIndex + len(text) - len(text.lstrip())
             self.parser.CharacterDataHandler = None
@@ -223,19 +231,6 @@ class Outline:
     def _end(self, _: str) -> None:
         self._end_text()
         self.path.pop()
-
-    def _start_appended(self, attributes: Attributes) -> None:
-        """Note where the data at the end begins, and parse no further."""
-        place = self.parser.CurrentByteIndex
-        found = APPENDED.match(self.file.read(place, LONGEST_TAG).tobytes())
-        if not found:
-            raise FileError(f"{self.file.name} is damaged: its appended data does not begin with _")
-        self.appended = attributes.get("encoding"), place + found.end()
-        raise _Found
-
-
-class _Found(Exception):  # noqa: N818, it is no error
-    """The data at the end of a file begins."""
 
 
 class Source:
@@ -356,15 +351,25 @@ class Part:
         packed = self._words(source, 3, count)
         self.packed = sum(packed)
         data = source.after((3 + count) * self.word.itemsize)
+        starts = [0, *accumulate(packed)]
+        blocks = (
+            _block(compressor, bytes_from(data, start, start + length), length, whole, self.name)
+            for start, length, whole in zip(starts, packed, sizes)
+        )
+        block = next(blocks)
 
-        def blocks() -> Iterator[Read]:
-            start = 0
-            for length, whole in zip(packed, sizes):
-                read = bytes_from(data, start, start + length)
-                yield _block(compressor, read, length, whole, self.name)
-                start += length
+        def read(count: int) -> bytes:
+            nonlocal block
+            pieces = []
+            while count:
+                piece = block(count)
+                if not piece:
+                    block = next(blocks)
+                pieces.append(piece)
+                count -= len(piece)
+            return b"".join(pieces)
 
-        return _joined(blocks())
+        return read
 
 
 def _block(compressor: str, packed: Read, length: int, size: int, name: str) -> Read:
@@ -373,41 +378,18 @@ def _block(compressor: str, packed: Read, length: int, size: int, name: str) -> 
         return Unpacker(packed, Deflate(), size, name).read
     if compressor == "vtkLZMADataCompressor":
         return Unpacker(packed, lzma.LZMADecompressor(memlimit=LZMA_MEMORY), size, name).read
-    if compressor == "vtkLZ4DataCompressor" and max(size, length) <= LARGEST_BLOCK:
-        return io.BytesIO(_unpack_lz4(packed(length), size, name)).read
-    raise FileError(
-        f"its compressor is {seen(compressor)}, a block {size:,} bytes: save it with "
-        "vtkZLibDataCompressor"
-    )
-
-
-def _unpack_lz4(packed: bytes, size: int, name: str) -> bytes:
-    """Return an unpacked block of LZ4, which has no checksum."""
+    if compressor != "vtkLZ4DataCompressor" or max(size, length) > LARGEST_BLOCK:
+        raise FileError(
+            f"its compressor is {seen(compressor)}, a block {size:,} bytes: save it with "
+            "vtkZLibDataCompressor"
+        )
     check_modules("LZ4 in VTK image data", "vti")
     from vtkmodules.vtkIOCore import vtkLZ4DataCompressor
 
-    block, compressor = np.empty(size, np.uint8), vtkLZ4DataCompressor()  # type: Any, Any
-    if compressor.Uncompress(packed, len(packed), block, size) != size:
+    data, block, unpacker = packed(length), np.empty(size, np.uint8), vtkLZ4DataCompressor()
+    if unpacker.Uncompress(data, len(data), block, size) != size:  # type: ignore[call-overload]
         raise FileError(f"{name} is damaged: a block of LZ4 does not have {size:,} bytes")
-    return block.tobytes()
-
-
-def _joined(blocks: Iterator[Read]) -> Read:
-    """Return a function that reads blocks one after the other."""
-    block = next(blocks)
-
-    def read(count: int) -> bytes:
-        nonlocal block
-        pieces = []
-        while count:
-            piece = block(count)
-            if not piece:
-                block = next(blocks)
-            pieces.append(piece)
-            count -= len(piece)
-        return b"".join(pieces)
-
-    return read
+    return io.BytesIO(block.tobytes()).read
 
 
 def _check_cover(parts: list[Part], shape: tuple[int, ...]) -> None:

@@ -113,10 +113,7 @@ class ZarrFiles:
                     )
 
     def chunks_of(self, path: str, counts: Sequence[int]) -> dict[tuple[int, ...], str]:
-        """Return the keys of the chunks of an array that are stored, by their indices.
-
-        ``counts`` is how many chunks (or shards) it has along each axis.
-        """
+        """Return the keys of the chunks, or shards, that are stored, by their indices."""
         before, found = f"{path}/" if path else "", {}
         for key in self.sizes:
             match = CHUNK_KEY.fullmatch(key, len(before)) if key.startswith(before) else None
