@@ -234,14 +234,12 @@ def test_what_mrc_files_say_that_no_grid_has():
 
 
 @pytest.mark.parametrize("kind", [np.int8, np.int16, np.uint16, np.float16])
-def test_modes_and_byte_orders_of_mrc(kind):
+def test_modes_of_mrc(kind):
     mask = (sampled(AFFINE) < 0).astype(kind)
-    for order in "<>":
-        with mrcfile.new("a.mrc", overwrite=True) as file:
-            file.set_data(np.ascontiguousarray(mask.T))
-            file.voxel_size = tuple(STEPS.tolist())
-        whole = mrcfile.read("a.mrc")
-        assert np.array_equal(read_grid("a.mrc", field="mask").values < 0, whole.T > 0), order
+    with mrcfile.new("a.mrc", overwrite=True) as file:
+        file.set_data(np.ascontiguousarray(mask.T))
+        file.voxel_size = tuple(STEPS.tolist())
+    assert np.array_equal(read_grid("a.mrc", field="mask").values < 0, mask > 0)
 
 
 # VTK

@@ -223,16 +223,8 @@ def test_a_direction_is_given_where_the_file_has_none():
     assert read_grid("a.npz", direction=np.eye(3)).is_straight
 
 
-def test_nifti_by_qform_slope_and_a_fourth_axis():
+def test_nifti_by_qform_and_slope():
     affine = affine_of(TURNS[5])
-    image = nibabel.Nifti1Image(np.rint(sampled(affine) * 1000).astype(np.int16), None)
-    image = nibabel.Nifti1Image(np.asarray(image.dataobj)[..., None], None, image.header)
-    image.set_qform(affine, code=1)
-    image.set_sform(None, code=0)
-    image.header.set_slope_inter(0.001, 0)
-    nibabel.save(image, "a.nii.gz")
-    packed = nibabel.load("a.nii.gz")
-    assert packed.header["qform_code"] == 1 and packed.header["sform_code"] == 0
     raw = nibabel.Nifti1Image(sampled(affine), None)
     raw.set_qform(affine, code=1)
     raw.header.set_data_dtype(np.int16)  # nibabel chooses slope and intercept
@@ -282,21 +274,6 @@ def test_tiff_stacks(options):
     assert grid.origin == (0, 0, 0)
     tifffile.imwrite("x.tif", sampled(affine), photometric="minisblack", **options)
     check(read_grid("x.tif", spacing=SPACING, origin=affine[:3, 3], axes="xyz"))
-
-
-def test_spacing_of_imagej_and_ome():
-    affine = affine_of(np.eye(3))
-    data = sampled(affine).T
-    about = {"axes": "ZYX", "spacing": SPACING, "unit": "um"}
-    tifffile.imwrite("j.tif", data, imagej=True, resolution=(2, 2), metadata=about)
-    check(read_grid("j.tif", origin=affine[:3, 3]))
-    sizes = {f"PhysicalSize{axis}": SPACING for axis in "XYZ"}
-    tifffile.imwrite("a.ome.tif", data, metadata={"axes": "ZYX", **sizes})
-    check(read_grid("a.ome.tif", origin=affine[:3, 3]))
-    sizes["PhysicalSizeZ"] = 0.8
-    affine = affine_of(np.diag([1, 1, 1.6]))
-    tifffile.imwrite("z.ome.tif", sampled(affine).T, metadata={"axes": "ZYX", **sizes})
-    check(read_grid("z.ome.tif", origin=affine[:3, 3]), spacing=[0.5, 0.5, 0.8])
 
 
 def test_hdf5_datasets():
