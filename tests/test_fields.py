@@ -467,7 +467,7 @@ def test_both_files_appear_or_neither(broken, suffix, command, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    writer = writing.FORMATS[suffix].writer
+    writer = writing.WRITERS[suffix]
     if broken == "disk":
         monkeypatch.setattr(writer, "finish", full)
     elif broken == "interrupt":

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from math import prod
 from pathlib import Path
-from typing import IO, Any, NamedTuple, Protocol
+from typing import IO, Any
 
 import numpy as np
 from numpy.lib import format as npy
@@ -28,18 +28,6 @@ CHUNK = 1 << 20  # values at a time, but at least a plane
 BYTES = 4  # of a value
 STDERR = 2
 Shape = tuple[int, int, int]
-
-
-class FieldWriter(Protocol):
-    """Writes a field that comes slab by slab."""
-
-    def add(self, field: FineField) -> None:
-        """Write the own planes of a slab's field."""
-        ...
-
-    def finish(self) -> None:
-        """Complete the file."""
-        ...
 
 
 class NpyWriter:
@@ -136,26 +124,12 @@ def _discarded_stderr() -> Iterator[None]:
         os.close(nowhere)
 
 
-class FieldFormat(NamedTuple):
-    """A file format of refined fields.
+WRITERS: dict[str, Any] = {".npz": SparseWriter, ".npy": NpyWriter, ".vti": VtiWriter}
+"""Each takes the path, the nodes along each axis of the lattice, and what closes files at the end.
 
-    ``writer`` takes the path, the nodes along each axis of the fine lattice, and what closes files
-    at the end. A dense file holds every node of the fine lattice; ``in_memory`` must fit there.
-    ``extra`` installs the library.
-    """
-
-    writer: Callable[[Path, Shape, ExitStack], FieldWriter]
-    dense: bool = False
-    in_memory: bool = False
-    extra: str | None = None
-
-
-FORMATS = {
-    ".npz": FieldFormat(SparseWriter),
-    ".npy": FieldFormat(NpyWriter, dense=True),
-    ".vti": FieldFormat(VtiWriter, dense=True, in_memory=True, extra="vti"),
-}
-FIELD_SUFFIXES = tuple(FORMATS)
+A writer has the methods ``add`` and ``finish``. All but the sparse one write every node.
+"""
+FIELD_SUFFIXES = tuple(WRITERS)
 
 
 def check_field_target(path: str | Path, *, force: bool = False) -> Path:
@@ -167,17 +141,17 @@ def check_field_target(path: str | Path, *, force: bool = False) -> Path:
             f"{path} cannot be written: OpenVDB's own module cannot be installed with pip; write "
             ".npz, and convert it with that module as docs/fields.md shows"
         )
-    if suffix not in FORMATS:
+    if suffix not in WRITERS:
         raise OptionError(f"{path} is not a field file: give one of {', '.join(FIELD_SUFFIXES)}")
-    if extra := FORMATS[suffix].extra:
-        check_modules(f"Writing {suffix}", extra)
+    if suffix == ".vti":
+        check_modules("Writing .vti", "vti")
     return check_free(path, force=force)
 
 
 def check_field_fits(path: Path, shape: Shape, max_memory: int | None = None) -> None:
     """Raise an error if a dense file of a lattice does not fit on the disk, or .vti in memory."""
-    format_ = FORMATS[path.suffix.lower()]
-    if not format_.dense:
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
         return
     size = BYTES * prod(shape)
     what = f"{' x '.join(map(str, shape))} values take {in_words(size)}"
@@ -188,7 +162,7 @@ def check_field_fits(path: Path, shape: Shape, max_memory: int | None = None) ->
             "is sparse"
         )
     left = None if bound is None else bound - (held_memory() or 0)
-    if format_.in_memory and left is not None and size > left:
+    if suffix == ".vti" and left is not None and size > left:
         raise OutOfMemoryError(
             f"{path} cannot be written: {what} of memory, {in_words(max(left, 0))} are left; "
             "write .npy, which is written plane by plane, or .npz, which is sparse"
@@ -201,7 +175,7 @@ class FieldFile:
     ``place`` has spacing and origin of the fine lattice, once there is a field.
     """
 
-    def __init__(self, path: Path, shape: Shape, writer: FieldWriter) -> None:
+    def __init__(self, path: Path, shape: Shape, writer: Any) -> None:
         self.path, self.shape, self.writer = path, shape, writer
         self.place: dict[str, Any] = {}
 
@@ -231,7 +205,7 @@ def saving_field(path: Path, shape: Shape, *, force: bool = False) -> Iterator[F
     ``shape`` is the number of nodes of the fine lattice along each axis.
     """
     with replacing(path, force=force) as part, ExitStack() as files:
-        yield FieldFile(path, shape, FORMATS[path.suffix.lower()].writer(part, shape, files))
+        yield FieldFile(path, shape, WRITERS[path.suffix.lower()](part, shape, files))
 
 
 def write_field(field: FineField, path: str | Path, *, force: bool = False) -> None:

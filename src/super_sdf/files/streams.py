@@ -61,12 +61,15 @@ def next_planes(read: Read, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Pla
     return planes
 
 
-def packed_planes(
-    packed: Read, codec: str, shape: tuple[int, ...], dtype: np.dtype[Any], name: str
-) -> Planes:
-    """Return a function that returns the next planes of an array, packed by one of ``CODECS``."""
-    size = prod(shape) * dtype.itemsize
-    return next_planes(Unpacker(packed, CODECS[codec](), size, name).read, shape, dtype)
+def planes_behind(
+    file: InputFile, offset: int, codec: str | None, shape: tuple[int, ...], dtype: np.dtype[Any]
+) -> tuple[Planes, int | None]:
+    """Return a function that reads planes of what follows in a file, and its size if packed."""
+    if codec is None:
+        return raw_planes(file, offset, shape, dtype).read, None
+    size, packed = prod(shape) * dtype.itemsize, bytes_from(file, offset)
+    unpacked = Unpacker(packed, CODECS[codec](), size, file.name)
+    return next_planes(unpacked.read, shape, dtype), file.size - offset
 
 
 class Deflate:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ...errors import FileError, GridError, seen
 from ...grid.planes import InputFile
 from ..regular import check_beside
-from ..streams import bytes_from, packed_planes, raw_planes
+from ..streams import planes_behind, raw_planes
 from ..volume import Planes, Request, Volume, kept_axes, reversed_axes, triple
 
 LONGEST = 1 << 20  # bytes of a header, with a list of files
@@ -197,7 +197,7 @@ def _data(
 
 def _compressed(
     files: list[InputFile], header: Header, start: int, shape: tuple[int, ...]
-) -> tuple[Planes, int]:
+) -> tuple[Planes, int | None]:
     """Return a function that reads planes of zlib data, and its size."""
     file = files[0]
     if len(files) > 1 or header.fields.get("HeaderSize", "0").startswith("-"):
@@ -209,5 +209,4 @@ def _compressed(
             f"{file.name} is damaged: its CompressedDataSize is {size:,}, but {follow:,} bytes "
             "follow"
         )
-    read = packed_planes(bytes_from(file, start), "zlib", shape, header.dtype, file.name)
-    return read, size
+    return planes_behind(file, start, "zlib", shape, header.dtype)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ...errors import FileError, GridError, seen
 from ...grid.planes import InputFile
 from ..regular import check_beside
-from ..streams import TextValues, bytes_from, packed_planes, raw_planes
+from ..streams import TextValues, planes_behind
 from ..volume import (
     MOST_NAMED,
     XYZ,
@@ -151,14 +151,11 @@ def _data(
                 f"{file.name} is truncated: {in_words_of(shape, dtype)} are promised, it has "
                 f"{file.size:,}"
             )
-        return raw_planes(file, start, shape, dtype).read, None
-    if skip or encoding.lower() not in (*TEXT, *CODECS):
+    elif skip or encoding.lower() not in (*TEXT, *CODECS):
         raise FileError(f"its encoding is {seen(encoding)}, byte skip {skip}: save it as raw")
-    if encoding.lower() in TEXT:
+    elif encoding.lower() in TEXT:
         return TextValues(file, start, file.size, dtype, shape).planes, None
-    packed = bytes_from(file, start)
-    read = packed_planes(packed, CODECS[encoding], shape, dtype, file.name)
-    return read, file.size - start
+    return planes_behind(file, start, CODECS.get(encoding.lower()), shape, dtype)
 
 
 def _after_lines(file: InputFile, start: int, lines: int) -> int:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...errors import FileError, GridError
 from ...grid.planes import InputFile
 from ..volume import Box, Request, Volume, from_affine
-from .vdb_tree import LEAF, Coding, Cursor, Tree, read_tree
+from .vdb_tree import LEAF, Coding, Cursor, Tree
 
 MAGIC = 0x56444220
 OLDEST = 222  # version of the file format, of OpenVDB 3
@@ -67,7 +67,7 @@ def read_vdb(request: Request) -> Volume:
         flags, _, _, place = _read_head(file, places[0])
     dtype = TYPES[entry.type.removesuffix(HALF)]
     stored = np.dtype("<f2") if entry.type.endswith(HALF) else dtype
-    tree = read_tree(file, place, partial(Coding, dtype, stored, flags))
+    tree = Tree(file, place, partial(Coding, dtype, stored, flags))
     stated = metadata.get("file_voxel_count", tree.active_count)
     if stated != tree.active_count:
         raise FileError(
@@ -157,7 +157,7 @@ def _volume(
     bounds = tree.bounds()
     if bounds is None:
         raise GridError(f"{file.name} has no active voxel: it holds no surface")
-    unknown = not tree.coding.background and tree.is_signed(file)
+    unknown = not tree.coding.background and tree.is_signed()
     margin = 0 if unknown else MARGIN
     low, high = bounds[0] - margin, bounds[1] + margin
     size = PICOGK_MM * float(metadata.get("PicoGK.VoxelSize", 1 / PICOGK_MM))
@@ -166,7 +166,7 @@ def _volume(
     def read_box(box: Box) -> NDArray[Any]:
         start = low + [part.start for part in box]
         shape = tuple(part.stop - part.start for part in box)
-        found = tree.read(file, start, shape, unknown=unknown)
+        found = tree.read(start, shape, unknown=unknown)
         return found if size == 1 else found * found.dtype.type(size)
 
     turn = affine[:, :3]

@@ -26,7 +26,8 @@ from ...errors import FileError, GridError, seen
 from ...grid.planes import InputFile
 from ...machine.extras import check_modules
 from ..streams import Deflate, Read, TextValues, Unpacker, bytes_from, next_planes
-from ..volume import Planes, Request, Volume, in_words_of, reversed_axes, triple
+from ..volume import Planes, Request, Volume, in_words_of
+from .vtk import ImageLattice
 
 PIECE, LONGEST_TAG = 1 << 20, 1 << 20  # bytes of XML
 MOST_CELLS = 10**7  # of the lattice that the borders of all pieces make
@@ -41,42 +42,6 @@ KINDS = ("PointData", "CellData")
 MARKS = ("vtkGhostType", "vtkValidPointMask")
 
 Attributes = dict[str, str]
-
-
-@dataclass(frozen=True)
-class ImageLattice:
-    """Where the samples of VTK image data lie: at its points, or at the centres of its cells.
-
-    Point (i, j, k) of the extent is at ``origin + direction @ (spacing * (i, j, k))``. The extent,
-    the first and the last point on each axis, need not begin at 0.
-    """
-
-    extent: tuple[int, ...]
-    spacing: NDArray[np.float64]
-    origin: NDArray[np.float64]
-    direction: NDArray[np.float64]
-    of_points: bool
-
-    @classmethod
-    def of_image(cls, image: Any, of_points: bool) -> ImageLattice:
-        """Return where the samples of VTK's image data lie, at its points or in its cells."""
-        matrix = image.GetDirectionMatrix()
-        direction = [[matrix.GetElement(row, column) for column in range(3)] for row in range(3)]
-        spacing, origin = np.array(image.GetSpacing()), np.array(image.GetOrigin())
-        return cls(image.GetExtent(), spacing, origin, np.array(direction), of_points)
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Shape (nz, ny, nx) of the array of samples: x is the fastest."""
-        low, high = self.extent[::2], self.extent[1::2]
-        return tuple(high[axis] - low[axis] + self.of_points for axis in (2, 1, 0))
-
-    def volume(self, dtype: Any, read: Planes) -> Volume:
-        """Return the samples, whose planes of z ``read`` returns, at their place in the world."""
-        first = np.array(self.extent[::2]) + (0 if self.of_points else 0.5)
-        start = triple(self.origin + self.direction @ (self.spacing * first))
-        spacing, direction = reversed_axes(self.spacing, self.direction)
-        return Volume(self.shape, np.dtype(dtype), read, spacing, start, direction)
 
 
 def read_vti(request: Request) -> Volume:

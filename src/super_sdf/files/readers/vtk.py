@@ -6,15 +6,16 @@ Rectilinear grids are read, too, if their steps are even.
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...errors import FileError, GridError, OptionTypeError, seen
-from ..volume import XYZ, Request, Volume
-from .vti import ImageLattice
+from ..volume import XYZ, Planes, Request, Volume, reversed_axes, triple
 
 NAME = "the image"  # in memory, in error messages
 RESAMPLE = (
@@ -27,6 +28,42 @@ RESAMPLE = (
 # Lines of text between the values of arrays: keywords, or name, counts and type of an array.
 BETWEEN = re.compile(rb"^(?:[A-Z_]{4,}.*|\S+ \d+ \d+ [a-zA-Z_]+\s*)$", re.M)
 EVEN = 1e-4  # share of a step by which steps may differ
+
+
+@dataclass(frozen=True)
+class ImageLattice:
+    """Where the samples of VTK image data lie: at its points, or at the centres of its cells.
+
+    Point (i, j, k) of the extent is at ``origin + direction @ (spacing * (i, j, k))``. The extent,
+    the first and the last point on each axis, need not begin at 0.
+    """
+
+    extent: tuple[int, ...]
+    spacing: NDArray[np.float64]
+    origin: NDArray[np.float64]
+    direction: NDArray[np.float64]
+    of_points: bool
+
+    @classmethod
+    def of_image(cls, image: Any, of_points: bool) -> ImageLattice:
+        """Return where the samples of VTK's image data lie, at its points or in its cells."""
+        matrix = image.GetDirectionMatrix()
+        direction = [[matrix.GetElement(row, column) for column in range(3)] for row in range(3)]
+        spacing, origin = np.array(image.GetSpacing()), np.array(image.GetOrigin())
+        return cls(image.GetExtent(), spacing, origin, np.array(direction), of_points)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape (nz, ny, nx) of the array of samples: x is the fastest."""
+        low, high = self.extent[::2], self.extent[1::2]
+        return tuple(high[axis] - low[axis] + self.of_points for axis in (2, 1, 0))
+
+    def volume(self, dtype: Any, read: Planes) -> Volume:
+        """Return the samples, whose planes of z ``read`` returns, at their place in the world."""
+        first = np.array(self.extent[::2]) + (0 if self.of_points else 0.5)
+        start = triple(self.origin + self.direction @ (self.spacing * first))
+        spacing, direction = reversed_axes(self.spacing, self.direction)
+        return Volume(self.shape, np.dtype(dtype), read, spacing, start, direction)
 
 
 def read_vtk(request: Request) -> Volume:
