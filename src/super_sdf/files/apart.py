@@ -121,7 +121,7 @@ def serve() -> None:
         volume = _answer(
             answers,
             lambda: READERS[key](Request(**request, files=files)),
-            lambda found: {n: value for n, value in vars(found).items() if n not in FUNCTIONS},
+            lambda volume: {n: v for n, v in vars(volume).items() if n not in FUNCTIONS},
         )
         while volume:
             _answer(answers, partial(volume.box, pickle.load(questions)), np.ascontiguousarray)

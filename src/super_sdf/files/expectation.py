@@ -106,14 +106,16 @@ def _crossings_of(
     """Count crossed edges plane by plane, (n, 3); ``has_before``: the first is the one before."""
     with np.errstate(over="ignore"):  # an offset beyond float32 is beyond all values
         inside = (negated(planes) if positive_inside else planes) <= offset
-    own = inside[int(has_before) :]
-    x, y, z = (_count(np.diff(part, axis=axis)) for axis, part in enumerate((inside, own, own)))
+    counted = inside[int(has_before) :]
+    x, y, z = (
+        _count(np.diff(part, axis=axis)) for axis, part in enumerate((inside, counted, counted))
+    )
     if not has_before:
         x = np.concatenate([_count(inside[:1]) * cap, x])
     if cap:
-        y += _count(own[:, [0, -1]])
-        z += _count(own[:, :, [0, -1]])
-        x[-1] += is_end * np.count_nonzero(own[-1])
+        y += _count(counted[:, [0, -1]])
+        z += _count(counted[:, :, [0, -1]])
+        x[-1] += is_end * np.count_nonzero(counted[-1])
     return np.stack([x, y, z], axis=1)
 
 

@@ -105,9 +105,9 @@ def read_grid(
     wanted: dict[str, Any] = {"field": field, "label": label, "level": level, "scale": scale}
     Wanted(**wanted).check()
     given = {"spacing": spacing, "origin": origin, "direction": direction}
-    found = read_array(path, given, axes, max_memory)
-    notes = found.pop("notes")
-    return make_grid(**found, inside=inside, **wanted).noted(notes)
+    arrays = read_array(path, given, axes, max_memory)
+    notes = arrays.pop("notes")
+    return make_grid(**arrays, inside=inside, **wanted).noted(notes)
 
 
 def read_array(
@@ -123,9 +123,9 @@ def read_array(
     with open_volume(path, format_, order, (room, left)) as volume:
         if given["direction"] is not None:
             volume = volume.turned(order)
-        found = take(volume, str(path), room, given, left)
-    check_planes(found["values"], bound)
-    return found | {"notes": volume.notes}
+        arrays = take(volume, str(path), room, given, left)
+    check_planes(arrays["values"], bound)
+    return arrays | {"notes": volume.notes}
 
 
 @contextmanager
@@ -241,8 +241,8 @@ def grid_from_image(
     from .readers.vtk import NAME, volume_of_image
 
     volume = volume_of_image(image, scalars)
-    found = take(volume, NAME, unpacking_room(max_memory), {})
-    return make_grid(**found, inside=inside, **wanted)
+    arrays = take(volume, NAME, unpacking_room(max_memory), {})
+    return make_grid(**arrays, inside=inside, **wanted)
 
 
 def describe_grid_file(path: str | Path) -> dict[str, Any]:
@@ -259,7 +259,7 @@ def describe_grid_file(path: str | Path) -> dict[str, Any]:
         placement = find_placement(volume, str(path))
         place = place_in_world(volume, placement, {})
     shape = placement.of_world(volume.shape)
-    found: dict[str, Any] = {
+    facts: dict[str, Any] = {
         "file": str(path),
         "format": format_.name,
         "shape": list(shape),
@@ -271,11 +271,11 @@ def describe_grid_file(path: str | Path) -> dict[str, Any]:
         **volume.about,
         "notes": list(volume.notes),
     }
-    if found["direction"] in (None, _listed(STRAIGHT)):
-        del found["direction"]
+    if facts["direction"] in (None, _listed(STRAIGHT)):
+        del facts["direction"]
     if not volume.chunks:
-        del found["chunks"]
-    return found
+        del facts["chunks"]
+    return facts
 
 
 def _listed(numbers: Any) -> list[float] | None:

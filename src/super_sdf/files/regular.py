@@ -45,17 +45,17 @@ def check_regular_file(path: str | Path) -> Path:
     The file is not opened, so this never blocks. An empty file is refused, too.
     """
     try:
-        found = os.stat(path)
+        state = os.stat(path)
     except OSError as error:
         raise FileError(f"{path} {reason_of(error)}") from None
     except ValueError:  # a NUL, or a character that the file system's encoding lacks
         raise FileError(f"{str(path)!r} is not a valid file name") from None
-    if not stat.S_ISREG(found.st_mode):
-        kind = KINDS.get(stat.S_IFMT(found.st_mode), "special file")
+    if not stat.S_ISREG(state.st_mode):
+        kind = KINDS.get(stat.S_IFMT(state.st_mode), "special file")
         raise FileError(f"{path} is a {kind}: give a file")
     if not os.access(path, os.R_OK):
         raise FileError(f"{path} {REASONS[errno.EACCES]}")
-    if not found.st_size:  # such as files in /proc, which the system makes up as they are read
+    if not state.st_size:  # such as files in /proc, which the system makes up as they are read
         raise FileError(f"{path} is empty: give a file with something in it")
     return Path(path)
 
@@ -136,8 +136,8 @@ def _names_in(file: Path) -> Iterator[str]:
         yield from (f"{file.stem}.img", f"{file.stem}.img.gz")
     if kind == ".onnx":
         content = file.read_bytes()
-        for found in WEIGHTS.finditer(content):
-            yield os.fsdecode(content[found.end() : found.end() + found[1][0]])
+        for match in WEIGHTS.finditer(content):
+            yield os.fsdecode(content[match.end() : match.end() + match[1][0]])
     elif kind in HEADERS:
         with file.open("rb") as header:
             lines = header.read(LONGEST_HEADER).split(b"\n")

@@ -37,8 +37,8 @@ def in_metres(unit: str) -> float | None:
         return METRES[plain]
     word = re.sub(r"(?<=.)(?<!inche)s$|(?<=inch)es$", "", plain.lower())
     word = re.sub("met(er|re)$", "m", {"micron": "um"}.get(word, word))
-    found = next((WORDS[start] + "m" for start in WORDS if word == f"{start}m"), word)
-    return METRES.get(found)
+    symbol = next((WORDS[start] + "m" for start in WORDS if word == f"{start}m"), word)
+    return METRES.get(symbol)
 
 
 def in_one_unit(units: Sequence[str]) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
@@ -82,17 +82,17 @@ class Axes:
         cls,
         names: Sequence[str],
         shape: Sequence[int],
-        found: Callable[[int], tuple[NDArray[Any] | None, dict[str, Any]]],
+        coordinates: Callable[[int], tuple[NDArray[Any] | None, dict[str, Any]]],
     ) -> Axes:
         """Return the axes of an array by their coordinates, which must be evenly spaced.
 
-        ``found`` returns those of an axis in space, or None, and their attributes, of which
+        ``coordinates`` returns those of an axis in space, or None, and their attributes, of which
         ``axis`` names an axis that has another name, and ``units`` states the unit.
         """
         axes, called = cls.named(names), list(names)
         units, steps, starts = (list(each) for each in (axes.units, axes.steps, axes.starts))
         for axis in axes.in_space(shape):
-            places, about = found(axis)
+            places, about = coordinates(axis)
             if places is None or len(places) < 2:
                 continue
             starts[axis], steps[axis] = even_steps(names[axis], places)

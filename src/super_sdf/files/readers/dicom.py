@@ -71,7 +71,7 @@ def _series_in(folder: Path) -> dict[str, list[tuple[Path, Any]]]:
     """Return the images of a folder, headers only, by the UID of their series."""
     import pydicom
 
-    found: dict[str, list[tuple[Path, Any]]] = {}
+    series: dict[str, list[tuple[Path, Any]]] = {}
     for name in sorted(os.listdir(folder)):
         if not (folder / name).is_file():
             continue
@@ -80,8 +80,8 @@ def _series_in(folder: Path) -> dict[str, list[tuple[Path, Any]]]:
             header = pydicom.dcmread(path, stop_before_pixels=True)
             if "Rows" in header:
                 uid = str(header.get("SeriesInstanceUID", ""))
-                found.setdefault(uid, []).append((path, header))
-    return found
+                series.setdefault(uid, []).append((path, header))
+    return series
 
 
 def _slices(images: list[tuple[Path, Any]]) -> Iterator[Slice]:

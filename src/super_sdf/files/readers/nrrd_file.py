@@ -109,13 +109,13 @@ def _layer(request: Request, header: dict[str, Any], sizes: tuple[int, ...]) -> 
 
 def _segments(header: dict[str, Any], layer: int) -> str:
     """Return names and labels of the segments in a layer, as 3D Slicer writes them."""
-    found = [
+    segments = [
         f"{header.get(key.replace('_Layer', '_Name'), '?')} "
         f"{header.get(key.replace('_Layer', '_LabelValue'), '?')}"
         for key, value in header.items()
         if re.fullmatch(r"Segment\d+_Layer", key) and value.strip() == str(layer)
     ]
-    return f" ({seen(', '.join(found))})" if found else ""
+    return f" ({seen(', '.join(segments))})" if segments else ""
 
 
 def _plain(name: str) -> str:

@@ -82,9 +82,9 @@ def _axes(file: Any, series: Any, order: str) -> tuple[Axes, tuple[str, ...]]:
     """Return what a file says of the axes of an array, and a note on what is not taken of it."""
     is_named = order == "zyx" and sorted(series.axes) == ["X", "Y", "Z"]
     names = series.axes.lower() if is_named else order
-    found: dict[str, Stated] = _ome_axes(file) or _imagej_axes(file) or {}
-    units, steps, starts = zip(*(found.get(name, ("", None, None)) for name in names))
-    return Axes.named(names, units, steps, starts), (() if found else _pixel_note(file))
+    stated: dict[str, Stated] = _ome_axes(file) or _imagej_axes(file) or {}
+    units, steps, starts = zip(*(stated.get(name, ("", None, None)) for name in names))
+    return Axes.named(names, units, steps, starts), (() if stated else _pixel_note(file))
 
 
 def _imagej_axes(file: Any) -> dict[str, Stated] | None:
@@ -93,23 +93,23 @@ def _imagej_axes(file: Any) -> dict[str, Stated] | None:
     What is not stated holds as in ImageJ: a spacing of z of 1, the unit of the resolution, that of
     x for all axes, and origins of 0 beside others, which are in pixels.
     """
-    found: dict[str, Any] = file.imagej_metadata or (file.shaped_metadata or ({},))[0]
+    metadata: dict[str, Any] = file.imagej_metadata or (file.shaped_metadata or ({},))[0]
     sizes = _pixel_sizes(file)
-    if not sizes or not (file.is_imagej or "spacing" in found):
+    if not sizes or not (file.is_imagej or "spacing" in metadata):
         return None
-    unit = str(found.get("unit") or _resolution_unit(file))
-    if "spacing" not in found and "unit" not in found and unit:
+    unit = str(metadata.get("unit") or _resolution_unit(file))
+    if "spacing" not in metadata and "unit" not in metadata and unit:
         return None  # x and y may be those of a print
     # ImageJ writes letters beyond ASCII by their numbers
     units = [
         re.sub(r"\\u([0-9a-fA-F]{4})", lambda number: chr(int(number[1], 16)), each)
-        for each in (str(found.get(f"{axis}unit") or unit) for axis in "xyz")
+        for each in (str(metadata.get(f"{axis}unit") or unit) for axis in "xyz")
     ]
-    steps = [*sizes, abs(float(found.get("spacing") or 1))]
+    steps = [*sizes, abs(float(metadata.get("spacing") or 1))]
     is_bare = not any(unit and not unit.startswith("pixel") for unit in units)
-    if is_bare and "spacing" not in found and sizes == (1, 1):
+    if is_bare and "spacing" not in metadata and sizes == (1, 1):
         return None
-    starts = [float(found.get(f"{axis}origin") or 0) for axis in "xyz"]
+    starts = [float(metadata.get(f"{axis}origin") or 0) for axis in "xyz"]
     placed = [-start * step if any(starts) else None for start, step in zip(starts, steps)]
     return dict(zip("xyz", zip(units, steps, placed)))
 
@@ -150,9 +150,9 @@ def _ome_axes(file: Any) -> dict[str, Stated] | None:
     pixels = ElementTree.fromstring(re.sub(r"\s\w+:(?=\w+=)", " ", text)).find(".//Pixels")
     if pixels is None:
         return None
-    found: dict[str, Stated] = {}
+    stated: dict[str, Stated] = {}
     for axis in "XYZ":
         size, unit = pixels.get(f"PhysicalSize{axis}"), pixels.get(f"PhysicalSize{axis}Unit", "µm")
         if size and float(size) > 0:
-            found[axis.lower()] = unit, float(size), None
-    return found
+            stated[axis.lower()] = unit, float(size), None
+    return stated

@@ -122,16 +122,16 @@ def _read_head(file: InputFile, place: int) -> tuple[int, dict[str, Any], NDArra
 
 def _read_metadata(cursor: Cursor) -> dict[str, Any]:
     """Return the numbers and texts of metadata."""
-    found: dict[str, Any] = {}
+    metadata: dict[str, Any] = {}
     for _ in range(cursor.number("I")):
         name, type_ = cursor.text(), cursor.text()
         data = Cursor(cursor.file, cursor.place + 4)
         cursor.skip(cursor.number("I"))
         if type_ == "string":
-            found[name] = data.take(cursor.place - data.place).decode("utf-8", "replace")
+            metadata[name] = data.take(cursor.place - data.place).decode("utf-8", "replace")
         elif type_ in NUMBERS:
-            found[name] = data.number(NUMBERS[type_])
-    return found
+            metadata[name] = data.number(NUMBERS[type_])
+    return metadata
 
 
 def _read_transform(cursor: Cursor) -> NDArray[np.float64]:
@@ -166,8 +166,8 @@ def _volume(
     def read_box(box: Box) -> NDArray[Any]:
         start = low + [part.start for part in box]
         shape = tuple(part.stop - part.start for part in box)
-        found = tree.read(start, shape, unknown=unknown)
-        return found if size == 1 else found * found.dtype.type(size)
+        voxels = tree.read(start, shape, unknown=unknown)
+        return voxels if size == 1 else voxels * voxels.dtype.type(size)
 
     turn = affine[:, :3]
     spacing, origin, direction = from_affine(

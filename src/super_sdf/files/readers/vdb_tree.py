@@ -95,11 +95,11 @@ class Coding:
         numbers = self._numbers(cursor, int(active.sum()) if packed else len(active))
         if not packed:
             return numbers
-        found = np.full(len(active), values[0], self.dtype)
+        filled = np.full(len(active), values[0], self.dtype)
         if selection is not None:
-            found[selection] = values[1]
-        found[active] = numbers
-        return found
+            filled[selection] = values[1]
+        filled[active] = numbers
+        return filled
 
     def skip(self, cursor: Cursor, active: int) -> int:
         """Skip the values of a leaf of ``active`` active voxels; return how others are stored."""

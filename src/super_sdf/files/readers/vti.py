@@ -120,14 +120,14 @@ class Outline:
 
         That of an array of cells beside one of points of the same name begins with ``CellData/``.
         """
-        found: dict[str, tuple[str, str, bool]] = {}
+        by_name: dict[str, tuple[str, str, bool]] = {}
         for kind in KINDS:
             pairs = (pair for piece in self.pieces for pair in piece.arrays[kind].items())
             for name, array in pairs:
                 is_scalar = array.attributes.get("NumberOfComponents", "1") == "1"
-                key = name if found.get(name, (kind,))[0] == kind else f"{kind}/{name}"
-                found[key] = kind, name, is_scalar and name not in MARKS
-        return found
+                key = name if by_name.get(name, (kind,))[0] == kind else f"{kind}/{name}"
+                by_name[key] = kind, name, is_scalar and name not in MARKS
+        return by_name
 
     def _parse(self) -> None:
         """Parse the XML; document types, and so entities, are refused."""
@@ -163,12 +163,12 @@ class Outline:
             case [_, "ImageData", "Piece"]:
                 self.pieces.append(Piece(attributes, {kind: {} for kind in KINDS}))
             case [_, "ImageData", "Piece", ("PointData" | "CellData") as kind, "DataArray"]:
-                arrays, own = self.pieces[-1].arrays[kind], attributes.get("Name", "")
-                if own in arrays:
+                arrays, label = self.pieces[-1].arrays[kind], attributes.get("Name", "")
+                if label in arrays:
                     raise FileError(
-                        f"{self.file.name} holds {own} twice in a piece: save one time step"
+                        f"{self.file.name} holds {label} twice in a piece: save one time step"
                     )
-                self.array = arrays[own] = Array(attributes)
+                self.array = arrays[label] = Array(attributes)
                 self.parser.CharacterDataHandler = self._text
             case [_, "AppendedData"]:
                 place = self.parser.CurrentByteIndex
@@ -240,9 +240,9 @@ class Part:
         lattice: ImageLattice,
     ) -> None:
         extent = _extent(piece.attributes, "Extent")
-        own = replace(lattice, extent=extent)
+        self.shape = replace(lattice, extent=extent).shape
         self.low = tuple(extent[2 * axis] - lattice.extent[2 * axis] for axis in (2, 1, 0))
-        self.high = tuple(low + size for low, size in zip(self.low, own.shape))
+        self.high = tuple(low + size for low, size in zip(self.low, self.shape))
         self.packed: int | None = None
         array = piece.arrays[which[0]].get(which[1])
         inside = all(a >= 0 and b <= n for a, b, n in zip(self.low, self.high, lattice.shape))
@@ -255,7 +255,6 @@ class Part:
         order = {"LittleEndian": "<", "BigEndian": ">"}[outline.top.get("byte_order", "")]
         self.dtype = np.dtype(order + TYPES[about["type"]])
         self.word = np.dtype(order + {"UInt64": "u8"}.get(outline.top.get("header_type", ""), "u4"))
-        self.shape = own.shape
         self.name = f"{file.name}:{which[1]}"
         self.planes = self._planes(file, outline, array)
 
@@ -264,8 +263,8 @@ class Part:
         start, stop = max(self.low[0], first), min(self.high[0], first + len(planes))
         if start < stop:
             _, rows, columns = (slice(*ends) for ends in zip(self.low, self.high))
-            own = self.planes(start - self.low[0], stop - self.low[0])
-            planes[start - first : stop - first, rows, columns] = own
+            part = self.planes(start - self.low[0], stop - self.low[0])
+            planes[start - first : stop - first, rows, columns] = part
 
     def _planes(self, file: InputFile, outline: Outline, array: Array) -> Planes:
         """Return a function that returns the next planes."""
