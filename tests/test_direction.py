@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from super_sdf import SdfGrid, extract_mesh, make_grid, read_grid, reconstruct, upsample
 from super_sdf.errors import GridError, OptionError
 from super_sdf.files.grids import write_grid
-from super_sdf.files.precision import check_format_holds
+from super_sdf.files.meshes import check_format_holds
 from super_sdf.mesh import vertex_type
 
 MIRROR = np.diag([1.0, -1.0, 1.0])
