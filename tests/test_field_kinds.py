@@ -12,7 +12,8 @@ from super_sdf import SdfGrid, load_network, make_grid, pipeline, reconstruct
 from super_sdf.errors import GridError, OptionError, OutOfMemoryError
 from super_sdf.evaluation.methods import isosurface
 from super_sdf.grid import planes
-from super_sdf.grid.evidence import look, weigh
+from super_sdf.grid.census import Census
+from super_sdf.grid.evidence import weigh
 from super_sdf.grid.field import FIELDS
 from super_sdf.grid.masks import mask_distances, mask_planes
 from super_sdf.grid.planes import reading_bytes
@@ -182,7 +183,7 @@ def test_distances_of_a_mask_are_those_of_scipy():
 @pytest.mark.parametrize("name", transforms(MASK))
 def test_a_distance_transform_gives_its_step_away(name):
     values = transforms(MASK)[name]
-    transform = find_transform(look(values, (values.min(), values.max())), None)
+    transform = find_transform(Census(values).looked, None)
     assert transform.step == pytest.approx(0.37 if "units" in name else 1)
 
 
@@ -510,7 +511,7 @@ def test_derived_planes_are_made_when_they_are_read(monkeypatch):
 
 def test_noise_is_told_from_a_wrong_slope():
     for values, noisy_, scaled in ((noisy(box()), True, False), (smooth_union(), False, True)):
-        found = weigh(look(values, (values.min(), values.max())), (1.0, 1.0, 1.0))
+        found = weigh(Census(values).looked, (1.0, 1.0, 1.0))
         assert (found.is_noisy, found.is_scaled) == (noisy_, scaled)
 
 
@@ -674,8 +675,8 @@ def test_samples_that_contradict_each_other_are_told_from_noise_and_exact_ones()
     exact = torus_at(*np.indices((24,) * 3))
     corner = np.maximum(exact, np.indices((24,) * 3)[0] - 12.2)  # no distance beyond the edge
     for values in (exact, corner, noisy(exact, 0.05), np.round(exact, 1), exact.astype(np.float16)):
-        assert not weigh(look(values, (-9.0, 30.0)), (1.0, 1.0, 1.0)).is_contradictory
-    assert weigh(look(marched(exact), (-9.0, 30.0)), (1.0, 1.0, 1.0)).is_contradictory
+        assert not weigh(Census(values).looked, (1.0, 1.0, 1.0)).is_contradictory
+    assert weigh(Census(marched(exact)).looked, (1.0, 1.0, 1.0)).is_contradictory
 
 
 @pytest.mark.parametrize("unit", [0.91, 0.97, 1.04, 1.09])

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from super_sdf.errors import GridError
-from super_sdf.grid.gradients import straight_gradients, typical_length
+from super_sdf.grid.census import Census
 from super_sdf.grid.one_sided import BEYOND, FAR, MOST_FLOODED, find_walls
 from super_sdf.grid.sdf_grid import make_grid
 
@@ -136,7 +136,7 @@ def test_large_unsigned_fields_are_told_from_fewer_samples():
 
 def test_the_spacing_of_a_thin_part_is_that_of_the_samples_away_from_it():
     for name, values in THIN.items():
-        assert typical_length(*straight_gradients(values)) == pytest.approx(1, abs=0.01), name
+        assert Census(values).everywhere.typical_length == pytest.approx(1, abs=0.01), name
 
 
 def test_a_given_spacing_is_believed_of_a_thin_part():

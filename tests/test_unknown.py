@@ -21,7 +21,9 @@ from super_sdf import (
 )
 from super_sdf.errors import GridError
 from super_sdf.grid.field import FIELDS
-from super_sdf.grid.unknown import Regions, components, filled
+from super_sdf.grid.census import Census
+from super_sdf.grid.regions import components
+from super_sdf.grid.unknown import filled
 from super_sdf.mesh import join_meshes
 
 FACES = ndimage.generate_binary_structure(3, 1)
@@ -37,7 +39,7 @@ def test_the_sides_of_regions_are_those_of_scipys_components():
     for _ in range(30):
         values = random.normal(size=(6, 7, 8))
         values[random.random(values.shape) < random.uniform(0.2, 0.9)] = np.nan
-        unknown, regions = np.isnan(values), Regions(values)
+        unknown, regions = np.isnan(values), Census(values).unknown
         labels = ndimage.label(unknown)[0]
         for found, side in ((regions.positive, values > 0), (regions.negative, values <= 0)):
             beside = labels[ndimage.binary_dilation(side, FACES) & unknown]
@@ -305,6 +307,6 @@ def test_filling_in_reads_planes_one_by_one():
     values = truncated()
     values[0] = np.nan
     notes: list[str] = []
-    planes, extremes = filled(values, notes)
-    assert planes.shape == values.shape and extremes == (-2, 2)
+    planes = filled(Census(values), notes)
+    assert planes.shape == values.shape and planes.limits == (-2, 2)
     assert (planes[0] == 2).all() and np.isnan(values[0]).all()

@@ -97,7 +97,7 @@ def axis_orders() -> tuple[str, ...]:
 
 def signs_inside() -> tuple[str, ...]:
     """Return the values of ``inside``: which sign the samples inside the solid have."""
-    from ..grid.sides import INSIDE
+    from ..grid.field import INSIDE
 
     return INSIDE
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import FileError
-from ..grid.direction import STRAIGHT
+from ..grid.placement import STRAIGHT
 from ..grid.planes import InputFile
 from ..options import check_path
 from .archives import open_archive

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Triple
 from ..errors import GridError, OutOfMemoryError
-from ..grid.direction import Direction, as_direction, check_direction
+from ..grid.placement import Direction, as_direction, check_direction
 from ..grid.planes import SampleArray
 from ..grid.samples import check_kind
 from ..machine.memory import in_words

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from ..arrays import BoolArray
 from ..errors import GridError
 from ..neighbourhood import NEIGHBOURHOOD
+from .placement import EQUAL_SPACING
 from .resampling import Resampled, resample
 from .sdf_grid import SdfGrid
-from .spacing import EQUAL_SPACING
 
 
 def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:

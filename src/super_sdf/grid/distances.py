@@ -12,16 +12,23 @@ import numpy as np
 
 from ..arrays import Triple
 from .advice import is_density, refusal
-from .evidence import SLOPE_OFF, Evidence, Looked, is_projective, slope_within, weigh
-from .field import AUTO, NOISY, NONE_EXACT, SCALED, TRUNCATED, Field
-from .gradients import surface_gradients, typical_length
-from .one_sided import UNSIGNED, find_fault, is_one_sided
+from .census import Census, Extremes
+from .evidence import SLOPE_OFF, Evidence, is_projective, slope_within, weigh
+from .field import (
+    AUTO,
+    NOISY,
+    NONE_EXACT,
+    SCALED,
+    TRUNCATED,
+    Field,
+    Interpreted,
+    Request,
+)
+from .one_sided import UNSIGNED, find_fault
+from .placement import is_cubic, steps_of
 from .planes import SampleArray, changed
-from .request import Interpreted, Request
-from .samples import Extremes
-from .sides import is_positive_inside
 from .slopes import normalised_planes
-from .spacing import choose_spacing, in_finest, is_cubic, measure_spacing, steps_of
+from .spacing import choose_spacing, is_positive_inside, measure_spacing
 from .truncation import filled_planes, without_plateaus
 
 # Voxels from which on values may be cut off without a loss; up to which the rest is filled in; and
@@ -34,7 +41,7 @@ BENT = 0.1  # share of wrong slopes from which the network has no say in a field
 
 def as_distances(
     samples: SampleArray,
-    extremes: Extremes,
+    census: Census,
     request: Request,
     notes: list[str],
     *,
@@ -42,32 +49,31 @@ def as_distances(
 ) -> Interpreted:
     """Return values that are taken as distances, exact or noisy ones, some perhaps cut off."""
     wanted = request.wanted.field
-    positive = is_positive_inside(samples, request.inside, extremes, notes)
-    spacing = choose_spacing(samples, request.spacing, notes, is_cut=is_cut)
-    if is_one_sided(extremes):
-        _check_thin(samples, extremes, spacing, request)
+    positive = is_positive_inside(census, request.inside, notes)
+    spacing = choose_spacing(census, request.spacing, notes, is_cut=is_cut)
+    if census.is_one_sided:
+        _check_thin(census, spacing, request)
     field = Field(NOISY, exact=NONE_EXACT) if wanted == NOISY else Field()
     field = replace(field, given=not request.is_auto)
-    return Interpreted(samples, extremes, spacing, positive, field)
+    return Interpreted(samples, census.extremes, spacing, positive, field)
 
 
-def _check_thin(
-    samples: SampleArray, extremes: Extremes, spacing: Triple, request: Request
-) -> None:
+def _check_thin(census: Census, spacing: Triple, request: Request) -> None:
     """Raise GridError unless values on one side of 0 can be distances to a thin solid.
 
     If the user says which side is inside, they only must be distances: there may be an offset.
     """
     if request.inside == AUTO:
-        fault = find_fault(samples, steps_of(spacing), extremes)
+        fault = find_fault(census, steps_of(spacing))
     else:
-        fault = UNSIGNED if is_density(samples, extremes, spacing) else ""
+        fault = UNSIGNED if is_density(census, spacing) else ""
     if fault:
-        raise refusal(samples, extremes, spacing, fault)
+        raise refusal(census, spacing, fault)
 
 
-def by_kind(found: Interpreted, looked: Looked, request: Request, notes: list[str]) -> Interpreted:
+def by_kind(found: Interpreted, census: Census, request: Request, notes: list[str]) -> Interpreted:
     """Return values that were taken as distances with the kind that the samples show."""
+    looked = census.looked
     evidence = weigh(looked, found.spacing)
     near = _cut_at(found, evidence) < HARMLESS
     if is_projective(looked, found.spacing) or (near and evidence.is_noisy):
@@ -78,16 +84,17 @@ def by_kind(found: Interpreted, looked: Looked, request: Request, notes: list[st
     if evidence.is_noisy:
         return _noisy(found, evidence, notes)
     if evidence.is_scaled:
-        in_unit = _in_another_unit(found, looked, notes)
+        in_unit = _in_another_unit(found, census, notes)
         return in_unit or _scaled(found, evidence, request, notes)
     return replace(found, field=replace(found.field, evidence=evidence.report()))
 
 
-def _in_another_unit(found: Interpreted, looked: Looked, notes: list[str]) -> Interpreted | None:
+def _in_another_unit(found: Interpreted, census: Census, notes: list[str]) -> Interpreted | None:
     """Return distances that only have another unit than the spacing, in the spacing's."""
     if not is_cubic(found.spacing):
         return None
-    unit, beside = measure_spacing(found.samples) / found.spacing[0], weigh(looked, found.spacing)
+    unit, looked = measure_spacing(census) / found.spacing[0], census.looked
+    beside = weigh(looked, found.spacing)
     if np.isfinite(beside.slope) and np.isfinite(unit):
         if abs(beside.slope / unit - 1) > ALIKE:
             return None
@@ -103,13 +110,13 @@ def _in_another_unit(found: Interpreted, looked: Looked, notes: list[str]) -> In
 
 
 def of_slope(
-    samples: SampleArray, looked: Looked, request: Request, notes: list[str]
+    samples: SampleArray, census: Census, request: Request, notes: list[str]
 ) -> Interpreted:
     """Return distances for a field of another slope; the given spacing is believed."""
-    if is_one_sided(looked.extremes):
-        raise refusal(samples, looked.extremes, request.spacing)
-    positive = is_positive_inside(samples, request.inside, looked.extremes, notes)
-    spacing = request.spacing or choose_spacing(samples, None, notes)
+    if census.is_one_sided:
+        raise refusal(census, request.spacing)
+    looked, positive = census.looked, is_positive_inside(census, request.inside, notes)
+    spacing = request.spacing or choose_spacing(census, None, notes)
     found = Interpreted(samples, looked.extremes, spacing, positive, Field())
     evidence = weigh(looked, spacing)
     is_cut = (evidence.cut_low or evidence.cut_high) and request.wanted.field != SCALED
@@ -117,7 +124,7 @@ def of_slope(
     if is_cut and not np.isfinite(slope):
         slope = slope_within(looked, spacing)
     if not np.isfinite(slope):
-        slope = _slope_beside(samples, spacing)
+        slope = census.beside.in_finest(spacing).typical_length / min(steps_of(spacing))
     divided = _divided(found, slope)
     shown = weigh(looked.divided(slope), spacing)
     if is_cut and (shown.is_noisy or is_projective(looked, spacing)):
@@ -130,13 +137,6 @@ def of_slope(
         notes.append(f"the values are divided by their slope, {slope:.4g} instead of 1")
         found = divided
     return _truncated(found, shown, request, notes)
-
-
-def _slope_beside(samples: SampleArray, spacing: Triple) -> float:
-    """Return the typical slope of values beside their surface."""
-    gradients, bend = surface_gradients(samples)
-    finest = in_finest((gradients, bend), spacing)
-    return typical_length(*finest) / min(steps_of(spacing))
 
 
 def _divided(found: Interpreted, slope: float) -> Interpreted:

@@ -9,25 +9,22 @@ noisy      distances with noise
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from numbers import Integral
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from ..arrays import Triple
 from ..errors import OptionError, seen
+from .census import Extremes
+from .placement import check_spacing
 from .planes import SampleArray
-from .samples import Extremes
 
-AUTO, EXACT, TRUNCATED, MASK, SCALED, NOISY = (
-    "auto",
-    "exact",
-    "truncated",
-    "mask",
-    "scaled",
-    "noisy",
-)
-FIELDS = (AUTO, EXACT, TRUNCATED, MASK, SCALED, NOISY)
+FIELDS = ("auto", "exact", "truncated", "mask", "scaled", "noisy")
+AUTO, EXACT, TRUNCATED, MASK, SCALED, NOISY = FIELDS
+INSIDE = ("auto", "negative", "positive")
 NONE_EXACT: Extremes = (0.0, 0.0)
 
 
@@ -118,8 +115,56 @@ def check_label(label: Any, name: str = "label") -> int:
 
 
 def _is_finite(number: Any) -> bool:
-    """Return whether something is a finite number, and no bool."""
     try:
         return not isinstance(number, (bool, np.bool_, str)) and bool(np.isfinite(float(number)))
     except (TypeError, ValueError):
         return False
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the user says of the values: what they are, the spacing if it is known, the inside."""
+
+    wanted: Wanted
+    spacing: Triple | None
+    inside: str
+
+    @classmethod
+    def checked(cls, wanted: Wanted, spacing: ArrayLike | None, inside: str) -> Request:
+        """Return a request whose parts have been checked; OptionError or GridError if one fails."""
+        wanted.check()
+        if not isinstance(inside, str) or inside not in INSIDE:
+            raise OptionError(f"inside is {seen(inside)}: give one of {', '.join(INSIDE)}")
+        return cls(wanted, None if spacing is None else check_spacing(spacing), inside)
+
+    @property
+    def is_auto(self) -> bool:
+        """Whether the samples are to show what the values are."""
+        return self.wanted.field == AUTO
+
+    @property
+    def is_density(self) -> bool:
+        """Whether the values are densities, from which a level was taken."""
+        return self.wanted.level is not None
+
+    def above_is_inside(self) -> Request:
+        """Return the request with what is above a level inside, unless the user says otherwise."""
+        return replace(self, inside="positive") if self.inside == AUTO else self
+
+    def with_spacing(self, spacing: float, why: str, notes: list[str]) -> Request:
+        """Return the request with a spacing if none is given, and why in a note."""
+        if self.spacing is not None:
+            return self
+        notes.append(f"spacing not given: taken as {spacing:.6g}, {why}")
+        return replace(self, spacing=check_spacing(spacing))
+
+
+@dataclass(frozen=True, eq=False)
+class Interpreted:
+    """Distances near the surface with their extremes, and how they are to be used."""
+
+    samples: SampleArray
+    extremes: Extremes
+    spacing: Triple
+    positive_inside: bool
+    field: Field

@@ -12,15 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 from ..arrays import BoolArray, IntArray
 from ..errors import GridError, OptionError, seen
 from .advice import MOST_NAMED
-from .field import MASK, NONE_EXACT, Field, Wanted, check_label
-from .masking import as_sample, labelled
-from .masks import REACH, extremes_of_masks, mask_planes
-from .named_axes import placed
+from .field import MASK, NONE_EXACT, Field, Request, Wanted, check_label
+from .masks import REACH, as_sample, extremes_of_masks, labelled, mask_planes
+from .placement import as_triple, is_cubic, placed
 from .planes import NoPlanes, SampleArray, SamplePlanes, changed
-from .request import Request
 from .samples import as_samples, check_kind
 from .sdf_grid import SdfGrid
-from .spacing import as_triple, is_cubic
 
 ALL = "all"
 MOST_LABELS = 1000  # more values than these are densities

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from ..arrays import BoolArray, Triple
 from ..machine.threads import chunks_of
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
+from .census import Census
 from .planes import SampleArray
-from .samples import Extremes
 
 Floats = NDArray[np.floating[Any]]
 
@@ -43,28 +43,12 @@ BEYOND = "only samples on the border of the grid are near 0, so no surface lies 
 UNSIGNED = "unsigned distances have no inside"
 
 
-def is_one_sided(extremes: Extremes) -> bool:
-    """Return whether no value is below 0, or none above."""
-    return extremes[0] >= 0 or extremes[1] <= 0
-
-
-def find_fault(values: SampleArray, spacing: Triple, extremes: Extremes) -> str:
+def find_fault(census: Census, spacing: Triple) -> str:
     """Return why values on one side of 0 cannot be distances to a thin solid; empty if they can.
 
-    Parameters
-    ----------
-    values : (nx, ny, nz) array or Planes
-        Samples, none below 0 or none above.
-    spacing : three floats
-        Along each axis.
-    extremes : two floats
-        The smallest and the largest sample.
-
-    Returns
-    -------
-    str
-        ``FAR``, ``BEYOND``, ``UNSIGNED`` or nothing.
+    ``spacing`` is that of each axis; the fault is ``FAR``, ``BEYOND`` or ``UNSIGNED``.
     """
+    extremes, values = census.extremes, census.samples
     steps = np.array(spacing) / max(spacing)
     scale = (1 if extremes[0] >= 0 else -1) / max(spacing)
     if min(map(abs, extremes)) * abs(scale) > reach(steps):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
 from io import FileIO
 from math import prod
@@ -174,10 +174,20 @@ class SamplePlanes(ABC):
     ) -> Iterator[Result]:
         """Yield what a function makes of ranges of ``samples``, which are made of these.
 
-        Samples of which workers read the planes have their own way.
+        Planes that a range shares with the one before are not read again. Samples of which workers
+        read the planes have their own way.
         """
+        start, planes = 0, np.empty((0, *samples.shape[1:]), samples.dtype)
         for first, last, *more in ranges:
-            yield work(samples[first:last], *more)
+            end = start + len(planes)
+            if start <= first < end < last:
+                planes = np.concatenate([planes[first - start :], samples[end:last]])
+            elif not start <= first < last <= end:
+                planes = samples[first:last]
+            else:
+                planes = planes[first - start :]
+            start = first
+            yield work(planes[: last - first], *more)
 
     def working_bytes(self, planes: int) -> int:
         """Return about how much memory making that many planes takes."""
@@ -287,25 +297,28 @@ def lowest(ranks: NDArray[np.uint64], most: int) -> NDArray[np.bool_] | slice:
     return ranks <= np.partition(ranks, most - 1)[most - 1] if len(ranks) > most else slice(None)
 
 
-def few_of(found: Iterable[tuple[NDArray[Any], ...]], most: int) -> list[NDArray[Any]]:
-    """Return what was found of samples, concatenated: of at most ``most``, those of lowest rank.
+class Few(list[tuple[NDArray[Any], ...]]):
+    """Arrays of rows, of which few are held: of at most ``most`` samples, those of lowest rank.
 
-    ``found`` are parts: the ranks of n samples, and arrays of n rows. The result depends on the
-    samples alone, and few are held at a time.
+    Each part has the ranks of n samples, and arrays of n rows. What is kept depends on the samples
+    alone, not on the parts.
     """
-    kept: list[tuple[NDArray[Any], ...]] = []
-    for part in found:
-        kept.append(part)
-        if sum(len(ranks) for ranks, *_ in kept) > 2 * most:
-            kept = [_lowest_of(kept, most)]
-    return list(_lowest_of(kept, most)[1:])
 
+    def __init__(self, most: int) -> None:
+        super().__init__()
+        self.most = most
 
-def _lowest_of(parts: list[tuple[NDArray[Any], ...]], most: int) -> tuple[NDArray[Any], ...]:
-    """Return the rows of the lowest ranks of all parts."""
-    joined = [np.concatenate(arrays) for arrays in zip(*parts)]
-    some = lowest(joined[0], most)
-    return tuple(array[some] for array in joined)
+    def append(self, part: tuple[NDArray[Any], ...]) -> None:
+        """Add a part."""
+        super().append(part)
+        if sum(len(ranks) for ranks, *_ in self) > 2 * self.most:
+            self[:] = [self.joined()]
+
+    def joined(self) -> tuple[NDArray[Any], ...]:
+        """Return the ranks and the arrays of those that are kept; there is at least one part."""
+        arrays = [np.concatenate(parts) for parts in zip(*self)]
+        some = lowest(arrays[0], self.most)
+        return tuple(array[some] for array in arrays)
 
 
 def spread_planes(first: int, last: int, most: int) -> list[int]:

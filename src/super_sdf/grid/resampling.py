@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, Triple
+from .placement import EQUAL_SPACING
 from .planes import SampleArray, SamplePlanes
-from .spacing import EQUAL_SPACING
 
 Floats = NDArray[np.float64]
 

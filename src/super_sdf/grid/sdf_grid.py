@@ -11,14 +11,25 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Triple
-from .direction import STRAIGHT, Direction, check_direction, in_rows, is_mirrored
+from ..errors import GridError
+from .census import Census, Extremes, not_finite
 from .field import AUTO, Field, Wanted
 from .interpret import interpret
-from .named_axes import placed
+from .placement import (
+    STRAIGHT,
+    Direction,
+    as_triple,
+    check_direction,
+    check_spacing,
+    in_rows,
+    is_cubic,
+    placed,
+)
 from .planes import NoPlanes, SampleArray, SamplePlanes
-from .samples import Extremes, as_samples, check_not_flat, check_values
-from .sides import check_negative_inside
-from .spacing import as_triple, check_spacing, choose_spacing, is_cubic
+from .samples import as_samples, check_kind
+from .spacing import check_negative_inside, choose_spacing
+
+MASK_HINT = "a mask holds no distances; make a grid of it with make_grid or read_grid"
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -81,14 +92,19 @@ class SdfGrid:
         origin: ArrayLike | None = None,
         direction: ArrayLike | None = None,
     ) -> None:
-        found = placed(values, spacing, origin)
-        samples, extremes = _checked(found.values)
-        check_negative_inside(samples)
+        given = placed(values, spacing, origin)
+        samples = as_samples(given.values)
+        census = _checked(samples)
+        low, high = census.extremes
+        if low == high:
+            raise GridError(f"every value is {low:.6g}: a constant field has no surface")
+        if census.has_two_values:
+            raise GridError(f"the only values are {low:.6g} and {high:.6g}: {MASK_HINT}")
+        check_negative_inside(census)
         notes: list[str] = []
-        chosen = choose_spacing(samples, check_spacing(spacing), notes)
-        origin = 0.0 if found.origin is None else found.origin
-        place = chosen, origin, direction
-        self._set(samples, place, tuple(notes), False, extremes)
+        chosen = choose_spacing(census, check_spacing(spacing), notes)
+        place = chosen, 0.0 if given.origin is None else given.origin, direction
+        self._set(samples, place, tuple(notes), False, census.extremes)
 
     @classmethod
     def trusted(
@@ -112,10 +128,10 @@ class SdfGrid:
         given = placed(values, spacing, origin)
         samples = as_samples(given.values)
         grid = object.__new__(cls)
-        found = extremes or check_values(samples)
+        extremes = extremes or _checked(samples).extremes
         origin = 0.0 if given.origin is None else given.origin
         place = check_spacing(spacing), origin, direction
-        grid._set(samples, place, notes, positive_inside, found, field)
+        grid._set(samples, place, notes, positive_inside, extremes, field)
         return grid
 
     def _set(
@@ -193,7 +209,7 @@ class SdfGrid:
     @property
     def is_mirrored(self) -> bool:
         """Whether the array's axes are left-handed in the world."""
-        return is_mirrored(self.direction)
+        return bool(np.linalg.det(np.array(self.direction)) < 0)
 
     @property
     def reach(self) -> float:
@@ -279,29 +295,32 @@ def make_grid(
     notes: list[str] = []
     wanted = Wanted(field, label, level, scale)
     given = placed(values, spacing, origin)
-    found = interpret(as_samples(given.values), wanted, given.spacing, inside, notes)
+    taken = interpret(as_samples(given.values), wanted, given.spacing, inside, notes)
     origin = given.origin
     if origin is None:
         notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
         origin = 0.0
     return SdfGrid.trusted(
-        found.samples,
-        found.spacing,
+        taken.samples,
+        taken.spacing,
         origin,
         tuple(notes),
         direction=direction,
-        positive_inside=found.positive_inside,
-        extremes=found.extremes,
-        field=found.field,
+        positive_inside=taken.positive_inside,
+        extremes=taken.extremes,
+        field=taken.field,
     )
 
 
-def _checked(values: ArrayLike | SamplePlanes) -> tuple[SampleArray, Extremes]:
-    """Return samples as an array, and their extremes; raise GridError if they are no field."""
-    samples = as_samples(values)
-    extremes = check_values(samples)
-    check_not_flat(samples, extremes)
-    return samples, extremes
+def _checked(samples: SampleArray) -> Census:
+    """Return what samples show; GridError unless they are finite numbers along three axes."""
+    check_kind(samples.dtype, samples.shape)
+    if samples.dtype == np.bool_:
+        raise GridError(f"values are true or false: {MASK_HINT}")
+    census = Census(samples)
+    if not census.is_finite:
+        raise not_finite(samples)
+    return census
 
 
 def with_samples(grid: SdfGrid, samples: SampleArray) -> SdfGrid:
@@ -318,6 +337,5 @@ def without_samples(grid: SdfGrid) -> SdfGrid:
 
 def negated(values: NDArray[Any]) -> NDArray[Any]:
     """Return the negated values, as floats so that unsigned integers work."""
-    found: NDArray[Any] = values.astype(np.promote_types(values.dtype, np.float32))
-    np.negative(found, out=found)
-    return found
+    floats: NDArray[Any] = values.astype(np.promote_types(values.dtype, np.float32))
+    return np.negative(floats, out=floats)

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, Triple
-from .evidence import BESIDE, Floats, Looked
-from .spacing import is_cubic
+from .census import BESIDE, Floats, Looked
+from .placement import is_cubic
 
 MOST_PATCHES = 1 << 12  # samples that are compared with all round them
 LEAST = 20  # samples from which shares of them are evidence

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray, Triple
+from .census import Extremes
 from .planes import DerivedPlanes, SampleArray, in_spacings
-from .samples import Extremes
 
 REACH = 3  # voxels from a sample up to which others are filled in with the help of its foot point
 FAR = 2.6  # voxels: the distance of a sample without a foot point near it

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...arrays import Triple
 from ...errors import GridError
-from ...grid.named_axes import UNNAMED, even_steps
+from ...grid.placement import UNNAMED, even_steps
 from ..headers import kept_axes
 from ..volume import axes_direction
 

@@ -1,0 +1,517 @@
+"""One pass over the planes of a grid: all that is asked of its samples before they are meshed.
+
+numbers     the extremes, what is not finite, the border, whether there are two values only
+unknown     the runs of NaN
+patches     5 x 5 x 5 samples round some beside the surface
+plateaus    samples amid others of the same extreme value
+beside      gradients beside the surface
+everywhere  gradients where the field is not bent
+labels      whole numbers, and how they change
+pairs       some neighbours
+
+An array in memory is asked when an answer is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cached_property, partial
+from math import isfinite
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import BoolArray
+from ..errors import GridError
+from .planes import (
+    Few,
+    Ranges,
+    SampleArray,
+    SamplePlanes,
+    lowest,
+    over_planes,
+    planes_at_once,
+    ranks_of,
+    spread_planes,
+)
+from .regions import Regions, runs_of_plane
+from .slopes import (
+    ENOUGH,
+    LARGEST_VALUE,
+    MOST_BESIDE,
+    STRAIGHT,
+    Gradients,
+    gradients_beside_surface,
+    gradients_where_straight,
+    mark_crossings,
+)
+
+Floats = NDArray[np.float64]
+Extremes = tuple[float, float]
+"""The smallest and the largest sample."""
+
+TOGETHER = 1 << 18  # samples whose numbers are looked at together
+KEPT_BYTES = 1 << 25  # of a grid in a file that is read into memory to be asked
+BESIDE = 2  # planes, rows and columns to either side, for fourth differences
+LOOKED_PLANES, MOST_LOOKED_AT = 12, 1 << 13  # of samples beside the surface, spread evenly
+GRADIENT_PLANES = 64  # unless too few samples are beside the surface there
+MOST_GRADIENTS = 1 << 19  # wherever they lie; all of them up to 80^3
+LABEL_PLANES = 12
+PAIR_PLANES, MOST_PAIRS = 32, 1 << 15
+CUT_OFF = 0.01  # share of samples amid equal ones, at the lowest or highest value
+MOST_BETWEEN = 0.4  # share of the samples at a boundary of labels that lie between two others
+LEAST_JUMP = 0.3  # of the range of labels: so far some neighbours are apart
+
+
+class Question(NamedTuple):
+    """What is asked of some ranges of planes, and the list of its answers."""
+
+    ranges: Ranges
+    work: Callable[..., Any]
+    answers: list[Any]
+
+
+class Numbers(NamedTuple):
+    """What the numbers of some planes are.
+
+    Attributes
+    ----------
+    low, high : number
+        The extremes of those that are finite.
+    is_finite : bool
+        Whether all are.
+    infinite : int
+        How many are infinite.
+    has_two : bool
+        Whether there are only these two.
+    border : (3,) int64
+        How many on the faces of the grid are negative, positive, and the lowest.
+    """
+
+    low: float
+    high: float
+    is_finite: bool
+    infinite: int
+    has_two: bool
+    border: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Looked:
+    """What was looked at.
+
+    Attributes
+    ----------
+    around : (n, 5, 5, 5) float64
+        The samples round samples that have one on the other side beside them.
+    cut : (2,) float64
+        Share of the samples that are, as their six neighbours, the lowest, and the highest.
+    extremes : two floats
+        The smallest and the largest sample.
+    """
+
+    around: Floats
+    cut: Floats
+    extremes: Extremes
+
+    @cached_property
+    def lines(self) -> Floats:
+        """Five samples in a row along each axis, (n, 3, 5)."""
+        a = self.around
+        return np.stack([a[:, :, BESIDE, BESIDE], a[:, BESIDE, :, BESIDE], a[:, BESIDE, BESIDE]], 1)
+
+    @property
+    def is_cut(self) -> BoolArray:
+        """Whether values are cut off at the lowest, and at the highest, (2,).
+
+        In a narrow grid the one is seen only; if the other is as large, it is where they were, too.
+        """
+        cut: BoolArray = self.cut > CUT_OFF
+        return cut | (cut.any() and bool(np.isclose(-self.extremes[0], self.extremes[1], atol=0)))
+
+    def divided(self, slope: float) -> Looked:
+        """Return what would have been seen of the values divided by a slope."""
+        low, high = self.extremes
+        return Looked(self.around / slope, self.cut, (low / slope, high / slope))
+
+
+class Census:
+    """What the samples of a grid show.
+
+    Parameters
+    ----------
+    samples : (nx, ny, nz) array or SamplePlanes
+        They are read once, plane by plane; of booleans, only the numbers are asked.
+    """
+
+    def __init__(self, samples: SampleArray) -> None:
+        self.samples, self.shape = samples, tuple(samples.shape)
+        self._questions: dict[str, Question] = {}
+        names = ("numbers", "unknown") if samples.dtype == np.bool_ else tuple(QUESTIONS)
+        self._kept = samples if _is_in_memory(samples) else _small(samples)
+        if self._kept is None:
+            self._ask(names)
+
+    def _ask(self, names: tuple[str, ...]) -> None:
+        """Ask questions, all of each part of the planes that is read."""
+        asked = {name: QUESTIONS[name](self.shape) for name in names}
+        if self._kept is None:
+            ask_together(self.samples, list(asked.values()))
+        else:
+            for ranges, work, answers in asked.values():
+                for answer in over_planes(self._kept, work, ranges):
+                    answers.append(answer)
+        self._questions |= asked
+
+    def _answers(self, name: str) -> Any:
+        if name not in self._questions:
+            self._ask((name,))
+        return self._questions[name].answers
+
+    @cached_property
+    def numbers(self) -> Numbers:
+        """What the numbers of the grid are; the extremes are infinite if none is finite."""
+        parts: list[Numbers] = self._answers("numbers")
+        low, high = min(part.low for part in parts), max(part.high for part in parts)
+        ends = low, high
+        border = sum(part.border * [1, 1, part.low == low] for part in parts)
+        return Numbers(
+            low,
+            high,
+            all(part.is_finite for part in parts),
+            sum(part.infinite for part in parts),
+            all(part.has_two and part.low in ends and part.high in ends for part in parts),
+            np.asarray(border),
+        )
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether all samples are finite."""
+        return self.numbers.is_finite
+
+    @property
+    def extremes(self) -> Extremes:
+        """The smallest and the largest finite sample."""
+        return self.numbers.low, self.numbers.high
+
+    @property
+    def border_size(self) -> int:
+        """The samples on the six faces; one on an edge counts for each of its faces."""
+        nx, ny, nz = self.shape
+        return 2 * (nx * ny + ny * nz + nz * nx)
+
+    @property
+    def is_one_sided(self) -> bool:
+        """Whether no value is below 0, or none above."""
+        return self.numbers.low >= 0 or self.numbers.high <= 0
+
+    @property
+    def has_two_values(self) -> bool:
+        """Whether there are only two different values, and not as beside a plane."""
+        is_whole = self.samples.dtype.kind in "iu"
+        return self.numbers.has_two and (is_whole or not _are_layers(self.samples))
+
+    @cached_property
+    def unknown(self) -> Regions:
+        """The regions of NaN."""
+        return Regions(self.shape, self._answers("unknown"))
+
+    @cached_property
+    def looked(self) -> Looked:
+        """What the samples beside the surface are."""
+        patches = self._answers("patches")
+        around = patches.joined()[1] if patches else np.empty((0, 5, 5, 5))
+        cut, total = np.zeros(2, np.int64), 0
+        for ends, counts, size in self._answers("plateaus"):
+            cut += np.where(np.equal(ends, self.extremes), counts, 0)
+            total += size
+        return Looked(around, cut / max(total, 1), self.extremes)
+
+    @cached_property
+    def beside(self) -> Gradients:
+        """Gradients at samples beside the surface, in 64 planes, in all if these have too few."""
+        answers, count = self._answers("beside"), self.shape[0]
+        gradients = Gradients(*answers.joined()[1:])
+        if count <= GRADIENT_PLANES or (gradients.bend < STRAIGHT).sum() >= ENOUGH:
+            return gradients
+        samples = self.samples if self._kept is None else self._kept
+        ranges, work, answers = _beside(self.shape, range(count))
+        for answer in over_planes(samples, work, ranges):
+            answers.append(answer)
+        return Gradients(*answers.joined()[1:])
+
+    @cached_property
+    def everywhere(self) -> Gradients:
+        """Gradients at samples anywhere in the grid at which the field is not bent."""
+        parts = self._answers("everywhere")
+        if not parts:
+            return Gradients(np.empty((0, 3)), np.empty(0))
+        return Gradients(*(np.concatenate(arrays) for arrays in zip(*parts)))
+
+    @cached_property
+    def pairs(self) -> Floats:
+        """Finite samples beside each other along an axis, (2, n), in some rows and planes."""
+        pairs = np.concatenate(self._answers("pairs"), axis=1)
+        if self.is_finite:
+            return pairs
+        finite = np.isfinite(pairs)
+        return pairs[:, finite[0] & finite[1]]
+
+    @cached_property
+    def are_labels(self) -> bool:
+        """Whether values look like labels: whole numbers of which regions jump to others.
+
+        At the boundary of a region, a sample hardly ever lies between a lower and a higher
+        neighbour; those of images and distances do.
+        """
+        planes = self._answers("labels")
+        if not planes or None in planes:
+            return False
+        lows, highs, counts, jumps = zip(*planes)
+        low, high = min(lows), max(highs)
+        between, among = sum(
+            each[0] - each[1] * (a == low) - each[2] * (b == high)
+            for each, a, b in zip(counts, lows, highs)
+        )
+        if LEAST_JUMP * (high - low) > max(jumps) or among < ENOUGH:
+            return False
+        return bool(between <= MOST_BETWEEN * among)
+
+
+def not_finite(values: SampleArray) -> GridError:
+    """Return the error for samples of which some are NaN or infinite, which names the first."""
+    with np.errstate(over="ignore", invalid="ignore"):  # of long doubles
+        bad = (np.argwhere(~np.isfinite(plane.astype(np.float64))) for plane in values)
+        i, (j, k) = next((i, places[0]) for i, places in enumerate(bad) if len(places))
+    return GridError(
+        f"values[{i}, {j}, {k}] is {values[i][j, k]!s}: every sample must be finite; "
+        "replace unknown far samples by a large distance of the right sign"
+    )
+
+
+def _is_in_memory(samples: SampleArray) -> bool:
+    return isinstance(samples, np.ndarray) and not isinstance(samples, np.memmap)
+
+
+def _small(samples: SampleArray) -> NDArray[Any] | None:
+    """Return the samples of a small grid that is read here, None of others."""
+    root, size = samples, np.prod(samples.shape, dtype=float) * samples.dtype.itemsize
+    while hasattr(root, "source"):
+        root = root.source
+    is_read_here = isinstance(root, np.ndarray) or type(root).over is SamplePlanes.over
+    return np.asarray(samples[0 : len(samples)]) if is_read_here and size <= KEPT_BYTES else None
+
+
+def ask_together(samples: SampleArray, questions: list[Question]) -> None:
+    """Ask questions of samples, each plane of which is read once."""
+    count, each = samples.shape[0], _together(tuple(samples.shape))
+    step = each * -(-planes_at_once(samples) // each)
+    ranges = []
+    for first in range(0, count, step):
+        low = max(first - BESIDE, 0)
+        mine = [
+            [
+                (a - low, b - low, *more)
+                for a, b, *more in question.ranges
+                if first <= (a + b - 1) // 2 < first + step
+            ]
+            for question in questions
+        ]
+        ranges.append((low, min(first + step + BESIDE, count), mine))
+    work = partial(_answer_all, [question.work for question in questions])
+    for parts in over_planes(samples, work, ranges):
+        for question, answers in zip(questions, parts):
+            for answer in answers:
+                question.answers.append(answer)
+
+
+def _answer_all(
+    works: list[Callable[..., Any]], slab: NDArray[Any], ranges: list[Ranges]
+) -> list[list[Any]]:
+    """Return the answers to all questions about the ranges of some planes."""
+    return [[work(slab[a:b], *more) for a, b, *more in mine] for work, mine in zip(works, ranges)]
+
+
+Shape = tuple[int, ...]
+
+
+def _together(shape: Shape) -> int:
+    """Return how many planes are looked at together."""
+    return max(TOGETHER // (shape[1] * shape[2]), 1)
+
+
+def _numbers(shape: Shape) -> Question:
+    """Ask for the numbers of all planes."""
+    step, count = _together(shape), shape[0]
+    ranges = [(i, min(i + step, count), i == 0, i + step >= count) for i in range(0, count, step)]
+    return Question(ranges, _numbers_of, [])
+
+
+def _numbers_of(planes: NDArray[Any], is_first: bool, is_last: bool) -> Numbers:
+    """Return the numbers of some planes, the first and the last of the grid perhaps."""
+    number = int if planes.dtype.kind in "iu" else float  # floats do not tell large ones apart
+    low, high, infinite = number(planes.min()), number(planes.max()), 0
+    if not (is_finite := isfinite(low) and isfinite(high)):
+        finite = planes[np.isfinite(planes)]
+        low, high = float(finite.min(initial=np.inf)), float(finite.max(initial=-np.inf))
+        infinite = int(np.isinf(planes).sum())
+    faces = [planes[:, [0, -1]], planes[:, :, [0, -1]]]
+    faces += [planes[:1]] * is_first + [planes[-1:]] * is_last
+    border = [sum(int(is_in(face).sum()) for face in faces) for is_in in
+              (lambda x: x < 0, lambda x: x > 0, lambda x: x == low)]  # fmt: skip
+    rows = planes[0, 0], planes[len(planes) // 2, planes.shape[1] // 2]  # they mostly show it
+    has_two = all(((part == low) | (part == high)).all() for part in (*rows, planes))
+    return Numbers(low, high, is_finite, infinite, has_two, np.array(border))
+
+
+def _are_layers(values: SampleArray) -> bool:
+    """Return whether values differ along an axis of two samples only: a plane is between them."""
+    if 2 not in values.shape:
+        return False
+    planes = np.asarray(values[0 : len(values)])
+    return any(
+        count == 2 and bool((planes == planes[_first_but(axis)]).all())
+        for axis, count in enumerate(planes.shape)
+    )
+
+
+def _first_but(axis: int) -> tuple[slice, ...]:
+    """Return an index to the first samples along all axes but one."""
+    return tuple(slice(None) if n == axis else slice(1) for n in range(3))
+
+
+def _unknown(shape: Shape) -> Question:
+    """Ask for the runs of NaN of all planes."""
+    ranges = [(max(i - 1, 0), i + 1) for i in range(shape[0])]
+    return Question(ranges, partial(runs_of_plane, np.isnan), [])
+
+
+def _spread(shape: Shape, beside: int, most: int) -> list[int]:
+    """Return planes, spread evenly, that have some beside them; none of a narrow grid."""
+    if min(shape) <= 2 * beside:
+        return []
+    return spread_planes(beside, shape[0] - 1 - beside, most)
+
+
+def _patches(shape: Shape) -> Question:
+    """Ask for the samples round some beside the surface."""
+    size = shape[1] * shape[2]
+    planes = _spread(shape, BESIDE, LOOKED_PLANES)
+    ranges = [(i - BESIDE, i + BESIDE + 1, i * size) for i in planes]
+    return Question(ranges, _around_surface, Few(MOST_LOOKED_AT))
+
+
+def _around_surface(slab: NDArray[Any], number: int) -> tuple[NDArray[Any], ...]:
+    """Return the samples round those that have one on the other side beside them.
+
+    ``slab`` has five planes; the samples are those of the middle one, which begins with sample
+    ``number``: (n,) ranks, (n, 5, 5, 5).
+    """
+    slab = np.asarray(slab)
+    near = slab[1:4]
+    sides = (near > 0).astype(np.int8) - (near < 0)
+    beside = (sides[0] != sides[1]) | (sides[2] != sides[1])
+    mark_crossings(sides[1], beside)
+    inner = beside[BESIDE:-BESIDE, BESIDE:-BESIDE]
+    at = np.flatnonzero(inner)
+    ranks = ranks_of(at + number)
+    some = lowest(ranks, MOST_LOOKED_AT)
+    j, k = np.unravel_index(at[some], inner.shape)
+    boxes = np.lib.stride_tricks.sliding_window_view(slab, (2 * BESIDE + 1,) * 3)[0]
+    around = boxes[j, k].astype(np.float64)
+    return ranks[some], np.clip(around, -LARGEST_VALUE, LARGEST_VALUE, out=around)
+
+
+def _plateaus(shape: Shape) -> Question:
+    """Ask for the samples that are, as their six neighbours, the lowest or the highest."""
+    planes = _spread(shape, BESIDE, LOOKED_PLANES)
+    return Question([(i - 1, i + 2) for i in planes], _amid_equal, [])
+
+
+def _amid_equal(slab: NDArray[Any]) -> tuple[tuple[Any, Any], list[int], int]:
+    """Return the extremes of the middle plane of three, how many are amid these, and of all."""
+    middle = slab[1]
+    ends, counts = (middle.min(), middle.max()), []
+    for end in ends:
+        amid = (middle == end) & (slab[0] == end) & (slab[2] == end)
+        amid[1:-1] &= middle[2:] == end
+        amid[1:-1] &= middle[:-2] == end
+        amid[:, 1:-1] &= middle[:, 2:] == end
+        amid[:, 1:-1] &= middle[:, :-2] == end
+        counts.append(int(amid[BESIDE:-BESIDE, BESIDE:-BESIDE].sum()))
+    return ends, counts, amid[BESIDE:-BESIDE, BESIDE:-BESIDE].size
+
+
+def _beside(shape: Shape, planes: Iterable[int] | None = None) -> Question:
+    """Ask for the gradients beside the surface in some planes."""
+    count, size = shape[0], shape[1] * shape[2]
+    ranges = [
+        (max(i - 1, 0), min(i + 2, count), min(i, 1), i * size)
+        for i in planes or spread_planes(0, count - 1, GRADIENT_PLANES)
+    ]
+    return Question(ranges, gradients_beside_surface, Few(MOST_BESIDE))
+
+
+def _everywhere(shape: Shape) -> Question:
+    """Ask for the gradients of some rows of some planes."""
+    planes = [i for i in spread_planes(0, shape[0] - 1, GRADIENT_PLANES) if 0 < i < shape[0] - 1]
+    planes = (planes or [1]) if min(shape) > 2 else []
+    step = -(-len(planes) * shape[1] * shape[2] // MOST_GRADIENTS)
+    return Question([(i - 1, i + 2, step) for i in planes], gradients_where_straight, [])
+
+
+def _labels(shape: Shape) -> Question:
+    """Ask how whole numbers change at boundaries."""
+    ranges = [(i - 1, i + 2) for i in _spread(shape, 1, LABEL_PLANES)]
+    return Question(ranges, _at_boundaries, [])
+
+
+def _at_boundaries(slab: NDArray[Any]) -> tuple[Any, Any, NDArray[np.int64], float] | None:
+    """Return the extremes of the middle plane of three, counts, and the largest difference.
+
+    The counts, (3, 2), are of samples between a lower and a higher neighbour, and of those with
+    another neighbour: all inner ones, the lowest, and the highest. None if some are not whole.
+    """
+    middle = slab[1]
+    if middle.dtype.kind == "f" and not (middle == np.rint(middle)).all():
+        return None
+    centre = middle[1:-1, 1:-1]
+    sides = [slab[0, 1:-1, 1:-1], slab[2, 1:-1, 1:-1], middle[:-2, 1:-1], middle[2:, 1:-1]]
+    sides += [middle[1:-1, :-2], middle[1:-1, 2:]]
+    lower = np.logical_or.reduce([side < centre for side in sides])
+    higher = np.logical_or.reduce([side > centre for side in sides])
+    jump = max(float(np.abs(np.subtract(x, centre, dtype=np.float64)).max()) for x in sides)
+    low, high = middle.min().item(), middle.max().item()
+    groups = np.ones(centre.shape, bool), centre == low, centre == high
+    counts = [[(own & lower & higher).sum(), (own & (lower | higher)).sum()] for own in groups]
+    return low, high, np.array(counts), jump
+
+
+def _pairs(shape: Shape) -> Question:
+    """Ask for some rows of some planes with their neighbours."""
+    planes = spread_planes(0, shape[0] - 2, PAIR_PLANES)
+    rows = slice(0, shape[1] - 1, -(-len(planes) * shape[1] * shape[2] // MOST_PAIRS))
+    return Question([(i, i + 2) for i in planes], partial(_pairs_of, rows), [])
+
+
+def _pairs_of(rows: slice, slab: NDArray[Any]) -> Floats:
+    """Return samples of some rows of the first of two planes with those beside them, (2, n)."""
+    row = slab[0, rows]
+    beside = slab[1, rows], slab[0, 1:][rows]
+    parts = [np.stack([row, other]).reshape(2, -1) for other in beside]
+    parts.append(np.stack([row[:, :-1], row[:, 1:]]).reshape(2, -1))
+    return np.concatenate(parts, axis=1).astype(np.float64)
+
+
+QUESTIONS: dict[str, Callable[[Shape], Question]] = {
+    "numbers": _numbers,
+    "unknown": _unknown,
+    "patches": _patches,
+    "plateaus": _plateaus,
+    "beside": _beside,
+    "everywhere": _everywhere,
+    "labels": _labels,
+    "pairs": _pairs,
+}
