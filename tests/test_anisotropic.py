@@ -14,8 +14,7 @@ from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruc
 from super_sdf.certificate.check import check_mesh
 from super_sdf.errors import GridError
 from super_sdf.files.expectation import count_by_plane, count_on_lattice
-from super_sdf.grid.cubic import cubic_grid, on_samples
-from super_sdf.grid.resampling import Resampled, new_places
+from super_sdf.grid.cubic import Resampled, cubic_grid, new_places, on_samples
 from super_sdf.mesh import join_meshes
 from super_sdf.pictures.sections import coarse_section, fine_section
 from super_sdf.pipeline import reconstruct_slabs
@@ -140,7 +139,7 @@ def test_planes_are_the_same_however_they_are_read(axis, step, seed):
 
 def test_chunks_change_nothing(monkeypatch):
     before = [cube_of(spacing).values for spacing in SPACINGS]
-    monkeypatch.setattr("super_sdf.grid.resampling.CHUNK", 1)
+    monkeypatch.setattr("super_sdf.grid.cubic.CHUNK", 1)
     for spacing, values in zip(SPACINGS, before):
         assert np.array_equal(cube_of(spacing).values, values)
 

@@ -20,8 +20,8 @@ from super_sdf import (
     upsample,
 )
 from super_sdf.errors import GridError
-from super_sdf.grid.field import FIELDS
 from super_sdf.grid.census import Census
+from super_sdf.grid.field import FIELDS
 from super_sdf.grid.regions import components
 from super_sdf.grid.unknown import filled
 from super_sdf.mesh import join_meshes

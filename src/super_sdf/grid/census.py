@@ -199,7 +199,7 @@ class Census:
     @property
     def border_size(self) -> int:
         """The samples on the six faces; one on an edge counts for each of its faces."""
-        nx, ny, nz = self.shape
+        nx, ny, nz = map(int, self.shape)
         return 2 * (nx * ny + ny * nz + nz * nx)
 
     @property
@@ -237,7 +237,8 @@ class Census:
         if count <= GRADIENT_PLANES or (gradients.bend < STRAIGHT).sum() >= ENOUGH:
             return gradients
         samples = self.samples if self._kept is None else self._kept
-        ranges, work, answers = _beside(self.shape, range(count))
+        ranges, work, _ = _beside(self.shape, range(count))
+        answers = Few(MOST_BESIDE)
         for answer in over_planes(samples, work, ranges):
             answers.append(answer)
         return Gradients(*answers.joined()[1:])
@@ -297,8 +298,9 @@ def _is_in_memory(samples: SampleArray) -> bool:
 
 def _small(samples: SampleArray) -> NDArray[Any] | None:
     """Return the samples of a small grid that is read here, None of others."""
-    root, size = samples, np.prod(samples.shape, dtype=float) * samples.dtype.itemsize
-    while hasattr(root, "source"):
+    root: Any = samples
+    size = np.prod(samples.shape, dtype=float) * samples.dtype.itemsize
+    while isinstance(getattr(root, "source", None), np.ndarray | SamplePlanes):
         root = root.source
     is_read_here = isinstance(root, np.ndarray) or type(root).over is SamplePlanes.over
     return np.asarray(samples[0 : len(samples)]) if is_read_here and size <= KEPT_BYTES else None
@@ -359,11 +361,10 @@ def _numbers_of(planes: NDArray[Any], is_first: bool, is_last: bool) -> Numbers:
         infinite = int(np.isinf(planes).sum())
     faces = [planes[:, [0, -1]], planes[:, :, [0, -1]]]
     faces += [planes[:1]] * is_first + [planes[-1:]] * is_last
-    border = [sum(int(is_in(face).sum()) for face in faces) for is_in in
-              (lambda x: x < 0, lambda x: x > 0, lambda x: x == low)]  # fmt: skip
+    border = [[(face < 0).sum(), (face > 0).sum(), (face == low).sum()] for face in faces]
     rows = planes[0, 0], planes[len(planes) // 2, planes.shape[1] // 2]  # they mostly show it
-    has_two = all(((part == low) | (part == high)).all() for part in (*rows, planes))
-    return Numbers(low, high, is_finite, infinite, has_two, np.array(border))
+    has_two = all(bool(((part == low) | (part == high)).all()) for part in (*rows, planes))
+    return Numbers(low, high, is_finite, infinite, has_two, np.sum(border, 0))
 
 
 def _are_layers(values: SampleArray) -> bool:

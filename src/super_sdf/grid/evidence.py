@@ -128,17 +128,13 @@ class Evidence:
 
     def report(self) -> dict[str, Any]:
         """Return the evidence as a dictionary that can be written as JSON."""
-        known = np.isfinite(self.slope)
-        return {
-            "samples": self.samples,
-            "slope": round(self.slope, 4) if known else None,
-            "wrong_slopes": round(self.wrong, 4),
-            "uneven": round(self.uneven, 4),
-            "contradicting": round(self.contradicting, 4),
-            "noisy": round(self.noisy, 4),
-            "roughness": round(self.roughness, 4),
-            "cut_off": [self.cut_low, self.cut_high],
-        }
+        slope = round(self.slope, 4) if np.isfinite(self.slope) else None
+        shares = {"wrong_slopes": self.wrong, "uneven": self.uneven}
+        shares |= {"contradicting": self.contradicting, "noisy": self.noisy}
+        shares |= {"roughness": self.roughness}
+        rounded = {name: round(share, 4) for name, share in shares.items()}
+        cut_off = [self.cut_low, self.cut_high]
+        return {"samples": self.samples, "slope": slope, **rounded, "cut_off": cut_off}
 
 
 def weigh(looked: Looked, spacing: Triple) -> Evidence:

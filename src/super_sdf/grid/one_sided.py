@@ -53,7 +53,7 @@ def find_fault(census: Census, spacing: Triple) -> str:
     scale = (1 if extremes[0] >= 0 else -1) / max(spacing)
     if min(map(abs, extremes)) * abs(scale) > reach(steps):
         return FAR
-    patches, walls, thickness = look_near_walls(values, scale, steps)
+    patches, walls, thickness = _look_near_walls(values, scale, steps)
     if not len(patches):
         return BEYOND
     if not (_are_distances(patches, steps) and _touch_walls(patches, steps)):
@@ -70,28 +70,17 @@ def reach(steps: Floats) -> float:
     return float(np.linalg.norm(steps)) / 2 * MARGIN
 
 
-def look_near_walls(values: SampleArray, scale: float, steps: Floats) -> tuple[Floats, int, Floats]:
+def _look_near_walls(
+    values: SampleArray, scale: float, steps: Floats
+) -> tuple[Floats, int, Floats]:
     """Return patches near 0, how many walls pass between samples, and how thick the thinnest are.
 
-    Parameters
-    ----------
-    values : (nx, ny, nz) array or Planes
-        Samples.
-    scale : float
-        Their factor to spacings, positive outside.
-    steps : (3,) float
-        The spacings of the axes, over the coarsest.
-
-    Returns
-    -------
-    patches : (n, 27) float64
-        Distances round some of the inner samples near 0, in the order of ``NEIGHBOURHOOD``.
-    walls : int
-        Of all lines along the axes.
-    thickness : (w,) float64
-        Of those of them with less than ``NO_THICKNESS``; below 0 if a constant was added.
+    ``scale`` is the factor of the values to spacings, positive outside; ``steps`` are the spacings
+    of the axes, over the coarsest. The patches, (n, 27), are distances round some of the inner
+    samples near 0, in the order of ``NEIGHBOURHOOD``. The walls are those of all lines along the
+    axes; of those with less than ``NO_THICKNESS`` it is returned, below 0 if a constant was added.
     """
-    found: list[Floats] = []
+    near_walls: list[Floats] = []
     walls, near = 0, reach(steps)
     thin: list[Floats] = [np.empty(0)]
     for i in range(1, len(values) - 1):
@@ -103,9 +92,9 @@ def look_near_walls(values: SampleArray, scale: float, steps: Floats) -> tuple[F
                     thickness = find_walls(lines[:, part] / step)[1]
                     walls += len(thickness)
                     thin.append(thickness[thickness < NO_THICKNESS])
-            found += _patches_near(slab[:3], near)
-    some = np.unique(np.linspace(0, max(len(found) - 1, 0), CANDIDATES).astype(int))
-    patches = np.array([found[n] for n in some] if found else []).reshape(-1, 27)
+            near_walls += _patches_near(slab[:3], near)
+    some = np.unique(np.linspace(0, max(len(near_walls) - 1, 0), CANDIDATES).astype(int))
+    patches = np.array([near_walls[n] for n in some] if near_walls else []).reshape(-1, 27)
     return patches, walls, np.concatenate(thin)
 
 
@@ -123,19 +112,11 @@ def _patches_near(slab: Floats, limit: float) -> list[Floats]:
 
 
 def find_walls(lines: Floats) -> tuple[BoolArray, Floats]:
-    """Return where a wall lies between two samples of a line, and how thick it is.
+    """Return where a wall lies between two samples of lines (n, ...), and how thick it is.
 
-    Parameters
-    ----------
-    lines : (n, ...) float64
-        Samples along the first axis, in spacings and positive.
-
-    Returns
-    -------
-    walls : (n - 3, ...) bool
-        Whether there is one between samples i + 1 and i + 2; n is at least 4, else there is none.
-    thickness : (walls,) float64
-        What the distances on either side leave of the way between the two.
+    Samples are along the first axis, in spacings and positive. The first result, (n - 3, ...),
+    says whether there is one between samples i + 1 and i + 2. The second, (walls,), is what the
+    distances on either side leave of the way between the two.
     """
     before, left, right, after = lines[:-3], lines[1:-2], lines[2:-1], lines[3:]
     falling, rising = before - left, after - right

@@ -51,7 +51,7 @@ class Regions:
         self.is_marked = is_marked
         self.before = np.zeros(shape[0] + 1, np.int64)
         none = np.empty(0, np.int64)
-        parts = [(none, none, none.reshape(2, 0), none, none)]
+        parts: list[tuple[Ints, ...]] = [(none, none, none.reshape(2, 0), none, none)]
         for i, runs in enumerate(planes):
             self.before[i + 1] = self.before[i]
             if runs is not None:
@@ -59,11 +59,9 @@ class Regions:
                 offset = self.before[i] - int(former)
                 parts.append((start + i * shape[1] * shape[2], size, *(x + offset for x in rest)))
                 self.before[i + 1] += len(start)
-        start, size, joined, positive, negative = zip(*parts)
-        self.start, self.size = np.concatenate(start), np.concatenate(size)
-        self.root = components(len(self.start), np.concatenate(joined, axis=1))
-        self.positive = self._has(np.concatenate(positive))
-        self.negative = self._has(np.concatenate(negative))
+        self.start, self.size, joined, *sides = (np.concatenate(x, axis=-1) for x in zip(*parts))
+        self.root = components(len(self.start), joined)
+        self.positive, self.negative = (self._has(side) for side in sides)
         self.unsure: BoolArray = self.positive == self.negative
 
     @classmethod

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -103,8 +102,7 @@ class SdfGrid:
         check_negative_inside(census)
         notes: list[str] = []
         chosen = choose_spacing(census, check_spacing(spacing), notes)
-        place = chosen, 0.0 if given.origin is None else given.origin, direction
-        self._set(samples, place, tuple(notes), False, census.extremes)
+        self._set(samples, (chosen, given.origin, direction), tuple(notes), census.extremes)
 
     @classmethod
     def trusted(
@@ -122,47 +120,46 @@ class SdfGrid:
         """Return a grid whose sign and spacing are known and not checked against the values.
 
         With ``positive_inside`` the sign of the values is flipped. With ``extremes``, their minimum
-        and maximum, they are not searched for NaN and infinity again. Values are taken as exact
-        distances unless ``field`` says what they are.
+        and maximum, they are not searched for NaN and infinity. Values are taken as exact distances
+        unless ``field`` says what they are.
         """
         given = placed(values, spacing, origin)
         samples = as_samples(given.values)
-        grid = object.__new__(cls)
         extremes = extremes or _checked(samples).extremes
-        origin = 0.0 if given.origin is None else given.origin
-        place = check_spacing(spacing), origin, direction
-        grid._set(samples, place, notes, positive_inside, extremes, field)
+        grid = object.__new__(cls)
+        place = check_spacing(spacing), given.origin, direction
+        grid._set(samples, place, notes, extremes, positive_inside, field)
         return grid
 
     def _set(
         self,
         samples: SampleArray,
-        place: tuple[Triple, ArrayLike, ArrayLike | None],
+        place: tuple[Triple, ArrayLike | None, ArrayLike | None],
         notes: tuple[str, ...],
-        positive_inside: bool,
         extremes: Extremes,
+        positive_inside: bool = False,
         field: Field | None = None,
     ) -> None:
         """Set all fields."""
-        set_ = partial(object.__setattr__, self)
         low, high = extremes
-        set_("samples", samples)
-        set_("spacing", place[0])
-        set_("origin", as_triple(place[1], "origin"))
-        set_("direction", check_direction(place[2]))
-        set_("notes", notes)
-        set_("positive_inside", positive_inside)
-        set_("low", -high if positive_inside else low)
-        set_("high", -low if positive_inside else high)
-        set_("field", field or Field())
+        spacing, origin, direction = place
+        vars(self).update(
+            samples=samples,
+            spacing=spacing,
+            origin=as_triple(0.0 if origin is None else origin, "origin"),
+            direction=check_direction(direction),
+            notes=notes,
+            positive_inside=positive_inside,
+            low=-high if positive_inside else low,
+            high=-low if positive_inside else high,
+            field=field or Field(),
+        )
 
     def noted(self, notes: tuple[str, ...]) -> SdfGrid:
         """Return the same grid with more sentences on it, before those on what was inferred."""
         if not notes:
             return self
-        grid = copy(self)
-        object.__setattr__(grid, "notes", (*notes, *self.notes))
-        return grid
+        return _with(self, notes=(*notes, *self.notes))
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.shape))
@@ -323,19 +320,20 @@ def _checked(samples: SampleArray) -> Census:
     return census
 
 
-def with_samples(grid: SdfGrid, samples: SampleArray) -> SdfGrid:
-    """Return a grid with other samples in the same place, taken as the same."""
+def _with(grid: SdfGrid, **fields: Any) -> SdfGrid:
+    """Return a grid with other fields, taken as they are."""
     other = copy(grid)
-    object.__setattr__(other, "samples", samples)
+    vars(other).update(fields)
     return other
 
 
 def without_samples(grid: SdfGrid) -> SdfGrid:
     """Return a grid that knows all but its samples: their shape and type, place and field."""
-    return with_samples(grid, NoPlanes(grid.shape, grid.samples.dtype))
+    return _with(grid, samples=NoPlanes(grid.shape, grid.samples.dtype))
 
 
 def negated(values: NDArray[Any]) -> NDArray[Any]:
     """Return the negated values, as floats so that unsigned integers work."""
     floats: NDArray[Any] = values.astype(np.promote_types(values.dtype, np.float32))
-    return np.negative(floats, out=floats)
+    np.negative(floats, out=floats)
+    return floats

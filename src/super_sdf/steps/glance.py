@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..grid.cubic import Resampled
 from ..grid.planes import over_planes, planes_at_once
-from ..grid.resampling import Resampled
 from ..grid.sdf_grid import SdfGrid, without_samples
 from ..neighbourhood import CENTRE
 from .band import BLOCK_PLANES, can_hold_surface, is_lipschitz, plane_blocks

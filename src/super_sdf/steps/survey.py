@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import NoSurfaceError, OutOfMemoryError
-from ..grid.cubic import on_samples, sampled_places
+from ..grid.cubic import Resampled, on_samples, sampled_places
 from ..grid.field import EXACT, MASK
 from ..grid.planes import (
     SampleArray,
@@ -27,7 +27,6 @@ from ..grid.planes import (
     reading_bytes,
     unpacked_bytes,
 )
-from ..grid.resampling import Resampled
 from ..grid.sdf_grid import SdfGrid, negated
 from ..machine.memory import held_memory, in_words
 from ..machine.resources import ONE_THREAD, Resources
