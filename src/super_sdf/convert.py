@@ -26,10 +26,9 @@ from .files.output import check_apart
 from .files.precision import check_format_holds, local_origin_note
 from .files.store import files_of
 from .grid.cubic import cubic_grid
-from .grid.placement import Direction
 from .grid.field import EXACT, MASK, SCALED
+from .grid.placement import Direction, as_triple
 from .grid.sdf_grid import SdfGrid
-from .grid.placement import as_triple
 from .mesh import Mesh, join_meshes
 from .network.decoder import Decoder
 from .options import check_goal, check_iterations

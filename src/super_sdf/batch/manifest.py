@@ -21,8 +21,7 @@ from ..convert import ConvertOptions
 from ..errors import FileError, OptionError
 from ..files.formats import AXES, mesh_path
 from ..files.meshes import MESH_SUFFIXES
-from ..grid.field import FIELDS, check_label
-from ..grid.field import INSIDE
+from ..grid.field import FIELDS, INSIDE, check_label
 from ..options import check_error, check_goal, check_iterations, check_triangles
 from ..steps.mesher_names import MESHERS
 from ..steps.nodes import check_factor

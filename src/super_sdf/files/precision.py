@@ -14,8 +14,8 @@ import numpy as np
 
 from ..arrays import Triple
 from ..errors import FileError
-from ..grid.sdf_grid import SdfGrid
 from ..grid.placement import as_triple
+from ..grid.sdf_grid import SdfGrid
 from ..mesh import CLEARANCE, tells_vertices_apart, vertex_type
 from .meshes import WORLD_ORIGIN, format_of
 
