@@ -187,50 +187,50 @@ class Resampled(SamplePlanes):
         block = np.asarray(self.source[low : first + len(out) + REACH])
         lines = np.moveaxis(block, self.axis, 0)
         for planes in _chunks(len(out), 2 * out[0].size):
-            own = slice(planes.start + first - low, planes.stop + first - low)
-            values = self._interpolate(lines, own, self.places, (0, 3 - self.axis))
+            asked = slice(planes.start + first - low, planes.stop + first - low)
+            values = self._interpolate(lines, asked, self.places, (0, 3 - self.axis))
             out[planes] = np.moveaxis(values, 0, self.axis)
 
     def _interpolate(
-        self, block: NDArray[Any], own: slice, places: Floats, across: tuple[int, int]
+        self, block: NDArray[Any], asked: slice, places: Floats, across: tuple[int, int]
     ) -> Floats:
         """Return the values at places on the lines of a block, whose first axis they run along.
 
-        ``own`` are the lines along the second axis, ``across`` the axes of the grid that are the
+        ``asked`` are the lines along the second axis, ``across`` the axes of the grid that are the
         second and the third of the block.
         """
-        start = max(own.start - REACH, 0)
+        start = max(asked.start - REACH, 0)
         h = self.spacing[self.axis]
-        samples = block[:, start : own.stop + REACH].astype(np.float64, order="C")
+        samples = block[:, start : asked.stop + REACH].astype(np.float64, order="C")
         np.clip(samples, self.level - MOST * h, self.level + MOST * h, out=samples)
-        own = slice(own.start - start, own.stop - start)
-        lines = Lines(samples, own, h, (self.spacing[across[0]], self.spacing[across[1]]))
+        asked = slice(asked.start - start, asked.stop - start)
+        lines = Lines(samples, asked, h, (self.spacing[across[0]], self.spacing[across[1]]))
         return lines.values_at(places, self.level, NEAR * self.step)
 
 
 class Lines:
     """Lines of samples (n, p, q), along the first axis, and the laws of distances on them.
 
-    Values are asked of those in the slice ``own`` of the second axis; the others are beside them.
+    Values are asked of those in the slice ``asked`` of the second axis; the others are beside them.
     ``h`` is the spacing along the lines, ``steps`` those across.
     """
 
-    def __init__(self, samples: Floats, own: slice, h: float, steps: tuple[float, float]) -> None:
-        self.samples, self.own, self.h, self.steps = samples, own, h, steps
+    def __init__(self, samples: Floats, asked: slice, h: float, steps: tuple[float, float]) -> None:
+        self.samples, self.asked, self.h, self.steps = samples, asked, h, steps
         self.around = np.pad(samples, ((0, 0), *((REACH, REACH),) * 2), constant_values=np.nan)
 
     def values_at(self, places: Floats, level: float, near: float) -> Floats:
-        """Return the values at places along all own lines, (m, p, q).
+        """Return the values at places along all asked lines, (m, p, q).
 
         Those within ``near`` of a ``level`` are kept within their bounds.
         """
         cells = np.minimum(places.astype(int), len(self.samples) - 2)
         shares = places - cells
-        values = np.empty((len(places), *self.samples[0, self.own].shape))
+        values = np.empty((len(places), *self.samples[0, self.asked].shape))
         is_near = np.zeros(values.shape, bool)
         before, slopes = -2, (values[0], values[0])
         for n, (cell, share) in enumerate(zip(cells.tolist(), shares.tolist())):
-            low, high = self.samples[cell, self.own], self.samples[cell + 1, self.own]
+            low, high = self.samples[cell, self.asked], self.samples[cell + 1, self.asked]
             if share in (0, 1):
                 values[n] = high if share else low
                 continue
@@ -275,12 +275,12 @@ class Lines:
         return bounded
 
     def _sample(self, i: int) -> Floats:
-        """Return sample i of the own lines; beyond their ends, it is extrapolated linearly."""
+        """Return sample i of the asked lines; beyond their ends, it is extrapolated linearly."""
         end = min(max(i, 0), len(self.samples) - 1)
         inner = end + 1 if i < 0 else end - 1
-        sample: Floats = self.samples[end, self.own]
+        sample: Floats = self.samples[end, self.asked]
         if i != end:
-            sample = sample + abs(i - end) * (sample - self.samples[inner, self.own])
+            sample = sample + abs(i - end) * (sample - self.samples[inner, self.asked])
         return sample
 
     def _steepness(self, i: int) -> tuple[Floats, Floats]:
@@ -293,8 +293,8 @@ class Lines:
         for axis, step in enumerate(self.steps):
             differences = np.diff(self.samples[i], axis=axis) / step
             first, last = differences.take([0], axis), differences.take([-1], axis)
-            behind = np.concatenate([first, differences], axis)[self.own]
-            ahead = np.concatenate([differences, last], axis)[self.own]
+            behind = np.concatenate([first, differences], axis)[self.asked]
+            ahead = np.concatenate([differences, last], axis)[self.asked]
             mean, half = np.abs(behind + ahead) / 2, np.abs(behind - ahead) / 2
             least = least + np.maximum(mean - half, 0) ** 2
             most = most + (mean + half) ** 2
@@ -309,7 +309,7 @@ class Lines:
     ) -> Floats:
         """Return values between samples, (n,), kept within what the samples round them allow."""
         _, rows, width = self.around.shape
-        at = (cells * rows + across[0] + self.own.start + REACH) * width + across[1] + REACH
+        at = (cells * rows + across[0] + self.asked.start + REACH) * width + across[1] + REACH
         low, high = np.full(len(at), -np.inf), np.full(len(at), np.inf)
         for start, along in ((at, shares), (at + rows * width, 1 - shares)):
             along = (along * self.h) ** 2

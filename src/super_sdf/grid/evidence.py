@@ -15,15 +15,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..arrays import BoolArray, Triple
-from .census import BESIDE, Looked
+from .census import Looked
 from .placement import steps_of
+from .questions import BESIDE, Floats
 from .slopes import BENT as STRAIGHT
 from .slopes import ENOUGH, LARGEST_VALUE
-
-Floats = NDArray[np.float64]
 
 # Slopes whose fourth differences are this small are known: of exact distances half of them are 1.
 # Where two kinks make them so, a third difference is half of the slope or more.

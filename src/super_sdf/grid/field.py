@@ -20,7 +20,7 @@ from ..arrays import Triple
 from ..errors import OptionError, seen
 from .census import Extremes
 from .placement import check_spacing
-from .planes import SampleArray
+from .planes import SampleArray, changed
 
 FIELDS = ("auto", "exact", "truncated", "mask", "scaled", "noisy")
 AUTO, EXACT, TRUNCATED, MASK, SCALED, NOISY = FIELDS
@@ -168,3 +168,13 @@ class Interpreted:
     spacing: Triple
     positive_inside: bool
     field: Field
+
+    def with_field(self, **changes: Any) -> Interpreted:
+        """Return the same with some attributes of the field changed."""
+        return replace(self, field=replace(self.field, **changes))
+
+    def divided(self, slope: float) -> Interpreted:
+        """Return values divided by a slope."""
+        low, high = self.extremes
+        samples = changed(self.samples, lambda values: values / slope)
+        return replace(self, samples=samples, extremes=(low / slope, high / slope))

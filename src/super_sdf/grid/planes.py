@@ -383,9 +383,9 @@ class DerivedPlanes(SamplePlanes):
         """Return about how much memory making that many planes takes, those beside included."""
         read = min(planes + 2 * self.beside, len(self))
         rows = min(self._rows_at_once(read) + 2 * self.beside, self.shape[1])
-        own = planes * self.plane_bytes + read * rows * self.shape[2] * self.each
+        made = planes * self.plane_bytes + read * rows * self.shape[2] * self.each
         stored = read * self.shape[1] * self.shape[2] * np.dtype(self.source.dtype).itemsize
-        return own + max(reading_bytes(self.source, read), stored)
+        return made + max(reading_bytes(self.source, read), stored)
 
 
 def unpacked_bytes(samples: SampleArray) -> int:

@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, Triple
-from .census import BESIDE, Floats, Looked
+from .census import Looked
 from .placement import is_cubic
+from .questions import BESIDE, Floats
 
 MOST_PATCHES = 1 << 12  # samples that are compared with all round them
 LEAST = 20  # samples from which shares of them are evidence

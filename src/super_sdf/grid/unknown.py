@@ -344,10 +344,10 @@ def _check_jumps(census: Census, value: float, count: int, limit: float) -> None
 
 def _are_any(values: Floats, some: tuple[float, ...]) -> BoolArray:
     """Return which values are one of some."""
-    found = np.zeros(values.shape, bool)
+    are_any = np.zeros(values.shape, bool)
     for one in some:
-        found |= values == one
-    return found
+        are_any |= values == one
+    return are_any
 
 
 def _are_jumps(pairs: Floats, limit: float, extremes: Extremes) -> BoolArray:
