@@ -44,18 +44,8 @@ Floats = NDArray[np.float64]
 class KnownPlanes(SamplePlanes):
     """Samples whose unknown ones are replaced by the cut-off of their side, when they are read.
 
-    Where both sides are near, the samples are continued linearly over ``LAYERS`` unknown ones.
-
-    Parameters
-    ----------
-    source : (nx, ny, nz) array or SamplePlanes
-        The samples.
-    regions : Regions
-        Of the samples that are NaN.
-    limits : two floats
-        The cut-offs: the lowest and the highest finite sample.
-    outside : float
-        The one of these that unknown samples get far from known ones of both sides.
+    Where both sides are near, the samples are continued linearly over ``LAYERS`` unknown ones;
+    farther away, unknown ones get ``outside``, one of the two ``limits``.
     """
 
     name = "the grid"
@@ -82,25 +72,22 @@ class KnownPlanes(SamplePlanes):
     @property
     def unseen(self) -> SampleArray | None:
         """Which samples are unknown and have both sides, or none, beside their region."""
-        return UnseenPlanes(self) if self.beside else None
+        return UnseenPlanes(self.source, self.regions) if self.beside else None
 
     def read(self, first: int, last: int) -> NDArray[Any]:
         """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
         start, stop = max(first - self.beside, 0), min(last + self.beside, len(self))
         planes = np.array(self.source[start:stop])
         low, high = self.limits
-        unsure = np.zeros(planes.shape, bool)
         for i, plane in enumerate(planes, start):
             unknown, infinite = np.isnan(plane), np.isinf(plane)
             runs = self.regions.runs_of(i, unknown)[unknown]
-            plane[unknown] = np.where(self.regions.positive[runs], high, low)
+            filled = np.where(self.regions.positive[runs], high, low)
+            plane[unknown] = np.where(self.regions.unsure[runs], np.nan, filled)
             plane[infinite] = np.where(plane[infinite] > 0, high, low)
-            unsure[i - start][unknown] = self.regions.unsure[runs]
-        if unsure.any():
-            planes[unsure] = np.nan
-            if self.beside:
-                planes = continued(planes, self.limits)
-            planes[np.isnan(planes)] = self.outside
+        if self.beside:
+            planes = _continued(planes, self.limits)
+        planes[np.isnan(planes)] = self.outside
         return planes[first - start : last - start]
 
     def working_bytes(self, planes: int) -> int:
@@ -109,14 +96,30 @@ class KnownPlanes(SamplePlanes):
         return copies * (planes + 2 * self.beside) * self.plane_bytes + RUN_BYTES * plane
 
 
+def _continued(planes: NDArray[Any], limits: Extremes) -> NDArray[Any]:
+    """Return planes in which samples are continued linearly over ``LAYERS`` that are NaN."""
+    for _ in range(LAYERS if np.isnan(planes).any() else 0):
+        total, count = np.zeros(planes.shape), np.zeros(planes.shape, np.int8)
+        for axis in range(3):
+            for flipped in (slice(None), slice(None, None, -1)):
+                values = np.moveaxis(planes, axis, 0)[flipped]
+                line = 2 * values[1:-1] - values[:-2]  # at the sample after these two
+                known = np.isfinite(line)
+                np.moveaxis(total, axis, 0)[flipped][2:] += np.where(known, line, 0)
+                np.moveaxis(count, axis, 0)[flipped][2:] += known
+        new = np.isnan(planes) & (count > 0)
+        planes[new] = np.clip(total[new] / count[new], *limits)
+    return planes
+
+
 class UnseenPlanes(SamplePlanes):
     """Which samples are unknown, with both sides beside their region, or none."""
 
     name = "the grid"
     dtype = np.dtype(bool)
 
-    def __init__(self, known: KnownPlanes) -> None:
-        self.source, self.regions, self.shape = known.source, known.regions, known.shape
+    def __init__(self, source: SampleArray, regions: Regions) -> None:
+        self.source, self.regions, self.shape = source, regions, tuple(source.shape)
 
     def read(self, first: int, last: int) -> BoolArray:
         """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
@@ -136,22 +139,6 @@ class UnseenPlanes(SamplePlanes):
             f"{count:,} samples are unknown{which}, values[{first}] the first, in regions that "
             "touch samples on both sides of the surface, so whether they are inside is unknown"
         )
-
-
-def continued(planes: NDArray[Any], limits: Extremes) -> NDArray[Any]:
-    """Return planes in which samples are continued linearly over ``LAYERS`` that are NaN."""
-    for _ in range(LAYERS):
-        total, count = np.zeros(planes.shape), np.zeros(planes.shape, np.int8)
-        for axis in range(3):
-            for flipped in (slice(None), slice(None, None, -1)):
-                values = np.moveaxis(planes, axis, 0)[flipped]
-                line = 2 * values[1:-1] - values[:-2]  # at the sample after these two
-                known = np.isfinite(line)
-                np.moveaxis(total, axis, 0)[flipped][2:] += np.where(known, line, 0)
-                np.moveaxis(count, axis, 0)[flipped][2:] += known
-        new = np.isnan(planes) & (count > 0)
-        planes[new] = np.clip(total[new] / count[new], *limits)
-    return planes
 
 
 class SeenPlanes(SamplePlanes):
@@ -183,10 +170,7 @@ class SeenPlanes(SamplePlanes):
 def filled(census: Census, notes: list[str]) -> KnownPlanes:
     """Return samples of which the unknown ones are replaced, and say so in the notes.
 
-    Raises
-    ------
-    GridError
-        If no sample is known, or one that is infinite is beside the surface.
+    GridError if no sample is known, or one that is infinite is beside the surface.
     """
     samples, numbers, regions = census.samples, census.numbers, census.unknown
     low, high = finite_extremes(census)
@@ -207,13 +191,7 @@ def filled(census: Census, notes: list[str]) -> KnownPlanes:
 
 
 def finite_extremes(census: Census) -> Extremes:
-    """Return the lowest and the highest finite sample.
-
-    Raises
-    ------
-    GridError
-        If none is finite, or one that is infinite is beside the surface.
-    """
+    """Return the lowest and the highest finite sample; GridError as above."""
     low, high = census.extremes
     if low > high:
         raise not_finite(census.samples)
@@ -249,12 +227,7 @@ def without_unseen(census: Census, notes: list[str]) -> Census:
     """Return what samples show that are NaN where they have a value that stands for unseen ones.
 
     Of samples that are not all known by their user, those with an extreme value may be beside any
-    others: few views leave such edges.
-
-    Raises
-    ------
-    GridError
-        If a value may stand for them, but not everywhere.
+    others: few views leave such edges. GridError if a value may stand for them, but not everywhere.
     """
     extremes = census.extremes if census.is_finite else finite_extremes(census)
     if not extremes[0] < 0 < extremes[1]:
@@ -363,19 +336,19 @@ def _unseen_runs(
     samples: SampleArray, regions: Regions, value: float, steepest: float, extremes: Extremes
 ) -> BoolArray:
     """Return which runs of a value were never seen, (n,)."""
-    beside, jumps, above, amid = _beside_regions(samples, regions, JUMP * steepest, extremes)
+    beside, jumps, above, amid = _count_beside(samples, regions, JUMP * steepest, extremes)
     unseen = (jumps > UNSEEN * beside) & (jumps > 0)
     unseen |= (beside == 0) & unseen.any()
     if value == 0:  # no distance is 0 throughout, though on a surface it is at corners of steps
         unseen |= amid > 0
         unseen |= ((above == 0) | (above == beside)) & unseen.any()
-    return unseen[regions.root]
+    return np.asarray(unseen[regions.root])
 
 
-def _beside_regions(
+def _count_beside(
     samples: SampleArray, regions: Regions, limit: float, extremes: Extremes
-) -> tuple[Ints, Ints, Ints, Ints]:
-    """Count, by the first run of each region, the pairs of its samples with others, (n,) each.
+) -> NDArray[np.int64]:
+    """Count, by the first run of each region, the pairs of its samples with others, (4, n).
 
     All but those of both extremes; those that differ by more than a limit; those with one above 0;
     and samples that have only others of the region round them.
@@ -385,30 +358,23 @@ def _beside_regions(
     def count(which: int, runs: Ints) -> None:
         counts[which] += np.bincount(regions.root[runs], minlength=counts.shape[1])
 
-    def look(runs: Ints, values: NDArray[Any], other_runs: Ints, others: NDArray[Any]) -> None:
-        at = (runs >= 0) & (other_runs < 0) & np.isfinite(others)
-        pairs = np.stack([values[at], others[at]]).astype(np.float64)
-        count(0, runs[at][~_are_any(pairs, extremes).all(0)])
-        count(1, runs[at][_are_jumps(pairs, limit, extremes)])
-        count(2, runs[at][pairs[1] > 0])
-
     before: deque[tuple[Ints, NDArray[Any]]] = deque(maxlen=2)
     for i, plane in enumerate(samples):
         runs = regions.runs_of(i, regions.is_marked(plane))
         sides = [(runs[1:], plane[1:], runs[:-1], plane[:-1])]
         sides += [(runs[:, 1:], plane[:, 1:], runs[:, :-1], plane[:, :-1])]
         sides += [(runs, plane, *before[-1])] if before else []
+        sides += [(other, others, one, values) for one, values, other, others in sides]
         for one, values, other, others in sides:
-            look(one, values, other, others)
-            look(other, others, one, values)
+            at = (one >= 0) & (other < 0) & np.isfinite(others)
+            pairs = np.stack([values[at], others[at]]).astype(np.float64)
+            count(0, one[at][~_are_any(pairs, extremes).all(0)])
+            count(1, one[at][_are_jumps(pairs, limit, extremes)])
+            count(2, one[at][pairs[1] > 0])
         if len(before) == 2:
-            count(3, _amid(before[0][0], before[1][0], runs))
+            amid = (before[0][0] >= 0) & (before[1][0] >= 0) & (runs >= 0)
+            amid = amid[2:] & amid[1:-1] & amid[:-2]
+            amid = amid[:, 2:] & amid[:, 1:-1] & amid[:, :-2]
+            count(3, before[1][0][1:-1, 1:-1][amid])
         before.append((runs, plane))
-    return counts[0], counts[1], counts[2], counts[3]
-
-
-def _amid(before: Ints, runs: Ints, after: Ints) -> Ints:
-    """Return the runs of samples of a plane that are marked, as the 26 round them."""
-    amid = (before >= 0) & (runs >= 0) & (after >= 0)
-    amid = amid[2:] & amid[1:-1] & amid[:-2]
-    return runs[1:-1, 1:-1][amid[:, 2:] & amid[:, 1:-1] & amid[:, :-2]]
+    return counts
