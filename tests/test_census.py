@@ -32,6 +32,12 @@ def with_nan(values):
     return np.where(np.abs(values) < 3, values, np.nan)
 
 
+def plate():
+    """Return distances to a plate between two planes of samples."""
+    apart = np.abs(np.indices((24, 24, 24)).T - 11.5).T - np.reshape([7.3, 8.1, 0.2], (3, 1, 1, 1))
+    return np.linalg.norm(np.maximum(apart, 0), axis=0) + np.minimum(apart.max(0), 0)
+
+
 KINDS = {
     "exact": ("exact", box()),
     "truncated": ("truncated", np.clip(box(), -2, 2)),
@@ -40,6 +46,7 @@ KINDS = {
     "scaled": ("scaled", box() * np.exp(0.02 * box())),
     "noisy": ("noisy", box() + RANDOM.normal(0, 0.2, box().shape)),
     "NaN": ("truncated", with_nan(box())),
+    "thin": ("exact", plate()),
 }
 
 

@@ -126,13 +126,16 @@ class Evidence:
 
     def report(self) -> dict[str, Any]:
         """Return the evidence as a dictionary that can be written as JSON."""
-        slope = round(self.slope, 4) if np.isfinite(self.slope) else None
-        shares = {"wrong_slopes": self.wrong, "uneven": self.uneven}
-        shares |= {"contradicting": self.contradicting, "noisy": self.noisy}
-        shares |= {"roughness": self.roughness}
-        rounded = {name: round(share, 4) for name, share in shares.items()}
-        cut_off = [self.cut_low, self.cut_high]
-        return {"samples": self.samples, "slope": slope, **rounded, "cut_off": cut_off}
+        shares = {
+            "slope": self.slope,
+            "wrong_slopes": self.wrong,
+            "uneven": self.uneven,
+            "contradicting": self.contradicting,
+            "noisy": self.noisy,
+            "roughness": self.roughness,
+        }
+        known = {name: round(x, 4) if np.isfinite(x) else None for name, x in shares.items()}
+        return {"samples": self.samples, **known, "cut_off": [self.cut_low, self.cut_high]}
 
 
 def weigh(looked: Looked, spacing: Triple) -> Evidence:
