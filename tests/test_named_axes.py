@@ -38,8 +38,7 @@ def refusal(array: xarray.DataArray | xarray.Dataset, **options) -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize("order", ["xyz", "zyx", "yzx"])
-@pytest.mark.parametrize("down", ["", "z", "xy"])
+@pytest.mark.parametrize("order, down", [("xyz", "xy"), ("zyx", "z"), ("yzx", "")])
 def test_a_sphere_lies_where_its_coordinates_say(order, down):
     grid = make_grid(sphere(order, down))
     assert (grid.shape, grid.spacing, grid.origin) == (SHAPE, STEP, FIRST)

@@ -55,8 +55,7 @@ THIN = {
 
 
 @pytest.mark.parametrize("name", sorted(set(THIN) - {"hollow ball"}))
-@pytest.mark.parametrize("spacing", [None, 0.1])
-@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("spacing, sign", [(None, 1), (0.1, -1)])
 def test_thin_solids_are_told(name, spacing, sign):
     values = THIN[name] * sign * 0.1
     assert (values * sign).min() > 0
@@ -145,7 +144,7 @@ def test_a_given_spacing_is_believed_of_a_thin_part():
     assert make_grid(walls, spacing=1.0, origin=0, inside="negative").notes == ()
 
 
-@pytest.mark.parametrize("turned", [(0, 1, 2), (2, 1, 0), (1, 2, 0)])
+@pytest.mark.parametrize("turned", [(2, 1, 0), (1, 2, 0)])
 @pytest.mark.parametrize("name", sorted(THIN))
 def test_the_axes_may_come_in_any_order(name, turned):
     values = THIN[name].transpose(turned)
