@@ -57,6 +57,7 @@ def test_a_grid_is_read_at_most_three_times(name, small, monkeypatch):
     if not small:  # in several parts
         monkeypatch.setattr(census, "KEPT_BYTES", 0)
         monkeypatch.setattr(questions, "TOGETHER", values[0].size)
+        monkeypatch.setattr(questions, "READ_SAMPLES", 4 * values[0].size)
     counted = Counted(values)
     grid = make_grid(counted, spacing=1.0, origin=0.0)
     assert grid.field.kind == kind
@@ -73,6 +74,7 @@ def test_the_census_is_the_same_in_whatever_parts_it_is_taken(name, monkeypatch)
     whole = Census(values)
     monkeypatch.setattr(census, "KEPT_BYTES", 0)
     monkeypatch.setattr(questions, "TOGETHER", values[0].size)
+    monkeypatch.setattr(questions, "READ_SAMPLES", 0)
     parts = Census(Counted(values))
     for one, other in zip(whole.numbers, parts.numbers):
         assert np.array_equal(one, other)

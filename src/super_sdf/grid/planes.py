@@ -28,7 +28,7 @@ FAR = 1e6  # spacings
 BLOCK_BYTES = 1 << 20  # read at a time when iterating over all planes
 LEAST_AT_ONCE = 4  # planes
 WORKING_BYTES = 1 << 26  # taken at a time when planes are made of others
-LOOKED_AT, LOOKING_BYTES = 6, 40  # planes, and bytes per sample of one, to look at the samples
+LOOKED_AT, LOOKING_BYTES = 12, 40  # planes, and bytes per sample of one, to look at the samples
 EVENLY = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio: its multiples, modulo 2^64
 
 Result = TypeVar("Result")
@@ -149,19 +149,20 @@ class SamplePlanes(ABC):
     ) -> Iterator[Result]:
         """Yield what a function makes of ranges of ``samples``, which are made of these.
 
-        Planes that a range shares with the one before are not read again. Samples of which workers
-        read the planes have their own way.
+        Planes that a range shares with the one before are not read again; they are valid during the
+        call. Samples of which workers read the planes have their own way.
         """
-        start, planes = 0, np.empty((0, *samples.shape[1:]), samples.dtype)
+        held = max((last - first for first, last, *_ in ranges), default=0)
+        planes = np.empty((held, *samples.shape[1:]), samples.dtype)
+        start = end = 0  # of the planes that are held
         for first, last, *more in ranges:
-            end = start + len(planes)
-            if start <= first < end < last:
-                planes = np.concatenate([planes[first - start :], samples[end:last]])
-            elif not start <= first < last <= end:
-                planes = samples[first:last]
-            else:
-                planes = planes[first - start :]
-            start = first
+            kept = end - first if start <= first < end else 0
+            if kept and first > start:
+                planes[:kept] = planes[first - start : end - start]
+            for low in range(first + kept, last, samples.block):  # which stay in the cache
+                high = min(low + samples.block, last)
+                planes[low - first : high - first] = samples[low:high]
+            start, end = first, max(last, first + kept)
             yield work(planes[: last - first], *more)
 
     def working_bytes(self, planes: int) -> int:

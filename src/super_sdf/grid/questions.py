@@ -26,7 +26,6 @@ from .planes import (
     SampleArray,
     lowest,
     over_planes,
-    planes_at_once,
     ranks_of,
     spread_planes,
 )
@@ -43,6 +42,7 @@ Floats: TypeAlias = NDArray[np.float64]
 Shape: TypeAlias = tuple[int, ...]
 
 TOGETHER = 1 << 18  # samples whose numbers are looked at together
+READ_SAMPLES = 1 << 21  # about, that are read at a time
 BESIDE = 2  # planes, rows and columns to either side, for fourth differences
 LOOKED_PLANES, MOST_LOOKED_AT = 12, 1 << 13  # of samples beside the surface, spread evenly
 GRADIENT_PLANES = 64  # unless too few samples are beside the surface there
@@ -87,7 +87,8 @@ class Numbers(NamedTuple):
 def ask_together(samples: SampleArray, questions: list[Question]) -> None:
     """Ask questions of samples, each plane of which is read once."""
     count, each = samples.shape[0], _together(tuple(samples.shape))
-    step = each * -(-planes_at_once(samples) // each)
+    least = READ_SAMPLES // (samples.shape[1] * samples.shape[2])
+    step = each * -(-max(least, 2 * getattr(samples, "beside", 1)) // each)
     ranges = []
     for first in range(0, count, step):
         low = max(first - BESIDE, 0)

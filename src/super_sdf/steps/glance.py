@@ -73,15 +73,15 @@ def _of_all(summaries: list[BandSummary]) -> BandSummary:
     )
 
 
-def _glance(grid: SdfGrid, offset: float, planes: NDArray[Any], own: tuple[int, int]) -> Glance:
-    """Return what is seen in the planes ``own``, given with those beside them."""
+def _glance(grid: SdfGrid, offset: float, planes: NDArray[Any], inner: tuple[int, int]) -> Glance:
+    """Return what is seen in the planes ``inner``, given with those beside them."""
     jumps: list[tuple[Jumps, Jumps]] = []
     leaving: list[bool] = []
-    first, last = own
+    first, last = inner
     voxels, decoded = np.zeros((2, last - first), np.int64)
     beyond = crossings = 0
     summaries: list[BandSummary] = []
-    for ijk, patches, _, value in band_of_samples(grid, offset, planes, own, jumps, leaving):
+    for ijk, patches, _, value in band_of_samples(grid, offset, planes, inner, jumps, leaving):
         lipschitz = is_lipschitz(patches)
         held = can_hold_surface(patches, lipschitz)
         band = limit_to_field(

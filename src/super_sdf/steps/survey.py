@@ -57,7 +57,7 @@ WINDOW_SAMPLES = 1 << 21  # among which the band is found at a time
 APPENDED = 1 << 16  # rows at a time: fewer would be moved too often
 FAR = 1e30  # half voxels: no sample of the band is there
 
-Found: TypeAlias = tuple[IntArray, FloatArray, NDArray[np.int64], FloatArray]
+BandPart: TypeAlias = tuple[IntArray, FloatArray, NDArray[np.int64], FloatArray]
 """Some of the band's voxels and their patches; numbers and values of samples beyond it."""
 
 NONE_ACTIVE: tuple[IntArray, FloatArray] = np.empty((0, 3), np.int32), np.empty((0, 27), np.float32)
@@ -227,7 +227,7 @@ def survey(
     held = held_memory() or 0
     planes, reading = plan_reading(grid.samples, held, resources)
 
-    def read(block: tuple[int, int]) -> list[Found]:
+    def read(block: tuple[int, int]) -> list[BandPart]:
         seen = jumps if among is None else None
         around = slice(max(block[0] - 1, 0), block[1] + 1)
         parts = list(band_of_samples(grid, offset, grid.samples[around], block, seen, leaving))
@@ -261,15 +261,15 @@ def band_bytes(voxels: int, beyond: int) -> int:
     return voxels * BYTES_PER_VOXEL + beyond * BYTES_BEYOND
 
 
-def _put_together(blocks: Iterable[list[Found]]) -> Found:
+def _put_together(blocks: Iterable[list[BandPart]]) -> BandPart:
     """Return what was found in all blocks, as one.
 
     The arrays grow, and each part is freed when it was taken, so that nothing is held twice.
     """
     voxel_ijk, patches = NONE_ACTIVE
     number, value = NONE_BEYOND.number, NONE_BEYOND.value
-    whole: Found = (voxel_ijk.copy(), patches.copy(), number.copy(), value.copy())
-    waiting: list[Found] = []
+    whole: BandPart = (voxel_ijk.copy(), patches.copy(), number.copy(), value.copy())
+    waiting: list[BandPart] = []
     for parts in blocks:
         while parts:
             waiting.append(parts.pop(0))
@@ -279,7 +279,7 @@ def _put_together(blocks: Iterable[list[Found]]) -> Found:
     return whole
 
 
-def _append(whole: Found, parts: list[Found]) -> None:
+def _append(whole: BandPart, parts: list[BandPart]) -> None:
     """Append parts to what was found, and empty the list."""
     arrays: tuple[NDArray[Any], ...] = whole
     for array, rows in zip(arrays, zip(*parts)):
@@ -417,7 +417,7 @@ def band_of_samples(
     planes: tuple[int, int],
     jumps: list[tuple[Jumps, Jumps]] | None,
     leaving: list[bool],
-) -> Iterator[Found]:
+) -> Iterator[BandPart]:
     """Yield what is found in some planes, in C order, given their samples and those beside them.
 
     Whether a sample on the grid's border is inside is appended to ``leaving``. With an offset, the
@@ -457,35 +457,35 @@ def _shifted(range_: slice, start: int) -> slice:
     return slice(range_.start - start, range_.stop - start)
 
 
-def _windows(shape: tuple[int, ...], own: slice) -> Iterator[tuple[slice, slice]]:
+def _windows(shape: tuple[int, ...], inner: slice) -> Iterator[tuple[slice, slice]]:
     """Yield the planes and rows of a block that are worked on at a time, in C order.
 
-    They are ``own`` planes of it, of large ones some rows of each.
+    They are the ``inner`` planes of it, of large ones some rows of each.
     """
     if np.prod(shape, dtype=float) <= WINDOW_SAMPLES:
-        yield own, slice(0, shape[1])
+        yield inner, slice(0, shape[1])
         return
     step = max(WINDOW_SAMPLES // (3 * shape[2]) - 2, 1)
-    for i in range(own.start, own.stop):
+    for i in range(inner.start, inner.stop):
         for first in range(0, shape[1], step):
             yield slice(i, i + 1), slice(first, min(first + step, shape[1]))
 
 
 def _patches_of(
-    window: FloatArray, own: tuple[slice, slice], hidden: BoolArray | None = None
+    window: FloatArray, inner: tuple[slice, slice], hidden: BoolArray | None = None
 ) -> Iterator[tuple[NDArray[np.int64], FloatArray]]:
     """Yield active voxels among some planes and rows of a window, and the samples round them.
 
     Those that are ``hidden``, of these planes and rows, and values that were filled in are left
     out.
     """
-    active = is_active(window)[own]
+    active = is_active(window)[inner]
     if hidden is not None:
         active &= ~hidden
     voxels = np.flatnonzero(active)
     if not len(voxels):
         return
-    first = np.array([own[0].start, own[1].start, 0])
+    first = np.array([inner[0].start, inner[1].start, 0])
     spans = [np.flatnonzero(active.any(axes)) for axes in ((1, 2), (0, 2), (0, 1))]
     low = np.maximum([span[0] for span in spans] + first - 1, 0)  # most of it is far from them
     high = [span[-1] for span in spans] + first + 2
