@@ -24,8 +24,8 @@ from .files.meshes import check_format_holds, check_target, local_origin_note, w
 from .files.output import check_apart, check_free
 from .files.regular import files_of
 from .grid.cubic import cubic_grid
+from .grid.placement import as_triple
 from .grid.sdf_grid import SdfGrid
-from .grid.spacing import as_triple
 from .mesh import Mesh, join_meshes
 from .network.decoder import Decoder
 from .options import MASK, SCALED

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import FileError, OptionError, OutOfMemoryError, SuperSdfError
-from ..grid.direction import STRAIGHT
+from ..grid.placement import STRAIGHT
 from ..grid.planes import InputFile, check_planes
 from ..grid.sdf_grid import SdfGrid, make_grid
 from ..machine.memory import ROOM_SHARE, held_memory, memory_bound

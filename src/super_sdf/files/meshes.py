@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from ..arrays import Triple
 from ..errors import FileError, OptionError
+from ..grid.placement import as_triple
 from ..grid.sdf_grid import SdfGrid
-from ..grid.spacing import as_triple
 from ..mesh import CLEARANCE, Mesh, check_mesh, tells_vertices_apart, vertex_type
 from ..options import check_path
 from .output import check_free, replacing

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Triple
 from ..errors import FileError, GridError, OutOfMemoryError
-from ..grid.direction import Direction, as_direction, check_direction
+from ..grid.placement import Direction, as_direction, check_direction
 from ..grid.planes import SampleArray
 from ..machine.memory import in_words
 

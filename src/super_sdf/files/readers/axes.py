@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ...arrays import Triple
 from ...errors import FileError, GridError
-from ...grid.named_axes import UNNAMED, even_steps
+from ...grid.placement import UNNAMED, even_steps
 from ..volume import Box, ReadBox, axes_direction, kept_axes, triple
 
 SPACE = "xyz"
