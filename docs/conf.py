@@ -10,6 +10,7 @@ myst_heading_anchors = 3  # headings are link targets, as on code hosts
 autodoc_typehints = "none"  # numpydoc sections have the types
 autodoc_member_order = "bysource"
 html_theme, html_title = "furo", f"super-sdf {release}"
+html_static_path, html_css_files = ["static"], ["site.css"]
 html_show_copyright = smartquotes = False
 
 
