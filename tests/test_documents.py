@@ -49,9 +49,10 @@ def command_lines(page: Path) -> list[str]:
 
 def sentences(page: Path) -> list[str]:
     """Return the sentences of a page: of paragraphs, items of lists and cells of tables."""
-    text = re.sub(r"^```.*?^```|<!--.*?-->", "", page.read_text(), flags=re.M | re.S)
+    text = re.sub(r"<!-- figures.*?<!-- /figures -->", "0", page.read_text(), flags=re.DOTALL)
+    text = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
     text = re.sub(r"!?\[([^]]*)\]\([^)]*\)", r"\1", text)  # of links, what is shown
-    text = re.sub(r"^( *[-*] |\d+\. |\||#)", r"\n\n\1", text, flags=re.M)
+    text = re.sub(r"^( *[-*] |\d+\. |\||#)", r"\n\n\1", text, flags=re.MULTILINE)
     parts = [part for line in re.split(r"\n\s*\n", text) for part in line.split("|")]
     ends = r"(?<=[.?!])[\"*)]*\s+(?=[\"(*]*[A-Z`-])"
     return [sentence for part in parts for sentence in re.split(ends, " ".join(part.split()))]
@@ -139,6 +140,8 @@ def test_commands_have_the_arguments_that_a_page_gives_them(page):
             command.make_context(words[1], words[2:])
         if words[:2] == ["python", "-m"] and words[2].startswith("export."):
             assert importlib.util.find_spec(words[2]), line
+        if words[:3] == ["python", "-m", "lab"] and (ROOT / "lab").is_dir():
+            assert (ROOT / "lab" / f"{words[3]}.py").exists(), line
 
 
 def documented(heading: str) -> set[str]:
