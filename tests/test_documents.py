@@ -26,7 +26,7 @@ PAGES = [README, ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md")), 
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 # Documents speak of today: what was, and what it was like, is in the history of the repository.
 HISTORY = (
-    r"of before|earlier|\bolder|no longer|any ?more|formerly|previous(ly)?\b|used to be|so far\b"
+    r"of before|earlier|\bolder|no longer|\bany ?more|formerly|previous(ly)?\b|used to be|so far\b"
     r"|(now|since|until) (then|version)|with \w+ blocks|in the version of"
 )
 LONGEST = 30  # words of a sentence
