@@ -3,11 +3,9 @@
 import importlib
 import importlib.util
 import json
-import os
 import re
 import runpy
 import shlex
-import subprocess
 import sys
 from pathlib import Path
 
@@ -190,9 +188,3 @@ def test_the_functions_on_the_tour_are_there():
     assert len(named) > 10
     for module, function in named:
         assert callable(getattr(importlib.import_module(f"super_sdf.{module}"), function))
-
-
-def test_the_installed_command_is_there():
-    command = Path(sys.executable).with_name("super-sdf")
-    done = subprocess.run([command, "--version"], capture_output=True, text=True, env=os.environ)
-    assert done.stdout.startswith("super-sdf, version ")
