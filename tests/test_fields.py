@@ -163,7 +163,7 @@ def test_numbers_come_back_bit_for_bit_in_every_unit(spacing):
 def test_the_examples_of_the_docs_run(capsys):
     """On a plane: the first gives every node's place and value; the second a mesh."""
     write_field(upsample(plane(), trilinear, 4), "part-field.npz")
-    text = (Path(__file__).parent.parent / "docs" / "fields.md").read_text()
+    text = (Path(__file__).parent.parent / "docs" / "reference" / "files.md").read_text()
     first, second = re.findall(r"```python\n(.*?)```", text, re.S)
     names: dict = {}
     exec(first, names)
@@ -180,7 +180,7 @@ def test_the_examples_of_the_docs_run(capsys):
 def test_the_keys_are_as_documented():
     write_field(upsample(plane(), trilinear, 4), "field.npz")
     data = np.load("field.npz")
-    text = (Path(__file__).parent.parent / "docs" / "fields.md").read_text()
+    text = (Path(__file__).parent.parent / "docs" / "reference" / "files.md").read_text()
     table = text[text.index("| Key |") : text.index("Distances are float64")]
     rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
     assert sorted(re.findall(r"`(\w+)`", " ".join(rows))) == sorted(data.files)
