@@ -199,7 +199,7 @@ CASES = {
         1,
         "damaged.npz[values] is damaged: its checksum is wrong",
     ),
-    ("flat.npy",): (1, "values have shape (5, 5): give three axes (x, y, z)"),
+    ("flat.npy",): (1, "flat.npy: values have shape (5, 5): give three axes (x, y, z)"),
     ("nan.npy",): (
         1,
         "values[0, 0, 0] is nan: every sample must be finite; replace unknown far samples by a "
