@@ -12,10 +12,20 @@ from conftest import ball, count_fans
 from solids import cube, inverted, joined, saved, sphere, torus
 
 from super_sdf import Mesh, SdfGrid, topology
-from super_sdf.certificate import slabs, surface
-from super_sdf.certificate.check import CheckOptions, check_files, check_mesh, stated_triangles
-from super_sdf.certificate.coloured import PIERCED, TOUCHING, UNKNOWN, colours, vertex_residuals
-from super_sdf.certificate.limits import NO_EVIDENCE, Limits
+from super_sdf.certificate import search as slabs
+from super_sdf.certificate import surface
+from super_sdf.certificate.check import (
+    NO_EVIDENCE,
+    PIERCED,
+    TOUCHING,
+    UNKNOWN,
+    Limits,
+    check_files,
+    check_mesh,
+    colours,
+    stated_triangles,
+)
+from super_sdf.convert import ConvertOptions
 from super_sdf.errors import OptionError, OutOfMemoryError
 from super_sdf.files import coloured_ply
 from super_sdf.machine import extras
@@ -246,13 +256,13 @@ def test_a_piece_far_from_every_sample_is_noticed(ball_mesh):
 
 def test_colours_are_those_of_the_residuals(ball_mesh):
     found = check_mesh(moved(ball_mesh, 0.1 * H), sphere_grid())
-    values = vertex_residuals(ball_mesh.vertices, found.touching, H)
+    values = found.residuals_at(ball_mesh.vertices)
     front = ball_mesh.vertices[:, 0] > 0.95 * RADIUS
     assert np.abs(values[front]).mean() == pytest.approx(0.1, abs=0.01)
     said = colours(np.array([0, -1, -0.05, np.nan], np.float32))
     assert [tuple(row) for row in said[[0, 1, 3]]] == [TOUCHING, PIERCED, UNKNOWN]
     np.testing.assert_allclose(said[2], (np.array(TOUCHING) + PIERCED) / 2, atol=1)
-    far = vertex_residuals(np.array([[9.0, 9, 9]]), found.touching, H)
+    far = found.residuals_at(np.array([[9.0, 9, 9]]))
     assert np.isnan(far).all()
 
 
@@ -264,7 +274,7 @@ def test_memory_is_refused_with_the_figure(ball_mesh, tmp_path):
     with pytest.raises(
         OutOfMemoryError, match=r"checking 81,920 triangles needs \d+ MB of memory, 9 MB"
     ):
-        check_files(path, tmp_path / "never-read.npz", CheckOptions(max_memory=9_000_000))
+        check_files(path, tmp_path / "never-read.npz", ConvertOptions(max_memory=9_000_000))
 
 
 def test_limits(ball_mesh):
@@ -376,7 +386,7 @@ def test_a_coloured_mesh_is_never_left_half_written(here, command, monkeypatch):
 
 def test_a_missing_extra_is_said_before_the_work(here, command, monkeypatch):
     monkeypatch.setattr(extras, "missing_modules", lambda modules: ["igl"])
-    line = "needs igl: pip install -e '.[eval]' in a clone of super-sdf\n"
+    line = "needs igl: pip install -e '.[report]' in a clone of super-sdf\n"
     assert command("check", "none.ply", "none.npz") == (1, "", f"Error: check {line}")
     for words in (("upsample", "ball.npz", "new.ply"), ("batch", "ball.npz", "--out", "new")):
         code, _, err = command(*words, "--check")

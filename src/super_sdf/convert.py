@@ -30,6 +30,7 @@ from .grid.direction import Direction
 from .grid.field import EXACT, MASK, SCALED
 from .grid.sdf_grid import SdfGrid
 from .grid.spacing import as_triple
+from .machine.memory import memory_bound
 from .mesh import Mesh, join_meshes
 from .network.decoder import Decoder
 from .options import check_goal, check_iterations
@@ -47,6 +48,7 @@ from .steps.lattice import lattice_shape
 from .steps.mesher_names import DEFAULT_MESHER
 from .steps.meshers import find_mesher
 from .steps.nodes import check_factor
+from .steps.survey import Band
 from .topology import OpenEdges
 
 if TYPE_CHECKING:
@@ -58,6 +60,7 @@ CAPPED = (
     "the solid runs out of the grid: its surface is closed along the border (leave it open with "
     "--open)"
 )
+KEPT_SHARE = 1 / 16  # of the memory bound: a mesh that takes more is too large to be checked
 SHARE_BEFORE = 0.2  # of the time, until the mesh is simplified
 
 
@@ -130,6 +133,15 @@ class Engine(Protocol):
         """Return sentences on what may be wrong with the result, after the work."""
 
 
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """What a check of a mesh needs: the grid as it was read, the mesh, and the band if known."""
+
+    grid: SdfGrid
+    mesh: Mesh
+    band: Band | None = None
+
+
 @dataclass(frozen=True)
 class Conversion:
     """The result of a conversion.
@@ -159,6 +171,8 @@ class Conversion:
         The path of the refined field, and shape, spacing and origin of the fine lattice.
     engine : dict
         Who did the work, if that was not this process.
+    kept : Kept, optional
+        What a check of the mesh needs, if it was asked for and is small enough.
     """
 
     shape: tuple[int, int, int]
@@ -176,6 +190,7 @@ class Conversion:
     field: dict[str, Any] = dataclass_field(default_factory=dict)
     saved_field: dict[str, Any] | None = None
     engine: dict[str, Any] = dataclass_field(default_factory=dict)
+    kept: Kept | None = None
 
     def remarks(self) -> list[str]:
         """Return sentences on what the mesh has that the samples do not show, or lacks."""
@@ -219,6 +234,7 @@ def convert(
     announce: Callable[[str], None] | None = None,
     save_field: str | Path | None = None,
     engine: Engine | None = None,
+    keep: bool = False,
 ) -> Conversion:
     """Convert a grid file to a mesh file.
 
@@ -244,6 +260,8 @@ def convert(
         complete at the end, or neither is written.
     engine : Engine, optional
         Who reads the grid and makes the mesh; by default this process, with ``network``.
+    keep : bool
+        Keep grid, band and mesh for a check, so that it need not read them again.
 
     Raises
     ------
@@ -273,16 +291,46 @@ def convert(
     tally = Tally(expected, cap=options.cap)
     with open_field(save_field, grid, options, force=force) as file:
         watch.lap("read")
-        maker = Maker(grid, network, options, engine, file)
+        keeper = Keeper(options.max_memory)
+        maker = Maker(grid, network, options, engine, file, keeper.take_band if keep else None)
         meshes = _meshes(maker, tally, watch, progress)
+        meshes = keeper.copies(meshes) if keep else meshes
         complete = partial(_complete_field, file, force=force, then=before_rename)
         write_pieces(meshes, target, force=force, about=about, before_rename=complete)
     watch.lap("write")
-    done = describe(grid, tally, options, watch.seconds, notes)
+    done = replace(describe(grid, tally, options, watch.seconds, notes), kept=keeper.kept(grid))
     if engine:
         warnings = (*done.warnings, *engine.warnings())
         done = replace(done, warnings=warnings, engine=engine.report())
     return replace(done, saved_field=file.report()) if file else done
+
+
+class Keeper:
+    """Keeps the band and copies the pieces of a mesh, while they are small beside the memory."""
+
+    def __init__(self, max_memory: int | None) -> None:
+        bound = memory_bound(max_memory)
+        self.room = np.inf if bound is None else KEPT_SHARE * bound
+        self.band: Band | None = None
+        self.meshes: list[Mesh] = []
+
+    def take_band(self, band: Band) -> None:
+        """Keep the band of the grid."""
+        self.band = band
+
+    def copies(self, meshes: Iterable[Mesh]) -> Iterator[Mesh]:
+        """Yield the meshes, and keep them."""
+        for mesh in meshes:
+            self.room -= mesh.vertices.nbytes + mesh.faces.nbytes
+            if self.room > 0:
+                self.meshes.append(mesh)
+            else:
+                self.meshes.clear()
+            yield mesh
+
+    def kept(self, grid: SdfGrid) -> Kept | None:
+        """Return what is kept; None if nothing, or not all of it."""
+        return Kept(grid, join_meshes(self.meshes), self.band) if self.meshes else None
 
 
 @dataclass(frozen=True)
@@ -294,6 +342,7 @@ class Maker:
     options: ConvertOptions
     engine: Engine | None
     file: FieldFile | None
+    look: Callable[[Band], None] | None = None
 
     def pieces(self, expected: Expectation, progress: Progress | None) -> Iterator[Piece]:
         """Yield the pieces, made while they are taken."""
@@ -311,6 +360,7 @@ class Maker:
             max_memory=options.max_memory,
             progress=progress,
             save=self.file.add if self.file else None,
+            look=self.look,
         )
 
 

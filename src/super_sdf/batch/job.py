@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..convert import ConvertOptions, convert
+from ..convert import Conversion, ConvertOptions, convert
 from ..errors import FileError, GridError, OptionError, WriteError
 from ..files.store import check_grid_file
 from ..network.decoder import Decoder
@@ -110,6 +110,7 @@ def attempt(job: Job, outputs: Outputs, network: Decoder, progress: Progress | N
             force=job.replace,
             progress=progress,
             before_rename=note,
+            keep=outputs.check or outputs.items is not None,
         )
     except Exception as error:  # a bug that one file shows must not cost the others
         retry = not _is_caused_by_input(error)
@@ -117,9 +118,9 @@ def attempt(job: Job, outputs: Outputs, network: Decoder, progress: Progress | N
         return {**row, "seconds": _since(start)}
     certificate = {}
     if outputs.items:
-        certificate = {"check": _keep_item(job, target, mesh_prints[0], outputs.items)}
+        certificate = {"check": _keep_item(job, done, mesh_prints[0], outputs)}
     elif outputs.check:
-        certificate = {"check": _certify(job, target)}
+        certificate = {"check": _certify(job, done, target)}
     return {
         **_paths(job),
         "status": "ok",
@@ -135,24 +136,26 @@ def attempt(job: Job, outputs: Outputs, network: Decoder, progress: Progress | N
     }
 
 
-def _certify(job: Job, target: Path) -> dict[str, Any]:
+def _certify(job: Job, done: Conversion, target: Path) -> dict[str, Any]:
     """Return the certificate of a finished mesh, or under ``error`` why it has none."""
-    from ..certificate.check import CheckOptions, check_files
+    from ..certificate.check import check_files
 
     try:
-        return check_files(target, job.source, CheckOptions.of(job.options)).report()
+        return check_files(target, job.source, job.options, kept=done.kept).report()
     except Exception as error:  # the mesh is good all the same
         return {"error": _reason(error)}
 
 
-def _keep_item(job: Job, target: Path, mesh_print: Fingerprint, items: Path) -> dict[str, Any]:
+def _keep_item(
+    job: Job, done: Conversion, mesh_print: Fingerprint, outputs: Outputs
+) -> dict[str, Any]:
     """Write what a page shows of a mesh; return its certificate, or why there is none."""
-    from ..certificate.check import CheckOptions
     from ..pages.items import item_of_files
     from .items import Items
 
+    target, items = outputs.folder / job.target, outputs.items or outputs.folder
     try:
-        item = item_of_files(target, job.source, CheckOptions.of(job.options))
+        item = item_of_files(target, job.source, job.options, done.kept)
         Items(items).add(item, job.target, mesh_print)
         return item.certificate or {}
     except Exception as error:  # the mesh is good all the same

@@ -7,12 +7,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from ..arrays import IntArray
 from ..mesh import Mesh
-from ..topology import Edges, count_fans, pair_edges, without_collapsed
+from ..topology import Edges, count_fans, pair_edges, vertex_components, without_collapsed
 
 FACES_AT_ONCE = 1 << 18  # for area and volume
 
@@ -90,40 +88,18 @@ class Surface:
 
 
 def examine_surface(mesh: Mesh, self_intersections: int | None = None) -> Surface:
-    """Return what a mesh is as a surface.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        Vertices at the same position must be one vertex.
-    self_intersections : int, optional
-        What ``slabs.search`` has counted; None if it was not asked to.
-    """
-    faces = without_collapsed(mesh.faces)
-    opposite, edges = pair_edges(faces, len(mesh.vertices))
+    """Return what a mesh is as a surface; vertices at the same position must be one vertex."""
+    faces, count = without_collapsed(mesh.faces), len(mesh.vertices)
+    opposite, edges = pair_edges(faces, count)
     pinched = int(np.count_nonzero(count_fans(faces, opposite) > 1))
     del opposite
-    volume, area = measure(mesh.vertices, faces)
-    return Surface(
-        len(mesh.vertices),
-        len(faces),
-        edges,
-        pinched,
-        count_components(faces, len(mesh.vertices)),
-        self_intersections,
-        volume,
-        area,
-    )
+    pieces, size = count_components(faces, count), measure(mesh.vertices, faces)
+    return Surface(count, len(faces), edges, pinched, pieces, self_intersections, *size)
 
 
 def count_components(faces: IntArray, count: int) -> int:
     """Return the number of pieces of a mesh that share no vertex; unused vertices do not count."""
-    pairs = np.concatenate([faces[:, :2], faces[:, 1:]])
-    graph = coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), (count, count))
-    found, _ = connected_components(graph, directed=False)
-    used = np.zeros(count, bool)
-    used[faces] = True
-    return int(found - np.count_nonzero(~used))
+    return len(np.unique(vertex_components(faces, count)[faces[:, 0]]))
 
 
 def measure(vertices: NDArray[Any], faces: IntArray) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""How far the sphere of each sample is from touching the mesh.
+"""How far the spheres of samples are from touching the mesh, and which vertices they contradict.
 
 An exact sample is the radius of an empty ball that touches the surface. Its residual is its
 distance to the mesh minus that radius: positive if the mesh does not reach the ball, negative if it
@@ -11,18 +11,40 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray
+from ..arrays import BoolArray, FloatArray, IntArray
 from ..grid.sdf_grid import SdfGrid
 from ..machine.threads import chunks_of
 from ..mesh import Mesh
-from ..neighbourhood import CENTRE
+from ..neighbourhood import CENTRE, NEIGHBOURHOOD
+from ..steps.band import plane_blocks, rescale
 from ..steps.survey import Band
+from ..steps.voxel_index import VoxelIndex
 from ..truth.solid import Points, Solid
-from .slabs import Found
+from .search import Found
 
 WIDTH = 4  # 2^17 samples at a time
 NOTICEABLE = 0.1  # voxels: a residual that is counted as large
+STRAY = 0.5  # voxels within a ball, from which on a vertex is counted
+NEAREST_FEET = 8  # foot points that a vertex looks at
+SMOOTHING = 0.02  # voxels: distance of a foot point that halves its weight
+FARTHEST = 1.5  # voxels: foot points farther away say nothing of a vertex
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """The exact samples of a grid near the surface; those left out are counted, see ``Touching``.
+
+    ``voxel_ijk`` are their indices, (n, 3); ``points`` (n, 3) are in world units, ``values`` (n,)
+    negative inside.
+    """
+
+    cut_off: int
+    noisy: int
+    voxel_ijk: IntArray
+    points: Points
+    values: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +57,8 @@ class Touching:
         Samples near the surface that promise nothing and were left out: at the limit of truncated
         values or at the band's edge; and all that differ from a neighbour by more than distances
         can, together with the rest if they are many.
+    voxel_ijk : (n, 3) int32
+        Indices of the exact samples, in C order.
     points : (n, 3) float64
         World positions of the exact samples.
     values : (n,) float32
@@ -49,6 +73,7 @@ class Touching:
 
     cut_off: int
     noisy: int
+    voxel_ijk: IntArray
     points: Points
     values: FloatArray
     residuals: FloatArray
@@ -79,28 +104,42 @@ class Touching:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class Samples:
-    """The exact samples of a grid near the surface; see ``Touching`` for what its fields are."""
+@dataclass(frozen=True)
+class Strays:
+    """Vertices that lie where the nearest sample says that no surface is.
 
-    cut_off: int
-    noisy: int
-    points: Points
-    values: FloatArray
+    The samples near the surface see nothing of a piece that lies far from it. But every sample,
+    however far away, promises a ball without surface, also if its value was truncated.
+
+    Attributes
+    ----------
+    count : int
+        Vertices more than ``STRAY`` voxels inside the ball of their nearest sample.
+    beyond : int
+        Vertices beyond the grid, more than half a voxel from its outermost samples.
+    deepest : float
+        Largest depth of a vertex in the ball of its nearest sample, in voxels; 0 if there is none.
+    """
+
+    count: int
+    beyond: int
+    deepest: float
 
 
 def exact_samples(band: Band, grid: SdfGrid) -> Samples:
     """Return the exact samples of a band: of its grid, from ``survey``."""
-    trusted = band.exact & ~at_limit(band.patches[:, CENTRE])
+    values = band.patches[:, CENTRE]
+    # ``is_cut_off`` keeps truncated samples beside the surface, whose neighbours are steep
+    trusted = band.exact & (values > values.min()) & (values < values.max())
     if band.sampled is not None:
         trusted &= band.sampled  # of a resampled grid, what is interpolated promises nothing
     exact = np.flatnonzero(trusted)
     # if none is exact, too many are no distances for any to be taken for one
     count = len(band.exact) if band.sampled is None else int(np.count_nonzero(band.sampled))
     noisy = band.noisy_voxels if len(exact) else count
-    points = grid.to_world(band.voxel_ijk[exact])
-    values = band.patches[exact, CENTRE] / 2  # from half voxels
-    return Samples(count - len(exact) - noisy, noisy, points, values)
+    ijk = band.voxel_ijk[exact]
+    cut_off, distances = count - len(exact) - noisy, values[exact] * np.float32(0.5)
+    return Samples(cut_off, noisy, ijk, grid.to_world(ijk), distances)
 
 
 def touch(
@@ -114,7 +153,7 @@ def touch(
         In world units.
     samples : Samples
     found : Found
-        By ``slabs.search`` for the points of the samples.
+        By ``search`` for the points of the samples.
     voxel_size : float
         Spacing of the grid.
     simple : bool
@@ -125,31 +164,56 @@ def touch(
     apart = distances + size > NOTICEABLE  # where the side matters
     inside = found.facing < 0
     unsure = np.flatnonzero(apart & (found.facing == 0) if simple else apart)
-    inside[unsure] = sides(mesh, samples.points[unsure])
+    solid, points = Solid(mesh), samples.points
+    for chunk in chunks_of(len(unsure), WIDTH):
+        inside[unsure[chunk]] = solid.is_inside(points[unsure[chunk]])
     wrong = apart & (inside != (samples.values <= 0))
-    return Touching(
-        samples.cut_off,
-        samples.noisy,
-        samples.points,
-        samples.values,
-        residuals,
-        found.feet,
-        wrong,
-    )
+    return Touching(**vars(samples), residuals=residuals, feet=found.feet, wrong_side=wrong)
 
 
-def at_limit(samples: FloatArray) -> BoolArray:
-    """Return which samples, (n,), are the largest or smallest of all.
+def find_strays(vertices: NDArray[Any], grid: SdfGrid, band: Band, offset: float = 0.0) -> Strays:
+    """Look up the nearest sample of each vertex, (n, 3) in world units.
 
-    ``is_cut_off`` keeps truncated samples beside the surface, whose neighbours are steep.
+    Planes of the grid are read only for vertices whose nearest sample is not in the band.
     """
-    found: BoolArray = (samples == samples.min()) | (samples == samples.max())
-    return found
+    position = grid.to_index(vertices)
+    nearest = np.rint(position).astype(np.int64)
+    inside = ((nearest >= 0) & (nearest < grid.shape)).all(1)
+    position, nearest = position[inside], nearest[inside]
+    row = VoxelIndex(band.voxel_ijk, grid.shape).find(nearest)
+    values = band.patches[:, CENTRE][row] if len(band.patches) else np.zeros(len(row))
+    far = np.flatnonzero(row < 0)
+    plane = nearest[far, 0]
+    for first, last in plane_blocks(grid.shape):
+        rows = far[(plane >= first) & (plane < last)]
+        if len(rows):
+            i, j, k = nearest[rows].T
+            values[rows] = rescale(grid, offset, first, last)[i - first, j, k]
+    depth = np.abs(values) / 2 - np.linalg.norm(position - nearest, axis=1)
+    count, beyond = np.count_nonzero(depth > STRAY), np.count_nonzero(~inside)
+    return Strays(int(count), int(beyond), float(depth.max(initial=0)))
 
 
-def sides(mesh: Mesh, points: Points) -> BoolArray:
-    """Return which of the points (n, 3) a mesh encloses, (n,), by its winding number."""
-    solid, inside = Solid(mesh), np.zeros(len(points), bool)
-    for chunk in chunks_of(len(points), WIDTH):
-        inside[chunk] = solid.is_inside(points[chunk])
-    return inside
+def vertex_residuals(vertices: NDArray[Any], touching: Touching, grid: SdfGrid) -> FloatArray:
+    """Return the residual at each vertex, (n,), in voxels; NaN where no foot point is near.
+
+    Its size is the mean of the absolute residuals at the nearest foot points of the samples around,
+    each weighted by the inverse of its distance; its sign is that of the mean with signs.
+    """
+    residuals = np.full(len(vertices), np.nan, np.float32)
+    index = VoxelIndex(touching.voxel_ijk, grid.shape)
+    if not len(touching.values):
+        return residuals
+    for chunk in chunks_of(len(vertices), 8 * len(NEIGHBOURHOOD)):
+        some = np.asarray(vertices[chunk], np.float64)
+        nearest = np.rint(grid.to_index(some)).astype(np.int64)
+        rows = index.find(nearest[:, None] + NEIGHBOURHOOD)
+        away = np.linalg.norm(some[:, None] - touching.feet[rows], axis=2) / grid.voxel_size
+        away[rows < 0] = np.inf
+        limit = np.partition(away, NEAREST_FEET - 1, axis=1)[:, NEAREST_FEET - 1, None]
+        weight = np.where(away <= np.minimum(limit, FARTHEST), 1 / (away + SMOOTHING), 0)
+        there = touching.residuals[rows]
+        with np.errstate(invalid="ignore"):
+            size = (weight * np.abs(there)).sum(1) / weight.sum(1)
+        residuals[chunk] = np.copysign(size, (weight * there).sum(1))
+    return residuals

@@ -26,7 +26,7 @@ from .conversion import (
     make_options,
 )
 from .interrupts import describe_interrupt, raising_interrupts
-from .reporting import check_page, report_option
+from .view import check_page, report_option
 
 if TYPE_CHECKING:
     from ..batch.job import Job
@@ -113,7 +113,7 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
     start = time.perf_counter()
     check_factor(options["factor"])
     if options["check"]:
-        check_can_check(f".{options['kind']}")
+        check_can_check()
     check_simplification(options)
     check_cluster(options)
     jobs, unread = find_jobs(sources, f".{options['kind']}", make_options(options))
@@ -209,7 +209,7 @@ def write_page(run: Run, jobs: list[Job], path: Path | None, interrupted: str = 
     """Write the page, if one was asked for; after an interrupt, at once and without drawing."""
     if path is None:
         return
-    from ..batch.page import BatchPage, Words
+    from ..batch.page import BatchPage
     from ..pages.html import is_page
 
     page = BatchPage(path, run.batch, jobs, run.ledger.rows)
@@ -217,5 +217,5 @@ def write_page(run: Run, jobs: list[Job], path: Path | None, interrupted: str = 
     if page.unfinished or interrupted:
         why = f", {interrupted}" if interrupted else ""
         alert = f"Incomplete{why}: {len(page.unfinished)} not finished; run it again to go on"
-    words = Words(f"Batch: {run.settings.folder}", sentence(run.batch), alert, run.batch.notes)
-    page.write(words, force=run.settings.force or is_page(path), draw=not interrupted)
+    title, force = f"Batch: {run.settings.folder}", run.settings.force or is_page(path)
+    page.write(title, sentence(run.batch), alert, force=force, draw=not interrupted)

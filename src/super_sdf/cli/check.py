@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -13,9 +13,6 @@ from ..machine.extras import check_modules
 from .common import CONTEXT, one_line_errors, print_stderr, print_stdout
 from .conversion import CHECK_MODULES, grid_options, parse_size
 from .interrupts import raising_interrupts
-
-if TYPE_CHECKING:
-    from ..certificate.check import Certificate, CheckOptions
 
 EXAMPLES = """\b
 Examples:
@@ -99,7 +96,7 @@ def check_command(mesh: Path, grid: Path, **options: Any) -> None:
     what upsample takes. The exit code is 1 if a limit is exceeded.
     """
     with one_line_errors(options["out"]):
-        check_modules("check", "eval", CHECK_MODULES)
+        check_modules("check", "report", CHECK_MODULES)
         exceeded = run_check(mesh, grid, options)
     for sentence in exceeded:
         print_stderr(f"Limit exceeded: {sentence}")
@@ -109,9 +106,9 @@ def check_command(mesh: Path, grid: Path, **options: Any) -> None:
 
 def run_check(mesh: Path, grid: Path, options: dict[str, Any]) -> list[str]:
     """Check the files, print the certificate, write the coloured mesh; return exceeded limits."""
-    from ..certificate.check import check_files
-    from ..certificate.coloured import check_coloured, write_coloured
-    from ..certificate.limits import Limits
+    from ..certificate.check import Limits, check_coloured, check_files, write_coloured
+    from ..convert import ConvertOptions
+    from ..files.grids import READ_OPTIONS
     from ..files.output import check_apart
     from ..files.store import files_of
 
@@ -121,34 +118,19 @@ def run_check(mesh: Path, grid: Path, options: dict[str, Any]) -> list[str]:
     if options["out"]:
         check_coloured(options["out"], force=options["force"])
         check_apart(options["out"], [mesh, *files_of(grid)])
-    certificate = check_files(mesh, grid, make_check_options(options))
+    given = ConvertOptions(**{name: options[name] for name in (*READ_OPTIONS, "offset")})
+    count = not options["skip_intersections"]
+    certificate = check_files(mesh, grid, given, intersections=count, processes=0)
     if options["out"]:
         with raising_interrupts():
             write_coloured(certificate, options["out"], force=options["force"])
     exceeded = limits.exceeded(certificate)
-    print_certificate(certificate, {"mesh": str(mesh), "grid": str(grid)}, exceeded, options)
-    return exceeded
-
-
-def make_check_options(options: dict[str, Any]) -> CheckOptions:
-    """Return the options of the check, picked from all options of a command."""
-    from ..certificate.check import SHARED, CheckOptions
-
-    chosen = {name: options[name] for name in SHARED}
-    count = not options["skip_intersections"]
-    return CheckOptions(**chosen, intersections=count, processes=0)
-
-
-def print_certificate(
-    certificate: Certificate, files: dict[str, str], exceeded: list[str], options: dict[str, Any]
-) -> None:
-    """Print the certificate to stdout, as lines or as JSON, and notes to stderr."""
-    kept = f"{options['out']} is written" if options["out"] else "nothing was written"
+    written = f"{options['out']} is written" if options["out"] else "nothing was written"
     if options["as_json"]:
-        report = {**files, **certificate.report(), "limits_exceeded": exceeded}
-        print_stdout(json.dumps(report, indent=2), kept)
+        report = {"mesh": str(mesh), "grid": str(grid), **certificate.report()}
+        print_stdout(json.dumps({**report, "limits_exceeded": exceeded}, indent=2), written)
     elif not options["quiet"]:
-        print_stdout("\n".join(certificate.lines()), kept)
-    if not options["quiet"]:
-        for note in certificate.notes:
-            print_stderr(f"Note: {note}")
+        print_stdout("\n".join(certificate.lines()), written)
+    for note in () if options["quiet"] else certificate.grid.notes:
+        print_stderr(f"Note: {note}")
+    return exceeded

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from ..convert import ConvertOptions
 
 
-CHECK_MODULES = ("igl", "scipy")  # of the extra eval, for certificates
+CHECK_MODULES = ("igl",)  # of the extra report, for certificates
 
 Option = Callable[[Callable[..., Any]], Callable[..., Any]]
 """Adds an option to a command."""
@@ -268,7 +268,7 @@ SIMPLIFY_OPTIONS: tuple[Option, ...] = (
 check_option = click.option(
     "--check",
     is_flag=True,
-    help="Check each mesh against its samples, as check does. Needs the extra eval.",
+    help="Check each mesh against its samples, as check does. Needs the extra report.",
 )
 
 
@@ -306,11 +306,9 @@ def _with_options(command: Callable[..., Any], options: tuple[Option, ...]) -> C
     return command
 
 
-def check_can_check(target: str) -> None:
-    """Raise FileError if meshes like ``target`` cannot be read again for ``--check``."""
-    check_modules("--check", "eval", CHECK_MODULES)
-    if target.lower().endswith(".3mf"):
-        check_modules("--check of .3mf files", "3mf")
+def check_can_check() -> None:
+    """Raise FileError if the library for ``--check`` is missing."""
+    check_modules("--check", "report", CHECK_MODULES)
 
 
 def check_cluster(options: dict[str, Any]) -> None:

@@ -6,7 +6,6 @@ import json
 import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +27,7 @@ from .conversion import (
     make_options,
 )
 from .interrupts import raising_interrupts
-from .reporting import check_page, report_option
+from .view import check_page, report_option
 
 if TYPE_CHECKING:
     from ..certificate.check import Certificate
@@ -128,7 +127,7 @@ class Upsampling:
         if options["save_field"] is not None:
             check_field_target(options["save_field"], force=options["force"])
         if options["check"]:
-            check_can_check(self.target)
+            check_can_check()
         if options["report"]:
             self.check_page()
         check_simplification(options)
@@ -156,6 +155,7 @@ class Upsampling:
                 announce=self.announce,
                 save_field=options["save_field"],
                 engine=engine,
+                keep=bool(options["check"] or options["report"]),
             )
         self.seconds = watch.seconds | self.result.seconds
 
@@ -195,14 +195,16 @@ class Upsampling:
 
     def check(self) -> None:
         """Check the finished mesh against its samples."""
-        from ..certificate.check import CheckOptions, check_files
+        from ..certificate.check import check_files
         from ..errors import SuperSdfError
         from ..progress import Stopwatch
 
-        watch, options = Stopwatch(), CheckOptions.of(make_options(self.options))
-        options = replace(options, processes=self.options["threads"])
+        watch, options = Stopwatch(), make_options(self.options)
+        kept, processes = self.result.kept, self.options["threads"]
         try:
-            self.certificate = check_files(self.target, self.source, options)
+            self.certificate = check_files(
+                self.target, self.source, options, kept=kept, processes=processes
+            )
         except SuperSdfError as error:
             raise type(error)(f"{error}; {self.target} is written, but not checked") from error
         watch.lap("check")
@@ -219,17 +221,14 @@ class Upsampling:
 
     def write_page(self) -> None:
         """Write the page; what cannot be shown in it is said there."""
-        from ..certificate.check import CheckOptions
-        from ..pages.viewing import write_single
+        from ..pages.html import page_of_conversion, write_page
         from ..progress import Stopwatch
 
         watch, page = Stopwatch(), self.options["report"]
-        options = replace(
-            CheckOptions.of(make_options(self.options)), processes=self.options["threads"]
-        )
-        notes = [*self.result.remarks(), *self.device_notes()]
-        report = {**self.report(), "notes": notes}
-        write_single(page, report, options, self.certificate, force=self.options["force"])
+        given = make_options(self.options), self.result.kept, self.certificate
+        report = {**self.report(), "notes": [*self.result.remarks(), *self.device_notes()]}
+        text = page_of_conversion(report, *given, processes=self.options["threads"])
+        write_page(text, page, force=self.options["force"])
         watch.lap("page")
         self.seconds |= watch.seconds
 

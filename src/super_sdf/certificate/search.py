@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..errors import SuperSdfError
 from ..machine.pool import Death, Pool
-from ..machine.serving import Tell, Work
+from ..machine.serving import Work
 from ..mesh import Mesh
 from ..truth.solid import Distances, Points, Solid
 
@@ -34,22 +34,11 @@ LEAST_SIZE = 1e-100  # of a ray times its triangle: squares of longer rays would
 
 
 @dataclass(frozen=True, eq=False)
-class Slab:
+class MeshSlab:
     """The triangles of a mesh that reach into a slab or are near it, and points in the slab.
 
-    Attributes
-    ----------
-    mesh : Mesh
-        With vertices of its own.
-    axis : int
-        The slab's normal.
-    first, last : float
-        Its range; no triangle or point is in two slabs.
-    points : (k, 3) float64
-    rows : (k,) int64
-        Numbers of the points among those of all slabs.
-    counts : bool
-        Whether intersections are counted.
+    Its range on ``axis`` is ``first`` to before ``last``; ``rows`` (k,) are the numbers of its
+    ``points`` (k, 3) among those of all slabs; ``counts`` says whether intersections are counted.
     """
 
     mesh: Mesh
@@ -82,45 +71,6 @@ class Found:
     facing: NDArray[np.int8]
 
 
-class Cutting:
-    """A mesh, cut along its longest axis into slabs in which about equally many triangles begin.
-
-    It is a queue of slabs; each is made when it is taken. Without a tree of its own, each slab has
-    the triangles within ``reach`` of it, so distances up to that are those to the whole mesh.
-    """
-
-    def __init__(self, mesh: Mesh, points: Points, reach: float, *, counts: bool) -> None:
-        self.mesh, self.points, self.reach, self.counts = mesh, points, reach, counts
-        self.axis = int(np.ptp(mesh.vertices, axis=0).argmax())
-        along = mesh.vertices[:, self.axis][mesh.faces]
-        self.low, self.high = along.min(1), along.max(1)
-        shares = np.linspace(0, 1, len(mesh.faces) // FACES_IN_SLAB + 2)[1:-1]
-        inner = np.unique(np.quantile(self.low, shares, method="lower"))
-        limits = [-np.inf, *inner.tolist(), np.inf]
-        self.ranges = deque(itertools.pairwise(limits))
-
-    def __len__(self) -> int:
-        return len(self.ranges)
-
-    def popleft(self) -> Slab:
-        """Return the next slab."""
-        first, last = self.ranges.popleft()
-        near = (self.low < last + self.reach) & (self.high >= first - self.reach)
-        along = self.points[:, self.axis]
-        rows = np.flatnonzero((along >= first) & (along < last))
-        mesh = part_of(self.mesh, np.flatnonzero(near))
-        return Slab(mesh, self.axis, first, last, self.points[rows], rows, self.counts)
-
-
-def part_of(mesh: Mesh, rows: NDArray[np.intp]) -> Mesh:
-    """Return some of a mesh's triangles with vertices of their own, float64."""
-    faces = mesh.faces[rows]
-    used = np.zeros(len(mesh.vertices), bool)
-    used[faces] = True
-    numbers = np.cumsum(used, dtype=np.int32) - 1
-    return Mesh(mesh.vertices[used].astype(np.float64), numbers[faces])
-
-
 def search(
     mesh: Mesh, points: Points, reach: float, *, intersections: bool, processes: int = 1
 ) -> Found:
@@ -137,103 +87,17 @@ def search(
     processes : int
         How many work at the same time.
     """
-    cutting = Cutting(mesh, points, reach, counts=intersections)
-    several = min(processes, len(cutting)) > 1
-    total, n = 0 if can_count() and intersections else None, len(points)
-    found = Found(total, np.empty(n), np.empty((n, 3)), np.empty(n, np.int8))
-    for rows, part in in_processes(cutting, processes) if several else in_turn(cutting):
+    slabs = MeshSlabs(mesh, points, reach, counts=intersections and can_count())
+    total, n = 0, len(points)
+    found = Found(None, np.empty(n), np.empty((n, 3)), np.empty(n, np.int8))
+    for rows, part in _search_all(slabs, min(processes, len(slabs))):
         _put(found, rows, part)
-        total = None if total is None else total + (part.intersections or 0)
+        total += part.intersections or 0
     far = np.flatnonzero(found.distances > reach)
-    if len(far) and np.isfinite(reach):
+    if len(far):
         _put(found, far, nearest(Solid(mesh), points[far]))
-    return Found(total, found.distances, found.feet, found.facing)
-
-
-def _put(found: Found, rows: NDArray[np.intp], part: Found) -> None:
-    """Copy what was found of some points to their rows."""
-    found.distances[rows], found.feet[rows] = part.distances, part.feet
-    found.facing[rows] = part.facing
-
-
-def in_turn(cutting: Cutting) -> Iterator[tuple[NDArray[np.intp], Found]]:
-    """Yield the rows of each slab's points, and what was found in the slab."""
-    while len(cutting):
-        slab = cutting.popleft()
-        yield slab.rows, search_slab(slab)
-
-
-def in_processes(cutting: Cutting, count: int) -> Iterator[tuple[NDArray[np.intp], Found]]:
-    """Yield what ``in_turn`` does, in any order, from ``count`` processes.
-
-    Raises
-    ------
-    SuperSdfError
-        If a process dies.
-    """
-    with closing(Pool(cutting, prepare).results(count)) as results:
-        for slab, found in results:
-            if isinstance(found, Death):
-                raise SuperSdfError(f"a process that checked a part of the mesh {found.cause}")
-            yield slab.rows, found
-
-
-def prepare() -> Work:
-    """Return what works at a slab: each worker process calls this once."""
-    return _work
-
-
-def _work(slab: Slab, tell: Tell) -> Found:
-    return search_slab(slab)
-
-
-def search_slab(slab: Slab) -> Found:
-    """Return what is found in a slab."""
-    found = nearest(Solid(slab.mesh), slab.points)
-    count = count_intersections(slab) if slab.counts else None
-    return Found(count, found.distances, found.feet, found.facing)
-
-
-def nearest(solid: Solid, points: Points) -> Found:
-    """Return the nearest points of a mesh, and on which side of its surface the points lie."""
-    distances, faces, feet = solid.nearest(points)
-    normals = normals_of(solid.mesh, faces)
-    facing = side_of(points - feet, normals, PARALLEL)
-    unsure = np.flatnonzero(facing == 0)
-    facing[unsure] = facing_by_rays(solid, points[unsure], faces[unsure])
-    return Found(None, distances, feet, facing)
-
-
-def facing_by_rays(solid: Solid, points: Points, faces: NDArray[np.int64]) -> NDArray[np.int8]:
-    """Return the ``facing`` of points, (n,), by the first triangles hit on the way to ``faces``.
-
-    A point whose foot lies on an edge may be in front of one triangle there and behind another. But
-    what is first hit on the way to the middle of one of them is seen from the point's own side.
-    """
-    if not len(points):
-        return np.zeros(0, np.int8)
-    mesh = solid.mesh
-    rays = mesh.vertices[mesh.faces[faces]].mean(1) - points
-    sizes = np.linalg.norm(rays, axis=1) * np.linalg.norm(normals_of(mesh, faces), axis=1)
-    sizes[sizes < LEAST_SIZE] = 1  # on a triangle without area: whatever is hit is not clear
-    rays *= LONG_RAY / sizes[:, None]
-    hit, place = solid.first_hits(points, rays)
-    clear = (hit >= 0) & (place.min(1) > CLEAR_HIT)
-    facing = side_of(-rays, normals_of(mesh, hit), CLEAR_COSINE)
-    return np.where(clear, facing, np.int8(0))
-
-
-def normals_of(mesh: Mesh, faces: NDArray[np.int64]) -> Points:
-    """Return the normals of triangles, (n, 3), as long as twice their areas."""
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces[faces]], 1, 0)
-    return np.cross(b - a, c - a)
-
-
-def side_of(ways: Points, normals: Points, cosine: float) -> NDArray[np.int8]:
-    """Return the sign of the products of vectors, (n,), 0 where the cosine is not above one."""
-    dots = np.einsum("ij,ij->i", ways, normals)
-    most = np.linalg.norm(ways, axis=1) * np.linalg.norm(normals, axis=1)
-    return np.where(np.abs(dots) > cosine * most, np.sign(dots), 0).astype(np.int8)
+    counted = total if slabs.counts else None
+    return Found(counted, found.distances, found.feet, found.facing)
 
 
 def self_intersections(mesh: Mesh) -> int | None:
@@ -249,13 +113,77 @@ def can_count() -> bool:
     return hasattr(igl.predicates, "find_self_intersections")
 
 
-def count_intersections(slab: Slab) -> int | None:
-    """Return the number of pairs of triangles that intersect, whose common range begins in a slab.
+class MeshSlabs:
+    """A queue of slabs along the longest axis, in which about equally many triangles begin.
 
-    It is None if libigl has no test for it.
+    Each is made when it is taken. It has the triangles within ``reach`` of it, so distances up to
+    that are those to the whole mesh.
     """
-    if not can_count():
-        return None
+
+    def __init__(self, mesh: Mesh, points: Points, reach: float, *, counts: bool) -> None:
+        self.mesh, self.points, self.reach, self.counts = mesh, points, reach, counts
+        self.axis = int(np.ptp(mesh.vertices, axis=0).argmax())
+        along = mesh.vertices[:, self.axis][mesh.faces]
+        self.low, self.high = along.min(1), along.max(1)
+        shares = np.linspace(0, 1, len(mesh.faces) // FACES_IN_SLAB + 2)[1:-1]
+        inner = np.unique(np.quantile(self.low, shares, method="lower"))
+        self.ranges = deque(itertools.pairwise([-np.inf, *inner.tolist(), np.inf]))
+
+    def __len__(self) -> int:
+        return len(self.ranges)
+
+    def popleft(self) -> MeshSlab:
+        """Return the next slab."""
+        first, last = self.ranges.popleft()
+        near = (self.low < last + self.reach) & (self.high >= first - self.reach)
+        along = self.points[:, self.axis]
+        rows = np.flatnonzero((along >= first) & (along < last))
+        mesh = _part_of(self.mesh, np.flatnonzero(near))
+        return MeshSlab(mesh, self.axis, first, last, self.points[rows], rows, self.counts)
+
+
+def _part_of(mesh: Mesh, rows: NDArray[np.intp]) -> Mesh:
+    """Return some of a mesh's triangles with vertices of their own, float64."""
+    faces = mesh.faces[rows]
+    used = np.zeros(len(mesh.vertices), bool)
+    used[faces] = True
+    numbers = np.cumsum(used, dtype=np.int32) - 1
+    return Mesh(mesh.vertices[used].astype(np.float64), numbers[faces])
+
+
+def _search_all(slabs: MeshSlabs, processes: int) -> Iterator[tuple[NDArray[np.intp], Found]]:
+    """Yield the rows of each slab's points and what was found; in any order from processes."""
+    if processes < 2:
+        while len(slabs):
+            slab = slabs.popleft()
+            yield slab.rows, _search_slab(slab)
+        return
+    with closing(Pool(slabs, _prepare).results(processes)) as results:
+        for slab, found in results:
+            if isinstance(found, Death):
+                raise SuperSdfError(f"a process that checked a part of the mesh {found.cause}")
+            yield slab.rows, found
+
+
+def _prepare() -> Work:
+    """Return what works at a slab: each worker process calls this once."""
+    return lambda slab, tell: _search_slab(slab)
+
+
+def _search_slab(slab: MeshSlab) -> Found:
+    found = nearest(Solid(slab.mesh), slab.points)
+    count = _count_intersections(slab) if slab.counts else None
+    return Found(count, found.distances, found.feet, found.facing)
+
+
+def _put(found: Found, rows: NDArray[np.intp], part: Found) -> None:
+    """Copy what was found of some points to their rows."""
+    found.distances[rows], found.feet[rows] = part.distances, part.feet
+    found.facing[rows] = part.facing
+
+
+def _count_intersections(slab: MeshSlab) -> int:
+    """Return the number of pairs that intersect, whose common range begins in a slab."""
     vertices, faces = slab.mesh.vertices, slab.mesh.faces
     along = vertices[:, slab.axis][faces]
     low, high = along.min(1), along.max(1)
@@ -264,3 +192,44 @@ def count_intersections(slab: Slab) -> int | None:
     pairs = igl.predicates.find_self_intersections(vertices, faces[rows].astype(np.int64))[1]
     begin = low[rows][pairs].max(1, initial=-np.inf)
     return int(np.count_nonzero((begin >= slab.first) & (begin < slab.last)))
+
+
+def nearest(solid: Solid, points: Points) -> Found:
+    """Return the nearest points of a mesh, and on which side of its surface the points lie."""
+    distances, faces, feet = solid.nearest(points)
+    facing = _side_of(points - feet, _normals_of(solid.mesh, faces), PARALLEL)
+    unsure = np.flatnonzero(facing == 0)
+    facing[unsure] = facing_by_rays(solid, points[unsure], faces[unsure])
+    return Found(None, distances, feet, facing)
+
+
+def facing_by_rays(solid: Solid, points: Points, faces: NDArray[np.int64]) -> NDArray[np.int8]:
+    """Return the ``facing`` of points, (n,), by the first triangles hit on the way to ``faces``.
+
+    A point whose foot lies on an edge may be in front of one triangle there and behind another. But
+    what is first hit on the way to the middle of one of them is seen from the point's own side.
+    """
+    if not len(points):
+        return np.zeros(0, np.int8)
+    mesh = solid.mesh
+    rays = mesh.vertices[mesh.faces[faces]].mean(1) - points
+    sizes = np.linalg.norm(rays, axis=1) * np.linalg.norm(_normals_of(mesh, faces), axis=1)
+    sizes[sizes < LEAST_SIZE] = 1  # on a triangle without area: whatever is hit is not clear
+    rays *= LONG_RAY / sizes[:, None]
+    hit, place = solid.first_hits(points, rays)
+    clear = (hit >= 0) & (place.min(1) > CLEAR_HIT)
+    facing = _side_of(-rays, _normals_of(mesh, hit), CLEAR_COSINE)
+    return np.where(clear, facing, np.int8(0))
+
+
+def _normals_of(mesh: Mesh, faces: NDArray[np.int64]) -> Points:
+    """Return the normals of triangles, (n, 3), as long as twice their areas."""
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces[faces]], 1, 0)
+    return np.cross(b - a, c - a)
+
+
+def _side_of(ways: Points, normals: Points, cosine: float) -> NDArray[np.int8]:
+    """Return the sign of the products of vectors, (n,), 0 where the cosine is not above one."""
+    dots = np.einsum("ij,ij->i", ways, normals)
+    most = np.linalg.norm(ways, axis=1) * np.linalg.norm(normals, axis=1)
+    return np.where(np.abs(dots) > cosine * most, np.sign(dots), 0).astype(np.int8)
