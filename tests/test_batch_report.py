@@ -18,20 +18,13 @@ from super_sdf.batch.journal import read_journal
 pytestmark = pytest.mark.usefixtures("grid_folder")
 
 
-@pytest.mark.parametrize("torn", [b'{"in": "x", "out": "a.p', b"{", b"\xff\xfe"])
+@pytest.mark.parametrize("torn", [b'{"in": "x", "out": "a.p', b"\xff\xfe"])
 def test_a_torn_line_is_cut_off(run_batch, torn):
     run_batch("in")
     lines = Path("out/report.jsonl").read_bytes().splitlines(keepends=True)
     Path("out/report.jsonl").write_bytes(b"".join(lines[:-1]) + torn)
     run_batch("in")
     assert len(rows()) == 4 and rows()[-1]["out"] == json.loads(lines[-1])["out"]
-
-
-def test_lines_of_others_in_the_report_are_passed_over(run_batch):
-    run_batch("in")
-    report = Path("out/report.jsonl")
-    report.write_bytes(b'nonsense\n[1]\n{"out": 1}\n' + report.read_bytes())
-    assert run_batch("in")[2].splitlines()[-1].startswith("nothing to do: 3 done before")
 
 
 def test_a_file_of_another_origin_is_not_replaced(run_batch):
@@ -46,7 +39,7 @@ def test_a_file_of_another_origin_is_not_replaced(run_batch):
     assert trimesh.load("out/a.ply").is_watertight
 
 
-FOREIGN = [b"a,b\n1,2", b'{"in": "a.npy"}', b'{"in": "a.npy"}\n{"in": "b', b"[]\n", b"\0\0\0\n"]
+FOREIGN = [b"a,b\n1,2", b'{"in": "a.npy"}\n{"in": "b', b"\0\0\0\n"]
 
 
 @pytest.mark.parametrize("text", FOREIGN)
@@ -62,15 +55,16 @@ def test_a_report_of_others_is_left_alone(run_batch, text):
     assert Path("out/report.jsonl").read_bytes() == text and list(Path("out").glob("*.ply")) == []
 
 
-@pytest.mark.parametrize("text", [b"", b"{", b'{"in": "/x", "out": "a'])
+@pytest.mark.parametrize("text", [b"", b'{"in": "/x", "out": "a'])
 def test_a_report_that_was_just_begun_is_gone_on_with(run_batch, text):
     Path("out").mkdir()
     Path("out/report.jsonl").write_bytes(text)
     assert run_batch("in/a.npy")[0] == 0 and len(rows()) == 1
 
 
-@pytest.mark.parametrize("name", ["report.jsonl", ".super-sdf-batch"])
-@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
+@pytest.mark.parametrize(
+    ("name", "make"), [("report.jsonl", os.mkfifo), (".super-sdf-batch", os.mkdir)]
+)
 def test_pipes_and_folders_of_the_batchs_names_are_refused(run_batch, name, make):
     Path("out").mkdir()
     make(Path("out", name))
@@ -78,17 +72,7 @@ def test_pipes_and_folders_of_the_batchs_names_are_refused(run_batch, name, make
     assert code == 1 and err.startswith(f"Error: {Path('out', name)} is ") and err.count("\n") == 1
 
 
-DAMAGED = {
-    "in": 1,
-    "out": ["a.ply"],
-    "status": None,
-    "reason": {},
-    "retry": "no",
-    "options": 0,
-    "content": "x",
-    "output": {"sha256": 1},
-    "closed": None,
-}
+DAMAGED = {"in": 1, "out": ["a.ply"], "status": None, "output": {"sha256": 1}}
 
 
 @pytest.mark.parametrize("key", DAMAGED)
@@ -97,14 +81,15 @@ def test_rows_with_wrong_types_are_done_again(run_batch, key):
     damaged = [{**row, key: DAMAGED[key]} if row["out"] == "a.ply" else row for row in rows()]
     Path("out/report.jsonl").write_text("".join(json.dumps(row) + "\n" for row in damaged))
     code, _, err = run_batch("in", "--force")
-    assert code == 1 and "3 done, 1 failed" in err and rows()[-1]["out"] != key
+    assert code == 1 and "3 done, 1 failed" in err
 
 
-def test_a_carriage_return_ends_no_line_and_deep_lines_are_passed_over(run_batch):
+def test_lines_of_others_are_passed_over_and_a_carriage_return_ends_none(run_batch):
     run_batch("in")
     report = Path("out/report.jsonl")
+    foreign = b'nonsense\n[1]\n{"out": 1}\n'
     deep = 100_000 * b"[" + b"\n" + b'{"reason": 1' + 5000 * b"0" + b"}\n"
-    report.write_bytes(b"a\rb\n" + deep + report.read_bytes())
+    report.write_bytes(b"a\rb\n" + foreign + deep + report.read_bytes())
     before = report.read_bytes()
     assert run_batch("in")[2].splitlines()[-1].startswith("nothing to do: 3 done before")
     assert report.read_bytes() == before

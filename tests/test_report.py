@@ -1,12 +1,16 @@
 """``--report``: what is checked before, what is written, resumed and interrupted batches."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from pages import blocks, wedge
 
+import super_sdf
+from super_sdf import SdfGrid
 from super_sdf.batch import page as batch_page
 from super_sdf.batch.run import Run
 
@@ -42,11 +46,42 @@ def test_the_page_of_a_conversion_holds_all_of_it(command, folder):
     assert ours["residuals"] and coarse["residuals"] and ours["triangles"] > coarse["triangles"]
 
 
-def test_the_mesh_is_the_same_with_and_without_a_page(command, folder):
+def broken(*arguments, **known):
+    """Stand in for what fails."""
+    raise RuntimeError("no display")
+
+
+def test_check_and_page_take_grid_band_and_mesh_from_the_conversion(command, folder, monkeypatch):
+    """Neither file is read again, and no band found again; the mesh is the same."""
     command(*UPSAMPLE)
     plain = Path("a.ply").read_bytes()
+    for name in ("read_grid_with", "read_mesh", "survey"):
+        monkeypatch.setattr(f"super_sdf.certificate.check.{name}", broken)
+    reads = []
+    planes = SdfGrid.planes
+    monkeypatch.setattr(SdfGrid, "planes", lambda *given: reads.append(given) or planes(*given))
     assert command(*UPSAMPLE, "--force", "--check", "--report", "a.html")[0] == 0
-    assert Path("a.ply").read_bytes() == plain
+    assert Path("a.ply").read_bytes() == plain and not reads
+    assert len(blocks(Path("a.html"))["meshes-0"]) == 2
+
+
+def test_a_page_needs_no_library_that_draws(folder):
+    """Nor does a check; libigl itself imports SciPy."""
+    script = (
+        "import sys; from super_sdf.cli.main import cli;"
+        f"cli.main({[str(word) for word in UPSAMPLE]} + ['--report', 'a.html', '--check', '-q'],"
+        "standalone_mode=False);"
+        "drawing = {'matplotlib', 'skimage', 'pyvista', 'vtkmodules'} & set(sys.modules);"
+        "assert not drawing, drawing"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True)
+    imports = [path.read_text() for room in ("pages", "certificate") for path in room_files(room)]
+    assert len(imports) > 6 and not any("scipy" in text for text in imports)
+
+
+def room_files(room):
+    """Return the modules of a room."""
+    return Path(super_sdf.__file__).parent.joinpath(room).glob("*.py")
 
 
 def test_a_page_is_replaced_with_force_only(command, folder):
@@ -175,11 +210,6 @@ def test_a_page_of_others_is_not_replaced_by_a_batch(run_batch, grid_folder):
         1,
         "Error: other-files, for the meshes of the page, is no folder: move it\n",
     )
-
-
-def broken(*arguments, **known):
-    """Stand in for what fails."""
-    raise RuntimeError("no display")
 
 
 def test_a_bug_in_the_page_of_a_mesh_costs_no_mesh(run_batch, grid_folder, monkeypatch):

@@ -23,14 +23,6 @@ from ..mesh import Mesh
 from ..truth.solid import Distances, Points, Solid
 
 FACES_IN_SLAB = 1 << 19
-# The way to a foot inside a triangle and the triangle's normal are parallel up to this cosine.
-PARALLEL = 1 - 1e-9
-# A ray says on which side it started if it hits a triangle at least that far from its edges, as a
-# share of its heights, and at an angle with at least this cosine to its normal.
-CLEAR_HIT, CLEAR_COSINE = 1e-3, 1e-2
-# Of a ray times twice the area that it is aimed at: libigl takes less than 1e-6 for parallel.
-LONG_RAY = 1e6
-LEAST_SIZE = 1e-100  # of a ray times its triangle: squares of longer rays would overflow
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,15 +52,11 @@ class Found:
         Pairs of triangles that intersect; None if they were not counted.
     distances, feet : (k,) float64, (k, 3) float64
         Of the points to the nearest triangle, and the nearest points of the mesh.
-    facing : (k,) int8
-        1 for points in front of the surface, -1 for those behind it, as far as the triangles near
-        them tell; 0 where they do not.
     """
 
     intersections: int | None
     distances: Distances
     feet: Points
-    facing: NDArray[np.int8]
 
 
 def search(
@@ -89,15 +77,14 @@ def search(
     """
     slabs = MeshSlabs(mesh, points, reach, counts=intersections and can_count())
     total, n = 0, len(points)
-    found = Found(None, np.empty(n), np.empty((n, 3)), np.empty(n, np.int8))
+    distances, feet = np.empty(n), np.empty((n, 3))
     for rows, part in _search_all(slabs, min(processes, len(slabs))):
-        _put(found, rows, part)
+        distances[rows], feet[rows] = part.distances, part.feet
         total += part.intersections or 0
-    far = np.flatnonzero(found.distances > reach)
+    far = np.flatnonzero(distances > reach)
     if len(far):
-        _put(found, far, nearest(Solid(mesh), points[far]))
-    counted = total if slabs.counts else None
-    return Found(counted, found.distances, found.feet, found.facing)
+        distances[far], _, feet[far] = Solid(mesh).nearest(points[far])
+    return Found(total if slabs.counts else None, distances, feet)
 
 
 def self_intersections(mesh: Mesh) -> int | None:
@@ -171,15 +158,8 @@ def _prepare() -> Work:
 
 
 def _search_slab(slab: MeshSlab) -> Found:
-    found = nearest(Solid(slab.mesh), slab.points)
-    count = _count_intersections(slab) if slab.counts else None
-    return Found(count, found.distances, found.feet, found.facing)
-
-
-def _put(found: Found, rows: NDArray[np.intp], part: Found) -> None:
-    """Copy what was found of some points to their rows."""
-    found.distances[rows], found.feet[rows] = part.distances, part.feet
-    found.facing[rows] = part.facing
+    distances, _, feet = Solid(slab.mesh).nearest(slab.points)
+    return Found(_count_intersections(slab) if slab.counts else None, distances, feet)
 
 
 def _count_intersections(slab: MeshSlab) -> int:
@@ -192,44 +172,3 @@ def _count_intersections(slab: MeshSlab) -> int:
     pairs = igl.predicates.find_self_intersections(vertices, faces[rows].astype(np.int64))[1]
     begin = low[rows][pairs].max(1, initial=-np.inf)
     return int(np.count_nonzero((begin >= slab.first) & (begin < slab.last)))
-
-
-def nearest(solid: Solid, points: Points) -> Found:
-    """Return the nearest points of a mesh, and on which side of its surface the points lie."""
-    distances, faces, feet = solid.nearest(points)
-    facing = _side_of(points - feet, _normals_of(solid.mesh, faces), PARALLEL)
-    unsure = np.flatnonzero(facing == 0)
-    facing[unsure] = facing_by_rays(solid, points[unsure], faces[unsure])
-    return Found(None, distances, feet, facing)
-
-
-def facing_by_rays(solid: Solid, points: Points, faces: NDArray[np.int64]) -> NDArray[np.int8]:
-    """Return the ``facing`` of points, (n,), by the first triangles hit on the way to ``faces``.
-
-    A point whose foot lies on an edge may be in front of one triangle there and behind another. But
-    what is first hit on the way to the middle of one of them is seen from the point's own side.
-    """
-    if not len(points):
-        return np.zeros(0, np.int8)
-    mesh = solid.mesh
-    rays = mesh.vertices[mesh.faces[faces]].mean(1) - points
-    sizes = np.linalg.norm(rays, axis=1) * np.linalg.norm(_normals_of(mesh, faces), axis=1)
-    sizes[sizes < LEAST_SIZE] = 1  # on a triangle without area: whatever is hit is not clear
-    rays *= LONG_RAY / sizes[:, None]
-    hit, place = solid.first_hits(points, rays)
-    clear = (hit >= 0) & (place.min(1) > CLEAR_HIT)
-    facing = _side_of(-rays, _normals_of(mesh, hit), CLEAR_COSINE)
-    return np.where(clear, facing, np.int8(0))
-
-
-def _normals_of(mesh: Mesh, faces: NDArray[np.int64]) -> Points:
-    """Return the normals of triangles, (n, 3), as long as twice their areas."""
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces[faces]], 1, 0)
-    return np.cross(b - a, c - a)
-
-
-def _side_of(ways: Points, normals: Points, cosine: float) -> NDArray[np.int8]:
-    """Return the sign of the products of vectors, (n,), 0 where the cosine is not above one."""
-    dots = np.einsum("ij,ij->i", ways, normals)
-    most = np.linalg.norm(ways, axis=1) * np.linalg.norm(normals, axis=1)
-    return np.where(np.abs(dots) > cosine * most, np.sign(dots), 0).astype(np.int8)

@@ -34,22 +34,7 @@ FARTHEST = 1.5  # voxels: foot points farther away say nothing of a vertex
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """The exact samples of a grid near the surface; those left out are counted, see ``Touching``.
-
-    ``voxel_ijk`` are their indices, (n, 3); ``points`` (n, 3) are in world units, ``values`` (n,)
-    negative inside.
-    """
-
-    cut_off: int
-    noisy: int
-    voxel_ijk: IntArray
-    points: Points
-    values: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class Touching:
-    """The exact samples of a grid near the surface, and where their balls meet the mesh.
+    """The exact samples of a grid near the surface.
 
     Attributes
     ----------
@@ -60,9 +45,24 @@ class Touching:
     voxel_ijk : (n, 3) int32
         Indices of the exact samples, in C order.
     points : (n, 3) float64
-        World positions of the exact samples.
+        Their world positions.
     values : (n,) float32
         Their distances, negative inside.
+    """
+
+    cut_off: int
+    noisy: int
+    voxel_ijk: IntArray
+    points: Points
+    values: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Touching(Samples):
+    """The exact samples of a grid, and where their balls meet the mesh.
+
+    Attributes
+    ----------
     residuals : (n,) float32
         Distance to the mesh minus absolute value.
     feet : (n, 3) float64
@@ -71,11 +71,6 @@ class Touching:
         Whether sample and mesh disagree on the side, by more than ``NOTICEABLE``.
     """
 
-    cut_off: int
-    noisy: int
-    voxel_ijk: IntArray
-    points: Points
-    values: FloatArray
     residuals: FloatArray
     feet: Points
     wrong_side: BoolArray
@@ -142,32 +137,19 @@ def exact_samples(band: Band, grid: SdfGrid) -> Samples:
     return Samples(cut_off, noisy, ijk, grid.to_world(ijk), distances)
 
 
-def touch(
-    mesh: Mesh, samples: Samples, found: Found, voxel_size: float, *, simple: bool
-) -> Touching:
+def touch(mesh: Mesh, samples: Samples, found: Found, voxel_size: float) -> Touching:
     """Return where the balls of exact samples meet a mesh.
 
-    Parameters
-    ----------
-    mesh : Mesh
-        In world units.
-    samples : Samples
-    found : Found
-        By ``search`` for the points of the samples.
-    voxel_size : float
-        Spacing of the grid.
-    simple : bool
-        Whether what is behind the surface is inside: see ``Surface.is_simple``.
+    ``found`` is by ``search`` for the points of the samples, ``voxel_size`` the spacing of the
+    grid. On which side of the mesh a sample lies is by its winding number.
     """
     distances, size = found.distances / voxel_size, np.abs(samples.values)
     residuals = (distances - size).astype(np.float32)
-    apart = distances + size > NOTICEABLE  # where the side matters
-    inside = found.facing < 0
-    unsure = np.flatnonzero(apart & (found.facing == 0) if simple else apart)
-    solid, points = Solid(mesh), samples.points
-    for chunk in chunks_of(len(unsure), WIDTH):
-        inside[unsure[chunk]] = solid.is_inside(points[unsure[chunk]])
-    wrong = apart & (inside != (samples.values <= 0))
+    solid, wrong = Solid(mesh), np.zeros(len(size), bool)
+    apart = np.flatnonzero(distances + size > NOTICEABLE)  # where the side matters
+    for chunk in chunks_of(len(apart), WIDTH):
+        some = apart[chunk]
+        wrong[some] = solid.is_inside(samples.points[some]) != (samples.values[some] <= 0)
     return Touching(**vars(samples), residuals=residuals, feet=found.feet, wrong_side=wrong)
 
 
