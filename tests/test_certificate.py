@@ -15,14 +15,16 @@ from super_sdf import Mesh, SdfGrid, topology
 from super_sdf.certificate import search as slabs
 from super_sdf.certificate import surface
 from super_sdf.certificate.check import (
+    LIMITS,
     NO_EVIDENCE,
     PIERCED,
     TOUCHING,
     UNKNOWN,
-    Limits,
     check_files,
+    check_limits,
     check_mesh,
     colours,
+    exceeded,
     stated_triangles,
 )
 from super_sdf.convert import ConvertOptions
@@ -225,8 +227,9 @@ def test_noisy_samples_promise_nothing(ball_mesh):
     assert len(found.touching.values) == 0 and found.touching.noisy > 3000
     assert found.report()["residual"] is None and found.strays is None
     assert "residual: unknown, since no sample is exact" in found.lines()
-    assert Limits(max_mean=9.0).exceeded(found) == [NO_EVIDENCE]
-    assert Limits().exceeded(found) == []
+    none = dict.fromkeys(LIMITS)
+    assert exceeded(found, {**none, "max_mean": 9.0}) == [NO_EVIDENCE]
+    assert exceeded(found, none) == []
 
 
 def test_a_piece_far_from_every_sample_is_noticed(ball_mesh):
@@ -264,16 +267,16 @@ def test_memory_is_refused_with_the_figure(ball_mesh, tmp_path):
 
 
 def test_limits(ball_mesh):
-    found = check_mesh(moved(ball_mesh, 0.15 * H), sphere_grid())
-    assert Limits(0.2, 0.1, 0.5).exceeded(found) == []
-    passed = Limits(0.1, 0.05, 0.01, True).exceeded(found)
+    found, names = check_mesh(moved(ball_mesh, 0.15 * H), sphere_grid()), list(LIMITS)
+    assert exceeded(found, dict(zip(names, (0.2, 0.1, 0.5)))) == []
+    passed = exceeded(found, dict(zip(names, (0.1, 0.05, 0.01))))
     assert passed[0].startswith("the largest residual is 0.1")
     assert passed[0].endswith(" voxels, --max-residual is 0.1")
     assert passed[1].startswith("the mean residual is 0.07")
-    assert passed[2].endswith(", --max-share is 0.01") and len(passed) == 4
-    for wrong in (Limits(max_residual=-1.0), Limits(max_mean=np.nan), Limits(max_share=2.0)):
+    assert passed[2].endswith(", --max-share is 0.01") and len(passed) == 3
+    for wrong in ((-1.0, None, None), (None, np.nan, None), (None, None, 2.0)):
         with pytest.raises(OptionError):
-            wrong.check()
+            check_limits(dict(zip(names, wrong)))
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -60,27 +61,13 @@ TOUCHING, PIERCED, NOT_TOUCHING, UNKNOWN = (
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """What is certain of a mesh without the true surface.
+    """What is certain of a mesh without the true surface."""
 
-    Attributes
-    ----------
-    mesh : Mesh
-        Vertices at the same position are one.
-    grid : SdfGrid
-        The samples on their cubic lattice, see ``cubic_grid``.
-    surface : Surface
-        Whether the mesh bounds a solid, and which.
-    touching : Touching
-        The residual of each exact sample.
-    strays : Strays, optional
-        Vertices far from any surface of the grid; None if no sample is exact.
-    """
-
-    mesh: Mesh
-    grid: SdfGrid
+    mesh: Mesh  # vertices at the same position are one
+    grid: SdfGrid  # on its cubic lattice
     surface: Surface
     touching: Touching
-    strays: Strays | None
+    strays: Strays | None  # None if no sample is exact
 
     @property
     def has_evidence(self) -> bool:
@@ -162,51 +149,36 @@ class Certificate:
         return vertex_residuals(vertices, self.touching, self.grid)
 
 
-@dataclass(frozen=True)
-class Limits:
-    """What a certificate may have at most; None or False: not asked.
+LIMITS = {
+    "max_residual": ("largest", "the largest residual is", "voxels"),
+    "max_mean": ("mean", "the mean residual is", "voxels"),
+    "max_share": ("share_above_tenth", "above 0.1 voxel is", ""),
+}
+"""Options, the figures that they limit, and how these are named, with their unit."""
 
-    Attributes
-    ----------
-    max_residual, max_mean : float, optional
-        Largest and mean absolute residual, in voxels.
-    max_share : float, optional
-        Share of samples whose absolute residual is above a tenth of a voxel, from 0 to 1.
-    no_faults : bool
-        Whether faults of the mesh count.
-    """
 
-    max_residual: float | None = None
-    max_mean: float | None = None
-    max_share: float | None = None
-    no_faults: bool = False
+def check_limits(limits: Mapping[str, float | None]) -> None:
+    """Raise OptionError if one of ``LIMITS``, None for those not asked for, is out of range."""
+    for name in LIMITS:
+        limit, option = limits[name], f"--{name.replace('_', '-')}"
+        if limit is not None and not 0 <= limit < float("inf"):
+            raise OptionError(f"{option} is {limit:g}: give 0 {LIMITS[name][2] or '1'} or more")
+    if (share := limits["max_share"]) is not None and share > 1:
+        raise OptionError(f"--max-share is {share:g}: give a share from 0 to 1")
 
-    def check(self) -> None:
-        """Raise OptionError if a limit is out of range."""
-        for name, unit in (("residual", "voxels"), ("mean", "voxels"), ("share", "1")):
-            limit = getattr(self, f"max_{name}")
-            if limit is not None and not 0 <= limit < float("inf"):
-                raise OptionError(f"--max-{name} is {limit:g}: give 0 {unit} or more")
-        if self.max_share is not None and self.max_share > 1:
-            raise OptionError(f"--max-share is {self.max_share:g}: give a share from 0 to 1")
 
-    def exceeded(self, certificate: Certificate) -> list[str]:
-        """Return a sentence for each limit that a certificate exceeds."""
-        rows = (
-            ("largest", "--max-residual", self.max_residual, "the largest residual is", " voxels"),
-            ("mean", "--max-mean", self.max_mean, "the mean residual is", " voxels"),
-            ("share_above_tenth", "--max-share", self.max_share, "above 0.1 voxel is", ""),
-        )
-        asked = any(row[2] is not None for row in rows)
-        figures = certificate.touching.summary() if asked and certificate.has_evidence else {}
-        found = [NO_EVIDENCE] if asked and not figures else []
-        found += [
-            f"{words} {figures[key]:.4g}{unit}, {option} is {limit:g}"
-            for key, option, limit, words, unit in rows
-            if figures and limit is not None and figures[key] > limit
-        ]
-        faults = certificate.faults() if self.no_faults else []
-        return found + [f"the mesh has {fault}" for fault in faults]
+def exceeded(certificate: Certificate, limits: Mapping[str, float | None]) -> list[str]:
+    """Return a sentence for each of ``LIMITS`` that a certificate exceeds."""
+    asked = [name for name in LIMITS if limits[name] is not None]
+    if asked and not certificate.has_evidence:
+        return [NO_EVIDENCE]
+    figures, found = certificate.touching.summary() if asked else {}, []
+    for name in asked:
+        (key, words, unit), limit = LIMITS[name], limits[name] or 0.0
+        if figures[key] > limit:
+            value = f"{figures[key]:.4g} {unit}".rstrip()
+            found.append(f"{words} {value}, --{name.replace('_', '-')} is {limit:g}")
+    return found
 
 
 def check_files(

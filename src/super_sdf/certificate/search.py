@@ -27,36 +27,24 @@ FACES_IN_SLAB = 1 << 19
 
 @dataclass(frozen=True, eq=False)
 class MeshSlab:
-    """The triangles of a mesh that reach into a slab or are near it, and points in the slab.
-
-    Its range on ``axis`` is ``first`` to before ``last``; ``rows`` (k,) are the numbers of its
-    ``points`` (k, 3) among those of all slabs; ``counts`` says whether intersections are counted.
-    """
+    """The triangles of a mesh that reach into a slab or are near it, and points in the slab."""
 
     mesh: Mesh
     axis: int
-    first: float
+    first: float  # its range on the axis
     last: float
-    points: Points
-    rows: NDArray[np.intp]
-    counts: bool
+    points: Points  # (k, 3)
+    rows: NDArray[np.intp]  # (k,): their numbers among those of all slabs
+    counts: bool  # whether intersections are counted
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What was found in a slab, or in all of them.
+    """What was found in a slab, or in all of them."""
 
-    Attributes
-    ----------
-    intersections : int, optional
-        Pairs of triangles that intersect; None if they were not counted.
-    distances, feet : (k,) float64, (k, 3) float64
-        Of the points to the nearest triangle, and the nearest points of the mesh.
-    """
-
-    intersections: int | None
-    distances: Distances
-    feet: Points
+    intersections: int | None  # pairs of triangles; None if they were not counted
+    distances: Distances  # (k,), of the points to the nearest triangle
+    feet: Points  # (k, 3), the nearest points of the mesh
 
 
 def search(
@@ -64,16 +52,7 @@ def search(
 ) -> Found:
     """Return the nearest points of a mesh, and the number of its self-intersections.
 
-    Parameters
-    ----------
-    mesh : Mesh
-    points : (n, 3) float64
-    reach : float
-        Distance up to which slabs look; points farther away are looked up in the whole mesh.
-    intersections : bool
-        Whether to count pairs of triangles that intersect.
-    processes : int
-        How many work at the same time.
+    Slabs look up to the distance ``reach``; points farther away are looked up in the whole mesh.
     """
     slabs = MeshSlabs(mesh, points, reach, counts=intersections and can_count())
     total, n = 0, len(points)

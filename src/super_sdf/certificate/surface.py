@@ -17,32 +17,15 @@ FACES_AT_ONCE = 1 << 18  # for area and volume
 
 @dataclass(frozen=True)
 class Surface:
-    """What a mesh is as a surface.
-
-    Attributes
-    ----------
-    vertices, triangles : int
-        Numbers of them; without triangles that have the same vertex twice.
-    edges : Edges
-        Faults of edges.
-    pinched_vertices : int
-        Vertices at which more than one fan of triangles meets: not manifold.
-    components : int
-        Pieces that share no vertex.
-    self_intersections : int, optional
-        Pairs of triangles that intersect or touch where they share no vertex or edge; None if they
-        were not counted.
-    volume, area : float
-        In cubic and square world units; the volume is negative if the triangles face inward.
-    """
+    """What a mesh is as a surface; triangles that have the same vertex twice are left out."""
 
     vertices: int
     triangles: int
     edges: Edges
-    pinched_vertices: int
-    components: int
-    self_intersections: int | None
-    volume: float
+    pinched_vertices: int  # at which several fans of triangles meet: not manifold
+    components: int  # that share no vertex
+    self_intersections: int | None  # pairs that meet off a common vertex or edge; None: not counted
+    volume: float  # in cubic world units, negative if the triangles face inward
     area: float
 
     @property

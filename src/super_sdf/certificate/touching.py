@@ -34,46 +34,27 @@ FARTHEST = 1.5  # voxels: foot points farther away say nothing of a vertex
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """The exact samples of a grid near the surface.
+    """The exact samples of a grid near the surface, in C order.
 
-    Attributes
-    ----------
-    cut_off, noisy : int
-        Samples near the surface that promise nothing and were left out: at the limit of truncated
-        values or at the band's edge; and all that differ from a neighbour by more than distances
-        can, together with the rest if they are many.
-    voxel_ijk : (n, 3) int32
-        Indices of the exact samples, in C order.
-    points : (n, 3) float64
-        Their world positions.
-    values : (n,) float32
-        Their distances, negative inside.
+    Those that promise nothing are counted and left out: cut off at the limit of truncated values or
+    at the band's edge; and noisy ones, which differ from a neighbour by more than distances can,
+    together with the rest if they are many.
     """
 
     cut_off: int
     noisy: int
-    voxel_ijk: IntArray
-    points: Points
-    values: FloatArray
+    voxel_ijk: IntArray  # (n, 3)
+    points: Points  # (n, 3), in world units
+    values: FloatArray  # (n,), negative inside
 
 
 @dataclass(frozen=True, eq=False)
 class Touching(Samples):
-    """The exact samples of a grid, and where their balls meet the mesh.
+    """The exact samples of a grid, and where their balls meet the mesh."""
 
-    Attributes
-    ----------
-    residuals : (n,) float32
-        Distance to the mesh minus absolute value.
-    feet : (n, 3) float64
-        World positions of the nearest points of the mesh.
-    wrong_side : (n,) bool
-        Whether sample and mesh disagree on the side, by more than ``NOTICEABLE``.
-    """
-
-    residuals: FloatArray
-    feet: Points
-    wrong_side: BoolArray
+    residuals: FloatArray  # (n,): distance to the mesh minus absolute value
+    feet: Points  # (n, 3): the nearest points of the mesh, in world units
+    wrong_side: BoolArray  # (n,): mesh and sample disagree on it by more than ``NOTICEABLE``
 
     def report(self) -> dict[str, Any]:
         """Return the figures as they stand in JSON; None where no sample is exact."""
@@ -105,20 +86,11 @@ class Strays:
 
     The samples near the surface see nothing of a piece that lies far from it. But every sample,
     however far away, promises a ball without surface, also if its value was truncated.
-
-    Attributes
-    ----------
-    count : int
-        Vertices more than ``STRAY`` voxels inside the ball of their nearest sample.
-    beyond : int
-        Vertices beyond the grid, more than half a voxel from its outermost samples.
-    deepest : float
-        Largest depth of a vertex in the ball of its nearest sample, in voxels; 0 if there is none.
     """
 
-    count: int
-    beyond: int
-    deepest: float
+    count: int  # vertices more than ``STRAY`` voxels inside the ball of their nearest sample
+    beyond: int  # vertices more than half a voxel from the outermost samples
+    deepest: float  # of a vertex in the ball of its nearest sample; 0 if there is none
 
 
 def exact_samples(band: Band, grid: SdfGrid) -> Samples:

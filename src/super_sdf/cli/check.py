@@ -106,15 +106,21 @@ def check_command(mesh: Path, grid: Path, **options: Any) -> None:
 
 def run_check(mesh: Path, grid: Path, options: dict[str, Any]) -> list[str]:
     """Check the files, print the certificate, write the coloured mesh; return exceeded limits."""
-    from ..certificate.check import Limits, check_coloured, check_files, write_coloured
+    from ..certificate.check import (
+        LIMITS,
+        check_coloured,
+        check_files,
+        check_limits,
+        exceeded,
+        write_coloured,
+    )
     from ..convert import ConvertOptions
     from ..files.grids import READ_OPTIONS
     from ..files.output import check_apart
     from ..files.store import files_of
 
-    names = ("max_residual", "max_mean", "max_share", "no_faults")
-    limits = Limits(**{name: options[name] for name in names})
-    limits.check()
+    limits = {name: options[name] for name in LIMITS}
+    check_limits(limits)
     if options["out"]:
         check_coloured(options["out"], force=options["force"])
         check_apart(options["out"], [mesh, *files_of(grid)])
@@ -124,13 +130,14 @@ def run_check(mesh: Path, grid: Path, options: dict[str, Any]) -> list[str]:
     if options["out"]:
         with raising_interrupts():
             write_coloured(certificate, options["out"], force=options["force"])
-    exceeded = limits.exceeded(certificate)
+    faults = certificate.faults() if options["no_faults"] else []
+    passed = exceeded(certificate, limits) + [f"the mesh has {fault}" for fault in faults]
     written = f"{options['out']} is written" if options["out"] else "nothing was written"
     if options["as_json"]:
         report = {"mesh": str(mesh), "grid": str(grid), **certificate.report()}
-        print_stdout(json.dumps({**report, "limits_exceeded": exceeded}, indent=2), written)
+        print_stdout(json.dumps({**report, "limits_exceeded": passed}, indent=2), written)
     elif not options["quiet"]:
         print_stdout("\n".join(certificate.lines()), written)
     for note in () if options["quiet"] else certificate.grid.notes:
         print_stderr(f"Note: {note}")
-    return exceeded
+    return passed

@@ -28,30 +28,14 @@ CALL = "superSdfMeshes"  # the function of ``page.js``
 
 @dataclass
 class Item:
-    """What a page shows of one result.
+    """What a page shows of one result."""
 
-    Attributes
-    ----------
-    thumbnail : str, optional
-        A data URL.
-    meshes : list
-        The packed meshes: result, and coarse marching cubes if there are any.
-    certificate : dict, optional
-        What ``Certificate.report`` returns, or under ``error`` why there is none.
-    remarks : list of str
-        What is missing, and why.
-    made_of : str
-        The SHA-256 of the mesh file, if the item is kept in a file.
-    size : int
-        About how many bytes the meshes take in a page; of an item from a file.
-    """
-
-    thumbnail: str | None = None
-    meshes: list[dict[str, Any]] = field(default_factory=list)
-    certificate: dict[str, Any] | None = None
-    remarks: list[str] = field(default_factory=list)
-    made_of: str = ""
-    size: int = 0
+    thumbnail: str | None = None  # a data URL
+    meshes: list[dict[str, Any]] = field(default_factory=list)  # packed: result, coarse mesh
+    certificate: dict[str, Any] | None = None  # or, under "error", why there is none
+    remarks: list[str] = field(default_factory=list)  # what is missing, and why
+    made_of: str = ""  # the SHA-256 of the mesh file, if the item is kept in a file
+    size: int = 0  # about how many bytes the meshes take in a page; of an item from a file
 
     def show(
         self,

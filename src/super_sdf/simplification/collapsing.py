@@ -173,19 +173,8 @@ def _euler_numbers(mesh: Mesh) -> NDArray[np.int64]:
 def collapse_within(mesh: Mesh, kept: BoolArray, distance: float) -> Mesh:
     """Collapse the edges whose new vertex is within a distance of the planes around it.
 
-    Parameters
-    ----------
-    mesh : Mesh
-        Triangles.
-    kept : (m,) bool
-        The triangles that stay as they are, with their vertices. Open edges stay, too.
-    distance : float
-        Root of the sum of squared distances to the planes, in world units.
-
-    Returns
-    -------
-    Mesh
-        With vertices of the same type.
+    That is the root of the sum of squared distances, in world units. The triangles that are
+    ``kept``, (m,) bool, stay as they are, with their vertices; open edges stay, too.
     """
     rising = {"alpha": COLLAPSING_ROUNDS**-3.0, "K": 1, "aggressiveness": 3.0}  # to the distance
     limits = {"target_count": 0, "max_iterations": COLLAPSING_ROUNDS, "update_rate": 1}
