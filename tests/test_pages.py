@@ -123,6 +123,9 @@ def test_an_item_has_the_residuals_of_both_meshes_and_the_certificate():
     means = [np.abs(unpack(each)[2].astype(float)).mean() for each in (ours, coarse)]
     assert 0 < means[0] < means[1]  # coarse marching cubes cut off the edges
     assert item.thumbnail and item.remarks == []
+    thick = SdfGrid(wedge()[:, :, ::2], (1.0, 1.0, 2.0))
+    caption = item_of(Kept(thick, mesh), ConvertOptions()).meshes[1]["caption"]
+    assert caption.startswith("marching cubes of the samples, made equally spaced: ")
 
 
 def test_the_file_of_an_item_is_read_back(tmp_path):

@@ -291,6 +291,7 @@ def convert(
     tally = Tally(expected, cap=options.cap)
     with open_field(save_field, grid, options, force=force) as file:
         watch.lap("read")
+        keep &= engine is None  # the grid of an engine is for its workers
         keeper = Keeper(options.max_memory)
         maker = Maker(grid, network, options, engine, file, keeper.take_band if keep else None)
         meshes = _meshes(maker, tally, watch, progress)

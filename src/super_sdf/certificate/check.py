@@ -70,6 +70,11 @@ class Certificate:
     strays: Strays | None  # None if no sample is exact
 
     @property
+    def voxel_size(self) -> float:
+        """The spacing of the grid, in world units."""
+        return self.grid.voxel_size
+
+    @property
     def has_evidence(self) -> bool:
         """Whether any sample is exact."""
         return len(self.touching.values) > 0
@@ -77,7 +82,7 @@ class Certificate:
     def report(self) -> dict[str, Any]:
         """Return the certificate as it stands in JSON; residuals and depths are in voxels."""
         return {
-            "voxel_size": self.grid.voxel_size,
+            "voxel_size": self.voxel_size,
             "surface": self.surface.report(),
             **self.touching.report(),
             "strays": None if self.strays is None else asdict(self.strays),

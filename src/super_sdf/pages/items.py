@@ -87,11 +87,12 @@ def item_of(
         item.certificate = {"error": str(error)}
     item.show(RESULT, kept.mesh, certificate, memory)
     if kept.band:
-        coarse = coarse_surface(kept.band, cubic_grid(kept.grid, options.offset))
-        checked = None
+        lattice, checked = cubic_grid(kept.grid, options.offset), None
+        coarse = coarse_surface(kept.band, lattice)
         if certificate and len(coarse.faces):
             checked = check_kept(replace(kept, mesh=coarse), options, intersections=False)
-        item.show(COARSE, coarse, checked, memory)
+        title = COARSE + (", made equally spaced" if lattice.shape != kept.grid.shape else "")
+        item.show(title, coarse, checked, memory)
     return item
 
 
