@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from super_sdf.evaluation.timing import LAUNCHER, describe_machine, run_command
-from super_sdf.steps.mesher_names import DEFAULT_MESHER, MESHERS
+from super_sdf.options import DEFAULT_MESHER, MESHERS
 
 FIELDS = ("ball", "gyroid", "wall across x", "wall across z")
 KINDS = ("mask", "truncated", "spline", "scaled")  # of a ball, see ``of_kind``

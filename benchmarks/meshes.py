@@ -34,8 +34,8 @@ from super_sdf import pipeline
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.evaluation.cases import Shape
 from super_sdf.evaluation.scope import find_meshes
-from super_sdf.network.names import DEFAULT_QUALITY
 from super_sdf.network.network import Network, find_model, load_network
+from super_sdf.options import DEFAULT_QUALITY
 from super_sdf.slabs.cutting import Slab, cut
 from super_sdf.steps.survey import Band
 from super_sdf.truth.sampling import sample_solid, unit_layout

@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 from super_sdf import Mesh, load_network
 from super_sdf.certificate.search import self_intersections
 from super_sdf.certificate.surface import examine_surface
-from super_sdf.steps.mesher_names import MARCHING, MESHERS
+from super_sdf.options import MARCHING, MESHERS
 
 # Fine spacings along an axis from a vertex of marching cubes in the same cell: half outside a cell.
 REACH = 1.5

@@ -21,9 +21,9 @@ from PIL import Image
 from super_sdf import Mesh, load_network
 from super_sdf.evaluation.cases import Case, Setting, Shape, turn_of
 from super_sdf.evaluation.methods import coarse_surface, our_surface
+from super_sdf.options import MARCHING, SHARP
 from super_sdf.pictures.page import Page, write_picture
 from super_sdf.pictures.rendering import Frame, Panel, draw_panel, view_axes
-from super_sdf.steps.mesher_names import MARCHING, SHARP
 
 TARGET = Path("docs/sharp.png")
 SEED = 0

@@ -32,7 +32,7 @@ from super_sdf.topology import OpenEdges
 
 # The function of each stage, in the module where it is looked up.
 STAGES = {
-    "read": [(convert, "read_grid_with")],
+    "read": [(convert, "read_grid")],
     "band": [(pipeline, "survey")],
     "gather": [(Band, "network_inputs")],
     "network": [(Network, "__call__")],
@@ -109,7 +109,9 @@ def sample(mesh: Path, size: int, folder: Path) -> Path:
 
 def measure(grid: Path, network: Network, factor: int, runs: int) -> dict[str, Any]:
     """Return seconds and peak memory of the stages, and counts."""
-    options = convert.ConvertOptions(factor, (1 / int(grid.stem),), (0.0,), "negative")
+    options = convert.ConvertOptions(
+        factor, spacing=(1 / int(grid.stem),), origin=(0.0,), inside="negative"
+    )
 
     def work() -> convert.Conversion:
         return convert.convert(grid, grid.with_suffix(".ply"), network, options, force=True)

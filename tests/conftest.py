@@ -110,9 +110,8 @@ def run_batch(command):
 @pytest.fixture
 def bare_plan(monkeypatch):
     """Let the plan count what grows with the surface, over 100 MB, and nothing else."""
-    stages = {name: (*row[:3], 0, 0) for name, row in footprint.STAGES.items()}
-    monkeypatch.setattr(footprint, "STAGES", stages)
-    monkeypatch.setattr(footprint, "NETWORK_FIXED", 0)
+    for name in ("THREAD_BYTES", "FIXED_BYTES", "NETWORK_FIXED"):
+        monkeypatch.setattr(footprint, name, 0)
     for module in (cutting, survey):
         monkeypatch.setattr(module, "held_memory", lambda: 10**8)
 

@@ -16,9 +16,9 @@ from conftest import ball
 
 # The command line where there are two cores, however few there are.
 COMMAND = """
-from super_sdf.batch import workers
+from super_sdf.batch import run
 from super_sdf.cli.entry import main
-workers.count_cores = lambda: 2
+run.count_cores = lambda: 2
 main()
 """
 PATIENCE = 600  # seconds, after which something hangs, however busy the machine is
@@ -58,10 +58,11 @@ def all_end(processes: Iterable[psutil.Process]) -> bool:
 
 
 def wait_for_lines(process: subprocess.Popen[str], path: Path, lines: int = 2) -> None:
-    """Wait until a process, which must run on, has written some lines to a file."""
+    """Wait until a process, which must run on, has written some finished rows to a file."""
 
     def are_there() -> bool:
-        return path.exists() and path.read_bytes().count(b"\n") >= lines
+        text = path.read_bytes() if path.exists() else b""
+        return text.count(b"\n") - text.count(b'"status": "started"') >= lines
 
     assert wait_until(lambda: are_there() or process.poll() is not None)
     assert process.poll() is None, process.stderr and process.stderr.read()

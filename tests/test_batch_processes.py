@@ -11,24 +11,21 @@ from pathlib import Path
 import psutil
 import pytest
 import trimesh
-from batches import CONSTANT, files, rows
+from batches import CONSTANT, FAST, PLAIN, files, rows
 from planted import COMMAND, run_beside_planted_files
 from processes import PATIENCE, all_end, larger_grids, start_command, wait_for_lines
 
 from super_sdf.batch import job as batch_job
-from super_sdf.batch.fingerprint import fingerprint
 from super_sdf.batch.inputs import find_jobs
-from super_sdf.batch.lock import FolderLock
 from super_sdf.batch.plan import Settings
-from super_sdf.batch.run import Queue, Run
-from super_sdf.batch.workers import choose_workers, useful_workers
+from super_sdf.batch.run import Queue, Run, choose_workers, useful_workers
 from super_sdf.convert import ConvertOptions
-from super_sdf.errors import FileError
 from super_sdf.machine.memory import held_memory
 from super_sdf.machine.pool import Death, Pool
 from super_sdf.machine.threads import count_cores
 
 pytestmark = pytest.mark.usefixtures("grid_folder")
+SMALL = (*FAST, "--factor", 2, "--spacing", 1)
 
 
 def test_an_interrupt_is_one_line_and_keeps_what_is_done(run_batch, monkeypatch):
@@ -46,52 +43,44 @@ def test_an_interrupt_is_one_line_and_keeps_what_is_done(run_batch, monkeypatch)
     assert len(files()) == 2 and len(rows()) == 1
 
 
-def test_a_folder_belongs_to_one_batch_at_a_time(run_batch):
-    with FolderLock(Path("out")):
-        want = "Error: out is in use by another batch: wait for it, or give another\n"
-        assert run_batch("in") == (1, "", want)
-        assert run_batch("in", "--dry-run")[0] == 0
-    assert run_batch("in")[0] == 1 and rows()
-
-
-def test_what_a_killed_batch_left_is_removed_and_nothing_else(run_batch):
+def test_what_a_killed_batch_left_is_removed_and_nothing_else(run_batch, command):
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
     Path("out/deep").mkdir(parents=True)
-    stale = Path(f"out/deep/.b.ply.{ended.pid}.part")
-    kept = [f"out/.x.ply.{ended.pid}.part", "out/b.part"]
-    for path in (stale, *map(Path, kept)):
+    mesh = Path("out/deep/b.ply")
+    command("upsample", "in/deep/b.npz", mesh, *FAST, *PLAIN[2:])  # in place, and has no row yet
+    stale, kept = Path(f"out/deep/.b.ply.{ended.pid}.part"), Path(f"out/.x.ply.{ended.pid}.part")
+    for path in (stale, kept):
         path.write_text("half")
-    Path("out/deep/b.ply").write_text("was moved into place, and not yet in the report")
-    made = {"out": "deep/b.ply", "sha256": fingerprint(Path("out/deep/b.ply"))["sha256"]}
-    Path("out/.super-sdf-batch").write_text(f'\n"deep/b.ply"\n\n{json.dumps(made)}\n"to')
+    started = {"in": os.path.abspath("in/deep/b.npz"), "out": "deep/b.ply", "status": "started"}
+    Path("out/report.jsonl").write_text(f"{json.dumps(started)}\n{{to")
     assert run_batch("in/", "--dry-run")[2].startswith("4 to do") and stale.exists()
     assert run_batch("in")[2].endswith("3 done, 1 failed; 3 meshes closed, 0 open\n")
-    assert not stale.exists() and all(map(os.path.exists, kept))
+    assert not stale.exists() and kept.exists()
     assert rows()[-1]["out"] == "deep/b.ply"  # last: it may be what ended the run
-    assert Path("out/.super-sdf-batch").read_text() == ""
 
 
-TWO_CORES = f"from super_sdf.batch import workers\n\nworkers.count_cores = lambda: 2\n{COMMAND}"
+TWO_CORES = f"from super_sdf.batch import run\n\nrun.count_cores = lambda: 2\n{COMMAND}"
 
 
-@pytest.mark.parametrize("code", ["", TWO_CORES])
-def test_nothing_of_the_current_folder_is_run(tmp_path, code):
+def test_nothing_of_the_current_folder_is_run(tmp_path):
     words = ("batch", "in", "--out", "out", "--jobs", 2, "--quality", "fast", "--factor", 2)
-    done, ran = run_beside_planted_files(tmp_path, code, *words)
+    done, ran = run_beside_planted_files(tmp_path, TWO_CORES, *words)
     assert "3 done, 1 failed" in done.stderr and not ran
 
 
 def start_batch(*options):
     """Start a batch as a process, and return it when its report has some lines."""
-    process = start_command("batch", "in", "--out", "out", "--jobs", 2, "--threads", 1, *options)
+    process = start_command(
+        "batch", "in", "--out", "out", "--jobs", 2, "--threads", 1, *SMALL, *options
+    )
     wait_for_lines(process, Path("out/report.jsonl"))
     return process
 
 
 def test_killed_on_the_way_it_goes_on(command):
-    larger_grids(40)
-    process = start_batch("--quality", "fast")
+    larger_grids(16)
+    process = start_batch()
     workers = psutil.Process(process.pid).children()
     assert len(workers) >= 2
     process.kill()
@@ -99,29 +88,24 @@ def test_killed_on_the_way_it_goes_on(command):
     assert all_end(workers)  # no orphans
     for mesh in Path("out").rglob("[!.]*.ply"):
         assert len(trimesh.load(mesh).faces) > 0
-    finished = Path("out/report.jsonl").read_text().count("\n")
-    code, _, err = command("batch", "in", "--out", "out", "--quality", "fast")
+    finished = len(rows())
+    code, _, err = command("batch", "in", "--out", "out", *SMALL)
     assert code == 1 and f", {finished} done before" in err
-    assert len(rows()) == 44 == len({row["out"] for row in rows()})
+    assert len(rows()) == 20 == len({row["out"] for row in rows()})
     assert not list(Path("out").rglob(".*.part"))
 
 
 def test_as_many_processes_as_cores_and_memory_allow(monkeypatch):
-    monkeypatch.setattr("super_sdf.batch.workers.count_cores", lambda: 8)
-    monkeypatch.setattr("super_sdf.batch.workers.free_memory", lambda: 3_500_000_000)
+    monkeypatch.setattr("super_sdf.batch.run.count_cores", lambda: 8)
+    monkeypatch.setattr("super_sdf.batch.run.free_memory", lambda: 3_500_000_000)
     assert choose_workers("cpu", 100) == 3
-    monkeypatch.setattr("super_sdf.batch.workers.free_memory", lambda: None)
+    monkeypatch.setattr("super_sdf.batch.run.free_memory", lambda: None)
     assert [choose_workers("cpu", jobs) for jobs in (0, 5, 100)] == [1, 5, 8]
     assert choose_workers("cuda", 100) == 1 and count_cores() >= 1
 
 
-def test_a_lock_refused_is_a_file_error():
-    with FolderLock(Path("out")), pytest.raises(FileError, match="in use by another batch"):
-        FolderLock(Path("out"))
-
-
-HOLD = "import sys; from pathlib import Path; from super_sdf.batch.lock import FolderLock\n"
-HOLD += "with FolderLock(Path('out')): print('held', flush=True); sys.stdin.read()"
+HOLD = "import sys; from pathlib import Path; from super_sdf.batch.lock import folder_lock\n"
+HOLD += "with folder_lock(Path('out')): print('held', flush=True); sys.stdin.read()"
 
 
 def test_a_lock_is_exclusive_among_processes_and_ends_with_its_own(run_batch):
@@ -130,6 +114,7 @@ def test_a_lock_is_exclusive_among_processes_and_ends_with_its_own(run_batch):
         assert holder.stdout.readline() == b"held\n"
         want = "Error: out is in use by another batch: wait for it, or give another\n"
         assert run_batch("in/a.npy") == (1, "", want)
+        assert run_batch("in/a.npy", "--dry-run")[0] == 0
         holder.kill()
         holder.wait()
         assert run_batch("in/a.npy")[0] == 0
@@ -151,37 +136,29 @@ def test_a_lock_file_that_cannot_be_written_is_named(run_batch, monkeypatch):
     assert run_batch("in/a.npy") == (1, "", "Error: out cannot be written: Permission denied\n")
 
 
-def test_what_is_locked_is_not_what_workers_read(run_batch):
-    """Windows lets no other process read it."""
-    from super_sdf.batch import journal
-
-    with FolderLock(Path("out")) as lock:
-        assert Path(lock.lock.lock_file).name == journal.LOCK_NAME != journal.NAME
-
-
-@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
+@pytest.mark.parametrize("name", ["SIGHUP", "SIGINT"])
 def test_a_signal_ends_batch_and_workers_in_a_line(name):
-    larger_grids(40)
-    process = start_batch("--quality", "fast")
+    larger_grids(16)
+    process = start_batch()
     workers = psutil.Process(process.pid).children()
     process.send_signal(getattr(signal, name))
     _, err = process.communicate(timeout=PATIENCE)
     said = "interrupted" if name == "SIGINT" else f"ended by {name}"
     assert process.returncode == 128 + getattr(signal, name)
     assert err.startswith(f"Error: {said}: ") and err.count("\n") == 1
-    assert err.endswith("of 44 are done and kept; run it again to go on\n")
+    assert err.endswith("of 20 are done and kept; run it again to go on\n")
     assert all_end(workers) and not list(Path("out").rglob(".*.part"))
 
 
 def test_a_worker_that_dies_once_costs_nothing(command):
-    larger_grids(30)
-    process = start_batch("--quality", "fast", "--quiet")
+    larger_grids(12)
+    process = start_batch("--quiet")
     children = psutil.Process(process.pid).children()
     worker = next(child for child in children if "spawn_main" in " ".join(child.cmdline()))
     worker.kill()
     _, err = process.communicate(timeout=PATIENCE)
     assert err == f"Failed: {Path('in/bad.npy')}: {CONSTANT}\n"
-    assert len(rows()) == 34 and not list(Path("out").rglob(".*.part"))
+    assert len(rows()) == 16 and not list(Path("out").rglob(".*.part"))
 
 
 def test_a_file_at_which_two_processes_die_is_named(command, monkeypatch):
@@ -195,7 +172,7 @@ def test_a_file_at_which_two_processes_die_is_named(command, monkeypatch):
             yield job, Death("was killed by SIGKILL") if job.source.name == "a.npy" else row
 
     monkeypatch.setattr(Pool, "results", deaths)
-    monkeypatch.setattr("super_sdf.batch.workers.count_cores", lambda: 2)
+    monkeypatch.setattr("super_sdf.batch.run.count_cores", lambda: 2)
     code, _, err = command("batch", "in", "--out", "out", "--quality", "fast", "--jobs", 2)
     reason = "the process that converted it was killed by SIGKILL, twice"
     assert code == 1 and err.startswith(f"Failed: in/a.npy: {reason}\n3 done, 1 failed")
@@ -205,7 +182,10 @@ def test_a_file_at_which_two_processes_die_is_named(command, monkeypatch):
 
 
 def test_fail_fast_begins_nothing_more_in_several_processes(monkeypatch):
-    batch = Run(find_jobs(["in"], ".ply", ConvertOptions()).jobs, *settings(fail_fast=True))
+    Path("out").mkdir()
+    batch = Run(
+        find_jobs(["in"], ".ply", ConvertOptions()).jobs, Settings(Path("out"), fail_fast=True)
+    )
     queue = Queue(batch, 2)
     assert len(queue) == 4
     first = queue.popleft()
@@ -213,22 +193,18 @@ def test_fail_fast_begins_nothing_more_in_several_processes(monkeypatch):
     assert len(queue) == 0 and len(batch.batch.waiting) == 3
 
 
-def settings(**options):
-    """Return how a batch is run, and its lock."""
-    return Settings(Path("out"), **options), FolderLock(Path("out"))
-
-
 def test_the_bound_is_read_once_and_shared_by_those_that_run(monkeypatch):
     bounds = iter([10**9])
     monkeypatch.setattr("super_sdf.batch.run.memory_bound", lambda asked: next(bounds))
     monkeypatch.setattr("super_sdf.batch.run.held_memory", lambda: 10**8)
-    run = Run(find_jobs(["in"], ".ply", ConvertOptions()).jobs, *settings())
+    Path("out").mkdir()
+    run = Run(find_jobs(["in"], ".ply", ConvertOptions()).jobs, Settings(Path("out")))
     queue = Queue(run, 3)
     assert [queue.popleft().options.max_memory for _ in range(4)] == 4 * [3 * 10**8]
 
 
 def test_no_more_processes_than_are_of_use(monkeypatch):
-    monkeypatch.setattr("super_sdf.batch.workers.count_cores", lambda: 4)
+    monkeypatch.setattr("super_sdf.batch.run.count_cores", lambda: 4)
     assert useful_workers(4, 10) == (4, None)
     assert useful_workers(8, 2) == (2, "--jobs 8 is cut to 2: there is no more to do")
     note = "--jobs 200 is cut to 4: this process may use no more cores"

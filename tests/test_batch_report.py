@@ -12,8 +12,7 @@ import trimesh
 from batches import LONE, rows
 
 from super_sdf.batch import job as batch_job
-from super_sdf.batch.fingerprint import fingerprint
-from super_sdf.batch.journal import read_journal
+from super_sdf.batch.ledger import is_row
 
 pytestmark = pytest.mark.usefixtures("grid_folder")
 
@@ -39,7 +38,7 @@ def test_a_file_of_another_origin_is_not_replaced(run_batch):
     assert trimesh.load("out/a.ply").is_watertight
 
 
-FOREIGN = [b"a,b\n1,2", b'{"in": "a.npy"}\n{"in": "b', b"\0\0\0\n"]
+FOREIGN = [b"a,b\n1,2", b'{"in": "a.npy"}', b'{"in": "a.npy"}\n{"in": "b', b"[]\n", b"\0\0\0\n"]
 
 
 @pytest.mark.parametrize("text", FOREIGN)
@@ -55,16 +54,15 @@ def test_a_report_of_others_is_left_alone(run_batch, text):
     assert Path("out/report.jsonl").read_bytes() == text and list(Path("out").glob("*.ply")) == []
 
 
-@pytest.mark.parametrize("text", [b"", b'{"in": "/x", "out": "a'])
+@pytest.mark.parametrize("text", [b"", b"{", b'{"in": "/x", "out": "a'])
 def test_a_report_that_was_just_begun_is_gone_on_with(run_batch, text):
     Path("out").mkdir()
     Path("out/report.jsonl").write_bytes(text)
     assert run_batch("in/a.npy")[0] == 0 and len(rows()) == 1
 
 
-@pytest.mark.parametrize(
-    ("name", "make"), [("report.jsonl", os.mkfifo), (".super-sdf-batch", os.mkdir)]
-)
+@pytest.mark.parametrize("name", ["report.jsonl", ".super-sdf-batch.lock"])
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
 def test_pipes_and_folders_of_the_batchs_names_are_refused(run_batch, name, make):
     Path("out").mkdir()
     make(Path("out", name))
@@ -72,24 +70,41 @@ def test_pipes_and_folders_of_the_batchs_names_are_refused(run_batch, name, make
     assert code == 1 and err.startswith(f"Error: {Path('out', name)} is ") and err.count("\n") == 1
 
 
-DAMAGED = {"in": 1, "out": ["a.ply"], "status": None, "output": {"sha256": 1}}
+DAMAGED = {
+    "in": 1,
+    "out": ["a.ply"],
+    "status": None,
+    "reason": {},
+    "retry": "no",
+    "options": 0,
+    "content": "x",
+    "output": {"sha256": 1},
+    "closed": None,
+}
 
 
-@pytest.mark.parametrize("key", DAMAGED)
-def test_rows_with_wrong_types_are_done_again(run_batch, key):
-    run_batch("in")
-    damaged = [{**row, key: DAMAGED[key]} if row["out"] == "a.ply" else row for row in rows()]
-    Path("out/report.jsonl").write_text("".join(json.dumps(row) + "\n" for row in damaged))
-    code, _, err = run_batch("in", "--force")
-    assert code == 1 and "3 done, 1 failed" in err
+def test_rows_with_wrong_types_are_passed_over(run_batch):
+    run_batch("in/a.npy")
+    (row,) = rows()
+    damaged = [{**row, key: value} for key, value in DAMAGED.items()]
+    assert is_row(row) and not any(map(is_row, damaged))
+    with Path("out/report.jsonl").open("a") as report:
+        report.writelines(json.dumps(each) + "\n" for each in damaged)
+    assert run_batch("in/a.npy", "--dry-run")[2].startswith("0 to do, 1 done before")
 
 
-def test_lines_of_others_are_passed_over_and_a_carriage_return_ends_none(run_batch):
+def test_lines_of_others_in_the_report_are_passed_over(run_batch):
     run_batch("in")
     report = Path("out/report.jsonl")
-    foreign = b'nonsense\n[1]\n{"out": 1}\n'
-    deep = 100_000 * b"[" + b"\n" + b'{"reason": 1' + 5000 * b"0" + b"}\n"
-    report.write_bytes(b"a\rb\n" + foreign + deep + report.read_bytes())
+    deep = (
+        b'nonsense\n[1]\n{"out": 1}\n'
+        + 100_000 * b"["
+        + b"\n"
+        + b'{"reason": 1'
+        + 5000 * b"0"
+        + b"}\n"
+    )
+    report.write_bytes(b"a\rb\n" + deep + report.read_bytes())
     before = report.read_bytes()
     assert run_batch("in")[2].splitlines()[-1].startswith("nothing to do: 3 done before")
     assert report.read_bytes() == before
@@ -112,14 +127,14 @@ def test_a_row_without_room_is_an_error_and_not_torn(run_batch):
     mesh, first = Path("out/a.ply"), Path("out/report.jsonl").read_bytes()
     row = first.replace(b'"in": "', b'"in": "' + 2 * mesh.stat().st_size * b"x")
     Path("out/report.jsonl").write_bytes(row)  # now there is room for meshes, and not for rows
-    code, err = limited(len(row) + 100)
+    code, err = limited(len(row) + 200)
     assert code == 1
     assert err == f"Error: {Path('out/report.jsonl')} cannot be written: File too large\n"
-    assert Path("out/report.jsonl").read_bytes() == row
+    started = Path("out/report.jsonl").read_bytes().removeprefix(row).splitlines()
+    assert [json.loads(line)["status"] for line in started] == ["started"]
     assert len(list(Path("out").rglob("*.ply"))) == 2
-    Path("out/report.jsonl").write_bytes(first)
+    Path("out/report.jsonl").write_bytes(first + started[0] + b"\n")
     assert run_batch("in/a.npy", "in/deep")[0] == 0  # the mesh without a row is known again
-    assert Path("out/.super-sdf-batch").read_bytes() == b""
 
 
 def test_a_mesh_without_room_fails_by_its_name_and_leaves_nothing():
@@ -144,21 +159,26 @@ def test_what_appears_while_the_batch_runs_is_kept(run_batch, monkeypatch):
 
 
 def test_only_its_own_content_makes_a_mesh_the_batchs(run_batch):
+    """A batch was killed before it could write the row."""
     run_batch("in/a.npy")
-    digest = fingerprint(Path("out/a.ply"))["sha256"]
-    os.remove("out/report.jsonl")
-    Path("out/.super-sdf-batch").write_text(f'"a.ply"\n{{"out": "a.ply", "sha256": "{digest}"}}\n')
+    started = Path("out/report.jsonl").read_bytes().splitlines(keepends=True)[0]
+    Path("out/report.jsonl").write_bytes(started)
     mesh = Path("out/a.ply").read_bytes()
     Path("out/a.ply").write_bytes(mesh + b" ")
-    assert "exists and was not made by a batch" in run_batch("in/a.npy")[2]
+    assert "out/a.ply exists and is not what this batch makes: remove" in run_batch("in/a.npy")[2]
     assert Path("out/a.ply").read_bytes() == mesh + b" "
     Path("out/a.ply").write_bytes(mesh)
     assert run_batch("in/a.npy")[0] == 0
+    os.remove("out/report.jsonl")
+    assert "exists and was not made by a batch" in run_batch("in/a.npy")[2]
 
 
-def test_a_journal_of_any_content_is_read(run_batch):
+def test_nothing_outside_the_folder_is_removed(run_batch):
     Path("out").mkdir()
-    lines = b'"../../x"\n[1]\n{"out": [], "sha256": 1}\n' + 100_000 * b"[" + b'\n\xff\n7\n"to'
-    Path("out/.super-sdf-batch").write_bytes(lines)
+    Path(".x.ply.1.part").touch()
+    line = {"in": "/x", "out": "../x.ply", "status": "started"}
+    rows = [{**line, "out": name} for name in ("../x.ply", os.path.abspath("x.ply"), "y.ply")]
+    Path("out/report.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    Path("out/.y.ply.1.part").touch()
     assert run_batch("in/a.npy")[0] == 0
-    assert read_journal(Path("out")).started == set()
+    assert Path(".x.ply.1.part").exists() and not Path("out/.y.ply.1.part").exists()

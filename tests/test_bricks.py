@@ -14,12 +14,10 @@ from conftest import ball
 from test_slabs import bad_samples, rod
 
 from super_sdf import load_network
-from super_sdf.bricks import engine, passes, stored
-from super_sdf.bricks.engine import BricksEngine
-from super_sdf.bricks.meshing import Loading, prepare_meshing
-from super_sdf.bricks.passes import Brick, Queue, ordered
-from super_sdf.bricks.stored import Source, StoredPlanes
+from super_sdf.cluster import bricks, stored
+from super_sdf.cluster.bricks import BrickWork, Loading, convert_on_cluster
 from super_sdf.cluster.connecting import connect
+from super_sdf.cluster.stored import Source, StoredPlanes
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.errors import ClusterError, GridError, MeshError, OptionError
 from super_sdf.grid.planes import DerivedPlanes
@@ -42,7 +40,7 @@ def network():
 @pytest.fixture(autouse=True)
 def many_bricks(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(engine, "LEAST_PER_WORKER", 5)
+    monkeypatch.setattr(bricks, "MESH_BRICKS", 5)
 
 
 def store(values, chunks):
@@ -57,46 +55,47 @@ def store(values, chunks):
 
 
 def both(cluster, network, values, chunks, **options):
-    """Convert on one machine and on a cluster; return both results and the engine."""
+    """Convert on one machine and on a cluster; return both results."""
     source = store(values, chunks)
     chosen = ConvertOptions(**{"spacing": (1.0,), "factor": 2, **options})
-    bricks = BricksEngine(cluster, LOADING)
     here = convert("a.npy", "here.ply", network, chosen)
-    there = convert(source, "there.ply", network, chosen, engine=bricks)
-    return here, there, bricks
+    return here, on_cluster(cluster, source, chosen)
 
 
-def check_same(here, there, bricks):
+def on_cluster(cluster, source, chosen, target="there.ply", **more):
+    """Convert on a cluster."""
+    return convert_on_cluster(source, target, cluster, LOADING, chosen, force=True, **more)
+
+
+def check_same(here, there):
     """Check that files, counts, notes and warnings are the same."""
     assert Path("there.ply").read_bytes() == Path("here.ply").read_bytes()
-    assert bricks.bricks > 2
+    assert there.report()["bricks"] > 2
     left_out = {"slabs", "planned_bytes", "bricks", "workers"}
     here, there = here.report(), there.report()
     for name in here.keys() - left_out:
         assert there[name] == here[name], name
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-@pytest.mark.parametrize("mesher", ["marching", "sharp"])
+@pytest.mark.parametrize(
+    ("layout", "mesher"), [("cubes", "marching"), ("first axis whole", "sharp"), ("npy", "sharp")]
+)
 def test_the_mesh_is_that_of_one_machine(cluster, network, layout, mesher):
     check_same(*both(cluster, network, rod(), LAYOUTS[layout], mesher=mesher))
 
 
+TURNED = (0, -1, 0, 1, 0, 0, 0, 0, 1)
 FIELDS = {
-    "leaves the grid": (rod()[4:52, :10], {}),
-    "left open": (rod()[4:52, :10], {"cap": False}),
-    "positive inside": (-rod(), {}),
+    "leaves the grid, positive inside": (-rod()[4:52, :10], {"cap": False}),
     "offset": (rod(), {"offset": 1.3}),
-    "bad samples": (bad_samples(rod()), {}),
-    "spacing inferred": (rod() * 0.25, {"spacing": None}),
-    "scale": (rod() * 10, {"scale": 0.1}),
-    "mask": (rod() < 0, {}),
+    "bad samples, spacing inferred": (bad_samples(rod()) * 0.25, {"spacing": None}),
     "label": ((rod() < 0) * np.int16(6), {"label": 6.0}),
     "truncated": (np.clip(rod(), -1.2, 1.2), {}),
     "level": (100 - rod() * 10, {"level": 100.0, "scale": 0.1}),
-    "simplified": (rod(), {"simplify": 0.05}),
-    "placed": (rod(), {"origin": (3.0, 4.0, 5.0), "direction": (0, -1, 0, 1, 0, 0, 0, 0, 1)}),
-    "integers": (np.rint(rod() * 40).astype(np.int16), {"scale": 1 / 40}),
+    "integers, placed": (
+        np.rint(rod() * 40).astype(np.int16),
+        {"scale": 1 / 40, "origin": (3.0, 4.0, 5.0), "direction": TURNED},
+    ),
 }
 
 
@@ -106,24 +105,18 @@ def test_other_fields_and_options(cluster, network, field):
     check_same(*both(cluster, network, values, LAYOUTS["cubes"], **options))
 
 
-def test_a_killed_worker_costs_its_bricks(cluster, network, monkeypatch):
+def test_a_killed_worker_costs_its_bricks(cluster, network):
     source, chosen = store(rod(), (8, 8, 8)), ConvertOptions(spacing=(1.0,), factor=2)
     convert("a.npy", "here.ply", network, chosen)
-    bricks, killed, lost = BricksEngine(cluster, LOADING), [], []
-    monkeypatch.setattr(
-        Queue,
-        "take_back",
-        lambda own, brick, cause, to=Queue.take_back: lost.append(brick) or to(own, brick, cause),
-    )
+    killed = []
 
     def kill(done, total):
         if done > 300 and not killed:
-            killed.append(bricks.team.checked.members[0].report.pid)
+            killed.append(next(iter(cluster.client.run(os.getpid).values())))
             os.kill(killed[0], signal.SIGKILL)
 
-    convert(source, "there.ply", network, chosen, engine=bricks, progress=kill)
-    assert killed and len(lost) <= 2
-    assert Path("there.ply").read_bytes() == Path("here.ply").read_bytes()
+    on_cluster(cluster, source, chosen, progress=kill)
+    assert killed and Path("there.ply").read_bytes() == Path("here.ply").read_bytes()
 
 
 class Off:
@@ -136,24 +129,20 @@ class Off:
         return self.network(*given) + np.float32(0.05)
 
 
-class OtherProcessor(Loading):
-    """Loads such a network."""
+class TwoProcessors(BrickWork):
+    """Makes the bricks from plane 29 on as another processor."""
 
-    def load(self, threads):
-        return Off(super().load(threads))
-
-
-def prepare_as_two(source, loading, limits):
-    """Prepare a worker that makes the bricks from the fifth on as another processor."""
-    one, other = (
-        prepare_meshing(source, some, limits) for some in (loading, OtherProcessor(*loading))
-    )
-    return lambda brick, check: (one if brick.number < 5 else other)(brick, check)
+    def mesh(self, task, check):
+        network, vars(self)["network"] = self.network, None
+        vars(self)["network"] = network if task.planes[0] < 29 else Off(network)
+        made = super().mesh(task, check)
+        vars(self)["network"] = network
+        return made
 
 
 def test_bricks_of_processors_that_round_differently_are_an_error(cluster, network, monkeypatch):
     cluster.client.wait_for_workers(2)  # one that was killed comes back; bricks depend on it
-    monkeypatch.setattr(engine, "prepare_meshing", prepare_as_two)
+    monkeypatch.setattr(bricks, "BrickWork", TwoProcessors)
     said = refusal(cluster, network, rod(), factor=2)
     assert re.fullmatch(
         r"the mesh is torn, with 110 open edges at plane 29, between planes 24 to 28 \(\S+:\d+\) "
@@ -163,28 +152,12 @@ def test_bricks_of_processors_that_round_differently_are_an_error(cluster, netwo
     )
 
 
-def test_a_brick_that_was_tampered_with_is_an_error(cluster, network, monkeypatch):
-    add, bricks = engine.Joining.add, []
-
-    def spoil(self, made):
-        bricks.append(made)
-        if len(bricks) == 3:
-            faces = made.pieces[0].meshes[0].faces
-            faces[np.flatnonzero((faces < 0).sum(1) == 2)[0]] = 0  # no triangle any more
-        return add(self, made)
-
-    monkeypatch.setattr(engine.Joining, "add", spoil)
-    said = refusal(cluster, network, rod(), factor=2)
-    plane = bricks[2].pieces[0].planes[0]
-    assert said.startswith(f"the mesh is torn, with 1 open edge at plane {plane}, between planes ")
-
-
 def refusal(cluster, network, values, **options):
     """Return the error for a grid that cannot be converted on a cluster."""
     store(values, None)
     chosen = ConvertOptions(**{"spacing": (1.0,), **options})
     with pytest.raises((OptionError, GridError, ClusterError, MeshError)) as caught:
-        convert("a.npy", "o.ply", network, chosen, engine=BricksEngine(cluster, LOADING))
+        on_cluster(cluster, "a.npy", chosen, "o.ply")
     assert not Path("o.ply").exists()
     return str(caught.value)
 
@@ -231,7 +204,7 @@ def test_a_grid_that_the_workers_do_not_see(cluster, network):
     store(rod(), None)
     path = Path("/proc/self/cwd/a.npy")
     with pytest.raises(ClusterError) as caught:
-        convert(path, "o.ply", network, ConvertOptions(), engine=BricksEngine(cluster, LOADING))
+        on_cluster(cluster, path, ConvertOptions(), "o.ply")
     assert re.fullmatch(
         r"worker tcp://127.0.0.1:\d+( and 1 other)? does not see /proc/self/cwd/a.npy: put the "
         r"inputs where all machines see them by this path",
@@ -277,30 +250,6 @@ def test_the_command(command):
     assert '"bricks": ' in out and '"peak_bytes": ' in out
 
 
-def test_results_come_in_order_also_through_files(monkeypatch):
-    monkeypatch.setattr(passes, "SPOOLED", 10)
-    found = [(2, "c" * 20), (0, "a"), (3, "d"), (1, np.arange(9)), (4, "e")]
-    got = list(ordered(found))
-    np.testing.assert_array_equal(got[1], np.arange(9))
-    assert [*got[:1], *got[2:]] == ["a", "c" * 20, "d", "e"]
-
-
-def test_workers_get_bricks_that_lie_beside_each_other():
-    bricks = [Brick(number, number, number + 1, None) for number in range(7)]
-    queue = Queue.of(bricks, ["one", "two"])
-    assert [queue.pop_for("one").number for _ in range(2)] == [0, 1]
-    assert [queue.pop_for("two").number for _ in range(2)] == [4, 5]
-    assert [queue.pop_for("one").number for _ in range(3)] == [2, 3, 6]
-    queue.take_back(bricks[3], "was lost")
-    assert len(queue) == 1 and queue.pop_for("a worker that came later") == bricks[3]
-    with pytest.raises(ClusterError) as caught:
-        queue.take_back(bricks[3], "was lost")
-    assert str(caught.value) == (
-        "the worker that had planes 3 to 3 was lost, and so did the next one: see their logs, or "
-        "give less memory (--max-memory)"
-    )
-
-
 def test_layers_are_unpacked_once_and_samples_travel_by_their_path(monkeypatch):
     values = ball(shape=(20, 18, 16)).values
     store(values, (4, 4, 4))
@@ -327,8 +276,7 @@ def test_spacing_origin_and_direction_of_the_store(cluster, network):
     made.attrs.update(spacing=0.5, origin=[1, 2, 3], direction=[-1, 0, 0, 0, -1, 0, 0, 0, 1])
     chosen = ConvertOptions(factor=2, scale=0.5)
     here = convert("b.zarr", "here.ply", network, chosen)
-    bricks = BricksEngine(cluster, LOADING)
-    check_same(here, convert("b.zarr", "there.ply", network, chosen, engine=bricks), bricks)
+    check_same(here, on_cluster(cluster, "b.zarr", chosen))
 
 
 def test_a_file_that_changed_since_the_last_conversion(cluster, network):
@@ -340,6 +288,4 @@ def test_a_file_that_changed_since_the_last_conversion(cluster, network):
         made[:] = values.T
         chosen = ConvertOptions(factor=2, spacing=(1.0,))
         here = convert("b.zarr", "here.ply", network, chosen, force=True)
-        bricks = BricksEngine(cluster, LOADING)
-        there = convert("b.zarr", "there.ply", network, chosen, engine=bricks, force=True)
-        check_same(here, there, bricks)
+        check_same(here, on_cluster(cluster, "b.zarr", chosen))

@@ -47,7 +47,6 @@ def old_group(name, most, taken, kept):
         ("0::/", group("", 500 * MB, 450 * MB, 400 * MB), 450 * MB),
         ("0::/", group("", 500 * MB, 600 * MB), 0),
         ("0::/a/b", group("a/b/", "max", 9) | group("a/", 100, 30) | group("", 300, 250), 50),
-        ("0::/a/b", group("a/b/", 90, 30, 10) | group("a/", "max", 30), 70),
         ("0::/a/b", group("a/b/", 90, "what?") | group("a/", 100, 30), 70),
         ("0::/not/mounted/here", group("", 100, 40), 60),
         ("4:memory:/a\n1:cpu:/", old_group("a/", 100, 80, 70) | old_group("", 2**63, 90, 0), 90),

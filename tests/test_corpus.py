@@ -23,7 +23,7 @@ from corpus.trying import try_case
 
 from super_sdf import load_network
 from super_sdf.network.onnx import ort
-from super_sdf.steps.mesher_names import MESHERS
+from super_sdf.options import MESHERS
 
 EACH = 45  # cases of a theme
 ALONE = 40  # of all that may hang or crash

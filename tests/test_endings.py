@@ -93,9 +93,11 @@ LINES = {
 }
 
 
-@pytest.mark.parametrize("script, more", [(STAGE, "; nothing was written"), (IMPORT, "")])
-@pytest.mark.parametrize("number", LINES)
-def test_a_signal_leaves_a_line_its_exit_code_and_no_file(number, script, more):
+@pytest.mark.parametrize(
+    "script, more, number",
+    [*((STAGE, "; nothing was written", number) for number in LINES), (IMPORT, "", signal.SIGTERM)],
+)
+def test_a_signal_leaves_a_line_its_exit_code_and_no_file(script, more, number):
     words = [sys.executable, "-c", script, *QUICK]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(words, preexec_fn=hear_signals, **pipes) as process:
@@ -107,8 +109,7 @@ def test_a_signal_leaves_a_line_its_exit_code_and_no_file(number, script, more):
     assert os.listdir() == ["in.npy"]
 
 
-@pytest.mark.parametrize("number", LINES)
-def test_a_signal_waits_for_the_end_of_an_import(number):
+def test_a_signal_waits_for_the_end_of_an_import(number=signal.SIGTERM):
     words = [sys.executable, "-c", LIBRARY, *QUICK]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(words, preexec_fn=hear_signals, **pipes) as process:
@@ -121,7 +122,7 @@ def test_a_signal_waits_for_the_end_of_an_import(number):
     assert sorted(os.listdir()) == ["go", "in.npy"]
 
 
-@pytest.mark.parametrize("made_of_it", [None, ValueError("odd"), SuperSdfError("odd")])
+@pytest.mark.parametrize("made_of_it", [None, SuperSdfError("odd")])
 def test_an_interrupt_that_other_code_catches_is_raised_all_the_same(made_of_it):
     with pytest.raises(Interrupted) as caught, raising_interrupts():
         try:
@@ -161,7 +162,7 @@ def test_a_report_that_cannot_be_printed_is_one_line_and_the_mesh_stays(shell, r
     assert run("--help", shell=shell) == (1, "", want)
 
 
-@pytest.mark.parametrize("handles", [7, 8, 10, 20])
+@pytest.mark.parametrize("handles", [7, 20])
 def test_few_file_handles_end_in_a_line_or_a_mesh(handles):
     def limit():
         resource.setrlimit(resource.RLIMIT_NOFILE, (handles, handles))
@@ -175,9 +176,8 @@ def test_few_file_handles_end_in_a_line_or_a_mesh(handles):
         assert os.listdir() == ["in.npy"]
 
 
-@pytest.mark.parametrize("size", [1, 1000, 100_000])
-@pytest.mark.parametrize("suffix", ["ply", "stl", "obj", "glb", "3mf"])
-def test_a_disk_that_fills_leaves_nothing(size, suffix, command):
+@pytest.mark.parametrize("suffix", ["ply", "obj", "glb", "3mf"])
+def test_a_disk_that_fills_leaves_nothing(suffix, command, size=1000):
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:

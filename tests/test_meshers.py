@@ -13,14 +13,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_slabs import in_pieces, rod
 
-from super_sdf import SdfGrid, extract_mesh, load_network, reconstruct, upsample
+from super_sdf import SdfGrid, extract_mesh, load_network, options, reconstruct, upsample
 from super_sdf.convert import ConvertOptions
 from super_sdf.evaluation import names
 from super_sdf.machine import threads
 from super_sdf.mesh import join_meshes
-from super_sdf.slabs import cutting, footprint
-from super_sdf.steps import mesher_names, meshers, sharp_groups
+from super_sdf.slabs import cutting
+from super_sdf.steps import meshers
 from super_sdf.steps.marching import extract_pieces
+from super_sdf.steps.sharp import mesher as sharp
 from super_sdf.steps.survey import survey
 
 
@@ -57,11 +58,10 @@ def joined(pieces):
 
 
 def test_there_is_one_list_of_names_and_one_default():
-    assert tuple(meshers.BY_NAME) == names.MESHERS == mesher_names.MESHERS
+    assert tuple(meshers.BY_NAME) == names.MESHERS == options.MESHERS
     assert all(mesher.name == name for name, mesher in meshers.BY_NAME.items())
-    assert set(mesher_names.MESHERS) <= set(footprint.STAGES)
-    assert ConvertOptions.mesher == mesher_names.DEFAULT_MESHER
-    assert cutting.DEFAULT.name == mesher_names.DEFAULT_MESHER
+    assert ConvertOptions.mesher == options.DEFAULT_MESHER
+    assert cutting.DEFAULT.name == options.DEFAULT_MESHER
 
 
 def test_each_name_gives_its_mesh(network):
@@ -121,8 +121,8 @@ def test_groups_and_threads_change_nothing(network, monkeypatch, factor):
     monkeypatch.setattr(threads, "CHUNK", 5000)
     monkeypatch.setattr(threads, "MIN_PER_THREAD", 1000)
     for groups, number in ((1, 2), (4, 1), (9, 3)):
-        size = sum(sharp_groups.voxel_bytes(factor)) * len(field.voxel_ijk)
-        monkeypatch.setattr(sharp_groups, "GROUP_BYTES", size // groups)
+        size = sum(sharp.voxel_bytes(factor)) * len(field.voxel_ijk)
+        monkeypatch.setattr(sharp, "GROUP_BYTES", size // groups)
         pieces = mesher.extract(field, grid, 7, number)
         assert len(pieces) > 1 or groups == 1
         assert_same(join_meshes(pieces), one)
@@ -163,14 +163,14 @@ def meshed_in(grid, network, max_memory):
 def test_the_command_takes_a_mesher_and_says_which(tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)
     np.save("in.npy", FIELDS["bar"])
-    options = ("--spacing", 1, "--quality", "fast", "--json", "--quiet")
-    code, out, _ = command("upsample", "in.npy", "sharp.ply", "--mesher", "sharp", *options)
+    words = ("--spacing", 1, "--quality", "fast", "--json", "--quiet")
+    code, out, _ = command("upsample", "in.npy", "sharp.ply", "--mesher", "sharp", *words)
     assert code == 0 and json.loads(out)["mesher"] == "sharp"
-    code, out, _ = command("upsample", "in.npy", "plain.ply", *options)
-    assert code == 0 and json.loads(out)["mesher"] == mesher_names.DEFAULT_MESHER
+    code, out, _ = command("upsample", "in.npy", "plain.ply", *words)
+    assert code == 0 and json.loads(out)["mesher"] == options.DEFAULT_MESHER
     sizes = [Path(name).stat().st_size for name in ("sharp.ply", "plain.ply")]
     assert sizes[0] > sizes[1]
-    code, out, err = command("upsample", "in.npy", "x.ply", "--mesher", "dual", *options)
+    code, out, err = command("upsample", "in.npy", "x.ply", "--mesher", "dual", *words)
     assert code == 2 and not Path("x.ply").exists()
     assert err.endswith("'--mesher': 'dual' is not one of 'marching', 'sharp'.\n")
 

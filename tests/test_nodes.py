@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from super_sdf.errors import OptionError
+from super_sdf.options import check_factor
 from super_sdf.steps.band import neighbour_table
 from super_sdf.steps.field import FineField
 from super_sdf.steps.nodes import (
     average_shared,
     block_ijk,
     block_offsets,
-    check_factor,
     pin_to_skipped,
     share_parts,
     signs_of_skipped,

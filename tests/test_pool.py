@@ -73,25 +73,20 @@ def blunder():
 
 
 def work(tasks, prepare, workers=2, **options):
-    """Return what came of the tasks, and at which a process had to be cleaned up after."""
-    cleaned = []
-    options = PoolOptions(lambda task, pid: cleaned.append(task), **options)
-    return dict(Pool(deque(tasks), prepare, options).results(workers)), cleaned
+    """Return what came of the tasks."""
+    return dict(Pool(deque(tasks), prepare, PoolOptions(**options)).results(workers))
 
 
-@pytest.mark.parametrize(
-    ("task", "death"),
-    [
-        ("while it works", KILLED),
-        ("while it sends", KILLED),
-        ("in good order", Death("ended with exit code 0")),
-        ("by a bug", Death("ended with exit code 1")),
-    ],
-)
-def test_a_death_is_the_result_of_its_task_alone(task, death):
-    done, cleaned = work([1, task, 2, 3], square)
-    assert done == {1: 1, 2: 4, 3: 9, task: death}
-    assert cleaned == [task]
+DEATHS = {
+    "while it works": KILLED,
+    "while it sends": KILLED,
+    "in good order": Death("ended with exit code 0"),
+    "by a bug": Death("ended with exit code 1"),
+}
+
+
+def test_a_death_is_the_result_of_its_task_alone():
+    assert work([1, *DEATHS, 2, 3], square) == {1: 1, 2: 4, 3: 9, **DEATHS}
 
 
 @pytest.mark.parametrize(
@@ -117,7 +112,7 @@ def test_a_process_killed_before_it_is_ready_is_replaced(monkeypatch):
             victims[0].kill()
 
     monkeypatch.setattr(Pool, "_start_worker", kill_the_first)
-    assert work([2, 3], square, 1)[0] == {2: 4, 3: 9} and victims[0].exitcode == -signal.SIGKILL
+    assert work([2, 3], square, 1) == {2: 4, 3: 9} and victims[0].exitcode == -signal.SIGKILL
 
 
 def test_partial_results_arrive_in_order_before_the_final_one():
@@ -178,11 +173,12 @@ def test_on_windows_signals_are_not_blocked(monkeypatch):
     assert serving.ending_signals() == {signal.SIGINT, signal.SIGTERM}
     serving.settle_signals()
     assert heard == [(signal.SIGINT, signal.SIG_IGN)]
-    assert work([2], square, 1)[0] == {2: 4}
+    assert work([2], square, 1) == {2: 4}
 
 
-@pytest.mark.parametrize("flag", ["-I", serving.SAFE_PATH])
-@pytest.mark.parametrize("method", ["spawn", "forkserver"])
+@pytest.mark.parametrize(
+    ("flag", "method"), [("-I", "spawn"), (serving.SAFE_PATH, "spawn"), ("-I", "forkserver")]
+)
 def test_no_process_runs_files_of_the_current_folder(tmp_path, flag, method):
     """Python 3.10 has no other flag than -I, which must not keep workers from ``PYTHONPATH``."""
     code = f"""
@@ -193,4 +189,4 @@ if __name__ == "__main__":
     print(test_pool.work([2, 3], test_pool.square, start_method=get_context({method!r})))
 """
     done, ran = run_beside_planted_files(tmp_path, code)
-    assert (done.stdout, done.stderr, ran) == ("({2: 4, 3: 9}, [])\n", "", [])
+    assert (done.stdout, done.stderr, ran) == ("{2: 4, 3: 9}\n", "", [])

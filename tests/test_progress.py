@@ -16,7 +16,7 @@ from test_network import network_inputs
 
 from super_sdf import load_network, reconstruct, upsample
 from super_sdf.network import network, running
-from super_sdf.network.pace import LINEAR_UP_TO, Pace, share_of_time, work_of
+from super_sdf.network.pace import LINEAR_UP_TO, share_of_time
 from super_sdf.progress import StepCounter
 from super_sdf.steps.nodes import block_offsets
 
@@ -172,24 +172,6 @@ def test_a_second_interrupt_does_not_wait_for_a_run():
     session.released.set()
 
 
-def test_an_exception_in_poll_stops_a_run_in_the_middle():
-    session = EndlessSession()
-    with pytest.raises(ZeroDivisionError):
-        running.run_on_cpu(session, FEEDS, poll=lambda: 1 / 0)
-    assert session.ended
-
-
-def test_onnxruntime_stops_between_two_chunks():
-    """A run with ``terminate`` set before it starts fails at once."""
-    session = load_network("fast", device="cpu").session
-    options = running.ort.RunOptions()
-    options.terminate = True
-    with pytest.raises(Exception, match="terminate flag"):
-        session.run(
-            None, dict(zip(network.INPUTS, (*network_inputs(ball()), block_offsets(2)))), options
-        )
-
-
 def test_the_pace_is_measured_in_a_part_only_if_progress_is_reported(polled, monkeypatch):
     inputs = *network_inputs(ball()), block_offsets(2)
     runs = []
@@ -210,27 +192,11 @@ def test_the_pace_is_measured_in_a_part_only_if_progress_is_reported(polled, mon
     assert runs == [len(inputs[0])] and other.pace.seconds > 0
 
 
-def test_cropped_inputs_have_no_neighbours_in_the_rest():
-    table = np.array([[0, 1, 2], [2, 1, -1], [0, 0, 0]], np.int32)
-    feeds = dict(zip(network.INPUTS, (np.zeros((3, 27)), table, np.array([2, 1]), "offsets")))
-    part = network.crop_inputs(feeds, 2)
-    np.testing.assert_array_equal(part["neighbours"], [[0, 1, -1], [-1, 1, -1]])
-    assert len(part["patches"]) == 2 and part["voxels"].tolist() == [1]
-    assert network.crop_inputs(feeds, 1)["voxels"].tolist() == [0]  # something must be decoded
-
-
 @given(st.floats(0, 1e6), st.floats(0, 1e6))
 def test_the_share_grows_with_time_and_is_never_all(one, two):
     low, high = (share_of_time(seconds, 10.0) for seconds in sorted((one, two)))
     assert 0 <= low <= high < 1
     assert low == min(one, two) / 10 or min(one, two) > 10 * LINEAR_UP_TO
-
-
-def test_before_the_pace_is_known_the_share_stays_0():
-    shares = []
-    Pace().watch(100, shares.append)()
-    assert shares == [0]
-    assert work_of(100, 10, 300) == 110
 
 
 def test_the_progress_bar_runs_to_100_percent(tmp_path, monkeypatch, command, polled):

@@ -7,13 +7,14 @@ from super_sdf.machine.records import RecordFile, parse_line
 
 def test_lines_are_appended_whole_or_not_at_all(tmp_path):
     path = tmp_path / "lines"
+    assert list(RecordFile(path).read()) == []
     RecordFile(path).append({"a": 1})
-    RecordFile(path, is_shared=True).append("b")
-    assert path.read_bytes() == b'{"a": 1}\n\n"b"\n'
+    RecordFile(path).append("b")
     with pytest.raises(OSError, match="No space left on device"):
         RecordFile(Full(path)).append([2])
-    assert path.read_bytes() == b'{"a": 1}\n\n"b"\n'
-    assert list(RecordFile(path).read()) == [{"a": 1}, None, "b"]
+    path.write_bytes(path.read_bytes() + b"nonsense\n")
+    assert path.read_bytes() == b'{"a": 1}\n"b"\nnonsense\n'
+    assert list(RecordFile(path).read()) == [{"a": 1}, "b", None]
 
 
 def test_an_unfinished_line_is_cut_off_before_the_next_one(tmp_path):
@@ -25,38 +26,6 @@ def test_an_unfinished_line_is_cut_off_before_the_next_one(tmp_path):
     file.append(2)
     file.append(3)
     assert path.read_bytes() == b"1\n2\n3\n"
-
-
-def test_what_another_process_has_appended_since_is_not_cut_off(tmp_path):
-    path = tmp_path / "lines"
-    path.write_bytes(b"1\n2")
-    file = RecordFile(path)
-    assert list(file.read()) == [1]
-    with path.open("ab") as other:
-        other.write(b"3\n")
-    file.append(4)
-    assert path.read_bytes() == b"1\n23\n4\n"
-
-
-def test_in_a_shared_file_an_unfinished_line_stays_and_harms_no_other(tmp_path):
-    path = tmp_path / "lines"
-    path.write_bytes(b'"a"\n"b')
-    file = RecordFile(path, is_shared=True)
-    assert list(file.read()) == ["a", None]
-    file.append("c")
-    assert [line for line in file.read() if line] == ["a", "c"]
-    path.write_bytes(b'"a"\n"b"')  # only its line break is missing
-    assert list(file.read()) == ["a", "b"]
-
-
-def test_a_file_that_is_not_there_has_no_records(tmp_path):
-    file = RecordFile(tmp_path / "none")
-    assert list(file.read()) == []
-    file.clear()
-    assert not file.path.exists()
-    file.append(1)
-    file.clear()
-    assert file.path.read_bytes() == b""
 
 
 @pytest.mark.parametrize(

@@ -55,7 +55,7 @@ def test_check_and_page_take_grid_band_and_mesh_from_the_conversion(command, fol
     """Neither file is read again, and no band found again; the mesh is the same."""
     command(*UPSAMPLE)
     plain = Path("a.ply").read_bytes()
-    for name in ("read_grid_with", "read_mesh", "survey"):
+    for name in ("read_grid", "read_mesh", "survey"):
         monkeypatch.setattr(f"super_sdf.certificate.check.{name}", broken)
     reads = []
     planes = SdfGrid.planes

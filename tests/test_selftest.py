@@ -116,30 +116,17 @@ def test_a_missing_extra_is_named_with_its_way_out(monkeypatch):
     )
 
 
-def test_a_system_that_does_not_tell_its_memory(monkeypatch):
-    monkeypatch.setattr(selftest, "free_memory", lambda: None)
-    assert selftest.check_memory().says == "the system does not report the free memory"
-
-
 def test_the_command_prints_a_line_a_check_and_its_exit_code_tells(command):
     code, out, err = command("info", "--check")
     lines = out.splitlines()
     assert (code, err) == (0, "") and lines[-1] == "What is installed works."
     assert lines[0].startswith("ok       versions: super-sdf ")
     assert all(re.match(r"(ok      |missing ) \w+", line) for line in lines[:-1])
-    code, out, _ = command("info", "--check", "--device", "cuda")
-    checks = 2 + 1 + len(SHIPPED) + len(EXTRAS)  # versions, memory; cuda; networks; extras
-    assert code == 1 and out.splitlines()[-1] == f"1 of {checks} checks failed"
-    assert "\nfailed   cuda: onnxruntime " in out
-
-
-def test_the_command_prints_json(command):
-    code, out, _ = command("info", "--check", "--device", "cpu", "--json")
+    code, out, _ = command("info", "--check", "--device", "cuda", "--json")
     report = json.loads(out)
-    assert code == 0 and report["works"] is True
+    assert code == 1 and report["works"] is False
     found = next(f for f in report["findings"] if f["what"] == "network fast on cpu")
     assert found["state"] == "ok" and found["figures"]["off_voxels"] < 0.05
-    assert command("info", "--check", "--device", "cuda", "--json")[0] == 1
 
 
 SHIPPED = network.shipped_models()

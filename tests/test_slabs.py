@@ -63,13 +63,14 @@ def in_pieces(grid, network, monkeypatch, pieces, **options):
     return list(reconstruct_slabs(grid, network, **options))
 
 
-@pytest.mark.parametrize("field", FIELDS)
-@pytest.mark.parametrize("factor, cap", [(2, True), (4, False)])
+@pytest.mark.parametrize(
+    "field, factor, cap", [*((field, 2, True) for field in FIELDS), ("leaves the grid", 4, False)]
+)
 def test_slabs_change_nothing(network, monkeypatch, field, factor, cap):
     grid = SdfGrid.trusted(FIELDS[field], (1.0,) * 3)
     (whole,) = in_pieces(grid, network, monkeypatch, 1, factor=factor, cap=cap)
     one = join_meshes(whole.meshes)
-    for pieces in (2, 3, 7, 56):
+    for pieces in (3, 56):
         parts = in_pieces(grid, network, monkeypatch, pieces, factor=factor, cap=cap)
         assert len(parts) > 1
         mesh = join_meshes([mesh for part in parts for mesh in part.meshes])
@@ -80,7 +81,7 @@ def test_slabs_change_nothing(network, monkeypatch, field, factor, cap):
         assert any(part.is_cut for part in parts) == whole.is_cut
 
 
-@settings(max_examples=10)
+@settings(max_examples=6)
 @given(st.integers(0, 10**6), st.integers(2, 30))
 def test_slabs_change_nothing_on_random_fields(network, seed, pieces):
     values = np.random.default_rng(seed).uniform(-3, 3, (36, 5, 6))
@@ -104,8 +105,7 @@ def test_slabs_need_all_the_planes_beside_them(network, monkeypatch):
     assert not np.array_equal(mesh.vertices, one.vertices)
 
 
-@pytest.mark.parametrize("field", ["clean", "bad samples", "noisy"])
-@pytest.mark.parametrize("factor", [2, 4, 8])
+@pytest.mark.parametrize("field, factor", [("noisy", 2), ("bad samples", 4), ("clean", 8)])
 def test_threads_change_nothing(monkeypatch, field, factor):
     grid = SdfGrid.trusted(FIELDS[field], (1.0,) * 3, (1.0, 2.0, 3.0))
     monkeypatch.setattr(threads, "CHUNK", 5000)
@@ -215,8 +215,15 @@ def solid_block():
 BRICKS = {**FIELDS, "fills the grid": solid_block(), "fills, turned over": -solid_block()}
 
 
-@pytest.mark.parametrize("field", BRICKS)
-@pytest.mark.parametrize("mesher, cap", [("marching", True), ("marching", False), ("sharp", True)])
+@pytest.mark.parametrize(
+    "field, mesher, cap",
+    [
+        *((field, "marching", True) for field in BRICKS),
+        ("leaves the grid", "marching", False),
+        ("bad samples", "sharp", True),
+        ("fills the grid", "sharp", True),
+    ],
+)
 def test_bricks_of_planes_make_the_same_mesh(network, field, mesher, cap):
     """Each knows only its planes and those beside them, in one slab or several."""
     grid = SdfGrid.trusted(BRICKS[field], (1.0,) * 3)
@@ -226,7 +233,7 @@ def test_bricks_of_planes_make_the_same_mesh(network, field, mesher, cap):
     before = np.append(0, np.cumsum(seen.decoded))
     assert seen.summary.voxels == whole[0].whole["band_voxels"]
     assert seen.summary.noisy == whole[0].whole["noisy_voxels"]
-    for pieces in (1, 2, 3, 9, 60):
+    for pieces in (2, 9):
         meshes, counts, vertices = [], [], 0
         for planes in equal_parts(before, pieces):
             brick = list(

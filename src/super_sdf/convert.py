@@ -9,128 +9,52 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
-from dataclasses import field as dataclass_field
-from functools import partial
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .arrays import Triple
 from .errors import MeshError
 from .files.expectation import CERTAIN_SHARE, Expectation, expect
-from .files.grids import read_grid_with
-from .files.meshes import write_pieces
-from .files.output import check_apart
-from .files.precision import check_format_holds, local_origin_note
-from .files.store import files_of
+from .files.grids import read_grid
+from .files.meshes import check_format_holds, check_target, local_origin_note, write_pieces
+from .files.output import check_apart, check_free
+from .files.regular import files_of
 from .grid.cubic import cubic_grid
-from .grid.direction import Direction
-from .grid.field import EXACT, MASK, SCALED
+from .grid.placement import as_triple
 from .grid.sdf_grid import SdfGrid
-from .grid.spacing import as_triple
 from .machine.memory import memory_bound
 from .mesh import Mesh, join_meshes
 from .network.decoder import Decoder
-from .options import check_goal, check_iterations
+from .options import MASK, SCALED
+from .options import ConvertOptions as ConvertOptions
 from .pipeline import reconstruct_slabs
 from .progress import Progress, Stopwatch, part_of, share_of
-from .simplification.simplify import (
-    Simplified,
-    check_can_simplify,
-    check_room,
-    simplify_mesh,
-)
+from .simplification.simplify import Simplified, check_can_simplify, check_room, simplify_mesh
 from .slabs.pieces import Piece
-from .steps.ends import check_all_seen, check_can_close
+from .steps.ends import check_can_close
 from .steps.lattice import lattice_shape
-from .steps.mesher_names import DEFAULT_MESHER
-from .steps.meshers import find_mesher
-from .steps.nodes import check_factor
 from .steps.survey import Band
 from .topology import OpenEdges
 
 if TYPE_CHECKING:
     from .fields.writing import FieldFile
 
-DROPPED = "pieces smaller than a voxel that no sample supports, and so left out: {}"
-LONE = "voxels of the mask without a neighbour on their side, each meshed as a piece: {}"
-CAPPED = (
-    "the solid runs out of the grid: its surface is closed along the border (leave it open with "
-    "--open)"
-)
 KEPT_SHARE = 1 / 16  # of the memory bound: a mesh that takes more is too large to be checked
 SHARE_BEFORE = 0.2  # of the time, until the mesh is simplified
-
-
-@dataclass(frozen=True)
-class ConvertOptions:
-    """The options of a conversion; see ``read_grid``, ``reconstruct`` and ``simplify_mesh``.
-
-    ``cap`` is True by default, as for the command, and unlike in ``reconstruct``. ``simplify`` is
-    an error in voxels; at most one of it and ``triangles`` may be given.
-    """
-
-    factor: int = 4
-    spacing: tuple[float, ...] | None = None
-    origin: tuple[float, ...] | None = None
-    inside: str = "auto"
-    offset: float = 0.0
-    cap: bool = True
-    max_memory: int | None = None
-    mesher: str = DEFAULT_MESHER
-    simplify: float | None = None
-    triangles: int | None = None
-    axes: str | None = None
-    iterations: int = 1
-    direction: tuple[float, ...] | None = None
-    field: str = "auto"
-    label: int | None = None
-    level: float | None = None
-    scale: float | None = None
-
-    @property
-    def simplifies(self) -> bool:
-        """Whether the mesh is to be simplified."""
-        return self.simplify is not None or self.triangles is not None
-
-
 COUNTS = (
-    "band_voxels",
-    "noisy_voxels",
-    "decoded_voxels",
-    "nodes",
-    "vertices",
-    "triangles",
-    "pinned_nodes",
-    "dropped_pieces",
-    "lone_samples",
-    "slabs",
-    "planned_bytes",
+    *("band_voxels", "noisy_voxels", "decoded_voxels", "nodes", "vertices", "triangles"),
+    *("pinned_nodes", "dropped_pieces", "lone_samples", "slabs", "planned_bytes"),
 )
 
+MakePieces = Callable[[Expectation, Progress | None], Iterator[Piece]]
+"""Yields the mesh of a grid in pieces, in order, made while they are taken.
 
-class Engine(Protocol):
-    """Who reads a grid and makes its mesh, such as the workers of a cluster."""
-
-    def read(self, source: str | Path, options: ConvertOptions) -> SdfGrid:
-        """Return the grid in a file."""
-
-    def pieces(
-        self,
-        grid: SdfGrid,
-        options: ConvertOptions,
-        expected: Expectation,
-        progress: Progress | None,
-    ) -> Iterator[Piece]:
-        """Yield the pieces of the mesh, in order."""
-
-    def report(self) -> dict[str, Any]:
-        """Return what ``Conversion.engine`` is, after the work."""
-
-    def warnings(self) -> tuple[str, ...]:
-        """Return sentences on what may be wrong with the result, after the work."""
+It is called with the expected size of the mesh, and a callback for progress.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,8 +72,8 @@ class Conversion:
 
     Attributes
     ----------
-    shape, spacing, origin, direction
-        Of the grid; spacing and origin in world units.
+    grid : SdfGrid
+        The grid, as it was read.
     counts : dict
         The counts named in ``COUNTS``, and ``expected_triangles`` and ``expected_bytes``.
     bounds : two Triples
@@ -159,14 +83,12 @@ class Conversion:
         not, the surface leaves the grid and is not capped.
     notes, warnings : tuple of str
         Sentences on what was inferred, and on what may be wrong with the result.
-    seconds : dict
-        Seconds per stage.
-    simplified : dict, optional
-        Of a simplified mesh, what ``Simplified.report`` returns; distances are in voxels.
     capped : bool
         Whether the solid runs out of the grid, and its surface was closed along the border.
-    field : dict
-        What the values were taken as, and what the samples show of it.
+    simplified : dict, optional
+        Of a simplified mesh, what ``Simplified.report`` returns; distances are in voxels.
+    seconds : dict
+        Seconds per stage.
     saved_field : dict, optional
         The path of the refined field, and shape, spacing and origin of the fine lattice.
     engine : dict
@@ -175,45 +97,48 @@ class Conversion:
         What a check of the mesh needs, if it was asked for and is small enough.
     """
 
-    shape: tuple[int, int, int]
-    spacing: Triple
-    origin: Triple
-    direction: Direction
+    grid: SdfGrid
     counts: dict[str, int]
     bounds: tuple[Triple, Triple]
     closed: bool
-    notes: tuple[str, ...]
+    capped: bool
     warnings: tuple[str, ...]
-    seconds: dict[str, float]
-    simplified: dict[str, Any] | None = None
-    capped: bool = False
-    field: dict[str, Any] = dataclass_field(default_factory=dict)
+    simplified: dict[str, Any] | None
+    notes: tuple[str, ...] = ()
+    seconds: dict[str, float] = field(default_factory=dict)
     saved_field: dict[str, Any] | None = None
-    engine: dict[str, Any] = dataclass_field(default_factory=dict)
+    engine: dict[str, Any] = field(default_factory=dict)
     kept: Kept | None = None
 
     def remarks(self) -> list[str]:
         """Return sentences on what the mesh has that the samples do not show, or lacks."""
         dropped, lone = self.counts["dropped_pieces"], self.counts["lone_samples"]
-        remarks = [CAPPED] if self.capped else []
+        remarks = []
+        if self.capped:
+            remarks.append(
+                "the solid runs out of the grid: its surface is closed along the border (leave it "
+                "open with --open)"
+            )
         if dropped:
-            remarks.append(DROPPED.format(dropped))
-        if lone and self.field.get("kind") == MASK:
-            remarks.append(LONE.format(lone))
+            remarks.append(
+                f"pieces smaller than a voxel that no sample supports, and so left out: {dropped}"
+            )
+        if lone and self.grid.field.kind == MASK:
+            remarks.append(
+                "voxels of the mask without a neighbour on their side, each meshed as a piece: "
+                f"{lone}"
+            )
         return remarks
 
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
         return {
-            "shape": list(self.shape),
-            "spacing": list(self.spacing),
-            "origin": list(self.origin),
-            "direction": [list(row) for row in self.direction],
+            **describe_place(self.grid),
             **self.counts,
             "bounds": [list(corner) for corner in self.bounds],
             "closed": self.closed,
             "capped": self.capped,
-            "field": self.field,
+            "field": self.grid.field.report(),
             **self.engine,
             **({"saved_field": self.saved_field} if self.saved_field else {}),
             **({"simplified": self.simplified} if self.simplified else {}),
@@ -233,7 +158,6 @@ def convert(
     before_rename: Callable[[Path], None] | None = None,
     announce: Callable[[str], None] | None = None,
     save_field: str | Path | None = None,
-    engine: Engine | None = None,
     keep: bool = False,
 ) -> Conversion:
     """Convert a grid file to a mesh file.
@@ -245,8 +169,7 @@ def convert(
     network : Network
         From ``load_network``; it can be used for any number of files.
     options : ConvertOptions
-        Factor, iterations, spacing, axis order, sign, offset, cap, mesher, memory bound and
-        simplification.
+        How the grid is read, refined and meshed.
     force : bool
         Replace the target, and the field's file, if they exist.
     progress : callable, optional
@@ -258,8 +181,6 @@ def convert(
     save_field : path, optional
         A file for the refined field, in a format of ``write_field``. It and the mesh file are both
         complete at the end, or neither is written.
-    engine : Engine, optional
-        Who reads the grid and makes the mesh; by default this process, with ``network``.
     keep : bool
         Keep grid, band and mesh for a check, so that it need not read them again.
 
@@ -267,43 +188,167 @@ def convert(
     ------
     SuperSdfError
         As in ``read_grid``, ``upsample``, ``simplify_mesh`` and ``write_mesh``; MeshError if slabs
-        or bricks do not meet, as those of processors that round differently. Nothing is written
-        then.
+        do not meet. Nothing is written then.
     """
     watch = Stopwatch()
     if options.simplifies:
-        check_goal(options.simplify, options.triangles, ("simplify", "triangles"))
         check_can_simplify()
-    grid = engine.read(source, options) if engine else read_grid_with(source, options)
-    check_can_close(grid, cap=options.cap)
-    if engine:
-        check_all_seen(grid, "convert it on one machine (without --cluster)")
-    inputs = files_of(source)
-    check_apart(target, inputs)
+    grid = read_grid(source, **options.reading())
+    keeper = Keeper(options.max_memory) if keep else None
     if save_field is not None:
-        check_apart(save_field, inputs)
-    total = _check_work(options)
-    lattice = cubic_grid(grid, options.offset)
-    about = check_format_holds(target, lattice, total)
-    notes = (*lattice.notes, *local_origin_note(target, about))
-    expected = expect(grid, total, options.offset, target, cap=options.cap)
-    _check_size(expected, target, options, announce)
-    tally = Tally(expected, cap=options.cap)
-    with open_field(save_field, grid, options, force=force) as file:
-        watch.lap("read")
-        keep &= engine is None  # the grid of an engine is for its workers
-        keeper = Keeper(options.max_memory)
-        maker = Maker(grid, network, options, engine, file, keeper.take_band if keep else None)
-        meshes = _meshes(maker, tally, watch, progress)
-        meshes = keeper.copies(meshes) if keep else meshes
-        complete = partial(_complete_field, file, force=force, then=before_rename)
-        write_pieces(meshes, target, force=force, about=about, before_rename=complete)
-    watch.lap("write")
-    done = replace(describe(grid, tally, options, watch.seconds, notes), kept=keeper.kept(grid))
-    if engine:
-        warnings = (*done.warnings, *engine.warnings())
-        done = replace(done, warnings=warnings, engine=engine.report())
+        check_apart(save_field, files_of(source))
+
+    def make(expected: Expectation, shown: Progress | None) -> Iterator[Piece]:
+        return reconstruct_slabs(
+            grid,
+            network,
+            options.factor,
+            offset=options.offset,
+            cap=options.cap,
+            mesher=options.mesher,
+            iterations=options.iterations,
+            max_memory=options.max_memory,
+            progress=shown,
+            save=file.add if file else None,
+            look=keeper.take_band if keeper else None,
+        )
+
+    def complete(part: Path) -> None:
+        if file:
+            file.finish()
+            check_free(file.path, force=force)  # both files appear, or none
+        if before_rename:
+            before_rename(part)
+
+    with _field_file(save_field, grid, options, force=force) as file:
+        done = convert_grid(
+            grid,
+            source,
+            target,
+            make,
+            options,
+            force=force,
+            progress=progress,
+            before_rename=complete,
+            announce=announce,
+            watch=watch,
+            keeper=keeper,
+        )
     return replace(done, saved_field=file.report()) if file else done
+
+
+def describe_place(grid: SdfGrid) -> dict[str, Any]:
+    """Return where the samples of a grid lie, for JSON."""
+    return {
+        "shape": list(grid.shape),
+        "spacing": list(grid.spacing),
+        "origin": list(grid.origin),
+        "direction": [list(row) for row in grid.direction],
+    }
+
+
+def _field_file(
+    path: str | Path | None, grid: SdfGrid, options: ConvertOptions, *, force: bool
+) -> AbstractContextManager[FieldFile | None]:
+    """Return the file to write the refined field to, which appears at the end; None without a path.
+
+    SuperSdfError if the file exists, its suffix is unknown, or the field would not fit.
+    """
+    if path is None:
+        return nullcontext()
+    # imported here, since few conversions write a field, and the start is part of each
+    from .fields.writing import check_field_fits, check_field_target, saving_field
+
+    path, shape = check_field_target(path, force=force), grid.shape
+    for _ in range(options.iterations):
+        shape = lattice_shape(shape, options.factor)
+    check_can_close(grid, cap=options.cap)
+    check_field_fits(path, shape, options.max_memory)
+    return saving_field(path, shape, force=force)
+
+
+def convert_grid(
+    grid: SdfGrid,
+    source: str | Path,
+    target: str | Path,
+    make: MakePieces,
+    options: ConvertOptions,
+    *,
+    force: bool = False,
+    progress: Progress | None = None,
+    before_rename: Callable[[Path], None] | None = None,
+    announce: Callable[[str], None] | None = None,
+    watch: Stopwatch | None = None,
+    keeper: Keeper | None = None,
+) -> Conversion:
+    """Write the mesh that ``make`` makes of a grid, which is that of ``source``; see ``convert``.
+
+    ``watch`` has measured how long reading took; ``keeper`` keeps what a check needs.
+    """
+    watch = watch or Stopwatch()
+    check_can_close(grid, cap=options.cap)
+    check_apart(target, files_of(source))
+    check_target(target, force=force)
+    finer = options.factor**options.iterations
+    lattice = cubic_grid(grid, options.offset)
+    about = check_format_holds(target, lattice, finer)
+    expected = expect(grid, finer, options.offset, target, cap=options.cap)
+    if options.simplifies:
+        least = int(expected.triangles * CERTAIN_SHARE)
+        check_room(least, options.max_memory, estimated=True)
+    elif announce and (sentence := expected.warning(target)):
+        announce(sentence)
+    watch.lap("read")
+    tally, simplified = Tally(options.cap), None
+    shown = part_of(progress, 0, SHARE_BEFORE) if options.simplifies else progress
+    meshes = tally.count(make(expected, shown), watch)
+    if options.simplifies:
+        simplified = _simplify(meshes, grid, options, part_of(progress, SHARE_BEFORE, 1))
+        meshes = iter([simplified.mesh])
+        tally.replace(simplified.mesh)
+        watch.lap("simplify")
+    meshes = keeper.copies(meshes) if keeper else meshes
+    write_pieces(meshes, target, force=force, about=about, before_rename=before_rename)
+    watch.lap("write")
+    done = describe(grid, options, expected, tally, simplified)
+    notes = (*lattice.notes, *local_origin_note(target, about))
+    kept = keeper.kept(grid) if keeper else None
+    return replace(done, notes=notes, seconds=watch.seconds, kept=kept)
+
+
+def describe(
+    grid: SdfGrid,
+    options: ConvertOptions,
+    expected: Expectation,
+    tally: Tally,
+    simplified: Simplified | None,
+) -> Conversion:
+    """Return the result of a conversion."""
+    counts = {name: tally.counts[name] for name in COUNTS}
+    counts |= {"expected_triangles": expected.triangles, "expected_bytes": expected.size}
+    warnings = find_warnings(grid, options.offset, counts, is_open=tally.is_open)
+    return Conversion(
+        grid,
+        counts,
+        bounds=(as_triple(tally.low, "low"), as_triple(tally.high, "high")),
+        closed=simplified.mesh.is_closed() if simplified else not tally.is_open,
+        warnings=(*warnings, *(simplified.warnings if simplified else ())),
+        capped=options.cap and tally.leaves,
+        simplified=simplified.report(grid.voxel_size) if simplified else None,
+    )
+
+
+def _simplify(
+    meshes: Iterable[Mesh], grid: SdfGrid, options: ConvertOptions, progress: Progress | None
+) -> Simplified:
+    """Return the simplified mesh of all pieces."""
+    return simplify_mesh(
+        join_meshes(list(meshes)),
+        error=None if options.simplify is None else options.simplify * grid.voxel_size,
+        triangles=options.triangles,
+        max_memory=options.max_memory,
+        progress=share_of(progress),
+    )
 
 
 class Keeper:
@@ -334,129 +379,26 @@ class Keeper:
         return Kept(grid, join_meshes(self.meshes), self.band) if self.meshes else None
 
 
-@dataclass(frozen=True)
-class Maker:
-    """What makes the pieces of a mesh: a grid, and a network or an engine."""
-
-    grid: SdfGrid
-    network: Decoder
-    options: ConvertOptions
-    engine: Engine | None
-    file: FieldFile | None
-    look: Callable[[Band], None] | None = None
-
-    def pieces(self, expected: Expectation, progress: Progress | None) -> Iterator[Piece]:
-        """Yield the pieces, made while they are taken."""
-        options = self.options
-        if self.engine:
-            return self.engine.pieces(self.grid, options, expected, progress)
-        return reconstruct_slabs(
-            self.grid,
-            self.network,
-            options.factor,
-            offset=options.offset,
-            cap=options.cap,
-            mesher=options.mesher,
-            iterations=options.iterations,
-            max_memory=options.max_memory,
-            progress=progress,
-            save=self.file.add if self.file else None,
-            look=self.look,
-        )
-
-
-def _check_work(options: ConvertOptions) -> int:
-    """Return how many times finer the mesh is than the grid; OptionError if that cannot be done."""
-    check_factor(options.factor)
-    find_mesher(options.mesher)
-    return int(options.factor ** check_iterations(options.iterations))
-
-
-def _check_size(
-    expected: Expectation,
-    target: str | Path,
-    options: ConvertOptions,
-    announce: Callable[[str], None] | None,
-) -> None:
-    """Announce a large file, or check that there is room to simplify the mesh."""
-    if options.simplifies:
-        least = int(expected.triangles * CERTAIN_SHARE)
-        check_room(least, options.max_memory, estimated=True)
-    elif announce and (sentence := expected.warning(target)):
-        announce(sentence)
-
-
-def _meshes(
-    maker: Maker, tally: Tally, watch: Stopwatch, progress: Progress | None
-) -> Iterator[Mesh]:
-    """Return the pieces of the mesh, made while they are taken, or the simplified one."""
-    options = maker.options
-    shown = part_of(progress, 0, SHARE_BEFORE) if options.simplifies else progress
-    pieces = maker.pieces(tally.expected, shown)
-    meshes = tally.count(pieces, watch)
-    if not options.simplifies:
-        return meshes
-    rest = part_of(progress, SHARE_BEFORE, 1)
-    return tally.simplify(meshes, maker.grid.voxel_size, options, watch, rest)
-
-
-def _complete_field(
-    file: FieldFile | None, part: Path, *, force: bool, then: Callable[[Path], None] | None
-) -> None:
-    """Complete the field's file, and check that it can appear, before the mesh ``part`` does."""
-    if file:
-        from .fields.writing import check_field_target
-
-        file.finish()
-        check_field_target(file.path, force=force)
-    if then:
-        then(part)
-
-
-def open_field(
-    path: str | Path | None, grid: SdfGrid, options: ConvertOptions, *, force: bool
-) -> AbstractContextManager[FieldFile | None]:
-    """Return the file to write the refined field to, which appears at the end; None without a path.
-
-    Raises
-    ------
-    SuperSdfError
-        If the file exists, its suffix is unknown, or the field would not fit.
-    """
-    if path is None:
-        return nullcontext()
-    # imported here, since few conversions write a field, and the start is part of each
-    from .fields.writing import check_field_fits, check_field_target, saving_field
-
-    path, shape = check_field_target(path, force=force), grid.shape
-    for _ in range(options.iterations):
-        shape = lattice_shape(shape, options.factor)
-    check_field_fits(path, shape, options.max_memory)
-    return saving_field(path, shape, force=force)
-
-
 class Tally:
-    """Counts and bounding box of a mesh, summed over its pieces while they are written."""
+    """Counts, bounding box and open edges of a mesh, added up while its pieces are written."""
 
-    def __init__(self, expected: Expectation, *, cap: bool) -> None:
-        self.expected, self.cap = expected, cap
+    def __init__(self, cap: bool) -> None:
+        self.cap = cap
         self.edges = OpenEdges()
         self.last: Piece | None = None  # without its meshes
         self.counts: Counter[str] = Counter()
         self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)
         self.is_cut = self.leaves = False
-        self.simplified: Simplified | None = None
-        self.voxel_size = 1.0
+
+    @property
+    def is_open(self) -> bool:
+        """Whether edges are open."""
+        return len(self.edges) > 0
 
     def count(self, pieces: Iterable[Piece], watch: Stopwatch) -> Iterator[Mesh]:
-        """Yield the meshes of the pieces, and count them.
+        """Yield the meshes of the pieces, and count them; MeshError if the pieces do not meet.
 
         The time until the caller takes the next mesh counts as writing.
-
-        Raises
-        ------
-        MeshError
-            If the pieces do not meet.
         """
         for piece in pieces:
             watch.take(piece.seconds)
@@ -467,15 +409,21 @@ class Tally:
             self.counts.update(piece.counts)
             self.counts |= Counter(piece.whole)
             for mesh in piece.meshes:
-                self.extend_box(mesh)
+                self._extend_box(mesh.vertices)
             yield from piece.meshes
             del piece  # before the next one is made
             watch.lap("write")
-        if self.last and self.must_be_closed and len(self.edges):
+        if self.last and self._must_be_closed and self.is_open:
             raise torn(len(self.edges), "in", self.last)
 
+    def replace(self, mesh: Mesh) -> None:
+        """Count another mesh instead of what was written; the open edges stay."""
+        self.counts["vertices"], self.counts["triangles"] = len(mesh.vertices), len(mesh.faces)
+        self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)
+        self._extend_box(mesh.vertices)
+
     @property
-    def must_be_closed(self) -> bool:
+    def _must_be_closed(self) -> bool:
         """Whether the surface so far may end only where the next piece begins."""
         return self.cap or not self.is_cut
 
@@ -485,42 +433,17 @@ class Tally:
         for mesh in piece.meshes:
             self.edges.add(mesh.faces)
         left = self.edges.before(first)  # no later piece has these vertices
-        if not self.must_be_closed:
+        if not self._must_be_closed:
             left = np.setdiff1d(left, before)  # the others may be on the border of the grid
         if self.last and len(left):
             raise torn(len(left), f"at plane {piece.planes[0]}, between", self.last, piece)
         self.last = replace(piece, meshes=[])
 
-    def simplify(
-        self,
-        pieces: Iterable[Mesh],
-        voxel_size: float,
-        options: ConvertOptions,
-        watch: Stopwatch,
-        progress: Progress | None,
-    ) -> Iterator[Mesh]:
-        """Yield the mesh of all pieces simplified; counts and bounding box are its own then."""
-        found = simplify_mesh(
-            join_meshes(list(pieces)),
-            error=None if options.simplify is None else options.simplify * voxel_size,
-            triangles=options.triangles,
-            max_memory=options.max_memory,
-            progress=share_of(progress),
-        )
-        self.simplified, self.voxel_size = found, voxel_size
-        self.counts["vertices"] = len(found.mesh.vertices)
-        self.counts["triangles"] = len(found.mesh.faces)
-        self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)
-        self.extend_box(found.mesh)
-        watch.lap("simplify")
-        yield found.mesh
-
-    def extend_box(self, mesh: Mesh) -> None:
-        """Extend the bounding box by a mesh, axis by axis: five times as fast as ``min(0)``."""
-        for axis, coordinates in enumerate(mesh.vertices.T):
-            if len(coordinates):
-                self.low[axis] = min(self.low[axis], coordinates.min())
-                self.high[axis] = max(self.high[axis], coordinates.max())
+    def _extend_box(self, vertices: NDArray[Any]) -> None:
+        """Extend the bounding box axis by axis: five times as fast as ``min(0)``."""
+        for axis, coordinates in enumerate(vertices.T if len(vertices) else ()):
+            self.low[axis] = min(self.low[axis], coordinates.min())
+            self.high[axis] = max(self.high[axis], coordinates.max())
 
 
 def torn(count: int, where: str, *pieces: Piece) -> MeshError:
@@ -537,59 +460,25 @@ def torn(count: int, where: str, *pieces: Piece) -> MeshError:
     return MeshError(f"the mesh is torn, with {edges} {where} {made}: {way}")
 
 
-def describe(
-    grid: SdfGrid,
-    tally: Tally,
-    options: ConvertOptions,
-    seconds: dict[str, float],
-    notes: tuple[str, ...],
-) -> Conversion:
-    """Return the result of a conversion."""
-    closed = not len(tally.edges)
-    counts = {name: tally.counts[name] for name in COUNTS}
-    counts["expected_triangles"] = tally.expected.triangles
-    counts["expected_bytes"] = tally.expected.size
-    ends = grid.field.unseen is not None
-    thin = grid.low >= options.offset
-    warnings = find_warnings(counts, closed, thin=thin, kind=grid.field.kind, ends=ends)
-    simplified = None
-    if tally.simplified:
-        simplified = tally.simplified.report(tally.voxel_size)
-        closed = tally.simplified.mesh.is_closed()
-        warnings += tally.simplified.warnings
-    where = grid.shape, grid.spacing, grid.origin, grid.direction
-    bounds = as_triple(tally.low, "low"), as_triple(tally.high, "high")
-    capped = options.cap and tally.leaves
-    found = grid.field.report()
-    return Conversion(
-        *where, counts, bounds, closed, notes, warnings, seconds, simplified, capped, found
-    )
-
-
 def find_warnings(
-    counts: dict[str, int],
-    closed: bool,
-    thin: bool = False,
-    kind: str = EXACT,
-    ends: bool = False,
-) -> tuple[str, ...]:
-    """Return a sentence on each thing that may be wrong with the result.
+    grid: SdfGrid, offset: float, counts: dict[str, int], *, is_open: bool
+) -> list[str]:
+    """Return a sentence on each thing that may be wrong with the mesh of a grid.
 
-    ``thin`` says that no sample lies inside the solid, ``kind`` what the field is: only distances
-    can be noisy, or contradict each other. ``ends``: the surface ends at unknown samples.
+    Only distances can be noisy, or contradict each other.
     """
     warnings = []
-    if not closed and ends:
+    if is_open and grid.field.unseen is not None:
         warnings.append("the surface ends where samples are unknown, and is open there")
-    elif not closed:
+    elif is_open:
         warnings.append("the surface runs out of the grid and is open there (close it with --cap)")
-    if thin:
+    if grid.low >= offset:
         warnings.append(
             "no sample lies inside: the solid is thinner than the spacing, and its mesh may have "
             "holes"
         )
-    if kind in (MASK, SCALED):
-        return tuple(warnings)
+    if grid.field.kind in (MASK, SCALED):
+        return warnings
     if counts["noisy_voxels"]:
         share = in_percent(counts["noisy_voxels"], counts["band_voxels"])
         warnings.append(
@@ -601,7 +490,7 @@ def find_warnings(
             f"{counts['pinned_nodes']} fine values contradict the coarse ones around them and were "
             "given their sign: the input is no distance field there"
         )
-    return tuple(warnings)
+    return warnings
 
 
 def in_percent(part: int, whole: int) -> str:

@@ -1,26 +1,7 @@
-"""Everything that this package raises on purpose.
+"""Everything that this package raises on purpose, below ``SuperSdfError``.
 
-- ``SuperSdfError``: the base class; its message is one line: what is wrong, the value, the remedy.
-
-  - ``GridError`` (also ``ValueError``): the samples are not a usable signed distance grid.
-
-    - ``NoSurfaceError``: they are, but contain no surface.
-
-  - ``MeshError`` (also ``ValueError``): a reference mesh does not bound a solid, or slabs or bricks
-    of a mesh do not meet.
-  - ``OptionError`` (also ``ValueError``): an argument is invalid, such as an odd factor.
-
-    - ``OptionTypeError`` (also ``TypeError``): an argument has the wrong type.
-
-  - ``FileError`` (also ``OSError``): a file cannot be read or written.
-
-    - ``WriteError``: an output file cannot be created, which is not the input's fault.
-
-  - ``ModelError`` (also ``ValueError``): an ONNX file does not fulfil the network's contract.
-  - ``DeviceError`` (also ``RuntimeError``): the requested device cannot run here.
-  - ``OutOfMemoryError`` (also ``MemoryError``): the work would not fit in memory and was not begun.
-  - ``ClusterError`` (also ``RuntimeError``): a cluster cannot be reached, or its workers lack
-    something.
+A message is one line: what is wrong, the value seen, the way out. Each class is also one of
+Python's own, so that code which knows only these catches it.
 """
 
 
@@ -41,7 +22,7 @@ class MeshError(SuperSdfError, ValueError):
 
 
 class OptionError(SuperSdfError, ValueError):
-    """An argument is invalid."""
+    """An argument is invalid, such as an odd factor."""
 
 
 class OptionTypeError(OptionError, TypeError):

@@ -4,27 +4,32 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
-from .convert import ConvertOptions
+from .convert import describe_place
 from .errors import MeshError, OptionError, seen
-from .files.meshes import check_mesh_suffix, check_target, format_of, write_together
+from .files.meshes import (
+    check_format_holds,
+    check_mesh_suffix,
+    check_target,
+    format_of,
+    local_origin_note,
+    write_together,
+)
 from .files.output import check_apart, naming
-from .files.precision import check_format_holds, local_origin_note
-from .files.store import files_of
+from .files.regular import files_of
 from .grid.labels import ALL, check_labels
 from .labels import LabelPiece, label_slabs, read_labels
 from .mesh import Mesh
 from .network.decoder import Decoder
+from .options import LABELS, OPTIONS, ConvertOptions
 from .progress import Progress
-from .steps.nodes import check_factor
 from .topology import OpenEdges
 
-USED = ("factor", "spacing", "origin", "direction", "axes", "max_memory")
 MOST_FILES = 500  # each is held open until all are complete
 
 
@@ -92,7 +97,7 @@ def convert_labels(
     network, labels
         See ``reconstruct_labels``.
     options : ConvertOptions, optional
-        Those named in ``USED``; others must have their defaults.
+        Those named in ``options.LABELS``; others must have their defaults.
     force : bool
         Replace files that exist.
     progress : callable, optional
@@ -114,7 +119,6 @@ def convert_labels(
     labels = check_labels(labels)
     check_options(options)
     check_mesh_suffix(Path(target))
-    check_factor(options.factor)
     place = options.spacing, options.origin, options.direction, options.axes
     image = read_labels(source, labels, *place, options.max_memory)
     grid, paths = image.grid, label_paths(target, image.names())
@@ -138,10 +142,7 @@ def convert_labels(
             files[mesh.path][f"label {label}"] = mesh.pieces()
         write_together(files, force=force, about=about)
     return {
-        "shape": list(grid.shape),
-        "spacing": list(grid.spacing),
-        "origin": list(grid.origin),
-        "direction": [list(row) for row in grid.direction],
+        **describe_place(grid),
         "labels": [mesh.report() for mesh in meshes.values()],
         "inferred": [*grid.notes, *local_origin_note(target, about)],
     }
@@ -156,7 +157,7 @@ def label_paths(target: str | Path, labels: list[int]) -> list[Path]:
         If they are too many.
     """
     path = Path(target)
-    if format_of(path).write_parts:
+    if format_of(path).has_parts:
         return [path] * len(labels)
     if len(labels) > MOST_FILES:
         raise OptionError(
@@ -171,8 +172,11 @@ def check_options(options: Any, more: Sequence[str] = ()) -> None:
 
     ``more`` are names of given options besides those of ``ConvertOptions``.
     """
-    others = [option for option in fields(ConvertOptions) if option.name not in USED]
-    given = [option.name for option in others if getattr(options, option.name) != option.default]
+    given = [
+        name
+        for name in vars(options)
+        if name not in LABELS and getattr(options, name) != OPTIONS[name].default
+    ]
     for name in (*given, *more):
         value = f" {seen(getattr(options, name))}" if name in given else ""
         text = "open" if name == "cap" else f"{name.replace('_', '-')}{value}"

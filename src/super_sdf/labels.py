@@ -29,12 +29,11 @@ from .mesh import Mesh, join_meshes, vertex_type
 from .neighbourhood import CENTRE
 from .network.decoder import Decoder
 from .network.kinds import network_for
-from .options import check_max_memory, check_network, check_progress
+from .options import check_factor, check_max_memory, check_network, check_progress
 from .pipeline import memory_needs, refine
 from .progress import Progress, StepCounter, part_of
 from .slabs.cutting import Slab, equal_parts, slab_of
 from .slabs.footprint import slab_bytes
-from .steps.nodes import check_factor
 from .steps.survey import Band, survey
 from .steps.voxel_index import VoxelIndex
 from .steps.walls import Labels, Part, absent_parts, extract_walls, put_together

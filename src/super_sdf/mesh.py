@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import IntArray
-from .errors import GridError
+from .errors import GridError, OptionTypeError, seen
 from .grid.sdf_grid import SdfGrid
 
 # A vertex stays this share of its lattice edge away from both ends. Otherwise vertices would
@@ -65,6 +65,12 @@ class Mesh:
     def is_closed(self) -> bool:
         """Return whether there are faces and no edge is open."""
         return len(self.faces) > 0 and self.open_edges() == 0
+
+
+def check_mesh(mesh: Any) -> None:
+    """Raise OptionTypeError if ``mesh`` is not a ``Mesh``."""
+    if not isinstance(mesh, Mesh):
+        raise OptionTypeError(f"mesh is {seen(mesh)}: give one from reconstruct(grid)")
 
 
 def join_meshes(pieces: list[Mesh]) -> Mesh:

@@ -1,123 +1,148 @@
-"""Checks of arguments before any work starts; the command line uses the same ones."""
+"""The table of options: name, type, default, check and help of each, and the names to choose from.
+
+The command line, the lists of a batch and the arguments of Python functions follow it. Neither it
+nor what it imports needs NumPy, so that help and wrong arguments are quick.
+"""
 
 from __future__ import annotations
 
-from math import isfinite
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, fields
+from math import inf, isfinite
 from numbers import Integral, Real
 from os import PathLike
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import Any, NamedTuple, TypedDict
 
 from .errors import OptionError, OptionTypeError, seen
-from .grid.sdf_grid import SdfGrid
-from .mesh import Mesh
+
+AUTO = "auto"
+EXACT, TRUNCATED, MASK, SCALED, NOISY = "exact", "truncated", "mask", "scaled", "noisy"
+FIELDS = (AUTO, EXACT, TRUNCATED, MASK, SCALED, NOISY)
+INSIDE = (AUTO, "negative", "positive")
+AXES = ("xyz", "zyx")
+MARCHING, SHARP = "marching", "sharp"
+MESHERS: tuple[str, ...] = (MARCHING, SHARP)
+DEFAULT_MESHER = MARCHING
+MESH_FORMATS = ("ply", "stl", "obj", "off", "glb", "3mf")
+DEVICES = (AUTO, "cpu", "cuda")
+AUTO_PRECISION, FLOAT32, INT8 = AUTO, "float32", "int8"
+PRECISIONS = (AUTO_PRECISION, FLOAT32, INT8)
+DEFAULT_QUALITY = "base"
+QUALITIES = {"fast": ("fast", 1), "base": ("base", 1), "best": ("base", 4)}
+"""The file of a shipped network, and the number of cube symmetries that are averaged."""
+MAX_FACTOR = 16
+UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9}
+
+Check = Callable[[Any, str], Any]
+"""Returns a value; raises OptionError if it is wrong, by the option's name."""
 
 
-def check_grid(grid: Any) -> None:
-    """Raise OptionTypeError if ``grid`` is not an ``SdfGrid``, but an array or a path, say."""
-    if not isinstance(grid, SdfGrid):
-        what = f"an array of shape {grid.shape}" if isinstance(grid, np.ndarray) else seen(grid)
-        raise OptionTypeError(
-            f"grid is {what}: make one with make_grid(values, spacing=...) or read_grid(path)"
-        )
+def _whole(least: float, way_out: str, kind: str = "a whole number") -> Check:
+    """Return the check of a whole number, with what to give if it is less or no whole number."""
+
+    def check(value: Any, name: str) -> int:
+        if not isinstance(value, Integral) or isinstance(value, bool):
+            raise OptionTypeError(f"{name} is {seen(value)}: give {kind}")
+        if int(value) < least:
+            raise OptionError(f"{name} is {seen(int(value))}: give {way_out}")
+        return int(value)
+
+    return check
 
 
-def check_path(path: Any, name: str) -> Path:
-    """Return an argument as a path; ``name`` is its name in the message.
+def _number(kind: str = "a number", above: float = -inf, way_out: str = "a finite number") -> Check:
+    """Return the check of a finite number, with what to give if it is none or not above another."""
 
-    Raises
-    ------
-    OptionTypeError
-        If it is neither a string nor a path.
-    """
-    if not isinstance(path, (str, PathLike)):
-        raise OptionTypeError(f"{name} is {seen(path)}: give the path of a file")
-    return Path(path)
+    def check(value: Any, name: str) -> float:
+        if not isinstance(value, Real) or isinstance(value, bool):
+            raise OptionTypeError(f"{name} is {seen(value)}: give {kind}")
+        try:
+            number = float(value)
+        except OverflowError:  # a whole number beyond 1.8e308
+            number = inf
+        if not (isfinite(number) and number > above):
+            raise OptionError(f"{name} is {seen(value)}: give {way_out}")
+        return number
+
+    return check
 
 
-def check_threads(threads: Any) -> int:
-    """Return a number of threads; 0 means one per core.
+def _numbers(counts: tuple[int, ...], way_out: str) -> Check:
+    """Return the check of a number, or of several."""
+
+    def check(value: Any, name: str) -> tuple[float, ...]:
+        several = isinstance(value, Iterable) and not isinstance(value, str)
+        numbers = tuple(value) if several else (value,)
+        if len(numbers) not in counts:
+            raise OptionError(f"{name} is {seen(value)}: give {way_out}")
+        return tuple(_number()(number, name) for number in numbers)
+
+    return check
+
+
+def _one_of(choices: Iterable[str]) -> Check:
+    """Return the check of a name."""
+    names = tuple(choices)
+
+    def check(value: Any, name: str) -> str:
+        if isinstance(value, str) and value in names:
+            return value
+        kind = OptionError if isinstance(value, str) else OptionTypeError
+        raise kind(f"{name} is {seen(value)}: give one of {', '.join(names)}")
+
+    return check
+
+
+def _flag(value: Any, name: str) -> bool:
+    if not isinstance(value, bool) and type(value).__name__ not in ("bool_", "bool"):  # NumPy's
+        raise OptionTypeError(f"{name} is {seen(value)}: give True or False, in JSON true or false")
+    return bool(value)
+
+
+def _as_given(value: Any, name: str) -> Any:
+    return value
+
+
+def check_factor(factor: Any, name: str = "factor") -> int:
+    """Return the factor if it is an even number from 2 to 16.
 
     Raises
     ------
     OptionError
-        If it is negative, or not a whole number (``OptionTypeError``).
+        If it is out of range, or odd: then no node lies on a sample.
+    OptionTypeError
+        If it is no whole number.
     """
-    if not isinstance(threads, Integral) or isinstance(threads, bool):
-        raise OptionTypeError(
-            f"threads is {seen(threads)}: give a whole number, 0 for one per core"
+    whole: int = _whole(-inf, "")(factor, name)
+    if not 2 <= whole <= MAX_FACTOR or whole % 2:
+        raise OptionError(
+            f"{name} is {seen(whole)}: give an even number from 2 to {MAX_FACTOR} "
+            "(an odd one has no node on the samples)"
         )
-    if int(threads) < 0:
-        raise OptionError(f"threads is {threads}: give 1 or more, or 0 for one per core")
-    return int(threads)
+    return whole
+
+
+def check_label(label: Any, name: str = "label") -> int:
+    """Return a label; OptionError if no integer of 64 bits, signed or not, can be it."""
+    is_whole = isinstance(label, Real) and not isinstance(label, bool) and isfinite(label)
+    if not (is_whole and int(label) == label and -(2**63) <= int(label) < 2**64):
+        raise OptionError(f"{name} is {seen(label)}: give a whole number, -2^63 to 2^64 - 1")
+    return int(label)
+
+
+def check_path(path: Any, name: str) -> Path:
+    """Return an argument as a path; OptionTypeError if it is neither a string nor a path."""
+    if not isinstance(path, (str, PathLike)):
+        raise OptionTypeError(f"{name} is {seen(path)}: give the path of a file")
+    return Path(path)
 
 
 def check_network(network: Any) -> None:
     """Raise OptionTypeError if ``network`` cannot be called."""
     if not callable(network):
         raise OptionTypeError(f"network is {seen(network)}: give one from load_network()")
-
-
-def check_distance(offset: Any) -> float:
-    """Return an offset, in world units, as a float.
-
-    Raises
-    ------
-    OptionError
-        If it is not finite, or not a number (``OptionTypeError``).
-    """
-    if not isinstance(offset, Real) or isinstance(offset, bool):
-        raise OptionTypeError(f"offset is {seen(offset)}: give a number, in world units")
-    if not isfinite(offset):
-        raise OptionError(f"offset is {offset}: give a finite number, in world units")
-    return float(offset)
-
-
-def check_cap(cap: Any) -> bool:
-    """Return ``cap`` as a bool, or raise OptionTypeError if it is not one."""
-    if not isinstance(cap, (bool, np.bool_)):
-        raise OptionTypeError(f"cap is {seen(cap)}: give True or False")
-    return bool(cap)
-
-
-def check_iterations(iterations: Any) -> int:
-    """Return how many times a grid is refined, one run after the other.
-
-    Raises
-    ------
-    OptionError
-        If it is less than 1, or not a whole number (``OptionTypeError``).
-    """
-    number = _check_whole(iterations, "iterations")
-    if number < 1:
-        raise OptionError(f"iterations is {seen(number)}: give 1 or more")
-    return number
-
-
-def _check_whole(number: Any, name: str) -> int:
-    """Return a whole number; OptionTypeError if it is none."""
-    if not isinstance(number, Integral) or isinstance(number, bool):
-        raise OptionTypeError(f"{name} is {seen(number)}: give a whole number")
-    return int(number)
-
-
-def check_max_memory(size: Any) -> int | None:
-    """Return a memory limit in bytes; None means a share of the free memory.
-
-    Raises
-    ------
-    OptionError
-        If it is not positive, or not a whole number (``OptionTypeError``).
-    """
-    if size is None:
-        return None
-    if not isinstance(size, Integral) or isinstance(size, bool):
-        raise OptionTypeError(f"max_memory is {seen(size)}: give a whole number of bytes")
-    if size <= 0:
-        raise OptionError(f"max_memory is {size}: give a number of bytes greater than 0")
-    return int(size)
 
 
 def check_progress(progress: Any) -> None:
@@ -128,24 +153,12 @@ def check_progress(progress: Any) -> None:
         )
 
 
-def check_mesh(mesh: Any) -> None:
-    """Raise OptionTypeError if ``mesh`` is not a ``Mesh``."""
-    if not isinstance(mesh, Mesh):
-        raise OptionTypeError(f"mesh is {seen(mesh)}: give one from reconstruct(grid)")
-
-
 def check_goal(
     error: Any, triangles: Any, names: tuple[str, str] = ("error", "triangles")
 ) -> tuple[float | None, int | None]:
     """Return to what a mesh is simplified: within an error, or to a number of triangles.
 
-    ``names`` are those of the arguments in messages.
-
-    Raises
-    ------
-    OptionError
-        If not exactly one of them is given, or it is not positive, or not a number
-        (``OptionTypeError``).
+    OptionError unless one of them is given, and only one.
     """
     if error is None and triangles is None:
         raise OptionError("give {} or {}".format(*names))
@@ -153,35 +166,330 @@ def check_goal(
         raise OptionError(
             f"{names[0]} {seen(error)} and {names[1]} {seen(triangles)}: give only one of them"
         )
-    if triangles is not None:
-        return None, check_triangles(triangles, names[1])
-    return check_error(error, names[0]), None
+    return (
+        OPTIONS["simplify"].check(error, names[0]),
+        OPTIONS["triangles"].check(triangles, names[1]),
+    )
 
 
-def check_error(error: Any, name: str = "error") -> float:
-    """Return the largest distance of a simplified mesh; ``name`` is its name in messages.
+def parse_numbers(text: str) -> tuple[float, ...]:
+    """Parse one number, or three separated by commas."""
+    return _parse_floats(text, (1, 3), "give one number, or three separated by commas")
 
-    Raises
-    ------
-    OptionError
-        If it is not positive and finite, or not a number (``OptionTypeError``).
+
+def parse_direction(text: str) -> tuple[float, ...]:
+    """Parse nine numbers separated by commas."""
+    return _parse_floats(text, (9,), "give nine numbers separated by commas, row by row")
+
+
+def _parse_floats(text: str, counts: tuple[int, ...], way_out: str) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) not in counts:
+        raise ValueError(way_out)
+    return numbers
+
+
+def parse_label(text: str) -> int | str:
+    """Parse a whole number, never as a float; other text is left to the check."""
+    return int(text) if re.fullmatch("[-+]?[0-9]{1,20}", text) else text
+
+
+def parse_labels(text: str) -> str | list[int | str]:
+    """Parse "all", or labels separated by commas."""
+    return text if text == "all" else [parse_label(part.strip()) for part in text.split(",")]
+
+
+def parse_size(text: str) -> int:
+    """Parse a number of bytes, such as "1500M" or "4G"; the units are powers of ten."""
+    number, unit = (text, "") if text[-1:].isdigit() else (text[:-1], text[-1:].upper())
+    try:
+        size = int(float(number) * UNITS[unit])
+    except (KeyError, ValueError, OverflowError):
+        size = 0
+    if size <= 0:
+        raise ValueError("give a number of bytes such as 1500M or 4G")
+    return size
+
+
+class Option(NamedTuple):
+    """A row of the table; ``name`` is its name in Python and in the lists of a batch.
+
+    Attributes
+    ----------
+    check : callable
+        Checks a value that is not None.
+    parse : type or callable
+        Makes the value of text on the command line; ValueError says what to give instead.
+    choices : tuple of str
+        All values, if there are only some.
+    off : str
+        The name of a flag's opposite on the command line.
     """
-    if not isinstance(error, Real) or isinstance(error, bool):
-        raise OptionTypeError(f"{name} is {seen(error)}: give a number greater than 0")
-    if not (isfinite(error) and float(error) > 0):
-        raise OptionError(f"{name} is {error}: give a number greater than 0")
-    return float(error)
+
+    name: str
+    default: Any
+    help: str
+    check_value: Check
+    parse: Callable[[str], Any]
+    metavar: str | None = None
+    choices: tuple[str, ...] = ()
+    off: str = ""
+
+    def check(self, value: Any, name: str = "") -> Any:
+        """Return a value, by another name in messages; OptionError if it is wrong."""
+        if value is None and self.default is None:
+            return None
+        return self.check_value(value, name or self.name)
 
 
-def check_triangles(triangles: Any, name: str = "triangles") -> int:
-    """Return the most triangles of a simplified mesh; ``name`` is the argument's in messages.
+def _option(default: Any, text: str, check: Check, parse: Any = str, **more: Any) -> Any:
+    """Return a field of a dataclass that is a row of the table."""
+    row = {"help": text, "check_value": check, "parse": parse, **more}
+    return field(default=default, metadata=row)
 
-    Raises
-    ------
-    OptionError
-        If it is less than 4, or not a whole number (``OptionTypeError``).
+
+def _choice(default: str | None, text: str, choices: Iterable[str]) -> Any:
+    return _option(default, text, _one_of(choices), choices=tuple(choices))
+
+
+class Values(TypedDict, total=False):
+    """What the values of a grid are: keywords of ``read_grid`` and of others that make grids."""
+
+    inside: str
+    field: str
+    label: int | None
+    level: float | None
+    scale: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadOptions:
+    """How a grid is read: where its samples lie, and what they are; see ``read_grid``."""
+
+    spacing: tuple[float, ...] | None = _option(
+        None,
+        "World distance between neighbouring samples: one number, or X,Y,Z where it differs "
+        "between axes; distances are resampled to the finest then. Default: from the file, else "
+        "estimated from the values.",
+        _numbers((1, 3), "one number, or three"),
+        parse_numbers,
+        metavar="H",
+    )
+    origin: tuple[float, ...] | None = _option(
+        None,
+        "World position of sample (0, 0, 0). Default: from the file, else 0,0,0.",
+        _numbers((1, 3), "one number, or three"),
+        parse_numbers,
+        metavar="X,Y,Z",
+    )
+    direction: tuple[float, ...] | None = _option(
+        None,
+        "World directions of the axes x, y and z of the array: the columns of a rotation or "
+        "mirrored rotation, as nine numbers with commas, row by row. Files of other formats than "
+        "NumPy, TIFF, HDF5 and Zarr state it.",
+        _numbers((9,), "nine numbers, row by row"),
+        parse_direction,
+        metavar="MATRIX",
+    )
+    axes: str | None = _choice(
+        None,
+        "Axis order of the array in a NumPy, TIFF, HDF5 or Zarr file. Default: the names "
+        "of the axes in the file, else xyz for NumPy, zyx for the others. Files of other formats "
+        "state it.",
+        AXES,
+    )
+    inside: str = _choice(
+        AUTO,
+        "Sign of the values inside the solid; auto takes the border of the grid as outside.",
+        INSIDE,
+    )
+    field: str = _choice(
+        AUTO,
+        "What the values are: exact distances, truncated near the surface, a mask (inside or "
+        "outside, or its distance transform), scaled (a field of another slope than 1), or noisy "
+        "distances; auto goes by what the samples show.",
+        FIELDS,
+    )
+    label: int | None = _option(
+        None,
+        "Mesh the samples with the value N of a label image.",
+        check_label,
+        parse_label,
+        metavar="N",
+    )
+    level: float | None = _option(
+        None,
+        "Mesh the surface at the value L of densities; what is above L is inside, unless "
+        "--inside is negative.",
+        _number(),
+        float,
+        metavar="L",
+    )
+    scale: float | None = _option(
+        None,
+        "World units per unit of the values, if they have another unit than the spacing.",
+        _number(above=0, way_out="a number greater than 0"),
+        float,
+        metavar="S",
+    )
+    max_memory: int | None = _option(
+        None,
+        "Memory limit of the process, such as 1500M or 4G. Default: 60 % of the free memory. "
+        "Larger grids are refined slab by slab, to the same mesh.",
+        _whole(1, "a number of bytes greater than 0", "a whole number of bytes"),
+        parse_size,
+        metavar="SIZE",
+    )
+
+    def __post_init__(self) -> None:
+        """Check the values; OptionError names the first that is wrong, or contradicts another."""
+        for each in fields(self):
+            if each.metadata:
+                OPTIONS[each.name].check(getattr(self, each.name))
+        if self.label is not None and self.level is not None:
+            raise OptionError(f"label {self.label} and level {self.level:g}: give only one of them")
+        if self.label is not None and self.field not in (AUTO, MASK):
+            raise OptionError(
+                f"label {self.label} and field {self.field}: the samples of a label are a mask"
+            )
+
+    def reading(self) -> dict[str, Any]:
+        """Return the keywords of ``read_grid``."""
+        return {each.name: getattr(self, each.name) for each in fields(ReadOptions)}
+
+
+@dataclass(frozen=True)
+class ConvertOptions(ReadOptions):
+    """The options of a conversion; see ``read_grid``, ``reconstruct`` and ``simplify_mesh``.
+
+    ``cap`` is True by default, as for the command, and unlike in ``reconstruct``. ``simplify`` is
+    an error in voxels; at most one of it and ``triangles`` may be given.
     """
-    number = _check_whole(triangles, name)
-    if number < 4:
-        raise OptionError(f"{name} is {number}: give 4 or more, as a closed mesh has")
-    return number
+
+    factor: int = _option(
+        4, "Refinement per axis: 2, 4, 8 or 16 times finer than the grid.", check_factor, int
+    )
+    iterations: int = _option(
+        1,
+        "Refine N times, each time by the factor and from the refined field before, for "
+        "lattices finer than factor 16. Twice factor 4 is no better than factor 16, and slower.",
+        _whole(1, "1 or more"),
+        int,
+        metavar="N",
+    )
+    offset: float = _option(
+        0.0,
+        "Mesh the offset surface at distance D, in world units; a positive D grows the "
+        "solid, whichever sign is inside.",
+        _number("a number, in world units", way_out="a finite number, in world units"),
+        float,
+        metavar="D",
+    )
+    cap: bool = _option(
+        True,
+        "Where the solid runs out of the grid, close the surface along the border, which is "
+        "the default, or leave it open. A surface that ends where samples are unknown needs "
+        "--open.",
+        _flag,
+        bool,
+        off="open",
+    )
+    mesher: str = _choice(
+        DEFAULT_MESHER,
+        "Mesher: marching is marching cubes, which cuts off edges and corners; sharp also "
+        "puts vertices on them and takes longer.",
+        MESHERS,
+    )
+    simplify: float | None = _option(
+        None,
+        "Simplify the mesh as far as it stays within ERROR of the unsimplified one, in voxels "
+        "of the grid (such as 0.02), measured both ways. A closed mesh stays closed. Needs the "
+        "extra simplify.",
+        _number("a number greater than 0", above=0, way_out="a number greater than 0"),
+        float,
+        metavar="ERROR",
+    )
+    triangles: int | None = _option(
+        None,
+        "Simplify the mesh to at most N triangles, instead of --simplify. If the shape needs "
+        "more, a warning says how many are left.",
+        _whole(4, "4 or more, as a closed mesh has"),
+        int,
+        metavar="N",
+    )
+
+    def __post_init__(self) -> None:
+        """Check the values; OptionError names the first that is wrong, or contradicts another."""
+        super().__post_init__()
+        if self.simplifies:
+            check_goal(self.simplify, self.triangles, ("simplify", "triangles"))
+
+    @property
+    def simplifies(self) -> bool:
+        """Whether the mesh is to be simplified."""
+        return self.simplify is not None or self.triangles is not None
+
+    def digest(self) -> dict[str, Any]:
+        """Return all that the mesh depends on, which the memory is not, for JSON."""
+        return {name: getattr(self, name) for name in BATCH_LISTS}
+
+
+@dataclass(frozen=True)
+class NetworkOptions:
+    """Which network, and where it runs; see ``load_network``."""
+
+    quality: str = _choice(
+        DEFAULT_QUALITY,
+        "Network: fast is smaller and quicker than base; best averages base over 4 turns of the "
+        "grid, and takes 4 times as long.",
+        QUALITIES,
+    )
+    precision: str = _choice(
+        AUTO_PRECISION,
+        "Arithmetic of the network: auto is int8 on the CPU if the network has it, otherwise "
+        "float32. On the CPU int8 takes about half as long.",
+        PRECISIONS,
+    )
+    model: str | None = _option(
+        None,
+        "Use the network in this ONNX file instead of --quality.",
+        _as_given,
+        metavar="FILE",
+    )
+    device: str = _choice(
+        AUTO, "Where the network runs; auto uses CUDA if it works here, else the CPU.", DEVICES
+    )
+    threads: int = _option(
+        0,
+        "CPU threads; 0 means one per core.",
+        _whole(0, "1 or more, or 0 for one per core", "a whole number, 0 for one per core"),
+        int,
+    )
+
+
+OPTIONS = {
+    each.name: Option(each.name, each.default, **each.metadata)
+    for each in (*fields(ConvertOptions), *fields(NetworkOptions))
+}
+GRID = tuple(each.name for each in fields(ReadOptions) if each.name != "max_memory")
+MESH = ("factor", "iterations", *GRID, "offset", "cap", "mesher")
+UPSAMPLE = (
+    *(*MESH, "quality", "precision", "model", "device", "max_memory", "threads"),
+    *("simplify", "triangles"),
+)
+"""What ``upsample``, ``batch`` and ``view`` take, in the order of their help."""
+BATCH_LISTS = (*MESH, "simplify", "triangles")
+"""What a line of a batch's list may say."""
+LABELS = ("factor", "spacing", "origin", "direction", "axes", "max_memory")
+"""What of ``ConvertOptions`` goes with ``--labels``."""
+
+check_distance = OPTIONS["offset"].check
+check_cap = OPTIONS["cap"].check
+check_mesher = OPTIONS["mesher"].check
+check_inside = OPTIONS["inside"].check
+check_iterations = OPTIONS["iterations"].check
+check_max_memory = OPTIONS["max_memory"].check
+check_threads = OPTIONS["threads"].check

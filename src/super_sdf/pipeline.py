@@ -24,7 +24,7 @@ from .errors import OptionError
 from .grid.cubic import cubic_grid
 from .grid.field import MASK
 from .grid.planes import SampleArray
-from .grid.sdf_grid import SdfGrid
+from .grid.sdf_grid import SdfGrid, check_grid
 from .machine.memory import give_back
 from .machine.resources import Resources, allot
 from .mesh import Mesh, join_meshes, vertex_type
@@ -32,9 +32,10 @@ from .neighbourhood import CENTRE
 from .network.decoder import Decoder, decode
 from .network.kinds import network_for
 from .options import (
+    DEFAULT_MESHER,
     check_cap,
     check_distance,
-    check_grid,
+    check_factor,
     check_iterations,
     check_max_memory,
     check_network,
@@ -53,12 +54,10 @@ from .steps.field import FineField, SampleSpheres
 from .steps.foot_points import spheres_of_band
 from .steps.holding import hold_sides
 from .steps.lattice import fine_grid
-from .steps.mesher_names import DEFAULT_MESHER
 from .steps.meshers import Mesher, extract_pieces, find_mesher
 from .steps.nodes import (
     average_shared,
     block_offsets,
-    check_factor,
     pin_to_skipped,
     share_parts,
     signs_of_skipped,

@@ -12,24 +12,24 @@ later is needed, and is not imported by ``import super_sdf``.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyvista
 
 from .errors import FileError, OptionError
-from .files.images import grid_from_image
+from .files.grids import grid_from_image
 from .grid.sdf_grid import SdfGrid
 from .machine.extras import check_modules, how_to_install
 from .mesh import Mesh
 from .network.decoder import Decoder
-from .network.names import DEFAULT_QUALITY
 from .network.network import load_network
+from .options import DEFAULT_MESHER, DEFAULT_QUALITY, Values
 from .pipeline import reconstruct
 from .progress import Progress
-from .steps.mesher_names import DEFAULT_MESHER
 
-RESIDUAL = "residual"  # the name of the array at the points of a surface
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 if not hasattr(pyvista, "register_dataset_accessor"):
     raise FileError(
@@ -56,12 +56,8 @@ class ImageAccessor:
         self,
         scalars: str | None = None,
         *,
-        inside: str = "auto",
-        field: str = "auto",
-        label: int | None = None,
-        level: float | None = None,
-        scale: float | None = None,
         max_memory: int | None = None,
+        **values: Unpack[Values],
     ) -> SdfGrid:
         """Return the samples as a grid, for the functions of super-sdf.
 
@@ -71,10 +67,10 @@ class ImageAccessor:
         ----------
         scalars : str, optional
             The name of an array of points or cells. Default: the active scalars.
-        inside, field, label, level, scale
-            What the values are; see ``make_grid``.
         max_memory : int, optional
             Bytes that this process may hold in all. Default: a share of the free memory.
+        inside, field, label, level, scale
+            What the values are; see ``make_grid``.
 
         Raises
         ------
@@ -83,36 +79,24 @@ class ImageAccessor:
         OptionError
             If ``inside`` or ``field`` is unknown.
         """
-        return grid_from_image(
-            self._image,
-            self._image.active_scalars_name if scalars is None else scalars,
-            inside=inside,
-            field=field,
-            label=label,
-            level=level,
-            scale=scale,
-            max_memory=max_memory,
-        )
+        name = self._image.active_scalars_name if scalars is None else scalars
+        return grid_from_image(self._image, name, max_memory=max_memory, **values)
 
     def contour(
         self,
         factor: int = 4,
         *,
         scalars: str | None = None,
-        offset: float = 0.0,
         quality: str | Path | None = None,
         network: Decoder | None = None,
-        mesher: str = DEFAULT_MESHER,
-        cap: bool = True,
-        iterations: int = 1,
         residuals: bool = False,
-        inside: str = "auto",
-        field: str = "auto",
-        label: int | None = None,
-        level: float | None = None,
-        scale: float | None = None,
+        offset: float = 0.0,
+        cap: bool = True,
+        mesher: str = DEFAULT_MESHER,
+        iterations: int = 1,
         max_memory: int | None = None,
         progress: Progress | None = None,
+        **values: Unpack[Values],
     ) -> pyvista.PolyData:
         """Return the surface of the solid, refined, as triangles in world coordinates.
 
@@ -120,33 +104,22 @@ class ImageAccessor:
 
         Parameters
         ----------
-        factor : int
-            How many times finer than the image per axis: an even number from 2 to 16.
+        factor, offset, mesher, iterations, max_memory, progress
+            See ``reconstruct``.
         scalars : str, optional
             The name of an array of points or cells. Default: the active scalars.
-        offset : float
-            The surface at this distance from the solid, in world units; positive is outwards.
         quality : str or path, optional
             "fast", "base" (default) or "best", or an ONNX file; see ``load_network``.
         network : Network, optional
             From ``load_network``, to load it only once; instead of ``quality``.
-        mesher : str
-            "marching" for marching cubes; "sharp" also puts vertices on edges and corners.
-        cap : bool
-            Close the surface along the border of the image where the solid runs out of it.
-        iterations : int
-            How often to refine by the factor.
         residuals : bool
             Also return the array "residual" of the points, float32: how far the surface is from
             touching the balls of the nearest samples, in voxels of the image, negative where it
-            pierces them, NaN where no exact sample is near. Needs the extra eval.
+            pierces them, NaN where no exact sample is near. Needs the extra report.
+        cap : bool
+            Close the surface along the border of the image where the solid runs out of it.
         inside, field, label, level, scale
             What the values are; see ``make_grid``.
-        max_memory : int, optional
-            Bytes that this process may hold in all, besides the mesh. Default: a share of the free
-            memory.
-        progress : callable, optional
-            Called with (done, total), see ``progress.Progress``.
 
         Returns
         -------
@@ -162,15 +135,7 @@ class ImageAccessor:
             raise OptionError(f"quality {str(quality)!r} and a network are given: give only one")
         if network is None:
             network = load_network(DEFAULT_QUALITY if quality is None else quality)
-        grid = self.grid(
-            scalars,
-            inside=inside,
-            field=field,
-            label=label,
-            level=level,
-            scale=scale,
-            max_memory=max_memory,
-        )
+        grid = self.grid(scalars, max_memory=max_memory, **values)
         mesh = reconstruct(
             grid,
             network,
@@ -185,7 +150,7 @@ class ImageAccessor:
         faces: Any = mesh.faces  # PyVista takes them with any integers
         surface = pyvista.PolyData.from_regular_faces(mesh.vertices, faces)
         if residuals:
-            surface.point_data[RESIDUAL] = residuals_of(mesh, grid, offset, max_memory)
+            surface.point_data["residual"] = residuals_of(mesh, grid, offset, max_memory)
         return surface
 
 

@@ -16,23 +16,18 @@ import numpy as np
 from . import __version__
 from .arrays import FloatArray, IntArray
 from .errors import DeviceError, SuperSdfError
-from .grid.field import AUTO, MASK
 from .grid.sdf_grid import make_grid
 from .machine.extras import EXTRAS, how_to_install, missing_modules
 from .machine.memory import free_memory
 from .network.cuda import available_devices, check_cuda, describe_gpu, onnxruntime_version
 from .network.kinds import MASK_MODEL
-from .network.names import FLOAT32, float32_name
-from .network.network import NO_NETWORKS, load_network, shipped_models
+from .network.network import NO_NETWORKS, float32_name, load_network, shipped_models
+from .options import AUTO, FLOAT32, MASK
 from .steps.nodes import block_offsets
 from .steps.survey import survey
 
 OK, MISSING, FAILED = "ok", "missing", "failed"
-BALL_SAMPLES, BALL_CENTRE, BALL_RADIUS = (
-    32,
-    15.63,
-    12.0,
-)  # in index units; the centre is not on a sample
+SAMPLES, CENTRE, RADIUS = 32, 15.63, 12.0  # of the ball, in voxels; the centre is on no sample
 MASK_ERROR = 0.6  # voxels: a mask shows the surface to half a voxel
 LARGEST_ERROR = 0.05  # voxels; shipped networks stay under 0.025, broken ones are off by voxels
 LARGEST_DIFFERENCE = 1e-4  # voxels, between the values of the CPU and of CUDA
@@ -50,9 +45,9 @@ class Finding:
 
 @dataclass(frozen=True)
 class Ball:
-    """The inputs of a network for a ball, and the exact distances, (D, Q), in voxels.
+    """The inputs of a network for a ball, the exact distances (D, Q), and how far it may be off.
 
-    ``allowed`` is how far a network that works may be off, in voxels.
+    The last two are in voxels.
     """
 
     inputs: tuple[FloatArray, IntArray, IntArray, FloatArray]
@@ -60,14 +55,11 @@ class Ball:
     allowed: float
 
 
-def run_checks(device: str = "auto") -> Iterator[Finding]:
+def run_checks(device: str = AUTO) -> Iterator[Finding]:
     """Run all checks and yield their results.
 
-    Parameters
-    ----------
-    device : str
-        "cpu" skips CUDA; "cuda" counts missing CUDA as a failure; "auto" does so only if the
-        installed onnxruntime was built for CUDA.
+    Without CUDA, the device "cuda" is a failure, and so is "auto" if the installed onnxruntime was
+    built for CUDA; "cpu" skips it.
     """
     yield check_versions()
     yield check_memory()
@@ -93,11 +85,11 @@ def check_versions() -> Finding:
         f"super-sdf {__version__}, Python {platform.python_version()}, NumPy "
         f"{np.__version__}, {onnxruntime_version()}"
     )
-    if is_installed("onnxruntime") and is_installed("onnxruntime-gpu"):
-        remedy = "uninstall both, then install one"
-        says += f"; onnxruntime and onnxruntime-gpu are both installed: {remedy}"
-        return Finding(FAILED, "versions", says)
-    return Finding(OK, "versions", says)
+    if not (is_installed("onnxruntime") and is_installed("onnxruntime-gpu")):
+        return Finding(OK, "versions", says)
+    remedy = "uninstall both, then install one"
+    says += f"; onnxruntime and onnxruntime-gpu are both installed: {remedy}"
+    return Finding(FAILED, "versions", says)
 
 
 def is_installed(package: str) -> bool:
@@ -126,16 +118,15 @@ def find_cuda(needed: bool) -> Finding:
     return Finding(OK, "cuda", describe_gpu() or "its libraries are there")
 
 
-def make_ball(field: str = AUTO) -> Ball:
-    """Sample a ball, as a mask if so wanted; return a network's inputs and the exact distances."""
-    ijk = np.indices((BALL_SAMPLES,) * 3)
-    values = np.linalg.norm(ijk - BALL_CENTRE, axis=0) - BALL_RADIUS
-    band = survey(make_grid(values.astype(np.float32), spacing=1.0, origin=0.0, field=field))
+def make_ball(kind: str = AUTO) -> Ball:
+    """Sample a ball, as a mask if so wanted."""
+    values = np.linalg.norm(np.indices((SAMPLES,) * 3) - CENTRE, axis=0) - RADIUS
+    band = survey(make_grid(values.astype(np.float32), spacing=1.0, origin=0.0, field=kind))
     patches, table, voxels = band.network_inputs()
     offsets = block_offsets(4)
     nodes = band.voxel_ijk[voxels, None] + offsets / 2  # offsets are in half voxels
-    exact = np.linalg.norm(nodes - BALL_CENTRE, axis=2) - BALL_RADIUS
-    allowed = MASK_ERROR if field == MASK else LARGEST_ERROR
+    exact = np.linalg.norm(nodes - CENTRE, axis=2) - RADIUS
+    allowed = MASK_ERROR if kind == MASK else LARGEST_ERROR
     return Ball((patches, table, voxels, offsets), exact.astype(np.float32), allowed)
 
 
@@ -177,9 +168,8 @@ def judge(
         says += f", {apart:.0e} voxels from the values of the CPU"
         figures["from_cpu_voxels"] = apart
     if not works:
-        says += (
-            f"; allowed are {ball.allowed} on the ball and {LARGEST_DIFFERENCE:.0e} from the CPU"
-        )
+        allowed = f"{ball.allowed} on the ball and {LARGEST_DIFFERENCE:.0e} from the CPU"
+        says += f"; allowed are {allowed}"
     return Finding(OK if works else FAILED, what, says, figures)
 
 

@@ -10,18 +10,17 @@ import numpy as np
 from conftest import count_fans
 
 from super_sdf import Mesh, SdfGrid, pipeline, reconstruct
-from super_sdf.bricks.engine import Joining
-from super_sdf.bricks.meshing import Meshed
+from super_sdf.cluster.bricks import Meshed, joined
 from super_sdf.convert import Tally
 from super_sdf.mesh import join_meshes
 from super_sdf.network.network import Network
+from super_sdf.options import DEFAULT_MESHER
 from super_sdf.pipeline import Decoder
 from super_sdf.progress import Stopwatch
 from super_sdf.slabs.cutting import cut, equal_parts
 from super_sdf.slabs.pieces import Piece
 from super_sdf.steps.glance import look_at_band
 from super_sdf.steps.marching import CAP_HEIGHT
-from super_sdf.steps.mesher_names import DEFAULT_MESHER
 
 from .case import ball, rng_of
 
@@ -138,9 +137,8 @@ def in_bricks(field: RandomField, network: Network, mesher: str, parts: int) -> 
     """Yield a field's mesh in at most ``parts`` bricks, as a cluster puts them together."""
     grid = SdfGrid.trusted(field.values, 1.0)
     seen = look_at_band(grid, 0.0)
-    joining = Joining(seen, lambda made: None)
-    for planes in equal_parts(np.append(0, np.cumsum(seen.decoded)), parts):
-        brick = pipeline.reconstruct_planes(
+    bricks = (
+        pipeline.reconstruct_planes(
             grid,
             network,
             field.factor,
@@ -149,7 +147,9 @@ def in_bricks(field: RandomField, network: Network, mesher: str, parts: int) -> 
             cap=field.cap,
             mesher=mesher,
         )
-        yield joining.add(Meshed(list(brick), "here:1", None, None))
+        for planes in equal_parts(np.append(0, np.cumsum(seen.decoded)), parts)
+    )
+    yield from joined((Meshed(list(brick), "here:1", None, None) for brick in bricks), seen)
 
 
 def faults_of_mesh(field: RandomField, mesh: Mesh) -> list[str]:

@@ -13,23 +13,19 @@ from pathlib import Path
 from typing import Any
 
 from ..files.formats import split_member
-from ..files.store import files_of, is_store
+from ..files.regular import files_of, is_store
 
 CHUNK = 1 << 20  # bytes read at a time
 Fingerprint = dict[str, Any]
 """``sha256``, ``size`` in bytes and ``mtime_ns``, as written in JSON."""
 
 
-def file_state(path: Path) -> tuple[int, int]:
+def file_state(path: Path, files: list[Path] | None = None) -> tuple[int, int]:
     """Return size and time of the last change, in ns; of several files the sums.
 
-    ``path`` may name an array in the file.
+    ``path`` may name an array in the file; ``files`` are those that are read for it.
     """
-    return _state_of(files_of(path))
-
-
-def _state_of(files: list[Path]) -> tuple[int, int]:
-    states = [file.stat() for file in files]
+    states = [file.stat() for file in files or files_of(path)]
     return sum(s.st_size for s in states), sum(s.st_mtime_ns for s in states)
 
 
@@ -45,23 +41,18 @@ def fingerprint(path: Path) -> Fingerprint | None:
         if not (is_store(file) or file.is_file()):  # opening a pipe would block
             return None
         files = files_of(path)
-        size, changed = _state_of(files)  # before reading, so that a change meanwhile shows
+        size, changed = file_state(path, files)  # before reading, so that a change meanwhile shows
         for part in files:
             if part != file:
                 digest.update(os.fsencode(os.path.relpath(part, file)) + b"\0")
-            _add(digest, part)
+            with part.open("rb", buffering=0) as opened:
+                left = os.fstat(opened.fileno()).st_size  # files of the system may have no end
+                while left > 0 and (chunk := opened.read(min(CHUNK, left))):
+                    digest.update(chunk)
+                    left -= len(chunk)
     except OSError:
         return None
     return {"sha256": digest.hexdigest(), "size": size, "mtime_ns": changed}
-
-
-def _add(digest: Any, path: Path) -> None:
-    """Add the content of a file to a digest."""
-    with path.open("rb", buffering=0) as file:
-        left = os.fstat(file.fileno()).st_size  # files that the system generates may have no end
-        while left > 0 and (chunk := file.read(min(CHUNK, left))):
-            digest.update(chunk)
-            left -= len(chunk)
 
 
 def is_unchanged(path: Path, known: Fingerprint | None, *, same_path: bool = True) -> bool:

@@ -16,12 +16,10 @@ from ..convert import ConvertOptions
 from ..errors import FileError, OptionError
 from ..files.formats import GRID_SUFFIXES, is_grid, mesh_path, split_member
 from ..files.meshes import check_mesh_suffix
-from ..files.regular import reason_of
-from ..files.store import is_store
+from ..files.regular import is_store, reason_of
 from .job import Job
-from .journal import LOCK_NAME, is_journal
-from .journal import NAME as JOURNAL
 from .ledger import NAME as LEDGER
+from .lock import LOCK_NAME
 from .manifest import read_manifest
 from .walking import files_below, fixed_part, matches
 
@@ -60,7 +58,7 @@ def find_jobs(arguments: Sequence[str], suffix: str, options: ConvertOptions) ->
         check_mesh_suffix(Path(f"*{kind}"))
     for job in jobs:
         first = PurePath(job.target).parts[0].casefold()
-        if first in (JOURNAL, LOCK_NAME, LEDGER) or is_journal(first):
+        if first in (LOCK_NAME, LEDGER):
             raise OptionError(
                 f"{job.source} would become {job.target}, but the first of these names is the "
                 "batch's own: rename it"

@@ -10,17 +10,16 @@ from typing import Any, NamedTuple
 
 from ..convert import Conversion, ConvertOptions, convert
 from ..errors import FileError, GridError, OptionError, WriteError
-from ..files.store import check_grid_file
+from ..files.regular import check_grid_file
 from ..network.decoder import Decoder
 from ..progress import Progress
 from .fingerprint import Fingerprint, fingerprint
-from .journal import note_made
 
 Row = dict[str, Any]
 """A line of the ledger, ``report.jsonl``.
 
 in, out : absolute path of the input; path of the output, relative to the output folder
-status, reason : "ok" and None, or "failed" and why
+status, reason : "ok" and None, or "failed" and why; or "started", with the paths alone
 retry : whether another run may succeed with the same input and options
 content, output : fingerprints of the input and of the mesh
 options : digest of all that the mesh depends on, besides the input
@@ -33,18 +32,9 @@ seconds : time in all; that of each stage is in ``stages``
 
 @dataclass(frozen=True)
 class Job:
-    """A grid to convert.
+    """A grid to convert: the path as it was given, the mesh below the output folder, and how.
 
-    Attributes
-    ----------
-    source : Path
-        The grid, as it was given.
-    target : str
-        The mesh, relative to the output folder.
-    options : ConvertOptions
-        How it is converted.
-    replace : bool
-        Whether an existing file may be replaced; decided when the job starts.
+    ``replace`` says whether an existing file may be replaced; decided when the job starts.
     """
 
     source: Path
@@ -55,24 +45,11 @@ class Job:
 
 @dataclass(frozen=True)
 class Outputs:
-    """Where the results of all jobs go.
-
-    Attributes
-    ----------
-    folder : Path
-        The output folder.
-    check : bool
-        Whether each mesh is checked against its samples.
-    items : Path, optional
-        The folder for what a page shows of each mesh; this needs the certificates, too.
-    host : str
-        The machine that runs the batch: another one has a journal of its own.
-    """
+    """The output folder; whether meshes are checked; the folder for what a page shows of them."""
 
     folder: Path
     check: bool = False
     items: Path | None = None
-    host: str = ""
 
 
 class Result(NamedTuple):
@@ -90,14 +67,19 @@ class Result(NamedTuple):
 def attempt(job: Job, outputs: Outputs, network: Decoder, progress: Progress | None = None) -> Row:
     """Convert a file and return its row; an error becomes a row, too.
 
-    With ``check`` or ``items`` of the outputs, the row has the certificate of the mesh; with
-    ``items``, what a page shows of it is written there. An exception in ``progress`` ends the work.
+    A mesh that has appeared since the plan is replaced by the same mesh only: it was made by a
+    process that was killed before the row was written. An exception in ``progress`` ends the work.
     """
     start, target = time.perf_counter(), outputs.folder / job.target
-    content, mesh_prints = fingerprint(job.source), []
+    content, printed = fingerprint(job.source), []
+    has_appeared = not job.replace and os.path.lexists(target)
 
     def note(part: Path) -> None:
-        mesh_prints.append(_note_mesh(part, outputs, job.target))
+        printed.append(_print_of_mesh(part))
+        if has_appeared and printed[0]["sha256"] != (fingerprint(target) or {}).get("sha256"):
+            raise WriteError(
+                f"{target} exists and is not what this batch makes: remove it or use --force"
+            )
 
     try:
         check_grid_file(job.source)
@@ -107,27 +89,26 @@ def attempt(job: Job, outputs: Outputs, network: Decoder, progress: Progress | N
             target,
             network,
             job.options,
-            force=job.replace,
+            force=job.replace or has_appeared,
             progress=progress,
             before_rename=note,
             keep=outputs.check or outputs.items is not None,
         )
     except Exception as error:  # a bug that one file shows must not cost the others
-        retry = not _is_caused_by_input(error)
+        by_input = isinstance(error, (GridError, OptionError, FileError))
+        retry = not by_input or isinstance(error, WriteError)
         row = failed_row(job, _reason(error), retry=retry, content=content)
         return {**row, "seconds": _since(start)}
     certificate = {}
-    if outputs.items:
-        certificate = {"check": _keep_item(job, done, mesh_prints[0], outputs)}
-    elif outputs.check:
-        certificate = {"check": _certify(job, done, target)}
+    if outputs.items or outputs.check:
+        certificate = {"check": _certify(job, done, printed[0], outputs)}
     return {
         **_paths(job),
         "status": "ok",
         "reason": None,
         "retry": False,
         "content": content,
-        "output": mesh_prints[0],
+        "output": printed[0],
         "mesher": job.options.mesher,
         **done.report(),
         **certificate,
@@ -136,38 +117,34 @@ def attempt(job: Job, outputs: Outputs, network: Decoder, progress: Progress | N
     }
 
 
-def _certify(job: Job, done: Conversion, target: Path) -> dict[str, Any]:
-    """Return the certificate of a finished mesh, or under ``error`` why it has none."""
-    from ..certificate.check import check_files
-
-    try:
-        return check_files(target, job.source, job.options, kept=done.kept).report()
-    except Exception as error:  # the mesh is good all the same
-        return {"error": _reason(error)}
-
-
-def _keep_item(
+def _certify(
     job: Job, done: Conversion, mesh_print: Fingerprint, outputs: Outputs
 ) -> dict[str, Any]:
-    """Write what a page shows of a mesh; return its certificate, or why there is none."""
-    from ..pages.items import item_of_files
-    from .items import Items
+    """Return the certificate of a finished mesh, or under ``error`` why it has none.
 
-    target, items = outputs.folder / job.target, outputs.items or outputs.folder
+    With ``items`` of the outputs, what a page shows of the mesh is written there.
+    """
+    from ..certificate.check import check_files
+
+    files = outputs.folder / job.target, job.source, job.options
     try:
-        item = item_of_files(target, job.source, job.options, done.kept)
-        Items(items).add(item, job.target, mesh_print)
+        if outputs.items is None:
+            return check_files(*files, kept=done.kept).report()
+        from ..pages.items import item_of_files
+        from .items import Items
+
+        item = item_of_files(*files, done.kept)
+        Items(outputs.items).add(item, job.target, mesh_print)
         return item.certificate or {}
     except Exception as error:  # the mesh is good all the same
         return {"error": _reason(error)}
 
 
-def _note_mesh(part: Path, outputs: Outputs, target: str) -> Fingerprint:
-    """Note a mesh in the journal before it is moved to its name; return its fingerprint."""
+def _print_of_mesh(part: Path) -> Fingerprint:
+    """Return the fingerprint of a finished mesh, before it is moved to its name."""
     mesh_print = fingerprint(part)
     if mesh_print is None:
         raise WriteError(f"{part} cannot be read again")
-    note_made(outputs.folder, target, mesh_print["sha256"], outputs.host)
     return mesh_print
 
 
@@ -193,12 +170,6 @@ def _paths(job: Job) -> Row:
 
 def _since(start: float) -> float:
     return round(time.perf_counter() - start, 4)
-
-
-def _is_caused_by_input(error: Exception) -> bool:
-    """Return whether the same file with the same options will always fail like this."""
-    by_input = isinstance(error, (GridError, OptionError, FileError))
-    return by_input and not isinstance(error, WriteError)
 
 
 def _reason(error: Exception) -> str:

@@ -3,44 +3,25 @@
 from __future__ import annotations
 
 import os
-import socket
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass, replace
+from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from ..cluster.checking import Needs, check_workers
-from ..cluster.connecting import Limits, connect
-from ..cluster.pool import ClusterPool, ClusterPoolOptions
+from ..cluster.checking import Needs
+from ..cluster.connecting import connect
+from ..cluster.crew import Crew
 from ..cluster.serving import CheckWanted, ClusterWork
 from ..files.formats import find_format, split_member
 from ..machine.extras import EXTRAS, all_modules, missing_modules
 from ..machine.pool import Death, Tasks
+from ..machine.resources import Resources
 from ..network.network import find_model, shipped_models
-from .job import Job, Outputs, Row, attempt
+from .job import Job, Outputs, Row, attempt, failed_row
 from .plan import Settings
-from .workers import Loading
 
 CERTIFICATE_MODULES = ("igl", "scipy")
-
-
-@dataclass(frozen=True)
-class Handling:
-    """What a run does with jobs whose worker died, and with warnings.
-
-    Attributes
-    ----------
-    clean_up : callable
-        Removes what a worker, given by its process ID, left of a job's output.
-    is_suspect : callable
-        Returns whether a worker died at the job before.
-    warn : callable
-        Tells the user a sentence.
-    """
-
-    clean_up: Callable[[Job, int], None]
-    is_suspect: Callable[[Job], bool]
-    warn: Callable[[str], None]
 
 
 def convert_on_cluster(
@@ -48,27 +29,12 @@ def convert_on_cluster(
     jobs: Sequence[Job],
     settings: Settings,
     workers: int,
-    handling: Handling,
-) -> Generator[tuple[Job, Row | Death], None, None]:
-    """Convert the jobs of a queue on a cluster.
+    warn: Callable[[str], None],
+) -> Generator[tuple[Job, Row], None, None]:
+    """Yield the jobs of a queue with their rows, as they are converted on a cluster.
 
-    Parameters
-    ----------
-    queue : Tasks
-        The jobs, as they are to be started.
-    jobs : sequence of Job
-        The same jobs, for the checks before the work.
-    settings : Settings
-        How the batch is run.
-    workers : int
-        Worker processes of this machine, for ``--cluster local``.
-    handling : Handling
-        What is done with jobs whose worker died, and with warnings.
-
-    Yields
-    ------
-    job, row or Death
-        Each job as it ends.
+    ``jobs`` are the same jobs, for the checks before the work; ``workers`` are processes of this
+    machine, for ``--cluster local``. ``warn`` tells the user a sentence.
 
     Raises
     ------
@@ -77,16 +43,16 @@ def convert_on_cluster(
     """
     address, memory = str(settings.cluster), jobs[0].options.max_memory
     settings = absolute(settings)
-    options = ClusterPoolOptions(
-        handling.clean_up, handling.is_suspect, not settings.fail_fast, handling.warn
-    )
-    with connect(address, workers=workers, threads=settings.threads, max_memory=memory) as cluster:
-        needs = needs_of(jobs, settings)
-        checked = check_workers(cluster, needs)
-        for warning in checked.warnings:
-            handling.warn(warning)
-        prepare = partial(prepare_on_cluster, settings, socket.gethostname(), Path.cwd())
-        yield from ClusterPool(cluster, checked, needs, queue, prepare, options).results()
+    prepare = partial(prepare_on_cluster, settings, Path.cwd())
+    with (
+        connect(address, workers=workers, threads=settings.threads, max_memory=memory) as cluster,
+        Crew(cluster, needs_of(jobs, settings), prepare, warn) as crew,
+        closing(crew.completed(queue)) as results,
+    ):
+        for job, row in results:
+            if isinstance(row, Death):
+                row = failed_row(job, f"the process that converted it {row.cause}")
+            yield job, row
 
 
 def absolute(settings: Settings) -> Settings:
@@ -95,9 +61,8 @@ def absolute(settings: Settings) -> Settings:
     path, _ = find_model(model, settings.precision)
     if path not in shipped_models().values():
         model = os.path.abspath(model)
-    items = settings.items and Path(os.path.abspath(settings.items))
-    folder = Path(os.path.abspath(settings.folder))
-    return replace(settings, folder=folder, items=items, model=model)
+    items = settings.items and settings.items.absolute()
+    return replace(settings, folder=settings.folder.absolute(), items=items, model=model)
 
 
 def needs_of(jobs: Sequence[Job], settings: Settings) -> Needs:
@@ -116,21 +81,13 @@ def needs_of(jobs: Sequence[Job], settings: Settings) -> Needs:
     return Needs(*network, tuple(sorted(here)), files, settings.folder)
 
 
-def prepare_on_cluster(settings: Settings, host: str, base: Path, limits: Limits) -> ClusterWork:
+def prepare_on_cluster(settings: Settings, base: Path, limits: Resources) -> ClusterWork:
     """Load the network in a worker; return the function that converts a job and returns its row.
 
-    Parameters
-    ----------
-    settings : Settings
-        How the batch is run; absolute paths.
-    host, base : str, Path
-        The machine that runs the batch, and its working folder.
-    limits : Limits
-        What this worker may use.
+    Paths of settings are absolute, those of jobs relative to ``base``.
     """
-    loading = Loading(settings.model, settings.precision, settings.device, limits.threads)
-    outputs = Outputs(settings.folder, settings.check, settings.items, host)
-    network = loading.load()
+    network = settings.load_network(limits.threads)
+    outputs = Outputs(settings.folder, settings.check, settings.items)
 
     def work(job: Job, check_wanted: CheckWanted) -> Row:
         options = replace(job.options, max_memory=limits.memory)

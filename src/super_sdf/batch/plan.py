@@ -11,89 +11,57 @@ from functools import cached_property
 from pathlib import Path
 
 from .. import __version__
-from ..files.store import files_of
-from ..network.names import AUTO_PRECISION
-from ..network.network import find_model
+from ..files.regular import files_of
+from ..network.network import Network, find_model, load_network
+from ..options import AUTO_PRECISION
 from .fingerprint import file_state, fingerprint, is_unchanged
 from .job import Job, Result, Row, failed_row
-from .journal import Journal, read_journal
 from .ledger import Ledger
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How a batch is run.
+    """How a batch is run; the network is named as for ``load_network``."""
 
-    Attributes
-    ----------
-    folder : Path
-        The output folder.
-    model, precision, device : str
-        The network and where it runs: see ``load_network``.
-    threads, workers : int
-        Threads of each worker process, and worker processes; 0: chosen by the number of cores.
-    force : bool
-        Convert everything again; replace files that are not as a batch made them.
-    retry : bool
-        Try inputs again that failed before.
-    fail_fast : bool
-        Start nothing more after the first failure.
-    check : bool
-        Check each mesh against its samples; meshes without a certificate are made again.
-    items : Path, optional
-        The folder for what a page shows of each mesh; see ``pages.items``.
-    cluster : str, optional
-        Where the files are converted instead: "local" for workers of Dask on this machine, or the
-        address of a scheduler.
-    """
-
-    folder: Path
+    folder: Path  # of the outputs
     model: str = "base"
     precision: str = AUTO_PRECISION
     device: str = "auto"
-    threads: int = 0
+    threads: int = 0  # of each worker process; 0: chosen by the number of cores
     workers: int = 0
-    force: bool = False
-    retry: bool = False
-    fail_fast: bool = False
-    check: bool = False
-    items: Path | None = None
-    cluster: str | None = None
+    force: bool = False  # convert everything again; replace files that are not as a batch made them
+    retry: bool = False  # try inputs again that failed before
+    fail_fast: bool = False  # start nothing more after the first failure
+    check: bool = False  # against the samples; meshes without a certificate are made again
+    items: Path | None = None  # the folder for what a page shows of each mesh
+    cluster: str | None = None  # "local", or the address of a scheduler: where files are converted
+
+    def load_network(self, threads: int) -> Network:
+        """Return the network of a worker."""
+        return load_network(
+            self.model, device=self.device, threads=threads, precision=self.precision
+        )
 
 
 @dataclass
 class Batch:
     """The state of a batch: jobs to be done, and the results so far.
 
-    Attributes
-    ----------
-    waiting : list of Job
-        Jobs that were not started yet, in their order.
-    done_before, failed_before : list of Result
-        Results of earlier runs that still hold; also outputs that may not be replaced.
-    done, failed : list of Result
-        Results of this run.
-    work, work_done : float
-        Estimated work, of all jobs and of those finished, in arbitrary units.
-    seconds : float
-        Time since the start of the run.
-    unread : list of (str, str)
-        Folders that could not be read, and why.
-    notes : list of str
-        Notes for the user on how the batch is run.
+    Results of earlier runs that still hold are ``done_before`` and ``failed_before``, also outputs
+    that may not be replaced.
     """
 
     settings: Settings
-    waiting: list[Job] = field(default_factory=list)
+    waiting: list[Job] = field(default_factory=list)  # not started yet, in their order
     done_before: list[Result] = field(default_factory=list)
     failed_before: list[Result] = field(default_factory=list)
     done: list[Result] = field(default_factory=list)
     failed: list[Result] = field(default_factory=list)
-    work: float = 0.0
+    work: float = 0.0  # estimated, of all jobs, in arbitrary units
     work_done: float = 0.0
-    seconds: float = 0.0
-    unread: list[tuple[str, str]] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
+    seconds: float = 0.0  # since the start of the run
+    unread: list[tuple[str, str]] = field(default_factory=list)  # folders, and why
+    notes: list[str] = field(default_factory=list)  # for the user, on how the batch is run
 
     def failures(self) -> list[Result]:
         """Return the failures of this run and of earlier ones."""
@@ -107,8 +75,8 @@ class Batch:
 class Planner:
     """Decides which jobs are to be done: those not done with the same content and options."""
 
-    def __init__(self, settings: Settings, ledger: Ledger, journal: Journal) -> None:
-        self.settings, self.ledger, self.journal = settings, ledger, journal
+    def __init__(self, settings: Settings, ledger: Ledger) -> None:
+        self.settings, self.ledger = settings, ledger
         self.jobs: Sequence[Job] = ()
         path, symmetries = find_model(settings.model, settings.precision)
         network = fingerprint(path)
@@ -129,7 +97,7 @@ class Planner:
             else:
                 before = batch.done_before if row["status"] == "ok" else batch.failed_before
                 before.append(Result(job, row))
-        last = self.journal.started.difference(self.ledger.written)
+        last = self.ledger.started.difference(self.ledger.written)
         batch.waiting.sort(key=lambda job: (job.target in last, -expected_work(job)))
         batch.work = sum(map(expected_work, batch.waiting))
         return batch
@@ -167,7 +135,7 @@ class Planner:
             return None
         if os.path.exists(path) and (read := self.inputs.get(_identity(path))):
             reason = f"{path} is the same file as {read}: remove that link"
-        elif self.may_replace(job):
+        elif job.target in self.ledger.started or self.may_replace(job):
             return None
         else:
             made = job.target in self.ledger.written
@@ -176,17 +144,9 @@ class Planner:
         return {**failed_row(job, reason), "options": self.digest(job)}
 
     def may_replace(self, job: Job) -> bool:
-        """Return whether a job may replace the existing file.
-
-        It may if a batch made that file as it is: its hash is in the ledger, or in the journal
-        because the process was killed before the row was written.
-        """
-        known, path = self.ledger.written.get(job.target), self._path(job)
-        if self.settings.force or (known and is_unchanged(path, known)):
-            return True
-        digests = self.journal.made.get(job.target)
-        now = fingerprint(path) if digests else None
-        return digests is not None and now is not None and now["sha256"] in digests
+        """Return whether a job may replace the existing file: if a batch made it as it is."""
+        known = self.ledger.written.get(job.target)
+        return self.settings.force or bool(known and is_unchanged(self._path(job), known))
 
     @cached_property
     def inputs(self) -> dict[tuple[int, int], Path]:
@@ -206,8 +166,7 @@ def _identity(path: Path) -> tuple[int, int]:
 
 def preview(jobs: Sequence[Job], settings: Settings) -> Batch:
     """Return the plan of a batch, writing nothing."""
-    folder = settings.folder
-    return Planner(settings, Ledger(folder), read_journal(folder)).plan(jobs)
+    return Planner(settings, Ledger(settings.folder)).plan(jobs)
 
 
 def expected_work(job: Job) -> float:

@@ -13,27 +13,23 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
-from ..files.parts import remove_abandoned_parts
-from ..machine.memory import held_memory, memory_bound
-from ..machine.pool import Death, Pool, PoolOptions
+from ..machine.memory import free_memory, held_memory, memory_bound
+from ..machine.pool import Death, Pool
+from ..machine.serving import Work
 from ..machine.threads import count_cores
-from .job import Job, Outputs, Result, Row, failed_row
-from .journal import read_journal
+from ..network.cuda import available_devices
+from .job import Job, Outputs, Result, Row, attempt, failed_row
 from .ledger import Ledger
-from .lock import FolderLock
 from .plan import Batch, Planner, Settings, expected_work
-from .workers import Loading, choose_workers, convert_here, prepare_worker, useful_workers
 
 # In units of ``expected_work``: done in the time that worker processes would take to start.
 SMALL_BATCH = 30_000
+BYTES_PER_WORKER = 10**9  # for the network and a grid of 128^3, where --jobs is not given
+MIN_BYTES_PER_WORKER = 3 * 10**8  # with less a worker cannot convert anything
 
 OnFile = Callable[[Batch], None]
 """Called after each file, with the batch as it stands."""
-
-Warn = Callable[[str], None]
-"""Called with a sentence that the user should read before the work goes on."""
 
 Results = Generator[tuple[Job, Row | Death], None, None]
 """Jobs as they end, each with its row, or with a Death if its process ended.
@@ -45,15 +41,16 @@ What converts the jobs of a ``Queue`` yields this: this process, processes, or a
 class Run:
     """A batch that runs in its output folder, which is locked meanwhile."""
 
-    def __init__(self, jobs: Sequence[Job], settings: Settings, lock: FolderLock) -> None:
-        self.settings, self.lock = settings, lock
+    def __init__(self, jobs: Sequence[Job], settings: Settings) -> None:
+        self.settings = settings
         self.ledger = Ledger(settings.folder)
-        lock.started.difference_update(self.ledger.written)
-        self.planner = Planner(settings, self.ledger, read_journal(settings.folder))
+        self.planner = Planner(settings, self.ledger)
         self.batch = self.planner.plan(jobs)
         self.died: set[str] = set()  # outputs whose worker died once
 
-    def complete(self, on_file: OnFile | None = None, warn: Warn | None = None) -> None:
+    def complete(
+        self, on_file: OnFile | None = None, warn: Callable[[str], None] | None = None
+    ) -> None:
         """Convert what is to be converted; call ``on_file`` after each file is in the ledger.
 
         ``warn`` is called with what may be wrong with the workers of a cluster; without it, that is
@@ -61,39 +58,38 @@ class Run:
         """
         start = time.perf_counter()
         self._note_refused()
-        with closing(self._convert(warn or self.batch.notes.append)) as results:
-            for job, result in results:
-                self._take(job, result)
-                self.batch.seconds = time.perf_counter() - start
-                if on_file:
-                    on_file(self.batch)
+        self.ledger.clean_up()
+        try:
+            with closing(self._convert(warn or self.batch.notes.append)) as results:
+                for job, result in results:
+                    self._take(job, result)
+                    self.batch.seconds = time.perf_counter() - start
+                    if on_file:
+                        on_file(self.batch)
+        finally:  # also what the workers of a killed batch wrote for a moment more
+            self.ledger.clean_up()
 
-    def _convert(self, warn: Warn) -> Results:
+    def _convert(self, warn: Callable[[str], None]) -> Results:
         """Convert in this process, in processes or on a cluster."""
         settings = self.settings
         if not self.batch.waiting or self.is_over():
             return
         workers = self._count_workers()
         if settings.cluster is not None:
-            yield from self._convert_on_cluster(workers, warn)
+            from .on_cluster import convert_on_cluster
+
+            jobs = list(self.batch.waiting)
+            yield from convert_on_cluster(Queue(self, 1), jobs, settings, workers, warn)
             return
         threads = settings.threads or (max(1, count_cores() // workers) if workers > 1 else 0)
-        loading = Loading(settings.model, settings.precision, settings.device, threads)
-        outputs = Outputs(settings.folder, settings.check, settings.items)
         queue = Queue(self, workers)
-        if workers == 1:
-            yield from convert_here(queue, loading, outputs)
-        else:
-            prepare = partial(prepare_worker, loading, outputs)
-            yield from Pool(queue, prepare, PoolOptions(self._clean_up)).results(workers)
-
-    def _convert_on_cluster(self, workers: int, warn: Warn) -> Results:
-        """Convert on a cluster, which determines threads and memory of each worker itself."""
-        from .on_cluster import Handling, convert_on_cluster
-
-        handling = Handling(self._clean_up, lambda job: job.target in self.died, warn)
-        jobs = list(self.batch.waiting)
-        return convert_on_cluster(Queue(self, 1), jobs, self.settings, workers, handling)
+        if workers > 1:
+            yield from Pool(queue, partial(prepare_worker, settings, threads)).results(workers)
+            return
+        work = prepare_worker(settings, threads)
+        while len(queue):
+            job = queue.popleft()
+            yield job, work(job, lambda value: None)
 
     def _count_workers(self) -> int:
         """Return how many processes convert files; on a cluster of this machine also for few."""
@@ -106,25 +102,18 @@ class Run:
         self.batch.notes += [note] if note else []
         return workers
 
-    def _clean_up(self, job: Job, pid: int) -> None:
-        """Remove what a dead worker left of a job's output."""
-        remove_abandoned_parts([self.settings.folder / job.target], pid)
-
     def is_over(self) -> bool:
         """Return whether no further job may be started."""
         return self.settings.fail_fast and bool(self.batch.failures())
 
     def start(self, job: Job) -> Job:
-        """Note in the journal that a job starts; return it with ``replace`` decided.
+        """Note in the ledger that a job starts; return it with ``replace`` decided.
 
-        It is decided now because the output may have appeared since the plan was made, written by
-        a worker that died, or by one that outlived a killed batch.
+        It is decided now because the output may have changed since the plan was made.
         """
-        self.lock.start(job.target)
-        if not os.path.lexists(self.settings.folder / job.target):
-            return job
-        self.planner.journal = read_journal(self.settings.folder)
-        return replace(job, replace=self.planner.may_replace(job))
+        self.ledger.start(job)
+        exists = os.path.lexists(self.settings.folder / job.target)
+        return replace(job, replace=exists and self.planner.may_replace(job))
 
     def _take(self, job: Job, result: Row | Death) -> None:
         """Keep the row of a job; if its worker died, try the job once more, after the others."""
@@ -141,16 +130,13 @@ class Run:
         """Put the row of a finished job into the ledger and count it."""
         row["options"] = self.planner.digest(job)
         self.ledger.add(row)
-        is_ok = row["status"] == "ok"
-        if is_ok or not os.path.lexists(self.settings.folder / job.target):
-            self.lock.finish(job.target)  # otherwise only the journal knows who made the file
-        (self.batch.done if is_ok else self.batch.failed).append(Result(job, row))
+        (self.batch.done if row["status"] == "ok" else self.batch.failed).append(Result(job, row))
         self.batch.work_done += expected_work(job)
 
     def _note_refused(self) -> None:
         """Put the refused outputs into the ledger, unless they are there with the same reason."""
         for job, row in self.batch.failed_before:
-            known: dict[str, Any] = self.ledger.rows.get(job.target, {})
+            known = self.ledger.rows.get(job.target, {})
             if row is not known and row["reason"] != known.get("reason"):
                 self.ledger.add(row)
 
@@ -176,3 +162,33 @@ class Queue:
         if self.workers == 1:
             return job
         return replace(job, options=replace(job.options, max_memory=self.bound))
+
+
+def prepare_worker(settings: Settings, threads: int) -> Work:
+    """Load the network; return the function that converts a job and returns its row."""
+    network = settings.load_network(threads)
+    outputs = Outputs(settings.folder, settings.check, settings.items)
+    return lambda job, tell: attempt(job, outputs, network)
+
+
+def choose_workers(device: str, jobs: int, max_memory: int | None = None) -> int:
+    """Return how many processes to use: one per core if memory allows; one on a GPU."""
+    if device == "cuda" or (device == "auto" and "cuda" in available_devices()):
+        return 1
+    free = max_memory or free_memory()
+    room = count_cores() if free is None else free // BYTES_PER_WORKER
+    return max(1, min(count_cores(), room, jobs))
+
+
+def useful_workers(asked: int, jobs: int, max_memory: int | None = None) -> tuple[int, str | None]:
+    """Return how many of the processes asked for are useful, and a note if that is fewer."""
+    limits = [
+        (jobs, "there is no more to do"),
+        (count_cores(), "this process may use no more cores"),
+    ]
+    if max_memory is not None:
+        limits.append(
+            (max(1, max_memory // MIN_BYTES_PER_WORKER), "--max-memory has no room for more")
+        )
+    most, cause = min(limits)
+    return min(asked, most), None if asked <= most else f"--jobs {asked} is cut to {most}: {cause}"

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray
-from ..convert import ConvertOptions, Kept
+from ..convert import Kept
 from ..errors import OptionError, OutOfMemoryError
-from ..files.coloured_ply import write_coloured_ply
-from ..files.grids import read_grid_with
+from ..files.grids import read_grid
 from ..files.output import check_free
+from ..files.plain_meshes import write_coloured_ply
 from ..files.regular import check_regular_file
 from ..grid.cubic import cubic_grid
 from ..grid.sdf_grid import SdfGrid
@@ -28,7 +28,7 @@ from ..machine.memory import give_back, held_memory, in_words, memory_bound
 from ..machine.resources import allot
 from ..machine.threads import useful_threads
 from ..mesh import Mesh
-from ..options import check_distance, check_max_memory
+from ..options import ConvertOptions, check_distance, check_max_memory
 from ..steps.survey import Band, no_surface, survey
 from ..truth.mesh_files import merged, read_mesh
 from .search import search
@@ -221,7 +221,7 @@ def read_for_check(
     if kept:
         return Kept(kept.grid, merged(kept.mesh), kept.band)
     check_room(stated_triangles(check_regular_file(mesh)), 0, options.max_memory)
-    samples = read_grid_with(grid, options)
+    samples = read_grid(grid, **options.reading())
     return Kept(samples, read_mesh(mesh, options.max_memory))
 
 

@@ -12,20 +12,19 @@ import click
 from ..errors import SuperSdfError, WriteError
 from ..files.formats import NAMED, list_formats
 from ..machine.extras import check_modules
+from ..options import MESH_FORMATS
 from .batch_report import print_plan, print_summary, progress_line, sentence
-from .choices import LazyChoice, mesh_formats
 from .common import CONTEXT, InterruptedCommand, one_line_errors, print_stderr, print_warning
 from .conversion import (
     check_can_check,
     check_cluster,
     check_option,
-    check_simplification,
     chosen_model,
     cluster_option,
     conversion_options,
     make_options,
 )
-from .interrupts import describe_interrupt, raising_interrupts
+from .interrupts import describe_interrupt, exit_code, raising_interrupts
 from .view import check_page, report_option
 
 if TYPE_CHECKING:
@@ -70,8 +69,8 @@ Examples:
 @click.option(
     "--format",
     "kind",
-    type=LazyChoice(mesh_formats),
-    default="ply",
+    type=click.Choice(MESH_FORMATS),
+    default=MESH_FORMATS[0],
     show_default=True,
     help="Mesh file format.",
 )
@@ -106,33 +105,29 @@ def batch_command(sources: tuple[str, ...], folder: Path, **options: Any) -> Non
 def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -> None:
     """Find the inputs, convert what is not done yet, print a summary."""
     from ..batch.inputs import find_jobs
+    from ..batch.items import items_folder
     from ..batch.plan import Settings, preview
     from ..network.network import find_model
-    from ..steps.nodes import check_factor
 
-    start = time.perf_counter()
-    check_factor(options["factor"])
+    start, page = time.perf_counter(), options["report"]
+    chosen, suffix = make_options(options), f".{options['kind']}"
     if options["check"]:
         check_can_check()
-    check_simplification(options)
     check_cluster(options)
-    jobs, unread = find_jobs(sources, f".{options['kind']}", make_options(options))
-    check_jobs_can_be_simplified(jobs)
-    if options["report"]:
-        check_batch_page(options["report"], jobs, folder, force=options["force"])
+    jobs, unread = find_jobs(sources, suffix, chosen)
+    if any(job.options.simplifies for job in jobs):  # a list may say so
+        check_modules("simplify", "simplify")
+    if page:
+        check_batch_page(page, jobs, folder, force=options["force"])
     model = chosen_model(options)
     find_model(model, options["precision"])
-    flags = {name: options[name] for name in ("force", "retry", "fail_fast", "check")}
+    taken = "precision", "device", "threads", "cluster", "force", "retry", "fail_fast", "check"
     settings = Settings(
         folder,
         model,
-        precision=options["precision"],
-        device=options["device"],
-        threads=options["threads"],
         workers=options["jobs"],
-        items=items_beside(options["report"]),
-        cluster=options["cluster"],
-        **flags,
+        items=items_folder(page) if page else None,
+        **{name: options[name] for name in taken},
     )
     if options["dry_run"]:
         plan = preview(jobs, settings)
@@ -146,21 +141,13 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
         sys.exit(1)
 
 
-def check_jobs_can_be_simplified(jobs: list[Job]) -> None:
-    """Raise FileError if a list of inputs asks for what the missing extra would do."""
-    from ..simplification.simplify import check_can_simplify
-
-    if any(job.options.simplifies for job in jobs):
-        check_can_simplify("simplify")
-
-
 def check_batch_page(page: Path, jobs: list[Job], folder: Path, *, force: bool) -> None:
     """Raise if the page or the folder beside it cannot be written.
 
     A page that super-sdf wrote may be replaced, so that a batch can be resumed.
     """
     from ..batch.items import items_folder
-    from ..files.store import files_of
+    from ..files.regular import files_of
     from ..pages.html import is_page
 
     check_modules("--report", "report")
@@ -171,24 +158,15 @@ def check_batch_page(page: Path, jobs: list[Job], folder: Path, *, force: bool) 
         raise WriteError(f"{beside}, for the meshes of the page, is no folder: move it")
 
 
-def items_beside(page: Path | None) -> Path | None:
-    """Return the folder for the meshes of a page, None without a page."""
-    if page is None:
-        return None
-    from ..batch.items import items_folder
-
-    return items_folder(page)
-
-
 def complete(
     jobs: list[Job], settings: Settings, options: dict[str, Any], unread: list[tuple[str, str]]
 ) -> Batch:
     """Run the batch and write its page; an interrupt reports how many files are done."""
-    from ..batch.lock import FolderLock
+    from ..batch.lock import folder_lock
     from ..batch.run import Run
 
-    with raising_interrupts(), FolderLock(settings.folder) as lock:
-        run = Run(jobs, settings, lock)
+    with raising_interrupts(), folder_lock(settings.folder):
+        run = Run(jobs, settings)
         run.batch.unread = unread
         total = len(run.batch.waiting)
         try:
@@ -197,7 +175,7 @@ def complete(
             write_page(run, jobs, options["report"])
         except KeyboardInterrupt as error:
             try:
-                write_page(run, jobs, options["report"], describe_interrupt(error))
+                write_page(run, jobs, options["report"], describe_interrupt(exit_code(error)))
             except SuperSdfError as fault:
                 print_stderr(f"Warning: {fault}")
             kept = f": {len(run.batch.done)} of {total} are done and kept; run it again to go on"

@@ -10,8 +10,9 @@ from typing import Any
 import click
 
 from ..machine.extras import check_modules
+from ..options import GRID, ConvertOptions, parse_size
 from .common import CONTEXT, one_line_errors, print_stderr, print_stdout
-from .conversion import CHECK_MODULES, grid_options, parse_size
+from .conversion import CHECK_MODULES, Parsed, table_options
 from .interrupts import raising_interrupts
 
 EXAMPLES = """\b
@@ -64,7 +65,7 @@ Examples:
     is_flag=True,
     help="Do not count self-intersections, which takes up to half of the time.",
 )
-@grid_options
+@table_options(*GRID)
 @click.option(
     "--offset",
     type=float,
@@ -75,7 +76,7 @@ Examples:
 )
 @click.option(
     "--max-memory",
-    callback=parse_size,
+    type=Parsed(parse_size),
     metavar="SIZE",
     help="Memory limit of the process, such as 1500M or 4G. Default: 60 % of the free memory. "
     "Larger meshes are refused.",
@@ -114,17 +115,15 @@ def run_check(mesh: Path, grid: Path, options: dict[str, Any]) -> list[str]:
         exceeded,
         write_coloured,
     )
-    from ..convert import ConvertOptions
-    from ..files.grids import READ_OPTIONS
     from ..files.output import check_apart
-    from ..files.store import files_of
+    from ..files.regular import files_of
 
     limits = {name: options[name] for name in LIMITS}
     check_limits(limits)
     if options["out"]:
         check_coloured(options["out"], force=options["force"])
         check_apart(options["out"], [mesh, *files_of(grid)])
-    given = ConvertOptions(**{name: options[name] for name in (*READ_OPTIONS, "offset")})
+    given = ConvertOptions(**{name: options[name] for name in (*GRID, "offset", "max_memory")})
     count = not options["skip_intersections"]
     certificate = check_files(mesh, grid, given, intersections=count, processes=0)
     if options["out"]:

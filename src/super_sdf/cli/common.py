@@ -9,6 +9,7 @@ from contextlib import contextmanager, suppress
 
 import click
 
+from ..errors import OptionError, SuperSdfError
 from .interrupts import describe_interrupt, exit_code
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
@@ -18,8 +19,8 @@ class InterruptedCommand(BaseException):  # as KeyboardInterrupt, no error
     """A signal ended the command: the message names the signal and what was kept."""
 
     def __init__(self, kept: str, interrupt: KeyboardInterrupt) -> None:
-        super().__init__(f"{describe_interrupt(interrupt)}{kept}")
         self.exit_code = exit_code(interrupt)
+        super().__init__(f"{describe_interrupt(self.exit_code)}{kept}")
 
 
 @contextmanager
@@ -29,24 +30,23 @@ def one_line_errors(*targets: str | os.PathLike[str] | None) -> Iterator[None]:
     The exit code is 2 for usage errors, 128 + n after signal n, and 1 for all others. After an
     interrupt the line says which of the targets, the output files, are written.
     """
-    from ..errors import OptionError, SuperSdfError
-
-    before = {str(target): file_at(target) for target in targets if target is not None}
+    before = {str(target): _file_at(target) for target in targets if target is not None}
     try:
         yield
-    except OptionError as error:
-        raise click.UsageError(on_one_line(error)) from error
     except SuperSdfError as error:
-        raise click.ClickException(on_one_line(error)) from error
+        kind = click.UsageError if isinstance(error, OptionError) else click.ClickException
+        raise kind(" ".join(str(error).splitlines())) from error  # names may have line breaks
     except MemoryError:
         raise click.ClickException("out of memory: use a smaller --factor or grid") from None
     except OSError as error:  # the system refused something, such as another file handle: no bug
-        raise click.ClickException(describe_os_error(error)) from error
+        reason = error.strerror or str(error)
+        named = f"{error.filename}: {reason}" if error.filename else reason
+        raise click.ClickException(named) from error
     except KeyboardInterrupt as error:
-        raise InterruptedCommand(what_is_written(before), error) from None
+        raise InterruptedCommand(_what_is_written(before), error) from None
 
 
-def file_at(path: str | os.PathLike[str]) -> tuple[int, int] | None:
+def _file_at(path: str | os.PathLike[str]) -> tuple[int, int] | None:
     """Return what tells the file at a path from one that replaces it; None without a file."""
     try:
         found = os.stat(path)
@@ -55,23 +55,12 @@ def file_at(path: str | os.PathLike[str]) -> tuple[int, int] | None:
     return found.st_dev, found.st_ino
 
 
-def what_is_written(before: dict[str, tuple[int, int] | None]) -> str:
+def _what_is_written(before: dict[str, tuple[int, int] | None]) -> str:
     """Return which files are not those of before, as the end of a sentence; "" for no files."""
-    written = [path for path, file in before.items() if file_at(path) != file]
+    written = [path for path, file in before.items() if _file_at(path) != file]
     if not written:
         return "; nothing was written" if before else ""
     return f"; {' and '.join(written)} {'is' if len(written) == 1 else 'are'} written"
-
-
-def on_one_line(error: Exception) -> str:
-    """Return an error's message on one line, even if a file name or key in it has line breaks."""
-    return " ".join(str(error).splitlines())
-
-
-def describe_os_error(error: OSError) -> str:
-    """Describe in one line what the system refused, with the file name if it is known."""
-    reason = error.strerror or str(error)
-    return f"{error.filename}: {reason}" if error.filename else reason
 
 
 @contextmanager
@@ -85,10 +74,7 @@ def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[int, int], None]
 
 
 def print_stderr(line: str) -> None:
-    """Print a line to stderr, if that can be written.
-
-    Line breaks, which file names may hold, become spaces.
-    """
+    """Print a line to stderr, if that can be written; line breaks of file names become spaces."""
     with suppress(OSError):
         click.echo(line.replace("\n", " "), err=True)
 
@@ -100,10 +86,7 @@ def print_warning(text: str) -> None:
 
 
 def print_stdout(text: str, kept: str) -> None:
-    """Print the result that the user asked for to stdout.
-
-    ``kept`` says which output exists if that fails.
-    """
+    """Print the result that the user asked for; ``kept`` says which output exists if that fails."""
     try:
         click.echo(text)
     except OSError as error:

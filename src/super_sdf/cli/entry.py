@@ -1,15 +1,20 @@
 """The entry point: what must be right before anything large is imported.
 
-That is signals, missing streams, and a processor that NumPy can run on.
+That is signals, a processor that NumPy can run on, and the standard streams: closed, full or broken
+ones must not cost the user the mesh.
 """
 
 from __future__ import annotations
 
 import os
+import sys
+from contextlib import suppress
 
 from ..machine.processor import check_processor
 from .interrupts import ending_at_once
-from .streams import open_missing_streams
+
+# Writing to a descriptor that is open for reading fails, as writing to a closed one does.
+MODES = (os.O_RDONLY, os.O_RDONLY, os.O_WRONLY)
 
 
 def main() -> None:
@@ -22,5 +27,38 @@ def main() -> None:
         check_processor()
         from .main import run
 
-        code = run()
+        try:
+            code = run()
+        finally:
+            discard_unwritable_output()
     os._exit(code)
+
+
+def open_missing_streams() -> None:
+    """Open null devices in place of standard streams that were closed before the start.
+
+    Otherwise the next file that is opened would get the stream's number, and its output. Text for
+    a missing stderr is lost; text for a missing stdout is an error.
+    """
+    for number, mode in enumerate(MODES):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, mode)  # takes the lowest free number, which is this one
+    if sys.stdout is None:
+        sys.stdout = os.fdopen(1, "w", closefd=False)
+    if sys.stderr is None:
+        sys.stderr = os.fdopen(2, "w", closefd=False, errors="backslashreplace")
+
+
+def discard_unwritable_output() -> None:
+    """Drop buffered output that cannot be written: Python would complain about it at exit."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError):
+            with suppress(OSError, ValueError):
+                null = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(null, stream.fileno())
+                os.close(null)
+                stream.flush()

@@ -13,9 +13,10 @@ import click
 
 from ..evaluation.names import EXPERIMENTS, FIELD_GROUPS, METHOD_LABELS, PEER_LABELS
 from ..machine.extras import check_modules
+from ..options import DEFAULT_QUALITY, ConvertOptions
 from ..pictures.choices import AXES
-from .choices import LazyDefault, convert_default, default_quality, precision_option
 from .common import CONTEXT, InterruptedCommand, one_line_errors, print_stderr, print_stdout
+from .conversion import table_options
 from .interrupts import raising_interrupts
 
 EXAMPLES = """\b
@@ -100,7 +101,7 @@ def accepts(option: click.Option, word: str, ctx: click.Context) -> bool:
 @click.option(
     "--factor",
     type=int,
-    default=convert_default("factor"),
+    default=ConvertOptions.factor,
     show_default=True,
     help="Refinement per axis.",
 )
@@ -179,11 +180,11 @@ def accepts(option: click.Option, word: str, ctx: click.Context) -> bool:
 )
 @click.option(
     "--model",
-    default=LazyDefault(default_quality),
+    default=DEFAULT_QUALITY,
     show_default=True,
     help="Shipped network (fast, base or best) or an ONNX file.",
 )
-@precision_option
+@table_options("precision")
 @click.option(
     "--jobs", type=click.IntRange(1), help="Worker processes. Default and maximum: one per core."
 )

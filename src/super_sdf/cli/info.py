@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import asdict
 from typing import Any
 
 import click
 
 from .. import __version__
-from ..errors import OptionError
-from .choices import LazyChoice, devices, first
+from ..errors import OptionError, SuperSdfError
+from ..options import DEVICES, FLOAT32, MESHERS
 from .common import CONTEXT, one_line_errors
 
 EXAMPLES = """\b
@@ -31,8 +32,8 @@ Examples:
 @click.option("--check", is_flag=True, help="Test the installation; exit code 1 if a check fails.")
 @click.option(
     "--device",
-    type=LazyChoice(devices),
-    default=first(devices),
+    type=click.Choice(DEVICES),
+    default=DEVICES[0],
     show_default=True,
     help="With --check: cpu skips CUDA; cuda makes it a failure if CUDA does not work.",
 )
@@ -52,24 +53,22 @@ def info_command(source: str | None, check: bool, device: str, as_json: bool) ->
             raise OptionError(f"{source} and --check: give only one of them")
         if source is not None:
             print_grid(source, as_json)
-            return
-        if check:
-            sys.exit(0 if print_checks(device, as_json) else 1)
-        sys.exit(0 if print_facts(as_json) else 1)
+        elif not (print_checks(device, as_json) if check else print_facts(as_json)):
+            sys.exit(1)
 
 
 def print_grid(source: str, as_json: bool) -> None:
     """Print what a grid file states."""
-    from ..files.description import describe_grid_file
+    from ..files.grids import describe_grid_file
 
     found = describe_grid_file(source)
     if as_json:
         click.echo(json.dumps(found, indent=2))
         return
+    notes = found.pop("notes", ())
     for key, value in found.items():
-        if key != "notes":
-            click.echo(f"{key}: {_in_words(value)}")
-    for note in found.get("notes", ()):
+        click.echo(f"{key}: {_in_words(value)}")
+    for note in notes:
         click.echo(f"note: {note}")
 
 
@@ -84,8 +83,6 @@ def _in_words(value: Any) -> str:
 
 def print_checks(device: str, as_json: bool) -> bool:
     """Run the checks and print each result as it comes; return whether none failed."""
-    from dataclasses import asdict
-
     from ..selftest import FAILED, run_checks
 
     findings = []
@@ -93,12 +90,12 @@ def print_checks(device: str, as_json: bool) -> bool:
         findings.append(finding)
         if not as_json:
             click.echo(f"{finding.state:<8} {finding.what}: {finding.says}")
-    failed = [finding for finding in findings if finding.state == FAILED]
+    failed = sum(finding.state == FAILED for finding in findings)
     if as_json:
         report = {"works": not failed, "findings": [asdict(finding) for finding in findings]}
         click.echo(json.dumps(report, indent=2))
     elif failed:
-        click.echo(f"{len(failed)} of {len(findings)} checks failed")
+        click.echo(f"{failed} of {len(findings)} checks failed")
     else:
         click.echo("What is installed works.")
     return not failed
@@ -107,21 +104,20 @@ def print_checks(device: str, as_json: bool) -> bool:
 def print_facts(as_json: bool) -> bool:
     """Print versions, devices and the networks' cards; return whether all networks load."""
     facts = gather_facts()
-    works = bool(facts["models"]) and not any("fault" in card for card in facts["models"].values())
     if as_json:
         click.echo(json.dumps(facts, indent=2))
-        return works
-    for key in ("super-sdf", "python", "onnxruntime"):
-        click.echo(f"{key} {facts[key]}")
-    click.echo(f"devices: {', '.join(facts['devices'])}")
-    click.echo(f"meshers: {', '.join(facts['meshers'])}")
-    for name, card in facts["models"].items():
-        click.echo(f"model {name}")
-        for key, value in sorted(card.items()):
-            click.echo(f"  {key.replace('_', ' ')}: {value}")
-    if not facts["models"]:
-        click.echo(f"models: {facts['fault']}")
-    return works
+    else:
+        for key in ("super-sdf", "python", "onnxruntime"):
+            click.echo(f"{key} {facts[key]}")
+        for key in ("devices", "meshers"):
+            click.echo(f"{key}: {', '.join(facts[key])}")
+        for name, card in facts["models"].items():
+            click.echo(f"model {name}")
+            for key, value in sorted(card.items()):
+                click.echo(f"  {key.replace('_', ' ')}: {value}")
+        if not facts["models"]:
+            click.echo(f"models: {facts['fault']}")
+    return "fault" not in facts and not any("fault" in card for card in facts["models"].values())
 
 
 def gather_facts() -> dict[str, Any]:
@@ -131,7 +127,6 @@ def gather_facts() -> dict[str, Any]:
     from ..network.cuda import available_devices
     from ..network.network import NO_NETWORKS, shipped_models
     from ..network.onnx import ort
-    from ..steps.mesher_names import MESHERS
 
     models = {name: load_card(name) for name in shipped_models()}
     facts = {
@@ -147,8 +142,6 @@ def gather_facts() -> dict[str, Any]:
 
 def load_card(name: str) -> dict[str, Any]:
     """Return the metadata of a shipped network, or under ``fault`` why it cannot be loaded."""
-    from ..errors import SuperSdfError
-    from ..network.names import FLOAT32
     from ..network.network import load_network
 
     try:

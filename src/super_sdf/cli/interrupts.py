@@ -33,27 +33,25 @@ class Interrupted(KeyboardInterrupt):
 
 def exit_code(error: KeyboardInterrupt) -> int:
     """Return the exit code of a process that a signal ended: 128 plus the signal's number."""
-    return 128 + _number(error)
+    return 128 + (error.number if isinstance(error, Interrupted) else signal.SIGINT)
 
 
-def describe_interrupt(error: KeyboardInterrupt) -> str:
-    """Describe what ended the command."""
-    return _describe(_number(error))
-
-
-def _number(error: KeyboardInterrupt) -> int:
-    return error.number if isinstance(error, Interrupted) else int(signal.SIGINT)
-
-
-def _describe(number: int) -> str:
-    name = signal.Signals(number).name
+def describe_interrupt(code: int) -> str:
+    """Describe what ended a process with an exit code."""
+    name = signal.Signals(code - 128).name
     return "interrupted" if name == "SIGINT" else f"ended by {name}"
 
 
 @contextmanager
 def ending_at_once() -> Iterator[None]:
     """End the process on a signal within the block, which must not write files."""
-    with _handling(_end):
+
+    def end(number: int, frame: FrameType | None) -> None:
+        with suppress(OSError):
+            os.write(2, f"Error: {describe_interrupt(128 + number)}\n".encode("ascii"))
+        os._exit(128 + number)
+
+    with _handling(end):
         yield
 
 
@@ -103,24 +101,12 @@ def _raise(number: int, frame: FrameType | None) -> None:
         sys.settrace(None)
         raise Interrupted(number)
 
-    if (importer := _importer(frame)) is None:
-        raise Interrupted(number)
-    importer.f_trace = raise_there
-    sys.settrace(lambda *_: None)  # only with one are the functions of frames called
-
-
-def _importer(frame: FrameType | None) -> FrameType | None:
-    """Return the frame that waits for the outermost import in progress, None if there is none."""
-    importer = None
+    importer = None  # the frame that waits for the outermost import in progress
     while frame is not None:
         if frame.f_code.co_filename == IMPORTING:
             importer = frame.f_back
         frame = frame.f_back
-    return importer
-
-
-def _end(number: int, frame: FrameType | None) -> None:
-    line = f"Error: {_describe(number)}\n"
-    with suppress(OSError):
-        os.write(2, line.encode("ascii"))
-    os._exit(128 + number)
+    if importer is None:
+        raise Interrupted(number)
+    importer.f_trace = raise_there
+    sys.settrace(lambda *_: None)  # only with one are the functions of frames called

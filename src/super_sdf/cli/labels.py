@@ -5,47 +5,36 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from ..label_files import check_options, convert_labels
+from ..progress import Stopwatch
 from .common import print_stderr, print_stdout, progress_bar
-from .conversion import chosen_model, make_options
+from .conversion import chosen_model, load_chosen, make_options
 from .interrupts import raising_interrupts
+from .upsampling import describe_network, rounded
 
-OTHERS = ("save_field", "check", "report", "cluster", "jobs")
+NOT_WITH_LABELS = ("save_field", "check", "report", "cluster", "jobs")
 
 
-def run_labels(source: str, target: str, options: dict[str, Any]) -> None:
+def upsample_labels(source: str, target: str, options: dict[str, Any]) -> None:
     """Convert the labels of an image to meshes, and print what was made."""
-    from ..label_files import check_options, convert_labels
-    from ..network.network import load_network
-    from ..progress import Stopwatch
-
-    watch, model, given = Stopwatch(), chosen_model(options), make_options(options)
-    check_options(given, [name for name in OTHERS if options[name]])
-    chosen = {name: options[name] for name in ("device", "threads", "precision")}
-    network = load_network(model, **chosen)
+    watch, chosen, model = Stopwatch(), make_options(options), chosen_model(options)
+    check_options(chosen, [name for name in NOT_WITH_LABELS if options[name]])
+    network, labels, force = load_chosen(options), options["labels"], options["force"]
     watch.lap("load network")
     with raising_interrupts(), progress_bar("upsampling", options["quiet"]) as progress:
         found = convert_labels(
-            source,
-            target,
-            network,
-            options["labels"],
-            given,
-            force=options["force"],
-            progress=progress,
+            source, target, network, labels, chosen, force=force, progress=progress
         )
     watch.lap("convert")
-    report = {
-        "input": source,
-        "output": target,
-        "factor": given.factor,
-        "model": model,
-        "precision": network.precision,
-        "device": network.device,
-        "device_notes": list(network.notes),
-        **found,
-        "seconds": {stage: round(seconds, 4) for stage, seconds in watch.seconds.items()},
-    }
     if options["as_json"]:
+        report = {
+            "input": source,
+            "output": target,
+            "factor": chosen.factor,
+            **describe_network(model, network),
+            **found,
+            "seconds": rounded(watch.seconds),
+        }
         print_stdout(json.dumps(report, indent=2), "the meshes are written")
     if options["quiet"]:
         return

@@ -11,68 +11,8 @@ import click
 
 from .. import __version__
 from .common import CONTEXT, InterruptedCommand, print_stderr
-from .interrupts import ending_at_once
-from .streams import discard_unwritable_output
 
-
-def _upsample() -> click.Command:
-    from .upsample import upsample_command
-
-    return upsample_command
-
-
-def _batch() -> click.Command:
-    from .batch import batch_command
-
-    return batch_command
-
-
-def _check() -> click.Command:
-    from .check import check_command
-
-    return check_command
-
-
-def _sample() -> click.Command:
-    from .sample import sample_command
-
-    return sample_command
-
-
-def _evaluate() -> click.Command:
-    from .evaluate import evaluate_command
-
-    return evaluate_command
-
-
-def _render() -> click.Command:
-    from .render import render_command
-
-    return render_command
-
-
-def _view() -> click.Command:
-    from .view import view_command
-
-    return view_command
-
-
-def _info() -> click.Command:
-    from .info import info_command
-
-    return info_command
-
-
-COMMANDS = {
-    "upsample": _upsample,
-    "batch": _batch,
-    "check": _check,
-    "sample": _sample,
-    "evaluate": _evaluate,
-    "render": _render,
-    "view": _view,
-    "info": _info,
-}
+COMMANDS = ("upsample", "batch", "check", "sample", "evaluate", "render", "view", "info")
 
 
 class LazyGroup(click.Group):
@@ -84,7 +24,26 @@ class LazyGroup(click.Group):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Return a command, None if there is none of this name."""
-        return COMMANDS[cmd_name]() if cmd_name in COMMANDS else None
+        match cmd_name:
+            case "upsample":
+                from .upsample import upsample_command as command
+            case "batch":
+                from .batch import batch_command as command
+            case "check":
+                from .check import check_command as command
+            case "sample":
+                from .sample import sample_command as command
+            case "evaluate":
+                from .evaluate import evaluate_command as command
+            case "render":
+                from .render import render_command as command
+            case "view":
+                from .view import view_command as command
+            case "info":
+                from .info import info_command as command
+            case _:
+                return None
+        return command
 
 
 @click.group(cls=LazyGroup, context_settings=CONTEXT)
@@ -100,15 +59,6 @@ def main() -> None:
 
 
 def run() -> int:
-    """Run a command and write its output; return the exit code."""
-    with ending_at_once():
-        try:
-            return run_command()
-        finally:
-            discard_unwritable_output()
-
-
-def run_command() -> int:
     """Run a command; return the exit code."""
     try:
         cli.main(standalone_mode=False)
@@ -125,7 +75,3 @@ def run_command() -> int:
         print_stderr(f"Error: stdout cannot be written: {error.strerror or error}")
         return 1
     return 0
-
-
-if __name__ == "__main__":
-    main()

@@ -11,8 +11,8 @@ from click.core import ParameterSource
 
 from ..errors import OptionError
 from ..machine.extras import EXTRAS, check_modules
+from ..options import ConvertOptions
 from ..pictures.choices import AXES, COLOURS
-from .choices import convert_default
 from .common import CONTEXT, one_line_errors
 from .interrupts import raising_interrupts
 
@@ -91,7 +91,7 @@ FOR_MESHES = ("colour", "reference", "top", "up", "zoom")
 @click.option(
     "--factor",
     type=int,
-    default=convert_default("factor"),
+    default=ConvertOptions.factor,
     show_default=True,
     help="For a grid: refinement per axis.",
 )
@@ -127,7 +127,7 @@ def check_given(others: tuple[str, ...], drawn: str) -> None:
 def check_picture(target: Path, inputs: Iterable[Path], *, force: bool) -> None:
     """Raise if the picture cannot be written; called before the work starts."""
     from ..files.output import check_apart, check_free
-    from ..files.store import files_of
+    from ..files.regular import files_of
 
     if target.suffix.lower() != ".png":
         raise OptionError(f"{target} is not a picture file: give .png")
@@ -164,9 +164,9 @@ def render_grid(sources: tuple[Path, ...], target: Path, options: dict[str, Any]
     """Draw a grid's section before and after upsampling."""
     from ..files.grids import read_grid
     from ..network.network import load_network
+    from ..options import check_factor
     from ..pictures.sections import check_section, find_plane, render_section
     from ..pipeline import upsample
-    from ..steps.nodes import check_factor
 
     check_factor(options["factor"])
     check_section(options["size"])

@@ -76,24 +76,18 @@ def run_sample(source: Path, target: Path, options: dict[str, Any]) -> None:
     from ..truth.sampling import check_numbers, fitted_layout, sample_solid, unit_layout
     from ..truth.solid import Solid, load_solid, normalise
 
-    start = time.perf_counter()
+    start, in_unit = time.perf_counter(), options["frame"] == "unit"
     check_grid_target(target, force=options["force"])
     check_apart(target, [source])
-    samples, spacing = options["samples"], options["spacing"]
-    if (samples is None) == (spacing is None):
-        raise OptionError("give either -n (samples along the longest axis) or --spacing")
-    if options["frame"] == "unit" and samples is None:
-        raise OptionError("--frame unit has a side of 1: give -n, not --spacing")
-    chosen = {"n": samples, "spacing": spacing, "band": options["band"]}
-    check_numbers(**chosen, padding=0 if options["frame"] == "unit" else options["padding"])
-    padded = click.get_current_context().get_parameter_source("padding")
-    if options["frame"] == "unit" and padded is not ParameterSource.DEFAULT:
-        raise OptionError("--frame unit has a side of 1: it takes no --padding")
+    size = {"n": options["samples"], "spacing": options["spacing"]}
+    check_layout(in_unit, **size)
+    padding = 0 if in_unit else options["padding"]
+    check_numbers(**size, padding=padding, band=options["band"])
     solid, notes = load_solid(source, allow_open=options["allow_open"])
-    if options["frame"] == "unit":
-        solid, layout = Solid(normalise(solid.mesh)), unit_layout(samples)
+    if in_unit:
+        solid, layout = Solid(normalise(solid.mesh)), unit_layout(options["samples"])
     else:
-        layout = fitted_layout(solid.mesh, n=samples, spacing=spacing, padding=options["padding"])
+        layout = fitted_layout(solid.mesh, **size, padding=padding)
     with progress_bar("sampling", options["quiet"]) as progress:
         grid = sample_solid(solid, layout, band=options["band"], progress=progress)
     with raising_interrupts():
@@ -101,6 +95,16 @@ def run_sample(source: Path, target: Path, options: dict[str, Any]) -> None:
     if not options["quiet"]:
         for note in (*notes, *grid.notes):
             print_stderr(f"Note: {note}")
-        size = " x ".join(map(str, grid.shape))
-        seconds = time.perf_counter() - start
-        print_stderr(f"{target}: {size} samples, spacing {grid.voxel_size:g}, {seconds:.1f} s")
+        shape, seconds = " x ".join(map(str, grid.shape)), time.perf_counter() - start
+        print_stderr(f"{target}: {shape} samples, spacing {grid.voxel_size:g}, {seconds:.1f} s")
+
+
+def check_layout(in_unit: bool, n: int | None, spacing: float | None) -> None:
+    """Raise OptionError for options that do not go together."""
+    if (n is None) == (spacing is None):
+        raise OptionError("give either -n (samples along the longest axis) or --spacing")
+    if in_unit and n is None:
+        raise OptionError("--frame unit has a side of 1: give -n, not --spacing")
+    padded = click.get_current_context().get_parameter_source("padding")
+    if in_unit and padded is not ParameterSource.DEFAULT:
+        raise OptionError("--frame unit has a side of 1: it takes no --padding")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import click
 from ..errors import OptionError
 from ..machine.extras import check_modules
 from .common import CONTEXT, one_line_errors, print_stderr
-from .conversion import check_simplification, chosen_model, conversion_options, make_options
+from .conversion import conversion_options, load_chosen, make_options
 from .interrupts import raising_interrupts
 
 PAGES = (".html", ".htm")
@@ -84,22 +85,15 @@ def write_view(sources: tuple[str, ...], options: dict[str, Any]) -> Path:
     """Read and refine the files and write their page; return its absolute path."""
     from tempfile import mkdtemp
 
-    from ..network.network import Network, load_network
     from ..pages.html import viewed_page, write_page
 
     check_modules("view", "report")
     page: Path | None = options["out"]
     if page:
         check_page("--out", page, sources, force=options["force"])
-    check_simplification(options)
-    model = chosen_model(options)
-
-    def load() -> Network:
-        chosen = {name: options[name] for name in ("device", "threads", "precision")}
-        return load_network(model, **chosen)
-
+    chosen = make_options(options)
     with raising_interrupts():
-        text = viewed_page(sources, load, make_options(options))
+        text = viewed_page(sources, partial(load_chosen, options), chosen)
         # a folder that only this user can read
         page = page or Path(mkdtemp(prefix="super-sdf-"), "view.html")
         write_page(text, page, force=options["force"])

@@ -1,5 +1,6 @@
-"""Worker processes on other machines, or on this one, that Dask runs (extra ``cluster``).
+"""Many grids, or one huge grid, on worker processes that Dask runs (extra ``cluster``).
 
-``connecting`` reaches them, ``checking`` says before the work what they lack, ``pool`` gives them
-tasks as ``machine.pool`` gives them to processes of this machine, and ``serving`` is their side.
+``connecting`` reaches the workers, ``checking`` says before the work what they lack, ``crew`` gives
+them tasks and ``serving`` is their side; ``bricks`` converts one grid, whose planes ``stored``
+reads.
 """

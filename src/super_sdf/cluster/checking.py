@@ -15,7 +15,7 @@ import signal
 import socket
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
@@ -28,15 +28,13 @@ from .. import __version__
 from ..errors import ClusterError, SuperSdfError, WriteError
 from ..machine.extras import missing_modules
 from ..machine.memory import free_memory, reuse_freed
+from ..machine.resources import Resources
 from ..machine.serving import settle_signals
 from ..network.cuda import onnxruntime_version
 from ..network.fingerprint import Fingerprint, fingerprint_of
-from ..network.names import AUTO_PRECISION
 from ..network.network import find_model, shipped_models
-from .connecting import Cluster, Limits, share_of
-
-Judge = Callable[[Any], str]
-"""Returns what is wrong with what a worker answered or raised, "" if nothing."""
+from ..options import AUTO_PRECISION
+from .connecting import Cluster, share_of
 
 MOST_FILES = 100  # whose presence each worker checks
 VERSION = "super_sdf:__version__"
@@ -67,76 +65,57 @@ class Needs:
     files: Sequence[Path] = ()
     folder: Path | None = None
 
-
-class Report(NamedTuple):
-    """What a worker has and may use, as it reports it.
-
-    Attributes
-    ----------
-    identity : str
-        Dask's name of this process: a restarted worker has another.
-    host, pid : str, int
-        Its machine and process number.
-    models : dict
-        SHA-256 of the networks by name: those that are shipped, and the one that is asked for.
-    versions : dict
-        What results depend on in the last bits, with version.
-    lacking : tuple of str
-        Modules that are not installed.
-    sizes : tuple
-        Bytes of each file asked for; None if it is not seen, -1 for a folder.
-    folder : str
-        Why the output folder cannot be used, "" if it can.
-    limit, free : int, optional
-        The bytes at which Dask kills it, and those that are free on its machine.
-    """
-
-    identity: str
-    host: str
-    pid: int
-    models: dict[str, str]
-    versions: dict[str, str]
-    lacking: tuple[str, ...]
-    sizes: tuple[int | None, ...]
-    folder: str
-    limit: int | None
-    free: int | None
+    def digests_of_models(self) -> dict[str, str]:
+        """Return the SHA-256 of the shipped networks and of this one, as far as they are here."""
+        paths = {path.name: path for path in shipped_models().values()}
+        with suppress(OSError, ValueError):
+            path, _ = find_model(self.model, self.precision)
+            paths[path.name if path in paths.values() else str(path)] = path
+        digests = {}
+        for name, path in paths.items():
+            with suppress(OSError):
+                digests[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        return digests
 
 
-class Question(NamedTuple):
-    """What a worker is asked: the needs, the files to look at, and what stands in the probe."""
+class Expected(NamedTuple):
+    """What is here and has to be where a worker is; the probe is a file and the text in it."""
 
     needs: Needs
-    files: tuple[Path, ...]
+    models: dict[str, str]
+    sizes: dict[Path, int | None]
     probe: tuple[Path, str] | None
     is_local: bool
 
 
-class Member(NamedTuple):
-    """A worker that was checked: its address, what it said and computed, what it may use."""
+class Report(NamedTuple):
+    """What a worker says of itself: what it lacks ("" if nothing), and what it has.
 
-    address: str
-    report: Report
-    values: Fingerprint
-    limits: Limits
+    ``limit`` are the bytes at which Dask kills it, ``free`` those that are free on its machine.
+    """
+
+    fault: str
+    host: str
+    versions: dict[str, str]
+    limit: int | None = None
+    free: int | None = None
 
 
-class Checked(NamedTuple):
-    """Workers that can do the work; the faults of others by address, and warnings."""
+@dataclass(frozen=True)
+class Checked:
+    """Workers that can do the work, with their limits; the faults of others; by address.
 
-    members: list[Member]
+    ``values`` are those of the first worker, which all others have to compute, too.
+    """
+
+    members: dict[str, Resources]
+    values: tuple[str, Fingerprint] | None
     faults: dict[str, str]
     warnings: list[str]
 
 
 def check_workers(cluster: Cluster, needs: Needs) -> Checked:
-    """Check all workers that the cluster has now.
-
-    Raises
-    ------
-    ClusterError
-        If one of them lacks something: what, and how to mend it.
-    """
+    """Check all workers that the cluster has now; ClusterError if one of them lacks something."""
     checked = check_some(cluster, needs, cluster.workers())
     if checked.faults:
         raise ClusterError(name_workers(checked.faults))
@@ -146,15 +125,18 @@ def check_workers(cluster: Cluster, needs: Needs) -> Checked:
 
 
 def check_some(
-    cluster: Cluster, needs: Needs, threads: Mapping[str, int], members: Sequence[Member] = ()
+    cluster: Cluster,
+    needs: Needs,
+    threads: Mapping[str, int],
+    first: tuple[str, Fingerprint] | None = None,
 ) -> Checked:
     """Check some workers, given by address with their threads; those that end meanwhile are out.
 
-    ``members`` are those that are at work already: the others must compute the same values.
+    ``first`` is a worker that is at work already, and the values that it computes.
     """
     faults: dict[str, str] = {}
 
-    def ask(workers: Iterable[str], judge: Judge, *call: Any) -> dict[str, Any]:
+    def ask(workers: Sequence[str], judge: Callable[[Any], str], *call: Any) -> dict[str, Any]:
         """Return the answers that are right; keep the faults of the others."""
         answers = cluster.run(*call, workers=list(workers)) if workers else {}
         there = {address: a for address, a in answers.items() if not isinstance(a, OSError)}
@@ -162,19 +144,19 @@ def check_some(
         return {address: answer for address, answer in there.items() if address not in faults}
 
     # The first call needs nothing of this package, the second no more than one function of it.
-    good = ask(threads, judge_version, pkgutil.resolve_name, VERSION)
-    good = ask(good, judge_sources, digest_of_sources)
+    good = ask(list(threads), judge_version, pkgutil.resolve_name, VERSION)
+    good = ask(list(good), judge_sources, digest_of_sources)
+    sizes = {path: size_of(path) for path in some_of(needs.files)}
     with probing(needs.folder) as probe:
-        question = Question(needs, some_of(needs.files), probe, cluster.is_local)
-        own = report_here(question)
-        good = ask(good, lambda r: judge_report(r, own, question), report_to, question)
+        expected = Expected(needs, needs.digests_of_models(), sizes, probe, cluster.is_local)
+        reports = ask(list(good), judge_report, report_to, expected)
     network = needs.model, needs.precision, needs.device
-    values = ask(good, judge_values, fingerprint_of, *network)
-    known = {member.address: member.values for member in members}
-    faults.update(differing({**known, **values}))
-    reports = {a: report for a, report in good.items() if a in values and a not in faults}
-    found = members_of(cluster, reports, values, threads)
-    return Checked(found, faults, warnings_of(reports, own))
+    values = ask(list(reports), judge_values, fingerprint_of, *network)
+    first = first or next(iter(values.items()), None)
+    faults.update(differing(first, values))
+    reports = {a: report for a, report in reports.items() if a in values and a not in faults}
+    members = members_of(cluster, reports, threads)
+    return Checked(members, first, faults, warnings_of(reports))
 
 
 def judge_version(answer: Any) -> str:
@@ -201,26 +183,11 @@ def judge_sources(answer: Any) -> str:
     )
 
 
-def judge_report(report: Any, own: Report, question: Question) -> str:
-    """Return what a worker lacks of what is here and needed, "" if nothing."""
-    if not isinstance(report, Report):
-        return f"cannot be checked ({describe(report)}): restart it"
-    needs = question.needs
-    for name, digest in own.models.items():
-        if name not in report.models:
-            return f"does not see the network {name}: put it where all machines see it"
-        if report.models[name] != digest:
-            return f"has another file of the network {name}: copy the one from here"
-    if report.lacking:
-        return f"lacks {', '.join(report.lacking)}: install there what is installed here"
-    for path, size, here in zip(question.files, report.sizes, own.sizes):
-        if size is None and here is not None:
-            return f"does not see {path}: put the inputs where all machines see them by this path"
-        if size != here:
-            return f"sees another {path}: its folder has to be the same on all machines"
-    if report.folder:
-        return f"{report.folder}: write to a folder that all machines share under {needs.folder}"
-    return ""
+def judge_report(report: Any) -> str:
+    """Return what a worker says that it lacks, "" if nothing."""
+    if isinstance(report, Report):
+        return report.fault
+    return f"cannot be checked ({describe(report)}): restart it"
 
 
 def judge_values(answer: Any) -> str:
@@ -231,17 +198,20 @@ def judge_values(answer: Any) -> str:
     return f"cannot run the network: {why}"
 
 
-def differing(values: Mapping[str, Fingerprint]) -> dict[str, str]:
+def differing(
+    first: tuple[str, Fingerprint] | None, values: Mapping[str, Fingerprint]
+) -> dict[str, str]:
     """Return a fault for each worker whose values are not those of the first one, by address."""
-    if not values:
-        return {}
-    first, own = next(iter(values.items()))
-    return {
-        address: f"({runs_on(found)}) gets other values from the network than worker {first} "
-        f"({runs_on(own)}), so that meshes would differ or be torn: {way_to_agree(found, own)}"
-        for address, found in values.items()
-        if found.digest != own.digest
-    }
+    faults = {}
+    for address, found in values.items():
+        if first and found.digest != first[1].digest:
+            way = "use workers with the same kind of processor"
+            way = "give --device cpu" if found.device != first[1].device else way
+            faults[address] = (
+                f"({runs_on(found)}) gets other values from the network than worker {first[0]} "
+                f"({runs_on(first[1])}), so that meshes would differ or be torn: {way}"
+            )
+    return faults
 
 
 def runs_on(found: Fingerprint) -> str:
@@ -249,24 +219,16 @@ def runs_on(found: Fingerprint) -> str:
     return f"{found.processor}, {found.precision} on {found.device}, {found.digest[:8]}"
 
 
-def way_to_agree(one: Fingerprint, other: Fingerprint) -> str:
-    """Return what to do so that two workers compute the same values."""
-    if one.device != other.device:
-        return "give --device cpu"
-    return "use workers with the same kind of processor"
-
-
-def warnings_of(reports: Mapping[str, Report], own: Report) -> list[str]:
+def warnings_of(reports: Mapping[str, Report]) -> list[str]:
     """Return a warning for each thing that workers have in another version than is here."""
     warnings = []
-    for name, here in own.versions.items():
-        others = {a: r.versions.get(name) for a, r in reports.items() if r.versions[name] != here}
+    for name, here in versions().items():
+        others = {a: r.versions[name] for a, r in reports.items() if r.versions[name] != here}
         if others:
             have = "have" if len(others) > 1 else "has"
-            there = ", ".join(sorted({str(version) for version in others.values()}))
             warnings.append(
-                f"{first_of(list(others))} {have} {there}, and here is {here}: results may differ "
-                "in their last bits"
+                f"{first_of(list(others))} {have} {', '.join(sorted(set(others.values())))}, and "
+                f"here is {here}: results may differ in their last bits"
             )
     return warnings
 
@@ -285,70 +247,56 @@ def first_of(addresses: Sequence[str]) -> str:
 
 
 def members_of(
-    cluster: Cluster,
-    reports: Mapping[str, Report],
-    values: Mapping[str, Fingerprint],
-    threads: Mapping[str, int],
-) -> list[Member]:
-    """Return the workers with what each may use; the free memory of a machine is shared equally."""
+    cluster: Cluster, reports: Mapping[str, Report], threads: Mapping[str, int]
+) -> dict[str, Resources]:
+    """Return what each worker may use; the free memory of a machine is shared equally."""
+    if cluster.is_local:
+        return dict.fromkeys(reports, cluster.limits)
     on_host = Counter(report.host for report in reports.values())
-    members = []
+    members = {}
     for address, report in reports.items():
         free = None if report.free is None else report.free // on_host[report.host]
-        limits = cluster.limits
-        if not cluster.is_local:
-            limits = share_of(limits, threads[address], report.limit, free)
-        members.append(Member(address, report, values[address], limits))
+        members[address] = share_of(cluster.limits, threads[address], report.limit, free)
     return members
 
 
-def report_to(question: Question, dask_worker: Any) -> Report:
+def report_to(expected: Expected, dask_worker: Any) -> Report:
     """Return the report of a worker; called in it, on its main thread."""
     reuse_freed()
-    if question.is_local:
+    if expected.is_local:
         with suppress(ValueError, AttributeError):  # not the main thread, or Windows
             settle_signals()
             signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the batch hears it, too
     limit = dask_worker.memory_manager.memory_limit
-    return report_here(question)._replace(identity=str(dask_worker.id), limit=limit or None)
+    fault = what_is_lacking(expected)
+    return Report(fault, socket.gethostname(), versions(), limit or None, free_memory())
 
 
-def report_here(question: Question) -> Report:
-    """Return what this process has of what is asked for."""
-    needs = question.needs
-    return Report(
-        identity="",
-        host=socket.gethostname(),
-        pid=os.getpid(),
-        models=digests_of_models(needs),
-        versions={
-            "numpy": f"numpy {np.__version__}",
-            "onnxruntime": onnxruntime_version(),
-        },
-        lacking=tuple(missing_modules(needs.modules)),
-        sizes=tuple(map(size_of, question.files)),
-        folder=why_unusable(question.probe),
-        limit=None,
-        free=free_memory(),
-    )
+def what_is_lacking(expected: Expected) -> str:
+    """Return what this process lacks of what is expected, "" if nothing."""
+    models = expected.needs.digests_of_models()
+    for name, digest in expected.models.items():
+        if name not in models:
+            return f"does not see the network {name}: put it where all machines see it"
+        if models[name] != digest:
+            return f"has another file of the network {name}: copy the one from here"
+    if lacking := missing_modules(expected.needs.modules):
+        return f"lacks {', '.join(lacking)}: install there what is installed here"
+    for path, here in expected.sizes.items():
+        size = size_of(path)
+        if size is None and here is not None:
+            return f"does not see {path}: put the inputs where all machines see them by this path"
+        if size != here:
+            return f"sees another {path}: its folder has to be the same on all machines"
+    if expected.probe and (why := why_unusable(*expected.probe)):
+        folder = expected.needs.folder
+        return f"{why}: write to a folder that all machines share under {folder}"
+    return ""
 
 
-def digests_of_models(needs: Needs) -> dict[str, str]:
-    """Return the SHA-256 of the shipped networks and of the one asked for, if it is there."""
-    paths = {path.name: path for path in shipped_models().values()}
-    with suppress(OSError, ValueError):
-        path, _ = find_model(needs.model, needs.precision)
-        paths[path.name if path in paths.values() else str(path)] = path
-    digests = {}
-    for name, path in paths.items():
-        with suppress(OSError):
-            digests[name] = digest_of(path)
-    return digests
-
-
-def digest_of(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+def versions() -> dict[str, str]:
+    """Return the versions of what results depend on in their last bits."""
+    return {"numpy": f"numpy {np.__version__}", "onnxruntime": onnxruntime_version()}
 
 
 @lru_cache(maxsize=1)  # a worker keeps the code that it has loaded, whatever is installed later
@@ -363,10 +311,9 @@ def digest_of_sources() -> str:
     return digest.hexdigest()
 
 
-def some_of(files: Sequence[Path]) -> tuple[Path, ...]:
+def some_of(files: Sequence[Path]) -> Sequence[Path]:
     """Return at most ``MOST_FILES`` of the files, evenly spread."""
-    step = max(1, -(-len(files) // MOST_FILES))
-    return tuple(files[::step])
+    return files[:: max(1, -(-len(files) // MOST_FILES))]
 
 
 def size_of(path: Path) -> int | None:
@@ -395,11 +342,8 @@ def probing(folder: Path | None) -> Iterator[tuple[Path, str] | None]:
         path.unlink(missing_ok=True)
 
 
-def why_unusable(probe: tuple[Path, str] | None) -> str:
-    """Return why the folder of a probe cannot be used by this process, "" if it can."""
-    if probe is None:
-        return ""
-    path, text = probe
+def why_unusable(path: Path, text: str) -> str:
+    """Return why this process cannot use the folder of a probe with a text, "" if it can."""
     own = path.with_name(f"{path.name}-{socket.gethostname()}-{os.getpid()}")
     try:
         if not path.exists() or path.read_text() != text:

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from ..errors import ClusterError
 from ..machine.extras import check_modules
 from ..machine.memory import SHARE, held_memory, memory_bound
+from ..machine.resources import Resources
 from ..machine.serving import ending_signals_blocked, python_flags
 from ..machine.threads import count_cores
 
@@ -40,6 +41,7 @@ CONFIG = {
     "distributed.worker.memory.terminate": 1.0,
     "distributed.admin.system-monitor.interval": "10s",
     "distributed.admin.tick.interval": "1s",
+    "distributed.scheduler.allowed-failures": 1,
     "distributed.scheduler.work-stealing": False,
     "distributed.scheduler.active-memory-manager.start": False,
     "distributed.scheduler.http.routes": [],
@@ -51,38 +53,15 @@ Answer = TypeVar("Answer")
 
 
 @dataclass(frozen=True)
-class Limits:
-    """What each worker may use.
-
-    Attributes
-    ----------
-    threads : int
-        Threads of each; 0: those that Dask gave it.
-    memory : int, optional
-        Bytes that each may hold in all; None: what its machine allows.
-    """
-
-    threads: int = 0
-    memory: int | None = None
-
-
-@dataclass(frozen=True)
 class Cluster:
-    """A cluster that is connected.
+    """A cluster that is connected: Dask's client, the address asked for, what each worker may use.
 
-    Attributes
-    ----------
-    client : distributed.Client
-        Dask's connection.
-    address : str
-        That of the scheduler, or "local".
-    limits : Limits
-        What each worker may use.
+    0 threads are those that Dask gave it.
     """
 
     client: Client
     address: str
-    limits: Limits
+    limits: Resources
 
     @property
     def is_local(self) -> bool:
@@ -90,30 +69,24 @@ class Cluster:
         return self.address == LOCAL
 
     def workers(self) -> dict[str, int]:
-        """Return the number of threads of each worker, by address.
-
-        Raises
-        ------
-        ClusterError
-            If the connection is lost.
-        """
+        """Return the threads of each worker by address; ClusterError if the connection is lost."""
         return dict(self.ask(self.client.nthreads))
 
-    def run(
-        self, function: Callable[..., Any], *arguments: Any, workers: list[str]
-    ) -> dict[str, Any]:
+    def run(self, function: Callable[..., Any], *given: Any, workers: list[str]) -> dict[str, Any]:
         """Call a function in some workers, beside their work; return results or exceptions."""
         run = self.client.run
-        return dict(self.ask(lambda: run(function, *arguments, workers=workers, on_error="return")))
+        return dict(self.ask(lambda: run(function, *given, workers=workers, on_error="return")))
 
     def ask(self, question: Callable[[], Answer]) -> Answer:
         """Return what the scheduler answers; raise ClusterError if the connection is lost."""
-        try:
+        with suppress(OSError, asyncio.TimeoutError):
             if self.client.status == "running":
                 return question()
-        except (OSError, asyncio.TimeoutError):
-            pass
-        raise ClusterError(
+        raise self.lost()
+
+    def lost(self) -> ClusterError:
+        """Return the error for a connection that was lost."""
+        return ClusterError(
             f"the connection to the Dask scheduler at {self.address} was lost: run it again when "
             "the scheduler is back"
         )
@@ -148,46 +121,39 @@ def connect(
     with ExitStack() as stack:
         stack.enter_context(silence())
         if address == LOCAL:
+            import dask
+
             count = workers or count_cores()
             limits = share_equally(count, threads, max_memory)
-            stack.enter_context(config(CONFIG))
+            stack.enter_context(dask.config.set(CONFIG))
             hard = max(int(HARD_LIMIT * (limits.memory or 0)), LEAST_HARD_LIMIT)
-            killed_at = hard if max_memory else 0
-            server = stack.enter_context(local_cluster(count, killed_at))
+            server = stack.enter_context(local_cluster(count, hard if max_memory else 0))
         else:
-            limits, server = Limits(threads, max_memory), address
+            limits, server = Resources(threads, max_memory), address
         client = stack.enter_context(open_client(server, address))
         cluster = Cluster(client, address, limits)
         wait_for_a_worker(cluster)
         yield cluster
 
 
-def share_equally(count: int, threads: int, max_memory: int | None) -> Limits:
+def share_equally(count: int, threads: int, max_memory: int | None) -> Resources:
     """Return the share of each of some processes in the threads and memory of this machine."""
     bound = memory_bound(max_memory)
     if bound is not None:
         bound = max(1, bound - (held_memory() or 0)) // count
-    return Limits(threads or max(1, count_cores() // count), bound)
+    return Resources(threads or max(1, count_cores() // count), bound)
 
 
-def share_of(limits: Limits, threads: int, limit: int | None, free: int | None) -> Limits:
-    """Return what a worker at an address may use.
+def share_of(limits: Resources, threads: int, limit: int | None, free: int | None) -> Resources:
+    """Return what a worker at an address may use, given what was asked for.
 
-    Parameters
-    ----------
-    limits : Limits
-        What was asked for.
-    threads : int
-        The threads that Dask gave it.
-    limit : int, optional
-        The bytes at which Dask kills it; None without a limit.
-    free : int, optional
-        Its part of the memory that is free on its machine.
+    Dask gave it ``threads`` and kills it at ``limit`` bytes; ``free`` is its part of the memory
+    that is free on its machine.
     """
     rooms = [int(share * size) for share, size in ((PAUSE_SHARE, limit), (SHARE, free)) if size]
     if limits.memory is not None:
         rooms = [limits.memory, *(rooms[:1] if limit else [])]
-    return Limits(limits.threads or threads, min(rooms, default=None))
+    return Resources(limits.threads or threads, min(rooms, default=None))
 
 
 @contextmanager
@@ -198,9 +164,10 @@ def local_cluster(count: int, killed_at: int) -> Iterator[Any]:
     they start: none may start without being known here, and what they inherit keeps a Ctrl-C in the
     terminal from them.
     """
+    import dask
     from distributed import Nanny, SpecCluster
 
-    from .quiet import QuietScheduler, QuietWorker
+    from .serving import QuietScheduler, QuietWorker
 
     host, silence_logs = "127.0.0.1", logging.CRITICAL
     scheduler = {"cls": QuietScheduler, "options": {"host": host, "port": 0, "dashboard": False}}
@@ -208,7 +175,7 @@ def local_cluster(count: int, killed_at: int) -> Iterator[Any]:
     worker = {"cls": Nanny, "options": {**options, "worker_class": QuietWorker}}
     with (
         tempfile.TemporaryDirectory(prefix="super-sdf-", ignore_cleanup_errors=True) as scratch,
-        config({"temporary-directory": scratch}),
+        dask.config.set({"temporary-directory": scratch}),
         python_flags(),  # as long as workers may be started again
     ):
         start_quiet_tracker()
@@ -241,13 +208,7 @@ def start_quiet_tracker() -> None:
 
 @contextmanager
 def open_client(server: Any, address: str) -> Iterator[Client]:
-    """Connect to a scheduler.
-
-    Raises
-    ------
-    ClusterError
-        If it does not answer.
-    """
+    """Connect to a scheduler; ClusterError if it does not answer."""
     from distributed import Client
 
     try:
@@ -255,7 +216,12 @@ def open_client(server: Any, address: str) -> Iterator[Client]:
             asyncio.run(greet(server))
         client = Client(server, timeout=CONNECT_SECONDS, set_as_default=False)
     except Exception as error:  # of many kinds: a bad address, a refused or silent port, TLS
-        raise ClusterError(no_answer(address, error)) from error
+        is_silent = isinstance(error, (OSError, asyncio.TimeoutError)) or not str(error)
+        why = "" if is_silent else f" ({' '.join(str(error).split())})"
+        raise ClusterError(
+            f"no Dask scheduler answers at {address}{why}: start one with 'dask scheduler' and "
+            "workers with 'dask worker ADDRESS', or give 'local' or another address"
+        ) from error
     try:
         yield client
     finally:
@@ -273,16 +239,6 @@ async def greet(address: str) -> None:
     await comm.close()
 
 
-def no_answer(address: str, error: Exception) -> str:
-    """Return the message for a scheduler that does not answer."""
-    silent = isinstance(error, (OSError, asyncio.TimeoutError)) or not str(error)
-    why = "" if silent else f" ({' '.join(str(error).split())})"
-    return (
-        f"no Dask scheduler answers at {address}{why}: start one with 'dask scheduler' and workers "
-        "with 'dask worker ADDRESS', or give 'local' or another address"
-    )
-
-
 def wait_for_a_worker(cluster: Cluster) -> None:
     """Raise ClusterError if the cluster shows no worker within a while."""
     with suppress(TimeoutError, asyncio.TimeoutError):  # the same from Python 3.11 on
@@ -292,15 +248,6 @@ def wait_for_a_worker(cluster: Cluster) -> None:
             f"the Dask scheduler at {cluster.address} has no workers: start some with "
             f"'dask worker {cluster.address}'"
         )
-
-
-@contextmanager
-def config(values: dict[str, Any]) -> Iterator[None]:
-    """Set Dask's configuration within the block; workers that are started there inherit it."""
-    import dask
-
-    with dask.config.set(values):
-        yield
 
 
 @contextmanager

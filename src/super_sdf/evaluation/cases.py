@@ -21,8 +21,8 @@ from ..errors import OptionError, seen
 from ..grid.sdf_grid import SdfGrid, make_grid
 from ..machine.memory import check_fits
 from ..mesh import Mesh
+from ..options import check_factor
 from ..steps.band import find_band, rescale
-from ..steps.nodes import check_factor
 from ..truth.sampling import sample_grid, unit_layout
 from ..truth.solid import Distances, Solid, load_solid
 from . import metrics

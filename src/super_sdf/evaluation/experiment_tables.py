@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import product
 
-from ..steps.mesher_names import MESHERS
+from ..options import MESHERS
 from . import published
 from .cases import Setting
 from .field_tables import field_section

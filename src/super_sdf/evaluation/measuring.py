@@ -19,8 +19,8 @@ from ..machine.memory import forget_peak, held_memory
 from ..mesh import Mesh
 from ..network.decoder import Decoder
 from ..network.kinds import KIND_MODELS
-from ..network.names import AUTO_PRECISION, float32_name
-from ..network.network import find_model, load_network, shipped_models
+from ..network.network import find_model, float32_name, load_network, shipped_models
+from ..options import AUTO_PRECISION
 from ..truth.solid import Distances, Solid
 from . import edges, metrics
 from .cases import RESULT_EDGES, RESULT_POINTS, Case, Setting, Shape

@@ -19,12 +19,12 @@ from ..errors import NoSurfaceError
 from ..grid.sdf_grid import SdfGrid
 from ..mesh import Mesh
 from ..network.decoder import Decoder
+from ..options import DEFAULT_MESHER, MARCHING, SHARP
 from ..pipeline import reconstruct, refine
 from ..simplification.simplify import simplify_mesh
 from ..slabs.cutting import whole
 from ..steps.band import neighbour_table
 from ..steps.field import FineField, SampleSpheres
-from ..steps.mesher_names import DEFAULT_MESHER, MARCHING, SHARP
 from ..steps.meshers import extract_mesh
 from ..steps.nodes import block_ijk, share_parts
 from ..steps.survey import survey

@@ -5,8 +5,8 @@ NumPy is not imported here, so the command's help takes them from here without l
 
 from __future__ import annotations
 
-from ..steps.mesher_names import DEFAULT_MESHER, MARCHING
-from ..steps.mesher_names import MESHERS as MESHERS
+from ..options import DEFAULT_MESHER, MARCHING
+from ..options import MESHERS as MESHERS
 
 OURS = "ours"
 FLOOR = "floor"  # not a method: the reference measured against itself

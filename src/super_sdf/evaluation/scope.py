@@ -9,8 +9,7 @@ from pathlib import Path
 
 from ..errors import FileError, OptionError, seen
 from ..files.regular import check_regular_file
-from ..network.names import AUTO_PRECISION
-from ..steps.mesher_names import MESHERS
+from ..options import AUTO_PRECISION, MESHERS
 from .cases import Setting
 from .field_kinds import kinds_at, methods_on
 from .measuring import NO_SETTING, Task, digest_of_file, digest_of_ours

@@ -35,7 +35,7 @@ def free_memory() -> int | None:
     try:
         sizes = _read_sizes(SYSTEM)
     except OSError:
-        return _free_by_psutil()
+        return _by_psutil("free")
     if "MemAvailable" not in sizes:
         return None
     left = left_memory()
@@ -62,7 +62,7 @@ def held_memory(peak: bool = False, pid: int | None = None) -> int | None:
     try:
         sizes = _read_sizes(Path(f"/proc/{pid}/status") if pid else PROCESS)
     except OSError:
-        return _peak_by_psutil() if peak else _held_by_psutil(pid)
+        return _peak_elsewhere() if peak else _by_psutil("rss", pid)
     return sizes.get("VmHWM" if peak else "VmRSS")
 
 
@@ -72,32 +72,26 @@ def _read_sizes(path: Path) -> dict[str, int]:
     return {name: int(text.split()[0]) * 1024 for name, text in fields if text.endswith(" kB")}
 
 
-def _free_by_psutil() -> int | None:
-    with suppress(ImportError):
-        import psutil
+def _by_psutil(what: str, pid: int | None = None) -> int | None:
+    """Return the bytes that are "free", that a process "rss" holds, or its peak "peak_wset".
 
-        return int(psutil.virtual_memory().available)
-    return None
-
-
-def _held_by_psutil(pid: int | None) -> int | None:
-    with suppress(ImportError):
-        import psutil
-
-        try:
-            process = psutil.Process(pid) if pid else psutil.Process()
-            return int(process.memory_info().rss)
-        except psutil.Error:  # it has ended
-            return None
-    return None
-
-
-def _peak_by_psutil() -> int | None:
-    """Return the peak of this process since its start: Windows tells psutil, others getrusage."""
+    None without psutil, once the process has ended, and where it has no peak.
+    """
     with suppress(ImportError, AttributeError):
         import psutil
 
-        return int(psutil.Process().memory_info().peak_wset)
+        if what == "free":
+            return int(psutil.virtual_memory().available)
+        with suppress(psutil.Error):  # it has ended
+            return int(getattr(psutil.Process(*[pid] if pid else []).memory_info(), what))
+    return None
+
+
+def _peak_elsewhere() -> int | None:
+    """Return the peak of this process since its start: Windows tells psutil, others getrusage."""
+    peak = _by_psutil("peak_wset")
+    if peak is not None:
+        return peak
     with suppress(ImportError):
         import resource
 

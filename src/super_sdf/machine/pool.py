@@ -21,7 +21,6 @@ from ..errors import SuperSdfError
 from .serving import (
     ClockStarted,
     Final,
-    Partial,
     Prepare,
     PrepareFailed,
     Ready,
@@ -69,38 +68,21 @@ class Worker(Generic[Task]):
 class PoolOptions(Generic[Task]):
     """How a pool runs its workers.
 
-    Attributes
-    ----------
-    clean_up : callable
-        Called with a task that was not finished and its worker's process ID, to remove what the
-        worker left behind.
-    time_limit : callable
-        Returns the seconds that a task may take from ``ClockStarted`` on; None: no limit.
-    start_method : multiprocessing context
-        How processes are started. Spawning works on every system and is safe beside the threads of
-        onnxruntime, unlike forking this process.
-    is_reused : bool
-        Whether a worker takes one task after another, or each task gets a process of its own.
+    ``time_limit`` returns the seconds that a task may take from ``ClockStarted`` on. Spawning works
+    on every system and is safe beside the threads of onnxruntime, unlike forking this process. A
+    worker that is not reused takes one task alone.
     """
 
-    clean_up: Callable[[Task, int], None] = lambda task, pid: None
     time_limit: Callable[[Task], float | None] = lambda task: None
     start_method: BaseContext = SPAWN
     is_reused: bool = True
 
 
 class Pool(Generic[Task]):
-    """Worker processes that share a queue of tasks.
+    """Worker processes that share a queue of tasks; each is taken when a worker starts it.
 
-    Parameters
-    ----------
-    tasks : Tasks
-        The queue. A task is taken from it when a worker starts it.
-    prepare : callable
-        Called without arguments in each worker; returns the function that works at a task. Tasks
-        and results are pickled.
-    options : PoolOptions
-        How the workers are run.
+    ``prepare`` is called in each worker, and returns the function that works at a task. Tasks and
+    results are pickled.
     """
 
     def __init__(
@@ -114,19 +96,14 @@ class Pool(Generic[Task]):
     def results(self, count: int) -> Generator[tuple[Task, Any], None, None]:
         """Run the tasks in ``count`` workers.
 
-        Yields
-        ------
-        task, result
-            The partial results of each task as they arrive, then its final result or a Death.
-
-        Raises
-        ------
-        SuperSdfError
-            If no worker can be started, or what ``prepare`` raised.
+        Yields the partial results of each task as they arrive, then its final result or a Death;
+        SuperSdfError if no worker can be started, or what ``prepare`` raised.
         """
         try:
             while self._start_workers(count):
-                for pipe in wait(list(self.workers), self._seconds_to_deadline()):
+                deadlines = [w.deadline for w in self.workers.values() if w.deadline is not None]
+                left = max(min(deadlines) - time.monotonic(), 0) if deadlines else None
+                for pipe in wait(list(self.workers), left):
                     yield from self._receive(self.workers[pipe])  # type: ignore[index]
                 yield from self._kill_late_workers()
         finally:
@@ -135,7 +112,9 @@ class Pool(Generic[Task]):
 
     def _start_workers(self, count: int) -> bool:
         """Start the workers that are missing; return whether there is anything to wait for."""
-        while len(self.workers) < count and self._count_preparing() < len(self.tasks):
+        while len(self.workers) < count:
+            if sum(not worker.is_ready for worker in self.workers.values()) >= len(self.tasks):
+                break
             try:
                 self._start_worker()
             except OSError as error:  # too many open files or processes: make do with fewer
@@ -146,9 +125,6 @@ class Pool(Generic[Task]):
                 break
         is_busy = any(worker.task is not None for worker in self.workers.values())
         return is_busy or len(self.tasks) > 0
-
-    def _count_preparing(self) -> int:
-        return sum(not worker.is_ready for worker in self.workers.values())
 
     def _start_worker(self) -> None:
         context = self.options.start_method
@@ -171,12 +147,10 @@ class Pool(Generic[Task]):
         """Take a message from a worker; yield the result that it brings, if any."""
         try:
             message = worker.pipe.recv()
-        except (EOFError, OSError):  # it has ended, perhaps while it was sending
-            worker.process.join(EXIT_SECONDS)  # killed at once, it would lose its exit code
-            yield from self._report_death(worker)
-            return
-        except Exception:  # what it sent cannot be unpickled
-            yield from self._report_death(worker)
+        except Exception as error:
+            if isinstance(error, (EOFError, OSError)):  # it has ended, perhaps while it was sending
+                worker.process.join(EXIT_SECONDS)  # killed at once, it would lose its exit code
+            yield from self._report_death(worker)  # else what it sent cannot be unpickled
             return
         if isinstance(message, PrepareFailed):
             raise message.error
@@ -184,24 +158,16 @@ class Pool(Generic[Task]):
             worker.is_ready, self.failed_starts = True, 0
             self._assign_task(worker)
         elif worker.task is not None:
-            yield from self._take_result(worker, worker.task, message)
-
-    def _take_result(
-        self, worker: Worker[Task], task: Task, message: Partial | Final
-    ) -> Iterator[tuple[Task, Any]]:
-        """Yield a result; after a final one, give the worker its next task."""
-        if isinstance(message.value, ClockStarted):
-            limit = self.options.time_limit(task)
-            worker.deadline = None if limit is None else time.monotonic() + limit
-        if isinstance(message, Partial):
-            yield task, message.value
-            return
-        worker.task = worker.deadline = None
-        yield task, message.value
-        if self.options.is_reused:
-            self._assign_task(worker)
-        else:
-            self._stop(worker)
+            if isinstance(message.value, ClockStarted):
+                limit = self.options.time_limit(worker.task)
+                worker.deadline = None if limit is None else time.monotonic() + limit
+            yield worker.task, message.value
+            if isinstance(message, Final):
+                worker.task = worker.deadline = None
+                if self.options.is_reused:
+                    self._assign_task(worker)
+                else:
+                    self._stop(worker)
 
     def _assign_task(self, worker: Worker[Task]) -> None:
         """Give a worker the next task, or stop it if there is none."""
@@ -211,11 +177,6 @@ class Pool(Generic[Task]):
         worker.task = self.tasks.popleft()
         with suppress(OSError):  # it has died: the next read from its pipe will show that
             worker.pipe.send(worker.task)
-
-    def _seconds_to_deadline(self) -> float | None:
-        """Return the seconds until the first deadline, None if there is none."""
-        deadlines = [w.deadline for w in self.workers.values() if w.deadline is not None]
-        return max(min(deadlines) - time.monotonic(), 0) if deadlines else None
 
     def _kill_late_workers(self) -> Iterator[tuple[Task, Death]]:
         """Kill the workers whose tasks are over their time limits; yield those tasks."""
@@ -241,13 +202,11 @@ class Pool(Generic[Task]):
             yield worker.task, Death(cause)
 
     def _stop(self, worker: Worker[Task]) -> None:
-        """Kill a worker if it still runs, and clean up after its unfinished task."""
+        """Kill a worker if it still runs."""
         worker.process.kill()
         worker.process.join()
         if self.workers.pop(worker.pipe, None):
             worker.pipe.close()
-        if worker.process.pid and worker.task is not None:
-            self.options.clean_up(worker.task, worker.process.pid)
 
 
 def describe_exit(code: int | None) -> str:

@@ -10,15 +10,7 @@ from .threads import useful_threads
 
 @dataclass(frozen=True)
 class Resources:
-    """The threads and memory that a run may use.
-
-    Attributes
-    ----------
-    threads : int
-        Number of threads.
-    memory : int, optional
-        Bytes that the process may hold in all; None for no bound.
-    """
+    """The threads that a run may use, and the bytes that its process may hold; None: no bound."""
 
     threads: int = 1
     memory: int | None = None
@@ -29,14 +21,8 @@ ONE_THREAD = Resources()
 
 
 def allot(threads: int = 0, max_memory: int | None = None) -> Resources:
-    """Return the threads and memory that a run may use.
+    """Return what a run may use: the threads asked for, 0 for one per core, which is also the most.
 
-    Parameters
-    ----------
-    threads : int
-        Requested number; 0 for one per core, which is also the maximum.
-    max_memory : int, optional
-        Bytes that the process may hold in all. By default what it holds already and a share of the
-        free memory.
+    Without ``max_memory``, the bytes are what the process holds and a share of the free memory.
     """
     return Resources(useful_threads(threads), memory_bound(max_memory))

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import DeviceError, ModelError
+from ..options import DEVICES
 from .cuda import CUDA, check_cuda, first_line, has_gpu, onnxruntime_version
-from .names import DEVICES
 from .onnx import ort
 from .running import run_bound, run_on_cpu
 

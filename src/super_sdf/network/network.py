@@ -16,11 +16,19 @@ from ..errors import DeviceError, FileError, ModelError, OptionError
 from ..files.regular import check_regular_file
 from ..machine.processor import lacks_avx2
 from ..machine.threads import cores_of_system, useful_threads
-from ..options import check_path, check_threads
+from ..options import (
+    AUTO_PRECISION,
+    DEFAULT_QUALITY,
+    FLOAT32,
+    INT8,
+    OPTIONS,
+    QUALITIES,
+    check_path,
+    check_threads,
+)
 from ..progress import ShareCallback
 from .contract import INPUTS, MASKS, one_voxel, read_card
 from .device import open_session
-from .names import AUTO_PRECISION, DEFAULT_QUALITY, FLOAT32, INT8, PRECISIONS, QUALITIES, int8_name
 from .onnx import ort
 from .pace import LONG_RUN, Pace, work_of
 from .running import CUDA_CHUNK, Poll, run_bound, run_on_cpu
@@ -215,6 +223,16 @@ def shipped_models() -> dict[str, Path]:
     return {path.stem: path for path in sorted(MODELS.glob("*.onnx"))}
 
 
+def int8_name(name: str) -> str:
+    """Return the name of the int8 variant of a network."""
+    return f"{name}-{INT8}"
+
+
+def float32_name(name: str) -> str:
+    """Return the name of a network without what marks an int8 variant."""
+    return name.removesuffix(f"-{INT8}")
+
+
 def find_model(model: str | Path, precision: str = AUTO_PRECISION) -> tuple[Path, int]:
     """Return the file for the CPU, and the number of symmetries to average over.
 
@@ -228,8 +246,7 @@ def find_model(model: str | Path, precision: str = AUTO_PRECISION) -> tuple[Path
     OptionError
         If there is no file of this precision.
     """
-    if precision not in PRECISIONS:
-        raise OptionError(f"precision is {precision!r}: give one of {', '.join(PRECISIONS)}")
+    OPTIONS["precision"].check(precision)
     name, symmetries = QUALITIES.get(str(model), (str(model), 1))
     if str(model) in QUALITIES and name not in shipped_models():
         raise FileError(f"the network {name!r} is missing: {NO_NETWORKS}")

@@ -14,8 +14,8 @@ from typing import Any
 from ..errors import OutOfMemoryError
 from ..machine.extras import check_modules
 from ..machine.memory import give_back, held_memory, in_words, memory_bound
-from ..mesh import Mesh
-from ..options import check_goal, check_max_memory, check_mesh
+from ..mesh import Mesh, check_mesh
+from ..options import check_goal, check_max_memory
 from ..progress import ShareCallback
 
 # Peak of memory beside the mesh, measured on meshes of 200,000 to 300,000 triangles: 905 to 1,375,

@@ -23,9 +23,9 @@ from ..grid.sdf_grid import SdfGrid
 from ..machine import index_width
 from ..machine.memory import ROOM_SHARE, advised, give_back, held_memory, in_words
 from ..machine.resources import Resources
+from ..options import DEFAULT_MESHER
 from ..steps import bounds, debris, spheres
 from ..steps.glance import look_at_band
-from ..steps.mesher_names import DEFAULT_MESHER
 from ..steps.meshers import BY_NAME, Mesher
 from ..steps.survey import Band, band_bytes, outline, plan_reading
 from .footprint import NETWORK_BYTES, slab_bytes
@@ -37,16 +37,10 @@ REACH_IN_VOXELS = spheres.REACH_IN_VOXELS + bounds.REACH_IN_VOXELS + debris.REAC
 
 @dataclass(frozen=True)
 class Slab:
-    """A slab: planes of voxels to mesh, and the rows of the band that this needs.
+    """A slab: its own planes, from the first to before the second, and rows of the band.
 
-    Attributes
-    ----------
-    planes : two ints
-        The slab's own planes, from the first to before the second.
-    decoded : slice
-        Rows of the band of which the voxels that can hold the surface are decoded.
-    seen : slice
-        Rows of the band that the network sees.
+    Of the rows ``decoded``, the voxels that can hold the surface are decoded; the network sees the
+    rows ``seen``.
     """
 
     planes: tuple[int, int]
@@ -88,7 +82,7 @@ def plan_slabs(
     resources : Resources
         The threads and memory that the run may use.
     network_bytes : two floats
-        Memory of the network in bytes, per voxel and per value: see ``footprint.slab_bytes``.
+        Memory of the network in bytes, per voxel and per value.
     mesher : Mesher
         What makes triangles of the slabs.
     planes : two ints, optional
@@ -122,10 +116,7 @@ def refuse_band(
     network_bytes: tuple[float, float] = NETWORK_BYTES,
     mesher: Mesher = DEFAULT,
 ) -> OutOfMemoryError:
-    """Return the error for a grid whose band does not fit in memory: the grid is read once more.
-
-    The parameters are those of ``plan_slabs`` and ``survey``.
-    """
+    """Return the error for a grid whose band does not fit in memory: the grid is read once more."""
     give_back()
     planes, _ = plan_reading(grid.samples, held_memory() or 0, resources)
     seen = look_at_band(grid, offset, planes)
@@ -191,11 +182,7 @@ def cut(
     beside: int,
     planes: tuple[int, int] | None = None,
 ) -> list[Slab]:
-    """Cut a band into at most ``pieces`` slabs with about the same number of decoded voxels.
-
-    ``beside`` is the number of planes beside each with final values, from ``planes_beside``. With
-    ``planes``, only these are cut.
-    """
+    """Cut planes of a band into at most ``pieces`` slabs with about equally many decoded voxels."""
     first, last = planes or (0, band.shape[0])
     before = band.decoded_before[first : last + 1] - band.decoded_before[first]
     return [
@@ -207,10 +194,7 @@ def cut(
 def equal_parts(before: NDArray[np.int64], pieces: int) -> list[tuple[int, int]]:
     """Cut planes into at most some pieces with about the same number of decoded voxels.
 
-    Parameters
-    ----------
-    before : (n + 1,) int64
-        Decoded voxels before each plane, and all.
+    ``before``, (n + 1,), are the decoded voxels before each plane, and all.
     """
     share = before / max(int(before[-1]), 1)
     inner = np.searchsorted(share, np.arange(1, pieces) / pieces)

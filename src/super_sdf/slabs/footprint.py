@@ -1,34 +1,26 @@
-"""The peak memory of each stage of the work on a slab."""
+"""The memory model: the peak of the work on a slab, by the voxels that it sees and decodes.
+
+The numbers are measured by ``python -m lab figures --only memory``, as the peaks of processes.
+"""
 
 from __future__ import annotations
 
-import numpy as np
-
 from ..machine.threads import CHUNK, rows_in_chunk
-from ..steps.bounds import LEAST_FACTOR
+from ..options import DEFAULT_MESHER, SHARP
 from ..steps.marching import LOOKUP_BYTES, lookups_at_once
-from ..steps.mesher_names import DEFAULT_MESHER, MARCHING, SHARP
 from ..steps.meshers import BY_NAME
 from ..steps.spline import spline_bytes
 from ..steps.survey import Band
 
-# Peak memory of the stages after the network in bytes, measured (``benchmarks.large``,
-# ``benchmarks.bounds``): per voxel that the network sees, per decoded voxel, per node of a decoded
-# block, per thread (its chunk), and a constant.
-STAGES = {
-    "average": (216, 300, 5.0, 1e7, 2e7),
-    "fit": (216, 1450, 4.0, 1e7, 3e7),
-    "bounds": (216, 450, 8.2, 2.5e7, 2e7),
-    MARCHING: (216, 350, 7.5, 1e7, 3e7),
-    SHARP: (216, 350, 7.5, 1e7, 3e7),
-}
-SPLINE = (216, 300, 4.5, 0, 2e7)
-# Default for a network: bytes per voxel that it sees, including its row of the neighbour table, and
-# per value.
+# Bytes per voxel that the network sees, per decoded voxel and per node of a decoded block: of the
+# fit to spheres with what goes before, of the bounds and the meshers, and of a spline.
+STAGES = {"fit": (216, 1450, 4.0), "mesh": (216, 450, 8.2), "spline": (216, 300, 4.5)}
+# Bytes per thread, for its chunk, and once.
+THREAD_BYTES, FIXED_BYTES = 25_000_000, 30_000_000
+# Of a network that does not state them: bytes per voxel that it sees, and per value.
 NETWORK_BYTES = (680.0, 8.0)
 # The head of a network works on a chunk of voxels at all offsets at once.
-BYTES_PER_OFFSET = 27_000
-NETWORK_FIXED = 5_000_000
+BYTES_PER_OFFSET, NETWORK_FIXED = 27_000, 5_000_000
 
 Range = tuple[int, int]
 
@@ -45,51 +37,24 @@ def slab_bytes(
 ) -> int:
     """Return the peak memory of the work on a slab, in bytes beyond what the process holds already.
 
-    Parameters
-    ----------
-    band : Band
-        The band of the whole grid.
-    seen, decoded : slice
-        Rows of the band, see ``cutting.Slab``.
-    planes : two ints
-        The slab's own planes.
-    factor : int
-        K.
-    network_bytes : two floats
-        Memory of the network in bytes, per voxel that it sees and per value.
-    threads : int
-        Threads that work at the same time.
-    mesher : str
-        The name of what makes triangles of the slab.
+    ``seen`` and ``decoded`` are rows of the band, see ``cutting.Slab``, ``planes`` those of the
+    slab alone; ``network_bytes`` is the memory of the network per voxel that it sees and per value.
     """
-    voxels, own = seen.stop - seen.start, band.count_decoded(decoded)
-    values = own * (factor + 1) ** 3
-    sizes = np.array([voxels, own, values, min(threads, values // CHUNK + 1), 1])
-    stages = *_stages_before_mesher(band, factor), mesher
-    needs = {stage: float(np.dot(STAGES[stage], sizes)) for stage in stages}
-    extra = _sharp_bytes if mesher == SHARP else _lookup_bytes
-    needs[mesher] += extra(band, planes, own, factor, threads)
-    if band.smooth is not None:
-        needs["spline"] = float(np.dot(SPLINE, sizes)) + spline_bytes(band.shape)
-    if band.smooth is None or band.has_kinks:
-        needs["network"] = _bytes_for_network(voxels, own, factor, network_bytes)
-    return int(max(needs.values()))
-
-
-def _stages_before_mesher(band: Band, factor: int) -> list[str]:
-    """Return the stages between the network and the mesher."""
+    voxels, own, nodes = seen.stop - seen.start, band.count_decoded(decoded), (factor + 1) ** 3
+    fixed = FIXED_BYTES + THREAD_BYTES * min(threads, own * nodes // CHUNK + 1)
+    needs = {
+        name: each[0] * voxels + (each[1] + each[2] * nodes) * own + fixed
+        for name, each in STAGES.items()
+    }
+    needs["spline"] += spline_bytes(band.shape) if band.smooth is not None else 0
     if band.smooth is not None and not band.exact.any():
-        return ["average"]  # there are no spheres
-    return ["average", "fit", "bounds"] if factor >= LEAST_FACTOR else ["average", "fit"]
-
-
-def _bytes_for_network(
-    voxels: int, decoded: int, factor: int, network_bytes: tuple[float, float]
-) -> float:
-    """Return the bytes of the network, which decodes at least as many voxels as offsets."""
-    offsets = (factor + 1) ** 3
-    fixed = BYTES_PER_OFFSET * offsets + NETWORK_FIXED
-    return float(np.dot(network_bytes, [voxels, max(decoded, offsets) * offsets])) + fixed
+        del needs["fit"]  # there are no spheres
+    extra = _sharp_bytes if mesher == SHARP else _lookup_bytes
+    needs["mesh"] += extra(band, planes, own, factor, threads)
+    if band.smooth is None or band.has_kinks:  # the network decodes no fewer voxels than offsets
+        network = network_bytes[0] * voxels + network_bytes[1] * max(own, nodes) * nodes
+        needs["network"] = network + BYTES_PER_OFFSET * nodes + NETWORK_FIXED
+    return int(max(needs.values()))
 
 
 def _lookup_bytes(band: Band, planes: Range, decoded: int, factor: int, threads: int) -> int:
@@ -106,7 +71,7 @@ def _sharp_bytes(band: Band, planes: Range, decoded: int, factor: int, threads: 
 
     Where edges are is not known yet: every voxel of the planes beside a group may be near one.
     """
-    from ..steps.sharp_groups import GROUP_BYTES, groups_at_once, voxel_bytes
+    from ..steps.sharp.mesher import GROUP_BYTES, groups_at_once, voxel_bytes
 
     beside = BY_NAME[SHARP].planes_beside(factor)
     before = band.decoded_before[max(planes[0] - beside, 0) : planes[1] + beside + 1]

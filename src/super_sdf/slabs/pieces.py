@@ -15,7 +15,7 @@ class Piece:
     Attributes
     ----------
     meshes : list of Mesh
-        Vertices and triangles of the slab. Faces index the vertices of all slabs so far.
+        Faces index the vertices of all slabs so far.
     counts : dict
         Counts of the slab: ``decoded_voxels``, ``nodes``, ``pinned_nodes``, ``dropped_pieces``,
         ``lone_samples`` (see ``FineField``), ``vertices``, ``triangles``.

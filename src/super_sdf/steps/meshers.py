@@ -8,16 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import OptionError, OptionTypeError, seen
+from ..errors import OptionTypeError, seen
 from ..grid.cubic import cubic_grid
-from ..grid.sdf_grid import SdfGrid
+from ..grid.sdf_grid import SdfGrid, check_grid
 from ..mesh import Mesh, join_meshes
-from ..options import check_cap, check_grid
+from ..options import DEFAULT_MESHER, MARCHING, SHARP, check_cap, check_mesher
 from . import marching
 from .cap import close
 from .ends import check_can_close
 from .field import FineField
-from .mesher_names import DEFAULT_MESHER, MARCHING, MESHERS, SHARP
 
 Extract = Callable[[FineField, SdfGrid, int, int], list[Mesh]]
 """Takes a field, the grid, the number of the first vertex, and threads; see ``extract_pieces``."""
@@ -30,7 +29,7 @@ class Mesher:
     Attributes
     ----------
     name : str
-        One of ``mesher_names.MESHERS``.
+        One of ``options.MESHERS``.
     extract : callable
         Returns the mesh of a field's own planes, in one or more pieces.
     planes_beside : callable
@@ -50,16 +49,18 @@ def _next_plane(factor: int) -> int:
 
 def _planes_beside_sharp(factor: int) -> int:
     """Return the planes beside a slab that edges depend on."""
-    from .sharp import planes_beside  # here, since its eight modules are a tenth of a short start
+    from .sharp.mesher import (
+        planes_beside,  # here, since its six modules are a tenth of a short start
+    )
 
     return planes_beside(factor)
 
 
 def _extract_sharp(field: FineField, grid: SdfGrid, first_vertex: int, threads: int) -> list[Mesh]:
     """Return the mesh with edges and corners."""
-    from .sharp_groups import extract_sharp_pieces
+    from .sharp.mesher import extract_pieces
 
-    return extract_sharp_pieces(field, grid, first_vertex, threads)
+    return extract_pieces(field, grid, first_vertex, threads)
 
 
 BY_NAME = {
@@ -79,11 +80,7 @@ def find_mesher(name: Any) -> Mesher:
     OptionError
         If there is none, or the name is no string (``OptionTypeError``).
     """
-    if not isinstance(name, str):
-        raise OptionTypeError(f"mesher is {seen(name)}: give one of {', '.join(MESHERS)}")
-    if name not in BY_NAME:
-        raise OptionError(f"mesher is {name!r}: give one of {', '.join(MESHERS)}")
-    return BY_NAME[name]
+    return BY_NAME[check_mesher(name)]
 
 
 def extract_mesh(

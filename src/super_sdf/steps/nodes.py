@@ -18,19 +18,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
-from numbers import Integral
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray, Signs
-from ..errors import OptionError, OptionTypeError, seen
 from ..machine.index_width import check_count
 from ..machine.threads import map_threads, worthwhile_threads
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 
-MAX_FACTOR = 16
 # The value of a node of which only the sign is known, in half voxels.
 BARELY_INSIDE, BARELY_OUTSIDE = np.float32(-1e-3), np.float32(1e-3)
 
@@ -39,27 +36,6 @@ SHARING = [
     np.flatnonzero(((NEIGHBOURHOOD == 0) | (sides == NEIGHBOURHOOD)).all(1))
     for sides in NEIGHBOURHOOD
 ]
-
-
-def check_factor(factor: Any) -> int:
-    """Return the factor if it is an even number from 2 to 16.
-
-    Raises
-    ------
-    OptionError
-        If it is out of range, or odd: then no node lies on a sample.
-    OptionTypeError
-        If it is no whole number.
-    """
-    if not isinstance(factor, Integral) or isinstance(factor, bool):
-        raise OptionTypeError(f"factor is {seen(factor)}: give a whole number")
-    whole = int(factor)
-    if not 2 <= whole <= MAX_FACTOR or whole % 2:
-        raise OptionError(
-            f"factor is {seen(whole)}: give an even number from 2 to {MAX_FACTOR} "
-            "(an odd one has no node on the samples)"
-        )
-    return whole
 
 
 def block_ijk(factor: int) -> IntArray:

@@ -1,0 +1,303 @@
+"""The mesher ``sharp``: edges and corners found, numbered and joined, groups of planes at a time.
+
+It holds some hundred bytes for each crossed cell near an edge. Each group of planes is meshed as a
+slab of its own, so the mesh is the same for any groups.
+
+Positions are in fine spacings, from node (0, 0, 0) of the fine lattice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...arrays import BoolArray, IntArray
+from ...grid.sdf_grid import SdfGrid
+from ...machine.index_width import check_count
+from ...machine.threads import map_chunks, map_threads
+from ...mesh import CLEARANCE, Mesh, vertex_type
+from ..field import FineField
+from ..marching import (
+    CAP_HEIGHT,
+    NO_FACES,
+    Crossings,
+    connect,
+    find_crossings,
+    lattice_positions,
+    to_world,
+)
+from .fans import Placed, triangles_of
+from .features import CHAIN_ROUNDS, MOVED_RINGS, RINGS, is_sharp, place_features
+from .patches import Index, Patches, beside, find_patches, nth_of_row, voxels_near_kinks
+from .planes import ROUNDS, Vectors, planes_at_crossings
+
+# Cells to every side that a vertex depends on: gradients reach 2 cells, a patch is 1 wide, and so
+# is the fan beside.
+REACH_IN_CELLS = RINGS + ROUNDS + CHAIN_ROUNDS + MOVED_RINGS + 5
+TEMPORARIES = 16  # numbers per crossing in the computation of its position
+REACH_IN_VOXELS = 2  # further: whether a voxel is examined depends on those beside it
+GROUP_BYTES = 1 << 28  # what the own planes of a group may take
+GROUPS_AT_ONCE = 4
+
+PlaneRange = tuple[int, int]
+
+
+def extract_pieces(
+    field: FineField, grid: SdfGrid, first_vertex: int = 0, threads: int = 1
+) -> list[Mesh]:
+    """Return the mesh with edges and corners, group by group of the field's own planes."""
+    at_once = min(threads, groups_at_once(field.planes, field.shape))
+    kinked = find_kinks(field, threads)
+    groups = groups_of_planes(field, kinked, at_once)
+    if len(groups) == 1:
+        return extract_group(field, grid, kinked, first_vertex, at_once)
+
+    def mesh_of(planes: PlaneRange) -> list[Mesh]:
+        return extract_group(replace(field, planes=planes), grid, kinked, 0, 1)
+
+    meshes = map_threads(mesh_of, groups, at_once)
+    return number_after(first_vertex, [mesh for group in meshes for mesh in group])
+
+
+def groups_at_once(planes: PlaneRange, shape: tuple[int, ...]) -> int:
+    """Return how many groups are worked on at a time: one in a slab, which is to save memory."""
+    return GROUPS_AT_ONCE if planes == (0, shape[0]) else 1
+
+
+def groups_of_planes(field: FineField, kinked: BoolArray, threads: int) -> list[PlaneRange]:
+    """Cut a field's own planes into groups that take about the same memory.
+
+    As many as memory asks for, and one for each thread if the groups are then not thinner than the
+    planes beside them, which are worked on again with every group.
+    """
+    first, last = field.planes
+    plain, edged = voxel_bytes(field.factor)
+    size = plain + edged * near_kinks(field, kinked)[field.own_rows]
+    before = np.cumsum(np.bincount(field.voxel_ijk[field.own_rows, 0] - first, size, last - first))
+    thick = (last - first) // (2 * planes_beside(field.factor))
+    count = max(-int(-before[-1] // GROUP_BYTES), min(threads, thick), 1)
+    inner = first + np.searchsorted(before, np.arange(1, count) / count * before[-1])
+    return list(pairwise(np.unique([first, *inner, last]).tolist()))
+
+
+def voxel_bytes(factor: int) -> tuple[int, int]:
+    """Return the bytes that a voxel takes in a group, and how many more if it is near a kink.
+
+    Measured on a ball and on a field of turned cubes, three voxels wide.
+    """
+    return 82 * factor**2, 350 * factor**2
+
+
+def number_after(first_vertex: int, meshes: list[Mesh]) -> list[Mesh]:
+    """Return meshes that each count vertices from 0 numbered one after the other, in place."""
+    counts = [len(mesh.vertices) for mesh in meshes]
+    check_count(first_vertex + sum(counts), "vertices")
+    for mesh, before in zip(meshes, accumulate(counts, initial=first_vertex)):
+        np.add(mesh.faces, np.int32(before), out=mesh.faces)
+    return meshes
+
+
+def extract_group(
+    field: FineField,
+    grid: SdfGrid,
+    kinked: BoolArray,
+    first_vertex: int = 0,
+    threads: int = 1,
+) -> list[Mesh]:
+    """Return the mesh of a field's planes with its edges and corners, as a list of one piece.
+
+    Vertices and faces are numbered as by ``marching.extract_pieces``; ``kinked`` is from
+    ``find_kinks``, for this field or one of more planes.
+
+    Raises
+    ------
+    OptionError
+        If there are more vertices than can be numbered, those before among them.
+    """
+    rows = _rows_around(field)
+    before = field.plane_before(rows).start if rows.start < rows.stop else rows.start
+    crossings = find_crossings(field, slice(before, rows.stop), threads)
+    if not len(crossings.own_row):
+        return [Mesh(np.empty((0, 3), vertex_type(grid, field.factor)), NO_FACES)]
+    examined = examine(field, crossings, rows, kinked, threads)
+    numbers = _number_vertices(field, crossings, examined, first_vertex)
+    vertices = _vertices(field, crossings, examined, numbers, first_vertex)
+    faces = _faces(field, crossings, examined, numbers)
+    return [Mesh(to_world(vertices.T, field, grid), faces)]
+
+
+@dataclass(frozen=True, eq=False)
+class Examined:
+    """What is found in the voxels that may hold an edge; the others are left to marching cubes.
+
+    Attributes
+    ----------
+    voxels : (D,) bool
+        Which voxels were examined.
+    patches : Patches
+        Their patches; ``crossing`` counts among ``used``.
+    used : (m,) int64
+        The crossings of these patches.
+    placed : Placed
+        Where the vertices on these crossings and on the features belong.
+    """
+
+    voxels: BoolArray
+    patches: Patches
+    used: Index
+    placed: Placed
+
+
+def find_kinks(field: FineField, threads: int = 1) -> BoolArray:
+    """Return the voxels, (D,), in which an edge may be, in all planes that the mesh depends on."""
+    return voxels_near_kinks(field, _rows_around(field), threads)
+
+
+def near_kinks(field: FineField, chosen: BoolArray) -> BoolArray:
+    """Return the voxels, (D,), that are examined if edges may be in chosen ones."""
+    return beside(field, chosen, -(-(RINGS + 1) // field.factor))
+
+
+def examine(
+    field: FineField, crossings: Crossings, rows: slice, kinked: BoolArray, threads: int = 1
+) -> Examined:
+    """Look for edges and corners in and beside voxels in which a patch of the surface turns."""
+    here = within(np.arange(len(kinked)), rows)
+    turning = turning_voxels(field, crossings, kinked & here, threads)
+    voxels = near_kinks(field, turning) & here
+    patches, used = find_patches(field, crossings, voxels)
+    own = planes_at_crossings(field, crossings, used, threads)
+    placed = place_features(patches, own, turning, field, threads)
+    position = _kept_in_grid(placed.position, own.point, field)
+    peak = _kept_in_grid(placed.peak, patches.low[placed.feature] + 0.5, field)
+    return Examined(voxels, patches, used, replace(placed, position=position, peak=peak))
+
+
+def turning_voxels(
+    field: FineField, crossings: Crossings, kinked: BoolArray, threads: int = 1
+) -> BoolArray:
+    """Return which of the kinked voxels, (D,), hold a patch whose normals differ as at an edge."""
+    patches, used = find_patches(field, crossings, kinked)
+    own = planes_at_crossings(field, crossings, used, threads)
+    turning = np.zeros(len(kinked), bool)
+    turning[patches.row[is_sharp(patches, own.normal, own.trust)]] = True
+    return turning
+
+
+def _kept_in_grid(position: Vectors, start: Vectors, field: FineField) -> Vectors:
+    """Return positions (n, 3) that do not leave the grid, nor its border if they started there.
+
+    An open surface ends on the border, and a cap is flat there. ``start``, (n, 3), is where a
+    vertex was on its lattice edge, or the middle of its cell.
+    """
+    last = np.array(field.shape, np.float64) * field.factor
+    at_border = (start <= 0) | (start >= last)
+    border = np.clip(start, -CAP_HEIGHT, last + CAP_HEIGHT)
+    return np.where(at_border, border, np.clip(position, CLEARANCE, last - CLEARANCE))
+
+
+def planes_beside(factor: int) -> int:
+    """Return how many coarse planes to either side a slab's mesh depends on."""
+    return -(-(REACH_IN_CELLS + 1) // factor) + REACH_IN_VOXELS
+
+
+def _rows_around(field: FineField) -> slice:
+    """Return the rows of the field's own planes and of those that they depend on."""
+    beside = planes_beside(field.factor)
+    return field.rows(field.planes[0] - beside, field.planes[1] + beside)
+
+
+@dataclass(frozen=True, eq=False)
+class Numbers:
+    """The numbers of vertices: voxel by voxel, on edges that it owns, then of its features.
+
+    Attributes
+    ----------
+    of_crossing : (n,) int64
+        Of the vertex on each crossing.
+    of_feature : (f,) int64
+        Of the vertex of each feature.
+    own : int
+        How many belong to the field's own voxels.
+    """
+
+    of_crossing: Index
+    of_feature: Index
+    own: int
+
+
+def _number_vertices(
+    field: FineField, crossings: Crossings, examined: Examined, first_vertex: int
+) -> Numbers:
+    """Number the vertices: the first of the field's own voxels is ``first_vertex``."""
+    count, row = len(field.voxel_ijk) + 1, examined.patches.row[examined.placed.feature]
+    edges = np.bincount(crossings.own_row, minlength=count)
+    peaks = np.bincount(row, minlength=count)
+    before = np.cumsum(edges + peaks) - edges - peaks
+    core = field.own_rows
+    own = int(before[core.stop] - before[core.start])
+    check_count(first_vertex + own, "vertices")
+    before += first_vertex - before[core.start]
+    of_crossing = before[crossings.own_row] + nth_of_row(crossings.own_row, edges)
+    return Numbers(of_crossing, before[row] + edges[row] + nth_of_row(row, peaks), own)
+
+
+def _vertices(
+    field: FineField,
+    crossings: Crossings,
+    examined: Examined,
+    numbers: Numbers,
+    first_vertex: int,
+) -> Vectors:
+    """Return the vertices of the field's own voxels, (n, 3), in fine spacings."""
+    vertices = np.empty((numbers.own, 3))
+    mine = crossings.own(field.own_rows)
+
+    def place(some: slice) -> None:
+        rows = slice(mine.start + some.start, mine.start + some.stop)
+        plain = lattice_positions(field, crossings.own_row[rows], crossings.own_edge[rows])
+        vertices[numbers.of_crossing[rows] - first_vertex] = plain.T
+
+    map_chunks(place, mine.stop - mine.start, TEMPORARIES)
+    used, placed = examined.used, examined.placed
+    for row, number, position in (
+        (crossings.own_row[used], numbers.of_crossing[used], placed.position),
+        (examined.patches.row[placed.feature], numbers.of_feature, placed.peak),
+    ):
+        core = within(row, field.own_rows)
+        vertices[number[core] - first_vertex] = position[core]
+    return vertices
+
+
+def within(row: NDArray[Any], rows: slice) -> BoolArray:
+    """Return which rows lie in a slice."""
+    inside: BoolArray = (row >= rows.start) & (row < rows.stop)
+    return inside
+
+
+def _faces(
+    field: FineField, crossings: Crossings, examined: Examined, numbers: Numbers
+) -> IntArray:
+    """Return the triangles of the field's own voxels, plane by plane.
+
+    In each plane those of voxels that were not examined come first, then the others in the order of
+    their patches. A side between two fans becomes two triangles of the later patch.
+    """
+    plain = ~examined.voxels[crossings.cell_row]
+    cells = (crossings.cell_row[plain], crossings.cell[plain], crossings.case[plain])
+    smooth = replace(crossings, cell_row=cells[0], cell=cells[1], case=cells[2])
+    patch, corners = triangles_of(examined.patches, examined.placed)
+    faces = np.concatenate([numbers.of_crossing[examined.used], numbers.of_feature])[corners]
+    row = examined.patches.row[patch]
+    parts = [NO_FACES]
+    for plane in range(*field.planes):
+        rows = field.rows(plane, plane + 1)
+        if rows.start < rows.stop:
+            parts.append(numbers.of_crossing[connect(field, smooth, rows, 0)].astype(np.int32))
+            start, stop = np.searchsorted(row, [rows.start, rows.stop])
+            parts.append(faces[start:stop].astype(np.int32))
+    return np.concatenate(parts)

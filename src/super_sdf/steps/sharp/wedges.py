@@ -1,0 +1,251 @@
+"""Edges and corners that lean on the samples' spheres.
+
+An exact sample x with distance d is the centre of a sphere of radius |d| that the surface touches
+and does not pierce. The foot point of a sample in the cone of normals of an edge, outside a convex
+one or inside a concave one, lies on the edge: its sphere says where the edge is, and whether there
+is one at all. In steps:
+
+1. ``wedges_of`` reads the two faces, their edge's direction and the point where all planes meet
+   off the planes of a patch.
+2. ``find_spheres`` lists the spheres that pass near each edge.
+3. ``lean`` moves each point so that the planes and the spheres agree.
+4. ``Contact`` says how well the spheres agree with the result.
+
+References
+----------
+Kobbelt, Botsch, Schwanecke and Seidel, "Feature Sensitive Surface Extraction from Volume Data",
+2001, for the point where the planes meet; Sellán, Batty and Stein, "Reach For the Spheres", 2023,
+and Carrera et al., "Dual Contouring of Signed Distance Data", 2026, for the spheres.
+
+Positions and lengths are in coarse spacings, from node (0, 0, 0) of the fine lattice, so sample
+(i, j, k) is at (i + 1/2, j + 1/2, k + 1/2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...arrays import BoolArray, IntArray
+from ..field import SampleSpheres
+from .planes import Numbers, Vectors, dot, length, square_falloff, sums, unit
+
+ALONG = 0.6  # distance along an edge at which a sphere counts for a quarter
+FARTHEST_ALONG = 1.8
+CLOSE_BY = 0.3  # distance along an edge within which no sphere may be pierced
+OFF_SPHERE = 0.05  # distance from a sphere at which it counts for half
+FARTHEST_SPHERE = 0.3
+LARGEST_RADIUS = 1.4  # samples near the band's edge, 1.5, may have been truncated there
+LEAST_RADIUS = 0.05  # of spheres: of smaller ones the direction is unknown
+PIERCED = 0.02  # by which a sphere outside the cone must be pierced to count
+HOLD = 1.0  # of the planes of a patch, in spheres
+ITERATIONS = 3
+LONGEST_STEP = 0.25
+RANK = 0.05  # eigenvalues below this share of the largest leave a direction open
+NEAR = 2  # voxels to each side whose samples are looked at
+AROUND: NDArray[np.int64] = np.indices((2 * NEAR + 1,) * 3).reshape(3, -1).T.astype(np.int64) - NEAR
+IDENTITY = np.eye(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Wedges:
+    """Where two or more faces meet, one for each patch.
+
+    Attributes
+    ----------
+    voxel : (f, 3) int64
+        The voxel of each.
+    point : (f, 3) float64
+        On the edge, or the corner.
+    tangent : (f, 3) float64
+        Direction of the edge.
+    corner : (f,) bool
+        Whether three faces or more meet, so that there is no direction.
+    sides : (f, 2, 3) float64
+        The two normals that differ most.
+    convex : (f,) float64
+        1 if the solid fills less than half of the space round the edge, -1 if it fills more.
+    stiffness : (f, 3, 3) float64
+        Mean of the squares of the normals: how the planes hold the point.
+    """
+
+    voxel: NDArray[np.int64]
+    point: Vectors
+    tangent: Vectors
+    corner: BoolArray
+    sides: Vectors
+    convex: Numbers
+    stiffness: Vectors
+
+    @property
+    def cosine(self) -> Numbers:
+        """Cosine of the angle between the two normals, (f,)."""
+        return dot(self.sides[:, 0], self.sides[:, 1])
+
+
+@dataclass(frozen=True, eq=False)
+class Nearby:
+    """Pairs of a wedge and a sphere that passes near it, in the order of the wedges.
+
+    Attributes
+    ----------
+    wedge : (n,) int64
+    centre : (n, 3) float64
+        The sample.
+    distance : (n,) float64
+        Its signed distance.
+    """
+
+    wedge: NDArray[np.int64]
+    centre: Vectors
+    distance: Numbers
+
+
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """How spheres stand to the edges that they are near.
+
+    Attributes
+    ----------
+    direction : (n, 3) float64
+        From the sample to the edge, of unit length.
+    along : (n,) float64
+        Distance along the edge.
+    gap : (n,) float64
+        Distance from the sphere to the edge, negative if it is pierced.
+    in_cone : (n,) bool
+        Whether the sphere must touch the edge, by the normals of the two faces.
+    """
+
+    direction: Vectors
+    along: Numbers
+    gap: Numbers
+    in_cone: BoolArray
+
+    @property
+    def is_close(self) -> BoolArray:
+        """Whether the sphere is so near along the edge that this may not pierce it.
+
+        Further on the edge may have ended, at a corner, or turned.
+        """
+        return np.abs(self.along) < CLOSE_BY
+
+
+def wedges_of(
+    voxel: NDArray[np.int64], point: Vectors, normal: Vectors, there: BoolArray
+) -> Wedges:
+    """Return the wedges of patches, at the points nearest to all planes of each.
+
+    Parameters
+    ----------
+    voxel : (f, 3) int64
+    point, normal : (f, S, 3) float64
+        The planes of each patch, in coarse spacings.
+    there : (f, S) bool
+        Which of them there are.
+    """
+    count = there.sum(1)
+    normal = normal * there[..., None]
+    stiffness = np.einsum("pei,pej->pij", normal, normal) / count[:, None, None]
+    values, vectors = np.linalg.eigh(stiffness)
+    middle = (point * there[..., None]).sum(1) / count[:, None]
+    height = dot(point - middle[:, None], normal)
+    right = (height[..., None] * normal).sum(1) / count[:, None]
+    inverse = np.where(values > RANK * values[:, -1:], 1 / np.maximum(values, 1e-9), 0)
+    step = np.einsum("pij,pj->pi", vectors, inverse * np.einsum("pij,pi->pj", vectors, right))
+    peak = middle + step
+    one, other = _most_different(normal, there)
+    row = np.arange(len(peak))
+    sides = np.stack([normal[row, one], normal[row, other]], 1)
+    above = dot(point[row, one] - peak, sides[:, 1]) + dot(point[row, other] - peak, sides[:, 0])
+    convex = np.where(above < 0, 1.0, -1.0)
+    corner = values[:, 0] > RANK * values[:, -1]
+    return Wedges(voxel, peak, vectors[:, :, 0], corner, sides, convex, stiffness)
+
+
+def _most_different(normal: Vectors, there: BoolArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the places of the two normals of each patch whose cosine is least, (f,) each."""
+    cosine = np.einsum("pei,pfi->pef", normal, normal)
+    cosine[~(there[:, :, None] & there[:, None, :])] = 2
+    least = cosine.reshape(len(cosine), there.shape[1] ** 2).argmin(1)
+    one, other = np.divmod(least, there.shape[1])
+    return one, other
+
+
+def find_spheres(wedges: Wedges, spheres: SampleSpheres) -> Nearby:
+    """Return the spheres that pass within ``FARTHEST_SPHERE`` of each wedge's edge."""
+    number = spheres.index.find(wedges.voxel[:, None] + AROUND)  # (f, 125)
+    wedge, place = np.nonzero(number >= 0)
+    number = number[wedge, place]
+    distance: Numbers = spheres.distance[number].astype(np.float64) / 2
+    centre = spheres.voxel_ijk[number].astype(np.float64) + 0.5
+    near = Nearby(wedge, centre, distance)
+    contact = contact_of(wedges, near)
+    kept = np.abs(contact.gap) < FARTHEST_SPHERE
+    kept &= (np.abs(contact.along) < FARTHEST_ALONG) & (np.abs(near.distance) < LARGEST_RADIUS)
+    return Nearby(wedge[kept], near.centre[kept], near.distance[kept])
+
+
+def contact_of(wedges: Wedges, near: Nearby) -> Contact:
+    """Return how spheres stand to edges now."""
+    wedge = near.wedge
+    away = wedges.point[wedge] - near.centre
+    along = np.where(wedges.corner[wedge], 0, dot(away, wedges.tangent[wedge]))
+    across = away - along[:, None] * wedges.tangent[wedge]
+    direction, radius = unit(across), length(across)
+    return Contact(
+        direction,
+        along,
+        radius - np.abs(near.distance),
+        _in_cone(wedges, near, -direction) & (radius > LEAST_RADIUS),
+    )
+
+
+def _in_cone(wedges: Wedges, near: Nearby, direction: Vectors) -> BoolArray:
+    """Return whether directions from edges to samples, (n, 3), lie between the two normals.
+
+    Never at a corner: the cone of three normals is narrow, and few samples lie in it.
+    """
+    wedge = near.wedge
+    outward = direction * wedges.convex[wedge, None]
+    first, second = (dot(outward, wedges.sides[wedge, side]) for side in (0, 1))
+    cosine = wedges.cosine[wedge]
+    between = (first > cosine * second) & (second > cosine * first)
+    faces_it: BoolArray = np.sign(near.distance) == wedges.convex[wedge]
+    return between & faces_it & ~wedges.corner[wedge]
+
+
+def lean(wedges: Wedges, near: Nearby) -> Wedges:
+    """Return the wedges with points at which planes and spheres agree best."""
+    start = wedges.point
+    hold = wedges.stiffness * HOLD
+    along = wedges.tangent[:, :, None] * wedges.tangent[:, None, :]
+    hold = hold + 1e-3 * IDENTITY + np.where(wedges.corner, 0, 1e3)[:, None, None] * along
+    for _ in range(ITERATIONS):
+        matrix, pull = _pull_of_spheres(wedges, near)
+        back = np.einsum("pij,pj->pi", wedges.stiffness * HOLD, start - wedges.point)
+        step = np.linalg.solve(hold + matrix, (pull + back)[..., None])[..., 0]
+        point = wedges.point + np.clip(step, -LONGEST_STEP, LONGEST_STEP)
+        wedges = replace(wedges, point=point)
+    return wedges
+
+
+def _pull_of_spheres(wedges: Wedges, near: Nearby) -> tuple[Vectors, Vectors]:
+    """Return matrix (f, 3, 3) and right side (f, 3) of the spheres' part in the least squares."""
+    count, wedge, contact = len(wedges.point), near.wedge, contact_of(wedges, near)
+    counts = contact.in_cone | (contact.is_close & (contact.gap < -PIERCED))
+    off = contact.gap / OFF_SPHERE
+    weight = counts * square_falloff(contact.along / ALONG) / (1 + off * off)
+    pull = -sums(wedge, (weight * contact.gap)[:, None] * contact.direction, count)
+    rows = [
+        sums(wedge, (weight * contact.direction[:, axis])[:, None] * contact.direction, count)
+        for axis in range(3)
+    ]
+    return np.stack(rows, 1), pull
+
+
+def count_by_wedge(near: Nearby, which: BoolArray, count: int) -> IntArray:
+    """Return how many of the chosen spheres each of ``count`` wedges has."""
+    return np.bincount(near.wedge[which], minlength=count).astype(np.int32)
