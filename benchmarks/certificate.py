@@ -29,8 +29,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import spearmanr
 
-from super_sdf.certificate.check import Certificate, CheckOptions, check_files
-from super_sdf.certificate.coloured import vertex_residuals
+from super_sdf.certificate.check import Certificate, check_files
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.evaluation.cases import RESULT_POINTS, Setting, Shape
 from super_sdf.evaluation.metrics import compare_distances, distance_or_dot, sample_surface
@@ -73,7 +72,7 @@ def certify(shape: Shape, size: int, network: Network) -> Certificate:
     with grid_file(shape, Setting(size, 4)) as grid:
         target = grid.with_suffix(".ply")
         convert(grid, target, network, ConvertOptions(inside="negative"), force=True)
-        return check_files(target, grid, CheckOptions(inside="negative", intersections=False))
+        return check_files(target, grid, ConvertOptions(inside="negative"), intersections=False)
 
 
 def measure(shape: Shape, size: int, network: Network) -> Row:
@@ -81,7 +80,7 @@ def measure(shape: Shape, size: int, network: Network) -> Row:
     found = certify(shape, size, network)
     mesh, touching = found.mesh, found.touching
     true = shape.solid.distance(mesh.vertices)
-    said = np.abs(vertex_residuals(mesh.vertices, touching, found.voxel_size))
+    said = np.abs(found.residuals_at(mesh.vertices))
     known = np.isfinite(said)
     drawn = sample_surface(mesh, shape.seed(RESULT_POINTS))
     there = distance_or_dot(Solid(mesh), shape.drawn.points)

@@ -24,7 +24,7 @@ from pathlib import Path
 from scipy.spatial import cKDTree
 
 from super_sdf import Mesh, load_network
-from super_sdf.certificate.slabs import self_intersections
+from super_sdf.certificate.search import self_intersections
 from super_sdf.certificate.surface import examine_surface
 from super_sdf.options import MARCHING, MESHERS
 

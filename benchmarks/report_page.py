@@ -23,13 +23,11 @@ import numpy as np
 from playwright.sync_api import Browser, sync_playwright
 
 from super_sdf import Mesh, load_network
-from super_sdf.certificate.check import CheckOptions
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.pages.entries import Entry, entry_of, entry_of_report
 from super_sdf.pages.html import make_page, write_page
 from super_sdf.pages.items import Item, item_of_files, write_item
-from super_sdf.pages.shown import reduced
-from super_sdf.pages.thumbnails import thumbnail
+from super_sdf.pages.meshes import reduced, thumbnail
 from super_sdf.truth.mesh_files import read_mesh
 
 GRID = Path("examples/part.npz")
@@ -49,7 +47,7 @@ def convert_once(folder: Path) -> tuple[dict[str, Any], Item, list[str | None]]:
     """Convert the example; return its report, its item and thumbnails."""
     target = folder / "part.ply"
     done = convert(GRID, target, load_network(device="cpu"), ConvertOptions(factor=2))
-    item = item_of_files(target, GRID, CheckOptions())
+    item = item_of_files(target, GRID, ConvertOptions())
     mesh = reduced(read_mesh(target), 20_000)
     angles = np.linspace(0, 2 * np.pi, THUMBNAILS, endpoint=False)
     report = {**done.report(), "seconds": done.seconds, "input": str(GRID)}

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from super_sdf.certificate.slabs import self_intersections
+from super_sdf.certificate.search import self_intersections
 from super_sdf.certificate.surface import examine_surface
 from super_sdf.evaluation.cases import Case, Setting, Shape
 from super_sdf.evaluation.measuring import measure_surface

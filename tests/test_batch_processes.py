@@ -71,7 +71,9 @@ def test_nothing_of_the_current_folder_is_run(tmp_path):
 
 def start_batch(*options):
     """Start a batch as a process, and return it when its report has some lines."""
-    process = start_command("batch", "in", "--out", "out", "--jobs", 2, "--threads", 1, *SMALL, *options)
+    process = start_command(
+        "batch", "in", "--out", "out", "--jobs", 2, "--threads", 1, *SMALL, *options
+    )
     wait_for_lines(process, Path("out/report.jsonl"))
     return process
 

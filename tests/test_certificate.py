@@ -9,17 +9,28 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import ball, count_fans
-from solids import cube, inverted, joined, saved, sphere, torus
+from solids import cube, inverted, joined, saved, torus
 
 from super_sdf import Mesh, SdfGrid, topology
-from super_sdf.certificate import slabs, surface
-from super_sdf.certificate.check import CheckOptions, check_files, check_mesh, stated_triangles
-from super_sdf.certificate.coloured import PIERCED, TOUCHING, UNKNOWN, colours, vertex_residuals
-from super_sdf.certificate.limits import NO_EVIDENCE, Limits
+from super_sdf.certificate import search as slabs
+from super_sdf.certificate import surface
+from super_sdf.certificate.check import (
+    LIMITS,
+    NO_EVIDENCE,
+    PIERCED,
+    TOUCHING,
+    UNKNOWN,
+    check_files,
+    check_limits,
+    check_mesh,
+    colours,
+    exceeded,
+    stated_triangles,
+)
+from super_sdf.convert import ConvertOptions
 from super_sdf.errors import OptionError, OutOfMemoryError
-from super_sdf.files import coloured_ply
+from super_sdf.files import plain_meshes
 from super_sdf.machine import extras
-from super_sdf.truth.solid import Solid
 
 H = 1 / 24  # of the grids
 RADIUS = 0.4
@@ -38,7 +49,7 @@ def sphere_grid(clamp: float = np.inf) -> SdfGrid:
 
 def round_mesh(radius: float = RADIUS) -> Mesh:
     """Return a fine sphere with vertices on it: triangles are at most 1e-4 voxels inside."""
-    found = trimesh.creation.icosphere(subdivisions=6, radius=radius)
+    found = trimesh.creation.icosphere(subdivisions=5, radius=radius)
     return Mesh(np.array(found.vertices), np.array(found.faces, np.int32))
 
 
@@ -51,7 +62,7 @@ def moved(mesh: Mesh, x: float) -> Mesh:
     return Mesh(mesh.vertices + np.array([x, 0, 0]), mesh.faces)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_open_edges_are_those_that_no_triangle_passes_the_other_way(seed):
     """Of triangles between a few vertices, in any pieces, and of a solid with holes."""
     random = np.random.default_rng(seed)
@@ -153,7 +164,7 @@ def test_a_vertex_shared_by_two_pieces_is_pinched():
     assert not found.manifold and found.closed
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_fans_are_those_of_a_graph_search(seed):
     """On random triangles, open and crowded: where no edge is crowded both agree."""
     random = np.random.default_rng(seed)
@@ -183,31 +194,18 @@ def test_processes_find_what_one_does(ball_mesh, monkeypatch):
     points = np.random.default_rng(4).uniform(-0.5, 0.5, (500, 3))
     mesh = joined(ball_mesh, moved(ball_mesh, 0.1))
     whole = slabs.search(mesh, points, np.inf, intersections=True)
-    monkeypatch.setattr(slabs, "FACES_IN_SLAB", 50_000)
+    monkeypatch.setattr(slabs, "FACES_IN_SLAB", 15_000)
     cut = slabs.search(mesh, points, 0.2, intersections=True, processes=2)
     assert cut.intersections == whole.intersections > 50
     np.testing.assert_allclose(cut.distances, whole.distances, rtol=0, atol=1e-14)
     np.testing.assert_allclose(cut.feet, whole.feet, rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize("mesh", [cube(), torus(24, 12), sphere(size=12)], ids=str)
-@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
-def test_what_is_behind_a_simple_surface_is_inside(mesh, scale):
-    """Also at edges and corners, where one triangle does not tell, and in any unit."""
-    points = np.random.default_rng(5).uniform(-0.8, 0.8, (5000, 3))
-    scaled = Mesh(mesh.vertices * scale, mesh.faces)
-    found = slabs.nearest(Solid(scaled), points * scale)
-    inside = Solid(mesh).is_inside(points)
-    sure = found.facing != 0
-    assert sure.mean() > 0.99 and inside.any()
-    assert np.array_equal(found.facing[sure] < 0, inside[sure])
-
-
 def test_sides_of_a_mesh_that_meets_itself_are_by_winding_number(ball_mesh):
     """A point in both balls is behind one sheet and nearest to the inner one, seen from inside."""
     mesh = joined(ball_mesh, round_mesh(0.5 * RADIUS))
     found = check_mesh(mesh, sphere_grid())
-    assert not found.surface.is_simple and found.surface.components == 2
+    assert found.surface.components == 2
     assert not found.touching.wrong_side.any()
 
 
@@ -229,8 +227,9 @@ def test_noisy_samples_promise_nothing(ball_mesh):
     assert len(found.touching.values) == 0 and found.touching.noisy > 3000
     assert found.report()["residual"] is None and found.strays is None
     assert "residual: unknown, since no sample is exact" in found.lines()
-    assert Limits(max_mean=9.0).exceeded(found) == [NO_EVIDENCE]
-    assert Limits().exceeded(found) == []
+    none = dict.fromkeys(LIMITS)
+    assert exceeded(found, {**none, "max_mean": 9.0}) == [NO_EVIDENCE]
+    assert exceeded(found, none) == []
 
 
 def test_a_piece_far_from_every_sample_is_noticed(ball_mesh):
@@ -246,13 +245,13 @@ def test_a_piece_far_from_every_sample_is_noticed(ball_mesh):
 
 def test_colours_are_those_of_the_residuals(ball_mesh):
     found = check_mesh(moved(ball_mesh, 0.1 * H), sphere_grid())
-    values = vertex_residuals(ball_mesh.vertices, found.touching, H)
+    values = found.residuals_at(ball_mesh.vertices)
     front = ball_mesh.vertices[:, 0] > 0.95 * RADIUS
     assert np.abs(values[front]).mean() == pytest.approx(0.1, abs=0.01)
     said = colours(np.array([0, -1, -0.05, np.nan], np.float32))
     assert [tuple(row) for row in said[[0, 1, 3]]] == [TOUCHING, PIERCED, UNKNOWN]
     np.testing.assert_allclose(said[2], (np.array(TOUCHING) + PIERCED) / 2, atol=1)
-    far = vertex_residuals(np.array([[9.0, 9, 9]]), found.touching, H)
+    far = found.residuals_at(np.array([[9.0, 9, 9]]))
     assert np.isnan(far).all()
 
 
@@ -262,22 +261,22 @@ def test_memory_is_refused_with_the_figure(ball_mesh, tmp_path):
     assert stated_triangles(saved(ball_mesh, tmp_path / "ball.stl")) == len(ball_mesh.faces)
     assert stated_triangles(saved(ball_mesh, tmp_path / "ball.off")) == 0
     with pytest.raises(
-        OutOfMemoryError, match=r"checking 81,920 triangles needs \d+ MB of memory, 9 MB"
+        OutOfMemoryError, match=r"checking 20,480 triangles needs \d+ MB of memory, 9 MB"
     ):
-        check_files(path, tmp_path / "never-read.npz", CheckOptions(max_memory=9_000_000))
+        check_files(path, tmp_path / "never-read.npz", ConvertOptions(max_memory=9_000_000))
 
 
 def test_limits(ball_mesh):
-    found = check_mesh(moved(ball_mesh, 0.15 * H), sphere_grid())
-    assert Limits(0.2, 0.1, 0.5).exceeded(found) == []
-    passed = Limits(0.1, 0.05, 0.01, True).exceeded(found)
+    found, names = check_mesh(moved(ball_mesh, 0.15 * H), sphere_grid()), list(LIMITS)
+    assert exceeded(found, dict(zip(names, (0.2, 0.1, 0.5)))) == []
+    passed = exceeded(found, dict(zip(names, (0.1, 0.05, 0.01))))
     assert passed[0].startswith("the largest residual is 0.1")
     assert passed[0].endswith(" voxels, --max-residual is 0.1")
     assert passed[1].startswith("the mean residual is 0.07")
-    assert passed[2].endswith(", --max-share is 0.01") and len(passed) == 4
-    for wrong in (Limits(max_residual=-1.0), Limits(max_mean=np.nan), Limits(max_share=2.0)):
+    assert passed[2].endswith(", --max-share is 0.01") and len(passed) == 3
+    for wrong in ((-1.0, None, None), (None, np.nan, None), (None, None, 2.0)):
         with pytest.raises(OptionError):
-            wrong.check()
+            check_limits(dict(zip(names, wrong)))
 
 
 @pytest.fixture
@@ -294,9 +293,9 @@ def test_the_command_prints_figures(here, command):
     code, out, err = command("check", "ball.ply", "ball.npz", "--max-residual", 0.01, "--no-faults")
     assert (code, err) == (0, "")
     lines = out.splitlines()
-    assert lines[0].startswith("mesh: 40,962 vertices, 81,920 triangles, 1 component, volume 0.268")
+    assert lines[0].startswith("mesh: 10,242 vertices, 20,480 triangles, 1 component, volume 0.26")
     assert lines[1].endswith(" cut off and 0 noisy left out")
-    assert lines[2].startswith("residual in voxels: mean 0.000")
+    assert lines[2].startswith("residual in voxels: mean 0.001")
     assert lines[3] == "above 0.1 voxel: 0.00% of the samples (0.00% not touching, 0.00% pierced)"
     assert lines[4] == "faults: none (closed, oriented, manifold, no self-intersections)"
     code, out, _ = command("check", "ball.ply", "ball.npz", "--skip-intersections")
@@ -325,32 +324,25 @@ def test_the_offset_is_that_of_the_mesh(here, command):
 def test_the_coloured_mesh_is_a_mesh_with_residuals(here, command):
     assert command("check", "off.ply", "ball.npz", "--out", "c.ply", "-q") == (0, "", "")
     mesh = trimesh.load("c.ply", process=False)
-    assert len(mesh.faces) == 81920 and mesh.is_watertight
+    assert len(mesh.faces) == 20480 and mesh.is_watertight
     residual = mesh.metadata["_ply_raw"]["vertex"]["data"]["residual"]
     assert np.abs(residual).max() == pytest.approx(0.1, abs=0.01)
     worst = mesh.visual.vertex_colors[np.abs(residual).argmax()][:3]
     assert abs(int(worst[0]) - int(worst[2])) > 100
-    assert command("check", "off.ply", "ball.npz", "--out", "c.ply")[0] == 1  # exists
-    assert command("check", "off.ply", "ball.npz", "--out", "c.ply", "--force", "-q")[0] == 0
 
 
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
         ("none.ply ball.npz", 1, "none.ply does not exist"),
-        ("ball.ply none.npz", 1, "none.npz does not exist"),
         ("ball.ply ball.ply", 2, "ball.ply is a mesh, not a grid: sample it first"),
         ("ball.ply ball.npz --out c.stl", 2, "c.stl is not a coloured mesh file: give .ply"),
-        ("ball.ply ball.npz --out no/c.ply", 1, "no is not a folder: make it first"),
         ("ball.ply ball.npz --out off.ply", 1, "off.ply exists: remove it or use --force"),
         ("ball.ply ball.npz --out ball.ply --force", 1, "ball.ply is the same file as ball.ply:"),
         ("ball.ply ball.npz --max-share 2", 2, "--max-share is 2: give a share from 0 to 1"),
-        ("ball.ply ball.npz --max-mean nan", 2, "--max-mean is nan: give 0 voxels or more"),
-        ("ball.ply ball.npz --max-residual -1", 2, "--max-residual is -1: give 0 voxels or more"),
         ("ball.ply ball.npz --offset nan", 2, "offset is nan: give a finite number, in world"),
         ("ball.ply ball.npz --offset 9", 1, "no surface at 9: the values go from "),
-        ("ball.ply ball.npz --max-memory 9M", 1, "checking 81,920 triangles needs "),
-        ("ball.ply ball.npz --spacing 0.001", 1, "spacing"),
+        ("ball.ply ball.npz --max-memory 9M", 1, "checking 20,480 triangles needs "),
     ],
 )
 def test_errors_are_one_line_and_leave_nothing(here, command, words, code, message):
@@ -365,7 +357,7 @@ def test_a_coloured_mesh_is_never_left_half_written(here, command, monkeypatch):
     def full(faces):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(coloured_ply, "ply_rows", full)
+    monkeypatch.setattr(plain_meshes, "_ply_rows", full)
     Path("c.ply").write_text("old")
     before = sorted(os.listdir())
     code, out, err = command("check", "off.ply", "ball.npz", "--out", "c.ply", "--force")
@@ -376,7 +368,7 @@ def test_a_coloured_mesh_is_never_left_half_written(here, command, monkeypatch):
 
 def test_a_missing_extra_is_said_before_the_work(here, command, monkeypatch):
     monkeypatch.setattr(extras, "missing_modules", lambda modules: ["igl"])
-    line = "needs igl: pip install -e '.[eval]' in a clone of super-sdf\n"
+    line = "needs igl: pip install -e '.[report]' in a clone of super-sdf\n"
     assert command("check", "none.ply", "none.npz") == (1, "", f"Error: check {line}")
     for words in (("upsample", "ball.npz", "new.ply"), ("batch", "ball.npz", "--out", "new")):
         code, _, err = command(*words, "--check")
@@ -406,25 +398,8 @@ def test_batch_records_certificates_and_makes_those_that_are_missing(here, run_b
         assert "nothing to do: 1 done before" in run_batch("in", *flags)[2]
 
 
-def test_a_mesh_of_marching_cubes_is_certified_worse_than_the_refined_one(here, command):
-    """On a coarse sphere: the order is right."""
-    coarse = check_mesh(sphere(RADIUS, 24), sphere_grid()).touching.summary()["mean"]
-    fine = check_mesh(sphere(RADIUS, 96), sphere_grid()).touching.summary()["mean"]
-    assert fine < coarse / 4
-
-
 def test_pairs_of_triangles_that_intersect_are_counted():
     corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, -0.5], [0.3, 0.2, 0.5], [0.2, 0.3, 0.5]]
     crossed = Mesh(np.array(corners, np.float64), np.array([[0, 1, 2], [3, 4, 5]], np.int32))
     assert slabs.self_intersections(crossed) == 1
     assert slabs.self_intersections(cube()) == 0
-
-
-def test_a_sample_beside_a_triangle_without_area_overflows_nothing():
-    """Coarse marching cubes have such triangles where samples lie on the surface."""
-    cube_mesh = cube()
-    flat = Mesh(cube_mesh.vertices, np.vstack([cube_mesh.faces, [[0, 0, 1]]]).astype(np.int32))
-    with np.errstate(all="raise"):
-        points = flat.vertices[:1] - [[0.1, 0.2, 0.3]]
-        found = slabs.facing_by_rays(Solid(flat), points, np.array([len(cube_mesh.faces)]))
-    assert found.tolist() == [0]

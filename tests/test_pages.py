@@ -9,20 +9,20 @@ from io import BytesIO
 import numpy as np
 import pytest
 import trimesh
-from conftest import ball
+from conftest import ball, trilinear
 from pages import blocks, wedge
 from PIL import Image
 
 from super_sdf import Mesh, SdfGrid, reconstruct
-from super_sdf.certificate.check import CheckOptions, check_mesh
-from super_sdf.certificate.coloured import FULL
-from super_sdf.pages import shown
+from super_sdf.certificate.check import FULL, check_mesh
+from super_sdf.convert import ConvertOptions, Kept
+from super_sdf.grid.cubic import cubic_grid
+from super_sdf.pages import meshes
 from super_sdf.pages.entries import certificate_facts, entry_of, entry_of_report
-from super_sdf.pages.html import is_page, make_page, safe_json, write_page
-from super_sdf.pages.items import Item, add_mesh, item_of, read_head, read_meshes, write_item
-from super_sdf.pages.packing import pack, residual_bytes
-from super_sdf.pages.shown import Shown, coarse_surface, reduced, shown_result
-from super_sdf.pages.thumbnails import thumbnail
+from super_sdf.pages.html import is_page, make_page, write_page
+from super_sdf.pages.items import Item, item_of, read_head, read_meshes, write_item
+from super_sdf.pages.meshes import coarse_surface, packed_mesh, residual_bytes, thumbnail
+from super_sdf.steps.survey import survey
 
 NASTY = '</script><img src=x onerror=alert(1)> & "quoted" \u2028\udcff'
 
@@ -52,18 +52,13 @@ def unpack(packed):
 def test_a_packed_mesh_comes_out_within_half_a_step():
     mesh = icosphere()
     moved = Mesh(mesh.vertices * [1, 2, 0.1] + [1e6, -3, 0], mesh.faces)
-    residuals = np.linspace(-0.2, 0.2, len(mesh.vertices)).astype(np.float32)
-    packed = pack(Shown("ball", moved, 5000, residuals))
-    vertices, faces, said = unpack(packed)
+    packed = packed_mesh("ball", moved)
+    vertices, faces, residuals = unpack(packed)
     assert packed["step"] == pytest.approx(20 / 65535)
     assert np.abs(vertices - moved.vertices).max() <= packed["step"] * 0.500001
-    assert (faces == mesh.faces).all() and (said == residual_bytes(residuals)).all()
-    assert packed["caption"] == "ball: 5,000 triangles, shown simplified to 1,280"
-
-
-def test_a_mesh_without_residuals_or_without_anything_is_packed():
-    assert not len(unpack(pack(Shown("ball", icosphere(1), 80)))[2])
-    vertices, faces, _ = unpack(pack(Shown("no", Mesh(np.zeros((0, 3)), np.zeros((0, 3), int)), 0)))
+    assert (faces == mesh.faces).all() and not len(residuals) and not packed["residuals"]
+    assert packed["caption"] == "ball: 1,280 triangles"
+    vertices, faces, _ = unpack(packed_mesh("no", Mesh(np.zeros((0, 3)), np.zeros((0, 3), int))))
     assert vertices.shape == faces.shape == (0, 3)
 
 
@@ -72,65 +67,70 @@ def test_residuals_are_full_at_a_tenth_of_a_voxel_and_unknown_ones_are_told_apar
     assert residual_bytes(values).tolist() == [0, 127, -127, 127, -127, 64, -128]
 
 
-def test_a_large_mesh_is_simplified_and_a_small_one_left_alone():
-    mesh = icosphere(4)
-    assert reduced(mesh, len(mesh.faces)) is mesh
-    small = reduced(mesh, 1000)
-    assert 500 < len(small.faces) <= 1000
-    assert small.volume() == pytest.approx(mesh.volume(), rel=0.02)
-
-
-def test_a_result_over_the_limit_says_both_counts(monkeypatch):
-    monkeypatch.setattr(shown, "MOST_TRIANGLES", 300)
-    found = shown_result("ball", icosphere(), None)
-    assert found.triangles == 1280 and len(found.mesh.faces) <= 300
-    counts = f"1,280 triangles, shown simplified to {len(found.mesh.faces)}"
-    assert found.caption() == f"ball: {counts}"
+def test_a_large_mesh_is_simplified_and_its_caption_has_both_counts(monkeypatch):
+    monkeypatch.setattr(meshes, "MOST_TRIANGLES", 300)
+    packed = packed_mesh("ball", icosphere())
+    vertices, faces, _ = unpack(packed)
+    assert 150 < len(faces) <= 300
+    assert packed["caption"] == f"ball: 1,280 triangles, shown simplified to {len(faces)}"
+    assert Mesh(vertices, faces).volume() == pytest.approx(icosphere().volume(), rel=0.05)
+    item = Item()
+    item.show("ball", icosphere(), max_memory=10**6)
+    assert not item.meshes and item.thumbnail and "not shown: simplifying" in item.remarks[0]
 
 
 MIRRORED = ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+def coarse(grid, offset=0.0):
+    """Return coarse marching cubes of a grid."""
+    lattice = cubic_grid(grid, offset)
+    return coarse_surface(survey(lattice, offset), lattice)
 
 
 @pytest.mark.parametrize("direction", [None, MIRRORED])
 def test_coarse_marching_cubes_lie_on_the_surface_and_face_outward(direction):
     values = ball(20, 6.0).values
     grid = SdfGrid.trusted(values * 2, (2, 2, 2), (5, -7, 1), direction=direction)
-    mesh = coarse_surface(grid)
+    mesh = coarse(grid)
     middle = grid.to_world(np.array(values.shape) / 2 - 0.37)
     radii = np.linalg.norm(mesh.vertices - middle, axis=1)
-    assert np.abs(radii - 12).max() < 0.2
+    assert np.abs(radii - 12).max() < 0.2 and mesh.is_closed()
     assert mesh.volume() == pytest.approx(4 / 3 * np.pi * 12**3, rel=0.05)
-    grown = coarse_surface(grid, offset=1.5)
+    grown = coarse(grid, offset=1.5)
     assert np.linalg.norm(grown.vertices - middle, axis=1).mean() == pytest.approx(13.5, abs=0.1)
 
 
-def test_coarse_marching_cubes_without_room_are_a_remark():
-    item, grid = Item(), ball(20, 6.0)
-    add_mesh(item, lambda: shown.shown_coarse(grid, CheckOptions(max_memory=10**6)))
-    assert not item.meshes
-    assert re.fullmatch(
-        r"not shown: marching cubes of the samples needs .* of memory, 1 MB may be used",
-        item.remarks[0],
-    )
+def test_coarse_marching_cubes_are_those_of_a_library():
+    """Of any field whose cells have one case: as many triangles, vertices at the same places."""
+    from skimage.measure import marching_cubes
+
+    grid = SdfGrid(wedge(), 1.0)
+    mesh = coarse(grid)
+    vertices, faces, _, _ = marching_cubes(wedge(), 0.0, method="lorensen")
+    assert mesh.is_closed() and len(mesh.faces) == len(faces)
+    assert np.abs(np.sort(mesh.vertices, 0) - np.sort(vertices, 0)).max() < 2e-3
 
 
 def test_an_item_has_the_residuals_of_both_meshes_and_the_certificate():
     grid = SdfGrid(wedge(), (1.0, 1.0, 1.0))
-    mesh, options = reconstruct(grid), CheckOptions()
-    item = item_of(mesh, grid, options)
+    mesh = reconstruct(grid, factor=2)
+    item = item_of(Kept(grid, mesh), ConvertOptions())
     ours, coarse = item.meshes
     assert ours["caption"] == f"super-sdf: {len(mesh.faces):,} triangles"
     assert coarse["caption"].startswith("marching cubes of the samples: ")
-    assert item.certificate == check_mesh(mesh, grid, options).report()
+    assert item.certificate == check_mesh(mesh, grid).report()
     means = [np.abs(unpack(each)[2].astype(float)).mean() for each in (ours, coarse)]
     assert 0 < means[0] < means[1]  # coarse marching cubes cut off the edges
-    assert item.thumbnail is None and item.remarks == []
+    assert item.thumbnail and item.remarks == []
+    thick = SdfGrid(wedge()[:, :, ::2], (1.0, 1.0, 2.0))
+    caption = item_of(Kept(thick, mesh), ConvertOptions()).meshes[1]["caption"]
+    assert caption.startswith("marching cubes of the samples, made equally spaced: ")
 
 
-@pytest.mark.graphics
 def test_the_file_of_an_item_is_read_back(tmp_path):
     path, item = tmp_path / "0123456789abcdef.js", Item(remarks=["a\u2028b"], made_of="digest")
-    add_mesh(item, lambda: Shown(NASTY, icosphere(1), 80), draw=True)
+    item.show(NASTY, icosphere(1))
     write_item(item, path)
     head = read_head(path)
     assert (head.remarks, head.made_of, head.thumbnail) == (["a\u2028b"], "digest", item.thumbnail)
@@ -148,12 +148,14 @@ def test_a_file_that_is_no_item_is_none(tmp_path, text):
     assert read_head(tmp_path / "missing.js") is None
 
 
-@pytest.mark.graphics
-def test_a_thumbnail_is_a_small_picture_of_something():
+def test_a_thumbnail_is_a_small_picture_of_the_mesh_lit_from_the_right():
     kind, data = thumbnail(icosphere()).split(",")
-    assert kind == "data:image/webp;base64" and len(data) < 8000
-    image = np.array(Image.open(BytesIO(base64.b64decode(data))).convert("L"))
-    assert max(image.shape) == 160 and len(np.unique(image)) > 50
+    assert kind == "data:image/png;base64" and len(data) < 8000
+    image = np.array(Image.open(BytesIO(base64.b64decode(data))).convert("L")).astype(int)
+    assert image.shape == (160, 160) and image[0, 0] == 255
+    inside = image[50:110, 50:110]
+    assert (inside < 230).all() and len(np.unique(inside)) > 12
+    assert inside[:20, 40:].mean() > inside[40:, :20].mean() + 20
     assert thumbnail(Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))) is None
 
 
@@ -165,10 +167,6 @@ def test_what_comes_from_files_cannot_be_markup_and_is_read_back():
     found = blocks(page)
     assert found["facts"]["title"] == NASTY and found["facts"]["files"][0]["notes"] == [NASTY]
     assert found["meshes-0"] == [{"caption": NASTY}]
-
-
-def test_json_in_a_page_has_no_character_of_markup():
-    assert safe_json({"a": "<&>\u2028\u2029"}) == '{"a": "\\u003c\\u0026\\u003e\\u2028\\u2029"}'
 
 
 @pytest.mark.parametrize("beside", [False, True])
@@ -198,7 +196,7 @@ def test_a_page_knows_itself(tmp_path):
 
 def test_the_entry_of_a_report_says_counts_times_notes_and_the_certificate():
     grid = SdfGrid(wedge(), (1.0, 1.0, 1.0))
-    certificate = check_mesh(reconstruct(grid), grid).report()
+    certificate = check_mesh(reconstruct(grid, trilinear, 2), grid).report()
     report = {
         **{"input": "a.npy", "output": "a.ply", "shape": [24, 24, 24], "triangles": 12345},
         **{"closed": True, "bounds": [[0, 0, 0], [1, 2.5, 3]], "inferred": ["x"], "notes": ["y"]},

@@ -1,12 +1,16 @@
 """``--report``: what is checked before, what is written, resumed and interrupted batches."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from pages import blocks, wedge
 
+import super_sdf
+from super_sdf import SdfGrid
 from super_sdf.batch import page as batch_page
 from super_sdf.batch.run import Run
 
@@ -25,7 +29,6 @@ def files_of(page):
     return blocks(Path(page))["facts"]["files"]
 
 
-@pytest.mark.graphics
 def test_the_page_of_a_conversion_holds_all_of_it(command, folder):
     code, _, err = command(*UPSAMPLE, "--report", "a.html")
     assert code == 0 and err.endswith("\nReport: a.html\n")
@@ -33,7 +36,7 @@ def test_the_page_of_a_conversion_holds_all_of_it(command, folder):
     found = blocks(Path("a.html"))
     (entry,) = found["facts"]["files"]
     assert found["facts"]["title"] == "a.ply" and entry["status"] == "ok"
-    assert entry["meshes"] == "page" and entry["thumbnail"].startswith("data:image/webp;base64,")
+    assert entry["meshes"] == "page" and entry["thumbnail"].startswith("data:image/png;base64,")
     assert entry["notes"] == ["origin not given: sample (0, 0, 0) is at 0, 0, 0"]
     assert [label for label, _ in found["facts"]["summary"]] == [
         "result", "time", "mean residual", "largest residual", "faults"
@@ -43,11 +46,42 @@ def test_the_page_of_a_conversion_holds_all_of_it(command, folder):
     assert ours["residuals"] and coarse["residuals"] and ours["triangles"] > coarse["triangles"]
 
 
-def test_the_mesh_is_the_same_with_and_without_a_page(command, folder):
+def broken(*arguments, **known):
+    """Stand in for what fails."""
+    raise RuntimeError("no display")
+
+
+def test_check_and_page_take_grid_band_and_mesh_from_the_conversion(command, folder, monkeypatch):
+    """Neither file is read again, and no band found again; the mesh is the same."""
     command(*UPSAMPLE)
     plain = Path("a.ply").read_bytes()
+    for name in ("read_grid", "read_mesh", "survey"):
+        monkeypatch.setattr(f"super_sdf.certificate.check.{name}", broken)
+    reads = []
+    planes = SdfGrid.planes
+    monkeypatch.setattr(SdfGrid, "planes", lambda *given: reads.append(given) or planes(*given))
     assert command(*UPSAMPLE, "--force", "--check", "--report", "a.html")[0] == 0
-    assert Path("a.ply").read_bytes() == plain
+    assert Path("a.ply").read_bytes() == plain and not reads
+    assert len(blocks(Path("a.html"))["meshes-0"]) == 2
+
+
+def test_a_page_needs_no_library_that_draws(folder):
+    """Nor does a check; libigl itself imports SciPy."""
+    script = (
+        "import sys; from super_sdf.cli.main import cli;"
+        f"cli.main({[str(word) for word in UPSAMPLE]} + ['--report', 'a.html', '--check', '-q'],"
+        "standalone_mode=False);"
+        "drawing = {'matplotlib', 'skimage', 'pyvista', 'vtkmodules'} & set(sys.modules);"
+        "assert not drawing, drawing"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True)
+    imports = [path.read_text() for room in ("pages", "certificate") for path in room_files(room)]
+    assert len(imports) > 6 and not any("scipy" in text for text in imports)
+
+
+def room_files(room):
+    """Return the modules of a room."""
+    return Path(super_sdf.__file__).parent.joinpath(room).glob("*.py")
 
 
 def test_a_page_is_replaced_with_force_only(command, folder):
@@ -71,11 +105,10 @@ def test_a_page_replaces_neither_input_nor_output(command, folder):
 
 @pytest.mark.parametrize("arguments", [UPSAMPLE, ("batch", "a.npy", "--out", "out")])
 def test_a_missing_extra_is_said_before_the_work(command, folder, monkeypatch, arguments):
-    modules = {"pyvista", "pyfqmr"}
     monkeypatch.setattr(
-        "super_sdf.machine.extras.find_spec", lambda name: None if name in modules else 1
+        "super_sdf.machine.extras.find_spec", lambda name: None if name == "pyfqmr" else 1
     )
-    said = "--report needs pyfqmr, pyvista: pip install -e '.[report]' in a clone of super-sdf"
+    said = "--report needs pyfqmr: pip install -e '.[report]' in a clone of super-sdf"
     assert command(*arguments, "--report", "a.html") == (1, "", f"Error: {said}\n")
     assert os.listdir() == ["a.npy"]
 
@@ -84,14 +117,13 @@ def test_a_mesh_without_room_for_the_check_has_a_page_that_says_so(command, fold
     monkeypatch.setattr("super_sdf.certificate.check.BYTES_PER_TRIANGLE", 10**9)
     assert command(*UPSAMPLE, "--report", "a.html", "--max-memory", "4G")[0] == 0
     (entry,) = files_of("a.html")
-    assert entry["meshes"] is None and entry["certificate"][0][0] == "not checked"
-    assert entry["remarks"][0].startswith("not shown: checking ")
+    assert entry["certificate"][0][0] == "not checked" and entry["meshes"] == "page"
+    assert not any(mesh["residuals"] for mesh in blocks(Path("a.html"))["meshes-0"])
 
 
 BATCH = ("in", "--report", "page.html")
 
 
-@pytest.mark.graphics
 def test_the_page_of_a_batch_names_failures_first(run_batch, grid_folder):
     code, _, err = run_batch(*BATCH)
     assert code == 1 and "Check: mean residual" in err
@@ -122,7 +154,6 @@ def test_many_meshes_are_beside_the_page(run_batch, grid_folder, monkeypatch):
     assert len(files_of("page.html")) == 4
 
 
-@pytest.mark.graphics
 def test_a_batch_made_without_a_page_is_drawn_and_checked_when_one_is_asked_for(
     run_batch, grid_folder
 ):
@@ -179,19 +210,6 @@ def test_a_page_of_others_is_not_replaced_by_a_batch(run_batch, grid_folder):
         1,
         "Error: other-files, for the meshes of the page, is no folder: move it\n",
     )
-
-
-def broken(*arguments, **known):
-    """Stand in for what fails."""
-    raise RuntimeError("no display")
-
-
-def test_a_mesh_whose_picture_cannot_be_drawn_is_shown_all_the_same(command, folder, monkeypatch):
-    monkeypatch.setattr("super_sdf.pages.items.thumbnail", broken)
-    assert command(*UPSAMPLE, "--report", "a.html")[0] == 0
-    (entry,) = files_of("a.html")
-    assert entry["thumbnail"] is None and entry["meshes"] == "page"
-    assert entry["remarks"] == ["no picture: RuntimeError: no display"]
 
 
 def test_a_bug_in_the_page_of_a_mesh_costs_no_mesh(run_batch, grid_folder, monkeypatch):

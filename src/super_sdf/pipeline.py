@@ -207,11 +207,13 @@ def reconstruct_slabs(
     max_memory: int | None = None,
     progress: Progress | None = None,
     save: SaveField | None = None,
+    look: Callable[[Band], None] | None = None,
 ) -> Iterator[Piece]:
     """Yield the mesh of ``reconstruct`` slab by slab, in as few slabs as fit in memory.
 
     Joined, the pieces are the same mesh, bit for bit, for any number of slabs and threads. ``save``
-    is called with the field of each slab, final in the slab's own planes and in the one before.
+    is called with the field of each slab, final in the slab's own planes and in the one before;
+    ``look`` with the band of the grid, but not if there are several iterations.
     """
     check_grid(grid)
     check_network(network)
@@ -223,6 +225,7 @@ def reconstruct_slabs(
         check_cap(cap),
         check_max_memory(max_memory),
         save,
+        look if iterations == 1 else None,
     )
     offset = check_distance(offset)
     check_can_close(grid, cap=cap)
@@ -242,6 +245,7 @@ class Run:
     cap: bool
     max_memory: int | None
     save: SaveField | None
+    look: Callable[[Band], None] | None = None
 
 
 def _iterated(
@@ -287,6 +291,8 @@ def _slabs(run: Run, grid: SdfGrid, offset: float, progress: Progress | None) ->
     band = find_surface(lattice, offset, factor, reach, resources, needed, mesher)
     slabs = plan_slabs(band, factor, reach, resources, needed, mesher)
     planned = peak_bytes(band, slabs, factor, needed, resources.threads, mesher)
+    if run.look:
+        run.look(band)
     steps.divide(len(slabs))
     steps.finish("band")
     seen: set[bool] = set()

@@ -115,7 +115,7 @@ class ImageAccessor:
         residuals : bool
             Also return the array "residual" of the points, float32: how far the surface is from
             touching the balls of the nearest samples, in voxels of the image, negative where it
-            pierces them, NaN where no exact sample is near. Needs the extra eval.
+            pierces them, NaN where no exact sample is near. Needs the extra report.
         cap : bool
             Close the surface along the border of the image where the solid runs out of it.
         inside, field, label, level, scale
@@ -158,11 +158,10 @@ def residuals_of(
     mesh: Mesh, grid: SdfGrid, offset: float, max_memory: int | None
 ) -> np.ndarray[Any, np.dtype[np.float32]]:
     """Return the residual at each vertex, in voxels; see ``certificate``."""
-    check_modules("residuals=True", "eval")
-    from .certificate.check import CheckOptions, check_mesh
-    from .certificate.coloured import vertex_residuals
+    check_modules("residuals=True", "report", ("igl",))
+    from .certificate.check import check_mesh
+    from .convert import ConvertOptions
 
-    options = CheckOptions(offset=offset, max_memory=max_memory, intersections=False)
-    certificate = check_mesh(mesh, grid, options)
-    vertices = certificate.mesh.vertices.astype(np.float64)
-    return vertex_residuals(vertices, certificate.touching, certificate.voxel_size)
+    options = ConvertOptions(offset=offset, max_memory=max_memory)
+    certificate = check_mesh(mesh, grid, options, intersections=False)
+    return certificate.residuals_at(certificate.mesh.vertices)

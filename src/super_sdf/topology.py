@@ -98,6 +98,23 @@ def count_fans(faces: IntArray, opposite: IntArray) -> NDArray[np.int64]:
     return np.bincount(start[ends], minlength=size) + np.bincount(start[cycles], minlength=size)
 
 
+def vertex_components(faces: IntArray, count: int) -> NDArray[np.int64]:
+    """Return the lowest vertex of the piece of each of ``count`` vertices, (count,).
+
+    In rounds, the roots at both ends of each edge are joined, and the ways to them shortened.
+    """
+    root = np.arange(count)
+    start, end = faces[:, :2].ravel(), faces[:, 1:].ravel()
+    while len(start):
+        one, other = root[start], root[end]
+        apart = one != other
+        start, end, one, other = start[apart], end[apart], one[apart], other[apart]
+        np.minimum.at(root, np.maximum(one, other), np.minimum(one, other))
+        while not np.array_equal(root, above := root[root]):
+            root = above
+    return root
+
+
 class OpenEdges:
     """A running count of the open edges of a mesh that comes in pieces.
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..convert import ConvertOptions, convert
+from ..convert import Conversion, ConvertOptions, convert
 from ..errors import FileError, GridError, OptionError, WriteError
 from ..files.regular import check_grid_file
 from ..network.decoder import Decoder
@@ -92,6 +92,7 @@ def attempt(job: Job, outputs: Outputs, network: Decoder, progress: Progress | N
             force=job.replace or has_appeared,
             progress=progress,
             before_rename=note,
+            keep=outputs.check or outputs.items is not None,
         )
     except Exception as error:  # a bug that one file shows must not cost the others
         by_input = isinstance(error, (GridError, OptionError, FileError))
@@ -100,7 +101,7 @@ def attempt(job: Job, outputs: Outputs, network: Decoder, progress: Progress | N
         return {**row, "seconds": _since(start)}
     certificate = {}
     if outputs.items or outputs.check:
-        certificate = {"check": _certify(job, target, printed[0], outputs.items)}
+        certificate = {"check": _certify(job, done, printed[0], outputs)}
     return {
         **_paths(job),
         "status": "ok",
@@ -116,22 +117,24 @@ def attempt(job: Job, outputs: Outputs, network: Decoder, progress: Progress | N
     }
 
 
-def _certify(job: Job, target: Path, mesh_print: Fingerprint, items: Path | None) -> dict[str, Any]:
+def _certify(
+    job: Job, done: Conversion, mesh_print: Fingerprint, outputs: Outputs
+) -> dict[str, Any]:
     """Return the certificate of a finished mesh, or under ``error`` why it has none.
 
-    With ``items``, what a page shows of the mesh is written there.
+    With ``items`` of the outputs, what a page shows of the mesh is written there.
     """
-    from ..certificate.check import CheckOptions, check_files
+    from ..certificate.check import check_files
 
-    options = CheckOptions.of(job.options)
+    files = outputs.folder / job.target, job.source, job.options
     try:
-        if items is None:
-            return check_files(target, job.source, options).report()
+        if outputs.items is None:
+            return check_files(*files, kept=done.kept).report()
         from ..pages.items import item_of_files
         from .items import Items
 
-        item = item_of_files(target, job.source, options)
-        Items(items).add(item, job.target, mesh_print)
+        item = item_of_files(*files, done.kept)
+        Items(outputs.items).add(item, job.target, mesh_print)
         return item.certificate or {}
     except Exception as error:  # the mesh is good all the same
         return {"error": _reason(error)}

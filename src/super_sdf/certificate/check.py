@@ -7,84 +7,77 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from ..errors import OutOfMemoryError
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import FloatArray
+from ..convert import Kept
+from ..errors import OptionError, OutOfMemoryError
 from ..files.grids import read_grid
+from ..files.output import check_free
+from ..files.plain_meshes import write_coloured_ply
 from ..files.regular import check_regular_file
 from ..grid.cubic import cubic_grid
 from ..grid.sdf_grid import SdfGrid
-from ..machine.memory import give_back, held_memory, in_words
-from ..machine.resources import Resources, allot
+from ..machine.memory import give_back, held_memory, in_words, memory_bound
+from ..machine.resources import allot
 from ..machine.threads import useful_threads
 from ..mesh import Mesh
-from ..options import ConvertOptions, ReadOptions, check_distance, check_max_memory
-from ..steps.survey import no_surface, survey
-from ..truth.mesh_files import read_mesh
-from .slabs import search
-from .strays import Strays, find_strays
+from ..options import ConvertOptions, check_distance, check_max_memory
+from ..steps.survey import Band, no_surface, survey
+from ..truth.mesh_files import merged, read_mesh
+from .search import search
 from .surface import Surface, examine_surface
-from .touching import NOTICEABLE, Touching, exact_samples, touch
+from .touching import (
+    NOTICEABLE,
+    Strays,
+    Touching,
+    exact_samples,
+    find_strays,
+    touch,
+    vertex_residuals,
+)
 
 # Bytes for each triangle and each exact sample, beside mesh and band, at the most: search trees.
 BYTES_PER_TRIANGLE = 420
 BYTES_PER_SAMPLE = 150
 REACH = 2.0  # voxels: how far slabs look; the samples near the surface are within 1.4 of it
 HEADER_BYTES = 4096  # of a PLY file, in which the number of faces is looked for
-
-
-@dataclass(frozen=True, kw_only=True)
-class CheckOptions(ReadOptions):
-    """How the grid of a mesh is read, and what is counted; see ``ConvertOptions``.
-
-    Attributes
-    ----------
-    offset : float
-        As given when the mesh was made, like how its grid was read.
-    intersections : bool
-        Count self-intersections, which takes up to half of the time.
-    processes : int
-        How many may search large meshes at the same time; 0: one per core.
-    """
-
-    offset: float = 0.0
-    intersections: bool = True
-    processes: int = 1
-
-    @classmethod
-    def of(cls, options: ConvertOptions) -> CheckOptions:
-        """Return how a grid is read that was converted with these options."""
-        return cls(**options.reading(), offset=options.offset)
+NO_EVIDENCE = "no sample is exact, so no limit on residuals can be shown to be kept"
+AS_GIVEN = ConvertOptions()
+FULL = 0.1  # voxels: residual at which a colour is saturated
+TOUCHING, PIERCED, NOT_TOUCHING, UNKNOWN = (
+    (240, 240, 240),
+    (190, 20, 30),
+    (20, 70, 190),
+    (120, 120, 60),
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """What is certain of a mesh without the true surface.
+    """What is certain of a mesh without the true surface."""
 
-    Attributes
-    ----------
-    mesh : Mesh
-        Vertices at the same position are one.
-    voxel_size : float
-        Spacing of the grid, in world units.
-    surface : Surface
-        Whether the mesh bounds a solid, and which.
-    touching : Touching
-        The residual of each exact sample.
-    strays : Strays, optional
-        Vertices far from any surface of the grid; None if no sample is exact.
-    notes : tuple of str
-        What was inferred of the grid.
-    """
-
-    mesh: Mesh
-    voxel_size: float
+    mesh: Mesh  # vertices at the same position are one
+    grid: SdfGrid  # on its cubic lattice
     surface: Surface
     touching: Touching
-    strays: Strays | None
-    notes: tuple[str, ...]
+    strays: Strays | None  # None if no sample is exact
+
+    @property
+    def voxel_size(self) -> float:
+        """The spacing of the grid, in world units."""
+        return self.grid.voxel_size
+
+    @property
+    def has_evidence(self) -> bool:
+        """Whether any sample is exact."""
+        return len(self.touching.values) > 0
 
     def report(self) -> dict[str, Any]:
         """Return the certificate as it stands in JSON; residuals and depths are in voxels."""
@@ -94,7 +87,7 @@ class Certificate:
             **self.touching.report(),
             "strays": None if self.strays is None else asdict(self.strays),
             "faults": self.faults(),
-            "inferred": list(self.notes),
+            "inferred": list(self.grid.notes),
         }
 
     def faults(self) -> list[str]:
@@ -107,28 +100,22 @@ class Certificate:
 
     def lines(self) -> list[str]:
         """Return the certificate as lines for users."""
-        return [self.surface_line(), *self.sample_lines(), *self.fault_lines()]
-
-    def surface_line(self) -> str:
-        """Return the size of the mesh in one line."""
-        surface = self.surface
+        surface, touching = self.surface, self.touching
         pieces = f"{surface.components:,} component" + "s" * (surface.components != 1)
-        return (
+        lines = [
             f"mesh: {surface.vertices:,} vertices, {surface.triangles:,} triangles, {pieces}, "
-            f"volume {surface.volume:.6g}, area {surface.area:.6g}"
-        )
+            f"volume {surface.volume:.6g}, area {surface.area:.6g}",
+            f"samples: {len(touching.values):,} exact near the surface, {touching.cut_off:,} cut "
+            f"off and {touching.noisy:,} noisy left out",
+        ]
+        return [*lines, *self._residual_lines(), *self._fault_lines()]
 
-    def sample_lines(self) -> list[str]:
-        """Return what the samples say, in a line or a few."""
-        touching = self.touching
-        left_out = f"{touching.cut_off:,} cut off and {touching.noisy:,} noisy left out"
-        lines = [f"samples: {len(touching.values):,} exact near the surface, {left_out}"]
-        if not len(touching.values):
-            return [*lines, "residual: unknown, since no sample is exact"]
-        figures = touching.summary()
+    def _residual_lines(self) -> list[str]:
+        if not self.has_evidence:
+            return ["residual: unknown, since no sample is exact"]
+        figures = self.touching.summary()
         at = ", ".join(f"{x:.6g}" for x in figures["largest_at"])
         return [
-            *lines,
             f"residual in voxels: mean {figures['mean']:.4f}, 99th percentile "
             f"{figures['p99']:.4f}, largest {figures['largest_signed']:+.4f} at ({at})",
             f"above {NOTICEABLE:g} voxel: {figures['share_above_tenth']:.2%} of the samples "
@@ -136,7 +123,7 @@ class Certificate:
             f"{figures['share_pierced']:.2%} pierced)",
         ]
 
-    def fault_lines(self) -> list[str]:
+    def _fault_lines(self) -> list[str]:
         """Return the faults in one line, and what was not looked for."""
         counted = self.surface.self_intersections is not None
         sound = "closed, oriented, manifold" + ", no self-intersections" * counted
@@ -149,42 +136,98 @@ class Certificate:
 
     def summary(self) -> str:
         """Return the certificate in one line."""
-        if not len(self.touching.values):
+        if not self.has_evidence:
             return "; ".join(["no sample is exact, so the residual is unknown", *self.faults()])
         figures = self.touching.summary()
-        said = (
+        residual = (
             f"residual {figures['mean']:.4f} voxels in the mean, {figures['largest']:.4f} at most, "
             f"{figures['share_above_tenth']:.2%} of {len(self.touching.values):,} samples above "
             f"{NOTICEABLE:g}"
         )
-        return "; ".join([said, *(self.faults() or ["no faults"])])
+        return "; ".join([residual, *(self.faults() or ["no faults"])])
+
+    def residuals_at(self, vertices: NDArray[Any]) -> FloatArray:
+        """Return the residual at positions on the mesh, (n,), in voxels; NaN where it is unknown.
+
+        See ``touching.vertex_residuals``.
+        """
+        return vertex_residuals(vertices, self.touching, self.grid)
+
+
+LIMITS = {
+    "max_residual": ("largest", "the largest residual is", "voxels"),
+    "max_mean": ("mean", "the mean residual is", "voxels"),
+    "max_share": ("share_above_tenth", "above 0.1 voxel is", ""),
+}
+"""Options, the figures that they limit, and how these are named, with their unit."""
+
+
+def check_limits(limits: Mapping[str, float | None]) -> None:
+    """Raise OptionError if one of ``LIMITS``, None for those not asked for, is out of range."""
+    for name in LIMITS:
+        limit, option = limits[name], f"--{name.replace('_', '-')}"
+        if limit is not None and not 0 <= limit < float("inf"):
+            raise OptionError(f"{option} is {limit:g}: give 0 {LIMITS[name][2] or '1'} or more")
+    if (share := limits["max_share"]) is not None and share > 1:
+        raise OptionError(f"--max-share is {share:g}: give a share from 0 to 1")
+
+
+def exceeded(certificate: Certificate, limits: Mapping[str, float | None]) -> list[str]:
+    """Return a sentence for each of ``LIMITS`` that a certificate exceeds."""
+    asked = [name for name in LIMITS if limits[name] is not None]
+    if asked and not certificate.has_evidence:
+        return [NO_EVIDENCE]
+    figures, found = certificate.touching.summary() if asked else {}, []
+    for name in asked:
+        (key, words, unit), limit = LIMITS[name], limits[name] or 0.0
+        if figures[key] > limit:
+            value = f"{figures[key]:.4g} {unit}".rstrip()
+            found.append(f"{words} {value}, --{name.replace('_', '-')} is {limit:g}")
+    return found
 
 
 def check_files(
-    mesh: str | Path, grid: str | Path, options: CheckOptions | None = None
+    mesh: str | Path,
+    grid: str | Path,
+    options: ConvertOptions = AS_GIVEN,
+    *,
+    kept: Kept | None = None,
+    intersections: bool = True,
+    processes: int = 1,
 ) -> Certificate:
-    """Check a mesh file against the grid file that it was made from.
+    """Check a mesh file against the grid file that it was made from; see ``check_mesh``.
+
+    Parameters
+    ----------
+    mesh, grid : path
+    options : ConvertOptions
+        Those that the mesh was made with: how the grid is read, the offset, the memory bound.
+    kept : Kept, optional
+        What the conversion kept, instead of reading the files again.
 
     Raises
     ------
     SuperSdfError
         As ``read_mesh``, ``read_grid`` and ``check_mesh`` raise it.
     """
-    options = options or CheckOptions()
-    return check_mesh(*read_for_check(mesh, grid, options), options)
+    kept = read_for_check(mesh, grid, options, kept)
+    return check_kept(kept, options, intersections=intersections, processes=processes)
 
 
 def read_for_check(
-    mesh: str | Path, grid: str | Path, options: CheckOptions
-) -> tuple[Mesh, SdfGrid]:
-    """Return a mesh and the grid that it was made from; raise OutOfMemoryError before both."""
-    bound = allot(0, check_max_memory(options.max_memory))
-    check_room(stated_triangles(check_regular_file(mesh)), 0, bound)
-    found = read_grid(grid, **options.reading())
-    return read_mesh(mesh, options.max_memory), found
+    mesh: str | Path, grid: str | Path, options: ConvertOptions, kept: Kept | None = None
+) -> Kept:
+    """Return a mesh and its grid: what was ``kept``, else read; OutOfMemoryError before both."""
+    if kept:
+        return Kept(kept.grid, merged(kept.mesh), kept.band)
+    check_room(stated_triangles(check_regular_file(mesh)), 0, options.max_memory)
+    samples = read_grid(grid, **options.reading())
+    return Kept(samples, read_mesh(mesh, options.max_memory))
 
 
-def check_mesh(mesh: Mesh, grid: SdfGrid, options: CheckOptions | None = None) -> Certificate:
+def check_mesh(
+    mesh: Mesh, grid: SdfGrid, options: ConvertOptions = AS_GIVEN, *, intersections: bool = True
+) -> Certificate:
     """Check a mesh against the grid that it was made from.
 
     Parameters
@@ -193,8 +236,10 @@ def check_mesh(mesh: Mesh, grid: SdfGrid, options: CheckOptions | None = None) -
         Vertices at the same position must be one vertex, as ``read_mesh`` returns them.
     grid : SdfGrid
         Coarse signed distances.
-    options : CheckOptions
-        Of these: the offset, the memory bound, and what is counted.
+    options : ConvertOptions
+        Of these: the offset and the memory bound.
+    intersections : bool
+        Count self-intersections, which takes up to half of the time.
 
     Raises
     ------
@@ -203,31 +248,46 @@ def check_mesh(mesh: Mesh, grid: SdfGrid, options: CheckOptions | None = None) -
     OutOfMemoryError
         If the search trees would not fit in memory.
     """
-    options = options or CheckOptions()
-    offset = check_distance(options.offset)
-    resources = allot(0, check_max_memory(options.max_memory))
-    grid = cubic_grid(grid, offset)
-    band = survey(grid, offset, resources)
-    if not len(band.voxel_ijk):
-        raise no_surface(grid, offset)
-    check_room(len(mesh.faces), len(band.voxel_ijk), resources)
+    return check_kept(Kept(grid, mesh), options, intersections=intersections)
+
+
+def check_kept(
+    kept: Kept, options: ConvertOptions, *, intersections: bool = True, processes: int = 1
+) -> Certificate:
+    """Check a mesh with its grid and, if it is known, the band; see ``check_mesh``.
+
+    ``processes`` is how many may search large meshes at the same time; 0: one per core.
+    """
+    mesh, band, offset = kept.mesh, band_of(kept, options), options.offset
+    check_room(len(mesh.faces), len(band.voxel_ijk), options.max_memory)
+    grid = cubic_grid(kept.grid, offset)
     samples = exact_samples(band, grid)
-    del band
-    give_back()
     found = search(
         mesh,
         samples.points,
         REACH * grid.voxel_size,
-        intersections=options.intersections,
-        processes=useful_threads(options.processes),
+        intersections=intersections,
+        processes=useful_threads(processes),
     )
     surface = examine_surface(mesh, found.intersections)
     give_back()
-    touching = touch(mesh, samples, found, grid.voxel_size, simple=surface.is_simple)
+    touching = touch(mesh, samples, found, grid.voxel_size)
     del found
     give_back()
-    strays = find_strays(mesh.vertices, grid, offset) if len(touching.values) else None
-    return Certificate(mesh, grid.voxel_size, surface, touching, strays, grid.notes)
+    strays = find_strays(mesh.vertices, grid, band, offset) if len(touching.values) else None
+    return Certificate(mesh, grid, surface, touching, strays)
+
+
+def band_of(kept: Kept, options: ConvertOptions) -> Band:
+    """Return the band of a grid on its cubic lattice; NoSurfaceError if it has none."""
+    offset = check_distance(options.offset)
+    if kept.band:
+        return kept.band
+    resources = allot(0, check_max_memory(options.max_memory))
+    band = survey(cubic_grid(kept.grid, offset), offset, resources)
+    if not len(band.voxel_ijk):
+        raise no_surface(kept.grid, offset)
+    return band
 
 
 def stated_triangles(path: Path) -> int:
@@ -242,11 +302,35 @@ def stated_triangles(path: Path) -> int:
     return count if is_stl else 0
 
 
-def check_room(triangles: int, samples: int, resources: Resources) -> None:
+def check_room(triangles: int, samples: int, max_memory: int | None) -> None:
     """Raise OutOfMemoryError if checking a mesh of ``triangles`` would exceed the memory bound."""
+    bound = memory_bound(check_max_memory(max_memory))
     need = triangles * BYTES_PER_TRIANGLE + samples * BYTES_PER_SAMPLE + (held_memory() or 0)
-    if resources.memory is not None and need > resources.memory:
+    if bound is not None and need > bound:
         raise OutOfMemoryError(
             f"checking {triangles:,} triangles needs {in_words(need)} of memory, "
-            f"{in_words(resources.memory)} may be taken in all; allow more (--max-memory)"
+            f"{in_words(bound)} may be taken in all; allow more (--max-memory)"
         )
+
+
+def check_coloured(path: Path, *, force: bool = False) -> None:
+    """Raise if a coloured mesh cannot be written; called before the work starts."""
+    if path.suffix.lower() != ".ply":
+        raise OptionError(f"{path} is not a coloured mesh file: give .ply")
+    check_free(path, force=force)
+
+
+def write_coloured(certificate: Certificate, path: Path, *, force: bool = False) -> None:
+    """Write the mesh of a certificate as PLY, with a colour and ``residual`` for each vertex."""
+    mesh = certificate.mesh
+    residuals = certificate.residuals_at(mesh.vertices)
+    write_coloured_ply(mesh, residuals, colours(residuals), path, force=force)
+
+
+def colours(residuals: FloatArray) -> NDArray[np.uint8]:
+    """Return red, green and blue, (n, 3), of residuals (n,) in voxels."""
+    share = np.nan_to_num(np.clip(np.abs(residuals) / FULL, 0, 1))[:, None]
+    end = np.where((residuals < 0)[:, None], PIERCED, NOT_TOUCHING)
+    mixed = (1 - share) * np.array(TOUCHING) + share * end
+    mixed[np.isnan(residuals)] = UNKNOWN
+    return np.rint(mixed).astype(np.uint8)

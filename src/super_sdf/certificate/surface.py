@@ -7,44 +7,25 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from ..arrays import IntArray
 from ..mesh import Mesh
-from ..topology import Edges, count_fans, pair_edges, without_collapsed
+from ..topology import Edges, count_fans, pair_edges, vertex_components, without_collapsed
 
 FACES_AT_ONCE = 1 << 18  # for area and volume
 
 
 @dataclass(frozen=True)
 class Surface:
-    """What a mesh is as a surface.
-
-    Attributes
-    ----------
-    vertices, triangles : int
-        Numbers of them; without triangles that have the same vertex twice.
-    edges : Edges
-        Faults of edges.
-    pinched_vertices : int
-        Vertices at which more than one fan of triangles meets: not manifold.
-    components : int
-        Pieces that share no vertex.
-    self_intersections : int, optional
-        Pairs of triangles that intersect or touch where they share no vertex or edge; None if they
-        were not counted.
-    volume, area : float
-        In cubic and square world units; the volume is negative if the triangles face inward.
-    """
+    """What a mesh is as a surface; triangles that have the same vertex twice are left out."""
 
     vertices: int
     triangles: int
     edges: Edges
-    pinched_vertices: int
-    components: int
-    self_intersections: int | None
-    volume: float
+    pinched_vertices: int  # at which several fans of triangles meet: not manifold
+    components: int  # that share no vertex
+    self_intersections: int | None  # pairs that meet off a common vertex or edge; None: not counted
+    volume: float  # in cubic world units, negative if the triangles face inward
     area: float
 
     @property
@@ -61,12 +42,6 @@ class Surface:
     def manifold(self) -> bool:
         """Whether all edges and vertices are manifold; open edges are allowed."""
         return self.edges.crowded_edges == 0 and self.pinched_vertices == 0
-
-    @property
-    def is_simple(self) -> bool:
-        """Whether the mesh is one closed sheet with an inside, known not to meet itself."""
-        whole = self.closed and self.oriented and self.manifold and self.components == 1
-        return whole and self.self_intersections == 0
 
     def faults(self) -> list[str]:
         """Return what keeps the mesh from being the boundary of a solid, in words."""
@@ -90,40 +65,18 @@ class Surface:
 
 
 def examine_surface(mesh: Mesh, self_intersections: int | None = None) -> Surface:
-    """Return what a mesh is as a surface.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        Vertices at the same position must be one vertex.
-    self_intersections : int, optional
-        What ``slabs.search`` has counted; None if it was not asked to.
-    """
-    faces = without_collapsed(mesh.faces)
-    opposite, edges = pair_edges(faces, len(mesh.vertices))
+    """Return what a mesh is as a surface; vertices at the same position must be one vertex."""
+    faces, count = without_collapsed(mesh.faces), len(mesh.vertices)
+    opposite, edges = pair_edges(faces, count)
     pinched = int(np.count_nonzero(count_fans(faces, opposite) > 1))
     del opposite
-    volume, area = measure(mesh.vertices, faces)
-    return Surface(
-        len(mesh.vertices),
-        len(faces),
-        edges,
-        pinched,
-        count_components(faces, len(mesh.vertices)),
-        self_intersections,
-        volume,
-        area,
-    )
+    pieces, size = count_components(faces, count), measure(mesh.vertices, faces)
+    return Surface(count, len(faces), edges, pinched, pieces, self_intersections, *size)
 
 
 def count_components(faces: IntArray, count: int) -> int:
     """Return the number of pieces of a mesh that share no vertex; unused vertices do not count."""
-    pairs = np.concatenate([faces[:, :2], faces[:, 1:]])
-    graph = coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), (count, count))
-    found, _ = connected_components(graph, directed=False)
-    used = np.zeros(count, bool)
-    used[faces] = True
-    return int(found - np.count_nonzero(~used))
+    return len(np.unique(vertex_components(faces, count)[faces[:, 0]]))
 
 
 def measure(vertices: NDArray[Any], faces: IntArray) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""How far the sphere of each sample is from touching the mesh.
+"""How far the spheres of samples are from touching the mesh, and which vertices they contradict.
 
 An exact sample is the radius of an empty ball that touches the surface. Its residual is its
 distance to the mesh minus that radius: positive if the mesh does not reach the ball, negative if it
@@ -11,49 +11,50 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray
+from ..arrays import BoolArray, FloatArray, IntArray
 from ..grid.sdf_grid import SdfGrid
 from ..machine.threads import chunks_of
 from ..mesh import Mesh
-from ..neighbourhood import CENTRE
+from ..neighbourhood import CENTRE, NEIGHBOURHOOD
+from ..steps.band import plane_blocks, rescale
 from ..steps.survey import Band
+from ..steps.voxel_index import VoxelIndex
 from ..truth.solid import Points, Solid
-from .slabs import Found
+from .search import Found
 
 WIDTH = 4  # 2^17 samples at a time
 NOTICEABLE = 0.1  # voxels: a residual that is counted as large
+STRAY = 0.5  # voxels within a ball, from which on a vertex is counted
+NEAREST_FEET = 8  # foot points that a vertex looks at
+SMOOTHING = 0.02  # voxels: distance of a foot point that halves its weight
+FARTHEST = 1.5  # voxels: foot points farther away say nothing of a vertex
 
 
 @dataclass(frozen=True, eq=False)
-class Touching:
-    """The exact samples of a grid near the surface, and where their balls meet the mesh.
+class Samples:
+    """The exact samples of a grid near the surface, in C order.
 
-    Attributes
-    ----------
-    cut_off, noisy : int
-        Samples near the surface that promise nothing and were left out: at the limit of truncated
-        values or at the band's edge; and all that differ from a neighbour by more than distances
-        can, together with the rest if they are many.
-    points : (n, 3) float64
-        World positions of the exact samples.
-    values : (n,) float32
-        Their distances, negative inside.
-    residuals : (n,) float32
-        Distance to the mesh minus absolute value.
-    feet : (n, 3) float64
-        World positions of the nearest points of the mesh.
-    wrong_side : (n,) bool
-        Whether sample and mesh disagree on the side, by more than ``NOTICEABLE``.
+    Those that promise nothing are counted and left out: cut off at the limit of truncated values or
+    at the band's edge; and noisy ones, which differ from a neighbour by more than distances can,
+    together with the rest if they are many.
     """
 
     cut_off: int
     noisy: int
-    points: Points
-    values: FloatArray
-    residuals: FloatArray
-    feet: Points
-    wrong_side: BoolArray
+    voxel_ijk: IntArray  # (n, 3)
+    points: Points  # (n, 3), in world units
+    values: FloatArray  # (n,), negative inside
+
+
+@dataclass(frozen=True, eq=False)
+class Touching(Samples):
+    """The exact samples of a grid, and where their balls meet the mesh."""
+
+    residuals: FloatArray  # (n,): distance to the mesh minus absolute value
+    feet: Points  # (n, 3): the nearest points of the mesh, in world units
+    wrong_side: BoolArray  # (n,): mesh and sample disagree on it by more than ``NOTICEABLE``
 
     def report(self) -> dict[str, Any]:
         """Return the figures as they stand in JSON; None where no sample is exact."""
@@ -79,77 +80,94 @@ class Touching:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class Samples:
-    """The exact samples of a grid near the surface; see ``Touching`` for what its fields are."""
+@dataclass(frozen=True)
+class Strays:
+    """Vertices that lie where the nearest sample says that no surface is.
 
-    cut_off: int
-    noisy: int
-    points: Points
-    values: FloatArray
+    The samples near the surface see nothing of a piece that lies far from it. But every sample,
+    however far away, promises a ball without surface, also if its value was truncated.
+    """
+
+    count: int  # vertices more than ``STRAY`` voxels inside the ball of their nearest sample
+    beyond: int  # vertices more than half a voxel from the outermost samples
+    deepest: float  # of a vertex in the ball of its nearest sample; 0 if there is none
 
 
 def exact_samples(band: Band, grid: SdfGrid) -> Samples:
     """Return the exact samples of a band: of its grid, from ``survey``."""
-    trusted = band.exact & ~at_limit(band.patches[:, CENTRE])
+    values = band.patches[:, CENTRE]
+    # ``is_cut_off`` keeps truncated samples beside the surface, whose neighbours are steep
+    trusted = band.exact & (values > values.min()) & (values < values.max())
     if band.sampled is not None:
         trusted &= band.sampled  # of a resampled grid, what is interpolated promises nothing
     exact = np.flatnonzero(trusted)
     # if none is exact, too many are no distances for any to be taken for one
     count = len(band.exact) if band.sampled is None else int(np.count_nonzero(band.sampled))
     noisy = band.noisy_voxels if len(exact) else count
-    points = grid.to_world(band.voxel_ijk[exact])
-    values = band.patches[exact, CENTRE] / 2  # from half voxels
-    return Samples(count - len(exact) - noisy, noisy, points, values)
+    ijk = band.voxel_ijk[exact]
+    cut_off, distances = count - len(exact) - noisy, values[exact] * np.float32(0.5)
+    return Samples(cut_off, noisy, ijk, grid.to_world(ijk), distances)
 
 
-def touch(
-    mesh: Mesh, samples: Samples, found: Found, voxel_size: float, *, simple: bool
-) -> Touching:
+def touch(mesh: Mesh, samples: Samples, found: Found, voxel_size: float) -> Touching:
     """Return where the balls of exact samples meet a mesh.
 
-    Parameters
-    ----------
-    mesh : Mesh
-        In world units.
-    samples : Samples
-    found : Found
-        By ``slabs.search`` for the points of the samples.
-    voxel_size : float
-        Spacing of the grid.
-    simple : bool
-        Whether what is behind the surface is inside: see ``Surface.is_simple``.
+    ``found`` is by ``search`` for the points of the samples, ``voxel_size`` the spacing of the
+    grid. On which side of the mesh a sample lies is by its winding number.
     """
     distances, size = found.distances / voxel_size, np.abs(samples.values)
     residuals = (distances - size).astype(np.float32)
-    apart = distances + size > NOTICEABLE  # where the side matters
-    inside = found.facing < 0
-    unsure = np.flatnonzero(apart & (found.facing == 0) if simple else apart)
-    inside[unsure] = sides(mesh, samples.points[unsure])
-    wrong = apart & (inside != (samples.values <= 0))
-    return Touching(
-        samples.cut_off,
-        samples.noisy,
-        samples.points,
-        samples.values,
-        residuals,
-        found.feet,
-        wrong,
-    )
+    solid, wrong = Solid(mesh), np.zeros(len(size), bool)
+    apart = np.flatnonzero(distances + size > NOTICEABLE)  # where the side matters
+    for chunk in chunks_of(len(apart), WIDTH):
+        some = apart[chunk]
+        wrong[some] = solid.is_inside(samples.points[some]) != (samples.values[some] <= 0)
+    return Touching(**vars(samples), residuals=residuals, feet=found.feet, wrong_side=wrong)
 
 
-def at_limit(samples: FloatArray) -> BoolArray:
-    """Return which samples, (n,), are the largest or smallest of all.
+def find_strays(vertices: NDArray[Any], grid: SdfGrid, band: Band, offset: float = 0.0) -> Strays:
+    """Look up the nearest sample of each vertex, (n, 3) in world units.
 
-    ``is_cut_off`` keeps truncated samples beside the surface, whose neighbours are steep.
+    Planes of the grid are read only for vertices whose nearest sample is not in the band.
     """
-    found: BoolArray = (samples == samples.min()) | (samples == samples.max())
-    return found
+    position = grid.to_index(vertices)
+    nearest = np.rint(position).astype(np.int64)
+    inside = ((nearest >= 0) & (nearest < grid.shape)).all(1)
+    position, nearest = position[inside], nearest[inside]
+    row = VoxelIndex(band.voxel_ijk, grid.shape).find(nearest)
+    values = band.patches[:, CENTRE][row] if len(band.patches) else np.zeros(len(row))
+    far = np.flatnonzero(row < 0)
+    plane = nearest[far, 0]
+    for first, last in plane_blocks(grid.shape):
+        rows = far[(plane >= first) & (plane < last)]
+        if len(rows):
+            i, j, k = nearest[rows].T
+            values[rows] = rescale(grid, offset, first, last)[i - first, j, k]
+    depth = np.abs(values) / 2 - np.linalg.norm(position - nearest, axis=1)
+    count, beyond = np.count_nonzero(depth > STRAY), np.count_nonzero(~inside)
+    return Strays(int(count), int(beyond), float(depth.max(initial=0)))
 
 
-def sides(mesh: Mesh, points: Points) -> BoolArray:
-    """Return which of the points (n, 3) a mesh encloses, (n,), by its winding number."""
-    solid, inside = Solid(mesh), np.zeros(len(points), bool)
-    for chunk in chunks_of(len(points), WIDTH):
-        inside[chunk] = solid.is_inside(points[chunk])
-    return inside
+def vertex_residuals(vertices: NDArray[Any], touching: Touching, grid: SdfGrid) -> FloatArray:
+    """Return the residual at each vertex, (n,), in voxels; NaN where no foot point is near.
+
+    Its size is the mean of the absolute residuals at the nearest foot points of the samples around,
+    each weighted by the inverse of its distance; its sign is that of the mean with signs.
+    """
+    residuals = np.full(len(vertices), np.nan, np.float32)
+    index = VoxelIndex(touching.voxel_ijk, grid.shape)
+    if not len(touching.values):
+        return residuals
+    for chunk in chunks_of(len(vertices), 8 * len(NEIGHBOURHOOD)):
+        some = np.asarray(vertices[chunk], np.float64)
+        nearest = np.rint(grid.to_index(some)).astype(np.int64)
+        rows = index.find(nearest[:, None] + NEIGHBOURHOOD)
+        away = np.linalg.norm(some[:, None] - touching.feet[rows], axis=2) / grid.voxel_size
+        away[rows < 0] = np.inf
+        limit = np.partition(away, NEAREST_FEET - 1, axis=1)[:, NEAREST_FEET - 1, None]
+        weight = np.where(away <= np.minimum(limit, FARTHEST), 1 / (away + SMOOTHING), 0)
+        there = touching.residuals[rows]
+        with np.errstate(invalid="ignore"):
+            size = (weight * np.abs(there)).sum(1) / weight.sum(1)
+        residuals[chunk] = np.copysign(size, (weight * there).sum(1))
+    return residuals

@@ -25,7 +25,7 @@ from .conversion import (
     make_options,
 )
 from .interrupts import describe_interrupt, exit_code, raising_interrupts
-from .reporting import check_page, report_option
+from .view import check_page, report_option
 
 if TYPE_CHECKING:
     from ..batch.job import Job
@@ -112,7 +112,7 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
     start, page = time.perf_counter(), options["report"]
     chosen, suffix = make_options(options), f".{options['kind']}"
     if options["check"]:
-        check_can_check(suffix)
+        check_can_check()
     check_cluster(options)
     jobs, unread = find_jobs(sources, suffix, chosen)
     if any(job.options.simplifies for job in jobs):  # a list may say so
@@ -187,7 +187,7 @@ def write_page(run: Run, jobs: list[Job], path: Path | None, interrupted: str = 
     """Write the page, if one was asked for; after an interrupt, at once and without drawing."""
     if path is None:
         return
-    from ..batch.page import BatchPage, Words
+    from ..batch.page import BatchPage
     from ..pages.html import is_page
 
     page = BatchPage(path, run.batch, jobs, run.ledger.rows)
@@ -195,5 +195,5 @@ def write_page(run: Run, jobs: list[Job], path: Path | None, interrupted: str = 
     if page.unfinished or interrupted:
         why = f", {interrupted}" if interrupted else ""
         alert = f"Incomplete{why}: {len(page.unfinished)} not finished; run it again to go on"
-    words = Words(f"Batch: {run.settings.folder}", sentence(run.batch), alert, run.batch.notes)
-    page.write(words, force=run.settings.force or is_page(path), draw=not interrupted)
+    title, force = f"Batch: {run.settings.folder}", run.settings.force or is_page(path)
+    page.write(title, sentence(run.batch), alert, force=force, draw=not interrupted)

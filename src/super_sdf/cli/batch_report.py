@@ -15,7 +15,7 @@ import click
 from .common import print_stderr, print_stdout
 
 if TYPE_CHECKING:
-    from ..batch.job import Job
+    from ..batch.job import Row
     from ..batch.plan import Batch
     from ..batch.run import OnFile
 
@@ -47,10 +47,10 @@ def progress_line(total: int, quiet: bool) -> Iterator[OnFile | None]:
 def describe_progress(batch: Batch, total: int) -> str:
     """Return the files finished, the rate, and the remaining time in one line."""
     finished = len(batch.done) + len(batch.failed)
-    rate = finished / batch.seconds
     left = batch.seconds * (batch.work / batch.work_done - 1)
     failed = f", {len(batch.failed)} failed" if batch.failed else ""
-    return f"{finished}/{total}, {rate:.2g} files/s, {duration(left)} left{failed}"
+    rate = f"{finished / batch.seconds:.2g} files/s"
+    return f"{finished}/{total}, {rate}, {duration(left)} left{failed}"
 
 
 def duration(seconds: float) -> str:
@@ -63,76 +63,53 @@ def duration(seconds: float) -> str:
 
 def print_plan(plan: Batch, as_json: bool) -> None:
     """Print what would be done with each file, and the counts."""
-    if as_json:
-        print_stdout(json.dumps(plan_report(plan), indent=2), "nothing was written")
-    else:
-        for line in plan_lines(plan):
-            print_stdout(line, "nothing was written")
-    kinds = {kind: len(found) for kind, found in plan_report(plan).items()}
-    if not kinds["unread"]:
-        del kinds["unread"]
-    counts = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in kinds.items())
-    print_stderr(counts)
-
-
-def plan_lines(plan: Batch) -> Iterator[str]:
-    """Yield a line per file: what would be done with it."""
     from ..batch.job import one_line
 
-    folder = plan.settings.folder
-    for job in plan.waiting:
-        yield one_line(f"to do: {job.source} -> {folder / job.target}")
-    for job, _ in plan.done_before:
-        yield one_line(f"done before: {job.source} -> {folder / job.target}")
-    for result in plan.failed_before:
-        yield f"{failure_kind(result.row).replace('_', ' ')}: {result.failure()}"
-    for path, reason in plan.unread:
-        yield one_line(f"unread: {path} {reason}")
-
-
-def plan_report(plan: Batch) -> dict[str, Any]:
-    """Return what would be done with each file, by kind, as ``--json`` prints it."""
-    failed: dict[str, list[dict[str, Any]]] = {"failed_before": [], "refused": []}
-    for _, row in plan.failed_before:
-        failed[failure_kind(row)].append(failure_entry(row))
-    return {
-        "to_do": [entry(job) for job in plan.waiting],
-        "done_before": [entry(job) for job, _ in plan.done_before],
-        **failed,
+    refused = [result for result in plan.failed_before if result.row["retry"]]
+    failed = [result for result in plan.failed_before if not result.row["retry"]]
+    jobs = {"to_do": plan.waiting, "done_before": [job for job, _ in plan.done_before]}
+    report = {
+        **{
+            kind: [{"in": os.path.abspath(job.source), "out": job.target} for job in some]
+            for kind, some in jobs.items()
+        },
+        "failed_before": [_failure(result.row) for result in failed],
+        "refused": [_failure(result.row) for result in refused],
         "unread": [{"in": path, "reason": reason} for path, reason in plan.unread],
     }
+    words = {kind: kind.replace("_", " ") for kind in report}
+    lines = [
+        one_line(f"{words[kind]}: {job.source} -> {plan.settings.folder / job.target}")
+        for kind, some in jobs.items()
+        for job in some
+    ]
+    lines += [f"failed before: {result.failure()}" for result in failed]
+    lines += [f"refused: {result.failure()}" for result in refused]
+    lines += [one_line(f"unread: {path} {reason}") for path, reason in plan.unread]
+    for text in [json.dumps(report, indent=2)] if as_json else lines:
+        print_stdout(text, "nothing was written")
+    counted = [kind for kind in report if kind != "unread" or plan.unread]
+    print_stderr(", ".join(f"{len(report[kind])} {words[kind]}" for kind in counted))
 
 
-def entry(job: Job) -> dict[str, str]:
-    """Return the JSON entry of a file that is done or to be done."""
-    return {"in": os.path.abspath(job.source), "out": job.target}
-
-
-def failure_entry(row: dict[str, Any]) -> dict[str, Any]:
+def _failure(row: Row) -> dict[str, Any]:
     """Return the JSON entry of a file that failed."""
     return {"in": row["in"], "out": row["out"], "reason": row["reason"]}
 
 
-def failure_kind(row: dict[str, Any]) -> str:
-    """Return why a failed file is not tried again: its output exists, or it failed before."""
-    return "refused" if row["retry"] else "failed_before"
-
-
 def print_summary(batch: Batch, options: dict[str, Any]) -> None:
     """Print counts and failures to stderr, and with ``--json`` JSON to stdout."""
+    report = batch.settings.folder / "report.jsonl"
     if options["as_json"]:
-        report = batch.settings.folder / "report.jsonl"
         print_stdout(json.dumps(summary(batch), indent=2), f"all is in {report}")
     failed = [result.failure() for result in batch.failures()]
     failed += [f"{path} {reason}" for path, reason in batch.unread]
     for line in failed[:MOST_FAILURES]:
         print_stderr(f"Failed: {line}")
-    more = len(failed) - MOST_FAILURES
-    if more > 0:
-        print_stderr(f"and {more} more, see {batch.settings.folder / 'report.jsonl'}")
-    if not options["quiet"]:
-        for remark in (*remarks(batch), sentence(batch)):
-            print_stderr(remark)
+    if len(failed) > MOST_FAILURES:
+        print_stderr(f"and {len(failed) - MOST_FAILURES} more, see {report}")
+    for remark in () if options["quiet"] else (*remarks(batch), sentence(batch)):
+        print_stderr(remark)
 
 
 def remarks(batch: Batch) -> list[str]:
@@ -141,59 +118,47 @@ def remarks(batch: Batch) -> list[str]:
     Open meshes are left out: the summary counts them.
     """
     rows = [result.row for result in batch.done]
-    inferred = sum(bool(row["inferred"]) for row in rows)
-    simplified = [row for row in rows if "simplified" in row]
-    unreached = sum(bool(row["simplified"]["warnings"]) for row in simplified)
-    warned = sum(_warnings_of_values(row) > 0 for row in rows)
     report = batch.settings.folder / "report.jsonl"
+    simplified = [row for row in rows if "simplified" in row]
+    inferred = sum(bool(row["inferred"]) for row in rows)
+    unreached = sum(bool(row["simplified"]["warnings"]) for row in simplified)
+    warned = 0
+    for row in rows:  # with warnings that are neither of an open mesh nor of its simplification
+        others = (not row["closed"]) + len(row.get("simplified", {}).get("warnings", []))
+        warned += len(row["warnings"]) > others
     lines = [f"Note: {note}" for note in batch.notes]
     if inferred:
         lines.append(f"Note: spacing, origin or sign of {inferred} was inferred: see {report}")
     if warned:
         lines.append(f"Warning: {warned} are from noisy or contradictory values: see {report}")
     if simplified:
-        lines.append(f"Simplified: {describe_simplified(simplified)}; see the report")
+        lines.append(f"Simplified: {_describe_simplified(simplified)}; see the report")
     if unreached:
         lines.append(f"Warning: {unreached} were not simplified as asked: see {report}")
-    return lines + check_lines([row for row in rows if "check" in row])
+    return lines + _check_lines([row for row in rows if "check" in row])
 
 
-def _warnings_of_values(row: dict[str, Any]) -> int:
-    """Return how many warnings of a row are neither of an open mesh nor of its simplification."""
-    others = (not row["closed"]) + len(row.get("simplified", {}).get("warnings", []))
-    return len(row["warnings"]) - others
-
-
-def describe_simplified(rows: list[dict[str, Any]]) -> str:
+def _describe_simplified(rows: list[Row]) -> str:
     """Describe in one line how much simpler meshes are in all, and the largest distance."""
-    figures = {row["out"]: row["simplified"] for row in rows}
-    before, after = (
-        sum(found[key] for found in figures.values()) for key in ("triangles_before", "triangles")
-    )
-    worst = max(figures, key=lambda name: largest_distance(figures[name]))
-    distance = largest_distance(figures[worst])
+    figures = [row["simplified"] for row in rows]
+    before, after = (sum(f[key] for f in figures) for key in ("triangles_before", "triangles"))
+    distances = [
+        (max(f["deviation"]["largest"], f["deviation"]["largest_back"]), row["out"])
+        for f, row in zip(figures, rows)
+    ]
+    distance, worst = max(distances, key=lambda pair: pair[0])
     counts = f"from {before:,} to {after:,} triangles"
     return f"{counts}; largest distance {distance:.4f} voxels, of {worst}"
 
 
-def largest_distance(simplified: dict[str, Any]) -> float:
-    """Return the larger one of the largest distances both ways, in voxels."""
-    off = simplified["deviation"]
-    return float(max(off["largest"], off["largest_back"]))
-
-
-def check_lines(rows: list[dict[str, Any]]) -> list[str]:
+def _check_lines(rows: list[Row]) -> list[str]:
     """Return in a line what the certificates of new meshes say, and in one how many are missing."""
-    if not rows:
-        return []
-    residuals = {row["out"]: row["check"].get("residual") for row in rows}
-    known = {name: found for name, found in residuals.items() if found}
-    lines = []
-    if known:
-        worst = max(known, key=lambda name: float(known[name]["mean"]))
-        mean = f"{known[worst]['mean']:.4f}"
-        lines.append(f"Check: mean residual {mean} voxels at most, of {worst}; see the report")
-    missing = len(rows) - len(known)
+    checked = [row for row in rows if row["check"].get("residual")]
+    means = [(row["check"]["residual"]["mean"], row["out"]) for row in checked]
+    lines, missing = [], len(rows) - len(means)
+    if means:
+        mean, worst = max(means, key=lambda pair: pair[0])
+        lines.append(f"Check: mean residual {mean:.4f} voxels at most, of {worst}; see the report")
     return lines + [f"Warning: {missing} without a residual: see the report"] * (missing > 0)
 
 
@@ -218,6 +183,7 @@ def sentence(batch: Batch) -> str:
 def summary(batch: Batch) -> dict[str, Any]:
     """Return the counts, and each failure with its reason, as ``--json`` prints them."""
     closed = sum(bool(result.row["closed"]) for result in batch.results())
+    unread = [{"in": path, "out": None, "reason": reason} for path, reason in batch.unread]
     return {
         "done": len(batch.done),
         "done_before": len(batch.done_before),
@@ -226,9 +192,6 @@ def summary(batch: Batch) -> dict[str, Any]:
         "closed": closed,
         "open": len(batch.results()) - closed,
         "seconds": round(batch.seconds, 3),
-        "failures": [
-            *(failure_entry(row) for _, row in batch.failures()),
-            *({"in": path, "out": None, "reason": reason} for path, reason in batch.unread),
-        ],
+        "failures": [*(_failure(row) for _, row in batch.failures()), *unread],
         "report": str(batch.settings.folder / "report.jsonl"),
     }

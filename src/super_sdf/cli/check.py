@@ -5,18 +5,15 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from ..machine.extras import check_modules
-from ..options import GRID, parse_size
+from ..options import GRID, ConvertOptions, parse_size
 from .common import CONTEXT, one_line_errors, print_stderr, print_stdout
 from .conversion import CHECK_MODULES, Parsed, table_options
 from .interrupts import raising_interrupts
-
-if TYPE_CHECKING:
-    from ..certificate.check import Certificate, CheckOptions
 
 EXAMPLES = """\b
 Examples:
@@ -100,7 +97,7 @@ def check_command(mesh: Path, grid: Path, **options: Any) -> None:
     what upsample takes. The exit code is 1 if a limit is exceeded.
     """
     with one_line_errors(options["out"]):
-        check_modules("check", "eval", CHECK_MODULES)
+        check_modules("check", "report", CHECK_MODULES)
         exceeded = run_check(mesh, grid, options)
     for sentence in exceeded:
         print_stderr(f"Limit exceeded: {sentence}")
@@ -110,46 +107,36 @@ def check_command(mesh: Path, grid: Path, **options: Any) -> None:
 
 def run_check(mesh: Path, grid: Path, options: dict[str, Any]) -> list[str]:
     """Check the files, print the certificate, write the coloured mesh; return exceeded limits."""
-    from ..certificate.check import check_files
-    from ..certificate.coloured import check_coloured, write_coloured
-    from ..certificate.limits import Limits
+    from ..certificate.check import (
+        LIMITS,
+        check_coloured,
+        check_files,
+        check_limits,
+        exceeded,
+        write_coloured,
+    )
     from ..files.output import check_apart
     from ..files.regular import files_of
 
-    names = ("max_residual", "max_mean", "max_share", "no_faults")
-    limits = Limits(**{name: options[name] for name in names})
-    limits.check()
+    limits = {name: options[name] for name in LIMITS}
+    check_limits(limits)
     if options["out"]:
         check_coloured(options["out"], force=options["force"])
         check_apart(options["out"], [mesh, *files_of(grid)])
-    certificate = check_files(mesh, grid, make_check_options(options))
+    given = ConvertOptions(**{name: options[name] for name in (*GRID, "offset", "max_memory")})
+    count = not options["skip_intersections"]
+    certificate = check_files(mesh, grid, given, intersections=count, processes=0)
     if options["out"]:
         with raising_interrupts():
             write_coloured(certificate, options["out"], force=options["force"])
-    exceeded = limits.exceeded(certificate)
-    print_certificate(certificate, {"mesh": str(mesh), "grid": str(grid)}, exceeded, options)
-    return exceeded
-
-
-def make_check_options(options: dict[str, Any]) -> CheckOptions:
-    """Return the options of the check, picked from all options of a command."""
-    from ..certificate.check import CheckOptions
-
-    chosen = {name: options[name] for name in (*GRID, "offset", "max_memory")}
-    count = not options["skip_intersections"]
-    return CheckOptions(**chosen, intersections=count, processes=0)
-
-
-def print_certificate(
-    certificate: Certificate, files: dict[str, str], exceeded: list[str], options: dict[str, Any]
-) -> None:
-    """Print the certificate to stdout, as lines or as JSON, and notes to stderr."""
-    kept = f"{options['out']} is written" if options["out"] else "nothing was written"
+    faults = certificate.faults() if options["no_faults"] else []
+    passed = exceeded(certificate, limits) + [f"the mesh has {fault}" for fault in faults]
+    written = f"{options['out']} is written" if options["out"] else "nothing was written"
     if options["as_json"]:
-        report = {**files, **certificate.report(), "limits_exceeded": exceeded}
-        print_stdout(json.dumps(report, indent=2), kept)
+        report = {"mesh": str(mesh), "grid": str(grid), **certificate.report()}
+        print_stdout(json.dumps({**report, "limits_exceeded": passed}, indent=2), written)
     elif not options["quiet"]:
-        print_stdout("\n".join(certificate.lines()), kept)
-    if not options["quiet"]:
-        for note in certificate.notes:
-            print_stderr(f"Note: {note}")
+        print_stdout("\n".join(certificate.lines()), written)
+    for note in () if options["quiet"] else certificate.grid.notes:
+        print_stderr(f"Note: {note}")
+    return passed

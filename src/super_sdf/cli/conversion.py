@@ -15,7 +15,7 @@ from ..options import OPTIONS, UPSAMPLE, ConvertOptions, Option, parse_labels
 if TYPE_CHECKING:
     from ..network.network import Network
 
-CHECK_MODULES = ("igl", "scipy")  # of the extra eval, for certificates
+CHECK_MODULES = ("igl",)  # of the extra report, for certificates
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 """Adds options to a command."""
@@ -74,7 +74,7 @@ conversion_options = table_options(*UPSAMPLE)
 check_option = click.option(
     "--check",
     is_flag=True,
-    help="Check each mesh against its samples, as check does. Needs the extra eval.",
+    help="Check each mesh against its samples, as check does. Needs the extra report.",
 )
 labels_option = click.option(
     "--labels",
@@ -93,11 +93,9 @@ cluster_option = click.option(
 )
 
 
-def check_can_check(target: str) -> None:
-    """Raise FileError if meshes like ``target`` cannot be read again for ``--check``."""
-    check_modules("--check", "eval", CHECK_MODULES)
-    if target.lower().endswith(".3mf"):
-        check_modules("--check of .3mf files", "3mf")
+def check_can_check() -> None:
+    """Raise FileError if the library for ``--check`` is missing."""
+    check_modules("--check", "report", CHECK_MODULES)
 
 
 def check_cluster(options: dict[str, Any]) -> None:

@@ -9,7 +9,7 @@ import click
 from ..files.formats import NAMED, list_formats
 from .common import CONTEXT, one_line_errors
 from .conversion import check_option, cluster_option, conversion_options, labels_option
-from .reporting import report_option
+from .view import report_option
 
 HELP = f"""Refine the signed distance grid IN and write its surface as the mesh OUT.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,10 +18,10 @@ from ..progress import Progress, Stopwatch
 from .common import print_stderr, print_stdout, progress_bar
 from .conversion import check_can_check, check_cluster, chosen_model, load_chosen, make_options
 from .interrupts import raising_interrupts
-from .reporting import check_page
+from .view import check_page
 
 if TYPE_CHECKING:
-    from ..certificate.check import Certificate, CheckOptions
+    from ..certificate.check import Certificate
 
 
 def upsample(source: str, target: str, options: dict[str, Any]) -> None:
@@ -49,7 +48,7 @@ def check_arguments(
         check_field_target(options["save_field"], force=options["force"])
         outputs.append(options["save_field"])
     if options["check"]:
-        check_can_check(target)
+        check_can_check()
     if options["report"]:
         check_modules("--report", "report")
         files: list[str | Path] = [*files_of(source), *outputs]
@@ -121,22 +120,18 @@ class Upsampling:
                     progress=progress,
                     announce=self.announce,
                     save_field=options["save_field"],
+                    keep=bool(options["check"] or options["report"]),
                 )
         self.seconds |= self.result.seconds
-
-    def check_options(self) -> CheckOptions:
-        """Return how the finished mesh is checked."""
-        from ..certificate.check import CheckOptions
-
-        return replace(CheckOptions.of(self.chosen), processes=self.options["threads"])
 
     def check(self) -> None:
         """Check the finished mesh against its samples."""
         from ..certificate.check import check_files
 
-        watch = Stopwatch()
+        watch, threads = Stopwatch(), self.options["threads"]
+        files = self.target, self.source, self.chosen
         try:
-            self.certificate = check_files(self.target, self.source, self.check_options())
+            self.certificate = check_files(*files, kept=self.result.kept, processes=threads)
         except SuperSdfError as error:
             raise type(error)(f"{error}; {self.target} is written, but not checked") from error
         watch.lap("check")
@@ -144,11 +139,13 @@ class Upsampling:
 
     def write_page(self) -> None:
         """Write the page; what cannot be shown in it is said there."""
-        from ..pages.viewing import write_single
+        from ..pages.html import page_of_conversion, write_page
 
-        watch, page, force = Stopwatch(), self.options["report"], self.options["force"]
+        watch, threads = Stopwatch(), self.options["threads"]
         report = {**self.report(), "notes": [*self.result.remarks(), *self.network.notes]}
-        write_single(page, report, self.check_options(), self.certificate, force=force)
+        given = self.chosen, self.result.kept, self.certificate
+        text = page_of_conversion(report, *given, processes=threads)
+        write_page(text, self.options["report"], force=self.options["force"])
         watch.lap("page")
         self.seconds |= watch.seconds
 

@@ -1,25 +1,51 @@
-"""The command ``view``: meshes and grids in the browser, from a page in a file."""
+"""The command ``view`` and the option ``--report``: pages for the browser, each in one file."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
 
-from ..machine.extras import EXTRAS, check_modules
+from ..errors import OptionError
+from ..machine.extras import check_modules
 from .common import CONTEXT, one_line_errors, print_stderr
 from .conversion import conversion_options, load_chosen, make_options
 from .interrupts import raising_interrupts
-from .reporting import check_page
 
-NEEDED = (*EXTRAS["eval"], *EXTRAS["simplify"])  # of the extra report: nothing is drawn here
+PAGES = (".html", ".htm")
 EXAMPLES = """\b
 Examples:
   super-sdf view part.npz
   super-sdf view part.ply other.stl --out page.html --no-browser
 """
+
+report_option = click.option(
+    "--report",
+    type=click.Path(path_type=Path),
+    metavar="PAGE.html",
+    help="Also write a page for the browser: figures, times, warnings, the check of each mesh, and "
+    "a 3-D view of it beside coarse marching cubes. Needs the extra report.",
+)
+
+
+def check_page(option: str, page: Path, others: Iterable[str | Path], *, force: bool) -> None:
+    """Raise if a page cannot be written; called before the work starts.
+
+    Raises
+    ------
+    SuperSdfError
+        If a package is missing, the suffix is another, the file exists and ``force`` is not set, or
+        it is one of the others, the inputs and outputs.
+    """
+    from ..files.output import check_apart, check_free
+
+    if page.suffix.lower() not in PAGES:
+        raise OptionError(f"{page} is not a page: give {option} a file {' or '.join(PAGES)}")
+    check_free(page, force=force)
+    check_apart(page, others)
 
 
 @click.command(
@@ -57,27 +83,21 @@ def view_command(sources: tuple[str, ...], **options: Any) -> None:
 
 def write_view(sources: tuple[str, ...], options: dict[str, Any]) -> Path:
     """Read and refine the files and write their page; return its absolute path."""
-    from ..pages.html import write_page
-    from ..pages.viewing import viewed_page
-
-    check_modules("view", "report", NEEDED)
-    page, force = options["out"], options["force"]
-    if page:
-        check_page("--out", page, sources, force=force)
-    chosen = make_options(options)
-
-    with raising_interrupts():
-        text = viewed_page(sources, partial(load_chosen, options), chosen)
-        page = page or private_file()
-        write_page(text, page, force=force)
-    return Path(page).absolute()
-
-
-def private_file() -> Path:
-    """Return the path of a file in a temporary folder that only this user can read."""
     from tempfile import mkdtemp
 
-    return Path(mkdtemp(prefix="super-sdf-"), "view.html")
+    from ..pages.html import viewed_page, write_page
+
+    check_modules("view", "report")
+    page: Path | None = options["out"]
+    if page:
+        check_page("--out", page, sources, force=options["force"])
+    chosen = make_options(options)
+    with raising_interrupts():
+        text = viewed_page(sources, partial(load_chosen, options), chosen)
+        # a folder that only this user can read
+        page = page or Path(mkdtemp(prefix="super-sdf-"), "view.html")
+        write_page(text, page, force=options["force"])
+    return page.absolute()
 
 
 def open_browser(page: Path) -> None:

@@ -24,11 +24,11 @@ EXTRAS = {
     "simplify": ("igl", "pyfqmr"),
     "eval": ("igl", "matplotlib", "scipy", "skimage"),
     "view": ("pyvista",),
-    "report": ("pyfqmr", "pyvista"),
+    "report": (),
     "peers": ("gpytoolbox",),
     "cluster": ("distributed",),
 }
-BUILT_ON = {"view": "eval", "peers": "eval", "report": "eval"}
+BUILT_ON = {"view": "eval", "peers": "eval", "report": "simplify"}
 
 
 def all_modules(extra: str) -> tuple[str, ...]:

@@ -9,15 +9,23 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from string import Template
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from .. import __version__
-from ..certificate import coloured
+from ..certificate import check
+from ..certificate.check import Certificate
+from ..convert import ConvertOptions, Kept, convert
+from ..files.formats import is_grid
 from ..files.output import replacing
+from ..network.decoder import Decoder
+from ..truth.mesh_files import read_mesh
+from .entries import Entry, entry_of, entry_of_report, numbers, tiles
+from .items import Item, item_of_files
 
 HOME = Path(__file__).parent
 SCRIPTS = ("three.min.js", "viewer.js", "page.js")
@@ -43,28 +51,34 @@ def make_page(
     """
     style = (HOME / "page.css").read_text("utf-8")
     scripts = [(HOME / name).read_text("utf-8") for name in SCRIPTS]
-    said = {**facts, "version": __version__, "made": made_now(), "colours": residual_colours()}
-    blocks = [json_block(f"meshes-{name}", packed) for name, packed in (meshes or {}).items()]
+    own = " ".join(map(_source_hash, scripts)) + (" 'self' file:" if beside else "")
+    colours = {name: list(getattr(check, name)) for name in ("TOUCHING", "PIERCED", "UNKNOWN")}
+    known = {
+        "version": __version__,
+        "made": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
+        "colours": {
+            **{name.lower(): colour for name, colour in colours.items()},
+            "apart": list(check.NOT_TOUCHING),
+            "full": check.FULL,
+        },
+    }
+    # the names of blocks are ours, never a file's
+    blocks = [
+        f'<script type="application/json" id="meshes-{name}">{safe_json(packed)}</script>'
+        for name, packed in (meshes or {}).items()
+    ]
     return Template((HOME / "page.html").read_text("utf-8")).substitute(
-        policy=policy(style, scripts, beside),
+        policy=f"default-src 'none'; script-src {own}; style-src {_source_hash(style)}; "
+        "img-src data:; base-uri 'none'; form-action 'none'",
         generator=GENERATOR,
         style=style,
-        facts=safe_json(said),
+        facts=safe_json({**facts, **known}),
         meshes="\n".join(blocks),
         scripts="\n".join(f"<script>{script}</script>" for script in scripts),
     )
 
 
-def policy(style: str, scripts: list[str], beside: bool) -> str:
-    """Return the content security policy: these scripts and this style, and nothing else."""
-    own = " ".join(map(source_hash, scripts)) + (" 'self' file:" if beside else "")
-    return (
-        f"default-src 'none'; script-src {own}; style-src {source_hash(style)}; img-src data:; "
-        "base-uri 'none'; form-action 'none'"
-    )
-
-
-def source_hash(text: str) -> str:
+def _source_hash(text: str) -> str:
     """Return the hash by which a policy names an inline script or style."""
     digest = hashlib.sha256(text.encode("utf-8")).digest()
     return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
@@ -73,23 +87,6 @@ def source_hash(text: str) -> str:
 def safe_json(value: Any) -> str:
     """Return JSON in ASCII without the characters of markup, which are escaped."""
     return json.dumps(value, ensure_ascii=True, allow_nan=False).translate(MARKUP)
-
-
-def json_block(name: str, value: Any) -> str:
-    """Return an element that holds JSON; ``name`` is one of ours, never a file's."""
-    return f'<script type="application/json" id="{name}">{safe_json(value)}</script>'
-
-
-def made_now() -> str:
-    """Return the local time."""
-    return datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
-
-
-def residual_colours() -> dict[str, Any]:
-    """Return the scale of residual colours, which is that of ``check --out``."""
-    names = {"touching": "TOUCHING", "pierced": "PIERCED", "apart": "NOT_TOUCHING"}
-    found = {key: list(getattr(coloured, name)) for key, name in names.items()}
-    return {**found, "unknown": list(coloured.UNKNOWN), "full": coloured.FULL}
 
 
 def write_page(text: str, path: Path, *, force: bool = False) -> None:
@@ -106,3 +103,89 @@ def is_page(path: Path) -> bool:
     except OSError:
         return False
     return f'<meta name="generator" content="{GENERATOR}">'.encode() in head
+
+
+def page_of_conversion(
+    report: Mapping[str, Any],
+    options: ConvertOptions,
+    kept: Kept | None = None,
+    certificate: Certificate | None = None,
+    processes: int = 1,
+) -> str:
+    """Return the page of a conversion.
+
+    ``report`` is what ``upsample --json`` prints, with ``input`` and ``output``; these are read
+    unless the conversion has ``kept`` what is in them. The mesh is checked unless there is a
+    certificate already.
+    """
+    given = options, kept, certificate, processes
+    item = item_of_files(report["output"], report["input"], *given)
+    name = Path(report["output"]).name
+    entry = entry_of_report(name, report, item)
+    return _whole_page(name, [(entry, item)], tiles(entry))
+
+
+def viewed_page(
+    sources: Sequence[str], load: Callable[[], Decoder], options: ConvertOptions
+) -> str:
+    """Return the page of some meshes and grids; all that it shows is within it.
+
+    Parameters
+    ----------
+    sources : list of str
+        Mesh files and grid files.
+    load : callable
+        Returns the network; called if there is a grid.
+    options : ConvertOptions
+        How the grids are refined.
+
+    Raises
+    ------
+    SuperSdfError
+        If a file cannot be read or refined.
+    """
+    network = load() if any(map(is_grid, sources)) else None
+    shown = [
+        _viewed_grid(source, network, options)
+        if network and is_grid(source)
+        else _viewed_mesh(source, options.max_memory)
+        for source in sources
+    ]
+    title = Path(sources[0]).name if len(sources) == 1 else f"{len(sources)} files"
+    return _whole_page(title, shown)
+
+
+def _whole_page(
+    title: str, shown: Sequence[tuple[Entry, Item]], summary: Sequence[Sequence[str]] = ()
+) -> str:
+    """Return a page with the meshes of its entries; ``summary`` are rows of label and text."""
+    meshes = {str(number): item.meshes for number, (_, item) in enumerate(shown)}
+    entries = [
+        entry | {"id": str(number), "meshes": "page" if item.meshes else None}
+        for number, (entry, item) in enumerate(shown)
+    ]
+    facts = {"title": title, "lead": "", "alert": "", "notes": [], "files": entries}
+    return make_page({**facts, "summary": summary}, meshes)
+
+
+def _viewed_grid(source: str, network: Decoder, options: ConvertOptions) -> tuple[Entry, Item]:
+    """Refine a grid; return what the page says and shows of it."""
+    with TemporaryDirectory(prefix="super-sdf-") as folder:
+        target = Path(folder, "mesh.ply")
+        done = convert(source, target, network, options, keep=True)
+        item = item_of_files(target, source, options, done.kept, processes=0)
+    report = {**done.report(), "input": source, "factor": options.factor}
+    report |= {"mesher": options.mesher, "seconds": done.seconds}
+    return entry_of_report(Path(source).name, report, item), item
+
+
+def _viewed_mesh(source: str, max_memory: int | None = None) -> tuple[Entry, Item]:
+    """Read a mesh; return what the page says and shows of it."""
+    mesh, item, name = read_mesh(source), Item(), Path(source).name
+    item.show(name, mesh, max_memory=max_memory)
+    low, high = (numbers(corner(axis=0)) for corner in (mesh.vertices.min, mesh.vertices.max))
+    bounds = ["bounds", f"({low}) to ({high})"]
+    facts = [["mesh", source], ["vertices", f"{len(mesh.vertices):,}"], bounds]
+    line = f"{len(mesh.faces):,} triangles, {'closed' if mesh.is_closed() else 'open'}"
+    shown = {"thumbnail": item.thumbnail, "remarks": item.remarks}
+    return entry_of(name, line=line, facts=facts) | shown, item

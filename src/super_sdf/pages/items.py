@@ -8,21 +8,19 @@ made without reading these; the second one hands the meshes to the page.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from ..certificate.check import Certificate, CheckOptions, check_mesh, read_for_check
+from ..certificate.check import Certificate, band_of, check_kept, read_for_check
+from ..convert import ConvertOptions, Kept
 from ..errors import SuperSdfError
 from ..files.output import replacing
-from ..grid.sdf_grid import SdfGrid
+from ..grid.cubic import cubic_grid
 from ..mesh import Mesh
-from .packing import pack
-from .shown import Shown, shown_coarse, shown_result
-from .thumbnails import thumbnail
+from .meshes import coarse_surface, packed_mesh, thumbnail
 
-RESULT = "super-sdf"
+RESULT, COARSE = "super-sdf", "marching cubes of the samples"
 LONGEST_HEAD = 1 << 20  # bytes of a file's first line
 COMMENT = b"// "
 CALL = "superSdfMeshes"  # the function of ``page.js``
@@ -30,84 +28,72 @@ CALL = "superSdfMeshes"  # the function of ``page.js``
 
 @dataclass
 class Item:
-    """What a page shows of one result.
+    """What a page shows of one result."""
 
-    Attributes
-    ----------
-    thumbnail : str, optional
-        A data URL.
-    meshes : list
-        The packed meshes: result, and coarse marching cubes if there are any.
-    certificate : dict, optional
-        What ``Certificate.report`` returns, or under ``error`` why there is none.
-    remarks : list of str
-        What is missing, and why.
-    made_of : str
-        The SHA-256 of the mesh file, if the item is kept in a file.
-    size : int
-        About how many bytes the meshes take in a page; of an item from a file.
-    """
+    thumbnail: str | None = None  # a data URL
+    meshes: list[dict[str, Any]] = field(default_factory=list)  # packed: result, coarse mesh
+    certificate: dict[str, Any] | None = None  # or, under "error", why there is none
+    remarks: list[str] = field(default_factory=list)  # what is missing, and why
+    made_of: str = ""  # the SHA-256 of the mesh file, if the item is kept in a file
+    size: int = 0  # about how many bytes the meshes take in a page; of an item from a file
 
-    thumbnail: str | None = None
-    meshes: list[dict[str, Any]] = field(default_factory=list)
-    certificate: dict[str, Any] | None = None
-    remarks: list[str] = field(default_factory=list)
-    made_of: str = ""
-    size: int = 0
+    def show(
+        self,
+        title: str,
+        mesh: Mesh,
+        certificate: Certificate | None = None,
+        max_memory: int | None = None,
+    ) -> None:
+        """Add a mesh, or a remark why it is not shown; the first one is also in the thumbnail."""
+        self.thumbnail = self.thumbnail or thumbnail(mesh)
+        try:
+            self.meshes.append(packed_mesh(title, mesh, certificate, max_memory))
+        except SuperSdfError as error:
+            self.remarks.append(f"not shown: {error}")
 
 
 def item_of_files(
     mesh: str | Path,
     grid: str | Path,
-    options: CheckOptions,
+    options: ConvertOptions,
+    kept: Kept | None = None,
     certificate: Certificate | None = None,
-    *,
-    draw: bool = True,
+    processes: int = 1,
 ) -> Item:
-    """Return the item of a mesh file and its grid file; what cannot be made is said in it.
+    """Return the item of a mesh and its grid; what cannot be made is said in it.
 
-    With ``draw`` it has a thumbnail.
+    The files are read unless the conversion has ``kept`` what is in them.
     """
     try:
-        read = read_for_check(mesh, grid, options)
+        kept = read_for_check(mesh, grid, options, kept)
     except SuperSdfError as error:
         return Item(certificate={"error": str(error)}, remarks=[f"not shown: {error}"])
-    return item_of(*read, options, certificate, draw=draw)
+    return item_of(kept, options, certificate, processes)
 
 
 def item_of(
-    mesh: Mesh,
-    grid: SdfGrid,
-    options: CheckOptions,
+    kept: Kept,
+    options: ConvertOptions,
     certificate: Certificate | None = None,
-    *,
-    draw: bool = False,
+    processes: int = 1,
 ) -> Item:
-    """Return the item of a mesh and its grid, with a thumbnail if asked for."""
-    item = Item()
+    """Return the item of a mesh and its grid, checked unless there is a certificate already."""
+    item, memory = Item(), options.max_memory
     try:
-        certificate = certificate or check_mesh(mesh, grid, options)
+        kept = replace(kept, band=band_of(kept, options))
+        certificate = certificate or check_kept(kept, options, processes=processes)
         item.certificate = certificate.report()
     except SuperSdfError as error:
         item.certificate = {"error": str(error)}
-    coarse = replace(options, intersections=False)
-    add_mesh(item, lambda: shown_result(RESULT, mesh, certificate, options.max_memory), draw=draw)
-    add_mesh(item, lambda: shown_coarse(grid, coarse))
+    item.show(RESULT, kept.mesh, certificate, memory)
+    if kept.band:
+        lattice, checked = cubic_grid(kept.grid, options.offset), None
+        coarse = coarse_surface(kept.band, lattice)
+        if certificate and len(coarse.faces):
+            checked = check_kept(replace(kept, mesh=coarse), options, intersections=False)
+        title = COARSE + (", made equally spaced" if lattice.shape != kept.grid.shape else "")
+        item.show(title, coarse, checked, memory)
     return item
-
-
-def add_mesh(item: Item, make: Callable[[], Shown], *, draw: bool = False) -> None:
-    """Add a mesh to an item, with its thumbnail if asked for; or a remark why it is not shown."""
-    try:
-        shown = make()
-        item.meshes.append(pack(shown))
-    except SuperSdfError as error:
-        item.remarks.append(f"not shown: {error}")
-        return
-    try:
-        item.thumbnail = thumbnail(shown.mesh) if draw else item.thumbnail
-    except Exception as error:  # whatever VTK raises where it cannot draw
-        item.remarks.append(f"no picture: {type(error).__name__}: {error}")
 
 
 def write_item(item: Item, path: Path) -> None:
@@ -125,7 +111,7 @@ def read_head(path: Path) -> Item | None:
         with path.open("rb") as file:
             line = file.readline(LONGEST_HEAD)
         return Item(**json.loads(line.removeprefix(COMMENT)))
-    except (OSError, ValueError, TypeError):  # of another version, or damaged
+    except (OSError, ValueError, TypeError):  # missing, or damaged
         return None
 
 

@@ -10,10 +10,10 @@ from collections.abc import Iterator
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..mesh import Mesh
 from ..truth.solid import Distances, Points, Solid
-from .deviation import Deviation
 
 POINTS_AT_ONCE = 1 << 18
 PER_SIDE = 1.5  # points along a triangle's side of mean length
@@ -31,8 +31,8 @@ class Original:
     @cached_property
     def points(self) -> tuple[Points, Distances]:
         """Points of the mesh and their weights: see ``points_on``."""
-        chunks = list(points_on(self.solid.mesh, self.step * PER_SIDE))
-        return np.concatenate([p for p, _ in chunks]), np.concatenate([w for _, w in chunks])
+        points, weights = zip(*points_on(self.solid.mesh, self.step * PER_SIDE))
+        return np.concatenate(points), np.concatenate(weights)
 
     def beyond(self, result: Mesh, distance: float) -> Points:
         """Return points, (n, 3), of either mesh that are farther than this from the other.
@@ -49,31 +49,36 @@ class Original:
             found.append(within[tree.distance(within) > distance])
         return np.concatenate(found)
 
-    def deviation(self, result: Mesh) -> Deviation:
-        """Return how far a simplified mesh and this one lie apart."""
+    def deviation(self, result: Mesh) -> tuple[float, float, float, float]:
+        """Return how far a simplified mesh and this one lie apart: see ``Deviation``."""
         points, weights = self.points
         there = Solid(result).distance(points)
-        parts = [
-            (distances.max(), distances @ weights, weights.sum())
-            for points, weights in points_on(result, self.step)
-            for distances in [self.solid.distance(points)]
-        ]
-        largest, sums, areas = np.array(parts).T
-        mean = there @ weights / weights.sum()
-        return Deviation(
-            float(there.max()), float(mean), float(largest.max()), float(sums.sum() / areas.sum())
-        )
+        largest = total = area = 0.0
+        for some, weight in points_on(result, self.step):
+            back = self.solid.distance(some)
+            largest = max(largest, float(back.max(initial=0)))
+            total, area = total + float(back @ weight), area + float(weight.sum())
+        mean = float(there @ weights / weights.sum())
+        return float(there.max()), mean, largest, total / area
 
 
 def points_on(mesh: Mesh, step: float) -> Iterator[tuple[Points, Distances]]:
     """Yield points of a mesh, (n, 3), and the area that each stands for, (n,), in chunks.
 
-    They are the vertices, which stand for none, and the middles of a pattern of cells on each
-    triangle: as many along its longest side, and across, as are needed to be no wider than a step.
+    They are the vertices, which stand for none, and those of ``points_within``.
     """
-    vertices = mesh.vertices.astype(np.float64)
-    yield vertices, np.zeros(len(vertices))
-    apex, low, high, area = _on_longest_side(vertices[mesh.faces])
+    yield mesh.vertices.astype(np.float64), np.zeros(len(mesh.vertices))
+    for points, weights, _ in points_within(mesh, step):
+        yield points, weights
+
+
+def points_within(mesh: Mesh, step: float) -> Iterator[tuple[Points, Distances, NDArray[np.int64]]]:
+    """Yield points within triangles, (n, 3), their areas and triangles, (n,), in chunks.
+
+    They are the middles of a pattern of cells on each triangle: as many along its longest side, and
+    across, as are needed to be no wider than a step.
+    """
+    apex, low, high, area = _on_longest_side(mesh.vertices.astype(np.float64)[mesh.faces])
     side = np.linalg.norm(high - low, axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         across = np.where(side > 0, 2 * area / side, 0)
@@ -88,7 +93,7 @@ def points_on(mesh: Mesh, step: float) -> Iterator[tuple[Points, Distances]]:
         base = low[face] + u * (high[face] - low[face])
         # cells are narrower, and so stand for less, towards the apex
         weight = area[face] * 2 * (1 - v[:, 0]) / (along[face] * rows[face])
-        yield base + v * (apex[face] - base), weight
+        yield base + v * (apex[face] - base), weight, face
 
 
 def _on_longest_side(corners: Points) -> tuple[Points, Points, Points, Distances]:

@@ -8,7 +8,7 @@ The modules that do it are imported when they are needed: they need the extra ``
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from ..errors import OutOfMemoryError
@@ -17,11 +17,28 @@ from ..machine.memory import give_back, held_memory, in_words, memory_bound
 from ..mesh import Mesh, check_mesh
 from ..options import check_goal, check_max_memory
 from ..progress import ShareCallback
-from .deviation import Deviation
 
 # Peak of memory beside the mesh, measured on meshes of 200,000 to 300,000 triangles: 905 to 1,375,
 # of which pyfqmr keeps 300 until the process ends.
 BYTES_PER_TRIANGLE = 1400
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """Distances between a mesh and a simplified one, in world units or in voxels.
+
+    Attributes
+    ----------
+    largest, mean : float
+        From points of the mesh to the simplified one; the mean is over the area.
+    largest_back, mean_back : float
+        From points of the simplified mesh to the mesh.
+    """
+
+    largest: float
+    mean: float
+    largest_back: float
+    mean_back: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +67,7 @@ class Simplified:
         return {
             "triangles_before": self.triangles_before,
             "triangles": len(self.mesh.faces),
-            "deviation": asdict(self.deviation.over(voxel_size)),
+            "deviation": {name: x / voxel_size for name, x in vars(self.deviation).items()},
             "warnings": list(self.warnings),
         }
 
@@ -97,8 +114,8 @@ def simplify_mesh(
     error, triangles = check_goal(error, triangles)
     check_can_simplify()
     check_room(len(mesh.faces), check_max_memory(max_memory))
+    from .collapsing import Rounds, down_to, within
     from .measuring import Original
-    from .passes import Rounds, down_to, within
 
     if not len(mesh.faces):
         return Simplified(mesh, 0, Deviation(0.0, 0.0, 0.0, 0.0))
@@ -107,7 +124,7 @@ def simplify_mesh(
         result, warnings = within(mesh, original, error, rounds)
     else:
         result, warnings = down_to(mesh, triangles or 0, rounds)
-    deviation = original.deviation(result)
+    deviation = Deviation(*original.deviation(result))
     if progress:
         progress(1.0)
     return Simplified(result, len(mesh.faces), deviation, warnings)

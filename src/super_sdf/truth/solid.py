@@ -72,24 +72,6 @@ class Solid:
         squared, face, feet = self._triangles.squared_distance(mesh.vertices, mesh.faces, points)
         return np.sqrt(squared), np.ravel(face), feet
 
-    def first_hits(self, points: Points, rays: Points) -> tuple[NDArray[np.int64], Points]:
-        """Return the first triangle that each ray hits, and where.
-
-        Parameters
-        ----------
-        points, rays : (n, 3) float64
-            Where the rays start, and their directions.
-
-        Returns
-        -------
-        (n,) int64, (n, 3) float64
-            The triangle, -1 if none is hit, and the barycentric coordinates of the hit in it.
-        """
-        mesh = self.mesh
-        face, _, uv = self._triangles.intersect_ray_first(mesh.vertices, mesh.faces, points, rays)
-        u, v = np.asarray(uv)[:, -2:].T
-        return np.ravel(face), np.stack([1 - u - v, u, v], axis=1)
-
     def winding_number(self, points: Points) -> Distances:
         """Return the winding number of points (n, 3), (n,): 1 inside, 0 outside."""
         return self._winding.winding_number(points) if len(points) else np.zeros(0)
@@ -180,6 +162,13 @@ def load_solid(path: str | Path, *, allow_open: bool = False) -> tuple[Solid, li
             "inner walls, too"
         )
     return solid, notes
+
+
+def normalise(mesh: Mesh) -> Mesh:
+    """Return a mesh, float64, centred on its bounding box and scaled to a box diagonal of 1."""
+    vertices = mesh.vertices.astype(np.float64)
+    low, high = vertices.min(0), vertices.max(0)
+    return Mesh((vertices - (low + high) / 2) / np.linalg.norm(high - low), mesh.faces)
 
 
 def _both_sides(mesh: Mesh) -> Points:
