@@ -187,23 +187,17 @@ def test_errors_keep_their_words():
     assert os.listdir() == []
 
 
-def test_grids_meshes_and_pictures_ask_once_more_in_the_end(monkeypatch):
+def test_grids_and_meshes_ask_once_more_in_the_end(monkeypatch):
     from super_sdf import Mesh, SdfGrid, write_mesh
     from super_sdf.files import grids, meshes
-    from super_sdf.pictures.sections import render_section
 
     grid = SdfGrid(np.arange(8.0).reshape(2, 2, 2) - 1, 4.0)
     for module in (grids, meshes):  # the first look finds nothing
         monkeypatch.setattr(module, "check_free", lambda path, force: path)
     Path("out.ply").write_text("theirs")
     Path("out.npz").write_text("theirs")
-    Path("out.png").write_text("theirs")
     with pytest.raises(WriteError, match="created by another program"):
         write_mesh(Mesh(np.eye(3), np.array([[0, 1, 2]])), "out.ply")
     with pytest.raises(WriteError, match="created by another program"):
         grids.write_grid(grid, "out.npz")
-    with pytest.raises(WriteError, match="created by another program"):
-        render_section(grid, Path("out.png"), force=False)
-    assert [path.read_text() for path in Path().iterdir()] == 3 * ["theirs"]
-    render_section(grid, Path("out.png"), force=True)
-    assert Path("out.png").read_bytes().startswith(b"\x89PNG")
+    assert [path.read_text() for path in Path().iterdir()] == 2 * ["theirs"]

@@ -39,18 +39,6 @@ def _sample() -> click.Command:
     return sample_command
 
 
-def _evaluate() -> click.Command:
-    from .evaluate import evaluate_command
-
-    return evaluate_command
-
-
-def _render() -> click.Command:
-    from .render import render_command
-
-    return render_command
-
-
 def _view() -> click.Command:
     from .view import view_command
 
@@ -68,8 +56,6 @@ COMMANDS = {
     "batch": _batch,
     "check": _check,
     "sample": _sample,
-    "evaluate": _evaluate,
-    "render": _render,
     "view": _view,
     "info": _info,
 }

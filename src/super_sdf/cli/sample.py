@@ -71,11 +71,10 @@ def sample_command(source: Path, target: Path, **options: Any) -> None:
 
 def run_sample(source: Path, target: Path, options: dict[str, Any]) -> None:
     """Read the mesh, lay out the grid, sample it, write it, print notes and the size."""
-    from ..evaluation.metrics import normalise
     from ..files.grids import check_grid_target, write_grid
     from ..files.output import check_apart
     from ..truth.sampling import check_numbers, fitted_layout, sample_solid, unit_layout
-    from ..truth.solid import Solid, load_solid
+    from ..truth.solid import Solid, load_solid, normalise
 
     start = time.perf_counter()
     check_grid_target(target, force=options["force"])

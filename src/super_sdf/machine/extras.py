@@ -22,13 +22,11 @@ EXTRAS = {
     "3mf": ("lxml", "networkx"),
     "pyvista": ("pyvista",),
     "simplify": ("igl", "pyfqmr"),
-    "eval": ("igl", "matplotlib", "scipy", "skimage"),
-    "view": ("pyvista",),
-    "report": ("pyfqmr", "pyvista"),
-    "peers": ("gpytoolbox",),
+    "eval": ("igl", "scipy"),
+    "report": ("matplotlib", "pyfqmr", "pyvista", "skimage"),
     "cluster": ("distributed",),
 }
-BUILT_ON = {"view": "eval", "peers": "eval", "report": "eval"}
+BUILT_ON = {"report": "eval"}
 
 
 def all_modules(extra: str) -> tuple[str, ...]:

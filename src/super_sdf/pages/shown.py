@@ -11,7 +11,6 @@ from ..arrays import FloatArray
 from ..certificate.check import Certificate, CheckOptions, check_mesh
 from ..certificate.coloured import vertex_residuals
 from ..errors import OutOfMemoryError, SuperSdfError
-from ..evaluation.methods import isosurface
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import held_memory, in_words, memory_bound
 from ..mesh import Mesh
@@ -87,7 +86,7 @@ def coarse_surface(grid: SdfGrid, offset: float = 0.0, max_memory: int | None = 
             f"marching cubes of the samples needs {in_words(need)} of memory, {in_words(bound)} "
             "may be used"
         )
-    mesh = isosurface(np.array(grid.values, np.float32) - np.float32(offset), 1.0, 0.0)
+    mesh = isosurface(np.array(grid.values, np.float32) - np.float32(offset))
     faces = mesh.faces[:, ::-1] if grid.is_mirrored else mesh.faces
     return Mesh(grid.to_world(mesh.vertices), np.ascontiguousarray(faces))
 
@@ -101,3 +100,14 @@ def reduced(mesh: Mesh, triangles: int, max_memory: int | None = None) -> Mesh:
         return mesh
     check_room(len(mesh.faces), max_memory)
     return collapse_to(mesh, np.zeros(len(mesh.faces), bool), triangles)
+
+
+def isosurface(field: FloatArray) -> Mesh:
+    """Mesh a dense field by marching cubes; empty if it has one sign only."""
+    from skimage.measure import marching_cubes
+
+    field[field == 0] = np.float32(1e-9)  # a vertex on a node can open the surface
+    if not field.min() < 0 < field.max():
+        return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
+    vertices, faces, _, _ = marching_cubes(field, 0.0, method="lorensen")
+    return Mesh(vertices.astype(np.float64), faces.astype(np.int32))

@@ -5,12 +5,12 @@ from __future__ import annotations
 import base64
 from io import BytesIO
 
-from matplotlib.image import imsave
+import numpy as np
 
 from ..mesh import Mesh
-from ..pictures.rendering import Panel, draw_panel, fit_frame, view_axes
 
 LONG_SIDE = 160  # pixels
+VIEW = (0.6, -1.0, 0.5)  # from the mesh to the viewer
 
 
 def thumbnail(mesh: Mesh) -> str | None:
@@ -20,7 +20,20 @@ def thumbnail(mesh: Mesh) -> str | None:
     """
     if not len(mesh.faces):
         return None
-    panel, file = Panel(mesh), BytesIO()
-    image = draw_panel(panel, fit_frame([panel], view_axes()), LONG_SIDE)
-    imsave(file, image, format="webp", pil_kwargs={"quality": 80})
+    import pyvista
+    from matplotlib.image import imsave
+
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    middle = (low + high) / 2
+    surface = pyvista.PolyData.from_regular_faces(
+        (mesh.vertices - middle).astype(np.float64), mesh.faces
+    )
+    plotter, file = pyvista.Plotter(off_screen=True, window_size=(LONG_SIDE,) * 2), BytesIO()
+    plotter.set_background("white")
+    plotter.add_mesh(surface, color="#b9c7df", smooth_shading=False)
+    plotter.camera_position = [VIEW, (0, 0, 0), (0, 0, 1)]
+    plotter.camera.parallel_projection = True
+    plotter.reset_camera()
+    imsave(file, plotter.screenshot(return_img=True)[..., :3], format="webp")
+    plotter.close()
     return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode("ascii")

@@ -12,8 +12,8 @@ from ..steps.meshers import BY_NAME
 from ..steps.spline import spline_bytes
 from ..steps.survey import Band
 
-# Peak memory of the stages after the network in bytes, measured (``benchmarks.large``,
-# ``benchmarks.bounds``): per voxel that the network sees, per decoded voxel, per node of a decoded
+# Peak memory of the stages after the network in bytes, measured (``python -m lab figures --only
+# memory``, ``bounds``): per voxel that the network sees, per decoded voxel, per node of a decoded
 # block, per thread (its chunk), and a constant.
 STAGES = {
     "average": (216, 300, 5.0, 1e7, 2e7),
