@@ -16,7 +16,6 @@ COMMANDS = {
     "batch": "many grids, some broken, with kills, or on a cluster",
     "faults": "conversions and batches ended at random moments, and full disks",
     "zoo": "grids as people have them, and the ways out that refusals name",
-    "readers": "every reader against a second library",
     "corpus": "thousands of bad and odd inputs, and random fields",
     "cuda": "CUDA against the CPU",
     "versions": "releases of Python and of the dependencies",

@@ -35,21 +35,11 @@ STRIP = 1.35  # inches for titles, labels and the colour bar
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """Values on a plane of a lattice; each is drawn as a rectangle around its point.
+    """Values on a plane of a lattice; each is drawn as a rectangle around its point."""
 
-    Attributes
-    ----------
-    values : (n, m) float64
-        Signed distances in world units, negative inside, NaN where unknown.
-    first : two floats
-        World position of value (0, 0) along the two axes of the plane.
-    step : two floats
-        World distance between neighbouring values along these axes.
-    """
-
-    values: NDArray[np.float64]
-    first: tuple[float, float]
-    step: tuple[float, float]
+    values: NDArray[np.float64]  # (n, m), in world units, negative inside, NaN where unknown
+    first: tuple[float, float]  # world position of value (0, 0) along the two axes
+    step: tuple[float, float]  # world distance between neighbours along them
 
     def places(self, along: int) -> NDArray[np.floating[Any]]:
         """Return the world positions of the values along an axis of the plane."""

@@ -3,9 +3,8 @@
     python -m lab cuda --sizes 64 128 256
 
 Prints Markdown: the machine; for each network and size the largest difference and the microseconds
-per voxel, copies to and from the GPU included; the time for several chunk sizes of the neighbour
-table; GPU memory after ever larger shapes; and the seconds from a grid to its mesh. All grids are
-noisy balls. If CUDA does not run, one line says why.
+per voxel, copies to and from the GPU included; GPU memory after ever larger shapes; and the seconds
+from a grid to its mesh. All grids are noisy balls. If CUDA does not run, one line says why.
 """
 
 from __future__ import annotations
@@ -20,16 +19,13 @@ import numpy as np
 
 from super_sdf import SdfGrid, load_network, reconstruct
 from super_sdf.errors import DeviceError
-from super_sdf.network.contract import INPUTS
 from super_sdf.network.cuda import describe_gpu, onnxruntime_version, query_gpu
 from super_sdf.network.names import QUALITIES
 from super_sdf.network.network import Network
-from super_sdf.network.running import CUDA_CHUNK, run_bound
 from super_sdf.steps.nodes import block_offsets
 from super_sdf.steps.survey import survey
 
 RUNS = 3
-CHUNKS = (512, 2048, 8192, CUDA_CHUNK, 65536)
 SHAPES = 40  # for the memory
 
 
@@ -89,17 +85,6 @@ def compare_values(device: str, sizes: Sequence[int]) -> None:
     print_table("Values and speed of the network", head, rows)
 
 
-def compare_chunks(device: str, size: int) -> None:
-    """Print the time of the network for several chunk sizes of the neighbour table."""
-    network = load_network("base", device=device)
-    feeds = dict(zip(INPUTS, network_inputs(size)))
-    rows = []
-    for chunk in CHUNKS:
-        seconds = best_seconds(run_bound, network.session, feeds, device, chunk)
-        rows.append([chunk, f"{1e6 * seconds / len(feeds['patches']):.2f}"])
-    print_table(f"Chunks of the neighbour table at {size}^3", ["rows", "us per voxel"], rows)
-
-
 def watch_memory(device: str, size: int) -> None:
     """Print GPU memory after many shapes, each with more voxels than the last."""
     rows = [["nothing", used_memory()]]
@@ -154,6 +139,5 @@ def main() -> None:
     gpu = describe_gpu() or "no GPU"
     print(f"{gpu}; {os.cpu_count()} cores; {onnxruntime_version()}; least of {RUNS} runs each")
     compare_values(arguments.device, arguments.sizes)
-    compare_chunks(arguments.device, max(arguments.sizes))
     watch_memory(arguments.device, max(arguments.sizes))
     compare_pipeline(arguments.device, arguments.sizes)

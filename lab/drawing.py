@@ -50,44 +50,21 @@ FOOT = {"shaded": 0.0, "normal": 2.0, "error": 5.0}  # height of the legend, in 
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One mesh of a picture.
-
-    Attributes
-    ----------
-    mesh : Mesh
-        The mesh that is drawn.
-    title : str
-        The text above it.
-    values : (n,) float array, optional
-        One value per vertex, shown with ``colour="error"``.
-    """
+    """One mesh of a picture."""
 
     mesh: Mesh
     title: str = ""
-    values: NDArray[Any] | None = None
+    values: NDArray[Any] | None = None  # one per vertex, shown with ``colour="error"``
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The camera's direction and the size of the panels.
+    """The camera's direction and the size of the panels."""
 
-    Attributes
-    ----------
-    view : three floats, optional
-        Direction from the meshes to the viewer, in world axes. Default: from the front, the right
-        and above.
-    zoom : float
-        Magnification; at 1 every mesh fits into its panel.
-    size : int
-        Pixels along the long side of a panel.
-    columns : int, optional
-        Most panels in a row.
-    """
-
-    view: tuple[float, float, float] | None = None
-    zoom: float = 1.0
-    size: int = 700
-    columns: int | None = None
+    view: tuple[float, float, float] | None = None  # from the meshes to the viewer
+    zoom: float = 1.0  # at 1 every mesh fits into its panel
+    size: int = 700  # pixels along the long side of a panel
+    columns: int | None = None  # most panels in a row
 
 
 DEFAULT_LAYOUT = Layout()
@@ -95,24 +72,12 @@ DEFAULT_LAYOUT = Layout()
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """The view that all panels share: x to the right, y up, z to the viewer, long side -1 to 1.
+    """The view that all panels share: x to the right, y up, z to the viewer, long side -1 to 1."""
 
-    Attributes
-    ----------
-    axes : (3, 3) float64
-        The directions of x, y and z in the world, one per row.
-    centre : (3,) float64
-        The middle of the frame, in coordinates along ``axes``.
-    half : float
-        Half the long side, in world units.
-    sides : two floats
-        Width and height, each over the long side.
-    """
-
-    axes: NDArray[np.float64]
-    centre: NDArray[np.float64]
-    half: float
-    sides: tuple[float, float]
+    axes: NDArray[np.float64]  # directions of x, y and z in the world, one per row
+    centre: NDArray[np.float64]  # in coordinates along ``axes``
+    half: float  # half the long side, in world units
+    sides: tuple[float, float]  # width and height, each over the long side
 
     def place(self, vertices: NDArray[Any]) -> Points:
         """Return the positions of vertices (n, 3) in the frame, (n, 3) float64."""

@@ -46,19 +46,11 @@ NO_NORMAL_ANGLE = 90.0  # degrees, of a result without a surface: the mean over 
 
 @dataclass(frozen=True, eq=False)
 class EdgeCurves:
-    """The sharp edges of a mesh, and points drawn from them.
+    """The sharp edges of a mesh, and points drawn from them."""
 
-    Attributes
-    ----------
-    vertices, edges : (n, 3) float, (e, 2) int
-        Vertices of the mesh, and the two ends of each sharp edge.
-    drawn : (m, 3) float
-        Points sampled uniformly by length, in the order of ``order_in_space``; none without edges.
-    """
-
-    vertices: Points
-    edges: IntArray
-    drawn: Points
+    vertices: Points  # (n, 3), of the mesh
+    edges: IntArray  # (e, 2), the ends of each sharp edge
+    drawn: Points  # (m, 3), uniform by length, in the order of ``order_in_space``
 
     @classmethod
     def of(cls, mesh: Mesh, seed: tuple[int, int]) -> EdgeCurves:

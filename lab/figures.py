@@ -55,29 +55,15 @@ LATE = 900.0  # seconds for another method on a shape
 
 @dataclass(frozen=True)
 class Bench:
-    """What the figures are measured on, and how.
+    """What the figures are measured on, and how."""
 
-    Attributes
-    ----------
-    shapes, parts : tuple of Path
-        The validation shapes, and the CAD parts of ``export.parts``.
-    rows : Rows
-        What is measured already.
-    network : str
-        Of the method ``ours``: a shipped network or an ONNX file.
-    sizes : tuple of int
-        Of the main tables.
-    jobs, runs : int
-        Processes at a time, and timed runs of each.
-    """
-
-    shapes: tuple[Path, ...]
-    parts: tuple[Path, ...]
+    shapes: tuple[Path, ...]  # for validation
+    parts: tuple[Path, ...]  # CAD parts of ``export.parts``
     rows: Rows
-    network: str = DEFAULT_QUALITY
-    sizes: tuple[int, ...] = (32, 64, 128)
-    jobs: int = 1
-    runs: int = 5
+    network: str = DEFAULT_QUALITY  # of the method ``ours``
+    sizes: tuple[int, ...] = (32, 64, 128)  # of the main tables
+    jobs: int = 1  # processes at a time
+    runs: int = 5  # of each that is timed
 
     @property
     def small(self) -> int:

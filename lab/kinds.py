@@ -60,38 +60,16 @@ AXES = "xyz"
 
 @dataclass(frozen=True, eq=False)
 class Kind:
-    """A kind of grid, and what is done with it.
+    """A kind of grid, and what is done with it."""
 
-    Attributes
-    ----------
-    group : str
-        What it belongs to: exact, mask, truncated, scaled, density, noisy or unequal.
-    title : str
-        What tables call it. Kinds with the same title share their rows.
-    make : callable
-        Takes a case; returns the values as they stand in a user's file.
-    methods : tuple of str
-        What is measured, by the names in ``KIND_LABELS``.
-    level : float, optional
-        Of a mask or of densities: the other methods mesh the surface at this value, and what is
-        above it is inside. Default: distances, negative inside.
-    options : mapping
-        What the user says of the values, as options of ``make_grid``.
-    unit : float, optional
-        The values are distances times this unit, and the user knows no spacing. Default: the
-        spacing is given.
-    ratio : float
-        The spacing along ``axis`` (x, y or z) over that along the others, which have more samples.
-    """
-
-    group: str
-    title: str
-    make: Callable[[Case], Array]
-    methods: tuple[str, ...] = DISTANCES
-    level: float | None = None
-    options: Mapping[str, Any] = field(default_factory=dict)
-    unit: float | None = None
-    ratio: float = 1.0
+    group: str  # exact, mask, truncated, scaled, density, noisy or unequal
+    title: str  # kinds with the same title share their rows
+    make: Callable[[Case], Array]  # values as they stand in a user's file
+    methods: tuple[str, ...] = DISTANCES  # by the names in ``KIND_LABELS``
+    level: float | None = None  # for other methods; above it is inside; else distances
+    options: Mapping[str, Any] = field(default_factory=dict)  # what the user says
+    unit: float | None = None  # of distances whose spacing the user does not know
+    ratio: float = 1.0  # the spacing along ``axis`` over that along the others
     axis: str = ""
 
     @property
@@ -107,19 +85,11 @@ class Kind:
 
 @dataclass(frozen=True, eq=False)
 class FieldSamples:
-    """The values of a kind for a case.
+    """The values of a kind for a case."""
 
-    Attributes
-    ----------
-    values : (nx, ny, nz) array
-        As in a user's file.
-    spacing, origin : (3,) float64
-        World distance between samples along each axis, and position of sample (0, 0, 0).
-    """
-
-    values: Array
-    spacing: NDArray[np.float64]
-    origin: NDArray[np.float64]
+    values: Array  # (nx, ny, nz)
+    spacing: NDArray[np.float64]  # (3,)
+    origin: NDArray[np.float64]  # of sample (0, 0, 0)
 
 
 @lru_cache(maxsize=1)

@@ -47,33 +47,16 @@ NOT_THE_METHOD = {"batch", "certificate", "cli", "cluster", "pages"}
 
 @dataclass(frozen=True)
 class Task:
-    """What one process measures: some methods on one shape in one setting.
-
-    Attributes
-    ----------
-    path : Path
-        The mesh file of the shape.
-    setting : Setting
-    methods : tuple of str
-        In the order of measuring; see ``methods``.
-    model, precision : str
-        The network of methods that name none: see ``load_network``.
-    threads : int
-        Threads of the network; 0: one per core.
-    turned : int, optional
-        Seed by which the shape is turned at random; as its file has it unless given.
-    limit : float, optional
-        Seconds that the task may take.
-    """
+    """What one process measures: some methods on one shape in one setting."""
 
     path: Path
     setting: Setting
-    methods: tuple[str, ...]
+    methods: tuple[str, ...]  # in the order of measuring
     model: str = DEFAULT_QUALITY
     precision: str = AUTO_PRECISION
-    threads: int = 0
-    turned: int | None = None
-    limit: float | None = None
+    threads: int = 0  # of the network; 0: one per core
+    turned: int | None = None  # seed by which the shape is turned at random
+    limit: float | None = None  # seconds
 
     def __str__(self) -> str:
         named = [str(self.setting), *(self.methods if self.limit else [])]

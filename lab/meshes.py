@@ -2,16 +2,14 @@
 
     python -m lab meshes MESHES --sizes 32 64 --out before.json --keep before/
     python -m lab meshes MESHES --sizes 32 64 --against before.json
-    python -m lab meshes MESHES --sizes 32 64 --near before/
     python -m lab meshes MESHES --sizes 32 64 --against lab/meshes.json
     python -m lab meshes fandisk.ply --sizes 512 --slabs 1 7 --against lab/meshes.json
 
 Samples every shape at every size, converts it with the network ``base`` to ``.ply``, and prints
-which files differ. ``--near`` compares with mesh files that ``--keep`` wrote: the triangles must be
-the same, and positions at most 1e-6 coarse spacings and one unit in the last place apart.
-``meshes.json`` has the digests of the 63 validation shapes, of fandisk at 512^3 in 1 and 7 slabs,
-and of the network; another network gives other meshes, and is refused. Sums of floats may differ
-between processors, so on another machine write a file with the earlier commit first.
+which files differ; ``--keep`` keeps them. ``meshes.json`` has the digests of the 63 validation
+shapes, of fandisk at 512^3 in 1 and 7 slabs, and of the network; another network gives other
+meshes, and is refused. Sums of floats may differ between processors, so on another machine write a
+file with the commit to compare with first.
 """
 
 from __future__ import annotations
@@ -27,9 +25,6 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-import numpy as np
-import trimesh
-
 from super_sdf import pipeline
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.network.names import DEFAULT_QUALITY
@@ -39,8 +34,6 @@ from super_sdf.steps.survey import Band
 
 from .processes import write_grid
 from .shapes import Shape, find_meshes
-
-ALLOWED = 1e-6
 
 
 def digest(path: Path) -> str:
@@ -73,19 +66,6 @@ def write_meshes(
                 yield f"{path.stem} {size}" + f" in {count} slabs" * (count > 1), target
 
 
-def distance(path: Path, other: Path, size: int) -> float:
-    """Return how far vertices of two meshes lie apart at most, in coarse spacings.
-
-    Differences of one unit in the last place do not count. Infinity if triangles differ.
-    """
-    (mesh, kept) = (trimesh.load(name, process=False) for name in (path, other))
-    if not np.array_equal(mesh.faces, kept.faces):
-        return float("inf")
-    a, b = (np.asarray(m.vertices, np.float32) for m in (mesh, kept))
-    apart = np.abs(a.astype(np.float64) - b)
-    return float(np.where(apart <= np.spacing(np.abs(b)), 0, apart).max() * size)
-
-
 def parse() -> argparse.Namespace:
     """Return the arguments."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -95,7 +75,6 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--out", type=Path, help="write the digests to this JSON file")
     parser.add_argument("--keep", type=Path, help="keep the mesh files in this folder")
     parser.add_argument("--against", type=Path, help="compare them with this JSON file")
-    parser.add_argument("--near", type=Path, help="compare them with the mesh files in this folder")
     return parser.parse_args()
 
 
@@ -110,17 +89,13 @@ def main() -> None:
     for path in find_meshes(options.meshes):
         for name, mesh in write_meshes(path, options.sizes, options.slabs, loaded):
             digests[name] = digest(mesh)
-            kept = f"{name.replace(' ', '-')}.ply"
             if options.keep:
-                shutil.copy(mesh, options.keep / kept)
-            if options.near:
-                apart = distance(mesh, options.near / kept, int(name.split()[1]))
-                others += [f"{name}: {apart:.1e} spacings"] * (apart > ALLOWED)
+                shutil.copy(mesh, options.keep / f"{name.replace(' ', '-')}.ply")
             if before and before["meshes"].get(name) != digests[name]:
                 others.append(name)
     if options.out:
         text = json.dumps({"network": network, "meshes": digests}, indent=1)
         options.out.write_text(text + "\n")
-    what = "the same bytes" if before else "near" if options.near else "written"
+    what = "the same bytes" if before else "written"
     print(f"{len(digests) - len(others)} of {len(digests)} meshes are {what}")
     raise SystemExit("\n".join(["Others:", *others]) if others else 0)

@@ -1,4 +1,4 @@
-"""Plots: quality by resolution, its distribution over the shapes, quality against time."""
+"""Plots: quality by resolution, and its distribution over the shapes."""
 
 from __future__ import annotations
 
@@ -40,7 +40,6 @@ def draw_plots(by_size: BySize, folder: Path) -> dict[str, str]:
     plots = {
         "resolution.png": ("Quality against resolution", draw_resolution),
         "distribution.png": ("F1 of every shape, sorted", draw_distribution),
-        "time.png": ("Quality against time", draw_time),
     }
     for name, (_, draw) in plots.items():
         with replacing(folder / name) as part:
@@ -75,29 +74,6 @@ def draw_distribution(by_size: BySize) -> Figure:
             )
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         ax.set(xlabel="shapes, worst first", ylabel="F1 at 0.003", title=f"{size}^3", ylim=(0, 1))
-    return with_legend(figure, axes[0])
-
-
-def draw_time(by_size: BySize) -> Figure:
-    """Draw mean F1 against mean seconds: a curve for each method, a point for each size."""
-    figure, axes = make_axes(1)
-    for method in [name for name in drawn(by_size) if name not in (FLOOR, "bound")]:
-        points = [
-            (mean_of(by_method[method], "seconds"), mean_of(by_method[method], "f1"), size)
-            for size, by_method in by_size.items()
-        ]
-        known = [(s, f1, size) for s, f1, size in points if s is not None and f1 is not None]
-        axes[0].plot(
-            [s for s, _, _ in known],
-            [f1 for _, f1, _ in known],
-            "o-",
-            color=COLOURS[method],
-            label=LABELS[method],
-        )
-        for seconds, f1, size in known:
-            axes[0].annotate(f"{size}", (seconds, f1), (4, -11), textcoords="offset points")
-    axes[0].set(xscale="log", xlabel="mean seconds from grid to mesh", ylabel="mean F1 at 0.003")
-    axes[0].set_title("Numbers are samples along an axis")
     return with_legend(figure, axes[0])
 
 

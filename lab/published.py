@@ -68,46 +68,9 @@ NOISE_F1: dict[float, tuple[float, float]] = {
     1.0: (0.283, 0.286),
 }
 
-# Supplement, Table 2: CD x1e5, F1, NC from 32^3 by passes of factor 4.
-ITERATED: dict[int, tuple[float, float, float]] = {
-    1: (1.351, 0.820, 0.950),
-    2: (1.317, 0.824, 0.952),
+# Supplement, Table 3: CD x1e5, F1, NC by scale, at 32^3.
+SCALED: dict[float, tuple[float, float, float]] = {
+    0.25: (13.826, 0.425, 0.871),
+    0.50: (2.653, 0.701, 0.929),
+    0.75: (1.252, 0.834, 0.953),
 }
-
-# Supplement, Table 3: CD x1e5, F1, NC by scale and size.
-SCALED: dict[tuple[float, int], tuple[float, float, float]] = {
-    (0.25, 32): (13.826, 0.425, 0.871),
-    (0.25, 64): (2.652, 0.702, 0.928),
-    (0.25, 128): (0.892, 0.891, 0.966),
-    (0.50, 32): (2.653, 0.701, 0.929),
-    (0.50, 64): (0.895, 0.891, 0.966),
-    (0.50, 128): (0.656, 0.936, 0.984),
-    (0.75, 32): (1.252, 0.834, 0.953),
-    (0.75, 64): (0.707, 0.927, 0.978),
-    (0.75, 128): (0.636, 0.939, 0.989),
-}
-
-# Table 2: seconds per shape: mean, minimum, maximum; the paper's and PoNQ on an RTX 3080.
-SECONDS: dict[int, dict[str, tuple[float, float, float]]] = {
-    32: {
-        "MES": (185.464, 38.121, 1475.907),
-        "RFTA": (25.0348, 19.146, 28.784),
-        "PoNQ": (0.974, 0.513, 1.519),
-        PAPER: (0.764, 0.670, 1.154),
-    },
-    64: {
-        "RFTA": (106.346, 81.519, 155.856),
-        "PoNQ": (5.873, 2.977, 8.476),
-        PAPER: (1.125, 0.857, 1.449),
-    },
-    128: {
-        "RFTA": (1095.909, 628.926, 1785.074),
-        "PoNQ": (56.663, 22.711, 85.210),
-        PAPER: (2.778, 1.740, 3.971),
-    },
-}
-
-# Fig. 9, a plot without numbers.
-FACTORS = (
-    "The paper (Fig. 9, one shape, 32^3): best at 4, slightly worse in CD and NC at 8 and at 16."
-)

@@ -404,9 +404,7 @@ TABLES: dict[str, Callable[[list[Row]], str]] = {
     "speed.stages": stage_table,
     "speed.networks": rate_table,
     "noise.table": noise_table,
-    "scale.table": lambda rows: setting_table(
-        rows, "scale", {s: paper for (s, n), paper in published.SCALED.items() if n == 32}
-    ),
+    "scale.table": lambda rows: setting_table(rows, "scale", published.SCALED),
     "factors.table": lambda rows: setting_table(rows, "factor", {}),
     "simplify.table": simplify_table,
     "check.table": check_table,

@@ -45,25 +45,12 @@ HALVES_SEED = 0
 
 @dataclass(frozen=True)
 class Setting:
-    """How a shape is sampled and refined.
+    """How a shape is sampled and refined."""
 
-    Attributes
-    ----------
-    size : int
-        Samples along each axis of the grid; 0 where nothing is sampled (the floor).
-    factor : int
-        Upscaling factor K.
-    noise : float
-        Amplitude of the uniform noise on the samples, in half voxels.
-    scale : float
-        Longest side of the shape's box over the side of the grid; 0: the grid's side is the box
-        diagonal, 1.
-    """
-
-    size: int
+    size: int  # samples along each axis; 0 where nothing is sampled (the floor)
     factor: int = 4
-    noise: float = 0.0
-    scale: float = 0.0
+    noise: float = 0.0  # amplitude of the uniform noise on the samples, in half voxels
+    scale: float = 0.0  # longest side of the box over the grid's; 0: the grid's is the diagonal
 
     def check(self) -> None:
         """Raise OptionError if a number is out of range."""
@@ -135,26 +122,6 @@ class Case:
     """A shape sampled in a setting.
 
     The fields of the baselines and the truth are dense, so they must fit into memory.
-
-    Attributes
-    ----------
-    coarse : (n, n, n) float32
-        Exact signed distances at the samples.
-    grid : SdfGrid
-        Input of the methods: the same, with the setting's noise. Ours takes ``recognised``.
-    side : float
-        Length of the grid's cube.
-    low : float
-        Coordinate of the first node of the fine lattice on every axis.
-    spacing, fine : float
-        Distance between samples, and between nodes of the fine lattice.
-    triangles : dict
-        How many the mesh of each method has that was measured, by name.
-
-    Raises
-    ------
-    OutOfMemoryError
-        If the dense fields do not fit into memory.
     """
 
     def __init__(self, shape: Shape, setting: Setting) -> None:

@@ -45,41 +45,18 @@ TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
 
 @dataclass(frozen=True, eq=False)
 class Kind:
-    """Values as they stand in a user's file, and the truth.
+    """Values as they stand in a user's file, and the truth."""
 
-    Attributes
-    ----------
-    values : (nx, ny, nz) array
-    form : callable
-        Of places in voxels, (..., 3): what ``values`` are without steps, cuts and noise.
-    level : float
-        The surface is where the form has this value.
-    above : bool
-        Whether the solid is above the level.
-    signs : bool
-        Whether the values only say which samples are inside, so that marching cubes gets a mask.
-    options : dict
-        Of the plain call.
-    steps : three floats
-        The spacings of the axes, in voxels.
-    unit : float
-        World units per voxel.
-    labels : dict
-        The form of each label that may be chosen, below 0 within.
-    ends : str
-        "mesh", "refusal", or "either".
-    """
-
-    values: Any
-    form: Form
-    level: float = 0.0
-    above: bool = False
-    signs: bool = False
-    options: dict[str, Any] = field(default_factory=dict)
-    steps: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    unit: float = H
-    labels: dict[int, Form] = field(default_factory=dict)
-    ends: str = "mesh"
+    values: Any  # (nx, ny, nz)
+    form: Form  # of places in voxels: the values without steps, cuts and noise
+    level: float = 0.0  # of the form at the surface
+    above: bool = False  # the solid is above the level
+    signs: bool = False  # the values only say what is inside: marching cubes gets a mask
+    options: dict[str, Any] = field(default_factory=dict)  # of the plain call
+    steps: tuple[float, float, float] = (1.0, 1.0, 1.0)  # spacings, in voxels
+    unit: float = H  # world units per voxel
+    labels: dict[int, Form] = field(default_factory=dict)  # below 0 within
+    ends: str = "mesh"  # or "refusal", "either"
 
 
 # Solids: distances in voxels at places (..., 3) of a grid of n voxels a side.
