@@ -102,8 +102,8 @@ def wide(
     first: str = "",
 ) -> str:
     """Return a table of one figure: a row for each label, a column for each entry of ``among``."""
-    across = values(rows, among)
-    body = []
+    rows = [row for row in rows if row.get(word) in labels]
+    across, body = values(rows, among), []
     for name, label in labels.items():
         found = [pick(rows, **{word: name, among: each}) for each in across]
         if any(found):
@@ -235,8 +235,7 @@ def slice_table(rows: Sequence[Row]) -> str:
 
 def option_table(rows: Sequence[Row], column: Column) -> str:
     """Return the options of whole processes at each size."""
-    sized = [row for row in rows if row["option"] in OPTION_LABELS]
-    return wide(sized, OPTION_LABELS, "option", column, first=column.title)
+    return wide(rows, OPTION_LABELS, "option", column, first=column.title)
 
 
 def dense_table(rows: Sequence[Row]) -> str:

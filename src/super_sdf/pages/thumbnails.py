@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 from io import BytesIO
+from typing import Any
 
 import numpy as np
 
@@ -23,12 +24,13 @@ def thumbnail(mesh: Mesh) -> str | None:
     import pyvista
     from matplotlib.image import imsave
 
+    draw: Any = pyvista
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     middle = (low + high) / 2
-    surface = pyvista.PolyData.from_regular_faces(
+    surface = draw.PolyData.from_regular_faces(
         (mesh.vertices - middle).astype(np.float64), mesh.faces
     )
-    plotter, file = pyvista.Plotter(off_screen=True, window_size=(LONG_SIDE,) * 2), BytesIO()
+    plotter, file = draw.Plotter(off_screen=True, window_size=(LONG_SIDE,) * 2), BytesIO()
     plotter.set_background("white")
     plotter.add_mesh(surface, color="#b9c7df", smooth_shading=False)
     plotter.camera_position = [VIEW, (0, 0, 0), (0, 0, 1)]
