@@ -20,9 +20,9 @@ import numpy as np
 from export.arguments import Parser, at_least, share
 from export.dataset import draw_mesh, find_meshes
 from export.shapes import random_solid
+from lab.metrics import face_vectors
+from lab.shapes import Case, Setting, Shape
 from super_sdf.errors import SuperSdfError
-from super_sdf.evaluation.cases import Case, Setting, Shape
-from super_sdf.evaluation.metrics import face_vectors
 from super_sdf.grid.sdf_grid import SdfGrid
 from super_sdf.network.network import Network, load_network
 from super_sdf.pipeline import upsample

@@ -1,6 +1,6 @@
 """The gap closed on each half of the validation shapes, from the measurements of ``evaluate``.
 
-    super-sdf evaluate FOLDER --sizes 32 64 128 --out report/
+    python -m lab evaluate FOLDER --sizes 32 64 128 --out report/
     python -m export.gaps FOLDER report/
 
 Prints a row for each size and half (``choice``): the means of F1, NC and the distance from result
@@ -17,15 +17,12 @@ from dataclasses import asdict
 from pathlib import Path
 
 from export.arguments import Parser
-from export.choice import draw_halves
+from lab.evaluate import ROWS
+from lab.methods import OURS
+from lab.rows import Row, Rows
+from lab.shapes import Setting, draw_halves, find_meshes
+from lab.tables import Column, gap_closed, markdown, mean_of, percent
 from super_sdf.errors import FileError
-from super_sdf.evaluation.cases import Setting
-from super_sdf.evaluation.folder import ROWS
-from super_sdf.evaluation.measuring import Measurement
-from super_sdf.evaluation.names import OURS
-from super_sdf.evaluation.scope import find_meshes
-from super_sdf.evaluation.store import Store
-from super_sdf.evaluation.tables import Column, gap_closed, markdown, mean_of, percent
 
 FIGURES = (
     Column("F1", "f1", digits=4),
@@ -36,7 +33,7 @@ COMPARED = (OURS, "bspline", "bound")
 SIZES = (32, 64, 128)
 
 
-def read_rows(reports: Sequence[Path], size: int) -> dict[str, dict[str, Measurement]]:
+def read_rows(reports: Sequence[Path], size: int) -> dict[str, dict[str, Row]]:
     """Return the measurements at a size, by method and shape; the first report that has one counts.
 
     Only exact samples of whole shapes, refined once by 4: not those of experiments.
@@ -47,17 +44,17 @@ def read_rows(reports: Sequence[Path], size: int) -> dict[str, dict[str, Measure
         If a folder is no report.
     """
     setting = asdict(Setting(size)).items()
-    found: dict[str, dict[str, Measurement]] = {method: {} for method in COMPARED}
+    found: dict[str, dict[str, Row]] = {method: {} for method in COMPARED}
     for report in reversed(reports):
         if not (report / ROWS).is_file():
-            raise FileError(f"{report} has no {ROWS}: give the --out of super-sdf evaluate")
-        for row in Store(report / ROWS).rows.values():
+            raise FileError(f"{report} has no {ROWS}: give the --out of python -m lab evaluate")
+        for row in Rows(report / ROWS):
             if row["method"] in found and setting <= row.items() and row["error"] is None:
                 found[row["method"]][row["shape"]] = row
     return found
 
 
-def gap_row(found: dict[str, dict[str, Measurement]], names: Sequence[str]) -> list[str]:
+def gap_row(found: dict[str, dict[str, Row]], names: Sequence[str]) -> list[str]:
     """Return the cells of the shapes that all methods were measured on."""
     common = [name for name in names if all(name in rows for rows in found.values())]
     ours, base, bound = ([found[method][name] for name in common] for method in COMPARED)
@@ -70,19 +67,20 @@ def gap_row(found: dict[str, dict[str, Measurement]], names: Sequence[str]) -> l
 
 def gap_rows(meshes: Sequence[Path], reports: Sequence[Path]) -> Iterator[list[str]]:
     """Yield the rows of the table: all shapes and each half, at each size that was measured."""
-    halves = {"all": meshes, **draw_halves(meshes)}
+    names = [path.stem for path in meshes]
+    halves = {"all": names, **draw_halves(names)}
     for size in SIZES:
         found = read_rows(reports, size)
         if all(found.values()):
-            for half, paths in halves.items():
-                yield [f"{size}^3", half, *gap_row(found, [path.stem for path in paths])]
+            for half, some in halves.items():
+                yield [f"{size}^3", half, *gap_row(found, some)]
 
 
 def main() -> None:
     """Print the table."""
     parser = Parser(description=__doc__.split("\n")[0])
     parser.add_argument("meshes", type=Path, help="folder of the shapes")
-    parser.add_argument("reports", nargs="+", type=Path, help="folders of super-sdf evaluate")
+    parser.add_argument("reports", nargs="+", type=Path, help="folders of python -m lab evaluate")
     options = parser.parse_args()
     titles = ["grid", "half", "shapes"]
     for column in FIGURES:

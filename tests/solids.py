@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from lab.surfaces import isosurface
 from super_sdf import Mesh, write_mesh
-from super_sdf.evaluation.methods import isosurface
 
 CUBE_CORNERS = "013 032 467 475 045 051 237 276 026 064 157 173"
 CUBE_FACES = np.array([[int(corner) for corner in face] for face in CUBE_CORNERS.split()], np.int32)

@@ -16,7 +16,6 @@ from super_sdf.errors import GridError
 from super_sdf.files.expectation import count_by_plane, count_on_lattice
 from super_sdf.grid.cubic import Resampled, cubic_grid, new_places, on_samples
 from super_sdf.mesh import join_meshes
-from super_sdf.pictures.sections import coarse_section, fine_section
 from super_sdf.pipeline import reconstruct_slabs
 from super_sdf.steps.survey import survey
 
@@ -261,19 +260,6 @@ def test_the_size_of_the_mesh_is_estimated_on_the_lattice(network):
         grid = make_grid(sampled(spacing), spacing=spacing)
         triangles = 2 * 4**2 * count_on_lattice(grid, count_by_plane(grid, 0.0))
         assert len(reconstruct(grid, network).faces) == pytest.approx(triangles, rel=0.05)
-
-
-@pytest.mark.parametrize("axis", "xyz")
-def test_sections_before_and_after_show_the_same_plane(axis):
-    grid = make_grid(sampled((0.3, 0.6, 0.3)), spacing=(0.3, 0.6, 0.3), origin=(1, 2, 3))
-    index = {"x": 15, "y": 6, "z": 16}[axis]
-    coarse = coarse_section(grid, axis, index)
-    fine = fine_section(upsample(grid, trilinear), grid, axis, index)
-    assert np.allclose(fine.box(), coarse.box(), atol=0.9)
-    inside = [np.nansum(part.values < 0) * part.step[0] * part.step[1] for part in (coarse, fine)]
-    assert (coarse.step == (0.3, 0.3)) == (axis == "y")
-    known = np.isfinite(fine.values) & (fine.values < 0)
-    assert known.any() and inside[0] > 0
 
 
 def test_thin_parts_without_a_sample_inside(network):

@@ -257,7 +257,6 @@ OWN_INPUTS = {
     "upsample raw.mhd out.ply --factor 2 --quality fast": ("raw.bin", "out.ply"),
     "check ball.ply in.npy --out out.ply": ("ball.ply", "out.ply"),
     "sample ball.ply out.npz -n 9": ("ball.ply", "out.npz"),
-    "render ball.ply out.png": ("ball.ply", "out.png"),
 }
 
 

@@ -1,12 +1,10 @@
 """CUDA, tested without a GPU: bindings, errors that name what is missing, no silent fallback.
 
-Fakes stand in for the GPU; `python -m benchmarks.cuda` and `super-sdf info --check --device cuda`
+Fakes stand in for the GPU; `python -m lab cuda` and `super-sdf info --check --device cuda`
 test a real one.
 """
 
 import ctypes
-import runpy
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -267,11 +265,3 @@ def test_shipped_files_let_the_chunk_be_chosen():
     for path in shipped_models().values():
         session = load_network(path, device="cpu").session
         assert [given.name for given in session.get_overridable_initializers()] == [CHUNK_INPUT]
-
-
-def test_the_benchmark_reports_that_there_is_nothing_to_measure(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["benchmarks.cuda"])
-    runpy.run_path(str(ROOT / "benchmarks" / "cuda.py"), run_name="__main__")
-    out = capsys.readouterr().out
-    assert out.startswith(f"nothing to measure: {ASKED}{HERE} here has no CUDA provider")
-    assert out.count("\n") == 1

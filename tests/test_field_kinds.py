@@ -8,9 +8,9 @@ import pytest
 from conftest import ball, trilinear
 from scipy import ndimage
 
+from lab.surfaces import isosurface
 from super_sdf import SdfGrid, load_network, make_grid, pipeline, reconstruct
 from super_sdf.errors import GridError, OptionError, OutOfMemoryError
-from super_sdf.evaluation.methods import isosurface
 from super_sdf.grid import planes
 from super_sdf.grid.census import Census
 from super_sdf.grid.evidence import weigh

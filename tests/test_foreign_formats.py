@@ -1,7 +1,6 @@
 """Files of medicine, microscopy, simulation and scanning: place, size, side, values, refusals.
 
-Each is written by the library that is common for it. ``python -m benchmarks.readers`` compares the
-readings of a second library.
+Each is written by the library that is common for it.
 """
 
 from __future__ import annotations

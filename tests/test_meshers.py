@@ -15,7 +15,6 @@ from test_slabs import in_pieces, rod
 
 from super_sdf import SdfGrid, extract_mesh, load_network, options, reconstruct, upsample
 from super_sdf.convert import ConvertOptions
-from super_sdf.evaluation import names
 from super_sdf.machine import threads
 from super_sdf.mesh import join_meshes
 from super_sdf.slabs import cutting
@@ -58,7 +57,7 @@ def joined(pieces):
 
 
 def test_there_is_one_list_of_names_and_one_default():
-    assert tuple(meshers.BY_NAME) == names.MESHERS == options.MESHERS
+    assert tuple(meshers.BY_NAME) == options.MESHERS
     assert all(mesher.name == name for name, mesher in meshers.BY_NAME.items())
     assert ConvertOptions.mesher == options.DEFAULT_MESHER
     assert cutting.DEFAULT.name == options.DEFAULT_MESHER

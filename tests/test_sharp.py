@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_isosurface import dense_field, fields
 
+from lab.methods import sharp_isosurface
 from super_sdf import Mesh, SdfGrid, extract_mesh, load_network, upsample
-from super_sdf.evaluation.methods import sharp_isosurface
 from super_sdf.steps.cell_cases import loop_table, triangle_table
 from super_sdf.steps.sharp.features import Rule
 

@@ -4,6 +4,7 @@ import ast
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -15,6 +16,7 @@ MODULES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts): path
     for path in PACKAGE.rglob("*.py")
 }
+BESIDE = {"lab", "export"}  # packages of a clone that are not in the wheel
 # The library of each file format is imported by its reader or writer alone, when it is used.
 READERS = {
     "fields.writing": {"vtkmodules"},
@@ -34,9 +36,7 @@ READERS = {
 WITH_EXTRAS = {
     "certificate",
     "cluster",
-    "evaluation",
     "pages",
-    "pictures",
     "simplification",
     "truth",
 }
@@ -96,6 +96,45 @@ def test_no_room_has_a_circle():
     TopologicalSorter({module: own(path) - {module} for module, path in MODULES.items()}).prepare()
 
 
+def beside(package: str) -> dict[str, set[str]]:
+    """Return the modules of a package beside the wheel, and what each imports of ``BESIDE``."""
+    found = {}
+    for path in (ROOT / package).rglob("*.py"):
+        name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        here = list(path.relative_to(ROOT).parts[:-1])
+        modules = set()
+        for node in runtime_imports(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                modules |= {alias.name for alias in node.names}
+                continue
+            base = here[: len(here) - node.level + 1] if node.level else []
+            whole = ".".join([*base, *([node.module] if node.module else [])])
+            modules |= {whole, *(f"{whole}.{alias.name}" for alias in node.names)}
+        found[name] = {module for module in modules if module.split(".")[0] in BESIDE}
+    return found
+
+
+def runtime_imports(tree: ast.AST) -> Iterator[ast.Import | ast.ImportFrom]:
+    """Yield the imports of a module, but for those that only type checkers see."""
+    if isinstance(tree, ast.If) and "TYPE_CHECKING" in ast.unparse(tree.test):
+        return
+    if isinstance(tree, (ast.Import, ast.ImportFrom)):
+        yield tree
+    for child in ast.iter_child_nodes(tree):
+        yield from runtime_imports(child)
+
+
+def test_what_is_beside_the_package_has_no_circle_and_is_not_imported_by_it():
+    """``export`` may import ``lab``, and both the package; never the other way round."""
+    graph = {**beside("lab"), **beside("export")}
+    own = {name: {m for m in modules if m in graph} - {name} for name, modules in graph.items()}
+    TopologicalSorter(own).prepare()
+    of_lab = set().union(*beside("lab").values())
+    assert not [module for module in of_lab if module.split(".")[0] == "export"]
+    foreign = {m: imported(path)[1] for m, path in MODULES.items()}
+    assert not [m for m, names in foreign.items() if {n.split(".")[0] for n in names} & BESIDE]
+
+
 @pytest.mark.parametrize("module", MODULES)
 def test_no_string_names_a_module(module):
     strings = [node.value for node in ast.walk(ast.parse(MODULES[module].read_text()))
@@ -121,7 +160,7 @@ def test_every_room_says_what_lives_there(room):
 
 def test_onnxruntime_is_imported_in_one_place():
     """There its telemetry is switched off before."""
-    rooms = [ROOT / room for room in ("src", "tests", "export", "benchmarks", "examples")]
+    rooms = [ROOT / room for room in ("src", "tests", "export", "lab", "examples")]
     importing = {
         path.name
         for room in rooms

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from export import gaps
+from lab.evaluate import ROWS
+from lab.measuring import PROTOCOL
+from lab.shapes import Setting
 from super_sdf.errors import FileError
-from super_sdf.evaluation.cases import Setting
-from super_sdf.evaluation.folder import ROWS
-from super_sdf.evaluation.measuring import NUMBERS, PROTOCOL
 
 MESHES = [Path(f"shape-{n}.ply") for n in range(3)]
 
@@ -21,15 +21,10 @@ MESHES = [Path(f"shape-{n}.ply") for n in range(3)]
 def row(shape, method, f1, **others):
     """A measurement at 32^3 unless ``others`` say otherwise; NC and distance are made from F1."""
     key = {"shape": shape, "mesh": "", "turned": None, **asdict(Setting(32)), "method": method}
-    figures = {**dict.fromkeys(NUMBERS, 0), "f1": f1, "nc": f1 / 2, "p2s_back": 1 - f1}
-    return {
-        **key,
-        "digest": "",
-        "protocol": PROTOCOL,
-        **figures,
-        "error": None,
-        "notes": [],
-    } | others
+    key |= {"digest": "", "protocol": PROTOCOL}
+    figures = {"f1": f1, "nc": f1 / 2, "p2s_back": 1 - f1, "error": None}
+    changed = {name: value for name, value in others.items() if name in key}
+    return {"key": key | changed, **figures, **others}
 
 
 def write_report(folder, rows):
@@ -58,7 +53,7 @@ def test_the_gap_is_that_of_the_means_for_all_shapes_and_each_half(baselines):
         ["32^3", "choose", "1"],
         ["32^3", "final", "2"],
     ]
-    assert rows[0][3:] == ["0.6000", "50.0 %", "0.3000", "50.0 %", "4000.0000", "50.0 %"]
+    assert rows[0][3:] == ["0.6000", "50.0 %", "0.3000", "50.0 %", "4,000.0000", "50.0 %"]
 
 
 def test_the_first_report_with_a_measurement_counts(baselines, tmp_path):
@@ -75,7 +70,7 @@ def test_only_shapes_that_all_three_have_count(baselines, tmp_path):
 
 
 def test_a_mistyped_report_is_refused_not_left_out(baselines, tmp_path):
-    said = f"{tmp_path / 'bset'} has no results.jsonl: give the --out of super-sdf evaluate"
+    said = f"{tmp_path / 'bset'} has no results.jsonl: give the --out of python -m lab evaluate"
     with pytest.raises(FileError, match=f"^{re.escape(said)}$"):
         list(gaps.gap_rows(MESHES, [tmp_path / "bset", baselines]))
 

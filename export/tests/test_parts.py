@@ -12,9 +12,9 @@ from export import part_tools, parts, usual_parts
 from export.shapes.edges import CHAMFER
 from export.shapes.families import FAMILIES
 from export.tests.test_shapes import check_closed, check_size
+from lab.edges import EdgeCurves
+from lab.metrics import face_vectors, sample_surface
 from super_sdf import Mesh
-from super_sdf.evaluation.edges import EdgeCurves
-from super_sdf.evaluation.metrics import face_vectors, sample_surface
 from super_sdf.truth.solid import Solid, load_solid
 
 # Least length of the sharp edges, and least square of it over the area: a cube's is 24.

@@ -24,7 +24,6 @@ from export.augment import (
     turned,
 )
 from export.batches import batch_of, encode
-from export.choice import HALVES, draw_halves
 from export.dataset import (
     CORNERS,
     draw_offsets,
@@ -557,16 +556,6 @@ def test_a_network_with_dead_units_is_not_exported(samples, monkeypatch):
     put_to_sleep(net)
     with pytest.raises(SystemExit, match=r"% of the rectified units react to nothing, 1 % may"):
         check_awake(net)
-
-
-def test_the_halves_are_drawn_by_name_alone():
-    paths = [Path("a") / f"shape-{n}.ply" for n in range(63)]
-    halves = draw_halves(paths)
-    assert [len(halves[half]) for half in HALVES] == [31, 32]
-    assert sorted(halves["choose"] + halves["final"]) == sorted(paths)
-    elsewhere = draw_halves([Path("b") / path.name for path in reversed(paths)])
-    assert {p.name for p in elsewhere["choose"]} == {p.name for p in halves["choose"]}
-    assert draw_halves(paths, seed=1)["choose"] != halves["choose"]
 
 
 @pytest.mark.parametrize("name", SIZES)

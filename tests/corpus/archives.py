@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .case import Case, Content, ball, batch, npy, npz, render, rng_of, upsample
+from .case import Case, Content, ball, batch, npy, npz, rng_of, upsample
 from .grids import header, said
 from .mutation import mutate
 
@@ -111,7 +111,6 @@ def cases(seed: int) -> Iterator[Case]:
     for name, data in odd_archives().items():
         yield upsample(f"archives/{name}", {"in.npz": data}, source="in.npz")
         yield batch(f"archives/{name}-batch", {"in.npz": data}, source="in.npz")
-        yield render(f"archives/{name}-render", {"in.npz": data}, source="in.npz")
     yield from _damaged(seed)
     yield from _bombs()
 

@@ -96,26 +96,6 @@ def sample(
     return Case(name, ("sample", source, target, *options), files, made(target), alone)
 
 
-def render(
-    name: str,
-    files: Files,
-    *options: str,
-    source: str,
-    target: str = "out.png",
-    alone: bool = False,
-) -> Case:
-    """Return a case of ``render``, in small."""
-    words = ("render", source, target, "--size", "100", *options)
-    return Case(name, words, files, made(target), alone)
-
-
-def evaluate(name: str, files: Files, *options: str, source: str) -> Case:
-    """Return a case of ``evaluate``, in small; it starts processes, so it is on its own."""
-    small = ("--sizes", "8", "--methods", "mc", "--model", "fast", "--jobs", "1", "--no-pictures")
-    words = ("evaluate", source, "--out", "report", *small, *options)
-    return Case(name, words, files, ("report", "report/*"), alone=True)
-
-
 def small_network(options: tuple[str, ...]) -> tuple[str, ...]:
     """Return the words for the small network, unless another is given."""
     return () if "--model" in options or "--quality" in options else ("--quality", "fast")

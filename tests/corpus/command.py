@@ -1,9 +1,9 @@
 """The corpus from the command line: a table of how the cases of each theme ended, and the faults.
 
-python -m benchmarks.corpus                       # a seeded sample
-python -m benchmarks.corpus --whole               # all
-python -m benchmarks.corpus --only grids/header   # those with this in their names
-python -m benchmarks.corpus --fields 10000        # random fields: closed manifolds?
+python -m lab corpus                       # a seeded sample
+python -m lab corpus --whole               # all
+python -m lab corpus --only grids/header   # those with this in their names
+python -m lab corpus --fields 10000        # random fields: closed manifolds?
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def main() -> int:
 
 def parse() -> argparse.Namespace:
     """Return what is asked for."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.corpus")
+    parser = argparse.ArgumentParser(prog="python -m lab corpus")
     parser.add_argument("--whole", action="store_true", help="All cases, not a sample.")
     parser.add_argument("--only", default="", metavar="TEXT", help="Cases with this in the name.")
     parser.add_argument("--count", type=int, default=500, help="Cases of a sample.")

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from .case import Case, ball, batch, npy, render, rng_of, upsample
+from .case import Case, ball, batch, npy, rng_of, upsample
 
 Field = Callable[[np.random.Generator, tuple[int, ...]], np.ndarray]
 
@@ -103,6 +103,5 @@ def cases(seed: int) -> Iterator[Case]:
         name = f"fields/{kind}"
         files = {"in.npy": npy(make(rng_of(name, seed), SHAPES[0]).astype(np.float32))}
         yield batch(f"{name}-batch", files)
-        yield render(f"{name}-render", files, source="in.npy")
         words = ("upsample", "in.npy", "out.ply", "--precision", "int8", "--spacing", "1")
         yield Case(f"{name}-int8", words, files, ("out.ply",))

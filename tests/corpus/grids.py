@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from .case import Case, ball, batch, npy, npz, render, rng_of, upsample
+from .case import Case, ball, batch, npy, npz, rng_of, upsample
 from .mutation import mutate
 
 DTYPES = "?bBhHiIlLqQefdgFDGSUOMmV"
@@ -80,8 +80,6 @@ def cases(seed: int) -> Iterator[Case]:
             yield upsample(name, {"in.npy": header(text, version)}, alone=len(text) > 8000)
         if number % 3 == 0:
             yield batch(f"grids/batch-header-{number}", {"in.npy": header(text)})
-        if number % 6 == 0:
-            yield render(f"grids/render-{number}", {"in.npy": header(text)}, source="in.npy")
     yield from _damaged(seed)
     yield from _dtypes()
     yield from _shapes()
@@ -155,4 +153,3 @@ def _shapes() -> Iterator[Case]:
             yield upsample(f"grids/shape-{number}-{factor}", files, *words)
             yield upsample(f"grids/shape-{number}-{factor}-cap", files, "--cap", "--factor", factor)
         yield batch(f"grids/shape-{number}-batch", files)
-        yield render(f"grids/shape-{number}-render", files, source="in.npy")

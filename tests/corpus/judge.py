@@ -77,7 +77,7 @@ def _of_words(case: Case, run: Run) -> list[Fault]:
         return [Fault("code", f"exit code {run.code}")]
     lines = run.err.rstrip("\n").split("\n") if run.err.strip() else []
     faults = [Fault("bug named", line[:300]) for line in lines if _names_a_bug(line)]
-    single = case.command in ("upsample", "sample", "render") or run.code == 2
+    single = case.command in ("upsample", "sample") or run.code == 2
     if run.code and single and (len(lines) != 1 or not lines[0].startswith("Error: ")):
         faults.append(Fault("not one line", f"{len(lines)} lines: {run.err[:300]!r}"))
     if run.code and not single:
@@ -121,7 +121,7 @@ def _of_files(case: Case, run: Run, before: Snapshot, after: Snapshot, folder: P
     allowed = [name for name in new if any(fnmatch(name, made) for made in case.makes)]
     faults += [Fault("made unasked", name) for name in new if name not in allowed]
     faults += [Fault("gone", name) for name in before if name not in after]
-    single = case.command in ("upsample", "sample", "render")
+    single = case.command in ("upsample", "sample")
     if single and run.code and allowed:
         faults.append(Fault("made in spite of failure", ", ".join(allowed)))
     if single and not run.code and not allowed and "-h" not in case.words:

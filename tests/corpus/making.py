@@ -12,7 +12,6 @@ from . import (
     meshes,
     models,
     options,
-    reports,
     scales,
     special,
 )
@@ -20,7 +19,7 @@ from .case import Case
 
 THEMES = (
     *(grids, archives, members, fields, scales, options, manifests, ledgers),
-    *(models, meshes, special, reports),
+    *(models, meshes, special),
 )
 
 

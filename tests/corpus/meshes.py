@@ -1,4 +1,4 @@
-"""Meshes for ``sample``, ``render`` and ``evaluate``: damaged, empty, flat, open, odd in scale."""
+"""Meshes for ``sample``: damaged, empty, flat, open, odd in scale."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from .case import Case, evaluate, render, rng_of, sample
+from .case import Case, rng_of, sample
 from .mutation import mutate
 
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
@@ -164,7 +164,7 @@ def odd_files() -> dict[str, tuple[str, bytes]]:
 
 
 def _three(name: str, suffix: str, data: bytes, also_slow: bool) -> Iterator[Case]:
-    """Yield a mesh for ``sample``, and some of them for ``render`` and ``evaluate``, too."""
+    """Yield a mesh for ``sample``."""
     source = f"in.{suffix}"
     files = {source: data}
     yield sample(f"meshes/{name}", files, "-n", "8", source=source, alone=True)
@@ -172,6 +172,3 @@ def _three(name: str, suffix: str, data: bytes, also_slow: bool) -> Iterator[Cas
         yield sample(
             f"meshes/{name}-open", files, "-n", "8", "--allow-open", source=source, alone=True
         )
-        yield render(f"meshes/{name}-render", files, source=source, alone=True)
-    if also_slow and (suffix == "ply"):
-        yield evaluate(f"meshes/{name}-evaluate", files, source=source)

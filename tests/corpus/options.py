@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from .case import Case, ball, batch, npy, render, sample, upsample
+from .case import Case, ball, batch, npy, sample, upsample
 from .meshes import CUBE
 
 GRID = {"in.npy": npy(ball())}
@@ -55,8 +55,6 @@ NUMBER_OPTIONS = {
         "--triangles",
     ],
     "sample": ["-n", "--spacing", "--padding", "--band"],
-    "render": ["--top", "--zoom", "--size"],
-    "section": ["--at", "--size", "--factor"],
 }
 WORD_OPTIONS = {
     "upsample": [
@@ -70,7 +68,6 @@ WORD_OPTIONS = {
     ],
     "batch": ["--format", "--inside", "--quality", "--model", "--none"],
     "sample": ["--frame", "--none"],
-    "render": ["--colour", "--reference", "--up", "--none"],
     "info": ["--device", "--none"],
 }
 
@@ -104,10 +101,6 @@ def _case(name: str, command: str, *options: str) -> Case:
     if command == "sample":
         count = () if options[0] in ("-n", "--spacing") else ("-n", "8")
         return sample(name, CUBE, *count, *options, source="cube.ply", alone=True)
-    if command == "render":
-        return render(name, CUBE, *options, source="cube.ply", alone=True)
-    if command == "section":
-        return render(name, GRID, *options, source="in.npy", alone=True)
     return Case(name, (command, *options))
 
 
@@ -118,9 +111,7 @@ def _targets() -> Iterator[Case]:
         for option in ([], ["--force"]):
             suffix = "".join(option)
             yield upsample(f"options/target-{number}{suffix}", taken, *option, target=target)
-        image, grid = target.replace(".ply", ".png"), target.replace(".ply", ".npz")
-        name = f"options/render-target-{number}"
-        yield render(name, taken, source="in.npy", target=image, alone=True)
+        grid = target.replace(".ply", ".npz")
         name = f"options/sample-target-{number}"
         yield sample(name, taken, "-n", "8", source="cube.ply", target=grid, alone=True)
         words = ("batch", "in.npy", "--out", target.removesuffix(".ply"), "--quality", "fast")
@@ -133,14 +124,11 @@ def _lines() -> Iterator[Case]:
     lines = [
         *([""], ["x"], ["--x"], ["-h"], ["--version"], ["upsample"], ["upsample", "in.npy"]),
         *(["upsample", "a", "b", "c"], ["batch"], ["batch", "in.npy"], ["batch", "--out", "out"]),
-        *(["sample"], ["sample", "cube.ply"], ["sample", "cube.ply", "out.npz"], ["render"]),
-        *(["render", "cube.ply"], ["render", "in.npy", "cube.ply", "out.png"], ["evaluate"]),
-        *(["evaluate", "cube.ply"], ["evaluate", "--out", "report"], ["info", "x"], ["info"]),
+        *(["sample"], ["sample", "cube.ply"], ["sample", "cube.ply", "out.npz"]),
+        *(["info", "x"], ["info"]),
         *(["info", "--json"], ["info", "--device", "cuda"], ["info", "-h"], ["sample", "-h"]),
         *(["sample", "cube.ply", "out.npz", "-n", "8", "--spacing", "1"],),
         *(["sample", "cube.ply", "out.npz", "--frame", "unit", "--spacing", "1"],),
-        *(["render", "cube.ply", "out.png", "--colour", "error"],),
-        *(["render", "cube.ply", "out.png", "--reference", "cube.ply"],),
         *(["upsample", "in.npy", "out.ply", "--quality", "best", "--model", "none.onnx"],),
         *(["upsample", "in.npy", "out.ply", "--device", "cuda"], ["\udcff"]),
         *(["upsample", "\udcff.npy", "out.ply"], ["upsample", "a\nb.npy", "out.ply"]),
@@ -160,7 +148,7 @@ def _lines() -> Iterator[Case]:
         ),
         *(["batch", "n" * 5000, "--out", "out"], ["upsample", "n" * 5000 + ".npy", "out.ply"]),
         *(["upsample", "n" * 300 + ".npy", "out.ply"], ["batch", "n" * 300 + ".npy", "--out", "o"]),
-        *(["sample", "n" * 300 + ".ply", "out.npz", "-n", "8"], ["render", "n" * 300, "out.png"]),
+        *(["sample", "n" * 300 + ".ply", "out.npz", "-n", "8"],),
     ]
     for number, words in enumerate(lines):
         made = ("out.*", "out", "out/*", "o", "o/*")

@@ -7,7 +7,7 @@ import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from .case import Case, Content, ball, batch, evaluate, npy, npz, render, sample, upsample
+from .case import Case, Content, ball, batch, npy, npz, sample, upsample
 
 
 def _socket(path: Path) -> None:
@@ -84,7 +84,6 @@ def cases(seed: int) -> Iterator[Case]:
             name = f"special/{kind}-{suffix}"
             yield upsample(name, at, source=f"in.{suffix}", alone=True)
             yield batch(f"{name}-batch", at, source=f"in.{suffix}", alone=True)
-            yield render(f"{name}-render", at, source=f"in.{suffix}", alone=True)
             inside = {f"grids/in.{suffix}": content, "grids/good.npy": GRID["good.npy"]}
             yield batch(f"{name}-within", inside, source="grids", alone=True)
             pattern = batch(f"{name}-pattern", inside, source=f"grids/*.{suffix}", alone=True)
@@ -99,9 +98,6 @@ def _meshes(kind: str, content: Content) -> Iterator[Case]:
     for suffix in ("ply", "stl", "obj"):
         at, source = {f"in.{suffix}": content}, f"in.{suffix}"
         yield sample(f"special/{kind}-{suffix}-sample", at, "-n", "8", source=source, alone=True)
-        yield render(f"special/{kind}-{suffix}-render", at, source=source, alone=True)
-    yield evaluate(f"special/{kind}-evaluate", {"in.ply": content}, source="in.ply")
-    yield evaluate(f"special/{kind}-evaluate-within", {"in/in.ply": content}, source="in")
 
 
 def _elsewhere(kind: str, content: Content) -> Iterator[Case]:

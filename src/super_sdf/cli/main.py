@@ -12,7 +12,7 @@ import click
 from .. import __version__
 from .common import CONTEXT, InterruptedCommand, print_stderr
 
-COMMANDS = ("upsample", "batch", "check", "sample", "evaluate", "render", "view", "info")
+COMMANDS = ("upsample", "batch", "check", "sample", "view", "info")
 
 
 class LazyGroup(click.Group):
@@ -33,10 +33,6 @@ class LazyGroup(click.Group):
                 from .check import check_command as command
             case "sample":
                 from .sample import sample_command as command
-            case "evaluate":
-                from .evaluate import evaluate_command as command
-            case "render":
-                from .render import render_command as command
             case "view":
                 from .view import view_command as command
             case "info":

@@ -22,13 +22,11 @@ EXTRAS = {
     "3mf": ("lxml", "networkx"),
     "pyvista": ("pyvista",),
     "simplify": ("igl", "pyfqmr"),
-    "eval": ("igl", "matplotlib", "scipy", "skimage"),
-    "view": ("pyvista",),
+    "eval": ("igl", "scipy"),
     "report": (),
-    "peers": ("gpytoolbox",),
     "cluster": ("distributed",),
 }
-BUILT_ON = {"view": "eval", "peers": "eval", "report": "simplify"}
+BUILT_ON = {"report": "simplify"}
 
 
 def all_modules(extra: str) -> tuple[str, ...]:

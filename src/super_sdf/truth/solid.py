@@ -26,6 +26,13 @@ Distances = NDArray[np.float64]
 SIDE_STEP = 1e-5
 
 
+def normalise(mesh: Mesh) -> Mesh:
+    """Return a mesh, float64, centred on its bounding box and scaled to a box diagonal of 1."""
+    vertices = mesh.vertices.astype(np.float64)
+    low, high = vertices.min(0), vertices.max(0)
+    return Mesh((vertices - (low + high) / 2) / np.linalg.norm(high - low), mesh.faces)
+
+
 class Solid:
     """The solid that a mesh encloses, with search trees for fast queries.
 

@@ -1,1 +1,0 @@
-"""Commands that measure quality, speed and robustness of super-sdf and print tables."""

@@ -1,0 +1,142 @@
+"""Compare CUDA with the CPU: values, speed, memory over many shapes, whole runs. Needs a GPU.
+
+    python -m lab cuda --sizes 64 128 256
+
+Prints Markdown: the machine; for each network and size the largest difference and the microseconds
+per voxel, copies to and from the GPU included; GPU memory after ever larger shapes; and the seconds
+from a grid to its mesh. All grids are noisy balls. If CUDA does not run, one line says why.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from super_sdf import SdfGrid, load_network, reconstruct
+from super_sdf.errors import DeviceError
+from super_sdf.network.cuda import describe_gpu, onnxruntime_version, query_gpu
+from super_sdf.network.network import Network
+from super_sdf.steps.nodes import block_offsets
+from super_sdf.steps.survey import survey
+
+RUNS = 3
+SHAPES = 40  # for the memory
+
+
+def noisy_ball(size: int) -> SdfGrid:
+    """Return a ball that fills most of the grid, with noise on some samples: every branch runs."""
+    rng = np.random.default_rng(0)
+    ijk = np.indices((size,) * 3, np.float32)
+    values = np.linalg.norm(ijk - (size / 2 - 0.37), axis=0) - 0.38 * size
+    values[: size // 4] += rng.uniform(-0.2, 0.2, values[: size // 4].shape)
+    return SdfGrid.trusted(values.astype(np.float32), (1.0, 1.0, 1.0))
+
+
+def network_inputs(size: int) -> tuple[np.ndarray, ...]:
+    """Return the inputs of the network for a ball at factor 4."""
+    return *survey(noisy_ball(size)).network_inputs(), block_offsets(4)
+
+
+def best_seconds(work: Callable[..., Any], *arguments: Any) -> float:
+    """Return the seconds of the fastest of several runs, after a warm-up run."""
+    work(*arguments)
+    seconds = []
+    for _ in range(RUNS):
+        start = time.perf_counter()
+        work(*arguments)
+        seconds.append(time.perf_counter() - start)
+    return min(seconds)
+
+
+def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """Print a Markdown table."""
+    print(f"\n{title}\n\n| {' | '.join(head)} |\n|{' ---: |' * len(head)}")
+    for row in rows:
+        print(f"| {' | '.join(str(cell) for cell in row)} |", flush=True)
+
+
+def compare_values(device: str, sizes: Sequence[int]) -> None:
+    """Print the difference between the values of CUDA and of the CPU, and both times."""
+    rows = []
+    for quality in QUALITIES:
+        here, there = (
+            load_network(quality, device=place, precision="float32") for place in ("cpu", device)
+        )
+        for size in sizes:
+            inputs = network_inputs(size)
+            apart = np.abs(here(*inputs) - there(*inputs)).max() / 2
+            seconds = [best_seconds(network, *inputs) for network in (here, there)]
+            shown = [f"{1e6 * value / len(inputs[0]):.2f}" for value in seconds]
+            rows.append([quality, f"{size}^3", f"{len(inputs[0]):,}", *shown, f"{apart:.1e}"])
+    head = [
+        "network",
+        "grid",
+        "voxels",
+        "CPU us per voxel",
+        f"{device} us per voxel",
+        "difference, voxels",
+    ]
+    print_table("Values and speed of the network", head, rows)
+
+
+def watch_memory(device: str, size: int) -> None:
+    """Print GPU memory after many shapes, each with more voxels than the last."""
+    rows = [["nothing", used_memory()]]
+    network = load_network("base", device=device)
+    rows.append(["loaded", used_memory()])
+    whole = network_inputs(size)
+    for count, share in enumerate(np.linspace(0.2, 1, SHAPES), 1):
+        run_part(network, whole, share)
+        if count in (1, 2, 5, 10, 20, SHAPES):
+            rows.append([f"{count} shapes", used_memory()])
+    run_part(network, whole, 0.2)
+    rows.append(["a small one", used_memory()])
+    print_table(f"Memory of the GPU in MiB, shapes up to {size}^3", ["after", "used"], rows)
+
+
+def run_part(network: Network, inputs: Sequence[np.ndarray], share: float) -> None:
+    """Run the network on the first part of a band, without the rest."""
+    patches, table, voxels, offsets = inputs
+    count = int(share * len(patches))
+    table = np.where(table[:count] < count, table[:count], -1).astype(np.int32)
+    network(patches[:count], table, voxels[voxels < count], offsets)
+
+
+def used_memory() -> str:
+    """Return the GPU memory in use, according to nvidia-smi."""
+    answer = query_gpu("memory.used")
+    return answer[0] if answer else "unknown"
+
+
+def compare_pipeline(device: str, sizes: Sequence[int]) -> None:
+    """Print the seconds from a grid to its mesh, without loading the network."""
+    rows = []
+    for size in sizes:
+        grid = noisy_ball(size)
+        networks = [load_network("base", device=place) for place in ("cpu", device)]
+        seconds = [best_seconds(reconstruct, grid, network) for network in networks]
+        rows.append([f"{size}^3", *(f"{value:.2f}" for value in seconds)])
+    print_table("From a grid to its mesh", ["grid", "CPU s", f"{device} s"], rows)
+
+
+def main() -> None:
+    """Print all tables, or one line that says why CUDA does not run."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128, 256])
+    parser.add_argument("--device", default="cuda", help="cpu tries this command itself")
+    arguments = parser.parse_args()
+    try:
+        load_network("fast", device=arguments.device)
+    except DeviceError as error:
+        print(f"nothing to measure: {error}")
+        return
+    gpu = describe_gpu() or "no GPU"
+    print(f"{gpu}; {os.cpu_count()} cores; {onnxruntime_version()}; least of {RUNS} runs each")
+    compare_values(arguments.device, arguments.sizes)
+    watch_memory(arguments.device, max(arguments.sizes))
+    compare_pipeline(arguments.device, arguments.sizes)

@@ -1,0 +1,85 @@
+"""Write the measured figures into README, the documents and the model cards.
+
+    python -m lab documents            # rewrites what stands between the markers
+    python -m lab documents --check    # exit code 1 if a document differs
+
+A table stands between ``<!-- figures: NAME.TABLE -->`` and ``<!-- /figures -->``, each on a line; a
+number in a sentence between ``<!-- figures: NAME.COLUMN WORDS -->`` and ``<!-- /figures -->``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from super_sdf.errors import FileError
+
+from .figures import FOLDER
+from .quoted import shown
+
+ROOT = Path(__file__).parents[1]
+PLACES = ("README.md", "docs/**/*.md", "src/super_sdf/models/*.md")
+MARKED = re.compile(r"(<!-- figures: ([^>]+?) -->)(.*?)(<!-- /figures -->)", re.DOTALL)
+# Words of a text that looks back, outside of where history is kept.
+HISTORY = re.compile(r"of before|\bearlier\b|\bolder\b|\bwith \w+ blocks\b", re.IGNORECASE)
+WITH_HISTORY = ("CHANGELOG.md", "export")
+
+
+def documents(root: Path = ROOT) -> list[Path]:
+    """Return the documents that show figures."""
+    return sorted(path for place in PLACES for path in root.glob(place))
+
+
+def rendered(text: str, folder: Path = FOLDER) -> str:
+    """Return a document with the figures as they were measured.
+
+    Raises
+    ------
+    FileError
+        If a marker names no figure, or does not end.
+    """
+    if len(MARKED.findall(text)) != len(re.findall(r"<!-- figures: ", text)):
+        raise FileError("a marker of figures is not ended by <!-- /figures -->")
+
+    def replace(match: re.Match[str]) -> str:
+        found = shown(match[2].strip(), folder)
+        is_block = "\n" in match[3] or "\n" in found
+        return match[1] + (f"\n\n{found}\n\n" if is_block else found) + match[4]
+
+    return MARKED.sub(replace, text)
+
+
+def lines_that_look_back(root: Path = ROOT) -> Iterator[str]:
+    """Yield the lines of documents that speak of what was, with file and number."""
+    for path in sorted(root.rglob("*.md")):
+        place = path.relative_to(root)
+        if place.parts[0] in WITH_HISTORY or any(part.startswith(".") for part in place.parts):
+            continue
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+            if HISTORY.search(line):
+                yield f"{place}:{number}: {line.strip()}"
+
+
+def main() -> int:
+    """Rewrite the documents, or compare them."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--check", action="store_true", help="write nothing")
+    parser.add_argument("--figures", type=Path, default=FOLDER, help="folder of the JSON files")
+    words = parser.parse_args()
+    differ = 0
+    for path in documents():
+        before = path.read_text(encoding="utf-8")
+        try:
+            after = rendered(before, words.figures)
+        except FileError as error:
+            raise FileError(f"{path.relative_to(ROOT)}: {error}") from error
+        if after != before:
+            differ += 1
+            print(path.relative_to(ROOT))
+            if not words.check:
+                path.write_text(after, encoding="utf-8")
+    return int(words.check and differ > 0)

@@ -1,0 +1,109 @@
+"""Fields that are no distances, by formula, as people write them; and the true surface of each.
+
+The formulas are the usual ones (https://iquilezles.org/articles/distfunctions): exact forms,
+bounds, and smooth combinations of them. The solids lie in the unit cube around the origin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from super_sdf import Mesh
+
+from .surfaces import isosurface
+
+Form = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+FINE = 256  # samples a side of the grid on which the true surface is meshed
+
+
+def ball(x, y, z, at: float, radius: float) -> np.ndarray:
+    """Return the distance to a ball on the x axis."""
+    return np.sqrt((x - at) ** 2 + y**2 + z**2) - radius
+
+
+def torus(x, y, z) -> np.ndarray:
+    """Return the distance to a torus round the z axis."""
+    return np.hypot(np.hypot(x, y) - 0.3, z) - 0.12
+
+
+def ellipsoid(x, y, z, *axes: float) -> np.ndarray:
+    """Return the usual bound of the distance to an ellipsoid."""
+    one = np.sqrt(sum((u / a) ** 2 for u, a in zip((x, y, z), axes)))
+    two = np.sqrt(sum((u / a**2) ** 2 for u, a in zip((x, y, z), axes)))
+    return one * (one - 1) / np.maximum(two, 1e-9)
+
+
+def box(x, y, z, *sides: float) -> np.ndarray:
+    """Return the distance to a box of these half sides."""
+    off = np.stack([np.abs(u) - side for u, side in zip((x, y, z), sides)])
+    return np.sqrt((np.maximum(off, 0) ** 2).sum(0)) + np.minimum(off.max(0), 0)
+
+
+def smooth_union(one: np.ndarray, other: np.ndarray, width: float) -> np.ndarray:
+    """Return the polynomial smooth minimum."""
+    blend = np.maximum(width - np.abs(one - other), 0) / width
+    return np.minimum(one, other) - blend**2 * width / 4
+
+
+def smooth_difference(one: np.ndarray, other: np.ndarray, width: float) -> np.ndarray:
+    """Return one less the other, with a smooth edge."""
+    return -smooth_union(-one, other, width)
+
+
+def quadric(x, y, z) -> np.ndarray:
+    """Return the polynomial of an ellipsoid."""
+    return (x / 0.4) ** 2 + (y / 0.25) ** 2 + (z / 0.2) ** 2 - 1
+
+
+def gyroid(x, y, z) -> np.ndarray:
+    """Return a gyroid within a ball."""
+    a, b, c = 15 * x, 15 * y, 15 * z
+    wave = np.sin(a) * np.cos(b) + np.sin(b) * np.cos(c) + np.sin(c) * np.cos(a)
+    return np.maximum(wave, 15 * ball(x, y, z, 0, 0.4))
+
+
+def blobs(x, y, z) -> np.ndarray:
+    """Return the sum of Gaussians, as of metaballs, less a level; positive inside is turned."""
+    places = ((-0.15, 0.0, 0.0), (0.15, 0.05, 0.0), (0.0, -0.15, 0.1))
+    return 0.6 - sum(
+        np.exp(-((x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2) / 0.02) for a, b, c in places
+    )
+
+
+FORMS: dict[str, Form] = {
+    "torus in thirds": lambda x, y, z: 3 * torus(x, y, z),
+    "box in fifths": lambda x, y, z: 5 * box(x, y, z, 0.3, 0.2, 0.15),
+    "ellipsoid": lambda x, y, z: ellipsoid(x, y, z, 0.4, 0.25, 0.15),
+    "quadric": quadric,
+    "cut quadric": lambda x, y, z: np.maximum(quadric(x, y, z), x + 0.4 * y - 0.1),
+    "smooth difference": lambda x, y, z: smooth_difference(
+        ball(x, y, z, -0.08, 0.3), ball(x, y, z, 0.2, 0.2), 0.1
+    ),
+    "smooth union": lambda x, y, z: smooth_union(
+        ball(x, y, z, -0.15, 0.2), ball(x, y, z, 0.15, 0.2), 0.1
+    ),
+    "smooth union of boxes": lambda x, y, z: smooth_union(
+        box(x, y, z, 0.35, 0.12, 0.1), box(x, y, z, 0.1, 0.1, 0.35), 0.08
+    ),
+    "gyroid": gyroid,
+    "blobs": blobs,
+}
+
+
+def lattice(size: int) -> tuple[np.ndarray, ...]:
+    """Return x, y and z of the samples of a grid of the unit cube, (n, n, n) each."""
+    line = (np.arange(size) + 0.5) / size - 0.5
+    return tuple(np.meshgrid(line, line, line, indexing="ij"))
+
+
+def sample(form: Form, size: int) -> tuple[np.ndarray, float, float]:
+    """Return the samples of a form, their spacing, and the coordinate of the first one."""
+    return form(*lattice(size)).astype(np.float32), 1 / size, 0.5 / size - 0.5
+
+
+def true_surface(form: Form) -> Mesh:
+    """Return the surface of a form: marching cubes of a fine grid."""
+    values, spacing, low = sample(form, FINE)
+    return isosurface(values, spacing, low)

@@ -1,0 +1,352 @@
+"""Kinds of grids that are not exact distances, and what is done with them: by us, and by others.
+
+``KINDS`` is the table: to measure another kind, made from the exact samples of a case, add an entry
+to it. Meshes are closed: beyond the border of a grid everything is outside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from super_sdf.arrays import BoolArray, FloatArray
+from super_sdf.errors import GridError
+from super_sdf.grid.field import AUTO, SCALED
+from super_sdf.grid.sdf_grid import SdfGrid, make_grid
+from super_sdf.mesh import Mesh
+from super_sdf.network.decoder import Decoder
+from super_sdf.pipeline import reconstruct
+from super_sdf.truth.solid import Solid
+
+from .shapes import FIELD_NOISE, Case
+from .surfaces import EMPTY, Surface, closed_isosurface, interpolate_spline, stretched
+
+Array = NDArray[Any]
+
+CUTS = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0)  # voxels
+UNEVEN_CUTS = (1.0, 2.5)  # voxels, inside and outside
+UNKNOWN = 2.0  # voxels from which on values are NaN
+UNIT = 0.01  # of values in another unit
+WAVES = 2.0  # periods of the varying slope along an axis of the grid
+SLOPES = (0.5, 1.5)  # least and largest of the varying slope
+NOISES = (0.1, 0.25)  # amplitudes, voxels
+INTEGERS = 30_000.0  # of the diagonal, in steps of whole numbers of 16 bits
+RATIOS = (1.5, 5.0)  # of the coarse spacing to the others
+MOST_BY_HAND = 2.0  # ratio up to which grids are resampled by hand to the finest spacing
+CHUNK = 1 << 18  # samples at a time
+
+WIDTHS = (0.5, 0.8, 1.2)  # voxels, of the Gaussians by which masks are smoothed
+DISTANCES = ("mc", "bspline", "ours")
+MASKS = ("mc", "mc-distances", *(f"mc-gaussian-{width:g}" for width in WIDTHS), "ours")
+TO_FINEST, TO_COARSEST = ("linear-finest", "spline-finest"), "spline-coarsest"
+KIND_LABELS = {
+    "mc": "MC",
+    "mc-distances": "MC of SciPy's distance transform",
+    **{f"mc-gaussian-{width:g}": f"MC, Gaussian of {width:g} voxels" for width in WIDTHS},
+    "bspline": "B-spline + MC",
+    "linear-finest": "by hand to the finest spacing, linear, super-sdf",
+    "spline-finest": "by hand to the finest spacing, cubic spline, super-sdf",
+    "spline-coarsest": "by hand to the coarsest spacing, cubic spline, super-sdf",
+    "ours": "super-sdf",
+}
+AXES = "xyz"
+
+
+@dataclass(frozen=True, eq=False)
+class Kind:
+    """A kind of grid, and what is done with it."""
+
+    group: str  # exact, mask, truncated, scaled, density, noisy or unequal
+    title: str  # kinds with the same title share their rows
+    make: Callable[[Case], Array]  # values as they stand in a user's file
+    methods: tuple[str, ...] = DISTANCES  # by the names in ``KIND_LABELS``
+    level: float | None = None  # for other methods; above it is inside; else distances
+    options: Mapping[str, Any] = field(default_factory=dict)  # what the user says
+    unit: float | None = None  # of distances whose spacing the user does not know
+    ratio: float = 1.0  # the spacing along ``axis`` over that along the others
+    axis: str = ""
+
+    @property
+    def name(self) -> str:
+        """What the kind is called in ``KINDS`` and in the rows of an evaluation."""
+        return f"{self.title}, {self.axis}" if self.axis else self.title
+
+    @property
+    def is_scaled(self) -> bool:
+        """Whether a user says ``--field scaled`` if the default call is refused."""
+        return self.group == "scaled"
+
+
+@dataclass(frozen=True, eq=False)
+class FieldSamples:
+    """The values of a kind for a case."""
+
+    values: Array  # (nx, ny, nz)
+    spacing: NDArray[np.float64]  # (3,)
+    origin: NDArray[np.float64]  # of sample (0, 0, 0)
+
+
+@lru_cache(maxsize=1)
+def samples_of(kind: Kind, case: Case) -> FieldSamples:
+    """Return the values of a kind; the methods of a kind follow one another, so one is kept."""
+    values = kind.make(case)
+    spacing = case.side / np.array(values.shape)
+    return FieldSamples(values, spacing, case.low + spacing / 2)
+
+
+def level_set(kind: Kind, values: Array) -> FloatArray:
+    """Return what the other methods mesh at 0, negative inside, float32.
+
+    Unknown values (NaN) are those of the nearest known sample.
+    """
+    signed = values if kind.level is None else kind.level - values.astype(np.float32)
+    return without_unknown(np.asarray(signed, np.float32))
+
+
+def without_unknown(values: FloatArray) -> FloatArray:
+    """Return values with each NaN replaced by that of the nearest sample that has none."""
+    unknown = np.isnan(values)
+    if not unknown.any():
+        return values
+    nearest = ndimage.distance_transform_edt(unknown, return_distances=False, return_indices=True)
+    return values[tuple(nearest)]
+
+
+def exact(case: Case) -> Array:
+    """Return the exact distances."""
+    return case.coarse
+
+
+def mask(case: Case) -> Array:
+    """Return 1 inside and 0 outside, uint8."""
+    return (case.coarse <= 0).astype(np.uint8)
+
+
+def truncated(case: Case, *, inside: float, outside: float) -> Array:
+    """Return distances that are cut off at a number of voxels on either side."""
+    h = case.spacing
+    return np.clip(case.coarse, -inside * h, outside * h)
+
+
+def partly_unknown(case: Case, *, beyond: float) -> Array:
+    """Return distances that are NaN beyond some voxels from the surface."""
+    return np.where(np.abs(case.coarse) <= beyond * case.spacing, case.coarse, np.float32(np.nan))
+
+
+def scaled(case: Case, *, unit: float) -> Array:
+    """Return distances in another unit."""
+    return case.coarse * np.float32(unit)
+
+
+def integers(case: Case) -> Array:
+    """Return distances in whole numbers of 16 bits."""
+    return np.rint(case.coarse * INTEGERS).astype(np.int16)
+
+
+def saturating(case: Case) -> Array:
+    """Return w tanh(d/w) of distances d, w two voxels: slope 1 at the surface, less beyond."""
+    width = np.float32(2 * case.spacing)
+    return width * np.tanh(case.coarse / width)
+
+
+def steepening(case: Case) -> Array:
+    """Return d + d^2 of distances d, in sides of the grid: slope 1 at the surface, more outside.
+
+    It is monotone, since no distance inside is beyond half of the side.
+    """
+    side = np.float32(case.side)
+    return case.coarse + case.coarse**2 / side
+
+
+def varying(case: Case) -> Array:
+    """Return distances times a smooth factor of the position, within ``SLOPES``."""
+    place = (np.indices(case.coarse.shape).sum(0) + 1.5) / case.setting.size
+    low, high = SLOPES
+    factor = (low + high) / 2 + (high - low) / 2 * np.sin(2 * np.pi * WAVES * place)
+    return (case.coarse * factor).astype(np.float32)
+
+
+def occupancy(case: Case) -> Array:
+    """Return 1 / (1 + exp(d / h)) of distances d: 1 deep inside, 1/2 on the surface."""
+    return (0.5 - 0.5 * np.tanh(case.coarse / (2 * case.spacing))).astype(np.float32)
+
+
+def shares(case: Case) -> Array:
+    """Return about the share of each voxel that is inside: 1/2 - d/h, between 0 and 1."""
+    return np.clip(0.5 - case.coarse / case.spacing, 0, 1).astype(np.float32)
+
+
+def noisy(case: Case, *, amplitude: float) -> Array:
+    """Return distances with uniform noise of an amplitude in voxels."""
+    random = np.random.default_rng(case.shape.seed(FIELD_NOISE))
+    noise = random.uniform(-amplitude, amplitude, case.coarse.shape) * case.spacing
+    return (case.coarse + noise).astype(np.float32)
+
+
+def unequal(case: Case, *, ratio: float, axis: str) -> Array:
+    """Return exact distances at the case's samples along an axis, and more along the others."""
+    size = case.setting.size
+    x, y, z = (size if letter == axis else round(size * ratio) for letter in AXES)
+    return sample_box(case.shape.solid, (x, y, z), case.side)
+
+
+def sample_box(solid: Solid, shape: tuple[int, int, int], side: float) -> FloatArray:
+    """Return the distances at the centres of the boxes into which a cube of some side is cut."""
+    spacing = side / np.array(shape)
+    values = np.empty(shape, np.float32)
+    flat = values.reshape(-1)
+    for start in range(0, flat.size, CHUNK):
+        numbers = np.arange(start, min(start + CHUNK, flat.size))
+        ijk = np.stack(np.unravel_index(numbers, shape), axis=1)
+        flat[numbers] = solid.signed_distance((ijk + 0.5) * spacing - side / 2)
+    return values
+
+
+def truncated_kind(title: str, inside: float, outside: float) -> Kind:
+    """Return the kind of distances cut off at these voxels."""
+    make = partial(truncated, inside=inside, outside=outside)
+    return Kind("truncated", f"cut off at {title}", make)
+
+
+def unequal_kind(ratio: float, axis: str) -> Kind:
+    """Return the kind of grid that is coarser along an axis."""
+    by_hand = (*TO_FINEST, TO_COARSEST) if ratio <= MOST_BY_HAND else (TO_COARSEST,)
+    make, methods = partial(unequal, ratio=ratio, axis=axis), ("mc", *by_hand, "ours")
+    return Kind("unequal", f"spacing 1:1:{ratio:g}", make, methods, ratio=ratio, axis=axis)
+
+
+HALF: dict[str, Any] = {"level": 0.5, "options": {"level": 0.5}}
+ALL_KINDS = (
+    Kind("exact", "exact", exact),
+    Kind("mask", "mask", mask, MASKS, level=0.5),
+    *(truncated_kind(f"{cut:g}", cut, cut) for cut in CUTS),
+    truncated_kind("-1 and 2.5", *UNEVEN_CUTS),
+    Kind("truncated", f"unknown beyond {UNKNOWN:g}", partial(partly_unknown, beyond=UNKNOWN)),
+    Kind("scaled", "d/100, no spacing given", partial(scaled, unit=UNIT), unit=UNIT),
+    Kind("scaled", "d/100, spacing given", partial(scaled, unit=UNIT)),
+    Kind("exact", "int16, no spacing given", integers, unit=INTEGERS),
+    Kind("scaled", "2h tanh(d/2h)", saturating),
+    Kind("scaled", "d + d^2", steepening),
+    Kind("scaled", "d times 0.5 to 1.5", varying),
+    Kind("density", "1/(1 + exp(d/h))", occupancy, **HALF),
+    Kind("density", "share of the voxel", shares, **HALF),
+    *(Kind("noisy", f"noise of {noise:g}", partial(noisy, amplitude=noise)) for noise in NOISES),
+    *(unequal_kind(ratio, axis) for ratio in RATIOS for axis in AXES),
+)
+KINDS = {kind.name: kind for kind in ALL_KINDS}
+
+
+# What is done with the values of a kind.
+
+
+def coarse_of_kind(kind: Kind, case: Case, network: Decoder) -> Surface:
+    """Mesh the values by marching cubes, as they are."""
+    return coarse_mesh(samples_of(kind, case), partial(level_set, kind))
+
+
+def coarse_mesh(samples: FieldSamples, change: Callable[[Array], FloatArray]) -> Surface:
+    """Mesh changed values by marching cubes."""
+    field = change(samples.values)
+    return Surface(closed_isosurface(field, samples.spacing, samples.origin))
+
+
+def spline_of_kind(kind: Kind, case: Case, network: Decoder) -> Surface:
+    """Mesh the cubic B-spline of the values at the fine nodes."""
+    field = interpolate_spline(level_set(kind, samples_of(kind, case).values), case.factor, 3)
+    return Surface(closed_isosurface(field, case.fine, case.low))
+
+
+def transform_of_mask(kind: Kind, case: Case, network: Decoder) -> Surface:
+    """Mesh SciPy's distance transform of a mask by marching cubes."""
+    return coarse_mesh(samples_of(kind, case), lambda values: distances_of(values > 0))
+
+
+def distances_of(inside: BoolArray) -> FloatArray:
+    """Return SciPy's distances of a mask, in voxels, half a voxel less on either side."""
+    out, into = (ndimage.distance_transform_edt(side) for side in (~inside, inside))
+    return np.where(inside, 0.5 - into, out - 0.5).astype(np.float32)
+
+
+def smoothed_mask(kind: Kind, case: Case, network: Decoder, *, width: float) -> Surface:
+    """Mesh a mask by marching cubes, smoothed by a Gaussian of a width in voxels."""
+    return coarse_mesh(samples_of(kind, case), partial(smoothed, width=width))
+
+
+def smoothed(values: Array, width: float) -> FloatArray:
+    """Return 1/2 less the smoothed values of a mask, negative inside."""
+    return 0.5 - ndimage.gaussian_filter(values.astype(np.float32), width, mode="nearest")
+
+
+def our_surface_of_kind(kind: Kind, case: Case, network: Decoder) -> Surface:
+    """Mesh the values with super-sdf, as a user of the command would.
+
+    If the default call is refused, and the kind is scaled, ``--field scaled`` is tried. ``facts``
+    has what the values were taken as and whether the user had to say so, or why they were refused.
+    """
+    refusals = []
+    for told in (AUTO, SCALED) if kind.is_scaled else (AUTO,):
+        try:
+            grid = grid_of(kind, case, told)
+            mesh = reconstruct(grid, network, factor=case.factor, cap=True)
+        except GridError as problem:
+            refusals.append(str(problem))
+        else:
+            facts = {"taken_as": grid.field.kind, "told": told != AUTO}
+            return Surface(placed(mesh, kind, case), facts=facts)
+    return Surface(EMPTY, facts={"refused": refusals[0]})
+
+
+def grid_of(kind: Kind, case: Case, told: str) -> SdfGrid:
+    """Return the grid of a kind's values; ``told`` is the value of ``--field``."""
+    samples, options = samples_of(kind, case), dict(kind.options)
+    if kind.unit is None:
+        options |= {"spacing": samples.spacing, "origin": samples.origin}
+    return make_grid(samples.values, field=told, **options)
+
+
+def placed(mesh: Mesh, kind: Kind, case: Case) -> Mesh:
+    """Return a mesh in the frame of the case; without a spacing it was in units of the values."""
+    if kind.unit is None:
+        return mesh
+    return stretched(mesh, 1 / kind.unit, samples_of(kind, case).origin)
+
+
+def resampled_by_hand(
+    kind: Kind, case: Case, network: Decoder, *, order: int, finest: bool
+) -> Surface:
+    """Mesh with super-sdf what SciPy resampled to one spacing; ``order`` is that of the spline."""
+    samples = samples_of(kind, case)
+    h = samples.spacing.min() if finest else samples.spacing.max()
+    step = h / samples.spacing
+    shape = np.rint((np.array(samples.values.shape) - 1) / step).astype(int) + 1
+    values = ndimage.affine_transform(
+        samples.values, step, output_shape=tuple(shape), order=order, mode="nearest"
+    )
+    grid = SdfGrid.trusted(values, h, samples.origin)
+    try:
+        return Surface(reconstruct(grid, network, factor=case.factor, cap=True))
+    except GridError as problem:
+        return Surface(EMPTY, facts={"refused": str(problem)})
+
+
+BY_METHOD: dict[str, Callable[[Kind, Case, Decoder], Surface]] = {
+    "mc": coarse_of_kind,
+    "mc-distances": transform_of_mask,
+    **{f"mc-gaussian-{width:g}": partial(smoothed_mask, width=width) for width in WIDTHS},
+    "bspline": spline_of_kind,
+    "linear-finest": partial(resampled_by_hand, order=1, finest=True),
+    "spline-finest": partial(resampled_by_hand, order=3, finest=True),
+    "spline-coarsest": partial(resampled_by_hand, order=3, finest=False),
+    "ours": our_surface_of_kind,
+}
+
+
+def mesh_kind(method: str, kind: Kind, case: Case, network: Decoder) -> Surface:
+    """Return the surface that a method makes of a kind of grid."""
+    return BY_METHOD[method](kind, case, network)

@@ -1,0 +1,197 @@
+"""The methods that reconstruct a surface from a coarse grid: ours, the baselines, our bound, peers.
+
+Each takes a case and a network, which only ours uses, and returns a surface. The name of a method
+may say more: ``ours-sharp`` is meshed by the mesher sharp, ``ours/4`` is simplified to a quarter
+of its triangles, ``ours/within`` within .02 voxel, ``ours@base:float32`` uses that network.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from scipy import ndimage
+
+from super_sdf.arrays import FloatArray, IntArray
+from super_sdf.errors import NoSurfaceError, OptionError
+from super_sdf.grid.sdf_grid import SdfGrid
+from super_sdf.mesh import Mesh
+from super_sdf.network.decoder import Decoder
+from super_sdf.options import DEFAULT_MESHER, SHARP
+from super_sdf.pipeline import reconstruct, refine
+from super_sdf.simplification.simplify import simplify_mesh
+from super_sdf.slabs.cutting import whole
+from super_sdf.steps.band import neighbour_table
+from super_sdf.steps.field import FineField, SampleSpheres
+from super_sdf.steps.meshers import extract_mesh
+from super_sdf.steps.nodes import block_ijk, share_parts
+from super_sdf.steps.survey import survey
+from super_sdf.truth.sampling import grid_points
+
+from .kinds import KINDS, mesh_kind
+from .shapes import Case
+from .surfaces import EMPTY, Surface, interpolate_spline, isosurface
+
+FACTOR_OF_BLOCKS = 4  # of the blocks that a dense field is cut into
+OURS, FLOOR = "ours", "floor"  # the floor is no method: the reference measured against itself
+ON = " on "
+WITHIN, ERROR = "within", 0.02  # simplified within this error, in voxels
+
+Method = Callable[[Case, Decoder], Surface]
+# What tables call each method.
+LABELS = {
+    "mc": "MC",
+    "mc-lewiner": "MC, Lewiner's table",
+    "trilinear": "trilinear + MC",
+    "bspline": "B-spline + MC",
+    OURS: "super-sdf",
+    "bound": "bound: true distance at the nodes",
+    FLOOR: "floor: the reference against itself",
+    "rfta": "RFTA",
+    "dual-contouring": "dual contouring of distances",
+}
+
+
+def coarse_surface(case: Case, network: Decoder, *, table: str) -> Surface:
+    """Mesh the coarse grid by marching cubes; ``table`` is lorensen or lewiner."""
+    field = np.array(case.grid.values)
+    return Surface(isosurface(field, case.spacing, case.low + case.spacing / 2, table))
+
+
+def spline_surface(case: Case, network: Decoder, *, order: int) -> Surface:
+    """Mesh the spline interpolation of the coarse grid at the fine nodes."""
+    field = interpolate_spline(case.grid.values, case.factor, order)
+    return Surface(isosurface(field, case.fine, case.low), lambda: field)
+
+
+def bound_surface(case: Case, network: Decoder, *, mesher: str = DEFAULT_MESHER) -> Surface:
+    """Mesh the true distances at the fine nodes: the bound of all upsampling to them."""
+    dense = sharp_isosurface if mesher == SHARP else isosurface
+    return Surface(dense(case.truth.copy(), case.fine, case.low))
+
+
+def our_surface(case: Case, network: Decoder, *, mesher: str = DEFAULT_MESHER) -> Surface:
+    """Mesh the coarse grid with super-sdf, capped where the surface leaves the grid.
+
+    Without a surface the mesh is empty.
+    """
+    try:
+        grid, factor = case.recognised, case.factor
+        mesh = reconstruct(grid, network, factor=factor, cap=True, mesher=mesher)
+    except NoSurfaceError:
+        return Surface(EMPTY)
+    if case.setting.noise:
+        return Surface(mesh)  # its field has another band than the protocol's
+    return Surface(mesh, lambda: band_field(case.grid, network, factor))
+
+
+def simplified_to(mesh: Mesh, triangles: int) -> Mesh:
+    """Simplify a mesh to a number of triangles."""
+    return simplify_mesh(mesh, triangles=triangles).mesh if triangles < len(mesh.faces) else mesh
+
+
+def band_field(grid: SdfGrid, network: Decoder, factor: int) -> FloatArray:
+    """Return our distances at the fine nodes in the band's blocks, NaN elsewhere, (K n + 1)^3.
+
+    The pipeline decodes only voxels that can hold the surface; the protocol compares all.
+    """
+    band = survey(grid)
+    band = replace(band, decoded=np.ones(len(band.voxel_ijk), bool))
+    fine = refine(band, network, factor, whole(band))
+    nodes = factor * fine.voxel_ijk[:, None] + block_ijk(factor)  # (V, Q, 3)
+    field = np.full([factor * n + 1 for n in grid.shape], np.nan, np.float32)
+    world = fine.values * np.float32(grid.voxel_size / 2)
+    field[tuple(np.moveaxis(nodes, 2, 0))] = world[fine.numbers]
+    return field
+
+
+def sharp_isosurface(field: FloatArray, spacing: float, low: float) -> Mesh:
+    """Mesh a dense field, (4 n + 1)^3, by the mesher that keeps edges; see ``isosurface``."""
+    if not field.min() < 0 < field.max():
+        return EMPTY
+    field = even_sided(field)
+    factor = FACTOR_OF_BLOCKS if (len(field) - 1) % FACTOR_OF_BLOCKS == 0 else 2
+    shape = tuple((nodes - 1) // factor for nodes in field.shape)
+    block = block_ijk(factor)
+    inside = np.stack([_node_of_blocks(field, node, factor) <= 0 for node in block])
+    crossed = ndimage.binary_dilation(inside.any(0) & ~inside.all(0), np.ones((3, 3, 3)), 2)
+    voxel_ijk = np.argwhere(crossed).astype(np.int32)
+    values = [_node_of_blocks(field, node, factor)[crossed] for node in block]
+    parts = share_parts(neighbour_table(voxel_ijk, shape))
+    side = spacing * factor
+    blocks = np.stack(values) * np.float32(2 / side)
+    middle = blocks[len(block) // 2]
+    spheres = SampleSpheres(shape, voxel_ijk, middle)
+    fine = FineField(shape, factor, voxel_ijk, blocks, parts, (0, shape[0]), spheres=spheres)
+    grid = SdfGrid.trusted(_node_of_blocks(field, block[0], factor), side, low + side / 2)
+    return extract_mesh(fine, grid, mesher=SHARP)
+
+
+def even_sided(field: FloatArray) -> FloatArray:
+    """Return a field with an even number of cells along each side; the last node is repeated."""
+    return np.pad(field, [(0, (nodes + 1) % 2) for nodes in field.shape], mode="edge")
+
+
+def _node_of_blocks(field: FloatArray, node: IntArray, factor: int) -> FloatArray:
+    """Return one node of every block of a dense field."""
+    first = tuple(slice(start, start + n - factor, factor) for start, n in zip(node, field.shape))
+    return field[first]
+
+
+def reach_for_the_arcs(case: Case, network: Decoder) -> Surface:
+    """Mesh the grid with Reach for the Arcs (Sellán et al. 2024), with its defaults."""
+    from gpytoolbox import reach_for_the_arcs
+
+    values = np.ravel(case.grid.values).astype(np.float64)
+    vertices, faces = reach_for_the_arcs(grid_points(case.layout), values)
+    return Surface(Mesh(np.asarray(vertices), np.asarray(faces, np.int32)))
+
+
+def dual_contouring(case: Case, network: Decoder) -> Surface:
+    """Mesh the grid with Dual Contouring of Signed Distance Data (Carrera et al. 2026)."""
+    from gpytoolbox import dual_contouring_of_signed_distance_data
+
+    shape = case.grid.shape
+    order = np.arange(np.prod(shape)).reshape(shape).ravel(order="F")  # there i varies fastest
+    values = np.ravel(case.grid.values).astype(np.float64)[order]
+    vertices, quads = dual_contouring_of_signed_distance_data(
+        values, grid_points(case.layout)[order], *shape
+    )
+    halves = np.asarray(quads, np.int32)[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
+    return Surface(Mesh(np.asarray(vertices), halves))
+
+
+METHODS: dict[str, Method] = {
+    "mc": partial(coarse_surface, table="lorensen"),
+    "mc-lewiner": partial(coarse_surface, table="lewiner"),
+    "trilinear": partial(spline_surface, order=1),
+    "bspline": partial(spline_surface, order=3),
+    OURS: our_surface,
+    "bound": bound_surface,
+}
+BY_NAME: dict[str, Method] = {
+    **METHODS,
+    f"{OURS}-{SHARP}": partial(our_surface, mesher=SHARP),
+    f"bound-{SHARP}": partial(bound_surface, mesher=SHARP),
+    "rfta": reach_for_the_arcs,
+    "dual-contouring": dual_contouring,
+}
+
+
+def make_surface(method: str, case: Case, network: Decoder) -> Surface:
+    """Return the surface that a method makes of a case."""
+    name, _, kind = method.partition("@")[0].partition(ON)
+    if kind:
+        return mesh_kind(name, KINDS[kind], case, network)
+    name, _, share = name.partition("/")
+    if name not in BY_NAME:
+        raise OptionError(f"method is {method!r}: give one of {', '.join(BY_NAME)}")
+    surface = BY_NAME[name](case, network)
+    if not share:
+        return surface
+    if share == WITHIN:
+        return Surface(simplify_mesh(surface.mesh, error=ERROR * case.spacing).mesh)
+    count = len(surface.mesh.faces) // int(share) if share.isdigit() else case.triangles[share]
+    return Surface(simplified_to(surface.mesh, count))

@@ -1,0 +1,238 @@
+"""Figures that no shape and method of ``measuring`` gives: formulas, thick slices, and residuals.
+
+The truth of a formula is marching cubes of itself on a fine grid. Distances are means of both
+directions between points on the surfaces, in voxels of the grid, of slices in those of the slices.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.stats import spearmanr
+
+from super_sdf import make_grid, reconstruct
+from super_sdf.certificate.surface import count_components
+from super_sdf.convert import ConvertOptions, convert
+from super_sdf.errors import GridError
+from super_sdf.mesh import Mesh
+from super_sdf.network.decoder import Decoder
+from super_sdf.truth.solid import Solid
+
+from .forms import FORMS, sample, true_surface
+from .kinds import sample_box
+from .measuring import network_of
+from .metrics import compare_distances, distance_or_dot, sample_surface
+from .processes import write_grid
+from .rows import Row
+from .shapes import RESULT_POINTS, Shape, spread
+from .surfaces import EMPTY, closed_isosurface, interpolate_spline
+
+if TYPE_CHECKING:
+    from .figures import Bench
+
+Values = NDArray[np.float64]
+POINTS = 20_000
+FACTOR = 4
+SLICES, RATIOS, CUTS = 24, (1.5, 2.5, 5.0), (0.5, 1.0, 2.0)
+MOST_PARTS = 4
+WORST = 0.05  # share of the vertices
+
+
+def distance(truth: Mesh, mesh: Mesh, spacing: float) -> float:
+    """Return the mean distance between two surfaces, both ways, in voxels; NaN without a mesh."""
+    if not len(mesh.faces):
+        return float("nan")
+    there = sample_surface(truth, (1, 1), POINTS).points
+    back = sample_surface(mesh, (1, 2), POINTS).points
+    far = Solid(mesh).distance(there).mean() + Solid(truth).distance(back).mean()
+    return float(far) / 2 / spacing
+
+
+def ours(values: Values, spacing: Any, low: Any, network: Decoder) -> tuple[Mesh, str]:
+    """Return the mesh of super-sdf, and what it took the values for.
+
+    Where values and spacing contradict each other, the user says that this is meant.
+    """
+    for told in ("auto", "scaled"):
+        try:
+            grid = make_grid(values, spacing=spacing, origin=low, field=told)
+            mesh = reconstruct(grid, network, factor=FACTOR, cap=True)
+        except GridError:
+            continue
+        return mesh, grid.field.kind if told == "auto" else f"{grid.field.kind}, told"
+    return EMPTY, "refused"
+
+
+def form_rows(bench: Bench) -> list[Row]:
+    """Measure closed forms that are no distances."""
+    rows = []
+    for name in FORMS:
+        for size in bench.sizes[:2]:
+            words = {"set": "forms", "kind": name, "size": size}
+            found = bench.kept(words, partial(measure_form, name, size, bench))
+            facts = {"taken_as": found["taken_as"]}
+            rows += [
+                {**words, "method": method, "voxels": found[method], **facts}
+                for method in ("mc", "bspline", "ours")
+            ]
+    return rows
+
+
+def measure_form(name: str, size: int, bench: Bench) -> Row:
+    """Return the distances of the meshes of a form from the truth."""
+    values, h, low = sample(FORMS[name], size)
+    truth, network = true_surface(FORMS[name]), network_of(bench.network, "auto", 0)
+    spline = interpolate_spline(values, FACTOR, 3)
+    mesh, taken_as = ours(values, h, low, network)
+    meshes = {
+        "mc": closed_isosurface(values, h, low),
+        "bspline": closed_isosurface(spline, h / FACTOR, low - h / 2),
+        "ours": mesh,
+    }
+    return {**{m: distance(truth, mesh, h) for m, mesh in meshes.items()}, "taken_as": taken_as}
+
+
+def slice_rows(bench: Bench) -> list[Row]:
+    """Measure masks and truncated distances with thick slices, on some turned CAD parts."""
+    found: dict[tuple[float, str], list[Row]] = {}
+    for path in spread(bench.parts, MOST_PARTS):
+        for ratio in RATIOS:
+            words = {"set": "slices", "part": path.stem, "size": SLICES, "ratio": ratio}
+            row = bench.kept(words, partial(measure_slices, path, ratio, bench))
+            for method, figures in row["methods"].items():
+                found.setdefault((ratio, method), []).append(figures)
+    return [
+        {
+            **{"set": "slices", "kind": f"{ratio:g}", "method": method, "grids": len(rows)},
+            "voxels": float(np.mean([row["distance"] for row in rows])),
+            "largest": max(row["distance"] for row in rows),
+            "pieces": sum(row["pieces"] for row in rows),
+        }
+        for (ratio, method), rows in found.items()
+    ]
+
+
+def measure_slices(path: Path, ratio: float, bench: Bench) -> Row:
+    """Return the figures of all methods on a part with slices some spacings apart."""
+    shape, fine = Shape.read(path, 0), round(SLICES * ratio)
+    values = sample_box(shape.solid, (fine, fine, SLICES), 1.0).astype(float)
+    spacing = 1 / np.array(values.shape)
+    network = network_of(bench.network, "auto", 0)
+    return {
+        "methods": {
+            method: {
+                "distance": distance(shape.mesh, mesh, float(spacing[2])),
+                "pieces": count_components(mesh.faces, len(mesh.vertices)),
+            }
+            for method, mesh in sliced_meshes(values, spacing, network)
+        }
+    }
+
+
+def sliced_meshes(values: Values, spacing: Values, network: Decoder) -> Iterator[tuple[str, Mesh]]:
+    """Yield the meshes of a mask, and of distances that are cut off.
+
+    "repeated": each slice is repeated to the finest spacing. "between": distances between samples
+    are interpolated to it (shape-based interpolation). Both are masks then.
+    """
+    inside, low, finest = values <= 0, spacing / 2 - 0.5, np.full(3, spacing[0])
+    ratio = float(spacing[2] / spacing[0])
+    yield "mask: MC", closed_isosurface((0.5 - inside).astype(np.float32), spacing, low)
+    repeated = resliced(inside.astype(float), ratio, 0) > 0.5
+    yield "mask: repeated", ours(repeated, finest, finest / 2 - 0.5, network)[0]
+    out, into = (ndimage.distance_transform_edt(s, sampling=spacing) for s in (~inside, inside))
+    between = resliced(out - into, ratio, 1) <= 0
+    yield "mask: between", ours(between, finest, finest / 2 - 0.5, network)[0]
+    yield "mask: ours", ours(inside, spacing, low, network)[0]
+    for cut in (*CUTS, np.inf):
+        clipped = np.clip(values, -cut * spacing[2], cut * spacing[2])
+        name = f"cut off at {cut:g}" if np.isfinite(cut) else "exact"
+        yield f"{name}: MC", closed_isosurface(clipped.astype(np.float32), spacing, low)
+        yield f"{name}: ours", ours(clipped, spacing, low, network)[0]
+
+
+def resliced(values: Values, ratio: float, order: int) -> Values:
+    """Return samples interpolated along z to the finest spacing, by splines of an order."""
+    z = (np.arange(round(values.shape[2] * ratio)) + 0.5) / ratio - 0.5
+    at = np.stack(np.meshgrid(*(np.arange(n) for n in values.shape[:2]), z, indexing="ij"))
+    return ndimage.map_coordinates(values, at, order=order, mode="nearest")
+
+
+def check_rows(bench: Bench) -> list[Row]:
+    """Measure how well the residuals of ``super-sdf check`` predict the true error of a mesh.
+
+    ``shapes``: over shapes, Spearman's rank correlation of the mean residual with the mean error
+    both ways. ``vertices``: the same over the vertices of a shape, the median over shapes.
+    ``found``: how many of the worst twentieth of the vertices are among the worst by residual.
+    """
+    rows = []
+    for size in bench.sizes[:2]:
+        found = [
+            bench.kept(
+                {"check": path.stem, "size": size}, partial(measure_check, path, size, bench)
+            )
+            for path in bench.shapes
+        ]
+        mean = [row["mean"] for row in found]
+        rows.append(
+            {
+                "size": size,
+                "shapes": rank(mean, [row["both_ways"] for row in found]),
+                "one_way": rank(mean, [row["error"] for row in found]),
+                "largest": rank([r["largest"] for r in found], [r["max_error"] for r in found]),
+                **quantiles("vertices", [row["vertices"] for row in found]),
+                **quantiles("found", [row["found"] for row in found]),
+                **quantiles("ratio", [row["both_ways"] / row["mean"] for row in found]),
+                "above": sum(row["max_error"] < row["largest"] for row in found),
+                "grids": len(found),
+            }
+        )
+    return rows
+
+
+def rank(one: Sequence[float], other: Sequence[float]) -> float:
+    """Return Spearman's rank correlation; NaN of fewer than two."""
+    return float(spearmanr(one, other).statistic) if len(one) > 1 else float("nan")
+
+
+def quantiles(name: str, values: Sequence[float]) -> Row:
+    """Return the median, and the tenth and ninetieth percentile."""
+    low, middle, high = map(float, np.quantile(values, [0.1, 0.5, 0.9]))
+    return {name: middle, f"{name}_low": low, f"{name}_high": high}
+
+
+def measure_check(path: Path, size: int, bench: Bench) -> Row:
+    """Return residuals and true errors of a shape's mesh, in voxels."""
+    from super_sdf.certificate.check import check_files
+
+    shape = Shape.read(path)
+    with tempfile.TemporaryDirectory() as folder:
+        grid = write_grid(shape, size, Path(folder))
+        network, options = network_of(bench.network, "auto", 0), ConvertOptions(inside="negative")
+        convert(grid, grid.with_suffix(".ply"), network, options, force=True)
+        found = check_files(grid.with_suffix(".ply"), grid, options, intersections=False)
+    mesh = found.mesh
+    true = shape.solid.distance(mesh.vertices.astype(np.float64))
+    said = np.abs(found.residuals_at(mesh.vertices))
+    known = np.isfinite(said)
+    said, true_known = said[known], true[known]
+    worst = [values >= np.quantile(values, 1 - WORST) for values in (said, true_known)]
+    drawn = sample_surface(mesh, shape.seed(RESULT_POINTS)).points
+    there = distance_or_dot(Solid(mesh), shape.drawn.points)
+    surfaces = compare_distances(there, distance_or_dot(shape.solid, drawn))
+    summary = found.touching.summary()
+    return {
+        **{name: float(summary[name]) for name in ("mean", "largest")},
+        "error": float(true.mean()) * size,
+        "both_ways": surfaces["p2s"] * size,
+        "max_error": surfaces["max"] * size,
+        "vertices": rank(said, true_known),
+        "found": float((worst[0] & worst[1]).sum() / worst[1].sum()),
+    }

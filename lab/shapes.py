@@ -1,0 +1,272 @@
+"""Shapes, and cases: a shape sampled on a grid, with the exact distances on the fine lattice.
+
+Shapes are centred on their bounding boxes and scaled to a box diagonal of 1. All lengths are in
+that unit.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from super_sdf.arrays import BoolArray, FloatArray, IntArray
+from super_sdf.errors import FileError, OptionError, seen
+from super_sdf.files.regular import check_regular_file
+from super_sdf.grid.sdf_grid import SdfGrid, make_grid
+from super_sdf.machine.memory import check_fits
+from super_sdf.mesh import Mesh
+from super_sdf.options import check_factor
+from super_sdf.steps.band import find_band, rescale
+from super_sdf.truth.sampling import sample_grid, unit_layout
+from super_sdf.truth.solid import Distances, Solid, load_solid, normalise
+
+from . import metrics
+from .edges import EdgeCurves
+
+# Peak memory per node of the fine lattice: dense fields, their masks, and meshing one of them.
+BYTES_PER_NODE = 20
+
+# Streams of random numbers, each seeded by the shape's name and its own number.
+REFERENCE_POINTS, REFERENCE_EDGES, RESULT_POINTS, NOISE, RESULT_EDGES, TURN, FIELD_NOISE = range(7)
+
+
+LARGEST_SIZE = 100_000  # samples along an axis; a larger grid fits into no memory
+MESH_SUFFIXES = (".ply", ".stl", ".obj", ".off", ".glb", ".gltf", ".3mf")
+HALVES = ("choose", "final")
+HALVES_SEED = 0
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How a shape is sampled and refined."""
+
+    size: int  # samples along each axis; 0 where nothing is sampled (the floor)
+    factor: int = 4
+    noise: float = 0.0  # amplitude of the uniform noise on the samples, in half voxels
+    scale: float = 0.0  # longest side of the box over the grid's; 0: the grid's is the diagonal
+
+    def check(self) -> None:
+        """Raise OptionError if a number is out of range."""
+        check_factor(self.factor)
+        if self.size < 4:
+            raise OptionError(f"size is {self.size}: give at least 4 samples along an axis")
+        if self.size > LARGEST_SIZE:
+            raise OptionError(f"size is {seen(self.size)}: give at most {LARGEST_SIZE:,} samples")
+
+    def __str__(self) -> str:
+        if not self.size:
+            return "reference"
+        parts = [f"{self.size}^3", f"factor {self.factor}"]
+        parts += [f"noise {self.noise:g}"] if self.noise else []
+        parts += [f"scale {self.scale:g}"] if self.scale else []
+        return ", ".join(parts)
+
+
+class Shape:
+    """A normalised reference mesh, and the points that are drawn from it for all methods."""
+
+    def __init__(self, name: str, mesh: Mesh) -> None:
+        self.name = name
+        self.solid = Solid(normalise(mesh))
+        self.mesh = self.solid.mesh
+        self.notes: Sequence[str] = ()
+        self.drawn = metrics.sample_surface(self.mesh, self.seed(REFERENCE_POINTS)).ordered()
+        self.sharp = EdgeCurves.of(self.mesh, self.seed(REFERENCE_EDGES))
+
+    @classmethod
+    def read(cls, path: Path, turned: int | None = None) -> Shape:
+        """Return the shape of a mesh file, named after the file.
+
+        With a seed ``turned`` it is turned at random, the same way for the same seed and name,
+        before it is put into the frame.
+        """
+        solid, notes = load_solid(path)
+        mesh = solid.mesh
+        if turned is not None:
+            mesh = mesh.transformed(turn_of(path.stem, turned), np.zeros(3))
+        shape = cls(path.stem, mesh)
+        shape.notes = notes
+        return shape
+
+    def seed(self, stream: int) -> tuple[int, int]:
+        """Return the seed of a stream of random numbers."""
+        return name_seed(self.name, stream)
+
+
+def name_seed(name: str, stream: int) -> tuple[int, int]:
+    """Return the seed of a stream of random numbers of a shape."""
+    return zlib.crc32(name.encode(errors="surrogateescape")), stream
+
+
+def turn_of(name: str, seed: int) -> NDArray[np.float64]:
+    """Return the rotation matrix, (3, 3), by which a seed turns the shape of a name."""
+    return random_rotation(np.random.default_rng((seed, *name_seed(name, TURN))))
+
+
+def random_rotation(random: np.random.Generator) -> NDArray[np.float64]:
+    """Return a rotation matrix, (3, 3), all rotations equally likely: of a random quaternion."""
+    quaternion = random.normal(size=4)
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + 2 * w * cross + 2 * cross @ cross
+
+
+class Case:
+    """A shape sampled in a setting.
+
+    The fields of the baselines and the truth are dense, so they must fit into memory.
+    """
+
+    def __init__(self, shape: Shape, setting: Setting) -> None:
+        self.triangles: dict[str, int] = {}
+        nodes = (setting.size * setting.factor + 1) ** 3
+        what = f"measuring {setting.size}^3 refined to {nodes:,} nodes"
+        check_fits(nodes * BYTES_PER_NODE, what, "use smaller sizes or fewer --jobs")
+        self.shape, self.setting, self.factor = shape, setting, setting.factor
+        self.side = side_of(shape.mesh, setting.scale)
+        self.low = -self.side / 2
+        self.layout = unit_layout(setting.size, self.side)
+        _, self.spacing, origin = self.layout
+        self.fine = self.spacing / self.factor
+        self.coarse = sample_grid(shape.solid, self.layout)
+        values = self.coarse.astype(np.float32)
+        if setting.noise:
+            random = np.random.default_rng(shape.seed(NOISE))
+            noise = random.uniform(-1, 1, self.coarse.shape) * setting.noise * self.spacing / 2
+            values = (self.coarse + noise).astype(np.float32)
+        self.grid = SdfGrid.trusted(values, self.spacing, origin)
+
+    @cached_property
+    def recognised(self) -> SdfGrid:
+        """The grid as super-sdf takes it from a file of a user: noise is recognised."""
+        if not self.setting.noise:
+            return self.grid
+        values, origin = np.asarray(self.grid.values), self.grid.origin
+        return make_grid(values, spacing=self.spacing, origin=origin, inside="negative")
+
+    @cached_property
+    def voxels(self) -> IntArray:
+        """Voxels of the band of the exact distances (Eq. 2), (V, 3)."""
+        return find_band(rescale(SdfGrid.trusted(self.coarse, self.spacing)))
+
+    @cached_property
+    def band(self) -> BoolArray:
+        """Mask of the fine nodes in the blocks of the band, faces included, (K n + 1)^3."""
+        active = np.zeros(self.coarse.shape, bool)
+        active[tuple(self.voxels.T)] = True
+        return spread_to_nodes(active, self.factor)
+
+    @cached_property
+    def truth(self) -> FloatArray:
+        """Exact distances at the fine nodes, (K n + 1)^3: see ``exact_field``."""
+        return exact_field(self)
+
+
+def side_of(mesh: Mesh, scale: float) -> float:
+    """Return the side of the grid's cube in which a normalised mesh has a given scale."""
+    if not scale:
+        return 1.0
+    return float(np.ptp(mesh.vertices, axis=0).max()) / scale
+
+
+def spread_to_nodes(voxels: BoolArray, factor: int) -> BoolArray:
+    """Return the mask of the fine nodes, (K n + 1)^3, in the blocks of a mask of voxels, n^3."""
+    for axis in range(3):
+        source = np.moveaxis(voxels, axis, 0)
+        target = np.zeros((factor * len(source) + 1, *source.shape[1:]), bool)
+        for offset in range(factor + 1):
+            target[offset : offset + factor * (len(source) - 1) + 1 : factor] |= source
+        voxels = np.moveaxis(target, 0, axis)
+    return voxels
+
+
+def spread_samples(samples: FloatArray, factor: int) -> FloatArray:
+    """Return for each fine node the sample of a voxel that it lies in, (K n + 1)^3."""
+    nearest = [np.minimum(np.arange(factor * n + 1) // factor, n - 1) for n in samples.shape]
+    return samples[np.ix_(*nearest)]
+
+
+def exact_field(case: Case) -> FloatArray:
+    """Return the signed distances at the fine nodes, (K n + 1)^3.
+
+    They are exact in the band and at every cell that the surface may cross: a node of such a cell
+    is within sqrt(3) h/K of the surface, so the sample of its block is within
+    sqrt(3) (1/2 + 1/K) h. Elsewhere they are the nearest sample, which has the right sign.
+    """
+    factor = case.factor
+    reach = 3**0.5 * (0.5 + 1 / factor) * case.spacing
+    field = spread_samples(case.coarse, factor)
+    nodes = np.argwhere(case.band | spread_to_nodes(np.abs(case.coarse) < reach, factor))
+    samples = np.minimum(nodes // factor, case.setting.size - 1)
+    steps = nodes - factor * (samples + 0.5)
+    apart = np.linalg.norm(steps, axis=1) * case.fine
+    field[tuple(nodes.T)] = signed_from_samples(
+        case.shape.solid, nodes * case.fine + case.low, case.coarse[tuple(samples.T)], apart
+    )
+    return field
+
+
+def signed_from_samples(
+    solid: Solid, points: NDArray[Any], known: FloatArray, apart: NDArray[Any]
+) -> Distances:
+    """Return the signed distances of points, (n,), negative inside.
+
+    The balls round the two points with their distances as radii hold no surface. If they overlap,
+    both points have the same sign. Only for the others the winding number is computed.
+    """
+    distance = solid.distance(points)
+    inside = known < 0
+    unsure = distance + np.abs(known) < apart * (1 + 1e-6)
+    inside[unsure] = solid.is_inside(points[unsure])
+    return np.where(inside, -distance, distance)
+
+
+def meshes_in(folder: Path) -> list[Path]:
+    """Return the mesh files of a folder, sorted by name."""
+    try:
+        paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in MESH_SUFFIXES)
+    except OSError as error:
+        raise FileError(f"{folder} cannot be read: {error.strerror}") from error
+    if not paths:
+        raise FileError(f"{folder} holds no mesh: give {', '.join(MESH_SUFFIXES)}")
+    return paths
+
+
+def find_meshes(sources: Sequence[Path]) -> tuple[Path, ...]:
+    """Return the given mesh files, and those in the given folders, sorted by name."""
+    paths: list[Path] = []
+    for source in sources:
+        inside = meshes_in(source) if source.is_dir() else [source]
+        paths += [check_regular_file(path) for path in inside]
+    names = [path.stem for path in paths]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice:
+        raise FileError(f"two meshes are named {twice!r}: shapes are known by their file names")
+    return tuple(paths)
+
+
+def spread(items: Sequence[Any], count: int) -> tuple[Any, ...]:
+    """Return ``count`` of the items, evenly spread over them."""
+    count = min(count, len(items))
+    return tuple(items[i * len(items) // count] for i in range(count))
+
+
+def draw_halves(names: Sequence[str], seed: int = HALVES_SEED) -> dict[str, list[str]]:
+    """Split names by a seed: networks are chosen on the first half, the second is for the end.
+
+    The split depends on the names only, not on their order; of an odd number the second gets one
+    more.
+    """
+    chosen = np.random.default_rng(seed).permutation(sorted(names))[: len(names) // 2]
+    first = set(chosen.tolist())
+    return {
+        "choose": [name for name in names if name in first],
+        "final": [name for name in names if name not in first],
+    }

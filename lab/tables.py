@@ -1,0 +1,210 @@
+"""Markdown tables of measurements, of whatever kind."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from . import published
+from .methods import LABELS, OURS
+from .rows import Row
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table: the figure that it shows, its title, scale and rounding."""
+
+    title: str
+    key: str
+    scale: float = 1.0
+    digits: int = 3
+
+    def cell(self, figure: Any) -> str:
+        """Return a figure as text, "-" if it is unknown."""
+        if figure is None or isinstance(figure, str):
+            return figure or "-"
+        return f"{figure * self.scale:,.{self.digits}f}"
+
+
+CD, F1, NC = Column("CD x1e5", "cd", 1e5), Column("F1", "f1"), Column("NC", "nc", 1, 4)
+P2S = Column("p2s x1e4", "p2s", 1e4, 2)
+THERE = Column("ref to res", "p2s_there", 1e4, 2)
+BACK = Column("res to ref", "p2s_back", 1e4, 2)
+EF1 = Column("EF1", "ef1")
+TRIANGLES = Column("triangles", "faces", 1, 0)
+SURFACE = (
+    *(CD, Column("excess CD x1e5", "excess_cd", 1e5), F1, NC, Column("signed NC", "signed_nc")),
+    *(P2S, THERE, BACK),
+    *(Column("p99 x1e4", "p99", 1e4, 1), Column("max x1e4", "max", 1e4, 0)),
+    *(Column("ECD x1e5", "ecd", 1e5, 2), EF1),
+    *(Column("field MSE x1e6", "field_mse", 1e6), Column("field MAE x1e4", "field_mae", 1e4, 2)),
+    TRIANGLES,
+)
+EDGES = (
+    *(EF1, Column("EFv", "efv"), Column("edge distance", "edge_distance")),
+    *(Column("angle near", "angle_near", 1, 2), Column("angle beyond", "angle_beyond", 1, 2)),
+    *(TRIANGLES, Column("slivers %", "slivers", 100, 2), Column("min angle", "min_angle", 1, 2)),
+)
+SHORT = (CD, F1, NC, P2S, BACK)
+CLOSED = Column("closed", "closed", 1, 0)
+COST = (
+    Column("mean s", "seconds", 1, 2),
+    Column("slowest s", "seconds_max", 1, 2),
+    Column("mean peak MB", "peak_mb", 1, 0),
+    Column("highest peak MB", "peak_mb_max", 1, 0),
+)
+GAPS = (
+    ("F1", "f1"),
+    ("NC", "nc"),
+    ("point to surface", "p2s"),
+    ("result to reference", "p2s_back"),  # one-sided: lost thin parts do not count
+)
+BY_KEY = {column.key: column for column in (*SURFACE, *EDGES)}
+
+
+def markdown(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table with its first column aligned left and the others right."""
+    head = [f"| {' | '.join(titles)} |", "| --- " + "| ---: " * (len(titles) - 1) + "|"]
+    return "\n".join(head + [f"| {' | '.join(row)} |" for row in rows])
+
+
+def mean_of(rows: Sequence[Row], key: str) -> float | None:
+    """Return the mean of a figure over the rows that have it; of ``..._max`` the maximum."""
+    name = key.removesuffix("_max")
+    figures = [row[name] for row in rows if row.get(name) is not None]
+    if not figures:
+        return None
+    return float(max(figures) if key.endswith("_max") else np.mean(figures))
+
+
+def means(rows: Sequence[Row], columns: Sequence[Column]) -> dict[str, float | None]:
+    """Return the means of columns by key."""
+    return {column.key: mean_of(rows, column.key) for column in columns}
+
+
+def cells(figures: Mapping[str, Any], columns: Sequence[Column]) -> list[str]:
+    """Return the cells of figures by key."""
+    return [column.cell(figures.get(column.key)) for column in columns]
+
+
+def table(
+    titles: Sequence[str],
+    columns: Sequence[Column],
+    rows: Iterable[tuple[Sequence[str], Mapping[str, Any]]],
+) -> str:
+    """Return a table; each row has some words and figures by the keys of the columns."""
+    shown = ([*words, *cells(figures, columns)] for words, figures in rows)
+    return markdown([*titles, *(column.title for column in columns)], shown)
+
+
+def count_row(rows: Sequence[Row]) -> list[str]:
+    """Return how many of the meshes are closed, and how many face outward."""
+    return [f"{sum(row[key] for row in rows)} of {len(rows)}" for key in ("closed", "outward")]
+
+
+def surface_table(by_method: Mapping[str, Sequence[Row]], size: int) -> str:
+    """Return the main table of one size, the published rows below ours."""
+    rows = [
+        [label_of(name), *cells(means(measured, SURFACE), SURFACE), *count_row(measured)]
+        for name, measured in by_method.items()
+    ]
+    titles = ["method", *(column.title for column in SURFACE), "closed", "outward"]
+    return markdown(titles, [*rows, *published_rows(size, SURFACE, 2)])
+
+
+def published_rows(size: int, columns: Sequence[Column], more: int = 0) -> list[list[str]]:
+    """Return the published rows of a size, marked as such; "-" where a figure is not given."""
+    rows = []
+    for name, (cd, f1, nc) in published.SURFACES.get(size, {}).items():
+        mse, mae = published.FIELDS[size].get(name, (None, None))
+        given = {"cd": cd * 1e-5, "f1": f1, "nc": nc, "field_mse": mse, "field_mae": mae}
+        rows.append([f"*{name}, published, Thingi30*", *cells(given, columns), *["-"] * more])
+    return rows
+
+
+def label_of(method: str) -> str:
+    """Return what tables call a method: ``ours-sharp@fast/4`` is super-sdf, sharp, fast, 1/4."""
+    name, _, model = method.partition("@")
+    name, _, share = name.partition("/")
+    plain = name.removesuffix("-sharp")
+    words = [LABELS.get(name) or LABELS.get(plain, plain)]
+    words += ["sharp"] if name != plain else []
+    words += [model.replace(":", ", ")] if model else []
+    if share:
+        words.append(f"1/{share}" if share.isdigit() else f"as many triangles as {LABELS[share]}")
+    return ", ".join(words)
+
+
+def edge_table(by_method: Mapping[str, Sequence[Row]]) -> str:
+    """Return a table of edges, angles and triangles."""
+    rows = []
+    for name, measured in by_method.items():
+        known = sum(row.get("edge_distance") is not None for row in measured)
+        rows.append(([label_of(name), str(known) if known else "-"], means(measured, EDGES)))
+    return table(["method", "shapes"], EDGES, rows)
+
+
+def shape_table(by_method: Mapping[str, Sequence[Row]]) -> str:
+    """Return the table of all shapes, with a row for each shape and method."""
+    columns = (*SURFACE, *(column for column in EDGES if column not in SURFACE))
+    titles = ["shape, method", *(column.title for column in columns), "closed", "outward"]
+    rows = [
+        [f"{row['shape']}, {label_of(name)}", *cells(row, columns), *count_row([row])]
+        for measured in zip(*by_method.values())
+        for name, row in zip(by_method, measured)
+    ]
+    return markdown(titles, rows)
+
+
+def cost_table(by_method: Mapping[str, Sequence[Row]]) -> str:
+    """Return a table of time and memory."""
+    rows = (([label_of(name)], means(rows, COST)) for name, rows in by_method.items())
+    return table(["method"], COST, rows)
+
+
+def gap_closed(
+    ours: Sequence[Row], base: Sequence[Row], bound: Sequence[Row], key: str
+) -> float | None:
+    """Return the share of the gap from B-spline to the bound that ours closes, of the means."""
+    mine, start, end = (mean_of(rows, key) for rows in (ours, base, bound))
+    if mine is None or start is None or end is None or end == start:
+        return None
+    return (mine - start) / (end - start)
+
+
+def percent(share: float | None, digits: int = 0) -> str:
+    """Return a share as text in percent, "-" if it is unknown."""
+    return "-" if share is None else f"{100 * share:.{digits}f} %"
+
+
+def gap_line(by_method: Mapping[str, Sequence[Row]]) -> str:
+    """Return a line on the gaps closed, empty unless the three methods were measured."""
+    if not {OURS, "bspline", "bound"} <= set(by_method):
+        return ""
+    three = by_method[OURS], by_method["bspline"], by_method["bound"]
+    shares = [f"{title} {percent(gap_closed(*three, key))}" for title, key in GAPS]
+    return f"Gap between B-spline and the bound closed by super-sdf: {', '.join(shares)}."
+
+
+def win_line(ours: Sequence[Row], others: Sequence[Row]) -> str:
+    """Return a line on how many shapes ours has the better F1, with the others by name."""
+    lost = [
+        f"{mine['shape']} ({mine['f1']:.3f}, B-spline {other['f1']:.3f})"
+        for mine, other in zip(ours, others)
+        if mine["f1"] <= other["f1"]
+    ]
+    line = f"super-sdf beats B-spline in F1 on {len(ours) - len(lost)} of {len(ours)}."
+    return f"{line} Not on: {', '.join(lost)}." if lost else line
+
+
+def empty_lines(by_method: Mapping[str, Sequence[Row]]) -> list[str]:
+    """Return a line for each method that found no surface on some shapes, with their names."""
+    lines = []
+    for method, rows in by_method.items():
+        names = [row["shape"] for row in rows if not row["faces"]]
+        if names:
+            lines.append(f"No surface (a dot stands in), {label_of(method)}: {', '.join(names)}.")
+    return lines

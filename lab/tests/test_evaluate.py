@@ -1,0 +1,309 @@
+"""The evaluation as a whole: kept rows, processes that die, reports that come out the same."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from processes import wait_for_lines
+from solids import cube, saved, sphere, torus
+
+from lab import evaluate, measuring, processes, runner, tables
+from lab.__main__ import main as lab
+from lab.evaluate import Results
+from lab.measuring import Task
+from lab.rows import Rows
+from lab.runner import LeftOut, complete
+from lab.shapes import Setting, find_meshes, spread
+from super_sdf import Mesh, SuperSdfError
+from super_sdf.errors import FileError
+from super_sdf.network.kinds import KIND_MODELS
+from super_sdf.network.network import shipped_models
+
+ROOT = Path(__file__).parents[2]
+TIMES = ("seconds", "peak_mb")
+
+
+@pytest.fixture
+def meshes(tmp_path: Path) -> Path:
+    """A folder of three shapes."""
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    for name, mesh in {"box": cube(), "ball": sphere(), "ring": torus()}.items():
+        saved(mesh, folder / f"{name}.ply")
+    return folder
+
+
+@pytest.fixture
+def command(capsys, monkeypatch):
+    """Run ``python -m lab`` in this process; return exit code, stdout and stderr."""
+
+    def run(*words: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["lab", *map(str, words)])
+        try:
+            code = lab()
+        except SystemExit as end:
+            code = end.code
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def task_of(path: Path, methods: tuple[str, ...] = ("mc",), **options) -> Task:
+    return Task(path, Setting(8), methods, **options)
+
+
+def quality_of(out: Path) -> dict[str, dict]:
+    """Return the figures of each row but for times."""
+    rows = [json.loads(line) for line in (out / "results.jsonl").read_text().splitlines()]
+    return {
+        json.dumps(row["key"]): {name: v for name, v in row.items() if name not in TIMES}
+        for row in rows
+    }
+
+
+def test_killed_and_started_again_it_ends_with_the_same_tables(meshes, tmp_path, command):
+    (meshes / "ring.ply").unlink()
+    words = ["evaluate", meshes, "--sizes", 8, "--methods", "mc", "--jobs", 1]
+    words += ["--no-pictures", "--out"]
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    assert command(*words, whole)[0] == 0
+    child = subprocess.Popen(
+        [sys.executable, "-m", "lab", *map(str, words), str(cut)],
+        cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    store = cut / "results.jsonl"
+    wait_for_lines(child, store)
+    child.kill()
+    child.wait()
+    with store.open("a") as file:
+        file.write('{"key": "torn')  # as if killed while writing
+    assert len(store.read_text().splitlines()) < len(quality_of(whole)) + 1
+    assert command(*words, cut)[0] == 0
+    store.write_text(store.read_text().replace('{"key": "torn\n', ""))
+    assert quality_of(cut) == quality_of(whole)
+    texts = [(out / "report.md").read_text().split("## Time")[0] for out in (cut, whole)]
+    assert texts[0] == texts[1]
+    assert (cut / "plots" / "resolution.png").stat().st_size > 5000
+    code, _, err = command(*words, cut)
+    assert (code, err) == (0, "")  # nothing is left to measure
+
+
+def test_a_bad_shape_is_named_and_the_others_are_measured(meshes, tmp_path, command):
+    saved(Mesh(cube().vertices, cube().faces[1:]), meshes / "lidless.ply")
+    (meshes / "junk.stl").write_text("junk")
+    out = tmp_path / "out"
+    words = ("--methods", "mc", "ours", "--model", "fast", "--jobs", 0, "--no-pictures")
+    code, _, err = command("evaluate", meshes, "--sizes", 8, *words, "--turned", 5, "--out", out)
+    assert code == 1
+    assert "Left out: lidless: " in err and "is open: 3 edges" in err and "out: junk: " in err
+    text = (out / "report.md").read_text()
+    assert "# Quality of super-sdf on 3 shapes" in text and "Left out, lidless: " in text
+    assert "| super-sdf |" in text and "3 of 3" in text
+    assert "turned at random, by seed 5" in text
+
+
+@pytest.mark.graphics
+def test_pictures_of_the_best_and_worst(meshes, tmp_path, command):
+    out = tmp_path / "out"
+    words = ("--methods", "mc", "ours", "--model", "fast", "--jobs", 0)
+    assert command("evaluate", meshes, "--sizes", 8, *words, "--out", out)[0] == 0
+    lines = (out / "report.md").read_text().splitlines()
+    shown = [line for line in lines if "](pictures/" in line]
+    assert len(shown) == 3 and "## 3 of 3 shapes at 8^3, best and worst" in "\n".join(lines)
+    assert all((out / line.split("(")[1][:-1]).exists() for line in shown)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--sizes", 3), "size is 3: give at least 4 samples along an axis"),
+        (("--turned", -1), "turned is -1: give a seed of 0 or more"),
+        (("--factor", 3), "factor is 3"),
+    ],
+)
+def test_options_out_of_range_are_refused_in_a_line(meshes, tmp_path, command, words, said):
+    code, _, err = command("evaluate", meshes, "--out", tmp_path / "out", *words)
+    assert code == 2 and err.startswith(f"Error: {said}") and err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_no_evaluation_made_is_refused(meshes, tmp_path, command):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "mine.md").write_text("mine")
+    code, _, err = command("evaluate", meshes, "--out", out)
+    assert (code, err) == (
+        1,
+        f"Error: {out} holds 'mine.md' and no results.jsonl, so no evaluation made it: give a new "
+        "or an empty folder\n",
+    )
+    assert command("nothing")[0] == 2 and "Usage" in command("--help")[1]
+
+
+def test_shapes_are_found_by_name(meshes, tmp_path):
+    paths = find_meshes([meshes])
+    assert [path.stem for path in paths] == ["ball", "box", "ring"]
+    assert [path.stem for path in spread(paths, 2)] == ["ball", "box"]
+    with pytest.raises(FileError, match="two meshes are named 'box'"):
+        find_meshes([meshes, meshes / "box.ply"])
+    with pytest.raises(FileError, match="holds no mesh: give"):
+        find_meshes([tmp_path])
+    os.mkfifo(meshes / "pipe.ply")
+    with pytest.raises(FileError, match="is a named pipe: give a file"):
+        find_meshes([meshes])
+
+
+def test_a_row_of_another_mesh_network_or_setting_is_another_row(meshes, tmp_path):
+    task, rows = task_of(meshes / "box.ply"), Rows(tmp_path / "rows.jsonl")
+    rows.add(task.key("ours"), {"f1": 0.5, "error": None})
+    with (tmp_path / "rows.jsonl").open("a") as file:
+        file.write('{"key": {"sha')
+    rows = Rows(tmp_path / "rows.jsonl")
+    assert rows.get(task.key("ours"))["f1"] == 0.5 and rows.is_final(task.key("ours"))
+    changed = (
+        replace(task, path=meshes / "ball.ply"),
+        replace(task, model="fast"),
+        replace(task, precision="float32"),
+        replace(task, turned=0),
+        replace(task, setting=Setting(8, noise=0.5)),
+    )
+    assert all(rows.get(other.key("ours")) is None for other in changed)
+    assert task.key("ours@fast")["digest"] == replace(task, model="fast").key("ours")["digest"]
+    assert task.key("mc") == replace(task, model="fast").key("mc")  # not made by our code
+    own = ("ours on mask", "spline-coarsest on spacing 1:1:5, x", "bound-sharp", "ours/4")
+    others = ("mc on mask", "mc-gaussian-0.5 on mask", "bspline on exact", "bound", "floor")
+    assert list(map(measuring.is_of_our_code, own + others)) == [True] * 4 + [False] * 5
+
+
+@pytest.mark.parametrize("name", KIND_MODELS)
+def test_rows_are_measured_again_with_another_network_for_a_kind(name, tmp_path, monkeypatch):
+    files, digest = shipped_models(), measuring.digest_of_ours.__wrapped__
+    before = digest("fast")
+    other = tmp_path / "other.onnx"
+    other.write_bytes(files[name].read_bytes() + b"0")
+    monkeypatch.setattr(measuring, "shipped_models", lambda: {**files, name: other})
+    assert digest("fast") != before
+
+
+def test_failures_are_tried_again_but_not_what_ran_out_of_time(tmp_path):
+    rows, key = Rows(tmp_path / "rows.jsonl"), {"shape": "box"}
+    rows.add(key, {"error": "OSError: disk"})
+    assert not rows.is_final(key)
+    rows.add(key, {"error": "over the limit of 10 s", "limit": 10.0})
+    assert rows.is_final(key, 10.0) and not rows.is_final(key, 20.0)
+
+
+STAND_IN = """
+import json, os, signal, sys, time
+def tell(*what): print("lab: " + json.dumps(what), flush=True)
+tasks = json.loads(sys.stdin.read())
+print("a library says hello")
+{read}
+for number, task in tasks.items():
+    for method in task["methods"]:
+        {work}
+        tell("row", int(number), method, {{"error": None}})
+"""
+READ = 'tell("read", 0, "", None)'
+KILL = "os.kill(os.getpid(), signal.SIGKILL)"
+
+
+@pytest.fixture
+def stand_in(monkeypatch):
+    """Put a script in place of the worker process."""
+
+    def put(read: str = READ, work: str = "pass") -> None:
+        script = STAND_IN.format(read=read, work=work)
+        monkeypatch.setattr(runner, "WORKER", ("-c", script))
+
+    return put
+
+
+def test_a_process_that_dies_fails_one_method_and_the_rest_go_on(meshes, tmp_path, stand_in):
+    stand_in(work=f'if method == "ours": {KILL}')
+    tasks = [
+        task_of(meshes / "box.ply", methods)
+        for methods in (("mc", "ours", "bound"), ("trilinear",))
+    ]
+    rows, seen = Rows(tmp_path / "rows.jsonl"), []
+    assert complete(tasks, rows, 1, lambda *step: seen.append(step)) == []
+    errors = {m: rows.get(task.key(m))["error"] for task in tasks for m in task.methods}
+    killed = "its process was ended by SIGKILL"
+    assert errors == {"mc": None, "ours": killed, "bound": None, "trilinear": None}
+    assert seen == [(1, 1, "box")]
+
+
+def test_a_process_over_its_limit_is_ended(meshes, tmp_path, stand_in):
+    stand_in(work="time.sleep(60)")
+    task, rows = task_of(meshes / "box.ply", limit=0.5), Rows(tmp_path / "rows.jsonl")
+    assert complete([task], rows, 1) == []
+    row = rows.get(task.key("mc"))
+    assert row["error"] == "over the limit of 0.5 s" and row["limit"] == 0.5
+    assert "f1" not in row  # a failure is no score
+
+
+def test_a_mesh_that_crashes_its_reader_is_left_out(meshes, tmp_path, stand_in):
+    stand_in(read=KILL)
+    tasks = [task_of(meshes / "box.ply"), task_of(meshes / "box.ply", ("ours",))]
+    left_out = complete(tasks, Rows(tmp_path / "rows.jsonl"), 1)
+    assert left_out == [LeftOut("box", "while it was read its process was ended by SIGKILL")]
+
+
+def row(shape: str, f1: float, **more) -> dict:
+    """Return a row that is made up."""
+    keys = [column.key for column in tables.BY_KEY.values()]
+    figures = {**dict.fromkeys(keys, 0.001), "f1": f1, "closed": True, "outward": True, "faces": 4}
+    return {"shape": shape, **figures, "error": None, "notes": [], **more}
+
+
+def test_a_shape_that_failed_in_a_setting_is_left_out_for_all_methods(meshes, tmp_path):
+    rows, like = Rows(tmp_path / "rows.jsonl"), task_of(meshes / "box.ply", ("mc", "ours"))
+    tasks = evaluate.tasks_of(find_meshes([meshes]), [Setting(8)], like)
+    for task in tasks:
+        for method in task.methods:
+            rows.add(task.key(method), row(task.path.stem, 0.5, cd=0.25))
+    rows.add(tasks[-1].key("ours"), {"error": "out of memory"})
+    results = Results(tasks, rows, [LeftOut("lost", "it is")])
+    assert results.left_out == [
+        LeftOut("lost", "it is"),
+        LeftOut("ring", "ours (8^3, factor 4): out of memory"),
+    ]
+    found = results.by_method(Setting(8), ("mc", "ours", "floor"))
+    shapes = {name: [each["shape"] for each in some] for name, some in found.items()}
+    assert shapes == {name: ["ball", "box"] for name in ("mc", "ours", "floor")}
+    assert found["ours"][0]["excess_cd"] == 0 and len(results.floors) == 3
+
+
+def test_tables_show_means_gaps_and_what_has_no_surface():
+    by_method = {
+        "bspline": [row("a", 0.5), row("b", 0.7)],
+        "ours": [row("a", 0.8), row("b", 0.6)],
+        "bound": [row("a", 1.0), row("b", 0.8)],
+        "mc": [row("a", 0.5), row("b", 0.0, faces=0, closed=False, efv=None)],
+    }
+    assert "F1 33 %" in tables.gap_line(by_method)
+    assert tables.win_line(by_method["ours"], by_method["bspline"]) == (
+        "super-sdf beats B-spline in F1 on 1 of 2. Not on: b (0.600, B-spline 0.700)."
+    )
+    lines = tables.surface_table(by_method, 32).splitlines()
+    mine = next(line for line in lines if line.startswith("| MC |"))
+    assert "| 0.250 |" in mine and mine.endswith("| 1 of 2 | 2 of 2 |")
+    assert any("*PoNQ, published, Thingi30*" in line for line in lines)
+    assert tables.empty_lines(by_method) == ["No surface (a dot stands in), MC: b."]
+    assert "| MC | 2 | 0.001 | 0.001 |" in tables.edge_table(by_method)
+    assert tables.label_of("ours-sharp/4@base:float32") == "super-sdf, sharp, base, float32, 1/4"
+
+
+def test_a_process_is_timed(tmp_path):
+    grid = processes.write_torus(tmp_path / "torus.npy", 12)
+    taken = processes.run_python(processes.upsample_words(grid, "--spacing", "0.0833"))
+    assert taken.seconds > 0.05 and 20 < taken.peak_mb < 2000 and not taken.code
+    with pytest.raises(SuperSdfError, match=r"upsample none\.npz .* ended with 1: Error: none"):
+        processes.run_python(processes.upsample_words(Path("none.npz")))
+    assert processes.run_python(["-c", "print('hi')"]).printed == "hi"

@@ -1,0 +1,155 @@
+"""Figures are measured once, quoted as measured, and of one network and machine each."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import pytest
+from solids import cube, saved, torus
+
+from lab import documents, figures, quoted
+from lab.__main__ import main as lab
+from lab.documents import lines_that_look_back, rendered
+from super_sdf.errors import FileError
+
+MACHINE = {
+    "processor": "a processor", "cores": 2, "instructions": ["avx2"], "system": "Linux",
+    "python": "3.11", "numpy": "2", "onnxruntime": "1.32",
+}  # fmt: skip
+
+
+def figure(folder, name: str, rows: list[dict]) -> None:
+    """Write a figure's file."""
+    content = {"name": name, "networks": {"base": "0123"}, "commit": "abc", "date": "2026-01-01"}
+    content |= {"machine": MACHINE, "rows": rows}
+    (folder / f"{name}.json").write_text(json.dumps(content))
+
+
+@pytest.fixture
+def speeds(tmp_path):
+    """A folder with figures of speed."""
+    rows = [
+        {"size": 32, "option": "default", "seconds": 0.5, "peak_mb": 100.0},
+        {"size": 64, "option": "default", "seconds": 1.0, "peak_mb": 1234.0},
+        {"size": 64, "option": "scipy", "seconds": 16.2, "peak_mb": 400.0},
+        {"size": 64, "option": "fast", "seconds": 0.92, "peak_mb": 200.0},
+    ]
+    figure(tmp_path, "speed", rows)
+    return tmp_path
+
+
+def test_tables_and_numbers_stand_where_they_are_marked(speeds):
+    text = "a\n<!-- figures: speed.process -->\nold\n<!-- /figures -->\nb"
+    assert rendered(text, speeds).splitlines()[3:6] == [
+        "| seconds | 32^3 | 64^3 |",
+        "| --- | ---: | ---: |",
+        "| default | 0.50 | 1.00 |",
+    ]
+    assert rendered(rendered(text, speeds), speeds) == rendered(text, speeds)
+    for marker, shown in {
+        "speed.seconds 32 default": "0.50",
+        "speed.peak_mb 64 default": "1,234",
+        "speed.seconds 64 scipy over 64 default": "16",
+        "speed.seconds 64 default over 32 default": "2.0",
+        "speed.seconds 64 fast below 64 default": "8.0 %",
+        "speed.seconds 64 default above 64 fast": "8.7 %",
+        "quality.f1 32 base": "(not measured)",
+    }.items():
+        line = f"it is <!-- figures: {marker} -->?<!-- /figures --> so"
+        assert rendered(line, speeds) == line.replace("?", shown)
+    assert "2 cores of a processor (avx2)" in quoted.shown("speed.about", speeds)
+
+
+@pytest.mark.parametrize(
+    ("marker", "said"),
+    [
+        ("spead.process", "there is no figure 'spead'"),
+        ("speed.procss", "there is no table 'speed.procss'"),
+        ("speed.scnds 32", "there is no column 'scnds'"),
+        ("speed.seconds 33 default", "no row has 33 default"),
+    ],
+)
+def test_a_marker_that_means_nothing_is_named(speeds, marker, said):
+    with pytest.raises(FileError, match=said):
+        rendered(f"<!-- figures: {marker} -->x<!-- /figures -->", speeds)
+    with pytest.raises(FileError, match="is not ended"):
+        rendered("<!-- figures: speed.process -->", speeds)
+
+
+def test_documents_show_what_was_measured():
+    differ = []
+    for path in documents.documents():
+        text = path.read_text(encoding="utf-8")
+        if rendered(text) != text:
+            differ.append(path.name)
+    assert not differ, "run python -m lab documents"
+
+
+def test_every_figure_is_of_one_machine_and_of_the_networks_that_it_names():
+    for path in figures.FOLDER.glob("*.json"):
+        content = quoted.read(path)
+        assert content["name"] == path.stem and path.stem in figures.FIGURES
+        assert set(content["networks"]) == set(figures.FIGURES[path.stem].networks)
+        assert {row.get("machine") for row in content["rows"]} <= {None, describe(content)}
+
+
+def describe(content: dict) -> str:
+    """Return the machine of a figure as rows have it."""
+    on = content["machine"]
+    return (
+        f"{on['processor']}, {on['cores']} cores, {on['system']}, Python {on['python']}, "
+        f"NumPy {on['numpy']}, onnxruntime {on['onnxruntime']}"
+    )
+
+
+def test_documents_speak_of_today():
+    assert list(lines_that_look_back()) == []
+
+
+def test_lines_that_look_back_are_found(tmp_path):
+    (tmp_path / "export").mkdir()
+    for name in ("CHANGELOG.md", "export/LOG.md"):
+        (tmp_path / name).write_text("the network of before\n")
+    text = "fine\nthe network of before\nwith nine blocks, say\nan older one\nbeforehand\n"
+    (tmp_path / "page.md").write_text(text)
+    assert list(lines_that_look_back(tmp_path)) == [
+        "page.md:2: the network of before",
+        "page.md:3: with nine blocks, say",
+        "page.md:4: an older one",
+    ]
+
+
+@pytest.fixture
+def shapes(tmp_path):
+    """A folder of two shapes."""
+    for name, mesh in {"box": cube(), "ring": torus()}.items():
+        saved(mesh, tmp_path / f"{name}.ply")
+    return tmp_path
+
+
+def run(monkeypatch, *words: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["lab", "figures", *map(str, words)])
+    return lab()
+
+
+def test_figures_are_measured_kept_and_printed(shapes, tmp_path, monkeypatch, capsys):
+    words = ("--shapes", shapes, "--parts", shapes, "--sizes", 8, "--jobs", 0, "--only", "simplify")
+    out = tmp_path / "out"
+    assert run(monkeypatch, *words, "--out", out) == 0
+    printed = capsys.readouterr().out
+    assert "simplify.table" in printed and "| CAD parts, sharp |" in printed
+    content = quoted.read(out / "simplify.json")
+    assert len(content["rows"]) == 8 and content["networks"].keys() == {"base"}
+    (out / "simplify.json").unlink()
+    monkeypatch.setattr("lab.runner.measure_task", None)  # nothing is measured again
+    assert run(monkeypatch, *words, "--out", out) == 0
+    assert quoted.read(out / "simplify.json")["rows"] == content["rows"]
+
+
+def test_figures_refuse_what_would_mix_networks_or_lacks_shapes(shapes, monkeypatch, capsys):
+    assert run(monkeypatch, "--shapes", shapes, "--network", "new.onnx") == 2
+    assert "give it its own folder, --out" in capsys.readouterr().err
+    out = ("--out", shapes / "out")
+    assert run(monkeypatch, "--shapes", shapes, "--sizes", 8, "--only", "edges", *out) == 2
+    assert "python -m export.parts PARTS" in capsys.readouterr().err
