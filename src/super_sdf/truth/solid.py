@@ -171,13 +171,6 @@ def load_solid(path: str | Path, *, allow_open: bool = False) -> tuple[Solid, li
     return solid, notes
 
 
-def normalise(mesh: Mesh) -> Mesh:
-    """Return a mesh, float64, centred on its bounding box and scaled to a box diagonal of 1."""
-    vertices = mesh.vertices.astype(np.float64)
-    low, high = vertices.min(0), vertices.max(0)
-    return Mesh((vertices - (low + high) / 2) / np.linalg.norm(high - low), mesh.faces)
-
-
 def _both_sides(mesh: Mesh) -> Points:
     """Return a point close to each side of each face, (2 m, 3); none for degenerate faces."""
     a, b, c = mesh.vertices[mesh.faces.T]
