@@ -58,9 +58,9 @@ PLAN = """
 import sys
 from super_sdf import load_network
 from super_sdf.files.grids import read_grid
-from super_sdf.network.kinds import network_for
+from super_sdf.network.network import network_for
 from super_sdf.machine.resources import allot
-from super_sdf.pipeline import find_surface
+from super_sdf.slabs.preparing import find_surface
 from super_sdf.slabs.cutting import peak_bytes, ways_to_cut, whole
 from super_sdf.steps.meshers import find_mesher
 

@@ -30,12 +30,12 @@ from unittest import mock
 import numpy as np
 import trimesh
 
-from super_sdf import pipeline
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.evaluation.cases import Shape
 from super_sdf.evaluation.scope import find_meshes
 from super_sdf.network.names import DEFAULT_QUALITY
 from super_sdf.network.network import Network, find_model, load_network
+from super_sdf.slabs import preparing
 from super_sdf.slabs.cutting import Slab, cut
 from super_sdf.steps.survey import Band
 from super_sdf.truth.sampling import sample_solid, unit_layout
@@ -55,7 +55,7 @@ def cut_into(slabs: int) -> Iterator[None]:
     def plan(band: Band, factor: int, reach: int, *others: Any) -> list[Slab]:
         return cut(band, slabs, reach, others[-1].planes_beside(factor))
 
-    with mock.patch.object(pipeline, "plan_slabs", plan) if slabs > 1 else nullcontext():
+    with mock.patch.object(preparing, "plan_slabs", plan) if slabs > 1 else nullcontext():
         yield
 
 

@@ -27,13 +27,14 @@ from super_sdf.evaluation.timing import describe_machine, run_command
 from super_sdf.files import spool
 from super_sdf.machine.memory import forget_peak, held_memory
 from super_sdf.network.network import Network
+from super_sdf.slabs import preparing
 from super_sdf.steps.survey import Band
 from super_sdf.topology import OpenEdges
 
 # The function of each stage, in the module where it is looked up.
 STAGES = {
     "read": [(convert, "read_grid_with")],
-    "band": [(pipeline, "survey")],
+    "band": [(preparing, "survey")],
     "gather": [(Band, "network_inputs")],
     "network": [(Network, "__call__")],
     "number": [(pipeline, "share_parts")],

@@ -9,9 +9,9 @@ from conftest import ball, trilinear
 from super_sdf import SdfGrid, pipeline, reconstruct
 from super_sdf.grid.cubic import cubic_grid
 from super_sdf.steps.band import HALF_BAND, neighbour_table
-from super_sdf.steps.beyond import FARTHEST
 from super_sdf.steps.bounds import (
     BOX_SAMPLES,
+    FARTHEST,
     MOST_LOST,
     REACH_OF_SAMPLES,
     bounded_values,
@@ -39,7 +39,8 @@ def blocks_of(grid, factor=4):
 
 def around(voxel_ijk, trusted):
     """Return the samples round the blocks of voxels, (n, m)."""
-    return samples_around(voxel_ijk, trusted).take(slice(None))
+    flat, start, steps = samples_around(voxel_ijk, trusted)
+    return flat.take(start[:, None] + steps)
 
 
 def clipped(limit):

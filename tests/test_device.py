@@ -19,10 +19,10 @@ from super_sdf import load_network
 from super_sdf.errors import DeviceError, ModelError
 from super_sdf.network import cuda, device
 from super_sdf.network.contract import INPUTS, one_voxel
-from super_sdf.network.cuda import CUDA, first_line
+from super_sdf.network.cuda import CUDA
 from super_sdf.network.device import CPU, CUDA_OPTIONS
 from super_sdf.network.network import shipped_models
-from super_sdf.network.onnx import ort
+from super_sdf.network.onnx import first_line, ort
 from super_sdf.network.running import CHUNK_INPUT, CUDA_CHUNK, run_bound
 from super_sdf.steps.nodes import block_offsets
 

@@ -45,8 +45,7 @@ from super_sdf.evaluation.runner import LeftOut, Runner, complete
 from super_sdf.evaluation.scope import Scope, find_meshes, spread
 from super_sdf.evaluation.store import KEY_TYPES, Store, is_row
 from super_sdf.machine.serving import ClockStarted
-from super_sdf.network.kinds import KIND_MODELS
-from super_sdf.network.network import load_network, shipped_models
+from super_sdf.network.network import KIND_MODELS, load_network, shipped_models
 
 KILLED = "was killed by SIGKILL (most likely out of memory)"
 QUALITY = ("cd", "f1", "nc", "signed_nc", "p2s", "ecd", "ef1", "field_mse", "faces", "closed")

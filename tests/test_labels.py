@@ -381,7 +381,6 @@ REFUSED = {
     "level 0.5": "--level 0.5",
     "offset 1.0": "--offset 1",
     "open": "--open",
-    "iterations 2": "--iterations 2",
     "inside 'negative'": "--inside negative",
     "scale 2.0": "--scale 2",
     "save-field": "--save-field f.npz",

@@ -12,9 +12,8 @@ from onnx_files import DOUBLE, FLOAT, INPUTS, metadata, write_network
 from super_sdf import load_network, reconstruct, upsample
 from super_sdf.errors import DeviceError, FileError, ModelError, OptionError
 from super_sdf.network.decoder import check_output, to_blocks
-from super_sdf.network.kinds import KIND_MODELS
 from super_sdf.network.names import QUALITIES
-from super_sdf.network.network import Network, shipped_models
+from super_sdf.network.network import KIND_MODELS, Network, shipped_models
 from super_sdf.steps.band import find_band, gather_patches, neighbour_table, rescale
 from super_sdf.steps.nodes import block_offsets
 

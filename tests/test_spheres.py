@@ -7,15 +7,18 @@ import pytest
 from conftest import ball, trilinear
 
 from super_sdf import SdfGrid, load_network, pipeline, reconstruct
-from super_sdf.steps.band import neighbour_table
-from super_sdf.steps.exact import MAX_DISTANCE, exact_samples
+from super_sdf.steps.band import MAX_DISTANCE, exact_samples, neighbour_table
 from super_sdf.steps.field import FineField
-from super_sdf.steps.foot_points import find_foot_points, spheres_of_band
-from super_sdf.steps.interpolation import prolong, sample_trilinear
-from super_sdf.steps.nodes import block_ijk, number_parts, share_parts
-from super_sdf.steps.spheres import PRIOR_WEIGHT, fit_to_spheres, mean_at_nodes, shrunk_mean
+from super_sdf.steps.foot_points import find_foot_points, sample_trilinear, spheres_of_band
+from super_sdf.steps.nodes import VoxelIndex, block_ijk, number_parts, share_parts
+from super_sdf.steps.spheres import (
+    PRIOR_WEIGHT,
+    fit_to_spheres,
+    mean_at_nodes,
+    prolong,
+    shrunk_mean,
+)
 from super_sdf.steps.survey import survey
-from super_sdf.steps.voxel_index import VoxelIndex
 
 CENTRE_OF_BALL = 10 - 0.37
 

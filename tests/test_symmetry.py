@@ -5,8 +5,7 @@ import pytest
 from conftest import ball
 
 from super_sdf import load_network
-from super_sdf.neighbourhood import NEIGHBOURHOOD
-from super_sdf.network.symmetry import cube_symmetries, turn
+from super_sdf.neighbourhood import NEIGHBOURHOOD, cube_symmetries, turn
 from super_sdf.steps.band import find_band, gather_patches, neighbour_table, rescale
 from super_sdf.steps.nodes import block_offsets
 

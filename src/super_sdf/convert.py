@@ -32,7 +32,7 @@ from .grid.sdf_grid import SdfGrid
 from .grid.spacing import as_triple
 from .mesh import Mesh, join_meshes
 from .network.decoder import Decoder
-from .options import check_goal, check_iterations
+from .options import check_goal
 from .pipeline import reconstruct_slabs
 from .progress import Progress, Stopwatch, part_of, share_of
 from .simplification.simplify import (
@@ -42,7 +42,7 @@ from .simplification.simplify import (
     simplify_mesh,
 )
 from .slabs.pieces import Piece
-from .steps.ends import check_all_seen, check_can_close
+from .steps.cap import check_all_seen, check_can_close
 from .steps.lattice import lattice_shape
 from .steps.mesher_names import DEFAULT_MESHER
 from .steps.meshers import find_mesher
@@ -80,7 +80,6 @@ class ConvertOptions:
     simplify: float | None = None
     triangles: int | None = None
     axes: str | None = None
-    iterations: int = 1
     direction: tuple[float, ...] | None = None
     field: str = "auto"
     label: int | None = None
@@ -229,7 +228,7 @@ def convert(
     network : Network
         From ``load_network``; it can be used for any number of files.
     options : ConvertOptions
-        Factor, iterations, spacing, axis order, sign, offset, cap, mesher, memory bound and
+        Factor, spacing, axis order, sign, offset, cap, mesher, memory bound and
         simplification.
     force : bool
         Replace the target, and the field's file, if they exist.
@@ -307,7 +306,6 @@ class Maker:
             offset=options.offset,
             cap=options.cap,
             mesher=options.mesher,
-            iterations=options.iterations,
             max_memory=options.max_memory,
             progress=progress,
             save=self.file.add if self.file else None,
@@ -318,7 +316,7 @@ def _check_work(options: ConvertOptions) -> int:
     """Return how many times finer the mesh is than the grid; OptionError if that cannot be done."""
     check_factor(options.factor)
     find_mesher(options.mesher)
-    return int(options.factor ** check_iterations(options.iterations))
+    return options.factor
 
 
 def _check_size(
@@ -377,9 +375,7 @@ def open_field(
     # imported here, since few conversions write a field, and the start is part of each
     from .fields.writing import check_field_fits, check_field_target, saving_field
 
-    path, shape = check_field_target(path, force=force), grid.shape
-    for _ in range(options.iterations):
-        shape = lattice_shape(shape, options.factor)
+    path, shape = check_field_target(path, force=force), lattice_shape(grid.shape, options.factor)
     check_field_fits(path, shape, options.max_memory)
     return saving_field(path, shape, force=force)
 

@@ -82,20 +82,6 @@ def check_cap(cap: Any) -> bool:
     return bool(cap)
 
 
-def check_iterations(iterations: Any) -> int:
-    """Return how many times a grid is refined, one run after the other.
-
-    Raises
-    ------
-    OptionError
-        If it is less than 1, or not a whole number (``OptionTypeError``).
-    """
-    number = _check_whole(iterations, "iterations")
-    if number < 1:
-        raise OptionError(f"iterations is {seen(number)}: give 1 or more")
-    return number
-
-
 def _check_whole(number: Any, name: str) -> int:
     """Return a whole number; OptionTypeError if it is none."""
     if not isinstance(number, Integral) or isinstance(number, bool):

@@ -104,7 +104,6 @@ class ImageAccessor:
         network: Decoder | None = None,
         mesher: str = DEFAULT_MESHER,
         cap: bool = True,
-        iterations: int = 1,
         residuals: bool = False,
         inside: str = "auto",
         field: str = "auto",
@@ -134,8 +133,6 @@ class ImageAccessor:
             "marching" for marching cubes; "sharp" also puts vertices on edges and corners.
         cap : bool
             Close the surface along the border of the image where the solid runs out of it.
-        iterations : int
-            How often to refine by the factor.
         residuals : bool
             Also return the array "residual" of the points, float32: how far the surface is from
             touching the balls of the nearest samples, in voxels of the image, negative where it
@@ -178,7 +175,6 @@ class ImageAccessor:
             offset=offset,
             cap=cap,
             mesher=mesher,
-            iterations=iterations,
             max_memory=max_memory,
             progress=progress,
         )

@@ -21,9 +21,8 @@ from .grid.sdf_grid import make_grid
 from .machine.extras import EXTRAS, how_to_install, missing_modules
 from .machine.memory import free_memory
 from .network.cuda import available_devices, check_cuda, describe_gpu, onnxruntime_version
-from .network.kinds import MASK_MODEL
 from .network.names import FLOAT32, float32_name
-from .network.network import NO_NETWORKS, load_network, shipped_models
+from .network.network import MASK_MODEL, NO_NETWORKS, load_network, shipped_models
 from .steps.nodes import block_offsets
 from .steps.survey import survey
 

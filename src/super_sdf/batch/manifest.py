@@ -23,7 +23,7 @@ from ..files.formats import AXES, mesh_path
 from ..files.meshes import MESH_SUFFIXES
 from ..grid.field import FIELDS, check_label
 from ..grid.sides import INSIDE
-from ..options import check_error, check_goal, check_iterations, check_triangles
+from ..options import check_error, check_goal, check_triangles
 from ..steps.mesher_names import MESHERS
 from ..steps.nodes import check_factor
 from .job import Job
@@ -157,12 +157,6 @@ def _factor(name: str, value: Any) -> int:
     return value
 
 
-def _iterations(name: str, value: Any) -> int:
-    if type(value) is not int:
-        raise OptionError(f"{name!r} is {value!r}: give a whole number")
-    return check_iterations(value)
-
-
 def _number(name: str, value: Any) -> float:
     if type(value) not in (int, float):
         raise OptionError(f"{name!r} is {value!r}: give a number")
@@ -239,7 +233,6 @@ def _triangles(name: str, value: Any) -> int:
 
 CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "factor": _factor,
-    "iterations": _iterations,
     "spacing": _numbers,
     "origin": _numbers,
     "direction": _direction,

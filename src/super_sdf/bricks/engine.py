@@ -49,11 +49,6 @@ def check_can_brick(source: str, options: ConvertOptions, save_field: Any = None
     Called before anything is started.
     """
     check_source(Source(source, options.axes))
-    if options.iterations > 1:
-        raise OptionError(
-            f"--iterations {options.iterations} refines the field of the whole grid again: "
-            f"{WAY_OUT}"
-        )
     if save_field is not None:
         raise OptionError(f"--save-field writes one file from the first plane on: {WAY_OUT}")
 

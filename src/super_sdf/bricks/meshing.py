@@ -17,7 +17,7 @@ from ..machine.memory import give_back, held_memory
 from ..network.network import Network, load_network
 from ..pipeline import reconstruct_planes
 from ..slabs.pieces import Piece
-from ..steps.exact import BandSummary
+from ..steps.band import BandSummary
 from .stored import Source, opened
 
 if TYPE_CHECKING:

@@ -191,13 +191,6 @@ OPTIONS: tuple[Option, ...] = (
         "Refinement per axis: 2, 4, 8 or 16 times finer than the grid.",
         type=int,
     ),
-    _usual(
-        "--iterations",
-        "Refine N times, each time by the factor and from the refined field before, for "
-        "lattices finer than factor 16. Twice factor 4 is no better than factor 16, and slower.",
-        type=int,
-        metavar="N",
-    ),
     *GRID_OPTIONS,
     _usual(
         "--offset",

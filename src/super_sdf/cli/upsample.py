@@ -117,13 +117,11 @@ class Upsampling:
         from ..fields.writing import check_field_target
         from ..files.meshes import check_target
         from ..network.network import load_network
-        from ..options import check_iterations
         from ..progress import Stopwatch
         from ..steps.nodes import check_factor
 
         options, watch = self.options, Stopwatch()
         check_factor(options["factor"])
-        check_iterations(options["iterations"])
         check_target(self.target, force=options["force"])
         if options["save_field"] is not None:
             check_field_target(options["save_field"], force=options["force"])
@@ -270,7 +268,6 @@ class Upsampling:
             "input": self.source,
             "output": self.target,
             "factor": self.options["factor"],
-            "iterations": self.options["iterations"],
             "offset": self.options["offset"],
             "mesher": self.options["mesher"],
             "model": self.model,

@@ -18,9 +18,8 @@ from ..files.regular import check_regular_file
 from ..machine.memory import forget_peak, held_memory
 from ..mesh import Mesh
 from ..network.decoder import Decoder
-from ..network.kinds import KIND_MODELS
 from ..network.names import AUTO_PRECISION, float32_name
-from ..network.network import find_model, load_network, shipped_models
+from ..network.network import KIND_MODELS, find_model, load_network, shipped_models
 from ..truth.solid import Distances, Solid
 from . import edges, metrics
 from .cases import RESULT_EDGES, RESULT_POINTS, Case, Setting, Shape

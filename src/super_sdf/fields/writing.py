@@ -14,7 +14,7 @@ from ..files.output import check_free, free_space, naming, replacing
 from ..machine.extras import check_modules
 from ..machine.memory import held_memory, in_words, memory_bound
 from ..options import check_path
-from ..steps.ends import check_all_seen
+from ..steps.cap import check_all_seen
 from ..steps.field import FineField
 from ..steps.lattice import fine_grid, lattice_shape
 from .dense import BYTES, NpyWriter

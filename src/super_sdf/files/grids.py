@@ -310,8 +310,7 @@ def find_members(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.ZipI
     names = [info.filename.removesuffix(".npy") for info in infos]
     if {"voxels", "factor"} <= set(names):
         raise FileError(
-            f"{path} is a refined field, no grid: mesh it with extract_mesh(read_field(path)), or "
-            "refine the grid again with --iterations"
+            f"{path} is a refined field, no grid: mesh it with extract_mesh(read_field(path))"
         )
     if "values" not in names:
         held = ", ".join(names[:MOST_NAMED]) or "nothing"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..machine.threads import CHUNK, rows_in_chunk
+from ..network.decoder import NETWORK_BYTES
 from ..steps.bounds import LEAST_FACTOR
 from ..steps.marching import LOOKUP_BYTES, lookups_at_once
 from ..steps.mesher_names import DEFAULT_MESHER, MARCHING, SHARP
@@ -23,9 +24,8 @@ STAGES = {
     SHARP: (216, 350, 7.5, 1e7, 3e7),
 }
 SPLINE = (216, 300, 4.5, 0, 2e7)
-# Default for a network: bytes per voxel that it sees, including its row of the neighbour table, and
-# per value.
-NETWORK_BYTES = (680.0, 8.0)
+
+
 # The head of a network works on a chunk of voxels at all offsets at once.
 BYTES_PER_OFFSET = 27_000
 NETWORK_FIXED = 5_000_000

@@ -24,20 +24,8 @@ from .nodes import BARELY_INSIDE, BARELY_OUTSIDE
 class FineLattice(SamplePlanes):
     """The values at all nodes of the fine lattice, in world units, negative inside.
 
-    Node (i, j, k) is at the coarse index ``(i, j, k) / K - 1/2``.
-
-    Parameters
-    ----------
-    field : FineField
-        The refined field, with the coarse grid that it was made from. Of a slab, the planes of
-        nodes in its own planes of voxels are right.
-
-    Attributes
-    ----------
-    shape : three ints
-        Nodes along each axis, ``K n + 1``.
-    dtype
-        float32.
+    Node (i, j, k) is at the coarse index ``(i, j, k) / K - 1/2``. The field has the coarse grid
+    that it was made from. Of a slab, the planes of nodes in its own planes of voxels are right.
     """
 
     dtype = np.dtype(np.float32)

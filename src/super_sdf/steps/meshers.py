@@ -14,8 +14,7 @@ from ..grid.sdf_grid import SdfGrid
 from ..mesh import Mesh, join_meshes
 from ..options import check_cap, check_grid
 from . import marching
-from .cap import close
-from .ends import check_can_close
+from .cap import check_can_close, close
 from .field import FineField
 from .mesher_names import DEFAULT_MESHER, MARCHING, MESHERS, SHARP
 
