@@ -45,8 +45,8 @@ def dense_values(network, field):
 
 @pytest.mark.parametrize(
     ("symmetries", "flipped"),
-    [(4, (0, 1)), (4, (0, 2)), (4, (1, 2)), (8, (0,)), (8, (0, 1, 2))],
-    ids=["half turn about z", "about y", "about x", "mirrored", "inverted"],
+    [(4, (0, 1)), (4, (1, 2)), (8, (0, 1, 2))],
+    ids=["half turn about z", "about x", "inverted"],
 )
 def test_a_mean_maps_a_turned_field_to_the_turned_surface(symmetries, flipped):
     """The plain network does so only approximately; otherwise the mean would have no effect."""

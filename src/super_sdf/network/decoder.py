@@ -34,27 +34,13 @@ class Decoder(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Adapter:
-    """A network, or any function, with all that the pipeline asks of it.
-
-    Attributes
-    ----------
-    run : Decoder
-    receptive_field : int, optional
-        Voxels to each side that a value depends on. If it is None, the network must see the whole
-        band at once.
-    reports_progress : bool
-        Whether a call takes the argument ``progress``, a ``ShareCallback``.
-    memory_bytes : two floats
-        Memory that a call takes, see ``NETWORK_BYTES``.
-    threads : int
-        CPU threads, also for the other steps; 0 for one per core.
-    """
+    """A network, or any function, with all that the pipeline asks of it."""
 
     run: Decoder
-    receptive_field: int | None = None
-    reports_progress: bool = False
+    receptive_field: int | None = None  # voxels to each side; None: it must see the whole band
+    reports_progress: bool = False  # whether a call takes ``progress``, a ``ShareCallback``
     memory_bytes: tuple[float, float] = NETWORK_BYTES
-    threads: int = 0
+    threads: int = 0  # of the CPU, also for the other steps; 0 for one per core
 
     def __call__(
         self, patches: FloatArray, table: IntArray, voxels: IntArray, offsets: FloatArray
@@ -78,30 +64,12 @@ def decode(
     progress: ShareCallback | None = None,
     threads: int = 1,
 ) -> FloatArray:
-    """Run a network once, and return its checked values as blocks.
+    """Run a network once, and return its checked values as blocks, (Q, D + 1) float32.
 
-    Parameters
-    ----------
-    network : Decoder
-    inputs : tuple of arrays
-        Patches (V, 27), neighbour table (V, 27), voxels (D,).
-    offsets : (Q, 3) float32
-        Query offsets in half voxels.
-    progress : callable, optional
-        Called with the finished share, if the network reports it.
-    threads : int
-        Threads to use after the network.
-
-    Returns
-    -------
-    (Q, D + 1) float32
-        Values in half voxels: a row per offset, a column per voxel, and a last column of zeros.
-        See ``steps.nodes``.
-
-    Raises
-    ------
-    ModelError
-        If the values have another shape or type, or are not finite. Later steps do not check.
+    ``inputs`` are patches (V, 27), neighbour table (V, 27) and voxels (D,); ``offsets``, (Q, 3),
+    are in half voxels, and so are the values: a row per offset, a column per voxel, and a last
+    column of zeros, see ``steps.nodes``. ModelError if they have another shape or type, or are not
+    finite: later steps do not check.
     """
     chosen = adapt(network)
     reports = progress is not None and chosen.reports_progress

@@ -30,11 +30,10 @@ CUDA_OPTIONS = {
 
 @dataclass(frozen=True, eq=False)
 class OpenedSession:
-    """An open session.
+    """An open session, where it runs, and what the user should know about the choice.
 
-    ``device`` is where it runs, "cpu" or "cuda"; ``notes`` are what the user should know about the
-    choice. ``failure`` is the error of the trial run, empty if it succeeded: the file may be a
-    network with another contract.
+    ``failure`` is the error of the trial run, empty if it succeeded: the file may be a network with
+    another contract.
     """
 
     session: ort.InferenceSession
@@ -46,26 +45,12 @@ class OpenedSession:
 def open_session(
     paths: tuple[Path, Path], device: str, threads: int, trial: Mapping[str, Any]
 ) -> OpenedSession:
-    """Open an ONNX file on a device.
+    """Open an ONNX file on a device: "cuda", "cpu", or "auto", which is CUDA if it runs.
 
-    Parameters
-    ----------
-    paths : two paths
-        The file for the CPU, and that for CUDA.
-    device : str
-        "cuda", "cpu", or "auto": CUDA if it runs, otherwise the CPU.
-    threads : int
-        CPU threads; 0 for one per core.
-    trial : dict
-        Inputs of a trial run: a session can open although it cannot run, for example on a GPU that
-        is too old or whose memory is full.
-
-    Raises
-    ------
-    ModelError
-        If onnxruntime cannot read the file.
-    DeviceError
-        If the device is "cuda" and CUDA cannot run.
+    ``paths`` are the file for the CPU and that for CUDA; ``trial`` are inputs of a trial run, since
+    a session can open although it cannot run, for example on a GPU that is too old or whose memory
+    is full. ModelError if onnxruntime cannot read the file, DeviceError if CUDA was asked for and
+    cannot run.
     """
     if device not in DEVICES:
         raise DeviceError(f"device is {device!r}: give one of {', '.join(DEVICES)}")

@@ -119,31 +119,12 @@ class Network:
         offsets: FloatArray,
         progress: ShareCallback | None = None,
     ) -> FloatArray:
-        """Return the values of voxels at query offsets.
+        """Return the values (D, Q) of voxels at query offsets: signed distances in half voxels.
 
-        Parameters
-        ----------
-        patches : (V, 27) float32
-            The samples round each voxel of the band, in half voxels.
-        table : (V, 27) int32
-            Neighbour table of the band.
-        voxels : (D,) int32
-            Rows of the band to decode.
-        offsets : (Q, 3) float32
-            Query offsets from the voxels' samples, in half voxels.
-        progress : callable, optional
-            Called several times a second with the finished share, 0 to 1, estimated from the
-            elapsed time. An exception in it, or an interrupt, ends the call within milliseconds.
-
-        Returns
-        -------
-        (D, Q) float32
-            Signed distances in half voxels.
-
-        Raises
-        ------
-        DeviceError
-            If onnxruntime fails, for example for lack of memory on a GPU.
+        Parameters and their shapes are those of ``decoder.Decoder``. ``progress`` is called several
+        times a second with the finished share, estimated from the elapsed time. An exception in it,
+        or an interrupt, ends the call within milliseconds. DeviceError if onnxruntime fails, for
+        example for lack of memory on a GPU.
         """
         if self.symmetries == 1:
             return self._run(patches, table, voxels, offsets, progress)
@@ -226,13 +207,7 @@ def find_model(model: str | Path, precision: str = AUTO_PRECISION) -> tuple[Path
 
     ``model`` is a quality, the name of a shipped network, or a file, and "auto" leaves a file as it
     is. So it does with all networks on processors with AVX but without AVX2, where int8 is slower.
-
-    Raises
-    ------
-    FileError
-        If there is no such file, or it is not a regular file.
-    OptionError
-        If there is no file of this precision.
+    FileError if there is no such regular file, OptionError if there is none of this precision.
     """
     if precision not in PRECISIONS:
         raise OptionError(f"precision is {precision!r}: give one of {', '.join(PRECISIONS)}")

@@ -260,20 +260,11 @@ def exact_samples(
     sampled: BoolArray | None = None,
     whole: BandSummary | None = None,
 ) -> BoolArray:
-    """Return which samples of a band can be taken as exact distances.
+    """Return which samples of a band can be taken as exact distances, (V,) bool.
 
-    Parameters
-    ----------
-    patches : (V, 27) float32
-        The samples round each voxel, in half voxels.
-    lipschitz : (V,) bool
-        From ``is_lipschitz``.
-    threads : int
-        Threads to use.
-    sampled : (V,) bool, optional
-        Which are samples, not interpolated: these tell whether the field is noisy. All by default.
-    whole : BandSummary, optional
-        Of the band of the whole grid, if these are the voxels of a part of it.
+    Those that are ``sampled``, not interpolated, tell by ``lipschitz`` (``is_lipschitz``) whether
+    the field is noisy; all by default. ``whole`` is of the band of the whole grid, if the patches
+    (V, 27) are those of a part of it.
     """
     sample = patches[:, CENTRE]
     whole = whole or summarise(sample, lipschitz if sampled is None else lipschitz[sampled])

@@ -89,29 +89,14 @@ def reach_beyond(limits: tuple[float, float]) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class TrustedSamples:
-    """All samples whose spheres can be trusted: exact ones of the band, and some beyond it.
+    """All samples whose spheres can be trusted: exact ones of the band, and some beyond it."""
 
-    Attributes
-    ----------
-    shape : three ints
-        Samples of the grid along each axis.
-    voxel_ijk : (V, 3) int32
-        The samples of the band, in C order.
-    value : (V,) float32
-        Their values.
-    exact : (V,) bool
-        Which of them are exact.
-    beyond : SamplesBeyond
-    limits : two floats
-        Between these, samples beyond the band can be exact.
-    """
-
-    shape: tuple[int, int, int]
-    voxel_ijk: IntArray
-    value: FloatArray
-    exact: BoolArray
+    shape: tuple[int, int, int]  # samples of the grid along each axis
+    voxel_ijk: IntArray  # (V, 3), the samples of the band, in C order
+    value: FloatArray  # (V,)
+    exact: BoolArray  # (V,)
     beyond: SamplesBeyond
-    limits: tuple[float, float]
+    limits: tuple[float, float]  # between these, samples beyond the band can be exact
 
     def box(self, low: IntArray, high: IntArray) -> FloatArray:
         """Return the samples from index ``low`` (3,) to before ``high``, NaN where there is none.
@@ -145,22 +130,8 @@ def keep_within_bounds(
 
     Samples keep their values, and so do blocks whose own sample is not trusted, but for the nodes
     that they share with others, which are averaged again. Where no sample beyond the band can be
-    trusted, and with a factor of 2, nothing is changed.
-
-    Parameters
-    ----------
-    blocks : (Q, D + 1) float32
-        Node values in half voxels, changed in place; the last column is 0.
-    parts : SharedParts
-        Of the D voxels.
-    factor : int
-        K.
-    voxel_ijk : (D, 3) int32
-        The voxels, in C order.
-    samples : TrustedSamples
-        Those that set bounds.
-    threads : int
-        Threads to use.
+    trusted, and with a factor of 2, nothing is changed. ``blocks`` (Q, D + 1) of voxels (D, 3), in
+    C order, are changed in place; the last column is 0.
     """
     if factor < LEAST_FACTOR or not reach_beyond(samples.limits) or not samples.exact.any():
         return
@@ -231,20 +202,11 @@ def bounded_values(values: FloatArray, factor: int, around: FloatArray) -> Float
 def move_out(
     values: FloatArray, factor: int, side: int, row: Rows, place: Rows, sample: FloatArray
 ) -> None:
-    """Move the values in spheres on one side of the surface out of these, in place.
+    """Move the values (n, Q) in spheres on one side of the surface out of these, in place.
 
-    Parameters
-    ----------
-    values : (n, Q) float32
-    factor : int
-        K.
-    side : {1, -1}
-        Whether the spheres' centres are outside or inside.
-    row, place : (k,) int
-        The block that each sphere may reach, ascending, and where its centre is, as a row of
-        ``sample_places``.
-    sample : (k,) float32
-        The signed distance at its centre.
+    The spheres' centres are outside if ``side`` is 1, inside if it is -1, and their signed
+    distances there are ``sample`` (k,). ``row`` is the block that each may reach, ascending, and
+    ``place`` where its centre is, as a row of ``sample_places``.
     """
     looked_at, to_nodes = nodes_to_look_at(factor), node_distances(factor)
     depth = values[:, looked_at].take(row, 0)

@@ -134,18 +134,10 @@ def rows_among(voxels: IntArray, count: int) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class SharedParts:
-    """Which voxels share the parts of their blocks.
+    """Which voxels share the parts of their blocks."""
 
-    Attributes
-    ----------
-    table : (27, D) int32
-        Neighbour table of the D voxels, -1 where there is no neighbour.
-    owner : (27, D) int8
-        The owner of each part, as a place in the neighbourhood: ``CENTRE`` is the voxel itself.
-    """
-
-    table: IntArray
-    owner: NDArray[np.int8]
+    table: IntArray  # (27, D), neighbour table of the D voxels, -1 where there is no neighbour
+    owner: NDArray[np.int8]  # (27, D), of each part, as a place: ``CENTRE`` is the voxel itself
 
     def owned(self, rows: slice = slice(None)) -> BoolArray:
         """Return which parts the voxels in ``rows`` own, (27, n) bool."""
@@ -189,22 +181,11 @@ def number_parts(parts: SharedParts, sizes: NDArray[np.int64]) -> tuple[IntArray
 
 
 def average_shared(blocks: FloatArray, parts: SharedParts, factor: int, threads: int = 1) -> None:
-    """Set each copy of a shared node to the mean of the copies (Eq. 7).
+    """Set each copy of a shared node to the mean of the copies (Eq. 7), in ``blocks`` (Q, D + 1).
 
     Sums are taken in the order of the voxels and in double precision (in single for two numbers,
     whose sum does not depend on the order), so that all copies get the same bits and the result
     does not depend on how the work was divided.
-
-    Parameters
-    ----------
-    blocks : (Q, D + 1) float32
-        A prediction for each node of each block, changed in place; the last column is 0.
-    parts : SharedParts
-        Of the D voxels.
-    factor : int
-        K.
-    threads : int
-        Threads to use.
     """
     groups = [axes for axes in product((False, True), repeat=3) if any(axes)]
     threads = worthwhile_threads(blocks.size, threads)
@@ -277,18 +258,7 @@ def hold_sides(blocks: FloatArray, factor: int, patches: FloatArray, voxels: Int
     A block's value at its sample is raised by adding a pyramid that is 0 on the faces of the block,
     so that neighbouring blocks still agree. The lines between samples are the network's: it joins
     slices of a thin vessel or plate across the line between two samples outside, and to hold that
-    line would drill a hole into the joint.
-
-    Parameters
-    ----------
-    blocks : (Q, D + 1) float32
-        Node values in half voxels, changed in place.
-    factor : int
-        K.
-    patches : (V, 27) float32
-        The samples round each voxel of the band.
-    voxels : (D,) int32
-        The rows of the band that were decoded.
+    line would drill a hole into the joint. The decoded rows of ``patches`` (V, 27) are ``voxels``.
     """
     sign = np.where(patches[voxels, CENTRE] > 0, np.float32(1), np.float32(-1))
     missing = np.maximum(LEAST_OF_MASK - sign * blocks[len(blocks) // 2, :-1], 0)
@@ -324,22 +294,12 @@ def signs_of_skipped(
 def pin_to_skipped(
     blocks: FloatArray, parts: SharedParts, factor: int, skipped: Signs
 ) -> NDArray[np.int64]:
-    """Give the nodes shared with a skipped voxel that voxel's sign.
+    """Give the nodes shared with a skipped voxel that voxel's sign, in ``blocks`` (Q, D).
 
     A skipped voxel holds no surface, so all its nodes have its sign. Once they do, no sign change
-    reaches the boundary of the decoded voxels, and the isosurface has no hole there. Returns for
-    each voxel the number of nodes that it owns whose sign was changed, (D,).
-
-    Parameters
-    ----------
-    blocks : (Q, D) float32
-        Node values in half voxels, changed in place.
-    parts : SharedParts
-        Of the decoded voxels.
-    factor : int
-        K.
-    skipped : (27, D) int8
-        From ``signs_of_skipped``. Skipped voxels that share a node have the same sign.
+    reaches the boundary of the decoded voxels, and the isosurface has no hole there. Skipped voxels
+    that share a node have the same sign. Returned is for each voxel the number of nodes that it
+    owns whose sign was changed, (D,).
     """
     changed = np.zeros(skipped.shape[1], np.int64)
     for part, nodes in enumerate(nodes_of_part(factor)):

@@ -53,21 +53,8 @@ def fit_to_spheres(
     """Move the surface so that it touches the samples' spheres.
 
     Nodes at exact samples keep the sample's value. Without exact samples nothing is changed.
-
-    Parameters
-    ----------
-    blocks : (Q, D + 1) float32
-        Node values in half voxels, changed in place; the last column is 0.
-    parts : SharedParts
-        Of the D voxels.
-    factor : int
-        K.
-    spheres : Spheres
-        Those that the surface should touch.
-    index : VoxelIndex
-        Of the D voxels.
-    threads : int
-        Threads to use.
+    ``blocks`` (Q, D + 1), in half voxels, are changed in place; the last column is 0. ``parts`` and
+    ``index`` are of the D voxels.
     """
     if not len(spheres):  # in a noisy field, for example
         return

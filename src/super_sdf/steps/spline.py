@@ -65,23 +65,10 @@ def spline_blocks(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the cubic spline at the nodes of voxels' blocks, and the network's share there.
 
-    Parameters
-    ----------
-    values : (nx, ny, nz) array or Planes
-        Samples, which are divided by ``unit``.
-    voxel_ijk : (D, 3) int32
-        The voxels, in C order.
-    factor : int
-        K.
-    uneven : bool
-        Whether the slope is uneven: where the samples jump, a spline would swing, and nodes are
-        interpolated linearly.
-
-    Returns
-    -------
-    (Q, D + 1) float32, (D,) float32
-        Blocks, see ``nodes``; the share of the network's values in each voxel, from 0 where the
-        field is smooth, or no distance, to 1.
+    The samples ``values`` are divided by ``unit``; the voxels (D, 3) are in C order. If the slope
+    is ``uneven``, a spline would swing where the samples jump, and nodes are interpolated linearly.
+    The blocks, (Q, D + 1), are those of ``nodes``; the share, (D,), goes from 0 where the field is
+    smooth, or no distance, to 1.
     """
     blocks = np.zeros(((factor + 1) ** 3, len(voxel_ijk) + 1), np.float32)
     share = np.empty(len(voxel_ijk), np.float32)
