@@ -71,10 +71,6 @@ class Lattice:
         place = (inner[:, 0] * side + inner[:, 1]) * side + inner[:, 2]
         return np.where(row < 0, -1, place * self.blocks.shape[1] + row)
 
-    def values(self, at: Nodes) -> FloatArray:
-        """Return the values at places from ``find``."""
-        return self.blocks.ravel().take(at)
-
     def set(self, node: Nodes, values: FloatArray) -> None:
         """Set the value of nodes (n, 3) in all blocks that share them."""
         for upper in CELL:
@@ -109,7 +105,7 @@ def drop_debris(
     pieces = small_pieces(lattice, find_seeds(blocks, factor, parts))
     first = (np.maximum(pieces.node[pieces.start[:-1], 0] - 1, 0) // factor).astype(np.int32)
     at = lattice.find(pieces.node)
-    values = lattice.values(at)
+    values = lattice.blocks.ravel().take(at)
     held = _hold_samples(pieces, values, factor)
     loose = at[pieces.spread(~held)]
     dropped = np.zeros(len(pieces), bool)
@@ -200,7 +196,7 @@ def _grow(lattice: Lattice, start: Nodes) -> tuple[Nodes, Nodes]:
         seed, step = _unpack(front, width)
         beside = (step[:, None] + NEIGHBOURHOOD).reshape(-1, 3)
         at = lattice.find(start[seed].repeat(27, 0) + beside).reshape(-1, 27)
-        joined = joined_nodes(lattice.values(at), at >= 0)
+        joined = joined_nodes(lattice.blocks.ravel().take(at), at >= 0)
         joined &= small[seed, None]
         seed, beside = seed.repeat(27)[joined.ravel()], beside[joined.ravel()]
         number = seed * box + ((beside + reach) @ [width * width, width, 1])
@@ -264,9 +260,10 @@ def is_supported(
     for centre, radius in zip(*_spheres_beside(lattice.factor, node, inside, spheres)):
         reach = (radius + TOLERANCE) * lattice.factor / 2
         if np.linalg.norm(own - centre, axis=1).min() <= reach:
-            around = centre + _ball(reach + 1)
+            steps = np.indices((2 * int(reach) + 3,) * 3).reshape(3, -1).T - int(reach) - 1
+            around = centre + steps[np.linalg.norm(steps, axis=1) <= reach + 1]
             at = lattice.find(around)
-            beside = lattice.values(at)
+            beside = lattice.blocks.ravel().take(at)
             rest = (at >= 0) & ((beside <= 0) == inside) & ~np.isin(at, loose)
             others = _vertices(lattice, around[rest], beside[rest])
             if np.linalg.norm(others - centre, axis=1).min(initial=np.inf) > reach:
@@ -277,7 +274,7 @@ def is_supported(
 def _vertices(lattice: Lattice, node: Nodes, values: FloatArray) -> NDArray[np.float64]:
     """Return where the surface crosses the lattice edges from nodes (n, 3), (m, 3)."""
     at = lattice.find((node[:, None] + NEIGHBOURHOOD[ALONG]).reshape(-1, 3))
-    high = lattice.values(at).reshape(-1, len(ALONG)).astype(np.float64)
+    high = lattice.blocks.ravel().take(at).reshape(-1, len(ALONG)).astype(np.float64)
     low = values[:, None].astype(np.float64)
     crossed = (at >= 0).reshape(high.shape) & ((high <= 0) != (low <= 0))
     row, along = np.nonzero(crossed)
@@ -298,11 +295,3 @@ def _spheres_beside(
     radius = spheres.distance[row] * (1 if inside else -1)
     some = (radius >= 0) & (radius <= LARGEST_SPHERE)
     return factor * around[some] + factor // 2, radius[some]
-
-
-def _ball(radius: float) -> Nodes:
-    """Return the steps to the nodes within a radius in fine spacings, (n, 3)."""
-    reach = int(radius)
-    steps = np.indices((2 * reach + 1,) * 3).reshape(3, -1).T - reach
-    near: Nodes = steps[np.linalg.norm(steps, axis=1) <= radius]
-    return near
