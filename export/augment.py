@@ -15,7 +15,7 @@ import numpy as np
 
 from export.dataset import Sample
 from super_sdf.grid.masks import mask_distances
-from super_sdf.network.symmetry import cube_symmetries, turn
+from super_sdf.neighbourhood import cube_symmetries, turn
 from super_sdf.steps.band import find_band, gather_patches, neighbour_table
 
 

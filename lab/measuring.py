@@ -20,8 +20,13 @@ from super_sdf.files.regular import check_regular_file
 from super_sdf.machine.memory import forget_peak, held_memory
 from super_sdf.mesh import Mesh
 from super_sdf.network.decoder import Decoder
-from super_sdf.network.kinds import KIND_MODELS
-from super_sdf.network.network import find_model, float32_name, load_network, shipped_models
+from super_sdf.network.network import (
+    KIND_MODELS,
+    find_model,
+    float32_name,
+    load_network,
+    shipped_models,
+)
 from super_sdf.options import AUTO_PRECISION, DEFAULT_QUALITY
 from super_sdf.truth.solid import Distances, Solid
 

@@ -25,10 +25,10 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from super_sdf import pipeline
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.network.network import Network, find_model, load_network
 from super_sdf.options import DEFAULT_QUALITY
+from super_sdf.slabs import preparing
 from super_sdf.slabs.cutting import Slab, cut
 from super_sdf.steps.survey import Band
 
@@ -48,7 +48,7 @@ def cut_into(slabs: int) -> Iterator[None]:
     def plan(band: Band, factor: int, reach: int, *others: Any) -> list[Slab]:
         return cut(band, slabs, reach, others[-1].planes_beside(factor))
 
-    with mock.patch.object(pipeline, "plan_slabs", plan) if slabs > 1 else nullcontext():
+    with mock.patch.object(preparing, "plan_slabs", plan) if slabs > 1 else nullcontext():
         yield
 
 

@@ -190,7 +190,7 @@ def test_offsets_grow_the_solid(offset, network):
 
 @pytest.mark.parametrize("axis, mesher", [(0, "marching"), (1, "sharp"), (2, "marching")])
 def test_slabs_and_threads_make_the_same_mesh(axis, mesher, network, monkeypatch):
-    from super_sdf import pipeline
+    from super_sdf.slabs import preparing
     from super_sdf.slabs.cutting import cut
 
     spacing = tuple(np.where(np.arange(3) == axis, 1.0, 0.35))
@@ -198,7 +198,7 @@ def test_slabs_and_threads_make_the_same_mesh(axis, mesher, network, monkeypatch
     whole = reconstruct(grid, network, mesher=mesher)
     threaded = reconstruct(grid, load_network("fast", threads=2), mesher=mesher)
     monkeypatch.setattr(
-        pipeline, "plan_slabs",
+        preparing, "plan_slabs",
         lambda band, k, field, *_: cut(band, 5, field, _[-1].planes_beside(k)),
     )  # fmt: skip
     monkeypatch.setattr("super_sdf.steps.band.BLOCK_SAMPLES", 1)

@@ -62,7 +62,7 @@ LISTS = {
     "": "list.jsonl names no file: give a path a line",
     '{"out": "a.ply"}': "list.jsonl, line 1: 'in' is None: give the path of a grid",
     '{"in": "a.npy", "Factor": 2}': "list.jsonl, line 1: 'Factor' is unknown: give in, out, "
-    "factor, iterations, spacing, origin, direction, axes, inside, field, label, level, scale, "
+    "factor, spacing, origin, direction, axes, inside, field, label, level, scale, "
     "offset, cap, mesher, simplify, triangles",
     '{"in": "a.npy", "simplify": 1, "triangles": 9}': "list.jsonl, line 1: simplify 1.0 and "
     "triangles 9: give only one of them",

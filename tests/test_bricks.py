@@ -217,8 +217,6 @@ REFUSED = {
     "convert it on one machine (without --cluster), or save it as .zarr",
     ("a.npy", "--axes", "zyx"): "axes is 'zyx', but workers read planes of x of a.npy: "
     "convert it on one machine (without --cluster), or save it as .zarr",
-    ("a.npy", "--iterations", "2"): "--iterations 2 refines the field of the whole grid again: "
-    "convert it on one machine (without --cluster)",
     ("a.npy", "--save-field", "f.npz"): "--save-field writes one file from the first plane on: "
     "convert it on one machine (without --cluster)",
 }

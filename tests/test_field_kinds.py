@@ -23,13 +23,12 @@ from super_sdf.grid.truncation import fill_in
 from super_sdf.machine import memory
 from super_sdf.machine.resources import Resources
 from super_sdf.mesh import join_meshes
-from super_sdf.network.kinds import network_for
-from super_sdf.network.network import shipped_models
+from super_sdf.network.network import network_for, shipped_models
 from super_sdf.pipeline import reconstruct_slabs
+from super_sdf.slabs import preparing
 from super_sdf.slabs.cutting import cut
 from super_sdf.steps import spline
-from super_sdf.steps.holding import hold_sides
-from super_sdf.steps.nodes import block_ijk
+from super_sdf.steps.nodes import block_ijk, hold_sides
 from super_sdf.steps.spline import network_share, node_weights, prefilter, spline_blocks
 from super_sdf.steps.survey import WINDOW_SAMPLES, plan_reading, survey
 
@@ -492,7 +491,7 @@ def test_any_number_of_slabs_and_threads_gives_the_same_mesh(name, monkeypatch):
     def plan(band, factor, receptive_field, resources, needed, mesher):
         return cut(band, 4, receptive_field, mesher.planes_beside(factor))
 
-    monkeypatch.setattr(pipeline, "plan_slabs", plan)
+    monkeypatch.setattr(preparing, "plan_slabs", plan)
     one = load_network("fast", device="cpu", threads=1)
     pieces = list(reconstruct_slabs(grid, one))
     mesh = join_meshes([mesh for piece in pieces for mesh in piece.meshes])

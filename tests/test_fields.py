@@ -230,7 +230,7 @@ def test_a_field_saved_in_slabs_is_the_same_file(name, suffix, bare_plan, monkey
     write_field(upsample(grid, network, 4), "whole" + suffix)
     monkeypatch.setattr(cutting, "plan_slabs", None)
     monkeypatch.setattr(
-        "super_sdf.pipeline.plan_slabs",
+        "super_sdf.slabs.preparing.plan_slabs",
         lambda band, factor, reach, resources, needed, mesher: cutting.cut(
             band, 4, reach, mesher.planes_beside(factor)
         ),
@@ -330,8 +330,7 @@ def test_a_field_as_a_grid_is_refused():
     with pytest.raises(FileError) as caught:
         read_grid("field.npz")
     assert str(caught.value) == (
-        "field.npz is a refined field, no grid: mesh it with extract_mesh(read_field(path)), or "
-        "refine the grid again with --iterations"
+        "field.npz is a refined field, no grid: mesh it with extract_mesh(read_field(path))"
     )
 
 
@@ -437,7 +436,6 @@ REFUSED = {
     ("--save-field", "grid.npz", "--force"): (
         "grid.npz is the same file as grid.npz: give another file"
     ),
-    ("--iterations", "0"): "iterations is 0: give 1 or more",
 }
 
 
@@ -501,40 +499,13 @@ def by_hand(grid, network, factor, **options):
 
 
 @pytest.mark.parametrize("name", GRIDS)
-def test_two_iterations_are_two_runs_by_hand(name):
+@pytest.mark.parametrize("mesher", ["marching", "sharp"])
+def test_the_fine_grid_is_refined_as_the_saved_one(name, mesher):
     grid = GRIDS[name]()
-    for options in ({"cap": True}, {"cap": False, "mesher": "sharp"}):
-        twice = reconstruct(grid, trilinear, 2, iterations=2, **options)
+    for cap in (False, True):
+        options = {"cap": cap, "mesher": mesher}
+        twice = reconstruct(fine_grid(upsample(grid, trilinear, 2)), trilinear, 2, **options)
         assert same(twice, by_hand(grid, trilinear, 2, **options))
-
-
-def test_iterations_mesh_the_offset_surface_once():
-    grid = ball()
-    mesh = reconstruct(grid, trilinear, 2, offset=1.5, iterations=2)
-    assert mesh.volume() == pytest.approx(4 / 3 * np.pi * 7.5**3, rel=0.02)
-
-
-def test_the_command_iterates_and_saves_the_last_field(command):
-    np.savez("grid.npz", values=ball().values, spacing=1.0)
-    options = ("--iterations", 2, "--factor", 2, "--quality=fast")
-    code, out, said = command(
-        "upsample", "grid.npz", "a.ply", "--save-field", "a.npz", "--json", *options
-    )
-    assert code == 0 and '"iterations": 2' in out and "Warning" not in said
-    field = read_field("a.npz")
-    assert field.shape == (41, 41, 41) and field.grid.spacing == (0.5, 0.5, 0.5)
-    write_mesh(extract_mesh(field), "b.ply")
-    assert Path("a.ply").read_bytes() == Path("b.ply").read_bytes()
-    network = load_network("fast")
-    write_mesh(reconstruct(read_grid("grid.npz"), network, 2, cap=True, iterations=2), "c.ply")
-    assert Path("a.ply").read_bytes() == Path("c.ply").read_bytes()
-
-
-def test_iterations_are_checked():
-    with pytest.raises(OptionTypeError, match=r"iterations is 1\.5: give a whole number"):
-        reconstruct(ball(), trilinear, iterations=1.5)
-    with pytest.raises(OptionError, match=r"iterations is -1: give 1 or more"):
-        reconstruct(ball(), trilinear, iterations=-1)
 
 
 def placed(**place) -> SdfGrid:
@@ -583,7 +554,8 @@ def corners(grid: SdfGrid) -> np.ndarray:
 
 def test_a_turned_grid_is_refined_twice():
     grid = placed(spacing=(0.5, 0.5, 0.75), origin=(3, -4, 5), direction=TURNED)
-    mesh = reconstruct(grid, load_network("fast"), 2, iterations=2)
+    network = load_network("fast")
+    mesh = reconstruct(fine_grid(upsample(grid, network, 2)), network, 2)
     centre = grid.to_world([6.2, 6.9, 7.1])
     radius = np.linalg.norm(mesh.vertices - centre, axis=1)
     np.testing.assert_allclose(radius, 4.1 * 0.5, atol=0.05)

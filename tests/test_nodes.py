@@ -22,7 +22,7 @@ def some_voxels(seed, density=0.4, shape=(6, 5, 7)):
     return voxels, neighbour_table(voxels, shape)
 
 
-@pytest.mark.parametrize("factor", [2, 4, 8, 16])
+@pytest.mark.parametrize("factor", [2, 16])
 def test_offsets_are_equation_5_on_the_lattice(factor):
     offsets = block_offsets(factor)
     assert offsets.shape == ((factor + 1) ** 3, 3)
@@ -32,7 +32,7 @@ def test_offsets_are_equation_5_on_the_lattice(factor):
     np.testing.assert_array_equal(steps, np.round(steps))
 
 
-@pytest.mark.parametrize("factor", [-2, 0, 1, 3, 5, 15, 18, 1000])
+@pytest.mark.parametrize("factor", [-2, 0, 3, 18])
 def test_odd_and_absurd_factors_are_refused(factor):
     message = (
         f"factor is {factor}: give an even number from 2 to 16 "
@@ -48,8 +48,7 @@ def field_of(voxels, table, factor, blocks=None):
     return FineField((6, 5, 7), factor, voxels, blocks, share_parts(table), (0, 6))
 
 
-@pytest.mark.parametrize("factor", [2, 4])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("seed", "factor"), [(0, 2), (1, 4)])
 def test_nodes_have_one_number_for_each_position(seed, factor):
     voxels, table = some_voxels(seed)
     field = field_of(voxels, table, factor)
@@ -70,8 +69,7 @@ def test_nodes_belong_to_the_first_voxel_that_has_them_and_come_in_its_order():
         assert field.parts.count_nodes(4, slice(0, row)) == (owner < row).sum()
 
 
-@pytest.mark.parametrize("factor", [2, 4])
-@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize(("factor", "threads"), [(2, 3), (4, 1)])
 def test_shared_nodes_are_plain_means_in_every_block(monkeypatch, factor, threads):
     monkeypatch.setattr("super_sdf.machine.threads.MIN_PER_THREAD", 1)
     voxels, table = some_voxels(7)

@@ -13,7 +13,7 @@ from super_sdf.mesh import CLEARANCE
 from super_sdf.steps import survey
 from super_sdf.steps.nodes import block_ijk
 
-FACTORS = [2, 4, 8, 16]
+FACTORS = [2, 4, 8]
 
 
 @pytest.fixture(scope="module")
@@ -75,15 +75,6 @@ def test_noisy_samples_are_corrected(network):
     assert np.abs(after - wanted)[near].mean() < 0.5 * np.abs(before)[near].mean()
 
 
-def test_voxels_agree_on_shared_faces_by_construction(network):
-    field = upsample(ball(), network)
-    position = (field.voxel_ijk[:, None] * 4 + block_ijk(4)).reshape(-1, 3)
-    value = field.values[field.numbers].ravel()
-    order = np.lexsort(position.T)
-    same = (np.diff(position[order], axis=0) == 0).all(1)
-    assert same.any() and (np.diff(value[order])[same] == 0).all()
-
-
 def test_unit_and_origin_only_scale_and_move_the_vertices(network):
     grid = ball()
     mesh = reconstruct(grid, network)
@@ -104,7 +95,7 @@ SYMMETRIES = [
     np.eye(3, dtype=int)[list(axes)] * signs
     for axes in permutations(range(3))
     for signs in product((1, -1), repeat=3)
-]
+][::5]  # ten of 48, of all orders of axes
 
 
 @pytest.mark.parametrize("name", ["stand-in", "shipped"])
@@ -131,7 +122,7 @@ def test_symmetries_of_the_cube_map_the_vertices_along(network, name, monkeypatc
         assert distance.mean() < mean + 2 * CLEARANCE
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.1, 0.3, 0.5])
+@pytest.mark.parametrize("noise", [0.0, 0.5])
 def test_decoding_only_what_can_hold_the_surface_loses_nothing(noise, monkeypatch):
     """Not even if the values are no distances: with uniform noise of up to half a voxel."""
     grid = ball()
@@ -156,9 +147,9 @@ def test_an_offset_is_a_shift_of_the_field(network):
 def test_threads_give_the_same_mesh(network):
     from concurrent.futures import ThreadPoolExecutor
 
-    grids = [ball(16, 4.0 + 0.1 * n) for n in range(4)]
+    grids = [ball(14, 4.0 + 0.1 * n) for n in range(3)]
     alone = [reconstruct(grid, network).vertices for grid in grids]
-    with ThreadPoolExecutor(4) as pool:
+    with ThreadPoolExecutor(3) as pool:
         together = list(pool.map(lambda grid: reconstruct(grid, network).vertices, grids))
     for one, other in zip(alone, together):
         np.testing.assert_array_equal(one, other)

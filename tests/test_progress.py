@@ -16,7 +16,7 @@ from test_network import network_inputs
 
 from super_sdf import load_network, reconstruct, upsample
 from super_sdf.network import network, running
-from super_sdf.network.pace import LINEAR_UP_TO, share_of_time
+from super_sdf.network.running import LINEAR_UP_TO, share_of_time
 from super_sdf.progress import StepCounter
 from super_sdf.steps.nodes import block_offsets
 
@@ -122,6 +122,9 @@ class EndlessSession:
 
     def get_outputs(self):
         return [SimpleNamespace(name="values")]
+
+    def get_overridable_initializers(self):
+        return []
 
     def run_with_iobinding(self, binding, options):
         self.at_begin()

@@ -10,7 +10,7 @@ from super_sdf import selftest
 from super_sdf.errors import DeviceError
 from super_sdf.machine import extras
 from super_sdf.machine.extras import EXTRAS
-from super_sdf.network import kinds, network
+from super_sdf.network import network
 from super_sdf.selftest import Finding, run_checks
 
 pytestmark = pytest.mark.usefixtures("cpu_build")
@@ -158,7 +158,7 @@ def test_a_package_without_networks_says_so(models, command, tmp_path, there):
 def test_a_package_without_the_network_for_masks_says_so(models, tmp_path, command):
     models.mkdir()
     (models / "fast.onnx").write_bytes(SHIPPED["fast"].read_bytes())
-    kinds._load.cache_clear()
+    network._load_once.cache_clear()
     np.save(tmp_path / "in.npy", np.linalg.norm(np.indices((9, 9, 9)) - 4, axis=0) < 3)
     code, _, err = command(
         *("upsample", tmp_path / "in.npy", tmp_path / "out.ply", "--quality", "fast")

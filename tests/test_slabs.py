@@ -15,7 +15,7 @@ from super_sdf.machine import threads
 from super_sdf.machine.resources import Resources
 from super_sdf.mesh import Mesh, join_meshes
 from super_sdf.pipeline import reconstruct_slabs
-from super_sdf.slabs import cutting
+from super_sdf.slabs import cutting, preparing
 from super_sdf.slabs.cutting import cut, equal_parts, peak_bytes, plan_slabs
 from super_sdf.slabs.footprint import slab_bytes
 from super_sdf.steps.glance import look_at_band
@@ -59,7 +59,7 @@ def in_pieces(grid, network, monkeypatch, pieces, **options):
     def plan(band, factor, receptive_field, resources, needed, mesher):
         return cut(band, pieces, receptive_field, mesher.planes_beside(factor))
 
-    monkeypatch.setattr(pipeline, "plan_slabs", plan)
+    monkeypatch.setattr(preparing, "plan_slabs", plan)
     return list(reconstruct_slabs(grid, network, **options))
 
 

@@ -5,8 +5,7 @@ import pytest
 from conftest import ball
 
 from super_sdf import load_network
-from super_sdf.neighbourhood import NEIGHBOURHOOD
-from super_sdf.network.symmetry import cube_symmetries, turn
+from super_sdf.neighbourhood import NEIGHBOURHOOD, cube_symmetries, turn
 from super_sdf.steps.band import find_band, gather_patches, neighbour_table, rescale
 from super_sdf.steps.nodes import block_offsets
 
@@ -46,8 +45,8 @@ def dense_values(network, field):
 
 @pytest.mark.parametrize(
     ("symmetries", "flipped"),
-    [(4, (0, 1)), (4, (0, 2)), (4, (1, 2)), (8, (0,)), (8, (0, 1, 2))],
-    ids=["half turn about z", "about y", "about x", "mirrored", "inverted"],
+    [(4, (0, 1)), (4, (1, 2)), (8, (0, 1, 2))],
+    ids=["half turn about z", "about x", "inverted"],
 )
 def test_a_mean_maps_a_turned_field_to_the_turned_surface(symmetries, flipped):
     """The plain network does so only approximately; otherwise the mean would have no effect."""

@@ -172,7 +172,6 @@ def test_what_needs_the_whole_surface_is_refused(tmp_path, command, monkeypatch)
     run = ["upsample", "seen.npy", "out.ply", "--spacing", 1, "--factor", 2, "--quality", "fast"]
     refused = [
         ((), "so whether they are inside is unknown; end the surface there (--open)"),
-        (("--open", "--iterations", 2), f"{said}refine once, by a larger factor (--iterations 1)"),
         (("--open", "--save-field", "f.npz"), f"{said}write the mesh alone, without its field"),
     ]
     for options, message in refused:

@@ -16,7 +16,7 @@ from export.tests.small_net import SMALL, small_net
 from export.tests.test_batches import ball_sample
 from export.tests.test_training import some_samples
 from export.train import ResidentStore, Run, read_changed, window_losses
-from super_sdf.network.symmetry import cube_symmetries
+from super_sdf.neighbourhood import cube_symmetries
 
 DRAWN, TURNS = [2, 0, 1, 2], [0, 5, 17, 40]
 

@@ -22,8 +22,7 @@ from lab.runner import LeftOut, complete
 from lab.shapes import Setting, find_meshes, spread
 from super_sdf import Mesh, SuperSdfError
 from super_sdf.errors import FileError
-from super_sdf.network.kinds import KIND_MODELS
-from super_sdf.network.network import shipped_models
+from super_sdf.network.network import KIND_MODELS, shipped_models
 
 ROOT = Path(__file__).parents[2]
 TIMES = ("seconds", "peak_mb")

@@ -35,7 +35,7 @@ from .pipeline import reconstruct_slabs
 from .progress import Progress, Stopwatch, part_of, share_of
 from .simplification.simplify import Simplified, check_can_simplify, check_room, simplify_mesh
 from .slabs.pieces import Piece
-from .steps.ends import check_can_close
+from .steps.cap import check_can_close
 from .steps.lattice import lattice_shape
 from .steps.survey import Band
 from .topology import OpenEdges
@@ -206,7 +206,6 @@ def convert(
             offset=options.offset,
             cap=options.cap,
             mesher=options.mesher,
-            iterations=options.iterations,
             max_memory=options.max_memory,
             progress=shown,
             save=file.add if file else None,
@@ -259,10 +258,8 @@ def _field_file(
     # imported here, since few conversions write a field, and the start is part of each
     from .fields.writing import check_field_fits, check_field_target, saving_field
 
-    path, shape = check_field_target(path, force=force), grid.shape
-    for _ in range(options.iterations):
-        shape = lattice_shape(shape, options.factor)
     check_can_close(grid, cap=options.cap)
+    path, shape = check_field_target(path, force=force), lattice_shape(grid.shape, options.factor)
     check_field_fits(path, shape, options.max_memory)
     return saving_field(path, shape, force=force)
 
@@ -289,7 +286,7 @@ def convert_grid(
     check_can_close(grid, cap=options.cap)
     check_apart(target, files_of(source))
     check_target(target, force=force)
-    finer = options.factor**options.iterations
+    finer = options.factor
     lattice = cubic_grid(grid, options.offset)
     about = check_format_holds(target, lattice, finer)
     expected = expect(grid, finer, options.offset, target, cap=options.cap)

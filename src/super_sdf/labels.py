@@ -27,15 +27,15 @@ from .machine.memory import advised, give_back, held_memory, in_words
 from .machine.resources import Resources, allot
 from .mesh import Mesh, join_meshes, vertex_type
 from .neighbourhood import CENTRE
-from .network.decoder import Decoder
-from .network.kinds import network_for
+from .network.decoder import Adapter, Decoder, adapt
+from .network.network import network_for
 from .options import check_factor, check_max_memory, check_network, check_progress
-from .pipeline import memory_needs, refine
+from .pipeline import refine
 from .progress import Progress, StepCounter, part_of
 from .slabs.cutting import Slab, equal_parts, slab_of
 from .slabs.footprint import slab_bytes
+from .steps.nodes import VoxelIndex
 from .steps.survey import Band, survey
-from .steps.voxel_index import VoxelIndex
 from .steps.walls import Labels, Part, absent_parts, extract_walls, put_together
 
 BAND_SHARE = 0.05  # of the time
@@ -155,10 +155,10 @@ def label_slabs(
     check_network(network)
     check_progress(progress)
     factor = check_factor(factor)
-    network = network_for(network, MASK)
+    chosen = adapt(network_for(network, MASK))
     vertex_type(image.grid, factor)  # raises if not even float64 resolves the vertices
-    resources = allot(getattr(network, "threads", 0), check_max_memory(max_memory))
-    work = Work(image, network, factor, resources, _bands(image, resources))
+    resources = allot(chosen.threads, check_max_memory(max_memory))
+    work = Work(image, chosen, factor, resources, _bands(image, resources))
     if progress:
         progress(round(1000 * BAND_SHARE), 1000)
     slabs = work.plan()
@@ -201,7 +201,7 @@ class Work:
     """What the slabs of an image have in common; ``bands`` are those of ``_bands``."""
 
     image: LabelImage
-    network: Decoder
+    network: Adapter
     factor: int
     resources: Resources
     bands: list[Band]
@@ -237,7 +237,7 @@ class Work:
         for number, band in enumerate(self.bands):
             slab, own = self.slab(number, planes)
             if own.start < own.stop:
-                args = slab.seen, slab.decoded, slab.planes, self.factor, memory_needs(self.network)
+                args = slab.seen, slab.decoded, slab.planes, self.factor, self.network.memory_bytes
                 most = max(most, slab_bytes(band, *args, self.resources.threads))
                 count += own.stop - own.start
         return most + count * (NODE_BYTES * (self.factor + 1) ** 3 + CELL_BYTES * self.factor**2)
@@ -246,7 +246,7 @@ class Work:
         """Return what some planes need of the band of a label, and which rows are their own."""
         start, count = self.image.boxes[number][0].start, self.bands[number].shape[0]
         low, high = (min(max(plane - start, 0), count) for plane in planes)
-        reach = getattr(self.network, "receptive_field", None)  # all planes if it states none
+        reach = self.network.receptive_field  # all planes if it states none
         slab = slab_of(self.bands[number], low, high, count if reach is None else reach, 1)
         return slab, self.bands[number].rows(low, high)
 

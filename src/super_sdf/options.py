@@ -372,14 +372,6 @@ class ConvertOptions(ReadOptions):
     factor: int = _option(
         4, "Refinement per axis: 2, 4, 8 or 16 times finer than the grid.", check_factor, int
     )
-    iterations: int = _option(
-        1,
-        "Refine N times, each time by the factor and from the refined field before, for "
-        "lattices finer than factor 16. Twice factor 4 is no better than factor 16, and slower.",
-        _whole(1, "1 or more"),
-        int,
-        metavar="N",
-    )
     offset: float = _option(
         0.0,
         "Mesh the offset surface at distance D, in world units; a positive D grows the "
@@ -475,7 +467,7 @@ OPTIONS = {
     for each in (*fields(ConvertOptions), *fields(NetworkOptions))
 }
 GRID = tuple(each.name for each in fields(ReadOptions) if each.name != "max_memory")
-MESH = ("factor", "iterations", *GRID, "offset", "cap", "mesher")
+MESH = ("factor", *GRID, "offset", "cap", "mesher")
 UPSAMPLE = (
     *(*MESH, "quality", "precision", "model", "device", "max_memory", "threads"),
     *("simplify", "triangles"),
@@ -490,6 +482,5 @@ check_distance = OPTIONS["offset"].check
 check_cap = OPTIONS["cap"].check
 check_mesher = OPTIONS["mesher"].check
 check_inside = OPTIONS["inside"].check
-check_iterations = OPTIONS["iterations"].check
 check_max_memory = OPTIONS["max_memory"].check
 check_threads = OPTIONS["threads"].check

@@ -93,7 +93,6 @@ class ImageAccessor:
         offset: float = 0.0,
         cap: bool = True,
         mesher: str = DEFAULT_MESHER,
-        iterations: int = 1,
         max_memory: int | None = None,
         progress: Progress | None = None,
         **values: Unpack[Values],
@@ -104,7 +103,7 @@ class ImageAccessor:
 
         Parameters
         ----------
-        factor, offset, mesher, iterations, max_memory, progress
+        factor, offset, mesher, max_memory, progress
             See ``reconstruct``.
         scalars : str, optional
             The name of an array of points or cells. Default: the active scalars.
@@ -143,7 +142,6 @@ class ImageAccessor:
             offset=offset,
             cap=cap,
             mesher=mesher,
-            iterations=iterations,
             max_memory=max_memory,
             progress=progress,
         )

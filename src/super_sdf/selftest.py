@@ -20,8 +20,13 @@ from .grid.sdf_grid import make_grid
 from .machine.extras import EXTRAS, how_to_install, missing_modules
 from .machine.memory import free_memory
 from .network.cuda import available_devices, check_cuda, describe_gpu, onnxruntime_version
-from .network.kinds import MASK_MODEL
-from .network.network import NO_NETWORKS, float32_name, load_network, shipped_models
+from .network.network import (
+    MASK_MODEL,
+    NO_NETWORKS,
+    float32_name,
+    load_network,
+    shipped_models,
+)
 from .options import AUTO, FLOAT32, MASK
 from .steps.nodes import block_offsets
 from .steps.survey import survey

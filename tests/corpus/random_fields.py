@@ -17,6 +17,7 @@ from super_sdf.network.network import Network
 from super_sdf.options import DEFAULT_MESHER
 from super_sdf.pipeline import Decoder
 from super_sdf.progress import Stopwatch
+from super_sdf.slabs import preparing
 from super_sdf.slabs.cutting import cut, equal_parts
 from super_sdf.slabs.pieces import Piece
 from super_sdf.steps.glance import look_at_band
@@ -127,7 +128,7 @@ def in_slabs(field: RandomField, network: Network, mesher: str, parts: int) -> I
         return cut(band, parts, reach, mesher.planes_beside(factor))
 
     grid = SdfGrid.trusted(field.values, 1.0)
-    with mock.patch.object(pipeline, "plan_slabs", plan):
+    with mock.patch.object(preparing, "plan_slabs", plan):
         yield from pipeline.reconstruct_slabs(
             grid, network, field.factor, cap=field.cap, mesher=mesher
         )

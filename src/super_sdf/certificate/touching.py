@@ -19,8 +19,8 @@ from ..machine.threads import chunks_of
 from ..mesh import Mesh
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD
 from ..steps.band import plane_blocks, rescale
+from ..steps.nodes import VoxelIndex
 from ..steps.survey import Band
-from ..steps.voxel_index import VoxelIndex
 from ..truth.solid import Points, Solid
 from .search import Found
 

@@ -182,7 +182,7 @@ class Upsampling:
 
     def report(self) -> dict[str, Any]:
         """Return counts, times and notes as ``--json`` prints them."""
-        shown = ("factor", "iterations", "offset", "mesher")
+        shown = ("factor", "offset", "mesher")
         return {
             "input": self.source,
             "output": self.target,

@@ -38,8 +38,8 @@ from ..pipeline import reconstruct_planes
 from ..progress import TOTAL, Progress, Stopwatch
 from ..slabs.cutting import check_crossings, equal_parts
 from ..slabs.pieces import Piece
-from ..steps.ends import check_all_seen
-from ..steps.exact import BandSummary
+from ..steps.band import BandSummary
+from ..steps.cap import check_all_seen
 from ..steps.glance import Glance, look_at_band
 from ..steps.survey import BYTES_PER_VOXEL, no_surface
 from .checking import Needs
@@ -196,11 +196,6 @@ def check_can_brick(source: str, options: ConvertOptions, save_field: Any = None
     Called before anything is started.
     """
     check_source(Source(source, options.axes))
-    if options.iterations > 1:
-        raise OptionError(
-            f"--iterations {options.iterations} refines the field of the whole grid again: "
-            f"{WAY_OUT}"
-        )
     if save_field is not None:
         raise OptionError(f"--save-field writes one file from the first plane on: {WAY_OUT}")
 

@@ -19,7 +19,7 @@ from ..grid.sdf_grid import SdfGrid
 from ..machine.extras import check_modules
 from ..machine.memory import held_memory, in_words, memory_bound
 from ..options import check_path
-from ..steps.ends import check_all_seen
+from ..steps.cap import check_all_seen
 from ..steps.field import FineField
 from ..steps.lattice import FineLattice, fine_grid, lattice_shape
 from .sparse import SparseWriter

@@ -196,8 +196,7 @@ def _known_members(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.Zi
     names = [info.filename.removesuffix(".npy") for info in infos]
     if {"voxels", "factor"} <= set(names):
         raise FileError(
-            f"{path} is a refined field, no grid: mesh it with extract_mesh(read_field(path)), or "
-            "refine the grid again with --iterations"
+            f"{path} is a refined field, no grid: mesh it with extract_mesh(read_field(path))"
         )
     if "values" not in names:
         raise FileError(f"{path} has no key 'values' (it holds {in_short(names) or 'nothing'})")

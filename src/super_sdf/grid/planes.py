@@ -272,7 +272,7 @@ class Few(list[tuple[NDArray[Any], ...]]):
 
 def spread_planes(first: int, last: int, most: int) -> list[int]:
     """Return at most so many planes from ``first`` to ``last`` (inclusive), spread evenly."""
-    return [int(i) for i in np.unique(np.linspace(first, last, most).astype(int))]
+    return sorted({int(i) for i in np.linspace(first, last, most)})
 
 
 def in_blocks(samples: SampleArray) -> list[tuple[int, int]]:

@@ -27,7 +27,7 @@ INPUTS = {
     "voxels": "tensor(int32)",
     "offsets": "tensor(float)",
 }
-OUTPUT, OUTPUT_TYPE = "values", "tensor(float)"
+OUTPUT = {"values": "tensor(float)"}
 # The whole numbers of a card: name, unit and largest value. A receptive field is to each side; a
 # patch alone reaches one voxel. The card of a network that sees farther, up to the whole grid,
 # leaves it out. The width decides how much memory a run takes.
@@ -52,13 +52,7 @@ def one_voxel() -> dict[str, Any]:
 
 
 def read_card(session: ort.InferenceSession, path: Path) -> dict[str, Any]:
-    """Return the metadata of a file.
-
-    Raises
-    ------
-    ModelError
-        If the file does not fulfil the contract.
-    """
+    """Return the metadata of a file; ModelError if it does not fulfil the contract."""
     try:
         inputs = {given.name: given.type for given in session.get_inputs()}
         outputs = {made.name: made.type for made in session.get_outputs()}
@@ -66,28 +60,32 @@ def read_card(session: ort.InferenceSession, path: Path) -> dict[str, Any]:
     except UnicodeDecodeError as error:
         raise ModelError(f"{path} is damaged: it has names that are not UTF-8 text") from error
     version = metadata.get("format_version", "none")
-    if inputs != INPUTS or outputs != {OUTPUT: OUTPUT_TYPE} or version != str(FORMAT_VERSION):
+    if inputs != INPUTS or outputs != OUTPUT or version != str(FORMAT_VERSION):
         raise ModelError(
-            f"{path} is no super-sdf network of format {FORMAT_VERSION} (format {shorten(version)}"
-            f", inputs {describe_types(inputs)}, outputs {describe_types(outputs)}); export one "
-            "with export/to_onnx.py"
+            f"{path} is no super-sdf network of format {FORMAT_VERSION} (format {_shorten(version)}"
+            f", inputs {_describe(inputs)}, outputs {_describe(outputs)}); export one with "
+            "export/to_onnx.py"
         )
     card = {key: _parse(key, text, path) for key, text in metadata.items()}
-    for key in WHOLE:
-        if key in card:
-            _check_whole(key, card[key], path)
+    for key, (name, unit, most) in WHOLE.items():
+        value = card.get(key, 1)
+        if type(value) is not int or not 1 <= value <= most:  # True is an int, too
+            raise ModelError(
+                f"{path}: its {name} is {_shorten(repr(value))}; it must be a whole number of "
+                f"{unit} from 1 to {most}: export it again with export/to_onnx.py"
+            )
     return card
 
 
-def shorten(text: str) -> str:
+def _shorten(text: str) -> str:
     """Return text from a file as part of one line, cut to ``MAX_SHOWN`` characters."""
     line = " ".join(text.split())
     return line if len(line) <= MAX_SHOWN else f"{line[:MAX_SHOWN]}..."
 
 
-def describe_types(values: Mapping[str, str]) -> str:
+def _describe(values: Mapping[str, str]) -> str:
     """Return the names of inputs or outputs with their types, in one line."""
-    return shorten(", ".join(f"{name} {kind}" for name, kind in values.items()))
+    return _shorten(", ".join(f"{name} {kind}" for name, kind in values.items()))
 
 
 def _parse(key: str, text: str, path: Path) -> Any:
@@ -98,16 +96,6 @@ def _parse(key: str, text: str, path: Path) -> Any:
         return text
     except (ValueError, RecursionError) as error:  # thousands of digits; nested too deep
         raise ModelError(
-            f"{path}: its metadata {shorten(key)!r} cannot be read, {shorten(text)!r}; export it "
+            f"{path}: its metadata {_shorten(key)!r} cannot be read, {_shorten(text)!r}; export it "
             "again with export/to_onnx.py"
         ) from error
-
-
-def _check_whole(key: str, value: Any, path: Path) -> None:
-    """Raise ModelError unless an entry is a whole number from 1 to its largest."""
-    name, unit, most = WHOLE[key]
-    if type(value) is not int or not 1 <= value <= most:  # True is an int, too
-        raise ModelError(
-            f"{path}: its {name} is {shorten(repr(value))}; it must be a whole number of {unit} "
-            f"from 1 to {most}: export it again with export/to_onnx.py"
-        )

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ctypes
 import io
-import re
 import subprocess
 import sys
 from contextlib import redirect_stdout
@@ -27,7 +26,7 @@ def available_devices() -> list[str]:
 
 def onnxruntime_version() -> str:
     """Return the version of onnxruntime, and of the CUDA that it was built for."""
-    cuda = getattr(ort, "cuda_version", "")
+    cuda = vars(ort).get("cuda_version", "")
     return f"onnxruntime {ort.__version__}" + (f" for CUDA {cuda}" if cuda else "")
 
 
@@ -40,7 +39,7 @@ def check_cuda() -> None:
         )
     if not has_driver():
         raise DeviceError(f"there is no {DRIVER}: install the NVIDIA driver")
-    library = missing_library()
+    library = _missing_library()
     if library:
         raise DeviceError(
             f"{onnxruntime_version()} does not find {library}: pip install "
@@ -48,7 +47,7 @@ def check_cuda() -> None:
         )
 
 
-def missing_library() -> str | None:
+def _missing_library() -> str | None:
     """Return the first library that onnxruntime's CUDA provider needs and that is not installed.
 
     This tries to load the provider, since each version needs other libraries. None if nothing is
@@ -100,15 +99,3 @@ def query_gpu(*fields: str) -> list[str] | None:
     except (OSError, subprocess.CalledProcessError):
         return None
     return run.stdout.strip().split(", ")
-
-
-def first_line(error: Exception) -> str:
-    """Return the message of an onnxruntime error in one line.
-
-    For a failure of CUDA this is the part of interest in a long line of source files and template
-    arguments.
-    """
-    failure = re.search(r"CUDA failure \d+: [^;\n]*", str(error))
-    if failure:
-        return failure[0].strip()
-    return next(iter(str(error).strip().splitlines()), type(error).__name__)

@@ -14,8 +14,8 @@ from typing import Any
 
 from ..errors import DeviceError, ModelError
 from ..options import DEVICES
-from .cuda import CUDA, check_cuda, first_line, has_gpu, onnxruntime_version
-from .onnx import ort
+from .cuda import CUDA, check_cuda, has_gpu, onnxruntime_version
+from .onnx import first_line, ort
 from .running import run_bound, run_on_cpu
 
 CPU = "CPUExecutionProvider"
@@ -30,19 +30,10 @@ CUDA_OPTIONS = {
 
 @dataclass(frozen=True, eq=False)
 class OpenedSession:
-    """An open session.
+    """An open session, where it runs, and what the user should know about the choice.
 
-    Attributes
-    ----------
-    session : InferenceSession
-        The session.
-    device : str
-        Where it runs: "cpu" or "cuda".
-    notes : tuple of str
-        What the user should know about the choice of device.
-    failure : str
-        The error of the trial run, empty if it succeeded. After a failure the file may be a network
-        with another contract.
+    ``failure`` is the error of the trial run, empty if it succeeded: the file may be a network with
+    another contract.
     """
 
     session: ort.InferenceSession
@@ -54,42 +45,28 @@ class OpenedSession:
 def open_session(
     paths: tuple[Path, Path], device: str, threads: int, trial: Mapping[str, Any]
 ) -> OpenedSession:
-    """Open an ONNX file on a device.
+    """Open an ONNX file on a device: "cuda", "cpu", or "auto", which is CUDA if it runs.
 
-    Parameters
-    ----------
-    paths : two paths
-        The file for the CPU, and that for CUDA.
-    device : str
-        "cuda", "cpu", or "auto": CUDA if it runs, otherwise the CPU.
-    threads : int
-        CPU threads; 0 for one per core.
-    trial : dict
-        Inputs of a trial run: a session can open although it cannot run, for example on a GPU that
-        is too old or whose memory is full.
-
-    Raises
-    ------
-    ModelError
-        If onnxruntime cannot read the file.
-    DeviceError
-        If the device is "cuda" and CUDA cannot run.
+    ``paths`` are the file for the CPU and that for CUDA; ``trial`` are inputs of a trial run, since
+    a session can open although it cannot run, for example on a GPU that is too old or whose memory
+    is full. ModelError if onnxruntime cannot read the file, DeviceError if CUDA was asked for and
+    cannot run.
     """
     if device not in DEVICES:
         raise DeviceError(f"device is {device!r}: give one of {', '.join(DEVICES)}")
     if device == "cpu":
-        return open_on_cpu(paths[0], threads, trial)
+        return _open_on_cpu(paths[0], threads, trial)
     try:
-        return OpenedSession(open_on_cuda(paths[1], threads, trial), "cuda")
+        return OpenedSession(_open_on_cuda(paths[1], threads, trial), "cuda")
     except DeviceError as error:
-        opened = open_on_cpu(paths[0], threads, trial)  # first, since the file may be the cause
+        opened = _open_on_cpu(paths[0], threads, trial)  # first, since the file may be the cause
         if device == "cuda":
             raise DeviceError(f"cuda was asked for, but {error}; or use --device cpu") from error
         note = f"a GPU seems to be here, but the network runs on the CPU: {error}"
         return replace(opened, notes=(note,) * has_gpu())
 
 
-def open_on_cpu(path: Path, threads: int, trial: Mapping[str, Any]) -> OpenedSession:
+def _open_on_cpu(path: Path, threads: int, trial: Mapping[str, Any]) -> OpenedSession:
     """Open a file on the CPU and run it once; ModelError if it cannot be opened."""
     try:
         session = ort.InferenceSession(str(path), session_options(threads), providers=[CPU])
@@ -103,7 +80,7 @@ def open_on_cpu(path: Path, threads: int, trial: Mapping[str, Any]) -> OpenedSes
     return OpenedSession(session, "cpu")
 
 
-def open_on_cuda(path: Path, threads: int, trial: Mapping[str, Any]) -> ort.InferenceSession:
+def _open_on_cuda(path: Path, threads: int, trial: Mapping[str, Any]) -> ort.InferenceSession:
     """Open a file on CUDA and run it once; DeviceError, with what is missing, if it cannot run."""
     check_cuda()
     providers = [(CUDA, CUDA_OPTIONS), CPU]
@@ -125,4 +102,7 @@ def session_options(threads: int) -> ort.SessionOptions:
     options.intra_op_num_threads = threads
     options.log_severity_level = 4  # errors are raised; the other messages are not for users
     options.enable_mem_pattern = False  # useful only if all inputs have the same size
+    # A thread that waits for the next operator keeps its core busy for so long, 1 ms by default: on
+    # a machine with other work to do that takes ten times as long.
+    options.add_session_config_entry("session.intra_op.spin_duration_us", "20")
     return options

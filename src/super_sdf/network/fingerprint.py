@@ -20,14 +20,8 @@ SIDE, CENTRE, RADIUS = 12, 5.63, 4.0  # of a ball, in index units; the centre is
 class Fingerprint(NamedTuple):
     """What a network computes, and where.
 
-    Attributes
-    ----------
-    digest : str
-        SHA-256 of its values on a small ball.
-    device, processor : str
-        "cpu" or "cuda", and the model of the processor.
-    precision : str
-        "float32" or "int8".
+    ``digest`` is the SHA-256 of its values on a small ball; ``device`` is "cpu" or "cuda",
+    ``processor`` the model of the processor, and ``precision`` "float32" or "int8".
     """
 
     digest: str

@@ -1,4 +1,7 @@
-"""The network: an ONNX file that fulfils the ``contract``, opened on a ``device``."""
+"""The network: an ONNX file that fulfils the ``contract``, opened on a ``device``.
+
+Masks and noisy distances have networks of their own, see ``network_for``.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,8 +18,10 @@ import numpy as np
 from ..arrays import FloatArray, IntArray
 from ..errors import DeviceError, FileError, ModelError, OptionError
 from ..files.regular import check_regular_file
+from ..grid.field import MASK, NOISY
 from ..machine.processor import lacks_avx2
 from ..machine.threads import cores_of_system, useful_threads
+from ..neighbourhood import cube_symmetries, turn
 from ..options import (
     AUTO_PRECISION,
     DEFAULT_QUALITY,
@@ -27,12 +33,11 @@ from ..options import (
     check_threads,
 )
 from ..progress import ShareCallback
-from .contract import INPUTS, MASKS, one_voxel, read_card
+from .contract import EXACT_DISTANCES, INPUTS, MASKS, one_voxel, read_card
+from .decoder import Decoder
 from .device import open_session
 from .onnx import ort
-from .pace import LONG_RUN, Pace, work_of
-from .running import CUDA_CHUNK, Poll, run_bound, run_on_cpu
-from .symmetry import cube_symmetries, turn
+from .running import CUDA_CHUNK, LONG_RUN, Pace, Poll, run_bound, run_on_cpu, work_of
 
 MODELS = Path(__file__).parent.parent / "models"
 # Memory of a run, measured: of each voxel that it sees, its patch and its row of the neighbour
@@ -45,6 +50,9 @@ USUAL_CHANNELS = 64  # of a network whose card does not say
 SYMMETRY_BYTES = (600.0, 4.0)
 NO_NETWORKS = "super-sdf was installed without its networks: install it again"
 TRIAL_ROWS = 1024  # voxels of a run on the CPU that measures the pace: two chunks
+MASK_MODEL, NOISY_MODEL = "mask", "noisy"
+KIND_MODELS = (MASK_MODEL, NOISY_MODEL)
+"""The shipped networks that replace others for a kind of field."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -119,39 +127,19 @@ class Network:
         offsets: FloatArray,
         progress: ShareCallback | None = None,
     ) -> FloatArray:
-        """Return the values of voxels at query offsets.
+        """Return the values (D, Q) of voxels at query offsets: signed distances in half voxels.
 
-        Parameters
-        ----------
-        patches : (V, 27) float32
-            The samples round each voxel of the band, in half voxels.
-        table : (V, 27) int32
-            Neighbour table of the band.
-        voxels : (D,) int32
-            Rows of the band to decode.
-        offsets : (Q, 3) float32
-            Query offsets from the voxels' samples, in half voxels.
-        progress : callable, optional
-            Called several times a second with the finished share, 0 to 1, estimated from the
-            elapsed time. An exception in it, or an interrupt, ends the call within milliseconds.
-
-        Returns
-        -------
-        (D, Q) float32
-            Signed distances in half voxels.
-
-        Raises
-        ------
-        DeviceError
-            If onnxruntime fails, for example for lack of memory on a GPU.
+        Parameters and their shapes are those of ``decoder.Decoder``. ``progress`` is called several
+        times a second with the finished share, estimated from the elapsed time. An exception in it,
+        or an interrupt, ends the call within milliseconds. DeviceError if onnxruntime fails, for
+        example for lack of memory on a GPU.
         """
         if self.symmetries == 1:
             return self._run(patches, table, voxels, offsets, progress)
         mean = np.zeros((len(voxels), len(offsets)), np.float32)
         for number, symmetry in enumerate(cube_symmetries()[: self.symmetries]):
             turned, turned_table, moved = turn(symmetry, patches, table, offsets)
-            part_progress = progress and progress_of_part(progress, number, self.symmetries)
-            values = self._run(turned, turned_table, voxels, moved, part_progress)
+            values = self._run(turned, turned_table, voxels, moved, self._within(progress, number))
             with np.errstate(invalid="ignore"):  # the caller checks for infinities
                 values /= self.symmetries
                 mean += values
@@ -185,6 +173,10 @@ class Network:
         self.pace.learn(work, time.perf_counter() - begun)
         return values[:count]
 
+    def _within(self, progress: ShareCallback | None, number: int) -> ShareCallback | None:
+        """Return a callback for the share of a run among those over all symmetries."""
+        return progress and (lambda share: progress((number + share) / self.symmetries))
+
     def _run_session(self, feeds: Mapping[str, Any], poll: Poll = lambda: None) -> FloatArray:
         """Run the session on its device."""
         run = run_bound if self.device == "cuda" else run_on_cpu
@@ -199,11 +191,6 @@ class Network:
         offsets = len(part["offsets"])  # at least this many voxels are decoded, see _run
         work = work_of(rows, max(len(part["voxels"]), offsets), offsets)
         self.pace.learn(work, time.perf_counter() - begun)
-
-
-def progress_of_part(progress: ShareCallback, number: int, count: int) -> ShareCallback:
-    """Return a callback for the share of part ``number`` of ``count`` that reports the whole."""
-    return lambda share: progress((number + share) / count)
 
 
 def crop_inputs(feeds: Mapping[str, Any], rows: int) -> dict[str, Any]:
@@ -238,13 +225,7 @@ def find_model(model: str | Path, precision: str = AUTO_PRECISION) -> tuple[Path
 
     ``model`` is a quality, the name of a shipped network, or a file, and "auto" leaves a file as it
     is. So it does with all networks on processors with AVX but without AVX2, where int8 is slower.
-
-    Raises
-    ------
-    FileError
-        If there is no such file, or it is not a regular file.
-    OptionError
-        If there is no file of this precision.
+    FileError if there is no such regular file, OptionError if there is none of this precision.
     """
     OPTIONS["precision"].check(precision)
     name, symmetries = QUALITIES.get(str(model), (str(model), 1))
@@ -301,8 +282,10 @@ def load_network(
     threads = check_threads(threads)
     check_path(model, "model")
     path, symmetries = find_model(model, precision)
-    if precision == INT8:
-        device = _cpu_for_int8(device)
+    if precision == INT8 and device == "cuda":
+        raise DeviceError("int8 is for the CPU: use --precision float32 with --device cuda")
+    if precision == INT8 and device == "auto":
+        device = "cpu"
     on_cuda, _ = find_model(model, FLOAT32 if precision == AUTO_PRECISION else precision)
     useful = useful_threads(threads)
     if not threads and useful == cores_of_system():
@@ -312,20 +295,33 @@ def load_network(
     card = read_card(opened.session, path)
     if opened.failure:
         raise ModelError(f"{path} does not run with its own inputs: {opened.failure}")
-    notes = (*opened.notes, *_note_threads(threads, useful))
+    cut = f"--threads {threads} is cut to {useful}, the cores that this process may use"
+    notes = (*opened.notes, *([cut] if threads > useful > 0 else []))
     shipped = path.parent == MODELS and card.get("inputs") != MASKS
     return Network(opened.session, card, opened.device, symmetries, useful, notes, shipped=shipped)
 
 
-def _note_threads(requested: int, useful: int) -> tuple[str, ...]:
-    """Return a note if fewer threads are used than requested."""
-    if not requested or requested <= useful:
-        return ()
-    return (f"--threads {requested} is cut to {useful}, the cores that this process may use",)
+def network_for(network: Decoder, kind: str) -> Decoder:
+    """Return the network for a kind of field: one for that kind in place of a shipped one.
+
+    Masks have a network of their own. So have noisy distances, unless the network was itself
+    trained on them. A network from another file, or any other function, is used as it is.
+    FileError if the network for the kind is missing.
+    """
+    if not isinstance(network, Network) or not network.shipped:
+        return network
+    chosen = network.device, network.threads, network.symmetries, network.precision
+    if kind == MASK:
+        return _load_once(MASK_MODEL, *chosen)
+    if kind == NOISY and network.card.get("inputs") == EXACT_DISTANCES:
+        return _load_once(NOISY_MODEL, *chosen)
+    return network
 
 
-def _cpu_for_int8(device: str) -> str:
-    """Return the device for int8, which is not faster on a GPU."""
-    if device == "cuda":
-        raise DeviceError("int8 is for the CPU: use --precision float32 with --device cuda")
-    return "cpu" if device == "auto" else device
+@lru_cache(maxsize=4)
+def _load_once(name: str, device: str, threads: int, symmetries: int, precision: str) -> Network:
+    """Load a network for a kind."""
+    if name not in shipped_models():
+        raise FileError(f"the network {name!r} is missing: {NO_NETWORKS}")
+    loaded = load_network(name, device=device, threads=threads, precision=precision)
+    return loaded.averaged(symmetries)

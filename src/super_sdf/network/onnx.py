@@ -8,13 +8,13 @@ for people's own shapes must not do that without their consent.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from ..errors import DeviceError
 
-# An environment variable that onnxruntime reads once, when it is imported.
-SWITCH = "ORT_DISABLE_TELEMETRY"
+SWITCH = "ORT_DISABLE_TELEMETRY"  # a variable that onnxruntime reads once, when it is imported
 
 
 @contextmanager
@@ -34,13 +34,25 @@ def without_telemetry() -> Iterator[None]:
         os.environ.pop(SWITCH, None)
 
 
+def first_line(error: Exception) -> str:
+    """Return the message of an onnxruntime error in one line.
+
+    For a failure of CUDA this is the part of interest in a long line of source files and template
+    arguments.
+    """
+    failure = re.search(r"CUDA failure \d+: [^;\n]*", str(error))
+    if failure:
+        return failure[0].strip()
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)
+
+
 try:
     with without_telemetry():
         import onnxruntime as ort
 except Exception as error:  # a broken installation fails in other ways than ImportError, too
-    reason = next(iter(str(error).strip().splitlines()), type(error).__name__)
     raise DeviceError(
-        f"onnxruntime cannot be imported ({reason}): pip install --force-reinstall onnxruntime"
+        f"onnxruntime cannot be imported ({first_line(error)}): pip install --force-reinstall "
+        "onnxruntime"
     ) from error
 
-__all__ = ["ort"]
+__all__ = ["first_line", "ort"]

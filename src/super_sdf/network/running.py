@@ -1,7 +1,13 @@
-"""Running a session: binding its inputs and output, and interrupting a long run."""
+"""Running a session: binding its inputs and output, interrupting a long run, and its progress.
+
+onnxruntime does not report progress. The time of a run is nearly proportional to its number of
+voxels and values; the factor is measured in the run before, or in a small part of this one.
+"""
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from threading import Event, Thread
@@ -11,8 +17,8 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..errors import DeviceError
-from .cuda import first_line
-from .onnx import ort
+from ..progress import ShareCallback
+from .onnx import first_line, ort
 
 # onnxruntime allocates from an arena, so that layers reuse the memory of earlier ones: the system
 # has to zero fresh memory, which takes a third of the time of the network itself. After a large run
@@ -20,11 +26,15 @@ from .onnx import ort
 SHRINK = "memory.enable_memory_arena_shrinkage"
 SMALL = 20_000  # voxels ...
 SMALL_OUTPUT = 5_000_000  # ... and values of a run after which the arena is not shrunk
-# An optional fifth input of networks: the rows of the neighbour table per chunk. Its default in the
-# file suits the cache of a CPU. A GPU waits between chunks, so it gets large ones: this many rows
+# An optional fifth input of networks: the rows of the neighbour table per chunk. On a CPU what 256
+# rows gather stays in the cache. A GPU waits between chunks, so it gets large ones: this many rows
 # of 27 * 64 gathered floats take 113 MB.
-CHUNK_INPUT, CUDA_CHUNK = "chunk", 16384
+CHUNK_INPUT, CPU_CHUNK, CUDA_CHUNK = "chunk", 256, 16384
 POLL_INTERVAL = 0.1  # seconds
+
+VALUES_PER_VOXEL = 300  # decoding this many values takes as long as encoding a voxel
+LONG_RUN = 20_000  # in the unit of ``work_of``: a few tenths of a second on one core
+LINEAR_UP_TO = 0.8  # above this share progress slows down: a run may take longer than expected
 
 Poll = Callable[[], None]
 """Called at the start of a run and every ``POLL_INTERVAL`` seconds; what it raises stops it."""
@@ -33,27 +43,10 @@ Poll = Callable[[], None]
 def run_on_cpu(
     session: ort.InferenceSession, feeds: Mapping[str, Any], poll: Poll = lambda: None
 ) -> FloatArray:
-    """Run a session on the CPU and return its output; an interrupt stops the run.
+    """Run a session on the CPU, given its inputs by name, and return its output, (D, Q) float32.
 
-    Parameters
-    ----------
-    session : InferenceSession
-        The network.
-    feeds : dict
-        Its inputs by name, see ``contract``.
-    poll : callable, optional
-        Called when the run has begun and while it lasts; an exception in it stops the run.
-
-    Returns
-    -------
-    (D, Q) float32
-        A row per voxel, a column per offset. It is allocated here: an output in onnxruntime's arena
-        would prevent the arena from shrinking.
-
-    Raises
-    ------
-    DeviceError
-        If onnxruntime fails.
+    An interrupt, or an exception in ``poll``, stops the run. DeviceError if onnxruntime fails. The
+    output is allocated here: in onnxruntime's arena it would prevent the arena from shrinking.
     """
     values = np.empty((len(feeds["voxels"]), len(feeds["offsets"])), np.float32)
     options = ort.RunOptions()
@@ -63,9 +56,12 @@ def run_on_cpu(
         binding = session.io_binding()
         for name, array in feeds.items():
             binding.bind_cpu_input(name, array)
+        chunk = ort.OrtValue.ortvalue_from_numpy(np.array([CPU_CHUNK]))
+        if takes_chunk(session):
+            binding.bind_ortvalue_input(CHUNK_INPUT, chunk)
         output = session.get_outputs()[0].name
         binding.bind_output(output, "cpu", 0, np.float32, values.shape, values.ctypes.data)
-    _run(session, binding, options, "cpu", poll, keep=(feeds, values))
+    _run(session, binding, options, "cpu", poll, keep=(feeds, chunk, values))
     return values
 
 
@@ -88,8 +84,7 @@ def run_bound(
     with failures_on(place):
         binding = session.io_binding()
         bound = {name: ort.OrtValue.ortvalue_from_numpy(feeds[name], place, 0) for name in feeds}
-        if any(given.name == CHUNK_INPUT for given in session.get_overridable_initializers()):
-            # On the CPU, which launches the kernels.
+        if takes_chunk(session):  # on the CPU, which launches the kernels
             bound[CHUNK_INPUT] = ort.OrtValue.ortvalue_from_numpy(np.array([chunk]), "cpu", 0)
         for name, value in bound.items():
             binding.bind_ortvalue_input(name, value)
@@ -98,6 +93,11 @@ def run_bound(
     with failures_on(place):
         values: FloatArray = binding.copy_outputs_to_cpu()[0]
     return values
+
+
+def takes_chunk(session: ort.InferenceSession) -> bool:
+    """Return whether a network lets the rows per chunk be chosen."""
+    return any(given.name == CHUNK_INPUT for given in session.get_overridable_initializers())
 
 
 @contextmanager
@@ -112,13 +112,11 @@ def failures_on(device: str) -> Iterator[None]:
 def _run(
     session: ort.InferenceSession, binding: Any, options: Any, device: str, poll: Poll, keep: Any
 ) -> None:
-    """Run a session in a thread and poll; an interrupt or an exception in ``poll`` stops the run.
+    """Run a session in a thread and poll; ``keep`` holds the bound arrays alive.
 
     Python handles no interrupt while onnxruntime runs in its own thread. onnxruntime reads
     ``options.terminate`` between two operators, also in the loops over chunks, so a run ends within
     milliseconds. A second interrupt waits for nothing: a loop of the file may have no end.
-
-    ``keep`` holds the bound arrays alive.
     """
     failures: list[BaseException] = []
     ended = Event()  # not Thread.join, which after an interrupt may return before the thread ends
@@ -145,3 +143,34 @@ def _run(
         raise
     if failures:
         raise failures[0]
+
+
+def work_of(voxels: int, decoded: int, offsets: int) -> float:
+    """Return the work of a run, in voxels to encode; values to decode are converted."""
+    return voxels + decoded * offsets / VALUES_PER_VOXEL
+
+
+class Pace:
+    """The seconds that a network takes per voxel of work, from its last long run."""
+
+    def __init__(self) -> None:
+        self.seconds: float | None = None
+
+    def learn(self, work: float, seconds: float) -> None:
+        """Record the seconds that a run took for its work."""
+        self.seconds = seconds / work
+
+    def watch(self, work: float, progress: ShareCallback) -> Callable[[], None]:
+        """Return a function that reports the progress of a run that starts now, when called."""
+        began = time.perf_counter()
+        expected = work * (self.seconds or math.inf)
+        return lambda: progress(share_of_time(time.perf_counter() - began, expected))
+
+
+def share_of_time(seconds: float, expected: float) -> float:
+    """Return the estimated finished share of a run; it stays below 1, however long it takes."""
+    share = seconds / expected
+    if share <= LINEAR_UP_TO:
+        return share
+    left = 1 - LINEAR_UP_TO
+    return 1 - left / (1 + (share - LINEAR_UP_TO) / left)

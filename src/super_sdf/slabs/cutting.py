@@ -23,12 +23,13 @@ from ..grid.sdf_grid import SdfGrid
 from ..machine import index_width
 from ..machine.memory import ROOM_SHARE, advised, give_back, held_memory, in_words
 from ..machine.resources import Resources
+from ..network.decoder import NETWORK_BYTES
 from ..options import DEFAULT_MESHER
 from ..steps import bounds, debris, spheres
 from ..steps.glance import look_at_band
 from ..steps.meshers import BY_NAME, Mesher
 from ..steps.survey import Band, band_bytes, outline, plan_reading
-from .footprint import NETWORK_BYTES, slab_bytes
+from .footprint import slab_bytes
 
 DEFAULT = BY_NAME[DEFAULT_MESHER]
 SURFACE_SHARE, DOUBT = 0.25, "is this a distance field?"  # of which few samples are

@@ -6,6 +6,7 @@ The numbers are measured by ``python -m lab figures --only memory``, as the peak
 from __future__ import annotations
 
 from ..machine.threads import CHUNK, rows_in_chunk
+from ..network.decoder import NETWORK_BYTES
 from ..options import DEFAULT_MESHER, SHARP
 from ..steps.marching import LOOKUP_BYTES, lookups_at_once
 from ..steps.meshers import BY_NAME
@@ -18,8 +19,6 @@ from ..steps.survey import Band
 STAGES = {"fit": (216, 1450, 4.0), "mesh": (216, 450, 8.2), "spline": (216, 300, 4.5)}
 # Bytes per thread, for its chunk, and once.
 THREAD_BYTES, FIXED_BYTES = 25_000_000, 30_000_000
-# Of a network that does not state them: bytes per voxel that it sees, and per value.
-NETWORK_BYTES = (680.0, 8.0)
 # The head of a network works on a chunk of voxels at all offsets at once.
 BYTES_PER_OFFSET, NETWORK_FIXED = 27_000, 5_000_000
 

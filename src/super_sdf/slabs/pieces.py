@@ -64,12 +64,3 @@ def describe_piece(
     whole = {"band_voxels": fine.band_voxels, "noisy_voxels": fine.noisy_voxels, **planned}
     is_cut = fine.octants is not None or (leaves and border_is_crossed(fine))
     return Piece(meshes, counts, whole, fine.planes, leaves, is_cut, fine.signs())
-
-
-def count_input(fine: FineField) -> dict[str, int]:
-    """Return the counts that say how good the input is, of the field of a whole grid."""
-    return {
-        "band_voxels": fine.band_voxels,
-        "noisy_voxels": fine.noisy_voxels,
-        "pinned_nodes": fine.pinned,
-    }

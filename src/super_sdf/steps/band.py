@@ -2,11 +2,15 @@
 
 Everything here is in index space with values in half voxels: a voxel has side 2, a distance of
 one spacing h is 2, and the band is ``abs(value) < 3``.
+
+Samples of the band can be taken as exact distances if they contradict no neighbour, are near the
+surface, and were not cut off. If too many contradict others, the field is noisy, and none is.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +18,7 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..grid.sdf_grid import SdfGrid
+from ..machine.threads import map_chunks
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD
 
 HALF_BAND = 3.0  # Eq. 2 after Eq. 4: 1.5 h
@@ -28,6 +33,10 @@ LIPSCHITZ_SLACK = 0.1
 
 JUMP = 0.2  # by which values differ more than noise makes distances differ
 
+MAX_DISTANCE = 2.8  # of exact samples: those near the band's edge, 3, may have been truncated there
+MIN_SLOPE = 0.7  # towards the steepest neighbour; near 1 for a distance
+MAX_NOISY_SHARE = 0.02  # of all samples; in a noisier field no sample is taken as exact
+
 # Planes are worked on in blocks of about this many samples, to save memory, but of at least this
 # many planes, since a block also reads one plane more on either side.
 BLOCK_SAMPLES = 1 << 18
@@ -41,23 +50,11 @@ MAX_DIFFERENCE = (2 * np.linalg.norm(NEIGHBOURHOOD, axis=1) + LIPSCHITZ_SLACK).a
 def rescale(
     grid: SdfGrid, offset: float = 0.0, first: int = 0, last: int | None = None
 ) -> FloatArray:
-    """Return the samples in half voxels, ``(values - offset) * 2 / h`` (Eq. 4).
+    """Return the samples in half voxels, ``(values - offset) * 2 / h`` (Eq. 4), as float32.
 
-    Values in the band then lie in [-3, 3], whatever the unit of the grid.
-
-    Parameters
-    ----------
-    grid : SdfGrid
-        Signed distances in world units, shape (nx, ny, nz).
-    offset : float
-        Distance in world units, positive outwards, of the surface that becomes the zero level
-        (Sec. 5.3).
-    first, last : int
-        Planes to read, from ``first`` to before ``last``; all by default.
-
-    Returns
-    -------
-    (last - first, ny, nz) float32
+    Values in the band then lie in [-3, 3], whatever the unit of the grid. ``offset`` is the
+    distance in world units, positive outwards, of the surface that becomes the zero level (Sec.
+    5.3). Read are planes ``first`` to before ``last``, all by default.
     """
     planes = grid.planes(first, grid.shape[0] if last is None else last)
     return rescale_planes(planes, grid.voxel_size, offset)
@@ -122,19 +119,7 @@ def pad_by_extrapolation(rescaled: FloatArray) -> FloatArray:
 
 
 def gather_patches(rescaled: FloatArray, voxel_ijk: IntArray) -> FloatArray:
-    """Return the 27 samples round each voxel, in half voxels, in the order of ``NEIGHBOURHOOD``.
-
-    Parameters
-    ----------
-    rescaled : (nx, ny, nz) float32
-        Samples in half voxels.
-    voxel_ijk : (V, 3) int32
-        The voxels.
-
-    Returns
-    -------
-    (V, 27) float32
-    """
+    """Return the 27 samples round each voxel (V, 3), in the order of ``NEIGHBOURHOOD``, (V, 27)."""
     return take_patches(pad_by_extrapolation(rescaled), voxel_ijk)
 
 
@@ -149,20 +134,10 @@ def take_patches(padded: FloatArray, voxel_ijk: IntArray) -> FloatArray:
 
 
 def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, ...]) -> IntArray:
-    """Return the neighbour table: the voxels at the 27 places round each voxel.
+    """Return the neighbour table (V, 27) of voxels (V, 3), all different and in C order.
 
-    Parameters
-    ----------
-    voxel_ijk : (V, 3) int32
-        The voxels, all different, in C order.
-    shape : three ints
-        Samples of the grid along each axis.
-
-    Returns
-    -------
-    (V, 27) int32
-        Rows of ``voxel_ijk`` in the order of ``NEIGHBOURHOOD``, -1 where there is no voxel. As an
-        index -1 is the last row, so append a row of zeros to the array that is gathered from.
+    It has their rows at the 27 places of ``NEIGHBOURHOOD`` round each, -1 where there is no voxel.
+    As an index -1 is the last row, so append a row of zeros to the array that is gathered from.
     """
     table = np.empty((len(voxel_ijk), 27), np.int32)
     for first, last in plane_blocks(shape):
@@ -245,3 +220,71 @@ def can_hold_surface(patches: FloatArray, lipschitz: BoolArray) -> BoolArray:
     """
     near: BoolArray = np.abs(patches[:, CENTRE]) <= DECODE_LIMIT
     return near | ~lipschitz
+
+
+@dataclass(frozen=True)
+class BandSummary:
+    """What the band of a whole grid says of its samples, whichever part of it is worked on.
+
+    ``voxels`` tell by their samples whether the field is noisy; round the ``noisy`` ones samples
+    differ by more than distances can. ``low`` and ``high`` are the lowest and the highest sample,
+    in half voxels; ``leaves`` is whether a sample on the border of the grid is inside.
+    """
+
+    voxels: int
+    noisy: int
+    low: float
+    high: float
+    leaves: bool = False
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether no sample can be taken as exact."""
+        return not self.voxels or self.noisy / self.voxels > MAX_NOISY_SHARE
+
+
+def summarise(sample: FloatArray, lipschitz: BoolArray, leaves: bool = False) -> BandSummary:
+    """Return the summary of samples (V,), some of which tell by ``lipschitz`` how noisy they are.
+
+    No sample is at infinity.
+    """
+    noisy = len(lipschitz) - int(np.count_nonzero(lipschitz))
+    low, high = float(sample.min(initial=np.inf)), float(sample.max(initial=-np.inf))
+    return BandSummary(len(lipschitz), noisy, low, high, leaves)
+
+
+def exact_samples(
+    patches: FloatArray,
+    lipschitz: BoolArray,
+    threads: int = 1,
+    sampled: BoolArray | None = None,
+    whole: BandSummary | None = None,
+) -> BoolArray:
+    """Return which samples of a band can be taken as exact distances, (V,) bool.
+
+    Those that are ``sampled``, not interpolated, tell by ``lipschitz`` (``is_lipschitz``) whether
+    the field is noisy; all by default. ``whole`` is of the band of the whole grid, if the patches
+    (V, 27) are those of a part of it.
+    """
+    sample = patches[:, CENTRE]
+    whole = whole or summarise(sample, lipschitz if sampled is None else lipschitz[sampled])
+    if not len(patches) or whole.is_noisy:
+        return np.zeros(len(patches), bool)
+    limits = np.float32(whole.low), np.float32(whole.high)
+    near = np.abs(sample) < MAX_DISTANCE
+    cut_off = map_chunks(lambda rows: is_cut_off(patches[rows], limits), len(patches), 27, threads)
+    exact: BoolArray = lipschitz & near & ~np.concatenate(cut_off)
+    return exact
+
+
+def is_cut_off(patches: FloatArray, limits: tuple[np.float32, np.float32]) -> BoolArray:
+    """Return which samples were truncated, (V,) bool.
+
+    A truncated sample has the largest value of its sign, and no neighbour towards which the field
+    is as steep as a distance. ``limits`` are the lowest and the highest sample.
+    """
+    sample = patches[:, CENTRE]
+    at_limit = sample == np.where(sample > 0, limits[1], limits[0])
+    slope = np.abs(patches - sample[:, None]) / np.maximum(MAX_DIFFERENCE, 1)
+    cut_off: BoolArray = at_limit & (slope.max(1) < MIN_SLOPE)
+    return cut_off

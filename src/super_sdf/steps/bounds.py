@@ -3,7 +3,8 @@
 Two distances differ by no more than their places are apart. So the field at x is at least
 s - |x - y| if a sample outside, at y, has distance s, and at most s + |x - y| if the sample is
 inside: no surface reaches into a sample's sphere. The network sees the samples nearest the surface
-only, and its values exceed the bounds of farther ones at a tenth of the nodes.
+only, and its values exceed the bounds of farther ones at a tenth of the nodes. Those beyond the
+band are kept as a list, since the grid is read once and most of it is far from the surface.
 
 Bounds need less than the fit to the spheres (``spheres``), for they hold wherever a sphere is: they
 do not say where it touches. A sample that was cut off sets a weaker bound, no wrong one.
@@ -27,9 +28,10 @@ from numpy.typing import NDArray
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..machine.threads import CHUNK, chunks_of, map_chunks
 from ..neighbourhood import CENTRE, STRIDES
-from .beyond import TrustedSamples
+from .band import HALF_BAND
 from .nodes import SharedParts, average_shared, block_ijk, block_offsets
 
+FARTHEST = 8.0  # of the samples that set bounds: four voxels
 REACH_OF_SAMPLES = 4  # voxels from a block's sample to those that bound its values
 # A sample counts where the block's own sample is this close to its bound. Nearly all bounds that
 # values exceed are so, and one in ten of the others.
@@ -42,11 +44,78 @@ LEAST_FACTOR = 4
 MOST_LOST = 0.15  # of the nodes inside a block: more are a thin wall
 BOX_ROWS = 4096  # blocks at most that are worked on with one box of samples ...
 BOX_SAMPLES = 1 << 21  # ... of at most this size: far fewer blocks along a diagonal
-SPHERES = 8  # about as many reach the values of a block
-TEMPORARIES = 1024  # numbers per block in the search for these
+SPHERES = 4  # blocks in a chunk have room for so many spheres each ...
+TEMPORARIES = 512  # ... and at least for these numbers
 
 # A block depends on those beside it, which may have a thin wall, and shared nodes are averaged.
 REACH_IN_VOXELS = 2
+
+Rows = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class SamplesBeyond:
+    """Samples between the band and ``FARTHEST`` that can be exact.
+
+    ``number``, (n,) int64, is the number of each in C order of the grid, ascending; ``value``, (n,)
+    float32, are their values.
+    """
+
+    number: NDArray[np.int64]
+    value: FloatArray
+
+
+NONE_BEYOND = SamplesBeyond(np.zeros(0, np.int64), np.zeros(0, np.float32))
+
+
+def samples_beyond(rescaled: FloatArray, first: int, limits: tuple[float, float]) -> SamplesBeyond:
+    """Return those beyond the band among samples that follow each other, from number ``first`` on.
+
+    They are those that can be exact: between ``limits``. Where a field is cut off, as most are that
+    were truncated, all of the rest of the grid is not.
+    """
+    if not reach_beyond(limits):
+        return NONE_BEYOND
+    low, high = np.asarray(limits, np.float32).clip(-FARTHEST, FARTHEST)
+    found = (rescaled > low) & (rescaled < high)
+    found &= ~((rescaled > -HALF_BAND) & (rescaled < HALF_BAND))
+    return SamplesBeyond(np.flatnonzero(found) + first, rescaled[found])
+
+
+def reach_beyond(limits: tuple[float, float]) -> bool:
+    """Return whether samples beyond the band can be exact: the same for all parts of a grid."""
+    return limits[0] < -HALF_BAND or limits[1] > HALF_BAND
+
+
+@dataclass(frozen=True, eq=False)
+class TrustedSamples:
+    """All samples whose spheres can be trusted: exact ones of the band, and some beyond it."""
+
+    shape: tuple[int, int, int]  # samples of the grid along each axis
+    voxel_ijk: IntArray  # (V, 3), the samples of the band, in C order
+    value: FloatArray  # (V,)
+    exact: BoolArray  # (V,)
+    beyond: SamplesBeyond
+    limits: tuple[float, float]  # between these, samples beyond the band can be exact
+
+    def box(self, low: IntArray, high: IntArray) -> FloatArray:
+        """Return the samples from index ``low`` (3,) to before ``high``, NaN where there is none.
+
+        The box may exceed the grid.
+        """
+        box = np.full(high - low, np.nan, np.float32)
+        planes = slice(*np.searchsorted(self.voxel_ijk[:, 0], [low[0], high[0]]))
+        exact = np.flatnonzero(self.exact[planes]) + planes.start
+        ends = np.array([low[0], high[0]], np.int64) * self.shape[1] * self.shape[2]
+        rows = slice(*np.searchsorted(self.beyond.number, ends))
+        ijk = np.stack(np.unravel_index(self.beyond.number[rows], self.shape), 1)
+        for at, value in (
+            (self.voxel_ijk[exact] - low, self.value[exact]),
+            (ijk - low, self.beyond.value[rows]),
+        ):
+            within = np.asarray(((at >= 0) & (at < box.shape)).all(1))
+            box[tuple(at[within].T)] = value[within]
+        return box
 
 
 def keep_within_bounds(
@@ -61,63 +130,26 @@ def keep_within_bounds(
 
     Samples keep their values, and so do blocks whose own sample is not trusted, but for the nodes
     that they share with others, which are averaged again. Where no sample beyond the band can be
-    trusted, and with a factor of 2, nothing is changed.
-
-    Parameters
-    ----------
-    blocks : (Q, D + 1) float32
-        Node values in half voxels, changed in place; the last column is 0.
-    parts : SharedParts
-        Of the D voxels.
-    factor : int
-        K.
-    voxel_ijk : (D, 3) int32
-        The voxels, in C order.
-    samples : TrustedSamples
-        Those that set bounds.
-    threads : int
-        Threads to use.
+    trusted, and with a factor of 2, nothing is changed. ``blocks`` (Q, D + 1) of voxels (D, 3), in
+    C order, are changed in place; the last column is 0.
     """
-    if factor < LEAST_FACTOR or not samples.reach_beyond or not samples.exact.any():
+    if factor < LEAST_FACTOR or not reach_beyond(samples.limits) or not samples.exact.any():
         return
     bounded, thin = blocks.copy(), np.zeros(blocks.shape[1], bool)
 
     def work(rows: slice) -> None:
         for group in cut_to_boxes(voxel_ijk, rows):
-            around = samples_around(voxel_ijk[group], samples)
-            for some in chunks_of(len(around.start), max(SPHERES * len(blocks), TEMPORARIES)):
+            flat, start, steps = samples_around(voxel_ijk[group], samples)
+            for some in chunks_of(len(start), max(SPHERES * len(blocks), TEMPORARIES)):
                 here = slice(group.start + some.start, group.start + some.stop)
                 values = np.ascontiguousarray(blocks[:, here].T)
-                moved = bounded_values(values, factor, around.take(some))
+                moved = bounded_values(values, factor, flat.take(start[some, None] + steps))
                 thin[here] = loses_wall(values, moved)
                 bounded[:, here] = moved.T
 
     map_chunks(work, len(voxel_ijk), CHUNK // BOX_ROWS, threads)
     np.copyto(blocks, bounded, where=~(thin | _any_beside(thin, parts)))
     average_shared(blocks, parts, factor, threads)
-
-
-@dataclass(frozen=True, eq=False)
-class Around:
-    """The samples round n blocks.
-
-    Attributes
-    ----------
-    flat : (l,) float32
-        A box of samples, NaN where none is trusted.
-    start : (n,) int64
-        Where in it each block's own sample is.
-    steps : (m,) int64
-        From there to the samples around, in the order of ``sample_places``.
-    """
-
-    flat: FloatArray
-    start: NDArray[np.int64]
-    steps: NDArray[np.int64]
-
-    def take(self, rows: slice) -> FloatArray:
-        """Return the samples round some blocks, (n, m)."""
-        return self.flat.take(self.start[rows, None] + self.steps)
 
 
 def cut_to_boxes(voxel_ijk: IntArray, rows: slice) -> Iterator[slice]:
@@ -131,32 +163,30 @@ def cut_to_boxes(voxel_ijk: IntArray, rows: slice) -> Iterator[slice]:
     yield from cut_to_boxes(voxel_ijk, slice(middle, rows.stop))
 
 
-def samples_around(voxel_ijk: IntArray, samples: TrustedSamples) -> Around:
-    """Return the samples round the blocks of voxels (n, 3)."""
+def samples_around(
+    voxel_ijk: IntArray, samples: TrustedSamples
+) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
+    """Return a box of samples (l,), NaN where none is trusted; where those of voxels (n, 3) are.
+
+    That is the place of each voxel's own sample, (n,), and the steps from there to the samples
+    around, (m,), in the order of ``sample_places``.
+    """
     low = voxel_ijk.min(0) - REACH_OF_SAMPLES
     box = samples.box(low, voxel_ijk.max(0) + REACH_OF_SAMPLES + 1)
     strides = np.array([box.shape[1] * box.shape[2], box.shape[2], 1])
-    steps, _ = sample_places()
-    return Around(box.reshape(-1), (voxel_ijk - low) @ strides, steps @ strides)
+    return box.reshape(-1), (voxel_ijk - low) @ strides, sample_places()[0] @ strides
 
 
 def bounded_values(values: FloatArray, factor: int, around: FloatArray) -> FloatArray:
-    """Return the values of blocks moved into their bounds.
+    """Return the values of blocks, (n, Q) float32, moved into their bounds.
 
-    Parameters
-    ----------
-    values : (n, Q) float32
-    factor : int
-        K.
-    around : (n, m) float32
-        The samples round each block in the order of ``sample_places``, its own first.
-
-    Returns
-    -------
-    (n, Q) float32
+    ``around``, (n, m) float32, are the samples round each block in the order of ``sample_places``,
+    its own first.
     """
     own, moved = around[:, :1], values.copy()
-    slack = sample_places()[1] - np.abs(around - own)
+    slack = np.subtract(around, own)
+    np.abs(slack, out=slack)
+    np.subtract(sample_places()[1], slack, out=slack)
     row, place = np.nonzero(slack < SLACK)
     sample = around[row, place]
     for side in (1, -1):
@@ -170,54 +200,43 @@ def bounded_values(values: FloatArray, factor: int, around: FloatArray) -> Float
 
 
 def move_out(
-    values: FloatArray,
-    factor: int,
-    side: int,
-    row: NDArray[np.intp],
-    place: NDArray[np.intp],
-    sample: FloatArray,
+    values: FloatArray, factor: int, side: int, row: Rows, place: Rows, sample: FloatArray
 ) -> None:
-    """Move the values in spheres on one side of the surface out of these, in place.
+    """Move the values (n, Q) in spheres on one side of the surface out of these, in place.
 
-    Parameters
-    ----------
-    values : (n, Q) float32
-    factor : int
-        K.
-    side : {1, -1}
-        Whether the spheres' centres are outside or inside.
-    row, place : (k,) int
-        The block that each sphere may reach, ascending, and where its centre is, as a row of
-        ``sample_places``.
-    sample : (k,) float32
-        The signed distance at its centre.
+    The spheres' centres are outside if ``side`` is 1, inside if it is -1, and their signed
+    distances there are ``sample`` (k,). ``row`` is the block that each may reach, ascending, and
+    ``place`` where its centre is, as a row of ``sample_places``.
     """
     looked_at, to_nodes = nodes_to_look_at(factor), node_distances(factor)
     depth = values[:, looked_at].take(row, 0)
     depth -= sample[:, None]
     depth *= -side
     depth -= to_nodes[:, looked_at].take(place, 0)
-    reaching = np.flatnonzero((depth > -MARGIN).any(1))
+    near = (depth > -MARGIN).view(np.uint64)  # eight nodes in each number
+    reaching = np.flatnonzero(near[:, 0] | near[:, 1] | near[:, 2] | near[:, 3])
     row, place, sample = row.take(reaching), place.take(reaching), sample.take(reaching)
+    count = np.bincount(row, minlength=len(values))
+    first = np.cumsum(count) - count
+    most = np.argsort(-count, kind="stable")  # blocks with many spheres first
     beyond, tightest = (np.subtract, np.maximum) if side > 0 else (np.add, np.minimum)
-    for some in by_rank(row):  # of the blocks in these rows, no two are the same
-        chosen, bound = row.take(some), to_nodes.take(place.take(some), 0)
+    moved = values.take(most, 0)
+    for nth, blocks in enumerate(np.cumsum(np.bincount(count)[::-1])[-2::-1]):
+        some = first[most[:blocks]] + nth
+        bound = to_nodes.take(place.take(some), 0)
         beyond(sample.take(some)[:, None], bound, out=bound)
-        values[chosen] = tightest(values.take(chosen, 0), bound, out=bound)
-
-
-def by_rank(row: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
-    """Yield where ascending numbers (k,) come first, where they come a second time, and so on."""
-    first = np.flatnonzero(np.diff(row, prepend=-1))
-    rank = np.arange(len(row)) - np.repeat(first, np.diff(first, append=len(row)))
-    order = np.argsort(rank, kind="stable")
-    yield from np.split(order, np.cumsum(np.bincount(rank))[:-1]) if len(row) else ()
+        tightest(moved[:blocks], bound, out=moved[:blocks])
+    values[most] = moved
 
 
 @lru_cache
-def nodes_to_look_at(factor: int) -> NDArray[np.intp]:
-    """Return the nodes of a block at its corners and in the middle of edges, faces and itself."""
-    return np.flatnonzero((block_ijk(factor) % (factor // 2) == 0).all(1))
+def nodes_to_look_at(factor: int) -> Rows:
+    """Return the nodes of a block at its corners and in the middle of edges, faces and itself.
+
+    These 27 are filled up to 32 by the last.
+    """
+    nodes = np.flatnonzero((block_ijk(factor) % (factor // 2) == 0).all(1))
+    return np.pad(nodes, (0, 5), mode="edge")
 
 
 @lru_cache

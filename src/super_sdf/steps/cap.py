@@ -1,24 +1,38 @@
-"""Closing a surface that runs out of the grid, along the grid's border."""
+"""Where the surface leaves what is known of the grid: closed along its border, or open.
+
+It ends where samples are unknown. As in marching cubes of the samples, a cell has a surface only if
+all its eight samples are known. Such a cell holds one octant of each of eight voxels.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import FloatArray, IntArray
+from ..errors import GridError
+from ..grid.planes import SampleArray
 from ..grid.sdf_grid import SdfGrid
 from ..neighbourhood import NEIGHBOURHOOD
 from .band import neighbour_table, plane_blocks, rescale
+from .cell_cases import CORNERS
 from .field import FineField, border_is_crossed
 from .nodes import (
     BARELY_INSIDE,
     BARELY_OUTSIDE,
     SHARING,
     SharedParts,
+    block_ijk,
     nodes_of_part,
     seen_from,
     share_parts,
+)
+
+WAY_OUT = (
+    "end the surface there (--open), or replace each by a distance of the right sign (the cut-off "
+    "value of its side)"
 )
 
 
@@ -30,20 +44,13 @@ def close(field: FineField, *, cap: bool, beside: int = 1) -> FineField:
     """
     if field.octants is not None:  # it ends where samples are unknown, and cannot be closed
         return field
-    if not field.leaves:
-        return close_if_crossed(field, beside)
-    return close_at_border(field, beside) if cap else field
-
-
-def close_if_crossed(field: FineField, beside: int = 1) -> FineField:
-    """Close the surface where it crosses the border though all samples there are outside.
-
-    A tip that ends just before the border does so: the fine lattice reaches half a voxel farther
-    than the samples. Such a solid does not leave the grid. ``beside`` is as in ``close_at_border``.
-    """
-    if not border_is_crossed(field, beside + 1):
-        return field
-    return _close(field, np.empty((0, 3), np.int32), beside)
+    if field.leaves:
+        return close_at_border(field, beside) if cap else field
+    # A tip that ends just before the border may cross it though all samples there are outside: the
+    # fine lattice reaches half a voxel farther than the samples. Such a solid does not leave.
+    if border_is_crossed(field, beside + 1):
+        return _close(field, np.empty((0, 3), np.int32), beside)
+    return field
 
 
 def close_at_border(field: FineField, beside: int = 1) -> FineField:
@@ -89,8 +96,8 @@ def _close(field: FineField, filled: IntArray, beside: int) -> FineField:
     column_of[order] = np.arange(len(order))
     known_at, solid_at, _ = np.split(column_of, [len(known), len(border)])
     blocks = np.full((len(field.blocks), len(voxel_ijk)), BARELY_OUTSIDE, np.float32)
-    set_blocks(BARELY_INSIDE, solid_at, blocks, parts, field.factor)
-    set_blocks(field.blocks[:, rows], known_at, blocks, parts, field.factor)  # last: these win
+    _set_blocks(BARELY_INSIDE, solid_at, blocks, parts, field.factor)
+    _set_blocks(field.blocks[:, rows], known_at, blocks, parts, field.factor)  # last: these win
     ends = (-1, field.shape[0] + 1)  # the outer layers belong to the first slab and the last
     planes = [ends[n] if at in (0, field.shape[0]) else at for n, at in enumerate(field.planes)]
     return replace(
@@ -98,27 +105,16 @@ def _close(field: FineField, filled: IntArray, beside: int) -> FineField:
     )
 
 
-def set_blocks(
+def _set_blocks(
     values: FloatArray | np.float32,
     columns: IntArray,
     blocks: FloatArray,
     parts: SharedParts,
     factor: int,
 ) -> None:
-    """Set the blocks of some voxels, and the nodes that other blocks share with them.
+    """Set the blocks of some voxels, and the nodes that other blocks share with them, in place.
 
-    Parameters
-    ----------
-    values : (Q, n) float32, or one number
-        The blocks' values, in half voxels.
-    columns : (n,) int32
-        The voxels' columns of ``blocks``.
-    blocks : (Q, D) float32
-        Changed in place.
-    parts : SharedParts
-        Of all D voxels.
-    factor : int
-        K.
+    The values, (Q, n) or one number, are those of the n columns of ``blocks`` (Q, D).
     """
     values = np.broadcast_to(values, (len(blocks), len(columns)))
     nodes = nodes_of_part(factor)
@@ -152,3 +148,42 @@ def outer_voxels(voxel_ijk: IntArray, shape: tuple[int, int, int]) -> IntArray:
     around = (border[:, None] + NEIGHBOURHOOD).reshape(-1, 3)
     beyond = around[((around < 0) | (around > last)).any(1)]
     return np.unique(beyond, axis=0).astype(np.int32)
+
+
+def check_can_close(grid: SdfGrid, *, cap: bool) -> None:
+    """Raise GridError if a surface is to be closed, and samples that may hide it are unknown."""
+    unseen = grid.field.unseen
+    if unseen is not None and cap:
+        why = getattr(unseen, "refusal", lambda: "samples beside the surface are unknown")()
+        raise GridError(f"{why}; {WAY_OUT}")
+
+
+def check_all_seen(grid: SdfGrid, what: str) -> None:
+    """Raise GridError if something cannot be done with a surface that ends at unknown samples."""
+    if grid.field.unseen is not None:
+        raise GridError(f"samples beside the surface are unknown, so it is open there: {what}")
+
+
+def seen_octants(unseen: SampleArray, voxel_ijk: IntArray) -> NDArray[np.uint8]:
+    """Return a bit for each octant of voxels (D, 3), (D,): whether no sample round it is unseen."""
+    seen = np.empty(len(voxel_ijk), np.uint8)
+    for first, last in plane_blocks(tuple(unseen.shape)):
+        rows = slice(*np.searchsorted(voxel_ijk[:, 0], [first, last]).tolist())
+        low, high = max(first - 1, 0), min(last + 1, unseen.shape[0])
+        marked = np.pad(np.asarray(unseen[low:high]), 1, mode="edge")
+        any_of = marked
+        for axis in range(3):
+            lines = np.moveaxis(any_of, axis, 0)
+            any_of = np.moveaxis(lines[1:] | lines[:-1], 0, axis)
+        cell = voxel_ijk[rows] - np.array([low, 0, 0], np.int32)
+        octants = [any_of[tuple((cell + corner).T)] for corner in CORNERS]
+        seen[rows] = np.packbits(~np.stack(octants, 1), axis=1, bitorder="little")[:, 0]
+    return seen
+
+
+def octant_of_cells(factor: int) -> NDArray[np.uint8]:
+    """Return the octant of the voxel, 0 to 7, in which each cell of a block lies, (K^3,)."""
+    low = block_ijk(factor)
+    low = low[(low < factor).all(1)]
+    octant: NDArray[np.uint8] = ((low >= factor // 2) @ np.array([4, 2, 1])).astype(np.uint8)
+    return octant

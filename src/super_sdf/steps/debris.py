@@ -22,9 +22,8 @@ from ..arrays import BoolArray, FloatArray, IntArray
 from ..machine.threads import map_chunks
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 from .field import SampleSpheres
-from .interpolation import CELL
-from .nodes import BARELY_INSIDE, BARELY_OUTSIDE, SharedParts, block_ijk
-from .voxel_index import VoxelIndex
+from .foot_points import CELL
+from .nodes import BARELY_INSIDE, BARELY_OUTSIDE, SharedParts, VoxelIndex, block_ijk
 
 TOLERANCE = 0.2  # a sphere is touched by surfaces up to so far from it
 LARGEST_SPHERE = 2.0  # farther samples say little of a small piece
@@ -72,10 +71,6 @@ class Lattice:
         place = (inner[:, 0] * side + inner[:, 1]) * side + inner[:, 2]
         return np.where(row < 0, -1, place * self.blocks.shape[1] + row)
 
-    def values(self, at: Nodes) -> FloatArray:
-        """Return the values at places from ``find``."""
-        return self.blocks.ravel().take(at)
-
     def set(self, node: Nodes, values: FloatArray) -> None:
         """Set the value of nodes (n, 3) in all blocks that share them."""
         for upper in CELL:
@@ -101,34 +96,18 @@ class Pieces:
 def drop_debris(
     blocks: FloatArray, factor: int, parts: SharedParts, index: VoxelIndex, spheres: SampleSpheres
 ) -> tuple[IntArray, IntArray]:
-    """Give the nodes of small pieces that nothing supports the opposite sign.
+    """Give the nodes of small pieces that nothing supports the opposite sign, in ``blocks``.
 
-    Parameters
-    ----------
-    blocks : (Q, D + 1) float32
-        Node values in half voxels, changed in place; the last column is for absent blocks.
-    factor : int
-        K.
-    parts : SharedParts
-        Of the D voxels.
-    index : VoxelIndex
-        Of the D voxels.
-    spheres : SampleSpheres
-        Of exact samples.
-
-    Returns
-    -------
-    (n,) and (m,) int32
-        The plane of voxels in which each small piece begins: of those that were dropped, and of
-        those that stay because a sample lies in them.
+    Returned are the planes of voxels in which small pieces begin: of those that were dropped, and
+    of those that stay because a sample lies in them.
     """
     lattice = Lattice(blocks, factor, index)
     pieces = small_pieces(lattice, find_seeds(blocks, factor, parts))
     first = (np.maximum(pieces.node[pieces.start[:-1], 0] - 1, 0) // factor).astype(np.int32)
     at = lattice.find(pieces.node)
-    values = lattice.values(at)
+    values = lattice.blocks.ravel().take(at)
     held = _hold_samples(pieces, values, factor)
-    loose = np.sort(at[pieces.spread(~held)])
+    loose = at[pieces.spread(~held)]
     dropped = np.zeros(len(pieces), bool)
     for n in np.flatnonzero(~held):
         some = slice(pieces.start[n], pieces.start[n + 1])
@@ -159,10 +138,7 @@ def find_seeds(blocks: FloatArray, factor: int, parts: SharedParts) -> Nodes:
     side, count = factor + 1, blocks.shape[1] - 1
 
     def seeds_of(rows: slice) -> Nodes:
-        inside = (
-            (blocks[:, rows] <= 0) if rows.stop <= count else (blocks[:, rows.start : count] <= 0)
-        )
-        inside = inside.reshape(side, side, side, -1)
+        inside = (blocks[:, rows] <= 0).reshape(side, side, side, -1)
         here = inside[1:, 1:, 1:]
         first = here != inside[:-1, 1:, 1:]
         first &= here != inside[1:, :-1, 1:]
@@ -196,16 +172,13 @@ def _ends_soon(
 
 def small_pieces(lattice: Lattice, seeds: Nodes) -> Pieces:
     """Return the pieces of at most K nodes along each axis that begin at seeds."""
-    start = lattice.factor * _voxels(lattice, seeds[:, 0]) + block_ijk(lattice.factor)[seeds[:, 1]]
+    index, factor = lattice.index, lattice.factor
+    voxel = np.stack(np.unravel_index(index.keys[seeds[:, 0]], index.shape), 1)
+    start = factor * voxel + block_ijk(factor)[seeds[:, 1]]
     found = [_grow(lattice, start[some : some + SEEDS]) for some in range(0, len(start), SEEDS)]
     nodes = np.concatenate([np.empty((0, 3), np.int64), *(node for node, _ in found)])
     sizes = np.concatenate([np.empty(0, np.int64), *(size for _, size in found)])
     return Pieces(nodes, np.append(0, np.cumsum(sizes)))
-
-
-def _voxels(lattice: Lattice, rows: Nodes) -> Nodes:
-    """Return the voxels of rows, (n, 3)."""
-    return np.stack(np.unravel_index(lattice.index.keys[rows], lattice.index.shape), 1)
 
 
 def _grow(lattice: Lattice, start: Nodes) -> tuple[Nodes, Nodes]:
@@ -223,7 +196,7 @@ def _grow(lattice: Lattice, start: Nodes) -> tuple[Nodes, Nodes]:
         seed, step = _unpack(front, width)
         beside = (step[:, None] + NEIGHBOURHOOD).reshape(-1, 3)
         at = lattice.find(start[seed].repeat(27, 0) + beside).reshape(-1, 27)
-        joined = joined_nodes(lattice.values(at), at >= 0)
+        joined = joined_nodes(lattice.blocks.ravel().take(at), at >= 0)
         joined &= small[seed, None]
         seed, beside = seed.repeat(27)[joined.ravel()], beside[joined.ravel()]
         number = seed * box + ((beside + reach) @ [width * width, width, 1])
@@ -240,14 +213,8 @@ def joined_nodes(values: FloatArray, known: BoolArray) -> BoolArray:
     """Return with which of the nodes around them nodes are joined in the surface, (n, 27).
 
     They are with nodes of their sign next to them, and with those across a face of a cell if the
-    face says so (``marching.choose_cases``). Nodes in no block have the sign of those beside.
-
-    Parameters
-    ----------
-    values : (n, 27) float32
-        The nodes in their middle and those around.
-    known : (n, 27) bool
-        Which are in a block.
+    face says so (``marching.choose_cases``). Nodes in no block, not ``known``, have the sign of
+    those beside.
     """
     here = values[:, CENTRE]
     same = ((values <= 0) == (here <= 0)[:, None]) | ~known
@@ -283,14 +250,8 @@ def is_supported(
 ) -> bool:
     """Return whether the sphere of an exact sample touches a piece and nothing that stays.
 
-    Parameters
-    ----------
-    lattice : Lattice
-    node, values : (m, 3) int, (m,) float32
-        The nodes of the piece.
-    loose : (l,) int
-        Where the nodes of pieces are that may be dropped, sorted, from ``Lattice.find``.
-    spheres : SampleSpheres
+    The piece has nodes (m, 3) with values (m,). ``loose`` is where the nodes of pieces are
+    that may be dropped, from ``Lattice.find``.
     """
     if np.abs(values).max() <= BARELY_OUTSIDE:
         return False  # it has no volume
@@ -299,10 +260,11 @@ def is_supported(
     for centre, radius in zip(*_spheres_beside(lattice.factor, node, inside, spheres)):
         reach = (radius + TOLERANCE) * lattice.factor / 2
         if np.linalg.norm(own - centre, axis=1).min() <= reach:
-            around = centre + _ball(reach + 1)
+            steps = np.indices((2 * int(reach) + 3,) * 3).reshape(3, -1).T - int(reach) - 1
+            around = centre + steps[np.linalg.norm(steps, axis=1) <= reach + 1]
             at = lattice.find(around)
-            beside = lattice.values(at)
-            rest = (at >= 0) & ((beside <= 0) == inside) & ~_is_among(at, loose)
+            beside = lattice.blocks.ravel().take(at)
+            rest = (at >= 0) & ((beside <= 0) == inside) & ~np.isin(at, loose)
             others = _vertices(lattice, around[rest], beside[rest])
             if np.linalg.norm(others - centre, axis=1).min(initial=np.inf) > reach:
                 return True
@@ -312,7 +274,7 @@ def is_supported(
 def _vertices(lattice: Lattice, node: Nodes, values: FloatArray) -> NDArray[np.float64]:
     """Return where the surface crosses the lattice edges from nodes (n, 3), (m, 3)."""
     at = lattice.find((node[:, None] + NEIGHBOURHOOD[ALONG]).reshape(-1, 3))
-    high = lattice.values(at).reshape(-1, len(ALONG)).astype(np.float64)
+    high = lattice.blocks.ravel().take(at).reshape(-1, len(ALONG)).astype(np.float64)
     low = values[:, None].astype(np.float64)
     crossed = (at >= 0).reshape(high.shape) & ((high <= 0) != (low <= 0))
     row, along = np.nonzero(crossed)
@@ -333,19 +295,3 @@ def _spheres_beside(
     radius = spheres.distance[row] * (1 if inside else -1)
     some = (radius >= 0) & (radius <= LARGEST_SPHERE)
     return factor * around[some] + factor // 2, radius[some]
-
-
-def _ball(radius: float) -> Nodes:
-    """Return the steps to the nodes within a radius in fine spacings, (n, 3)."""
-    reach = int(radius)
-    steps = np.indices((2 * reach + 1,) * 3).reshape(3, -1).T - reach
-    near: Nodes = steps[np.linalg.norm(steps, axis=1) <= radius]
-    return near
-
-
-def _is_among(numbers: Nodes, ascending: Nodes) -> BoolArray:
-    """Return which numbers are among those of a list."""
-    at = np.searchsorted(ascending, numbers)
-    at = np.minimum(at, len(ascending) - 1)
-    found: BoolArray = ascending[at] == numbers
-    return found

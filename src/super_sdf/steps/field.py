@@ -11,28 +11,24 @@ from numpy.typing import NDArray
 from ..arrays import FloatArray, IntArray
 from ..errors import OptionError
 from ..grid.sdf_grid import SdfGrid
-from ..machine.threads import map_chunks
-from .nodes import SharedParts, block_ijk, number_parts, part_of_node, part_sizes
-from .voxel_index import VoxelIndex
+from ..machine.threads import chunks_of
+from .nodes import (
+    SharedParts,
+    VoxelIndex,
+    block_ijk,
+    number_parts,
+    part_of_node,
+    part_sizes,
+)
 
 
 @dataclass(frozen=True, eq=False)
 class SampleSpheres:
-    """The spheres of exact samples: the surface touches each and pierces none.
+    """The spheres of exact samples: the surface touches each and pierces none."""
 
-    Attributes
-    ----------
-    shape : three ints
-        Samples of the grid along each axis.
-    voxel_ijk : (m, 3) int32
-        The samples, in C order.
-    distance : (m,) float32
-        Their signed distances, in half voxels.
-    """
-
-    shape: tuple[int, int, int]
-    voxel_ijk: IntArray
-    distance: FloatArray
+    shape: tuple[int, int, int]  # samples of the grid along each axis
+    voxel_ijk: IntArray  # (m, 3), the samples, in C order
+    distance: FloatArray  # (m,), signed, in half voxels
 
     @cached_property
     def index(self) -> VoxelIndex:
@@ -158,7 +154,7 @@ class FineField:
         OptionError
             If the field was made without its ``grid``.
         """
-        return self._to_world(self.node_ijk)
+        return self.placed.to_world(self.node_ijk / self.factor - 0.5)
 
     def distances(self) -> NDArray[np.float64]:
         """Return the signed distances at ``positions``, (n,), in world units, negative inside."""
@@ -172,7 +168,7 @@ class FineField:
         rows : slice
             The voxels, rows of ``voxel_ijk``; all by default.
         """
-        return self._to_world(self._block_node_ijk(rows))
+        return self.placed.to_world(self._block_node_ijk(rows) / self.factor - 0.5)
 
     def block_distances(self, rows: slice = slice(None)) -> NDArray[np.float64]:
         """Return the signed distances at ``block_positions``, (m, Q), in world units."""
@@ -192,9 +188,6 @@ class FineField:
     def _block_node_ijk(self, rows: slice) -> IntArray:
         """Return the indices of the nodes of voxels' blocks in the fine lattice, (m, Q, 3)."""
         return self.factor * self.voxel_ijk[rows][:, None] + block_ijk(self.factor)
-
-    def _to_world(self, node_ijk: IntArray) -> NDArray[np.float64]:
-        return self.placed.to_world(node_ijk / self.factor - 0.5)
 
     def rows(self, first: int, last: int) -> slice:
         """Return the rows of the voxels in planes ``first`` to before ``last``."""
@@ -233,22 +226,13 @@ def border_is_crossed(field: FineField, beside: int = 0) -> bool:
     on either side of the field's own.
     """
     rows = field.rows(field.planes[0] - beside, field.planes[1] + beside)
-    core = np.arange(len(field.voxel_ijk))[rows]
     side = block_ijk(field.factor)
     for axis, samples in enumerate(field.shape):
         for voxel, node in ((0, 0), (samples - 1, field.factor)):
-            at_face = core[field.voxel_ijk[core, axis] == voxel]
+            at_face = np.flatnonzero(field.voxel_ijk[rows, axis] == voxel) + rows.start
             outer = np.flatnonzero(side[:, axis] == node)
-            if _any_is_crossed(field, at_face, outer):
-                return True
+            for chunk in chunks_of(len(at_face), len(outer)):
+                inside = field.blocks[outer[:, None], at_face[chunk]] <= 0
+                if (inside.any(0) & ~inside.all(0)).any():
+                    return True
     return False
-
-
-def _any_is_crossed(field: FineField, rows: IntArray, block_nodes: NDArray[np.intp]) -> bool:
-    """Return whether in the block of any of these voxels some of the nodes are inside, not all."""
-
-    def crossed(chunk: slice) -> bool:
-        inside = field.blocks[block_nodes[:, None], rows[chunk]] <= 0
-        return bool((inside.any(0) & ~inside.all(0)).any())
-
-    return any(map_chunks(crossed, len(rows), len(block_nodes)))

@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..machine.threads import map_chunks
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
-from .exact import MAX_DISTANCE, MIN_SLOPE
-from .interpolation import sample_trilinear
-from .voxel_index import VoxelIndex
+from .band import MAX_DISTANCE, MIN_SLOPE
+from .nodes import VoxelIndex
 
 BEYOND = 2.0  # samples this much farther than MAX_DISTANCE have spheres, too
 APART = np.maximum(2 * np.linalg.norm(NEIGHBOURHOOD, axis=1), 1).astype(np.float32)  # of samples
@@ -39,24 +38,17 @@ MIN_WEIGHT = 1e-3  # foot points of a smaller weight are dropped
 
 TEMPORARIES = 64  # numbers per sample in the search for its foot point
 
+CELL = np.indices((2, 2, 2)).reshape(3, 8).T
+"""The corners of a cell, (8, 3)."""
+
 
 @dataclass(frozen=True, eq=False)
 class Spheres:
-    """The spheres of exact samples.
+    """The spheres of exact samples."""
 
-    Attributes
-    ----------
-    centre : (n, 3) int32
-        The samples.
-    distance : (n,) float32
-        Their signed distances.
-    direction : (3, n) float32
-        About the gradient of the field there, of length 1.
-    """
-
-    centre: IntArray
-    distance: FloatArray
-    direction: FloatArray
+    centre: IntArray  # (n, 3), the samples
+    distance: FloatArray  # (n,), signed
+    direction: FloatArray  # (3, n), about the gradient of the field there, of length 1
 
     def __len__(self) -> int:
         return len(self.distance)
@@ -85,20 +77,8 @@ def spheres_of_band(
 ) -> Spheres:
     """Return the spheres of the exact samples of a band, then of those a voxel beyond.
 
-    Parameters
-    ----------
-    voxel_ijk : (V, 3) int32
-        The voxels of the band, in C order.
-    patches : (V, 27) float32
-        The samples round each, in half voxels.
-    exact : (n,) int
-        The rows whose own sample is exact.
-    shape : three ints
-        Samples of the grid along each axis.
-    limits : two floats
-        Samples beyond the band have no sphere unless they lie between these, in half voxels.
-    threads : int
-        Threads to use.
+    The band has voxels (V, 3), in C order, and their patches (V, 27); in the rows ``exact`` the own
+    sample is exact. Samples beyond have no sphere unless they lie between ``limits``.
     """
 
     def gather(rows: slice) -> tuple[Spheres, Spheres, FloatArray]:
@@ -148,44 +128,18 @@ def steepest_of_each(
 
 @dataclass(frozen=True, eq=False)
 class FootPoints:
-    """Foot points of samples, and the field's value there.
+    """Foot points of samples, and the field's value there."""
 
-    Attributes
-    ----------
-    rows : (n,) int32
-        The block that each lies in.
-    place : (3, n) float32
-        Position in the block, 0 to 1 along each axis.
-    values : (n,) float32
-        The field there, in half voxels: the error, since it should be 0.
-    weights : (n,) float32
-        How far to trust it, 0 to 1.
-    """
-
-    rows: IntArray
-    place: FloatArray
-    values: FloatArray
-    weights: FloatArray
+    rows: IntArray  # (n,), the block that each lies in
+    place: FloatArray  # (3, n), the position in the block, 0 to 1 along each axis
+    values: FloatArray  # (n,), the field there: the error, since it should be 0
+    weights: FloatArray  # (n,), how far to trust it, 0 to 1
 
 
 def find_foot_points(
     blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex, threads: int = 1
 ) -> FootPoints:
-    """Return the foot points of samples, leaving out those outside all blocks.
-
-    Parameters
-    ----------
-    blocks : (Q, D + 1) float32
-        Node values in half voxels; the last column is 0.
-    factor : int
-        K.
-    spheres : Spheres
-        Those of the samples.
-    index : VoxelIndex
-        Of the D voxels.
-    threads : int
-        Threads to use.
-    """
+    """Return the foot points of samples, leaving out those outside all blocks (Q, D + 1)."""
 
     def search(rows: slice) -> FootPoints:
         some = spheres.some(rows)
@@ -193,39 +147,20 @@ def find_foot_points(
 
     parts = map_chunks(search, len(spheres), TEMPORARIES, threads)
     return FootPoints(
-        np.concatenate([part.rows for part in parts]),
-        np.concatenate([part.place for part in parts], 1),
-        np.concatenate([part.values for part in parts]),
-        np.concatenate([part.weights for part in parts]),
+        *(np.concatenate(each, -1) for each in zip(*(vars(part).values() for part in parts)))
     )
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """The field at a place on each of n spheres.
+    """The field at a place on each of n spheres."""
 
-    Attributes
-    ----------
-    direction : (3, n) float32
-        From the place to the sample, or the other way round for a sample inside.
-    rows : (n,) int32
-        The block that the place lies in, -1 if it was not decoded.
-    place : (3, n) float32
-        The position in it, 0 to 1 along each axis.
-    value : (n,) float32
-        The field.
-    normal : (3, n) float32
-        Its gradient, of length 1.
-    clearance : (n,) float32
-        How far the surface is from the sphere there: below 0 where it pierces it.
-    """
-
-    direction: FloatArray
-    rows: IntArray
-    place: FloatArray
-    value: FloatArray
-    normal: FloatArray
-    clearance: FloatArray
+    direction: FloatArray  # (3, n), from the place to the sample, or back for a sample inside
+    rows: IntArray  # (n,), the block that the place lies in, -1 if it was not decoded
+    place: FloatArray  # (3, n), the position in it, 0 to 1 along each axis
+    value: FloatArray  # (n,), the field
+    normal: FloatArray  # (3, n), its gradient, of length 1
+    clearance: FloatArray  # (n,), from the sphere to the surface: below 0 where it pierces it
 
     @property
     def cosine(self) -> FloatArray:
@@ -309,3 +244,35 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return the dot products of vectors (3, n), (n,), summed in a fixed order."""
     product: FloatArray = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
     return product
+
+
+def sample_trilinear(
+    blocks: FloatArray, rows: IntArray, place: FloatArray, factor: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the trilinear value (n,) and its gradient per cell (3, n) at places in blocks.
+
+    A place is given by its block, a column of ``blocks`` (Q, D + 1), where -1 reads the last, and
+    the position in it, (3, n), 0 to 1 along each axis. All sums are written out, so that the bits
+    of a result do not depend on the number of places.
+    """
+    low, (x, y, z) = find_cell(place, factor)
+    side, width = factor + 1, blocks.shape[1]
+    steps = (CELL @ np.array([side * side, side, 1])) * width
+    first = ((low[0] * side + low[1]) * side + low[2]) * np.int64(width) + rows % width
+    corner = blocks.ravel().take(first + steps[:, None])  # (8, n)
+    along_z = corner[1::2] - corner[::2]
+    at_z = corner[::2] + along_z * z
+    along_y = at_z[1::2] - at_z[::2]
+    at_yz = at_z[::2] + along_y * y
+    along_x = at_yz[1] - at_yz[0]
+    slope_z = along_z[::2] + (along_z[1::2] - along_z[::2]) * y
+    gradient_y = along_y[0] + (along_y[1] - along_y[0]) * x
+    gradient_z = slope_z[0] + (slope_z[1] - slope_z[0]) * x
+    return at_yz[0] + along_x * x, np.stack([along_x, gradient_y, gradient_z])
+
+
+def find_cell(place: FloatArray, cells: int) -> tuple[IntArray, FloatArray]:
+    """Return the cells of places (3, n), (3, n) int32, and the positions in them, 0 to 1."""
+    scaled = place * np.float32(cells)
+    low = np.minimum(scaled.astype(np.int32), cells - 1)
+    return low, scaled - low.astype(np.float32)

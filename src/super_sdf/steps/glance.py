@@ -13,8 +13,7 @@ from ..grid.cubic import Resampled
 from ..grid.planes import over_planes, planes_at_once
 from ..grid.sdf_grid import SdfGrid, without_samples
 from ..neighbourhood import CENTRE
-from .band import BLOCK_PLANES, can_hold_surface, is_lipschitz, plane_blocks
-from .exact import BandSummary, summarise
+from .band import BLOCK_PLANES, BandSummary, can_hold_surface, is_lipschitz, plane_blocks, summarise
 from .offsets import Jumps
 from .survey import Band, band_of_samples, check_jumps, limit_to_field
 

@@ -24,20 +24,8 @@ from .nodes import BARELY_INSIDE, BARELY_OUTSIDE
 class FineLattice(SamplePlanes):
     """The values at all nodes of the fine lattice, in world units, negative inside.
 
-    Node (i, j, k) is at the coarse index ``(i, j, k) / K - 1/2``.
-
-    Parameters
-    ----------
-    field : FineField
-        The refined field, with the coarse grid that it was made from. Of a slab, the planes of
-        nodes in its own planes of voxels are right.
-
-    Attributes
-    ----------
-    shape : three ints
-        Nodes along each axis, ``K n + 1``.
-    dtype
-        float32.
+    Node (i, j, k) is at the coarse index ``(i, j, k) / K - 1/2``. The field has the coarse grid
+    that it was made from. Of a slab, the planes of nodes in its own planes of voxels are right.
     """
 
     dtype = np.dtype(np.float32)
@@ -137,20 +125,11 @@ def lattice_shape(shape: tuple[int, int, int], factor: int) -> tuple[int, int, i
 
 
 def fine_grid(field: FineField) -> SdfGrid:
-    """Return the fine lattice of a field as a grid, which can be refined again.
+    """Return the fine lattice of a whole grid's field, from ``upsample``, as a grid of spacing h/K.
 
-    Its samples are not stored: planes of them are made from the field, and from the coarse grid
-    away from the surface, when they are needed.
-
-    Parameters
-    ----------
-    field : FineField
-        Of a whole grid, from ``upsample``.
-
-    Returns
-    -------
-    SdfGrid
-        Of spacing h/K. The samples are relative to the surface at the field's offset.
+    It can be refined again. Its samples are not stored: planes of them are made from the field, and
+    from the coarse grid away from the surface, when they are needed. They are relative to the
+    surface at the field's offset.
     """
     grid, lattice = field.placed, FineLattice(field)
     spacing = tuple(along / field.factor for along in grid.spacing)

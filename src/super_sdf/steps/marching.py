@@ -32,8 +32,8 @@ from ..machine.index_width import check_count
 from ..machine.threads import map_chunks, map_threads, rows_in_chunk
 from ..mesh import CLEARANCE, Mesh, vertex_type
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
+from .cap import octant_of_cells
 from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, FACES, choices, triangle_table
-from .ends import octant_of_cells
 from .field import FineField
 from .nodes import block_ijk, part_of_node
 

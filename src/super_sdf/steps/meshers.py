@@ -14,8 +14,7 @@ from ..grid.sdf_grid import SdfGrid, check_grid
 from ..mesh import Mesh, join_meshes
 from ..options import DEFAULT_MESHER, MARCHING, SHARP, check_cap, check_mesher
 from . import marching
-from .cap import close
-from .ends import check_can_close
+from .cap import check_can_close, close
 from .field import FineField
 
 Extract = Callable[[FineField, SdfGrid, int, int], list[Mesh]]

@@ -28,8 +28,10 @@ from ..machine.index_width import check_count
 from ..machine.threads import map_threads, worthwhile_threads
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 
-# The value of a node of which only the sign is known, in half voxels.
+# The value of a node of which only the sign is known, and the least of a mask's sample, in half
+# voxels.
 BARELY_INSIDE, BARELY_OUTSIDE = np.float32(-1e-3), np.float32(1e-3)
+LEAST_OF_MASK = np.float32(0.04)
 
 # The neighbours that share each part, the voxel itself included.
 SHARING = [
@@ -40,8 +42,7 @@ SHARING = [
 
 def block_ijk(factor: int) -> IntArray:
     """Return the indices of the block's nodes from the voxel's low corner, (Q, 3) in 0..K."""
-    side = factor + 1
-    return np.indices((side,) * 3).reshape(3, -1).T.astype(np.int32)
+    return np.indices((factor + 1,) * 3).reshape(3, -1).T.astype(np.int32)
 
 
 def block_offsets(factor: int) -> FloatArray:
@@ -78,20 +79,46 @@ def seen_from(part: int, neighbour: int | np.integer[Any]) -> int:
     return int((NEIGHBOURHOOD[part] - 2 * NEIGHBOURHOOD[neighbour] + 1) @ STRIDES)
 
 
+class VoxelIndex:
+    """The rows of voxels (n, 3), in C order, by their place in a grid of a shape."""
+
+    def __init__(self, voxel_ijk: IntArray, shape: tuple[int, int, int]) -> None:
+        self.shape = shape
+        self.keys = self._key_of(voxel_ijk)
+
+    def _key_of(self, voxel_ijk: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Return the number of each voxel, (...,), in C order of the whole grid."""
+        _, rows, columns = self.shape
+        i, j, k = (voxel_ijk[..., axis].astype(np.int64) for axis in range(3))
+        return (i * rows + j) * columns + k
+
+    def find(self, voxel_ijk: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Return the row of each voxel (..., 3), -1 if it is not in the list, (...,)."""
+        if not len(self.keys):
+            return np.full(voxel_ijk.shape[:-1], -1, np.int64)
+        wanted = self._key_of(voxel_ijk)
+        at = np.minimum(np.searchsorted(self.keys, wanted), len(self.keys) - 1)
+        in_grid = ((voxel_ijk >= 0) & (voxel_ijk < self.shape)).all(-1)
+        return np.where(in_grid & (self.keys[at] == wanted), at, -1)
+
+
+def rows_among(voxels: IntArray, count: int) -> IntArray:
+    """Return the row in ``voxels`` of each of ``count`` voxels, -1 if it is not among them.
+
+    The result, (count + 1,) int32, has one more -1 at the end, for the index -1 of absent
+    neighbours.
+    """
+    row_of = np.full(count + 1, -1, np.int32)
+    row_of[voxels] = np.arange(len(voxels), dtype=np.int32)
+    return row_of
+
+
 @dataclass(frozen=True, eq=False)
 class SharedParts:
-    """Which voxels share the parts of their blocks.
+    """Which voxels share the parts of their blocks."""
 
-    Attributes
-    ----------
-    table : (27, D) int32
-        Neighbour table of the D voxels, -1 where there is no neighbour.
-    owner : (27, D) int8
-        The owner of each part, as a place in the neighbourhood: ``CENTRE`` is the voxel itself.
-    """
-
-    table: IntArray
-    owner: NDArray[np.int8]
+    table: IntArray  # (27, D), neighbour table of the D voxels, -1 where there is no neighbour
+    owner: NDArray[np.int8]  # (27, D), of each part, as a place: ``CENTRE`` is the voxel itself
 
     def owned(self, rows: slice = slice(None)) -> BoolArray:
         """Return which parts the voxels in ``rows`` own, (27, n) bool."""
@@ -118,22 +145,8 @@ def share_parts(table: IntArray) -> SharedParts:
 def number_parts(parts: SharedParts, sizes: NDArray[np.int64]) -> tuple[IntArray, int]:
     """Number the nodes of all parts, in the order of the voxels that own them.
 
-    Parameters
-    ----------
-    parts : SharedParts
-        Of D voxels.
-    sizes : (27,) int64
-        Nodes per part.
-
-    Returns
-    -------
-    (27, D) int32 and int
-        The number of the first node of each part, and the number of nodes.
-
-    Raises
-    ------
-    OptionError
-        If there are more nodes than 32-bit numbers.
+    Returns the number of the first node of each part, (27, D) int32, and the number of nodes, given
+    the nodes per part, (27,). OptionError if there are more nodes than 32-bit numbers.
     """
     owned = parts.owned()
     count = check_count(int(np.count_nonzero(owned, axis=1) @ sizes), "nodes")
@@ -149,21 +162,8 @@ def number_parts(parts: SharedParts, sizes: NDArray[np.int64]) -> tuple[IntArray
 
 
 def average_shared(blocks: FloatArray, parts: SharedParts, factor: int, threads: int = 1) -> None:
-    """Set each copy of a shared node to the mean of the copies (Eq. 7).
+    """Set each copy of a shared node to the mean of the copies (Eq. 7), in ``blocks`` (Q, D + 1).
 
-    Parameters
-    ----------
-    blocks : (Q, D + 1) float32
-        A prediction for each node of each block, changed in place; the last column is 0.
-    parts : SharedParts
-        Of the D voxels.
-    factor : int
-        K.
-    threads : int
-        Threads to use.
-
-    Notes
-    -----
     Sums are taken in the order of the voxels and in double precision (in single for two numbers,
     whose sum does not depend on the order), so that all copies get the same bits and the result
     does not depend on how the work was divided.
@@ -193,7 +193,7 @@ def _average_group(
 
     With one such axis they are the interiors of faces, with two of edges, with three the corners.
     """
-    places, nodes_at = nodes_of_group(factor, axes)
+    places, nodes_at = _nodes_of_group(factor, axes)
     kind = np.float32 if len(places) == 2 else np.float64
     means = []
     for own in places:
@@ -214,7 +214,7 @@ def _average_group(
 
 
 @lru_cache
-def nodes_of_group(
+def _nodes_of_group(
     factor: int, axes: tuple[bool, ...]
 ) -> tuple[list[IntArray], list[NDArray[np.intp]]]:
     """Return the places that a shared node can have in a block, and the block's nodes there.
@@ -233,6 +233,22 @@ def nodes_of_group(
     return places, nodes_at
 
 
+def hold_sides(blocks: FloatArray, factor: int, patches: FloatArray, voxels: IntArray) -> int:
+    """Give every sample of a mask its side, whatever the network says; return how many it raised.
+
+    A block's value at its sample is raised by adding a pyramid that is 0 on the faces of the block,
+    so that neighbouring blocks still agree. The lines between samples are the network's: it joins
+    slices of a thin vessel or plate across the line between two samples outside, and to hold that
+    line would drill a hole into the joint. The decoded rows of ``patches`` (V, 27) are ``voxels``.
+    """
+    sign = np.where(patches[voxels, CENTRE] > 0, np.float32(1), np.float32(-1))
+    missing = np.maximum(LEAST_OF_MASK - sign * blocks[len(blocks) // 2, :-1], 0)
+    wrong = np.flatnonzero(missing)
+    pyramid = (1 - np.abs(block_offsets(factor))).prod(1).astype(np.float32)
+    blocks[:, wrong] += pyramid[:, None] * (sign * missing)[wrong]
+    return len(wrong)
+
+
 def signs_of_skipped(
     parts: SharedParts,
     voxel_ijk: IntArray,
@@ -240,31 +256,16 @@ def signs_of_skipped(
     voxels: IntArray,
     shape: tuple[int, int, int],
 ) -> Signs:
-    """Return the signs of the skipped voxels, those beside decoded ones that were not decoded.
+    """Return the signs of the neighbours (27, D) of decoded voxels that were not decoded.
 
-    Parameters
-    ----------
-    parts : SharedParts
-        Of the decoded voxels.
-    voxel_ijk : (D, 3) int32
-        The decoded voxels.
-    patches : (V, 27) float32
-        The samples round each voxel of the band.
-    voxels : (D,) int32
-        The rows of the band that were decoded.
-    shape : three ints
-        Samples of the grid along each axis; there are no voxels to skip beyond it.
-
-    Returns
-    -------
-    (27, D) int8
-        Of the neighbours of each decoded voxel: 1 outside, -1 inside, 0 not skipped.
+    It is 1 outside, -1 inside, and 0 for those that were decoded, and beyond the grid. The decoded
+    voxels (D, 3) are the rows ``voxels`` of the band, with the samples ``patches`` (V, 27).
     """
     signs = np.zeros(parts.table.shape, np.int8)
     inner = [(ijk != 0, ijk != n - 1) for ijk, n in zip(np.ascontiguousarray(voxel_ijk.T), shape)]
     for place, step in enumerate(NEIGHBOURHOOD):
         skipped = parts.table[place] < 0
-        for axis in np.flatnonzero(step):  # beyond the grid nothing was skipped
+        for axis in np.flatnonzero(step):
             skipped &= inner[axis][int(step[axis] > 0)]
         rows = np.flatnonzero(skipped)
         signs[place][rows] = np.where(patches[voxels.take(rows), place] > 0, 1, -1)
@@ -274,26 +275,12 @@ def signs_of_skipped(
 def pin_to_skipped(
     blocks: FloatArray, parts: SharedParts, factor: int, skipped: Signs
 ) -> NDArray[np.int64]:
-    """Give the nodes shared with a skipped voxel that voxel's sign.
+    """Give the nodes shared with a skipped voxel that voxel's sign, in ``blocks`` (Q, D).
 
     A skipped voxel holds no surface, so all its nodes have its sign. Once they do, no sign change
-    reaches the boundary of the decoded voxels, and the isosurface has no hole there.
-
-    Parameters
-    ----------
-    blocks : (Q, D) float32
-        Node values in half voxels, changed in place.
-    parts : SharedParts
-        Of the decoded voxels.
-    factor : int
-        K.
-    skipped : (27, D) int8
-        From ``signs_of_skipped``. Skipped voxels that share a node have the same sign.
-
-    Returns
-    -------
-    (D,) int64
-        For each voxel, the number of nodes that it owns whose sign was changed.
+    reaches the boundary of the decoded voxels, and the isosurface has no hole there. Skipped voxels
+    that share a node have the same sign. Returned is for each voxel the number of nodes that it
+    owns whose sign was changed, (D,).
     """
     changed = np.zeros(skipped.shape[1], np.int64)
     for part, nodes in enumerate(nodes_of_part(factor)):

@@ -27,37 +27,17 @@ ROUNDING, UNSAMPLED = 1e-3, 0.1
 
 
 class Jumps(NamedTuple):
-    """Counts of the samples near an offset, and of those from which the field jumps to a neighbour.
+    """Counts of the samples near an offset, and of those with a jump to a neighbour."""
 
-    Attributes
-    ----------
-    edges : int
-        Samples near the offset with a jump to a neighbour.
-    near : int
-        Samples near the offset.
-    end : float
-        The farthest sample with a jump, in half voxels from the offset; -inf if there is none.
-    """
-
-    edges: int
-    near: int
-    end: float
+    edges: int  # samples near the offset with a jump to a neighbour
+    near: int  # samples near the offset
+    end: float  # the farthest with a jump, in half voxels from the offset; -inf if there is none
 
 
 def check_not_cut_off(patches: FloatArray, offset: float, voxel_size: float) -> None:
-    """Raise if the distances are truncated within 1.5 voxels of an offset.
+    """Raise GridError if the distances are truncated within 1.5 voxels of an offset.
 
-    Parameters
-    ----------
-    patches : (V, 27) float32
-        The samples round voxels of the band at the offset, in half voxels from it.
-    offset, voxel_size : float
-        In world units.
-
-    Raises
-    ------
-    GridError
-        If they are; its message suggests an offset that works.
+    ``patches`` (V, 27) are the samples round voxels of the band there, in half voxels from it.
     """
     centre = patches[:, CENTRE]
     cut_off = is_flat(patches) & (np.abs(centre) < CUT_OFF_MARGIN - ROUNDING)
@@ -97,20 +77,7 @@ def _jumps_up(rescaled: FloatArray, own: tuple[slice, ...]) -> Jumps:
 
 
 def check_not_filled(found: list[tuple[Jumps, Jumps]], offset: float, voxel_size: float) -> None:
-    """Raise if fill values begin within 2.5 voxels of an offset.
-
-    Parameters
-    ----------
-    found : list
-        The jumps of all planes, from ``find_jumps``.
-    offset, voxel_size : float
-        In world units.
-
-    Raises
-    ------
-    GridError
-        If they do; its message suggests an offset that works.
-    """
+    """Raise GridError if fill values begin within 2.5 voxels of an offset, by all planes' jumps."""
     for side, parts in zip((1, -1), zip(*found)):
         count, near = sum(part.edges for part in parts), sum(part.near for part in parts)
         reach = max(part.end for part in parts)

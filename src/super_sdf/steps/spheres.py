@@ -17,6 +17,7 @@ Lengths are in half voxels, as in ``band``.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -26,11 +27,9 @@ from ..arrays import FloatArray, IntArray
 from ..machine.threads import map_chunks
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 from . import foot_points
-from .exact import MAX_DISTANCE
-from .foot_points import FootPoints, Spheres, find_foot_points
-from .interpolation import CELL, find_cell, prolong
-from .nodes import SharedParts, nodes_of_part, number_parts
-from .voxel_index import VoxelIndex
+from .band import MAX_DISTANCE
+from .foot_points import CELL, FootPoints, Spheres, find_cell, find_foot_points
+from .nodes import SharedParts, VoxelIndex, nodes_of_part, number_parts
 
 PRIOR_WEIGHT = 0.2  # of the assumption that the error is 0, in foot points
 VARIANCE_PENALTY = 0.5  # how strongly disagreement of the errors reduces their mean
@@ -54,21 +53,8 @@ def fit_to_spheres(
     """Move the surface so that it touches the samples' spheres.
 
     Nodes at exact samples keep the sample's value. Without exact samples nothing is changed.
-
-    Parameters
-    ----------
-    blocks : (Q, D + 1) float32
-        Node values in half voxels, changed in place; the last column is 0.
-    parts : SharedParts
-        Of the D voxels.
-    factor : int
-        K.
-    spheres : Spheres
-        Those that the surface should touch.
-    index : VoxelIndex
-        Of the D voxels.
-    threads : int
-        Threads to use.
+    ``blocks`` (Q, D + 1), in half voxels, are changed in place; the last column is 0. ``parts`` and
+    ``index`` are of the D voxels.
     """
     if not len(spheres):  # in a noisy field, for example
         return
@@ -103,26 +89,11 @@ def find_correction(feet: FootPoints, parts: SharedParts) -> FloatArray:
 def mean_at_nodes(
     feet: FootPoints, values: FloatArray, numbers: IntArray, count: int, cells: int
 ) -> tuple[FloatArray, NDArray[np.intp], FloatArray]:
-    """Return the weighted mean at each node of the values at foot points in the cells round it.
+    """Return the weighted mean at each node of values (n,) at foot points in the cells round it.
 
-    Parameters
-    ----------
-    feet : FootPoints
-        Positions and weights.
-    values : (n,) float32
-        The values at the foot points, in half voxels.
-    numbers : (27, D) int32
-        The node of each part of each block, 0 to ``count - 1``.
-    count : int
-        Number of nodes.
-    cells : {1, 2}
-        Cells along a block. With 1 the nodes are the corners of blocks, with 2 all parts.
-
-    Returns
-    -------
-    (count,) float32, (8, n) int64, (8, n) float32
-        The mean, in half voxels; the 8 nodes round each foot point, and its trilinear weights for
-        them.
+    The nodes, 0 to ``count - 1``, have ``numbers`` (27, D) by the part of each block; with 1 cell
+    along a block they are the corners of blocks, with 2 all parts. Returned are the mean, (count,);
+    the 8 nodes round each foot point, (8, n), and its trilinear weights for them, (8, n).
     """
     at, shares = surrounding_parts(feet.place, cells)
     at *= numbers.shape[1]  # in place: these arrays are the largest of the fit
@@ -151,16 +122,9 @@ def surrounding_parts(place: FloatArray, cells: int) -> tuple[NDArray[np.int64],
 def shrunk_mean(
     weight: NDArray[np.float64], total: NDArray[np.float64], squares: NDArray[np.float64]
 ) -> FloatArray:
-    """Return the means of weighted sums, shrunk towards 0 by little weight or large variance.
+    """Return the means of values, shrunk towards 0 by little weight or large variance, (n,).
 
-    Parameters
-    ----------
-    weight, total, squares : (n,) float64
-        Weighted sums of 1, of the values and of their squares.
-
-    Returns
-    -------
-    (n,) float32
+    Given are the weighted sums of 1, of the values and of their squares, (n,) each.
     """
     mean = total / np.maximum(weight, 1e-9)
     variance = np.maximum(squares / np.maximum(weight, 1e-9) - mean**2, 0)
@@ -175,3 +139,31 @@ def restore_samples(blocks: FloatArray, factor: int, spheres: Spheres, index: Vo
     inside = nodes_of_part(factor)[CENTRE]
     middle = inside[len(inside) // 2]
     blocks[middle, rows[rows >= 0]] = own.distance[rows >= 0]
+
+
+def prolong(values: FloatArray, cells: int, finer: int) -> FloatArray:
+    """Interpolate values trilinearly to the nodes of a finer lattice of the same n blocks.
+
+    ``cells`` and ``finer`` are the cells along a block before and after, and values
+    ((cells + 1)^3, n) become ((finer + 1)^3, n). If the copies of shared nodes were equal before,
+    they are equal, bit for bit.
+    """
+    block = values.reshape(*(cells + 1,) * 3, -1)
+    for axis in range(3):
+        source = np.moveaxis(block, axis, 0)
+        block = np.empty((*block.shape[:axis], finer + 1, *block.shape[axis + 1 :]), np.float32)
+        for plane, (low, share) in zip(np.moveaxis(block, axis, 0), _finer_places(cells, finer)):
+            plane[:] = source[low]
+            if share:
+                plane += (source[low + 1] - source[low]) * share
+    return block.reshape(len(block) ** 3, -1)
+
+
+@lru_cache
+def _finer_places(cells: int, finer: int) -> list[tuple[int, np.float32]]:
+    """Return along an axis the coarse node before each finer node, and the share beyond it.
+
+    The share is 0 for a finer node that lies on a coarse one, the last one included.
+    """
+    places = [divmod(number * cells, finer) for number in range(finer + 1)]
+    return [(low, np.float32(rest / finer)) for low, rest in places]

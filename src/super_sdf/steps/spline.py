@@ -18,7 +18,10 @@ from numpy.typing import NDArray
 from ..arrays import FloatArray, IntArray
 from ..grid.planes import SampleArray, in_spacings
 from ..grid.slopes import local_slopes
+from ..network.decoder import Decoder, decode
 from .band import plane_blocks
+from .nodes import block_offsets
+from .survey import Band
 
 POLE = 3**0.5 - 2
 TAIL = 12  # samples after which the prefilter has fallen to 1e-7
@@ -31,30 +34,41 @@ JUMPING, JUMPED = 5.0, 9.0  # the same for a field of uneven slope, which is lin
 WRONG_SLOPE = 0.05  # from 1: local slopes so far off are not those of distances
 
 
+def interpolate(
+    band: Band,
+    network: Decoder,
+    factor: int,
+    own_ijk: IntArray,
+    inputs: tuple[FloatArray, IntArray, IntArray],
+    threads: int = 1,
+) -> FloatArray:
+    """Return the blocks of a field that is no distance: its spline, and the network at kinks.
+
+    Of a field that is far from a distance, or was cut off, the network adds nothing. ``inputs`` are
+    those of ``decode``, for the voxels (D, 3).
+    """
+    assert band.smooth is not None
+    patches, table, voxels = inputs
+    size, uneven = band.half_voxel, band.is_uneven
+    blocks, share = spline_blocks(band.smooth, own_ijk, factor, size, uneven=uneven)
+    blocks[:, :-1] -= np.float32(band.level)
+    some = np.flatnonzero(share)
+    if band.has_kinks and len(some):
+        kinked = patches, table, voxels[some]
+        added = decode(network, kinked, block_offsets(factor), None, threads)[:, :-1]
+        blocks[:, some] += share[some] * (added - blocks[:, some])
+    return blocks
+
+
 def spline_blocks(
     values: SampleArray, voxel_ijk: IntArray, factor: int, unit: float, *, uneven: bool = False
 ) -> tuple[FloatArray, FloatArray]:
     """Return the cubic spline at the nodes of voxels' blocks, and the network's share there.
 
-    Parameters
-    ----------
-    values : (nx, ny, nz) array or Planes
-        Samples.
-    voxel_ijk : (D, 3) int32
-        The voxels, in C order.
-    factor : int
-        K.
-    unit : float
-        The values are divided by this.
-    uneven : bool
-        Whether the slope is uneven: where the samples jump, a spline would swing, and nodes are
-        interpolated linearly.
-
-    Returns
-    -------
-    (Q, D + 1) float32, (D,) float32
-        Blocks, see ``nodes``; the share of the network's values in each voxel, from 0 where the
-        field is smooth, or no distance, to 1.
+    The samples ``values`` are divided by ``unit``; the voxels (D, 3) are in C order. If the slope
+    is ``uneven``, a spline would swing where the samples jump, and nodes are interpolated linearly.
+    The blocks, (Q, D + 1), are those of ``nodes``; the share, (D,), goes from 0 where the field is
+    smooth, or no distance, to 1.
     """
     blocks = np.zeros(((factor + 1) ** 3, len(voxel_ijk) + 1), np.float32)
     share = np.empty(len(voxel_ijk), np.float32)
@@ -78,7 +92,8 @@ def spline_blocks(
                 found = _evaluate(prefilter(strip), at + 2, node_weights(factor))
                 if uneven:
                     jumps = (roughness(strip * np.float32(0.5)) - JUMPING) / (JUMPED - JUMPING)
-                    linear = _evaluate(_continued_all(strip), at + 2, linear_weights(factor))
+                    straight = np.pad(strip, 2, mode="reflect", reflect_type="odd")
+                    linear = _evaluate(straight, at + 2, linear_weights(factor))
                     found += np.clip(jumps, 0, 1)[tuple(at.T)] * (linear - found)
                 blocks[:, rows.start + which] = found
     return blocks, share
@@ -117,11 +132,6 @@ def prefilter(values: FloatArray) -> FloatArray:
 def _continued(lines: FloatArray, beyond: int) -> FloatArray:
     """Return lines continued beyond both ends by point reflection, as straight ones would go on."""
     return np.pad(lines, [(beyond, beyond), (0, 0), (0, 0)], mode="reflect", reflect_type="odd")
-
-
-def _continued_all(values: FloatArray) -> FloatArray:
-    """Return values continued by two samples on every side."""
-    return np.pad(values, 2, mode="reflect", reflect_type="odd")
 
 
 def roughness(values: FloatArray) -> FloatArray:

@@ -35,7 +35,9 @@ from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 from .band import (
     BLOCK_PLANES,
     BLOCK_SAMPLES,
+    BandSummary,
     can_hold_surface,
+    exact_samples,
     has_both_sides,
     is_active,
     is_filled_in,
@@ -46,8 +48,7 @@ from .band import (
     rescale_planes,
     take_patches,
 )
-from .beyond import NONE_BEYOND, SamplesBeyond, TrustedSamples, samples_beyond
-from .exact import BandSummary, exact_samples
+from .bounds import NONE_BEYOND, SamplesBeyond, TrustedSamples, samples_beyond
 from .offsets import Jumps, check_not_cut_off, check_not_filled, find_jumps
 
 # Of a band: patches, indices and flags; what is made of them on the way; and of samples beyond it.

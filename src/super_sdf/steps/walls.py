@@ -30,8 +30,7 @@ from ..neighbourhood import NEIGHBOURHOOD
 from .cap import outer_voxels
 from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, FACES
 from .marching import CAP_HEIGHT, cells_low_nodes, strides
-from .nodes import SHARING, block_ijk, part_of_node
-from .voxel_index import VoxelIndex
+from .nodes import SHARING, VoxelIndex, block_ijk, part_of_node
 from .wall_cases import FACE_POINTS, PLACES, walls
 
 Keys = NDArray[np.int64]

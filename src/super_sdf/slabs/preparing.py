@@ -1,0 +1,101 @@
+"""What comes before the steps of a slab: the network, the band, and its cut into slabs."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+
+from ..errors import OptionError
+from ..grid.cubic import cubic_grid
+from ..grid.sdf_grid import SdfGrid
+from ..machine.resources import Resources, allot
+from ..mesh import vertex_type
+from ..network.decoder import Adapter, Decoder, adapt
+from ..network.network import network_for
+from ..progress import StepCounter
+from ..steps.band import BandSummary
+from ..steps.meshers import Mesher
+from ..steps.survey import Band, BandTooLargeError, no_surface, survey
+from .cutting import DEFAULT, Slab, peak_bytes, plan_slabs, planes_needed, refuse_band
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What is known of a run before the first slab is refined; ``planned`` is its peak in bytes."""
+
+    lattice: SdfGrid
+    offset: float
+    network: Adapter
+    factor: int
+    mesher: Mesher
+    band: Band
+    slabs: list[Slab]
+    planned: int
+    threads: int
+    steps: StepCounter
+
+
+def prepare(
+    grid: SdfGrid,
+    network: Decoder,
+    factor: int,
+    offset: float,
+    max_memory: int | None,
+    steps: StepCounter,
+    mesher: Mesher = DEFAULT,
+    *,
+    at_once: bool = False,
+    part: tuple[tuple[int, int], BandSummary] | None = None,
+) -> Run:
+    """Find the band of a grid, and cut it into slabs; the arguments have been checked.
+
+    With ``part``, some planes and what the band of the whole grid says, only these are meshed.
+    """
+    chosen = adapt(network_for(network, grid.field.kind))
+    resources = allot(chosen.threads, max_memory)
+    lattice, reach = cubic_grid(grid, offset), None if at_once else chosen.receptive_field
+    plan = factor, reach, resources, chosen.memory_bytes, mesher
+    if part is None:
+        band = find_surface(lattice, offset, *plan)
+        slabs = plan_slabs(band, *plan)
+    elif reach is None:
+        raise OptionError(
+            "the network states no receptive field, so it has to see the whole grid at once: "
+            "convert the grid on one machine"
+        )
+    else:
+        (first, last), whole = part
+        more = planes_needed(reach, mesher, factor)
+        among = max(first - more, 0), min(last + more, grid.shape[0])
+        band = survey(lattice, offset, resources, among, whole)
+        slabs = plan_slabs(band, *plan, (first, last))
+    threads = resources.threads
+    planned = peak_bytes(band, slabs, factor, chosen.memory_bytes, threads, mesher)
+    steps.divide(len(slabs))
+    steps.finish("band")
+    return Run(lattice, offset, chosen, factor, mesher, band, slabs, planned, threads, steps)
+
+
+def find_surface(
+    grid: SdfGrid,
+    offset: float,
+    factor: int,
+    receptive_field: int | None,
+    resources: Resources,
+    network_bytes: tuple[float, float],
+    mesher: Mesher = DEFAULT,
+) -> Band:
+    """Return the band of a grid; GridError if no voxel can hold a surface.
+
+    The parameters are those of ``plan_slabs``, for what is said if it does not fit in memory.
+    """
+    vertex_type(grid, factor)  # raises if not even float64 resolves the vertices
+    band = None
+    with suppress(BandTooLargeError):  # and free what it holds
+        band = survey(grid, offset, resources)  # Eqs. 2 and 4
+    if band is None:
+        plan = factor, receptive_field, resources, network_bytes, mesher
+        raise refuse_band(grid, offset, *plan)
+    if not band.decoded.any():
+        raise no_surface(grid, offset)
+    return band
