@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+from batches import rows
 from conftest import ball, trilinear
 from scipy import ndimage
 
@@ -312,8 +313,8 @@ BAD = {
     "label is True: give a whole number, -2^63 to 2^64 - 1": {"label": True},
     f"label is {2**64}: give a whole number, -2^63 to 2^64 - 1": {"label": 2**64},
     f"label {2**53 + 1} and level 2: give only one of them": {"label": 2**53 + 1, "level": 2},
-    "level is nan: give a number": {"level": float("nan")},
-    "scale is -1: it must be greater than 0": {"scale": -1},
+    "level is nan: give a finite number": {"level": float("nan")},
+    "scale is -1: give a number greater than 0": {"scale": -1},
     "label 1 and level 2: give only one of them": {"label": 1, "level": 2},
     "label 1 and field exact: the samples of a label are a mask": {"label": 1, "field": "exact"},
 }
@@ -530,11 +531,11 @@ def test_the_command_takes_labels_levels_and_scales(tmp_path, command):
     assert command(*base, labels, out, "--label", "3")[0] == 0
     for words, shown in (("3.0", "'3.0'"), (str(2**64), str(2**64))):
         code, _, err = command(*base, labels, out, "--label", words)
-        want = f"Error: --label is {shown}: give a whole number, -2^63 to 2^64 - 1"
+        want = f"Error: label is {shown}: give a whole number, -2^63 to 2^64 - 1"
         assert (code, err.splitlines()[-1]) == (2, want)
     assert command(*base, grid, out, "--level", "100", "--scale", "0.025")[0] == 0
     code, _, err = command(*base, grid, out, "--level", "100", "--scale", "0")
-    assert (code, err.splitlines()[-1]) == (2, "Error: scale is 0: it must be greater than 0")
+    assert (code, err.splitlines()[-1]) == (2, "Error: scale is 0.0: give a number greater than 0")
     assert (
         command("check", out, grid, "--spacing", "1", "--level", "100", "--scale", ".025")[0] == 0
     )
@@ -546,7 +547,7 @@ def test_a_list_of_batch_takes_what_the_values_are(tmp_path, command):
     (tmp_path / "list.jsonl").write_text(json.dumps(job))
     run = "batch", str(tmp_path / "list.jsonl"), "--out", str(tmp_path / "out")
     assert command(*run)[0] == 0
-    row = json.loads((tmp_path / "out" / "report.jsonl").read_text())
+    (row,) = rows(tmp_path / "out")
     assert row["field"]["kind"] == "mask" and row["closed"] and row["out"] == "labels-label3.ply"
 
 

@@ -183,5 +183,7 @@ def _has_other_slope(looked: Looked, request: Request) -> bool:
         return False
     if is_normalised(looked, request.spacing) or is_projective(looked, request.spacing):
         return True
+    if not request.is_density:
+        return False
     evidence = weigh(looked, request.spacing)
-    return request.is_density and (not np.isfinite(evidence.slope) or evidence.is_scaled)
+    return not np.isfinite(evidence.slope) or evidence.is_scaled
