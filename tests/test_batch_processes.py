@@ -1,7 +1,6 @@
 """Batches and their processes, killed, ended, short of memory: nothing is lost or left over."""
 
 import errno
-import json
 import os
 import signal
 import subprocess
@@ -52,12 +51,12 @@ def test_what_a_killed_batch_left_is_removed_and_nothing_else(run_batch, command
     stale, kept = Path(f"out/deep/.b.ply.{ended.pid}.part"), Path(f"out/.x.ply.{ended.pid}.part")
     for path in (stale, kept):
         path.write_text("half")
-    started = {"in": os.path.abspath("in/deep/b.npz"), "out": "deep/b.ply", "status": "started"}
-    Path("out/report.jsonl").write_text(f"{json.dumps(started)}\n{{to")
+    Path("out/.super-sdf-batch").write_text('"deep/b.ply"\n"to')
     assert run_batch("in/", "--dry-run")[2].startswith("4 to do") and stale.exists()
     assert run_batch("in")[2].endswith("3 done, 1 failed; 3 meshes closed, 0 open\n")
     assert not stale.exists() and kept.exists()
     assert rows()[-1]["out"] == "deep/b.ply"  # last: it may be what ended the run
+    assert Path("out/.super-sdf-batch").read_text() == ""
 
 
 TWO_CORES = f"from super_sdf.batch import run\n\nrun.count_cores = lambda: 2\n{COMMAND}"
