@@ -70,7 +70,7 @@ def test_slabs_change_nothing(network, monkeypatch, field, factor, cap):
     grid = SdfGrid.trusted(FIELDS[field], (1.0,) * 3)
     (whole,) = in_pieces(grid, network, monkeypatch, 1, factor=factor, cap=cap)
     one = join_meshes(whole.meshes)
-    for pieces in (3, 56):
+    for pieces in (3, 14):
         parts = in_pieces(grid, network, monkeypatch, pieces, factor=factor, cap=cap)
         assert len(parts) > 1
         mesh = join_meshes([mesh for part in parts for mesh in part.meshes])
