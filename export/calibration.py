@@ -1,6 +1,6 @@
 """The ranges of the inputs of a network's layers, on samples as in training.
 
-``quantize`` derives quantization steps from them, and ``prune`` finds blocks that never react.
+``quantize`` derives quantization steps from them.
 """
 
 from __future__ import annotations
@@ -15,10 +15,13 @@ import torch
 from torch import Tensor, nn
 
 from export.augment import USUAL, Prepared, augment, augment_mask
+from export.batches import batch_of, encode
 from export.dataset import fill_shard
-from export.latency import ball
 from export.network import Block, SuperSdfNet
+from super_sdf.grid.sdf_grid import SdfGrid
 from super_sdf.network.network import load_network
+from super_sdf.steps.nodes import block_offsets
+from super_sdf.steps.survey import survey
 
 THIN = 0.05  # share of thin solids, as in training
 SAMPLES = 200
@@ -85,9 +88,19 @@ def find_ranges(net: SuperSdfNet, samples: list[Prepared]) -> list[Ranges]:
     for block, block_ranges in zip(watched.all_blocks(), ranges):
         block_ranges.watch(block)
     for sample in samples:
-        watched.encode_batch([sample])
+        encode(watched, batch_of([sample]))
     first = net.config.blocks - net.config.gated
     return ranges[:first] + [each.join(ranges[first:]) for each in ranges[first:]]
+
+
+def ball(radius: float = 35.0) -> Prepared:
+    """Return the band of a ball; the targets are empty."""
+    shape = (int(2 * radius + 8),) * 3
+    distance = np.linalg.norm(np.indices(shape) - (shape[0] - 1) / 2, axis=0) - radius
+    band = survey(SdfGrid.trusted(distance.astype(np.float32), 1.0))
+    patches, table, voxels = band.network_inputs()
+    targets = np.zeros((len(voxels), 0), np.float32)
+    return Prepared(band.voxel_ijk, patches, table, voxels, block_offsets(4), targets)
 
 
 def distance_apart(one: Path, other: Path, samples: Sequence[Prepared] = ()) -> np.ndarray:

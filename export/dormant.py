@@ -21,8 +21,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from export.network import Block, NeighbourConv, SuperSdfNet
-from export.resident import Batch
+from export.batches import Batch, encode
+from export.network import NeighbourConv, SuperSdfNet
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,20 +55,17 @@ class Rectified:
 
 
 def rectified_layers(net: SuperSdfNet) -> list[Rectified]:
-    """Return the layers that a rectifier follows; of variants, only those that are as in ours."""
+    """Return the layers that a rectifier follows."""
     first, _, second = net.stem
     layers = [Rectified(first, first.weight, second.weight, False)]
-    for block in net.modules():
-        if type(block) is Block:  # other kinds may have other rectifiers, or none
-            layers.append(Rectified(block.conv, block.conv.weight, block.expand.weight, False))
-            layers.append(Rectified(block.expand, block.expand.weight, block.reduce.weight, False))
+    for block in net.all_blocks():
+        layers.append(Rectified(block.conv, block.conv.weight, block.expand.weight, False))
+        layers.append(Rectified(block.expand, block.expand.weight, block.reduce.weight, False))
     if net.config.gated:
         first, _, second = net.gate.layers
         layers.append(Rectified(first, first.weight, second.weight, False))
-    if type(net).residual is SuperSdfNet.residual:
-        functions, channels = net.trunk.layers[-1].weight, net.config.channels
-        layers.append(Rectified(net.branch, net.branch.weight, functions, True, channels))
-    return layers
+    functions, channels = net.trunk.layers[-1].weight, net.config.channels
+    return [*layers, Rectified(net.branch, net.branch.weight, functions, True, channels)]
 
 
 @contextmanager
@@ -94,7 +91,7 @@ def reacting(net: SuperSdfNet, batches: Sequence[Batch]) -> list[Tensor]:
     found = [torch.zeros_like(entry.bias, dtype=torch.bool) for entry in layers]
     with watching(layers) as seen:
         for batch in batches:
-            net.decode(net.encode_batch(batch), torch.zeros(1, 3, device=found[0].device))
+            net.decode(encode(net, batch), torch.zeros(1, 3, device=found[0].device))
             for known, inputs in zip(found, seen):
                 known |= (inputs > 0).any(0)
     return found
@@ -121,7 +118,7 @@ def revive(
     for entry, units in zip(layers, asleep):
         restart(entry, units, optimisers)
     with watching(layers) as seen:
-        net.decode(net.encode_batch(batches[0]), torch.zeros(1, 3, device=layers[0].bias.device))
+        net.decode(encode(net, batches[0]), torch.zeros(1, 3, device=layers[0].bias.device))
         for entry, units, inputs in zip(layers, asleep, seen):
             entry.bias[units] -= inputs[:, units].float().mean(0)
     return sum(map(len, asleep))

@@ -1,4 +1,4 @@
-"""Fit the rule that tells edges from rounded ground: see ``super_sdf.steps.features``.
+"""Fit the rule that tells edges from rounded ground: see ``super_sdf.steps.sharp.features``.
 
     python -m export.edges --meshes FOLDER_OF_PLY --procedural 0.4 --count 200 --out edges.npz
 
@@ -27,12 +27,12 @@ from super_sdf.grid.sdf_grid import SdfGrid
 from super_sdf.network.network import Network, load_network
 from super_sdf.pipeline import upsample
 from super_sdf.steps.cap import close_at_border
-from super_sdf.steps.fans import Placed, fan_triangles, flat_triangles, unfolded
-from super_sdf.steps.features import Candidates, Rule, find_candidates, move_beside
 from super_sdf.steps.field import FineField
 from super_sdf.steps.marching import find_crossings, to_world
-from super_sdf.steps.patches import Patches, find_patches
-from super_sdf.steps.planes import Planes, planes_at_crossings
+from super_sdf.steps.sharp.fans import Placed, fan_triangles, flat_triangles, unfolded
+from super_sdf.steps.sharp.features import Candidates, Rule, find_candidates, move_beside
+from super_sdf.steps.sharp.patches import Patches, find_patches
+from super_sdf.steps.sharp.planes import Planes, planes_at_crossings
 from super_sdf.truth.solid import Solid
 
 SIZES = (24, 32, 32, 48)  # drawn from, samples along an axis

@@ -16,7 +16,8 @@ import torch
 from scipy.stats import spearmanr
 
 from export.arguments import Parser, share
-from export.augment import Prepared, batch_table
+from export.augment import Prepared
+from export.batches import batch_of, encode, predict, singly
 from export.network import Encoded, SuperSdfNet
 from export.recipe import RECIPE
 from export.to_onnx import read_network
@@ -26,7 +27,6 @@ from export.train import (
     Store,
     batch_losses,
     check_store,
-    predict_encoded,
     sample_errors,
 )
 from super_sdf.errors import OptionError
@@ -45,7 +45,7 @@ HEADER = (
 def encode_first(net: SuperSdfNet, samples: list[Prepared]) -> list[Encoded]:
     """Return the voxels of each sample after the first blocks."""
     net.gate.threshold.fill_(NEVER)
-    return [net.encode_batch([sample]) for sample in samples]
+    return [encode(net, batch) for batch in singly(net, samples)]
 
 
 def threshold_of(encoded: list[Encoded], share: float) -> float:
@@ -63,9 +63,9 @@ def measure_at(
     errors, count = [], 0
     for sample, first in zip(samples, encoded):
         rows = net.gate.rows(first.doubts, first.patches)
-        table = torch.from_numpy(batch_table([sample.table]))
-        deep = net.blend(first, table, rows)
-        errors.append(sample_errors(*predict_encoded(net, [sample], deep)[0]))
+        batch = batch_of([sample])
+        deep = net.blend(first, batch.table, rows)
+        errors.append(sample_errors(predict(net, batch, deep), batch.targets))
         count += len(rows)
     band = sum(len(sample.patches) for sample in samples)
     return count / band, Errors(*np.nanmean(errors, axis=0).tolist())
@@ -74,7 +74,7 @@ def measure_at(
 @torch.no_grad()
 def correlation(net: SuperSdfNet, samples: list[Prepared], encoded: list[Encoded]) -> float:
     """Return the rank correlation between what the gate says and the loss of each voxel."""
-    losses = [batch_losses(net, [s], first, RECIPE) for s, first in zip(samples, encoded)]
+    losses = [batch_losses(net, batch_of([s]), first, RECIPE) for s, first in zip(samples, encoded)]
     said = [first.doubts[s.voxels] for s, first in zip(samples, encoded)]
     return float(spearmanr(torch.cat(said), torch.cat(losses)).statistic)
 

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from export.arguments import Parser
+from export.batches import singly
 from export.dormant import dormant_share
 from export.to_onnx import read_inputs, read_network
 from export.train import HELD_OUT, Errors, Store, check_store, measure
@@ -30,7 +31,7 @@ def measure_files(files: list[Path], folder: Path) -> Iterator[str]:
     for file in files:
         net = read_network(file)
         samples = Store(folder, HELD_OUT, most=0, inputs=read_inputs(file)).held_out
-        dormant = dormant_share(net, [[sample] for sample in samples])
+        dormant = dormant_share(net, singly(net, samples))
         yield format_row(file.name, measure(net, samples), dormant)
 
 

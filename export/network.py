@@ -20,20 +20,14 @@ can be distances. The distances of a mask are right to half a voxel only, and no
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
-from export.augment import Prepared, batch_table
 from super_sdf.neighbourhood import CENTRE
 from super_sdf.steps.band import DECODE_LIMIT, MAX_DIFFERENCE
-
-if TYPE_CHECKING:
-    from export.resident import TurnedBatch
 
 
 @dataclass(frozen=True)
@@ -60,11 +54,12 @@ class NetworkConfig:
 
 
 SIZES = {
-    "fast": NetworkConfig(blocks=3, functions=192),
-    "base": NetworkConfig(blocks=9),
-    "wide": NetworkConfig(channels=96, blocks=9, hidden=192, functions=320),
+    "fast": NetworkConfig(blocks=4, functions=192),
+    "base": NetworkConfig(channels=96, blocks=16, hidden=192, functions=320),
+    "noisy": NetworkConfig(blocks=9),
+    "mask": NetworkConfig(blocks=9, keeps_samples=False),
 }
-"""The sizes of networks, by name."""
+"""The sizes of the shipped networks, by name."""
 
 
 CHUNK = 1024  # voxels gathered at a time on a CPU, so that their columns stay in cache
@@ -322,19 +317,8 @@ class SuperSdfNet(nn.Module):
             some = block(some, near, features)
         return some
 
-    def encode_batch(
-        self, batch: Sequence[Prepared] | TurnedBatch, share: float | None = None
-    ) -> Encoded:
-        """Encode a batch of samples, concatenated; for ``share`` see ``Gate.rows``."""
-        if not isinstance(batch, Sequence):
-            return self.encode_all(batch.patches, batch.table, share)
-        device = next(self.parameters()).device
-        patches = torch.from_numpy(np.concatenate([sample.patches for sample in batch])).to(device)
-        table = torch.from_numpy(batch_table([sample.table for sample in batch])).to(device)
-        return self.encode_all(patches, table, share)
-
     def encode_all(self, patches: Tensor, table: Tensor, share: float | None = None) -> Encoded:
-        """Encode voxels; return all inputs of the head."""
+        """Encode voxels; return all inputs of the head. For ``share`` see ``Gate.rows``."""
         noisy = is_noisy(patches, table)
         if not self.config.keeps_samples:
             noisy = torch.ones_like(noisy)

@@ -3,11 +3,10 @@ r"""Write the int8 variant of an exported network, and check its error.
     python -m export.quantize src/super_sdf/models/base.onnx \
         --out src/super_sdf/models/base-int8.onnx
 
-Only the blocks change, and those that never react are removed (``prune``); stem, head and the
-features between the blocks stay float32. Weights are integers with one scale per output channel;
-the inputs of a layer are integers with one step per input channel. The steps are static, calibrated
-on procedural shapes, or on masks of them: dynamic steps would make the values of a voxel depend on
-all others in the call.
+Only the blocks change; stem, head and the features between the blocks stay float32. Weights are
+integers with one scale per output channel; the inputs of a layer are integers with one step per
+input channel. The steps are static, calibrated on procedural shapes, or on masks of them: dynamic
+steps would make the values of a voxel depend on all others in the call.
 """
 
 from __future__ import annotations
@@ -28,8 +27,7 @@ from export.calibration import (
 )
 from export.int8_graph import IntBlock, IntLayer, replace_blocks
 from export.network import Block
-from export.prune import card_of, without_idle_blocks
-from export.to_onnx import read_network, write_model
+from export.to_onnx import read_card, read_network, write_model
 
 LEVELS = 255  # of the inputs of a layer: uint8
 # Two products must fit into 16 bits, in which processors without VNNI add them with saturation.
@@ -46,9 +44,8 @@ def quantize(
 ) -> None:
     """Write the int8 variant of a file, with its metadata."""
     net = read_network(source)
-    net = without_idle_blocks(net, find_ranges(net, samples))
     changed = {"name": target.stem, "precision": "int8", "accuracy": accuracy}
-    write_model(net, target, card_of(source, net, **changed))
+    write_model(net, target, {**read_card(source), **changed})
     model = onnx.load(target)
     blocks = [whole_block(*pair) for pair in zip(net.all_blocks(), find_ranges(net, samples))]
     replace_blocks(model.graph, blocks)

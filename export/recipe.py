@@ -1,7 +1,4 @@
-"""How a network is trained: loss, optimisers, learning rates.
-
-README's table has the alternatives that were tried, with ``compare``.
-"""
+"""How a network is trained: loss, optimisers, learning rates; README has what was tried."""
 
 from __future__ import annotations
 
@@ -21,19 +18,16 @@ from export.network import SuperSdfNet
 class Recipe:
     """The hyperparameters of a run."""
 
-    muon: bool = True  # for the matrices of the blocks; AdamW for all other parameters
     hidden_rate: float = 4e-3  # of the blocks; 2e-3 and 1e-2 are worse
     outer_rate: float = 2e-3
     warm_up: float = 0.03  # share of the budget
     batch_voxels: int = 12_000  # small enough for the arrays of a step to stay in cache
     average_decay: float = 0.998  # of the averaged weights, per step
-    power: int = 1  # of the error: 1 or 2
     voxel_power: float = 0.5  # of the number of voxels of a sample, for its weight in a batch
     spread: float = 3.0  # of the chances of windows, by their loss; 1: equal (``sampler``)
     reach: float = 0.5  # half voxels: decay length of the weight away from the surface ...
     far_weight: float = 0.25  # ... to this
     gradient_weight: float = 0.5
-    eikonal_weight: float = 0.0
     first_weight: float = 0.2  # of the loss after the first blocks of a gated network
     gate_weight: float = 0.01  # of the error of what its gate says of that loss
     shares_gated: tuple[float, float] = (0.05, 0.5)  # of a batch's voxels, drawn between these
@@ -67,17 +61,11 @@ def nearness(target: Tensor, recipe: Recipe) -> Tensor:
 
 def voxel_losses(prediction: Tensor, target: Tensor, recipe: Recipe) -> Tensor:
     """Return the loss of each voxel, (D,): the weighted error of values and of their gradient."""
-    error = (prediction - target).abs() ** recipe.power
+    error = (prediction - target).abs()
     loss = (nearness(target, recipe) * error).mean(1)
     corners = nearness(target[:, : 4 * CORNERS : 4], recipe)
-    slope = differences(prediction)
-    if recipe.gradient_weight:
-        apart = (slope - differences(target)).abs().sum(2)
-        loss = loss + recipe.gradient_weight * (corners * apart).mean(1)
-    if recipe.eikonal_weight:
-        unit = (slope.norm(dim=2) - 1).abs()
-        loss = loss + recipe.eikonal_weight * (corners * unit).mean(1)
-    return loss
+    apart = (differences(prediction) - differences(target)).abs().sum(2)
+    return loss + recipe.gradient_weight * (corners * apart).mean(1)
 
 
 def relative_weights(voxels: list[int], recipe: Recipe) -> Tensor:
@@ -92,16 +80,14 @@ def relative_weights(voxels: list[int], recipe: Recipe) -> Tensor:
 
 def make_optimisers(net: SuperSdfNet, recipe: Recipe) -> list[torch.optim.Optimizer]:
     """Return Muon for the matrices of the blocks, AdamW for all other parameters."""
-    blocks = {id(p) for p in net.all_blocks().parameters() if p.ndim == 2 and recipe.muon}
+    blocks = {id(p) for p in net.all_blocks().parameters() if p.ndim == 2}
     hidden = [p for p in net.trained() if id(p) in blocks]
     others = [p for p in net.trained() if id(p) not in blocks]
-    optimisers: list[torch.optim.Optimizer] = [
-        torch.optim.AdamW(others, lr=recipe.outer_rate, weight_decay=1e-3)
+    rate = {"lr": recipe.hidden_rate, "adjust_lr_fn": "match_rms_adamw"}
+    return [
+        torch.optim.AdamW(others, lr=recipe.outer_rate, weight_decay=1e-3),
+        *([StackedMuon(hidden, weight_decay=1e-3, **rate)] if hidden else []),
     ]
-    if hidden:
-        rate = {"lr": recipe.hidden_rate, "adjust_lr_fn": "match_rms_adamw"}
-        optimisers.append(StackedMuon(hidden, weight_decay=1e-3, **rate))
-    return optimisers
 
 
 def rate_factor(spent: float, recipe: Recipe) -> float:

@@ -15,36 +15,12 @@ import torch
 from torch import Tensor
 
 from export.augment import Prepared
+from export.batches import Batch, copies_of_queries, neighbours_with_targets
 from export.dataset import ANYWHERE, CORNERS, FINE_NODES
-from export.network import Encoded, SuperSdfNet
-from export.sharing import copies_of_queries, neighbours_with_targets
 from super_sdf.network.symmetry import cube_symmetries, turned_places
 
 # A corner and its three neighbours have at most 8 + 3 * 4 copies (``dataset.draw_offsets``).
 MOST_COPIES = 20 * CORNERS + 8 * FINE_NODES + ANYWHERE
-
-
-@dataclass(frozen=True, eq=False)
-class TurnedBatch:
-    """Samples side by side on a device, each turned by a symmetry of the cube.
-
-    A query on a face, edge or corner has copies in the voxels that share it (``sharing``); each
-    sample has M of them, of which the last ones may belong to no query.
-    """
-
-    patches: Tensor  # (V, 27) float32
-    table: Tensor  # (V, 27) rows of the band, V where absent
-    voxels: Tensor  # (D,) rows of the band that have targets
-    near: Tensor  # (D, 27) which of the D voxels are around each, D where none
-    window: Tensor  # (D,) sample that each belongs to
-    counts: list[int]  # voxels with targets of each sample, (B,)
-    query: Tensor  # (B, M) query of a copy, Q for none
-    place: Tensor  # (B, M) of the 27
-    moved: Tensor  # (B, M, 3) float32, its offset there
-    targets: Tensor  # (D, Q) float32
-
-
-Batch = list[Prepared] | TurnedBatch
 
 
 class Rows:
@@ -125,7 +101,7 @@ class Residents:
         self.band_counts = np.append(self.band_counts, gathered.band_counts)
         self.counts = np.append(self.counts, gathered.counts)
 
-    def batch(self, drawn: Sequence[int], turns: Sequence[int]) -> TurnedBatch:
+    def batch(self, drawn: Sequence[int], turns: Sequence[int]) -> Batch:
         """Return some samples, each turned by one of the 48 symmetries."""
         chosen = np.asarray(drawn)
         band = rows_of(self.band_counts, chosen, self.device)
@@ -133,7 +109,7 @@ class Residents:
         which = torch.from_numpy(chosen).to(self.device)
         turn = torch.as_tensor(np.asarray(turns), device=self.device)
         places = self.places[turn[band.part]]
-        return TurnedBatch(
+        return Batch(
             patches=self.arrays["patches"][band.rows].gather(1, places),
             table=moved_to(self.arrays["table"][band.rows], band).gather(1, places),
             voxels=self.arrays["voxels"][some.rows].long() + band.firsts[some.part],
@@ -149,23 +125,22 @@ class Residents:
 
 def arrays_of(sample: Prepared) -> dict[str, np.ndarray]:
     """Return what is kept of a sample, indices within it, -1 for none."""
-    query, place, moved = copies_of_queries(sample.offsets)
-    near = neighbours_with_targets(sample)
-    room = MOST_COPIES - len(query)
-    if room < 0:
+    copies, queries = copies_of_queries(sample.offsets), len(sample.offsets)
+    if len(copies.query) > MOST_COPIES:
         raise ValueError(
-            f"{len(sample.offsets)} queries have {len(query)} copies, more than {MOST_COPIES}: "
+            f"{queries} queries have {len(copies.query)} copies, more than {MOST_COPIES}: "
             "draw them with dataset.draw_offsets"
         )
+    copies = copies.padded(MOST_COPIES, queries)
     return {
         "patches": sample.patches,
         "table": sample.table,
         "voxels": sample.voxels.astype(np.int32),
-        "near": np.where(near < len(near), near, -1).astype(np.int32),
+        "near": neighbours_with_targets(sample).astype(np.int32),
         "targets": sample.targets.astype(np.float16),
-        "query": np.pad(query, (0, room), constant_values=len(sample.offsets))[None],
-        "place": np.pad(place, (0, room))[None],
-        "moved": np.pad(moved, ((0, room), (0, 0))).astype(np.float32)[None],
+        "query": copies.query[None],
+        "place": copies.place[None],
+        "moved": copies.moved[None],
     }
 
 
@@ -190,22 +165,3 @@ def rows_of(counts: np.ndarray, chosen: np.ndarray, device: str) -> Parts:
 def moved_to(indices: Tensor, parts: Parts) -> Tensor:
     """Return indices within samples as indices among all rows, their number for -1."""
     return torch.where(indices < 0, len(indices), indices + parts.firsts[parts.part][:, None])
-
-
-def predict_turned(net: SuperSdfNet, batch: TurnedBatch, encoded: Encoded) -> Tensor:
-    """Return the values (D, Q) of a batch; those of shared nodes are averaged (``sharing``)."""
-    voxels = encoded.some(batch.voxels)
-    values = net.decode_parts(voxels, batch.counts, batch.moved)
-    rows = batch.near.gather(1, batch.place[batch.window])
-    query, there = batch.query[batch.window], (rows < len(values)).to(values.dtype)
-    seen = torch.cat([values, values.new_zeros(1, values.shape[1])]).gather(0, rows)
-    none = values.new_zeros(len(values), batch.targets.shape[1] + 1)
-    total = none.scatter_add(1, query, seen) / none.scatter_add(1, query, there).clamp(min=1)
-    return total[:, :-1]
-
-
-def means_turned(values: Tensor, batch: TurnedBatch) -> Tensor:
-    """Return the mean of values (D,) of each sample of a batch, (B,)."""
-    counts = torch.tensor(batch.counts, device=values.device)
-    sums = values.new_zeros(len(batch.counts)).index_add(0, batch.window, values)
-    return sums / counts

@@ -22,6 +22,7 @@ import onnx
 import torch
 from onnx import helper, numpy_helper
 
+from export.batches import singly
 from export.calibration import draw_samples
 from export.dormant import dormant_share
 from export.network import NetworkConfig, SuperSdfNet
@@ -161,7 +162,7 @@ def check_awake(net: SuperSdfNet) -> None:
         If more than ``DORMANT`` of the rectified units react to no voxel of procedural shapes.
     """
     samples = draw_samples(masks=not net.config.keeps_samples)
-    share = dormant_share(net, [[sample] for sample in samples if len(sample.voxels)])
+    share = dormant_share(net, singly(net, [sample for sample in samples if len(sample.voxels)]))
     if share > DORMANT:
         raise SystemExit(
             f"{100 * share:.1f} % of the rectified units react to nothing, "

@@ -2,10 +2,10 @@
 
     python -m export.train --store training/store --run training/run --minutes 90
     python -m export.train --store training/store --run training/run --minutes 90     # resumes
-    python -m export.train --store training/store --run training/run --device cuda    # a GPU
+    python -m export.train --store training/store --run training/run --device cuda --by-clock
     python -m export.train ... --start src/super_sdf/models/base.onnx --rate 0.7   # its weights
     python -m export.train ... --start src/super_sdf/models/base.onnx --blocks 12  # more blocks
-    python -m export.train ... --start src/super_sdf/models/base.onnx --size wide  # more units
+    python -m export.train ... --start src/super_sdf/models/noisy.onnx --size base # more units
     python -m export.train ... --inputs masks      # the network for masks
     OMP_NUM_THREADS=1 python -m export.train ... --threads 2   # each works on a part of a batch
 
@@ -44,6 +44,7 @@ from export.augment import (
     prepare,
     prepare_mask,
 )
+from export.batches import Batch, batch_of, encode, means, predict, singly
 from export.dataset import CORNERS, Sample, read_shard
 from export.dormant import dormant_share, revive
 from export.grow import grow_from, without_blocks
@@ -59,17 +60,12 @@ from export.recipe import (
     voxel_losses,
 )
 from export.resident import (
-    Batch,
     Gathered,
     Residents,
-    TurnedBatch,
     gather_samples,
-    means_turned,
-    predict_turned,
 )
 from export.run_log import append_line, plot_run, read_log
 from export.sampler import Sampler
-from export.sharing import decode_shared, neighbours_with_targets
 from export.to_onnx import DISTANCES, read_weights
 from super_sdf.errors import FileError
 from super_sdf.files.regular import check_regular_file
@@ -85,26 +81,6 @@ INPUTS = (DISTANCES, MASKS)
 NEAR = 0.5  # half voxels from the surface: limit for normals; half of it for values
 
 
-def predict(net: SuperSdfNet, batch: list[Prepared]) -> list[tuple[Tensor, Tensor]]:
-    """Return prediction and target, (D, Q), of each sample; shared nodes are averaged."""
-    return predict_encoded(net, batch, net.encode_batch(batch))
-
-
-def predict_encoded(
-    net: SuperSdfNet, batch: list[Prepared], encoded: Encoded
-) -> list[tuple[Tensor, Tensor]]:
-    """Return prediction and target, (D, Q), of each sample of a batch that was encoded."""
-    device = next(net.parameters()).device
-    starts = np.cumsum([0] + [len(sample.patches) for sample in batch])
-    pairs = []
-    for sample, start in zip(batch, starts[:-1]):
-        rows = torch.from_numpy(sample.voxels + start).to(device)
-        near = torch.from_numpy(neighbours_with_targets(sample)).to(device)
-        values = decode_shared(net, encoded.some(rows), near, sample.offsets)
-        pairs.append((values, torch.from_numpy(sample.targets).to(device)))
-    return pairs
-
-
 class Store:
     """The samples of the shards in a folder; the first shards, by name, are held out.
 
@@ -115,10 +91,15 @@ class Store:
     """
 
     def __init__(
-        self, folder: Path, held_out: int, most: int | None = None, inputs: str = INPUTS[0]
+        self,
+        folder: Path,
+        held_out: int,
+        most: int | None = None,
+        inputs: str = INPUTS[0],
+        device: str = "cpu",
     ) -> None:
         check_store(folder, held_out)
-        self.folder, self.most, self.inputs = folder, most, inputs
+        self.folder, self.most, self.inputs, self.device = folder, most, inputs, device
         self.seen = sorted(folder.glob("shard-*.npz"))[:held_out]
         gathered = prepare_mask if inputs == MASKS else prepare
         held = [gathered(s) for path in self.seen for s in read_shard(path)]
@@ -139,18 +120,25 @@ class Store:
         """Return the number of samples to train on."""
         return len(self.samples)
 
-    def draw_batch(self, rng: np.random.Generator, recipe: Recipe) -> tuple[list[int], Batch]:
-        """Return samples with about ``batch_voxels`` voxels together, and which they are."""
+    def draw_batch(
+        self, rng: np.random.Generator, recipe: Recipe, parts: int
+    ) -> tuple[list[int], list[Batch]]:
+        """Return windows with about ``batch_voxels`` voxels together, and which they are.
+
+        They come in as many batches as there are threads, so that each can work on one.
+        """
         drawn: list[int] = []
-        batch: list[Prepared] = []
-        while sum(len(sample.patches) for sample in batch) < recipe.batch_voxels:
+        shown: list[Prepared] = []
+        while sum(len(sample.patches) for sample in shown) < recipe.batch_voxels:
             index = self.sampler.draw(rng, recipe.spread)
             sample = self._changed(rng, self.samples[index], recipe)
             if len(sample.voxels):
-                drawn, batch = [*drawn, index], [*batch, sample]
+                drawn, shown = [*drawn, index], [*shown, sample]
             else:
                 self.sampler.record([index], [0.0])
-        return drawn, batch
+        groups = divide([len(sample.patches) for sample in shown], parts)
+        batches = [batch_of([shown[row] for row in rows], self.device) for rows in groups]
+        return [drawn[row] for rows in groups for row in rows], batches
 
     def _changed(self, rng: np.random.Generator, sample: Sample, recipe: Recipe) -> Prepared:
         """Return a sample as it is shown this time."""
@@ -192,12 +180,15 @@ class ResidentStore(Store):
         """Return the number of samples to train on."""
         return len(self.residents)
 
-    def draw_batch(self, rng: np.random.Generator, recipe: Recipe) -> tuple[list[int], TurnedBatch]:
-        """Return samples with about ``batch_voxels`` voxels together, and which they are."""
+    def draw_batch(
+        self, rng: np.random.Generator, recipe: Recipe, parts: int
+    ) -> tuple[list[int], list[Batch]]:
+        """Return windows with about ``batch_voxels`` voxels in one batch, and which they are."""
         drawn: list[int] = []
         while sum(self.residents.band_counts[index] for index in drawn) < recipe.batch_voxels:
             drawn.append(self.sampler.draw(rng, recipe.spread))
-        return drawn, self.residents.batch(drawn, rng.integers(48, size=len(drawn)).tolist())
+        turns = rng.integers(48, size=len(drawn)).tolist()
+        return drawn, [self.residents.batch(drawn, turns)]
 
 
 def read_changed(path: Path, shares: Shares) -> Gathered:
@@ -219,13 +210,6 @@ def check_store(folder: Path, held_out: int) -> None:
         )
 
 
-def target_counts(batch: Batch) -> list[int]:
-    """Return the number of voxels with targets of each sample of a batch."""
-    if isinstance(batch, TurnedBatch):
-        return batch.counts
-    return [len(sample.voxels) for sample in batch]
-
-
 def window_losses(net: SuperSdfNet, batch: Batch, recipe: Recipe) -> Tensor:
     """Return the loss of each sample of a batch, (B,).
 
@@ -233,11 +217,11 @@ def window_losses(net: SuperSdfNet, batch: Batch, recipe: Recipe) -> Tensor:
     blocks, and the error of what the gate says of this.
     """
     if not net.config.gated:
-        return means(batch_losses(net, batch, net.encode_batch(batch), recipe), batch)
+        return means(batch_losses(net, batch, encode(net, batch), recipe), batch)
     low, high = recipe.shares_gated
-    encoded = net.encode_batch(batch, low + (high - low) * float(torch.rand(())))
+    encoded = encode(net, batch, low + (high - low) * float(torch.rand(())))
     of_first = batch_losses(net, batch, encoded.after_first(), recipe)
-    apart = encoded.doubts[rows_with_targets(batch)] - of_first.detach().log()
+    apart = encoded.doubts[batch.voxels] - of_first.detach().log()
     loss = recipe.first_weight * of_first + recipe.gate_weight * apart.abs()
     if high:
         loss = loss + batch_losses(net, batch, encoded, recipe)
@@ -246,25 +230,7 @@ def window_losses(net: SuperSdfNet, batch: Batch, recipe: Recipe) -> Tensor:
 
 def batch_losses(net: SuperSdfNet, batch: Batch, encoded: Encoded, recipe: Recipe) -> Tensor:
     """Return the loss of each voxel with targets of a batch, (D,)."""
-    if isinstance(batch, TurnedBatch):
-        return voxel_losses(predict_turned(net, batch, encoded), batch.targets, recipe)
-    pairs = predict_encoded(net, batch, encoded)
-    return torch.cat([voxel_losses(*pair, recipe) for pair in pairs])
-
-
-def rows_with_targets(batch: Batch) -> Tensor:
-    """Return the rows of a batch's voxels that have targets, (D,)."""
-    if isinstance(batch, TurnedBatch):
-        return batch.voxels
-    starts = np.cumsum([0] + [len(sample.patches) for sample in batch])
-    return torch.from_numpy(np.concatenate([s.voxels + at for s, at in zip(batch, starts)]))
-
-
-def means(values: Tensor, batch: Batch) -> Tensor:
-    """Return the mean of values (D,) of each sample of a batch, (B,)."""
-    if isinstance(batch, TurnedBatch):
-        return means_turned(values, batch)
-    return torch.stack([part.mean() for part in values.split(target_counts(batch))])
+    return voxel_losses(predict(net, batch, encoded), batch.targets, recipe)
 
 
 class Run:
@@ -285,7 +251,7 @@ class Run:
         self.optimisers = make_optimisers(self.net, recipe)
         self.peaks = [optimiser.param_groups[0]["lr"] for optimiser in self.optimisers]
         self.step, self.seconds = 0, 0.0
-        self.recent: deque[Batch] = deque(maxlen=WATCHED)
+        self.recent: deque[list[Batch]] = deque(maxlen=WATCHED)
 
     def save(self) -> None:
         """Write the checkpoint, completely or not at all."""
@@ -316,51 +282,36 @@ class Run:
         grow_from(self.net, weights)
         self.average.load_state_dict(self.net.state_dict())
 
-    def advance(self, batch: Batch, spent: float) -> tuple[float, list[float]]:
+    def advance(self, batches: list[Batch], spent: float) -> tuple[float, list[float]]:
         """Take one step at the rate for this share of the budget; return the loss, and each's."""
         for optimiser, peak in zip(self.optimisers, self.peaks):
             optimiser.param_groups[0]["lr"] = peak * rate_factor(spent, self.recipe)
-        weights = relative_weights(target_counts(batch), self.recipe)
-        losses = self.find_gradients(batch, weights)
+        weights = relative_weights([n for batch in batches for n in batch.counts], self.recipe)
+        losses = self.find_gradients(batches, weights)
         torch.nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
         for optimiser in self.optimisers:
             optimiser.step()
         self.step += 1
         self.update_average()
-        self.recent.append(batch)
+        self.recent.append(batches)
         if self.is_time_to_revive(spent):
-            revive(self.net, self.optimisers, self.recent)
+            revive(self.net, self.optimisers, [each for some in self.recent for each in some])
         return float(weights @ losses), losses.tolist()
 
-    def find_gradients(self, batch: Batch, weights: Tensor) -> Tensor:
+    def find_gradients(self, batches: list[Batch], weights: Tensor) -> Tensor:
         """Set the gradients of the weighted sum of the windows' losses; return each loss, (B,).
 
-        On a CPU each thread works on some of the windows, since one product is too small to be
-        shared.
+        Each batch has a thread of its own, since on a CPU one product is too small to be shared.
         """
-        weights = weights.to(self.device)
-        if isinstance(batch, TurnedBatch):
-            losses, grads = self._gradients(batch, weights)
-            for parameter, grad in zip(self.net.trained(), grads):
-                parameter.grad = grad
-            return losses.cpu()
-        shares = divide(batch, self.threads)
-        with ThreadPoolExecutor(self.threads) as pool:
-            found = list(
-                pool.map(
-                    lambda rows: self._gradients([batch[row] for row in rows], weights[rows]),
-                    shares,
-                )
-            )
-        for parameter, *parts in zip(self.net.trained(), *(grads for _, grads in found)):
-            parameter.grad = sum(parts[1:], parts[0])
-        losses = torch.empty(len(batch))
-        for rows, (some, _) in zip(shares, found):
-            losses[rows] = some.cpu()
-        return losses
+        parts = weights.to(self.device).split([len(batch.counts) for batch in batches])
+        with ThreadPoolExecutor(len(batches)) as pool:
+            found = list(pool.map(self._gradients, batches, parts))
+        for parameter, *grads in zip(self.net.trained(), *(grads for _, grads in found)):
+            parameter.grad = sum(grads[1:], grads[0])
+        return torch.cat([losses.cpu() for losses, _ in found])
 
     def _gradients(self, batch: Batch, weights: Tensor) -> tuple[Tensor, Sequence[Tensor]]:
-        """Return the loss of each of some windows, and the gradients of their weighted sum."""
+        """Return the loss of each window, and the gradients of their weighted sum."""
         with autocast(self.device):
             losses = window_losses(self.net, batch, self.recipe)
         total = (weights * losses).sum()
@@ -387,17 +338,14 @@ class Run:
             kept.copy_(buffer)
 
 
-def divide(batch: Sequence[Prepared], parts: int) -> list[list[int]]:
+def divide(sizes: Sequence[int], parts: int) -> list[list[int]]:
     """Return which windows of a batch each of at most ``parts`` threads works on.
 
     The largest windows are given out first, each to the part with the fewest voxels so far.
     """
     rows: list[list[int]] = [[] for _ in range(parts)]
-    sizes = [0] * parts
-    for row in sorted(range(len(batch)), key=lambda row: -len(batch[row].patches)):
-        least = sizes.index(min(sizes))
-        rows[least].append(row)
-        sizes[least] += len(batch[row].patches)
+    for row in sorted(range(len(sizes)), key=lambda row: -sizes[row]):
+        min(rows, key=lambda part: sum(sizes[other] for other in part)).append(row)
     return [part for part in rows if part]
 
 
@@ -413,8 +361,11 @@ class Errors:
 def measure(net: SuperSdfNet, samples: list[Prepared]) -> Errors:
     """Return the errors on held-out samples, in float32, as the exported network computes."""
     with torch.no_grad():
-        pairs = [predict(net, [sample])[0] for sample in samples]
-    return Errors(*np.nanmean([sample_errors(*pair) for pair in pairs], axis=0).tolist())
+        errors = [
+            sample_errors(predict(net, batch, encode(net, batch)), batch.targets)
+            for batch in singly(net, samples)
+        ]
+    return Errors(*np.nanmean(errors, axis=0).tolist())
 
 
 def sample_errors(prediction: Tensor, target: Tensor) -> list[float]:
@@ -427,13 +378,17 @@ def sample_errors(prediction: Tensor, target: Tensor) -> list[float]:
     return [float(error.mean()), float(near.mean()), float(1 - cosine.mean())]
 
 
-def train(run: Run, store: Store, minutes: float, seed: int) -> None:
-    """Train until the budget is spent."""
+def train(run: Run, store: Store, minutes: float, seed: int, began: float | None = None) -> None:
+    """Train until the budget is spent.
+
+    That is counted in time spent on steps, so that a run may be paused and resumed; or, with
+    ``began`` (of ``time.monotonic``), by the clock since then, as on a machine that is lent.
+    """
     rng = np.random.default_rng([seed, run.step])
     saved, losses = time.monotonic(), []
-    while run.seconds < 60 * minutes:
+    while (spent := share_spent(run, minutes, began)) < 1:
         start = time.monotonic()
-        losses.append(take_step(run, store, rng, run.seconds / (60 * minutes)))
+        losses.append(take_step(run, store, rng, spent))
         run.seconds += min(time.monotonic() - start, LONGEST_STEP)
         if run.step % LOG_STEPS == 0:
             log(run, store, float(np.mean(losses)), measured=run.step % (10 * LOG_STEPS) == 0)
@@ -447,10 +402,16 @@ def train(run: Run, store: Store, minutes: float, seed: int) -> None:
         log(run, store, float(np.mean(losses)), measured=True)
 
 
+def share_spent(run: Run, minutes: float, began: float | None) -> float:
+    """Return the share of the budget that is spent."""
+    seconds = run.seconds if began is None else time.monotonic() - began
+    return seconds / (60 * minutes)
+
+
 def take_step(run: Run, store: Store, rng: np.random.Generator, spent: float) -> float:
     """Train on the next batch of a store; return the loss."""
-    drawn, batch = store.draw_batch(rng, run.recipe)
-    loss, losses = run.advance(batch, spent)
+    drawn, batches = store.draw_batch(rng, run.recipe, run.threads)
+    loss, losses = run.advance(batches, spent)
     store.sampler.record(drawn, losses)
     return loss
 
@@ -462,7 +423,7 @@ def log(run: Run, store: Store, loss: float, *, measured: bool) -> None:
     if measured:
         errors = measure(run.average, store.held_out)
         line += [f"{errors.everywhere:.5f}", f"{errors.near:.5f}", f"{errors.normal:.5f}"]
-        line += [f"{dormant_share(run.net, [[sample] for sample in store.held_out]):.4f}"]
+        line += [f"{dormant_share(run.net, singly(run.net, store.held_out)):.4f}"]
     append_line(path, line)
     if measured:
         plot_run(read_log(path), path.with_name("loss.png"))
@@ -475,6 +436,11 @@ def main() -> None:
     parser.add_argument("--run", type=Path, required=True, help="folder of the run")
     add_network_options(parser)
     parser.add_argument("--minutes", type=positive, default=90.0, help="training time in all")
+    parser.add_argument(
+        "--by-clock",
+        action="store_true",
+        help="count the minutes from the start of this call, reading and pauses included",
+    )
     parser.add_argument("--rate", type=positive, default=1.0, help="factor on the learning rates")
     parser.add_argument("--noisy", type=share, default=USUAL.noisy, help="share of noisy samples")
     parser.add_argument(
@@ -544,6 +510,7 @@ def add_network_options(parser: Parser) -> None:
 
 def run_training(options: argparse.Namespace) -> None:
     """Check the store before anything is written, then train."""
+    began = time.monotonic() if options.by_clock else None
     check_store(options.store, HELD_OUT)
     if options.start:
         check_regular_file(options.start)
@@ -579,8 +546,8 @@ def run_training(options: argparse.Namespace) -> None:
     if options.device == "cuda" and options.inputs == DISTANCES:
         store: Store = ResidentStore(options.store, HELD_OUT, recipe.shares, options.device)
     else:
-        store = Store(options.store, HELD_OUT, inputs=options.inputs)
-    train(run, store, options.minutes, options.seed)
+        store = Store(options.store, HELD_OUT, None, options.inputs, options.device)
+    train(run, store, options.minutes, options.seed, began)
 
 
 if __name__ == "__main__":

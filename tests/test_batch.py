@@ -19,7 +19,7 @@ from super_sdf.batch.job import Result
 from super_sdf.batch.plan import Batch, Settings
 from super_sdf.cli.batch_report import describe_progress, duration
 from super_sdf.convert import convert
-from super_sdf.files.store import files_of
+from super_sdf.files.regular import files_of
 
 pytestmark = pytest.mark.usefixtures("grid_folder")
 

@@ -233,7 +233,7 @@ def test_a_zip_bomb_is_refused_unread(here, command, monkeypatch):
     np.savez_compressed("bomb.npz", values=np.zeros((200, 200, 200), np.float32))
     packed = zipfile.ZipFile("bomb.npz").getinfo("values.npy").compress_size
     monkeypatch.setattr("super_sdf.machine.memory.free_memory", lambda: 10**7)
-    monkeypatch.setattr("super_sdf.files.grids.unpack", None)
+    monkeypatch.setattr("super_sdf.files.unpacking._scratch_file", None)
     want = (
         "bomb.npz[values], 200 x 200 x 200 float32, 32,000,000 bytes, is compressed to "
         f"{packed:,} bytes, like a zip bomb, and does not fit in memory; if it is a grid, save "
@@ -307,7 +307,7 @@ def test_a_folder_without_permission_is_named(here, command, monkeypatch):
     assert command("upsample", "in.npy", "out.ply") == (1, "", want)
 
 
-@pytest.mark.parametrize("stage", ["pipeline.refine", "files.ply.write_split"])
+@pytest.mark.parametrize("stage", ["pipeline.refine", "files.plain_meshes.write_split"])
 def test_an_interrupt_at_any_stage_leaves_nothing(here, command, monkeypatch, stage):
     def interrupt(*_, **__):
         raise KeyboardInterrupt

@@ -5,7 +5,7 @@ import pytest
 from conftest import ball
 
 from super_sdf.errors import GridError, OptionError
-from super_sdf.grid.gradients import surface_gradients, typical_length
+from super_sdf.grid.census import Census
 from super_sdf.grid.sdf_grid import SdfGrid, make_grid
 from super_sdf.steps.band import rescale
 
@@ -18,7 +18,7 @@ def torus(n: int, unit: float = 1.0) -> np.ndarray:
 
 @pytest.mark.parametrize("n", [32, 64])
 def test_the_spacing_is_measured_to_half_a_percent(n):
-    assert typical_length(*surface_gradients(torus(n))) * n == pytest.approx(1, abs=0.005)
+    assert Census(torus(n)).beside.typical_length * n == pytest.approx(1, abs=0.005)
 
 
 def test_walls_thinner_than_the_spacing_are_not_taken_for_unequal_axes():

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
-from conftest import ball
 from test_formats import affine_of, sampled, save_itk, save_nifti, save_nrrd, save_vti, text_sdf
 from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
 from vtkmodules.vtkCommonDataModel import vtkImageData
@@ -96,7 +95,7 @@ ENDS_OF_TEXT = {
 
 @pytest.mark.parametrize("name", CHECKED)
 def test_no_flipped_bit_in_checked_data_passes(name, monkeypatch):
-    """Of 400 anywhere behind the text of a header, for which no format has a checksum."""
+    """Of 150 anywhere behind the text of a header, for which no format has a checksum."""
     monkeypatch.setattr("super_sdf.machine.memory.left_memory", lambda: None)  # it takes a while
     CHECKED[name](name)
     whole, rng = Path(name).read_bytes(), np.random.default_rng(7)
@@ -104,7 +103,7 @@ def test_no_flipped_bit_in_checked_data_passes(name, monkeypatch):
     first = 8 * (whole.index(end) + len(end))
     want, other = read_grid(name), f"x{name[1:]}"
     silent = []
-    for bit in rng.choice(np.arange(first, 8 * len(whole)), 400, replace=False):
+    for bit in rng.choice(np.arange(first, 8 * len(whole)), 150, replace=False):
         damaged = bytearray(whole)
         damaged[bit // 8] ^= 1 << bit % 8
         Path(other).write_bytes(damaged)
@@ -159,8 +158,7 @@ def test_raw_data_is_as_long_as_the_header_says():
 # Headers that state too much
 
 
-@pytest.mark.parametrize("first", ["", "-"])
-@pytest.mark.parametrize("size", ["1000000000", "999999999999999999"])
+@pytest.mark.parametrize("first, size", [("", "999999999999999999"), ("-", "1000000000")])
 def test_sizes_that_no_file_has_are_refused_at_once(size, first):
     huge = f"{first}{size} {size} {size}"
     write("a.mha", MHA.replace("24 20 17", huge), "ElementDataFile = LOCAL\n", RAW)
@@ -516,17 +514,3 @@ def test_xml_that_no_vtk_file_has_is_refused():
 
 
 # Commands
-
-
-def test_a_batch_goes_on_after_a_damaged_file(command):
-    os.mkdir("in")
-    np.save("in/b.npy", ball(12, 3.0).values)
-    packed = bytearray(zlib.compress(RAW))
-    packed[1000] ^= 8
-    mha("CompressedData = True", data=bytes(packed), name="in/a.mha")
-    mha(data=RAW[:100], name="in/c.mha")
-    code, _, err = command("batch", "in", "--out", "out", "--quality", "fast", "--jobs", "1")
-    assert code == 1 and os.path.exists("out/b.ply")
-    assert "in/a.mha is damaged" in err and "in/c.mha is truncated" in err
-    code, _, err = command("upsample", "in/a.mha", "a.ply")
-    assert (code, len(err.splitlines())) == (1, 1) and not os.path.exists("a.ply")

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from super_sdf import SdfGrid, extract_mesh, make_grid, read_grid, reconstruct, upsample
 from super_sdf.errors import GridError, OptionError
 from super_sdf.files.grids import write_grid
-from super_sdf.files.precision import check_format_holds
+from super_sdf.files.meshes import check_format_holds
 from super_sdf.mesh import vertex_type
 
 MIRROR = np.diag([1.0, -1.0, 1.0])
@@ -33,7 +33,7 @@ def pear(shape=(18, 15, 21), h=0.5) -> np.ndarray:
 
 
 @given(st.tuples(*[st.floats(-3, 3)] * 3), st.booleans(), st.sampled_from(MESHERS))
-@settings(max_examples=20)
+@settings(max_examples=8)
 def test_the_mesh_of_a_turned_grid_is_the_turned_mesh(angles, mirrored, mesher):
     direction = turn(*angles) @ (MIRROR if mirrored else np.eye(3))
     straight = reconstruct(make_grid(pear(), spacing=0.5), trilinear, 4, mesher=mesher)

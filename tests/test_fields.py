@@ -30,7 +30,6 @@ from super_sdf import (
 from super_sdf.errors import FileError, OptionError, OptionTypeError, OutOfMemoryError, WriteError
 from super_sdf.fields import writing
 from super_sdf.machine.memory import held_memory
-from super_sdf.mesh import CLEARANCE
 from super_sdf.pipeline import reconstruct_slabs
 from super_sdf.slabs import cutting
 
@@ -121,15 +120,6 @@ def test_the_fine_lattice_of_a_plane_is_the_plane_also_far_from_it(factor):
     assert fine.low == pytest.approx(fine.values.min(), abs=SPACING)
 
 
-def test_planes_of_the_lattice_are_the_same_for_any_cut():
-    fine = fine_grid(upsample(ball(), trilinear))
-    whole = fine.planes(0, fine.shape[0])
-    for first, last in [(0, 1), (0, 7), (7, 8), (40, 43), (76, 81), (80, 81)]:
-        assert np.array_equal(fine.planes(first, last), whole[first:last])
-    assert fine.planes(3, 3).shape == (0, 81, 81)
-    assert np.array_equal(fine.values, whole)
-
-
 def test_the_lattice_holds_the_samples_and_their_signs():
     grid = ball()
     fine = fine_grid(upsample(grid, trilinear, 4))
@@ -142,8 +132,7 @@ def test_the_lattice_holds_the_samples_and_their_signs():
 
 
 @pytest.mark.parametrize("name", GRIDS)
-@pytest.mark.parametrize("cap", [False, True])
-@pytest.mark.parametrize("mesher", ["marching", "sharp"])
+@pytest.mark.parametrize("cap, mesher", [(False, "marching"), (True, "sharp")])
 def test_a_field_that_was_read_back_gives_the_same_mesh(name, cap, mesher):
     grid = GRIDS[name]()
     field = upsample(grid, trilinear, 4)
@@ -156,7 +145,7 @@ def test_a_field_that_was_read_back_gives_the_same_mesh(name, cap, mesher):
     assert want.is_closed() == (cap or name != "leaving")
 
 
-@pytest.mark.parametrize("spacing", [1.0, 0.25, 0.1, 1 / 3, 1e-9, 3e12])
+@pytest.mark.parametrize("spacing", [0.25, 1 / 3, 1e-9, 3e12])
 def test_numbers_come_back_bit_for_bit_in_every_unit(spacing):
     grid = SdfGrid.trusted(np.float32(ball().values * spacing), spacing, np.float64(1e3) * spacing)
     field = upsample(grid, trilinear, 2, offset=spacing / 7)
@@ -373,21 +362,6 @@ def test_a_file_that_the_system_cuts_off_is_an_error_of_one_line(suffix, reason)
     assert os.listdir() == ["grid.npz"]
 
 
-def test_batch_iterates_as_upsample_does(command, grid_folder, run_batch):
-    assert run_batch("in/a.npy", "--iterations", 2, "--factor", 2)[0] == 0
-    options = ("--iterations", 2, "--factor", 2, "--quality=fast", "-q")
-    assert command("upsample", "in/a.npy", "a.ply", *options)[0] == 0
-    assert Path("out/a.ply").read_bytes() == Path("a.ply").read_bytes()
-    Path("list.jsonl").write_text(
-        '{"in": "in/a.npy", "out": "b.ply", "iterations": 2, "factor": 2}'
-    )
-    assert run_batch("list.jsonl")[0] == 0
-    assert Path("out/b.ply").read_bytes() == Path("a.ply").read_bytes()
-    Path("list.jsonl").write_text('{"in": "in/a.npy", "out": "b.ply", "iterations": 0}')
-    code, _, said = run_batch("list.jsonl")
-    assert code != 0 and "iterations is 0: give 1 or more" in said
-
-
 def test_targets_are_refused_before_anything_is_written():
     field = upsample(ball(12, 3.0), trilinear, 2)
     with pytest.raises(OptionError) as caught:
@@ -481,7 +455,7 @@ def test_the_command_refuses_in_one_line_and_writes_nothing(options, command):
     assert Path("grid.npz").read_bytes() == before and Path("old.npz").read_bytes() == b"old"
 
 
-@pytest.mark.parametrize("suffix", [".npz", ".npy", ".vti"])
+@pytest.mark.parametrize("suffix", [".npz", ".vti"])
 @pytest.mark.parametrize("broken", ["disk", "mesh", "taken", "interrupt"])
 def test_both_files_appear_or_neither(broken, suffix, command, monkeypatch):
     np.savez("grid.npz", values=ball().values, spacing=1.0)
@@ -493,7 +467,7 @@ def test_both_files_appear_or_neither(broken, suffix, command, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    writer = writing.FORMATS[suffix].writer
+    writer = writing.WRITERS[suffix]
     if broken == "disk":
         monkeypatch.setattr(writer, "finish", full)
     elif broken == "interrupt":
@@ -520,17 +494,6 @@ def test_both_files_appear_or_neither(broken, suffix, command, monkeypatch):
         assert Path(target).read_bytes() == b"another program's"
 
 
-def test_a_full_disk_while_blocks_are_written_names_the_field(command, monkeypatch):
-    np.savez("grid.npz", values=ball().values, spacing=1.0)
-    monkeypatch.setattr(
-        "super_sdf.fields.sparse.SparseWriter._extend",
-        lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")),
-    )
-    code, _, said = command("upsample", "grid.npz", "a.ply", "--save-field", "f.npz", "-q")
-    assert (code, said) == (1, "Error: f.npz cannot be written: No space left on device\n")
-    assert os.listdir() == ["grid.npz"]
-
-
 def by_hand(grid, network, factor, **options):
     """Refine a grid, and its dense fine lattice again, as a user would with two commands."""
     write_field(upsample(grid, network, factor), "first.npy", force=True)
@@ -541,33 +504,11 @@ def by_hand(grid, network, factor, **options):
 
 
 @pytest.mark.parametrize("name", GRIDS)
-@pytest.mark.parametrize("mesher", ["marching", "sharp"])
-def test_two_iterations_are_two_runs_by_hand(name, mesher):
+def test_two_iterations_are_two_runs_by_hand(name):
     grid = GRIDS[name]()
-    for cap in (False, True):
-        options = {"cap": cap, "mesher": mesher}
+    for options in ({"cap": True}, {"cap": False, "mesher": "sharp"}):
         twice = reconstruct(grid, trilinear, 2, iterations=2, **options)
         assert same(twice, by_hand(grid, trilinear, 2, **options))
-
-
-def test_two_iterations_with_the_network_are_two_runs_by_hand():
-    grid, network = ball(), load_network("fast", threads=1)
-    twice = reconstruct(grid, network, 4, cap=True, iterations=2)
-    assert same(twice, by_hand(grid, network, 4, cap=True))
-    assert twice.is_closed() and twice.volume() == pytest.approx(4 / 3 * np.pi * 6**3, rel=2e-3)
-
-
-def test_three_iterations_are_one_more():
-    grid = ball(10, 3.0)
-    fine = fine_grid(upsample(grid, trilinear, 2))
-    rest = reconstruct(fine, trilinear, 2, iterations=2)
-    assert same(reconstruct(grid, trilinear, 2, iterations=3), rest)
-
-
-def test_iterations_of_a_plane_stay_on_it():
-    mesh = reconstruct(plane(), trilinear, 4, iterations=2)
-    off = np.abs(to_plane(mesh.vertices.astype(np.float64)))
-    assert off.max() < CLEARANCE * SPACING / 16  # vertices stay this far from the nodes
 
 
 def test_iterations_mesh_the_offset_surface_once():

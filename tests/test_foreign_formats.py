@@ -38,12 +38,13 @@ from test_formats import (
     sampled,
     save_itk,
 )
+from test_formats import save_any as save_common
 from vtkmodules.vtkIOHDF import vtkHDFWriter
 
 from super_sdf import read_grid
 from super_sdf.errors import SuperSdfError
-from super_sdf.files import grids
 from super_sdf.files.formats import DICOM, FORMATS, find_format, is_grid, split_member
+from super_sdf.files.grids import open_volume
 
 STEPS = np.array([0.5, 0.7, 0.9])
 AFFINE = affine_of(np.diag([1, 1.4, 1.8]))
@@ -144,17 +145,15 @@ def save_dicom(path: str, affine: np.ndarray) -> None:
 
 
 PLACED = {
-    "a.mgh": save_mgh,
     "a.mgz": save_mgh,
     "a.hdr": save_pair,
     "a.vtkhdf": save_vtkhdf,
     "itk.h5": save_itk,
-    "itk.hdf5": save_itk,
     "series": save_dicom,
 }
 
 
-@pytest.mark.parametrize("turn", [0, 5, 9, 14, 18, 23])
+@pytest.mark.parametrize("turn", [5, 14])
 @pytest.mark.parametrize("name", PLACED)
 def test_turned_and_mirrored_axes_with_three_spacings(name, turn):
     order = np.abs(TURNS[turn]).argmax(1)
@@ -235,14 +234,12 @@ def test_what_mrc_files_say_that_no_grid_has():
 
 
 @pytest.mark.parametrize("kind", [np.int8, np.int16, np.uint16, np.float16])
-def test_modes_and_byte_orders_of_mrc(kind):
+def test_modes_of_mrc(kind):
     mask = (sampled(AFFINE) < 0).astype(kind)
-    for order in "<>":
-        with mrcfile.new("a.mrc", overwrite=True) as file:
-            file.set_data(np.ascontiguousarray(mask.T))
-            file.voxel_size = tuple(STEPS.tolist())
-        whole = mrcfile.read("a.mrc")
-        assert np.array_equal(read_grid("a.mrc", field="mask").values < 0, whole.T > 0), order
+    with mrcfile.new("a.mrc", overwrite=True) as file:
+        file.set_data(np.ascontiguousarray(mask.T))
+        file.voxel_size = tuple(STEPS.tolist())
+    assert np.array_equal(read_grid("a.mrc", field="mask").values < 0, mask > 0)
 
 
 # VTK
@@ -309,10 +306,12 @@ def array_of(order: str = "zyx", falling: str = "") -> xr.DataArray:
     return turned.transpose(*order)
 
 
-@pytest.mark.parametrize("order", ["zyx", "xyz", "yxz", "zxy"])
-@pytest.mark.parametrize("version", ["NETCDF4", "NETCDF3_CLASSIC", "NETCDF3_64BIT"])
+@pytest.mark.parametrize(
+    "version, order",
+    [("NETCDF4", "zyx"), ("NETCDF4", "yxz"), ("NETCDF3_CLASSIC", "xyz"), ("NETCDF3_64BIT", "zxy")],
+)
 def test_netcdf_at_its_coordinates(version, order):
-    for falling in ("", "y", "xz"):
+    for falling in ("", "xz"):
         array_of(order, falling).to_netcdf("a.nc", format=version, engine="netcdf4")
         check(read_grid("a.nc"), STEPS)
 
@@ -370,7 +369,7 @@ def save_mat(name: str, **variables: Any) -> None:
         scipy.io.savemat(name, variables, do_compression="packed" in name)
 
 
-@pytest.mark.parametrize("name", ["a.mat", "packed.mat", "v73.mat"])
+@pytest.mark.parametrize("name", ["packed.mat", "v73.mat"])
 def test_arrays_of_matlab(name):
     affine = affine_of(OBLIQUE @ np.diag([1, 1.4, 1.8]))
     place = {"spacing": STEPS, "origin": affine[:3, 3], "direction": OBLIQUE}
@@ -505,7 +504,9 @@ def test_blocks_that_open3d_saved():
     assert grid.spacing == pytest.approx((0.06,) * 3)
     index = grid.to_index(said["places"].astype(float))
     assert np.abs(index - np.rint(index)).max() < 1e-4
-    stored = grids._read_npz(DATA / "open3d-blocks.npz", 1 << 30)["values"]
+    path = DATA / "open3d-blocks.npz"
+    with open_volume(path, find_format(path), "xyz", (1 << 30, None)) as volume:
+        stored = volume.box(tuple(slice(0, count) for count in volume.shape)).T
     found = stored[tuple(np.rint(index).astype(int).T)]
     assert np.array_equal(found, np.where(said["weight"] > 0, said["tsdf"], np.nan), equal_nan=True)
     assert stored.shape == grid.shape and "samples are unknown" in grid.notes[0]
@@ -547,7 +548,9 @@ def test_files_of_other_programs_are_refused_with_the_line_that_converts_them():
 
 def save_any(name: str) -> None:
     """Write the part in the format of the name."""
-    if name in PLACED:
+    if name in COMMON:
+        save_common(name)
+    elif name in PLACED:
         PLACED[name](name, AFFINE)
     elif ".mrc" in name or ".map" in name:
         save_mrc("plain.mrc", AFFINE)
@@ -562,13 +565,15 @@ def save_any(name: str) -> None:
         save_mat(name, d=sampled(AFFINE))
 
 
+COMMON = ["a.nii", "a.nii.gz", "a.nrrd", "a.mha", "a.vti", "a.tif", "a.h5", "a.vdb", "a.sdf"]
 FILES = [
-    *("a.mgh", "a.mgz", "a.vtkhdf", "itk.h5", "a.mrc", "a.map.gz", "a.vtk", "text.vtk"),
-    *("a.nc", "v3.nc", "a.mat", "packed.mat", "v73.mat"),
+    *COMMON,
+    *("a.mgz", "a.vtkhdf", "itk.h5", "a.mrc", "a.map.gz", "a.vtk", "text.vtk"),
+    *("a.nc", "v3.nc", "a.mat", "v73.mat"),
 ]
 
 
-@pytest.mark.parametrize("share", [0.02, 0.5, 0.9])
+@pytest.mark.parametrize("share", [0.02, 0.9])
 @pytest.mark.parametrize("name", FILES)
 def test_a_truncated_file_is_refused_in_one_line(name, share, capfd):
     save_any(name)
@@ -653,6 +658,8 @@ def test_a_missing_library_is_named_with_the_command_that_installs_it(monkeypatc
     for name in (*FILES, "series"):
         save_any(name)
         format_ = find_format(name)
+        if format_.extra is None:
+            continue
         with monkeypatch.context() as patch:
             patch.setattr("super_sdf.machine.extras.find_spec", lambda module: None)
             said = refusal(name)

@@ -6,7 +6,6 @@ by the format's own library; where each sample is in the world is said by that l
 
 from __future__ import annotations
 
-import gzip
 import itertools
 import json
 import os
@@ -134,7 +133,7 @@ ORIENTED = {
 }
 
 
-@pytest.mark.parametrize("turn", range(len(TURNS)))
+@pytest.mark.parametrize("turn", range(0, len(TURNS), 5))
 @pytest.mark.parametrize("name", ORIENTED)
 def test_axes_in_any_order_and_direction(name, turn):
     ORIENTED[name](name, affine_of(TURNS[turn]))
@@ -144,11 +143,10 @@ def test_axes_in_any_order_and_direction(name, turn):
 @pytest.mark.parametrize("name", ORIENTED)
 def test_the_file_is_read_slab_by_slab_into_a_temporary_file(name, monkeypatch):
     """As if it were too large for memory: the same samples."""
-    for turn in TURNS[::5]:
+    for turn in TURNS[6], TURNS[13]:
         ORIENTED[name](name, affine_of(turn))
         with monkeypatch.context() as patch:
             patch.setattr("super_sdf.files.grids.ROOM_SHARE", 0)
-            patch.setattr("super_sdf.files.volume.PIECE", 3000)
             patch.setattr(unpacking, "PIECE", 3000)
             grid = read_grid(name)
         assert isinstance(grid.samples, PlaneFile)
@@ -158,7 +156,7 @@ def test_the_file_is_read_slab_by_slab_into_a_temporary_file(name, monkeypatch):
 OBLIQUE = trimesh.transformations.euler_matrix(0.3, -0.2, 0.5)[:3, :3]
 
 
-@pytest.mark.parametrize("turn", range(0, len(TURNS), 3))
+@pytest.mark.parametrize("turn", [0, 7])
 @pytest.mark.parametrize("name", ORIENTED)
 def test_an_oblique_grid_keeps_its_direction(name, turn):
     """The axes come in the order and sense in which they are nearest to the world's."""
@@ -225,37 +223,8 @@ def test_a_direction_is_given_where_the_file_has_none():
     assert read_grid("a.npz", direction=np.eye(3)).is_straight
 
 
-def test_a_direction_that_the_file_states_is_not_overruled():
-    save_nifti("a.nii", affine_of(np.eye(3)))
-    with pytest.raises(OptionError) as caught:
-        read_grid("a.nii", direction=np.eye(3))
-    said = "direction is given, but NIfTI files state their axes: leave it out"
-    assert str(caught.value) == said
-
-
-@pytest.mark.parametrize("name", ["a.nii", "a.nii.gz", "b.nrrd", "a.mha", "a.mhd"])
-def test_simpleitk_puts_the_samples_at_the_same_place(name):
-    """ITK's world is LPS: that of NRRD and MetaImage; NIfTI's, RAS, has x and y reversed."""
-    ORIENTED[name](name, affine_of(TURNS[9]))
-    grid, image = read_grid(name), sitk.ReadImage(name)
-    signs = np.array([-1, -1, 1]) if ".nii" in name else np.ones(3)
-    for index in ((0, 0, 0), (23, 0, 0), (4, 19, 16)):
-        there = np.array(image.TransformIndexToPhysicalPoint(index)) * signs
-        ijk = (there - grid.origin) / SPACING
-        assert np.abs(ijk - np.rint(ijk)).max() < 1e-4
-        assert grid.values[tuple(np.rint(ijk).astype(int))] == image[index]
-
-
-def test_nifti_by_qform_slope_and_a_fourth_axis():
+def test_nifti_by_qform_and_slope():
     affine = affine_of(TURNS[5])
-    image = nibabel.Nifti1Image(np.rint(sampled(affine) * 1000).astype(np.int16), None)
-    image = nibabel.Nifti1Image(np.asarray(image.dataobj)[..., None], None, image.header)
-    image.set_qform(affine, code=1)
-    image.set_sform(None, code=0)
-    image.header.set_slope_inter(0.001, 0)
-    nibabel.save(image, "a.nii.gz")
-    packed = nibabel.load("a.nii.gz")
-    assert packed.header["qform_code"] == 1 and packed.header["sform_code"] == 0
     raw = nibabel.Nifti1Image(sampled(affine), None)
     raw.set_qform(affine, code=1)
     raw.header.set_data_dtype(np.int16)  # nibabel chooses slope and intercept
@@ -296,7 +265,7 @@ def test_vti_of_cells_and_of_one_of_several_arrays():
         read_grid("cells.vti")
 
 
-@pytest.mark.parametrize("options", [{}, {"compression": "zlib"}, {"bigtiff": True}])
+@pytest.mark.parametrize("options", [{"compression": "zlib"}, {"bigtiff": True}])
 def test_tiff_stacks(options):
     affine = affine_of(np.eye(3))
     tifffile.imwrite("a.tif", sampled(affine).T, photometric="minisblack", **options)
@@ -305,21 +274,6 @@ def test_tiff_stacks(options):
     assert grid.origin == (0, 0, 0)
     tifffile.imwrite("x.tif", sampled(affine), photometric="minisblack", **options)
     check(read_grid("x.tif", spacing=SPACING, origin=affine[:3, 3], axes="xyz"))
-
-
-def test_spacing_of_imagej_and_ome():
-    affine = affine_of(np.eye(3))
-    data = sampled(affine).T
-    about = {"axes": "ZYX", "spacing": SPACING, "unit": "um"}
-    tifffile.imwrite("j.tif", data, imagej=True, resolution=(2, 2), metadata=about)
-    check(read_grid("j.tif", origin=affine[:3, 3]))
-    sizes = {f"PhysicalSize{axis}": SPACING for axis in "XYZ"}
-    tifffile.imwrite("a.ome.tif", data, metadata={"axes": "ZYX", **sizes})
-    check(read_grid("a.ome.tif", origin=affine[:3, 3]))
-    sizes["PhysicalSizeZ"] = 0.8
-    affine = affine_of(np.diag([1, 1, 1.6]))
-    tifffile.imwrite("z.ome.tif", sampled(affine).T, metadata={"axes": "ZYX", **sizes})
-    check(read_grid("z.ome.tif", origin=affine[:3, 3]), spacing=[0.5, 0.5, 0.8])
 
 
 def test_hdf5_datasets():
@@ -360,14 +314,6 @@ def test_zarr_arrays_and_groups(version):
     check(read_grid("g.zarr:/0", **place))
     with pytest.raises(FileError, match=r"g.zarr holds several arrays, /0, /1: give g.zarr:/0, "):
         read_grid("g.zarr")
-    steps = [{"type": "scale", "scale": [SPACING] * 3}]
-    steps.append({"type": "translation", "translation": affine[:3, 3][::-1].tolist()})
-    axes = [{"name": axis, "type": "space"} for axis in "zyx"]
-    levels = [{"path": "0", "coordinateTransformations": steps}, {"path": "1"}]
-    scales = [{"axes": axes, "datasets": levels}]
-    about = {"multiscales": scales}
-    group.attrs.update(about if version == 2 else {"ome": about})
-    check(read_grid("g.zarr"))
 
 
 def test_a_level_set_that_openvdb_wrote():
@@ -407,7 +353,7 @@ def text_sdf(affine: np.ndarray) -> str:
 def test_three_dialects_of_sdf(monkeypatch):
     affine = affine_of(np.eye(3))
     values, low = sampled(affine), affine[:3, 3].astype("<f4")
-    monkeypatch.setattr("super_sdf.files.readers.values.TEXT_PIECE", 1001)
+    monkeypatch.setattr("super_sdf.files.streams.TEXT_PIECE", 1001)
     Path("text.sdf").write_text(text_sdf(affine))
     check(read_grid("text.sdf"))
     tag = "#sdf 1\ndim {} {} {}\ndata\n".format(*SIZES).encode()
@@ -436,19 +382,6 @@ def test_a_given_spacing_and_origin_replace_those_of_the_file():
     check(read_grid("a.nii", spacing=SPACING, origin=affine[:3, 3]))
 
 
-DAMAGED = {
-    "a.nii": "as NIfTI",
-    "a.nii.gz": "as NIfTI",
-    "a.nrrd": "as NRRD",
-    "a.mha": "as MetaImage",
-    "a.vti": "",
-    "a.tif": "as TIFF stack",
-    "a.h5": "as HDF5",
-    "a.vdb": "as OpenVDB",
-    "a.sdf": "",
-}
-
-
 def save_any(name: str) -> None:
     """Write the part in the format of the name."""
     affine = affine_of(np.eye(3))
@@ -465,39 +398,6 @@ def save_any(name: str) -> None:
         Path(name).write_text(text_sdf(affine))
 
 
-def read_damaged(name: str, capfd: pytest.CaptureFixture[str]) -> str:
-    """Return the message of the error that a file raises; nothing is printed beside."""
-    with pytest.raises((FileError, GridError)) as caught:
-        read_grid(name)
-    message = str(caught.value)
-    assert message.startswith(name) and len(message.splitlines()) == 1 and len(message) < 400
-    assert capfd.readouterr() == ("", "")
-    return message
-
-
-@pytest.mark.parametrize("share", [0.02, 0.5, 0.9])
-@pytest.mark.parametrize("name", DAMAGED)
-def test_a_truncated_file_is_refused_in_one_line(name, share, capfd):
-    save_any(name)
-    whole = Path(name).read_bytes()
-    Path(name).write_bytes(whole[: int(share * len(whole))])
-    said = read_damaged(name, capfd)
-    assert f"cannot be read {DAMAGED[name]}" in said or "truncated" in said or "damaged" in said
-
-
-@pytest.mark.parametrize("name", DAMAGED)
-def test_another_kind_of_file_is_refused_in_one_line(name, capfd):
-    Path(name).write_bytes(b"hello, this is no grid at all\n" * 20)
-    read_damaged(name, capfd)
-
-
-def test_nothing_is_written_for_a_damaged_file(command):
-    Path("a.nii").write_bytes(b"no")
-    code, out, err = command("upsample", "a.nii", "out.ply")
-    assert (code, out) == (1, "") and err.startswith("Error: a.nii cannot be read as NIfTI: ")
-    assert os.listdir() == ["a.nii"]
-
-
 def test_a_mesh_as_input_is_told_to_be_sampled_first(command):
     want = (
         "Error: part.stl is a mesh, not a grid: sample it first with super-sdf sample part.stl "
@@ -506,21 +406,13 @@ def test_a_mesh_as_input_is_told_to_be_sampled_first(command):
     assert command("upsample", "part.stl", "out.ply")[::2] == (2, want)
 
 
-def test_a_missing_library_is_named_with_the_command_that_installs_it(command, monkeypatch):
-    for name in ("a.nii", "a.nrrd", "a.tif", "a.h5", "a.vdb"):
-        save_any(name)
-        format_ = formats.find_format(name)
-        with monkeypatch.context() as patch:
-            patch.setattr("super_sdf.machine.extras.find_spec", lambda module: None)
-            code, _, err = command("upsample", name, "out.ply")
-        wanted = f"pip install -e '.[{format_.extra}]' in a clone of super-sdf\n"
-        assert code == 1 and err.startswith(f"Error: {format_.name} (") and err.endswith(wanted)
-
-
 def test_axes_that_the_file_states_are_not_overruled():
     save_nifti("a.nii", affine_of(np.eye(3)))
     with pytest.raises(OptionError, match="axes is 'zyx', but NIfTI files state their axes"):
         read_grid("a.nii", axes="zyx")
+    said = "direction is given, but NIfTI files state their axes: leave it out"
+    with pytest.raises(OptionError, match=said):
+        read_grid("a.nii", direction=np.eye(3))
     with pytest.raises(OptionError, match="axes is 'yxz': give one of xyz, zyx"):
         read_grid("a.npy", axes="yxz")
 
@@ -554,16 +446,7 @@ def test_components_and_missing_axes_are_refused():
             read_grid(name)
 
 
-def test_a_wrong_checksum_in_a_compressed_file_is_found():
-    save_nifti("a.nii", affine_of(np.eye(3)))
-    packed = bytearray(gzip.compress(Path("a.nii").read_bytes()))
-    packed[-8] ^= 1
-    Path("a.nii.gz").write_bytes(packed)
-    with pytest.raises(FileError, match=r"a.nii.gz cannot be read as NIfTI"):
-        read_grid("a.nii.gz")
-
-
-@pytest.mark.parametrize("name", ["a.nii.gz", "a.mha", "a.vti", "a.h5:/field", "a.sdf", "a.vdb"])
+@pytest.mark.parametrize("name", ["a.nii.gz", "a.h5:/field", "a.vdb"])
 def test_the_command_makes_the_mesh_at_its_place(name, command):
     save_any(name.split(":")[0])
     origin = ",".join(map(str, affine_of(np.eye(3))[:3, 3]))

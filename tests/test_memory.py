@@ -16,10 +16,10 @@ from super_sdf import SdfGrid
 from super_sdf.errors import OutOfMemoryError
 from super_sdf.files import unpacking
 from super_sdf.files.grids import read_grid
-from super_sdf.grid import evidence
-from super_sdf.grid.evidence import look, weigh
-from super_sdf.grid.gradients import surface_gradients, typical_length
-from super_sdf.grid.planes import changed, few_of, ranks_of
+from super_sdf.grid import questions
+from super_sdf.grid.census import Census
+from super_sdf.grid.evidence import weigh
+from super_sdf.grid.planes import Few, changed, ranks_of
 from super_sdf.machine import memory
 from super_sdf.machine.resources import Resources
 from super_sdf.pipeline import reconstruct_slabs
@@ -150,37 +150,42 @@ def peak_of():
     tracemalloc.stop()
 
 
-@pytest.mark.parametrize("gather", [surface_gradients, lambda values: look(values, (-100, 100))])
-def test_evidence_beside_a_surface_that_is_everywhere_takes_little_memory(gather):
-    values = noise(64, 96, 192)
+@pytest.mark.parametrize("asked", ["beside", "looked"])
+def test_evidence_beside_a_surface_that_is_everywhere_takes_little_memory(asked):
+    values = noise(64, 192, 192)
     with peak_of() as peak:
-        gather(values)
+        getattr(Census(values), asked)
     assert peak[0] < 7e7
 
 
 @pytest.mark.parametrize("most", [1, 100, 10**6])
 def test_the_samples_that_are_taken_do_not_depend_on_the_parts(most):
     numbers = np.flatnonzero(np.random.default_rng(0).random(20_000) < 0.3)
-    (whole,) = few_of([(ranks_of(numbers), numbers)], most)
+    few = Few(most)
+    few.append((ranks_of(numbers), numbers))
+    whole = few.joined()[1]
     assert len(whole) == min(most, len(numbers)) and (np.diff(whole) > 0).all()
     for count in (2, 50):
         parts = [(ranks_of(part), part) for part in np.array_split(numbers, count)]
-        np.testing.assert_array_equal(few_of(parts, most)[0], whole)
+        few = Few(most)
+        for part in parts:
+            few.append(part)
+        np.testing.assert_array_equal(few.joined()[1], whole)
 
 
 def test_few_samples_show_what_all_show(monkeypatch):
     i, j, k = np.indices((40, 40, 40)) * (np.pi / 16)
     values = np.sin(i) * np.cos(j) + np.sin(j) * np.cos(k) + np.sin(k) * np.cos(i)
-    everything = weigh(look(values, (-1.5, 1.5)), (np.pi / 16,) * 3)
-    length = typical_length(*surface_gradients(values))
-    monkeypatch.setattr(evidence, "MOST_LOOKED_AT", 500)
-    monkeypatch.setattr("super_sdf.grid.gradients.MOST_BESIDE", 2000)
-    few = weigh(look(values, (-1.5, 1.5)), (np.pi / 16,) * 3)
+    everything = weigh(Census(values).looked, (np.pi / 16,) * 3)
+    length = Census(values).beside.typical_length
+    monkeypatch.setattr(questions, "MOST_LOOKED_AT", 500)
+    monkeypatch.setattr(questions, "MOST_BESIDE", 2000)
+    few = weigh(Census(values).looked, (np.pi / 16,) * 3)
     assert few.samples == 500 < everything.samples
     assert few.slope == pytest.approx(everything.slope, rel=0.03)
     assert few.wrong == pytest.approx(everything.wrong, abs=0.06)
-    assert len(surface_gradients(values)[1]) == 2000
-    assert typical_length(*surface_gradients(values)) == pytest.approx(length, rel=0.05)
+    beside = Census(values).beside
+    assert len(beside.bend) == 2000 and beside.typical_length == pytest.approx(length, rel=0.05)
 
 
 def test_the_survey_holds_nothing_twice(monkeypatch):

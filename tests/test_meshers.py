@@ -19,8 +19,9 @@ from super_sdf.evaluation import names
 from super_sdf.machine import threads
 from super_sdf.mesh import join_meshes
 from super_sdf.slabs import cutting
-from super_sdf.steps import meshers, sharp_groups
+from super_sdf.steps import meshers
 from super_sdf.steps.marching import extract_pieces
+from super_sdf.steps.sharp import mesher as sharp
 from super_sdf.steps.survey import survey
 
 
@@ -120,8 +121,8 @@ def test_groups_and_threads_change_nothing(network, monkeypatch, factor):
     monkeypatch.setattr(threads, "CHUNK", 5000)
     monkeypatch.setattr(threads, "MIN_PER_THREAD", 1000)
     for groups, number in ((1, 2), (4, 1), (9, 3)):
-        size = sum(sharp_groups.voxel_bytes(factor)) * len(field.voxel_ijk)
-        monkeypatch.setattr(sharp_groups, "GROUP_BYTES", size // groups)
+        size = sum(sharp.voxel_bytes(factor)) * len(field.voxel_ijk)
+        monkeypatch.setattr(sharp, "GROUP_BYTES", size // groups)
         pieces = mesher.extract(field, grid, 7, number)
         assert len(pieces) > 1 or groups == 1
         assert_same(join_meshes(pieces), one)

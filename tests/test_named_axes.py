@@ -10,7 +10,7 @@ from conftest import trilinear
 
 from super_sdf import SdfGrid, make_grid, reconstruct
 from super_sdf.errors import GridError, OutOfMemoryError
-from super_sdf.grid import named_axes
+from super_sdf.grid import placement
 
 SHAPE = 18, 20, 22  # along x, y, z
 STEP = 0.5, 0.5, 0.5
@@ -38,8 +38,7 @@ def refusal(array: xarray.DataArray | xarray.Dataset, **options) -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize("order", ["xyz", "zyx", "yzx"])
-@pytest.mark.parametrize("down", ["", "z", "xy"])
+@pytest.mark.parametrize("order, down", [("xyz", "xy"), ("zyx", "z"), ("yzx", "")])
 def test_a_sphere_lies_where_its_coordinates_say(order, down):
     grid = make_grid(sphere(order, down))
     assert (grid.shape, grid.spacing, grid.origin) == (SHAPE, STEP, FIRST)
@@ -89,7 +88,7 @@ def test_coordinates_in_single_precision_are_even_up_to_their_rounding():
     places = np.float32(1e5) + np.arange(18, dtype=np.float32) / 7
     steps = np.diff(places)
     assert steps.max() > 1.03 * steps.min()  # float32 does not hold them
-    found = named_axes.placed(sphere().assign_coords(x=places))
+    found = placement.placed(sphere().assign_coords(x=places))
     assert found.origin[0] == 1e5 and found.spacing[0] == pytest.approx(1 / 7, rel=0.01)
     assert "'x' are not evenly spaced" in refusal(sphere().assign_coords(x=places.astype(float)))
 
@@ -176,7 +175,7 @@ def test_what_has_no_place_is_refused(case):
 
 
 def test_a_step_is_even_up_to_a_thousandth():
-    assert make_grid(uneven(13.5 + 0.5 * named_axes.EVEN / 2)).spacing[1] == 0.5
+    assert make_grid(uneven(13.5 + 0.5 * placement.EVEN / 2)).spacing[1] == 0.5
     assert "a step of 0.502 among" in refusal(uneven(13.502))
 
 

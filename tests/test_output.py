@@ -7,13 +7,17 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from super_sdf.errors import FileError, GridError, SuperSdfError, WriteError
-from super_sdf.files import output, parts
-from super_sdf.files.output import check_apart, check_free, replacing
-from super_sdf.files.parts import part_path, remove_abandoned_parts
+from super_sdf.files import output
+from super_sdf.files.output import (
+    check_apart,
+    check_free,
+    part_path,
+    remove_abandoned_parts,
+    replacing,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -143,7 +147,7 @@ def leave_part(target, pid):
 @pytest.mark.parametrize("has_locks", [True, False])
 def test_what_a_killed_process_left_goes_with_the_next_run(monkeypatch, target, has_locks):
     if not has_locks:
-        monkeypatch.setattr(parts, "take_lock", lambda file: None)
+        monkeypatch.setattr(output, "take_lock", lambda file: None)
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
     leave_part(target, gone.pid)
@@ -157,8 +161,8 @@ def test_what_a_killed_process_left_goes_with_the_next_run(monkeypatch, target, 
 def test_what_is_being_written_is_not_touched():
     with replacing(Path("out.ply")) as part:
         part.write_text("mine")
-        script = "import sys; from pathlib import Path; from super_sdf.files import parts; "
-        script += "parts.remove_abandoned_parts([Path('out.ply')])"
+        script = "import sys; from pathlib import Path; from super_sdf.files import output; "
+        script += "output.remove_abandoned_parts([Path('out.ply')])"
         subprocess.run([sys.executable, "-c", script], check=True)
         remove_abandoned_parts([Path("out.ply")])
         assert part.read_text() == "mine"
@@ -185,25 +189,3 @@ def test_errors_keep_their_words():
             raise error
         assert str(caught.value) == want
     assert os.listdir() == []
-
-
-def test_grids_meshes_and_pictures_ask_once_more_in_the_end(monkeypatch):
-    from super_sdf import Mesh, SdfGrid, write_mesh
-    from super_sdf.files import grids, meshes
-    from super_sdf.pictures.sections import render_section
-
-    grid = SdfGrid(np.arange(8.0).reshape(2, 2, 2) - 1, 4.0)
-    for module in (grids, meshes):  # the first look finds nothing
-        monkeypatch.setattr(module, "check_free", lambda path, force: path)
-    Path("out.ply").write_text("theirs")
-    Path("out.npz").write_text("theirs")
-    Path("out.png").write_text("theirs")
-    with pytest.raises(WriteError, match="created by another program"):
-        write_mesh(Mesh(np.eye(3), np.array([[0, 1, 2]])), "out.ply")
-    with pytest.raises(WriteError, match="created by another program"):
-        grids.write_grid(grid, "out.npz")
-    with pytest.raises(WriteError, match="created by another program"):
-        render_section(grid, Path("out.png"), force=False)
-    assert [path.read_text() for path in Path().iterdir()] == 3 * ["theirs"]
-    render_section(grid, Path("out.png"), force=True)
-    assert Path("out.png").read_bytes().startswith(b"\x89PNG")

@@ -10,7 +10,7 @@ from test_isosurface import dense_field, fields
 from super_sdf import Mesh, SdfGrid, extract_mesh, load_network, upsample
 from super_sdf.evaluation.methods import sharp_isosurface
 from super_sdf.steps.cell_cases import loop_table, triangle_table
-from super_sdf.steps.features import Rule
+from super_sdf.steps.sharp.features import Rule
 
 TURN = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
 
@@ -92,9 +92,9 @@ def test_any_lattice_gives_a_closed_manifold_with_features_everywhere(seed, leas
     lattice = np.random.default_rng(seed).normal(size=(9, 11, 9)).astype(np.float32) * least
     lattice[[0, -1]] = lattice[:, [0, -1]] = lattice[:, :, [0, -1]] = 1
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("super_sdf.steps.features.SHARP_COSINE", 1.1)
-        patch.setattr("super_sdf.steps.features.LEAST_SLOPE_TRUST", 0)
-        patch.setattr("super_sdf.steps.features.RULE", Rule(1.0, ()))
+        patch.setattr("super_sdf.steps.sharp.features.SHARP_COSINE", 1.1)
+        patch.setattr("super_sdf.steps.sharp.features.LEAST_SLOPE_TRUST", 0)
+        patch.setattr("super_sdf.steps.sharp.features.RULE", Rule(1.0, ()))
         mesh = extract_sharp(*dense_field(lattice))
     if len(mesh.faces):
         assert mesh.open_edges() == 0

@@ -170,7 +170,7 @@ def test_a_label_image_with_thick_slices_is_at_its_place_in_the_world(tmp_path):
     assert mesh.volume() == pytest.approx(volume(), rel=0.03)
 
 
-@pytest.mark.parametrize("cut", [0.5, 0.75, 1, 2])
+@pytest.mark.parametrize("cut", [0.5, 1, 2])
 def test_a_truncated_box_along_the_axes_keeps_its_unit(cut):
     """Along z its values change by less than the spacing, and along all axes at corners only."""
     at = np.abs(np.indices((60, 60, 24)) * SPACING[:, None, None, None] - 29.0)

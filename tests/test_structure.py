@@ -17,20 +17,16 @@ MODULES = {
 }
 # The library of each file format is imported by its reader or writer alone, when it is used.
 READERS = {
-    "fields.vti": {"vtkmodules"},
-    "files.images": {"vtkmodules"},
+    "fields.writing": {"vtkmodules"},
     "files.readers.dicom": {"pydicom"},
-    "files.readers.hdf5": {"h5py"},
-    "files.readers.matlab": {"h5py", "scipy"},
+    "files.readers.hdf5": {"h5py", "scipy"},
     "files.readers.mrc": {"mrcfile"},
-    "files.readers.netcdf": {"h5py", "scipy"},
     "files.readers.nibabel_files": {"nibabel"},
-    "files.readers.nifti": {"nibabel"},
     "files.readers.nrrd_file": {"nrrd"},
     "files.readers.tiff": {"tifffile"},
     "files.readers.vdb_tree": {"numcodecs"},
     "files.readers.vti": {"vtkmodules"},
-    "files.readers.vtk_files": {"vtkmodules"},
+    "files.readers.vtk": {"vtkmodules"},
     "files.readers.zarr_store": {"zarr"},
     "pyvista": {"pyvista"},
 }

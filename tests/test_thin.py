@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from super_sdf.errors import GridError
-from super_sdf.grid.gradients import straight_gradients, typical_length
+from super_sdf.grid.census import Census
 from super_sdf.grid.one_sided import BEYOND, FAR, MOST_FLOODED, find_walls
 from super_sdf.grid.sdf_grid import make_grid
 
@@ -55,8 +55,7 @@ THIN = {
 
 
 @pytest.mark.parametrize("name", sorted(set(THIN) - {"hollow ball"}))
-@pytest.mark.parametrize("spacing", [None, 0.1])
-@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("spacing, sign", [(None, 1), (0.1, -1)])
 def test_thin_solids_are_told(name, spacing, sign):
     values = THIN[name] * sign * 0.1
     assert (values * sign).min() > 0
@@ -136,7 +135,7 @@ def test_large_unsigned_fields_are_told_from_fewer_samples():
 
 def test_the_spacing_of_a_thin_part_is_that_of_the_samples_away_from_it():
     for name, values in THIN.items():
-        assert typical_length(*straight_gradients(values)) == pytest.approx(1, abs=0.01), name
+        assert Census(values).everywhere.typical_length == pytest.approx(1, abs=0.01), name
 
 
 def test_a_given_spacing_is_believed_of_a_thin_part():
@@ -145,7 +144,7 @@ def test_a_given_spacing_is_believed_of_a_thin_part():
     assert make_grid(walls, spacing=1.0, origin=0, inside="negative").notes == ()
 
 
-@pytest.mark.parametrize("turned", [(0, 1, 2), (2, 1, 0), (1, 2, 0)])
+@pytest.mark.parametrize("turned", [(2, 1, 0), (1, 2, 0)])
 @pytest.mark.parametrize("name", sorted(THIN))
 def test_the_axes_may_come_in_any_order(name, turned):
     values = THIN[name].transpose(turned)

@@ -80,7 +80,7 @@ def of_itk(inside, spacing):
     return {**maps, "outside": SimpleITK.GetArrayFromImage(outside).T}
 
 
-@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.7, 0.7, 0.7), THICK, (1.2, 1.0, 4.0)])
+@pytest.mark.parametrize("spacing", [(0.7, 0.7, 0.7), THICK])
 @pytest.mark.parametrize("library", [of_scipy, of_itk])
 def test_of_a_distance_transform_only_the_sides_are_used(library, spacing):
     inside = organ(spacing)
@@ -188,7 +188,7 @@ def two_labels() -> np.ndarray:
     return labels
 
 
-@pytest.mark.parametrize("spacing", [(1, 1, 1), (1, 1, 3), (0.5, 1, 1)])
+@pytest.mark.parametrize("spacing", [(1, 1, 1), (0.5, 1, 1)])
 def test_labels_are_refused_whatever_the_spacing(spacing):
     nested = two_labels()
     nested[ndimage.binary_erosion(nested == 1, iterations=3)] = 3

@@ -20,8 +20,10 @@ from super_sdf import (
     upsample,
 )
 from super_sdf.errors import GridError
+from super_sdf.grid.census import Census
 from super_sdf.grid.field import FIELDS
-from super_sdf.grid.unknown import Regions, components, filled
+from super_sdf.grid.regions import components
+from super_sdf.grid.unknown import filled
 from super_sdf.mesh import join_meshes
 
 FACES = ndimage.generate_binary_structure(3, 1)
@@ -37,7 +39,7 @@ def test_the_sides_of_regions_are_those_of_scipys_components():
     for _ in range(30):
         values = random.normal(size=(6, 7, 8))
         values[random.random(values.shape) < random.uniform(0.2, 0.9)] = np.nan
-        unknown, regions = np.isnan(values), Regions(values)
+        unknown, regions = np.isnan(values), Census(values).unknown
         labels = ndimage.label(unknown)[0]
         for found, side in ((regions.positive, values > 0), (regions.negative, values <= 0)):
             beside = labels[ndimage.binary_dilation(side, FACES) & unknown]
@@ -147,7 +149,7 @@ def test_the_surface_ends_where_that_of_marching_cubes_of_the_known_cells_does(m
     assert lengths[0] == pytest.approx(lengths[1], rel=0.04)
 
 
-@pytest.mark.parametrize("options", [{}, {"field": "scaled"}, {"field": "noisy"}])
+@pytest.mark.parametrize("options", [{}, {"field": "scaled"}])
 def test_slabs_and_threads_change_nothing_where_a_surface_ends(options, monkeypatch):
     network = load_network("fast", device="cpu", threads=1)
     grid = make_grid(half_seen(), **PLACE, **options)
@@ -221,7 +223,7 @@ def test_fields_of_all_kinds_have_unknown_samples(field):
         SdfGrid(values, 1.0)
 
 
-@pytest.mark.parametrize("unit", [1.5, 2, 3])
+@pytest.mark.parametrize("unit", [1.5, 3])
 def test_a_band_over_its_truncation_is_the_same_with_nan_elsewhere(unit):
     """Its extremes are a little less than 1 then."""
     distances = box() / unit
@@ -238,20 +240,19 @@ NEVER = [0, 1, -1, -1000, 100, 255, 1e10, -32768]
 
 
 @pytest.mark.parametrize("value", NEVER)
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_a_value_where_nothing_was_seen_is_told_by_its_jumps(value, dtype):
+def test_a_value_where_nothing_was_seen_is_told_by_its_jumps(value):
     distances = np.linalg.norm(np.indices((28,) * 3).T - 13.3, axis=-1) - 8.2
     far = np.abs(distances) >= 3.2
-    values = np.where(far, value, distances).astype(dtype)
+    values = np.where(far, value, distances).astype(np.float32)
     grid = make_grid(values, **PLACE)
     assert f"samples are exactly {value:g}, where no distance is: they are taken" in grid.notes[0]
-    want = make_grid(np.where(far, np.nan, distances).astype(dtype), **PLACE)
+    want = make_grid(np.where(far, np.nan, distances).astype(np.float32), **PLACE)
     np.testing.assert_array_equal(grid.values, want.values)
     mesh, same = (reconstruct(g, trilinear, cap=True) for g in (grid, want))
     assert mesh.volume() == pytest.approx(same.volume(), rel=1e-3)
 
 
-@pytest.mark.parametrize("cut", [0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1, 2, 3])
+@pytest.mark.parametrize("cut", [0.2, 0.5, 1, 3])
 @pytest.mark.parametrize("make", [box, torus, thin_frame])
 def test_values_that_are_cut_off_were_seen(cut, make):
     for low in (-cut, -2 * cut):
@@ -288,8 +289,9 @@ def fused(cut: float) -> tuple[np.ndarray, np.ndarray]:
     return np.divide(total, count, out=np.ones_like(total), where=count > 0), count
 
 
-@pytest.mark.parametrize("unseen", [-1, np.nan, 0, 1, -1000])
-@pytest.mark.parametrize("scale", [1, 3, 32767])
+@pytest.mark.parametrize(
+    "unseen, scale", [(-1, 1), (np.nan, 3), (0, 32767), (1, 3), (-1000, 1), (-1, 32767)]
+)
 def test_fused_depth_images_are_meshed_by_their_spline(unseen, scale):
     values, count = fused(3.0)
     values = np.where(count > 0, values, unseen) * scale
@@ -305,6 +307,6 @@ def test_filling_in_reads_planes_one_by_one():
     values = truncated()
     values[0] = np.nan
     notes: list[str] = []
-    planes, extremes = filled(values, notes)
-    assert planes.shape == values.shape and extremes == (-2, 2)
+    planes = filled(Census(values), notes)
+    assert planes.shape == values.shape and planes.limits == (-2, 2)
     assert (planes[0] == 2).all() and np.isnan(values[0]).all()

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from export.augment import prepare
+from export.batches import batch_of, encode
 from export.calibration import distance_apart, draw_samples
 from export.dormant import dormant_share, rectified_layers
 from export.gates import correlation, encode_first, measure_at, rows_of_table, threshold_of
@@ -201,7 +202,7 @@ def test_samples_on_a_device_have_the_same_losses_and_the_gate_learns(net, sampl
     found = []
     for batch in (
         residents.batch([2, 0, 1, 2], [0, 5, 17, 40]),
-        list(turned_one_by_one(samples)),
+        batch_of(list(turned_one_by_one(samples))),
     ):
         torch.manual_seed(3)
         found.append(window_losses(net, batch, RECIPE))
@@ -228,7 +229,8 @@ def test_errors_at_a_threshold_are_those_of_the_network_with_it(net, samples):
 def test_what_the_gate_says_is_ranked_against_the_loss(net, samples):
     with torch.no_grad():
         encoded = encode_first(net, samples)
-        losses = batch_losses(net, samples, net.encode_batch(samples), RECIPE)
+        batch = batch_of(samples)
+        losses = batch_losses(net, batch, encode(net, batch), RECIPE)
     ends = np.cumsum([len(each.voxels) for each in samples])[:-1].tolist()
     for each, first, loss in zip(samples, encoded, losses.tensor_split(ends)):
         first.doubts[each.voxels] = -loss
@@ -250,4 +252,4 @@ def test_units_behind_the_gate_and_of_it_may_be_dormant(net, samples):
         for entry in layers:
             entry.bias[:4] = -1e4
     units = sum(len(entry.bias) for entry in layers)
-    assert dormant_share(net, [samples[:1]]) >= 4 * len(layers) / units
+    assert dormant_share(net, [batch_of(samples[:1])]) >= 4 * len(layers) / units

@@ -1,6 +1,4 @@
-"""From float32 to int8: rounding, what onnxruntime makes of the graph, idle blocks, invariance."""
-
-import copy
+"""From float32 to int8: rounding, what onnxruntime makes of the graph."""
 
 import numpy as np
 import onnx
@@ -9,9 +7,8 @@ import torch
 
 from export.calibration import distance_apart, draw_samples, find_ranges
 from export.network import NetworkConfig, SuperSdfNet
-from export.prune import without_idle_blocks
 from export.quantize import LEVELS, MOST, quantize, steps_of, whole_block, whole_layer
-from export.to_onnx import make_card, read_network, write_model
+from export.to_onnx import make_card, write_model
 from super_sdf.network.network import load_network, shipped_models
 from super_sdf.network.onnx import ort
 
@@ -107,17 +104,3 @@ def test_nothing_stands_between_a_product_and_its_rounding(files):
             made = {node.output[0]: node.op_type for node in body.node}
             rounded = [node for node in body.node if node.op_type == "QuantizeLinear"]
             assert {made[node.input[0]] for node in rounded} <= {"Gemm", "Add"}, (path, body.name)
-
-
-def test_idle_blocks_are_left_out_and_change_nothing(files, samples, tmp_path):
-    net = read_network(files[0])
-    idle = copy.deepcopy(net)
-    with torch.no_grad():
-        idle.blocks[0].conv.bias -= 1000
-        idle.blocks[2].conv.bias -= 1000
-    pruned = without_idle_blocks(idle, find_ranges(idle, samples))
-    assert (len(pruned.blocks), pruned.config.receptive_field) == (1, 2)
-    for number, made in enumerate((idle, pruned)):
-        write_model(made, tmp_path / f"{number}.onnx", make_card(made, "x", "nothing", "none"))
-    assert distance_apart(tmp_path / "0.onnx", tmp_path / "1.onnx").max() < 1e-5
-    assert len(idle.blocks) == 3

@@ -8,21 +8,14 @@ import torch
 
 import export.train
 from export.augment import CLEAN, prepare, turn
+from export.batches import batch_of, copies_of_queries, encode, means, predict
 from export.dataset import write_shard
 from export.recipe import RECIPE
-from export.resident import (
-    MOST_COPIES,
-    Residents,
-    Rows,
-    gather_samples,
-    means_turned,
-    predict_turned,
-)
-from export.sharing import copies_of_queries
+from export.resident import MOST_COPIES, Residents, Rows, gather_samples
 from export.tests.small_net import SMALL, small_net
-from export.tests.test_sharing import ball_sample
+from export.tests.test_batches import ball_sample
 from export.tests.test_training import some_samples
-from export.train import ResidentStore, Run, predict, read_changed, window_losses
+from export.train import ResidentStore, Run, read_changed, window_losses
 from super_sdf.network.symmetry import cube_symmetries
 
 DRAWN, TURNS = [2, 0, 1, 2], [0, 5, 17, 40]
@@ -54,32 +47,26 @@ def turned_one_by_one(prepared):
         yield replace(sample, patches=patches, table=table, offsets=offsets)
 
 
-def test_a_batch_predicts_what_samples_turned_one_by_one_do(prepared, residents):
-    batch, net = residents.batch(DRAWN, TURNS), small_net()
-    singly = predict(net, list(turned_one_by_one(prepared)))
-    got = predict_turned(net, batch, net.encode_batch(batch)).split(batch.counts)
-    for mine, targets, (want, wanted) in zip(got, batch.targets.split(batch.counts), singly):
-        torch.testing.assert_close(mine, want, atol=1e-5, rtol=0)
-        torch.testing.assert_close(targets, wanted)
-
-
-def test_a_batch_has_the_losses_of_its_samples(prepared, residents):
-    net = small_net()
-    got = window_losses(net, residents.batch(DRAWN, TURNS), RECIPE)
-    want = window_losses(net, list(turned_one_by_one(prepared)), RECIPE)
-    torch.testing.assert_close(got, want)
+def test_a_batch_is_that_of_samples_turned_one_by_one(prepared, residents):
+    net, batch = small_net(), residents.batch(DRAWN, TURNS)
+    want = batch_of(list(turned_one_by_one(prepared)))
+    torch.testing.assert_close(batch.targets, want.targets)
+    assert batch.counts == want.counts
+    values = [predict(net, each, encode(net, each)) for each in (batch, want)]
+    torch.testing.assert_close(*values, atol=1e-5, rtol=0)
+    torch.testing.assert_close(*(window_losses(net, each, RECIPE) for each in (batch, want)))
 
 
 def test_a_mean_is_that_of_the_sample(residents):
     batch = residents.batch([1, 0], [3, 4])
     values = torch.arange(sum(batch.counts), dtype=torch.float32)
     want = [part.mean() for part in values.split(batch.counts)]
-    torch.testing.assert_close(means_turned(values, batch), torch.stack(want))
+    torch.testing.assert_close(means(values, batch), torch.stack(want))
 
 
 def test_the_copies_of_all_queries_of_a_sample_have_room(samples):
     for sample in samples:
-        assert len(copies_of_queries(sample.offsets)[0]) <= MOST_COPIES
+        assert len(copies_of_queries(sample.offsets).query) <= MOST_COPIES
 
 
 def test_a_sample_with_more_copies_is_refused():

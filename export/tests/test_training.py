@@ -1,5 +1,6 @@
 """From a mesh to an ONNX file in small: distances, samples, gradients, resuming, parity."""
 
+import time
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -22,8 +23,8 @@ from export.augment import (
     shifted,
     turned,
 )
+from export.batches import batch_of, encode
 from export.choice import HALVES, draw_halves
-from export.compare import ENTRIES, append_row, format_table, read_rows
 from export.dataset import (
     CORNERS,
     draw_offsets,
@@ -35,8 +36,8 @@ from export.dataset import (
     write_shard,
 )
 from export.dormant import dormant_share, moments, rectified_layers, revive
-from export.latency import ball, microseconds
 from export.network import (
+    SIZES,
     GatherMatMul,
     SuperSdfNet,
     gather,
@@ -63,8 +64,7 @@ from export.to_onnx import (
     rewrite,
     write_model,
 )
-from export.train import Errors, Run, Store, divide, log, sample_errors, take_step, train
-from export.variants import UNet
+from export.train import Run, Store, divide, log, sample_errors, take_step, train
 from super_sdf import Mesh, load_network
 from super_sdf.errors import FileError, OptionError
 from super_sdf.neighbourhood import CENTRE, NEIGHBOURHOOD
@@ -222,9 +222,9 @@ def test_a_window_without_two_sides_makes_no_mask(samples):
 def test_a_network_for_masks_corrects_every_sample_also_as_a_file(tmp_path, samples):
     net = SuperSdfNet(replace(SMALL, keeps_samples=False))
     torch.nn.init.constant_(net.correction.bias, 0.5)
-    batch = [prepare_mask(sample) for sample in samples[:2]]
+    batch = batch_of([prepare_mask(sample) for sample in samples[:2]])
     with torch.no_grad():
-        encoded = net.encode_batch(batch)
+        encoded = encode(net, batch)
         at_sample = net.decode(encoded, torch.zeros(1, 3))[:, 0]
         want = encoded.patches[:, CENTRE] + net.correction(encoded.features)[:, 0]
     torch.testing.assert_close(at_sample, want, atol=1e-5, rtol=0)
@@ -246,9 +246,9 @@ def test_a_store_of_masks_has_masks_held_out_and_drawn(tmp_path, samples):
     write_shard(tmp_path / "shard-0-0000.npz", samples[:1])
     write_shard(tmp_path / "shard-0-0001.npz", samples[1:])
     store = Store(tmp_path, 1, inputs="masks")
-    _, batch = store.draw_batch(np.random.default_rng(0), replace(RECIPE, batch_voxels=1))
-    for sample in (*store.held_out, *batch):
-        assert np.abs(sample.patches[:, CENTRE]).min() == 1
+    _, (batch,) = store.draw_batch(np.random.default_rng(0), replace(RECIPE, batch_voxels=1), 1)
+    for sample in (*store.held_out, batch):
+        assert abs(sample.patches[:, CENTRE]).min() == 1
 
 
 def test_noise_may_push_voxels_with_targets_out_of_the_band(samples):
@@ -335,6 +335,10 @@ def test_a_run_learns_and_goes_on_where_it_stopped(tmp_path, samples):
     train(again, store, again.seconds / 60 + 0.01, seed=0)
     assert again.step > 158
     assert read_log(tmp_path / "log.csv")["step"][-1] == again.step  # the end is measured
+    train(again, store, 0.01, seed=0)  # spent
+    step = again.step
+    train(again, store, 0.01, seed=0, began=time.monotonic())
+    assert again.step > step and step == read_log(tmp_path / "log.csv")["step"][-2]
 
 
 def test_the_held_out_errors_of_the_truth_are_zero(samples):
@@ -377,20 +381,6 @@ def test_consecutive_runs_are_drawn_one_after_the_other(tmp_path, capsys):
     np.testing.assert_allclose(two, [[1 / 2, 0.016], [2 / 3, 0.008]])
 
 
-@pytest.mark.parametrize("entry", ENTRIES)
-def test_every_compared_network_keeps_the_sample(entry, samples):
-    make, config, _ = ENTRIES[entry]
-    net = make(replace(config, channels=8, hidden=16, blocks=2, functions=24))
-    batch = [prepare(sample) for sample in samples[:2]]
-    with torch.no_grad():
-        encoded = net.encode_batch(batch)
-        at_sample = net.decode(encoded, torch.zeros(1, 3))
-    assert len(encoded.features) == sum(len(sample.patches) for sample in batch)
-    kept = encoded.noisy[:, 0] == 0  # not at the border, where the patch is continued
-    assert kept.float().mean() > 0.9
-    np.testing.assert_allclose(at_sample[kept, 0], encoded.patches[kept, CENTRE], atol=1e-5)
-
-
 def test_noisy_are_the_voxels_whose_neighbours_are_no_distance(samples):
     sample = samples[0]
     window = sample.window.copy()
@@ -403,19 +393,6 @@ def test_noisy_are_the_voxels_whose_neighbours_are_no_distance(samples):
     near = np.append(broken, False)[prepared.table].any(1)
     assert broken.any() and not near.all()
     np.testing.assert_array_equal(noisy, near)
-
-
-def test_a_row_is_kept_and_shown(tmp_path):
-    run = Run(tmp_path, SuperSdfNet(SMALL))
-    append_row(tmp_path / "rows.jsonl", "ours", run, Errors(0.01, 0.02, 0.03), 0.285)
-    (row,) = read_rows(tmp_path / "rows.jsonl").values()
-    table = format_table({"ours": {**row, "us": 7.03}})
-    assert table.endswith("| ours | 6 k | 7.0 | 0 | 1.00 | 2.00 | 3.00 | 28.5 % |")
-
-
-@pytest.mark.parametrize("make", [SuperSdfNet, UNet])
-def test_any_make_is_timed_in_onnxruntime(make):
-    assert 0 < microseconds(make(SMALL), ball(3.0), 1) < 1e4
 
 
 def test_the_rate_warms_up_and_anneals():
@@ -516,25 +493,25 @@ def put_to_sleep(net, units=3):
 
 
 def test_dormant_units_are_counted_and_start_again_without_a_change(samples):
-    net, batch = small_net(), [prepare(samples[0])]
+    net, batch = small_net(), batch_of([prepare(samples[0])])
     layers = rectified_layers(net)
     units = sum(len(entry.bias) for entry in layers)
     put_to_sleep(net)
     assert dormant_share(net, [batch]) >= 3 * len(layers) / units
     with torch.no_grad():
-        before = net.encode_batch(batch)
-        offsets = torch.from_numpy(batch[0].offsets)
+        before = encode(net, batch)
+        offsets = torch.from_numpy(samples[0].offsets)
         values = net.decode(before, offsets)
         optimisers = make_optimisers(net, RECIPE)
         assert revive(net, optimisers, [batch]) >= 3 * len(layers)
-        torch.testing.assert_close(net.decode(net.encode_batch(batch), offsets), values)
+        torch.testing.assert_close(net.decode(encode(net, batch), offsets), values)
     assert dormant_share(net, [batch]) == 0
 
 
 def test_a_unit_that_starts_again_forgets_what_moved_it(samples):
-    net, batch = small_net(), [prepare(samples[0])]
+    net, batch = small_net(), batch_of([prepare(samples[0])])
     optimisers = make_optimisers(net, RECIPE)
-    values = net.decode(net.encode_batch(batch), torch.from_numpy(batch[0].offsets))
+    values = net.decode(encode(net, batch), torch.from_numpy(samples[0].offsets))
     values.square().mean().backward()
     for optimiser in optimisers:
         optimiser.step()
@@ -547,38 +524,35 @@ def test_a_unit_that_starts_again_forgets_what_moved_it(samples):
 
 def test_a_run_starts_dormant_units_again_until_its_last_fifth(tmp_path, samples):
     recipe = replace(RECIPE, batch_voxels=1, shares=CLEAN, revive_steps=10)
-    run, batch = Run(tmp_path, SuperSdfNet(SMALL), recipe), [prepare(samples[0])]
+    run, batch = Run(tmp_path, SuperSdfNet(SMALL), recipe), batch_of([prepare(samples[0])])
     for spent, asleep in ((0.5, False), (0.9, True)):
         put_to_sleep(run.net)
         for _ in range(10):
-            run.advance(batch, spent)
+            run.advance([batch], spent)
         assert (dormant_share(run.net, [batch]) > 0.05) == asleep
 
 
 def test_threads_share_a_batch_and_find_the_same_gradients(tmp_path, samples, monkeypatch):
     monkeypatch.setattr("export.train.autocast", lambda _: nullcontext())
-    batch = [prepare(sample) for sample in samples]
+    shown = [prepare(sample) for sample in samples]
     found = []
-    for threads in (1, 2):
-        run = Run(tmp_path, small_net(), RECIPE, threads=threads)
-        losses = run.find_gradients(batch, torch.full((len(batch),), 0.25))
+    for batches in ([batch_of(shown)], [batch_of(shown[:1]), batch_of(shown[1:])]):
+        run = Run(tmp_path, small_net(), RECIPE)
+        losses = run.find_gradients(batches, torch.tensor([0.2, 0.3, 0.5]))
         found.append([losses, *(parameter.grad for parameter in run.net.parameters())])
     for one, two in zip(*found, strict=True):
         torch.testing.assert_close(one, two, rtol=1e-4, atol=1e-6)
 
 
-def test_every_window_of_a_batch_is_given_to_one_thread(samples):
-    batch = [prepare(sample) for sample in samples]
-    parts = divide(batch, 2)
-    assert len(parts) == 2
-    assert sorted(row for part in parts for row in part) == list(range(len(batch)))
-    assert divide(batch[:1], 2) == [[0]]
+def test_every_window_of_a_batch_is_given_to_one_thread():
+    assert divide([3, 9, 5, 2], 2) == [[1], [2, 0, 3]]
+    assert divide([7], 2) == [[0]]
 
 
 def test_a_network_with_dead_units_is_not_exported(samples, monkeypatch):
     net = small_net()
     monkeypatch.setattr("export.to_onnx.draw_samples", lambda **_: [prepare(samples[0])])
-    revive(net, [], [[prepare(samples[0])]])
+    revive(net, [], [batch_of([prepare(samples[0])])])
     check_awake(net)
     put_to_sleep(net)
     with pytest.raises(SystemExit, match=r"% of the rectified units react to nothing, 1 % may"):
@@ -593,3 +567,8 @@ def test_the_halves_are_drawn_by_name_alone():
     elsewhere = draw_halves([Path("b") / path.name for path in reversed(paths)])
     assert {p.name for p in elsewhere["choose"]} == {p.name for p in halves["choose"]}
     assert draw_halves(paths, seed=1)["choose"] != halves["choose"]
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_a_size_is_that_of_the_shipped_network(name):
+    assert read_network(shipped_models()[name]).config == SIZES[name]

@@ -20,13 +20,12 @@ from .arrays import Triple
 from .errors import MeshError
 from .files.expectation import CERTAIN_SHARE, Expectation, expect
 from .files.grids import read_grid
-from .files.meshes import check_target, write_pieces
+from .files.meshes import check_format_holds, check_target, local_origin_note, write_pieces
 from .files.output import check_apart, check_free
-from .files.precision import check_format_holds, local_origin_note
-from .files.store import files_of
+from .files.regular import files_of
 from .grid.cubic import cubic_grid
+from .grid.placement import as_triple
 from .grid.sdf_grid import SdfGrid
-from .grid.spacing import as_triple
 from .mesh import Mesh, join_meshes
 from .network.decoder import Decoder
 from .options import MASK, SCALED

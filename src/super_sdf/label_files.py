@@ -12,10 +12,16 @@ import numpy as np
 
 from .convert import describe_place
 from .errors import MeshError, OptionError, seen
-from .files.meshes import check_mesh_suffix, check_target, format_of, write_together
+from .files.meshes import (
+    check_format_holds,
+    check_mesh_suffix,
+    check_target,
+    format_of,
+    local_origin_note,
+    write_together,
+)
 from .files.output import check_apart, naming
-from .files.precision import check_format_holds, local_origin_note
-from .files.store import files_of
+from .files.regular import files_of
 from .grid.labels import ALL, check_labels
 from .labels import LabelPiece, label_slabs, read_labels
 from .mesh import Mesh
@@ -151,7 +157,7 @@ def label_paths(target: str | Path, labels: list[int]) -> list[Path]:
         If they are too many.
     """
     path = Path(target)
-    if format_of(path).write_parts:
+    if format_of(path).has_parts:
         return [path] * len(labels)
     if len(labels) > MOST_FILES:
         raise OptionError(

@@ -3,8 +3,8 @@
 from .errors import SuperSdfError as SuperSdfError
 from .fields.sparse import read_field as read_field
 from .fields.writing import write_field as write_field
+from .files.grids import grid_from_image as grid_from_image
 from .files.grids import read_grid as read_grid
-from .files.images import grid_from_image as grid_from_image
 from .files.meshes import write_mesh as write_mesh
 from .grid.sdf_grid import SdfGrid as SdfGrid
 from .grid.sdf_grid import make_grid as make_grid

@@ -18,7 +18,7 @@ import numpy as np
 import pyvista
 
 from .errors import FileError, OptionError
-from .files.images import grid_from_image
+from .files.grids import grid_from_image
 from .grid.sdf_grid import SdfGrid
 from .machine.extras import check_modules, how_to_install
 from .mesh import Mesh

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..files.formats import split_member
-from ..files.store import files_of, is_store
+from ..files.regular import files_of, is_store
 
 CHUNK = 1 << 20  # bytes read at a time
 Fingerprint = dict[str, Any]

@@ -16,8 +16,7 @@ from ..convert import ConvertOptions
 from ..errors import FileError, OptionError
 from ..files.formats import GRID_SUFFIXES, is_grid, mesh_path, split_member
 from ..files.meshes import check_mesh_suffix
-from ..files.regular import reason_of
-from ..files.store import is_store
+from ..files.regular import is_store, reason_of
 from .job import Job
 from .ledger import NAME, STARTED_NAME
 from .lock import LOCK_NAME

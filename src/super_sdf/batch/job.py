@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from ..convert import ConvertOptions, convert
 from ..errors import FileError, GridError, OptionError, WriteError
-from ..files.store import check_grid_file
+from ..files.regular import check_grid_file
 from ..network.decoder import Decoder
 from ..progress import Progress
 from .fingerprint import Fingerprint, fingerprint

@@ -17,7 +17,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from ..errors import FileError, WriteError
-from ..files.parts import remove_abandoned_parts
+from ..files.output import remove_abandoned_parts
 from ..machine.records import RecordFile, parse_line
 from .fingerprint import Fingerprint, is_fingerprint, is_unchanged
 from .job import Row

@@ -11,7 +11,7 @@ from functools import cached_property
 from pathlib import Path
 
 from .. import __version__
-from ..files.store import files_of
+from ..files.regular import files_of
 from ..network.network import Network, find_model, load_network
 from ..options import AUTO_PRECISION
 from .fingerprint import file_state, fingerprint, is_unchanged

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from fnmatch import fnmatch
 from pathlib import Path
 
-from ..files.store import is_store
+from ..files.regular import is_store
 
 OnError = Callable[[OSError], None]
 """Called with the error of a folder that cannot be read."""

@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 
 from ..arrays import FloatArray
 from ..errors import OptionError
-from ..files.coloured_ply import write_coloured_ply
 from ..files.output import check_free
+from ..files.plain_meshes import write_coloured_ply
 from .check import Certificate
 from .touching import Touching
 

@@ -147,7 +147,7 @@ def check_batch_page(page: Path, jobs: list[Job], folder: Path, *, force: bool) 
     A page that super-sdf wrote may be replaced, so that a batch can be resumed.
     """
     from ..batch.items import items_folder
-    from ..files.store import files_of
+    from ..files.regular import files_of
     from ..pages.html import is_page
 
     check_modules("--report", "report")

@@ -114,7 +114,7 @@ def run_check(mesh: Path, grid: Path, options: dict[str, Any]) -> list[str]:
     from ..certificate.coloured import check_coloured, write_coloured
     from ..certificate.limits import Limits
     from ..files.output import check_apart
-    from ..files.store import files_of
+    from ..files.regular import files_of
 
     names = ("max_residual", "max_mean", "max_share", "no_faults")
     limits = Limits(**{name: options[name] for name in names})

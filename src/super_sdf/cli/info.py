@@ -59,7 +59,7 @@ def info_command(source: str | None, check: bool, device: str, as_json: bool) ->
 
 def print_grid(source: str, as_json: bool) -> None:
     """Print what a grid file states."""
-    from ..files.description import describe_grid_file
+    from ..files.grids import describe_grid_file
 
     found = describe_grid_file(source)
     if as_json:

@@ -127,7 +127,7 @@ def check_given(others: tuple[str, ...], drawn: str) -> None:
 def check_picture(target: Path, inputs: Iterable[Path], *, force: bool) -> None:
     """Raise if the picture cannot be written; called before the work starts."""
     from ..files.output import check_apart, check_free
-    from ..files.store import files_of
+    from ..files.regular import files_of
 
     if target.suffix.lower() != ".png":
         raise OptionError(f"{target} is not a picture file: give .png")

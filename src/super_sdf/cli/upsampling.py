@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from ..convert import Conversion, convert
 from ..errors import OptionError, SuperSdfError
 from ..files.meshes import check_target
-from ..files.store import files_of
+from ..files.regular import files_of
 from ..machine.extras import check_modules
 from ..network.network import Network
 from ..options import QUALITIES, ConvertOptions

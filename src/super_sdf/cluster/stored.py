@@ -16,12 +16,10 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, OptionError, OutOfMemoryError
 from ..files.formats import choose_axes, find_format
-from ..files.grids import one_line_errors, open_volume, reader_of
-from ..files.headers import read_array_header
-from ..files.regular import check_regular_file
-from ..files.unpacking import PIECE
-from ..files.volume import find_placement, place_in_world, unpacked
-from ..grid.planes import InputFile, PlaneFile, SampleArray, SamplePlanes
+from ..files.grids import one_line_errors, open_volume
+from ..files.unpacking import PIECE, unpacked
+from ..files.volume import find_placement, place_in_world
+from ..grid.planes import SampleArray, SamplePlanes
 from ..machine.memory import ROOM_SHARE, held_memory
 
 ROOM = 1 << 28  # bytes for layers that stay unpacked, if there is no bound
@@ -106,13 +104,13 @@ class Store:
 
     def _open_npy(self) -> None:
         """Open an .npy file in C order."""
-        path = check_regular_file(Path(self.source.path))
-        file = InputFile.open(path)
-        header = read_array_header(reader_of(file), str(path)).squeezed()
-        if header.fortran_order:
-            raise FileError(f"{path} is in Fortran order: save it in C order, or {WAY_OUT}")
-        self.shape, self.dtype = header.shape, header.dtype
-        self.planes = PlaneFile(file, header.length, header.shape, header.dtype)
+        path = Path(self.source.path)
+        with open_volume(path, find_format(path), "xyz", (0, None)) as volume:
+            if volume.axes != "xyz":
+                raise FileError(f"{path} is in Fortran order: save it in C order, or {WAY_OUT}")
+        self.shape, self.dtype = volume.shape, volume.dtype
+        self.planes: Any = volume.stored
+        self.layer = 1
 
     def _open_volume(self) -> None:
         """Open a store that a library reads."""
@@ -140,7 +138,7 @@ class Store:
     def read(self, first: int, last: int) -> NDArray[Any]:
         """Return planes ``first`` to before ``last``."""
         if self.source.is_npy:
-            return self.planes.read(first, last)
+            return np.asarray(self.planes[first:last])
         parts = [np.empty((0, *self.shape[1:]), self.dtype)]
         for start in range(first - first % self.layer, last, self.layer):
             low, high = max(first - start, 0), min(last - start, self.layer)

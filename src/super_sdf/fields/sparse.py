@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import zipfile
-from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import IO, Any
@@ -19,10 +18,9 @@ from numpy.typing import DTypeLike, NDArray
 
 from ..arrays import FloatArray, IntArray
 from ..errors import FileError, GridError, OptionError
-from ..files.archives import Member, open_archive
-from ..files.headers import ArrayHeader, read_array_header
+from ..files.numpy_files import Member, open_archive
+from ..files.output import append_spool, little_endian, spool_beside
 from ..files.regular import check_regular_file
-from ..files.spool import append_spool, little_endian, spool_beside
 from ..grid.field import Field
 from ..grid.planes import InputFile, SamplePlanes
 from ..grid.sdf_grid import SdfGrid
@@ -49,17 +47,7 @@ def exact_type(voxel_size: float) -> type[np.float32] | type[np.float64]:
 
 
 class SparseWriter:
-    """Writes a field slab by slab: blocks to the archive, voxels and samples to temporary files.
-
-    Parameters
-    ----------
-    part : Path
-        The file.
-    shape : three ints
-        Nodes of the whole fine lattice; the file does not depend on it.
-    files : ExitStack
-        Closes the files at the end, however that comes.
-    """
+    """Writes a field slab by slab: blocks to the archive, voxels and samples to temporary files."""
 
     def __init__(self, part: Path, shape: tuple[int, int, int], files: ExitStack) -> None:
         self.archive = zipfile.ZipFile(part, "w")
@@ -185,7 +173,7 @@ def read_field(path: str | Path) -> FineField:
         raise OptionError(f"{path} is no sparse field: give .npz")
     file = InputFile.open(check_regular_file(path))
     try:
-        with open_archive(file) as archive:
+        with open_archive(path) as archive:
             return _Reader(archive, str(path)).read()
     finally:
         file.check_unchanged()  # a change explains whatever else went wrong
@@ -276,12 +264,16 @@ class _Reader:
 
     def _blocks(self, count: int, factor: int, grid: SdfGrid) -> FloatArray:
         """Return the values (Q, D) in half voxels, read in pieces."""
-        member, header = self._open("values", "f", (count, *(factor + 1,) * 3))
-        nodes = (factor + 1) ** 3
+        member = self._open("values", "f", (count, *(factor + 1,) * 3))
+        nodes, dtype = (factor + 1) ** 3, member.header.dtype
         check_fits(4 * nodes * count, f"{self.name}, as a field,", "read it on a larger machine")
         blocks = np.empty((nodes, count), np.float32)
-        for rows, data in _pieces(member, header, nodes):
-            blocks[:, rows] = _in_half_voxels(data, grid).reshape(-1, nodes).T
+        step = max(CHUNK // nodes, 1)
+        for first in range(0, count, step):
+            rows = slice(first, min(first + step, count))
+            data = member.read((rows.stop - first) * nodes * dtype.itemsize)
+            values = _in_half_voxels(np.frombuffer(data, dtype), grid)
+            blocks[:, rows] = values.reshape(-1, nodes).T
         if not np.isfinite(blocks).all():
             raise self._not_finite("values")
         return blocks
@@ -291,20 +283,18 @@ class _Reader:
 
     def _array(self, key: str, kinds: str, shape: tuple[int | None, ...]) -> NDArray[Any]:
         """Return an array of one of some kinds and of a shape, in which None is any length."""
-        member, header = self._open(key, kinds, shape)
-        check_fits(header.size, f"{self.name}[{key}]", "read it on a larger machine")
-        array: NDArray[Any] = np.frombuffer(member.read(header.size), header.dtype)
-        if header.dtype.kind == "f" and not np.isfinite(array).all():
+        member = self._open(key, kinds, shape)
+        check_fits(member.header.size, f"{self.name}[{key}]", "read it on a larger machine")
+        array = member.array()
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise self._not_finite(key)
-        return array.reshape(header.shape)
+        return array
 
-    def _open(
-        self, key: str, kinds: str, shape: tuple[int | None, ...]
-    ) -> tuple[Member, ArrayHeader]:
-        """Return the member of a key, to be read after its header, which must be as expected."""
+    def _open(self, key: str, kinds: str, shape: tuple[int | None, ...]) -> Member:
+        """Return the member of a key, whose header must be as expected."""
         name = f"{self.name}[{key}]"
         member = Member(self.archive, self.members[key], name)
-        header = read_array_header(member.read, name)
+        header = member.header
         fits = len(header.shape) == len(shape) and all(
             want in (None, have) for want, have in zip(shape, header.shape)
         )
@@ -314,18 +304,7 @@ class _Reader:
             raise FileError(
                 f"{name} is damaged: its header promises {header}, but {member.left:,} follow"
             )
-        return member, header
-
-
-def _pieces(
-    member: Member, header: ArrayHeader, nodes: int
-) -> Iterator[tuple[slice, NDArray[Any]]]:
-    """Yield rows of an array of blocks, and their values."""
-    step, count = max(CHUNK // nodes, 1), header.shape[0]
-    for first in range(0, count, step):
-        rows = slice(first, min(first + step, count))
-        size = (rows.stop - first) * nodes * header.dtype.itemsize
-        yield rows, np.frombuffer(member.read(size), header.dtype)
+        return member
 
 
 def _in_half_voxels(world: NDArray[Any], grid: SdfGrid) -> FloatArray:

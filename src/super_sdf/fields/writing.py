@@ -2,83 +2,138 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from math import prod
 from pathlib import Path
-from typing import Any, Protocol
+from typing import IO, Any
 
+import numpy as np
+from numpy.lib import format as npy
+
+from ..arrays import FloatArray
 from ..errors import OptionError, OptionTypeError, OutOfMemoryError, WriteError, seen
-from ..files.output import check_free, free_space, naming, replacing
+from ..files.output import check_free, free_space, little_endian, naming, replacing
+from ..grid.sdf_grid import SdfGrid
 from ..machine.extras import check_modules
 from ..machine.memory import held_memory, in_words, memory_bound
 from ..options import check_path
 from ..steps.ends import check_all_seen
 from ..steps.field import FineField
-from ..steps.lattice import fine_grid, lattice_shape
-from .dense import BYTES, NpyWriter
+from ..steps.lattice import FineLattice, fine_grid, lattice_shape
 from .sparse import SparseWriter
-from .vti import VtiWriter
 
-
-class FieldWriter(Protocol):
-    """Writes a field that comes slab by slab."""
-
-    def add(self, field: FineField) -> None:
-        """Write the own planes of a slab's field."""
-        ...
-
-    def finish(self) -> None:
-        """Complete the file."""
-        ...
-
-
+CHUNK = 1 << 20  # values at a time, but at least a plane
+BYTES = 4  # of a value
+STDERR = 2
 Shape = tuple[int, int, int]
 
 
-@dataclass(frozen=True)
-class FieldFormat:
-    """A file format of refined fields.
+class NpyWriter:
+    """Writes the planes of the fine lattice slab by slab to an ``.npy`` file."""
 
-    Attributes
-    ----------
-    writer : callable
-        Takes the path of the file, the number of nodes along each axis of the fine lattice, and an
-        ExitStack that closes what it opens.
-    dense : bool
-        Whether the file holds every node of the fine lattice.
-    in_memory : bool
-        Whether the whole lattice must fit in memory.
-    extra : str or None
-        The extra that installs its library.
+    def __init__(self, part: Path, shape: Shape, files: ExitStack) -> None:
+        self.file: IO[bytes] = files.enter_context(part.open("wb"))
+        header = {"descr": "<f4", "fortran_order": False, "shape": shape}
+        npy.write_array_header_1_0(self.file, header)
+
+    def add(self, field: FineField) -> None:
+        """Write the planes of nodes of a slab."""
+        for _, planes in _own_planes(field):
+            self.file.write(little_endian(planes))
+
+    def finish(self) -> None:
+        """Complete the file."""
+        self.file.close()
+
+
+class VtiWriter:
+    """Gathers the fine lattice in memory and writes it as VTK image data at the end.
+
+    The memory is filled at once, so that the plan of the work counts it.
     """
 
-    writer: Callable[[Path, Shape, ExitStack], FieldWriter]
-    dense: bool = False
-    in_memory: bool = False
-    extra: str | None = None
+    def __init__(self, part: Path, shape: Shape, files: ExitStack) -> None:
+        self.part = part
+        self.values = np.full(shape[::-1], np.float32(np.inf))  # x is the fastest
+        self.grid: SdfGrid | None = None
+
+    def add(self, field: FineField) -> None:
+        """Copy the planes of nodes of a slab."""
+        self.grid = fine_grid(field)
+        for first, planes in _own_planes(field):
+            self.values[:, :, first : first + len(planes)] = planes.transpose(2, 1, 0)
+
+    def finish(self) -> None:
+        """Write the file."""
+        from vtkmodules.util.numpy_support import numpy_to_vtk
+        from vtkmodules.vtkCommonDataModel import vtkImageData
+        from vtkmodules.vtkCommonMisc import vtkErrorCode
+        from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
+
+        image = vtkImageData()
+        image.SetDimensions(*self.values.shape[::-1])
+        if self.grid:
+            image.SetSpacing(*self.grid.spacing)
+            image.SetOrigin(*self.grid.origin)
+            image.SetDirectionMatrix(np.ravel(self.grid.direction).tolist())
+        array = numpy_to_vtk(self.values.reshape(-1))
+        array.SetName("distance")
+        image.GetPointData().SetScalars(array)
+        writer = vtkXMLImageDataWriter()
+        writer.SetFileName(str(self.part))
+        writer.SetInputData(image)
+        writer.EncodeAppendedDataOff()
+        writer.SetCompressorTypeToNone()
+        with _discarded_stderr():  # VTK's log
+            written = writer.Write()
+        if not written:
+            reason = vtkErrorCode.GetStringFromErrorCode(writer.GetErrorCode())
+            raise OSError(f"VTK says {reason!r}")
 
 
-FORMATS = {
-    ".npz": FieldFormat(SparseWriter),
-    ".npy": FieldFormat(NpyWriter, dense=True),
-    ".vti": FieldFormat(VtiWriter, dense=True, in_memory=True, extra="vti"),
-}
-FIELD_SUFFIXES = tuple(FORMATS)
+def _own_planes(field: FineField) -> Iterator[tuple[int, FloatArray]]:
+    """Yield the planes of nodes of a slab, a few at a time, and the number of the first of them.
+
+    The plane between two slabs belongs to the second; the last slab also has the last plane.
+    """
+    lattice, factor = FineLattice(field), field.factor
+    first, last = (factor * plane for plane in field.planes)
+    last += field.planes[1] == field.shape[0]
+    step = max(CHUNK // (lattice.shape[1] * lattice.shape[2]), 1)
+    for start in range(first, last, step):
+        yield start, lattice.read(start, min(start + step, last))
+
+
+@contextmanager
+def _discarded_stderr() -> Iterator[None]:
+    """Discard what libraries in C++ write to file descriptor 2, if there is one."""
+    try:
+        kept = os.dup(STDERR)
+    except OSError:  # it is closed already
+        yield
+        return
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, STDERR)
+        yield
+    finally:
+        os.dup2(kept, STDERR)
+        os.close(kept)
+        os.close(nowhere)
+
+
+WRITERS: dict[str, Any] = {".npz": SparseWriter, ".npy": NpyWriter, ".vti": VtiWriter}
+"""Each takes the path, the nodes along each axis of the lattice, and what closes files at the end.
+
+A writer has the methods ``add`` and ``finish``. All but the sparse one write every node.
+"""
+FIELD_SUFFIXES = tuple(WRITERS)
 
 
 def check_field_target(path: str | Path, *, force: bool = False) -> Path:
-    """Return the path if a field can be written there; called before the work starts.
-
-    Raises
-    ------
-    OptionError
-        If the suffix is not one of ``FIELD_SUFFIXES``.
-    FileError
-        If the file exists and ``force`` is not set, the folder cannot be written to, or the
-        library for the format is missing.
-    """
+    """Return the path if a field can be written there; called before the work starts."""
     path = check_path(path, "path")
     suffix = path.suffix.lower()
     if suffix == ".vdb":
@@ -86,17 +141,17 @@ def check_field_target(path: str | Path, *, force: bool = False) -> Path:
             f"{path} cannot be written: OpenVDB's own module cannot be installed with pip; write "
             ".npz, and convert it with that module as docs/fields.md shows"
         )
-    if suffix not in FORMATS:
+    if suffix not in WRITERS:
         raise OptionError(f"{path} is not a field file: give one of {', '.join(FIELD_SUFFIXES)}")
-    if extra := FORMATS[suffix].extra:
-        check_modules(f"Writing {suffix}", extra)
+    if suffix == ".vti":
+        check_modules("Writing .vti", "vti")
     return check_free(path, force=force)
 
 
 def check_field_fits(path: Path, shape: Shape, max_memory: int | None = None) -> None:
     """Raise an error if a dense file of a lattice does not fit on the disk, or .vti in memory."""
-    format_ = FORMATS[path.suffix.lower()]
-    if not format_.dense:
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
         return
     size = BYTES * prod(shape)
     what = f"{' x '.join(map(str, shape))} values take {in_words(size)}"
@@ -107,7 +162,7 @@ def check_field_fits(path: Path, shape: Shape, max_memory: int | None = None) ->
             "is sparse"
         )
     left = None if bound is None else bound - (held_memory() or 0)
-    if format_.in_memory and left is not None and size > left:
+    if suffix == ".vti" and left is not None and size > left:
         raise OutOfMemoryError(
             f"{path} cannot be written: {what} of memory, {in_words(max(left, 0))} are left; "
             "write .npy, which is written plane by plane, or .npz, which is sparse"
@@ -117,22 +172,10 @@ def check_field_fits(path: Path, shape: Shape, max_memory: int | None = None) ->
 class FieldFile:
     """A file of a field that is being written; errors name it.
 
-    Parameters
-    ----------
-    path : Path
-        The file, as the user named it.
-    shape : three ints
-        Nodes of the fine lattice along each axis.
-    writer : FieldWriter
-        What writes it.
-
-    Attributes
-    ----------
-    place : dict
-        Shape, spacing and origin of the fine lattice, once there is a field.
+    ``place`` has spacing and origin of the fine lattice, once there is a field.
     """
 
-    def __init__(self, path: Path, shape: Shape, writer: FieldWriter) -> None:
+    def __init__(self, path: Path, shape: Shape, writer: Any) -> None:
         self.path, self.shape, self.writer = path, shape, writer
         self.place: dict[str, Any] = {}
 
@@ -162,7 +205,7 @@ def saving_field(path: Path, shape: Shape, *, force: bool = False) -> Iterator[F
     ``shape`` is the number of nodes of the fine lattice along each axis.
     """
     with replacing(path, force=force) as part, ExitStack() as files:
-        yield FieldFile(path, shape, FORMATS[path.suffix.lower()].writer(part, shape, files))
+        yield FieldFile(path, shape, WRITERS[path.suffix.lower()](part, shape, files))
 
 
 def write_field(field: FineField, path: str | Path, *, force: bool = False) -> None:

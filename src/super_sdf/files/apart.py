@@ -14,18 +14,15 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import fields
 from functools import partial
 from subprocess import DEVNULL, PIPE, Popen
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import FileError, OutOfMemoryError, SuperSdfError
 from ..machine.memory import held_memory, in_words, memory_bound
 from ..machine.serving import isolated_python
-from .boxes import Box
 from .volume import Request, Volume
 
 STEP = 0.02  # seconds between two looks at the memory
@@ -38,23 +35,12 @@ START = "from super_sdf.files import apart; apart.serve()"
 def volume_apart(key: str, request: Request) -> Iterator[Volume]:
     """Yield the volume that the reader of a format returns in a process of its own.
 
-    Raises
-    ------
-    FileError
-        If that process crashes.
-    OutOfMemoryError
-        If both processes hold more memory than they may.
+    Raises FileError if that process crashes, OutOfMemoryError if both processes hold too much.
     """
     reader = _Process(request)
     try:
         stated = {name: value for name, value in vars(request).items() if name != "files"}
-        found: dict[str, Any] = reader.ask((key, stated))
-        _, ny, nz = found["shape"] if len(found["shape"]) == 3 else (0, 0, 0)
-
-        def read(first: int, last: int) -> NDArray[Any]:
-            return reader.box((slice(first, last), slice(0, ny), slice(0, nz)))
-
-        yield Volume(**found, read=read, read_box=reader.box)
+        yield Volume(**reader.ask((key, stated)), read_box=reader.ask)
     finally:
         reader.close()
 
@@ -84,11 +70,6 @@ class _Process:
         if isinstance(answer, Exception):
             raise answer
         return answer
-
-    def box(self, box: Box) -> NDArray[Any]:
-        """Return a box of samples."""
-        samples: NDArray[Any] = self.ask(box)
-        return samples
 
     def _watch(self) -> None:
         """Kill the process when it holds too much, together with what this one took meanwhile."""
@@ -128,29 +109,22 @@ class _Process:
 
 def serve() -> None:
     """Read the file of the first question, and answer with the boxes of the following ones."""
+    from .readers import READERS
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other process handles it
     warnings.simplefilter("ignore")
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # libraries may print
     with ExitStack() as files, suppress(EOFError, BrokenPipeError):
         questions = sys.stdin.buffer
-        first = pickle.load(questions)
-        volume = _answer(answers, partial(_opened, files, *first), _stated)
+        key, request = pickle.load(questions)
+        volume = _answer(
+            answers,
+            lambda: READERS[key](Request(**request, files=files)),
+            lambda volume: {n: v for n, v in vars(volume).items() if n not in FUNCTIONS},
+        )
         while volume:
             _answer(answers, partial(volume.box, pickle.load(questions)), np.ascontiguousarray)
-
-
-def _opened(files: ExitStack, key: str, request: dict[str, Any]) -> Volume:
-    """Return the volume in a file."""
-    from .readers.table import READERS
-
-    return READERS[key](Request(**request, files=files))
-
-
-def _stated(volume: Volume) -> dict[str, Any]:
-    """Return the fields of a volume that are sent to the other process."""
-    names = (field.name for field in fields(volume))
-    return {name: getattr(volume, name) for name in names if name not in FUNCTIONS}
 
 
 def _answer(answers: IO[bytes], make: Callable[[], Any], told: Callable[[Any], Any]) -> Any:

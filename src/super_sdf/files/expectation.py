@@ -55,10 +55,7 @@ def expect(
 ) -> Expectation:
     """Estimate the size of the mesh of a grid, and of its file; ``cap`` is as in ``reconstruct``.
 
-    Raises
-    ------
-    WriteError
-        If half of that is more than the free disk space.
+    Raises WriteError if half of that is more than the free disk space.
     """
     by_plane = count_by_plane(grid, offset, cap=cap)
     triangles = 2 * factor**2 * round(count_on_lattice(grid, by_plane))
@@ -107,29 +104,24 @@ def _crossings_of(
     is_end: bool,
 ) -> NDArray[np.int64]:
     """Count crossed edges plane by plane, (n, 3); ``has_before``: the first is the one before."""
-    counts = []
-    before = None
-    for plane in planes:
-        with np.errstate(over="ignore"):  # an offset beyond float32 is beyond all values
-            inside = (negated(plane) if positive_inside else plane) <= offset
-        if before is not None or not has_before:
-            counts.append(_crossings_of_plane(inside, before, cap))
-        before = inside
-    if is_end and cap and before is not None:
-        counts[-1][0] += int(np.count_nonzero(before))
-    return np.array(counts, np.int64)
-
-
-def _crossings_of_plane(inside: BoolArray, before: BoolArray | None, cap: bool) -> list[int]:
-    """Count the crossed edges along x, to the plane before, y and z of a plane of samples."""
-    x, y = 0, int(np.count_nonzero(inside[1:] != inside[:-1]))
-    z = int(np.count_nonzero(inside[:, 1:] != inside[:, :-1]))
+    with np.errstate(over="ignore"):  # an offset beyond float32 is beyond all values
+        inside = (negated(planes) if positive_inside else planes) <= offset
+    counted = inside[int(has_before) :]
+    x, y, z = (
+        _count(np.diff(part, axis=axis)) for axis, part in enumerate((inside, counted, counted))
+    )
+    if not has_before:
+        x = np.concatenate([_count(inside[:1]) * cap, x])
     if cap:
-        y += int(np.count_nonzero(inside[[0, -1]]))
-        z += int(np.count_nonzero(inside[:, [0, -1]]))
-    if before is not None or cap:
-        x = int(np.count_nonzero(inside if before is None else inside != before))
-    return [x, y, z]
+        y += _count(counted[:, [0, -1]])
+        z += _count(counted[:, :, [0, -1]])
+        x[-1] += is_end * np.count_nonzero(counted[-1])
+    return np.stack([x, y, z], axis=1)
+
+
+def _count(marks: BoolArray) -> NDArray[np.int64]:
+    """Count the marks of each plane."""
+    return np.asarray(np.count_nonzero(marks, axis=(1, 2)))
 
 
 def _rounded(count: int) -> int:

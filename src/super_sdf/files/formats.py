@@ -1,13 +1,14 @@
 """The table of grid file formats: help texts, messages, extras and readers follow it.
 
-It needs no package, so that help texts are quick.
+A new format is a row here, and its reader in ``readers``. It needs no package, so that help texts
+are quick.
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path, PurePath
+from typing import NamedTuple
 
 from ..errors import OptionError
 from ..machine.extras import check_modules
@@ -28,35 +29,16 @@ WAYS_OUT = {
 }
 
 
-@dataclass(frozen=True)
-class GridFormat:
-    """A grid file format.
+class GridFormat(NamedTuple):
+    """A grid file format."""
 
-    Attributes
-    ----------
-    key : str
-        Its name in code: the key of its reader.
-    name : str
-        Its name in texts.
-    suffixes : tuple of str
-        How its file names end, in lower case.
-    extra : str or None
-        The extra that installs its library; None if none is needed.
-    axes : str or None
-        The axis order of an array unless ``--axes`` gives another; None if the file states it.
-    has_members : bool
-        Whether a file may hold several arrays, one of which ``FILE:NAME`` names.
-    is_apart : bool
-        Whether its library, in C, reads it in a process of its own.
-    """
-
-    key: str
-    name: str
-    suffixes: tuple[str, ...]
-    extra: str | None = None
-    axes: str | None = None
-    has_members: bool = False
-    is_apart: bool = False
+    key: str  # of its reader
+    name: str  # in texts
+    suffixes: tuple[str, ...]  # how its file names end, in lower case
+    extra: str | None = None  # that installs its library
+    axes: str | None = None  # the order of axes without --axes; None if the file states it
+    has_members: bool = False  # whether a file may hold several arrays: FILE:NAME
+    is_apart: bool = False  # whether its library, in C, reads it in a process of its own
 
 
 FORMATS = (
@@ -88,13 +70,7 @@ _WITH_MEMBER = re.compile(rf"(?P<file>.*\.(?:{_MEMBERS})):(?P<member>.+)", re.I 
 
 
 def find_format(path: str | Path) -> GridFormat:
-    """Return the format of a grid file by the end of its name.
-
-    Raises
-    ------
-    OptionError
-        If it is none of the table, such as a mesh.
-    """
+    """Return the format of a grid file by its name; raise OptionError if it is none, or a mesh."""
     file, _ = split_member(path)
     ending = _ending(file)
     if ending:
@@ -120,15 +96,15 @@ def is_grid(path: str | Path) -> bool:
 def _ending(path: PurePath) -> str:
     """Return the suffix by which a file is a grid, in lower case; "" if it is none."""
     name = path.name.lower()
-    found = [end for end in GRID_SUFFIXES if name.endswith(end) and len(name) > len(end)]
-    return max(found, key=len, default="")
+    ends = [end for end in GRID_SUFFIXES if name.endswith(end) and len(name) > len(end)]
+    return max(ends, key=len, default="")
 
 
 def split_member(path: str | PurePath) -> tuple[Path, str | None]:
     """Split ``FILE:NAME`` into the file and the name of an array in it, None if none is named."""
-    found = _WITH_MEMBER.fullmatch(str(path))
-    if found:
-        return Path(found["file"]), found["member"]
+    parts = _WITH_MEMBER.fullmatch(str(path))
+    if parts:
+        return Path(parts["file"]), parts["member"]
     folder, _, series = str(path).rpartition(":")
     if folder and Path(folder).is_dir() and not Path(path).exists():
         return Path(folder), series
@@ -158,13 +134,7 @@ def check_library(format_: GridFormat) -> None:
 
 
 def choose_axes(format_: GridFormat, given: str | None) -> str:
-    """Return the axis order of an array file: as given, else the convention of the format.
-
-    Raises
-    ------
-    OptionError
-        If the format's files state their axes, or the order is unknown.
-    """
+    """Return the axis order of an array file: as given, else the convention of the format."""
     if given is None:
         return format_.axes or "xyz"
     OPTIONS["axes"].check(given)

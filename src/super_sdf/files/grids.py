@@ -1,31 +1,25 @@
-"""Reading and writing grid files: ``.npy`` (one array), ``.npz``, and other people's formats.
+"""Reading grid files of all formats, and writing ``.npz``. Files are checked before they are read.
 
-The keys of an ``.npz`` are ``values`` and, optionally, ``spacing``, ``origin`` and ``direction``.
-Files are checked before they are read. ``formats`` has the table of all formats, ``readers`` their
-readers.
+``formats`` has the table of all formats, ``readers`` their readers.
 """
 
 from __future__ import annotations
 
 import warnings
-import zipfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..errors import FileError, GridError, OptionError, OutOfMemoryError, SuperSdfError
-from ..grid.planes import InputFile, PlaneFile, SampleArray, check_planes
-from ..grid.samples import check_kind
+from ..errors import FileError, OptionError, OutOfMemoryError, SuperSdfError
+from ..grid.placement import STRAIGHT
+from ..grid.planes import InputFile, check_planes
 from ..grid.sdf_grid import SdfGrid, make_grid
 from ..machine.memory import ROOM_SHARE, held_memory, memory_bound
 from ..options import ReadOptions, Values, check_path
 from .apart import volume_apart
-from .archives import Member, open_archive
 from .formats import (
     GridFormat,
     check_direction_given,
@@ -34,21 +28,15 @@ from .formats import (
     find_format,
     split_member,
 )
-from .headers import ArrayHeader, Read, read_array_header
+from .numpy_files import NUMPY_READERS
 from .output import check_free, replacing
-from .regular import check_regular_file
-from .store import check_grid_file
-from .unpacking import check_ratio, unpack
-from .volume import Request, Volume, axes_direction, take
+from .regular import check_grid_file
+from .unpacking import take
+from .volume import PLACE, Request, Volume, find_placement, place_in_world
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-PLACE = ("spacing", "origin", "direction")
-NPZ_KEYS = ("values", *PLACE)
-OPEN3D = {"key.npy", "voxel_size.npy", "block_resolution.npy", "attr_name_tsdf.npy"}
-NUMBERS = "one number or three"
-MOST_NAMED = 10  # members of an archive that an error lists
 UNKNOWN_ROOM = 1 << 28  # bytes that an unpacked array may take if the memory left is unknown
 
 
@@ -102,10 +90,10 @@ def read_grid(
         files of the format state it.
     """
     ReadOptions(**values)  # checks them
-    place = {"spacing": spacing, "origin": origin, "direction": direction}
-    found = read_array(path, place, axes, max_memory)
-    grid = make_grid(found["values"], **{key: found[key] for key in PLACE}, **values)
-    return grid.noted(found["notes"])
+    given = {"spacing": spacing, "origin": origin, "direction": direction}
+    arrays = read_array(path, given, axes, max_memory)
+    notes = arrays.pop("notes")
+    return make_grid(**arrays, **values).noted(notes)
 
 
 def read_array(
@@ -116,102 +104,74 @@ def read_array(
     format_ = find_format(path)
     order = choose_axes(format_, axes)
     check_direction_given(format_, given["direction"])
-    room = unpacking_room(max_memory)
-    if format_.key in ("npy", "npz"):
-        found = _read_numpy(check_regular_file(path), order, room, given)
-    else:
-        found = _read_foreign(path, format_, order, room, given, max_memory)
-    check_planes(found["values"], memory_bound(max_memory))
-    return {key: found[key] for key in ("values", *PLACE)} | {"notes": found.get("notes", ())}
-
-
-def _read_numpy(path: Path, axes: str, room: int, given: dict[str, Any]) -> dict[str, Any]:
-    """Return the arrays of an .npy or .npz file, with the axes x, y, z."""
-    read = _read_npy if path.suffix.lower() == ".npy" else _read_npz
-    found = read(path, room)
-    place = {key: found.get(key) if own is None else own for key, own in given.items()}
-    values = found["values"]
-    if axes != "xyz":
-        turned = axes_direction(axes)
-        volume = Volume(values.shape, values.dtype, lambda a, b: values[a:b], direction=turned)
-        values = take(volume, str(path), room, place)["values"]
-    return {"values": values, **place}
-
-
-def _read_foreign(
-    path: Path,
-    format_: GridFormat,
-    axes: str,
-    room: int,
-    given: dict[str, Any],
-    max_memory: int | None,
-) -> dict[str, Any]:
-    """Return values and place of a file that its own library reads."""
-    bound = memory_bound(max_memory)
+    room, bound = unpacking_room(max_memory), memory_bound(max_memory)
     left = None if bound is None else bound - (held_memory() or 0)
-    with open_volume(path, format_, axes, (room, left)) as volume:
+    with open_volume(path, format_, order, (room, left)) as volume:
         if given["direction"] is not None:
-            volume = volume.turned(axes)
-        found = take(volume, str(path), room, given, left)
-        return found | {"notes": volume.notes}
+            volume = volume.turned(order)
+        arrays = take(volume, str(path), room, given, left)
+    check_planes(arrays["values"], bound)
+    return arrays | {"notes": volume.notes}
 
 
 @contextmanager
 def open_volume(
     path: Path, format_: GridFormat, axes: str, memory: tuple[int, int | None]
 ) -> Iterator[Volume]:
-    """Yield the volume in a file that its own library reads; its errors are of one line.
+    """Yield the volume in a file; whatever its library raises is an error of one line.
 
     ``memory`` is how many bytes the unpacked array may take, and the process in all.
     """
     file, member = split_member(path)
     check_grid_file(path)
     check_library(format_)
-    from .readers.table import READERS
-
     watched = None if file.is_dir() else InputFile.open(file)
     with one_line_errors(path, format_, watched), ExitStack() as files:
         request = Request(file, member, axes, *memory, files)
         if format_.is_apart:
             yield files.enter_context(volume_apart(format_.key, request))
+        elif format_.key in NUMPY_READERS:
+            yield NUMPY_READERS[format_.key](request)
         else:
+            from .readers import READERS  # a dozen modules
+
             yield READERS[format_.key](request)
 
 
 @contextmanager
 def one_line_errors(path: Path, format_: GridFormat, watched: InputFile | None) -> Iterator[None]:
-    """Turn whatever a library raises into a FileError of one line, and silence its warnings."""
+    """Turn whatever a library raises into a FileError of one line, and silence it meanwhile."""
+    import logging
+
+    logs = logging.root.manager.disable
     try:
-        with warnings.catch_warnings(), _silent_logs():
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore")
+            logging.disable(logging.CRITICAL)  # what matters is raised
             yield
+    except MemoryError as error:
+        if isinstance(error, OutOfMemoryError):
+            _check_unchanged(watched)
+        raise
     except SuperSdfError as error:
-        if str(split_member(path)[0]) in str(error) or isinstance(error, OutOfMemoryError):
+        _check_unchanged(watched)
+        if str(split_member(path)[0]) in str(error):
             raise
         raise type(error)(f"{path}: {error}") from None
     except Exception as error:  # the libraries raise all kinds of errors
-        if isinstance(error, MemoryError):
-            raise
-        if watched:
-            watched.check_unchanged()
+        _check_unchanged(watched)
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         reason = lines[-1][:200] if lines else type(error).__name__
         raise FileError(f"{path} cannot be read as {format_.name}: {reason}") from error
+    finally:
+        logging.disable(logs)
+    _check_unchanged(watched)
+
+
+def _check_unchanged(watched: InputFile | None) -> None:
+    """Raise FileError if a file changed, which explains whatever else went wrong."""
     if watched:
         watched.check_unchanged()
-
-
-@contextmanager
-def _silent_logs() -> Iterator[None]:
-    """Keep libraries from logging to stderr: what matters is raised."""
-    import logging
-
-    disabled = logging.root.manager.disable
-    logging.disable(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        logging.disable(disabled)
 
 
 def unpacking_room(max_memory: int | None) -> int:
@@ -222,124 +182,86 @@ def unpacking_room(max_memory: int | None) -> int:
     return int(ROOM_SHARE * max(bound - (held_memory() or 0), 0))
 
 
-def _read_npy(path: Path, room: int) -> dict[str, Any]:
-    """Return the array of an .npy file: a ``PlaneFile``, or unpacked if in Fortran order."""
-    file = InputFile.open(path)
-    read = reader_of(file)
-    header = read_array_header(read, str(path)).squeezed()
-    _check_size(header, file.size - header.length, str(path))
-    check_kind(header.dtype, header.shape)
-    if header.fortran_order:
-        return {"values": unpack(read, header, str(path), room)}
-    return {"values": PlaneFile(file, header.length, header.shape, header.dtype)}
+def grid_from_image(
+    image: Any,
+    scalars: str | None = None,
+    *,
+    max_memory: int | None = None,
+    **values: Unpack[Values],
+) -> SdfGrid:
+    """Make a grid of VTK image data: the one that ``read_grid`` makes of it as a ``.vti`` file.
+
+    Parameters
+    ----------
+    image : vtkImageData
+        Or a subclass, such as ``pyvista.ImageData``. Its spacing, origin, extent and direction
+        place the samples in the world.
+    scalars : str, optional
+        The name of an array of numbers at its points or, if no array there has that name, in its
+        cells; samples in cells are at their centres. Default: the active scalars of the points,
+        else of the cells, else the only array.
+    inside, field, label, level, scale
+        What the values are; see ``make_grid``.
+    max_memory : int, optional
+        Bytes that this process may hold in all. Default: a share of the free memory.
+
+    Returns
+    -------
+    SdfGrid
+        With a copy of the samples, in a temporary file if they are large.
+
+    Raises
+    ------
+    GridError
+        If there is no such array, or several and none is named; if its values are not a signed
+        distance grid.
+    OptionError
+        If ``inside`` or ``field`` is unknown, or ``image`` is no image data (``OptionTypeError``).
+    """
+    ReadOptions(**values)  # checks them
+    from .readers.vtk import NAME, volume_of_image
+
+    volume = volume_of_image(image, scalars)
+    arrays = take(volume, NAME, unpacking_room(max_memory), {})
+    return make_grid(**arrays, **values)
 
 
-def reader_of(file: InputFile) -> Read:
-    """Return a function that reads a file from its beginning on."""
-    place = 0
+def describe_grid_file(path: str | Path) -> dict[str, Any]:
+    """Return format, shape (x, y, z), type, place and storage of the array in a grid file.
 
-    def read(count: int) -> bytes:
-        nonlocal place
-        data = file.read(place, count)
-        place += len(data)
-        return data.tobytes()
-
-    return read
-
-
-def _read_npz(path: Path, room: int) -> dict[str, Any]:
-    """Read the known arrays of an .npz file."""
-    file = InputFile.open(path)
-    try:
-        with open_archive(file) as archive:
-            if OPEN3D.issubset(archive.namelist()):
-                return _read_blocks(archive, path, room)
-            members = find_members(archive, path)
-            found = {
-                key: read_small(archive, members[key], f"{path}[{key}]")
-                for key in NPZ_KEYS[1:]
-                if key in members
-            }
-            return found | {"values": _read_values(archive, members["values"], path, room)}
-    finally:
-        file.check_unchanged()  # a change explains whatever else went wrong
-
-
-def _read_blocks(archive: zipfile.ZipFile, path: Path, room: int) -> dict[str, Any]:
-    """Return the dense values and place of a ``VoxelBlockGrid`` that Open3D saved."""
-    from .readers.open3d import volume_of_blocks
-
-    def array(key: str) -> NDArray[Any]:
-        if f"{key}.npy" not in archive.namelist():
-            raise FileError(f"{path} is Open3D's VoxelBlockGrid, but has no key {key!r}")
-        name = f"{path}[{key}]"
-        member = Member(archive, archive.getinfo(f"{key}.npy"), name)
-        header = read_array_header(member.read, name)
-        if header.size > room:
-            raise OutOfMemoryError(f"{name}, {header}, does not fit: allow more (--max-memory)")
-        _check_size(header, member.left, name)
-        return np.frombuffer(member.read(header.size), header.dtype).reshape(header.shape)
-
-    return take(volume_of_blocks(array), str(path), room, dict.fromkeys(PLACE))
+    No sample is read where the format allows it. What the file does not state is None or missing.
+    Chunks and shards are in the order of the array's own axes. Raises as ``read_grid``.
+    """
+    path = check_path(path, "path")
+    format_ = find_format(path)
+    with open_volume(path, format_, choose_axes(format_, None), (0, None)) as volume:
+        if len(volume.shape) != 3:
+            raise FileError(f"its array has shape {volume.shape}: give three axes")
+        placement = find_placement(volume, str(path))
+        place = place_in_world(volume, placement, {})
+    shape = placement.of_world(volume.shape)
+    facts: dict[str, Any] = {
+        "file": str(path),
+        "format": format_.name,
+        "shape": list(shape),
+        "dtype": str(volume.dtype),
+        "bytes": int(np.prod(shape, dtype=object)) * volume.dtype.itemsize,
+        "axes in the file": "".join("xyz"[w] for w in placement.world_axes),
+        **{key: _listed(place[key]) for key in PLACE},
+        "chunks": volume.chunks and list(volume.chunks),
+        **volume.about,
+        "notes": list(volume.notes),
+    }
+    if facts["direction"] in (None, _listed(STRAIGHT)):
+        del facts["direction"]
+    if not volume.chunks:
+        del facts["chunks"]
+    return facts
 
 
-def find_members(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.ZipInfo]:
-    """Return the members that belong to a grid, by key."""
-    infos = archive.infolist()
-    names = [info.filename.removesuffix(".npy") for info in infos]
-    if {"voxels", "factor"} <= set(names):
-        raise FileError(
-            f"{path} is a refined field, no grid: mesh it with extract_mesh(read_field(path)), or "
-            "refine the grid again with --iterations"
-        )
-    if "values" not in names:
-        held = ", ".join(names[:MOST_NAMED]) or "nothing"
-        more = f" and {len(names) - MOST_NAMED:,} more" if len(names) > MOST_NAMED else ""
-        raise FileError(f"{path} has no key 'values' (it holds {held}{more})")
-    twice = next((key for key in NPZ_KEYS if names.count(key) > 1), None)
-    if twice:
-        raise FileError(f"{path} holds {twice!r} {names.count(twice)} times: save it once")
-    return {name: info for name, info in zip(names, infos) if name in NPZ_KEYS}
-
-
-def read_small(archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str) -> NDArray[Any]:
-    """Read an array of one number or three; of nine, for a direction."""
-    most, asked = (9, "nine numbers") if name.endswith("[direction]") else (3, NUMBERS)
-    member = Member(archive, info, name)
-    header = read_array_header(member.read, name)
-    if prod(header.shape) > most:
-        raise GridError(f"{name} has shape {header.shape}: give {asked}")
-    if header.dtype.kind not in "fiu":
-        raise GridError(f"{name} has dtype {header.dtype}: give {asked}")
-    _check_size(header, member.left, name)
-    return np.frombuffer(member.read(header.size), header.dtype).reshape(header.shape)
-
-
-def npz_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path) -> Member:
-    """Return the values of an .npz file, to be read from their beginning on."""
-    return Member(archive, info, f"{path}[values]")
-
-
-def _read_values(
-    archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path, room: int
-) -> SampleArray:
-    """Unpack the array of samples."""
-    name = f"{path}[values]"
-    member = npz_member(archive, info, path)
-    header = read_array_header(member.read, name).squeezed()
-    _check_size(header, member.left, name)
-    check_kind(header.dtype, header.shape)
-    check_ratio(header, info.compress_size, name, room)
-    return unpack(member.read, header, name, room)
-
-
-def _check_size(header: ArrayHeader, follow: int, name: str) -> None:
-    """Raise FileError unless ``follow`` bytes, those after the header, are the array."""
-    sizes = f"its header promises {header}, but {follow:,} follow"
-    if header.size > follow:
-        raise FileError(f"{name} is truncated: {sizes}")
-    if header.size < follow:
-        raise FileError(f"{name} holds more than one array, or its header is damaged: {sizes}")
+def _listed(numbers: Any) -> list[float] | None:
+    """Return numbers as a list of floats; None if there are none."""
+    return None if numbers is None else [float(number) for number in np.ravel(numbers)]
 
 
 def check_grid_target(path: str | Path, *, force: bool = False) -> Path:
@@ -351,15 +273,7 @@ def check_grid_target(path: str | Path, *, force: bool = False) -> Path:
 
 
 def write_grid(grid: SdfGrid, path: str | Path, *, force: bool = False) -> None:
-    """Write a grid as ``.npz``: the keys values, spacing, origin and, if it is turned, direction.
-
-    Raises
-    ------
-    OptionError
-        If the suffix is not ``.npz``.
-    FileError
-        If the file exists and ``force`` is not set, or cannot be written.
-    """
+    """Write a grid as ``.npz``: values, spacing, origin and, if it is turned, direction."""
     path = check_grid_target(path, force=force)
     arrays: dict[str, Any] = {"spacing": grid.spacing, "origin": grid.origin}
     if not grid.is_straight:

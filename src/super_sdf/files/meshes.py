@@ -1,58 +1,59 @@
 """Writing mesh files. A target is checked before the work starts, and only complete files appear.
 
-Each format has its module (``ply``, ``stl``, ``text_meshes``, ``glb``, ``threemf``) and its entry
-in ``FORMATS``. All write a mesh piece by piece and hold no more than one piece in memory.
+``FORMATS`` is the table of formats: a new one is a row there, and its writer. All write a mesh
+piece by piece and hold no more than one piece in memory.
+
+Neighbouring vertices may be as close as a thousandth of the fine spacing. Far from the world origin
+float32 cannot resolve that and vertices would coincide: degenerate triangles, and a mesh that is no
+longer closed when a program reads it. So it is checked whether the numbers of a format can hold a
+mesh.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Triple
 from ..errors import FileError, OptionError
-from ..mesh import Mesh, check_mesh
+from ..grid.placement import as_triple
+from ..grid.sdf_grid import SdfGrid
+from ..mesh import CLEARANCE, Mesh, check_mesh, tells_vertices_apart, vertex_type
 from ..options import check_path
-from .glb import write_glb, write_glb_parts
 from .output import check_free, replacing
-from .ply import write_ply
-from .stl import write_stl
-from .text_meshes import write_obj, write_off
-from .threemf import write_3mf, write_3mf_parts
+from .plain_meshes import write_obj, write_off, write_ply, write_stl
+from .scenes import write_3mf, write_glb
 
 WORLD_ORIGIN = (0.0, 0.0, 0.0)
 CHUNK = 1 << 16  # triangles checked at a time
 
 
-@dataclass(frozen=True)
-class MeshFormat:
+class MeshFormat(NamedTuple):
     """A mesh file format.
 
-    Attributes
-    ----------
-    write : callable
-        Writes pieces of a mesh to a path.
-    bytes_per_triangle : int
-        Size of a triangle in the file with its half of a vertex; approximate for text and archives.
-    single_precision : bool
-        Whether coordinates are float32.
-    local_origin : bool
-        Whether coordinates may be relative to a point, ``write``'s third argument.
-    write_parts : callable, optional
-        Writes several meshes, by their names, to one file.
+    ``write`` writes pieces of a mesh to a path; of a format that ``has_parts``, several meshes by
+    their names.
     """
 
     write: Callable[..., None]
-    bytes_per_triangle: int
-    single_precision: bool = False
-    local_origin: bool = False
-    write_parts: Callable[..., None] | None = None
+    bytes_per_triangle: int  # with its half of a vertex; approximate for text and archives
+    single_precision: bool = False  # whether coordinates are float32
+    local_origin: bool = False  # whether coordinates may be relative to a point
+    has_parts: bool = False
+
+    def write_named(
+        self, named: Mapping[str, Iterable[Mesh]], path: Path, about: Triple = WORLD_ORIGIN
+    ) -> None:
+        """Write meshes in pieces by their names, one if the format has no parts."""
+        origin = (about,) if self.local_origin else ()
+        for pieces in [named] if self.has_parts else named.values():
+            self.write(pieces, path, *origin)
 
 
 FORMATS = {
@@ -60,10 +61,8 @@ FORMATS = {
     ".stl": MeshFormat(write_stl, 50, single_precision=True),
     ".obj": MeshFormat(write_obj, 40),
     ".off": MeshFormat(write_off, 39),
-    ".glb": MeshFormat(
-        write_glb, 18, single_precision=True, local_origin=True, write_parts=write_glb_parts
-    ),
-    ".3mf": MeshFormat(write_3mf, 13, write_parts=write_3mf_parts),
+    ".glb": MeshFormat(write_glb, 18, single_precision=True, local_origin=True, has_parts=True),
+    ".3mf": MeshFormat(write_3mf, 13, has_parts=True),
 }
 MESH_SUFFIXES = tuple(FORMATS)
 
@@ -74,15 +73,7 @@ def format_of(path: str | Path) -> MeshFormat:
 
 
 def check_target(path: str | Path, *, force: bool = False) -> Path:
-    """Return the path if a mesh file can be written there; called before the work starts.
-
-    Raises
-    ------
-    OptionError
-        If the suffix is not that of a mesh format.
-    FileError
-        If the file exists and ``force`` is not set, or the folder cannot be written to.
-    """
+    """Return the path if a mesh file can be written there; called before the work starts."""
     check_mesh_suffix(Path(path))
     return check_free(Path(path), force=force)
 
@@ -134,28 +125,12 @@ def write_pieces(
     """Write a mesh that comes in pieces; triangles may use the vertices of earlier pieces.
 
     Like ``write_mesh``, without checking that the format can hold the mesh: see
-    ``precision.check_format_holds``.
-
-    Parameters
-    ----------
-    pieces : iterable of Mesh
-        The pieces, in world units.
-    path : path
-        The file.
-    force : bool
-        Replace an existing file.
-    about : three floats
-        The local origin of the vertices, for formats that have one.
-    before_rename : callable, optional
-        Called with the path of the complete file before it is renamed to ``path``.
+    ``check_format_holds``. ``about`` is the local origin of the vertices, for formats that have
+    one. ``before_rename`` is called with the path of the complete file before it is renamed.
     """
     path = check_target(path, force=force)
-    mesh_format = format_of(path)
     with replacing(path, force=force, before_rename=before_rename) as part:
-        if mesh_format.local_origin:
-            mesh_format.write(pieces, part, about)
-        else:
-            mesh_format.write(pieces, part)
+        format_of(path).write_named({"": pieces}, part, about)
 
 
 def write_together(
@@ -171,13 +146,7 @@ def write_together(
     with ExitStack() as files:
         for path, named in meshes.items():
             part = files.enter_context(replacing(check_target(path, force=force), force=force))
-            mesh_format = format_of(path)
-            origin = (about,) if mesh_format.local_origin else ()
-            if mesh_format.write_parts:
-                mesh_format.write_parts(named, part, *origin)
-                continue
-            for pieces in named.values():
-                mesh_format.write(pieces, part, *origin)
+            format_of(path).write_named(named, part, about)
         for path in meshes:
             check_target(path, force=force)  # before the first of them appears
 
@@ -214,3 +183,43 @@ def _flat_triangles(corners: NDArray[Any]) -> int:
     """Count the triangles, (n, 3, 3), with two equal corners."""
     same = (corners == np.roll(corners, 1, axis=1)).all(2).any(1)
     return int(np.count_nonzero(same))
+
+
+def check_format_holds(path: str | Path, grid: SdfGrid, factor: int) -> Triple:
+    """Return the local origin for the vertices of a mesh file.
+
+    It is the world origin, or the middle of the grid if float32 resolves neighbouring vertices only
+    there and the format can store a local origin. Formats with double precision or text hold all
+    that ``mesh.vertex_type`` accepts. Raises FileError if the format does not resolve neighbouring
+    vertices, whatever the local origin, and GridError if not even float64 does.
+    """
+    mesh_format = format_of(path)
+    if vertex_type(grid, factor) is np.float32 or not mesh_format.single_precision:
+        return WORLD_ORIGIN
+    reach = grid.reach
+    if mesh_format.local_origin:
+        sides = np.array(grid.spacing) * grid.shape / 2  # from its middle on
+        reach = float((np.abs(grid.direction) @ sides).max())
+        if tells_vertices_apart(np.float32, reach, grid, factor):
+            return as_triple(grid.to_world((np.array(grid.shape) - 1) / 2), "middle")
+    apart, suffix = CLEARANCE * grid.voxel_size / factor, Path(path).suffix.lower()
+    limits = np.finfo(np.float32)
+    step = max(math.ulp(reach) * 2**29, float(limits.smallest_subnormal))  # 29 bits fewer
+    limit = f"in steps of {step:.2g} at {reach:.6g}"
+    if reach > float(limits.max):
+        limit = f"numbers up to {limits.max:.2g}, the mesh reaches {reach:.2g}"
+    raise FileError(
+        f"{path} cannot hold the mesh: {suffix} has single precision, {limit}, and vertices are "
+        f"down to {apart:.2g} apart; write .ply or .obj"
+    )
+
+
+def local_origin_note(path: str | Path, about: Triple) -> tuple[str, ...]:
+    """Return a note that names the local origin of a file, none if it is the world origin."""
+    if about == WORLD_ORIGIN:
+        return ()
+    point = ", ".join(f"{coordinate:.12g}" for coordinate in about)
+    return (
+        f"{path} has single precision: its vertices are relative to {point}, "
+        "the translation of its node",
+    )

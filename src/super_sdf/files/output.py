@@ -1,29 +1,37 @@
-"""Output files: checked before the work starts, and either complete or absent afterwards."""
+"""Output files: checked before the work starts, and either complete or absent afterwards.
+
+Process 123 writes ``.part.ply.123.part`` beside ``part.ply`` and holds a lock on it meanwhile. A
+file without a lock was abandoned; where there are no locks, one whose process has ended.
+"""
 
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import stat
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import IO, Any
+
+from numpy.typing import NDArray
 
 from ..errors import SuperSdfError, WriteError
-from .parts import reserved_part
 
 WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
+# File systems allow names of 255 bytes (some 143); the name of a spool file is 9 bytes longer.
+LONGEST = 96
+PART = re.compile(r"(?P<stem>\..+\.)(?P<pid>\d+)\.part(\.\w+)?", re.DOTALL)
+SPOOL_BYTES = 4_000_000  # kept in memory before a file is made
 
 
 def check_free(path: Path, *, force: bool = False) -> Path:
-    """Return the path if a file can be created there.
+    """Return the path if a file can be created there; raise WriteError if not.
 
-    A link counts as its target; a dangling link counts as an existing file.
-
-    Raises
-    ------
-    WriteError
-        If the file exists and ``force`` is not set, or cannot be created.
+    Without ``force`` no file may exist. A link counts as its target; a dangling link counts as an
+    existing file.
     """
     kind = _kind_at(path)
     if kind is not None and stat.S_ISDIR(kind):
@@ -46,6 +54,12 @@ def check_apart(path: str | Path, others: Iterable[str | Path]) -> None:
     for other in others if os.path.exists(path) else ():
         if os.path.exists(other) and os.path.samefile(path, other):
             raise WriteError(f"{path} is the same file as {other}: give another file")
+
+
+def free_space(path: Path) -> int:
+    """Return the free bytes on the disk of a file."""
+    with naming(path):
+        return shutil.disk_usage(_behind_links(path).parent).free
 
 
 def _kind_at(path: Path) -> int | None:
@@ -72,18 +86,6 @@ def _behind_links(path: Path) -> Path:
     return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
-class _NameTakenError(Exception):
-    """The target was created by another program meanwhile."""
-
-
-def free_space(path: Path) -> int:
-    """Return the free bytes on the disk of a file."""
-    try:
-        return shutil.disk_usage(_behind_links(path).parent).free
-    except OSError as error:
-        raise _cannot_be_written(path, error) from error
-
-
 @contextmanager
 def replacing(
     path: Path, *, force: bool = True, before_rename: Callable[[Path], None] | None = None
@@ -91,40 +93,18 @@ def replacing(
     """Yield a temporary path beside the target, renamed to the target if the block succeeds.
 
     A link stays, and the file it points to is replaced and keeps its mode. Temporary files of the
-    same target that killed processes left are removed.
-
-    Parameters
-    ----------
-    path : Path
-        The target.
-    force : bool
-        Replace a file that exists at the end; otherwise that is an error, and the file stays.
-    before_rename : callable, optional
-        Called with the path of the complete file before it is renamed.
-
-    Raises
-    ------
-    WriteError
-        If the file cannot be written, for whatever reason the system gives.
+    same target that killed processes left are removed. Without ``force`` a file that exists at the
+    end stays, which is an error. ``before_rename`` is called with the path of the complete file.
     """
     target = _behind_links(path) if force else path
-    try:
-        with reserved_part(target) as part:
-            yield part
-            if before_rename:
-                before_rename(part)
-            if force:
-                _replace(part, target)
-            else:
-                _rename_if_free(part, target)
-    except _NameTakenError:
-        raise WriteError(
-            f"{path} was created by another program meanwhile: remove it or use --force"
-        ) from None
-    except SuperSdfError:  # some are OSErrors, too, but not from the system
-        raise
-    except OSError as error:
-        raise _cannot_be_written(path, error) from error
+    with naming(path), _reserved_part(target) as part:
+        yield part
+        if before_rename:
+            before_rename(part)
+        if force:
+            _replace(part, target)
+        else:
+            _rename_if_free(part, target)
 
 
 @contextmanager
@@ -138,6 +118,11 @@ def naming(path: Path) -> Iterator[None]:
         raise _cannot_be_written(path, error) from error
 
 
+def _cannot_be_written(path: Path, error: OSError | ValueError) -> WriteError:
+    """Return the error for a file that the system refuses to write."""
+    return WriteError(f"{path} cannot be written: {getattr(error, 'strerror', None) or error}")
+
+
 def _replace(part: Path, target: Path) -> None:
     """Rename a file to a target, whose mode it takes over if that exists."""
     mode = _kind_at(target)
@@ -149,16 +134,136 @@ def _replace(part: Path, target: Path) -> None:
 
 def _rename_if_free(part: Path, target: Path) -> None:
     """Rename a file unless the target exists: a hard link, unlike a rename, never replaces."""
+    taken = WriteError(
+        f"{target} was created by another program meanwhile: remove it or use --force"
+    )
     try:
         os.link(part, target)
     except FileExistsError:
-        raise _NameTakenError from None
+        raise taken from None
     except OSError:  # a file system without hard links: check just before the rename
         if os.path.lexists(target):
-            raise _NameTakenError from None
+            raise taken from None
         os.rename(part, target)
 
 
-def _cannot_be_written(path: Path, error: OSError | ValueError) -> WriteError:
-    """Return the error for a file that the system refuses to write."""
-    return WriteError(f"{path} cannot be written: {getattr(error, 'strerror', None) or error}")
+# Temporary files
+
+
+def part_path(target: Path) -> Path:
+    """Return the path of the unfinished target that this process writes."""
+    return target.with_name(f"{_stem(target.name)}{os.getpid()}.part")
+
+
+def _stem(name: str) -> str:
+    """Return the prefix of the names of a target's parts; long names are hashed."""
+    raw = name.encode("utf-8", "surrogatepass")  # a report may hold names that no file can have
+    if len(raw) <= LONGEST:
+        return f".{name}."
+    from hashlib import sha256  # loads OpenSSL, and long names are rare
+
+    return f".{sha256(raw).hexdigest()[:32]}."
+
+
+@contextmanager
+def _reserved_part(target: Path) -> Iterator[Path]:
+    """Create and lock this process's part of a target; remove it at the end if it still exists."""
+    remove_abandoned_parts([target])
+    part = part_path(target)
+    try:
+        file = os.open(part, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
+    except FileExistsError:
+        raise WriteError(f"{target} is being written already: wait for it") from None
+    has_lock = take_lock(file) is not None
+    if not has_lock:
+        os.close(file)
+    try:
+        yield part
+    finally:
+        part.unlink(missing_ok=True)
+        if has_lock:
+            os.close(file)
+
+
+def remove_abandoned_parts(targets: Iterable[Path], pid: int | None = None) -> None:
+    """Remove unfinished parts of the targets that ended processes, or process ``pid``, left."""
+    stems_in: dict[Path, set[str]] = {}
+    for target in targets:
+        stems_in.setdefault(target.parent, set()).add(_stem(target.name))
+    for folder, stems in stems_in.items():
+        with suppress(OSError):
+            for name in os.listdir(folder):
+                match = PART.fullmatch(name)
+                if match and match["stem"] in stems:
+                    owner = int(match["pid"])
+                    if owner == pid or _is_abandoned(folder / name, owner):
+                        (folder / name).unlink(missing_ok=True)
+
+
+def _is_abandoned(path: Path, pid: int) -> bool:
+    """Return whether no process holds a part's lock; without locks, whether its process ended."""
+    try:
+        file = os.open(path, os.O_RDWR)
+    except OSError:  # another user's, or gone
+        return False
+    try:
+        taken = take_lock(file)
+    finally:
+        os.close(file)
+    return taken if taken is not None else not _is_running(pid)
+
+
+def take_lock(file: int) -> bool | None:
+    """Lock an open file until it is closed.
+
+    Return whether that worked, or None if the system or file system has no locks.
+    """
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return None
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        return None
+    return True
+
+
+def _is_running(pid: int) -> bool:
+    """Return whether a process is running; False on Windows, where open files cannot be removed."""
+    if os.name == "nt":
+        return False
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True  # another user's
+    with suppress(OSError):  # a zombie has ended
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    return True
+
+
+@contextmanager
+def spool_beside(part: Path) -> Iterator[IO[bytes]]:
+    """Open a temporary file beside a file that is being written, for what comes later in it.
+
+    It has no name, so it disappears with the process, however that ends. Where the system cannot
+    create such files, it briefly has a name that ``remove_abandoned_parts`` recognises.
+    """
+    folder, name = str(part.parent), f"{part.name}."
+    with tempfile.SpooledTemporaryFile(SPOOL_BYTES, dir=folder, prefix=name) as spool:
+        yield spool
+
+
+def append_spool(waiting: IO[bytes], file: IO[bytes]) -> None:
+    """Copy the temporary file ``waiting`` to the end of ``file``."""
+    waiting.seek(0)
+    shutil.copyfileobj(waiting, file, SPOOL_BYTES)
+
+
+def little_endian(array: NDArray[Any]) -> bytes:
+    """Return the bytes of an array in little-endian order."""
+    return array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()

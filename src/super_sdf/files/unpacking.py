@@ -1,7 +1,9 @@
-"""Arrays that cannot be read plane by plane in their file: compressed, or in Fortran order.
+"""Arrays that cannot be read plane by plane in their file: compressed, or in another axis order.
 
-Each is copied once, from its first byte to its last: into memory if it is small, else into a
-temporary file without a name, which disappears with the process, however that ends.
+Each is copied once, so that its planes of x are contiguous: into memory if it is small, else into a
+temporary file without a name, which disappears with the process, however that ends. It is read in
+boxes of whole chunks, each of which is unpacked once. A box has as many chunks side by side as a
+little memory allows, first along the axis that is fastest in the copy.
 """
 
 from __future__ import annotations
@@ -9,125 +11,195 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
 from io import FileIO
-from typing import Any
+from itertools import pairwise, product
+from math import prod
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, OutOfMemoryError
 from ..grid.planes import InputFile, PlaneFile, SampleArray
+from ..grid.samples import check_kind
 from ..machine.memory import in_words, is_in_memory
-from .headers import ArrayHeader, Read
+from .volume import Box, Placement, Volume, find_placement, in_words_of, place_in_world
 
 PIECE = 1 << 23  # bytes at a time
+# Of a chunked array: bytes of a box, unless little memory is left; how many times the memory of a
+# box or chunk reading it takes, with its packed bytes and the copy in another order of axes.
+BOX, LEAST_SHARE, COPIES = 1 << 25, 16, 3
 # No grid with a surface is compressed further than this; deflate reaches 1,030 on zeros.
 BOMB_RATIO = 500
 ON_DISK = "/var/tmp"  # /tmp is in memory on many systems
 
-Write = Callable[[int, NDArray[np.uint8]], None]
+Sizes: TypeAlias = tuple[int, ...]
+Write: TypeAlias = Callable[[int, NDArray[np.uint8]], None]
 """Writes bytes at an offset from the beginning."""
 
 
-def check_ratio(header: ArrayHeader, packed: int, name: str, room: int) -> None:
-    """Raise OutOfMemoryError if an array is compressed as no grid is, and does not fit in ``room``.
+def take(
+    volume: Volume, name: str, room: int, given: dict[str, Any], left: int | None = None
+) -> dict[str, Any]:
+    """Return values (nx, ny, nz), spacing, origin and direction of a volume, for ``make_grid``.
 
-    So no scratch file takes more than ``BOMB_RATIO`` times the bytes of the input.
+    ``given`` replaces what the file says of its place. ``left`` is how many bytes of memory the
+    process may still take, None if unknown.
     """
-    if header.size > room and header.size > BOMB_RATIO * packed:
+    check_kind(volume.dtype, volume.shape)
+    placement = find_placement(volume, name)
+    values = volume.stored
+    if values is None or placement.world_axes != (0, 1, 2) or any(placement.backwards):
+        values = unpacked(volume, placement, name, (room, left))
+    return {"values": values, **place_in_world(volume, placement, given)}
+
+
+def unpacked(
+    volume: Volume,
+    placement: Placement,
+    name: str,
+    memory: tuple[int, int | None],
+    planes: tuple[int, int] | None = None,
+) -> SampleArray:
+    """Return the samples, or some planes of x, as an array in memory or in a temporary file.
+
+    ``memory`` is how many bytes the array may take, and the process in all, None if unknown.
+    """
+    room, left = memory
+    name += volume.part
+    _check_chunk(volume, name, left)
+    size = prod(volume.shape) * volume.dtype.itemsize
+    if volume.packed is not None and size > room and size > BOMB_RATIO * volume.packed:
         raise OutOfMemoryError(
-            f"{name}, {header}, is compressed to {packed:,} bytes, like a zip bomb, and does not "
-            "fit in memory; if it is a grid, save it as .npy"
+            f"{name}, {in_words_of(volume.shape, volume.dtype)}, is compressed to "
+            f"{volume.packed:,} bytes, like a zip bomb, and does not fit in memory; if it is a "
+            "grid, save it as .npy"
+        )
+    world = placement.world_axes
+    orders = [tuple(world.index(w) for w in order) for order in ((0, 1, 2), (0, 2, 1))]
+    budget = PIECE
+    if volume.chunks:
+        budget = BOX if left is None else max(min(BOX, left // LEAST_SHARE), PIECE)
+    layout = choose_layout(volume.shape, volume.unit, orders, budget // volume.dtype.itemsize)
+    nx, ny, nz = placement.of_world(volume.shape)
+    first, last = planes or (0, nx)
+    is_swapped = world[layout.order[1]] == 2  # z before y
+    copy = (last - first, *((nz, ny) if is_swapped else (ny, nz)))
+    if prod(copy) * volume.dtype.itemsize <= room:
+        held = np.empty(copy, volume.dtype)
+        _copy(volume, placement, layout, (first, last), _writer_to(held))
+        return held.transpose(0, 2, 1) if is_swapped else held
+    shape = (last - first, ny, nz)
+    file = _scratch_file(
+        prod(copy) * volume.dtype.itemsize, f"{name}, {in_words_of(shape, volume.dtype)}"
+    )
+    _copy(volume, placement, layout, (first, last), _writer_to_file(file, name))
+    return PlaneFile(InputFile(file, name), 0, shape, volume.dtype, swapped=is_swapped)
+
+
+def _check_chunk(volume: Volume, name: str, left: int | None) -> None:
+    """Raise OutOfMemoryError if not even one chunk, or plane, of an array can be unpacked."""
+    size = prod(volume.unit) * volume.dtype.itemsize
+    if left is not None and COPIES * size > (left if volume.chunks else max(left, BOX)):
+        parts = "chunks" if volume.chunks else "planes"
+        chunk = " x ".join(map(str, volume.unit))
+        raise OutOfMemoryError(
+            f"{name} is stored in {parts} of {chunk} samples, {in_words(size)} each, and to unpack "
+            f"one takes {in_words(COPIES * size)} of memory, {in_words(max(left, 0))} are left; "
+            "allow more (--max-memory), or store it in smaller chunks"
         )
 
 
-def unpack(read: Read, header: ArrayHeader, name: str, room: int) -> SampleArray:
-    """Return the 3D array (nx, ny, nz) whose bytes come from ``read``.
+class Layout(NamedTuple):
+    """How an array is copied: axes in the order of the copy, the fastest last; samples of a box.
 
-    Parameters
-    ----------
-    read : callable
-        Returns the next bytes after the header.
-    header : ArrayHeader
-        Shape, dtype and order of the array.
-    name : str
-        The name of the array in error messages.
-    room : int
-        Bytes of memory that the array may take.
-
-    Returns
-    -------
-    array or PlaneFile
-        In memory if it fits in ``room``, else in a temporary file.
-
-    Raises
-    ------
-    OutOfMemoryError
-        If it fits neither in ``room`` nor in the folder for temporary files.
+    ``run`` is how many samples of a box are contiguous in the copy.
     """
-    copy_all = _copy_swapped if header.fortran_order else _copy
-    return fill(partial(copy_all, read, header), header, name, room)
+
+    order: Sizes
+    box: Sizes
+    run: int
 
 
-def fill(copy: Callable[[Write], None], header: ArrayHeader, name: str, room: int) -> SampleArray:
-    """Return the 3D array (nx, ny, nz) that ``copy`` writes.
+def choose_layout(shape: Sizes, chunks: Sizes, orders: Sequence[Sizes], budget: int) -> Layout:
+    """Return the layout with the longest runs; the first of those that are equal.
 
-    Parameters
-    ----------
-    copy : callable
-        Called with a function that writes bytes; planes of x are contiguous. In them y is fastest
-        if the header says Fortran order, else z.
-    header, name, room
-        As in ``unpack``.
+    A box has at most ``budget`` samples, or one chunk.
     """
-    if header.size <= room:
-        held = np.empty(header.size, np.uint8)
-        copy(_writer_to(held))
-        return _as_planes(held, header)
-    file = _scratch_file(header, name)
-    copy(_writer_to_file(file, name))
-    return PlaneFile(
-        InputFile(file, name), 0, header.shape, header.dtype, swapped=header.fortran_order
-    )
+    layouts = []
+    for order in orders:
+        box = [min(chunk, count) for chunk, count in zip(chunks, shape)]
+        for axis in reversed(order):
+            fitting = max(budget // (prod(box) // box[axis] * chunks[axis]), 1)
+            box[axis] = min(fitting * chunks[axis], shape[axis])
+        run = 1
+        for axis in reversed(order):
+            run *= box[axis]
+            if box[axis] < shape[axis]:
+                break
+        layouts.append(Layout(order, tuple(box), run))
+    return max(layouts, key=lambda layout: layout.run)
 
 
-def _as_planes(held: NDArray[np.uint8], header: ArrayHeader) -> NDArray[Any]:
-    """Return a view of the bytes as an array (nx, ny, nz)."""
-    nx, ny, nz = header.shape
-    if header.fortran_order:
-        return held.view(header.dtype).reshape(nx, nz, ny).transpose(0, 2, 1)
-    return held.view(header.dtype).reshape(nx, ny, nz)
+def _copy(
+    volume: Volume, placement: Placement, layout: Layout, planes: tuple[int, int], write: Write
+) -> None:
+    """Copy some planes of x of a volume box by box."""
+    along, backwards = layout.order[0], placement.backwards
+    shape = (planes[1] - planes[0], *(volume.shape[axis] for axis in layout.order[1:]))
+    bounds = [(0, size) for size in volume.shape]
+    bounds[along] = planes
+    if backwards[along]:
+        bounds[along] = volume.shape[along] - planes[1], volume.shape[along] - planes[0]
+    flipped = tuple(axis for axis in range(3) if backwards[axis])
+    for box in boxes_of(bounds, layout.box):
+        block = np.ascontiguousarray(np.flip(volume.box(box), flipped).transpose(layout.order))
+        start = [
+            volume.shape[axis] - box[axis].stop if backwards[axis] else box[axis].start
+            for axis in layout.order
+        ]
+        start[0] -= planes[0]
+        for offset, piece in runs_of(block, tuple(start), shape):
+            write(offset, piece)
+        del block  # before the next one is read
 
 
-def _copy(read: Read, header: ArrayHeader, write: Write) -> None:
-    """Copy an array in C order."""
-    for start in range(0, header.size, PIECE):
-        write(start, np.frombuffer(read(min(PIECE, header.size - start)), np.uint8))
+def boxes_of(bounds: Sequence[tuple[int, int]], box: Sizes) -> Iterator[Box]:
+    """Yield boxes of a size that fill the samples between bounds along each axis.
 
-
-def _copy_swapped(read: Read, header: ArrayHeader, write: Write) -> None:
-    """Copy an array in Fortran order (x fastest, then y, then z) to the order x, z, y (y fastest).
-
-    Then a plane of x is contiguous, and each chunk of z planes is written in pieces of kilobytes.
+    They begin at multiples of their size, where chunks begin, but for the first ones.
     """
-    nx, ny, nz = header.shape
-    size = header.dtype.itemsize
-    step = max(PIECE // (nx * ny * size), 1)
-    for first in range(0, nz, step):
-        count = min(step, nz - first)
-        planes = np.frombuffer(read(count * nx * ny * size), header.dtype)
-        swapped = np.ascontiguousarray(planes.reshape(count * ny, nx).T).view(np.uint8)
-        for i, piece in enumerate(swapped):
-            write((i * nz + first) * ny * size, piece)
+    cuts = []
+    for (low, high), size in zip(bounds, box):
+        inner = range((low // size + 1) * size, high, size)
+        cuts.append([slice(a, b) for a, b in pairwise([low, *inner, high])])
+    yield from product(*cuts)
 
 
-def _writer_to(held: NDArray[np.uint8]) -> Write:
+def runs_of(
+    block: NDArray[Any], start: Sizes, shape: Sizes
+) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """Yield the bytes of a block that are contiguous in an array, and where they begin there.
+
+    The block is contiguous, its first sample is at ``start`` in an array of ``shape`` in C order.
+    """
+    _, b, c = shape
+    apart = 1 if block.shape[2] == c else 2  # axes along which pieces are apart in the array
+    if apart == 1 and block.shape[1] == b:
+        apart = 0
+    steps = np.array([b * c, c, 1]) * block.itemsize
+    first = int(np.dot(start, steps))
+    for place in np.ndindex(block.shape[:apart]):
+        yield first + int(np.dot(place, steps[:apart])), block[place].reshape(-1).view(np.uint8)
+
+
+def _writer_to(held: NDArray[Any]) -> Write:
     """Return a function that writes to memory."""
+    raw = held.reshape(-1).view(np.uint8)
 
     def write(start: int, piece: NDArray[np.uint8]) -> None:
-        held[start : start + len(piece)] = piece
+        raw[start : start + len(piece)] = piece
 
     return write
 
@@ -157,18 +229,18 @@ def scratch_folder() -> str:
     return tempfile.gettempdir()
 
 
-def _scratch_file(header: ArrayHeader, name: str) -> FileIO:
+def _scratch_file(size: int, what: str) -> FileIO:
     """Return an empty unnamed file with room for an array, on a disk: memory would count."""
     folder = scratch_folder()
     if is_in_memory(folder):
         raise OutOfMemoryError(
-            f"{name}, {header}, is too large to unpack into memory, and {folder} is in memory, "
+            f"{what}, is too large to unpack into memory, and {folder} is in memory, "
             "too: set TMPDIR to a folder on a disk, or allow more (--max-memory)"
         )
     free = shutil.disk_usage(folder).free
-    if header.size > free:
+    if size > free:
         raise OutOfMemoryError(
-            f"{name}, {header}, is too large to unpack into memory, and {folder} has "
+            f"{what}, is too large to unpack into memory, and {folder} has "
             f"{in_words(free)} free; save it as .npy in C order, or set TMPDIR to a folder "
             "with more room"
         )

@@ -11,27 +11,18 @@ apart, and is bent there.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..arrays import BoolArray, Triple
-from .gradients import BENT as STRAIGHT
-from .gradients import LARGEST_VALUE
-from .planes import SampleArray, few_of, lowest, over_planes, ranks_of, spread_planes
-from .samples import Extremes
-from .spacing import steps_of
+from .census import Looked
+from .placement import steps_of
+from .questions import BESIDE, Floats
+from .slopes import BENT as STRAIGHT
+from .slopes import ENOUGH, LARGEST_VALUE
 
-Floats = NDArray[np.float64]
-
-PLANES = 12  # of samples beside the surface are looked at, spread evenly
-MOST_LOOKED_AT = 1 << 13  # of these samples, spread evenly, if there are more
-BESIDE = 2  # planes, rows and columns to either side, for fourth differences
-ENOUGH = 30  # samples, from which a slope is known
 # Slopes whose fourth differences are this small are known: of exact distances half of them are 1.
 # Where two kinks make them so, a third difference is half of the slope or more.
 KNOWN, KINKED = 0.2, 0.45
@@ -45,7 +36,6 @@ ROUNDING = 0.015
 # Share of slopes that are off from which the field is no distance: where it is smooth enough for a
 # typical slope, and where it is not.
 WRONG_SLOPES, WRONG_IF_ROUGH = 0.01, 0.05
-CUT_OFF = 0.01  # share of samples amid equal ones, at the lowest or highest value
 LIPSCHITZ, BENT, NOISY = 1.05, 0.3, 0.02  # change, difference and share from which it is noisy
 LEAST_SAMPLES = 100  # from which shares are evidence
 # Noise makes values change by more than distances can at a share of the samples that grows with its
@@ -66,29 +56,27 @@ STEEPEST, MOST_STEEP, FEW = 0.95, 1.07, 10
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the samples show.
+    """What the samples beside the surface show; lengths are in spacings.
 
     Attributes
     ----------
     samples : int
-        How many samples beside the surface were looked at.
+        How many were looked at.
     slope : float
-        Typical change of the values from sample to sample, over the spacing: 1 for distances. NaN
-        if too few samples are straight.
-    wrong : float
-        Share of the samples at which the slope cannot be that of a distance, whatever its unit.
+        Typical change of the values from sample to sample: 1 for distances, NaN if too few samples
+        are straight.
+    wrong, contradicting, noisy : float
+        Shares of the samples at which the slope cannot be that of a distance, whatever its unit;
+        that differ from others by more than distances and noise can; at which the values change
+        by more than distances can.
     uneven : float
         By how much the typical slope farther from the surface differs from that near it, over it.
-    contradicting : float
-        Share of the samples that differ from others by more than distances and noise can.
-    noisy : float
-        Share of the samples at which the values change by more than distances can, beside others.
     roughness : float
-        Standard deviation of the noise, in spacings, if the fourth differences were all noise.
+        Standard deviation of the noise, if the fourth differences were all noise.
     cut_low, cut_high : bool
         Whether values are cut off at the lowest, and at the highest.
     digit : float
-        The last digit of the values, in spacings: slopes are known no better.
+        The last digit of the values: slopes are known no better.
     """
 
     samples: int
@@ -138,137 +126,16 @@ class Evidence:
 
     def report(self) -> dict[str, Any]:
         """Return the evidence as a dictionary that can be written as JSON."""
-        known = np.isfinite(self.slope)
-        return {
-            "samples": self.samples,
-            "slope": round(self.slope, 4) if known else None,
-            "wrong_slopes": round(self.wrong, 4),
-            "uneven": round(self.uneven, 4),
-            "contradicting": round(self.contradicting, 4),
-            "noisy": round(self.noisy, 4),
-            "roughness": round(self.roughness, 4),
-            "cut_off": [self.cut_low, self.cut_high],
+        shares = {
+            "slope": self.slope,
+            "wrong_slopes": self.wrong,
+            "uneven": self.uneven,
+            "contradicting": self.contradicting,
+            "noisy": self.noisy,
+            "roughness": self.roughness,
         }
-
-
-@dataclass(frozen=True, eq=False)
-class Looked:
-    """What was looked at.
-
-    Attributes
-    ----------
-    around : (n, 5, 5, 5) float64
-        The samples round samples that have one on the other side beside them.
-    cut : (2,) float64
-        Share of the samples that are, as their six neighbours, the lowest, and the highest.
-    extremes : two floats
-        The smallest and the largest sample.
-    """
-
-    around: Floats
-    cut: Floats
-    extremes: Extremes
-
-    @property
-    def lines(self) -> Floats:
-        """Five samples in a row along each axis, (n, 3, 5)."""
-        a = self.around
-        return np.stack([a[:, :, BESIDE, BESIDE], a[:, BESIDE, :, BESIDE], a[:, BESIDE, BESIDE]], 1)
-
-    @property
-    def is_cut(self) -> BoolArray:
-        """Whether values are cut off at the lowest, and at the highest, (2,).
-
-        In a narrow grid the one is seen only; if the other is as large, it is where they were, too.
-        """
-        cut: BoolArray = self.cut > CUT_OFF
-        return cut | (cut.any() and bool(np.isclose(-self.extremes[0], self.extremes[1], atol=0)))
-
-    def divided(self, slope: float) -> Looked:
-        """Return what would have been seen of the values divided by a slope."""
-        low, high = self.extremes
-        return Looked(self.around / slope, self.cut, (low / slope, high / slope))
-
-
-def look(values: SampleArray, extremes: Extremes) -> Looked:
-    """Look at some samples, those beside the surface above all.
-
-    Parameters
-    ----------
-    values : (nx, ny, nz) array or Planes
-        Samples.
-    extremes : two floats
-        The smallest and the largest sample.
-    """
-    planes: list[int] = []
-    if min(values.shape) > 2 * BESIDE:  # those with enough beside them
-        planes = spread_planes(BESIDE, len(values) - 1 - BESIDE, PLANES)
-    plane = values.shape[1] * values.shape[2]
-    ranges = [(i - BESIDE, i + BESIDE + 1, i * plane) for i in planes]
-    cut, count = np.zeros(2, np.int64), 0
-
-    def found_in_planes() -> Iterator[tuple[NDArray[Any], ...]]:
-        nonlocal cut, count
-        yield np.empty(0, np.uint64), np.empty((0, 5, 5, 5))
-        for ranks, around, amid, size in over_planes(values, look_at_plane, ranges):
-            cut, count = cut + amid, count + size
-            yield ranks, around
-
-    look_at_plane = partial(_look_at_plane, extremes)
-    (around,) = few_of(found_in_planes(), MOST_LOOKED_AT)
-    return Looked(around, cut / max(count, 1), extremes)
-
-
-def _look_at_plane(
-    extremes: Extremes, slab: NDArray[Any], number: int
-) -> tuple[NDArray[np.uint64], Floats, NDArray[np.int64], int]:
-    """Return ranks of samples of the middle of five planes, those around; how many are cut off.
-
-    ``number`` is that of the first sample of the middle plane.
-    """
-    slab = np.asarray(slab)
-    ranks, around = _around_surface(slab, number)
-    inner = slab[0, BESIDE:-BESIDE, BESIDE:-BESIDE]
-    return ranks, around, _count_amid_equal(slab, extremes), inner.size
-
-
-def _around_surface(slab: NDArray[Any], number: int) -> tuple[NDArray[np.uint64], Floats]:
-    """Return the samples round those that have one on the other side beside them.
-
-    ``slab`` has five planes; the samples are those of the middle one: (n,) ranks, (n, 5, 5, 5).
-    """
-    near = slab[1:4]
-    sides = (near > 0).astype(np.int8) - (near < 0)
-    own = sides[1]
-    beside = (sides[0] != own) | (sides[2] != own)
-    for axis in range(2):
-        marks, samples = np.moveaxis(beside, axis, 0), np.moveaxis(own, axis, 0)
-        crossed = samples[1:] != samples[:-1]
-        marks[1:] |= crossed
-        marks[:-1] |= crossed
-    inner = beside[BESIDE:-BESIDE, BESIDE:-BESIDE]
-    at = np.flatnonzero(inner)
-    ranks = ranks_of(at + number)
-    some = lowest(ranks, MOST_LOOKED_AT)
-    j, k = np.unravel_index(at[some], inner.shape)
-    boxes = np.lib.stride_tricks.sliding_window_view(slab, (2 * BESIDE + 1,) * 3)[0]
-    around = boxes[j, k].astype(np.float64)
-    return ranks[some], np.clip(around, -LARGEST_VALUE, LARGEST_VALUE, out=around)
-
-
-def _count_amid_equal(slab: NDArray[Any], extremes: Extremes) -> NDArray[np.int64]:
-    """Count samples of the middle plane that are, as their six neighbours, lowest, and highest."""
-    counts = []
-    for extreme in extremes:
-        plane = slab[BESIDE] == extreme
-        if not plane.any():
-            counts.append(0)
-            continue
-        amid = plane & (slab[BESIDE - 1] == extreme) & (slab[BESIDE + 1] == extreme)
-        amid[1:-1] &= plane[2:] & plane[:-2]
-        amid[:, 1:-1] &= plane[:, 2:] & plane[:, :-2]
-        counts.append(int(amid[BESIDE:-BESIDE, BESIDE:-BESIDE].sum()))
-    return np.array(counts)
+        known = {name: round(x, 4) if np.isfinite(x) else None for name, x in shares.items()}
+        return {"samples": self.samples, **known, "cut_off": [self.cut_low, self.cut_high]}
 
 
 def weigh(looked: Looked, spacing: Triple) -> Evidence:
@@ -337,8 +204,7 @@ def contradict(around: Floats, steps: Floats, noise: float) -> BoolArray:
     places = np.indices((5,) * 3).reshape(3, -1).T - BESIDE
     beyond = np.abs(boxes - middle[:, None]) - np.linalg.norm(places * steps, axis=1)
     allowed = max(APART, BY_NOISE * noise, digit * (1 + ROUNDING))
-    found: BoolArray = (beyond > allowed).sum(1) >= SEVERAL
-    return found
+    return np.asarray((beyond > allowed).sum(1) >= SEVERAL)
 
 
 def slope_within(looked: Looked, spacing: Triple) -> float:

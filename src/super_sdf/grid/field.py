@@ -9,11 +9,13 @@ noisy      distances with noise
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from ..arrays import Triple
 from ..options import AUTO as AUTO
 from ..options import EXACT as EXACT
 from ..options import FIELDS as FIELDS
@@ -21,8 +23,10 @@ from ..options import MASK as MASK
 from ..options import NOISY as NOISY
 from ..options import SCALED as SCALED
 from ..options import TRUNCATED as TRUNCATED
-from .planes import SampleArray
-from .samples import Extremes
+from ..options import ReadOptions, check_inside
+from .census import Extremes
+from .placement import check_spacing
+from .planes import SampleArray, changed
 
 NONE_EXACT: Extremes = (0.0, 0.0)
 
@@ -67,3 +71,60 @@ class Field:
     def report(self) -> dict[str, Any]:
         """Return kind and evidence as a dictionary that can be written as JSON."""
         return {"kind": self.kind, "given": self.given, **self.evidence}
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the user says of the values: what they are, the spacing if it is known, the inside."""
+
+    wanted: ReadOptions
+    spacing: Triple | None
+    inside: str
+
+    @classmethod
+    def checked(cls, wanted: ReadOptions, spacing: ArrayLike | None, inside: str) -> Request:
+        """Return a request whose parts have been checked; OptionError or GridError if one fails."""
+        check_inside(inside)
+        return cls(wanted, None if spacing is None else check_spacing(spacing), inside)
+
+    @property
+    def is_auto(self) -> bool:
+        """Whether the samples are to show what the values are."""
+        return self.wanted.field == AUTO
+
+    @property
+    def is_density(self) -> bool:
+        """Whether the values are densities, from which a level was taken."""
+        return self.wanted.level is not None
+
+    def above_is_inside(self) -> Request:
+        """Return the request with what is above a level inside, unless the user says otherwise."""
+        return replace(self, inside="positive") if self.inside == AUTO else self
+
+    def with_spacing(self, spacing: float, why: str, notes: list[str]) -> Request:
+        """Return the request with a spacing if none is given, and why in a note."""
+        if self.spacing is not None:
+            return self
+        notes.append(f"spacing not given: taken as {spacing:.6g}, {why}")
+        return replace(self, spacing=check_spacing(spacing))
+
+
+@dataclass(frozen=True, eq=False)
+class Interpreted:
+    """Distances near the surface with their extremes, and how they are to be used."""
+
+    samples: SampleArray
+    extremes: Extremes
+    spacing: Triple
+    positive_inside: bool
+    field: Field
+
+    def with_field(self, **changes: Any) -> Interpreted:
+        """Return the same with some attributes of the field changed."""
+        return replace(self, field=replace(self.field, **changes))
+
+    def divided(self, slope: float) -> Interpreted:
+        """Return values divided by a slope."""
+        low, high = self.extremes
+        samples = changed(self.samples, lambda values: values / slope)
+        return replace(self, samples=samples, extremes=(low / slope, high / slope))

@@ -13,24 +13,17 @@ from numpy.typing import ArrayLike
 
 from ..errors import GridError
 from ..options import ReadOptions
-from . import distances, masking
-from .advice import are_labels, choose_label, choose_level, is_density, refusal
-from .evidence import Looked, is_normalised, is_projective, look, weigh
-from .field import EXACT, MASK, NOISY, SCALED
-from .one_sided import is_one_sided
+from . import distances, masks
+from .advice import choose_label, choose_level, is_density, refusal
+from .census import Census, Looked, not_finite
+from .evidence import is_normalised, is_projective, weigh
+from .field import EXACT, MASK, NOISY, SCALED, Interpreted, Request
 from .planes import SampleArray, changed
-from .request import Interpreted, Request
-from .samples import (
-    Extremes,
-    check_kind,
-    check_not_constant,
-    find_extremes,
-    has_two_values,
-    not_finite,
-)
+from .samples import check_kind
 from .transforms import Transform, find_transform
-from .unknown import KnownPlanes, filled, finite_extremes
-from .unseen import without_unseen
+from .unknown import filled, without_unseen
+
+UNIT = (1.0, 1.0, 1.0)
 
 
 def interpret(
@@ -51,40 +44,64 @@ def interpret(
     """
     request = Request.checked(wanted, spacing, inside)
     check_kind(samples.dtype, samples.shape)
-    found, known = _interpreted(samples, request, notes)
-    unseen = known.unseen if isinstance(known, KnownPlanes) else None
-    return replace(found, field=replace(found.field, unseen=unseen)) if unseen else found
+    if wanted.label is not None:
+        mask = masks.labelled(samples, wanted.label)
+        return _of_mask(mask, request.above_is_inside(), notes)
+    if samples.dtype == np.bool_:
+        return _of_mask(Census(samples), request, notes)
+    given = samples
+    samples, request = _about_zero(samples, request, notes)
+    census = Census(samples)
+    if wanted.scale is not None and not request.is_density:
+        _check_no_densities(given, census, request, float(wanted.scale))
+    samples, census, transform = _known(census, request, notes)
+    low, high = census.extremes
+    if request.is_density and (low > 0 or high < 0):
+        raise _no_level(given, wanted, low, high)
+    interpreted = _interpreted(samples, census, transform, request, notes)
+    unseen = getattr(samples, "unseen", None)
+    if unseen is None:
+        return interpreted
+    return replace(interpreted, field=replace(interpreted.field, unseen=unseen))
 
 
 def _interpreted(
-    samples: SampleArray, request: Request, notes: list[str]
-) -> tuple[Interpreted, SampleArray]:
-    """Return distances, and the samples of which they were made, the unknown ones filled in."""
-    wanted = request.wanted
-    if wanted.label is not None:
-        chosen = masking.labelled(samples, wanted.label)
-        return masking.of_mask(chosen, request.above_is_inside(), notes), samples
-    if samples.dtype == np.bool_:
-        return masking.of_mask(samples, request, notes), samples
-    given = samples
-    samples, request = _about_zero(samples, request, notes)
-    samples, looked, transform = _known(samples, request, notes)
-    extremes = looked.extremes
-    if request.is_density and (extremes[0] > 0 or extremes[1] < 0):
-        raise _no_level(given, extremes, wanted)
-    check_not_constant(extremes)
-    if has_two_values(samples, extremes):
-        lower = 0.0 if request.is_density else extremes[0]
-        return masking.of_mask(masking.above(samples, lower), request, notes), samples
+    samples: SampleArray,
+    census: Census,
+    transform: Transform | None,
+    request: Request,
+    notes: list[str],
+) -> Interpreted:
+    """Return the distances of samples that are all known."""
+    wanted, (low, high) = request.wanted, census.extremes
+    if low == high:
+        raise GridError(f"every value is {low:.6g}: a constant field has no surface")
+    if census.has_two_values:
+        lower = 0.0 if request.is_density else low
+        if high <= lower:
+            raise GridError("every value is False: a constant field has no surface")
+        share = census.numbers.border[2] / census.border_size
+        return masks.of_mask(masks.above_level(samples, lower), share, request, notes)
     if wanted.field == MASK:
-        return masking.of_signs(samples, extremes, request, notes), samples
+        return masks.of_signs(samples, census, request, notes)
     if transform is not None and request.is_auto:
-        return _of_transform(samples, extremes, transform, request, notes), samples
-    if not request.is_density and are_labels(samples):
-        raise GridError(f"no solid is chosen: {choose_label(samples)}")
+        request = request.with_spacing(transform.step, "the step of the transform", notes)
+        notes.append("the values are a distance transform, so only their sign says something")
+        return masks.of_signs(samples, census, request, notes, transform.zeros)
+    if not request.is_density and census.are_labels:
+        raise GridError(f"no solid is chosen: {choose_label(census.samples)}")
     if wanted.field in (EXACT, NOISY):
-        return distances.as_distances(samples, extremes, request, notes), samples
-    return _by_evidence(samples, looked, request, notes), samples
+        return distances.as_distances(samples, census, request, notes)
+    return _by_evidence(samples, census, request, notes)
+
+
+def _of_mask(census: Census, request: Request, notes: list[str]) -> Interpreted:
+    """Return the distances of samples that are true or false."""
+    low, high = census.extremes
+    if low == high:
+        raise GridError(f"every value is {bool(low)}: a constant field has no surface")
+    share = census.numbers.border[2] / census.border_size
+    return masks.of_mask(census.samples, share, request, notes)
 
 
 def _about_zero(
@@ -98,83 +115,64 @@ def _about_zero(
         notes.append(f"values {which} {level:g} are taken as inside (see --inside)")
         request = request.above_is_inside()
     if scale is not None:
-        if level is None:
-            _check_no_densities(samples, request, float(scale))
         samples = changed(samples, partial(np.multiply, float(scale)))
     return samples, request
 
 
-def _check_no_densities(samples: SampleArray, request: Request, scale: float) -> None:
+def _check_no_densities(given: SampleArray, census: Census, request: Request, scale: float) -> None:
     """Raise GridError for values on one side of 0 that have no unit; a level is one of theirs."""
-    extremes = find_extremes(samples)
-    x, y, z = (step / abs(scale) for step in request.spacing or (1.0, 1.0, 1.0))
-    if extremes and is_one_sided(extremes) and is_density(samples, extremes, (x, y, z)):
-        raise refusal(samples, extremes, None)
+    if census.is_finite and census.is_one_sided and is_density(census, request.spacing or UNIT):
+        raise refusal(Census(given), None)
 
 
-def _no_level(given: SampleArray, extremes: Extremes, wanted: ReadOptions) -> GridError:
+def _no_level(given: SampleArray, wanted: ReadOptions, low: float, high: float) -> GridError:
     """Return the error for a level that no value is above, or none below."""
     level = float(wanted.level or 0)
-    low, high = (x / (wanted.scale or 1) + level for x in extremes)
+    low, high = (x / (wanted.scale or 1) + level for x in (low, high))
     return GridError(
         f"no value is {'above' if high < level else 'below'} the level {level:g} (they go from "
-        f"{low:.6g} to {high:.6g}): {choose_level(given, (low, high))}"
+        f"{low:.6g} to {high:.6g}): {choose_level(Census(given))}"
     )
 
 
 def _known(
-    samples: SampleArray, request: Request, notes: list[str]
-) -> tuple[SampleArray, Looked, Transform | None]:
+    census: Census, request: Request, notes: list[str]
+) -> tuple[SampleArray, Census, Transform | None]:
     """Return samples, those that are unknown filled in, what they show, and of which transform.
 
     All of a transform, and all labels, are known, though they may jump beside many equal ones.
     """
-    extremes = find_extremes(samples)
-    if extremes is None and samples.dtype.itemsize > 8:  # long doubles, infinite as float64 only
+    samples = census.samples
+    if not census.is_finite and samples.dtype.itemsize > 8:  # long doubles, infinite as float64
         raise not_finite(samples)
-    if extremes:
-        looked = look(samples, extremes)
-        transform = find_transform(looked, request.spacing)
-        if transform or request.is_density or are_labels(samples):
-            return samples, looked, transform
-    seen = samples
-    if not request.is_density:
-        ends = extremes or finite_extremes(samples)
-        seen = without_unseen(samples, ends, notes, all_known=extremes is not None)
-    if extremes and seen is samples:
-        return samples, looked, None
-    known, extremes = filled(seen, notes)
-    looked = look(known.not_continued if isinstance(known, KnownPlanes) else known, extremes)
-    return known, looked, find_transform(looked, request.spacing)
-
-
-def _of_transform(
-    samples: SampleArray,
-    extremes: Extremes,
-    transform: Transform,
-    request: Request,
-    notes: list[str],
-) -> Interpreted:
-    """Return the distances of the mask of which values are a distance transform."""
-    request = request.with_spacing(transform.step, "the step of the transform", notes)
-    notes.append("the values are a distance transform, so only their sign says something")
-    return masking.of_signs(samples, extremes, request, notes, transform.zeros)
+    if census.is_finite:
+        transform = find_transform(census.looked, request.spacing)
+        if transform or request.is_density or census.are_labels:
+            return samples, census, transform
+    seen = census if request.is_density else without_unseen(census, notes)
+    if seen is census and census.is_finite:
+        return samples, census, None
+    known = filled(seen, notes)
+    census = Census(known.not_continued)
+    return known, census, find_transform(census.looked, request.spacing)
 
 
 def _by_evidence(
-    samples: SampleArray, looked: Looked, request: Request, notes: list[str]
+    samples: SampleArray, census: Census, request: Request, notes: list[str]
 ) -> Interpreted:
     """Return distances for values that are no mask at first sight, by what the samples show."""
-    if request.is_auto and request.is_density and masking.is_step(looked):
+    looked = census.looked
+    if request.is_auto and request.is_density and masks.is_step(looked):
         notes.append("the densities jump from one side of the level to the other")
-        return masking.of_mask(masking.above(samples, 0), request, notes)
+        share = 1 - census.numbers.border[1] / census.border_size
+        return masks.of_mask(masks.above_level(samples, 0), share, request, notes)
     if request.is_density:
         request = request.with_spacing(1, "since densities show none (give --spacing)", notes)
     if _has_other_slope(looked, request):
-        return distances.of_slope(samples, looked, request, notes)
+        return distances.of_slope(samples, census, request, notes)
     is_cut = bool(looked.is_cut.any())
-    found = distances.as_distances(samples, looked.extremes, request, notes, is_cut=is_cut)
-    return distances.by_kind(found, looked, request, notes)
+    taken = distances.as_distances(samples, census, request, notes, is_cut=is_cut)
+    return distances.by_kind(taken, census, request, notes)
 
 
 def _has_other_slope(looked: Looked, request: Request) -> bool:

@@ -13,15 +13,12 @@ from ..arrays import BoolArray, IntArray
 from ..errors import GridError, OptionError, seen
 from ..options import ReadOptions, check_label
 from .advice import MOST_NAMED
-from .field import MASK, NONE_EXACT, Field
-from .masking import as_sample, labelled
-from .masks import REACH, extremes_of_masks, mask_planes
-from .named_axes import placed
+from .field import MASK, NONE_EXACT, Field, Request
+from .masks import REACH, as_sample, extremes_of_masks, labelled, mask_planes
+from .placement import is_cubic, placed
 from .planes import NoPlanes, SampleArray, SamplePlanes, changed
-from .request import Request
 from .samples import as_samples, check_kind
 from .sdf_grid import SdfGrid
-from .spacing import as_triple, is_cubic
 
 ALL = "all"
 MOST_LABELS = 1000  # more values than these are densities
@@ -53,7 +50,7 @@ class LabelImage:
     samples : array or SamplePlanes
         The label of each sample.
     labels : (L,) array
-        The labels to be meshed, in ascending order, in the type of the samples.
+        Those to be meshed, in ascending order, in the type of the samples.
     boxes : list of L + 1 boxes
         The samples on which each of them depends; first, those of what is beside all of them.
     grid : SdfGrid
@@ -90,16 +87,15 @@ class LabelImage:
 
         The result is (b, 4) int32; numbers are those of ``mask``.
         """
-        found = [np.empty((0, 4), np.int64)]
+        parts = [np.empty((0, 4), np.int64)]
         for plane in range(*planes):
             some = np.ones(self.grid.shape[1:], bool)
             some[1:-1, 1:-1] = plane in (0, self.grid.shape[0] - 1)
             values = np.asarray(self.samples[plane])[some]
             at = np.searchsorted(self.labels, values).clip(max=len(self.labels) - 1)
             number = np.where(self.labels[at] == values, at + 1, 0)
-            place = np.full(len(values), plane)
-            found.append(np.column_stack([place, np.argwhere(some), number]))
-        return np.concatenate(found).astype(np.int32)
+            parts.append(np.column_stack([np.full(len(values), plane), np.argwhere(some), number]))
+        return np.concatenate(parts).astype(np.int32)
 
 
 def make_labels(
@@ -124,31 +120,37 @@ def make_labels(
     given = placed(values, spacing, origin)
     samples = as_samples(given.values)
     check_kind(samples.dtype, samples.shape)
-    found = find_labels(samples, None if isinstance(wanted, str) else wanted)
+    boxes = find_labels(samples, None if isinstance(wanted, str) else wanted)
     added: list[str] = []
     request = Request.checked(ReadOptions(), given.spacing, "auto")
     request = request.with_spacing(1, "since labels show none (give --spacing)", added)
     assert request.spacing is not None
     if given.origin is None:
         added.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
-    cut = [str(int(x)) for x, (low, high) in found.items() if _is_cut(low, high, samples.shape)]
+    ends, shape = np.array(list(boxes.values())), np.array(samples.shape)
+    is_cut = (ends[:, 0] == 0).any(1) | (ends[:, 1] == shape - 1).any(1)
+    cut = [str(int(label)) for label, leaves in zip(boxes, is_cut) if leaves]
     if cut:
         named = ", ".join(cut[:MOST_NAMED]) + ", ..." * (len(cut) > MOST_NAMED)
         added.append(f"solids of labels run out of the grid: closed along the border ({named})")
-    around = [_with_margin(box, samples.shape) for box in found.values()]
-    ends = np.array([[(s.start, s.stop) for s in box] for box in around])
-    whole = [slice(int(a), int(b)) for a, b in zip(ends[..., 0].min(0), ends[..., 1].max(0))]
+    low, high = np.maximum(ends[:, 0] - MARGIN, 0), np.minimum(ends[:, 1] + MARGIN + 1, shape)
+    low, high = np.vstack([low.min(0), low]), np.vstack([high.max(0), high])
     grid = SdfGrid.trusted(
         NoPlanes(samples.shape, samples.dtype),
         request.spacing,
-        as_triple(0.0 if given.origin is None else given.origin, "origin"),
+        0.0 if given.origin is None else given.origin,
         (*notes, *added),
         direction=direction,
         extremes=extremes_of_masks(min(request.spacing)),
         field=Field(MASK, True, NONE_EXACT, on_lattice=not is_cubic(request.spacing)),
     )
-    known = np.array(list(found), samples.dtype)
-    return LabelImage(samples, known, [(whole[0], whole[1], whole[2]), *around], grid)
+    around = [_box(*pair) for pair in zip(low.tolist(), high.tolist())]
+    return LabelImage(samples, np.array(list(boxes), samples.dtype), around, grid)
+
+
+def _box(low: list[int], high: list[int]) -> Box:
+    i, j, k = map(slice, low, high)
+    return i, j, k
 
 
 def check_labels(labels: Any) -> str | list[int]:
@@ -229,15 +231,3 @@ def _check_whole(values: NDArray[Any]) -> None:
             f"a value is {wrong[0]:g}: labels are whole numbers; choose what is above a value with "
             "--level if they are densities"
         )
-
-
-def _is_cut(low: NDArray[np.int64], high: NDArray[np.int64], shape: tuple[int, ...]) -> bool:
-    """Return whether a box reaches the border of an array."""
-    return bool((low == 0).any() or (high == np.array(shape) - 1).any())
-
-
-def _with_margin(box: NDArray[np.int64], shape: tuple[int, ...]) -> Box:
-    """Return a box and what is beside it in an array."""
-    low, high = np.maximum(box[0] - MARGIN, 0), np.minimum(box[1] + MARGIN + 1, shape)
-    i, j, k = (slice(int(a), int(b)) for a, b in zip(low, high))
-    return i, j, k

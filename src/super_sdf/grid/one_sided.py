@@ -7,7 +7,9 @@ fields have no inside either: unsigned distances to a thick solid, and values th
 
 from __future__ import annotations
 
-from typing import Any
+from collections import deque
+from itertools import chain
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +17,8 @@ from numpy.typing import NDArray
 from ..arrays import BoolArray, Triple
 from ..machine.threads import chunks_of
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
+from .census import Census
 from .planes import SampleArray
-from .samples import Extremes
 
 Floats = NDArray[np.floating[Any]]
 
@@ -43,40 +45,24 @@ BEYOND = "only samples on the border of the grid are near 0, so no surface lies 
 UNSIGNED = "unsigned distances have no inside"
 
 
-def is_one_sided(extremes: Extremes) -> bool:
-    """Return whether no value is below 0, or none above."""
-    return extremes[0] >= 0 or extremes[1] <= 0
-
-
-def find_fault(values: SampleArray, spacing: Triple, extremes: Extremes) -> str:
+def find_fault(census: Census, spacing: Triple) -> str:
     """Return why values on one side of 0 cannot be distances to a thin solid; empty if they can.
 
-    Parameters
-    ----------
-    values : (nx, ny, nz) array or Planes
-        Samples, none below 0 or none above.
-    spacing : three floats
-        Along each axis.
-    extremes : two floats
-        The smallest and the largest sample.
-
-    Returns
-    -------
-    str
-        ``FAR``, ``BEYOND``, ``UNSIGNED`` or nothing.
+    ``spacing`` is that of each axis; the fault is ``FAR``, ``BEYOND`` or ``UNSIGNED``.
     """
+    extremes, values = census.extremes, census.samples
     steps = np.array(spacing) / max(spacing)
     scale = (1 if extremes[0] >= 0 else -1) / max(spacing)
     if min(map(abs, extremes)) * abs(scale) > reach(steps):
         return FAR
-    patches, walls, thickness = look_near_walls(values, scale, steps)
-    if not len(patches):
+    walls = _look_near_walls(values, scale, steps)
+    if not len(walls.patches):
         return BEYOND
-    if not (_are_distances(patches, steps) and _touch_walls(patches, steps)):
+    if not (_are_distances(walls.patches, steps) and _touch_walls(walls.patches, steps)):
         return UNSIGNED
-    if len(thickness) > UNSIGNED_SHARE * walls:
-        beyond = max(-float(np.quantile(thickness, LEAST_THICKNESS)), 0.0)
-        if _is_cut_off(values, scale, steps, FREE + beyond):
+    if len(walls.thickness) > UNSIGNED_SHARE * walls.total:
+        beyond = max(-float(np.quantile(walls.thickness, LEAST_THICKNESS)), 0.0)
+        if _is_cut_off(walls.coarse, steps, FREE + beyond):
             return UNSIGNED
     return ""
 
@@ -86,43 +72,61 @@ def reach(steps: Floats) -> float:
     return float(np.linalg.norm(steps)) / 2 * MARGIN
 
 
-def look_near_walls(values: SampleArray, scale: float, steps: Floats) -> tuple[Floats, int, Floats]:
-    """Return patches near 0, how many walls pass between samples, and how thick the thinnest are.
+class Walls(NamedTuple):
+    """What lies near 0 in a grid.
 
-    Parameters
+    Attributes
     ----------
-    values : (nx, ny, nz) array or Planes
-        Samples.
-    scale : float
-        Their factor to spacings, positive outside.
-    steps : (3,) float
-        The spacings of the axes, over the coarsest.
-
-    Returns
-    -------
     patches : (n, 27) float64
         Distances round some of the inner samples near 0, in the order of ``NEIGHBOURHOOD``.
-    walls : int
-        Of all lines along the axes.
+    total : int
+        How many walls pass between samples, of all lines along the axes.
     thickness : (w,) float64
-        Of those of them with less than ``NO_THICKNESS``; below 0 if a constant was added.
+        Of those with less than ``NO_THICKNESS``; below 0 if a constant was added.
+    coarse : array
+        Every n-th sample along each axis, at most ``MOST_FLOODED``, in n spacings.
     """
-    found: list[Floats] = []
-    walls, near = 0, reach(steps)
+
+    patches: Floats
+    total: int
+    thickness: Floats
+    coarse: Floats
+
+
+def _look_near_walls(values: SampleArray, scale: float, steps: Floats) -> Walls:
+    """Return what lies near 0, reading each plane once.
+
+    ``scale`` is the factor of the values to spacings, positive outside; ``steps`` are the spacings
+    of the axes, over the coarsest.
+    """
+    nth = 1
+    while np.prod([-(-count // nth) for count in values.shape], dtype=float) > MOST_FLOODED:
+        nth += 1
+    count, near = 0, reach(steps)
+    patches: list[Floats] = []
     thin: list[Floats] = [np.empty(0)]
-    for i in range(1, len(values) - 1):
-        slab = np.array(values[i - 1 : i + 3], np.float64)
-        slab *= scale
+    coarse: list[Floats] = []
+    window: deque[Floats] = deque(maxlen=4)
+    for number, plane in enumerate(chain(values, [None])):
+        if plane is not None:
+            window.append(np.asarray(plane, np.float64) * scale)
+            if number % nth == 0:
+                coarse.append(window[-1][::nth, ::nth])
+        elif len(window) == 4:
+            window.popleft()
+        if number < 3:
+            continue
+        slab = np.stack(window)
         if slab[1:3].min() <= near:
             for lines, step in zip((slab, slab[1], slab[1].T), steps):
                 for part in chunks_of(lines.shape[1], lines[:, 0].size):  # to save memory
                     thickness = find_walls(lines[:, part] / step)[1]
-                    walls += len(thickness)
+                    count += len(thickness)
                     thin.append(thickness[thickness < NO_THICKNESS])
-            found += _patches_near(slab[:3], near)
-    some = np.unique(np.linspace(0, max(len(found) - 1, 0), CANDIDATES).astype(int))
-    patches = np.array([found[n] for n in some] if found else []).reshape(-1, 27)
-    return patches, walls, np.concatenate(thin)
+            patches += _patches_near(slab[:3], near)
+    some = np.unique(np.linspace(0, max(len(patches) - 1, 0), CANDIDATES).astype(int))
+    chosen = np.array([patches[n] for n in some] if patches else []).reshape(-1, 27)
+    return Walls(chosen, count, np.concatenate(thin), np.array(coarse) / nth)
 
 
 def _patches_near(slab: Floats, limit: float) -> list[Floats]:
@@ -139,19 +143,11 @@ def _patches_near(slab: Floats, limit: float) -> list[Floats]:
 
 
 def find_walls(lines: Floats) -> tuple[BoolArray, Floats]:
-    """Return where a wall lies between two samples of a line, and how thick it is.
+    """Return where a wall lies between two samples of lines (n, ...), and how thick it is.
 
-    Parameters
-    ----------
-    lines : (n, ...) float64
-        Samples along the first axis, in spacings and positive.
-
-    Returns
-    -------
-    walls : (n - 3, ...) bool
-        Whether there is one between samples i + 1 and i + 2; n is at least 4, else there is none.
-    thickness : (walls,) float64
-        What the distances on either side leave of the way between the two.
+    Samples are along the first axis, in spacings and positive. The first result, (n - 3, ...),
+    says whether there is one between samples i + 1 and i + 2. The second, (walls,), is what the
+    distances on either side leave of the way between the two.
     """
     before, left, right, after = lines[:-3], lines[1:-2], lines[2:-1], lines[3:]
     falling, rising = before - left, after - right
@@ -185,12 +181,11 @@ def _touch_walls(patches: Floats, steps: Floats) -> bool:
     return bool((rises & (np.abs(deepest) <= TOUCHING)).mean() >= TOUCHING_SHARE)
 
 
-def _is_cut_off(values: SampleArray, scale: float, steps: Floats, free: float) -> bool:
+def _is_cut_off(coarse: Floats, steps: Floats, free: float) -> bool:
     """Return whether walls cut deep samples off from the farthest sample of the border.
 
     No wall passes between samples that add up to more than ``free`` times their spacing.
     """
-    coarse = _every_nth(values, scale)
     border = coarse.copy()
     border[1:-1, 1:-1, 1:-1] = -np.inf
     reached = np.zeros(coarse.shape, bool)
@@ -200,15 +195,6 @@ def _is_cut_off(values: SampleArray, scale: float, steps: Floats, free: float) -
         for axis, step in enumerate(steps):
             _spread(np.moveaxis(reached, axis, 0), np.moveaxis(coarse, axis, 0), free * step)
     return bool((coarse[~reached] >= DEEP).any())
-
-
-def _every_nth(values: SampleArray, scale: float) -> Floats:
-    """Return every n-th sample along each axis, at most ``MOST_FLOODED``, in n spacings."""
-    step = 1
-    while np.prod([-(-count // step) for count in values.shape], dtype=float) > MOST_FLOODED:
-        step += 1
-    planes = [np.asarray(values[i])[::step, ::step] for i in range(0, len(values), step)]
-    return np.array(planes, np.float64) * (scale / step)
 
 
 def _spread(reached: BoolArray, samples: Floats, limit: float) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
 from io import FileIO
 from math import prod
@@ -28,7 +28,7 @@ FAR = 1e6  # spacings
 BLOCK_BYTES = 1 << 20  # read at a time when iterating over all planes
 LEAST_AT_ONCE = 4  # planes
 WORKING_BYTES = 1 << 26  # taken at a time when planes are made of others
-LOOKED_AT, LOOKING_BYTES = 6, 40  # planes, and bytes per sample of one, to look at the samples
+LOOKED_AT, LOOKING_BYTES = 12, 40  # planes, and bytes per sample of one, to look at the samples
 EVENLY = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio: its multiples, modulo 2^64
 
 Result = TypeVar("Result")
@@ -39,17 +39,7 @@ Ranges: TypeAlias = Sequence[tuple[Any, ...]]
 class InputFile:
     """A file that any thread may read at any offset; it must not change while it is open.
 
-    Parameters
-    ----------
-    file : FileIO
-        The open file.
-    name : str
-        The name of the file in error messages.
-
-    Attributes
-    ----------
-    size : int
-        Size of the file in bytes when it was opened.
+    ``name`` is that in messages, ``size`` its size in bytes when it was opened.
     """
 
     def __init__(self, file: FileIO, name: str) -> None:
@@ -60,13 +50,7 @@ class InputFile:
 
     @classmethod
     def open(cls, path: Path) -> InputFile:
-        """Open a file by its path.
-
-        Raises
-        ------
-        FileError
-            If it cannot be opened.
-        """
+        """Open a file by its path; FileError if that fails."""
         try:
             return cls(FileIO(str(path)), str(path))
         except OSError as error:
@@ -77,7 +61,6 @@ class InputFile:
             self.file.close()
 
     def _stat(self) -> tuple[int, int]:
-        """Return size and time of the last change."""
         status = os.fstat(self.file.fileno())
         return status.st_size, status.st_mtime_ns
 
@@ -89,10 +72,7 @@ class InputFile:
     def read_into(self, out: NDArray[Any], offset: int) -> None:
         """Fill a contiguous array with the bytes of the file from ``offset`` on.
 
-        Raises
-        ------
-        FileError
-            If the file changed, ends too early, or cannot be read.
+        FileError if the file changed, ends too early, or cannot be read.
         """
         view = out.view(np.uint8).reshape(-1).data
         while view:
@@ -123,14 +103,9 @@ class InputFile:
 
 
 class SamplePlanes(ABC):
-    """A 3D array whose planes along the first axis are made when they are needed.
+    """A 3D array, (nx, ny, nz), whose planes along the first axis are made when they are needed.
 
-    Attributes
-    ----------
-    shape, dtype
-        Shape (nx, ny, nz) and type of the array.
-    name : str
-        What the array is called in error messages.
+    ``name`` is what it is called in messages.
     """
 
     ndim = 3
@@ -174,10 +149,21 @@ class SamplePlanes(ABC):
     ) -> Iterator[Result]:
         """Yield what a function makes of ranges of ``samples``, which are made of these.
 
-        Samples of which workers read the planes have their own way.
+        Planes that a range shares with the one before are not read again; they are valid during the
+        call. Samples of which workers read the planes have their own way.
         """
+        held = max((last - first for first, last, *_ in ranges), default=0)
+        planes = np.empty((held, *samples.shape[1:]), samples.dtype)
+        start = end = 0  # of the planes that are held
         for first, last, *more in ranges:
-            yield work(samples[first:last], *more)
+            kept = end - first if start <= first < end else 0
+            if kept and first > start:
+                planes[:kept] = planes[first - start : end - start]
+            for low in range(first + kept, last, samples.block):  # which stay in the cache
+                high = min(low + samples.block, last)
+                planes[low - first : high - first] = samples[low:high]
+            start, end = first, max(last, first + kept)
+            yield work(planes[: last - first], *more)
 
     def working_bytes(self, planes: int) -> int:
         """Return about how much memory making that many planes takes."""
@@ -185,13 +171,7 @@ class SamplePlanes(ABC):
 
     @cached_property
     def loaded(self) -> NDArray[Any]:
-        """The whole array; it stays in memory.
-
-        Raises
-        ------
-        OutOfMemoryError
-            If it is larger than what is free.
-        """
+        """The whole array, which stays in memory; OutOfMemoryError if it is too large."""
         size = prod(self.shape) * self.dtype.itemsize
         check_fits(size, f"{self.name}, whole,", "read it plane by plane (SdfGrid.planes)")
         return self.read(0, len(self))
@@ -205,18 +185,9 @@ class SamplePlanes(ABC):
 
 
 class PlaneFile(SamplePlanes):
-    """A 3D array in a file, whose planes along the first axis are read when they are needed.
+    """A 3D array in a file, from byte ``offset`` on, whose planes are read when they are needed.
 
-    Parameters
-    ----------
-    file : InputFile
-        The file.
-    offset : int
-        The byte in the file at which the array begins.
-    shape, dtype
-        Shape (nx, ny, nz) and type of the array.
-    swapped : bool
-        Whether the last two axes are swapped in the file: (nx, nz, ny).
+    If it is ``swapped``, the last two axes are so in the file: (nx, nz, ny).
     """
 
     def __init__(
@@ -232,13 +203,7 @@ class PlaneFile(SamplePlanes):
         self.shape, self.dtype, self.swapped = shape, dtype, swapped
 
     def read(self, first: int, last: int) -> NDArray[Any]:
-        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz).
-
-        Raises
-        ------
-        FileError
-            If the file changed since it was opened, or cannot be read any more.
-        """
+        """Return planes ``first`` to ``last`` (exclusive); FileError if the file changed."""
         _, ny, nz = self.shape
         planes = np.empty(
             (max(last - first, 0), *((nz, ny) if self.swapped else (ny, nz))), self.dtype
@@ -261,14 +226,8 @@ def over_planes(
 ) -> Iterator[Result]:
     """Yield what a function makes of some ranges of planes, in order.
 
-    Parameters
-    ----------
-    samples : (nx, ny, nz) array or SamplePlanes
-        The planes are read here, unless they say who does that: see ``SamplePlanes.over``.
-    work : callable
-        Takes the planes of a range, and what the range has besides its ends.
-    ranges : sequence of tuples
-        The first plane of each range, that after its last, and arguments.
+    ``work`` takes the planes of a range, and what the range has besides its ends. The planes are
+    read here, unless the samples say who does that: see ``SamplePlanes.over``.
     """
     if isinstance(samples, SamplePlanes):
         yield from samples.over(samples, work, ranges)
@@ -287,25 +246,28 @@ def lowest(ranks: NDArray[np.uint64], most: int) -> NDArray[np.bool_] | slice:
     return ranks <= np.partition(ranks, most - 1)[most - 1] if len(ranks) > most else slice(None)
 
 
-def few_of(found: Iterable[tuple[NDArray[Any], ...]], most: int) -> list[NDArray[Any]]:
-    """Return what was found of samples, concatenated: of at most ``most``, those of lowest rank.
+class Few(list[tuple[NDArray[Any], ...]]):
+    """Arrays of rows, of which few are held: of at most ``most`` samples, those of lowest rank.
 
-    ``found`` are parts: the ranks of n samples, and arrays of n rows. The result depends on the
-    samples alone, and few are held at a time.
+    Each part has the ranks of n samples, and arrays of n rows. What is kept depends on the samples
+    alone, not on the parts.
     """
-    kept: list[tuple[NDArray[Any], ...]] = []
-    for part in found:
-        kept.append(part)
-        if sum(len(ranks) for ranks, *_ in kept) > 2 * most:
-            kept = [_lowest_of(kept, most)]
-    return list(_lowest_of(kept, most)[1:])
 
+    def __init__(self, most: int) -> None:
+        super().__init__()
+        self.most = most
 
-def _lowest_of(parts: list[tuple[NDArray[Any], ...]], most: int) -> tuple[NDArray[Any], ...]:
-    """Return the rows of the lowest ranks of all parts."""
-    joined = [np.concatenate(arrays) for arrays in zip(*parts)]
-    some = lowest(joined[0], most)
-    return tuple(array[some] for array in joined)
+    def append(self, part: tuple[NDArray[Any], ...]) -> None:
+        """Add a part."""
+        super().append(part)
+        if sum(len(ranks) for ranks, *_ in self) > 2 * self.most:
+            self[:] = [self.joined()]
+
+    def joined(self) -> tuple[NDArray[Any], ...]:
+        """Return the ranks and the arrays of those that are kept; there is at least one part."""
+        arrays = [np.concatenate(parts) for parts in zip(*self)]
+        some = lowest(arrays[0], self.most)
+        return tuple(array[some] for array in arrays)
 
 
 def spread_planes(first: int, last: int, most: int) -> list[int]:
@@ -347,13 +309,10 @@ class DerivedPlanes(SamplePlanes):
     Parameters
     ----------
     source : (nx, ny, nz) array or SamplePlanes
-        The other array.
     make : callable
         Takes some planes of it; returns as many.
     beside : int
         How many planes to either side the values of a plane depend on, and how many rows.
-    dtype
-        Type of the array.
     unit : float
         What ``make`` returns is multiplied by this.
     each : int
@@ -390,8 +349,7 @@ class DerivedPlanes(SamplePlanes):
         return super().over(samples, work, ranges)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle how they are made, if their source can be read elsewhere, else the array."""
-        if not getattr(self.source, "travels", False):
+        if not self.travels:
             return super().__reduce__()
         make = partial(DerivedPlanes, unit=self.unit, each=self.each)
         return make, (self.source, self.make, self.beside, self.dtype)
@@ -408,20 +366,15 @@ class DerivedPlanes(SamplePlanes):
             return np.empty((0, *self.shape[1:]), self.dtype)
         source = np.asarray(self.source[low:high])
         out = np.empty((last - first, *self.shape[1:]), self.dtype)
-        for rows in self._rows(len(source)):
-            around = slice(max(rows.start - self.beside, 0), rows.stop + self.beside)
-            made = self.make(source[:, around])[first - low : last - low]
-            out[:, rows] = made[:, rows.start - around.start :][:, : rows.stop - rows.start]
+        size = self._rows_at_once(len(source))
+        for start in range(0, self.shape[1], size):
+            stop, low_row = min(start + size, self.shape[1]), max(start - self.beside, 0)
+            made = self.make(source[:, low_row : stop + self.beside])[first - low : last - low]
+            out[:, start:stop] = made[:, start - low_row : stop - low_row]
         return out if self.unit == 1 else np.multiply(out, self.unit, out=out)
 
-    def _rows(self, planes: int) -> Iterator[slice]:
-        """Yield slices of rows that are worked on at a time, so that little memory is taken."""
-        size = self._rows_at_once(planes)
-        for start in range(0, self.shape[1], size):
-            yield slice(start, min(start + size, self.shape[1]))
-
     def _rows_at_once(self, planes: int) -> int:
-        """Return how many rows of that many planes are worked on at a time."""
+        """Return how many rows of that many planes are worked on at a time, to save memory."""
         fitting = WORKING_BYTES // (planes * self.shape[2] * self.each)
         if fitting >= self.shape[1]:
             return self.shape[1]
@@ -431,9 +384,9 @@ class DerivedPlanes(SamplePlanes):
         """Return about how much memory making that many planes takes, those beside included."""
         read = min(planes + 2 * self.beside, len(self))
         rows = min(self._rows_at_once(read) + 2 * self.beside, self.shape[1])
-        own = planes * self.plane_bytes + read * rows * self.shape[2] * self.each
+        made = planes * self.plane_bytes + read * rows * self.shape[2] * self.each
         stored = read * self.shape[1] * self.shape[2] * np.dtype(self.source.dtype).itemsize
-        return own + max(reading_bytes(self.source, read), stored)
+        return made + max(reading_bytes(self.source, read), stored)
 
 
 def unpacked_bytes(samples: SampleArray) -> int:

@@ -4,23 +4,32 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Triple
-from ..errors import OptionTypeError, seen
+from ..errors import GridError, OptionTypeError, seen
 from ..options import ReadOptions
-from .direction import STRAIGHT, Direction, check_direction, in_rows, is_mirrored
+from .census import Census, Extremes, not_finite
 from .field import AUTO, Field
 from .interpret import interpret
-from .named_axes import placed
+from .placement import (
+    STRAIGHT,
+    Direction,
+    as_triple,
+    check_direction,
+    check_spacing,
+    in_rows,
+    is_cubic,
+    placed,
+)
 from .planes import NoPlanes, SampleArray, SamplePlanes
-from .samples import Extremes, as_samples, check_not_flat, check_values
-from .sides import check_negative_inside
-from .spacing import as_triple, check_spacing, choose_spacing, is_cubic
+from .samples import as_samples, check_kind
+from .spacing import check_negative_inside, choose_spacing
+
+MASK_HINT = "a mask holds no distances; make a grid of it with make_grid or read_grid"
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -83,14 +92,18 @@ class SdfGrid:
         origin: ArrayLike | None = None,
         direction: ArrayLike | None = None,
     ) -> None:
-        found = placed(values, spacing, origin)
-        samples, extremes = _checked(found.values)
-        check_negative_inside(samples)
+        given = placed(values, spacing, origin)
+        samples = as_samples(given.values)
+        census = _checked(samples)
+        low, high = census.extremes
+        if low == high:
+            raise GridError(f"every value is {low:.6g}: a constant field has no surface")
+        if census.has_two_values:
+            raise GridError(f"the only values are {low:.6g} and {high:.6g}: {MASK_HINT}")
+        check_negative_inside(census)
         notes: list[str] = []
-        chosen = choose_spacing(samples, check_spacing(spacing), notes)
-        origin = 0.0 if found.origin is None else found.origin
-        place = chosen, origin, direction
-        self._set(samples, place, tuple(notes), False, extremes)
+        chosen = choose_spacing(census, check_spacing(spacing), notes)
+        self._set(samples, (chosen, given.origin, direction), tuple(notes), census.extremes)
 
     @classmethod
     def trusted(
@@ -108,47 +121,46 @@ class SdfGrid:
         """Return a grid whose sign and spacing are known and not checked against the values.
 
         With ``positive_inside`` the sign of the values is flipped. With ``extremes``, their minimum
-        and maximum, they are not searched for NaN and infinity again. Values are taken as exact
-        distances unless ``field`` says what they are.
+        and maximum, they are not searched for NaN and infinity. Values are taken as exact distances
+        unless ``field`` says what they are.
         """
         given = placed(values, spacing, origin)
         samples = as_samples(given.values)
+        extremes = extremes or _checked(samples).extremes
         grid = object.__new__(cls)
-        found = extremes or check_values(samples)
-        origin = 0.0 if given.origin is None else given.origin
-        place = check_spacing(spacing), origin, direction
-        grid._set(samples, place, notes, positive_inside, found, field)
+        place = check_spacing(spacing), given.origin, direction
+        grid._set(samples, place, notes, extremes, positive_inside, field)
         return grid
 
     def _set(
         self,
         samples: SampleArray,
-        place: tuple[Triple, ArrayLike, ArrayLike | None],
+        place: tuple[Triple, ArrayLike | None, ArrayLike | None],
         notes: tuple[str, ...],
-        positive_inside: bool,
         extremes: Extremes,
+        positive_inside: bool = False,
         field: Field | None = None,
     ) -> None:
         """Set all fields."""
-        set_ = partial(object.__setattr__, self)
         low, high = extremes
-        set_("samples", samples)
-        set_("spacing", place[0])
-        set_("origin", as_triple(place[1], "origin"))
-        set_("direction", check_direction(place[2]))
-        set_("notes", notes)
-        set_("positive_inside", positive_inside)
-        set_("low", -high if positive_inside else low)
-        set_("high", -low if positive_inside else high)
-        set_("field", field or Field())
+        spacing, origin, direction = place
+        vars(self).update(
+            samples=samples,
+            spacing=spacing,
+            origin=as_triple(0.0 if origin is None else origin, "origin"),
+            direction=check_direction(direction),
+            notes=notes,
+            positive_inside=positive_inside,
+            low=-high if positive_inside else low,
+            high=-low if positive_inside else high,
+            field=field or Field(),
+        )
 
     def noted(self, notes: tuple[str, ...]) -> SdfGrid:
         """Return the same grid with more sentences on it, before those on what was inferred."""
         if not notes:
             return self
-        grid = copy(self)
-        object.__setattr__(grid, "notes", (*notes, *self.notes))
-        return grid
+        return _with(self, notes=(*notes, *self.notes))
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.shape))
@@ -195,7 +207,7 @@ class SdfGrid:
     @property
     def is_mirrored(self) -> bool:
         """Whether the array's axes are left-handed in the world."""
-        return is_mirrored(self.direction)
+        return bool(np.linalg.det(np.array(self.direction)) < 0)
 
     @property
     def reach(self) -> float:
@@ -281,20 +293,20 @@ def make_grid(
     notes: list[str] = []
     wanted = ReadOptions(inside=inside, field=field, label=label, level=level, scale=scale)
     given = placed(values, spacing, origin)
-    found = interpret(as_samples(given.values), wanted, given.spacing, inside, notes)
+    taken = interpret(as_samples(given.values), wanted, given.spacing, inside, notes)
     origin = given.origin
     if origin is None:
         notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
         origin = 0.0
     return SdfGrid.trusted(
-        found.samples,
-        found.spacing,
+        taken.samples,
+        taken.spacing,
         origin,
         tuple(notes),
         direction=direction,
-        positive_inside=found.positive_inside,
-        extremes=found.extremes,
-        field=found.field,
+        positive_inside=taken.positive_inside,
+        extremes=taken.extremes,
+        field=taken.field,
     )
 
 
@@ -307,28 +319,31 @@ def check_grid(grid: Any) -> None:
         )
 
 
-def _checked(values: ArrayLike | SamplePlanes) -> tuple[SampleArray, Extremes]:
-    """Return samples as an array, and their extremes; raise GridError if they are no field."""
-    samples = as_samples(values)
-    extremes = check_values(samples)
-    check_not_flat(samples, extremes)
-    return samples, extremes
+def _checked(samples: SampleArray) -> Census:
+    """Return what samples show; GridError unless they are finite numbers along three axes."""
+    check_kind(samples.dtype, samples.shape)
+    if samples.dtype == np.bool_:
+        raise GridError(f"values are true or false: {MASK_HINT}")
+    census = Census(samples)
+    if not census.is_finite:
+        raise not_finite(samples)
+    return census
 
 
-def with_samples(grid: SdfGrid, samples: SampleArray) -> SdfGrid:
-    """Return a grid with other samples in the same place, taken as the same."""
+def _with(grid: SdfGrid, **fields: Any) -> SdfGrid:
+    """Return a grid with other fields, taken as they are."""
     other = copy(grid)
-    object.__setattr__(other, "samples", samples)
+    vars(other).update(fields)
     return other
 
 
 def without_samples(grid: SdfGrid) -> SdfGrid:
     """Return a grid that knows all but its samples: their shape and type, place and field."""
-    return with_samples(grid, NoPlanes(grid.shape, grid.samples.dtype))
+    return _with(grid, samples=NoPlanes(grid.shape, grid.samples.dtype))
 
 
 def negated(values: NDArray[Any]) -> NDArray[Any]:
     """Return the negated values, as floats so that unsigned integers work."""
-    found: NDArray[Any] = values.astype(np.promote_types(values.dtype, np.float32))
-    np.negative(found, out=found)
-    return found
+    floats: NDArray[Any] = values.astype(np.promote_types(values.dtype, np.float32))
+    np.negative(floats, out=floats)
+    return floats

@@ -1,4 +1,4 @@
-"""The spacing of the samples: as given, or estimated from the values."""
+"""The spacing of the samples, and the sign inside: as given, or as the values show them."""
 
 from __future__ import annotations
 
@@ -6,92 +6,56 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Triple
-from ..errors import GridError, seen
+from ..errors import GridError
 from .advice import way_out
-from .gradients import (
-    ENOUGH,
-    Gradients,
-    are_consistent,
-    spacing_of_axes,
-    straight_gradients,
-    surface_gradients,
-    typical_length,
-    unequal_axes,
-)
-from .planes import SampleArray
+from .census import Census
+from .placement import LEAST_SPACING, MOST_SPACING, check_spacing, is_cubic, steps_of
+from .slopes import ENOUGH, Gradients
 
-# Spacings that differ by less than this ratio count as equal. Coarser axes are resampled to the
-# finest spacing, so a large ratio makes many samples of few.
-EQUAL_SPACING, MOST_UNEQUAL = 1e-3, 50.0
-# Within these, areas, volumes and squared areas neither overflow nor underflow.
-LEAST_SPACING, MOST_SPACING = 1e-60, 1e60
 SNAP = 0.02  # an estimate this close to a usual spacing is replaced by it
 CLEARLY_UNEQUAL = 1.1  # ratio of estimated spacings, from which on they are taken as different
-# Ratio of measured to given spacing, or its inverse, above which there is a note.
-TOLERATED = 1.1
+TOLERATED = 1.1  # ratio of measured to given spacing, or its inverse, above which there is a note
 # Distances cannot change by more than the samples are apart. Larger ratios are refused: the first
 # limit applies to gradients that agree with each other, the second to noisy or bent fields. They
 # do change by less at thin parts and where they are truncated, so that is never refused.
 REFUSED, REFUSED_IF_UNSURE = 1.25, 2.0
 
 
-def as_triple(number: ArrayLike, name: str) -> Triple:
-    """Return one number or three as three floats.
+def is_positive_inside(census: Census, inside: str, notes: list[str]) -> bool:
+    """Return whether the values are positive inside: as given, or for "auto" from the border.
 
-    Raises
-    ------
-    GridError
-        If ``number``, which the message calls ``name``, is neither or not finite.
+    It counts as outside. A sentence is added to the notes if the sign was inferred and may be
+    wrong.
     """
-    try:
-        array = np.asarray(number)
-        if array.dtype.kind not in "fiu":  # booleans and strings are refused
-            raise TypeError
-        with np.errstate(over="ignore"):  # of long doubles, which are found to be infinite below
-            triple = np.broadcast_to(array.astype(np.float64).ravel(), (3,))
-    except (TypeError, ValueError, RuntimeError):
-        raise GridError(f"{name} is {seen(number)}: give one number or three") from None
-    if not np.isfinite(triple).all():
-        raise GridError(f"{name} is {seen(number)}: it must be finite")
-    return float(triple[0]), float(triple[1]), float(triple[2])
-
-
-def check_spacing(spacing: ArrayLike) -> Triple:
-    """Return the spacing as three floats.
-
-    Raises
-    ------
-    GridError
-        If they are not positive, out of range, or one is more than 50 times another.
-    """
-    triple = as_triple(spacing, "spacing")
-    if min(triple) <= 0:
-        raise GridError(f"spacing is {_join(triple)}: it must be greater than 0")
-    if not LEAST_SPACING <= min(triple) <= max(triple) <= MOST_SPACING:
-        raise GridError(
-            f"spacing is {_join(triple)}: give lengths in a unit in which it is between "
-            f"{LEAST_SPACING:g} and {MOST_SPACING:g}"
+    if inside != "auto":
+        return inside == "positive"
+    if census.is_one_sided:
+        return census.numbers.low < 0
+    below, total = int(census.numbers.border[0]), census.border_size
+    positive = 2 * below > total
+    share = max(below, total - below) / total
+    if positive or share < 1:
+        sign = "positive" if positive else "negative"
+        notes.append(
+            f"{sign} values are taken as inside: {share:.0%} of the grid's border has the other "
+            "sign (if that is wrong, use --inside)"
         )
-    if max(triple) > min(triple) * MOST_UNEQUAL:
+    return positive
+
+
+def check_negative_inside(census: Census) -> None:
+    """Raise GridError if most of the border is negative: the sign seems to be reversed."""
+    below, total = int(census.numbers.border[0]), census.border_size
+    if 2 * below > total:
         raise GridError(
-            f"spacing is {_join(triple)}: the largest may be {MOST_UNEQUAL:g} times the smallest; "
-            "leave out samples along the finer axes"
+            f"{below / total:.0%} of the grid's border is negative, which is inside: make the grid "
+            "with make_grid(values, spacing=..., inside='positive'), or inside='negative' if the "
+            "solid does run out of the grid there"
         )
-    return triple
-
-
-def is_cubic(spacing: Triple) -> bool:
-    """Return whether a spacing is the same on all axes, up to 0.1 %."""
-    return max(spacing) <= min(spacing) * (1 + EQUAL_SPACING)
-
-
-def steps_of(spacing: Triple) -> Triple:
-    """Return the spacing of each axis, the mean if they are nearly equal."""
-    return (sum(spacing) / 3,) * 3 if is_cubic(spacing) else spacing
 
 
 def choose_spacing(
-    values: SampleArray, spacing: ArrayLike | None, notes: list[str], *, is_cut: bool = False
+    census: Census, spacing: ArrayLike | None, notes: list[str], *, is_cut: bool = False
 ) -> Triple:
     """Return the given spacing, or else the one that is measured on the values.
 
@@ -103,61 +67,55 @@ def choose_spacing(
     GridError
         If the values change by more than the given spacing allows, or show none.
     """
-    given = None if spacing is None else check_spacing(spacing)
-    beside = surface_gradients(values)
-    if given and not len(beside[0]):
+    beside = census.beside
+    if spacing is not None:
+        given = check_spacing(spacing)
+        if len(beside.bend):
+            if not is_cut:
+                _check_axes(census, beside.in_finest(given), given)
+            _check_unit(census, given, notes, is_cut)
         return given
-    if given:
-        if not is_cut:
-            _check_axes(values, in_finest(beside, given), given)
-        _check_unit(values, beside, given, notes, is_cut)
-        return given
-    everywhere = straight_gradients(values)
-    unequal = unequal_axes(*beside) or unequal_axes(*everywhere)
+    everywhere = census.everywhere
+    unequal = beside.of_axes or everywhere.of_axes
     if unequal or not _show_one_spacing(everywhere):
-        each = spacing_of_axes(*everywhere)
+        each = everywhere.spacing
         if each is not None and each.max() > CLEARLY_UNEQUAL * each.min():
             return _infer_axes(each, notes)
     if unequal:
         steps = ", ".join(f"{step:.4g} along {name}" for name, step in unequal.items())
         raise GridError(
             f"spacing not given: the values change by {steps} from sample to sample, and do not "
-            f"show it for all axes; {way_out(values)}"
+            f"show it for all axes; {way_out(census)}"
         )
-    return _infer_spacing(_measure(everywhere, beside), values.shape, notes)
+    return _infer_spacing(_measure(everywhere, beside), census.shape, notes)
 
 
 def _show_one_spacing(gradients: Gradients) -> bool:
     """Return whether gradients agree on a spacing, whatever their direction."""
-    return len(gradients[0]) < ENOUGH or are_consistent(typical_length(*gradients), *gradients)
+    return len(gradients.bend) < ENOUGH or gradients.agree_with(gradients.typical_length)
 
 
-def in_finest(gradients: Gradients, spacing: Triple) -> Gradients:
-    """Return gradients in index units of the finest axis, if the spacings differ."""
-    if is_cubic(spacing):
-        return gradients
-    return gradients[0] * (min(spacing) / np.array(spacing)), gradients[1]
-
-
-def _check_axes(values: SampleArray, gradients: Gradients, spacing: Triple) -> None:
+def _check_axes(census: Census, gradients: Gradients, spacing: Triple) -> None:
     """Raise GridError if gradients, scaled to one spacing, show different ones along the axes."""
-    found, h = unequal_axes(*gradients), dict(zip("xyz", spacing))
-    if found:
+    unequal, h = gradients.of_axes, dict(zip("xyz", spacing))
+    if unequal:
         steps = ", ".join(
-            f"{step * h[name] / min(spacing):.4g} along {name}" for name, step in found.items()
+            f"{step * h[name] / min(spacing):.4g} along {name}" for name, step in unequal.items()
         )
+        each = ", ".join(f"{x:g}" for x in (spacing[:1] if is_cubic(spacing) else spacing))
         raise GridError(
-            f"the values change by {steps} from sample to sample, but spacing is "
-            f"{_join(spacing[:1] if is_cubic(spacing) else spacing)}: {way_out(values, spacing)}"
+            f"the values change by {steps} from sample to sample, but spacing is {each}: "
+            f"{way_out(census, spacing)}"
         )
 
 
-def _infer_axes(found: NDArray[np.float64], notes: list[str]) -> Triple:
+def _infer_axes(each: NDArray[np.float64], notes: list[str]) -> Triple:
     """Return the estimated spacings of the axes, those that are nearly equal as one."""
-    for near in found.copy():  # axes that are equal but for the error of the estimate
-        alike = np.abs(found / near - 1) <= SNAP
-        found[alike] = found[alike].mean()
-    spacing = check_spacing(found)
+    each = each.copy()
+    for near in each.copy():  # axes that are equal but for the error of the estimate
+        alike = np.abs(each / near - 1) <= SNAP
+        each[alike] = each[alike].mean()
+    spacing = check_spacing(each)
     notes.append(
         f"spacing not given: estimated as {', '.join(f'{h:.6g}' for h in spacing)} along x, y, z "
         "from the values, so the size of the mesh is approximate (give --spacing)"
@@ -165,12 +123,11 @@ def _infer_axes(found: NDArray[np.float64], notes: list[str]) -> Triple:
     return spacing
 
 
-def measure_spacing(values: SampleArray) -> float:
+def measure_spacing(census: Census) -> float:
     """Return the change of values from sample to sample where they are smooth; NaN if nowhere."""
-    everywhere, beside = straight_gradients(values), surface_gradients(values)
-    if not (len(everywhere[0]) or len(beside[0])):
+    if not (len(census.everywhere.bend) or len(census.beside.bend)):
         return float("nan")
-    return _measure(everywhere, beside)
+    return _measure(census.everywhere, census.beside)
 
 
 def _measure(everywhere: Gradients, beside: Gradients) -> float:
@@ -179,12 +136,12 @@ def _measure(everywhere: Gradients, beside: Gradients) -> float:
     It is that of the whole field, unless only the samples beside the surface agree with each other:
     then the field is no distance, and what it is at the surface matters.
     """
-    if len(everywhere[0]) < ENOUGH and len(beside[0]):
-        return typical_length(*beside)
-    measured = typical_length(*everywhere)
-    if len(beside[0]) and not are_consistent(measured, *everywhere):
-        near = typical_length(*beside)
-        return near if are_consistent(near, *beside) else measured
+    if len(everywhere.bend) < ENOUGH and len(beside.bend):
+        return beside.typical_length
+    measured = everywhere.typical_length
+    if len(beside.bend) and not everywhere.agree_with(measured):
+        near = beside.typical_length
+        return near if beside.agree_with(near) else measured
     return measured
 
 
@@ -209,28 +166,25 @@ def _infer_spacing(measured: float, shape: tuple[int, ...], notes: list[str]) ->
     return (measured,) * 3
 
 
-def _check_unit(
-    values: SampleArray, beside: Gradients, spacing: Triple, notes: list[str], is_cut: bool
-) -> None:
+def _check_unit(census: Census, spacing: Triple, notes: list[str], is_cut: bool) -> None:
     """Raise GridError, or add a note, if the values contradict the given spacing.
 
     They do if they change by more. Exact distances change by less beside thin parts: there is no
     note if the rest of the field agrees with the spacing.
     """
-    h = min(steps_of(spacing))
-    beside = in_finest(beside, spacing)
-    measured = typical_length(*beside)
+    h, beside = min(steps_of(spacing)), census.beside.in_finest(spacing)
+    measured = beside.typical_length
     named = f"{spacing[0]:.6g}" if is_cubic(spacing) else f"{h:.6g} along the finest axis"
     observed = f"the values change by {measured:.6g} from sample to sample, but spacing is {named}"
-    allowed = REFUSED if are_consistent(measured, *beside) else REFUSED_IF_UNSURE
+    allowed = REFUSED if beside.agree_with(measured) else REFUSED_IF_UNSURE
     if measured > allowed * h:
-        raise GridError(f"{observed}: {way_out(values, spacing)}")
+        raise GridError(f"{observed}: {way_out(census, spacing)}")
     if _agree(measured, h):
         return
     if measured < h:
-        everywhere = in_finest(straight_gradients(values), spacing)
+        everywhere = census.everywhere.in_finest(spacing)
         if not is_cut:
-            _check_axes(values, everywhere, spacing)
+            _check_axes(census, everywhere, spacing)
         if _agree(_measure(everywhere, beside), h):
             return
     notes.append(f"{observed}: they are not exact distances, or the unit is wrong")
@@ -239,7 +193,3 @@ def _check_unit(
 def _agree(measured: float, h: float) -> bool:
     """Return whether the values change by about as much as the spacing."""
     return h / TOLERATED <= measured <= h * TOLERATED
-
-
-def _join(triple: tuple[float, ...]) -> str:
-    return ", ".join(f"{number:g}" for number in triple)

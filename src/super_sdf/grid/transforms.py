@@ -11,17 +11,17 @@ high wherever it is not along the axes.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from itertools import permutations, product
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, Triple
-from .evidence import BESIDE, Floats, Looked
-from .spacing import is_cubic
+from .census import Looked
+from .placement import is_cubic
+from .questions import BESIDE, Floats
 
 MOST_PATCHES = 1 << 12  # samples that are compared with all round them
 LEAST = 20  # samples from which shares of them are evidence
@@ -36,34 +36,22 @@ Measure: TypeAlias = Callable[[NDArray[np.int64]], Floats]
 """From offsets between samples, (n, 3), to their lengths, (n,); 1 to the nearest sample."""
 
 
-@dataclass(frozen=True)
-class Transform:
-    """A distance transform of a mask.
+class Transform(NamedTuple):
+    """A distance transform: the spacing of the finest axis, and the side of samples that are 0.
 
-    Attributes
-    ----------
-    step : float
-        The spacing of the finest axis, in the unit of the values.
-    zeros : int
-        The sign of the side to which samples that are 0 belong; 0 if it is the inside.
+    ``zeros`` is the sign of that side; 0 if it is the inside.
     """
 
     step: float
     zeros: int
 
 
-@dataclass(frozen=True)
-class Found:
-    """What was seen of values that follow from the sides, where exact distances may not.
+class Apart(NamedTuple):
+    """Where values follow from the sides: at samples at which exact distances may not.
 
-    Attributes
-    ----------
-    apart : bool
-        Whether there are samples whose nearest one of another side is not along an axis. Exact
-        distances to planes half-way between samples are others there.
-    beyond : bool
-        Whether it is along an axis for some, but not next to them: other than of planes at 45
-        degrees.
+    Their nearest one of another side is not along an axis: exact distances to planes half-way
+    between samples are others there. Or it is, but farther than the next (``beyond``): so are those
+    to all but planes at 45 degrees.
     """
 
     apart: bool
@@ -71,14 +59,9 @@ class Found:
 
 
 def find_transform(looked: Looked, spacing: Triple | None) -> Transform | None:
-    """Return what transform of a mask values are, None if they cannot be one.
+    """Return what transform of a mask values are, by samples beside the surface; None if of none.
 
-    Parameters
-    ----------
-    looked : Looked
-        Samples beside the surface.
-    spacing : three floats, optional
-        The spacing of each axis, if it is known.
+    ``spacing`` is that of each axis, if it is known.
     """
     steps = np.ones(3) if spacing is None or is_cubic(spacing) else np.array(spacing)
     steps = steps / steps.min()
@@ -116,9 +99,8 @@ def _beside(patches: Floats, inside: BoolArray, steps: Floats) -> tuple[float, f
         if len(side) < LEAST // 2 or alike.mean() < MOST:
             return None
         ends.append(middle)
-    low, high = ends
     share = min(ends) / max(ends) if max(ends) > 0 else 0.5
-    return (low, high) if share <= ZERO or share >= 1 - ERROR else None
+    return (ends[0], ends[1]) if share <= ZERO or share >= 1 - ERROR else None
 
 
 def _of_both_sides(
@@ -130,39 +112,35 @@ def _of_both_sides(
         if _follow(patches, sides, measure, (0, 0), clipped):
             return Transform(step, 0)
     for measure, step in _euclidean(steps, 2 * unit):
-        if (found := _follow(patches / 2, sides, measure, (0.5, 0.5), clipped / 2)) and found.apart:
+        seen = _follow(patches / 2, sides, measure, (0.5, 0.5), clipped / 2)
+        if seen and seen.apart:
             return Transform(step, 0)
     return None
 
 
 def _with_zeros(
-    patches: Floats,
-    steps: Floats,
-    clipped: Floats,
-    unit: float,
-    side: int,
-    *,
-    is_flat: bool,
+    patches: Floats, steps: Floats, clipped: Floats, unit: float, side: int, *, is_flat: bool
 ) -> Transform | None:
     """Return the transform if samples beside the surface are 0 on one side.
 
     ``side`` is the sign of the others there. Values that are ``is_flat`` beyond the second sample
     may be the shares of voxels that are inside, 0, 1/2 and 1.
     """
-    own = np.sign(patches)
+    signs = np.sign(patches)
     one_sided = clipped.min() == 0
     euclidean = list(_euclidean(steps, unit))
     for measure, step in (*euclidean, *_others(steps, unit, weighted=one_sided)):
-        found = _follow(patches, own, measure, (0, 0), clipped)
-        if found and one_sided and is_flat and not found.apart:
+        seen = _follow(patches, signs, measure, (0, 0), clipped)
+        if seen and one_sided and is_flat and not seen.apart:
             return None
-        if found and (found.beyond or (measure, step) in euclidean):
-            is_mask = _is_filled(own) or _is_stepped(own)
-            return Transform(step, side if one_sided else _side_of_zeros(own)) if is_mask else None
-    joined = np.where(own == 0, side, own)
+        if seen and (seen.beyond or (measure, step) in euclidean):
+            is_mask = _count_lone(signs == 0) >= LEAST or _is_stepped(signs)
+            zeros = side if one_sided else _side_of_zeros(signs)
+            return Transform(step, zeros) if is_mask else None
+    joined = np.where(signs == 0, side, signs)
     for measure, step in euclidean:
-        found = _follow(patches, joined, measure, (side < 0, side > 0), clipped)
-        if found and found.apart:
+        seen = _follow(patches, joined, measure, (side < 0, side > 0), clipped)
+        if seen and seen.apart:
             return Transform(step, side)
     return None
 
@@ -180,14 +158,10 @@ def _euclidean(steps: Floats, unit: float) -> Iterator[tuple[Measure, float]]:
 def _others(steps: Floats, unit: float, *, weighted: bool) -> Iterator[tuple[Measure, float]]:
     """Yield the squares of these, and ``weighted`` measures: chessboard, city-block and 3-4-5."""
     for length, _ in _euclidean(steps, unit):
-        yield partial(_squared, length), unit**0.5
+        yield lambda offsets, length=length: length(offsets) ** 2, unit**0.5  # type: ignore[misc]
     if weighted:
         yield from ((partial(_weighted, weight), unit) for weight in (0.0, 1.0))
         yield partial(_weighted, 1 / 3), unit / 3
-
-
-def _squared(length: Measure, offsets: NDArray[np.int64]) -> Floats:
-    return length(offsets) ** 2
 
 
 def _length(steps: Floats, offsets: NDArray[np.int64]) -> Floats:
@@ -203,13 +177,9 @@ def _weighted(weight: float, offsets: NDArray[np.int64]) -> Floats:
 
 
 def _follow(
-    patches: Floats,
-    sides: Floats,
-    measure: Measure,
-    less: tuple[float, float],
-    clipped: Floats,
-) -> Found | None:
-    """Return what shows that values follow from the sides, less something on either; None if not.
+    patches: Floats, sides: Floats, measure: Measure, less: tuple[float, float], clipped: Floats
+) -> Apart | None:
+    """Return where values follow from the sides, less something on either; None if they do not.
 
     ``clipped`` are the largest values.
     """
@@ -222,12 +192,9 @@ def _follow(
     free = known & (expected > nearest - ERROR)
     groups = known, free & ~straight, free & straight & (expected > 1 + ERROR)
     enough = [bool(group.sum() >= LEAST) for group in groups]
-    follow = all(
-        agree[group].mean() >= share
-        for group, share, is_enough in zip(groups, (MOST, MOST_APART, MOST_APART), enough)
-        if is_enough
-    )
-    return Found(*enough[1:]) if enough[0] and follow else None
+    shares = zip(groups, (MOST, MOST_APART, MOST_APART), enough)
+    follow = all(agree[group].mean() >= share for group, share, is_enough in shares if is_enough)
+    return Apart(*enough[1:]) if enough[0] and follow else None
 
 
 def _nearest(sides: Floats, measure: Measure) -> tuple[Floats, BoolArray]:
@@ -251,14 +218,11 @@ def _nearest(sides: Floats, measure: Measure) -> tuple[Floats, BoolArray]:
     return nearest, straight != 0
 
 
-def _is_filled(sides: Floats) -> bool:
-    """Return whether there are zeros amid zeros, as on the other side of one-sided transforms."""
-    return int((~_windows(sides).any((-3, -2, -1))).sum()) >= LEAST
-
-
-def _windows(sides: Floats) -> Floats:
-    """Return the neighbours of inner samples and these, (m, 3, 3, 3, 3, 3, 3)."""
-    return np.lib.stride_tricks.sliding_window_view(sides, (3, 3, 3), axis=(1, 2, 3))
+def _count_lone(marked: BoolArray, centre: BoolArray | None = None) -> int:
+    """Count inner samples, those of ``centre`` if given, round which all are marked."""
+    windows = np.lib.stride_tricks.sliding_window_view(marked, (3, 3, 3), axis=(1, 2, 3))
+    alone = windows.all((-3, -2, -1))
+    return int((alone if centre is None else alone & centre).sum())
 
 
 def _is_stepped(sides: Floats) -> bool:
@@ -276,9 +240,9 @@ def _is_stepped(sides: Floats) -> bool:
     for i, j in permutations(range(6), 2):
         if i % 3 != j % 3:
             goes_on = _at(zero, ways[i] - ways[j]) & _at(zero, ways[j] - ways[i])
-            found = next_to[i] & next_to[j] & ~goes_on
-            stepped |= found
-            counts[i, j] = found.sum()
+            steps = next_to[i] & next_to[j] & ~goes_on
+            stepped |= steps
+            counts[i, j] = steps.sum()
     share = stepped.sum() / max(np.any(next_to, 0).sum(), LEAST)
     both_ways = np.minimum(counts, np.roll(counts, (3, 3), (0, 1)))
     return bool(share > STEPPED and both_ways.any())
@@ -286,8 +250,7 @@ def _is_stepped(sides: Floats) -> bool:
 
 def _at(patches: BoolArray, offset: NDArray[np.int64]) -> BoolArray:
     """Return the samples at an offset from the middle of patches (m, 3, 3, 3)."""
-    found: BoolArray = patches[(..., *(1 + offset))]
-    return found
+    return np.asarray(patches[(..., *(1 + offset))])
 
 
 def _side_of_zeros(sides: Floats) -> int:
@@ -296,5 +259,5 @@ def _side_of_zeros(sides: Floats) -> int:
     Each of them has a neighbour of the other side then, but not of its own side.
     """
     zero = sides[:, INNER, INNER, INNER] == 0
-    lone = [int((zero & ~(_windows(sides) == sign).any((-3, -2, -1))).sum()) for sign in (-1, 1)]
+    lone = [_count_lone(sides != sign, zero) for sign in (-1, 1)]
     return int(np.sign(lone[1] - lone[0]))

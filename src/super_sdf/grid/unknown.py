@@ -2,13 +2,16 @@
 
 An infinite sample is on the side of its sign. One that is NaN is on the side of the known samples
 round the connected region of such samples that it lies in. All get the cut-off of their side: the
-largest known distance there. Where a region has both sides beside it, the surface ends. The planes
-are read one after the other, and only where the runs of NaN along z begin is kept in memory.
+largest known distance there. Where a region has both sides beside it, the surface ends.
+
+Many programs write 0, 1, -1000 or 1e10 instead. That is told by what no distance does: whole
+regions of samples have exactly this value, and beside them the values jump; or they are 0.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections import deque
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,33 +19,33 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray
 from ..errors import GridError
-from .planes import SampleArray, SamplePlanes, changed
-from .samples import Extremes, not_finite
-from .sides import count_border
-
-Ints = NDArray[np.int64]
-IsMarked = Callable[[NDArray[Any]], BoolArray]
+from .census import Census, Extremes, not_finite
+from .planes import SampleArray, SamplePlanes
+from .regions import RUN_BYTES, Ints, Regions, with_the_one_before
 
 LAYERS = 3  # of unknown samples to which the surface beside them is continued
-RUN_BYTES = 32  # per sample of a plane, to number its runs
 WAY_OUT = "replace each by a distance of the right sign (the cut-off value of its side)"
+FREQUENT, LEAST_VALUES = 8, 6  # values that are tried, and different ones that tell steepness
+# From sample to sample values change by at most ``JUMP`` times the steepest typical change, but
+# beside unseen ones: nearly all changes there are larger.
+STEEPEST, JUMP, UNSEEN = 0.95, 1.5, 0.9
+# Share of the changes of sign that are jumps from where values are cut off: .00 where all was seen,
+# .15 and more where the unseen has that value, too; also at the edges of what few views saw, but
+# there the unseen was filled in, and the sign changes as often from one extreme to the other.
+MIXED, FILLED_IN = 0.1, 0.03
+FEW_SPANS = 3.0  # times what few values span is more than they change by
+MANY = 4096  # samples among which different values are counted
+ENOUGH = 30  # changes from which the steepest is known
+LEAST_JUMPS = 6  # beside one value
+
+Floats = NDArray[np.float64]
 
 
 class KnownPlanes(SamplePlanes):
     """Samples whose unknown ones are replaced by the cut-off of their side, when they are read.
 
-    Where both sides are near, the samples are continued linearly over ``LAYERS`` unknown ones.
-
-    Parameters
-    ----------
-    source : (nx, ny, nz) array or SamplePlanes
-        The samples.
-    regions : Regions
-        Of the samples that are NaN.
-    limits : two floats
-        The cut-offs: the lowest and the highest finite sample.
-    outside : float
-        The one of these that unknown samples get far from known ones of both sides.
+    Where both sides are near, the samples are continued linearly over ``LAYERS`` unknown ones;
+    farther away, unknown ones get ``outside``, one of the two ``limits``.
     """
 
     name = "the grid"
@@ -69,25 +72,22 @@ class KnownPlanes(SamplePlanes):
     @property
     def unseen(self) -> SampleArray | None:
         """Which samples are unknown and have both sides, or none, beside their region."""
-        return UnseenPlanes(self) if self.beside else None
+        return UnseenPlanes(self.source, self.regions) if self.beside else None
 
     def read(self, first: int, last: int) -> NDArray[Any]:
         """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
         start, stop = max(first - self.beside, 0), min(last + self.beside, len(self))
         planes = np.array(self.source[start:stop])
         low, high = self.limits
-        unsure = np.zeros(planes.shape, bool)
         for i, plane in enumerate(planes, start):
             unknown, infinite = np.isnan(plane), np.isinf(plane)
             runs = self.regions.runs_of(i, unknown)[unknown]
-            plane[unknown] = np.where(self.regions.positive[runs], high, low)
+            filled = np.where(self.regions.positive[runs], high, low)
+            plane[unknown] = np.where(self.regions.unsure[runs], np.nan, filled)
             plane[infinite] = np.where(plane[infinite] > 0, high, low)
-            unsure[i - start][unknown] = self.regions.unsure[runs]
-        if unsure.any():
-            planes[unsure] = np.nan
-            if self.beside:
-                planes = continued(planes, self.limits)
-            planes[np.isnan(planes)] = self.outside
+        if self.beside:
+            planes = _continued(planes, self.limits)
+        planes[np.isnan(planes)] = self.outside
         return planes[first - start : last - start]
 
     def working_bytes(self, planes: int) -> int:
@@ -96,14 +96,30 @@ class KnownPlanes(SamplePlanes):
         return copies * (planes + 2 * self.beside) * self.plane_bytes + RUN_BYTES * plane
 
 
+def _continued(planes: NDArray[Any], limits: Extremes) -> NDArray[Any]:
+    """Return planes in which samples are continued linearly over ``LAYERS`` that are NaN."""
+    for _ in range(LAYERS if np.isnan(planes).any() else 0):
+        total, count = np.zeros(planes.shape), np.zeros(planes.shape, np.int8)
+        for axis in range(3):
+            for flipped in (slice(None), slice(None, None, -1)):
+                values = np.moveaxis(planes, axis, 0)[flipped]
+                line = 2 * values[1:-1] - values[:-2]  # at the sample after these two
+                known = np.isfinite(line)
+                np.moveaxis(total, axis, 0)[flipped][2:] += np.where(known, line, 0)
+                np.moveaxis(count, axis, 0)[flipped][2:] += known
+        new = np.isnan(planes) & (count > 0)
+        planes[new] = np.clip(total[new] / count[new], *limits)
+    return planes
+
+
 class UnseenPlanes(SamplePlanes):
     """Which samples are unknown, with both sides beside their region, or none."""
 
     name = "the grid"
     dtype = np.dtype(bool)
 
-    def __init__(self, known: KnownPlanes) -> None:
-        self.source, self.regions, self.shape = known.source, known.regions, known.shape
+    def __init__(self, source: SampleArray, regions: Regions) -> None:
+        self.source, self.regions, self.shape = source, regions, tuple(source.shape)
 
     def read(self, first: int, last: int) -> BoolArray:
         """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
@@ -125,230 +141,240 @@ class UnseenPlanes(SamplePlanes):
         )
 
 
-def continued(planes: NDArray[Any], limits: Extremes) -> NDArray[Any]:
-    """Return planes in which samples are continued linearly over ``LAYERS`` that are NaN."""
-    for _ in range(LAYERS):
-        total, count = np.zeros(planes.shape), np.zeros(planes.shape, np.int8)
-        for axis in range(3):
-            for flipped in (slice(None), slice(None, None, -1)):
-                values = np.moveaxis(planes, axis, 0)[flipped]
-                line = 2 * values[1:-1] - values[:-2]  # at the sample after these two
-                known = np.isfinite(line)
-                np.moveaxis(total, axis, 0)[flipped][2:] += np.where(known, line, 0)
-                np.moveaxis(count, axis, 0)[flipped][2:] += known
-        new = np.isnan(planes) & (count > 0)
-        planes[new] = np.clip(total[new] / count[new], *limits)
-    return planes
+class SeenPlanes(SamplePlanes):
+    """Samples that are NaN in some regions of a value, when they are read."""
+
+    name = "the grid"
+    dtype = np.dtype(np.float64)
+
+    def __init__(
+        self, source: SampleArray, regions: Regions, unseen: BoolArray, value: float
+    ) -> None:
+        self.source, self.regions, self.unseen, self.value = source, regions, unseen, value
+        self.shape = tuple(source.shape)
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
+        planes = np.array(self.source[first:last], np.float64)
+        for i, plane in enumerate(planes, first):
+            marked = self.regions.is_marked(plane)
+            runs = self.regions.runs_of(i, marked)[marked]
+            plane[marked] = np.where(self.unseen[runs], np.nan, plane[marked])
+        return planes
+
+    def working_bytes(self, planes: int) -> int:
+        """Return about how much memory making that many planes takes."""
+        return 2 * planes * self.plane_bytes + RUN_BYTES * self.shape[1] * self.shape[2]
 
 
-class Regions:
-    """The connected regions of samples that are NaN, or marked, made of their runs along z.
+def filled(census: Census, notes: list[str]) -> KnownPlanes:
+    """Return samples of which the unknown ones are replaced, and say so in the notes.
 
-    Parameters
-    ----------
-    samples : (nx, ny, nz) array or Planes
-    is_marked : callable
-        Returns which samples of a plane are.
-
-    Attributes
-    ----------
-    before : (nx + 1,) int64
-        How many runs there are before each plane, and in all.
-    start, size, root : (n,) int64
-        The first sample of each run, in C order, its length, and the first run of its region.
-    positive, negative, unsure : (n,) bool
-        Whether the region of a run has known samples beside it that are positive, and negative or
-        0; and whether it has both, or none.
+    GridError if no sample is known, or one that is infinite is beside the surface.
     """
-
-    def __init__(self, samples: SampleArray, is_marked: IsMarked = np.isnan) -> None:
-        self.is_marked = is_marked
-        self.before = np.zeros(len(samples) + 1, np.int64)
-        found = [self._look(i, *planes) for i, planes in enumerate(with_the_one_before(samples))]
-        starts, sizes, joined, positive, negative = zip(*found)
-        self.start, self.size = np.concatenate(starts), np.concatenate(sizes)
-        self.root = root = components(len(self.start), np.concatenate(joined, axis=1))
-        self.positive = _of_regions(root, np.concatenate(positive))
-        self.negative = _of_regions(root, np.concatenate(negative))
-        self.unsure: BoolArray = self.positive == self.negative
-
-    def runs_of(self, i: int, unknown: BoolArray) -> Ints:
-        """Return the run that each sample of plane ``i`` is in, (ny, nz); -1 for known ones."""
-        numbers = np.cumsum(_begins(unknown)).reshape(unknown.shape) - 1 + self.before[i]
-        return np.where(unknown, numbers, -1)
-
-    def _look(
-        self, i: int, plane: NDArray[Any], former: NDArray[Any] | None
-    ) -> tuple[Ints, Ints, Ints, Ints, Ints]:
-        """Return start and size of a plane's runs, pairs that touch, and runs beside known samples.
-
-        The pairs, (2, n), and the runs beside positive and others may be of the plane before, too.
-        """
-        unknown = self.is_marked(plane)
-        runs, start = self.runs_of(i, unknown), np.flatnonzero(_begins(unknown))
-        size = np.bincount(runs[unknown] - self.before[i], minlength=len(start))
-        self.before[i + 1] = self.before[i] + len(start)
-        sides = [(runs[:, 1:], runs[:, :-1], plane[:, 1:], plane[:, :-1])]
-        sides += [(runs[1:], runs[:-1], plane[1:], plane[:-1])]
-        if former is not None:
-            sides += [(runs, self.runs_of(i - 1, self.is_marked(former)), plane, former)]
-        pairs, positive, negative = zip(*(_beside(*side) for side in sides))
-        joined = np.concatenate(pairs, axis=1)
-        return (
-            start + i * plane.size,
-            size,
-            joined,
-            np.concatenate(positive),
-            np.concatenate(negative),
-        )
-
-
-def filled(samples: SampleArray, notes: list[str]) -> tuple[KnownPlanes, Extremes]:
-    """Return samples of which the unknown ones are replaced, and the extremes of all.
-
-    Parameters
-    ----------
-    samples : (nx, ny, nz) array or Planes
-        Floating-point numbers, NaN or infinite where they are unknown.
-    notes : list of str
-        Sentences say how many were replaced, and how many may hide the surface.
-
-    Raises
-    ------
-    GridError
-        If no sample is known, or one that is infinite is beside the surface.
-    """
-    low, high, infinite = _look_at_numbers(samples)
-    regions = Regions(samples)
-    count = int(regions.size.sum()) + infinite
+    samples, numbers, regions = census.samples, census.numbers, census.unknown
+    low, high = finite_extremes(census)
+    nan = int(regions.size.sum())
     outer = int(regions.size[regions.positive & ~regions.unsure].sum())
     notes.append(
-        f"{count:,} samples are unknown ({count - infinite:,} NaN, of which {outer:,} lie on the "
-        f"positive side, and {infinite:,} infinite): they are taken as cut off at {low:.6g} and "
-        f"{high:.6g}"
+        f"{nan + numbers.infinite:,} samples are unknown ({nan:,} NaN, of which {outer:,} lie on "
+        f"the positive side, and {numbers.infinite:,} infinite): they are taken as cut off at "
+        f"{low:.6g} and {high:.6g}"
     )
-    outside = high
+    below, above, _ = numbers.border
     if regions.unsure.any():
-        below, above = count_border(samples)[0], count_border(changed(samples, np.negative))[0]
-        outside = low if below > above else high
         notes.append(
             f"{int(regions.size[regions.unsure].sum()):,} of the unknown samples are in regions "
             "that touch both sides of the surface: it is open there"
         )
-    return KnownPlanes(samples, regions, (low, high), outside), (low, high)
+    return KnownPlanes(samples, regions, (low, high), low if below > above else high)
 
 
-def finite_extremes(samples: SampleArray) -> Extremes:
-    """Return the lowest and the highest finite sample; GridError if none is finite."""
-    low, high, _ = _look_at_numbers(samples)
+def finite_extremes(census: Census) -> Extremes:
+    """Return the lowest and the highest finite sample; GridError as above."""
+    low, high = census.extremes
+    if low > high:
+        raise not_finite(census.samples)
+    if census.numbers.infinite:
+        _check_infinite(census.samples)
     return low, high
 
 
-def _look_at_numbers(samples: SampleArray) -> tuple[float, float, int]:
-    """Return the lowest and the highest finite sample, and the number of infinite ones.
-
-    Raises
-    ------
-    GridError
-        If none is finite, or one that is infinite is beside the surface.
-    """
-    low, high, infinite = np.inf, -np.inf, 0
-    beside: list[Ints] = []
-    for i, (plane, former) in enumerate(with_the_one_before(samples)):
-        finite = plane[np.isfinite(plane)]
-        low = min(low, float(finite.min(initial=np.inf)))
-        high = max(high, float(finite.max(initial=-np.inf)))
-        infinite += int(np.isinf(plane).sum())
-        beside.append(_infinite_at_surface(i, plane, former))
-    if low > high:
-        raise not_finite(samples)
-    _check_infinite(np.concatenate(beside), samples)
-    return low, high, infinite
-
-
-def _infinite_at_surface(i: int, plane: NDArray[Any], former: NDArray[Any] | None) -> Ints:
-    """Return the infinite samples of a plane, and of that before, beside one of the other sign.
-
-    They are (n, 3) indices.
-    """
-    pairs = [((0, 0, 1), plane[:, 1:], plane[:, :-1]), ((0, 1, 0), plane[1:], plane[:-1])]
-    pairs += [((1, 0, 0), plane, former)] if former is not None else []
-    found = [np.empty((0, 3), np.int64)]
-    for step, one, other in pairs:
-        known = ~(np.isnan(one) | np.isnan(other))
-        crossed = known & ((one > 0) != (other > 0))
-        for values, shift in ((one, step), (other, (0, 0, 0))):
-            jk = np.argwhere(crossed & np.isinf(values))
-            plane_of = np.full((len(jk), 1), i - step[0])
-            found.append(np.concatenate([plane_of, jk], axis=1) + np.array(shift))
-    return np.unique(np.concatenate(found), axis=0)
-
-
-def _check_infinite(beside: Ints, samples: SampleArray) -> None:
-    """Raise GridError if infinite samples, (n, 3), are beside the surface."""
+def _check_infinite(samples: SampleArray) -> None:
+    """Raise GridError if infinite samples are beside the surface."""
+    parts = [np.empty((0, 3), np.int64)]
+    for i, slab in enumerate(with_the_one_before(samples)):
+        plane = slab[-1]
+        pairs = [((0, 0, 1), plane[:, 1:], plane[:, :-1]), ((0, 1, 0), plane[1:], plane[:-1])]
+        pairs += [((1, 0, 0), plane, slab[0])] if i else []
+        for step, one, other in pairs:
+            crossed = ~(np.isnan(one) | np.isnan(other)) & ((one > 0) != (other > 0))
+            for values, shift in ((one, step), (other, (0, 0, 0))):
+                jk = np.argwhere(crossed & np.isinf(values))
+                plane_of = np.full((len(jk), 1), i - step[0])
+                parts.append(np.concatenate([plane_of, jk], axis=1) + np.array(shift))
+    beside = np.unique(np.concatenate(parts), axis=0)
     if len(beside):
         i, j, k = (int(index) for index in beside[0])
         raise GridError(
             f"values[{i}, {j}, {k}] is {samples[i][j, k]!s}, and a sample beside it has the other "
-            f"sign, as at {len(np.unique(beside, axis=0)):,} infinite samples: where the surface "
-            f"passes between them is unknown; {WAY_OUT}, or by NaN where nothing was seen"
+            f"sign, as at {len(beside):,} infinite samples: where the surface passes between them "
+            f"is unknown; {WAY_OUT}, or by NaN where nothing was seen"
         )
 
 
-def _begins(unknown: BoolArray) -> BoolArray:
-    """Return where runs of NaN begin along the rows of a plane."""
-    begins = unknown.copy()
-    begins[:, 1:] &= ~unknown[:, :-1]
-    return begins
+def without_unseen(census: Census, notes: list[str]) -> Census:
+    """Return what samples show that are NaN where they have a value that stands for unseen ones.
 
-
-def with_the_one_before(
-    samples: SampleArray,
-) -> Iterator[tuple[NDArray[Any], NDArray[Any] | None]]:
-    """Yield each plane with the one before it."""
-    former = None
-    for plane in samples:
-        yield plane, former
-        former = plane
-
-
-def _beside(
-    runs: Ints, other_runs: Ints, values: NDArray[Any], other_values: NDArray[Any]
-) -> tuple[Ints, Ints, Ints]:
-    """Return the pairs of runs beside each other, (2, n), and the runs beside known samples.
-
-    First those beside positive ones, then those beside others; each array is that of neighbours.
+    Of samples that are not all known by their user, those with an extreme value may be beside any
+    others: few views leave such edges. GridError if a value may stand for them, but not everywhere.
     """
-    one, other = runs >= 0, other_runs >= 0
-    both = one & other
-    base = int(max(runs.max(initial=0), other_runs.max(initial=0))) + 1
-    pairs = np.stack(np.divmod(np.unique(runs[both] * base + other_runs[both]), base))
-    positive, negative = [], []
-    for mine, theirs in (
-        (runs[one & ~other], other_values[one & ~other]),
-        (other_runs[other & ~one], values[other & ~one]),
-    ):
-        positive.append(mine[theirs > 0])
-        negative.append(mine[theirs <= 0])
-    return pairs, np.unique(np.concatenate(positive)), np.unique(np.concatenate(negative))
+    extremes = census.extremes if census.is_finite else finite_extremes(census)
+    if not extremes[0] < 0 < extremes[1]:
+        return census
+    samples, all_known = census.samples, census.is_finite
+    for value, steepest in _suspects(census.pairs, extremes):
+        regions = Regions.of(samples, partial(np.equal, value))
+        unseen = _unseen_runs(samples, regions, value, steepest, extremes)
+        if unseen.any():
+            notes.append(
+                f"{int(regions.size[unseen].sum()):,} samples are exactly {value:g}, where no "
+                "distance is: they are taken as unknown (write NaN where nothing was seen)"
+            )
+            samples, all_known = SeenPlanes(samples, regions, unseen, value), False
+        elif all_known and value in extremes:
+            _check_jumps(census, value, int(regions.size.sum()), JUMP * steepest)
+    return census if samples is census.samples else Census(samples)
 
 
-def components(count: int, pairs: Ints) -> Ints:
-    """Return the lowest of the numbers from 0 to ``count`` that each is joined to by pairs."""
-    root = np.arange(count)
-    while True:
-        one, other = root[pairs]
-        apart = one != other
-        if not apart.any():
-            return root
-        pairs, low = pairs[:, apart], np.minimum(one, other)[apart]
-        np.minimum.at(root, np.maximum(one, other)[apart], low)
-        while (root != root[root]).any():
-            root = root[root]
+def _suspects(pairs: Floats, extremes: Extremes) -> list[tuple[float, float]]:
+    """Return values that may stand for unseen samples, and the steepest change of the others."""
+    values, counts = np.unique(pairs[0], return_counts=True)
+    often = values[counts >= ENOUGH][np.argsort(counts[counts >= ENOUGH])[-FREQUENT:]]
+    changes = np.abs(pairs[1] - pairs[0])
+    ordered = np.sort(changes)
+    extreme = _are_any(pairs, extremes)
+    changes[extreme[0] & extreme[1]] = 0  # values that are cut off near the surface
+    suspects = []
+    for value in np.unique([0.0, *extremes, *often]):
+        has = pairs == value
+        beside = np.sort(changes[has[0] != has[1]])[-LEAST_JUMPS:]
+        largest = beside[0] if len(beside) == LEAST_JUMPS else 0.0
+        is_plateau = value == 0 and (has[0] & has[1]).sum() >= ENOUGH
+        if not is_plateau and largest <= JUMP * _least_steep(pairs, ordered, has, extreme):
+            continue
+        steepest = _steepest(pairs, value, extremes)
+        if value in extremes and _is_cut_near(pairs, value, steepest, extremes):
+            continue
+        if is_plateau or largest > JUMP * steepest:
+            suspects.append((float(value), steepest))
+    return suspects
 
 
-def _of_regions(root: Ints, runs: Ints) -> BoolArray:
-    """Return which runs are in the region of one of some runs."""
-    found = np.zeros(len(root), bool)
-    found[root[runs]] = True
-    return found[root]
+def _least_steep(pairs: Floats, ordered: Floats, has: BoolArray, extreme: BoolArray) -> float:
+    """Return what ``_steepest`` exceeds, by all changes in order; 0 where that does not show."""
+    inner = pairs[~(has | extreme)]
+    if len(np.unique(inner[:MANY])) < LEAST_VALUES:
+        return 0.0
+    first, last = np.searchsorted(ordered, [0, np.ptp(inner)], "right")
+    rest = last - first - int((has[0] | has[1]).sum())  # if all others are steeper
+    return float(ordered[first + int(STEEPEST * (rest - 1))]) if rest > ENOUGH else 0.0
+
+
+def _is_cut_near(pairs: Floats, value: float, steepest: float, extremes: Extremes) -> bool:
+    """Return whether the sign changes from one extreme to the other, and others are near a value.
+
+    So it does where values are cut off near the surface, or what is unseen was filled in by hand.
+    """
+    crossing = pairs[:, (pairs[0] > 0) != (pairs[1] > 0)]
+    others = pairs[~_are_any(pairs, extremes)]
+    near = np.abs(others - value).min(initial=np.inf) < JUMP * steepest
+    return bool(near and _are_any(crossing, extremes).all(0).mean() > FILLED_IN)
+
+
+def _steepest(pairs: Floats, value: float, extremes: Extremes) -> float:
+    """Return the steepest change of samples without a value, or all that they span, if few tell."""
+    rest, inner = pairs[pairs != value], pairs[~_are_any(pairs, (value, *extremes))]
+    changes = np.abs(pairs[1] - pairs[0])[(pairs != value).all(0)]
+    span = np.ptp(inner) if len(inner) else 0.0  # larger changes are those to another such value
+    changes = changes[(changes > 0) & (changes <= span)]
+    if len(changes) < ENOUGH or len(np.unique(inner[:MANY])) < LEAST_VALUES:
+        low, high = rest.min(initial=0), rest.max(initial=0)
+        return FEW_SPANS * float(high - low) if low < 0 < high else np.inf
+    return float(np.quantile(changes, STEEPEST))
+
+
+def _check_jumps(census: Census, value: float, count: int, limit: float) -> None:
+    """Raise GridError if the sign changes mostly by jumps from where values are cut off."""
+    pairs = census.pairs[:, (census.pairs[0] > 0) != (census.pairs[1] > 0)]
+    jumps = _are_jumps(pairs, limit, census.extremes) & (pairs == value).any(0)
+    if jumps.mean() > MIXED and jumps.sum() >= LEAST_JUMPS:
+        raise GridError(
+            f"{count:,} samples are exactly {value:g}, and beside some the values jump as no "
+            "distance does: write NaN where nothing was seen"
+        )
+
+
+def _are_any(values: Floats, some: tuple[float, ...]) -> BoolArray:
+    """Return which values are one of some."""
+    are_any = np.zeros(values.shape, bool)
+    for one in some:
+        are_any |= values == one
+    return are_any
+
+
+def _are_jumps(pairs: Floats, limit: float, extremes: Extremes) -> BoolArray:
+    """Return which pairs (2, n) differ by more than a limit, but for those of both extremes.
+
+    Values that are cut off near the surface, or filled in by hand, go from one to the other.
+    """
+    large: BoolArray = np.abs(pairs[1] - pairs[0]) > limit
+    return large & ~_are_any(pairs, extremes).all(0)
+
+
+def _unseen_runs(
+    samples: SampleArray, regions: Regions, value: float, steepest: float, extremes: Extremes
+) -> BoolArray:
+    """Return which runs of a value were never seen, (n,)."""
+    beside, jumps, above, amid = _count_beside(samples, regions, JUMP * steepest, extremes)
+    unseen = (jumps > UNSEEN * beside) & (jumps > 0)
+    unseen |= (beside == 0) & unseen.any()
+    if value == 0:  # no distance is 0 throughout, though on a surface it is at corners of steps
+        unseen |= amid > 0
+        unseen |= ((above == 0) | (above == beside)) & unseen.any()
+    return np.asarray(unseen[regions.root])
+
+
+def _count_beside(
+    samples: SampleArray, regions: Regions, limit: float, extremes: Extremes
+) -> NDArray[np.int64]:
+    """Count, by the first run of each region, the pairs of its samples with others, (4, n).
+
+    All but those of both extremes; those that differ by more than a limit; those with one above 0;
+    and samples that have only others of the region round them.
+    """
+    counts = np.zeros((4, len(regions.root)), np.int64)
+
+    def count(which: int, runs: Ints) -> None:
+        counts[which] += np.bincount(regions.root[runs], minlength=counts.shape[1])
+
+    before: deque[tuple[Ints, NDArray[Any]]] = deque(maxlen=2)
+    for i, plane in enumerate(samples):
+        runs = regions.runs_of(i, regions.is_marked(plane))
+        sides = [(runs[1:], plane[1:], runs[:-1], plane[:-1])]
+        sides += [(runs[:, 1:], plane[:, 1:], runs[:, :-1], plane[:, :-1])]
+        sides += [(runs, plane, *before[-1])] if before else []
+        sides += [(other, others, one, values) for one, values, other, others in sides]
+        for one, values, other, others in sides:
+            at = (one >= 0) & (other < 0) & np.isfinite(others)
+            pairs = np.stack([values[at], others[at]]).astype(np.float64)
+            count(0, one[at][~_are_any(pairs, extremes).all(0)])
+            count(1, one[at][_are_jumps(pairs, limit, extremes)])
+            count(2, one[at][pairs[1] > 0])
+        if len(before) == 2:
+            amid = (before[0][0] >= 0) & (before[1][0] >= 0) & (runs >= 0)
+            amid = amid[2:] & amid[1:-1] & amid[:-2]
+            amid = amid[:, 2:] & amid[:, 1:-1] & amid[:, :-2]
+            count(3, before[1][0][1:-1, 1:-1][amid])
+        before.append((runs, plane))
+    return counts

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from ..errors import OptionError
 from ..grid.cubic import cubic_grid
+from ..grid.placement import as_triple
 from ..grid.sdf_grid import SdfGrid
-from ..grid.spacing import as_triple
 from ..steps.field import FineField
 from .choices import AXES
 from .page import check_page, write_picture

@@ -71,7 +71,7 @@ def _sharp_bytes(band: Band, planes: Range, decoded: int, factor: int, threads: 
 
     Where edges are is not known yet: every voxel of the planes beside a group may be near one.
     """
-    from ..steps.sharp_groups import GROUP_BYTES, groups_at_once, voxel_bytes
+    from ..steps.sharp.mesher import GROUP_BYTES, groups_at_once, voxel_bytes
 
     beside = BY_NAME[SHARP].planes_beside(factor)
     before = band.decoded_before[max(planes[0] - beside, 0) : planes[1] + beside + 1]

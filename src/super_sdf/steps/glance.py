@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from functools import partial
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..grid.cubic import Resampled
 from ..grid.planes import over_planes, planes_at_once
-from ..grid.resampling import Resampled
 from ..grid.sdf_grid import SdfGrid, without_samples
 from ..neighbourhood import CENTRE
 from .band import BLOCK_PLANES, can_hold_surface, is_lipschitz, plane_blocks
@@ -21,18 +22,8 @@ from .survey import Band, band_of_samples, check_jumps, limit_to_field
 class Glance(NamedTuple):
     """What is seen of the band in some planes, without keeping it.
 
-    Attributes
-    ----------
-    summary : BandSummary
-        Of the voxels in these planes.
-    voxels, decoded : lists of int
-        The voxels in each plane, and those that are decoded.
-    beyond : int
-        The samples beyond the band that can be exact.
-    crossings : int
-        See ``Band.count_crossings``.
-    jumps : list of (Jumps, Jumps)
-        With an offset.
+    Of each plane the voxels, and those that are decoded; the samples beyond the band that can be
+    exact; see ``Band.count_crossings``; and, with an offset, the jumps.
     """
 
     summary: BandSummary
@@ -63,22 +54,16 @@ def look_at_band(grid: SdfGrid, offset: float, planes: int = 0) -> Glance:
     # resampled ones are made here, and say so
     known = grid if isinstance(samples, Resampled) else without_samples(grid)
     look = partial(_glance, known, offset)
-    found = list(over_planes(samples, look, ranges))
-    jumps = [jump for glance in found for jump in glance.jumps]
+    parts = zip(*over_planes(samples, look, ranges))
+    summaries, voxels, decoded, beyond, crossings, jumps = map(list, parts)
+    all_jumps = list(chain(*jumps))
     if offset:
-        check_jumps(jumps, grid, offset)
-    return Glance(
-        _of_all([glance.summary for glance in found]),
-        [number for glance in found for number in glance.voxels],
-        [number for glance in found for number in glance.decoded],
-        sum(glance.beyond for glance in found),
-        sum(glance.crossings for glance in found),
-        jumps,
-    )
+        check_jumps(all_jumps, grid, offset)
+    counts = list(chain(*voxels)), list(chain(*decoded)), sum(beyond), sum(crossings)
+    return Glance(_of_all(summaries), *counts, all_jumps)
 
 
 def _of_all(summaries: list[BandSummary]) -> BandSummary:
-    """Return the summary of all parts of a band."""
     return BandSummary(
         sum(part.voxels for part in summaries),
         sum(part.noisy for part in summaries),
@@ -88,15 +73,15 @@ def _of_all(summaries: list[BandSummary]) -> BandSummary:
     )
 
 
-def _glance(grid: SdfGrid, offset: float, planes: NDArray[Any], own: tuple[int, int]) -> Glance:
-    """Return what is seen in the planes ``own``, given with those beside them."""
+def _glance(grid: SdfGrid, offset: float, planes: NDArray[Any], inner: tuple[int, int]) -> Glance:
+    """Return what is seen in the planes ``inner``, given with those beside them."""
     jumps: list[tuple[Jumps, Jumps]] = []
     leaving: list[bool] = []
-    first, last = own
+    first, last = inner
     voxels, decoded = np.zeros((2, last - first), np.int64)
     beyond = crossings = 0
     summaries: list[BandSummary] = []
-    for ijk, patches, _, value in band_of_samples(grid, offset, planes, own, jumps, leaving):
+    for ijk, patches, _, value in band_of_samples(grid, offset, planes, inner, jumps, leaving):
         lipschitz = is_lipschitz(patches)
         held = can_hold_surface(patches, lipschitz)
         band = limit_to_field(

@@ -49,16 +49,18 @@ def _next_plane(factor: int) -> int:
 
 def _planes_beside_sharp(factor: int) -> int:
     """Return the planes beside a slab that edges depend on."""
-    from .sharp import planes_beside  # here, since its eight modules are a tenth of a short start
+    from .sharp.mesher import (
+        planes_beside,  # here, since its six modules are a tenth of a short start
+    )
 
     return planes_beside(factor)
 
 
 def _extract_sharp(field: FineField, grid: SdfGrid, first_vertex: int, threads: int) -> list[Mesh]:
     """Return the mesh with edges and corners."""
-    from .sharp_groups import extract_sharp_pieces
+    from .sharp.mesher import extract_pieces
 
-    return extract_sharp_pieces(field, grid, first_vertex, threads)
+    return extract_pieces(field, grid, first_vertex, threads)
 
 
 BY_NAME = {

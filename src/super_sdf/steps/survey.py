@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import NoSurfaceError, OutOfMemoryError
-from ..grid.cubic import on_samples, sampled_places
+from ..grid.cubic import Resampled, on_samples, sampled_places
 from ..grid.field import EXACT, MASK
 from ..grid.planes import (
     SampleArray,
@@ -27,7 +27,6 @@ from ..grid.planes import (
     reading_bytes,
     unpacked_bytes,
 )
-from ..grid.resampling import Resampled
 from ..grid.sdf_grid import SdfGrid, negated
 from ..machine.memory import held_memory, in_words
 from ..machine.resources import ONE_THREAD, Resources
@@ -58,7 +57,7 @@ WINDOW_SAMPLES = 1 << 21  # among which the band is found at a time
 APPENDED = 1 << 16  # rows at a time: fewer would be moved too often
 FAR = 1e30  # half voxels: no sample of the band is there
 
-Found: TypeAlias = tuple[IntArray, FloatArray, NDArray[np.int64], FloatArray]
+BandPart: TypeAlias = tuple[IntArray, FloatArray, NDArray[np.int64], FloatArray]
 """Some of the band's voxels and their patches; numbers and values of samples beyond it."""
 
 NONE_ACTIVE: tuple[IntArray, FloatArray] = np.empty((0, 3), np.int32), np.empty((0, 27), np.float32)
@@ -80,33 +79,24 @@ class Band:
         The voxels, in C order.
     patches : (V, 27) float32
         The samples round each voxel, in half voxels.
-    lipschitz : (V,) bool
-        Which patches can be distances.
-    decoded : (V,) bool
-        Which voxels can hold the surface, and so are decoded.
-    exact : (V,) bool
-        Which voxels' own samples can be taken as exact distances.
+    lipschitz, decoded, exact : (V,) bool
+        Which patches can be distances; which voxels can hold the surface, and so are decoded; which
+        own samples can be taken as exact distances.
     limits : two floats
         Samples beyond the band may be exact distances if they lie between these, in half voxels.
     sampled : (V,) bool, optional
-        Which voxels' own values are samples of a grid that was resampled, not interpolated; None if
-        all are.
+        Which own values are samples of a grid that was resampled; None if all are.
     leaves : bool
         Whether a sample on the border of the grid is inside: then the solid leaves the grid.
     kind : str
         What the field is, see ``grid.field``.
-    smooth : array or Planes, optional
-        Values whose cubic spline has the surface where they are smooth, in world units.
-    is_uneven : bool
-        Whether that field is interpolated linearly where it jumps.
-    has_kinks : bool
-        Whether the network may refine that field where it is not smooth.
+    smooth, is_uneven, has_kinks
+        The field that is meshed by its cubic spline, in world units; whether it is interpolated
+        linearly where it jumps; and whether the network may refine it where it is not smooth.
     half_voxel, level : float
         Half a spacing in world units, by which these are divided; and what is zero then.
-    peak : int
-        The memory of the process in bytes while the band was found.
-    unpacked : int
-        The bytes of the samples in a temporary file.
+    peak, unpacked : int
+        The memory of the process in bytes while the band was found; those of a temporary file.
     beyond : SamplesBeyond
         The samples a few voxels farther away.
     unseen : bool array or Planes, optional
@@ -190,30 +180,16 @@ class Band:
     ) -> tuple[FloatArray, IntArray, IntArray]:
         """Return the network's inputs: patches, neighbour table, and the voxels to decode.
 
-        Parameters
-        ----------
-        seen : slice, optional
-            Rows of the n voxels that the network sees; all by default.
-        decoded : slice, optional
-            Rows of which the voxels that can hold the surface are decoded; all by default.
-
-        Returns
-        -------
-        (n, 27) float32, (n, 27) int32, (d,) int32
-            The second and the third are row numbers within ``seen``.
+        They are those of the rows that the network sees, all by default, and of those that are
+        decoded: (n, 27) float32, (n, 27) int32, (d,) int32, row numbers within ``seen``.
         """
         seen, decoded = seen or self.all_rows, decoded or self.all_rows
-        table = neighbour_table(*_crop_planes(self.voxel_ijk[seen], self.shape))
+        voxel_ijk = self.voxel_ijk[seen]
+        first, last = int(voxel_ijk[0, 0]), int(voxel_ijk[-1, 0])  # the others have none
+        within = voxel_ijk - np.array([first, 0, 0], np.int32)
+        table = neighbour_table(within, (last - first + 1, *self.shape[1:]))
         voxels = np.flatnonzero(self.decoded[decoded]) + decoded.start - seen.start
         return self.patches[seen], table, voxels.astype(np.int32)
-
-
-def _crop_planes(
-    voxel_ijk: IntArray, shape: tuple[int, int, int]
-) -> tuple[IntArray, tuple[int, ...]]:
-    """Return voxels counted from the first plane that has any, and the shape up to the last one."""
-    first, last = int(voxel_ijk[0, 0]), int(voxel_ijk[-1, 0])
-    return voxel_ijk - np.array([first, 0, 0], np.int32), (last - first + 1, *shape[1:])
 
 
 def survey(
@@ -251,13 +227,19 @@ def survey(
     held = held_memory() or 0
     planes, reading = plan_reading(grid.samples, held, resources)
 
-    def read(block: tuple[int, int]) -> list[Found]:
+    def read(block: tuple[int, int]) -> list[BandPart]:
         seen = jumps if among is None else None
         around = slice(max(block[0] - 1, 0), block[1] + 1)
-        found = list(band_of_samples(grid, offset, grid.samples[around], block, seen, leaving))
-        sizes.append(sum(band_bytes(len(ijk), len(value)) for ijk, _, _, value in found))
-        _check_bound(sum(sizes) + reading, block[1], held, resources.memory)
-        return found
+        parts = list(band_of_samples(grid, offset, grid.samples[around], block, seen, leaving))
+        sizes.append(sum(band_bytes(len(ijk), len(value)) for ijk, _, _, value in parts))
+        if sum(sizes) + reading > _room(resources.memory, held):
+            raise BandTooLargeError(
+                f"the band of the first {block[1]:,} planes already takes "
+                f"{in_words(sum(sizes) + reading)} of memory, and "
+                f"{in_words(resources.memory or 0)} may be used in all; is this a distance field? "
+                "If so, allow more (--max-memory)"
+            )
+        return parts
 
     first, last = among or (0, grid.shape[0])
     blocks = list(plane_blocks(grid.shape, first, last, planes))
@@ -279,15 +261,15 @@ def band_bytes(voxels: int, beyond: int) -> int:
     return voxels * BYTES_PER_VOXEL + beyond * BYTES_BEYOND
 
 
-def _put_together(blocks: Iterable[list[Found]]) -> Found:
+def _put_together(blocks: Iterable[list[BandPart]]) -> BandPart:
     """Return what was found in all blocks, as one.
 
     The arrays grow, and each part is freed when it was taken, so that nothing is held twice.
     """
     voxel_ijk, patches = NONE_ACTIVE
     number, value = NONE_BEYOND.number, NONE_BEYOND.value
-    whole: Found = (voxel_ijk.copy(), patches.copy(), number.copy(), value.copy())
-    waiting: list[Found] = []
+    whole: BandPart = (voxel_ijk.copy(), patches.copy(), number.copy(), value.copy())
+    waiting: list[BandPart] = []
     for parts in blocks:
         while parts:
             waiting.append(parts.pop(0))
@@ -297,7 +279,7 @@ def _put_together(blocks: Iterable[list[Found]]) -> Found:
     return whole
 
 
-def _append(whole: Found, parts: list[Found]) -> None:
+def _append(whole: BandPart, parts: list[BandPart]) -> None:
     """Append parts to what was found, and empty the list."""
     arrays: tuple[NDArray[Any], ...] = whole
     for array, rows in zip(arrays, zip(*parts)):
@@ -310,10 +292,7 @@ def _append(whole: Found, parts: list[Found]) -> None:
 def plan_reading(samples: SampleArray, held: int, resources: Resources) -> tuple[int, int]:
     """Return how many planes to read at a time, and the bytes that this takes, beside those held.
 
-    Raises
-    ------
-    OutOfMemoryError
-        If they do not fit in memory even plane by plane.
+    OutOfMemoryError if they do not fit in memory even plane by plane.
     """
     plane, need = samples.shape[1] * samples.shape[2], 0
     for least in (planes_at_once(samples), BLOCK_PLANES, 1):
@@ -335,21 +314,28 @@ def limit_to_field(band: Band, grid: SdfGrid, offset: float) -> Band:
     In a mask, only the voxels round which samples lie on both sides hold the surface.
     """
     field, scale = grid.field, 2 / grid.voxel_size
+    level = offset * scale
     band = replace(band, limits=limits_beyond(grid, offset), unseen=field.unseen)
     if field.kind == EXACT:
         return band
     sample = band.patches[:, CENTRE]
     low, high = _exact_between(grid, offset)
-    exact = band.exact & (sample > low) & (sample < high)
     decoded = band.decoded
     if field.kind == MASK:
         decoded = has_both_sides(band.patches)
     if field.smooth is not None:  # no distances: what they say of the voxels is not certain
         decoded = np.ones_like(band.decoded)
-    band = replace(band, exact=exact, decoded=decoded, kind=field.kind, smooth=field.smooth)
-    level = offset * scale
-    band = replace(band, has_kinks=field.has_kinks, is_uneven=field.is_uneven)
-    return replace(band, half_voxel=1 / scale, level=level)
+    return replace(
+        band,
+        exact=band.exact & (sample > low) & (sample < high),
+        decoded=decoded,
+        kind=field.kind,
+        smooth=field.smooth,
+        has_kinks=field.has_kinks,
+        is_uneven=field.is_uneven,
+        half_voxel=1 / scale,
+        level=level,
+    )
 
 
 def _exact_between(grid: SdfGrid, offset: float) -> tuple[float, float]:
@@ -368,16 +354,6 @@ def limits_beyond(grid: SdfGrid, offset: float) -> tuple[float, float]:
     ends = np.clip([grid.low - offset, grid.high - offset], -FAR / scale, FAR / scale) * scale
     lowest, highest = map(float, ends.astype(np.float32))  # where it may be cut off
     return max(low, lowest), min(high, highest)
-
-
-def _check_bound(need: int, planes: int, held: int, bound: int | None) -> None:
-    """Raise if the band, and what is read, do not fit in the memory bound beside the bytes held."""
-    if need > _room(bound, held):
-        raise BandTooLargeError(
-            f"the band of the first {planes:,} planes already takes {in_words(need)} of memory, "
-            f"and {in_words(bound or 0)} may be used in all; is this a distance field? If so, "
-            "allow more (--max-memory)"
-        )
 
 
 def _room(bound: int | None, held: int) -> float:
@@ -441,7 +417,7 @@ def band_of_samples(
     planes: tuple[int, int],
     jumps: list[tuple[Jumps, Jumps]] | None,
     leaving: list[bool],
-) -> Iterator[Found]:
+) -> Iterator[BandPart]:
     """Yield what is found in some planes, in C order, given their samples and those beside them.
 
     Whether a sample on the grid's border is inside is appended to ``leaving``. With an offset, the
@@ -481,45 +457,51 @@ def _shifted(range_: slice, start: int) -> slice:
     return slice(range_.start - start, range_.stop - start)
 
 
-def _windows(shape: tuple[int, ...], own: slice) -> Iterator[tuple[slice, slice]]:
+def _windows(shape: tuple[int, ...], inner: slice) -> Iterator[tuple[slice, slice]]:
     """Yield the planes and rows of a block that are worked on at a time, in C order.
 
-    They are ``own`` planes of it, of large ones some rows of each.
+    They are the ``inner`` planes of it, of large ones some rows of each.
     """
     if np.prod(shape, dtype=float) <= WINDOW_SAMPLES:
-        yield own, slice(0, shape[1])
+        yield inner, slice(0, shape[1])
         return
     step = max(WINDOW_SAMPLES // (3 * shape[2]) - 2, 1)
-    for i in range(own.start, own.stop):
+    for i in range(inner.start, inner.stop):
         for first in range(0, shape[1], step):
             yield slice(i, i + 1), slice(first, min(first + step, shape[1]))
 
 
 def _patches_of(
-    window: FloatArray, own: tuple[slice, slice], hidden: BoolArray | None = None
+    window: FloatArray, inner: tuple[slice, slice], hidden: BoolArray | None = None
 ) -> Iterator[tuple[NDArray[np.int64], FloatArray]]:
     """Yield active voxels among some planes and rows of a window, and the samples round them.
 
     Those that are ``hidden``, of these planes and rows, and values that were filled in are left
     out.
     """
-    active = is_active(window)[own]
+    active = is_active(window)[inner]
     if hidden is not None:
         active &= ~hidden
-    found, padded = np.flatnonzero(active), pad_by_extrapolation(window)
-    first = np.array([own[0].start, own[1].start, 0])
-    for rows in chunks_of(len(found), len(NEIGHBOURHOOD)):
-        ijk = np.stack(np.unravel_index(found[rows], active.shape), 1) + first
-        patches = take_patches(padded, ijk)
+    voxels = np.flatnonzero(active)
+    if not len(voxels):
+        return
+    first = np.array([inner[0].start, inner[1].start, 0])
+    spans = [np.flatnonzero(active.any(axes)) for axes in ((1, 2), (0, 2), (0, 1))]
+    low = np.maximum([span[0] for span in spans] + first - 1, 0)  # most of it is far from them
+    high = [span[-1] for span in spans] + first + 2
+    padded = pad_by_extrapolation(window[tuple(map(slice, low, high))])
+    for rows in chunks_of(len(voxels), len(NEIGHBOURHOOD)):
+        ijk = np.stack(np.unravel_index(voxels[rows], active.shape), 1) + first
+        patches = take_patches(padded, ijk - low)
         kept = ~is_filled_in(patches)
         yield ijk[kept], patches[kept]
 
 
-def check_jumps(found: list[tuple[Jumps, Jumps]], grid: SdfGrid, offset: float) -> None:
+def check_jumps(jumps: list[tuple[Jumps, Jumps]], grid: SdfGrid, offset: float) -> None:
     """Raise GridError if no sample is near an offset, or fill values begin near it."""
-    if not any(up.near for up, _ in found):
+    if not any(up.near for up, _ in jumps):
         raise no_surface(grid, offset)
-    check_not_filled(found, offset, grid.voxel_size)
+    check_not_filled(jumps, offset, grid.voxel_size)
 
 
 def _has_inside_on_border(rescaled: FloatArray, first: bool, last: bool) -> bool:

@@ -1,5 +1,41 @@
-"""One module per grid file format: each turns a ``Request`` into a ``Volume``.
+"""The readers of grid files by the key of their format: each turns a Request into a Volume.
 
 A reader says what the file says, in the world coordinates of the file, and imports its library when
 it is called. It may raise anything: ``files.grids`` turns what a library raises into one line.
 """
+
+from collections.abc import Callable
+
+from ..volume import Request, Volume
+from .dicom import read_dicom
+from .hdf5 import read_hdf5, read_mat, read_netcdf
+from .metaimage import read_metaimage
+from .mrc import read_mrc
+from .nibabel_files import read_analyze, read_mgh, read_nifti
+from .nrrd_file import read_nrrd
+from .sdf import read_sdf
+from .tiff import read_tiff
+from .vdb import read_vdb
+from .vti import read_vti
+from .vtk import read_vtk, read_vtkhdf
+from .zarr_store import read_zarr
+
+READERS: dict[str, Callable[[Request], Volume]] = {
+    "nifti": read_nifti,
+    "nrrd": read_nrrd,
+    "metaimage": read_metaimage,
+    "vti": read_vti,
+    "tiff": read_tiff,
+    "hdf5": read_hdf5,
+    "zarr": read_zarr,
+    "vdb": read_vdb,
+    "sdf": read_sdf,
+    "mgh": read_mgh,
+    "analyze": read_analyze,
+    "mrc": read_mrc,
+    "vtk": read_vtk,
+    "vtkhdf": read_vtkhdf,
+    "mat": read_mat,
+    "netcdf": read_netcdf,
+    "dicom": read_dicom,
+}

@@ -1,4 +1,8 @@
-"""The axes of an array by what a file says of them: names, units, steps and where they begin."""
+"""What files say of an array: names, units, steps and starts of its axes, its place and scale.
+
+Arrays in HDF5, Zarr, NetCDF, MATLAB and TIFF share this, and the guard for parts that are not
+stored.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Triple
-from ...errors import GridError
-from ...grid.named_axes import UNNAMED, even_steps
-from ..headers import kept_axes
-from ..volume import axes_direction
+from ...errors import FileError, GridError
+from ...grid.placement import UNNAMED, even_steps
+from ..volume import Box, ReadBox, axes_direction, kept_axes, triple
 
 SPACE = "xyz"
 PREFIXES = {"k": 1e3, "": 1.0, "d": 1e-1, "c": 1e-2, "m": 1e-3, "u": 1e-6, "n": 1e-9, "p": 1e-12}
@@ -34,8 +37,8 @@ def in_metres(unit: str) -> float | None:
         return METRES[plain]
     word = re.sub(r"(?<=.)(?<!inche)s$|(?<=inch)es$", "", plain.lower())
     word = re.sub("met(er|re)$", "m", {"micron": "um"}.get(word, word))
-    found = next((WORDS[start] + "m" for start in WORDS if word == f"{start}m"), word)
-    return METRES.get(found)
+    symbol = next((WORDS[start] + "m" for start in WORDS if word == f"{start}m"), word)
+    return METRES.get(symbol)
 
 
 def in_one_unit(units: Sequence[str]) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
@@ -58,19 +61,12 @@ def in_one_unit(units: Sequence[str]) -> tuple[NDArray[np.float64] | None, tuple
 
 @dataclass(frozen=True)
 class Axes:
-    """The axes of an array, in order; for each what the file says, "" or None where it does not.
-
-    Attributes
-    ----------
-    names, units : tuple of str
-    steps, starts : tuple of floats or None
-        Distance from a sample to the next, below 0 along a falling axis, and position of the first.
-    """
+    """The axes of an array, in order; for each what the file says, "" or None where it does not."""
 
     names: tuple[str, ...]
     units: tuple[str, ...]
-    steps: tuple[float | None, ...]
-    starts: tuple[float | None, ...]
+    steps: tuple[float | None, ...]  # from a sample to the next, below 0 along a falling axis
+    starts: tuple[float | None, ...]  # positions of the first sample
 
     @classmethod
     def named(
@@ -86,22 +82,17 @@ class Axes:
         cls,
         names: Sequence[str],
         shape: Sequence[int],
-        found: Callable[[int], tuple[NDArray[Any] | None, dict[str, Any]]],
+        coordinates: Callable[[int], tuple[NDArray[Any] | None, dict[str, Any]]],
     ) -> Axes:
-        """Return the axes of an array by their coordinates.
+        """Return the axes of an array by their coordinates, which must be evenly spaced.
 
-        ``found`` returns those of an axis in space, or None, and their attributes, of which
+        ``coordinates`` returns those of an axis in space, or None, and their attributes, of which
         ``axis`` names an axis that has another name, and ``units`` states the unit.
-
-        Raises
-        ------
-        GridError
-            If coordinates are not evenly spaced numbers, or as in ``in_space``.
         """
         axes, called = cls.named(names), list(names)
         units, steps, starts = (list(each) for each in (axes.units, axes.steps, axes.starts))
         for axis in axes.in_space(shape):
-            places, about = found(axis)
+            places, about = coordinates(axis)
             if places is None or len(places) < 2:
                 continue
             starts[axis], steps[axis] = even_steps(names[axis], places)
@@ -116,13 +107,7 @@ class Axes:
         return sorted(name for name in self.names if name in tuple(SPACE)) == list(SPACE)
 
     def in_space(self, shape: Sequence[int]) -> list[int]:
-        """Return the axes of an array that are in space, in order; the others have length 1.
-
-        Raises
-        ------
-        GridError
-            If the array has fewer than three axes, or more that are longer than 1.
-        """
+        """Return the axes of an array that are in space, in order; others must have length 1."""
         if len(shape) < len(SPACE):
             raise GridError(f"values have shape {tuple(shape)}: give three axes (x, y, z)")
         space = kept_axes(shape)
@@ -164,17 +149,116 @@ class Axes:
             return (None, None, direction), notes
         starts = [self.starts[axis] for axis in world]
         known = [0.0 if start is None else start for start in starts]
-        origin = None if None in starts else _triple(known * factors)
+        origin = None if None in starts else triple(known * factors)
         lengths = np.abs(np.array([self.steps[axis] for axis in space], np.float64))
-        return (_triple(lengths * (np.abs(direction).T @ factors)), origin, direction), notes
+        return (triple(lengths * (np.abs(direction).T @ factors)), origin, direction), notes
 
 
 def _text(attributes: dict[str, Any], name: str) -> str:
     """Return an attribute as text, "" if there is none."""
-    found = attributes.get(name, "")
-    return found.decode() if isinstance(found, bytes) else str(found)
+    stated = attributes.get(name, "")
+    return stated.decode() if isinstance(stated, bytes) else str(stated)
 
 
-def _triple(numbers: Any) -> Triple:
-    x, y, z = (float(number) for number in numbers)
-    return x, y, z
+def placed(
+    axes: Axes, attributes: dict[str, Any], shape: tuple[int, ...], order: str
+) -> tuple[list[int], dict[str, Any]]:
+    """Return the axes of an array that are in space, and what a ``Volume`` says of their place.
+
+    Attributes replace what ``axes`` says: ``element_size_um``, as the HDF5 plugin of ImageJ writes
+    it, has the order of the array's axes; ``spacing`` and ``origin`` are x, y, z. The columns of
+    ``direction``, nine numbers row by row, are the world directions of the axes x, y and z.
+    ``order`` is that of axes that have no names.
+    """
+    space = axes.in_space(shape)
+    (spacing, origin, direction), notes = axes.place(space, order)
+    named = axes.order(space, order)
+    stated = _stated_triple(attributes, "spacing")
+    if "element_size_um" in attributes:
+        spacing = _stated_triple(attributes, "element_size_um")
+    elif stated is not None:
+        spacing = triple(stated["xyz".index(name)] for name in named)
+    if "direction" in attributes:
+        try:
+            direction = np.asarray(attributes["direction"], np.float64).reshape(3, 3) @ direction
+        except (TypeError, ValueError):
+            raise FileError(
+                f"its attribute direction is {attributes['direction']!r}: give nine numbers"
+            ) from None
+    return space, {
+        "spacing": spacing,
+        "origin": _stated_triple(attributes, "origin") or origin,
+        "direction": direction,
+        "notes": notes,
+        "axes": named,
+    }
+
+
+def _stated_triple(attributes: dict[str, Any], name: str) -> Triple | None:
+    """Return an attribute of one number or three; None if there is none of this name."""
+    if name not in attributes:
+        return None
+    try:
+        return triple(np.broadcast_to(np.asarray(attributes[name], np.float64).ravel(), 3))
+    except (TypeError, ValueError):
+        raise FileError(
+            f"its attribute {name} is {attributes[name]!r}: give one number or three"
+        ) from None
+
+
+def along(space: list[int], box: Sequence[slice], count: int) -> tuple[Any, ...]:
+    """Return the index of a box along some axes of an array, at 0 of its others."""
+    where: list[Any] = [0] * count
+    for axis, part in zip(space, box):
+        where[axis] = part
+    return tuple(where)
+
+
+def without_gaps(read_box: ReadBox, absent: int, total: int, fill: Any) -> ReadBox:
+    """Return ``read_box``, which refuses signed samples if parts that are not stored read as 0.
+
+    A file leaves out parts that hold nothing but its fill value. In masks and densities 0 is the
+    background, but of signed distances it is the surface. Any other fill value is as good as a
+    stored one; None, if the file does not say which, is refused at once. ``absent`` of ``total``
+    parts (chunks, strips) are not stored.
+    """
+    gaps = GridError(
+        f"{absent:,} of its {total:,} chunks are not stored and read as 0, which is the surface: "
+        "write them all, or give the array a fill value other than 0 (NaN for unknown)"
+    )
+    if absent and fill is None:
+        raise gaps
+
+    def read(box: Box) -> NDArray[Any]:
+        samples = read_box(box)
+        if samples.dtype.kind in "fi" and (samples < 0).any():
+            raise gaps
+        return samples
+
+    return read if absent and fill == 0 else read_box
+
+
+def unscaled(
+    read_box: ReadBox, dtype: np.dtype[Any], attributes: dict[str, Any], missing: Any = None
+) -> tuple[ReadBox, np.dtype[Any]]:
+    """Return ``read_box`` for values that are stored as other numbers, and their type.
+
+    By the conventions for climate and forecast data a value is ``scale_factor`` times the number,
+    plus ``add_offset``; ``missing``, or ``_FillValue``, is no value.
+    """
+    names = "scale_factor", "add_offset"
+    has_gaps = dtype.kind == "f" and "_FillValue" in attributes
+    if not has_gaps and not any(name in attributes for name in names):
+        return read_box, dtype
+    numbers = (np.ravel(attributes.get(name, i)) for name, i in zip(names, (1, 0)))
+    factor, offset = (float(number[0]) for number in numbers)
+    none = np.ravel(attributes.get("_FillValue", missing))
+    kind = np.result_type(dtype, np.float32)
+
+    def read(box: Box) -> NDArray[Any]:
+        stored = read_box(box)
+        values = (stored * factor + offset).astype(kind)
+        values[np.isin(stored, none)] = np.nan
+        return values
+
+    return read, kind

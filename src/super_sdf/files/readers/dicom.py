@@ -8,9 +8,8 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,26 +17,25 @@ from numpy.typing import NDArray
 from ...errors import GridError
 from ..regular import check_beside
 from ..volume import Request, Volume
-from .choosing import choose_member
 
 EVEN = 0.01  # share of the spacing by which slices may be off
 PARALLEL = 1e-4  # by which components of directions may differ
 
 
-@dataclass(frozen=True)
-class Slice:
-    """A slice: a file and the frame in it, its place, and how its values are scaled."""
+class Slice(NamedTuple):
+    """A slice: a file and the frame in it, its place, and how its values are scaled.
+
+    ``across``, (2, 3), has the directions of the axes along a row and along a column; ``spacing``
+    is that of rows, and of columns; ``scale`` is slope and intercept.
+    """
 
     path: Path
     frame: int
     shape: tuple[int, int]
     corner: NDArray[np.float64]
     across: NDArray[np.float64]
-    """(2, 3): world directions of the axes along a row and along a column."""
     spacing: tuple[float, float]
-    """Distance between rows, and between columns."""
     scale: tuple[float, float]
-    """Slope and intercept."""
 
     def read(self) -> NDArray[Any]:
         """Return its values as they are stored."""
@@ -49,7 +47,7 @@ class Slice:
 def read_dicom(request: Request) -> Volume:
     """Read ``FOLDER``, or ``FOLDER:SERIES`` by the UID of one of several series."""
     series = _series_in(request.path)
-    uid = choose_member(request, list(series), "series of DICOM images")
+    uid = request.choose(list(series), "series of DICOM images")
     slices, step = _sorted(list(_slices(series[uid])))
     first = slices[0]
     scales = np.array([each.scale for each in slices])
@@ -73,7 +71,7 @@ def _series_in(folder: Path) -> dict[str, list[tuple[Path, Any]]]:
     """Return the images of a folder, headers only, by the UID of their series."""
     import pydicom
 
-    found: dict[str, list[tuple[Path, Any]]] = {}
+    series: dict[str, list[tuple[Path, Any]]] = {}
     for name in sorted(os.listdir(folder)):
         if not (folder / name).is_file():
             continue
@@ -82,18 +80,12 @@ def _series_in(folder: Path) -> dict[str, list[tuple[Path, Any]]]:
             header = pydicom.dcmread(path, stop_before_pixels=True)
             if "Rows" in header:
                 uid = str(header.get("SeriesInstanceUID", ""))
-                found.setdefault(uid, []).append((path, header))
-    return found
+                series.setdefault(uid, []).append((path, header))
+    return series
 
 
 def _slices(images: list[tuple[Path, Any]]) -> Iterator[Slice]:
-    """Yield the slices of images, each of which may have several frames.
-
-    Raises
-    ------
-    GridError
-        If an image is in colour, or has frames without a place each.
-    """
+    """Yield the slices of grey images, each of which may have several frames."""
     for path, header in images:
         if header.get("SamplesPerPixel", 1) != 1 or "ModalityLUTSequence" in header:
             raise GridError(f"{path.name} has colours or a table of values: give grey images")
@@ -109,13 +101,7 @@ def _slices(images: list[tuple[Path, Any]]) -> Iterator[Slice]:
 
 
 def _slice(path: Path, index: int, header: Any, groups: list[Any]) -> Slice:
-    """Return a frame of an image; what is stated of it is in the first of the groups that has it.
-
-    Raises
-    ------
-    GridError
-        If it states no place.
-    """
+    """Return a frame of an image; what is stated of it is in the first group that has it."""
     corner = _stated(groups, "PlanePositionSequence", "ImagePositionPatient")
     across = _stated(groups, "PlaneOrientationSequence", "ImageOrientationPatient")
     steps = _stated(groups, "PixelMeasuresSequence", "PixelSpacing")
@@ -145,13 +131,7 @@ def _normal(each: Slice) -> NDArray[np.float64]:
 
 
 def _sorted(slices: list[Slice]) -> tuple[list[Slice], float]:
-    """Return slices in the order of their places along their normal, and the step.
-
-    Raises
-    ------
-    GridError
-        If they are not parallel, of one size and one above the other, or some are missing.
-    """
+    """Return slices in the order of their places along their normal, and the step."""
     first = slices[0]
     normal = _normal(first)
     slices = sorted(slices, key=lambda each: float(each.corner @ normal))

@@ -1,6 +1,7 @@
-"""HDF5 files, with h5py: a dataset of three axes, besides some of length 1.
+"""HDF5, NetCDF and MATLAB's files: an array of three axes, besides some of length 1.
 
-They are (z, y, x) unless dimension labels, scales, ``axistags`` or ``--axes`` say otherwise.
+HDF5 and what is made of it (NetCDF 4, MATLAB 7.3) with h5py, the others with SciPy. Axes are
+(z, y, x) unless dimension labels, scales, ``axistags`` or ``--axes`` say otherwise.
 """
 
 from __future__ import annotations
@@ -14,14 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import FileError
-from ..boxes import Box
 from ..regular import check_beside
-from ..volume import Request, Volume, reversed_axes
-from .axes import Axes
-from .choosing import choose_member
-from .stored import along, placed, unscaled, without_gaps
+from ..volume import PLACE, Box, Request, Volume, reversed_axes
+from .axes import Axes, along, placed, unscaled, without_gaps
 
 NO_COORDINATES = b"This is a netCDF dimension but not a netCDF variable"
+INTEGERS = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))
+NUMBERS = ("double", "single", "logical", *INTEGERS)  # of MATLAB
+ORDER = (
+    "its axes are taken as x, y, z, the order of ndgrid; of an array in the order of meshgrid, "
+    "which is y, x, z, save permute(V, [2 1 3])"
+)
+Coordinates = tuple[NDArray[Any] | None, dict[str, Any]]
 
 
 def read_hdf5(request: Request) -> Volume:
@@ -31,53 +36,69 @@ def read_hdf5(request: Request) -> Volume:
     import h5py
 
     file = request.files.enter_context(h5py.File(request.path, "r"))
-    found: list[str] = []
-
+    names: list[str] = []
     asked = (request.member or "").strip("/")
 
     def note(name: str, entry: Any) -> None:
-        if isinstance(entry, h5py.Dataset) and (name == asked or may_be_grid(entry.shape)):
-            found.append(f"/{name}")
+        if isinstance(entry, h5py.Dataset) and (name == asked or _may_be_grid(entry.shape)):
+            names.append(f"/{name}")
 
     file.visititems(note)
-    if "ITKImage" in file:
-        return _read_itk(file, request)
-    values = file[choose_member(request, found, "3D dataset")]
-    check_stored(values, request)
-    return volume_of(
-        values, *placed(_axes(values, request), dict(values.attrs), values.shape, request.axes)
-    )
+    if "ITKImage" in file:  # in LPS, with a direction a row
+        image = file["ITKImage/0"]
+        values, space = image["VoxelData"], list(range(3))
+        spacing, direction = reversed_axes(image["Spacing"][:], image["Directions"][:].T)
+        origin = tuple(image["Origin"][:].tolist())
+        place: dict[str, Any] = {"spacing": spacing, "origin": origin, "direction": direction}
+        _check_stored(values, request)
+    else:
+        values = file[request.choose(names, "3D dataset")]
+        _check_stored(values, request)
+        axes = _axes(values, request)
+        space, place = placed(axes, dict(values.attrs), values.shape, request.axes)
+    return _volume_of(values, space, place)
 
 
-def _read_itk(file: Any, request: Request) -> Volume:
-    """Read an image that ITK wrote: in LPS, with a direction a row."""
-    image = file["ITKImage/0"]
-    check_stored(image["VoxelData"], request)
-    spacing, direction = reversed_axes(image["Spacing"][:], image["Directions"][:].T)
-    origin = tuple(image["Origin"][:].tolist())
-    place = {"spacing": spacing, "origin": origin, "direction": direction}
-    return volume_of(image["VoxelData"], list(range(3)), place)
+def read_netcdf(request: Request) -> Volume:
+    """Read ``FILE.nc:/VARIABLE``; without a name the only variable of three axes."""
+    import h5py
+
+    return read_hdf5(request) if h5py.is_hdf5(request.path) else _read_classic(request)
 
 
-def volume_of(values: Any, space: list[int], place: dict[str, Any]) -> Volume:
+def read_mat(request: Request) -> Volume:
+    """Read ``FILE.mat:VARIABLE``; without a name the only array of three axes.
+
+    Variables ``spacing``, ``origin`` and ``direction`` beside it are its place, as in ``.npz``.
+    """
+    import h5py
+
+    return (_read_73 if h5py.is_hdf5(request.path) else _read_5)(request)
+
+
+def _volume_of(values: Any, space: list[int], place: dict[str, Any]) -> Volume:
     """Return the volume of a dataset: its axes in space and their place; others have length 1."""
-    shape = tuple(values.shape[axis] for axis in space)
 
     def stored(box: Box) -> NDArray[Any]:
         return np.asarray(values[along(space, box, values.ndim)])
 
-    whole = without_gaps(stored, *_absent(values), values.fillvalue)
+    absent = total = 0
+    if values.chunks:
+        total = prod(-(-size // chunk) for size, chunk in zip(values.shape, values.chunks))
+        absent = total - values.id.get_num_chunks()
+    whole = without_gaps(stored, absent, total, values.fillvalue)
     read_box, dtype = unscaled(whole, values.dtype, dict(values.attrs))
+    return Volume(
+        tuple(values.shape[axis] for axis in space),
+        dtype,
+        **place,
+        chunks=tuple(values.chunks[axis] for axis in space) if values.chunks else None,
+        read_box=read_box,
+        packed=values.id.get_storage_size(),
+    )
 
-    def read(first: int, last: int) -> NDArray[Any]:
-        return read_box((slice(first, last), slice(0, shape[1]), slice(0, shape[2])))
 
-    chunks = tuple(values.chunks[axis] for axis in space) if values.chunks else None
-    about = {"chunks": chunks, "read_box": read_box, "packed": values.id.get_storage_size()}
-    return Volume(shape, dtype, read, **place, **about)
-
-
-def may_be_grid(shape: tuple[int, ...] | None) -> bool:
+def _may_be_grid(shape: tuple[int, ...] | None) -> bool:
     """Return whether a dataset has three axes, besides some of length 1."""
     return shape is not None and len(shape) >= 3 >= sum(count > 1 for count in shape)
 
@@ -98,24 +119,18 @@ def _axes(values: Any, request: Request) -> Axes:
         for dim, scale in zip(values.dims, scales)
     ]
 
-    def coordinates(axis: int) -> tuple[NDArray[Any] | None, dict[str, Any]]:
-        return _coordinates(scales[axis], values.shape[axis], request)
+    def coordinates(axis: int) -> Coordinates:
+        scale: Any = scales[axis]
+        if scale is None or scale.shape != (values.shape[axis],):
+            return None, {}
+        _check_stored(scale, request)
+        about = dict(scale.attrs)
+        return (None if NO_COORDINATES in bytes(about.get("NAME", b"")) else scale[:]), about
 
     return Axes.of_coordinates(names, values.shape, coordinates)
 
 
-def _coordinates(
-    scale: Any, count: int, request: Request
-) -> tuple[NDArray[Any] | None, dict[str, Any]]:
-    """Return the coordinates in a dimension scale, None if it has only a name, and attributes."""
-    if scale is None or scale.shape != (count,):
-        return None, {}
-    check_stored(scale, request)
-    about = dict(scale.attrs)
-    return (None if NO_COORDINATES in bytes(about.get("NAME", b"")) else scale[:]), about
-
-
-def check_stored(values: Any, request: Request) -> None:
+def _check_stored(values: Any, request: Request) -> None:
     """Raise FileError if the numbers of a dataset come from files that lie elsewhere."""
     if values.is_virtual:
         raise FileError(
@@ -126,9 +141,65 @@ def check_stored(values: Any, request: Request) -> None:
         check_beside(request.path, raw)
 
 
-def _absent(values: Any) -> tuple[int, int]:
-    """Return how many chunks of a dataset are not stored, and how many it has."""
-    if not values.chunks:
-        return 0, 1
-    total = prod(-(-size // chunk) for size, chunk in zip(values.shape, values.chunks))
-    return total - values.id.get_num_chunks(), total
+def _read_classic(request: Request) -> Volume:
+    """Read a NetCDF file of version 3 or lower, whose samples are mapped into memory."""
+    from scipy.io import netcdf_file
+
+    variables = request.files.enter_context(netcdf_file(request.path, mmap=True)).variables
+    names = [f"/{name}" for name, values in variables.items() if _may_be_grid(values.shape)]
+    values = variables[request.choose(names, "variable of three axes")[1:]]
+    about = vars(values)["_attributes"]
+
+    def coordinates(axis: int) -> Coordinates:
+        scale = variables.get(values.dimensions[axis])
+        return (None, {}) if scale is None else (np.array(scale.data), vars(scale)["_attributes"])
+
+    axes = Axes.of_coordinates(values.dimensions, values.shape, coordinates)
+    space, place = placed(axes, about, values.shape, request.axes)
+
+    def stored(box: Box) -> NDArray[Any]:
+        samples: NDArray[Any] = values.data[along(space, box, len(values.shape))]
+        return samples
+
+    read_box, dtype = unscaled(stored, values.data.dtype, about)
+    return Volume(tuple(values.shape[axis] for axis in space), dtype, read_box=read_box, **place)
+
+
+def _read_5(request: Request) -> Volume:
+    """Read a MATLAB file of version 4 to 7: a variable is loaded whole."""
+    from scipy.io import loadmat, whosmat
+
+    listed = whosmat(request.path)
+    arrays = {name: shape for name, shape, kind in listed if len(shape) == 3 and kind in NUMBERS}
+    name = request.choose(list(arrays), "array of three axes")
+    request.check_loads(8 * prod(arrays[name]), "SciPy")
+    variables = loadmat(request.path, variable_names=[name, *PLACE])
+    values = variables[name].T  # planes of the last axis are contiguous
+    stated = {key: variables[key] for key in PLACE if key in variables}
+    _, place = _placed_of_mat(stated, values.shape, request)
+    return Volume(values.shape, values.dtype, lambda first, last: values[first:last], **place)
+
+
+def _read_73(request: Request) -> Volume:
+    """Read a MATLAB file of version 7.3: the axes of its datasets are in reverse order."""
+    import h5py
+
+    file = request.files.enter_context(h5py.File(request.path, "r"))
+
+    def is_array(name: str) -> bool:
+        kind = file[name].attrs.get("MATLAB_class", b"")
+        return kind in map(str.encode, NUMBERS) and len(file[name].shape) == 3
+
+    names = [name for name in file if isinstance(file[name], h5py.Dataset) and is_array(name)]
+    values = file[request.choose(names, "array of three axes")]
+    _check_stored(values, request)
+    stated = {key: np.transpose(file[key][()]) for key in PLACE if key in file}
+    return _volume_of(values, *_placed_of_mat(stated, values.shape, request))
+
+
+def _placed_of_mat(
+    stated: dict[str, Any], shape: tuple[int, ...], request: Request
+) -> tuple[list[int], dict[str, Any]]:
+    """Return axes and place of an array whose axes are in reverse order."""
+    space, place = placed(Axes.named([""] * 3), stated, shape, request.axes[::-1])
+    return space, place | {"notes": (ORDER,) if request.axes == "xyz" else ()}

@@ -7,7 +7,6 @@ names, and checks no size in it: what is left to do is a header of text before r
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from itertools import zip_longest
 from math import prod
 from typing import Any
@@ -17,10 +16,9 @@ from numpy.typing import NDArray
 
 from ...errors import FileError, GridError, seen
 from ...grid.planes import InputFile
-from ..headers import kept_axes
 from ..regular import check_beside
-from ..volume import Request, Volume, reversed_axes
-from .values import bytes_from, packed_planes, raw_planes
+from ..streams import planes_behind, raw_planes
+from ..volume import Planes, Request, Volume, kept_axes, reversed_axes, triple
 
 LONGEST = 1 << 20  # bytes of a header, with a list of files
 LAST = "ElementDataFile"  # the field after which the data begins
@@ -42,8 +40,6 @@ KNOWN = (*SPACING, *ORIGIN, *DIRECTION, *IS_BIG, "DimSize", "CompressedData", "B
 MERGED = re.compile(rf"({'|'.join(KNOWN)}) *=")  # a line whose end is damaged
 NO_UNIT = ("", "?", "mm", "UNKNOWN")
 
-Planes = Callable[[int, int], NDArray[Any]]
-
 
 def read_metaimage(request: Request) -> Volume:
     """Read a ``.mha`` file, or a ``.mhd`` file and the data files that it names."""
@@ -63,34 +59,27 @@ def read_metaimage(request: Request) -> Volume:
     spacing = np.array(header.numbers(SPACING, np.ones(count)))[space]
     matrix = np.array(header.numbers(DIRECTION, np.eye(count).ravel())).reshape(count, count)
     direction = matrix.T[np.ix_(space, space)] * np.where(spacing < 0, -1, 1)  # as ITK takes it
-    x, y, z = np.array(header.numbers(ORIGIN, np.zeros(count)))[space].tolist()
-    place = reversed_axes(np.abs(spacing), direction)
+    origin = triple(np.array(header.numbers(ORIGIN, np.zeros(count)))[space])
+    steps, direction = reversed_axes(np.abs(spacing), direction)
     size = tuple(size[axis] for axis in space)
     read, packed = _data(request, file, header, size[::-1])
-    about: dict[str, Any] = {"packed": packed, "notes": header.notes()}
-    return Volume(size[::-1], header.dtype, read, place[0], (x, y, z), place[1], **about)
+    place = steps, origin, direction
+    return Volume(size[::-1], header.dtype, read, *place, packed=packed, notes=header.notes())
 
 
 class Header:
     """The fields of a header, up to the one that names the data.
 
-    Attributes
-    ----------
-    fields : dict
-        The text of each field.
-    rest : bytes
-        What follows in the beginning of the file, and ``length``, where that begins.
+    ``rest`` is what follows in the beginning of the file, and ``length`` where that begins.
     """
 
     def __init__(self, text: bytes) -> None:
         self.fields: dict[str, str] = {}
         for line in LINE.finditer(text):
-            name, found, value = FIELD.fullmatch(line[0]).groups()  # type: ignore[union-attr]
-            key, said = (
-                name.decode("latin1").strip(),
-                value.decode(errors="surrogateescape").strip(),
-            )
-            if not found and key:
+            name, sign, value = FIELD.fullmatch(line[0]).groups()  # type: ignore[union-attr]
+            key = name.decode("latin1").strip()
+            said = value.decode(errors="surrogateescape").strip()
+            if not sign and key:
                 raise FileError(f"its header is damaged: the line {seen(key)} is no NAME = VALUE")
             if self.fields.get(key, said) != said and key != "Comment":
                 raise FileError(f"its header is damaged: it states {key} twice")
@@ -130,13 +119,12 @@ class Header:
 
     def notes(self) -> tuple[str, ...]:
         """Return sentences on the unit, and on a spacing that is not stated."""
-        unit = self.fields.get("DistanceUnits", "?").strip()
-        found: tuple[str, ...] = ()
+        unit, notes = self.fields.get("DistanceUnits", "?").strip(), tuple[str, ...]()
         if unit not in NO_UNIT:
-            found = (f"lengths are in the unit that it states, {unit}",)
+            notes = (f"lengths are in the unit that it states, {unit}",)
         if not any(name in self.fields for name in SPACING):
-            found += ("it states no ElementSpacing: taken as 1, as ITK does",)
-        return found
+            notes += ("it states no ElementSpacing: taken as 1, as ITK does",)
+        return notes
 
     def flag(self, name: str, default: bool = False) -> bool:
         """Return a field that is true or false, as ITK reads it: by its first letter."""
@@ -209,16 +197,16 @@ def _data(
 
 def _compressed(
     files: list[InputFile], header: Header, start: int, shape: tuple[int, ...]
-) -> tuple[Planes, int]:
+) -> tuple[Planes, int | None]:
     """Return a function that reads planes of zlib data, and its size."""
+    file = files[0]
     if len(files) > 1 or header.fields.get("HeaderSize", "0").startswith("-"):
         raise FileError("it is compressed, in several files or behind others: store it as .mha")
-    follow = files[0].size - start
+    follow = file.size - start
     size = header.whole("CompressedDataSize", (follow,))[0]
     if size != follow:
         raise FileError(
-            f"{files[0].name} is damaged: its CompressedDataSize is {size:,}, but {follow:,} "
-            "bytes follow"
+            f"{file.name} is damaged: its CompressedDataSize is {size:,}, but {follow:,} bytes "
+            "follow"
         )
-    packed = bytes_from(files[0], start)
-    return packed_planes(packed, "zlib", shape, header.dtype, files[0].name), size
+    return planes_behind(file, start, "zlib", shape, header.dtype)

@@ -6,6 +6,7 @@ Columns, rows and sections run along the world's axes in the order of ``mapc``, 
 
 from __future__ import annotations
 
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,8 @@ from numpy.typing import NDArray
 from ...arrays import Triple
 from ...errors import FileError, GridError
 from ...grid.planes import InputFile
-from ..archives import Unpacker
-from ..headers import ArrayHeader
-from ..volume import XYZ, Request, Volume
-from .values import CODECS, bytes_from, next_planes, raw_planes
+from ..streams import CODECS, Unpacker, bytes_from, next_planes, raw_planes
+from ..volume import XYZ, Request, Volume, triple
 
 MAIN_HEADER = 1024  # bytes
 VOLUME_STACKS = 401  # space groups from here on are of stacks of volumes
@@ -38,23 +37,21 @@ def read_mrc(request: Request) -> Volume:
         raise GridError(f"it is a stack of volumes of {header.mz} sections: save one of them")
     place, notes = _place(header)
     start = MAIN_HEADER + max(int(header.nsymbt), 0)
-    array = ArrayHeader(sizes, data_dtype_from_header(header), False, start)
-    file = InputFile.open(request.path)
-    about: dict[str, Any] = {"notes": notes}
-    if request.path.suffix.lower() == ".gz":
-        packed, size = bytes_from(file, 0), start + array.size
-        unpacked = Unpacker(packed, CODECS["gzip"](), size, file.name).read
-        unpacked(start)
-        return Volume(
-            sizes, array.dtype, next_planes(unpacked, array), *place, packed=file.size, **about
-        )
-    planes = raw_planes(file, start, sizes, array.dtype)
-    return Volume(sizes, array.dtype, planes.read, *place, **about)
+    dtype, file = data_dtype_from_header(header), InputFile.open(request.path)
+    if request.path.suffix.lower() != ".gz":
+        stored = raw_planes(file, start, sizes, dtype)
+        return Volume(sizes, dtype, stored.read, *place, notes=notes)
+    size = start + prod(sizes) * dtype.itemsize
+    unpacked = Unpacker(bytes_from(file, 0), CODECS["gzip"](), size, file.name).read
+    unpacked(start)
+    read = next_planes(unpacked, sizes, dtype)
+    return Volume(sizes, dtype, read, *place, packed=file.size, notes=notes)
 
 
-def _place(
-    header: Any,
-) -> tuple[tuple[Triple | None, Triple, NDArray[np.float64]], tuple[str, ...]]:
+Place = tuple[Triple | None, Triple, NDArray[np.float64]]
+
+
+def _place(header: Any) -> tuple[Place, tuple[str, ...]]:
     """Return spacing, origin and direction of the sections, rows and columns, and a note.
 
     The origin is the field of this name, in angstrom; if it is 0 the place of the first sample in
@@ -83,19 +80,12 @@ def _place(
             f"its origin is {_listed(stated)} and its nstart means {_listed(in_cell)}: the origin "
             "is taken",
         )
-    x, y, z = (stated if stated.any() else in_cell).tolist()
-    spacing = _triple(steps[order]) if is_stated else None
-    return (spacing, (x, y, z), XYZ[:, order]), notes
+    spacing = triple(steps[order]) if is_stated else None
+    return (spacing, triple(stated if stated.any() else in_cell), XYZ[:, order]), notes
 
 
 def _numbers(fields: Any, names: Any) -> NDArray[np.float64]:
-    """Return three fields of the header.
-
-    Raises
-    ------
-    FileError
-        If they are not finite.
-    """
+    """Return three fields of the header, which must be finite."""
     numbers = np.array([fields[name] for name in names], np.float64)
     if not np.isfinite(numbers).all():
         raise FileError(f"its header is damaged: {', '.join(names)} are {numbers.tolist()}")
@@ -104,8 +94,3 @@ def _numbers(fields: Any, names: Any) -> NDArray[np.float64]:
 
 def _listed(numbers: NDArray[np.float64]) -> str:
     return ", ".join(f"{number:g}" for number in numbers)
-
-
-def _triple(numbers: Any) -> Triple:
-    x, y, z = (float(number) for number in numbers)
-    return x, y, z

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import re
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -15,14 +16,25 @@ from numpy.typing import NDArray
 
 from ...errors import FileError, GridError, seen
 from ...grid.planes import InputFile
-from ..headers import ArrayHeader
 from ..regular import check_beside
-from ..volume import XYZ, Request, Volume, from_affine, reversed_axes
+from ..streams import TextValues, planes_behind
+from ..volume import (
+    MOST_NAMED,
+    XYZ,
+    Planes,
+    Request,
+    Volume,
+    from_affine,
+    in_words_of,
+    reversed_axes,
+)
 from .axes import Axes, in_one_unit
-from .choosing import MOST_NAMED
-from .values import TextValues, bytes_from, packed_planes, raw_planes
 
 LONGEST = 1 << 20  # bytes of a header
+CENTERING = (
+    "it states axis mins, but no centerings: its samples are taken as cells, half a spacing from "
+    "them, as ITK does"
+)
 TEXT = ("ascii", "text", "txt")
 IN_SPACE = ("domain", "space", "???", "none")  # kinds of axes; others are lists, vectors, time
 CODECS = {"gzip": "gzip", "gz": "gzip", "bzip2": "bz2", "bz2": "bz2"}
@@ -51,15 +63,15 @@ def read_nrrd(request: Request) -> Volume:
         raise FileError(f"its header has more than {LONGEST:,} bytes")
     layers = 1 if layer is None else sizes[0]
     stored = (*shape[:2], shape[2] * layers)  # layers are the fastest axis
-    array = ArrayHeader(stored, _dtype(nrrd, header), False, 0)
-    read_all, packed = _data(file, header, start, array)
+    dtype = _dtype(nrrd, header)
+    read_all, packed = _data(file, header, start, stored, dtype)
 
     def read(first: int, last: int) -> NDArray[Any]:
         planes: NDArray[Any] = read_all(first, last)[..., layer or 0 :: layers]
         return planes
 
     place, notes = _place(header, space)
-    return Volume(tuple(shape), array.dtype, read, *place, packed=packed, notes=notes)
+    return Volume(tuple(shape), dtype, read, *place, packed=packed, notes=notes)
 
 
 def _axes(header: dict[str, Any]) -> Axes:
@@ -97,13 +109,13 @@ def _layer(request: Request, header: dict[str, Any], sizes: tuple[int, ...]) -> 
 
 def _segments(header: dict[str, Any], layer: int) -> str:
     """Return names and labels of the segments in a layer, as 3D Slicer writes them."""
-    found = [
+    segments = [
         f"{header.get(key.replace('_Layer', '_Name'), '?')} "
         f"{header.get(key.replace('_Layer', '_LabelValue'), '?')}"
         for key, value in header.items()
         if re.fullmatch(r"Segment\d+_Layer", key) and value.strip() == str(layer)
     ]
-    return f" ({seen(', '.join(found))})" if found else ""
+    return f" ({seen(', '.join(segments))})" if segments else ""
 
 
 def _plain(name: str) -> str:
@@ -123,23 +135,27 @@ def _dtype(nrrd: Any, header: dict[str, Any]) -> np.dtype[Any]:
 
 
 def _data(
-    file: InputFile, header: dict[str, Any], start: int, array: ArrayHeader
-) -> tuple[Any, int | None]:
+    file: InputFile,
+    header: dict[str, Any],
+    start: int,
+    shape: tuple[int, ...],
+    dtype: np.dtype[Any],
+) -> tuple[Planes, int | None]:
     """Return a function that reads planes, and the size of compressed data."""
     encoding, skip = header["encoding"], header.get("byteskip", 0)
     start = _after_lines(file, start, header.get("lineskip", 0))
     if encoding == "raw":
-        start = file.size - array.size if skip == -1 else start + skip
+        start = file.size - prod(shape) * dtype.itemsize if skip == -1 else start + skip
         if start < 0:
-            raise FileError(f"{file.name} is truncated: {array} are promised, it has {file.size:,}")
-        return raw_planes(file, start, array.shape, array.dtype).read, None
-    if skip or encoding.lower() not in (*TEXT, *CODECS):
+            raise FileError(
+                f"{file.name} is truncated: {in_words_of(shape, dtype)} are promised, it has "
+                f"{file.size:,}"
+            )
+    elif skip or encoding.lower() not in (*TEXT, *CODECS):
         raise FileError(f"its encoding is {seen(encoding)}, byte skip {skip}: save it as raw")
-    if encoding.lower() in TEXT:
-        return TextValues(file, start, file.size, array.dtype, array.shape).planes, None
-    packed = bytes_from(file, start)
-    read = packed_planes(packed, CODECS[encoding], array.shape, array.dtype, file.name)
-    return read, file.size - start
+    elif encoding.lower() in TEXT:
+        return TextValues(file, start, file.size, dtype, shape).planes, None
+    return planes_behind(file, start, CODECS.get(encoding.lower()), shape, dtype)
 
 
 def _after_lines(file: InputFile, start: int, lines: int) -> int:
@@ -168,7 +184,9 @@ def _place(
         columns = None if steps is None else np.diag(steps)
         units = units or _of_axes(header.get("units"), space, ())
         if origin is None and low is not None:
-            origin, notes = low, _centering_note(header)
+            origin = low
+            if "centerings" not in header:
+                notes = (CENTERING,)
     else:
         columns = np.asarray(directions, np.float64)[space, :3].T
         if columns.shape != (3, 3) or not np.isfinite(columns).all():
@@ -205,16 +223,6 @@ def _steps(header: dict[str, Any], space: list[int]) -> tuple[Any, Any]:
         return None, None
     low = low + np.where(is_cell, steps / 2, 0)
     return steps, low if np.isfinite(low).all() else None
-
-
-def _centering_note(header: dict[str, Any]) -> tuple[str, ...]:
-    """Return a sentence on how axis mins are taken without centerings."""
-    if "centerings" in header:
-        return ()
-    return (
-        "it states axis mins, but no centerings: its samples are taken as cells, half a spacing "
-        "from them, as ITK does",
-    )
 
 
 def _of_axes(values: Any, space: list[int], default: Any) -> Any:

@@ -17,8 +17,8 @@ import numpy as np
 
 from ...errors import FileError
 from ...grid.planes import InputFile
+from ..streams import TextValues, raw_planes
 from ..volume import XYZ, ZYX, Request, Volume
-from .values import TextValues, raw_planes
 
 HEADER = struct.Struct("<3i6f")
 BEGINNING = 4096  # bytes that show the dialect
@@ -28,13 +28,7 @@ TEXT = re.compile(rb"[\s\d.+\-a-zA-Z]+")
 
 
 def read_sdf(request: Request) -> Volume:
-    """Read a file of any of the three dialects.
-
-    Raises
-    ------
-    FileError
-        If it is none of them, or truncated.
-    """
+    """Read a file of any of the three dialects."""
     file = InputFile.open(request.path)
     beginning = file.read(0, BEGINNING).tobytes()
     tagged = TAGGED.match(beginning)

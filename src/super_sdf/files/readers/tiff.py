@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from ...errors import FileError, GridError
 from ..regular import check_beside
-from ..volume import Request, Volume
-from .axes import Axes
-from .stored import placed, without_gaps
+from ..volume import Planes, Request, Volume
+from .axes import Axes, placed, without_gaps
 
 Stated = tuple[str, float | None, float | None]  # of an axis: unit, step, start
 
@@ -49,8 +48,7 @@ def read_tiff(request: Request) -> Volume:
         series.keyframe.nodata,
     )
     packed = sum(map(sum, segments))
-    about: dict[str, Any] = {"read_box": read_box, "packed": packed, **place}
-    return Volume(series.shape, np.dtype(series.dtype), read, **about)
+    return Volume(series.shape, np.dtype(series.dtype), read_box=read_box, packed=packed, **place)
 
 
 def _check_other_files(file: Any, request: Request) -> None:
@@ -63,40 +61,30 @@ def _check_other_files(file: Any, request: Request) -> None:
             check_beside(request.path, named)
 
 
-def _reader(request: Request, series: Any) -> Any:
+def _reader(request: Request, series: Any) -> Planes:
     """Return a function that reads planes: pages if each is a plane, else from the whole array."""
     pages, shape = series.pages, series.shape
-    if len(pages) == shape[0] and tuple(pages[0].shape) == tuple(shape[1:]):
+    if len(pages) != shape[0] or tuple(pages[0].shape) != tuple(shape[1:]):
+        request.check_loads(prod(shape) * np.dtype(series.dtype).itemsize, "tifffile")
+        whole: NDArray[Any] = series.asarray()
+        return lambda first, last: whole[first:last]
 
-        def read_pages(first: int, last: int) -> NDArray[Any]:
-            _check_pages(request, series, first, last)
-            return np.stack([pages[i].asarray() for i in range(first, last)])
+    def read_pages(first: int, last: int) -> NDArray[Any]:
+        missing = [i for i in range(first, last) if pages[i] is None]
+        if missing:
+            raise FileError(f"{request.path} has no page {missing[0]}: it is damaged")
+        return np.stack([pages[i].asarray() for i in range(first, last)])
 
-        return read_pages
-    request.check_loads(prod(shape) * np.dtype(series.dtype).itemsize, "tifffile")
-    whole = series.asarray()
-
-    def read(first: int, last: int) -> NDArray[Any]:
-        planes: NDArray[Any] = whole[first:last]
-        return planes
-
-    return read
-
-
-def _check_pages(request: Request, series: Any, first: int, last: int) -> None:
-    """Raise FileError if a page is missing."""
-    missing = [i for i in range(first, last) if series.pages[i] is None]
-    if missing:
-        raise FileError(f"{request.path} has no page {missing[0]}: it is damaged")
+    return read_pages
 
 
 def _axes(file: Any, series: Any, order: str) -> tuple[Axes, tuple[str, ...]]:
     """Return what a file says of the axes of an array, and a note on what is not taken of it."""
     is_named = order == "zyx" and sorted(series.axes) == ["X", "Y", "Z"]
     names = series.axes.lower() if is_named else order
-    found: dict[str, Stated] = _ome_axes(file) or _imagej_axes(file) or {}
-    units, steps, starts = zip(*(found.get(name, ("", None, None)) for name in names))
-    return Axes.named(names, units, steps, starts), (() if found else _pixel_note(file))
+    stated: dict[str, Stated] = _ome_axes(file) or _imagej_axes(file) or {}
+    units, steps, starts = zip(*(stated.get(name, ("", None, None)) for name in names))
+    return Axes.named(names, units, steps, starts), (() if stated else _pixel_note(file))
 
 
 def _imagej_axes(file: Any) -> dict[str, Stated] | None:
@@ -105,19 +93,23 @@ def _imagej_axes(file: Any) -> dict[str, Stated] | None:
     What is not stated holds as in ImageJ: a spacing of z of 1, the unit of the resolution, that of
     x for all axes, and origins of 0 beside others, which are in pixels.
     """
-    found: dict[str, Any] = file.imagej_metadata or (file.shaped_metadata or ({},))[0]
+    metadata: dict[str, Any] = file.imagej_metadata or (file.shaped_metadata or ({},))[0]
     sizes = _pixel_sizes(file)
-    if not sizes or not (file.is_imagej or "spacing" in found):
+    if not sizes or not (file.is_imagej or "spacing" in metadata):
         return None
-    unit = str(found.get("unit") or _resolution_unit(file))
-    if "spacing" not in found and "unit" not in found and unit:
+    unit = str(metadata.get("unit") or _resolution_unit(file))
+    if "spacing" not in metadata and "unit" not in metadata and unit:
         return None  # x and y may be those of a print
-    units = [_unescaped(str(found.get(f"{axis}unit") or unit)) for axis in "xyz"]
-    steps = [*sizes, abs(float(found.get("spacing") or 1))]
+    # ImageJ writes letters beyond ASCII by their numbers
+    units = [
+        re.sub(r"\\u([0-9a-fA-F]{4})", lambda number: chr(int(number[1], 16)), each)
+        for each in (str(metadata.get(f"{axis}unit") or unit) for axis in "xyz")
+    ]
+    steps = [*sizes, abs(float(metadata.get("spacing") or 1))]
     is_bare = not any(unit and not unit.startswith("pixel") for unit in units)
-    if is_bare and "spacing" not in found and sizes == (1, 1):
+    if is_bare and "spacing" not in metadata and sizes == (1, 1):
         return None
-    starts = [float(found.get(f"{axis}origin") or 0) for axis in "xyz"]
+    starts = [float(metadata.get(f"{axis}origin") or 0) for axis in "xyz"]
     placed = [-start * step if any(starts) else None for start, step in zip(starts, steps)]
     return dict(zip("xyz", zip(units, steps, placed)))
 
@@ -127,14 +119,9 @@ def _pixel_sizes(file: Any) -> tuple[float, float] | None:
     tags = file.pages[0].tags
     if "XResolution" not in tags or "YResolution" not in tags:
         return None
-    x, y = (_per_pixel(tags[name].value) for name in ("XResolution", "YResolution"))
+    stated = (tags[name].value for name in ("XResolution", "YResolution"))  # pixels, units
+    x, y = (units / pixels if pixels else 0.0 for pixels, units in stated)
     return (x, y) if x > 0 and y > 0 else None
-
-
-def _per_pixel(resolution: tuple[int, int]) -> float:
-    """Return the size of a pixel from pixels per unit, a fraction."""
-    pixels, units = resolution
-    return units / pixels if pixels else 0.0
 
 
 def _resolution_unit(file: Any) -> str:
@@ -142,11 +129,6 @@ def _resolution_unit(file: Any) -> str:
     tag = file.pages[0].tags.get("ResolutionUnit")
     number = 2 if tag is None else int(tag.value)  # inches, by the standard
     return {2: "inch", 3: "cm", 4: "mm", 5: "µm"}.get(number, "")
-
-
-def _unescaped(unit: str) -> str:
-    """Return a unit whose letters beyond ASCII are written as ImageJ does, by their numbers."""
-    return re.sub(r"\\u([0-9a-fA-F]{4})", lambda found: chr(int(found[1], 16)), unit)
 
 
 def _pixel_note(file: Any) -> tuple[str, ...]:
@@ -168,9 +150,9 @@ def _ome_axes(file: Any) -> dict[str, Stated] | None:
     pixels = ElementTree.fromstring(re.sub(r"\s\w+:(?=\w+=)", " ", text)).find(".//Pixels")
     if pixels is None:
         return None
-    found: dict[str, Stated] = {}
+    stated: dict[str, Stated] = {}
     for axis in "XYZ":
         size, unit = pixels.get(f"PhysicalSize{axis}"), pixels.get(f"PhysicalSize{axis}Unit", "µm")
         if size and float(size) > 0:
-            found[axis.lower()] = unit, float(size), None
-    return found
+            stated[axis.lower()] = unit, float(size), None
+    return stated

@@ -7,19 +7,16 @@ flags of its compression, metadata, the transform and the tree (``vdb_tree``).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import FileError, GridError
 from ...grid.planes import InputFile
-from ..boxes import Box
-from ..volume import Request, Volume, from_affine
-from .choosing import choose_member
-from .vdb_tree import LEAF, Coding, Cursor, Tree, read_tree
+from ..volume import Box, Request, Volume, from_affine
+from .vdb_tree import LEAF, Coding, Cursor, Tree
 
 MAGIC = 0x56444220
 OLDEST = 222  # version of the file format, of OpenVDB 3
@@ -42,8 +39,7 @@ MATRICES = ("AffineMap", "UnitaryMap")
 PICOGK_MM = 1000  # PicoGK states the size of a voxel in metres, and works in millimetres
 
 
-@dataclass(frozen=True)
-class _Entry:
+class _Entry(NamedTuple):
     """A grid of a file: its name, the type of its tree, and where it begins."""
 
     name: str
@@ -57,26 +53,27 @@ def read_vdb(request: Request) -> Volume:
 
     Every voxel has the value that OpenVDB gives it, inactive ones too. A background of 0 is no
     distance: where values are signed, voxels that have it and are not active are unknown.
-
-    Raises
-    ------
-    FileError
-        If the file is no ``.vdb`` file, is damaged, or is of before OpenVDB 3.
-    GridError
-        If the grid has no voxel that is not background, or its transform is not affine.
     """
     file = InputFile.open(request.path)
     entries = _entries(file)
     usable = [entry for entry in entries if entry.type.removesuffix(HALF) in TYPES]
     names = [entry.name for entry in usable]
-    entry = usable[names.index(choose_member(request, names, "grid of floating-point values"))]
+    entry = usable[names.index(request.choose(names, "grid of floating-point values"))]
     flags, metadata, affine, place = _read_head(file, entry.place)
-    if entry.parent:
-        flags, _, _, place = _read_head(file, _parent(entries, entry, file).place)
+    if entry.parent:  # whose tree it shares
+        places = [other.place for other in entries if other.name == entry.parent]
+        if not places:
+            raise FileError(f"{file.name} is damaged: it lacks the grid {entry.parent!r}")
+        flags, _, _, place = _read_head(file, places[0])
     dtype = TYPES[entry.type.removesuffix(HALF)]
     stored = np.dtype("<f2") if entry.type.endswith(HALF) else dtype
-    tree = read_tree(file, place, partial(Coding, dtype, stored, flags))
-    _check_count(file, tree, metadata)
+    tree = Tree(file, place, partial(Coding, dtype, stored, flags))
+    stated = metadata.get("file_voxel_count", tree.active_count)
+    if stated != tree.active_count:
+        raise FileError(
+            f"{file.name} is damaged: it has {tree.active_count:,} active voxels and states "
+            f"{stated:,}"
+        )
     return _volume(file, tree, metadata, affine)
 
 
@@ -115,14 +112,6 @@ def _read_entries(cursor: Cursor, count: int) -> Iterator[_Entry]:
             cursor.skip(0)
 
 
-def _parent(entries: list[_Entry], entry: _Entry, file: InputFile) -> _Entry:
-    """Return the grid whose tree another one shares."""
-    for other in entries:
-        if other.name == entry.parent:
-            return other
-    raise FileError(f"{file.name} is damaged: it lacks the grid {entry.parent!r}")
-
-
 def _read_head(file: InputFile, place: int) -> tuple[int, dict[str, Any], NDArray[np.float64], int]:
     """Return compression, metadata and transform of a grid, and where its tree begins."""
     cursor = Cursor(file, place)
@@ -133,16 +122,16 @@ def _read_head(file: InputFile, place: int) -> tuple[int, dict[str, Any], NDArra
 
 def _read_metadata(cursor: Cursor) -> dict[str, Any]:
     """Return the numbers and texts of metadata."""
-    found: dict[str, Any] = {}
+    metadata: dict[str, Any] = {}
     for _ in range(cursor.number("I")):
         name, type_ = cursor.text(), cursor.text()
         data = Cursor(cursor.file, cursor.place + 4)
         cursor.skip(cursor.number("I"))
         if type_ == "string":
-            found[name] = data.take(cursor.place - data.place).decode("utf-8", "replace")
+            metadata[name] = data.take(cursor.place - data.place).decode("utf-8", "replace")
         elif type_ in NUMBERS:
-            found[name] = data.number(NUMBERS[type_])
-    return found
+            metadata[name] = data.number(NUMBERS[type_])
+    return metadata
 
 
 def _read_transform(cursor: Cursor) -> NDArray[np.float64]:
@@ -161,16 +150,6 @@ def _read_transform(cursor: Cursor) -> NDArray[np.float64]:
     return np.column_stack([np.diag(np.ones(3) if scale is None else vectors[scale]), moved])
 
 
-def _check_count(file: InputFile, tree: Tree, metadata: dict[str, Any]) -> None:
-    """Raise FileError if not all voxels that the file states were found."""
-    stated = metadata.get("file_voxel_count", tree.active_count)
-    if stated != tree.active_count:
-        raise FileError(
-            f"{file.name} is damaged: it has {tree.active_count:,} active voxels and states "
-            f"{stated:,}"
-        )
-
-
 def _volume(
     file: InputFile, tree: Tree, metadata: dict[str, Any], affine: NDArray[np.float64]
 ) -> Volume:
@@ -178,7 +157,7 @@ def _volume(
     bounds = tree.bounds()
     if bounds is None:
         raise GridError(f"{file.name} has no active voxel: it holds no surface")
-    unknown = not tree.coding.background and tree.is_signed(file)
+    unknown = not tree.coding.background and tree.is_signed()
     margin = 0 if unknown else MARGIN
     low, high = bounds[0] - margin, bounds[1] + margin
     size = PICOGK_MM * float(metadata.get("PicoGK.VoxelSize", 1 / PICOGK_MM))
@@ -187,20 +166,18 @@ def _volume(
     def read_box(box: Box) -> NDArray[Any]:
         start = low + [part.start for part in box]
         shape = tuple(part.stop - part.start for part in box)
-        found = tree.read(file, start, shape, unknown=unknown)
-        return found if size == 1 else found * found.dtype.type(size)
+        voxels = tree.read(start, shape, unknown=unknown)
+        return voxels if size == 1 else voxels * voxels.dtype.type(size)
 
-    nx, ny, nz = map(int, high - low)
+    turn = affine[:, :3]
     spacing, origin, direction = from_affine(
-        size * np.column_stack([affine[:, :3], affine[:, :3] @ low + affine[:, 3]])
+        size * np.column_stack([turn, turn @ low + affine[:, 3]])
     )
     return Volume(
-        (nx, ny, nz),
+        tuple(map(int, high - low)),
         tree.coding.dtype.newbyteorder("="),
-        lambda first, last: read_box((slice(first, last), slice(0, ny), slice(0, nz))),
-        spacing,
-        origin,
-        direction,
+        None,
+        *(spacing, origin, direction),
         chunks=(LEAF, LEAF, LEAF),
         read_box=read_box,
         notes=(notes,) if "PicoGK.VoxelSize" in metadata else (),

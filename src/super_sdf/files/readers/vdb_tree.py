@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ from ...errors import FileError
 from ...grid.planes import InputFile
 
 Ints = NDArray[np.int64]
+Tiles = tuple[Ints, Ints, NDArray[Any], BoolArray]  # corners, edges, values, which are active
+Leaves = tuple[Ints, NDArray[np.uint8]]  # corners, masks of active voxels
 
 ZIP, ACTIVE_MASK, BLOSC = 1, 2, 4  # flags of a grid's compression
 # How the inactive values of a node are stored, besides the active ones. The first three have one
@@ -41,13 +44,7 @@ class Cursor:
         self._start, self._held = 0, b""
 
     def take(self, count: int) -> bytes:
-        """Return the next bytes.
-
-        Raises
-        ------
-        FileError
-            If the file ends before.
-        """
+        """Return the next bytes."""
         if not 0 <= count <= self.file.size - self.place:
             raise FileError(
                 f"{self.file.name} is truncated or damaged: {count:,} bytes are to follow byte "
@@ -98,11 +95,11 @@ class Coding:
         numbers = self._numbers(cursor, int(active.sum()) if packed else len(active))
         if not packed:
             return numbers
-        found = np.full(len(active), values[0], self.dtype)
+        filled = np.full(len(active), values[0], self.dtype)
         if selection is not None:
-            found[selection] = values[1]
-        found[active] = numbers
-        return found
+            filled[selection] = values[1]
+        filled[active] = numbers
+        return filled
 
     def skip(self, cursor: Cursor, active: int) -> int:
         """Skip the values of a leaf of ``active`` active voxels; return how others are stored."""
@@ -134,7 +131,7 @@ class Coding:
         length, packed = self._length(cursor, count)
         data, size = cursor.take(length), count * self.stored.itemsize
         if packed:
-            data = (_from_blosc if self.flags & BLOSC else _from_zip)(data, size)
+            data = _unpacked(data, size, self.flags & BLOSC)
         if len(data) != size:
             raise FileError(f"{cursor.file.name} is damaged: a node's values cannot be unpacked")
         return np.frombuffer(data, self.stored).astype(self.dtype)
@@ -145,55 +142,88 @@ def bits(mask: NDArray[np.uint8]) -> BoolArray:
     return np.unpackbits(mask, bitorder="little").astype(bool)
 
 
-def _from_zip(data: bytes, size: int) -> bytes:
-    """Return the ``size`` bytes of a zlib stream; empty if it is damaged."""
-    stream = zlib.decompressobj()
-    try:
-        unpacked = stream.decompress(data, size + 1)
-    except zlib.error:
-        return b""
-    return unpacked if stream.eof else b""
+def _unpacked(data: bytes, size: int, is_blosc: int) -> bytes:
+    """Return the bytes of a zlib stream or Blosc buffer; none if it is damaged."""
+    with suppress(zlib.error, RuntimeError, ValueError):
+        if not is_blosc:
+            stream = zlib.decompressobj()
+            unpacked = stream.decompress(data, size + 1)
+            return unpacked if stream.eof else b""
+        from numcodecs import blosc
+
+        # the header: four bytes, then the sizes unpacked, of a block, and packed
+        if len(data) >= 16 and struct.unpack_from("<I4xI", data, 4) == (size, len(data)):
+            return bytes(blosc.decompress(data))
+    return b""
 
 
-def _from_blosc(data: bytes, size: int) -> bytes:
-    """Return the ``size`` bytes of a Blosc buffer; empty if it states other sizes or is damaged."""
-    from numcodecs import blosc
-
-    # the header: four bytes, then the sizes unpacked, of a block, and packed
-    if len(data) < 16 or struct.unpack_from("<I4xI", data, 4) != (size, len(data)):
-        return b""
-    try:
-        return bytes(blosc.decompress(data))
-    except (RuntimeError, ValueError):
-        return b""
-
-
-@dataclass
 class Tree:
-    """Where the tiles and leaves of a grid are.
+    """Where the T tiles and L leaves of a grid are, which are read from a byte of a file on.
 
-    Attributes
+    Tiles are kept that are active or have another value than the background. ``places`` are where
+    the values of each leaf begin; a leaf that is ``whole`` may have inactive voxels of other values
+    than the background.
+
+    Parameters
     ----------
-    corners, edges, values, active : (T, 3), (T,), (T,), (T,) arrays
-        First voxel, voxels along an edge, value and state of each tile that is active or has
-        another value than the background.
-    leaves, masks : (L, 3) int64, (L, 64) uint8
-        First voxel of each leaf, and which of its voxels are active.
-    places : (L,) int64
-        Where the values of each leaf begin in the file.
-    whole : (L,) bool
-        Whether a leaf's inactive voxels may have other values than the background.
+    coding : callable
+        Makes the coding of a background.
     """
 
-    coding: Coding
-    corners: Ints
-    edges: Ints
-    values: NDArray[Any]
-    active: BoolArray
-    leaves: Ints
-    masks: NDArray[np.uint8]
-    places: Ints = field(default_factory=lambda: np.empty(0, np.int64))
-    whole: BoolArray = field(default_factory=lambda: np.empty(0, bool))
+    def __init__(self, file: InputFile, place: int, coding: Callable[[float], Coding]) -> None:
+        self.file, cursor = file, Cursor(file, place)
+        buffers = cursor.number("I")
+        if buffers != 1:
+            raise FileError(f"{file.name} is damaged: its tree has {buffers} buffers, not one")
+        dtype = coding(0.0).dtype
+        self.coding = coding(float(cursor.array(dtype, 1)[0]))
+        corner, edge = np.empty((0, 3), np.int64), np.empty(0, np.int64)
+        tiles: list[Tiles] = [(corner, edge, np.empty(0, dtype), np.empty(0, bool))]
+        leaves: list[Leaves] = [(corner, np.empty((0, LEAF**3 // 8), np.uint8))]
+        for part in self._parts(cursor):
+            (tiles if len(part) == 4 else leaves).append(part)  # type: ignore[arg-type]
+        self.corners, self.edges, self.values, self.active = map(np.concatenate, zip(*tiles))
+        self.leaves, self.masks = map(np.concatenate, zip(*leaves))
+        counts = ONES[self.masks].sum(1)
+        self.places = np.empty(len(counts), np.int64)
+        self.whole = np.empty(len(counts), bool)
+        for leaf, count in enumerate(counts.tolist()):  # after the topology, each after its mask
+            cursor.skip(LEAF**3 // 8)
+            self.places[leaf] = cursor.place
+            self.whole[leaf] = self.coding.skip(cursor, count) != 0
+        cursor.skip(0)
+
+    def _parts(self, cursor: Cursor) -> Iterator[Tiles | Leaves]:
+        """Yield tiles and leaves of the topology from the root on."""
+        tiles, children = cursor.unpack("II")
+        for _ in range(tiles):
+            corner = cursor.array("<i4", 3).astype(np.int64)[None]
+            value = cursor.array(self.coding.dtype, 1)
+            yield self._tiles(corner, EDGES[0], value, bits(cursor.array("u1", 1))[:1])
+        for _ in range(children):
+            yield from self._node(cursor, cursor.array("<i4", 3).astype(np.int64), EDGES)
+
+    def _node(
+        self, cursor: Cursor, corner: Ints, edges: tuple[int, ...]
+    ) -> Iterator[Tiles | Leaves]:
+        """Yield what is in a node whose children have the second edge, or are leaves."""
+        edge = edges[1] if len(edges) > 1 else LEAF
+        count = edges[0] // edge
+        child, active = (bits(cursor.array("u1", count**3 // 8)) for _ in range(2))
+        values = self.coding.read(cursor, active)
+        corners = corner + edge * np.argwhere(np.ones((count,) * 3, bool))
+        yield self._tiles(corners[~child], edge, values[~child], active[~child])
+        if edge > LEAF:
+            for place in corners[child]:
+                yield from self._node(cursor, place, edges[1:])
+            return
+        masks = cursor.array("u1", 64 * int(child.sum()))
+        yield corners[child], masks.reshape(-1, LEAF**3 // 8)
+
+    def _tiles(self, corners: Ints, edge: int, values: NDArray[Any], active: BoolArray) -> Tiles:
+        """Return the tiles that are active, or have another value than the background."""
+        kept = active | (values != self.coding.background)
+        return corners[kept], np.full(int(kept.sum()), edge), values[kept], active[kept]
 
     @property
     def active_count(self) -> int:
@@ -202,52 +232,43 @@ class Tree:
 
     def bounds(self) -> tuple[Ints, Ints] | None:
         """Return the first voxel and the one after the last that is no inactive background."""
-        firsts, ends = _extents(self.masks)
-        firsts[self.whole], ends[self.whole] = 0, LEAF
-        some = ends[:, 0] > 0
+        by_axis = self.masks.reshape(-1, LEAF, LEAF)  # the bits of a byte are along z
+        z = np.bitwise_or.reduce(self.masks, axis=1)[:, None]
+        lines = [by_axis.any(2), by_axis.any(1), np.unpackbits(z, axis=1, bitorder="little")]
+        along = np.stack(lines, axis=1).astype(bool)  # (L, 3, 8): whether any voxel is active there
+        along[self.whole] = True
+        some = along.any((1, 2))
+        firsts, ends = along.argmax(2), LEAF - along[:, :, ::-1].argmax(2)
         low = np.concatenate([self.corners, (self.leaves + firsts)[some]])
         high = np.concatenate([self.corners + self.edges[:, None], (self.leaves + ends)[some]])
         return (low.min(0), high.max(0)) if len(low) else None
 
-    def is_signed(self, file: InputFile) -> bool:
+    def is_signed(self) -> bool:
         """Return whether any tile, or any value of a leaf, is negative."""
-        leaves = range(len(self.leaves))
-        cursor = Cursor(file)
-        negative = any((self._values(cursor, leaf)[0] < 0).any() for leaf in leaves)
+        cursor, leaves = Cursor(self.file), range(len(self.leaves))
+        negative = any((self._values_of(cursor, leaf)[0] < 0).any() for leaf in leaves)
         return negative or bool((self.values < 0).any())
 
-    def read(
-        self, file: InputFile, first: Ints, shape: tuple[int, ...], *, unknown: bool = False
-    ) -> NDArray[Any]:
+    def read(self, first: Ints, shape: tuple[int, ...], *, unknown: bool = False) -> NDArray[Any]:
         """Return a box of voxels from ``first`` on; inactive background may be unknown, NaN."""
         background = np.nan if unknown else self.coding.background
         box = np.full(shape, background, self.coding.dtype)
         for tile in np.flatnonzero(_touch(self.corners, self.edges[:, None], first, shape)):
             edges = (int(self.edges[tile]),) * 3
             _put(box, np.broadcast_to(self.values[tile], edges), self.corners[tile] - first)
-        cursor = Cursor(file)
+        cursor = Cursor(self.file)
         for leaf in np.flatnonzero(_touch(self.leaves, LEAF, first, shape)).tolist():
-            values, active = self._values(cursor, leaf)
+            values, active = self._values_of(cursor, leaf)
             if unknown:
                 values[~active & (values == self.coding.background)] = np.nan
             _put(box, values.reshape(LEAF, LEAF, LEAF), self.leaves[leaf] - first)
         return box
 
-    def _values(self, cursor: Cursor, leaf: int) -> tuple[NDArray[Any], BoolArray]:
+    def _values_of(self, cursor: Cursor, leaf: int) -> tuple[NDArray[Any], BoolArray]:
         """Return the values of a leaf, and which are active, both (512,)."""
         cursor.place = int(self.places[leaf])
         active = bits(self.masks[leaf])
         return self.coding.read(cursor, active), active
-
-
-def _extents(masks: NDArray[np.uint8]) -> tuple[Ints, Ints]:
-    """Return the first active voxel of each leaf and the one after the last, (L, 3), else 0."""
-    by_axis = masks.reshape(-1, LEAF, LEAF)  # the bits of a byte are along z
-    z = np.bitwise_or.reduce(masks, axis=1)[:, None]
-    lines = [by_axis.any(2), by_axis.any(1), np.unpackbits(z, axis=1, bitorder="little")]
-    along = np.stack(lines, axis=1).astype(bool)
-    first, after = along.argmax(2), LEAF - along[:, :, ::-1].argmax(2)
-    return first, np.where(along.any(2), after, 0)
 
 
 def _touch(corners: Ints, edges: Any, first: Ints, shape: tuple[int, ...]) -> BoolArray:
@@ -262,88 +283,3 @@ def _put(box: NDArray[Any], values: NDArray[Any], start: Ints) -> None:
     high = np.minimum(start + values.shape, box.shape)
     there = tuple(slice(a, b) for a, b in zip(low, high))
     box[there] = values[tuple(slice(a, b) for a, b in zip(low - start, high - start))]
-
-
-class _Topology:
-    """The tiles and leaves of a tree while its topology is read."""
-
-    def __init__(self, cursor: Cursor, coding: Coding) -> None:
-        self.cursor, self.coding = cursor, coding
-        self.tiles: list[tuple[Ints, int, NDArray[Any], BoolArray]] = []
-        self.leaves: list[Ints] = [np.empty((0, 3), np.int64)]
-        self.masks = [np.empty((0, LEAF**3 // 8), np.uint8)]
-
-    def read_root(self) -> None:
-        """Read the topology from the root on."""
-        cursor = self.cursor
-        tiles, children = cursor.unpack("II")
-        for _ in range(tiles):
-            corner = cursor.array("<i4", 3).astype(np.int64)[None]
-            value = cursor.array(self.coding.dtype, 1)
-            self._add_tiles(corner, EDGES[0], value, bits(cursor.array("u1", 1))[:1])
-        for _ in range(children):
-            self._read_node(cursor.array("<i4", 3).astype(np.int64), EDGES)
-
-    def _read_node(self, corner: Ints, edges: tuple[int, ...]) -> None:
-        """Read a node whose children have the second edge, or are leaves, and all below it."""
-        edge = edges[1] if len(edges) > 1 else LEAF
-        count = edges[0] // edge
-        child, active = (bits(self.cursor.array("u1", count**3 // 8)) for _ in range(2))
-        values = self.coding.read(self.cursor, active)
-        corners = corner + edge * np.argwhere(np.ones((count,) * 3, bool))
-        self._add_tiles(corners[~child], edge, values[~child], active[~child])
-        if edge == LEAF:
-            self.leaves.append(corners[child])
-            masks = self.cursor.array("u1", 64 * int(child.sum()))
-            self.masks.append(masks.reshape(-1, LEAF**3 // 8))
-            return
-        for place in corners[child]:
-            self._read_node(place, edges[1:])
-
-    def _add_tiles(self, corners: Ints, edge: int, values: NDArray[Any], active: BoolArray) -> None:
-        """Keep the tiles that are active, or have another value than the background."""
-        kept = active | (values != self.coding.background)
-        self.tiles.append((corners[kept], edge, values[kept], active[kept]))
-
-
-def read_tree(file: InputFile, place: int, coding: Callable[[float], Coding]) -> Tree:
-    """Read the topology of the tree that begins at a byte of a file, and find its leaves' values.
-
-    ``coding`` makes the coding of a background.
-
-    Raises
-    ------
-    FileError
-        If the file is truncated or damaged.
-    """
-    cursor = Cursor(file, place)
-    buffers = cursor.number("I")
-    if buffers != 1:
-        raise FileError(f"{file.name} is damaged: its tree has {buffers} buffers, not one")
-    dtype = coding(0.0).dtype
-    topology = _Topology(cursor, coding(float(cursor.array(dtype, 1)[0])))
-    topology.read_root()
-    corners, edges, values, active = zip(*topology.tiles) if topology.tiles else ((), (), (), ())
-    tree = Tree(
-        topology.coding,
-        np.concatenate([np.empty((0, 3), np.int64), *corners]),
-        np.repeat(np.array(edges, np.int64), [len(each) for each in values]),
-        np.concatenate([np.empty(0, dtype), *values]),
-        np.concatenate([np.empty(0, bool), *active]),
-        np.concatenate(topology.leaves),
-        np.concatenate(topology.masks),
-    )
-    _find_values(cursor, tree)
-    return tree
-
-
-def _find_values(cursor: Cursor, tree: Tree) -> None:
-    """Find where the values of each leaf are; they follow the topology, each after its mask."""
-    counts = ONES[tree.masks].sum(1)
-    tree.places = np.empty(len(counts), np.int64)
-    tree.whole = np.empty(len(counts), bool)
-    for leaf, count in enumerate(counts.tolist()):
-        cursor.skip(LEAF**3 // 8)
-        tree.places[leaf] = cursor.place
-        tree.whole[leaf] = tree.coding.skip(cursor, count) != 0
-    cursor.skip(0)

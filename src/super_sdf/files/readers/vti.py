@@ -13,9 +13,8 @@ import base64
 import io
 import lzma
 import re
-import zlib
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from math import prod
 from typing import Any, NamedTuple
 from xml.parsers import expat
@@ -26,14 +25,11 @@ from numpy.typing import NDArray
 from ...errors import FileError, GridError, seen
 from ...grid.planes import InputFile
 from ...machine.extras import check_modules
-from ..archives import Deflate, Unpacker
-from ..headers import ArrayHeader, Read
-from ..volume import ImageLattice, Request, Volume
-from .choosing import choose_member
-from .values import TextValues, bytes_from, next_planes
+from ..streams import Deflate, Read, TextValues, Unpacker, bytes_from, next_planes
+from ..volume import Planes, Request, Volume, in_words_of
+from .vtk import ImageLattice
 
 PIECE, LONGEST_TAG = 1 << 20, 1 << 20  # bytes of XML
-DEEPEST = 5  # elements from that of the file to that of an array
 MOST_CELLS = 10**7  # of the lattice that the borders of all pieces make
 LARGEST_BLOCK = 1 << 26  # bytes, of LZ4, which is unpacked block by block
 LZMA_MEMORY = 1 << 27  # bytes; xz takes 65 MB at its usual setting
@@ -46,7 +42,6 @@ KINDS = ("PointData", "CellData")
 MARKS = ("vtkGhostType", "vtkValidPointMask")
 
 Attributes = dict[str, str]
-Planes = Callable[[int, int], NDArray[Any]]
 
 
 def read_vti(request: Request) -> Volume:
@@ -58,7 +53,7 @@ def read_vti(request: Request) -> Volume:
     outline = Outline(file)
     arrays = outline.arrays()
     scalar = [name for name in arrays if arrays[name][2] or name == request.member]
-    name = choose_member(request, scalar or list(arrays), "array of points or cells")
+    name = request.choose(scalar or list(arrays), "array of points or cells")
     kind, name = arrays[name][:2]
     of_points = kind == KINDS[0]
     spacing = _numbers(outline.image, "Spacing", 3, 1)
@@ -97,17 +92,15 @@ class Piece(NamedTuple):
     arrays: dict[str, dict[str, Array]]
 
 
+class _FoundError(Exception):
+    """The data at the end of a file begins."""
+
+
 class Outline:
     """What the XML of a file says, up to the data at its end.
 
-    Attributes
-    ----------
-    top, image : dict
-        Attributes of the elements VTKFile and ImageData.
-    pieces : list of Piece
-        All pieces that are not empty.
-    appended : str or None, int
-        The encoding of the data at the end, and where it begins.
+    ``top`` and ``image`` are the attributes of the elements VTKFile and ImageData; ``appended`` is
+    the encoding of the data at the end, and where it begins.
     """
 
     def __init__(self, file: InputFile) -> None:
@@ -127,18 +120,17 @@ class Outline:
 
         That of an array of cells beside one of points of the same name begins with ``CellData/``.
         """
-        found: dict[str, tuple[str, str, bool]] = {}
+        by_name: dict[str, tuple[str, str, bool]] = {}
         for kind in KINDS:
-            for name, array in (
-                (n, a) for piece in self.pieces for n, a in piece.arrays[kind].items()
-            ):
+            pairs = (pair for piece in self.pieces for pair in piece.arrays[kind].items())
+            for name, array in pairs:
                 is_scalar = array.attributes.get("NumberOfComponents", "1") == "1"
-                key = name if found.get(name, (kind,))[0] == kind else f"{kind}/{name}"
-                found[key] = kind, name, is_scalar and name not in MARKS
-        return found
+                key = name if by_name.get(name, (kind,))[0] == kind else f"{kind}/{name}"
+                by_name[key] = kind, name, is_scalar and name not in MARKS
+        return by_name
 
     def _parse(self) -> None:
-        """Parse the XML, of which no entity is expanded."""
+        """Parse the XML; document types, and so entities, are refused."""
         parser = self.parser = expat.ParserCreate()
         parser.StartElementHandler = self._start
         parser.EndElementHandler = self._end
@@ -149,7 +141,7 @@ class Outline:
                 parser.Parse(text, place + PIECE >= self.file.size)
                 if place + len(text) - parser.CurrentByteIndex > LONGEST_TAG:
                     raise FileError(f"{self.file.name} is damaged: a tag is too long")
-        except _Found:
+        except _FoundError:
             pass
         except expat.ExpatError as error:
             raise FileError(
@@ -163,28 +155,33 @@ class Outline:
         """Take notice of an element."""
         self._end_text()
         self.path.append(name)
-        where = self.path[1:] if len(self.path) <= DEEPEST else []
-        if self.path == ["VTKFile"]:
-            self.top = attributes
-        elif where == ["ImageData"]:
-            self.image = attributes
-        elif where == ["ImageData", "Piece"]:
-            self.pieces.append(Piece(attributes, {kind: {} for kind in KINDS}))
-        elif where[:2] + where[3:] == ["ImageData", "Piece", "DataArray"] and where[2] in KINDS:
-            self._start_array(where[2], attributes)
-        elif where == ["AppendedData"]:
-            self._start_appended(attributes)
-
-    def _start_array(self, kind: str, attributes: Attributes) -> None:
-        """Take notice of an array; its text, if any, begins at the first character."""
-        arrays, name = self.pieces[-1].arrays[kind], attributes.get("Name", "")
-        if name in arrays:
-            raise FileError(f"{self.file.name} holds {name} twice in a piece: save one time step")
-        self.array = arrays[name] = Array(attributes)
-        self.parser.CharacterDataHandler = self._text
+        match self.path:
+            case ["VTKFile"]:
+                self.top = attributes
+            case [_, "ImageData"]:
+                self.image = attributes
+            case [_, "ImageData", "Piece"]:
+                self.pieces.append(Piece(attributes, {kind: {} for kind in KINDS}))
+            case [_, "ImageData", "Piece", ("PointData" | "CellData") as kind, "DataArray"]:
+                arrays, label = self.pieces[-1].arrays[kind], attributes.get("Name", "")
+                if label in arrays:
+                    raise FileError(
+                        f"{self.file.name} holds {label} twice in a piece: save one time step"
+                    )
+                self.array = arrays[label] = Array(attributes)
+                self.parser.CharacterDataHandler = self._text
+            case [_, "AppendedData"]:
+                place = self.parser.CurrentByteIndex
+                tag = APPENDED.match(self.file.read(place, LONGEST_TAG).tobytes())
+                if not tag:
+                    raise FileError(
+                        f"{self.file.name} is damaged: its appended data does not begin with _"
+                    )
+                self.appended = attributes.get("encoding"), place + tag.end()
+                raise _FoundError
 
     def _text(self, text: str) -> None:
-        """Note where the text of an array begins."""
+        """Note where the text of an array begins: at the first character."""
         if self.array and text.strip():
             self.array.start = self.parser.CurrentByteIndex + len(text) - len(text.lstrip())
             self.parser.CharacterDataHandler = None
@@ -200,32 +197,9 @@ class Outline:
         self._end_text()
         self.path.pop()
 
-    def _start_appended(self, attributes: Attributes) -> None:
-        """Note where the data at the end begins, and parse no further."""
-        place = self.parser.CurrentByteIndex
-        found = APPENDED.match(self.file.read(place, LONGEST_TAG).tobytes())
-        if not found:
-            raise FileError(f"{self.file.name} is damaged: its appended data does not begin with _")
-        self.appended = attributes.get("encoding"), place + found.end()
-        raise _Found
-
-
-class _Found(Exception):  # noqa: N818, it is no error
-    """The data at the end of a file begins."""
-
 
 class Source:
-    """Bytes in a file, as they are or in base64.
-
-    Parameters
-    ----------
-    file : InputFile
-        The file.
-    start, end : int
-        Where the bytes, or their text, begin and end.
-    is_text : bool
-        Whether they are in base64.
-    """
+    """Bytes between two places in a file, as they are or in base64."""
 
     def __init__(self, file: InputFile, start: int, end: int, is_text: bool) -> None:
         self.file, self.start, self.end, self.is_text = file, start, end, is_text
@@ -253,12 +227,8 @@ class Source:
 class Part:
     """An array of a piece, whose planes come in order, and where it is in the whole array.
 
-    Attributes
-    ----------
-    low, high : three ints
-        Its first sample along each axis (z, y, x), and that after its last.
-    packed : int or None
-        Bytes of compressed data.
+    ``low`` and ``high`` are its first sample along each axis (z, y, x), and that after its last;
+    ``packed`` is the size of compressed data.
     """
 
     def __init__(
@@ -270,9 +240,9 @@ class Part:
         lattice: ImageLattice,
     ) -> None:
         extent = _extent(piece.attributes, "Extent")
-        own = replace(lattice, extent=extent)
+        self.shape = replace(lattice, extent=extent).shape
         self.low = tuple(extent[2 * axis] - lattice.extent[2 * axis] for axis in (2, 1, 0))
-        self.high = tuple(low + size for low, size in zip(self.low, own.shape))
+        self.high = tuple(low + size for low, size in zip(self.low, self.shape))
         self.packed: int | None = None
         array = piece.arrays[which[0]].get(which[1])
         inside = all(a >= 0 and b <= n for a, b, n in zip(self.low, self.high, lattice.shape))
@@ -285,7 +255,6 @@ class Part:
         order = {"LittleEndian": "<", "BigEndian": ">"}[outline.top.get("byte_order", "")]
         self.dtype = np.dtype(order + TYPES[about["type"]])
         self.word = np.dtype(order + {"UInt64": "u8"}.get(outline.top.get("header_type", ""), "u4"))
-        self.header = ArrayHeader(own.shape, self.dtype, False, 0)
         self.name = f"{file.name}:{which[1]}"
         self.planes = self._planes(file, outline, array)
 
@@ -294,14 +263,14 @@ class Part:
         start, stop = max(self.low[0], first), min(self.high[0], first + len(planes))
         if start < stop:
             _, rows, columns = (slice(*ends) for ends in zip(self.low, self.high))
-            own = self.planes(start - self.low[0], stop - self.low[0])
-            planes[start - first : stop - first, rows, columns] = own
+            part = self.planes(start - self.low[0], stop - self.low[0])
+            planes[start - first : stop - first, rows, columns] = part
 
     def _planes(self, file: InputFile, outline: Outline, array: Array) -> Planes:
         """Return a function that returns the next planes."""
         form = array.attributes.get("format")
         if form == "ascii":
-            return TextValues(file, array.start, array.end, self.dtype, self.header.shape).planes
+            return TextValues(file, array.start, array.end, self.dtype, self.shape).planes
         source = Source(file, array.start, array.end, True)
         if form == "appended":
             encoding, start = outline.appended
@@ -311,7 +280,7 @@ class Part:
             source = Source(file, start + int(offset), file.size, encoding == "base64")
         compressor = outline.top.get("compressor")
         read = self._blocks(source, compressor) if compressor else self._whole(source)
-        return next_planes(read, self.header)
+        return next_planes(read, self.shape, self.dtype)
 
     def _words(self, source: Source, first: int, count: int) -> list[int]:
         """Return some of the numbers before the data."""
@@ -334,8 +303,9 @@ class Part:
 
     def _check_size(self, size: int) -> None:
         """Raise FileError unless data of some bytes is the array."""
-        if size != self.header.size:
-            raise FileError(f"{self.name} is damaged: {size:,} bytes for {self.header}")
+        if size != prod(self.shape) * self.dtype.itemsize:
+            promised = in_words_of(self.shape, self.dtype)
+            raise FileError(f"{self.name} is damaged: {size:,} bytes for {promised}")
 
     def _blocks(self, source: Source, compressor: str) -> Read:
         """Return a function that reads compressed data: blocks of one size, the last shorter."""
@@ -345,58 +315,45 @@ class Part:
         packed = self._words(source, 3, count)
         self.packed = sum(packed)
         data = source.after((3 + count) * self.word.itemsize)
+        starts = [0, *accumulate(packed)]
+        blocks = (
+            _block(compressor, bytes_from(data, start, start + length), length, whole, self.name)
+            for start, length, whole in zip(starts, packed, sizes)
+        )
+        block = next(blocks)
 
-        def blocks() -> Iterator[Read]:
-            start = 0
-            for length, whole in zip(packed, sizes):
-                read = bytes_from(data, start, start + length)
-                yield _block(compressor, read, length, whole, self.name)
-                start += length
+        def read(count: int) -> bytes:
+            nonlocal block
+            pieces = []
+            while count:
+                piece = block(count)
+                if not piece:
+                    block = next(blocks)
+                pieces.append(piece)
+                count -= len(piece)
+            return b"".join(pieces)
 
-        return _joined(blocks())
+        return read
 
 
 def _block(compressor: str, packed: Read, length: int, size: int, name: str) -> Read:
     """Return a function that reads a block of some bytes, of which ``length`` are stored."""
     if compressor == "vtkZLibDataCompressor":
-        return Unpacker(packed, Deflate(zlib.MAX_WBITS), size, name).read
+        return Unpacker(packed, Deflate(), size, name).read
     if compressor == "vtkLZMADataCompressor":
         return Unpacker(packed, lzma.LZMADecompressor(memlimit=LZMA_MEMORY), size, name).read
-    if compressor == "vtkLZ4DataCompressor" and max(size, length) <= LARGEST_BLOCK:
-        return io.BytesIO(_unpack_lz4(packed(length), size, name)).read
-    raise FileError(
-        f"its compressor is {seen(compressor)}, a block {size:,} bytes: save it with "
-        "vtkZLibDataCompressor"
-    )
-
-
-def _unpack_lz4(packed: bytes, size: int, name: str) -> bytes:
-    """Return an unpacked block of LZ4, which has no checksum."""
+    if compressor != "vtkLZ4DataCompressor" or max(size, length) > LARGEST_BLOCK:
+        raise FileError(
+            f"its compressor is {seen(compressor)}, a block {size:,} bytes: save it with "
+            "vtkZLibDataCompressor"
+        )
     check_modules("LZ4 in VTK image data", "vti")
     from vtkmodules.vtkIOCore import vtkLZ4DataCompressor
 
-    block, compressor = np.empty(size, np.uint8), vtkLZ4DataCompressor()  # type: Any, Any
-    if compressor.Uncompress(packed, len(packed), block, size) != size:
+    data, block, unpacker = packed(length), np.empty(size, np.uint8), vtkLZ4DataCompressor()
+    if unpacker.Uncompress(data, len(data), block, size) != size:  # type: ignore[call-overload]
         raise FileError(f"{name} is damaged: a block of LZ4 does not have {size:,} bytes")
-    return block.tobytes()
-
-
-def _joined(blocks: Iterator[Read]) -> Read:
-    """Return a function that reads blocks one after the other."""
-    block = next(blocks)
-
-    def read(count: int) -> bytes:
-        nonlocal block
-        pieces = []
-        while count:
-            piece = block(count)
-            if not piece:
-                block = next(blocks)
-            pieces.append(piece)
-            count -= len(piece)
-        return b"".join(pieces)
-
-    return read
+    return io.BytesIO(block.tobytes()).read
 
 
 def _check_cover(parts: list[Part], shape: tuple[int, ...]) -> None:

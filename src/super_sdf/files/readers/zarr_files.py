@@ -38,17 +38,9 @@ Document = dict[str, Any]
 
 
 class ZarrFiles:
-    """The files of a Zarr store in a folder or a zip file.
+    """The files of a Zarr store in a folder or a zip file, which may not lead out of it.
 
-    Attributes
-    ----------
-    sizes : dict
-        The bytes that each file takes, by its key.
-
-    Raises
-    ------
-    FileError
-        If one is no regular file, or leads out of the store.
+    ``sizes`` has the bytes that each file takes, by its key.
     """
 
     def __init__(self, request: Request) -> None:
@@ -82,21 +74,21 @@ class ZarrFiles:
         if key not in self.sizes:
             return {}
         with self.open(key) as file:
-            found = json.load(file)
-        if not isinstance(found, dict):
+            content = json.load(file)
+        if not isinstance(content, dict):
             raise FileError(f"{self.path} is damaged: {key} is no JSON object")
-        return found
+        return content
 
     def arrays(self) -> dict[str, int]:
         """Return the number of axes of each array, by its path in the store."""
-        found = {}
+        counts = {}
         for key in self.sizes:
             path, _, name = key.rpartition("/")
             if name in (ARRAY_2, NODE_3):
                 about = self.document(key)
                 if name == ARRAY_2 or about.get("node_type") == "array":
-                    found[path] = len(about.get("shape", ()))
-        return found
+                    counts[path] = len(about.get("shape", ()))
+        return counts
 
     def axes_of(self, path: str) -> int:
         """Return the number of axes of an array, 0 if there is none at a path."""
@@ -121,30 +113,27 @@ class ZarrFiles:
                     )
 
     def chunks_of(self, path: str, counts: Sequence[int]) -> dict[tuple[int, ...], str]:
-        """Return the keys of the chunks of an array that are stored, by their indices.
-
-        ``counts`` is how many chunks (or shards) it has along each axis.
-        """
-        before, found = f"{path}/" if path else "", {}
+        """Return the keys of the chunks, or shards, that are stored, by their indices."""
+        before, chunks = f"{path}/" if path else "", {}
         for key in self.sizes:
             match = CHUNK_KEY.fullmatch(key, len(before)) if key.startswith(before) else None
             indices = tuple(map(int, re.split("[./]", match[1]))) if match else ()
             if len(indices) == len(counts) and all(i < n for i, n in zip(indices, counts)):
-                found[indices] = key
-        return found
+                chunks[indices] = key
+        return chunks
 
     def absent(self, array: Any, path: str, stored: dict[tuple[int, ...], str]) -> tuple[int, int]:
         """Return how many chunks of an array are not stored, and how many it has."""
         total = prod(counts_of(array.shape, array.chunks))
-        here = len(stored)
+        there = len(stored)
         if array_shards(array):
-            here = sum(self._in_shard(array, path, *shard) for shard in stored.items())
-        if total - here > MOST_ABSENT:
+            there = sum(self._in_shard(array, path, *shard) for shard in stored.items())
+        if total - there > MOST_ABSENT:
             raise FileError(
-                f"{self.path} has {total:,} chunks, of which {here:,} are stored: store it in "
+                f"{self.path} has {total:,} chunks, of which {there:,} are stored: store it in "
                 "larger ones"
             )
-        return total - here, total
+        return total - there, total
 
     def _in_shard(self, array: Any, path: str, indices: tuple[int, ...], key: str) -> int:
         """Return how many chunks of a shard are stored, of those within the array."""
@@ -194,8 +183,8 @@ def _codecs_of(about: Any) -> Iterator[str]:
     """Yield the names of all codecs in the metadata of an array, also of those within others."""
     if isinstance(about, dict):
         for key in ("compressor", "filters", "codecs", "index_codecs"):
-            found: Any = about.get(key) or ()
-            for codec in found if isinstance(found, list) else (found,) if found else ():
+            listed: Any = about.get(key) or ()
+            for codec in listed if isinstance(listed, list) else (listed,) if listed else ():
                 stated = codec if isinstance(codec, dict) else {"name": codec}
                 name = stated.get("id", stated.get("name"))
                 yield str(name).removeprefix("numcodecs.")

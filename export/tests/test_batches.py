@@ -1,13 +1,14 @@
 """The loss is that of the values that the runtime makes: those of shared nodes are averaged."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
 from export.augment import CLEAN, augment, prepare
+from export.batches import Batch, batch_of, copies_of_queries, encode, predict
 from export.dataset import Sample
-from export.sharing import copies_of_queries, decode_shared, neighbours_with_targets
 from export.tests.small_net import small_net
-from export.train import predict
 from super_sdf.neighbourhood import CENTRE, NEIGHBOURHOOD
 from super_sdf.network.decoder import to_blocks
 from super_sdf.pipeline import rows_among
@@ -26,9 +27,21 @@ def ball_sample(factor=4):
     return Sample(window, offsets, near.astype(np.uint8), targets.astype(np.float16))
 
 
+def predicted(net, sample):
+    batch = batch_of([sample])
+    return predict(net, batch, encode(net, batch))
+
+
+def alone(net, sample, offsets):
+    """The values of the voxels with targets, each for itself."""
+    voxels = encode(net, batch_of([sample])).some(torch.from_numpy(sample.voxels))
+    return net.decode(voxels, torch.from_numpy(offsets))
+
+
 def test_the_copies_of_a_query_are_the_same_point_in_other_voxels():
     offsets = np.array([[0, 0.5, -0.5], [1, 0, 0.5], [-1, 1, 0], [1, -1, 1]], np.float32)
-    query, place, moved = copies_of_queries(offsets)
+    copies = copies_of_queries(offsets)
+    query, place, moved = copies.query, copies.place, copies.moved
     assert np.bincount(query).tolist() == [1, 2, 4, 8]
     assert len({(int(q), int(p)) for q, p in zip(query, place)}) == len(query)
     assert query[:4].tolist() == [0, 1, 2, 3] and (place[:4] == CENTRE).all()
@@ -39,44 +52,50 @@ def test_the_copies_of_a_query_are_the_same_point_in_other_voxels():
 def test_a_query_inside_every_voxel_is_decoded_as_it_is():
     sample, net = prepare(ball_sample()), small_net()
     offsets = np.random.default_rng(0).uniform(-0.9, 0.9, (6, 3)).astype(np.float32)
-    voxels = net.encode_batch([sample]).some(torch.from_numpy(sample.voxels))
-    near = torch.from_numpy(neighbours_with_targets(sample))
-    got = decode_shared(net, voxels, near, offsets)
-    torch.testing.assert_close(got, net.decode(voxels, torch.from_numpy(offsets)))
+    inside = replace(sample, offsets=offsets, targets=sample.targets[:, :6])
+    torch.testing.assert_close(predicted(net, inside), alone(net, sample, offsets))
 
 
 def test_shared_nodes_have_the_mean_that_the_runtime_gives_them():
     sample, net = prepare(ball_sample()), small_net()
     with torch.no_grad():
-        got = predict(net, [sample])[0][0].numpy()
-        voxels = net.encode_batch([sample]).some(torch.from_numpy(sample.voxels))
-        alone = net.decode(voxels, torch.from_numpy(sample.offsets)).numpy()
-    blocks = to_blocks(alone)
+        got = predicted(net, sample).numpy()
+        singly = alone(net, sample, sample.offsets).numpy()
+    blocks = to_blocks(singly)
     near = rows_among(sample.voxels, len(sample.table))[sample.table[sample.voxels]]
     average_shared(blocks, share_parts(near), 4)
     np.testing.assert_allclose(got, blocks[:, :-1].T, atol=1e-5)
-    assert np.abs(got - alone).max() > 1e-3
+    assert np.abs(got - singly).max() > 1e-3
+
+
+def test_samples_side_by_side_have_their_own_values():
+    net, one, other = small_net(), prepare(ball_sample()), prepare(ball_sample(2))
+    other = replace(other, offsets=one.offsets[:27], targets=one.targets[:, :27])
+    one = replace(one, offsets=one.offsets[-27:], targets=one.targets[:, -27:])
+    batch = batch_of([one, other])
+    got = predict(net, batch, encode(net, batch)).split(batch.counts)
+    for values, sample in zip(got, (one, other)):
+        torch.testing.assert_close(values, predicted(net, sample), atol=1e-5, rtol=0)
 
 
 def test_a_turned_sample_shares_the_same_nodes():
     rng, net = np.random.default_rng(3), small_net()
     for weight in net.parameters():
         torch.nn.init.zeros_(weight)  # interpolation alone turns with the cube
-    want = predict(net, [prepare(ball_sample())])[0][0]
+    want = predicted(net, prepare(ball_sample()))
     for _ in range(5):
-        got = predict(net, [augment(rng, ball_sample(), CLEAN)])[0][0]
+        got = predicted(net, augment(rng, ball_sample(), CLEAN))
         torch.testing.assert_close(got, want, atol=1e-5, rtol=0)
 
 
 def test_the_gradient_reaches_the_voxels_that_share_a_node():
     sample, net = prepare(ball_sample()), small_net()
-    voxels = net.encode_batch([sample]).some(torch.from_numpy(sample.voxels))
-    features = voxels.features.detach().requires_grad_()
-    voxels = type(voxels)(features, voxels.patches, voxels.noisy)
-    near = torch.from_numpy(neighbours_with_targets(sample))
     corner = np.array([[1, 1, 1]], np.float32)
-    decode_shared(net, voxels, near, corner)[0, 0].backward()
+    batch: Batch = batch_of([replace(sample, offsets=corner, targets=sample.targets[:, :1])])
+    encoded = encode(net, batch)
+    features = encoded.features.detach().requires_grad_()
+    predict(net, batch, replace(encoded, features=features))[0, 0].backward()
     reached = np.flatnonzero(features.grad.abs().sum(1).numpy())
-    count = len(near)
-    shares = [int(row) for row in near[0, [13, 14, 16, 17, 22, 23, 25, 26]] if row < count]
+    near = batch.near[0, [13, 14, 16, 17, 22, 23, 25, 26]].tolist()
+    shares = [int(batch.voxels[row]) for row in near if row < len(batch.near)]
     assert reached.tolist() == sorted(shares) and len(shares) > 1

@@ -28,10 +28,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, IntArray
-from .field import SampleSpheres
-from .planes import square_falloff
-from .vectors import Numbers, Vectors, dot, length, sums, unit
+from ...arrays import BoolArray, IntArray
+from ..field import SampleSpheres
+from .planes import Numbers, Vectors, dot, length, square_falloff, sums, unit
 
 ALONG = 0.6  # distance along an edge at which a sphere counts for a quarter
 FARTHEST_ALONG = 1.8

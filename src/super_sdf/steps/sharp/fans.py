@@ -15,10 +15,10 @@ from functools import cached_property
 
 import numpy as np
 
-from ..arrays import BoolArray
-from .cell_cases import loop_table
+from ...arrays import BoolArray
+from ..cell_cases import loop_table
 from .patches import Index, Patches, nth_of_row
-from .vectors import Numbers, Vectors, dot, unit
+from .planes import Numbers, Vectors, dot, unit
 
 PULL = 0.5  # share of the way to the middle of its crossings that a vertex which folds its fan goes
 

@@ -22,13 +22,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray
-from ..machine.threads import map_chunks
+from ...arrays import BoolArray
+from ...machine.threads import map_chunks
+from ..field import FineField, SampleSpheres
 from .fans import Placed, unfolded
-from .field import FineField, SampleSpheres
 from .patches import Index, Patches, dilate
-from .planes import Planes, settle_planes
-from .vectors import Numbers, Vectors, dot, length
+from .planes import Numbers, Planes, Vectors, dot, length, settle_planes
 from .wedges import (
     Contact,
     Nearby,

@@ -1,0 +1,262 @@
+"""Where samples lie: the spacing and direction of the axes, and arrays whose axes have names.
+
+xarray is not imported: whoever has a ``DataArray`` has imported it.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..arrays import Triple
+from ..errors import GridError, seen
+from ..machine.memory import check_fits
+from .planes import SamplePlanes
+from .samples import check_kind
+
+# Spacings that differ by less than this ratio count as equal. Coarser axes are resampled to the
+# finest spacing, so a large ratio makes many samples of few.
+EQUAL_SPACING, MOST_UNEQUAL = 1e-3, 50.0
+# Within these, areas, volumes and squared areas neither overflow nor underflow.
+LEAST_SPACING, MOST_SPACING = 1e-60, 1e60
+
+Direction: TypeAlias = tuple[Triple, Triple, Triple]
+"""A matrix, row by row; its columns are the world directions of the array's axes."""
+
+STRAIGHT: Direction = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+SKEW = 1e-3  # largest error of a product of two columns: files hold few digits
+DIGITS = 1e-9  # a matrix this near to the identity is it
+
+AXES = ("x", "y", "z")
+UNNAMED = ("dim_0", "dim_1", "dim_2")  # xarray's names of dimensions that got none
+EVEN = 1e-3  # of a step: how far coordinates may be from even ones, besides their rounding
+
+
+def as_triple(number: ArrayLike, name: str) -> Triple:
+    """Return one number or three as three floats.
+
+    Raises
+    ------
+    GridError
+        If ``number``, which the message calls ``name``, is neither or not finite.
+    """
+    try:
+        array = np.asarray(number)
+        if array.dtype.kind not in "fiu":  # booleans and strings are refused
+            raise TypeError
+        with np.errstate(over="ignore"):  # of long doubles, which are found to be infinite below
+            triple = np.broadcast_to(array.astype(np.float64).ravel(), (3,))
+    except (TypeError, ValueError, RuntimeError):
+        raise GridError(f"{name} is {seen(number)}: give one number or three") from None
+    if not np.isfinite(triple).all():
+        raise GridError(f"{name} is {seen(number)}: it must be finite")
+    return float(triple[0]), float(triple[1]), float(triple[2])
+
+
+def check_spacing(spacing: ArrayLike) -> Triple:
+    """Return the spacing as three floats.
+
+    Raises
+    ------
+    GridError
+        If they are not positive, out of range, or one is more than 50 times another.
+    """
+    triple = as_triple(spacing, "spacing")
+    if min(triple) <= 0:
+        raise GridError(f"spacing is {_join(triple)}: it must be greater than 0")
+    if not LEAST_SPACING <= min(triple) <= max(triple) <= MOST_SPACING:
+        raise GridError(
+            f"spacing is {_join(triple)}: give lengths in a unit in which it is between "
+            f"{LEAST_SPACING:g} and {MOST_SPACING:g}"
+        )
+    if max(triple) > min(triple) * MOST_UNEQUAL:
+        raise GridError(
+            f"spacing is {_join(triple)}: the largest may be {MOST_UNEQUAL:g} times the smallest; "
+            "leave out samples along the finer axes"
+        )
+    return triple
+
+
+def is_cubic(spacing: Triple) -> bool:
+    """Return whether a spacing is the same on all axes, up to 0.1 %."""
+    return max(spacing) <= min(spacing) * (1 + EQUAL_SPACING)
+
+
+def steps_of(spacing: Triple) -> Triple:
+    """Return the spacing of each axis, the mean if they are nearly equal."""
+    return (sum(spacing) / 3,) * 3 if is_cubic(spacing) else spacing
+
+
+def _join(triple: tuple[float, ...]) -> str:
+    return ", ".join(f"{number:g}" for number in triple)
+
+
+def check_direction(direction: ArrayLike | None) -> Direction:
+    """Return a direction row by row; None is along the world's axes.
+
+    Parameters
+    ----------
+    direction : (3, 3) array_like or nine numbers, row by row
+        The columns are unit vectors at right angles; they may be mirrored.
+
+    Raises
+    ------
+    GridError
+        If it is something else.
+    """
+    if direction is None:
+        return STRAIGHT
+    try:
+        array = np.asarray(direction)
+        if array.dtype.kind not in "fiu" or array.shape not in ((9,), (3, 3)):
+            raise TypeError
+    except (TypeError, ValueError, RuntimeError):
+        raise GridError(
+            f"direction is {seen(direction)}: give nine numbers, row by row, or a 3 x 3 matrix"
+        ) from None
+    matrix = array.astype(np.float64).reshape(3, 3)
+    if not np.isfinite(matrix).all():
+        raise GridError(f"direction is {in_rows(matrix)}: it must be finite")
+    products = matrix.T @ matrix
+    off = np.abs(products - np.eye(3))
+    if off.max() > SKEW:
+        a, b = (int(n) for n in np.unravel_index(off.argmax(), (3, 3)))
+        fault = f"column {a + 1} has length {np.sqrt(products[a, a]):.4g}"
+        if a != b:
+            fault = f"columns {a + 1} and {b + 1} are not at right angles"
+        raise GridError(
+            f"direction is {in_rows(matrix)}: {fault}; give unit vectors at right angles, or "
+            "resample a sheared grid"
+        )
+    return STRAIGHT if np.abs(matrix - np.eye(3)).max() <= DIGITS else as_direction(matrix)
+
+
+def as_direction(matrix: Any) -> Direction:
+    """Return a 3 x 3 matrix row by row, as floats."""
+    (a, b, c), (d, e, f), (g, h, i) = (map(float, row) for row in np.asarray(matrix))
+    return (a, b, c), (d, e, f), (g, h, i)
+
+
+def in_rows(matrix: Any) -> str:
+    """Return a matrix as text, row by row."""
+    return "; ".join(", ".join(f"{entry:.4g}" for entry in row) for row in np.asarray(matrix))
+
+
+class Placed(NamedTuple):
+    """Samples along increasing x, y and z, and what their coordinates say: None if nothing."""
+
+    values: ArrayLike | SamplePlanes
+    spacing: ArrayLike | None = None
+    origin: ArrayLike | None = None
+
+
+def placed(
+    values: ArrayLike | SamplePlanes,
+    spacing: ArrayLike | None = None,
+    origin: ArrayLike | None = None,
+) -> Placed:
+    """Return samples and their place in the world; of a ``DataArray``, from its coordinates.
+
+    A spacing or an origin that is given replaces that of the coordinates. Anything but an array of
+    xarray is returned as it is.
+
+    Raises
+    ------
+    GridError
+        If the dimensions are not x, y and z in any order, besides some of length 1; if their
+        coordinates are not evenly spaced numbers; if ``values`` is a ``Dataset``.
+    OutOfMemoryError
+        If the array is one of Dask and does not fit in memory.
+    """
+    xarray: Any = sys.modules.get("xarray")
+    if xarray is None or not isinstance(values, (xarray.DataArray, xarray.Dataset)):
+        return Placed(values, spacing, origin)
+    if isinstance(values, xarray.Dataset):
+        names = ", ".join(map(str, values.data_vars)) or "none"
+        raise GridError(f"values are a Dataset: give one of its arrays ({names})")
+    array = _axes_in_order(values)
+    check_kind(array.dtype, array.shape)
+    return _at_coordinates(array, spacing, origin)
+
+
+def _axes_in_order(array: Any) -> Any:
+    """Return an array with the dimensions x, y, z, or with those that have no names."""
+    if array.ndim < len(AXES):
+        check_kind(array.dtype, array.shape)  # raises
+    wanted = UNNAMED if set(array.dims) == set(UNNAMED) else AXES
+    extra = [name for name in array.dims if name not in wanted]
+    if not set(wanted) <= set(array.dims):
+        raise GridError(
+            f"dimensions are {', '.join(map(repr, array.dims)) or 'none'}: name those of the axes "
+            "'x', 'y' and 'z', with array.rename(...)"
+        )
+    for name in extra:
+        if array.sizes[name] > 1:
+            raise GridError(
+                f"dimension {name!r} has length {array.sizes[name]:,}: choose one, such as "
+                f"array.isel({name}=0)"
+            )
+    return array.isel(dict.fromkeys(extra, 0)).transpose(*wanted)
+
+
+def _at_coordinates(array: Any, spacing: ArrayLike | None, origin: ArrayLike | None) -> Placed:
+    """Return an array along increasing coordinates, and the place that they give it."""
+    names = [x for x in array.dims if x in array.coords and array.coords[x].dims == (x,)]
+    if array.chunks is not None:
+        check_fits(array.nbytes, "the array of Dask, whole,", "save it as .npy and give its path")
+    samples: NDArray[Any] = np.asanyarray(array.values)
+    if not names:
+        return Placed(samples, spacing, origin)
+    if len(names) < len(AXES):
+        missing = next(name for name in array.dims if name not in names)
+        raise GridError(
+            f"dimension {missing!r} has no coordinates, but {names[0]!r} has: give those of all "
+            "axes, or of none (array.drop_vars(...))"
+        )
+    firsts, steps = zip(*(even_steps(name, array.coords[name].values) for name in names))
+    samples = samples[tuple(slice(None, None, -1 if step < 0 else 1) for step in steps)]
+    lowest = [first + min(step, 0) * (n - 1) for first, step, n in zip(firsts, steps, array.shape)]
+    return Placed(
+        samples,
+        np.abs(steps) if spacing is None else spacing,
+        lowest if origin is None else origin,
+    )
+
+
+def even_steps(name: str, coordinates: NDArray[Any]) -> tuple[float, float]:
+    """Return the first of some coordinates, and the step from one to the next.
+
+    Raises
+    ------
+    GridError
+        If they are not numbers, or not evenly spaced.
+    """
+    if coordinates.dtype.kind not in "fiu":
+        raise GridError(
+            f"coordinates of {name!r} have dtype {coordinates.dtype}: give numbers, in the unit of "
+            "the distances"
+        )
+    places = coordinates.astype(np.float64)
+    bad = np.flatnonzero(~np.isfinite(places))
+    if len(bad):
+        raise GridError(
+            f"coordinate {bad[0]} of {name!r} is {places[bad[0]]}: every coordinate must be finite"
+        )
+    first, count = float(places[0]), len(places)
+    step = float(places[-1] - first) / (count - 1)
+    is_float = coordinates.dtype.kind == "f"
+    rounding = np.finfo(coordinates.dtype).eps * np.abs(places).max() if is_float else 0.0
+    off = np.abs(places - (first + step * np.arange(count))).max()
+    if step == 0 or off > EVEN * abs(step) + rounding:
+        steps = np.diff(places)
+        usual = float(np.median(steps))
+        worst = int(np.abs(steps - usual).argmax())
+        raise GridError(
+            f"coordinates of {name!r} are not evenly spaced: {places[worst]:.6g} is followed by "
+            f"{places[worst + 1]:.6g}, a step of {steps[worst]:.6g} among steps of {usual:.6g}; "
+            f"resample the array (array.interp({name}=...))"
+        )
+    return first, step

@@ -1,0 +1,92 @@
+"""A grid is read at most three times: the census, a look beside the surface, the survey."""
+
+import numpy as np
+import pytest
+from test_field_kinds import box
+
+from super_sdf import make_grid
+from super_sdf.grid import census, questions
+from super_sdf.grid.census import Census
+from super_sdf.grid.planes import SamplePlanes
+from super_sdf.steps.survey import survey
+
+RANDOM = np.random.default_rng(0)
+
+
+class Counted(SamplePlanes):
+    """An array whose planes are counted as they are read."""
+
+    name = "the grid"
+
+    def __init__(self, values):
+        self.values, self.shape, self.dtype = values, values.shape, values.dtype
+        self.reads = np.zeros(len(values), int)
+
+    def read(self, first, last):
+        self.reads[first:last] += 1
+        return self.values[first:last].copy()
+
+
+def with_nan(values):
+    """Return truncated distances that are unknown beyond where they were cut off."""
+    return np.where(np.abs(values) < 3, values, np.nan)
+
+
+def plate():
+    """Return distances to a plate between two planes of samples."""
+    apart = np.abs(np.indices((24, 24, 24)).T - 11.5).T - np.reshape([7.3, 8.1, 0.2], (3, 1, 1, 1))
+    return np.linalg.norm(np.maximum(apart, 0), axis=0) + np.minimum(apart.max(0), 0)
+
+
+KINDS = {
+    "exact": ("exact", box()),
+    "truncated": ("truncated", np.clip(box(), -2, 2)),
+    "mask": ("mask", box() < 0),
+    "mask of numbers": ("mask", np.where(box() < 0, -1.0, 1.0)),
+    "scaled": ("scaled", box() * np.exp(0.02 * box())),
+    "noisy": ("noisy", box() + RANDOM.normal(0, 0.2, box().shape)),
+    "NaN": ("truncated", with_nan(box())),
+    "thin": ("exact", plate()),
+}
+
+
+@pytest.mark.parametrize("small", [True, False], ids=["kept", "not kept"])
+@pytest.mark.parametrize("name", KINDS)
+def test_a_grid_is_read_at_most_three_times(name, small, monkeypatch):
+    kind, values = KINDS[name]
+    if not small:  # in several parts
+        monkeypatch.setattr(census, "KEPT_BYTES", 0)
+        monkeypatch.setattr(questions, "TOGETHER", values[0].size)
+        monkeypatch.setattr(questions, "READ_SAMPLES", 4 * values[0].size)
+    counted = Counted(values)
+    grid = make_grid(counted, spacing=1.0, origin=0.0)
+    assert grid.field.kind == kind
+    band, reads = survey(grid), counted.reads.copy()
+    whole = survey(make_grid(values, spacing=1.0, origin=0.0))
+    assert np.array_equal(band.patches, whole.patches) and band.kind == whole.kind
+    # blocks of the survey share two planes, and those of filled samples some more
+    assert np.median(reads) <= 3 and (reads <= 6).all()
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_the_census_is_the_same_in_whatever_parts_it_is_taken(name, monkeypatch):
+    values = KINDS[name][1]
+    whole = Census(values)
+    monkeypatch.setattr(census, "KEPT_BYTES", 0)
+    monkeypatch.setattr(questions, "TOGETHER", values[0].size)
+    monkeypatch.setattr(questions, "READ_SAMPLES", 0)
+    parts = Census(Counted(values))
+    for one, other in zip(whole.numbers, parts.numbers):
+        assert np.array_equal(one, other)
+    assert whole.numbers.has_two == parts.numbers.has_two == ("mask" in name)
+    if values.dtype != bool:
+        assert whole.are_labels == parts.are_labels
+        for ask in (
+            lambda one: one.looked.around,
+            lambda one: one.looked.cut,
+            lambda one: one.beside.vectors,
+            lambda one: one.everywhere.bend,
+            lambda one: one.pairs,
+            lambda one: one.unknown.root,
+        ):
+            assert np.array_equal(ask(whole), ask(parts), equal_nan=True)
