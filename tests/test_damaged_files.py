@@ -240,7 +240,7 @@ def test_a_number_without_end_is_refused():
 BOMB = 1 << 27
 
 
-@pytest.mark.parametrize("name", ["a.mha", "a.nrrd", "a.nii.gz", "a.vti", "a.npz"])
+@pytest.mark.parametrize("name", ["a.mha", "a.nii.gz", "a.vti", "a.npz"])
 def test_a_bomb_is_refused_within_the_bound(name, monkeypatch):
     """Zeros of 134 MB in some kilobytes, with 100 MB allowed: before anything is unpacked."""
     make_bomb(name, bytes(BOMB))

@@ -485,7 +485,7 @@ def test_batch_takes_the_same_inputs(command):
 
 
 def test_the_page_on_formats_lists_those_of_the_table():
-    page = (Path(__file__).parent.parent / "docs" / "formats.md").read_text()
+    page = (Path(__file__).parent.parent / "docs" / "guides" / "formats.md").read_text()
     for format_ in (*formats.FORMATS, formats.DICOM):
         start = f"| {format_.name} | `{'`, `'.join(format_.suffixes)}` | "
         assert start + (f"`{format_.extra}`" if format_.extra else "none") in page

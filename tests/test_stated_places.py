@@ -440,7 +440,8 @@ def test_axes_of_length_1_are_dropped(name, where):
 def test_more_than_three_longer_axes_are_refused():
     for name, shape in (("n.npy", (4, 6, *SIZES[1:])), ("a.h5", (17, 20, 6, 4))):
         write_ones(name, shape)
-    assert line(GridError, "n.npy") == "values have shape (4, 6, 20, 17): give three axes (x, y, z)"
+    said = "n.npy: values have shape (4, 6, 20, 17): give three axes (x, y, z)"
+    assert line(GridError, "n.npy") == said
     assert line(FileError, "a.h5") == "a.h5 holds no 3D dataset"
     assert "its axis 3 has 4 entries, and a grid" in line(GridError, "a.h5:m")
 

@@ -1,4 +1,4 @@
-"""Imports point down the list of rooms in docs/tour.md, and the runtime is light."""
+"""Imports point down the list of rooms in docs/develop/tour.md, and the runtime is light."""
 
 import ast
 import re
@@ -49,7 +49,7 @@ def room_of(module: str) -> str:
 
 def rooms() -> list[set[str]]:
     """Return the rooms of the tour, those on a line together."""
-    lines = (ROOT / "docs" / "tour.md").read_text().splitlines()
+    lines = (ROOT / "docs" / "develop" / "tour.md").read_text().splitlines()
     cells = [line.split("|")[1] for line in lines if line.startswith("| `")]
     return [set(re.findall(r"`(\w+)/?`", cell)) for cell in cells]
 

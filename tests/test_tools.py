@@ -1,4 +1,4 @@
-"""The recipes for Blender and ParaView as far as they run without either, and docs/tools.md."""
+"""The recipes for Blender and ParaView as far as they run without either, and their page."""
 
 import re
 import runpy
@@ -17,7 +17,7 @@ from super_sdf.truth.mesh_files import read_mesh
 
 ROOT = Path(__file__).parent.parent
 TOOLS = ROOT / "examples" / "tools"
-PAGE = (ROOT / "docs" / "tools.md").read_text()
+PAGE = (ROOT / "docs" / "guides" / "tools.md").read_text()
 
 
 @pytest.fixture(scope="module")
@@ -91,5 +91,5 @@ def test_the_python_on_the_page_runs(tmp_path, monkeypatch):
 
 def test_what_the_page_names_is_there():
     for path in re.findall(r"\]\(([^)#]+)\)", PAGE):
-        assert (ROOT / "docs" / path).exists(), path
+        assert (ROOT / "docs" / "guides" / path).exists(), path
     assert {path.name for path in TOOLS.glob("*.py")} <= set(re.findall(r"\w+\.py", PAGE))

@@ -1,7 +1,8 @@
 """ParaView: the refined surface of image data, as a Programmable Filter.
 
-Paste this file into a Programmable Filter whose Output Data Set Type is vtkPolyData. docs/tools.md
-says how ParaView's Python gets super-sdf. paraview_render.py does all of it without a window.
+Paste this file into a Programmable Filter whose Output Data Set Type is vtkPolyData.
+docs/guides/tools.md says how ParaView finds super-sdf; paraview_render.py does it all without a
+window.
 """
 
 FACTOR = 4  # times finer than the image: 2, 4, 8 or 16
