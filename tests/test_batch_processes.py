@@ -1,7 +1,6 @@
 """Batches and their processes, killed, ended, short of memory: nothing is lost or left over."""
 
 import errno
-import json
 import os
 import signal
 import subprocess
@@ -52,12 +51,12 @@ def test_what_a_killed_batch_left_is_removed_and_nothing_else(run_batch, command
     stale, kept = Path(f"out/deep/.b.ply.{ended.pid}.part"), Path(f"out/.x.ply.{ended.pid}.part")
     for path in (stale, kept):
         path.write_text("half")
-    started = {"in": os.path.abspath("in/deep/b.npz"), "out": "deep/b.ply", "status": "started"}
-    Path("out/report.jsonl").write_text(f"{json.dumps(started)}\n{{to")
+    Path("out/.super-sdf-batch").write_text('"deep/b.ply"\n"to')
     assert run_batch("in/", "--dry-run")[2].startswith("4 to do") and stale.exists()
     assert run_batch("in")[2].endswith("3 done, 1 failed; 3 meshes closed, 0 open\n")
     assert not stale.exists() and kept.exists()
     assert rows()[-1]["out"] == "deep/b.ply"  # last: it may be what ended the run
+    assert Path("out/.super-sdf-batch").read_text() == ""
 
 
 TWO_CORES = f"from super_sdf.batch import run\n\nrun.count_cores = lambda: 2\n{COMMAND}"
@@ -71,15 +70,14 @@ def test_nothing_of_the_current_folder_is_run(tmp_path):
 
 def start_batch(*options):
     """Start a batch as a process, and return it when its report has some lines."""
-    process = start_command(
-        "batch", "in", "--out", "out", "--jobs", 2, "--threads", 1, *SMALL, *options
-    )
+    words = ("batch", "in", "--out", "out", "--jobs", 2, "--threads", 1, *SMALL, *options)
+    process = start_command(*words)
     wait_for_lines(process, Path("out/report.jsonl"))
     return process
 
 
 def test_killed_on_the_way_it_goes_on(command):
-    larger_grids(16)
+    larger_grids(30)
     process = start_batch()
     workers = psutil.Process(process.pid).children()
     assert len(workers) >= 2
@@ -91,7 +89,7 @@ def test_killed_on_the_way_it_goes_on(command):
     finished = len(rows())
     code, _, err = command("batch", "in", "--out", "out", *SMALL)
     assert code == 1 and f", {finished} done before" in err
-    assert len(rows()) == 20 == len({row["out"] for row in rows()})
+    assert len(rows()) == 34 == len({row["out"] for row in rows()})
     assert not list(Path("out").rglob(".*.part"))
 
 
@@ -138,7 +136,7 @@ def test_a_lock_file_that_cannot_be_written_is_named(run_batch, monkeypatch):
 
 @pytest.mark.parametrize("name", ["SIGHUP", "SIGINT"])
 def test_a_signal_ends_batch_and_workers_in_a_line(name):
-    larger_grids(16)
+    larger_grids(30)
     process = start_batch()
     workers = psutil.Process(process.pid).children()
     process.send_signal(getattr(signal, name))
@@ -146,19 +144,19 @@ def test_a_signal_ends_batch_and_workers_in_a_line(name):
     said = "interrupted" if name == "SIGINT" else f"ended by {name}"
     assert process.returncode == 128 + getattr(signal, name)
     assert err.startswith(f"Error: {said}: ") and err.count("\n") == 1
-    assert err.endswith("of 20 are done and kept; run it again to go on\n")
+    assert err.endswith("of 34 are done and kept; run it again to go on\n")
     assert all_end(workers) and not list(Path("out").rglob(".*.part"))
 
 
 def test_a_worker_that_dies_once_costs_nothing(command):
-    larger_grids(12)
+    larger_grids(30)
     process = start_batch("--quiet")
     children = psutil.Process(process.pid).children()
     worker = next(child for child in children if "spawn_main" in " ".join(child.cmdline()))
     worker.kill()
     _, err = process.communicate(timeout=PATIENCE)
     assert err == f"Failed: {Path('in/bad.npy')}: {CONSTANT}\n"
-    assert len(rows()) == 16 and not list(Path("out").rglob(".*.part"))
+    assert len(rows()) == 34 and not list(Path("out").rglob(".*.part"))
 
 
 def test_a_file_at_which_two_processes_die_is_named(command, monkeypatch):

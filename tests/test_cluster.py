@@ -288,7 +288,7 @@ def test_a_task_that_kills_workers_is_the_only_one_that_fails():
         results = dict(crew.completed(deque(range(12))))
         assert list(crew.in_order(range(5, 9))) == [(2 * task, 1) for task in range(5, 9)]
         assert results.pop(3) == Death(
-            "was lost by the cluster 2 times (most likely out of memory)"
+            "was lost 2 times by the cluster (most likely out of memory)"
         )
         assert results.pop(4) == Death("ended with OSError: four")
         assert results == {task: (2 * task, 1) for task in range(12) if task not in (3, 4)}

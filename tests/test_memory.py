@@ -63,7 +63,7 @@ def test_a_c_library_that_has_no_such_calls_is_left_alone(monkeypatch, error):
 
 @pytest.mark.parametrize(
     "size, want",
-    [(32_000_000, "32 MB"), (999, "0 MB"), (10**9, "1.00 GB"), (10**13, "10,000.00 GB")],
+    [(999, "0 MB"), (10**13, "10,000.00 GB")],
 )
 def test_sizes_are_said_as_they_are_given(size, want):
     assert memory.in_words(size) == want

@@ -100,14 +100,8 @@ def test_what_the_user_decided_stays(monkeypatch):
     assert os.environ[onnx.SWITCH] == "0"
 
 
-@pytest.mark.parametrize(
-    ("fault", "reason"),
-    [
-        ("raise ImportError('no libonnxruntime.so\\nmore')", "no libonnxruntime.so"),
-        ("x = 1 / 0", "division by zero"),
-    ],
-)
-def test_an_onnxruntime_that_does_not_load_is_one_line(tmp_path, fault, reason):
+def test_an_onnxruntime_that_does_not_load_is_one_line(tmp_path):
+    fault = "raise ImportError('no libonnxruntime.so\\nmore')"
     (tmp_path / "onnxruntime.py").write_text(fault)
     np.save(tmp_path / "in.npy", ball(16, 4.0).values)
     script = f"import sys; sys.path.insert(0, {str(tmp_path)!r})" + UPSAMPLE.replace(
@@ -115,7 +109,7 @@ def test_an_onnxruntime_that_does_not_load_is_one_line(tmp_path, fault, reason):
     )
     run = run_at_home(tmp_path, script)
     way_out = "pip install --force-reinstall onnxruntime"
-    said = f"Error: onnxruntime cannot be imported ({reason}): {way_out}\n"
+    said = f"Error: onnxruntime cannot be imported (no libonnxruntime.so): {way_out}\n"
     assert (run.returncode, run.stderr) == (1, said)
 
 

@@ -70,7 +70,7 @@ def test_slabs_change_nothing(network, monkeypatch, field, factor, cap):
     grid = SdfGrid.trusted(FIELDS[field], (1.0,) * 3)
     (whole,) = in_pieces(grid, network, monkeypatch, 1, factor=factor, cap=cap)
     one = join_meshes(whole.meshes)
-    for pieces in (3, 56):
+    for pieces in (3, 14):
         parts = in_pieces(grid, network, monkeypatch, pieces, factor=factor, cap=cap)
         assert len(parts) > 1
         mesh = join_meshes([mesh for part in parts for mesh in part.meshes])
@@ -105,7 +105,7 @@ def test_slabs_need_all_the_planes_beside_them(network, monkeypatch):
     assert not np.array_equal(mesh.vertices, one.vertices)
 
 
-@pytest.mark.parametrize("field, factor", [("noisy", 2), ("bad samples", 4), ("clean", 8)])
+@pytest.mark.parametrize("field, factor", [("noisy", 2), ("bad samples", 4)])
 def test_threads_change_nothing(monkeypatch, field, factor):
     grid = SdfGrid.trusted(FIELDS[field], (1.0,) * 3, (1.0, 2.0, 3.0))
     monkeypatch.setattr(threads, "CHUNK", 5000)

@@ -112,7 +112,7 @@ def faults_of_pieces(
     """
     faults = []
     for made_in, make in (("slabs", in_slabs), ("bricks", in_bricks)):
-        tally = Tally(None, cap=field.cap)
+        tally = Tally(field.cap)
         mesh = join_meshes(list(tally.count(make(field, network, mesher, parts), Stopwatch())))
         if not np.array_equal(mesh.faces, whole.faces):
             faults.append(f"{parts} {made_in} make another mesh")

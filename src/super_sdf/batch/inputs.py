@@ -18,7 +18,7 @@ from ..files.formats import GRID_SUFFIXES, is_grid, mesh_path, split_member
 from ..files.meshes import check_mesh_suffix
 from ..files.regular import is_store, reason_of
 from .job import Job
-from .ledger import NAME as LEDGER
+from .ledger import NAME, STARTED_NAME
 from .lock import LOCK_NAME
 from .manifest import read_manifest
 from .walking import files_below, fixed_part, matches
@@ -58,7 +58,7 @@ def find_jobs(arguments: Sequence[str], suffix: str, options: ConvertOptions) ->
         check_mesh_suffix(Path(f"*{kind}"))
     for job in jobs:
         first = PurePath(job.target).parts[0].casefold()
-        if first in (LOCK_NAME, LEDGER):
+        if first in (LOCK_NAME, NAME, STARTED_NAME):
             raise OptionError(
                 f"{job.source} would become {job.target}, but the first of these names is the "
                 "batch's own: rename it"

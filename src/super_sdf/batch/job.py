@@ -19,7 +19,7 @@ Row = dict[str, Any]
 """A line of the ledger, ``report.jsonl``.
 
 in, out : absolute path of the input; path of the output, relative to the output folder
-status, reason : "ok" and None, or "failed" and why; or "started", with the paths alone
+status, reason : "ok" and None, or "failed" and why
 retry : whether another run may succeed with the same input and options
 content, output : fingerprints of the input and of the mesh
 options : digest of all that the mesh depends on, besides the input

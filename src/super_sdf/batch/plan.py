@@ -97,7 +97,7 @@ class Planner:
             else:
                 before = batch.done_before if row["status"] == "ok" else batch.failed_before
                 before.append(Result(job, row))
-        last = self.ledger.started.difference(self.ledger.written)
+        last = self.ledger.left.difference(self.ledger.written)
         batch.waiting.sort(key=lambda job: (job.target in last, -expected_work(job)))
         batch.work = sum(map(expected_work, batch.waiting))
         return batch
@@ -135,7 +135,7 @@ class Planner:
             return None
         if os.path.exists(path) and (read := self.inputs.get(_identity(path))):
             reason = f"{path} is the same file as {read}: remove that link"
-        elif job.target in self.ledger.started or self.may_replace(job):
+        elif job.target in self.ledger.left or self.may_replace(job):
             return None
         else:
             made = job.target in self.ledger.written

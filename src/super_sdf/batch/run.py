@@ -58,7 +58,7 @@ class Run:
         """
         start = time.perf_counter()
         self._note_refused()
-        self.ledger.clean_up()
+        self.ledger.remove_parts()
         try:
             with closing(self._convert(warn or self.batch.notes.append)) as results:
                 for job, result in results:
@@ -67,7 +67,7 @@ class Run:
                     if on_file:
                         on_file(self.batch)
         finally:  # also what the workers of a killed batch wrote for a moment more
-            self.ledger.clean_up()
+            self.ledger.close()
 
     def _convert(self, warn: Callable[[str], None]) -> Results:
         """Convert in this process, in processes or on a cluster."""
@@ -111,7 +111,7 @@ class Run:
 
         It is decided now because the output may have changed since the plan was made.
         """
-        self.ledger.start(job)
+        self.ledger.start(job.target)
         exists = os.path.lexists(self.settings.folder / job.target)
         return replace(job, replace=exists and self.planner.may_replace(job))
 

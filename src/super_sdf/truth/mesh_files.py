@@ -18,12 +18,12 @@ from ..errors import FileError, MeshError, OutOfMemoryError, SuperSdfError
 from ..files.regular import check_regular_file
 from ..machine.memory import held_memory, in_words, memory_bound
 from ..mesh import Mesh
+from ..topology import row_keys
 from .plain_ply import read_plain_ply
 
 # Products and squares of larger coordinates overflow.
 LARGEST_COORDINATE = 1e30
 MERGE_DISTANCE = 1e-8  # vertices closer than this are merged
-HASH_FACTOR = np.uint64(0x9E3779B97F4A7C15)  # odd, its bits as if random
 SMALLEST_STEP = 1e-18  # of the largest coordinate, so that multiples of it fit in 64 bits
 XML_BYTES = 20  # of memory that trimesh takes for each byte of XML in a .3mf
 
@@ -90,13 +90,8 @@ def merged(mesh: Mesh) -> Mesh:
 
 def are_distinct(rows: NDArray[np.int64]) -> bool:
     """Return whether the rows, (n, 3), are certainly distinct: their hashes differ."""
-    mixed = np.zeros(len(rows), np.uint64)
-    for column in rows.T:
-        mixed ^= column.astype(np.uint64)
-        mixed *= HASH_FACTOR
-        mixed ^= mixed >> np.uint64(32)
-    mixed.sort()
-    return not bool((mixed[1:] == mixed[:-1]).any())
+    keys = np.sort(row_keys(rows.astype(np.float64)))
+    return not bool((keys[1:] == keys[:-1]).any())
 
 
 def _check_archive(path: Path, max_memory: int | None) -> None:
