@@ -27,13 +27,13 @@ from .files.store import files_of
 from .grid.cubic import cubic_grid
 from .grid.sdf_grid import SdfGrid
 from .grid.spacing import as_triple
+from .machine.extras import check_modules
 from .mesh import Mesh, join_meshes
 from .network.decoder import Decoder
 from .options import MASK, SCALED
 from .options import ConvertOptions as ConvertOptions
 from .pipeline import reconstruct_slabs
 from .progress import Progress, Stopwatch, part_of, share_of
-from .simplification.simplify import Simplified, check_can_simplify, check_room, simplify_mesh
 from .slabs.pieces import Piece
 from .steps.ends import check_can_close
 from .steps.lattice import lattice_shape
@@ -41,7 +41,14 @@ from .topology import OpenEdges
 
 if TYPE_CHECKING:
     from .fields.writing import FieldFile
+    from .simplification.simplify import Simplified
 
+CAPPED = (
+    "the solid runs out of the grid: its surface is closed along the border (leave it open with "
+    "--open)"
+)
+DROPPED = "pieces smaller than a voxel that no sample supports, and so left out"
+LONE = "voxels of the mask without a neighbour on their side, each meshed as a piece"
 SHARE_BEFORE = 0.2  # of the time, until the mesh is simplified
 COUNTS = (
     *("band_voxels", "noisy_voxels", "decoded_voxels", "nodes", "vertices", "triangles"),
@@ -99,22 +106,12 @@ class Conversion:
     def remarks(self) -> list[str]:
         """Return sentences on what the mesh has that the samples do not show, or lacks."""
         dropped, lone = self.counts["dropped_pieces"], self.counts["lone_samples"]
-        remarks = []
-        if self.capped:
-            remarks.append(
-                "the solid runs out of the grid: its surface is closed along the border (leave it "
-                "open with --open)"
-            )
-        if dropped:
-            remarks.append(
-                f"pieces smaller than a voxel that no sample supports, and so left out: {dropped}"
-            )
-        if lone and self.grid.field.kind == MASK:
-            remarks.append(
-                "voxels of the mask without a neighbour on their side, each meshed as a piece: "
-                f"{lone}"
-            )
-        return remarks
+        is_mask = self.grid.field.kind == MASK
+        return (
+            [CAPPED] * self.capped
+            + [f"{DROPPED}: {dropped}"] * (dropped > 0)
+            + [f"{LONE}: {lone}"] * (lone > 0 and is_mask)
+        )
 
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
@@ -175,7 +172,7 @@ def convert(
     """
     watch = Stopwatch()
     if options.simplifies:
-        check_can_simplify()
+        check_modules("simplifying", "simplify")
     grid = read_grid(source, **options.reading())
     if save_field is not None:
         check_apart(save_field, files_of(source))
@@ -273,6 +270,8 @@ def convert_grid(
     about = check_format_holds(target, lattice, finer)
     expected = expect(grid, finer, options.offset, target, cap=options.cap)
     if options.simplifies:
+        from .simplification.simplify import check_room  # here, as few conversions need it
+
         least = int(expected.triangles * CERTAIN_SHARE)
         check_room(least, options.max_memory, estimated=True)
     elif announce and (sentence := expected.warning(target)):
@@ -319,6 +318,8 @@ def _simplify(
     meshes: Iterable[Mesh], grid: SdfGrid, options: ConvertOptions, progress: Progress | None
 ) -> Simplified:
     """Return the simplified mesh of all pieces."""
+    from .simplification.simplify import simplify_mesh
+
     return simplify_mesh(
         join_meshes(list(meshes)),
         error=None if options.simplify is None else options.simplify * grid.voxel_size,
