@@ -14,7 +14,7 @@ from math import inf, isfinite
 from numbers import Integral, Real
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, NamedTuple, TypedDict, cast
 
 from .errors import OptionError, OptionTypeError, seen
 
@@ -348,6 +348,11 @@ class ReadOptions:
     def reading(self) -> dict[str, Any]:
         """Return the keywords of ``read_grid``."""
         return {each.name: getattr(self, each.name) for each in fields(ReadOptions)}
+
+    def values(self) -> Values:
+        """Return what the values are: keywords of ``make_grid``."""
+        kept = {name: getattr(self, name) for name in Values.__annotations__}
+        return cast(Values, kept)
 
 
 @dataclass(frozen=True)

@@ -135,11 +135,7 @@ class BricksEngine:
         grid = make_grid(
             TeamPlanes(self.source, facts, self.team),
             **facts.place,
-            inside=options.inside,
-            field=options.field,
-            label=options.label,
-            level=options.level,
-            scale=options.scale,
+            **options.values(),
         )
         check_is_local(grid)
         check_has_offsets(grid, options.offset)
