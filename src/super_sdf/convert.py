@@ -363,7 +363,7 @@ class Tally:
             yield from piece.meshes
             del piece  # before the next one is made
             watch.lap("write")
-        if self.last and self._must_be_closed and self.is_open:
+        if self.last and self.is_open and (self.cap or not self.is_cut):
             raise torn(len(self.edges), "in", self.last)
 
     def replace(self, mesh: Mesh) -> None:
@@ -372,18 +372,13 @@ class Tally:
         self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)
         self._extend_box(mesh.vertices)
 
-    @property
-    def _must_be_closed(self) -> bool:
-        """Whether the surface so far may end only where the next piece begins."""
-        return self.cap or not self.is_cut
-
     def _count_edges(self, piece: Piece) -> None:
         """Count the edges of a piece; MeshError if edges before it stay open."""
         before, first = self.edges.edges, self.counts["vertices"]
         for mesh in piece.meshes:
             self.edges.add(mesh.faces)
         left = self.edges.before(first)  # no later piece has these vertices
-        if not self._must_be_closed:
+        if self.is_cut and not self.cap:
             left = np.setdiff1d(left, before)  # the others may be on the border of the grid
         if self.last and len(left):
             raise torn(len(left), f"at plane {piece.planes[0]}, between", self.last, piece)
