@@ -1,11 +1,9 @@
 """README and examples say and do what they say and do."""
 
 import importlib
-import os
 import re
 import runpy
 import shlex
-import subprocess
 import sys
 from pathlib import Path
 
@@ -87,9 +85,3 @@ def test_the_functions_on_the_tour_are_there():
     assert len(named) == 20
     for module, function in named:
         assert callable(getattr(importlib.import_module(f"super_sdf.{module}"), function))
-
-
-def test_the_installed_command_is_there():
-    command = Path(sys.executable).with_name("super-sdf")
-    done = subprocess.run([command, "--version"], capture_output=True, text=True, env=os.environ)
-    assert done.stdout.startswith("super-sdf, version ")
