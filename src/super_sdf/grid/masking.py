@@ -28,6 +28,7 @@ STEP, STEP_TAIL = 0.85, 0.05
 
 def labelled(samples: SampleArray, label: int) -> SampleArray:
     """Return which samples have a label; GridError if none or all have."""
+    label = int(label)
     value = as_sample(label, samples.dtype)
     if value is not None:
         found = changed(samples, lambda planes: planes == value, np.bool_)
