@@ -9,7 +9,7 @@ from conftest import ball
 from super_sdf.network.network import shipped_models
 
 
-@pytest.mark.parametrize("quality", ["fast", "base", "best"])
+@pytest.mark.parametrize("quality", ["base", "best"])
 @pytest.mark.parametrize("words", ["upsample in.npy out.ply", "batch in.npy --out meshes"])
 def test_a_model_and_a_quality_are_not_given_at_once(
     tmp_path, monkeypatch, command, quality, words

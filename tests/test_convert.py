@@ -63,14 +63,6 @@ def test_stages_are_timed_and_steps_reported():
     assert steps == [(20, 1000), (800, 1000), (900, 1000), (1000, 1000)]
 
 
-@pytest.mark.parametrize("cap", [False, True])
-def test_closed_agrees_with_the_mesh(cap):
-    np.save("cut.npy", ball(16, 4.0).values[:9])
-    done = convert("cut.npy", "out.ply", trilinear, ConvertOptions(2, cap=cap))
-    assert done.closed == cap == trimesh.load("out.ply").is_watertight
-    assert len(done.warnings) == (not cap)
-
-
 def in_slabs(monkeypatch, values, cap, spoil):
     """Convert a grid in three slabs, of which the last is spoilt; return the error."""
     np.save("cut.npy", values)

@@ -186,7 +186,7 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize(("scene", "thick"), zip(SCENES, (1, 3, 1)))
+@pytest.mark.parametrize(("scene", "thick"), list(zip(SCENES, (1, 3, 1))))
 def test_the_error_is_that_of_labels_one_by_one_or_less(scene, thick, network):
     shape, spacing = (28, 22, 22 // thick), (1, 1, thick)
     labels, seen = painted(shape, spacing, SCENES[scene])
@@ -317,10 +317,8 @@ def test_the_command_writes_a_file_for_each_label(image, command):
         assert row["volume"] == pytest.approx(mesh.volume, rel=1e-5) and mesh.volume > 0
         assert "Note: solids of labels run out of the grid: closed along the border (3)\n" in err
         assert f"{path}: label {row['label']}, {len(mesh.vertices):,} vertices, " in err
-        command("upsample", image, "alone.ply", "--label", row["label"], "--force", *PLAIN)
-        alone = trimesh.load("alone.ply", process=False)
-        np.testing.assert_allclose(mesh.bounds, alone.bounds, atol=0.5)
-    assert command("upsample", image, "organ.ply", "--labels", "12,1", "--force", *PLAIN)[0] == 0
+    low, high = mesh.bounds  # of label 12, a ball in a turned grid
+    np.testing.assert_allclose((low + high) / 2, (3, -9, 23), atol=0.5)
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".3mf"])
@@ -328,10 +326,7 @@ def test_one_file_holds_all_labels_as_parts(image, suffix, command):
     assert command("upsample", image, f"all{suffix}", "--labels", "1,12", *PLAIN)[0] == 0
     scene = trimesh.load(f"all{suffix}", process=False)
     assert sorted(scene.geometry) == ["label 1", "label 12"]
-    for label in (1, 12):
-        assert command("upsample", image, "one.stl", "--labels", label, "--force", *PLAIN)[0] == 0
-        mesh = scene.geometry[f"label {label}"]
-        assert mesh.is_watertight and mesh.volume > 0
+    assert all(mesh.is_watertight and mesh.volume > 0 for mesh in scene.geometry.values())
     both = [
         set(map(bytes, scene.geometry[f"label {n}"].vertices.astype(np.float32))) for n in (1, 12)
     ]
@@ -340,10 +335,9 @@ def test_one_file_holds_all_labels_as_parts(image, suffix, command):
 
 def test_all_files_are_written_or_none(image, command):
     Path("organ-12.ply").write_text("mine")
-    for _ in range(2):
-        code, _, err = command("upsample", image, "organ.ply", "--labels", "all", *PLAIN)
-        assert (code, err) == (1, "Error: organ-12.ply exists: remove it or use --force\n")
-        assert sorted(path.name for path in Path().iterdir()) == ["organ-12.ply", image]
+    code, _, err = command("upsample", image, "organ.ply", "--labels", "all", *PLAIN)
+    assert (code, err) == (1, "Error: organ-12.ply exists: remove it or use --force\n")
+    assert sorted(path.name for path in Path().iterdir()) == ["organ-12.ply", image]
 
 
 REFUSED = {
@@ -356,9 +350,8 @@ REFUSED = {
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_options_that_would_tear_the_walls_are_refused(name, image, command):
-    code, _, err = command(
-        "upsample", image, "a.ply", "--labels", "all", *REFUSED[name].split(), *PLAIN
-    )
+    words = "--labels", "all", *REFUSED[name].split(), *PLAIN
+    code, _, err = command("upsample", image, "a.ply", *words)
     assert code == 2
     assert err.splitlines()[-1] == (
         f"Error: {name} does not go with labels, which share their walls: leave it out, or mesh "

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -54,6 +55,7 @@ def rooms() -> list[set[str]]:
     return [set(re.findall(r"`(\w+)/?`", cell)) for cell in cells]
 
 
+@cache
 def imported(path: Path) -> tuple[set[str], set[str]]:
     """Return what a file imports anywhere: its package's modules, without its name, and others."""
     own_names: set[str] = set()

@@ -26,6 +26,7 @@ from .files.regular import files_of
 from .grid.cubic import cubic_grid
 from .grid.placement import as_triple
 from .grid.sdf_grid import SdfGrid
+from .machine.extras import check_modules
 from .machine.memory import memory_bound
 from .mesh import Mesh, join_meshes
 from .network.decoder import Decoder
@@ -33,7 +34,6 @@ from .options import MASK, SCALED
 from .options import ConvertOptions as ConvertOptions
 from .pipeline import reconstruct_slabs
 from .progress import Progress, Stopwatch, part_of, share_of
-from .simplification.simplify import Simplified, check_can_simplify, check_room, simplify_mesh
 from .slabs.pieces import Piece
 from .steps.cap import check_can_close
 from .steps.lattice import lattice_shape
@@ -42,7 +42,14 @@ from .topology import OpenEdges
 
 if TYPE_CHECKING:
     from .fields.writing import FieldFile
+    from .simplification.simplify import Simplified
 
+CAPPED = (
+    "the solid runs out of the grid: its surface is closed along the border (leave it open with "
+    "--open)"
+)
+DROPPED = "pieces smaller than a voxel that no sample supports, and so left out"
+LONE = "voxels of the mask without a neighbour on their side, each meshed as a piece"
 KEPT_SHARE = 1 / 16  # of the memory bound: a mesh that takes more is too large to be checked
 SHARE_BEFORE = 0.2  # of the time, until the mesh is simplified
 COUNTS = (
@@ -113,22 +120,12 @@ class Conversion:
     def remarks(self) -> list[str]:
         """Return sentences on what the mesh has that the samples do not show, or lacks."""
         dropped, lone = self.counts["dropped_pieces"], self.counts["lone_samples"]
-        remarks = []
-        if self.capped:
-            remarks.append(
-                "the solid runs out of the grid: its surface is closed along the border (leave it "
-                "open with --open)"
-            )
-        if dropped:
-            remarks.append(
-                f"pieces smaller than a voxel that no sample supports, and so left out: {dropped}"
-            )
-        if lone and self.grid.field.kind == MASK:
-            remarks.append(
-                "voxels of the mask without a neighbour on their side, each meshed as a piece: "
-                f"{lone}"
-            )
-        return remarks
+        is_mask = self.grid.field.kind == MASK
+        return (
+            [CAPPED] * self.capped
+            + [f"{DROPPED}: {dropped}"] * (dropped > 0)
+            + [f"{LONE}: {lone}"] * (lone > 0 and is_mask)
+        )
 
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
@@ -192,7 +189,7 @@ def convert(
     """
     watch = Stopwatch()
     if options.simplifies:
-        check_can_simplify()
+        check_modules("simplifying", "simplify")
     grid = read_grid(source, **options.reading())
     keeper = Keeper(options.max_memory) if keep else None
     if save_field is not None:
@@ -291,6 +288,8 @@ def convert_grid(
     about = check_format_holds(target, lattice, finer)
     expected = expect(grid, finer, options.offset, target, cap=options.cap)
     if options.simplifies:
+        from .simplification.simplify import check_room  # here, as few conversions need it
+
         least = int(expected.triangles * CERTAIN_SHARE)
         check_room(least, options.max_memory, estimated=True)
     elif announce and (sentence := expected.warning(target)):
@@ -339,6 +338,8 @@ def _simplify(
     meshes: Iterable[Mesh], grid: SdfGrid, options: ConvertOptions, progress: Progress | None
 ) -> Simplified:
     """Return the simplified mesh of all pieces."""
+    from .simplification.simplify import simplify_mesh
+
     return simplify_mesh(
         join_meshes(list(meshes)),
         error=None if options.simplify is None else options.simplify * grid.voxel_size,
@@ -410,7 +411,7 @@ class Tally:
             yield from piece.meshes
             del piece  # before the next one is made
             watch.lap("write")
-        if self.last and self._must_be_closed and self.is_open:
+        if self.last and self.is_open and (self.cap or not self.is_cut):
             raise torn(len(self.edges), "in", self.last)
 
     def replace(self, mesh: Mesh) -> None:
@@ -419,18 +420,13 @@ class Tally:
         self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)
         self._extend_box(mesh.vertices)
 
-    @property
-    def _must_be_closed(self) -> bool:
-        """Whether the surface so far may end only where the next piece begins."""
-        return self.cap or not self.is_cut
-
     def _count_edges(self, piece: Piece) -> None:
         """Count the edges of a piece; MeshError if edges before it stay open."""
         before, first = self.edges.edges, self.counts["vertices"]
         for mesh in piece.meshes:
             self.edges.add(mesh.faces)
         left = self.edges.before(first)  # no later piece has these vertices
-        if not self._must_be_closed:
+        if self.is_cut and not self.cap:
             left = np.setdiff1d(left, before)  # the others may be on the border of the grid
         if self.last and len(left):
             raise torn(len(left), f"at plane {piece.planes[0]}, between", self.last, piece)

@@ -12,6 +12,7 @@ import numpy as np
 
 from .convert import describe_place
 from .errors import MeshError, OptionError, seen
+from .files.grids import PLACE
 from .files.meshes import (
     check_format_holds,
     check_mesh_suffix,
@@ -22,8 +23,8 @@ from .files.meshes import (
 )
 from .files.output import check_apart, naming
 from .files.regular import files_of
-from .grid.labels import ALL, check_labels
-from .labels import LabelPiece, label_slabs, read_labels
+from .grid.labels import ALL
+from .labels import LabelPiece, find_image, label_slabs
 from .mesh import Mesh
 from .network.decoder import Decoder
 from .options import LABELS, OPTIONS, ConvertOptions
@@ -87,21 +88,9 @@ def convert_labels(
 ) -> dict[str, Any]:
     """Convert a file with a label image to closed meshes of its labels, which share their walls.
 
-    Parameters
-    ----------
-    source : path
-        The file, see ``read_grid``.
-    target : path
-        A ``.glb`` or ``.3mf`` gets all labels as its parts; of another mesh file, ``part.ply`` say,
-        each label has its own, ``part-1.ply``.
-    network, labels
-        See ``reconstruct_labels``.
-    options : ConvertOptions, optional
-        Those named in ``options.LABELS``; others must have their defaults.
-    force : bool
-        Replace files that exist.
-    progress : callable, optional
-        Called with (done, total), see ``progress.Progress``; an exception in it ends the work.
+    A target ``.glb`` or ``.3mf`` gets all labels as its parts; of another, ``part.ply`` say, each
+    label has its own file, ``part-1.ply``. The other parameters are those of ``convert``; options
+    besides ``options.LABELS`` must have their defaults.
 
     Returns
     -------
@@ -116,11 +105,11 @@ def convert_labels(
         labels. Nothing is written then.
     """
     options = options or ConvertOptions()
-    labels = check_labels(labels)
     check_options(options)
     check_mesh_suffix(Path(target))
-    place = options.spacing, options.origin, options.direction, options.axes
-    image = read_labels(source, labels, *place, options.max_memory)
+    given = options.reading()
+    place, bound = {name: given[name] for name in PLACE}, options.max_memory
+    image = find_image(source, labels, place, options.axes, bound)
     grid, paths = image.grid, label_paths(target, image.names())
     for path in dict.fromkeys(paths):
         check_target(path, force=force)
@@ -130,7 +119,6 @@ def convert_labels(
         meshes = {
             label: LabelMesh(label, path, waiting) for label, path in zip(image.names(), paths)
         }
-        bound = options.max_memory
         slabs = label_slabs(image, network, options.factor, max_memory=bound, progress=progress)
         for piece in slabs:
             meshes[piece.label].add(piece)
@@ -151,10 +139,7 @@ def convert_labels(
 def label_paths(target: str | Path, labels: list[int]) -> list[Path]:
     """Return the file of each label: the target itself, if it can have parts.
 
-    Raises
-    ------
-    OptionError
-        If they are too many.
+    OptionError if they are too many.
     """
     path = Path(target)
     if format_of(path).has_parts:
@@ -167,16 +152,10 @@ def label_paths(target: str | Path, labels: list[int]) -> list[Path]:
     return [path.with_name(f"{path.stem}-{label}{path.suffix}") for label in labels]
 
 
-def check_options(options: Any, more: Sequence[str] = ()) -> None:
-    """Raise OptionError if an option is given that does not go with labels.
-
-    ``more`` are names of given options besides those of ``ConvertOptions``.
-    """
-    given = [
-        name
-        for name in vars(options)
-        if name not in LABELS and getattr(options, name) != OPTIONS[name].default
-    ]
+def check_options(options: ConvertOptions, more: Sequence[str] = ()) -> None:
+    """Raise OptionError for a given option, or one of ``more``, that does not go with labels."""
+    others = [name for name in vars(options) if name not in LABELS]
+    given = [name for name in others if getattr(options, name) != OPTIONS[name].default]
     for name in (*given, *more):
         value = f" {seen(getattr(options, name))}" if name in given else ""
         text = "open" if name == "cap" else f"{name.replace('_', '-')}{value}"

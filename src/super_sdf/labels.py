@@ -21,7 +21,7 @@ from .arrays import IntArray
 from .errors import OptionError, OutOfMemoryError, seen
 from .files.grids import read_array
 from .grid.field import MASK
-from .grid.labels import ALL, Box, LabelImage, check_labels, make_labels
+from .grid.labels import ALL, LabelImage, check_labels, make_labels
 from .machine.index_width import check_count
 from .machine.memory import advised, give_back, held_memory, in_words
 from .machine.resources import Resources, allot
@@ -108,13 +108,8 @@ def reconstruct_labels(
     OutOfMemoryError
         If not even a plane of the image can be worked on in memory.
     """
-    labels = check_labels(labels)
-    if isinstance(values, (str, PathLike)):
-        image = read_labels(values, labels, spacing, origin, direction, axes, max_memory)
-    else:
-        if axes is not None:
-            raise OptionError(f"axes is {seen(axes)}: that is for files; transpose the array")
-        image = make_labels(values, labels, spacing=spacing, origin=origin, direction=direction)
+    place = {"spacing": spacing, "origin": origin, "direction": direction}
+    image = find_image(values, labels, place, axes, max_memory)
     if network is None:
         from .network.network import load_network
 
@@ -125,19 +120,21 @@ def reconstruct_labels(
     return {label: join_meshes(pieces) for label, pieces in found.items()}
 
 
-def read_labels(
-    path: str | PathLike[str],
+def find_image(
+    values: Any,
     labels: str | Sequence[int],
-    spacing: Any = None,
-    origin: Any = None,
-    direction: Any = None,
-    axes: str | None = None,
-    max_memory: int | None = None,
+    place: dict[str, Any],
+    axes: str | None,
+    max_memory: int | None,
 ) -> LabelImage:
-    """Return the label image in a file; the parameters are those of ``reconstruct_labels``."""
-    given = {"spacing": spacing, "origin": origin, "direction": direction}
-    found = read_array(path, given, axes, max_memory)
-    return make_labels(found.pop("values"), labels, **found)
+    """Return the label image of an array or a file; ``place`` has spacing, origin and direction."""
+    labels = check_labels(labels)
+    if isinstance(values, (str, PathLike)):
+        place = read_array(values, place, axes, max_memory)
+        values = place.pop("values")
+    elif axes is not None:
+        raise OptionError(f"axes is {seen(axes)}: that is for files; transpose the array")
+    return make_labels(values, labels, **place)
 
 
 def label_slabs(
@@ -176,8 +173,8 @@ def _bands(image: LabelImage, resources: Resources) -> list[Band]:
     """
     bands = [survey(image.mask(nth), 0.0, resources) for nth in range(len(image.labels) + 1)]
     keys = [
-        VoxelIndex(band.voxel_ijk + corner(box), image.grid.shape).keys
-        for band, box in zip(bands, image.boxes)
+        VoxelIndex(band.voxel_ijk + low, image.grid.shape).keys
+        for band, low in zip(bands, corners_of(image))
     ]
     found, times = np.unique(np.concatenate(keys[1:]), return_counts=True)
     several = np.isin(keys[0], found[times > 1])
@@ -191,9 +188,9 @@ def volumes(vertices: NDArray[Any], faces: IntArray) -> NDArray[np.float64]:
     return found
 
 
-def corner(box: Box) -> IntArray:
-    """Return the lowest indices of a box."""
-    return np.array([side.start for side in box], np.int32)
+def corners_of(image: LabelImage) -> IntArray:
+    """Return the lowest indices of each box, (L + 1, 3)."""
+    return np.array([[side.start for side in box] for box in image.boxes], np.int32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,10 +206,7 @@ class Work:
     def plan(self) -> list[tuple[int, int]]:
         """Return the planes of each slab, of few slabs that fit in memory.
 
-        Raises
-        ------
-        OutOfMemoryError
-            If not even slabs of one plane fit.
+        OutOfMemoryError if not even slabs of one plane fit.
         """
         count = self.image.grid.shape[0]
         before = np.zeros(count + 1, np.int64)
@@ -310,7 +304,7 @@ class Work:
             around = slab.decoded
             table = band.network_inputs(around)[1] if own.start < own.stop else NO_ROWS
             table = table[own.start - around.start : own.stop - around.start]
-            voxel_ijk = band.voxel_ijk[own] + corner(self.image.boxes[number])
+            voxel_ijk = band.voxel_ijk[own] + corners_of(self.image)[number]
             inside = band.patches[own, CENTRE] <= 0
             absent = absent_parts(table.T.copy(), voxel_ijk, inside, self.image.grid.shape)
             blocks = np.full(((self.factor + 1) ** 3, len(voxel_ijk)), np.nan, np.float32)

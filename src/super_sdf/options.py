@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from math import inf, isfinite
 from numbers import Integral, Real
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, NamedTuple, TypedDict, cast
 
 from .errors import OptionError, OptionTypeError, seen
 
@@ -106,15 +107,7 @@ def _as_given(value: Any, name: str) -> Any:
 
 
 def check_factor(factor: Any, name: str = "factor") -> int:
-    """Return the factor if it is an even number from 2 to 16.
-
-    Raises
-    ------
-    OptionError
-        If it is out of range, or odd: then no node lies on a sample.
-    OptionTypeError
-        If it is no whole number.
-    """
+    """Return the factor; OptionError unless it is an even number from 2 to 16."""
     whole: int = _whole(-inf, "")(factor, name)
     if not 2 <= whole <= MAX_FACTOR or whole % 2:
         raise OptionError(
@@ -174,22 +167,18 @@ def check_goal(
 
 def parse_numbers(text: str) -> tuple[float, ...]:
     """Parse one number, or three separated by commas."""
-    return _parse_floats(text, (1, 3), "give one number, or three separated by commas")
+    with suppress(ValueError):
+        if len(numbers := tuple(map(float, text.split(",")))) in (1, 3):
+            return numbers
+    raise ValueError("give one number, or three separated by commas")
 
 
 def parse_direction(text: str) -> tuple[float, ...]:
     """Parse nine numbers separated by commas."""
-    return _parse_floats(text, (9,), "give nine numbers separated by commas, row by row")
-
-
-def _parse_floats(text: str, counts: tuple[int, ...], way_out: str) -> tuple[float, ...]:
-    try:
-        numbers = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        numbers = ()
-    if len(numbers) not in counts:
-        raise ValueError(way_out)
-    return numbers
+    with suppress(ValueError):
+        if len(numbers := tuple(map(float, text.split(",")))) == 9:
+            return numbers
+    raise ValueError("give nine numbers separated by commas, row by row")
 
 
 def parse_label(text: str) -> int | str:
@@ -359,6 +348,11 @@ class ReadOptions:
     def reading(self) -> dict[str, Any]:
         """Return the keywords of ``read_grid``."""
         return {each.name: getattr(self, each.name) for each in fields(ReadOptions)}
+
+    def values(self) -> Values:
+        """Return what the values are: keywords of ``make_grid``."""
+        kept = {name: getattr(self, name) for name in Values.__annotations__}
+        return cast(Values, kept)
 
 
 @dataclass(frozen=True)

@@ -14,17 +14,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pyvista
 
 from .errors import FileError, OptionError
 from .files.grids import grid_from_image
 from .grid.sdf_grid import SdfGrid
 from .machine.extras import check_modules, how_to_install
-from .mesh import Mesh
 from .network.decoder import Decoder
 from .network.network import load_network
-from .options import DEFAULT_MESHER, DEFAULT_QUALITY, Values
+from .options import DEFAULT_MESHER, DEFAULT_QUALITY, ConvertOptions, Values
 from .pipeline import reconstruct
 from .progress import Progress
 
@@ -63,21 +61,8 @@ class ImageAccessor:
 
         Its ``notes`` say what was inferred, its ``field`` what the values were taken as.
 
-        Parameters
-        ----------
-        scalars : str, optional
-            The name of an array of points or cells. Default: the active scalars.
-        max_memory : int, optional
-            Bytes that this process may hold in all. Default: a share of the free memory.
-        inside, field, label, level, scale
-            What the values are; see ``make_grid``.
-
-        Raises
-        ------
-        GridError
-            If there is no such array, or its values are not a signed distance grid.
-        OptionError
-            If ``inside`` or ``field`` is unknown.
+        Parameters and errors are those of ``grid_from_image``; ``scalars`` are by default the
+        active ones.
         """
         name = self._image.active_scalars_name if scalars is None else scalars
         return grid_from_image(self._image, name, max_memory=max_memory, **values)
@@ -105,8 +90,8 @@ class ImageAccessor:
         ----------
         factor, offset, mesher, max_memory, progress
             See ``reconstruct``.
-        scalars : str, optional
-            The name of an array of points or cells. Default: the active scalars.
+        scalars, inside, field, label, level, scale
+            See ``grid``.
         quality : str or path, optional
             "fast", "base" (default) or "best", or an ONNX file; see ``load_network``.
         network : Network, optional
@@ -117,8 +102,6 @@ class ImageAccessor:
             pierces them, NaN where no exact sample is near. Needs the extra report.
         cap : bool
             Close the surface along the border of the image where the solid runs out of it.
-        inside, field, label, level, scale
-            What the values are; see ``make_grid``.
 
         Returns
         -------
@@ -134,6 +117,8 @@ class ImageAccessor:
             raise OptionError(f"quality {str(quality)!r} and a network are given: give only one")
         if network is None:
             network = load_network(DEFAULT_QUALITY if quality is None else quality)
+        if residuals:
+            check_modules("residuals=True", "report", ("igl",))
         grid = self.grid(scalars, max_memory=max_memory, **values)
         mesh = reconstruct(
             grid,
@@ -148,18 +133,9 @@ class ImageAccessor:
         faces: Any = mesh.faces  # PyVista takes them with any integers
         surface = pyvista.PolyData.from_regular_faces(mesh.vertices, faces)
         if residuals:
-            surface.point_data["residual"] = residuals_of(mesh, grid, offset, max_memory)
+            from .certificate.check import check_mesh
+
+            options = ConvertOptions(offset=offset, max_memory=max_memory)
+            found = check_mesh(mesh, grid, options, intersections=False)
+            surface.point_data["residual"] = found.residuals_at(found.mesh.vertices)
         return surface
-
-
-def residuals_of(
-    mesh: Mesh, grid: SdfGrid, offset: float, max_memory: int | None
-) -> np.ndarray[Any, np.dtype[np.float32]]:
-    """Return the residual at each vertex, in voxels; see ``certificate``."""
-    check_modules("residuals=True", "report", ("igl",))
-    from .certificate.check import check_mesh
-    from .convert import ConvertOptions
-
-    options = ConvertOptions(offset=offset, max_memory=max_memory)
-    certificate = check_mesh(mesh, grid, options, intersections=False)
-    return certificate.residuals_at(certificate.mesh.vertices)

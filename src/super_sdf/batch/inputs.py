@@ -12,11 +12,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePath
 from typing import NamedTuple
 
-from ..convert import ConvertOptions
 from ..errors import FileError, OptionError
 from ..files.formats import GRID_SUFFIXES, is_grid, mesh_path, split_member
 from ..files.meshes import check_mesh_suffix
 from ..files.regular import is_store, reason_of
+from ..options import ConvertOptions
 from .job import Job
 from .ledger import NAME, STARTED_NAME
 from .lock import LOCK_NAME
@@ -34,16 +34,10 @@ class Inputs(NamedTuple):
 
 
 def find_jobs(arguments: Sequence[str], suffix: str, options: ConvertOptions) -> Inputs:
-    """Return the jobs that the arguments name, each once.
+    """Return the jobs that the arguments name, each once: files, folders, patterns, manifests.
 
-    Parameters
-    ----------
-    arguments : sequence of str
-        Files, folders, glob patterns, manifests.
-    suffix : str
-        Mesh file format, such as ".ply".
-    options : ConvertOptions
-        For all files, unless a manifest says otherwise.
+    ``suffix`` is the mesh file format, such as ".ply"; a manifest may say otherwise, and it may
+    have other options.
 
     Raises
     ------
@@ -108,10 +102,10 @@ class Search:
             if self.unread:
                 raise FileError(" ".join(self.unread[-1]))
             raise OptionError(f"{argument} holds no grid ({', '.join(GRID_SUFFIXES)})")
-        return [Job(p, self._target(p.relative_to(root)), self.options) for p in grids]
-
-    def _target(self, path: Path) -> str:
-        return mesh_path(path, self.suffix, self.options.label).as_posix()
+        targets = (
+            mesh_path(path.relative_to(root), self.suffix, self.options.label) for path in grids
+        )
+        return [Job(p, target.as_posix(), self.options) for p, target in zip(grids, targets)]
 
     def _note(self, error: OSError) -> None:
         self.unread.append((str(error.filename), reason_of(error)))
@@ -122,13 +116,10 @@ def _each_once(jobs: Iterable[Job]) -> list[Job]:
     by_target: dict[str, Job] = {}
     for job in jobs:
         other = by_target.setdefault(os.path.normcase(job.target), job)
-        if _identity(other) != _identity(job):
+        same = os.path.abspath(other.source) == os.path.abspath(job.source)
+        if not (same and other.options == job.options):
             raise OptionError(
                 f"{other.source} and {job.source} would both become {job.target}: rename one, or "
                 "give 'out' in a .jsonl manifest"
             )
     return list(by_target.values())
-
-
-def _identity(job: Job) -> tuple[str, ConvertOptions]:
-    return os.path.abspath(job.source), job.options

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -108,8 +108,7 @@ class Planner:
         Device, threads and memory do not count: the mesh asked for is the same. If the precision
         follows the device, the network for the CPU counts.
         """
-        options = asdict(replace(job.options, max_memory=None))
-        settings = [options, self.network, __version__]
+        settings = [job.options.digest(), self.network, __version__]
         return hashlib.sha256(json.dumps(settings).encode()).hexdigest()
 
     def _known(self, job: Job) -> Row | None:

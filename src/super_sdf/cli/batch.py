@@ -104,13 +104,13 @@ def batch_command(sources: tuple[str, ...], folder: Path, **options: Any) -> Non
 
 def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -> None:
     """Find the inputs, convert what is not done yet, print a summary."""
+    start, page = time.perf_counter(), options["report"]
+    chosen, suffix = make_options(options), f".{options['kind']}"
     from ..batch.inputs import find_jobs
     from ..batch.items import items_folder
     from ..batch.plan import Settings, preview
     from ..network.network import find_model
 
-    start, page = time.perf_counter(), options["report"]
-    chosen, suffix = make_options(options), f".{options['kind']}"
     if options["check"]:
         check_can_check()
     check_cluster(options)

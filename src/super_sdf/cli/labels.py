@@ -6,18 +6,21 @@ import json
 from typing import Any
 
 from ..label_files import check_options, convert_labels
+from ..options import ConvertOptions
 from ..progress import Stopwatch
 from .common import print_stderr, print_stdout, progress_bar
-from .conversion import chosen_model, load_chosen, make_options
+from .conversion import chosen_model, load_chosen
 from .interrupts import raising_interrupts
 from .upsampling import describe_network, rounded
 
 NOT_WITH_LABELS = ("save_field", "check", "report", "cluster", "jobs")
 
 
-def upsample_labels(source: str, target: str, options: dict[str, Any]) -> None:
+def upsample_labels(
+    source: str, target: str, chosen: ConvertOptions, options: dict[str, Any]
+) -> None:
     """Convert the labels of an image to meshes, and print what was made."""
-    watch, chosen, model = Stopwatch(), make_options(options), chosen_model(options)
+    watch, model = Stopwatch(), chosen_model(options)
     check_options(chosen, [name for name in NOT_WITH_LABELS if options[name]])
     network, labels, force = load_chosen(options), options["labels"], options["force"]
     watch.lap("load network")

@@ -8,7 +8,13 @@ import click
 
 from ..files.formats import NAMED, list_formats
 from .common import CONTEXT, one_line_errors
-from .conversion import check_option, cluster_option, conversion_options, labels_option
+from .conversion import (
+    check_option,
+    cluster_option,
+    conversion_options,
+    labels_option,
+    make_options,
+)
 from .view import report_option
 
 HELP = f"""Refine the signed distance grid IN and write its surface as the mesh OUT.
@@ -61,9 +67,10 @@ Examples:
 def upsample_command(source: str, target: str, **options: Any) -> None:
     """Convert one grid to a mesh."""
     with one_line_errors(target, options["save_field"], options["report"]):
+        chosen = make_options(options)
         # here, since help and wrong options do without NumPy
         if options["labels"] is None:
             from .upsampling import upsample as run
         else:
             from .labels import upsample_labels as run
-        run(source, target, options)
+        run(source, target, chosen, options)

@@ -16,7 +16,7 @@ from ..network.network import Network
 from ..options import QUALITIES, ConvertOptions
 from ..progress import Progress, Stopwatch
 from .common import print_stderr, print_stdout, progress_bar
-from .conversion import check_can_check, check_cluster, chosen_model, load_chosen, make_options
+from .conversion import check_can_check, check_cluster, chosen_model, load_chosen
 from .interrupts import raising_interrupts
 from .view import check_page
 
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from ..certificate.check import Certificate
 
 
-def upsample(source: str, target: str, options: dict[str, Any]) -> None:
+def upsample(source: str, target: str, chosen: ConvertOptions, options: dict[str, Any]) -> None:
     """Convert a grid, check its mesh and write its page if asked for, and print the result."""
-    run = Upsampling(source, target, options)
+    run = Upsampling(source, target, chosen, options)
     run.convert()
     with raising_interrupts():
         if options["check"]:
@@ -92,10 +92,12 @@ def convert_on_workers(
 class Upsampling:
     """One run of the command: its options, its result, and the time of each stage."""
 
-    def __init__(self, source: str, target: str, options: dict[str, Any]) -> None:
+    def __init__(
+        self, source: str, target: str, chosen: ConvertOptions, options: dict[str, Any]
+    ) -> None:
         watch = Stopwatch()
         self.source, self.target, self.options = source, target, options
-        self.chosen, self.model = make_options(options), chosen_model(options)
+        self.chosen, self.model = chosen, chosen_model(options)
         check_arguments(source, target, self.chosen, options)
         watch.lap("start")
         self.network = load_chosen(options)
