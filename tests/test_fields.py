@@ -367,7 +367,7 @@ def test_targets_are_refused_before_anything_is_written():
         write_field(field, "field.vdb")
     assert str(caught.value) == (
         "field.vdb cannot be written: OpenVDB's own module cannot be installed with pip; write "
-        ".npz, and convert it with that module as docs/fields.md shows"
+        ".npz, and convert it with that module as docs/reference/files.md shows"
     )
     Path("old.npz").write_bytes(b"old")
     with pytest.raises(WriteError, match=r"old\.npz exists: remove it or use --force"):

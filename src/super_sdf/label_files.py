@@ -12,7 +12,6 @@ import numpy as np
 
 from .convert import describe_place
 from .errors import MeshError, OptionError, seen
-from .files.grids import PLACE
 from .files.meshes import (
     check_format_holds,
     check_mesh_suffix,
@@ -23,6 +22,7 @@ from .files.meshes import (
 )
 from .files.output import check_apart, naming
 from .files.regular import files_of
+from .files.volume import PLACE
 from .grid.labels import ALL
 from .labels import LabelPiece, find_image, label_slabs
 from .mesh import Mesh

@@ -1,6 +1,6 @@
 """Refined fields as sparse ``.npz`` files: written slab by slab, read back by ``read_field``.
 
-docs/fields.md describes the keys. Values are in world units and exact: as float32 if the spacing is
+docs/reference/files.md describes the keys. Values are in world units and exact: as float32 if the spacing is
 a power of two, since the field's own numbers are float32 in half voxels, else as float64.
 """
 
@@ -157,7 +157,7 @@ def read_field(path: str | Path) -> FineField:
     Parameters
     ----------
     path : path
-        The file; docs/fields.md describes its keys.
+        The file; docs/reference/files.md describes its keys.
 
     Raises
     ------

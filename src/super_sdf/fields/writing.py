@@ -139,7 +139,7 @@ def check_field_target(path: str | Path, *, force: bool = False) -> Path:
     if suffix == ".vdb":
         raise OptionError(
             f"{path} cannot be written: OpenVDB's own module cannot be installed with pip; write "
-            ".npz, and convert it with that module as docs/fields.md shows"
+            ".npz, and convert it with that module as docs/reference/files.md shows"
         )
     if suffix not in WRITERS:
         raise OptionError(f"{path} is not a field file: give one of {', '.join(FIELD_SUFFIXES)}")
@@ -217,7 +217,7 @@ def write_field(field: FineField, path: str | Path, *, force: bool = False) -> N
         From ``upsample``.
     path : path
         The file: .npz for the sparse field, which ``read_field`` reads back; .npy or .vti for the
-        whole fine lattice. docs/fields.md describes them.
+        whole fine lattice. docs/reference/files.md describes them.
     force : bool
         Replace an existing file.
 

@@ -403,7 +403,7 @@ def look_at_samples(band: Band, grid: SdfGrid, threads: int = 1) -> Band:
     """Return the band of a resampled grid, in which samples are trusted by samples alone.
 
     Interpolated values do not tell whether the samples are noisy. Where they do not contradict
-    others they count as exact, since thin parts need them (docs/placement.md).
+    others they count as exact, since thin parts need them (docs/guides/formats.md).
     """
     sampled, lipschitz = on_samples(grid, band.voxel_ijk), band.lipschitz.copy()
     lipschitz[sampled] = is_lipschitz(band.patches[sampled], sampled_places(grid))
