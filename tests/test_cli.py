@@ -187,7 +187,6 @@ CASES = {
         2,
         "simplify 1.0 and triangles 9: give only one of them",
     ),
-    ("in.npy", "--iterations", "0"): (2, "iterations is 0: give 1 or more"),
     ("in.npy", "--factor", "5"): (
         2,
         "factor is 5: give an even number from 2 to 16 (an odd one has no node on the samples)",

@@ -156,7 +156,7 @@ def test_the_command_takes_a_direction_and_check_agrees(folder, command):
 def test_a_direction_in_a_list_has_nine_numbers(folder, command):
     Path("list.jsonl").write_text('{"in": "a.npy", "direction": [1, 0, 0]}')
     code, _, err = command("batch", "list.jsonl", "--out", "out")
-    said = "'direction' is [1, 0, 0]: give a list of nine numbers, row by row\n"
+    said = "'direction' is [1, 0, 0]: give nine numbers, row by row\n"
     assert code == 2 and err.endswith(f"Error: list.jsonl, line 1: {said}")
 
 

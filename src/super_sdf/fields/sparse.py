@@ -1,7 +1,7 @@
 """Refined fields as sparse ``.npz`` files: written slab by slab, read back by ``read_field``.
 
-docs/reference/files.md describes the keys. Values are in world units and exact: as float32 if the spacing is
-a power of two, since the field's own numbers are float32 in half voxels, else as float64.
+docs/reference/files.md describes the keys. Values are in world units and exact: as float32 if the
+spacing is a power of two, since the field's own are float32 in half voxels, else as float64.
 """
 
 from __future__ import annotations

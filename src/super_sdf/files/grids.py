@@ -50,7 +50,7 @@ def read_grid(
     max_memory: int | None = None,
     **values: Unpack[Values],
 ) -> SdfGrid:
-    """Read a grid from a file of any format in ``formats.FORMATS``; docs/guides/formats.md describes them.
+    """Read a grid from a file of any format in ``formats.FORMATS``: see docs/guides/formats.md.
 
     An ``.npy`` file is not loaded but read plane by plane, now and when the grid is refined. Others
     are unpacked first, and so are arrays in another axis order: into memory if that takes at most

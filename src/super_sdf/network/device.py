@@ -104,5 +104,5 @@ def session_options(threads: int) -> ort.SessionOptions:
     options.enable_mem_pattern = False  # useful only if all inputs have the same size
     # A thread that waits for the next operator keeps its core busy for so long, 1 ms by default: on
     # a machine with other work to do that takes ten times as long.
-    options.add_session_config_entry("session.intra_op.spin_duration_us", "20")
+    options.add_session_config_entry("session.intra_op.spin_duration_us", "100")
     return options
