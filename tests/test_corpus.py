@@ -25,9 +25,9 @@ from super_sdf import load_network
 from super_sdf.network.onnx import ort
 from super_sdf.options import MESHERS
 
-EACH = 45  # cases of a theme
-ALONE = 40  # of all that may hang or crash
-FIELDS = 500
+EACH = 25  # cases of a theme
+ALONE = 20  # of all that may hang or crash
+FIELDS = 160
 
 
 @pytest.fixture(scope="module")
