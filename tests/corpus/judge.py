@@ -21,7 +21,7 @@ LEFT = re.compile(r"\.part$|^tmp|\.tmp$|^\.~")
 NAMED_BUG = re.compile(r"\b([A-Z]\w+): ")
 COUNTS = re.compile(r": ([\d,]+) vertices, ([\d,]+) triangles")
 # How each line begins on standard error: after success, and where files failed one by one.
-SAID = re.compile(r"Note: |Warning: |.*: [\d,]+ (vertices|x )|\d+ of \d+: |.*[\\/.]md$")
+SAID = re.compile(r"Note: |Warning: |Simplified: |.*: [\d,]+ (vertices|x )|\d+ of \d+: ")
 FAILED = re.compile(
     r"Failed: |Left out: |Error: |Note: |Warning: |\d+ |and \d+ more|nothing to do|.*\.md$"
 )
