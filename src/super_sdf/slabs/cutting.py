@@ -69,33 +69,7 @@ def plan_slabs(
     mesher: Mesher = DEFAULT,
     planes: tuple[int, int] | None = None,
 ) -> list[Slab]:
-    """Return the fewest slabs that fit in memory, in order.
-
-    Parameters
-    ----------
-    band : Band
-        The band of the whole grid.
-    factor : int
-        K.
-    receptive_field : int, optional
-        Voxels to each side that the network's values depend on. If it is None, the network must see
-        the whole band at once.
-    resources : Resources
-        The threads and memory that the run may use.
-    network_bytes : two floats
-        Memory of the network in bytes, per voxel and per value.
-    mesher : Mesher
-        What makes triangles of the slabs.
-    planes : two ints, optional
-        Cut only these planes, from the first to before the second.
-
-    Raises
-    ------
-    OutOfMemoryError
-        If the thinnest slabs do not fit.
-    OptionError
-        If the mesh will certainly have more vertices than 32-bit numbers.
-    """
+    """Return the fewest slabs that fit in memory, in order."""
     check_vertices(band, factor)
     bound, need = resources.memory, 0
     beside = mesher.planes_beside(factor)

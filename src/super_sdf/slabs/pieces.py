@@ -10,41 +10,22 @@ from ..steps.field import FineField, border_is_crossed
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """The mesh of one slab.
+    """The mesh of one slab."""
 
-    Attributes
-    ----------
-    meshes : list of Mesh
-        Faces index the vertices of all slabs so far.
-    counts : dict
-        Counts of the slab: ``decoded_voxels``, ``nodes``, ``pinned_nodes``, ``dropped_pieces``,
-        ``lone_samples`` (see ``FineField``), ``vertices``, ``triangles``.
-    whole : dict
-        Counts of the whole run, the same in each piece: ``band_voxels``, ``noisy_voxels`` (see
-        ``FineField``), ``slabs``, and ``planned_bytes``, the planned peak memory of the process.
-    planes : two ints
-        The slab's planes of voxels, from the first to before the second.
-    leaves : bool
-        Whether the solid leaves the grid, anywhere: a sample on the border is inside.
-    is_cut : bool
-        Whether the surface leaves the grid in this slab, or may end at unknown samples.
-    signs : set of bool
-        Which signs the slab's nodes have: True outside, False inside.
-    seconds : dict
-        Seconds of each step, by its name in ``progress.STEPS``; the band is in the first piece.
-    worker : str
-        Machine and number of the process that made it, if that was not this one.
-    """
-
-    meshes: list[Mesh]
+    meshes: list[Mesh]  # faces index the vertices of all slabs so far
+    # counts of the slab: ``decoded_voxels``, ``nodes``, ``pinned_nodes``, ``dropped_pieces``,
+    # ``lone_samples`` (see ``FineField``), ``vertices``, ``triangles``
     counts: dict[str, int]
+    # counts of the whole run, the same in each piece: ``band_voxels``, ``noisy_voxels`` (see
+    # ``FineField``), ``slabs``, and ``planned_bytes``, the planned peak memory of the process
     whole: dict[str, int]
-    planes: tuple[int, int]
-    leaves: bool
-    is_cut: bool
-    signs: set[bool]
+    planes: tuple[int, int]  # the slab's planes of voxels, from the first to before the second
+    leaves: bool  # whether the solid leaves the grid, anywhere: a sample on the border is inside
+    is_cut: bool  # whether the surface leaves the grid in this slab, or may end at unknown samples
+    signs: set[bool]  # which signs the slab's nodes have: True outside, False inside
+    # seconds of each step, by its name in ``progress.STEPS``; the band is in the first piece
     seconds: dict[str, float] = field(default_factory=dict)
-    worker: str = ""
+    worker: str = ""  # machine and number of the process that made it, if that was not this one
 
 
 def describe_piece(

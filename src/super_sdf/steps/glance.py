@@ -38,11 +38,6 @@ def look_at_band(grid: SdfGrid, offset: float, planes: int = 0) -> Glance:
 
     The planes are read where the samples are, see ``planes.over_planes``; by default at least as
     many at a time as are best.
-
-    Raises
-    ------
-    GridError
-        As in ``survey``.
     """
     count, samples = grid.shape[0], grid.samples
     planes = planes or max(planes_at_once(samples), BLOCK_PLANES)

@@ -23,21 +23,12 @@ Extract = Callable[[FineField, SdfGrid, int, int], list[Mesh]]
 
 @dataclass(frozen=True)
 class Mesher:
-    """A way to make triangles of a field.
+    """A way to make triangles of a field."""
 
-    Attributes
-    ----------
-    name : str
-        One of ``options.MESHERS``.
-    extract : callable
-        Returns the mesh of a field's own planes, in one or more pieces.
-    planes_beside : callable
-        Takes the factor; returns how many coarse planes to either side of a slab must have final
-        values, since its mesh depends on them.
-    """
-
-    name: str
-    extract: Extract
+    name: str  # one of ``options.MESHERS``
+    extract: Extract  # returns the mesh of a field's own planes, in one or more pieces
+    # takes the factor; returns how many coarse planes to either side of a slab must have final
+    # values, since its mesh depends on them
     planes_beside: Callable[[int], int]
 
 
@@ -72,13 +63,7 @@ BY_NAME = {
 
 
 def find_mesher(name: Any) -> Mesher:
-    """Return the mesher with a name.
-
-    Raises
-    ------
-    OptionError
-        If there is none, or the name is no string (``OptionTypeError``).
-    """
+    """Return the mesher with a name."""
     return BY_NAME[check_mesher(name)]
 
 

@@ -70,59 +70,39 @@ class BandTooLargeError(OutOfMemoryError):
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """The active voxels of a grid (Eq. 2), their samples, and what these can be used for.
+    """The active voxels of a grid (Eq. 2), their samples, and what these can be used for."""
 
-    Attributes
-    ----------
-    shape : three ints
-        Samples of the grid along each axis.
-    voxel_ijk : (V, 3) int32
-        The voxels, in C order.
-    patches : (V, 27) float32
-        The samples round each voxel, in half voxels.
-    lipschitz, decoded, exact : (V,) bool
-        Which patches can be distances; which voxels can hold the surface, and so are decoded; which
-        own samples can be taken as exact distances.
-    limits : two floats
-        Samples beyond the band may be exact distances if they lie between these, in half voxels.
-    sampled : (V,) bool, optional
-        Which own values are samples of a grid that was resampled; None if all are.
-    leaves : bool
-        Whether a sample on the border of the grid is inside: then the solid leaves the grid.
-    kind : str
-        What the field is, see ``grid.field``.
-    smooth, is_uneven, has_kinks
-        The field that is meshed by its cubic spline, in world units; whether it is interpolated
-        linearly where it jumps; and whether the network may refine it where it is not smooth.
-    half_voxel, level : float
-        Half a spacing in world units, by which these are divided; and what is zero then.
-    peak, unpacked : int
-        The memory of the process in bytes while the band was found; those of a temporary file.
-    beyond : SamplesBeyond
-        The samples a few voxels farther away.
-    unseen : bool array or Planes, optional
-        The samples at which the surface ends, see ``Field``.
-    """
-
-    shape: tuple[int, int, int]
-    voxel_ijk: IntArray
-    patches: FloatArray
+    shape: tuple[int, int, int]  # samples of the grid along each axis
+    voxel_ijk: IntArray  # (V, 3), the voxels, in C order
+    patches: FloatArray  # (V, 27), the samples round each voxel, in half voxels
+    # lipschitz, decoded, exact: (V,), which patches can be distances; which voxels can hold the
+    # surface, and so are decoded; which own samples can be taken as exact distances
     lipschitz: BoolArray
     decoded: BoolArray
     exact: BoolArray
+    # samples beyond the band may be exact distances if they lie between these, in half voxels
     limits: tuple[float, float] = (0.0, 0.0)
+    # (V,), which own values are samples of a grid that was resampled; None if all are
     sampled: BoolArray | None = None
+    # whether a sample on the border of the grid is inside: then the solid leaves the grid
     leaves: bool = False
-    kind: str = EXACT
+    kind: str = EXACT  # what the field is, see ``grid.field``
+    # smooth, is_uneven, has_kinks: the field that is meshed by its cubic spline, in world units;
+    # whether it is interpolated linearly where it jumps; and whether the network may refine it
+    # where it is not smooth
     smooth: SampleArray | None = None
     is_uneven: bool = False
     has_kinks: bool = False
+    # half_voxel, level: half a spacing in world units, by which these are divided; and what is zero
+    # then
     half_voxel: float = 1.0
     level: float = 0.0
+    # peak, unpacked: the memory of the process in bytes while the band was found; those of a
+    # temporary file
     peak: int = 0
     unpacked: int = 0
-    beyond: SamplesBeyond = NONE_BEYOND
-    unseen: SampleArray | None = None
+    beyond: SamplesBeyond = NONE_BEYOND  # the samples a few voxels farther away
+    unseen: SampleArray | None = None  # the samples at which the surface ends, see ``Field``
 
     @cached_property
     def trusted(self) -> TrustedSamples:
@@ -200,27 +180,10 @@ def survey(
     among: tuple[int, int] | None = None,
     whole: BandSummary | None = None,
 ) -> Band:
-    """Read a grid once and return its band.
+    """Read a grid once and return its band; BandTooLargeError as soon as it exceeds the memory.
 
-    Parameters
-    ----------
-    grid : SdfGrid
-        Signed distances in world units, with the same spacing on all axes: see ``cubic_grid``.
-    offset : float
-        Distance of the surface in world units, positive outwards.
-    resources : Resources
-        The threads and memory that the run may use.
-    among : two ints, optional
-        Look only among planes from the first to before the second, and do not check the offset.
-    whole : BandSummary, optional
-        What ``look_at_band`` says of the whole grid; needed with ``among``.
-
-    Raises
-    ------
-    GridError
-        If the distances end too near the offset.
-    BandTooLargeError
-        As soon as the part of the band read so far exceeds the memory bound.
+    With ``among``, only these planes are looked at, the offset is not checked, and ``whole`` is
+    what ``look_at_band`` says of the whole grid.
     """
     sizes: list[int] = []
     jumps: list[tuple[Jumps, Jumps]] = []

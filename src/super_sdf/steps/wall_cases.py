@@ -38,18 +38,9 @@ Segment = tuple[int, int, int, int]
 def walls(ranks: int, joined: int) -> IntArray:
     """Return the triangles of a case, (n, 5): three points, and a corner on either side.
 
-    Parameters
-    ----------
-    ranks : int
-        Three bits for each corner of the cell: how many labels at its corners are lower.
-    joined : int
-        A bit for each face with two labels at the ends of its diagonals: whether the corners with
-        the higher one are joined.
-
-    Returns
-    -------
-    (n, 5) int32
-        Counter-clockwise seen from the side of the second corner, whose label is lower.
+    Of ``ranks`` three bits are for each corner: how many labels at corners are lower. ``joined``
+    has a bit for each face with two labels at the ends of its diagonals: whether it joins those of
+    the higher. Triangles are counter-clockwise seen from the second corner, whose label is lower.
     """
     label = [ranks >> 3 * corner & 7 for corner in range(8)]
     rows: list[Segment] = []

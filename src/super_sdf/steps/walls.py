@@ -40,38 +40,19 @@ Cells = tuple[Keys, Labels]
 
 @dataclass(frozen=True, eq=False)
 class Labelled:
-    """The fields of some labels at the nodes of voxels in which the walls can be.
+    """The fields of some labels at the nodes of voxels in which the walls can be."""
 
-    Attributes
-    ----------
-    shape : three ints
-        Samples of the coarse grid along each axis.
-    factor : int
-        K.
-    planes : two ints
-        Planes of voxels, from the first to before the second.
-    voxel_ijk : (D, 3) int32
-        The voxels, in C order.
-    values : (Q, S) float32
-        Their blocks, label by label; NaN where that of label 0 is minus that of any other.
-    column : (S,) int64
-        ``voxel * labels + label``, in ascending order, of each column ``order`` of the values.
-    order : (S,) int64
-    labels : int
-        Number of labels, 0 included, which is beside all others.
-    holder : (Q, D) int16
-        The label of each node.
-    """
-
-    shape: tuple[int, int, int]
-    factor: int
-    planes: tuple[int, int]
-    voxel_ijk: IntArray
+    shape: tuple[int, int, int]  # samples of the coarse grid along each axis
+    factor: int  # K
+    planes: tuple[int, int]  # planes of voxels, from the first to before the second
+    voxel_ijk: IntArray  # (D, 3), the voxels, in C order
+    # (Q, S), their blocks, label by label; NaN where that of label 0 is minus that of any other
     values: FloatArray
+    # (S,), ``voxel * labels + label``, in ascending order, of each column ``order`` of the values
     column: Keys
-    order: NDArray[np.intp]
-    labels: int
-    holder: Labels
+    order: NDArray[np.intp]  # (S,)
+    labels: int  # number of labels, 0 included, which is beside all others
+    holder: Labels  # (Q, D), the label of each node
 
     @cached_property
     def index(self) -> VoxelIndex:
@@ -79,17 +60,7 @@ class Labelled:
         return VoxelIndex(self.voxel_ijk, self.shape)
 
     def apart(self, low: Keys, node: Keys, between: Labels, holder: Labels) -> NDArray[np.float64]:
-        """Return by how much the field of a node's holder is lower than that of another, (n,).
-
-        Parameters
-        ----------
-        low, node : (n, 3) int64
-            The low nodes of cells, and a node of each, that lies in the grid.
-        between : (2, n) int16
-            Two labels at corners of the cell, in ascending order.
-        holder : (n,) int16
-            Which of them is that of the node.
-        """
+        """Return by how much the field of a node's holder is lower than that of another, (n,)."""
         voxel = np.clip(low // self.factor, 0, np.array(self.shape) - 1)
         row, place = self.index.find(voxel), (node - self.factor * voxel) @ strides(self.factor)
         values = []
@@ -104,40 +75,19 @@ class Labelled:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """The field of one label in some planes.
+    """The field of one label in some planes."""
 
-    Attributes
-    ----------
-    voxel_ijk : (n, 3) int32
-        The voxels round which some samples have the label, and others do not, in C order.
-    absent : (27, n) bool
-        Which parts of their blocks touch a voxel round which no sample has the label.
-    blocks : (Q, n) float32
-        Their values; NaN where they are not known.
-    """
-
+    # (n, 3), the voxels round which some samples have the label, and others do not, in C order
     voxel_ijk: IntArray
+    # (27, n), which parts of their blocks touch a voxel round which no sample has the label
     absent: BoolArray
-    blocks: FloatArray
+    blocks: FloatArray  # (Q, n), their values; NaN where they are not known
 
 
 def absent_parts(
     table: IntArray, voxel_ijk: IntArray, inside: BoolArray, shape: tuple[int, int, int]
 ) -> BoolArray:
-    """Return ``Part.absent``.
-
-    Parameters
-    ----------
-    table : (27, n) int32
-        The voxels of the label at the places round each, -1 where there is none: there, all samples
-        are on the side of those beside them.
-    voxel_ijk : (n, 3) int32
-        The voxels.
-    inside : (n,) bool
-        Whether their own sample has the label.
-    shape : three ints
-        Samples of the grid along each axis.
-    """
+    """Return ``Part.absent``."""
     none = table < 0
     for place, step in enumerate(NEIGHBOURHOOD):
         beside = voxel_ijk + step
@@ -152,18 +102,7 @@ def put_together(
     factor: int,
     planes: tuple[int, int],
 ) -> Labelled:
-    """Return the fields of labels in some planes.
-
-    Parameters
-    ----------
-    parts : iterable
-        Of the labels, in ascending order; they are taken one by one.
-    ground : Part
-        Of what is beside all labels. Where at most one label can hold a node, the value is not
-        used: it is minus that of the label.
-    shape, factor, planes
-        See ``Labelled``.
-    """
+    """Return the fields of labels in some planes."""
     number, every = [0], [ground]
     for label, part in parts:
         number.append(label)
@@ -206,25 +145,11 @@ def _holders(
 def extract_walls(
     field: Labelled, border: IntArray
 ) -> tuple[NDArray[np.float64], IntArray, Labels, int]:
-    """Return the walls in the planes of fields.
+    """Return the walls in the planes of fields: vertices, triangles, labels on both sides.
 
-    Parameters
-    ----------
-    field : Labelled
-        From ``put_together``.
-    border : (b, 4) int32
-        The voxels on the border of the grid in its planes, and the label of each, which is closed
-        there.
-
-    Returns
-    -------
-    (v, 3) float64
-        The vertices in fine spacings from node 0. Those on the first face of the planes come first.
-    (m, 3) int32, (m, 2) int16
-        The triangles, and the labels on both sides: counter-clockwise seen from the second, which
-        is lower.
-    int
-        The number of vertices on that face, which the planes before have, too.
+    Triangles are counter-clockwise seen from the second label, which is lower. ``border``, (b, 4),
+    are the voxels on the border of the grid and the label of each, which is closed there. The last
+    number is that of vertices on the first face of the planes: they come first.
     """
     cells = low, _ = _cells(field, border)
     lattice = Halves(field.shape, field.factor)
