@@ -36,8 +36,7 @@ from .options import (
 )
 from .progress import STEPS, Progress, StepCounter
 from .slabs.cutting import Slab
-from .slabs.pieces import Piece, describe_piece
-from .slabs.preparing import Run, prepare
+from .slabs.preparing import Piece, Run, describe_piece, prepare
 from .steps.band import BandSummary
 from .steps.bounds import keep_within_bounds
 from .steps.cap import check_can_close, close, seen_octants

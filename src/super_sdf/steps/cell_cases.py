@@ -101,7 +101,7 @@ class LoopTable:
     sides: NDArray[np.int64]  # (L,), how many edges a loop has
     # (L, S), its cell edges in order, counter-clockwise from outside; -1 after the last
     edges: NDArray[np.int64]
-    # (L, T, 3), places in the loop of the corners of its triangles, of which there are ``sides - 2``
+    # (L, T, 3), places in the loop of its triangles' corners; there are ``sides - 2``
     triangles: NDArray[np.int64]
 
 

@@ -2,16 +2,17 @@
 
 The grid is read once, in blocks of planes, and a block is worked on in windows, so that little is
 held beside the band. This takes 135 bytes per voxel, and 12 per sample beyond it, so it grows with
-the surface, not with the grid.
+the surface, not with the grid. ``look_at_band`` reads a grid whose band is not kept: it is worked
+on in bricks, or too large.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
-from itertools import pairwise
-from typing import Any, TypeAlias
+from functools import cached_property, partial
+from itertools import chain, pairwise
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +23,13 @@ from ..grid.cubic import Resampled, on_samples, sampled_places
 from ..grid.field import EXACT, MASK
 from ..grid.planes import (
     SampleArray,
+    over_planes,
     planes_at_once,
     planes_too_large,
     reading_bytes,
     unpacked_bytes,
 )
-from ..grid.sdf_grid import SdfGrid, negated
+from ..grid.sdf_grid import SdfGrid, negated, without_samples
 from ..machine.memory import held_memory, in_words
 from ..machine.resources import ONE_THREAD, Resources
 from ..machine.threads import chunks_of, over_threads
@@ -36,8 +38,12 @@ from .band import (
     BLOCK_PLANES,
     BLOCK_SAMPLES,
     BandSummary,
+    Jumps,
     can_hold_surface,
+    check_not_cut_off,
+    check_not_filled,
     exact_samples,
+    find_jumps,
     has_both_sides,
     is_active,
     is_filled_in,
@@ -46,10 +52,10 @@ from .band import (
     pad_by_extrapolation,
     plane_blocks,
     rescale_planes,
+    summarise,
     take_patches,
 )
 from .bounds import NONE_BEYOND, SamplesBeyond, TrustedSamples, samples_beyond
-from .offsets import Jumps, check_not_cut_off, check_not_filled, find_jumps
 
 # Of a band: patches, indices and flags; what is made of them on the way; and of samples beyond it.
 BYTES_PER_VOXEL, BYTES_BEYOND = 135, 12
@@ -480,3 +486,75 @@ def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:
     return NoSurfaceError(
         f"no surface at {offset:g}: the values go from {grid.low:.6g} to {grid.high:.6g}"
     )
+
+
+class Glance(NamedTuple):
+    """What is seen of the band in some planes, without keeping it.
+
+    Of each plane the voxels, and those that are decoded; the samples beyond the band that can be
+    exact; see ``Band.count_crossings``; and, with an offset, the jumps.
+    """
+
+    summary: BandSummary
+    voxels: list[int]
+    decoded: list[int]
+    beyond: int
+    crossings: int
+    jumps: list[tuple[Jumps, Jumps]]
+
+
+def look_at_band(grid: SdfGrid, offset: float, planes: int = 0) -> Glance:
+    """Return what the band of a grid says without keeping it, as if ``survey`` had read it.
+
+    The planes are read where the samples are, see ``planes.over_planes``; by default at least as
+    many at a time as are best.
+    """
+    count, samples = grid.shape[0], grid.samples
+    planes = planes or max(planes_at_once(samples), BLOCK_PLANES)
+    ranges = [
+        (max(first - 1, 0), min(last + 1, count), (first, last))
+        for first, last in plane_blocks(grid.shape, least=planes)
+    ]
+    # resampled ones are made here, and say so
+    known = grid if isinstance(samples, Resampled) else without_samples(grid)
+    look = partial(_glance, known, offset)
+    parts = zip(*over_planes(samples, look, ranges))
+    summaries, voxels, decoded, beyond, crossings, jumps = map(list, parts)
+    all_jumps = list(chain(*jumps))
+    if offset:
+        check_jumps(all_jumps, grid, offset)
+    counts = list(chain(*voxels)), list(chain(*decoded)), sum(beyond), sum(crossings)
+    return Glance(_of_all(summaries), *counts, all_jumps)
+
+
+def _of_all(summaries: list[BandSummary]) -> BandSummary:
+    return BandSummary(
+        sum(part.voxels for part in summaries),
+        sum(part.noisy for part in summaries),
+        min(part.low for part in summaries),
+        max(part.high for part in summaries),
+        any(part.leaves for part in summaries),
+    )
+
+
+def _glance(grid: SdfGrid, offset: float, planes: NDArray[Any], inner: tuple[int, int]) -> Glance:
+    """Return what is seen in the planes ``inner``, given with those beside them."""
+    jumps: list[tuple[Jumps, Jumps]] = []
+    leaving: list[bool] = []
+    first, last = inner
+    voxels, decoded = np.zeros((2, last - first), np.int64)
+    beyond = crossings = 0
+    summaries: list[BandSummary] = []
+    for ijk, patches, _, value in band_of_samples(grid, offset, planes, inner, jumps, leaving):
+        lipschitz = is_lipschitz(patches)
+        held = can_hold_surface(patches, lipschitz)
+        band = limit_to_field(
+            Band(grid.shape, ijk, patches, lipschitz, held, lipschitz), grid, offset
+        )
+        plane = ijk[:, 0] - first
+        voxels += np.bincount(plane, minlength=last - first)
+        decoded += np.bincount(plane[band.decoded], minlength=last - first)
+        beyond, crossings = beyond + len(value), crossings + band.count_crossings()
+        summaries.append(summarise(patches[:, CENTRE], lipschitz, leaving[0]))
+    summary = _of_all(summaries)
+    return Glance(summary, voxels.tolist(), decoded.tolist(), beyond, crossings, jumps)
