@@ -277,17 +277,10 @@ def reconstruct_planes(
 ) -> Iterator[Piece]:
     """Yield the pieces of ``reconstruct_slabs`` in some planes; it is a brick of a huge grid.
 
-    Only these planes are read, and those beside them on which the mesh depends. The pieces of all
-    bricks, in order, are the same mesh, bit for bit. Vertices are counted from the first of the
-    brick: those of the brick before have numbers below 0. The first plane of the brick and that
-    after its last are ``planes``; ``whole`` is of the band of the whole grid, see ``look_at_band``.
-
-    Raises
-    ------
-    OptionError
-        If the network states no receptive field, so that it has to see the whole grid.
-    OutOfMemoryError
-        If not even a plane of the brick fits in memory.
+    Only these planes, from the first to before the second, are read, and those beside them on which
+    the mesh depends. The pieces of all bricks, in order, are the same mesh, bit for bit. Vertices
+    are counted from the first of the brick: those of the brick before have numbers below 0.
+    ``whole`` is of the band of the whole grid, see ``look_at_band``.
     """
     part, steps = (planes, whole), StepCounter(progress)
     run = prepare(grid, network, factor, offset, max_memory, steps, find_mesher(mesher), part=part)

@@ -67,6 +67,8 @@ except Exception as error:  # a broken installation fails in other ways than Imp
         "onnxruntime"
     ) from error
 
+__all__ = ["ort"]
+
 
 # onnxruntime allocates from an arena, so that layers reuse the memory of earlier ones: the system
 # has to zero fresh memory, which takes a third of the time of the network itself. After a large run

@@ -215,8 +215,7 @@ def _does_not_fit(
 
 
 # Bytes per voxel that the network sees, per decoded voxel and per node of a decoded block: of the
-# fit to spheres with what goes before, of the bounds and the meshers, and of a spline. Measured by
-# ``python -m lab figures --only memory``.
+# fit to spheres with what goes before, of the bounds and the meshers, and of a spline.
 STAGES = {"fit": (216, 1450, 4.0), "mesh": (216, 450, 8.2), "spline": (216, 300, 4.5)}
 # Bytes per thread, for its chunk, and once.
 THREAD_BYTES, FIXED_BYTES = 25_000_000, 30_000_000

@@ -142,11 +142,7 @@ def _crossings_of_chunk(field: FineField, start: int, stop: int) -> tuple[NDArra
 
 
 def _are_edges_of(
-    cell_row: IntArray,
-    cell: NDArray[np.int16],
-    row: IntArray,
-    edge: NDArray[np.int16],
-    factor: int,
+    cell_row: IntArray, cell: NDArray[np.int16], row: IntArray, edge: NDArray[np.int16], factor: int
 ) -> BoolArray:
     """Return which edges of voxels' blocks belong to some cells of these blocks.
 

@@ -102,11 +102,7 @@ def number_after(first_vertex: int, meshes: list[Mesh]) -> list[Mesh]:
 
 
 def extract_group(
-    field: FineField,
-    grid: SdfGrid,
-    kinked: BoolArray,
-    first_vertex: int = 0,
-    threads: int = 1,
+    field: FineField, grid: SdfGrid, kinked: BoolArray, first_vertex: int = 0, threads: int = 1
 ) -> list[Mesh]:
     """Return the mesh of a field's planes with its edges and corners, as a list of one piece.
 
@@ -220,11 +216,7 @@ def _number_vertices(
 
 
 def _vertices(
-    field: FineField,
-    crossings: Crossings,
-    examined: Examined,
-    numbers: Numbers,
-    first_vertex: int,
+    field: FineField, crossings: Crossings, examined: Examined, numbers: Numbers, first_vertex: int
 ) -> Vectors:
     """Return the vertices of the field's own voxels, (n, 3), in fine spacings."""
     vertices = np.empty((numbers.own, 3))
