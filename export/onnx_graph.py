@@ -24,7 +24,7 @@ from onnx import TensorProto, helper, numpy_helper
 from export.network import SuperSdfNet
 from export.writer import Writer
 from super_sdf.neighbourhood import CENTRE
-from super_sdf.network.running import CHUNK_INPUT
+from super_sdf.network.onnx import CHUNK_INPUT
 from super_sdf.steps.band import DECODE_LIMIT, MAX_DIFFERENCE
 
 CHUNK = 512  # voxels at a time; on a CPU 256 to 2048 differ by a few percent

@@ -19,7 +19,7 @@ import numpy as np
 
 from super_sdf import SdfGrid, load_network, reconstruct
 from super_sdf.errors import DeviceError
-from super_sdf.network.cuda import describe_gpu, onnxruntime_version, query_gpu
+from super_sdf.network.device import describe_gpu, onnxruntime_version, query_gpu
 from super_sdf.network.network import Network
 from super_sdf.options import QUALITIES
 from super_sdf.steps.nodes import block_offsets

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, settings
 from super_sdf import SdfGrid
 from super_sdf.neighbourhood import NEIGHBOURHOOD
 from super_sdf.network.onnx import ort
-from super_sdf.slabs import cutting, footprint
+from super_sdf.slabs import cutting
 from super_sdf.steps import survey
 
 # How long an example takes says nothing on a busy machine.
@@ -111,7 +111,7 @@ def run_batch(command):
 def bare_plan(monkeypatch):
     """Let the plan count what grows with the surface, over 100 MB, and nothing else."""
     for name in ("THREAD_BYTES", "FIXED_BYTES", "NETWORK_FIXED"):
-        monkeypatch.setattr(footprint, name, 0)
+        monkeypatch.setattr(cutting, name, 0)
     for module in (cutting, survey):
         monkeypatch.setattr(module, "held_memory", lambda: 10**8)
 

@@ -29,7 +29,7 @@ from super_sdf.cluster.crew import Crew
 from super_sdf.errors import ClusterError, DeviceError
 from super_sdf.machine.pool import Death
 from super_sdf.machine.resources import Resources
-from super_sdf.network.fingerprint import Fingerprint
+from super_sdf.network.network import Fingerprint
 
 pytestmark = pytest.mark.usefixtures("grid_folder")
 LOCAL = ("--cluster", "local")

@@ -15,13 +15,11 @@ from test_network import network_inputs
 
 from super_sdf import load_network
 from super_sdf.errors import DeviceError, ModelError
-from super_sdf.network import cuda, device
+from super_sdf.network import device
 from super_sdf.network.contract import INPUTS, one_voxel
-from super_sdf.network.cuda import CUDA
-from super_sdf.network.device import CPU, CUDA_OPTIONS
+from super_sdf.network.device import CPU, CUDA, CUDA_OPTIONS
 from super_sdf.network.network import shipped_models
-from super_sdf.network.onnx import first_line, ort
-from super_sdf.network.running import CHUNK_INPUT, CUDA_CHUNK, run_bound
+from super_sdf.network.onnx import CHUNK_INPUT, CUDA_CHUNK, first_line, ort, run_bound
 from super_sdf.steps.nodes import block_offsets
 
 pytestmark = pytest.mark.usefixtures("cpu_build")
@@ -219,22 +217,22 @@ def test_a_bad_file_is_not_reported_as_a_failure_of_cuda(tmp_path, monkeypatch, 
 def test_a_gpu_is_seen_by_its_driver(monkeypatch):
     monkeypatch.setattr(Path, "exists", lambda self: False)
     monkeypatch.setattr(ctypes, "CDLL", no_library("libcuda.so.1"))
-    assert not cuda.has_gpu()
+    assert not device.has_gpu()
     monkeypatch.setattr(ctypes, "CDLL", no_library(None))
-    assert cuda.has_gpu()
+    assert device.has_gpu()
     monkeypatch.setattr(ctypes, "CDLL", no_library("libcuda.so.1"))
     monkeypatch.setattr(Path, "exists", lambda self: str(self) == "/dev/nvidia0")
-    assert cuda.has_gpu()
+    assert device.has_gpu()
 
 
 def test_nvidia_smi_describes_the_gpu(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert cuda.describe_gpu() is None
+    assert device.describe_gpu() is None
     fake = tmp_path / "nvidia-smi"
     fake.write_text("#!/bin/sh\necho 'NVIDIA H100, 580.1, 81559, 1559'\n")
     fake.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/bin:/usr/bin")
-    assert cuda.describe_gpu() == "NVIDIA H100, driver 580.1, 83.9 GB free"
+    assert device.describe_gpu() == "NVIDIA H100, driver 580.1, 83.9 GB free"
 
 
 def test_errors_of_onnxruntime_become_one_line():

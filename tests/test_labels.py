@@ -21,7 +21,7 @@ from super_sdf.label_files import MOST_FILES, label_paths
 from super_sdf.labels import Work, reconstruct_labels
 from super_sdf.slabs.cutting import equal_parts
 from super_sdf.steps.cell_cases import FACES
-from super_sdf.steps.wall_cases import walls
+from super_sdf.steps.walls import walls
 
 CAP = 0.02 / 4  # of a voxel, at most: how far outside the border a surface is closed
 

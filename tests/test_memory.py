@@ -26,8 +26,7 @@ from super_sdf.pipeline import reconstruct_slabs
 from super_sdf.steps import band as band_step
 from super_sdf.steps import spline
 from super_sdf.steps import survey as survey_step
-from super_sdf.steps.glance import look_at_band
-from super_sdf.steps.survey import survey
+from super_sdf.steps.survey import look_at_band, survey
 
 # Arrays of 4 MB in a row, of which the last stays: the C library keeps what is freed before it.
 FREED = """

@@ -10,8 +10,7 @@ import pytest
 from super_sdf import load_network
 from super_sdf.cli.entry import main
 from super_sdf.machine import processor
-from super_sdf.network.fingerprint import fingerprint_of, small_ball
-from super_sdf.network.network import Network, find_model
+from super_sdf.network.network import Network, find_model, fingerprint_of, small_ball
 
 CORE_2 = "fpu sse sse2 pni ssse3 cx16"
 NEHALEM = f"{CORE_2} sse4_1 sse4_2 popcnt"

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from test_network import network_inputs
 
 from super_sdf import load_network, reconstruct, upsample
-from super_sdf.network import network, running
-from super_sdf.network.running import LINEAR_UP_TO, share_of_time
+from super_sdf.network import network, onnx
+from super_sdf.network.onnx import LINEAR_UP_TO, share_of_time
 from super_sdf.progress import StepCounter
 from super_sdf.steps.nodes import block_offsets
 
@@ -37,7 +37,7 @@ def progress(reports):
 def polled(monkeypatch):
     """Poll during every run, however short, and often."""
     monkeypatch.setattr(network, "LONG_RUN", 0)
-    monkeypatch.setattr(running, "POLL_INTERVAL", 1e-4)
+    monkeypatch.setattr(onnx, "POLL_INTERVAL", 1e-4)
 
 
 def test_steps_are_reported_in_thousandths_of_their_usual_time(reports, progress):
@@ -87,14 +87,14 @@ def test_polled_runs_give_the_same_bits(monkeypatch):
 
 
 def test_a_bound_run_is_polled_and_stopped_as_well(monkeypatch):
-    monkeypatch.setattr(running, "POLL_INTERVAL", 1e-4)
+    monkeypatch.setattr(onnx, "POLL_INTERVAL", 1e-4)
     feeds = dict(zip(network.INPUTS, (*network_inputs(ball()), block_offsets(4))))
     session, polls = load_network("fast", device="cpu").session, []
-    polled = running.run_bound(session, feeds, "cpu", poll=lambda: polls.append(1))
-    np.testing.assert_array_equal(polled, running.run_bound(session, feeds, "cpu"))
+    polled = onnx.run_bound(session, feeds, "cpu", poll=lambda: polls.append(1))
+    np.testing.assert_array_equal(polled, onnx.run_bound(session, feeds, "cpu"))
     assert polls
     with pytest.raises(ZeroDivisionError):
-        running.run_bound(session, feeds, "cpu", poll=lambda: 1 / 0)
+        onnx.run_bound(session, feeds, "cpu", poll=lambda: 1 / 0)
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError("enough")])
@@ -150,7 +150,7 @@ def hearing():
 def test_an_interrupt_stops_a_run_in_the_middle():
     session = EndlessSession(lambda: os.kill(os.getpid(), signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
-        running.run_on_cpu(session, FEEDS)
+        onnx.run_on_cpu(session, FEEDS)
     assert session.ended
 
 
@@ -170,7 +170,7 @@ class DeafSession(EndlessSession):
 def test_a_second_interrupt_does_not_wait_for_a_run():
     session = DeafSession()
     with pytest.raises(KeyboardInterrupt):
-        running.run_on_cpu(session, FEEDS)
+        onnx.run_on_cpu(session, FEEDS)
     assert session.thread.is_alive() and session.thread.daemon  # so this process can end
     session.released.set()
 

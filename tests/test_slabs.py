@@ -16,10 +16,8 @@ from super_sdf.machine.resources import Resources
 from super_sdf.mesh import Mesh, join_meshes
 from super_sdf.pipeline import reconstruct_slabs
 from super_sdf.slabs import cutting, preparing
-from super_sdf.slabs.cutting import cut, equal_parts, peak_bytes, plan_slabs
-from super_sdf.slabs.footprint import slab_bytes
-from super_sdf.steps.glance import look_at_band
-from super_sdf.steps.survey import survey
+from super_sdf.slabs.cutting import cut, equal_parts, peak_bytes, plan_slabs, slab_bytes
+from super_sdf.steps.survey import look_at_band, survey
 
 
 @pytest.fixture(scope="module")

@@ -27,8 +27,7 @@ from super_sdf.errors import OptionError
 from super_sdf.neighbourhood import CENTRE
 from super_sdf.network.contract import INPUTS
 from super_sdf.network.network import load_network, shipped_models
-from super_sdf.network.onnx import ort
-from super_sdf.network.running import CHUNK_INPUT
+from super_sdf.network.onnx import CHUNK_INPUT, ort
 from super_sdf.steps.band import DECODE_LIMIT
 
 CONFIG = replace(SMALL, channels=16, hidden=32, blocks=4, gated=2)

@@ -69,7 +69,7 @@ from super_sdf.errors import FileError, OptionError
 from super_sdf.neighbourhood import CENTRE, NEIGHBOURHOOD
 from super_sdf.network.contract import EXACT_DISTANCES, INPUTS
 from super_sdf.network.network import shipped_models
-from super_sdf.network.running import CHUNK_INPUT
+from super_sdf.network.onnx import CHUNK_INPUT
 from super_sdf.steps.band import find_band, is_lipschitz, neighbour_table
 from super_sdf.steps.nodes import block_offsets
 from super_sdf.truth.sampling import sample_grid

@@ -34,9 +34,9 @@ from .options import MASK, SCALED
 from .options import ConvertOptions as ConvertOptions
 from .pipeline import reconstruct_slabs
 from .progress import Progress, Stopwatch, part_of, share_of
-from .slabs.pieces import Piece
+from .slabs.preparing import Piece
 from .steps.cap import check_can_close
-from .steps.lattice import lattice_shape
+from .steps.field import lattice_shape
 from .steps.survey import Band
 from .topology import OpenEdges
 

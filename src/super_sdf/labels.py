@@ -32,8 +32,7 @@ from .network.network import network_for
 from .options import check_factor, check_max_memory, check_network, check_progress
 from .pipeline import refine
 from .progress import Progress, StepCounter, part_of
-from .slabs.cutting import Slab, equal_parts, slab_of
-from .slabs.footprint import slab_bytes
+from .slabs.cutting import Slab, equal_parts, slab_bytes, slab_of
 from .steps.nodes import VoxelIndex
 from .steps.survey import Band, survey
 from .steps.walls import Labels, Part, absent_parts, extract_walls, put_together

@@ -84,13 +84,7 @@ def join_meshes(pieces: list[Mesh]) -> Mesh:
 
 
 def vertex_type(grid: SdfGrid, factor: int) -> type[np.float32] | type[np.float64]:
-    """Return the dtype that resolves neighbouring vertices: float32 if possible, else float64.
-
-    Raises
-    ------
-    GridError
-        If float64 does not resolve them either.
-    """
+    """Return the dtype that resolves neighbouring vertices: float32 if possible, else float64."""
     reach = grid.reach
     for kind in (np.float32, np.float64):
         if tells_vertices_apart(kind, reach, grid, factor):

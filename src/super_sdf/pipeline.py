@@ -18,6 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from . import options
 from .grid.field import MASK
 from .grid.sdf_grid import SdfGrid, check_grid
 from .machine.memory import give_back
@@ -25,19 +26,9 @@ from .mesh import Mesh, join_meshes
 from .neighbourhood import CENTRE
 from .network.decoder import Decoder, decode
 from .network.network import load_network
-from .options import (
-    DEFAULT_MESHER,
-    check_cap,
-    check_distance,
-    check_factor,
-    check_max_memory,
-    check_network,
-    check_progress,
-)
 from .progress import STEPS, Progress, StepCounter
 from .slabs.cutting import Slab
-from .slabs.pieces import Piece, describe_piece
-from .slabs.preparing import Run, prepare
+from .slabs.preparing import Piece, Run, describe_piece, prepare
 from .steps.band import BandSummary
 from .steps.bounds import keep_within_bounds
 from .steps.cap import check_can_close, close, seen_octants
@@ -58,9 +49,6 @@ from .steps.nodes import (
 from .steps.spheres import fit_to_spheres
 from .steps.spline import interpolate
 from .steps.survey import Band, no_surface
-
-SaveField = Callable[[FineField], None]
-"""Called with the field of each slab, in order, before its surface is extracted."""
 
 
 def refine(
@@ -161,11 +149,13 @@ def upsample(
         outside.
     """
     check_grid(grid)
-    check_network(network)
-    check_progress(progress)
-    factor, offset = check_factor(factor), check_distance(offset)
+    options.check_network(network)
+    options.check_progress(progress)
+    factor, offset = options.check_factor(factor), options.check_distance(offset)
     steps = StepCounter(progress, [name for name in STEPS if name != "isosurface"])
-    run = prepare(grid, network, factor, offset, check_max_memory(max_memory), steps, at_once=True)
+    run = prepare(
+        grid, network, factor, offset, options.check_max_memory(max_memory), steps, at_once=True
+    )
     field = refine(run.band, run.network, factor, run.slabs[0], run.threads, steps)
     if len(field.signs()) < 2:
         raise no_surface(grid, offset)
@@ -179,7 +169,7 @@ def reconstruct(
     *,
     offset: float = 0.0,
     cap: bool = False,
-    mesher: str = DEFAULT_MESHER,
+    mesher: str = options.DEFAULT_MESHER,
     max_memory: int | None = None,
     progress: Progress | None = None,
 ) -> Mesh:
@@ -229,10 +219,10 @@ def reconstruct_slabs(
     *,
     offset: float = 0.0,
     cap: bool = False,
-    mesher: str = DEFAULT_MESHER,
+    mesher: str = options.DEFAULT_MESHER,
     max_memory: int | None = None,
     progress: Progress | None = None,
-    save: SaveField | None = None,
+    save: Callable[[FineField], None] | None = None,
     look: Callable[[Band], None] | None = None,
 ) -> Iterator[Piece]:
     """Yield the mesh of ``reconstruct`` slab by slab, in as few slabs as fit in memory.
@@ -242,10 +232,14 @@ def reconstruct_slabs(
     ``look`` with the band of the grid.
     """
     check_grid(grid)
-    check_network(network)
-    check_progress(progress)
-    factor, offset, cap = check_factor(factor), check_distance(offset), check_cap(cap)
-    mesh_with, bound = find_mesher(mesher), check_max_memory(max_memory)
+    options.check_network(network)
+    options.check_progress(progress)
+    factor, offset, cap = (
+        options.check_factor(factor),
+        options.check_distance(offset),
+        options.check_cap(cap),
+    )
+    mesh_with, bound = find_mesher(mesher), options.check_max_memory(max_memory)
     check_can_close(grid, cap=cap)
 
     def pieces() -> Iterator[Piece]:
@@ -272,23 +266,16 @@ def reconstruct_planes(
     whole: BandSummary,
     offset: float = 0.0,
     cap: bool = False,
-    mesher: str = DEFAULT_MESHER,
+    mesher: str = options.DEFAULT_MESHER,
     max_memory: int | None = None,
     progress: Progress | None = None,
 ) -> Iterator[Piece]:
     """Yield the pieces of ``reconstruct_slabs`` in some planes; it is a brick of a huge grid.
 
-    Only these planes are read, and those beside them on which the mesh depends. The pieces of all
-    bricks, in order, are the same mesh, bit for bit. Vertices are counted from the first of the
-    brick: those of the brick before have numbers below 0. The first plane of the brick and that
-    after its last are ``planes``; ``whole`` is of the band of the whole grid, see ``look_at_band``.
-
-    Raises
-    ------
-    OptionError
-        If the network states no receptive field, so that it has to see the whole grid.
-    OutOfMemoryError
-        If not even a plane of the brick fits in memory.
+    Only these planes, from the first to before the second, are read, and those beside them on which
+    the mesh depends. The pieces of all bricks, in order, are the same mesh, bit for bit. Vertices
+    are counted from the first of the brick: those of the brick before have numbers below 0.
+    ``whole`` is of the band of the whole grid, see ``look_at_band``.
     """
     part, steps = (planes, whole), StepCounter(progress)
     run = prepare(grid, network, factor, offset, max_memory, steps, find_mesher(mesher), part=part)
@@ -300,7 +287,7 @@ def reconstruct_planes(
         del piece  # before the next one is made
 
 
-def _mesh_slabs(run: Run, cap: bool, save: SaveField | None) -> Iterator[Piece]:
+def _mesh_slabs(run: Run, cap: bool, save: Callable[[FineField], None] | None) -> Iterator[Piece]:
     """Yield the piece of each slab of a run."""
     steps, mesher, vertices = run.steps, run.mesher, 0
     work = {"slabs": len(run.slabs), "planned_bytes": run.planned}

@@ -60,15 +60,7 @@ class Stopwatch:
 
 
 class StepCounter:
-    """Reports progress and measures time, step by step; ``finish`` ends each step.
-
-    Parameters
-    ----------
-    progress : callable, optional
-        Called as ``Progress`` describes.
-    names : iterable of str
-        The steps that will be done, of ``STEPS``.
-    """
+    """Reports progress and measures time, step by step; ``finish`` ends each step."""
 
     def __init__(self, progress: Progress | None = None, names: Iterable[str] = STEPS) -> None:
         whole = sum(STEPS[name] for name in names)

@@ -15,5 +15,5 @@ from .pipeline import reconstruct as reconstruct
 from .pipeline import upsample as upsample
 from .simplification.simplify import simplify_mesh as simplify_mesh
 from .steps.field import FineField as FineField
-from .steps.lattice import fine_grid as fine_grid
+from .steps.field import fine_grid as fine_grid
 from .steps.meshers import extract_mesh as extract_mesh

@@ -19,7 +19,7 @@ from .errors import DeviceError, SuperSdfError
 from .grid.sdf_grid import make_grid
 from .machine.extras import EXTRAS, how_to_install, missing_modules
 from .machine.memory import free_memory
-from .network.cuda import available_devices, check_cuda, describe_gpu, onnxruntime_version
+from .network.device import available_devices, check_cuda, describe_gpu, onnxruntime_version
 from .network.network import (
     MASK_MODEL,
     NO_NETWORKS,

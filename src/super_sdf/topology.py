@@ -46,19 +46,6 @@ def pair_edges(faces: IntArray, count: int) -> tuple[IntArray, Edges]:
     """Find the neighbour of each triangle across each of its edges.
 
     Half-edge 3 f + i runs from corner i of face f to the next corner.
-
-    Parameters
-    ----------
-    faces : (m, 3) int32
-        Corners of the triangles.
-    count : int
-        Number of vertices.
-
-    Returns
-    -------
-    (3 m,) int32, Edges
-        The half-edge that runs along the same edge in the other direction, -1 unless the edge has
-        exactly these two; and the numbers of all other edges.
     """
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     key = np.minimum(start, end).astype(np.int64)
@@ -139,11 +126,6 @@ class OpenEdges:
     that follow, less those that precede, sum to 0. Edges between other vertices are paired exactly.
     At the end of an open edge the sum is 0 by chance once in 2^46 cases. A hole has three such ends
     at least, and is missed if two of them are.
-
-    Attributes
-    ----------
-    edges : (n,) int64
-        The open edges in the direction of their triangle: start times 2^32 plus end.
     """
 
     def __init__(self) -> None:

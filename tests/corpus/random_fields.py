@@ -19,9 +19,9 @@ from super_sdf.pipeline import Decoder
 from super_sdf.progress import Stopwatch
 from super_sdf.slabs import preparing
 from super_sdf.slabs.cutting import cut, equal_parts
-from super_sdf.slabs.pieces import Piece
-from super_sdf.steps.glance import look_at_band
+from super_sdf.slabs.preparing import Piece
 from super_sdf.steps.marching import CAP_HEIGHT
+from super_sdf.steps.survey import look_at_band
 
 from .case import ball, rng_of
 

@@ -124,7 +124,7 @@ def gather_facts() -> dict[str, Any]:
     """Return versions, devices and the networks' cards."""
     import platform
 
-    from ..network.cuda import available_devices
+    from ..network.device import available_devices
     from ..network.network import NO_NETWORKS, shipped_models
     from ..network.onnx import ort
 

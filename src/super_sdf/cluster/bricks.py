@@ -37,11 +37,10 @@ from ..options import ConvertOptions
 from ..pipeline import reconstruct_planes
 from ..progress import TOTAL, Progress, Stopwatch
 from ..slabs.cutting import check_crossings, equal_parts
-from ..slabs.pieces import Piece
+from ..slabs.preparing import Piece
 from ..steps.band import BandSummary
 from ..steps.cap import check_all_seen
-from ..steps.glance import Glance, look_at_band
-from ..steps.survey import BYTES_PER_VOXEL, no_surface
+from ..steps.survey import BYTES_PER_VOXEL, Glance, look_at_band, no_surface
 from .checking import Needs
 from .connecting import Cluster
 from .stored import WAY_OUT, Source, Store, StoredPlanes, check_source, close_stores, opened

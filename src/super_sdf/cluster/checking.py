@@ -30,9 +30,8 @@ from ..machine.extras import missing_modules
 from ..machine.memory import free_memory, reuse_freed
 from ..machine.resources import Resources
 from ..machine.serving import settle_signals
-from ..network.cuda import onnxruntime_version
-from ..network.fingerprint import Fingerprint, fingerprint_of
-from ..network.network import find_model, shipped_models
+from ..network.device import onnxruntime_version
+from ..network.network import Fingerprint, find_model, fingerprint_of, shipped_models
 from ..options import AUTO_PRECISION
 from .connecting import Cluster, share_of
 

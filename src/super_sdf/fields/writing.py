@@ -20,8 +20,7 @@ from ..machine.extras import check_modules
 from ..machine.memory import held_memory, in_words, memory_bound
 from ..options import check_path
 from ..steps.cap import check_all_seen
-from ..steps.field import FineField
-from ..steps.lattice import FineLattice, fine_grid, lattice_shape
+from ..steps.field import FineField, FineLattice, fine_grid, lattice_shape
 from .sparse import SparseWriter
 
 CHUNK = 1 << 20  # values at a time, but at least a plane

@@ -5,13 +5,14 @@ Masks and noisy distances have networks of their own, see ``network_for``.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -19,9 +20,9 @@ from ..arrays import FloatArray, IntArray
 from ..errors import DeviceError, FileError, ModelError, OptionError
 from ..files.regular import check_regular_file
 from ..grid.field import MASK, NOISY
-from ..machine.processor import lacks_avx2
+from ..machine.processor import lacks_avx2, processor_name
 from ..machine.threads import cores_of_system, useful_threads
-from ..neighbourhood import cube_symmetries, turn
+from ..neighbourhood import NEIGHBOURHOOD, cube_symmetries, turn
 from ..options import (
     AUTO_PRECISION,
     DEFAULT_QUALITY,
@@ -36,8 +37,7 @@ from ..progress import ShareCallback
 from .contract import EXACT_DISTANCES, INPUTS, MASKS, one_voxel, read_card
 from .decoder import Decoder
 from .device import open_session
-from .onnx import ort
-from .running import CUDA_CHUNK, LONG_RUN, Pace, Poll, run_bound, run_on_cpu, work_of
+from .onnx import CUDA_CHUNK, LONG_RUN, Pace, Poll, ort, run_bound, run_on_cpu, work_of
 
 MODELS = Path(__file__).parent.parent / "models"
 # Memory of a run, measured: of each voxel that it sees, its patch and its row of the neighbour
@@ -325,3 +325,49 @@ def _load_once(name: str, device: str, threads: int, symmetries: int, precision:
         raise FileError(f"the network {name!r} is missing: {NO_NETWORKS}")
     loaded = load_network(name, device=device, threads=threads, precision=precision)
     return loaded.averaged(symmetries)
+
+
+BALL_SIDE, BALL_CENTRE, BALL_RADIUS = (
+    12,
+    5.63,
+    4.0,
+)  # of a ball, in index units; the centre is not on a sample
+
+
+class Fingerprint(NamedTuple):
+    """What a network computes, and where.
+
+    ``digest`` is the SHA-256 of its values on a small ball; ``device`` is "cpu" or "cuda",
+    ``processor`` the model of the processor, and ``precision`` "float32" or "int8".
+    """
+
+    digest: str
+    device: str
+    processor: str
+    precision: str
+
+
+def fingerprint_of(model: str, precision: str, device: str) -> Fingerprint:
+    """Return the fingerprint of a network, named as for ``load_network``; its errors, too."""
+    network = load_network(model, precision=precision, device=device, threads=1)
+    digest = hashlib.sha256(network(*small_ball()).tobytes()).hexdigest()
+    return Fingerprint(digest, network.device, processor_name(), network.precision)
+
+
+def small_ball() -> tuple[Any, Any, Any, Any]:
+    """Return the inputs of a network for a ball: the 624 voxels of its band, and 125 offsets."""
+    ijk = np.indices((BALL_SIDE,) * 3).reshape(3, -1).T
+    band = ijk[np.abs(_distances(ijk)) < 3]  # 1.5 voxels
+    around = band[:, None] + NEIGHBOURHOOD
+    row_of = np.full((BALL_SIDE + 2,) * 3, -1, np.int32)
+    row_of[tuple(band.T + 1)] = np.arange(len(band))
+    table = row_of[tuple(np.moveaxis(around + 1, -1, 0))]
+    offsets = np.indices((5,) * 3).reshape(3, -1).T / 2 - 1
+    voxels = np.arange(len(band), dtype=np.int32)
+    return _distances(around), table, voxels, offsets.astype(np.float32)
+
+
+def _distances(ijk: Any) -> Any:
+    """Return the signed distances of the ball at indices (..., 3), in half voxels."""
+    x, y, z = np.moveaxis(ijk - BALL_CENTRE, -1, 0)
+    return (2 * (np.sqrt(x * x + y * y + z * z) - BALL_RADIUS)).astype(np.float32)

@@ -1,18 +1,30 @@
-"""The only module that imports onnxruntime, so that it is always imported without telemetry.
+"""Running sessions of onnxruntime, which this module alone imports: without telemetry.
 
 Since 2026 the wheels for Linux and macOS send usage data by default: the import writes files under
 the user's cache folder, and a process that runs for a minute sends data about its machine. A tool
 for people's own shapes must not do that without their consent.
+
+Inputs and output are bound, and a long run can be interrupted. onnxruntime does not report
+progress: the time of a run is nearly proportional to its number of voxels and values, and the
+factor is measured in the run before, or in a small part of this one.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import re
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from threading import Event, Thread
+from typing import Any
 
+import numpy as np
+
+from ..arrays import FloatArray
 from ..errors import DeviceError
+from ..progress import ShareCallback
 
 SWITCH = "ORT_DISABLE_TELEMETRY"  # a variable that onnxruntime reads once, when it is imported
 
@@ -55,4 +67,160 @@ except Exception as error:  # a broken installation fails in other ways than Imp
         "onnxruntime"
     ) from error
 
-__all__ = ["first_line", "ort"]
+__all__ = ["ort"]
+
+
+# onnxruntime allocates from an arena, so that layers reuse the memory of earlier ones: the system
+# has to zero fresh memory, which takes a third of the time of the network itself. After a large run
+# the arena is shrunk, since the next grid has another size; after a small one there is no need.
+SHRINK = "memory.enable_memory_arena_shrinkage"
+SMALL = 20_000  # voxels ...
+SMALL_OUTPUT = 5_000_000  # ... and values of a run after which the arena is not shrunk
+# An optional fifth input of networks: the rows of the neighbour table per chunk. On a CPU what 256
+# rows gather stays in the cache. A GPU waits between chunks, so it gets large ones: this many rows
+# of 27 * 64 gathered floats take 113 MB.
+CHUNK_INPUT, CPU_CHUNK, CUDA_CHUNK = "chunk", 256, 16384
+POLL_INTERVAL = 0.1  # seconds
+
+VALUES_PER_VOXEL = 300  # decoding this many values takes as long as encoding a voxel
+LONG_RUN = 20_000  # in the unit of ``work_of``: a few tenths of a second on one core
+LINEAR_UP_TO = 0.8  # above this share progress slows down: a run may take longer than expected
+
+Poll = Callable[[], None]
+"""Called at the start of a run and every ``POLL_INTERVAL`` seconds; what it raises stops it."""
+
+
+def run_on_cpu(
+    session: ort.InferenceSession, feeds: Mapping[str, Any], poll: Poll = lambda: None
+) -> FloatArray:
+    """Run a session on the CPU, given its inputs by name, and return its output, (D, Q) float32.
+
+    An interrupt, or an exception in ``poll``, stops the run. DeviceError if onnxruntime fails. The
+    output is allocated here: in onnxruntime's arena it would prevent the arena from shrinking.
+    """
+    values = np.empty((len(feeds["voxels"]), len(feeds["offsets"])), np.float32)
+    options = ort.RunOptions()
+    if len(feeds["patches"]) > SMALL or values.size > SMALL_OUTPUT:
+        options.add_run_config_entry(SHRINK, "cpu:0")
+    with failures_on("cpu"):
+        binding = session.io_binding()
+        for name, array in feeds.items():
+            binding.bind_cpu_input(name, array)
+        chunk = ort.OrtValue.ortvalue_from_numpy(np.array([CPU_CHUNK]))
+        if takes_chunk(session):
+            binding.bind_ortvalue_input(CHUNK_INPUT, chunk)
+        output = session.get_outputs()[0].name
+        binding.bind_output(output, "cpu", 0, np.float32, values.shape, values.ctypes.data)
+    _run(session, binding, options, "cpu", poll, keep=(feeds, chunk, values))
+    return values
+
+
+def run_bound(
+    session: ort.InferenceSession,
+    feeds: Mapping[str, Any],
+    place: str = "cuda",
+    chunk: int = CUDA_CHUNK,
+    poll: Poll = lambda: None,
+) -> FloatArray:
+    """Run a session with its inputs and its output on a device, and return the output.
+
+    Each input is copied to the device once and the output back once, nothing more. ``chunk`` is the
+    number of rows of the neighbour table per chunk, for networks that have this input. Everything
+    else is as in ``run_on_cpu``.
+    """
+    options = ort.RunOptions()
+    if place == "cuda":
+        options.add_run_config_entry(SHRINK, "gpu:0")
+    with failures_on(place):
+        binding = session.io_binding()
+        bound = {name: ort.OrtValue.ortvalue_from_numpy(feeds[name], place, 0) for name in feeds}
+        if takes_chunk(session):  # on the CPU, which launches the kernels
+            bound[CHUNK_INPUT] = ort.OrtValue.ortvalue_from_numpy(np.array([chunk]), "cpu", 0)
+        for name, value in bound.items():
+            binding.bind_ortvalue_input(name, value)
+        binding.bind_output(session.get_outputs()[0].name, place, 0)
+    _run(session, binding, options, place, poll, keep=bound)
+    with failures_on(place):
+        values: FloatArray = binding.copy_outputs_to_cpu()[0]
+    return values
+
+
+def takes_chunk(session: ort.InferenceSession) -> bool:
+    """Return whether a network lets the rows per chunk be chosen."""
+    return any(given.name == CHUNK_INPUT for given in session.get_overridable_initializers())
+
+
+@contextmanager
+def failures_on(device: str) -> Iterator[None]:
+    """Turn exceptions of onnxruntime into DeviceError."""
+    try:
+        yield
+    except Exception as error:  # onnxruntime's errors have no other common base class
+        raise DeviceError(f"the network failed on {device}: {first_line(error)}") from error
+
+
+def _run(
+    session: ort.InferenceSession, binding: Any, options: Any, device: str, poll: Poll, keep: Any
+) -> None:
+    """Run a session in a thread and poll; ``keep`` holds the bound arrays alive.
+
+    Python handles no interrupt while onnxruntime runs in its own thread. onnxruntime reads
+    ``options.terminate`` between two operators, also in the loops over chunks, so a run ends within
+    milliseconds. A second interrupt waits for nothing: a loop of the file may have no end.
+    """
+    failures: list[BaseException] = []
+    ended = Event()  # not Thread.join, which after an interrupt may return before the thread ends
+
+    def work(keep: Any = keep) -> None:
+        try:
+            with failures_on(device):
+                session.run_with_iobinding(binding, options)
+        except DeviceError as error:
+            failures.append(error)
+        finally:
+            ended.set()
+
+    thread = Thread(target=work, name="super-sdf network", daemon=True)
+    try:
+        thread.start()
+        poll()
+        while not ended.wait(POLL_INTERVAL):
+            poll()
+    except BaseException:
+        options.terminate = True
+        if thread.ident:  # not if the interrupt came before the thread started
+            ended.wait()
+        raise
+    if failures:
+        raise failures[0]
+
+
+def work_of(voxels: int, decoded: int, offsets: int) -> float:
+    """Return the work of a run, in voxels to encode; values to decode are converted."""
+    return voxels + decoded * offsets / VALUES_PER_VOXEL
+
+
+class Pace:
+    """The seconds that a network takes per voxel of work, from its last long run."""
+
+    def __init__(self) -> None:
+        self.seconds: float | None = None
+
+    def learn(self, work: float, seconds: float) -> None:
+        """Record the seconds that a run took for its work."""
+        self.seconds = seconds / work
+
+    def watch(self, work: float, progress: ShareCallback) -> Callable[[], None]:
+        """Return a function that reports the progress of a run that starts now, when called."""
+        began = time.perf_counter()
+        expected = work * (self.seconds or math.inf)
+        return lambda: progress(share_of_time(time.perf_counter() - began, expected))
+
+
+def share_of_time(seconds: float, expected: float) -> float:
+    """Return the estimated finished share of a run; it stays below 1, however long it takes."""
+    share = seconds / expected
+    if share <= LINEAR_UP_TO:
+        return share
+    left = 1 - LINEAR_UP_TO
+    return 1 - left / (1 + (share - LINEAR_UP_TO) / left)

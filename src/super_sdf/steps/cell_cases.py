@@ -44,18 +44,11 @@ EDGE_BETWEEN = {
 
 @dataclass(frozen=True, eq=False)
 class Choices:
-    """The cases that cells with the same corners inside can have.
+    """The cases that cells with the same corners inside can have."""
 
-    Attributes
-    ----------
-    ambiguous : (256,) uint8
-        A bit for each of ``FACES``: whether it is ambiguous.
-    number : (256, 64) int16
-        The case for the same bits, set where an ambiguous face joins its inside corners. Bits of
-        other faces must be 0. Where no face joins them it is the number of the row.
-    """
-
-    ambiguous: NDArray[np.uint8]
+    ambiguous: NDArray[np.uint8]  # (256,), a bit for each of ``FACES``: whether it is ambiguous
+    # (256, 64), the case for the same bits, set where an ambiguous face joins its inside corners.
+    # Bits of other faces must be 0. Where no face joins them it is the number of the row
     number: NDArray[np.int16]
 
 
@@ -88,14 +81,7 @@ def _ambiguous(inside: int) -> int:
 
 @lru_cache(maxsize=1)
 def triangle_table() -> tuple[IntArray, IntArray]:
-    """Return the triangles of every case.
-
-    Returns
-    -------
-    (C,) int32 and (C, T, 3) int32
-        The number of triangles of a case, and the cell edges on which their vertices lie, in
-        counter-clockwise order seen from outside; unused rows are 0.
-    """
+    """Return the number of triangles of every case, (C,), and their cell edges, (C, T, 3)."""
     cases = [[t for loop in _loops(*case) for t in triangulate(loop)] for case in _cases()]
     counts = np.array([len(triangles) for triangles in cases], np.int32)
     table = np.zeros((len(cases), counts.max(), 3), np.int32)
@@ -107,24 +93,15 @@ def triangle_table() -> tuple[IntArray, IntArray]:
 
 @dataclass(frozen=True, eq=False)
 class LoopTable:
-    """The loops of all cases, one after the other: each is a patch of the surface in a cell.
+    """The loops of all cases, one after the other: each is a patch of the surface in a cell."""
 
-    Attributes
-    ----------
-    count, first : (C,) int64
-        How many loops a case has, and which is its first.
-    sides : (L,) int64
-        How many edges a loop has.
-    edges : (L, S) int64
-        Its cell edges in order, counter-clockwise from outside; -1 after the last.
-    triangles : (L, T, 3) int64
-        Places in the loop of the corners of its triangles, of which there are ``sides - 2``.
-    """
-
+    # count, first: (C,), how many loops a case has, and which is its first
     count: NDArray[np.int64]
     first: NDArray[np.int64]
-    sides: NDArray[np.int64]
+    sides: NDArray[np.int64]  # (L,), how many edges a loop has
+    # (L, S), its cell edges in order, counter-clockwise from outside; -1 after the last
     edges: NDArray[np.int64]
+    # (L, T, 3), places in the loop of its triangles' corners; there are ``sides - 2``
     triangles: NDArray[np.int64]
 
 

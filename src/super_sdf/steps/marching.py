@@ -52,16 +52,6 @@ def extract_pieces(
 
     Vertices lie on lattice edges, by linear interpolation. A node with value 0 is inside. The
     arguments are those of ``meshers.extract_mesh``.
-
-    Raises
-    ------
-    OptionError
-        If there are more vertices than 32-bit numbers, including those before.
-
-    References
-    ----------
-    Lorensen and Cline, "Marching Cubes", 1987. Nielson and Hamann, "The Asymptotic Decider:
-    Resolving the Ambiguity in Marching Cubes", 1991.
     """
     core = field.own_rows
     before = field.plane_before(core).start if core.start < core.stop else core.start
@@ -83,22 +73,17 @@ def extract_pieces(
 
 @dataclass(frozen=True, eq=False)
 class Crossings:
-    """Edges and cells that the surface crosses in the blocks of some voxels, in their order.
+    """Edges and cells that the surface crosses in the blocks of some voxels, in their order."""
 
-    Attributes
-    ----------
-    own_row, own_edge : (n,) int32, int16
-        Voxels, and crossed edges of their blocks that the voxel owns: each has a vertex.
-    other_row, other_edge : (m,) int32, int16
-        Voxels, and crossed edges of their blocks that another voxel owns.
-    cell_row, cell, case : (c,) int32, int16, int16
-        Voxels, crossed cells of their blocks, and the cases of these cells (``cell_cases``).
-    """
-
+    # own_row, own_edge: (n,), voxels, and crossed edges of their blocks that the voxel owns: each
+    # has a vertex
     own_row: IntArray
     own_edge: NDArray[np.int16]
+    # other_row, other_edge: (m,), voxels, and crossed edges of their blocks that another voxel owns
     other_row: IntArray
     other_edge: NDArray[np.int16]
+    # cell_row, cell, case: (c,), voxels, crossed cells of their blocks, and the cases of these
+    # cells (``cell_cases``)
     cell_row: IntArray
     cell: NDArray[np.int16]
     case: NDArray[np.int16]
@@ -157,11 +142,7 @@ def _crossings_of_chunk(field: FineField, start: int, stop: int) -> tuple[NDArra
 
 
 def _are_edges_of(
-    cell_row: IntArray,
-    cell: NDArray[np.int16],
-    row: IntArray,
-    edge: NDArray[np.int16],
-    factor: int,
+    cell_row: IntArray, cell: NDArray[np.int16], row: IntArray, edge: NDArray[np.int16], factor: int
 ) -> BoolArray:
     """Return which edges of voxels' blocks belong to some cells of these blocks.
 
@@ -319,24 +300,7 @@ def _crossing(low: FloatArray, high: FloatArray) -> NDArray[np.float64]:
 def _onto_border(
     start: IntArray, runs: BoolArray, share: NDArray[np.float64], last: int
 ) -> NDArray[np.float64]:
-    """Return coordinates along an axis of vertices, with nodes beyond the border moved onto it.
-
-    Parameters
-    ----------
-    start : (n,) int
-        Fine index of the edges' low ends along the axis.
-    runs : (n,) bool
-        Which edges run along the axis.
-    share : (n,) float64
-        Positions of the vertices on the edges, 0 to 1.
-    last : int
-        Fine index of the border at the high end of the axis; that at its low end is 0.
-
-    Returns
-    -------
-    (n,) float64
-        In fine spacings.
-    """
+    """Return coordinates along an axis of vertices, with nodes beyond the border moved onto it."""
     low = np.clip(start.astype(np.float64), -CAP_HEIGHT, last + CAP_HEIGHT)
     high = np.clip(start + runs.astype(np.float64), -CAP_HEIGHT, last + CAP_HEIGHT)
     return low + share * (high - low)
@@ -410,13 +374,9 @@ def edge_steps(factor: int) -> NDArray[np.int64]:
 
 @lru_cache
 def _flat_triangles(factor: int) -> tuple[IntArray, IntArray, NDArray[np.int64]]:
-    """Return the triangles of all cases, one after the other.
+    """Return the triangles of all cases: how many, the first of each, and edges, (n, 3).
 
-    Returns
-    -------
-    (C,) int32, (C,) int32, (n, 3) int64
-        The number of triangles of each case, its first triangle, and the edges on which the
-        triangles' vertices lie, counted from the number of the cell's low node.
+    Edges are counted from the number of the cell's low node.
     """
     counts, table = triangle_table()
     edge = edge_steps(factor)

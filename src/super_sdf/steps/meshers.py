@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -23,62 +24,35 @@ Extract = Callable[[FineField, SdfGrid, int, int], list[Mesh]]
 
 @dataclass(frozen=True)
 class Mesher:
-    """A way to make triangles of a field.
+    """A way to make triangles of a field."""
 
-    Attributes
-    ----------
-    name : str
-        One of ``options.MESHERS``.
-    extract : callable
-        Returns the mesh of a field's own planes, in one or more pieces.
-    planes_beside : callable
-        Takes the factor; returns how many coarse planes to either side of a slab must have final
-        values, since its mesh depends on them.
-    """
-
-    name: str
-    extract: Extract
+    name: str  # one of ``options.MESHERS``
+    extract: Extract  # returns the mesh of a field's own planes, in one or more pieces
+    # takes the factor; returns how many coarse planes to either side of a slab must have final
+    # values, since its mesh depends on them
     planes_beside: Callable[[int], int]
 
 
-def _next_plane(factor: int) -> int:
-    """Return 1: the plane before decides who owns the vertices on the shared face."""
-    return 1
+def _sharp() -> ModuleType:
+    """Return the sharp mesher, imported when asked for: it is a tenth of a short start."""
+    from .sharp import mesher
 
-
-def _planes_beside_sharp(factor: int) -> int:
-    """Return the planes beside a slab that edges depend on."""
-    from .sharp.mesher import (
-        planes_beside,  # here, since its six modules are a tenth of a short start
-    )
-
-    return planes_beside(factor)
-
-
-def _extract_sharp(field: FineField, grid: SdfGrid, first_vertex: int, threads: int) -> list[Mesh]:
-    """Return the mesh with edges and corners."""
-    from .sharp.mesher import extract_pieces
-
-    return extract_pieces(field, grid, first_vertex, threads)
+    return mesher
 
 
 BY_NAME = {
-    mesher.name: mesher
-    for mesher in (
-        Mesher(MARCHING, marching.extract_pieces, _next_plane),
-        Mesher(SHARP, _extract_sharp, _planes_beside_sharp),
-    )
+    # the plane before decides who owns the vertices on the shared face
+    MARCHING: Mesher(MARCHING, marching.extract_pieces, lambda factor: 1),
+    SHARP: Mesher(
+        SHARP,
+        lambda *arguments: _sharp().extract_pieces(*arguments),
+        lambda factor: _sharp().planes_beside(factor),
+    ),
 }
 
 
 def find_mesher(name: Any) -> Mesher:
-    """Return the mesher with a name.
-
-    Raises
-    ------
-    OptionError
-        If there is none, or the name is no string (``OptionTypeError``).
-    """
+    """Return the mesher with a name."""
     return BY_NAME[check_mesher(name)]
 
 

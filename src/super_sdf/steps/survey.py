@@ -2,16 +2,17 @@
 
 The grid is read once, in blocks of planes, and a block is worked on in windows, so that little is
 held beside the band. This takes 135 bytes per voxel, and 12 per sample beyond it, so it grows with
-the surface, not with the grid.
+the surface, not with the grid. ``look_at_band`` reads a grid whose band is not kept: it is worked
+on in bricks, or too large.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
-from itertools import pairwise
-from typing import Any, TypeAlias
+from functools import cached_property, partial
+from itertools import chain, pairwise
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +23,13 @@ from ..grid.cubic import Resampled, on_samples, sampled_places
 from ..grid.field import EXACT, MASK
 from ..grid.planes import (
     SampleArray,
+    over_planes,
     planes_at_once,
     planes_too_large,
     reading_bytes,
     unpacked_bytes,
 )
-from ..grid.sdf_grid import SdfGrid, negated
+from ..grid.sdf_grid import SdfGrid, negated, without_samples
 from ..machine.memory import held_memory, in_words
 from ..machine.resources import ONE_THREAD, Resources
 from ..machine.threads import chunks_of, over_threads
@@ -36,8 +38,12 @@ from .band import (
     BLOCK_PLANES,
     BLOCK_SAMPLES,
     BandSummary,
+    Jumps,
     can_hold_surface,
+    check_not_cut_off,
+    check_not_filled,
     exact_samples,
+    find_jumps,
     has_both_sides,
     is_active,
     is_filled_in,
@@ -46,10 +52,10 @@ from .band import (
     pad_by_extrapolation,
     plane_blocks,
     rescale_planes,
+    summarise,
     take_patches,
 )
 from .bounds import NONE_BEYOND, SamplesBeyond, TrustedSamples, samples_beyond
-from .offsets import Jumps, check_not_cut_off, check_not_filled, find_jumps
 
 # Of a band: patches, indices and flags; what is made of them on the way; and of samples beyond it.
 BYTES_PER_VOXEL, BYTES_BEYOND = 135, 12
@@ -70,59 +76,39 @@ class BandTooLargeError(OutOfMemoryError):
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """The active voxels of a grid (Eq. 2), their samples, and what these can be used for.
+    """The active voxels of a grid (Eq. 2), their samples, and what these can be used for."""
 
-    Attributes
-    ----------
-    shape : three ints
-        Samples of the grid along each axis.
-    voxel_ijk : (V, 3) int32
-        The voxels, in C order.
-    patches : (V, 27) float32
-        The samples round each voxel, in half voxels.
-    lipschitz, decoded, exact : (V,) bool
-        Which patches can be distances; which voxels can hold the surface, and so are decoded; which
-        own samples can be taken as exact distances.
-    limits : two floats
-        Samples beyond the band may be exact distances if they lie between these, in half voxels.
-    sampled : (V,) bool, optional
-        Which own values are samples of a grid that was resampled; None if all are.
-    leaves : bool
-        Whether a sample on the border of the grid is inside: then the solid leaves the grid.
-    kind : str
-        What the field is, see ``grid.field``.
-    smooth, is_uneven, has_kinks
-        The field that is meshed by its cubic spline, in world units; whether it is interpolated
-        linearly where it jumps; and whether the network may refine it where it is not smooth.
-    half_voxel, level : float
-        Half a spacing in world units, by which these are divided; and what is zero then.
-    peak, unpacked : int
-        The memory of the process in bytes while the band was found; those of a temporary file.
-    beyond : SamplesBeyond
-        The samples a few voxels farther away.
-    unseen : bool array or Planes, optional
-        The samples at which the surface ends, see ``Field``.
-    """
-
-    shape: tuple[int, int, int]
-    voxel_ijk: IntArray
-    patches: FloatArray
+    shape: tuple[int, int, int]  # samples of the grid along each axis
+    voxel_ijk: IntArray  # (V, 3), the voxels, in C order
+    patches: FloatArray  # (V, 27), the samples round each voxel, in half voxels
+    # lipschitz, decoded, exact: (V,), which patches can be distances; which voxels can hold the
+    # surface, and so are decoded; which own samples can be taken as exact distances
     lipschitz: BoolArray
     decoded: BoolArray
     exact: BoolArray
+    # samples beyond the band may be exact distances if they lie between these, in half voxels
     limits: tuple[float, float] = (0.0, 0.0)
+    # (V,), which own values are samples of a grid that was resampled; None if all are
     sampled: BoolArray | None = None
+    # whether a sample on the border of the grid is inside: then the solid leaves the grid
     leaves: bool = False
-    kind: str = EXACT
+    kind: str = EXACT  # what the field is, see ``grid.field``
+    # smooth, is_uneven, has_kinks: the field that is meshed by its cubic spline, in world units;
+    # whether it is interpolated linearly where it jumps; and whether the network may refine it
+    # where it is not smooth
     smooth: SampleArray | None = None
     is_uneven: bool = False
     has_kinks: bool = False
+    # half_voxel, level: half a spacing in world units, by which these are divided; and what is zero
+    # then
     half_voxel: float = 1.0
     level: float = 0.0
+    # peak, unpacked: the memory of the process in bytes while the band was found; those of a
+    # temporary file
     peak: int = 0
     unpacked: int = 0
-    beyond: SamplesBeyond = NONE_BEYOND
-    unseen: SampleArray | None = None
+    beyond: SamplesBeyond = NONE_BEYOND  # the samples a few voxels farther away
+    unseen: SampleArray | None = None  # the samples at which the surface ends, see ``Field``
 
     @cached_property
     def trusted(self) -> TrustedSamples:
@@ -200,27 +186,10 @@ def survey(
     among: tuple[int, int] | None = None,
     whole: BandSummary | None = None,
 ) -> Band:
-    """Read a grid once and return its band.
+    """Read a grid once and return its band; BandTooLargeError as soon as it exceeds the memory.
 
-    Parameters
-    ----------
-    grid : SdfGrid
-        Signed distances in world units, with the same spacing on all axes: see ``cubic_grid``.
-    offset : float
-        Distance of the surface in world units, positive outwards.
-    resources : Resources
-        The threads and memory that the run may use.
-    among : two ints, optional
-        Look only among planes from the first to before the second, and do not check the offset.
-    whole : BandSummary, optional
-        What ``look_at_band`` says of the whole grid; needed with ``among``.
-
-    Raises
-    ------
-    GridError
-        If the distances end too near the offset.
-    BandTooLargeError
-        As soon as the part of the band read so far exceeds the memory bound.
+    With ``among``, only these planes are looked at, the offset is not checked, and ``whole`` is
+    what ``look_at_band`` says of the whole grid.
     """
     sizes: list[int] = []
     jumps: list[tuple[Jumps, Jumps]] = []
@@ -517,3 +486,75 @@ def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:
     return NoSurfaceError(
         f"no surface at {offset:g}: the values go from {grid.low:.6g} to {grid.high:.6g}"
     )
+
+
+class Glance(NamedTuple):
+    """What is seen of the band in some planes, without keeping it.
+
+    Of each plane the voxels, and those that are decoded; the samples beyond the band that can be
+    exact; see ``Band.count_crossings``; and, with an offset, the jumps.
+    """
+
+    summary: BandSummary
+    voxels: list[int]
+    decoded: list[int]
+    beyond: int
+    crossings: int
+    jumps: list[tuple[Jumps, Jumps]]
+
+
+def look_at_band(grid: SdfGrid, offset: float, planes: int = 0) -> Glance:
+    """Return what the band of a grid says without keeping it, as if ``survey`` had read it.
+
+    The planes are read where the samples are, see ``planes.over_planes``; by default at least as
+    many at a time as are best.
+    """
+    count, samples = grid.shape[0], grid.samples
+    planes = planes or max(planes_at_once(samples), BLOCK_PLANES)
+    ranges = [
+        (max(first - 1, 0), min(last + 1, count), (first, last))
+        for first, last in plane_blocks(grid.shape, least=planes)
+    ]
+    # resampled ones are made here, and say so
+    known = grid if isinstance(samples, Resampled) else without_samples(grid)
+    look = partial(_glance, known, offset)
+    parts = zip(*over_planes(samples, look, ranges))
+    summaries, voxels, decoded, beyond, crossings, jumps = map(list, parts)
+    all_jumps = list(chain(*jumps))
+    if offset:
+        check_jumps(all_jumps, grid, offset)
+    counts = list(chain(*voxels)), list(chain(*decoded)), sum(beyond), sum(crossings)
+    return Glance(_of_all(summaries), *counts, all_jumps)
+
+
+def _of_all(summaries: list[BandSummary]) -> BandSummary:
+    return BandSummary(
+        sum(part.voxels for part in summaries),
+        sum(part.noisy for part in summaries),
+        min(part.low for part in summaries),
+        max(part.high for part in summaries),
+        any(part.leaves for part in summaries),
+    )
+
+
+def _glance(grid: SdfGrid, offset: float, planes: NDArray[Any], inner: tuple[int, int]) -> Glance:
+    """Return what is seen in the planes ``inner``, given with those beside them."""
+    jumps: list[tuple[Jumps, Jumps]] = []
+    leaving: list[bool] = []
+    first, last = inner
+    voxels, decoded = np.zeros((2, last - first), np.int64)
+    beyond = crossings = 0
+    summaries: list[BandSummary] = []
+    for ijk, patches, _, value in band_of_samples(grid, offset, planes, inner, jumps, leaving):
+        lipschitz = is_lipschitz(patches)
+        held = can_hold_surface(patches, lipschitz)
+        band = limit_to_field(
+            Band(grid.shape, ijk, patches, lipschitz, held, lipschitz), grid, offset
+        )
+        plane = ijk[:, 0] - first
+        voxels += np.bincount(plane, minlength=last - first)
+        decoded += np.bincount(plane[band.decoded], minlength=last - first)
+        beyond, crossings = beyond + len(value), crossings + band.count_crossings()
+        summaries.append(summarise(patches[:, CENTRE], lipschitz, leaving[0]))
+    summary = _of_all(summaries)
+    return Glance(summary, voxels.tolist(), decoded.tolist(), beyond, crossings, jumps)

@@ -5,8 +5,17 @@ label, 0 last. Label 0 is what is beside all others; its field is minus that of 
 others or more could hold the node. A label cannot hold a node of a voxel round which no sample has
 it. Where two neighbouring nodes have different labels, the wall crosses the edge between them where
 the difference of the two fields is 0, by linear interpolation: both labels get the very same
-vertex. ``wall_cases`` says how the walls run in a cell. So the surface of each label is closed, and
-there is neither gap nor overlap between two.
+vertex. So the surface of each label is closed, and there is
+neither gap nor overlap between two.
+
+A wall crosses the edges of the cell whose ends have different labels. On a face with two labels it
+runs as in ``cell_cases``. Where three labels or four meet on a face, a point on it is joined to all
+edges that are crossed, unless two opposite corners have the same label: they are joined, and each
+of the others is cut off. This depends on the face alone, so both cells beside it agree.
+
+The segments on all faces bound the walls. A loop of them between the same two labels is cut into
+triangles as in ``cell_cases``; all that hang together by points on faces are joined to one point in
+the cell. So each triangle has a label on either side.
 
 A vertex is named by its place in the lattice of half the fine spacing, which tells points on edges,
 on faces and in cells apart. They are in the order of these names, and triangles in that of the
@@ -15,9 +24,9 @@ cells, so a surface made slab by slab is the same as one made at once.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import product
 from typing import Any
 
@@ -28,10 +37,79 @@ from ..arrays import BoolArray, FloatArray, IntArray
 from ..mesh import CLEARANCE
 from ..neighbourhood import NEIGHBOURHOOD
 from .cap import outer_voxels
-from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, FACES
+from .cell_cases import CORNERS, EDGE_AXIS, EDGE_BETWEEN, EDGE_START, FACES, segments, triangulate
 from .marching import CAP_HEIGHT, cells_low_nodes, strides
 from .nodes import SHARING, VoxelIndex, block_ijk, part_of_node
-from .wall_cases import FACE_POINTS, PLACES, walls
+
+FACE_POINTS, CELL_POINT = 12, 18  # the numbers of points, after those of the twelve edges
+# Where the points are in a cell of two steps along each axis, (19, 3).
+PLACES: IntArray = np.concatenate(
+    [
+        2 * CORNERS[list(EDGE_START)] + np.eye(3, dtype=np.int32)[list(EDGE_AXIS)],
+        [CORNERS[list(face)].sum(0) // 2 for face in FACES],
+        [[1, 1, 1]],
+    ]
+).astype(np.int32)
+
+Segment = tuple[int, int, int, int]
+"""Two points, and the labels inside and outside: the higher is inside, counter-clockwise."""
+
+
+@lru_cache(maxsize=1 << 14)
+def walls(ranks: int, joined: int) -> IntArray:
+    """Return the triangles of a case, (n, 5): three points, and a corner on either side.
+
+    Of ``ranks`` three bits are for each corner: how many labels at corners are lower. ``joined``
+    has a bit for each face with two labels at the ends of its diagonals: whether it joins those of
+    the higher. Triangles are counter-clockwise seen from the second corner, whose label is lower.
+    """
+    label = [ranks >> 3 * corner & 7 for corner in range(8)]
+    rows: list[Segment] = []
+    for n, face in enumerate(FACES):
+        rows += _on_face(n, [label[corner] for corner in face], joined >> n & 1)
+    faces = [(*abc, label.index(high), label.index(low)) for *abc, high, low in _triangles(rows)]
+    return np.array(faces, np.int32).reshape(-1, 5)
+
+
+def _on_face(n: int, label: list[int], joined: int) -> Iterator[Segment]:
+    """Yield the segments on face ``n`` with these labels at its corners."""
+    high, kinds = max(label), len(set(label))
+    edge = [EDGE_BETWEEN[frozenset((FACES[n][at - 1], FACES[n][at]))] for at in range(4)]
+    if kinds == 2:
+        inside = tuple(int(x == high) for x in label)
+        for start, end in segments(n, inside, joined).items():
+            yield start, end, high, min(label)
+    elif kinds > 2 and (label[0] == label[2] or label[1] == label[3]):
+        first = int(label[0] == label[2])  # the first corner that is cut off
+        for at in (first, first + 2):
+            yield _turned(edge[at], edge[(at + 1) % 4], label[at], label[at - 1])
+    elif kinds > 2:
+        for at in range(4):
+            if label[at] != label[at - 1]:
+                yield _turned(edge[at], FACE_POINTS + n, label[at], label[at - 1])
+
+
+def _turned(start: int, end: int, inside: int, outside: int) -> Segment:
+    """Return a segment with the higher label inside."""
+    return (start, end, inside, outside) if inside > outside else (end, start, outside, inside)
+
+
+def _triangles(rows: list[Segment]) -> Iterator[tuple[int, ...]]:
+    """Yield triangles, and the labels inside and outside, of the segments on a cell."""
+    while rows:
+        loop, points, some = [rows[-1][0]], {rows[-1][0]}, []
+        while more := [row for row in rows if points & set(row[:2])]:  # all that hang together
+            some += more
+            points |= {point for row in more for point in row[:2]}
+            rows = [row for row in rows if row not in more]
+        if max(points) >= FACE_POINTS:
+            yield from ((start, end, CELL_POINT, *sides) for start, end, *sides in some)
+            continue
+        after = {start: end for start, end, *_ in some}
+        while (point := after[loop[-1]]) != loop[0]:
+            loop.append(point)
+        yield from ((*triangle, *some[0][2:]) for triangle in triangulate(tuple(loop)))
+
 
 Keys = NDArray[np.int64]
 Labels = NDArray[np.int16]
@@ -40,38 +118,19 @@ Cells = tuple[Keys, Labels]
 
 @dataclass(frozen=True, eq=False)
 class Labelled:
-    """The fields of some labels at the nodes of voxels in which the walls can be.
+    """The fields of some labels at the nodes of voxels in which the walls can be."""
 
-    Attributes
-    ----------
-    shape : three ints
-        Samples of the coarse grid along each axis.
-    factor : int
-        K.
-    planes : two ints
-        Planes of voxels, from the first to before the second.
-    voxel_ijk : (D, 3) int32
-        The voxels, in C order.
-    values : (Q, S) float32
-        Their blocks, label by label; NaN where that of label 0 is minus that of any other.
-    column : (S,) int64
-        ``voxel * labels + label``, in ascending order, of each column ``order`` of the values.
-    order : (S,) int64
-    labels : int
-        Number of labels, 0 included, which is beside all others.
-    holder : (Q, D) int16
-        The label of each node.
-    """
-
-    shape: tuple[int, int, int]
-    factor: int
-    planes: tuple[int, int]
-    voxel_ijk: IntArray
+    shape: tuple[int, int, int]  # samples of the coarse grid along each axis
+    factor: int  # K
+    planes: tuple[int, int]  # planes of voxels, from the first to before the second
+    voxel_ijk: IntArray  # (D, 3), the voxels, in C order
+    # (Q, S), their blocks, label by label; NaN where that of label 0 is minus that of any other
     values: FloatArray
+    # (S,), ``voxel * labels + label``, in ascending order, of each column ``order`` of the values
     column: Keys
-    order: NDArray[np.intp]
-    labels: int
-    holder: Labels
+    order: NDArray[np.intp]  # (S,)
+    labels: int  # number of labels, 0 included, which is beside all others
+    holder: Labels  # (Q, D), the label of each node
 
     @cached_property
     def index(self) -> VoxelIndex:
@@ -79,17 +138,7 @@ class Labelled:
         return VoxelIndex(self.voxel_ijk, self.shape)
 
     def apart(self, low: Keys, node: Keys, between: Labels, holder: Labels) -> NDArray[np.float64]:
-        """Return by how much the field of a node's holder is lower than that of another, (n,).
-
-        Parameters
-        ----------
-        low, node : (n, 3) int64
-            The low nodes of cells, and a node of each, that lies in the grid.
-        between : (2, n) int16
-            Two labels at corners of the cell, in ascending order.
-        holder : (n,) int16
-            Which of them is that of the node.
-        """
+        """Return by how much the field of a node's holder is lower than that of another, (n,)."""
         voxel = np.clip(low // self.factor, 0, np.array(self.shape) - 1)
         row, place = self.index.find(voxel), (node - self.factor * voxel) @ strides(self.factor)
         values = []
@@ -104,40 +153,19 @@ class Labelled:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """The field of one label in some planes.
+    """The field of one label in some planes."""
 
-    Attributes
-    ----------
-    voxel_ijk : (n, 3) int32
-        The voxels round which some samples have the label, and others do not, in C order.
-    absent : (27, n) bool
-        Which parts of their blocks touch a voxel round which no sample has the label.
-    blocks : (Q, n) float32
-        Their values; NaN where they are not known.
-    """
-
+    # (n, 3), the voxels round which some samples have the label, and others do not, in C order
     voxel_ijk: IntArray
+    # (27, n), which parts of their blocks touch a voxel round which no sample has the label
     absent: BoolArray
-    blocks: FloatArray
+    blocks: FloatArray  # (Q, n), their values; NaN where they are not known
 
 
 def absent_parts(
     table: IntArray, voxel_ijk: IntArray, inside: BoolArray, shape: tuple[int, int, int]
 ) -> BoolArray:
-    """Return ``Part.absent``.
-
-    Parameters
-    ----------
-    table : (27, n) int32
-        The voxels of the label at the places round each, -1 where there is none: there, all samples
-        are on the side of those beside them.
-    voxel_ijk : (n, 3) int32
-        The voxels.
-    inside : (n,) bool
-        Whether their own sample has the label.
-    shape : three ints
-        Samples of the grid along each axis.
-    """
+    """Return ``Part.absent``."""
     none = table < 0
     for place, step in enumerate(NEIGHBOURHOOD):
         beside = voxel_ijk + step
@@ -152,18 +180,7 @@ def put_together(
     factor: int,
     planes: tuple[int, int],
 ) -> Labelled:
-    """Return the fields of labels in some planes.
-
-    Parameters
-    ----------
-    parts : iterable
-        Of the labels, in ascending order; they are taken one by one.
-    ground : Part
-        Of what is beside all labels. Where at most one label can hold a node, the value is not
-        used: it is minus that of the label.
-    shape, factor, planes
-        See ``Labelled``.
-    """
+    """Return the fields of labels in some planes."""
     number, every = [0], [ground]
     for label, part in parts:
         number.append(label)
@@ -206,25 +223,11 @@ def _holders(
 def extract_walls(
     field: Labelled, border: IntArray
 ) -> tuple[NDArray[np.float64], IntArray, Labels, int]:
-    """Return the walls in the planes of fields.
+    """Return the walls in the planes of fields: vertices, triangles, labels on both sides.
 
-    Parameters
-    ----------
-    field : Labelled
-        From ``put_together``.
-    border : (b, 4) int32
-        The voxels on the border of the grid in its planes, and the label of each, which is closed
-        there.
-
-    Returns
-    -------
-    (v, 3) float64
-        The vertices in fine spacings from node 0. Those on the first face of the planes come first.
-    (m, 3) int32, (m, 2) int16
-        The triangles, and the labels on both sides: counter-clockwise seen from the second, which
-        is lower.
-    int
-        The number of vertices on that face, which the planes before have, too.
+    Triangles are counter-clockwise seen from the second label, which is lower. ``border``, (b, 4),
+    are the voxels on the border of the grid and the label of each, which is closed there. The last
+    number is that of vertices on the first face of the planes: they come first.
     """
     cells = low, _ = _cells(field, border)
     lattice = Halves(field.shape, field.factor)

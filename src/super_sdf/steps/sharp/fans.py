@@ -28,22 +28,13 @@ Triangles = tuple[Index, Index]
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """Where the vertices of patches are.
+    """Where the vertices of patches are."""
 
-    Attributes
-    ----------
-    position, normal : (n, 3) float64
-        Of the crossings: positions, and the normals of their planes.
-    feature : (f,) int64
-        The patches that hold an edge or a corner.
-    peak : (f, 3) float64
-        The vertices on these.
-    """
-
+    # position, normal: (n, 3), of the crossings: positions, and the normals of their planes
     position: Vectors
     normal: Vectors
-    feature: Index
-    peak: Vectors
+    feature: Index  # (f,), the patches that hold an edge or a corner
+    peak: Vectors  # (f, 3), the vertices on these
 
     @cached_property
     def points(self) -> Vectors:

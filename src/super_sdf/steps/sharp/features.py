@@ -71,37 +71,20 @@ class Rule:
 
 
 RULE = Rule(
-    0.979,
-    (0.083, 0.940, -88.25, -2.820, -0.340, 0.900, -10.76, -1.843, -1.684, -0.226, -0.253),
+    0.979, (0.083, 0.940, -88.25, -2.820, -0.340, 0.900, -10.76, -1.843, -1.684, -0.226, -0.253)
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Patches that may hold an edge or a corner.
+    """Patches that may hold an edge or a corner."""
 
-    Attributes
-    ----------
-    patch : (f,) int64
-        Their rows in all patches.
-    vertex : (f, 3) float64
-        The edge's nearest point, or the corner, kept near the patch's cell.
-    evidence : (f, 11) float64
-        Averaged along the chain: see ``evidence_of``.
-    spheres : (f,) int32
-        How many spheres pass near the edge.
-    planes : Planes
-        The settled planes of all crossings.
-    near : (n,) bool
-        Which crossings were settled.
-    """
-
-    patch: Index
-    vertex: Vectors
-    evidence: Vectors
-    spheres: NDArray[np.int32]
-    planes: Planes
-    near: BoolArray
+    patch: Index  # (f,), their rows in all patches
+    vertex: Vectors  # (f, 3), the edge's nearest point, or the corner, kept near the patch's cell
+    evidence: Vectors  # (f, 11), averaged along the chain: see ``evidence_of``
+    spheres: NDArray[np.int32]  # (f,), how many spheres pass near the edge
+    planes: Planes  # the settled planes of all crossings
+    near: BoolArray  # (n,), which crossings were settled
 
     def score(self) -> Numbers:
         """Return the score of each, (f,), positive for a feature."""
@@ -111,18 +94,7 @@ class Candidates:
 def place_features(
     patches: Patches, own: Planes, turning: BoolArray, field: FineField, threads: int = 1
 ) -> Placed:
-    """Return the positions of all crossings, which patches have a feature, and its vertices.
-
-    Parameters
-    ----------
-    patches : Patches
-    own : Planes
-        Those of the crossings, by the field alone.
-    turning : (D,) bool
-        The voxels that hold a patch whose normals differ as at an edge.
-    field : FineField
-    threads : int
-    """
+    """Return the positions of all crossings, which patches have a feature, and its vertices."""
     candidates = find_candidates(patches, own, turning, field, threads)
     score = candidates.score()
     kept = score > 0
@@ -280,17 +252,6 @@ def distance_from(
     """Return the distance of crossings to the nearest vertex of a feature, (n,).
 
     It is infinite for crossings that are not within some rings of patches round a feature.
-
-    Parameters
-    ----------
-    patches : Patches
-    features : (f,) int64
-        Rows of the patches that have a feature.
-    vertex : (f, 3) float64
-        Their vertices.
-    point : (n, 3) float64
-        The crossings.
-    rings : int
     """
     distance: Numbers = np.full(len(point), np.inf)
     nearest = np.full(len(point), -1, np.int64)

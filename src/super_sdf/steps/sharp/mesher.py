@@ -102,21 +102,12 @@ def number_after(first_vertex: int, meshes: list[Mesh]) -> list[Mesh]:
 
 
 def extract_group(
-    field: FineField,
-    grid: SdfGrid,
-    kinked: BoolArray,
-    first_vertex: int = 0,
-    threads: int = 1,
+    field: FineField, grid: SdfGrid, kinked: BoolArray, first_vertex: int = 0, threads: int = 1
 ) -> list[Mesh]:
     """Return the mesh of a field's planes with its edges and corners, as a list of one piece.
 
     Vertices and faces are numbered as by ``marching.extract_pieces``; ``kinked`` is from
     ``find_kinks``, for this field or one of more planes.
-
-    Raises
-    ------
-    OptionError
-        If there are more vertices than can be numbered, those before among them.
     """
     rows = _rows_around(field)
     before = field.plane_before(rows).start if rows.start < rows.stop else rows.start
@@ -132,24 +123,12 @@ def extract_group(
 
 @dataclass(frozen=True, eq=False)
 class Examined:
-    """What is found in the voxels that may hold an edge; the others are left to marching cubes.
+    """What is found in the voxels that may hold an edge; the others are left to marching cubes."""
 
-    Attributes
-    ----------
-    voxels : (D,) bool
-        Which voxels were examined.
-    patches : Patches
-        Their patches; ``crossing`` counts among ``used``.
-    used : (m,) int64
-        The crossings of these patches.
-    placed : Placed
-        Where the vertices on these crossings and on the features belong.
-    """
-
-    voxels: BoolArray
-    patches: Patches
-    used: Index
-    placed: Placed
+    voxels: BoolArray  # (D,), which voxels were examined
+    patches: Patches  # their patches; ``crossing`` counts among ``used``
+    used: Index  # (m,), the crossings of these patches
+    placed: Placed  # where the vertices on these crossings and on the features belong
 
 
 def find_kinks(field: FineField, threads: int = 1) -> BoolArray:
@@ -213,21 +192,11 @@ def _rows_around(field: FineField) -> slice:
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """The numbers of vertices: voxel by voxel, on edges that it owns, then of its features.
+    """The numbers of vertices: voxel by voxel, on edges that it owns, then of its features."""
 
-    Attributes
-    ----------
-    of_crossing : (n,) int64
-        Of the vertex on each crossing.
-    of_feature : (f,) int64
-        Of the vertex of each feature.
-    own : int
-        How many belong to the field's own voxels.
-    """
-
-    of_crossing: Index
-    of_feature: Index
-    own: int
+    of_crossing: Index  # (n,), of the vertex on each crossing
+    of_feature: Index  # (f,), of the vertex of each feature
+    own: int  # how many belong to the field's own voxels
 
 
 def _number_vertices(
@@ -247,11 +216,7 @@ def _number_vertices(
 
 
 def _vertices(
-    field: FineField,
-    crossings: Crossings,
-    examined: Examined,
-    numbers: Numbers,
-    first_vertex: int,
+    field: FineField, crossings: Crossings, examined: Examined, numbers: Numbers, first_vertex: int
 ) -> Vectors:
     """Return the vertices of the field's own voxels, (n, 3), in fine spacings."""
     vertices = np.empty((numbers.own, 3))

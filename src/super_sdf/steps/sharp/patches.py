@@ -84,26 +84,13 @@ def beside(field: FineField, chosen: BoolArray, rings: int) -> BoolArray:
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """The patches of the surface in the crossed cells of some blocks, in the order of the cells.
+    """The patches of the surface in the crossed cells of some blocks, in the order of the cells."""
 
-    Attributes
-    ----------
-    row : (P,) int32
-        The voxel of each.
-    low : (P, 3) float64
-        The low corner of its cell, in fine spacings.
-    loop : (P,) int64
-        Which row of ``loop_table`` it is.
-    sides : (P,) int64
-        How many crossings it has.
-    crossing : (P, S) int64
-        Its crossings in order, counter-clockwise from outside, -1 after the last.
-    """
-
-    row: IntArray
-    low: NDArray[np.float64]
-    loop: Index
-    sides: Index
+    row: IntArray  # (P,), the voxel of each
+    low: NDArray[np.float64]  # (P, 3), the low corner of its cell, in fine spacings
+    loop: Index  # (P,), which row of ``loop_table`` it is
+    sides: Index  # (P,), how many crossings it has
+    # (P, S), its crossings in order, counter-clockwise from outside, -1 after the last
     crossing: Index
 
     def chosen(self, rows: Index | slice) -> Patches:
@@ -126,21 +113,7 @@ class Patches:
 def find_patches(
     field: FineField, crossings: Crossings, voxels: BoolArray
 ) -> tuple[Patches, Index]:
-    """Return the patches in the crossed cells of some voxels, and the crossings that they use.
-
-    Parameters
-    ----------
-    field : FineField
-    crossings : Crossings
-        Of all voxels that own an edge of these cells, at least.
-    voxels : (D,) bool
-        Which voxels.
-
-    Returns
-    -------
-    Patches and (m,) int64
-        The patches, whose ``crossing`` counts among those used; their numbers in ``crossings``.
-    """
+    """Return the patches in the crossed cells of some voxels, and the crossings that they use."""
     table, factor = loop_table(), field.factor
     slot, edge_at = _edges_of(field, crossings, voxels)
     some = voxels[crossings.cell_row]
@@ -165,13 +138,9 @@ def find_patches(
 
 
 def _edges_of(field: FineField, crossings: Crossings, voxels: BoolArray) -> tuple[Index, IntArray]:
-    """Return a table of the crossings on the edges of some voxels' blocks.
+    """Return the crossings on the edges of some voxels' blocks, set only where there is one.
 
-    Returns
-    -------
-    (D,) int64 and (n 3 Q,) int32
-        The place of each voxel in the table, of those that own an edge of ``voxels``, too; the
-        crossing on each edge of a place, set only where there is one.
+    Before it comes the place of each voxel in the table, (D,).
     """
     edges = 3 * len(field.blocks)
     other = voxels[crossings.other_row]

@@ -70,20 +70,12 @@ def sums(row: NDArray[np.int64], vectors: Vectors, count: int) -> Vectors:
 
 @dataclass(frozen=True, eq=False)
 class Planes:
-    """A plane at each crossing.
+    """A plane at each crossing."""
 
-    Attributes
-    ----------
-    point : (n, 3) float64
-        On the plane; at first where the surface crosses the lattice edge.
-    normal : (n, 3) float64
-        Of unit length; at first of the nearer end of the edge if the ends disagree.
-    trust : (n,) float64
-        1 where the field is a distance, less where its slope is not 1, or the ground not flat.
-    """
-
-    point: Vectors
+    point: Vectors  # (n, 3), on the plane; at first where the surface crosses the lattice edge
+    # (n, 3), of unit length; at first of the nearer end of the edge if the ends disagree
     normal: Vectors
+    # (n,), 1 where the field is a distance, less where its slope is not 1, or the ground not flat
     trust: Numbers
 
 

@@ -51,32 +51,16 @@ IDENTITY = np.eye(3)
 
 @dataclass(frozen=True, eq=False)
 class Wedges:
-    """Where two or more faces meet, one for each patch.
+    """Where two or more faces meet, one for each patch."""
 
-    Attributes
-    ----------
-    voxel : (f, 3) int64
-        The voxel of each.
-    point : (f, 3) float64
-        On the edge, or the corner.
-    tangent : (f, 3) float64
-        Direction of the edge.
-    corner : (f,) bool
-        Whether three faces or more meet, so that there is no direction.
-    sides : (f, 2, 3) float64
-        The two normals that differ most.
-    convex : (f,) float64
-        1 if the solid fills less than half of the space round the edge, -1 if it fills more.
-    stiffness : (f, 3, 3) float64
-        Mean of the squares of the normals: how the planes hold the point.
-    """
-
-    voxel: NDArray[np.int64]
-    point: Vectors
-    tangent: Vectors
-    corner: BoolArray
-    sides: Vectors
+    voxel: NDArray[np.int64]  # (f, 3), the voxel of each
+    point: Vectors  # (f, 3), on the edge, or the corner
+    tangent: Vectors  # (f, 3), direction of the edge
+    corner: BoolArray  # (f,), whether three faces or more meet, so that there is no direction
+    sides: Vectors  # (f, 2, 3), the two normals that differ most
+    # (f,), 1 if the solid fills less than half of the space round the edge, -1 if it fills more
     convex: Numbers
+    # (f, 3, 3), mean of the squares of the normals: how the planes hold the point
     stiffness: Vectors
 
     @property
@@ -87,41 +71,21 @@ class Wedges:
 
 @dataclass(frozen=True, eq=False)
 class Nearby:
-    """Pairs of a wedge and a sphere that passes near it, in the order of the wedges.
+    """Pairs of a wedge and a sphere that passes near it, in the order of the wedges."""
 
-    Attributes
-    ----------
-    wedge : (n,) int64
-    centre : (n, 3) float64
-        The sample.
-    distance : (n,) float64
-        Its signed distance.
-    """
-
-    wedge: NDArray[np.int64]
-    centre: Vectors
-    distance: Numbers
+    wedge: NDArray[np.int64]  # (n,)
+    centre: Vectors  # (n, 3), the sample
+    distance: Numbers  # (n,), its signed distance
 
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """How spheres stand to the edges that they are near.
+    """How spheres stand to the edges that they are near."""
 
-    Attributes
-    ----------
-    direction : (n, 3) float64
-        From the sample to the edge, of unit length.
-    along : (n,) float64
-        Distance along the edge.
-    gap : (n,) float64
-        Distance from the sphere to the edge, negative if it is pierced.
-    in_cone : (n,) bool
-        Whether the sphere must touch the edge, by the normals of the two faces.
-    """
-
-    direction: Vectors
-    along: Numbers
-    gap: Numbers
+    direction: Vectors  # (n, 3), from the sample to the edge, of unit length
+    along: Numbers  # (n,), distance along the edge
+    gap: Numbers  # (n,), distance from the sphere to the edge, negative if it is pierced
+    # (n,), whether the sphere must touch the edge, by the normals of the two faces
     in_cone: BoolArray
 
     @property
@@ -136,16 +100,7 @@ class Contact:
 def wedges_of(
     voxel: NDArray[np.int64], point: Vectors, normal: Vectors, there: BoolArray
 ) -> Wedges:
-    """Return the wedges of patches, at the points nearest to all planes of each.
-
-    Parameters
-    ----------
-    voxel : (f, 3) int64
-    point, normal : (f, S, 3) float64
-        The planes of each patch, in coarse spacings.
-    there : (f, S) bool
-        Which of them there are.
-    """
+    """Return the wedges of patches, at the points nearest to all planes of each."""
     count = there.sum(1)
     normal = normal * there[..., None]
     stiffness = np.einsum("pei,pej->pij", normal, normal) / count[:, None, None]
