@@ -145,7 +145,6 @@ def choose_layout(shape: Sizes, chunks: Sizes, orders: Sequence[Sizes], budget: 
 def _copy(
     volume: Volume, placement: Placement, layout: Layout, planes: tuple[int, int], write: Write
 ) -> None:
-    """Copy some planes of x of a volume box by box."""
     along, backwards = layout.order[0], placement.backwards
     shape = (planes[1] - planes[0], *(volume.shape[axis] for axis in layout.order[1:]))
     bounds = [(0, size) for size in volume.shape]
@@ -195,7 +194,6 @@ def runs_of(
 
 
 def _writer_to(held: NDArray[Any]) -> Write:
-    """Return a function that writes to memory."""
     raw = held.reshape(-1).view(np.uint8)
 
     def write(start: int, piece: NDArray[np.uint8]) -> None:
@@ -205,8 +203,6 @@ def _writer_to(held: NDArray[Any]) -> Write:
 
 
 def _writer_to_file(file: FileIO, name: str) -> Write:
-    """Return a function that writes to a file."""
-
     def write(start: int, piece: NDArray[np.uint8]) -> None:
         rest = piece.data
         try:

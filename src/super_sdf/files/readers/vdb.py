@@ -78,7 +78,6 @@ def read_vdb(request: Request) -> Volume:
 
 
 def _entries(file: InputFile) -> list[_Entry]:
-    """Return the grids of a file."""
     cursor = Cursor(file)
     if file.size < 12 or cursor.number("q") != MAGIC:
         raise FileError(f"{file.name} is no .vdb file: its first bytes are not OpenVDB's")
@@ -121,7 +120,6 @@ def _read_head(file: InputFile, place: int) -> tuple[int, dict[str, Any], NDArra
 
 
 def _read_metadata(cursor: Cursor) -> dict[str, Any]:
-    """Return the numbers and texts of metadata."""
     metadata: dict[str, Any] = {}
     for _ in range(cursor.number("I")):
         name, type_ = cursor.text(), cursor.text()
@@ -153,7 +151,6 @@ def _read_transform(cursor: Cursor) -> NDArray[np.float64]:
 def _volume(
     file: InputFile, tree: Tree, metadata: dict[str, Any], affine: NDArray[np.float64]
 ) -> Volume:
-    """Return the voxels at their place in the world."""
     bounds = tree.bounds()
     if bounds is None:
         raise GridError(f"{file.name} has no active voxel: it holds no surface")

@@ -127,7 +127,6 @@ class Coding:
         return abs(length), length > 0
 
     def _numbers(self, cursor: Cursor, count: int) -> NDArray[Any]:
-        """Return the next numbers."""
         length, packed = self._length(cursor, count)
         data, size = cursor.take(length), count * self.stored.itemsize
         if packed:
@@ -194,7 +193,6 @@ class Tree:
         cursor.skip(0)
 
     def _parts(self, cursor: Cursor) -> Iterator[Tiles | Leaves]:
-        """Yield tiles and leaves of the topology from the root on."""
         tiles, children = cursor.unpack("II")
         for _ in range(tiles):
             corner = cursor.array("<i4", 3).astype(np.int64)[None]
@@ -272,7 +270,6 @@ class Tree:
 
 
 def _touch(corners: Ints, edges: Any, first: Ints, shape: tuple[int, ...]) -> BoolArray:
-    """Return which cubes have voxels in a box."""
     overlap = (corners < first + np.array(shape)) & (corners + edges > first)
     return np.asarray(overlap.all(1))
 
