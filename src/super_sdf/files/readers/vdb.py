@@ -6,7 +6,6 @@ flags of its compression, metadata, the transform and the tree (``vdb_tree``).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -40,8 +39,6 @@ PICOGK_MM = 1000  # PicoGK states the size of a voxel in metres, and works in mi
 
 
 class _Entry(NamedTuple):
-    """A grid of a file: its name, the type of its tree, and where it begins."""
-
     name: str
     type: str
     parent: str
@@ -97,18 +94,15 @@ def _entries(file: InputFile) -> list[_Entry]:
             f"{file.name} holds {count} grids one after the other, as a stream: save it with "
             "openvdb.write"
         )
-    return list(_read_entries(cursor, count))
-
-
-def _read_entries(cursor: Cursor, count: int) -> Iterator[_Entry]:
-    """Yield the grids that follow, each of which states where it ends."""
+    entries = []
     for _ in range(count):
         name, type_, parent = (cursor.text().replace("\x1e", "#") for _ in range(3))
         _, _, end = cursor.unpack("qqq")
-        yield _Entry(name, type_, parent, cursor.place)
+        entries.append(_Entry(name, type_, parent, cursor.place))
         if count > 1:
             cursor.place = end
             cursor.skip(0)
+    return entries
 
 
 def _read_head(file: InputFile, place: int) -> tuple[int, dict[str, Any], NDArray[np.float64], int]:

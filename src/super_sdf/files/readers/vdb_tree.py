@@ -161,12 +161,7 @@ class Tree:
 
     Tiles are kept that are active or have another value than the background. ``places`` are where
     the values of each leaf begin; a leaf that is ``whole`` may have inactive voxels of other values
-    than the background.
-
-    Parameters
-    ----------
-    coding : callable
-        Makes the coding of a background.
+    than the background. ``coding`` makes the coding of a background.
     """
 
     def __init__(self, file: InputFile, place: int, coding: Callable[[float], Coding]) -> None:
