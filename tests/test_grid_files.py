@@ -70,5 +70,5 @@ def test_members_packed_with_bzip2_are_read_and_checked(tmp_path):
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
-    with pytest.raises(FileError, match="is damaged|cannot be read"):
+    with pytest.raises(FileError, match=r"is damaged|cannot be read"):
         read_grid(path)
