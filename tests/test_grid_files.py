@@ -1,10 +1,13 @@
 """Grids from files: every kind of array, mapped or not."""
 
+from zipfile import ZIP_BZIP2, ZipFile
+
 import numpy as np
 import pytest
 from conftest import ball, trilinear
 
 from super_sdf import SdfGrid, read_grid, reconstruct
+from super_sdf.errors import FileError
 from super_sdf.grid.planes import PlaneFile
 
 
@@ -55,3 +58,17 @@ def test_a_file_is_read_as_the_array_is(tmp_path, monkeypatch, dtype, order, sav
     np.testing.assert_array_equal(read.vertices, given.vertices)
     np.testing.assert_array_equal(read.faces, given.faces)
     np.testing.assert_array_equal(grid.values, values)
+
+
+def test_members_packed_with_bzip2_are_read_and_checked(tmp_path):
+    np.savez(tmp_path / "in.npz", values=ball().values, spacing=1.0)
+    path = tmp_path / "bz2.npz"
+    with ZipFile(tmp_path / "in.npz") as plain, ZipFile(path, "w", ZIP_BZIP2) as packed:
+        for name in plain.namelist():
+            packed.writestr(name, plain.read(name))
+    np.testing.assert_array_equal(read_grid(path).values, ball().values)
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(FileError, match=r"is damaged|cannot be read"):
+        read_grid(path)

@@ -13,8 +13,7 @@ from solids import cube, sphere
 
 from super_sdf import Mesh, write_mesh
 from super_sdf.errors import FileError, MeshError, SuperSdfError
-from super_sdf.truth.mesh_files import are_distinct, merged, read_mesh
-from super_sdf.truth.plain_ply import read_plain_ply
+from super_sdf.truth.mesh_files import are_distinct, merged, read_mesh, read_plain_ply
 from super_sdf.truth.solid import load_solid
 
 FORMATS = ("ply", "stl", "stl_ascii", "obj", "off", "glb")

@@ -21,16 +21,15 @@ BESIDE = {"lab", "export"}  # packages of a clone that are not in the wheel
 # The library of each file format is imported by its reader or writer alone, when it is used.
 READERS = {
     "fields.writing": {"vtkmodules"},
-    "files.readers.dicom": {"pydicom"},
+    "files.readers.medical": {"nibabel", "pydicom"},
     "files.readers.hdf5": {"h5py", "scipy"},
-    "files.readers.mrc": {"mrcfile"},
-    "files.readers.nibabel_files": {"nibabel"},
+    "files.readers.raw_files": {"mrcfile"},
     "files.readers.nrrd_file": {"nrrd"},
     "files.readers.tiff": {"tifffile"},
     "files.readers.vdb_tree": {"numcodecs"},
     "files.readers.vti": {"vtkmodules"},
     "files.readers.vtk": {"vtkmodules"},
-    "files.readers.zarr_store": {"zarr"},
+    "files.readers.zarr_files": {"zarr"},
     "pyvista": {"pyvista"},
 }
 # Rooms that need more than the few packages that are always installed.

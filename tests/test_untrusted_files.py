@@ -26,7 +26,7 @@ from conftest import ball
 
 from super_sdf import read_grid
 from super_sdf.errors import FileError, GridError, OutOfMemoryError, SuperSdfError, seen
-from super_sdf.files import apart, grids
+from super_sdf.files import apart
 from super_sdf.files.readers import READERS
 from super_sdf.files.readers.zarr_files import CODECS
 from super_sdf.truth.mesh_files import read_mesh
@@ -321,7 +321,7 @@ def in_process(monkeypatch):
     """Read files in this process: hundreds of others would take minutes."""
     monkeypatch.setenv("HDF5_EXTFILE_PREFIX", "")
     monkeypatch.setattr(
-        grids, "volume_apart", lambda key, request: nullcontext(READERS[key](request))
+        apart, "volume_apart", lambda key, request: nullcontext(READERS[key](request))
     )
 
 

@@ -84,7 +84,6 @@ class SparseWriter:
         self.archive.close()
 
     def _close(self) -> None:
-        """Close the archive, also if writing to it has failed."""
         with suppress(OSError, ValueError):
             if self.values is not None:
                 self.values.close()
@@ -92,7 +91,6 @@ class SparseWriter:
             self.archive.close()
 
     def _begin(self, field: FineField) -> None:
-        """Write what does not grow with the field, and the header of the values."""
         grid, side = field.placed, field.factor + 1
         exact = exact_type(grid.voxel_size)
         self.types = {**dict.fromkeys(LISTS, np.int32), "values": exact, "sample_distances": exact}
@@ -107,7 +105,6 @@ class SparseWriter:
         self.values = self._open("values", (field.decoded_voxels, side, side, side), exact)
 
     def _add_samples(self, field: FineField) -> None:
-        """Write the exact samples in a slab's own planes."""
         spheres = field.spheres
         if spheres is None:
             return
@@ -124,7 +121,6 @@ class SparseWriter:
         return little_endian(array.astype(self.types[name], copy=False))
 
     def _open(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> IO[bytes]:
-        """Return a new array of the archive, with its header written."""
         member = self.archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True)
         descr = np.dtype(dtype).newbyteorder("<").str
         header = {"descr": descr, "fortran_order": False, "shape": tuple(map(int, shape))}
@@ -187,7 +183,6 @@ class _Reader:
         self.members = {i.filename.removesuffix(".npy"): i for i in archive.infolist()}
 
     def read(self) -> FineField:
-        """Return the field."""
         missing = [key for key in KEYS if key not in self.members]
         if missing:
             raise FileError(f"{self.name} is no refined field: it has no key {missing[0]!r}")
@@ -231,7 +226,6 @@ class _Reader:
         )
 
     def _border_inside(self, blocks: IntArray, shape: tuple[int, ...]) -> IntArray:
-        """Return the border voxels without a block."""
         voxels = self._voxels("border_inside", shape)
         at_border = ((voxels == 0) | (voxels == np.array(shape) - 1)).any(1)
         numbers = (np.ravel_multi_index(tuple(ijk.T), shape) for ijk in (voxels, blocks))
@@ -242,7 +236,6 @@ class _Reader:
         return voxels
 
     def _grid(self, shape: tuple[int, ...]) -> SdfGrid:
-        """Return the coarse grid, without samples."""
         spacing, origin = (self._array(key, "f", (3,)) for key in ("spacing", "origin"))
         direction, samples = self._array("direction", "f", (3, 3)), NoSamples(shape, self.name)
         ends = -math.inf, math.inf

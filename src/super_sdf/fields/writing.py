@@ -93,10 +93,7 @@ class VtiWriter:
 
 
 def _own_planes(field: FineField) -> Iterator[tuple[int, FloatArray]]:
-    """Yield the planes of nodes of a slab, a few at a time, and the number of the first of them.
-
-    The plane between two slabs belongs to the second; the last slab also has the last plane.
-    """
+    """Yield planes of a slab and their number; one between two slabs belongs to the second."""
     lattice, factor = FineLattice(field), field.factor
     first, last = (factor * plane for plane in field.planes)
     last += field.planes[1] == field.shape[0]

@@ -46,8 +46,6 @@ def volume_apart(key: str, request: Request) -> Iterator[Volume]:
 
 
 class _Process:
-    """The process that reads a file."""
-
     def __init__(self, request: Request) -> None:
         self.path, self.ended, self.limit = request.path, threading.Event(), 0
         self.start = held_memory() or 0
@@ -83,7 +81,6 @@ class _Process:
                 return
 
     def _death(self) -> SuperSdfError:
-        """Return why the process ended."""
         code = self.process.wait()
         if self.limit:
             return OutOfMemoryError(
@@ -97,7 +94,6 @@ class _Process:
         )
 
     def close(self) -> None:
-        """End the process."""
         self.ended.set()
         self.process.kill()
         self.process.wait()

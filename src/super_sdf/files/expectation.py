@@ -120,15 +120,12 @@ def _crossings_of(
 
 
 def _count(marks: BoolArray) -> NDArray[np.int64]:
-    """Count the marks of each plane."""
     return np.asarray(np.count_nonzero(marks, axis=(1, 2)))
 
 
 def _rounded(count: int) -> int:
-    """Round a number to two digits: it is an estimate."""
     return int(float(f"{count:.2g}"))
 
 
 def _size(count: int) -> str:
-    """Return a number of bytes with a unit, or in full if it is small."""
     return in_words(count) if count >= SMALL else f"{count:,} bytes"

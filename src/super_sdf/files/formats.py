@@ -94,7 +94,6 @@ def is_grid(path: str | Path) -> bool:
 
 
 def _ending(path: PurePath) -> str:
-    """Return the suffix by which a file is a grid, in lower case; "" if it is none."""
     name = path.name.lower()
     ends = [end for end in GRID_SUFFIXES if name.endswith(end) and len(name) > len(end)]
     return max(ends, key=len, default="")

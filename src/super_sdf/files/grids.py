@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import FileError, OptionError, OutOfMemoryError, SuperSdfError
+from ..errors import FileError, OptionError, SuperSdfError
 from ..grid.placement import STRAIGHT
 from ..grid.planes import InputFile, check_planes
 from ..grid.sdf_grid import SdfGrid, make_grid
 from ..machine.memory import ROOM_SHARE, held_memory, memory_bound
 from ..options import ReadOptions, Values, check_path
-from .apart import volume_apart
 from .formats import (
     GridFormat,
     check_direction_given,
@@ -129,6 +128,8 @@ def open_volume(
     with one_line_errors(path, format_, watched), ExitStack() as files:
         request = Request(file, member, axes, *memory, files)
         if format_.is_apart:
+            from .apart import volume_apart  # loads what talks to other processes
+
             yield files.enter_context(volume_apart(format_.key, request))
         elif format_.key in NUMPY_READERS:
             yield NUMPY_READERS[format_.key](request)
@@ -144,34 +145,27 @@ def one_line_errors(path: Path, format_: GridFormat, watched: InputFile | None) 
     import logging
 
     logs = logging.root.manager.disable
+    check_unchanged = watched.check_unchanged if watched else lambda: None
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             logging.disable(logging.CRITICAL)  # what matters is raised
             yield
-    except MemoryError as error:
-        if isinstance(error, OutOfMemoryError):
-            _check_unchanged(watched)
-        raise
     except SuperSdfError as error:
-        _check_unchanged(watched)
+        check_unchanged()  # a change explains whatever else went wrong
         if str(split_member(path)[0]) in str(error):
             raise
         raise type(error)(f"{path}: {error}") from None
+    except MemoryError:
+        raise
     except Exception as error:  # the libraries raise all kinds of errors
-        _check_unchanged(watched)
+        check_unchanged()
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         reason = lines[-1][:200] if lines else type(error).__name__
         raise FileError(f"{path} cannot be read as {format_.name}: {reason}") from error
     finally:
         logging.disable(logs)
-    _check_unchanged(watched)
-
-
-def _check_unchanged(watched: InputFile | None) -> None:
-    """Raise FileError if a file changed, which explains whatever else went wrong."""
-    if watched:
-        watched.check_unchanged()
+    check_unchanged()
 
 
 def unpacking_room(max_memory: int | None) -> int:
@@ -260,7 +254,6 @@ def describe_grid_file(path: str | Path) -> dict[str, Any]:
 
 
 def _listed(numbers: Any) -> list[float] | None:
-    """Return numbers as a list of floats; None if there are none."""
     return None if numbers is None else [float(number) for number in np.ravel(numbers)]
 
 

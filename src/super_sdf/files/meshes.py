@@ -180,7 +180,6 @@ def _check_mesh_holds(mesh: Mesh, path: Path, about: Triple) -> None:
 
 
 def _flat_triangles(corners: NDArray[Any]) -> int:
-    """Count the triangles, (n, 3, 3), with two equal corners."""
     same = (corners == np.roll(corners, 1, axis=1)).all(2).any(1)
     return int(np.count_nonzero(same))
 

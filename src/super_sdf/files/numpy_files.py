@@ -10,6 +10,7 @@ import warnings
 import zipfile
 from collections.abc import Callable
 from contextlib import suppress
+from copy import copy
 from dataclasses import replace
 from math import prod
 from pathlib import Path
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, GridError, OutOfMemoryError
 from ..grid.planes import InputFile, PlaneFile
-from .streams import Read, bytes_from, next_planes
+from .streams import CODECS, Read, Unpacker, bytes_from, next_planes
 from .volume import (
     PLACE,
     ZYX,
@@ -144,13 +145,19 @@ class Member:
         self.name, self.packed, self.left = name, info.compress_size, info.file_size
         if info.flag_bits & 1:
             raise FileError(f"{name} is encrypted: save it without a password")
-        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2):
             raise FileError(
                 f"{name} is compressed by a method that NumPy does not write "
                 f"({info.compress_type}): use np.savez_compressed"
             )
         try:
-            self._file = archive.open(info)
+            self._file: Any = archive.open(info)
+            if info.compress_type == zipfile.ZIP_BZIP2:  # which zipfile unpacks without a bound
+                stored = copy(info)
+                stored.compress_type, stored.file_size = zipfile.ZIP_STORED, info.compress_size
+                del stored.CRC  # that of what is unpacked; bzip2 has its own
+                packed = archive.open(stored).read
+                self._file = Unpacker(packed, CODECS["bz2"](), self.left, name)
         except Exception as error:
             raise FileError(f"{name} is damaged: {error}") from None
         self.header = read_array_header(self.read, name)
@@ -158,7 +165,9 @@ class Member:
     def read(self, count: int) -> bytes:
         """Return the next bytes, or fewer at the end, where the checksum is compared."""
         try:
-            data = self._file.read(count)
+            data: bytes = self._file.read(count)
+        except FileError:
+            raise
         except zipfile.BadZipFile:
             raise FileError(f"{self.name} is damaged: its checksum is wrong") from None
         except Exception as error:  # zipfile and zlib raise their own errors
@@ -191,7 +200,6 @@ def read_npz(request: Request) -> Volume:
 
 
 def _known_members(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.ZipInfo]:
-    """Return the members that belong to a grid, by key."""
     infos = archive.infolist()
     names = [info.filename.removesuffix(".npy") for info in infos]
     if {"voxels", "factor"} <= set(names):
@@ -222,8 +230,6 @@ def _read_small(
 
 
 def _read_blocks(archive: zipfile.ZipFile, request: Request) -> Volume:
-    """Read a ``VoxelBlockGrid`` that Open3D saved."""
-
     def array(key: str) -> NDArray[Any]:
         if f"{key}.npy" not in archive.namelist():
             raise FileError(f"{request.path} is Open3D's VoxelBlockGrid, but has no key {key!r}")

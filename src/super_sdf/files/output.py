@@ -63,7 +63,6 @@ def free_space(path: Path) -> int:
 
 
 def _kind_at(path: Path) -> int | None:
-    """Return the mode of the file at a path, None if there is none."""
     try:
         return path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
@@ -73,10 +72,7 @@ def _kind_at(path: Path) -> int | None:
 
 
 def _check_not_protected(path: Path, mode: int | None) -> None:
-    """Raise WriteError if the file at a path, of some mode, may not be written to.
-
-    A rename would replace it all the same; and root may write to it, but it was protected.
-    """
+    """Raise WriteError if the file at a path is protected: a rename, or root, would replace it."""
     if mode is not None and not (mode & WRITABLE and os.access(path, os.W_OK)):
         raise WriteError(f"{path} is write-protected: allow writing to it, or give another name")
 
@@ -101,10 +97,14 @@ def replacing(
         yield part
         if before_rename:
             before_rename(part)
-        if force:
-            _replace(part, target)
-        else:
+        if not force:
             _rename_if_free(part, target)
+            return
+        mode = _kind_at(target)
+        _check_not_protected(target, mode)
+        if mode is not None:
+            part.chmod(stat.S_IMODE(mode))
+        os.replace(part, target)
 
 
 @contextmanager
@@ -119,17 +119,7 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def _cannot_be_written(path: Path, error: OSError | ValueError) -> WriteError:
-    """Return the error for a file that the system refuses to write."""
     return WriteError(f"{path} cannot be written: {getattr(error, 'strerror', None) or error}")
-
-
-def _replace(part: Path, target: Path) -> None:
-    """Rename a file to a target, whose mode it takes over if that exists."""
-    mode = _kind_at(target)
-    _check_not_protected(target, mode)
-    if mode is not None:
-        part.chmod(stat.S_IMODE(mode))
-    os.replace(part, target)
 
 
 def _rename_if_free(part: Path, target: Path) -> None:

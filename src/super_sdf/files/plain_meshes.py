@@ -137,7 +137,6 @@ def _ply_header(
 
 
 def _ply_rows(faces: NDArray[Any]) -> bytes:
-    """Return triangles as PLY lists: the number of corners, then their indices."""
     rows = np.empty(len(faces), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
     rows["count"], rows["corners"] = 3, faces
     return rows.tobytes()
@@ -189,7 +188,6 @@ def _write_triangles(
 
 
 def _stl_rows(corners: NDArray[Any]) -> bytes:
-    """Return the bytes of triangles, (n, 3, 3), with their unit normals."""
     sides = corners[:, 1:].astype(np.float64) - corners[:, :1]
     sides /= np.maximum(np.abs(sides).max((1, 2), keepdims=True), np.finfo(np.float64).tiny)
     normals = np.cross(sides[:, 0], sides[:, 1])

@@ -81,8 +81,6 @@ def write_glb(
 
 
 class _Shift:
-    """Shifts vertices to a local origin, and keeps their bounding box."""
-
     def __init__(self, about: Triple) -> None:
         self.about = np.array(about)
         self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)

@@ -78,15 +78,8 @@ class Deflate:
     def __init__(self, window: int = zlib.MAX_WBITS) -> None:
         self._inner = zlib.decompressobj(window)
 
-    @property
-    def eof(self) -> bool:
-        """Whether the compressed data has ended, with a right checksum."""
-        return self._inner.eof
-
-    @property
-    def unused_data(self) -> bytes:
-        """What was found after the end."""
-        return self._inner.unused_data
+    def __getattr__(self, name: str) -> Any:  # eof and unused_data
+        return getattr(self._inner, name)
 
     @property
     def needs_input(self) -> bool:
@@ -179,7 +172,6 @@ class TextValues:
         return taken.reshape(last - first, *self.shape[1:])
 
     def _parse_more(self) -> None:
-        """Parse the next piece of text, up to its last white space."""
         piece = self.text(TEXT_PIECE)
         text = self.rest + piece
         if not text:

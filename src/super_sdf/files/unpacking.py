@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from io import FileIO
 from itertools import pairwise, product
 from math import prod
@@ -35,8 +35,6 @@ BOMB_RATIO = 500
 ON_DISK = "/var/tmp"  # /tmp is in memory on many systems
 
 Sizes: TypeAlias = tuple[int, ...]
-Write: TypeAlias = Callable[[int, NDArray[np.uint8]], None]
-"""Writes bytes at an offset from the beginning."""
 
 
 def take(
@@ -88,13 +86,16 @@ def unpacked(
     copy = (last - first, *((nz, ny) if is_swapped else (ny, nz)))
     if prod(copy) * volume.dtype.itemsize <= room:
         held = np.empty(copy, volume.dtype)
-        _copy(volume, placement, layout, (first, last), _writer_to(held))
+        for start, block in _blocks(volume, placement, layout, (first, last)):
+            held[tuple(slice(a, a + n) for a, n in zip(start, block.shape))] = block
         return held.transpose(0, 2, 1) if is_swapped else held
     shape = (last - first, ny, nz)
     file = _scratch_file(
         prod(copy) * volume.dtype.itemsize, f"{name}, {in_words_of(shape, volume.dtype)}"
     )
-    _copy(volume, placement, layout, (first, last), _writer_to_file(file, name))
+    for start, block in _blocks(volume, placement, layout, (first, last)):
+        for offset, piece in runs_of(block, start, copy):
+            _write(file, offset, piece, name)
     return PlaneFile(InputFile(file, name), 0, shape, volume.dtype, swapped=is_swapped)
 
 
@@ -142,12 +143,11 @@ def choose_layout(shape: Sizes, chunks: Sizes, orders: Sequence[Sizes], budget: 
     return max(layouts, key=lambda layout: layout.run)
 
 
-def _copy(
-    volume: Volume, placement: Placement, layout: Layout, planes: tuple[int, int], write: Write
-) -> None:
-    """Copy some planes of x of a volume box by box."""
+def _blocks(
+    volume: Volume, placement: Placement, layout: Layout, planes: tuple[int, int]
+) -> Iterator[tuple[Sizes, NDArray[Any]]]:
+    """Yield some planes of x of a volume box by box, each with its start in the copy."""
     along, backwards = layout.order[0], placement.backwards
-    shape = (planes[1] - planes[0], *(volume.shape[axis] for axis in layout.order[1:]))
     bounds = [(0, size) for size in volume.shape]
     bounds[along] = planes
     if backwards[along]:
@@ -160,8 +160,7 @@ def _copy(
             for axis in layout.order
         ]
         start[0] -= planes[0]
-        for offset, piece in runs_of(block, tuple(start), shape):
-            write(offset, piece)
+        yield tuple(start), block
         del block  # before the next one is read
 
 
@@ -194,32 +193,17 @@ def runs_of(
         yield first + int(np.dot(place, steps[:apart])), block[place].reshape(-1).view(np.uint8)
 
 
-def _writer_to(held: NDArray[Any]) -> Write:
-    """Return a function that writes to memory."""
-    raw = held.reshape(-1).view(np.uint8)
-
-    def write(start: int, piece: NDArray[np.uint8]) -> None:
-        raw[start : start + len(piece)] = piece
-
-    return write
-
-
-def _writer_to_file(file: FileIO, name: str) -> Write:
-    """Return a function that writes to a file."""
-
-    def write(start: int, piece: NDArray[np.uint8]) -> None:
-        rest = piece.data
-        try:
-            file.seek(start)
-            while rest:
-                rest = rest[file.write(rest) :]
-        except OSError as error:
-            raise FileError(
-                f"{name} cannot be unpacked to {scratch_folder()}: {error.strerror or error}; "
-                "set TMPDIR to another folder"
-            ) from None
-
-    return write
+def _write(file: FileIO, start: int, piece: NDArray[np.uint8], name: str) -> None:
+    rest = piece.data
+    try:
+        file.seek(start)
+        while rest:
+            rest = rest[file.write(rest) :]
+    except OSError as error:
+        raise FileError(
+            f"{name} cannot be unpacked to {scratch_folder()}: {error.strerror or error}; "
+            "set TMPDIR to another folder"
+        ) from None
 
 
 def scratch_folder() -> str:

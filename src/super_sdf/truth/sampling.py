@@ -231,7 +231,6 @@ def _signed(solid: Solid, points: Points, spacing: float) -> NDArray[np.float64]
 
 
 def _write_cubes(values: FloatArray, corners: NDArray[np.int64], cubes: FloatArray) -> None:
-    """Copy cubes into the grid; parts beyond its end are dropped."""
     for (i, j, k), cube in zip(corners, cubes):
         part = values[i : i + EDGE, j : j + EDGE, k : k + EDGE]
         part[...] = cube[tuple(map(slice, part.shape))]

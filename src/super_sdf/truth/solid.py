@@ -95,22 +95,11 @@ class Solid:
 
 @dataclass(frozen=True)
 class Findings:
-    """Faults of a mesh that should bound a solid.
+    """Faults of a mesh that should bound a solid."""
 
-    Attributes
-    ----------
-    open_edges : int
-        Edges with more faces on one side than on the other.
-    inverted : bool
-        Whether the faces point inward: the volume is negative.
-    overlapping : int
-        Number of faces with a winding number of 2 or more, or below 0, on one side: pieces overlap,
-        fold over or are inverted there.
-    """
-
-    open_edges: int
-    inverted: bool
-    overlapping: int
+    open_edges: int  # with more faces on one side than on the other
+    inverted: bool  # whether the faces point inward: the volume is negative
+    overlapping: int  # faces with a winding number of 2 or more, or below 0, on one side
 
 
 def examine(solid: Solid) -> Findings:

@@ -7,18 +7,16 @@ it is called. It may raise anything: ``files.grids`` turns what a library raises
 from collections.abc import Callable
 
 from ..volume import Request, Volume
-from .dicom import read_dicom
 from .hdf5 import read_hdf5, read_mat, read_netcdf
+from .medical import read_analyze, read_dicom, read_mgh, read_nifti
 from .metaimage import read_metaimage
-from .mrc import read_mrc
-from .nibabel_files import read_analyze, read_mgh, read_nifti
 from .nrrd_file import read_nrrd
-from .sdf import read_sdf
+from .raw_files import read_mrc, read_sdf
 from .tiff import read_tiff
 from .vdb import read_vdb
 from .vti import read_vti
 from .vtk import read_vtk, read_vtkhdf
-from .zarr_store import read_zarr
+from .zarr_files import read_zarr
 
 READERS: dict[str, Callable[[Request], Volume]] = {
     "nifti": read_nifti,

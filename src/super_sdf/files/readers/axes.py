@@ -155,7 +155,6 @@ class Axes:
 
 
 def _text(attributes: dict[str, Any], name: str) -> str:
-    """Return an attribute as text, "" if there is none."""
     stated = attributes.get(name, "")
     return stated.decode() if isinstance(stated, bytes) else str(stated)
 
@@ -195,7 +194,6 @@ def placed(
 
 
 def _stated_triple(attributes: dict[str, Any], name: str) -> Triple | None:
-    """Return an attribute of one number or three; None if there is none of this name."""
     if name not in attributes:
         return None
     try:

@@ -77,8 +77,6 @@ def read_mat(request: Request) -> Volume:
 
 
 def _volume_of(values: Any, space: list[int], place: dict[str, Any]) -> Volume:
-    """Return the volume of a dataset: its axes in space and their place; others have length 1."""
-
     def stored(box: Box) -> NDArray[Any]:
         return np.asarray(values[along(space, box, values.ndim)])
 
@@ -99,7 +97,6 @@ def _volume_of(values: Any, space: list[int], place: dict[str, Any]) -> Volume:
 
 
 def _may_be_grid(shape: tuple[int, ...] | None) -> bool:
-    """Return whether a dataset has three axes, besides some of length 1."""
     return shape is not None and len(shape) >= 3 >= sum(count > 1 for count in shape)
 
 
@@ -200,6 +197,5 @@ def _read_73(request: Request) -> Volume:
 def _placed_of_mat(
     stated: dict[str, Any], shape: tuple[int, ...], request: Request
 ) -> tuple[list[int], dict[str, Any]]:
-    """Return axes and place of an array whose axes are in reverse order."""
     space, place = placed(Axes.named([""] * 3), stated, shape, request.axes[::-1])
     return space, place | {"notes": (ORDER,) if request.axes == "xyz" else ()}

@@ -167,7 +167,6 @@ def _are_one_letter_apart(a: str, b: str) -> bool:
 def _data(
     request: Request, file: InputFile, header: Header, shape: tuple[int, ...]
 ) -> tuple[Planes, int | None]:
-    """Return a function that reads planes, and the size of compressed data."""
     if not header.flag("BinaryData", True):
         raise FileError("its BinaryData is False: save it as binary")
     if header.fields[LAST].lower() == "local":
@@ -198,7 +197,6 @@ def _data(
 def _compressed(
     files: list[InputFile], header: Header, start: int, shape: tuple[int, ...]
 ) -> tuple[Planes, int | None]:
-    """Return a function that reads planes of zlib data, and its size."""
     file = files[0]
     if len(files) > 1 or header.fields.get("HeaderSize", "0").startswith("-"):
         raise FileError("it is compressed, in several files or behind others: store it as .mha")

@@ -108,7 +108,6 @@ def _layer(request: Request, header: dict[str, Any], sizes: tuple[int, ...]) -> 
 
 
 def _segments(header: dict[str, Any], layer: int) -> str:
-    """Return names and labels of the segments in a layer, as 3D Slicer writes them."""
     segments = [
         f"{header.get(key.replace('_Layer', '_Name'), '?')} "
         f"{header.get(key.replace('_Layer', '_LabelValue'), '?')}"
@@ -141,7 +140,6 @@ def _data(
     shape: tuple[int, ...],
     dtype: np.dtype[Any],
 ) -> tuple[Planes, int | None]:
-    """Return a function that reads planes, and the size of compressed data."""
     encoding, skip = header["encoding"], header.get("byteskip", 0)
     start = _after_lines(file, start, header.get("lineskip", 0))
     if encoding == "raw":
@@ -159,7 +157,6 @@ def _data(
 
 
 def _after_lines(file: InputFile, start: int, lines: int) -> int:
-    """Return where the data begins after some lines."""
     text = file.read(start, LONGEST).tobytes() if lines else b""
     place = 0
     for _ in range(lines):

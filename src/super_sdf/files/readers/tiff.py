@@ -52,7 +52,6 @@ def read_tiff(request: Request) -> Volume:
 
 
 def _check_other_files(file: Any, request: Request) -> None:
-    """Raise FileError unless the files that OME metadata names lie beside the file."""
     if not file.is_ome:
         return
     for element in ElementTree.fromstring(file.ome_metadata).iter():
@@ -115,7 +114,6 @@ def _imagej_axes(file: Any) -> dict[str, Stated] | None:
 
 
 def _pixel_sizes(file: Any) -> tuple[float, float] | None:
-    """Return the size of a pixel along x and y by the resolution; None if it is not stated."""
     tags = file.pages[0].tags
     if "XResolution" not in tags or "YResolution" not in tags:
         return None
@@ -125,7 +123,6 @@ def _pixel_sizes(file: Any) -> tuple[float, float] | None:
 
 
 def _resolution_unit(file: Any) -> str:
-    """Return the unit of the resolution, "" if it has none."""
     tag = file.pages[0].tags.get("ResolutionUnit")
     number = 2 if tag is None else int(tag.value)  # inches, by the standard
     return {2: "inch", 3: "cm", 4: "mm", 5: "µm"}.get(number, "")
@@ -143,7 +140,6 @@ def _pixel_note(file: Any) -> tuple[str, ...]:
 
 
 def _ome_axes(file: Any) -> dict[str, Stated] | None:
-    """Return unit and step of the axes of an OME stack; None if it states none."""
     if not file.is_ome:
         return None
     text = re.sub(r'\sxmlns(:\w+)?="[^"]*"', "", file.ome_metadata)

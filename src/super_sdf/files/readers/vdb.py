@@ -6,7 +6,6 @@ flags of its compression, metadata, the transform and the tree (``vdb_tree``).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -40,8 +39,6 @@ PICOGK_MM = 1000  # PicoGK states the size of a voxel in metres, and works in mi
 
 
 class _Entry(NamedTuple):
-    """A grid of a file: its name, the type of its tree, and where it begins."""
-
     name: str
     type: str
     parent: str
@@ -78,7 +75,6 @@ def read_vdb(request: Request) -> Volume:
 
 
 def _entries(file: InputFile) -> list[_Entry]:
-    """Return the grids of a file."""
     cursor = Cursor(file)
     if file.size < 12 or cursor.number("q") != MAGIC:
         raise FileError(f"{file.name} is no .vdb file: its first bytes are not OpenVDB's")
@@ -98,18 +94,15 @@ def _entries(file: InputFile) -> list[_Entry]:
             f"{file.name} holds {count} grids one after the other, as a stream: save it with "
             "openvdb.write"
         )
-    return list(_read_entries(cursor, count))
-
-
-def _read_entries(cursor: Cursor, count: int) -> Iterator[_Entry]:
-    """Yield the grids that follow, each of which states where it ends."""
+    entries = []
     for _ in range(count):
         name, type_, parent = (cursor.text().replace("\x1e", "#") for _ in range(3))
         _, _, end = cursor.unpack("qqq")
-        yield _Entry(name, type_, parent, cursor.place)
+        entries.append(_Entry(name, type_, parent, cursor.place))
         if count > 1:
             cursor.place = end
             cursor.skip(0)
+    return entries
 
 
 def _read_head(file: InputFile, place: int) -> tuple[int, dict[str, Any], NDArray[np.float64], int]:
@@ -121,7 +114,6 @@ def _read_head(file: InputFile, place: int) -> tuple[int, dict[str, Any], NDArra
 
 
 def _read_metadata(cursor: Cursor) -> dict[str, Any]:
-    """Return the numbers and texts of metadata."""
     metadata: dict[str, Any] = {}
     for _ in range(cursor.number("I")):
         name, type_ = cursor.text(), cursor.text()
@@ -153,7 +145,6 @@ def _read_transform(cursor: Cursor) -> NDArray[np.float64]:
 def _volume(
     file: InputFile, tree: Tree, metadata: dict[str, Any], affine: NDArray[np.float64]
 ) -> Volume:
-    """Return the voxels at their place in the world."""
     bounds = tree.bounds()
     if bounds is None:
         raise GridError(f"{file.name} has no active voxel: it holds no surface")

@@ -127,7 +127,6 @@ class Coding:
         return abs(length), length > 0
 
     def _numbers(self, cursor: Cursor, count: int) -> NDArray[Any]:
-        """Return the next numbers."""
         length, packed = self._length(cursor, count)
         data, size = cursor.take(length), count * self.stored.itemsize
         if packed:
@@ -162,12 +161,7 @@ class Tree:
 
     Tiles are kept that are active or have another value than the background. ``places`` are where
     the values of each leaf begin; a leaf that is ``whole`` may have inactive voxels of other values
-    than the background.
-
-    Parameters
-    ----------
-    coding : callable
-        Makes the coding of a background.
+    than the background. ``coding`` makes the coding of a background.
     """
 
     def __init__(self, file: InputFile, place: int, coding: Callable[[float], Coding]) -> None:
@@ -194,7 +188,6 @@ class Tree:
         cursor.skip(0)
 
     def _parts(self, cursor: Cursor) -> Iterator[Tiles | Leaves]:
-        """Yield tiles and leaves of the topology from the root on."""
         tiles, children = cursor.unpack("II")
         for _ in range(tiles):
             corner = cursor.array("<i4", 3).astype(np.int64)[None]
@@ -272,7 +265,6 @@ class Tree:
 
 
 def _touch(corners: Ints, edges: Any, first: Ints, shape: tuple[int, ...]) -> BoolArray:
-    """Return which cubes have voxels in a box."""
     overlap = (corners < first + np.array(shape)) & (corners + edges > first)
     return np.asarray(overlap.all(1))
 

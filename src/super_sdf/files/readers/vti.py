@@ -152,7 +152,6 @@ class Outline:
         raise FileError(f"{self.file.name} has a document type: VTK image data has none")
 
     def _start(self, name: str, attributes: Attributes) -> None:
-        """Take notice of an element."""
         self._end_text()
         self.path.append(name)
         match self.path:
@@ -187,7 +186,6 @@ class Outline:
             self.parser.CharacterDataHandler = None
 
     def _end_text(self) -> None:
-        """Note that the text of an array, if there is one, ends at a tag."""
         self.parser.CharacterDataHandler = None
         if self.array:
             self.array.end = self.parser.CurrentByteIndex
@@ -267,7 +265,6 @@ class Part:
             planes[start - first : stop - first, rows, columns] = part
 
     def _planes(self, file: InputFile, outline: Outline, array: Array) -> Planes:
-        """Return a function that returns the next planes."""
         form = array.attributes.get("format")
         if form == "ascii":
             return TextValues(file, array.start, array.end, self.dtype, self.shape).planes
@@ -283,7 +280,6 @@ class Part:
         return next_planes(read, self.shape, self.dtype)
 
     def _words(self, source: Source, first: int, count: int) -> list[int]:
-        """Return some of the numbers before the data."""
         size = self.word.itemsize
         if (first + count) * size > source.size:
             raise FileError(f"{self.name} is truncated: its data begins after the end of the file")
@@ -291,7 +287,6 @@ class Part:
         return [int(number) for number in data.view(self.word)]
 
     def _whole(self, source: Source) -> Read:
-        """Return a function that reads data that is not compressed."""
         (size,) = self._words(source, 0, 1)
         start = self.word.itemsize
         self._check_size(size)
@@ -376,7 +371,6 @@ def _check_cover(parts: list[Part], shape: tuple[int, ...]) -> None:
 
 
 def _extent(attributes: Attributes, name: str) -> tuple[int, ...]:
-    """Return the first and the last point on each axis: x, y, z."""
     words = attributes.get(name, "").split()
     if len(words) != 6 or not all(re.fullmatch("-?[0-9]{1,10}", word) for word in words):
         raise FileError(f"its {name} is {seen(attributes.get(name))}: give six whole numbers")
@@ -384,7 +378,6 @@ def _extent(attributes: Attributes, name: str) -> tuple[int, ...]:
 
 
 def _numbers(attributes: Attributes, name: str, count: int, default: Any) -> NDArray[np.float64]:
-    """Return the numbers of an attribute, or what holds without it."""
     if name not in attributes:
         return np.broadcast_to(np.asarray(default, np.float64), count)
     numbers = np.array(attributes[name].split(), np.float64)

@@ -108,7 +108,6 @@ def volume_of_image(image: Any, scalars: str | None) -> Volume:
 
 
 def _volume_of(lattice: ImageLattice, array: Any) -> Volume:
-    """Return an array of VTK with a number for each sample."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     values = vtk_to_numpy(array).reshape(lattice.shape)
@@ -116,13 +115,11 @@ def _volume_of(lattice: ImageLattice, array: Any) -> Volume:
 
 
 def _names(data: Any) -> list[str]:
-    """Return the names of the arrays of numbers."""
     arrays = (data.GetArray(number) for number in range(data.GetNumberOfArrays()))
     return [str(array.GetName()) for array in arrays if array]
 
 
 def _no_array(data: tuple[Any, Any], scalars: str | None) -> str:
-    """Return what is wrong if no array was found."""
     points, cells = map(_names, data)
     listed = ", ".join([*points, *(f"{name} (cells)" for name in cells)])
     if not listed:
@@ -133,7 +130,6 @@ def _no_array(data: tuple[Any, Any], scalars: str | None) -> str:
 
 
 def _read(request: Request, reader: Any) -> Volume:
-    """Return the array that a reader of VTK finds in a file."""
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
 
     request.check_loads(request.path.stat().st_size, "VTK")
