@@ -331,7 +331,7 @@ def test_of_many_failures_twenty_are_shown(run_batch):
 
 def test_options_are_checked_before_the_work(run_batch, command):
     code, _, err = command("batch", "in", "--out", "out", "--factor", 3)
-    assert code == 2 and err.startswith("Error: factor is 3: give an even number")
+    assert code == 2 and err.startswith("Error: --factor is 3: give an even number")
     assert command("batch", "in")[0] == 2
     Path("taken").write_text("")
     want = "Error: taken cannot be written: File exists\n"

@@ -340,7 +340,7 @@ def test_the_coloured_mesh_is_a_mesh_with_residuals(here, command):
         ("ball.ply ball.npz --out off.ply", 1, "off.ply exists: remove it or use --force"),
         ("ball.ply ball.npz --out ball.ply --force", 1, "ball.ply is the same file as ball.ply:"),
         ("ball.ply ball.npz --max-share 2", 2, "--max-share is 2: give a share from 0 to 1"),
-        ("ball.ply ball.npz --offset nan", 2, "offset is nan: give a finite number, in world"),
+        ("ball.ply ball.npz --offset nan", 2, "--offset is nan: give a finite number, in world"),
         ("ball.ply ball.npz --offset 9", 1, "no surface at 9: the values go from "),
         ("ball.ply ball.npz --max-memory 9M", 1, "checking 20,480 triangles needs "),
     ],

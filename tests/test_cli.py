@@ -179,17 +179,17 @@ CASES = {
     ("constant.npy",): (1, "every value is 1: a constant field has no surface"),
     ("in.npy", "--label", "1.5"): (
         2,
-        "label is '1.5': give a whole number, -2^63 to 2^64 - 1",
+        "--label is 1.5: give a whole number, -2^63 to 2^64 - 1",
     ),
-    ("in.npy", "--scale", "0"): (2, "scale is 0.0: give a number greater than 0"),
-    ("in.npy", "--triangles", "3"): (2, "triangles is 3: give 4 or more, as a closed mesh has"),
+    ("in.npy", "--scale", "0"): (2, "--scale is 0: give a number greater than 0"),
+    ("in.npy", "--triangles", "3"): (2, "--triangles is 3: give 4 or more, as a closed mesh has"),
     ("in.npy", "--simplify", "1", "--triangles", "9"): (
         2,
-        "simplify 1.0 and triangles 9: give only one of them",
+        "--simplify 1 and --triangles 9: give only one of them",
     ),
     ("in.npy", "--factor", "5"): (
         2,
-        "factor is 5: give an even number from 2 to 16 (an odd one has no node on the samples)",
+        "--factor is 5: give an even number from 2 to 16 (an odd one has no node on the samples)",
     ),
     ("in.npy", "--factor", "four"): (
         2,
@@ -391,3 +391,20 @@ def test_a_large_file_is_announced_unless_quiet(here, command, monkeypatch):
     options = "--quality", "fast", "--quiet", "--json"
     code, out, err = command("upsample", "in.npy", "new.ply", *options)
     assert (code, err) == (0, "") and json.loads(out)["expected_bytes"] > 400_000
+
+
+def test_wrong_values_are_named_as_typed_and_in_lists_by_their_names(command, tmp_path):
+    grid = str(tmp_path / "a.npy")
+    np.save(grid, np.zeros((4, 4, 4)))
+    cases = {
+        "--simplify -1": "--simplify is -1:",
+        "--spacing 1,nan,1": "--spacing is nan:",
+        "--level 1.5 --label 2": "--label 2 and --level 1.5:",
+    }
+    for words, shown in cases.items():
+        code, _, err = command("upsample", grid, "a.ply", *words.split())
+        assert code == 2 and err.startswith(f"Error: {shown} give ")
+    listed = tmp_path / "list.jsonl"
+    listed.write_text(json.dumps({"in": grid, "simplify": -1}))
+    _, _, err = command("batch", listed, "--out", tmp_path / "out", "--simplify", "0.5")
+    assert "'simplify' is -1: give a number" in err and "--simplify" not in err

@@ -529,13 +529,13 @@ def test_the_command_takes_labels_levels_and_scales(tmp_path, command):
     base = ["upsample", "--spacing", "1", "--force"]
     labels, grid, out = (str(tmp_path / name) for name in ("labels.npy", "grid.npy", "out.ply"))
     assert command(*base, labels, out, "--label", "3")[0] == 0
-    for words, shown in (("3.0", "'3.0'"), (str(2**64), str(2**64))):
+    for words, shown in (("3.0", "3.0"), (str(2**64), str(2**64))):
         code, _, err = command(*base, labels, out, "--label", words)
-        want = f"Error: label is {shown}: give a whole number, -2^63 to 2^64 - 1"
+        want = f"Error: --label is {shown}: give a whole number, -2^63 to 2^64 - 1"
         assert (code, err.splitlines()[-1]) == (2, want)
     assert command(*base, grid, out, "--level", "100", "--scale", "0.025")[0] == 0
     code, _, err = command(*base, grid, out, "--level", "100", "--scale", "0")
-    assert (code, err.splitlines()[-1]) == (2, "Error: scale is 0.0: give a number greater than 0")
+    assert (code, err.splitlines()[-1]) == (2, "Error: --scale is 0: give a number greater than 0")
     assert (
         command("check", out, grid, "--spacing", "1", "--level", "100", "--scale", ".025")[0] == 0
     )

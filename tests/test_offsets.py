@@ -153,7 +153,7 @@ def test_the_command_refuses_an_offset_near_the_truncation(command, tmp_path, mo
     )
     assert command("upsample", PART, "a.ply", "--offset", 5.5) == (1, "", message)
     code, _, err = command("upsample", PART, "a.ply", "--offset", "nan")
-    assert code == 2 and err.endswith("offset is nan: give a finite number, in world units\n")
+    assert code == 2 and err.endswith("--offset is nan: give a finite number, in world units\n")
     assert not list(tmp_path.iterdir())
     assert command("upsample", PART, "a.ply", "--offset", 3.75, "--factor", 2)[0] == 0
     assert trimesh.load("a.ply").is_watertight

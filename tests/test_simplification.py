@@ -310,10 +310,10 @@ def test_a_count_that_cannot_be_reached_is_a_warning(here, command):
 
 
 REFUSED = {
-    ("--simplify", "0.1", "--triangles", "5"): "simplify 0.1 and triangles 5: give only one of "
+    ("--simplify", "0.1", "--triangles", "5"): "--simplify 0.1 and --triangles 5: give only one of "
     "them",
-    ("--simplify", "-1"): "simplify is -1.0: give a number greater than 0",
-    ("--triangles", "2"): "triangles is 2: give 4 or more, as a closed mesh has",
+    ("--simplify", "-1"): "--simplify is -1: give a number greater than 0",
+    ("--triangles", "2"): "--triangles is 2: give 4 or more, as a closed mesh has",
 }
 
 

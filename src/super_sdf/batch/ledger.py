@@ -35,22 +35,11 @@ ROW_START = b'{"in": "'  # of every line
 
 
 class Ledger:
-    """The rows of an output folder, by output.
+    """The rows of an output folder; FileError if something else has the name of its files.
 
-    Attributes
-    ----------
-    rows : dict
-        The last finished row of each output.
-    written : dict
-        The fingerprint of the last mesh that a batch wrote of each output.
-    started, left : set of str
-        The outputs that this batch has started and not finished, and those that were started by a
-        batch that was killed: a part of a mesh, or a mesh that has no row, may be there.
-
-    Raises
-    ------
-    FileError
-        If something else has the name of one of the files, or if it cannot be read.
+    ``rows`` are the last finished ones by output, ``written`` the fingerprints of the last meshes
+    that a batch wrote. This batch has ``started`` some outputs and not finished them. A killed
+    one ``left`` others: a part of a mesh, or a mesh without a row, may be there.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -23,15 +23,7 @@ NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP}
 
 @contextmanager
 def folder_lock(folder: Path) -> Iterator[None]:
-    """Make an output folder and hold its lock within the block.
-
-    Raises
-    ------
-    FileError
-        If another batch holds it.
-    WriteError
-        If the folder, or the file of the lock, cannot be made.
-    """
+    """Make an output folder and hold its lock within the block; FileError if a batch has it."""
     path = folder / LOCK_NAME
     lock = FileLock(path, timeout=0)
     try:

@@ -34,12 +34,8 @@ def convert_on_cluster(
     """Yield the jobs of a queue with their rows, as they are converted on a cluster.
 
     ``jobs`` are the same jobs, for the checks before the work; ``workers`` are processes of this
-    machine, for ``--cluster local``. ``warn`` tells the user a sentence.
-
-    Raises
-    ------
-    ClusterError
-        If the cluster cannot be reached, if its workers lack something, or if it is lost.
+    machine, for ``--cluster local``. ``warn`` tells the user a sentence. ClusterError if no
+    cluster can be reached, its workers lack something, or it is lost.
     """
     address, memory = str(settings.cluster), jobs[0].options.max_memory
     settings = absolute(settings)

@@ -271,7 +271,7 @@ def check_kept(
     )
     surface = examine_surface(mesh, found.intersections)
     give_back()
-    touching = touch(mesh, samples, found, grid.voxel_size)
+    touching = touch(mesh, samples, found, grid.voxel_size, simple=surface.is_simple)
     del found
     give_back()
     strays = find_strays(mesh.vertices, grid, band, offset) if len(touching.values) else None

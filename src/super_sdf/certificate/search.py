@@ -45,6 +45,7 @@ class Found:
     intersections: int | None  # pairs of triangles; None if they were not counted
     distances: Distances  # (k,), of the points to the nearest triangle
     feet: Points  # (k, 3), the nearest points of the mesh
+    cosines: Distances  # (k,), between the ways from there and the normals of the triangles
 
 
 def search(
@@ -56,14 +57,24 @@ def search(
     """
     slabs = MeshSlabs(mesh, points, reach, counts=intersections and can_count())
     total, n = 0, len(points)
-    distances, feet = np.empty(n), np.empty((n, 3))
+    distances, feet, cosines = np.empty(n), np.empty((n, 3)), np.empty(n)
     for rows, part in _search_all(slabs, min(processes, len(slabs))):
-        distances[rows], feet[rows] = part.distances, part.feet
+        distances[rows], feet[rows], cosines[rows] = part.distances, part.feet, part.cosines
         total += part.intersections or 0
     far = np.flatnonzero(distances > reach)
     if len(far):
-        distances[far], _, feet[far] = Solid(mesh).nearest(points[far])
-    return Found(total if slabs.counts else None, distances, feet)
+        distances[far], feet[far], cosines[far] = _nearest(mesh, points[far])
+    return Found(total if slabs.counts else None, distances, feet, cosines)
+
+
+def _nearest(mesh: Mesh, points: Points) -> tuple[Distances, Points, Distances]:
+    """Return distances, feet and cosines: see ``Found``; the cosine at no triangle's side is 0."""
+    distances, faces, feet = Solid(mesh).nearest(points)
+    a, b, c = mesh.vertices[mesh.faces[faces].T].astype(np.float64)
+    normals, ways = np.cross(b - a, c - a), points - feet
+    sizes = np.linalg.norm(normals, axis=1) * distances
+    dots = np.einsum("ij,ij->i", ways, normals)
+    return distances, feet, np.divide(dots, sizes, out=np.zeros(len(points)), where=sizes > 0)
 
 
 def self_intersections(mesh: Mesh) -> int | None:
@@ -137,8 +148,8 @@ def _prepare() -> Work:
 
 
 def _search_slab(slab: MeshSlab) -> Found:
-    distances, _, feet = Solid(slab.mesh).nearest(slab.points)
-    return Found(_count_intersections(slab) if slab.counts else None, distances, feet)
+    count = _count_intersections(slab) if slab.counts else None
+    return Found(count, *_nearest(slab.mesh, slab.points))
 
 
 def _count_intersections(slab: MeshSlab) -> int:

@@ -43,6 +43,12 @@ class Surface:
         """Whether all edges and vertices are manifold; open edges are allowed."""
         return self.edges.crowded_edges == 0 and self.pinched_vertices == 0
 
+    @property
+    def is_simple(self) -> bool:
+        """Whether the mesh is one closed sheet with an inside, known not to meet itself."""
+        whole = self.closed and self.oriented and self.manifold and self.components == 1
+        return whole and self.self_intersections == 0
+
     def faults(self) -> list[str]:
         """Return what keeps the mesh from being the boundary of a solid, in words."""
         edges = self.edges

@@ -25,6 +25,7 @@ from ..truth.solid import Points, Solid
 from .search import Found
 
 WIDTH = 4  # 2^17 samples at a time
+CLEAR = 0.5  # cosine to the nearest triangle's normal above which that tells the side
 NOTICEABLE = 0.1  # voxels: a residual that is counted as large
 STRAY = 0.5  # voxels within a ball, from which on a vertex is counted
 NEAREST_FEET = 8  # foot points that a vertex looks at
@@ -109,16 +110,20 @@ def exact_samples(band: Band, grid: SdfGrid) -> Samples:
     return Samples(cut_off, noisy, ijk, grid.to_world(ijk), distances)
 
 
-def touch(mesh: Mesh, samples: Samples, found: Found, voxel_size: float) -> Touching:
+def touch(
+    mesh: Mesh, samples: Samples, found: Found, voxel_size: float, *, simple: bool
+) -> Touching:
     """Return where the balls of exact samples meet a mesh.
 
     ``found`` is by ``search`` for the points of the samples, ``voxel_size`` the spacing of the
-    grid. On which side of the mesh a sample lies is by its winding number.
+    grid. On which side of the mesh a sample lies is by its winding number; but if the mesh is
+    ``simple``, see ``Surface``, not where the nearest triangle agrees with the sample.
     """
     distances, size = found.distances / voxel_size, np.abs(samples.values)
     residuals = (distances - size).astype(np.float32)
     solid, wrong = Solid(mesh), np.zeros(len(size), bool)
-    apart = np.flatnonzero(distances + size > NOTICEABLE)  # where the side matters
+    agreed = simple & (np.where(samples.values > 0, 1, -1) * found.cosines > CLEAR)
+    apart = np.flatnonzero((distances + size > NOTICEABLE) & ~agreed)  # where the side matters
     for chunk in chunks_of(len(apart), WIDTH):
         some = apart[chunk]
         wrong[some] = solid.is_inside(samples.points[some]) != (samples.values[some] <= 0)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
 import click
 
-from ..errors import OptionError, SuperSdfError
+from ..errors import OptionError, SuperSdfError, seen
 from .interrupts import describe_interrupt, exit_code
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
@@ -35,7 +36,8 @@ def one_line_errors(*targets: str | os.PathLike[str] | None) -> Iterator[None]:
         yield
     except SuperSdfError as error:
         kind = click.UsageError if isinstance(error, OptionError) else click.ClickException
-        raise kind(" ".join(str(error).splitlines())) from error  # names may have line breaks
+        line = " ".join(str(error).splitlines())  # names may have line breaks
+        raise kind(_as_typed(line) if kind is click.UsageError else line) from error
     except MemoryError:
         raise click.ClickException("out of memory: use a smaller --factor or grid") from None
     except OSError as error:  # the system refused something, such as another file handle: no bug
@@ -44,6 +46,23 @@ def one_line_errors(*targets: str | os.PathLike[str] | None) -> Iterator[None]:
         raise click.ClickException(named) from error
     except KeyboardInterrupt as error:
         raise InterruptedCommand(_what_is_written(before), error) from None
+
+
+def _as_typed(line: str) -> str:
+    """Return a message with the options that it begins with as the user typed them."""
+    context = click.get_current_context(silent=True)
+    given = context.params if context else {}
+    for option in context.command.params if context else ():
+        word, value = option.opts[0], given.get(option.name or "")
+        for part in (value, *value) if isinstance(value, tuple) else (value,):
+            typed = part if isinstance(part, str) else repr(part).removesuffix(".0")
+            name, shown = word.lstrip("-").replace("-", "_"), re.escape(seen(part))
+            shown += f"|{re.escape(typed)}"
+            found = re.match(rf"(.* and )?{name} (is )?(?:{shown})(?=[:,]| and )", line)
+            if found and word.startswith("-"):
+                head = f"{found[1] or ''}{word} {found[2] or ''}{typed}"
+                line = head + line[found.end() :]
+    return line
 
 
 def _file_at(path: str | os.PathLike[str]) -> tuple[int, int] | None:

@@ -135,13 +135,7 @@ def load_chosen(options: dict[str, Any]) -> Network:
 
 
 def make_options(options: dict[str, Any]) -> ConvertOptions:
-    """Return the conversion's options, picked from all options of a command.
-
-    Raises
-    ------
-    SuperSdfError
-        If a value is wrong, or a package is missing that it needs.
-    """
+    """Return the conversion's options, picked from all options of a command."""
     taken = [name for name in UPSAMPLE if hasattr(ConvertOptions, name)]
     chosen = ConvertOptions(**{name: options[name] for name in taken})
     if chosen.simplifies:

@@ -69,8 +69,7 @@ def upsample_command(source: str, target: str, **options: Any) -> None:
     with one_line_errors(target, options["save_field"], options["report"]):
         chosen = make_options(options)
         # here, since help and wrong options do without NumPy
-        if options["labels"] is None:
-            from .upsampling import upsample as run
-        else:
-            from .labels import upsample_labels as run
+        from .upsampling import upsample, upsample_labels
+
+        run = upsample if options["labels"] is None else upsample_labels
         run(source, target, chosen, options)

@@ -32,14 +32,7 @@ report_option = click.option(
 
 
 def check_page(option: str, page: Path, others: Iterable[str | Path], *, force: bool) -> None:
-    """Raise if a page cannot be written; called before the work starts.
-
-    Raises
-    ------
-    SuperSdfError
-        If a package is missing, the suffix is another, the file exists and ``force`` is not set, or
-        it is one of the others, the inputs and outputs.
-    """
+    """Raise if a page cannot be written, or is one of the others, the inputs and outputs."""
     from ..files.output import check_apart, check_free
 
     if page.suffix.lower() not in PAGES:

@@ -212,14 +212,9 @@ def convert_on_cluster(
 ) -> Conversion:
     """Convert a grid file to a mesh file on the workers of a cluster; see ``convert``.
 
-    ``announce`` also gets sentences about workers, while the work goes on.
-
-    Raises
-    ------
-    ClusterError
-        If a worker lacks something, such as the file, or if the cluster is lost.
-    SuperSdfError
-        As in ``convert``; OptionError if the values need the whole grid at once.
+    ``announce`` also gets sentences about workers, while the work goes on. ClusterError if a worker
+    lacks something, such as the file, or the cluster is lost; OptionError if the values need the
+    whole grid at once.
     """
     from .crew import Crew
 
@@ -311,12 +306,8 @@ class Bricks:
     def _tasks(self, expected: Expectation, seen: Glance) -> list[MeshTask]:
         """Cut the grid into bricks with about the same number of decoded voxels.
 
-        Raises
-        ------
-        GridError
-            If no voxel can hold a surface, or not even float64 resolves the vertices.
-        OptionError
-            If the mesh will certainly have too many vertices.
+        GridError without a surface, or if not even float64 resolves the vertices; OptionError if
+        the mesh will certainly have too many.
         """
         grid, options = self.grid, self.options
         vertex_type(grid, options.factor)

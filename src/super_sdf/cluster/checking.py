@@ -43,26 +43,14 @@ PROBE = ".super-sdf-probe-"  # a file in the output folder while the workers are
 
 @dataclass(frozen=True)
 class Needs:
-    """What the work needs of every worker.
+    """What the work needs of every worker; paths are absolute."""
 
-    Attributes
-    ----------
-    model, precision, device : str
-        The network: see ``load_network``.
-    modules : tuple of str
-        Python modules beyond those that are always installed.
-    files : sequence of Path
-        Inputs; absolute paths. If they are many, some of them are looked at.
-    folder : Path, optional
-        The folder of the outputs; absolute. It exists.
-    """
-
-    model: str
+    model: str  # the network: see ``load_network``
     precision: str = AUTO_PRECISION
     device: str = "auto"
-    modules: tuple[str, ...] = ()
-    files: Sequence[Path] = ()
-    folder: Path | None = None
+    modules: tuple[str, ...] = ()  # beyond those that are always installed
+    files: Sequence[Path] = ()  # inputs; if they are many, some of them are looked at
+    folder: Path | None = None  # of the outputs; it exists
 
     def digests_of_models(self) -> dict[str, str]:
         """Return the SHA-256 of the shipped networks and of this one, as far as they are here."""

@@ -98,24 +98,10 @@ def connect(
 ) -> Iterator[Cluster]:
     """Connect to a cluster; at the end, and after errors, everything that was started is closed.
 
-    Parameters
-    ----------
-    address : str
-        "local" for worker processes of this machine, else the address of a Dask scheduler, such as
-        tcp://10.0.0.1:8786.
-    workers : int
-        Worker processes of this machine, for "local"; 0 means one per core.
-    threads : int
-        Threads of each worker; 0: its share of the cores, or those that Dask gave it.
-    max_memory : int, optional
-        Bytes of memory: of all workers together for "local", else of each.
-
-    Raises
-    ------
-    FileError
-        If the extra is missing.
-    ClusterError
-        If nobody answers at the address, or if the cluster has no worker.
+    The address is "local", for processes of this machine (``workers`` of them, 0: one per core), or
+    that of a Dask scheduler, such as tcp://10.0.0.1:8786. ``threads`` are those of each worker; 0:
+    its share of the cores, or those that Dask gave it. ``max_memory`` are the bytes of all workers
+    together for "local", else of each. ClusterError if nobody answers, or there is no worker.
     """
     check_modules("--cluster", "cluster")
     with ExitStack() as stack:

@@ -16,7 +16,6 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import suppress
 from itertools import islice
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..errors import ClusterError, SuperSdfError
@@ -67,12 +66,7 @@ class Crew:
         self._admit(checked.members)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         with suppress(SuperSdfError):  # the connection may be lost
             if not self.cluster.is_local:
                 self.cluster.run(forget, self.run, workers=list(self.members))
@@ -86,14 +80,8 @@ class Crew:
         """Yield the tasks of a queue with their results as they are completed.
 
         A task is taken from the queue when a worker is free for it. The result is a Death if the
-        workers died that had the task, or if it raised an error.
-
-        Raises
-        ------
-        ClusterError
-            If the connection is lost, or if there is no worker any more.
-        SuperSdfError
-            What a worker raised.
+        workers died that had the task, or if it raised an error. ClusterError if the connection is
+        lost, or there is no worker any more; SuperSdfError as a worker raised it.
         """
         given: dict[Future[Any], Task] = {}
         try:

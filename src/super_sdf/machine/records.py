@@ -17,14 +17,8 @@ from typing import Any
 class RecordFile:
     """A file of JSON lines, which need not exist.
 
-    A line that a killed process left unfinished is cut off when the next one is appended.
-
-    Attributes
-    ----------
-    whole_bytes : int
-        Length of the finished lines, after ``read``.
-    unfinished : bytes
-        What stands after them, after ``read``.
+    A line that a killed process left unfinished is cut off when the next one is appended. After
+    ``read``, the finished lines have ``whole_bytes``, and ``unfinished`` is what follows them.
     """
 
     def __init__(self, path: Path) -> None:
@@ -33,13 +27,7 @@ class RecordFile:
         self.unfinished = b""
 
     def read(self) -> Iterator[Any]:
-        """Yield what each finished line holds; None for a line that is not valid JSON.
-
-        Raises
-        ------
-        OSError
-            If the file exists and cannot be read.
-        """
+        """Yield what each finished line holds; None for a line that is not valid JSON."""
         self.whole_bytes, self.unfinished = 0, b""
         with suppress(FileNotFoundError), self.path.open("rb") as file:
             for line in file:
@@ -50,13 +38,7 @@ class RecordFile:
                     self.unfinished = line
 
     def append(self, record: Any) -> None:
-        """Append a record as a line; after an error the file is as it was before.
-
-        Raises
-        ------
-        OSError
-            If there is no room, say.
-        """
+        """Append a record as a line; after an OSError the file is as it was before."""
         left = memoryview(f"{json.dumps(record)}\n".encode())
         with self.path.open("ab", buffering=0) as file:
             size = file.seek(0, 2)

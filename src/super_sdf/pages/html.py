@@ -37,17 +37,11 @@ MARKUP = {ord(c): f"\\u{ord(c):04x}" for c in "<>&"}  # of JSON in which a tag c
 def make_page(
     facts: Mapping[str, Any], meshes: Mapping[str, Any] | None = None, *, beside: bool = False
 ) -> str:
-    """Return a page.
+    """Return a page of ``meshes``, packed and by the id of their entry.
 
-    Parameters
-    ----------
-    facts : dict
-        ``title``, ``lead`` (a sentence), ``alert`` (a sentence or ""), ``summary`` (rows of label
-        and text), ``notes`` and ``files``, entries as ``entries`` makes them.
-    meshes : dict, optional
-        Packed meshes by the id of their entry, which are put into the page.
-    beside : bool
-        Whether it may load scripts from beside it, with the meshes that are not in it.
+    ``facts`` are ``title``, ``lead`` (a sentence), ``alert`` (a sentence or ""), ``summary`` (rows
+    of label and text), ``notes`` and ``files``, entries as ``entries`` makes them. If ``beside``,
+    the page may load scripts from beside it, with the meshes that are not in it.
     """
     style = (HOME / "page.css").read_text("utf-8")
     scripts = [(HOME / name).read_text("utf-8") for name in SCRIPTS]
@@ -128,21 +122,10 @@ def page_of_conversion(
 def viewed_page(
     sources: Sequence[str], load: Callable[[], Decoder], options: ConvertOptions
 ) -> str:
-    """Return the page of some meshes and grids; all that it shows is within it.
+    """Return the page of some mesh files and grid files; all that it shows is within it.
 
-    Parameters
-    ----------
-    sources : list of str
-        Mesh files and grid files.
-    load : callable
-        Returns the network; called if there is a grid.
-    options : ConvertOptions
-        How the grids are refined.
-
-    Raises
-    ------
-    SuperSdfError
-        If a file cannot be read or refined.
+    ``load`` returns the network, and is called if there is a grid; ``options`` say how that is
+    refined.
     """
     network = load() if any(map(is_grid, sources)) else None
     shown = [
