@@ -35,7 +35,7 @@ from .census import BESIDE, Extremes, Looked
 from .placement import check_spacing, steps_of
 from .planes import SampleArray, changed
 from .slopes import BENT as STRAIGHT
-from .slopes import ENOUGH, LARGEST_VALUE, Floats, median
+from .slopes import ENOUGH, LARGEST_VALUE, Floats, distinct, median, quantile
 
 NONE_EXACT: Extremes = (0.0, 0.0)
 
@@ -173,9 +173,7 @@ class Evidence(NamedTuple):
     wrong: float
     contradicting: float
     noisy: float
-    uneven: (
-        float  # difference of the slopes far from and near the surface, over the typical one
-    )
+    uneven: float  # difference of the slopes far from and near the surface, over the typical one
     roughness: float  # standard deviation of the noise, if the fourth differences were all noise
     cut_low: bool  # whether values are cut off at the lowest
     cut_high: bool
@@ -243,10 +241,10 @@ def weigh(looked: Looked, spacing: Triple) -> Evidence:
     h, rough, noise = max(steps), 0.0, 0.0
     if len(fourth):  # of noise, their standard deviation is sqrt(70) times its own
         rough = median(fourth.ravel()) / 70**0.5 / 0.6745
-        noise = float(np.quantile(fourth, 0.25)) / 70**0.5 / 0.3186
+        noise = quantile(fourth, 0.25) / 70**0.5 / 0.3186
     contradicting = _contradict(around / (h * unit), steps / h, noise / unit)
     off, beyond, steep = (float(x.mean()) if len(x) else 0.0 for x in (wrong, contradicting, noisy))
-    least = float(np.diff(np.unique(lines)).min(initial=np.inf))
+    least = float(np.diff(distinct(lines)).min(initial=np.inf))
     digit = least if least < MOST_DIGIT else 0.0  # by so much no rounded values differ
     cut = bool(is_cut[0]), bool(is_cut[1])
     return Evidence(len(lines), typical, off, beyond, steep, uneven, rough, *cut, digit)
@@ -279,7 +277,7 @@ def _contradict(around: Floats, steps: Floats, noise: float) -> BoolArray:
     matters = MATTERS * min(steps)
     boxes = np.clip(around.reshape(len(around), 5**3), -matters, matters)
     middle = boxes[:, 5**3 // 2]
-    digits = np.diff(np.unique(middle.astype(np.float32)))
+    digits = np.diff(distinct(middle.astype(np.float32)))
     digit = median(digits) if len(digits) else 0.0
     places = np.indices((5,) * 3).reshape(3, -1).T - BESIDE
     beyond = np.abs(boxes - middle[:, None]) - np.linalg.norm(places * steps, axis=1)
@@ -316,7 +314,7 @@ def is_projective(looked: Looked, spacing: Triple) -> bool:
     slope = np.sqrt((((high - low) / steps / 2) ** 2).sum(1))
     bend = (np.abs(high - 2 * middle + low) / steps).sum(1)
     straight = slope[bend < STRAIGHT * slope]
-    steep = float(np.quantile(straight, STEEPEST)) if len(straight) >= FEW else 0.0
+    steep = quantile(straight, STEEPEST) if len(straight) >= FEW else 0.0
     return steep > 0 and steep > MOST_STEEP * median(straight)
 
 

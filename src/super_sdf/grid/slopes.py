@@ -32,11 +32,29 @@ MOST_BESIDE = 1 << 18  # samples beside the surface of which gradients are taken
 
 Floats: TypeAlias = NDArray[np.float64]
 
+# NumPy's own median, quantile and unique import its masked arrays, which takes 9 ms.
+
 
 def median(values: NDArray[Any]) -> float:
-    """Return the median of some values; that of NumPy imports its masked arrays, for 9 ms."""
+    """Return the median of some values."""
     ordered = np.sort(values)
     return float(ordered[(len(ordered) - 1) // 2 : len(ordered) // 2 + 1].mean())
+
+
+def quantile(values: NDArray[Any], share: float) -> float:
+    """Return the value below which a share of some values lies, interpolated linearly."""
+    ordered = np.sort(values, axis=None)
+    place = (len(ordered) - 1) * share
+    low, high = float(ordered[int(place)]), float(ordered[min(int(place) + 1, len(ordered) - 1)])
+    rest = place - int(place)
+    return low + (high - low) * rest if rest < 0.5 else high - (high - low) * (1 - rest)
+
+
+def distinct(values: NDArray[Any]) -> NDArray[Any]:
+    """Return the different values, in order."""
+    ordered = np.sort(values, axis=None)
+    different: NDArray[Any] = ordered[np.append(True, ordered[1:] != ordered[:-1])[: len(ordered)]]
+    return different
 
 
 @dataclass(frozen=True, eq=False)

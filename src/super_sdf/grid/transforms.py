@@ -37,13 +37,10 @@ Measure: TypeAlias = Callable[[NDArray[np.int64]], Floats]
 
 
 class Transform(NamedTuple):
-    """A distance transform: the spacing of the finest axis, and the side of samples that are 0.
+    """A distance transform."""
 
-    ``zeros`` is the sign of that side; 0 if it is the inside.
-    """
-
-    step: float
-    zeros: int
+    step: float  # the spacing of the finest axis
+    zeros: int  # the sign of the side of samples that are 0; 0 if it is the inside
 
 
 class Apart(NamedTuple):
@@ -83,10 +80,7 @@ def find_transform(looked: Looked, spacing: Triple | None) -> Transform | None:
 
 
 def _beside(patches: Floats, inside: BoolArray, steps: Floats) -> tuple[float, float] | None:
-    """Return how far samples below and above 0 beside the other side are from it, if all alike.
-
-    No sample of the other side is nearer than that along the finest axes.
-    """
+    """Return how far samples below and above 0 beside the other side are from it, if all alike."""
     beside = np.zeros(len(patches), bool)
     for axis in np.flatnonzero(steps < 1 + ZERO):
         line = np.moveaxis(inside, axis + 1, 1)[:, 1:4, BESIDE, BESIDE]
