@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from export.dataset import Sample
-from super_sdf.grid.masks import mask_distances
+from super_sdf.grid.derived import mask_distances
 from super_sdf.neighbourhood import cube_symmetries, turn
 from super_sdf.steps.band import find_band, gather_patches, neighbour_table
 

@@ -5,7 +5,7 @@ import pytest
 from test_field_kinds import box
 
 from super_sdf import make_grid
-from super_sdf.grid import census, questions
+from super_sdf.grid import census
 from super_sdf.grid.census import Census
 from super_sdf.grid.planes import SamplePlanes
 from super_sdf.steps.survey import survey
@@ -56,8 +56,8 @@ def test_a_grid_is_read_at_most_three_times(name, small, monkeypatch):
     kind, values = KINDS[name]
     if not small:  # in several parts
         monkeypatch.setattr(census, "KEPT_BYTES", 0)
-        monkeypatch.setattr(questions, "TOGETHER", values[0].size)
-        monkeypatch.setattr(questions, "READ_SAMPLES", 4 * values[0].size)
+        monkeypatch.setattr(census, "TOGETHER", values[0].size)
+        monkeypatch.setattr(census, "READ_SAMPLES", 4 * values[0].size)
     counted = Counted(values)
     grid = make_grid(counted, spacing=1.0, origin=0.0)
     assert grid.field.kind == kind
@@ -73,8 +73,8 @@ def test_the_census_is_the_same_in_whatever_parts_it_is_taken(name, monkeypatch)
     values = KINDS[name][1]
     whole = Census(values)
     monkeypatch.setattr(census, "KEPT_BYTES", 0)
-    monkeypatch.setattr(questions, "TOGETHER", values[0].size)
-    monkeypatch.setattr(questions, "READ_SAMPLES", 0)
+    monkeypatch.setattr(census, "TOGETHER", values[0].size)
+    monkeypatch.setattr(census, "READ_SAMPLES", 0)
     parts = Census(Counted(values))
     for one, other in zip(whole.numbers, parts.numbers):
         assert np.array_equal(one, other)

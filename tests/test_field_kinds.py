@@ -14,13 +14,10 @@ from super_sdf import SdfGrid, load_network, make_grid, pipeline, reconstruct
 from super_sdf.errors import GridError, OptionError, OutOfMemoryError
 from super_sdf.grid import planes
 from super_sdf.grid.census import Census
-from super_sdf.grid.evidence import weigh
-from super_sdf.grid.field import FIELDS
-from super_sdf.grid.masks import mask_distances, mask_planes
+from super_sdf.grid.derived import fill_in, local_slopes, mask_distances, mask_planes
+from super_sdf.grid.field import FIELDS, weigh
 from super_sdf.grid.planes import reading_bytes
-from super_sdf.grid.slopes import local_slopes
 from super_sdf.grid.transforms import find_transform
-from super_sdf.grid.truncation import fill_in
 from super_sdf.machine import memory
 from super_sdf.machine.resources import Resources
 from super_sdf.mesh import join_meshes

@@ -16,9 +16,9 @@ from super_sdf import SdfGrid
 from super_sdf.errors import OutOfMemoryError
 from super_sdf.files import unpacking
 from super_sdf.files.grids import read_grid
-from super_sdf.grid import questions
+from super_sdf.grid import census
 from super_sdf.grid.census import Census
-from super_sdf.grid.evidence import weigh
+from super_sdf.grid.field import weigh
 from super_sdf.grid.planes import Few, changed, ranks_of
 from super_sdf.machine import memory
 from super_sdf.machine.resources import Resources
@@ -177,8 +177,8 @@ def test_few_samples_show_what_all_show(monkeypatch):
     values = np.sin(i) * np.cos(j) + np.sin(j) * np.cos(k) + np.sin(k) * np.cos(i)
     everything = weigh(Census(values).looked, (np.pi / 16,) * 3)
     length = Census(values).beside.typical_length
-    monkeypatch.setattr(questions, "MOST_LOOKED_AT", 500)
-    monkeypatch.setattr(questions, "MOST_BESIDE", 2000)
+    monkeypatch.setattr(census, "MOST_LOOKED_AT", 500)
+    monkeypatch.setattr(census, "MOST_BESIDE", 2000)
     few = weigh(Census(values).looked, (np.pi / 16,) * 3)
     assert few.samples == 500 < everything.samples
     assert few.slope == pytest.approx(everything.slope, rel=0.03)

@@ -22,7 +22,6 @@ import numpy as np
 
 from ..errors import FileError, OutOfMemoryError, SuperSdfError
 from ..machine.memory import held_memory, in_words, memory_bound
-from ..machine.serving import isolated_python
 from .volume import Request, Volume
 
 STEP = 0.02  # seconds between two looks at the memory
@@ -53,6 +52,8 @@ class _Process:
         self.left = request.left
         if self.left is None and bound is not None:
             self.left = bound - self.start
+        from ..machine.serving import isolated_python  # imports multiprocessing, for 10 ms
+
         self.process = Popen(isolated_python(START), stdin=PIPE, stdout=PIPE, stderr=DEVNULL)
         threading.Thread(target=self._watch, daemon=True).start()
 

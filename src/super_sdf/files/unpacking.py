@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, OutOfMemoryError
+from ..grid.placement import check_kind
 from ..grid.planes import InputFile, PlaneFile, SampleArray
-from ..grid.samples import check_kind
 from ..machine.memory import in_words, is_in_memory
 from .volume import Box, Placement, Volume, find_placement, in_words_of, place_in_world
 

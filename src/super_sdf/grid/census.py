@@ -1,37 +1,68 @@
 """One pass over the planes of a grid: all that is asked of its samples before they are meshed.
 
-An array in memory is asked when an answer is needed (``questions`` has all that are asked).
+Each question is about some ranges of planes, so that its parts are answered wherever these are
+read:
+
+numbers     the extremes, what is not finite, the border, whether there are two values only
+unknown     the runs of NaN
+patches     5 x 5 x 5 samples round some beside the surface
+plateaus    samples amid others of the same extreme value
+beside      gradients beside the surface
+everywhere  gradients where the field is not bent
+labels      whole numbers, and how they change
+pairs       some neighbours
+
+An array in memory is asked when an answer is needed.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from functools import cached_property, partial
+from math import isfinite
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray
 from ..errors import GridError
-from .planes import Few, SampleArray, SamplePlanes, over_planes
-from .questions import (
-    BESIDE,
-    GRADIENT_PLANES,
-    QUESTIONS,
-    Floats,
-    Numbers,
-    Question,
-    ask_together,
-    beside_surface,
+from .planes import (
+    Few,
+    Ranges,
+    SampleArray,
+    SamplePlanes,
+    lowest,
+    over_planes,
+    ranks_of,
+    spread_planes,
 )
-from .regions import Regions
-from .slopes import ENOUGH, MOST_BESIDE, STRAIGHT, Gradients
+from .regions import Regions, runs_of_plane
+from .slopes import (
+    ENOUGH,
+    MOST_BESIDE,
+    STRAIGHT,
+    Floats,
+    Gradients,
+    as_clamped,
+    gradients_beside_surface,
+    gradients_where_straight,
+    mark_crossings,
+)
 
-Extremes = tuple[float, float]
+Extremes: TypeAlias = tuple[float, float]
 """The smallest and the largest sample."""
+Shape: TypeAlias = tuple[int, ...]
 
 KEPT_BYTES = 1 << 25  # of a grid in a file that is read into memory to be asked
+TOGETHER = 1 << 18  # samples whose numbers are looked at together
+READ_SAMPLES = 1 << 21  # about, that are read at a time
+BESIDE = 2  # planes, rows and columns to either side, for fourth differences
+LOOKED_PLANES, MOST_LOOKED_AT = 12, 1 << 13  # of samples beside the surface, spread evenly
+GRADIENT_PLANES = 64  # unless too few samples are beside the surface there
+MOST_GRADIENTS = 1 << 19  # wherever they lie; all of them up to 80^3
+PAIR_PLANES, MOST_PAIRS = 32, 1 << 15
 CUT_OFF = 0.01  # share of samples amid equal ones, at the lowest or highest value
 MOST_BETWEEN = 0.4  # share of the samples at a boundary of labels that lie between two others
 LEAST_JUMP = 0.3  # of the range of labels: so far some neighbours are apart
@@ -39,16 +70,10 @@ LEAST_JUMP = 0.3  # of the range of labels: so far some neighbours are apart
 
 @dataclass(frozen=True, eq=False)
 class Looked:
-    """What was looked at.
+    """What was looked at beside the surface.
 
-    Attributes
-    ----------
-    around : (n, 5, 5, 5) float64
-        The samples round samples that have one on the other side beside them.
-    cut : (2,) float64
-        Share of the samples that are, as their six neighbours, the lowest, and the highest.
-    extremes : two floats
-        The smallest and the largest sample.
+    ``around`` (n, 5, 5, 5) are the samples round some that have one on the other side beside them,
+    ``cut`` (2,) the shares of samples that are, as their six neighbours, the lowest or highest.
     """
 
     around: Floats
@@ -76,38 +101,41 @@ class Looked:
         return Looked(self.around / slope, self.cut, (low / slope, high / slope))
 
 
-class Census:
-    """What the samples of a grid show.
+class Numbers(NamedTuple):
+    """What the numbers of some planes are; the extremes are of those that are finite."""
 
-    Parameters
-    ----------
-    samples : (nx, ny, nz) array or SamplePlanes
-        They are read once, plane by plane; of booleans, only the numbers are asked.
-    """
+    low: float
+    high: float
+    is_finite: bool
+    infinite: int
+    has_two: bool  # only the extremes
+    border: NDArray[np.int64]  # on the grid's faces: how many are negative, positive, the lowest
+
+
+class Census:
+    """What the samples of a grid, (nx, ny, nz), show; planes in files are read once, in order."""
 
     def __init__(self, samples: SampleArray) -> None:
         self.samples, self.shape = samples, tuple(samples.shape)
-        self._questions: dict[str, Question] = {}
-        names = ("numbers", "unknown") if samples.dtype == np.bool_ else tuple(QUESTIONS)
-        self._kept = samples if _is_in_memory(samples) else _small(samples)
+        self._given: dict[str, list[Any]] = {}
+        is_file = isinstance(samples, SamplePlanes | np.memmap)
+        self._kept = _small(samples) if is_file else samples
         if self._kept is None:
-            self._ask(names)
-
-    def _ask(self, names: tuple[str, ...]) -> None:
-        """Ask questions, all of each part of the planes that is read."""
-        asked = {name: QUESTIONS[name](self.shape) for name in names}
-        if self._kept is None:
-            ask_together(self.samples, list(asked.values()))
-        else:
-            for ranges, work, answers in asked.values():
-                for answer in over_planes(self._kept, work, ranges):
-                    answers.append(answer)
-        self._questions |= asked
+            names = ("numbers", "unknown") if samples.dtype == np.bool_ else tuple(QUESTIONS)
+            questions = [QUESTIONS[name](self.shape) for name in names]
+            self._given = dict(zip(names, _ask_together(samples, questions)))
 
     def _answers(self, name: str) -> Any:
-        if name not in self._questions:
-            self._ask((name,))
-        return self._questions[name].answers
+        if name not in self._given:
+            self._given[name] = self._ask(QUESTIONS[name](self.shape))
+        return self._given[name]
+
+    def _ask(self, question: Question) -> list[Any]:
+        ranges, work, answers = question
+        samples = self.samples if self._kept is None else self._kept
+        for answer in over_planes(samples, work, ranges):
+            answers.append(answer)
+        return answers
 
     @cached_property
     def numbers(self) -> Numbers:
@@ -135,11 +163,15 @@ class Census:
         """The smallest and the largest finite sample."""
         return self.numbers.low, self.numbers.high
 
-    @property
-    def border_size(self) -> int:
-        """The samples on the six faces; one on an edge counts for each of its faces."""
+    def border_shares(self) -> tuple[float, float, float]:
+        """Return the shares of the samples on the faces that are below 0, above 0, and the lowest.
+
+        One on an edge counts for each of its faces.
+        """
         nx, ny, nz = map(int, self.shape)
-        return 2 * (nx * ny + ny * nz + nz * nx)
+        below, above, at_lowest = self.numbers.border.tolist()
+        size = 2 * (nx * ny + ny * nz + nz * nx)
+        return below / size, above / size, at_lowest / size
 
     @property
     def is_one_sided(self) -> bool:
@@ -171,33 +203,24 @@ class Census:
     @cached_property
     def beside(self) -> Gradients:
         """Gradients at samples beside the surface, in 64 planes, in all if these have too few."""
-        answers, count = self._answers("beside"), self.shape[0]
-        gradients = Gradients(*answers.joined()[1:])
+        gradients = Gradients(*self._answers("beside").joined()[1:])
+        count = self.shape[0]
         if count <= GRADIENT_PLANES or (gradients.bend < STRAIGHT).sum() >= ENOUGH:
             return gradients
-        samples = self.samples if self._kept is None else self._kept
-        ranges, work, _ = beside_surface(self.shape, range(count))
-        answers = Few(MOST_BESIDE)
-        for answer in over_planes(samples, work, ranges):
-            answers.append(answer)
-        return Gradients(*answers.joined()[1:])
+        few: Any = self._ask(_beside(self.shape, range(count)))
+        return Gradients(*few.joined()[1:])
 
     @cached_property
     def everywhere(self) -> Gradients:
         """Gradients at samples anywhere in the grid at which the field is not bent."""
-        parts = self._answers("everywhere")
-        if not parts:
-            return Gradients(np.empty((0, 3)), np.empty(0))
+        parts = [(np.empty((0, 3)), np.empty(0)), *self._answers("everywhere")]
         return Gradients(*(np.concatenate(arrays) for arrays in zip(*parts)))
 
     @cached_property
     def pairs(self) -> Floats:
         """Finite samples beside each other along an axis, (2, n), in some rows and planes."""
         pairs = np.concatenate(self._answers("pairs"), axis=1)
-        if self.is_finite:
-            return pairs
-        finite = np.isfinite(pairs)
-        return pairs[:, finite[0] & finite[1]]
+        return pairs if self.is_finite else pairs[:, np.isfinite(pairs).all(0)]
 
     @cached_property
     def are_labels(self) -> bool:
@@ -231,10 +254,6 @@ def not_finite(values: SampleArray) -> GridError:
     )
 
 
-def _is_in_memory(samples: SampleArray) -> bool:
-    return isinstance(samples, np.ndarray) and not isinstance(samples, np.memmap)
-
-
 def _small(samples: SampleArray) -> NDArray[Any] | None:
     """Return the samples of a small grid that is read here, None of others."""
     root: Any = samples
@@ -250,12 +269,198 @@ def _are_layers(values: SampleArray) -> bool:
     if 2 not in values.shape:
         return False
     planes = np.asarray(values[0 : len(values)])
-    return any(
-        count == 2 and bool((planes == planes[_first_but(axis)]).all())
-        for axis, count in enumerate(planes.shape)
-    )
+    lines = [np.moveaxis(planes, axis, 0) for axis in range(3)]
+    return any(len(line) == 2 and bool((line == line[:, :1, :1]).all()) for line in lines)
 
 
-def _first_but(axis: int) -> tuple[slice, ...]:
-    """Return an index to the first samples along all axes but one."""
-    return tuple(slice(None) if n == axis else slice(1) for n in range(3))
+class Question(NamedTuple):
+    """What is asked of some ranges of planes, and the list of its answers."""
+
+    ranges: Ranges
+    work: Callable[..., Any]
+    answers: list[Any]
+
+
+def _ask_together(samples: SampleArray, questions: list[Question]) -> list[list[Any]]:
+    """Return the answers to questions of samples, each plane of which is read once."""
+    count, each = samples.shape[0], _together(tuple(samples.shape))
+    least = READ_SAMPLES // (samples.shape[1] * samples.shape[2])
+    step = each * -(-max(least, 2 * getattr(samples, "beside", 1)) // each)
+    ranges = []
+    for first in range(0, count, step):
+        low = max(first - BESIDE, 0)
+        mine = [
+            [
+                (a - low, b - low, *more)
+                for a, b, *more in question.ranges
+                if first <= (a + b - 1) // 2 < first + step
+            ]
+            for question in questions
+        ]
+        ranges.append((low, min(first + step + BESIDE, count), mine))
+    work = partial(_answer_all, [question.work for question in questions])
+    for parts in over_planes(samples, work, ranges):
+        for question, answers in zip(questions, parts):
+            for answer in answers:
+                question.answers.append(answer)
+    return [question.answers for question in questions]
+
+
+def _answer_all(
+    works: list[Callable[..., Any]], slab: NDArray[Any], ranges: list[Ranges]
+) -> list[list[Any]]:
+    """Return the answers to all questions about the ranges of some planes."""
+    return [[work(slab[a:b], *more) for a, b, *more in mine] for work, mine in zip(works, ranges)]
+
+
+def _together(shape: Shape) -> int:
+    """Return how many planes are looked at together."""
+    return max(TOGETHER // (shape[1] * shape[2]), 1)
+
+
+def _numbers(shape: Shape) -> Question:
+    step, count = _together(shape), shape[0]
+    ranges = [(i, min(i + step, count), i == 0, i + step >= count) for i in range(0, count, step)]
+    return Question(ranges, _numbers_of, [])
+
+
+def _numbers_of(planes: NDArray[Any], is_first: bool, is_last: bool) -> Numbers:
+    """Return the numbers of some planes, the first and the last of the grid perhaps."""
+    number = int if planes.dtype.kind in "iu" else float  # floats do not tell large ones apart
+    low, high, infinite = number(planes.min()), number(planes.max()), 0
+    if not (is_finite := isfinite(low) and isfinite(high)):
+        finite = planes[np.isfinite(planes)]
+        low, high = float(finite.min(initial=np.inf)), float(finite.max(initial=-np.inf))
+        infinite = int(np.isinf(planes).sum())
+    faces = [planes[:, [0, -1]], planes[:, :, [0, -1]]]
+    faces += [planes[:1]] * is_first + [planes[-1:]] * is_last
+    border = [[(face < 0).sum(), (face > 0).sum(), (face == low).sum()] for face in faces]
+    rows = planes[0, 0], planes[len(planes) // 2, planes.shape[1] // 2]  # they mostly show it
+    has_two = all(bool(((part == low) | (part == high)).all()) for part in (*rows, planes))
+    return Numbers(low, high, is_finite, infinite, has_two, np.sum(border, 0))
+
+
+def _unknown(shape: Shape) -> Question:
+    ranges = [(max(i - 1, 0), i + 1) for i in range(shape[0])]
+    return Question(ranges, partial(runs_of_plane, np.isnan), [])
+
+
+def _inner(shape: Shape, beside: int) -> list[int]:
+    """Return planes, spread evenly, that have some beside them; none of a narrow grid."""
+    if min(shape) <= 2 * beside:
+        return []
+    return spread_planes(beside, shape[0] - 1 - beside, LOOKED_PLANES)
+
+
+def _patches(shape: Shape) -> Question:
+    size = shape[1] * shape[2]
+    ranges = [(i - BESIDE, i + BESIDE + 1, i * size) for i in _inner(shape, BESIDE)]
+    return Question(ranges, _around_surface, Few(MOST_LOOKED_AT))
+
+
+def _around_surface(slab: NDArray[Any], number: int) -> tuple[NDArray[Any], ...]:
+    """Return the samples round those that have one on the other side beside them.
+
+    ``slab`` has five planes; the samples are those of the middle one, which begins with sample
+    ``number``: (n,) ranks, (n, 5, 5, 5).
+    """
+    slab = np.asarray(slab)
+    near = slab[1:4]
+    sides = (near > 0).astype(np.int8) - (near < 0)
+    beside = (sides[0] != sides[1]) | (sides[2] != sides[1])
+    mark_crossings(sides[1], beside)
+    inner = beside[BESIDE:-BESIDE, BESIDE:-BESIDE]
+    at = np.flatnonzero(inner)
+    ranks = ranks_of(at + number)
+    some = lowest(ranks, MOST_LOOKED_AT)
+    j, k = np.unravel_index(at[some], inner.shape)
+    boxes = np.lib.stride_tricks.sliding_window_view(slab, (2 * BESIDE + 1,) * 3)[0]
+    return ranks[some], as_clamped(boxes[j, k])
+
+
+def _plateaus(shape: Shape) -> Question:
+    return Question([(i - 1, i + 2) for i in _inner(shape, BESIDE)], _amid_equal, [])
+
+
+def _amid_equal(slab: NDArray[Any]) -> tuple[tuple[Any, Any], list[int], int]:
+    """Return the extremes of the middle plane of three, how many are amid these, and of all."""
+    middle = slab[1]
+    ends, counts = (middle.min(), middle.max()), []
+    for end in ends:
+        amid = (middle == end) & (slab[0] == end) & (slab[2] == end)
+        amid[1:-1] &= middle[2:] == end
+        amid[1:-1] &= middle[:-2] == end
+        amid[:, 1:-1] &= middle[:, 2:] == end
+        amid[:, 1:-1] &= middle[:, :-2] == end
+        counts.append(int(amid[BESIDE:-BESIDE, BESIDE:-BESIDE].sum()))
+    return ends, counts, amid[BESIDE:-BESIDE, BESIDE:-BESIDE].size
+
+
+def _beside(shape: Shape, planes: Iterable[int] | None = None) -> Question:
+    count, size = shape[0], shape[1] * shape[2]
+    ranges = [
+        (max(i - 1, 0), min(i + 2, count), min(i, 1), i * size)
+        for i in planes or spread_planes(0, count - 1, GRADIENT_PLANES)
+    ]
+    return Question(ranges, gradients_beside_surface, Few(MOST_BESIDE))
+
+
+def _everywhere(shape: Shape) -> Question:
+    planes = [i for i in spread_planes(0, shape[0] - 1, GRADIENT_PLANES) if 0 < i < shape[0] - 1]
+    planes = (planes or [1]) if min(shape) > 2 else []
+    step = -(-len(planes) * shape[1] * shape[2] // MOST_GRADIENTS)
+    return Question([(i - 1, i + 2, step) for i in planes], gradients_where_straight, [])
+
+
+def _labels(shape: Shape) -> Question:
+    return Question([(i - 1, i + 2) for i in _inner(shape, 1)], _at_boundaries, [])
+
+
+def _at_boundaries(slab: NDArray[Any]) -> tuple[Any, Any, NDArray[np.int64], float] | None:
+    """Return the extremes of the middle plane of three, counts, and the largest difference.
+
+    The counts, (3, 2), are of samples between a lower and a higher neighbour, and of those with
+    another neighbour: all inner ones, the lowest, and the highest. None if some are not whole.
+    """
+    middle = slab[1]
+    if middle.dtype.kind == "f" and not (middle == np.rint(middle)).all():
+        return None
+    centre = middle[1:-1, 1:-1]
+    sides = [slab[0, 1:-1, 1:-1], slab[2, 1:-1, 1:-1], middle[:-2, 1:-1], middle[2:, 1:-1]]
+    sides += [middle[1:-1, :-2], middle[1:-1, 2:]]
+    lower = np.logical_or.reduce([side < centre for side in sides])
+    higher = np.logical_or.reduce([side > centre for side in sides])
+    jump = max(float(np.abs(np.subtract(x, centre, dtype=np.float64)).max()) for x in sides)
+    low, high = middle.min().item(), middle.max().item()
+    groups = np.ones(centre.shape, bool), centre == low, centre == high
+    counts = [
+        [(group & lower & higher).sum(), (group & (lower | higher)).sum()] for group in groups
+    ]
+    return low, high, np.array(counts), jump
+
+
+def _pairs(shape: Shape) -> Question:
+    planes = spread_planes(0, shape[0] - 2, PAIR_PLANES)
+    rows = slice(0, shape[1] - 1, -(-len(planes) * shape[1] * shape[2] // MOST_PAIRS))
+    return Question([(i, i + 2) for i in planes], partial(_pairs_of, rows), [])
+
+
+def _pairs_of(rows: slice, slab: NDArray[Any]) -> Floats:
+    """Return samples of some rows of the first of two planes with those beside them, (2, n)."""
+    row = slab[0, rows]
+    beside = slab[1, rows], slab[0, 1:][rows]
+    parts = [np.stack([row, other]).reshape(2, -1) for other in beside]
+    parts.append(np.stack([row[:, :-1], row[:, 1:]]).reshape(2, -1))
+    return np.concatenate(parts, axis=1).astype(np.float64)
+
+
+QUESTIONS: dict[str, Callable[[Shape], Question]] = {
+    "numbers": _numbers,
+    "unknown": _unknown,
+    "patches": _patches,
+    "plateaus": _plateaus,
+    "beside": _beside,
+    "everywhere": _everywhere,
+    "labels": _labels,
+    "pairs": _pairs,
+}

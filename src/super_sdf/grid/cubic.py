@@ -93,7 +93,6 @@ def check_has_offsets(grid: SdfGrid, offset: float) -> None:
 
 
 def _describe_resampling(grid: SdfGrid, shape: tuple[int, ...]) -> str:
-    """Return a sentence that names the axes that are resampled, and their spacings."""
     coarser = [
         f"{name} from {h:.6g}"
         for name, h in zip("xyz", grid.spacing)
@@ -142,12 +141,10 @@ def _resample(samples: SampleArray, spacing: Triple, level: float) -> tuple[Samp
 
 
 class Resampled(SamplePlanes):
-    """Samples interpolated along one axis, from the first sample on; made when they are read.
+    """Samples interpolated along one axis, from the first on, alike in whatever parts are read.
 
-    A value depends on the samples round it alone, so it is the same in whatever parts it is read.
     ``step`` is the new spacing along the axis, ``level`` the value at which the surface will be
-    meshed. The new samples lie at ``places``, in old spacings; those ``on_sample`` have the value
-    of an old one.
+    meshed. The new samples lie at ``places``, in old spacings; those ``on_sample`` are old ones.
     """
 
     dtype = np.dtype(np.float64)

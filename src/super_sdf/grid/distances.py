@@ -11,25 +11,33 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import Triple
-from .advice import is_density, refusal
 from .census import Census, Extremes
-from .evidence import SLOPE_OFF, Evidence, is_projective, slope_within, weigh
+from .derived import filled_planes, normalised_planes, without_plateaus
 from .field import (
     AUTO,
     NOISY,
     NONE_EXACT,
     SCALED,
+    SLOPE_OFF,
     TRUNCATED,
+    Evidence,
     Field,
     Interpreted,
     Request,
+    is_projective,
+    slope_within,
+    weigh,
 )
 from .one_sided import UNSIGNED, find_fault
 from .placement import is_cubic, steps_of
 from .planes import SampleArray, changed
-from .slopes import normalised_planes
-from .spacing import choose_spacing, is_positive_inside, measure_spacing
-from .truncation import filled_planes, without_plateaus
+from .spacing import (
+    choose_spacing,
+    is_density,
+    is_positive_inside,
+    measure_spacing,
+    refusal,
+)
 
 # Voxels from which on values may be cut off without a loss; up to which the rest is filled in; and
 # below which too few are left for that.
@@ -135,7 +143,7 @@ def of_slope(
     # densities that fade out over voxels are blurred, not cut off
     fades = request.is_density and _cut_at(divided, shown) > TOO_NEAR
     if not is_cut or shown.is_bent or fades:
-        return _scaled(taken, replace(evidence, slope=slope), request, notes)
+        return _scaled(taken, evidence._replace(slope=slope), request, notes)
     if abs(slope - 1) <= SLOPE_OFF:
         return _truncated(taken, shown, request, notes)
     notes.append(f"the values are divided by their slope, {slope:.4g} instead of 1")

@@ -1,21 +1,28 @@
-"""What the values of a grid are, and what the method may do with them.
+"""What the values of a grid are, what the method may do with them, and the evidence for it.
 
 exact      distances
 truncated  distances that are cut off near the surface
 mask       inside or outside, nothing else
 scaled     a field of another slope than 1: another unit, or no distance at all
 noisy      distances with noise
+
+A distance field has slope 1 wherever it is smooth, in units of the spacing. It is bent only where
+its third and fourth differences show it: at a kink between samples, or where it is curved. So a
+slope that is off by more than these differences can explain belongs to a field that is no distance.
+So do samples that differ by more than they are apart, along diagonals too, and by more than noise
+of the size that fourth differences show: fast marching and other schemes make such fields. A
+truncated field is constant away from the surface. A noisy one changes by more than the samples are
+apart, and is bent there.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..arrays import Triple
+from ..arrays import BoolArray, Triple
 from ..options import AUTO as AUTO
 from ..options import EXACT as EXACT
 from ..options import FIELDS as FIELDS
@@ -23,12 +30,44 @@ from ..options import MASK as MASK
 from ..options import NOISY as NOISY
 from ..options import SCALED as SCALED
 from ..options import TRUNCATED as TRUNCATED
-from ..options import ReadOptions, check_inside
-from .census import Extremes
-from .placement import check_spacing
+from ..options import ReadOptions
+from .census import BESIDE, Extremes, Looked
+from .placement import check_spacing, steps_of
 from .planes import SampleArray, changed
+from .slopes import BENT as STRAIGHT
+from .slopes import ENOUGH, LARGEST_VALUE, Floats, distinct, median, quantile
 
 NONE_EXACT: Extremes = (0.0, 0.0)
+
+# Slopes whose fourth differences are this small are known: of exact distances half of them are 1.
+# Where two kinks make them so, a third difference is half of the slope or more.
+KNOWN, KINKED = 0.2, 0.45
+UNEVEN = 0.025  # by which they differ near the surface and farther away if the field is no distance
+# Two samples of a distance differ by no more than they are apart. In other fields this share of the
+# samples differ from several by more: by this, by more than noise, and than their last digit.
+CONTRADICTING, SEVERAL, APART, BY_NOISE = 0.05, 2, 0.02, 2.5
+MATTERS = 3.0  # spacings from the surface, beyond which values may be anything
+# A slope may be off by the third and fourth differences, and by this.
+ROUNDING = 0.015
+# Share of slopes that are off from which the field is no distance: where it is smooth enough for a
+# typical slope, and where it is not.
+WRONG_SLOPES, WRONG_IF_ROUGH = 0.01, 0.05
+LIPSCHITZ, BENT, NOISY_SHARE = 1.05, 0.3, 0.02  # change, difference and share of noisy values
+LEAST_SAMPLES = 100  # from which shares are evidence
+# Noise makes values change by more than distances can at a share of the samples that grows with its
+# standard deviation: up to 2.6 per spacing were measured, up to 4 on planes along the axes. It
+# hardly makes a slope wrong that is known.
+MOST_BY_NOISE = 3.0
+MOST_DIGIT = 0.1  # spacings, of rounded values
+OFF = 0.012  # from 1: typical slopes further off show another unit
+SLOPE_OFF = 0.25  # from 1: truncated distances have another unit
+# Ends of values that were divided by the truncation; where the rest is unknown, the last known
+# samples are a little nearer to 0.
+ENDS_ALIKE = 0.05
+# Of truncated distances the steepest slopes where they are straight are hardly more than the
+# typical one: up to 1.06 were measured. Along lines of sight they differ with the angle to the
+# surface: 1.08 and more were.
+STEEPEST, MOST_STEEP, FEW = 0.95, 1.07, 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,19 +112,12 @@ class Field:
         return {"kind": self.kind, "given": self.given, **self.evidence}
 
 
-@dataclass(frozen=True)
-class Request:
-    """What the user says of the values: what they are, the spacing if it is known, the inside."""
+class Request(NamedTuple):
+    """What the user says of the values, checked; the spacing is None if it is unknown."""
 
     wanted: ReadOptions
     spacing: Triple | None
     inside: str
-
-    @classmethod
-    def checked(cls, wanted: ReadOptions, spacing: ArrayLike | None, inside: str) -> Request:
-        """Return a request whose parts have been checked; OptionError or GridError if one fails."""
-        check_inside(inside)
-        return cls(wanted, None if spacing is None else check_spacing(spacing), inside)
 
     @property
     def is_auto(self) -> bool:
@@ -99,14 +131,14 @@ class Request:
 
     def above_is_inside(self) -> Request:
         """Return the request with what is above a level inside, unless the user says otherwise."""
-        return replace(self, inside="positive") if self.inside == AUTO else self
+        return self._replace(inside="positive") if self.inside == AUTO else self
 
     def with_spacing(self, spacing: float, why: str, notes: list[str]) -> Request:
         """Return the request with a spacing if none is given, and why in a note."""
         if self.spacing is not None:
             return self
         notes.append(f"spacing not given: taken as {spacing:.6g}, {why}")
-        return replace(self, spacing=check_spacing(spacing))
+        return self._replace(spacing=check_spacing(spacing))
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,3 +160,177 @@ class Interpreted:
         low, high = self.extremes
         samples = changed(self.samples, lambda values: values / slope)
         return replace(self, samples=samples, extremes=(low / slope, high / slope))
+
+
+class Evidence(NamedTuple):
+    """What the samples beside the surface show; lengths are in spacings."""
+
+    samples: int  # that were looked at
+    slope: float  # typical change from sample to sample; NaN if too few samples are straight
+    # Shares of the samples at which the slope cannot be that of a distance, whatever its unit; that
+    # differ from others by more than distances and noise can; and that change by more than
+    # distances can.
+    wrong: float
+    contradicting: float
+    noisy: float
+    uneven: float  # difference of the slopes far from and near the surface, over the typical one
+    roughness: float  # standard deviation of the noise, if the fourth differences were all noise
+    cut_low: bool  # whether values are cut off at the lowest
+    cut_high: bool
+    digit: float  # the last one of the values: slopes are known no better
+
+    @property
+    def is_scaled(self) -> bool:
+        """Whether the values are no distances in the unit of the spacing."""
+        return self.is_bent or abs(self.slope - 1) > max(OFF, self.roughness, self.digit)
+
+    @property
+    def is_bent(self) -> bool:
+        """Whether the slope differs from place to place, so that no unit makes distances of it."""
+        allowed = WRONG_SLOPES if np.isfinite(self.slope) else WRONG_IF_ROUGH
+        uneven = abs(self.uneven) > max(UNEVEN, self.roughness, self.digit)
+        is_wrong = self.wrong > allowed or uneven
+        return self.is_enough and (is_wrong or self.is_too_steep or self.is_contradictory)
+
+    @property
+    def is_contradictory(self) -> bool:
+        """Whether samples contradict each other's distances, and noise does not explain it."""
+        return self.contradicting > CONTRADICTING and self.noisy <= NOISY_SHARE
+
+    @property
+    def is_too_steep(self) -> bool:
+        """Whether values change by more than distances can at more samples than noise explains."""
+        steep = self.noisy > max(NOISY_SHARE, MOST_BY_NOISE * self.roughness)
+        return steep and self.wrong > WRONG_SLOPES
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether the values are noisy: noise makes slopes wrong, but no more than it is seen."""
+        return self.is_enough and self.noisy > NOISY_SHARE and not self.is_bent
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether there are enough samples for shares of them to be evidence."""
+        return self.samples >= LEAST_SAMPLES
+
+    def report(self) -> dict[str, Any]:
+        """Return the evidence as a dictionary that can be written as JSON."""
+        names = ("slope", "wrong", "uneven", "contradicting", "noisy", "roughness")
+        shares = {name: float(getattr(self, name)) for name in names}
+        known = {name: round(x, 4) if np.isfinite(x) else None for name, x in shares.items()}
+        known = {"wrong_slopes" if name == "wrong" else name: x for name, x in known.items()}
+        return {"samples": self.samples, **known, "cut_off": [self.cut_low, self.cut_high]}
+
+
+def weigh(looked: Looked, spacing: Triple) -> Evidence:
+    """Return the evidence of what was looked at, with the spacing of each axis."""
+    is_cut, steps = looked.is_cut, np.array(steps_of(spacing))
+    lines = looked.lines
+    whole = _are_whole(lines, looked)
+    around = looked.around[whole]
+    lines = np.clip(lines[whole] / steps[:, None], -LARGEST_VALUE, LARGEST_VALUE)
+    a, b, c, d, e = np.moveaxis(lines, -1, 0)
+    second, third = np.abs(d - 2 * c + b), np.abs((e - 2 * d + 2 * b - a) / 2)
+    fourth = np.abs(e - 4 * d + 6 * c - 4 * b + a)
+    typical, uneven = _known_slopes(lines, third, fourth)
+    unit = typical if np.isfinite(typical) else 1.0
+    slope = np.sqrt((((d - b) / 2) ** 2).sum(1))
+    wrong = np.abs(slope / unit - 1) > (third + fourth).sum(1) / 2 / unit + ROUNDING
+    apart = np.abs(np.diff(lines[..., 1:4], axis=-1)).max((1, 2), initial=0)
+    noisy = (apart > LIPSCHITZ * unit) & (second.max(1, initial=0) > BENT * unit)
+    h, rough, noise = max(steps), 0.0, 0.0
+    if len(fourth):  # of noise, their standard deviation is sqrt(70) times its own
+        rough = median(fourth.ravel()) / 70**0.5 / 0.6745
+        noise = quantile(fourth, 0.25) / 70**0.5 / 0.3186
+    contradicting = _contradict(around / (h * unit), steps / h, noise / unit)
+    off, beyond, steep = (float(x.mean()) if len(x) else 0.0 for x in (wrong, contradicting, noisy))
+    least = float(np.diff(distinct(lines)).min(initial=np.inf))
+    digit = least if least < MOST_DIGIT else 0.0  # by so much no rounded values differ
+    cut = bool(is_cut[0]), bool(is_cut[1])
+    return Evidence(len(lines), typical, off, beyond, steep, uneven, rough, *cut, digit)
+
+
+def _known_slopes(lines: Floats, third: Floats, fourth: Floats) -> tuple[float, float]:
+    """Return the typical slope of lines (n, 3, 5), and how it changes away from the surface.
+
+    Slopes are exact but for fifth derivatives, and known where third and fourth differences (n, 3)
+    are small: no kink is among the samples. The first is NaN if too few are known.
+    """
+    a, b, middle, d, e = np.moveaxis(lines, -1, 0)
+    slope = np.sqrt((((8 * (d - b) - (e - a)) / 12) ** 2).sum(1))
+    known = (fourth.sum(1) < KNOWN * slope) & (third.max(1, initial=0) < KINKED * slope)
+    slope, far = slope[known], np.abs(middle[known, 0])
+    if len(slope) < ENOUGH:
+        return float("nan"), 0.0
+    near = far <= median(far)
+    typical = median(slope)
+    beyond = median(slope[~near]) if not near.all() else typical
+    return typical, (beyond - median(slope[near])) / typical
+
+
+def _contradict(around: Floats, steps: Floats, noise: float) -> BoolArray:
+    """Return which samples differ from several others by more than distances can, (n,).
+
+    ``around`` (n, 5, 5, 5) has each sample in the middle, ``steps`` are the spacings, and ``noise``
+    is its standard deviation, all in the largest spacing. Rounding explains its last digit.
+    """
+    matters = MATTERS * min(steps)
+    boxes = np.clip(around.reshape(len(around), 5**3), -matters, matters)
+    middle = boxes[:, 5**3 // 2]
+    digits = np.diff(distinct(middle.astype(np.float32)))
+    digit = median(digits) if len(digits) else 0.0
+    places = np.indices((5,) * 3).reshape(3, -1).T - BESIDE
+    beyond = np.abs(boxes - middle[:, None]) - np.linalg.norm(places * steps, axis=1)
+    allowed = max(APART, BY_NOISE * noise, digit * (1 + ROUNDING))
+    return np.asarray((beyond > allowed).sum(1) >= SEVERAL)
+
+
+def slope_within(looked: Looked, spacing: Triple) -> float:
+    """Return the typical slope between a sample and its neighbours, none of them cut off.
+
+    Of the pairs beside the surface, the steepest along an axis gives the slope. It is NaN if there
+    are too few samples that change along all axes: those may all be at corners.
+    """
+    low, high = looked.extremes
+    line = looked.lines[..., 1:4]
+    free = (line > low) & (line < high)
+    change = np.where(free[..., 1:] & free[..., :-1], np.abs(np.diff(line)), 0).max(-1)
+    known = (change > 0).all(1)
+    lengths = np.sqrt(((change[known] / np.array(steps_of(spacing))) ** 2).sum(1))
+    return median(lengths) if len(lengths) >= ENOUGH else float("nan")
+
+
+def is_projective(looked: Looked, spacing: Triple) -> bool:
+    """Return whether values that are cut off were measured along lines of sight.
+
+    So are the fused depth images of a scan: beside the surface their slope is that of a distance
+    only where it was seen straight on, whatever their unit.
+    """
+    if not looked.is_cut.any():
+        return False
+    lines = looked.lines[..., 1:4]
+    low, middle, high = np.moveaxis(lines[_are_whole(lines, looked)], -1, 0)
+    steps = np.array(steps_of(spacing))
+    slope = np.sqrt((((high - low) / steps / 2) ** 2).sum(1))
+    bend = (np.abs(high - 2 * middle + low) / steps).sum(1)
+    straight = slope[bend < STRAIGHT * slope]
+    steep = quantile(straight, STEEPEST) if len(straight) >= FEW else 0.0
+    return steep > 0 and steep > MOST_STEEP * median(straight)
+
+
+def _are_whole(lines: Floats, looked: Looked) -> BoolArray:
+    """Return of which lines, (n, 3, m), no sample is cut off, (n,)."""
+    ends = zip(looked.extremes, looked.is_cut, (-1, 1))
+    low, high = (end if is_cut else sign * np.inf for end, is_cut, sign in ends)
+    return np.asarray(((lines > low) & (lines < high)).all((1, 2)))
+
+
+def is_normalised(looked: Looked, spacing: Triple) -> bool:
+    """Return whether values are cut off at -T and T, or at 1, and their slope is not 1.
+
+    So are distances that were divided by the truncation, as many programs store them.
+    """
+    ends = [abs(end) for end, is_cut in zip(looked.extremes, looked.is_cut) if is_cut]
+    alike = len(ends) == 2 and bool(np.isclose(ends[0], ends[-1], rtol=ENDS_ALIKE))
+    at_one = bool(ends) and bool(np.allclose(ends, 1, rtol=ENDS_ALIKE))
+    return (alike or at_one) and abs(slope_within(looked, spacing) - 1) > SLOPE_OFF

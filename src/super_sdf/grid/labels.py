@@ -12,13 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 from ..arrays import BoolArray, IntArray
 from ..errors import GridError, OptionError, seen
 from ..options import ReadOptions, check_label
-from .advice import MOST_NAMED
+from .derived import REACH, extremes_of_masks, mask_planes
 from .field import MASK, NONE_EXACT, Field, Request
-from .masks import REACH, as_sample, extremes_of_masks, labelled, mask_planes
-from .placement import is_cubic, placed
+from .interpret import as_sample, labelled
+from .placement import as_samples, check_kind, check_spacing, is_cubic, placed
 from .planes import NoPlanes, SampleArray, SamplePlanes, changed
-from .samples import as_samples, check_kind
 from .sdf_grid import SdfGrid
+from .spacing import MOST_NAMED
 
 ALL = "all"
 MOST_LABELS = 1000  # more values than these are densities
@@ -122,7 +122,8 @@ def make_labels(
     check_kind(samples.dtype, samples.shape)
     boxes = find_labels(samples, None if isinstance(wanted, str) else wanted)
     added: list[str] = []
-    request = Request.checked(ReadOptions(), given.spacing, "auto")
+    steps = None if given.spacing is None else check_spacing(given.spacing)
+    request = Request(ReadOptions(), steps, "auto")
     request = request.with_spacing(1, "since labels show none (give --spacing)", added)
     assert request.spacing is not None
     if given.origin is None:

@@ -73,24 +73,12 @@ def reach(steps: Floats) -> float:
 
 
 class Walls(NamedTuple):
-    """What lies near 0 in a grid.
+    """What lies near 0 in a grid."""
 
-    Attributes
-    ----------
-    patches : (n, 27) float64
-        Distances round some of the inner samples near 0, in the order of ``NEIGHBOURHOOD``.
-    total : int
-        How many walls pass between samples, of all lines along the axes.
-    thickness : (w,) float64
-        Of those with less than ``NO_THICKNESS``; below 0 if a constant was added.
-    coarse : array
-        Every n-th sample along each axis, at most ``MOST_FLOODED``, in n spacings.
-    """
-
-    patches: Floats
-    total: int
-    thickness: Floats
-    coarse: Floats
+    patches: Floats  # distances round some of the inner samples near 0, (n, 27)
+    total: int  # walls that pass between samples, of all lines along the axes
+    thickness: Floats  # of those with less than ``NO_THICKNESS``; below 0 if a constant was added
+    coarse: Floats  # every n-th sample along each axis, at most ``MOST_FLOODED``, in n spacings
 
 
 def _look_near_walls(values: SampleArray, scale: float, steps: Floats) -> Walls:

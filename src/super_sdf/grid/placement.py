@@ -1,4 +1,4 @@
-"""Where samples lie: the spacing and direction of the axes, and arrays whose axes have names.
+"""Arrays of samples and where these lie: spacing and direction of the axes, names of axes.
 
 xarray is not imported: whoever has a ``DataArray`` has imported it.
 """
@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..arrays import Triple
 from ..errors import GridError, seen
 from ..machine.memory import check_fits
-from .planes import SamplePlanes
-from .samples import check_kind
+from .planes import SampleArray, SamplePlanes
 
 # Spacings that differ by less than this ratio count as equal. Coarser axes are resampled to the
 # finest spacing, so a large ratio makes many samples of few.
@@ -260,3 +259,40 @@ def even_steps(name: str, coordinates: NDArray[Any]) -> tuple[float, float]:
             f"resample the array (array.interp({name}=...))"
         )
     return first, step
+
+
+def as_samples(values: ArrayLike | SamplePlanes) -> SampleArray:
+    """Return samples as an array; ``SamplePlanes`` are returned as they are.
+
+    Raises
+    ------
+    GridError
+        If they make no array.
+    """
+    if isinstance(values, SamplePlanes):
+        return values
+    try:
+        samples = np.asanyarray(values)
+    except (TypeError, ValueError, RuntimeError):  # ragged lists, tensors on a GPU
+        raise GridError(f"values are {seen(values)}: give an array of three axes") from None
+    return _unmasked(samples) if hasattr(samples, "mask") else samples  # to name it takes 7 ms
+
+
+def _unmasked(samples: NDArray[Any]) -> NDArray[Any]:
+    """Return the data of a masked array, NaN where it is masked: unknown."""
+    masked = np.ma.getmaskarray(samples)
+    if not masked.any() or samples.dtype.kind not in "fiu":
+        return np.asarray(np.ma.filled(samples, False) if masked.any() else samples.data)
+    data = np.array(samples.data, np.result_type(samples.dtype, np.float32))
+    data[masked] = np.nan
+    return data
+
+
+def check_kind(dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
+    """Raise GridError if an array of this type and shape cannot be a grid."""
+    if dtype.kind not in "fiub":
+        raise GridError(f"values have dtype {dtype}: give floating-point or integer numbers")
+    if len(shape) != 3:
+        raise GridError(f"values have shape {shape}: give three axes (x, y, z)")
+    if min(shape) < 2:
+        raise GridError(f"values have shape {shape}: give at least 2 samples on each axis")

@@ -306,17 +306,8 @@ class NoPlanes(SamplePlanes):
 class DerivedPlanes(SamplePlanes):
     """Planes that are made of those of another array, and of some beside them.
 
-    Parameters
-    ----------
-    source : (nx, ny, nz) array or SamplePlanes
-    make : callable
-        Takes some planes of it; returns as many.
-    beside : int
-        How many planes to either side the values of a plane depend on, and how many rows.
-    unit : float
-        What ``make`` returns is multiplied by this.
-    each : int
-        The bytes that ``make`` takes per sample, of those beside, too.
+    ``make`` takes some planes of ``source`` and returns as many, in ``unit``; it takes ``each``
+    bytes per sample. Values depend on ``beside`` planes, and rows, to either side.
     """
 
     name = "the grid"

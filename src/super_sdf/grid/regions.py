@@ -22,24 +22,10 @@ RUN_BYTES = 32  # per sample of a plane, to number its runs
 class Regions:
     """Regions of marked samples, and of which sides the others beside them are.
 
-    Parameters
-    ----------
-    shape : three ints
-        Of the grid.
-    planes : iterable
-        What ``runs_of_plane`` returns of each plane, in order.
-    is_marked : callable
-        Returns which samples of a plane are.
-
-    Attributes
-    ----------
-    before : (nx + 1,) int64
-        How many runs there are before each plane, and in all.
-    start, size, root : (n,) int64
-        The first sample of each run, in C order, its length, and the first run of its region.
-    positive, negative, unsure : (n,) bool
-        Whether the region of a run has known samples beside it that are positive, and negative or
-        0; and whether it has both, or none.
+    ``planes`` yields what ``runs_of_plane`` returns of each plane. ``before`` (nx + 1,) are the
+    runs before each plane, and in all. Of each run, (n,), are ``start``, its first sample in C
+    order, ``size``, its length, and ``root``, the first run of its region; and whether this has
+    ``positive`` known samples beside it, ``negative`` ones or 0, and both or none (``unsure``).
     """
 
     def __init__(

@@ -18,15 +18,16 @@ from .interpret import interpret
 from .placement import (
     STRAIGHT,
     Direction,
+    as_samples,
     as_triple,
     check_direction,
+    check_kind,
     check_spacing,
     in_rows,
     is_cubic,
     placed,
 )
 from .planes import NoPlanes, SampleArray, SamplePlanes
-from .samples import as_samples, check_kind
 from .spacing import check_negative_inside, choose_spacing
 
 MASK_HINT = "a mask holds no distances; make a grid of it with make_grid or read_grid"
@@ -293,7 +294,7 @@ def make_grid(
     notes: list[str] = []
     wanted = ReadOptions(inside=inside, field=field, label=label, level=level, scale=scale)
     given = placed(values, spacing, origin)
-    taken = interpret(as_samples(given.values), wanted, given.spacing, inside, notes)
+    taken = interpret(as_samples(given.values), wanted, given.spacing, notes)
     origin = given.origin
     if origin is None:
         notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")

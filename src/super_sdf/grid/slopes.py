@@ -1,4 +1,4 @@
-"""Slopes of a field: gradients at samples, what spacing they show, and the local slope.
+"""Gradients at samples, and what spacing they show.
 
 Where a distance field is smooth its gradient has length 1 in world units, so its length in index
 units is the spacing. Next to the surface of a thin part no sample is smooth, so samples away from
@@ -10,15 +10,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, Triple
+from ..arrays import BoolArray, Triple
 from ..errors import GridError
 from .placement import is_cubic
-from .planes import DerivedPlanes, SampleArray, in_spacings, lowest, ranks_of
+from .planes import lowest, ranks_of
 
 # Values are clamped to this, so that squares of their differences do not overflow.
 LARGEST_VALUE = 1e150
@@ -30,27 +30,40 @@ AGREEING, AGREEMENT = 0.9, 0.05
 UNEQUAL = 1.3  # ratio of the spacings measured along two axes from which they differ
 MOST_BESIDE = 1 << 18  # samples beside the surface of which gradients are taken
 
-AROUND = 2  # samples to either side over which local slopes are averaged
-TYPICAL_ERROR = 0.1  # of a slope, relative: half the weight
-LEAST_WEIGHT = 1e-3
-SLOPE_BYTES = 60  # per sample, measured
-FLAT, STEEP = 0.25, 4.0  # local slopes over the typical one
-NEARLY = 0.2  # from 1: slopes nearer to it count as 1, since dividing by them overshoots
+Floats: TypeAlias = NDArray[np.float64]
 
-Floats = NDArray[np.float64]
+# NumPy's own median, quantile and unique import its masked arrays, which takes 9 ms.
+
+
+def median(values: NDArray[Any]) -> float:
+    """Return the median of some values."""
+    ordered = np.sort(values)
+    return float(ordered[(len(ordered) - 1) // 2 : len(ordered) // 2 + 1].mean())
+
+
+def quantile(values: NDArray[Any], share: float) -> float:
+    """Return the value below which a share of some values lies, interpolated linearly."""
+    ordered = np.sort(values, axis=None)
+    place = (len(ordered) - 1) * share
+    low, high = float(ordered[int(place)]), float(ordered[min(int(place) + 1, len(ordered) - 1)])
+    rest = place - int(place)
+    return low + (high - low) * rest if rest < 0.5 else high - (high - low) * (1 - rest)
+
+
+def distinct(values: NDArray[Any]) -> NDArray[Any]:
+    """Return the different values, in order."""
+    ordered = np.sort(values, axis=None)
+    different: NDArray[Any] = ordered[np.append(True, ordered[1:] != ordered[:-1])[: len(ordered)]]
+    return different
 
 
 @dataclass(frozen=True, eq=False)
 class Gradients:
     """Gradients of a field at some samples.
 
-    Attributes
-    ----------
-    vectors : (n, 3) float64
-        Central differences, in index units; one-sided ones at the ends of the grid.
-    bend : (n,) float64
-        Sum of the absolute second differences over the length of the gradient: 0 for a linear
-        field, infinite where opposite neighbours are equal.
+    ``vectors`` (n, 3) are central differences in index units, one-sided ones at the ends of the
+    grid. ``bend`` (n,) is the sum of the absolute second differences over their length: 0 for a
+    linear field, infinite where opposite neighbours are equal.
     """
 
     vectors: Floats
@@ -67,12 +80,11 @@ class Gradients:
 
     @cached_property
     def straighter(self) -> BoolArray:
-        """Which are in the less bent half of the field, (n,).
+        """Which are in the less bent half of the field, (n,); of enough, those below ``STRAIGHT``.
 
-        If enough samples are below ``STRAIGHT``, only those. Thin walls, edges and noise bend the
-        field, and make its gradient too short or too long.
+        Thin walls, edges and noise bend the field, and make its gradient too short or too long.
         """
-        limit = float(np.median(self.bend))
+        limit = median(self.bend)
         if (self.bend < STRAIGHT).sum() >= ENOUGH:
             limit = min(limit, STRAIGHT)
         return self.bend <= limit
@@ -146,7 +158,10 @@ def gradients_beside_surface(slab: NDArray[Any], middle: int, number: int) -> tu
     The slab has the planes beside it, too. ``number`` is that of the plane's first sample.
     """
     slab = np.asarray(slab)
-    beside = np.flatnonzero(_beside_surface(slab <= 0, middle))
+    inside = slab <= 0
+    marks = (inside != inside[middle]).any(0)
+    mark_crossings(inside[middle], marks)
+    beside = np.flatnonzero(marks)
     ranks = ranks_of(beside + number)
     some = lowest(ranks, MOST_BESIDE)
     at = [np.full(1, middle), *np.unravel_index(beside[some], slab.shape[1:])]
@@ -182,21 +197,10 @@ def gradients_where_straight(slab: NDArray[Any], step: int) -> tuple[Floats, Flo
 
 
 def _relative_bend(change: Floats, gradient: Floats) -> Floats:
-    """Return the bend: infinite where opposite neighbours are equal, or nearly."""
     length = np.sqrt((gradient**2).sum(1))
     bend = np.full(len(length), np.inf)
     np.divide(change, length, out=bend, where=length > 1e-9 * change)
     return bend
-
-
-def _beside_surface(inside: BoolArray, middle: int) -> BoolArray:
-    """Return which samples of a plane have a neighbour along an axis on the other side."""
-    plane = inside[middle]
-    beside = np.zeros(plane.shape, bool)
-    for other in (*inside[:middle], *inside[middle + 1 :]):
-        beside |= plane != other
-    mark_crossings(plane, beside)
-    return beside
 
 
 def mark_crossings(sides: NDArray[Any], marks: BoolArray) -> None:
@@ -210,56 +214,3 @@ def mark_crossings(sides: NDArray[Any], marks: BoolArray) -> None:
 def as_clamped(samples: NDArray[Any]) -> Floats:
     """Return samples as float64, clamped to ``LARGEST_VALUE``."""
     return np.clip(samples.astype(np.float64), -LARGEST_VALUE, LARGEST_VALUE)
-
-
-def normalised_planes(values: SampleArray, h: float, change: float) -> DerivedPlanes:
-    """Return values over their local slope, made plane by plane: distances on the lattice.
-
-    The value over the length of the gradient is the distance to first order. ``h`` is what a step
-    of the lattice is in the result, ``change`` the typical one from sample to sample.
-    """
-
-    def make(planes: NDArray[Any]) -> FloatArray:
-        scaled = in_spacings(planes, change)
-        off = local_slopes(scaled) - 1
-        far: FloatArray = np.sign(off) * np.maximum(np.abs(off) - NEARLY, 0)
-        return np.divide(scaled, 1 + far)
-
-    return DerivedPlanes(values, make, AROUND + 2, unit=h, each=SLOPE_BYTES)
-
-
-def local_slopes(values: FloatArray) -> FloatArray:
-    """Return the mean length of the gradient round each sample, (nx, ny, nz).
-
-    It is weighted by how well it is known: at a kink the central difference is too short.
-    ``values`` are in spacings of their typical slope, so that results are about 1.
-    """
-    if min(values.shape) < 3:
-        return np.ones_like(values)
-    padded = np.pad(values, 2, mode="reflect", reflect_type="odd")
-    square, bend = np.zeros_like(values), np.zeros_like(values)
-    for axis in range(3):
-        inner = padded[tuple(slice(None) if n == axis else slice(2, -2) for n in range(3))]
-        lines = np.moveaxis(inner, axis, 0)
-        a, b, c, d, e = (
-            np.moveaxis(lines[step : len(lines) - 4 + step], 0, axis) for step in range(5)
-        )
-        square += ((d - b) / 2) ** 2
-        bend += np.abs(e - 4 * d + 6 * c - 4 * b + a)
-    length = np.clip(np.sqrt(square), FLAT, STEEP)
-    weight = 1 / (1 + (bend / (TYPICAL_ERROR * length)) ** 2) + LEAST_WEIGHT
-    trust: FloatArray = np.asarray(weight, np.float32)
-    total: FloatArray = np.asarray(trust * length, np.float32)
-    return np.divide(_box_sum(total), _box_sum(trust))
-
-
-def _box_sum(values: FloatArray) -> FloatArray:
-    """Return the sum over the samples up to ``AROUND`` away along each axis."""
-    for axis in range(3):
-        lines = np.moveaxis(values, axis, 0)
-        total = lines.copy()
-        for step in range(1, AROUND + 1):
-            total[step:] += lines[:-step]
-            total[:-step] += lines[step:]
-        values = np.moveaxis(total, 0, axis)
-    return values

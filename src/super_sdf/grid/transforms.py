@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, Triple
-from .census import Looked
+from .census import BESIDE, Looked
 from .placement import is_cubic
-from .questions import BESIDE, Floats
+from .slopes import Floats, median
 
 MOST_PATCHES = 1 << 12  # samples that are compared with all round them
 LEAST = 20  # samples from which shares of them are evidence
@@ -37,13 +37,10 @@ Measure: TypeAlias = Callable[[NDArray[np.int64]], Floats]
 
 
 class Transform(NamedTuple):
-    """A distance transform: the spacing of the finest axis, and the side of samples that are 0.
+    """A distance transform."""
 
-    ``zeros`` is the sign of that side; 0 if it is the inside.
-    """
-
-    step: float
-    zeros: int
+    step: float  # the spacing of the finest axis
+    zeros: int  # the sign of the side of samples that are 0; 0 if it is the inside
 
 
 class Apart(NamedTuple):
@@ -83,10 +80,7 @@ def find_transform(looked: Looked, spacing: Triple | None) -> Transform | None:
 
 
 def _beside(patches: Floats, inside: BoolArray, steps: Floats) -> tuple[float, float] | None:
-    """Return how far samples below and above 0 beside the other side are from it, if all alike.
-
-    No sample of the other side is nearer than that along the finest axes.
-    """
+    """Return how far samples below and above 0 beside the other side are from it, if all alike."""
     beside = np.zeros(len(patches), bool)
     for axis in np.flatnonzero(steps < 1 + ZERO):
         line = np.moveaxis(inside, axis + 1, 1)[:, 1:4, BESIDE, BESIDE]
@@ -94,7 +88,7 @@ def _beside(patches: Floats, inside: BoolArray, steps: Floats) -> tuple[float, f
     centre, is_in = (x[beside, BESIDE, BESIDE, BESIDE] for x in (patches, inside))
     ends: list[float] = []
     for side in (-centre[is_in], centre[~is_in]):
-        middle = float(np.median(side)) if len(side) else 0.0
+        middle = median(side) if len(side) else 0.0
         alike = np.abs(side - middle) <= ERROR * np.abs(centre).max(initial=0)
         if len(side) < LEAST // 2 or alike.mean() < MOST:
             return None

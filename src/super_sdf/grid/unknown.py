@@ -22,6 +22,7 @@ from ..errors import GridError
 from .census import Census, Extremes, not_finite
 from .planes import SampleArray, SamplePlanes
 from .regions import RUN_BYTES, Ints, Regions, with_the_one_before
+from .slopes import distinct, quantile
 
 LAYERS = 3  # of unknown samples to which the surface beside them is continued
 WAY_OUT = "replace each by a distance of the right sign (the cut-off value of its side)"
@@ -256,7 +257,7 @@ def _suspects(pairs: Floats, extremes: Extremes) -> list[tuple[float, float]]:
     extreme = _are_any(pairs, extremes)
     changes[extreme[0] & extreme[1]] = 0  # values that are cut off near the surface
     suspects = []
-    for value in np.unique([0.0, *extremes, *often]):
+    for value in sorted({0.0, *extremes, *often.tolist()}):
         has = pairs == value
         beside = np.sort(changes[has[0] != has[1]])[-LEAST_JUMPS:]
         largest = beside[0] if len(beside) == LEAST_JUMPS else 0.0
@@ -274,7 +275,7 @@ def _suspects(pairs: Floats, extremes: Extremes) -> list[tuple[float, float]]:
 def _least_steep(pairs: Floats, ordered: Floats, has: BoolArray, extreme: BoolArray) -> float:
     """Return what ``_steepest`` exceeds, by all changes in order; 0 where that does not show."""
     inner = pairs[~(has | extreme)]
-    if len(np.unique(inner[:MANY])) < LEAST_VALUES:
+    if len(distinct(inner[:MANY])) < LEAST_VALUES:
         return 0.0
     first, last = np.searchsorted(ordered, [0, np.ptp(inner)], "right")
     rest = last - first - int((has[0] | has[1]).sum())  # if all others are steeper
@@ -298,10 +299,10 @@ def _steepest(pairs: Floats, value: float, extremes: Extremes) -> float:
     changes = np.abs(pairs[1] - pairs[0])[(pairs != value).all(0)]
     span = np.ptp(inner) if len(inner) else 0.0  # larger changes are those to another such value
     changes = changes[(changes > 0) & (changes <= span)]
-    if len(changes) < ENOUGH or len(np.unique(inner[:MANY])) < LEAST_VALUES:
+    if len(changes) < ENOUGH or len(distinct(inner[:MANY])) < LEAST_VALUES:
         low, high = rest.min(initial=0), rest.max(initial=0)
         return FEW_SPANS * float(high - low) if low < 0 < high else np.inf
-    return float(np.quantile(changes, STEEPEST))
+    return quantile(changes, STEEPEST)
 
 
 def _check_jumps(census: Census, value: float, count: int, limit: float) -> None:

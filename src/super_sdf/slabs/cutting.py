@@ -177,7 +177,7 @@ def equal_parts(before: NDArray[np.int64], pieces: int) -> list[tuple[int, int]]
     share = before / max(int(before[-1]), 1)
     inner = np.searchsorted(share, np.arange(1, pieces) / pieces)
     last = len(before) - 1
-    return list(pairwise(np.unique(np.clip([0, *inner, last], 0, last)).tolist()))
+    return list(pairwise(sorted(set(np.clip([0, *inner, last], 0, last).tolist()))))
 
 
 def ways_to_cut(

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray, IntArray
+from ..grid.derived import local_slopes
 from ..grid.planes import SampleArray, in_spacings
-from ..grid.slopes import local_slopes
 from ..network.decoder import Decoder, decode
 from .band import plane_blocks
 from .nodes import block_offsets

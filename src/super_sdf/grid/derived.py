@@ -1,8 +1,18 @@
-"""Distances that were cut off near the surface: the missing ones are filled in.
+"""Distances made plane by plane of values that are none: masks, truncated and scaled fields.
 
-A sample x with distance d and gradient n touches the surface at the foot point x - d n. The
-distance of a sample that was cut off is that to the nearest foot point of the others, and no less
-than where it was cut off.
+A mask only says which samples are inside. Its surface passes half-way between a sample inside and
+one outside, for want of better knowledge. So the distance of a sample is that to the nearest sample
+of the other side, less half a voxel: the Euclidean distance transform of both sides, exact up to
+``REACH`` voxels and constant beyond, since farther samples do not matter to the surface.
+
+Of a truncated field, a sample x with distance d and gradient n touches the surface at the foot
+point x - d n. The distance of a sample that was cut off is that to the nearest foot point of the
+others, and no less than where it was cut off.
+
+A scaled field over its local slope is a distance to first order.
+
+Reference: Felzenszwalb and Huttenlocher, "Distance Transforms of Sampled Functions", 2012, for
+taking the axes one after the other.
 """
 
 from __future__ import annotations
@@ -16,24 +26,70 @@ from ..arrays import BoolArray, FloatArray, IntArray, Triple
 from .census import Extremes
 from .planes import DerivedPlanes, SampleArray, in_spacings
 
-REACH = 3  # voxels from a sample up to which others are filled in with the help of its foot point
+MASK_BYTES, FILL_BYTES, SLOPE_BYTES = 10, 40, 60  # per sample, measured
+REACH = 4  # voxels; patches are clipped to 3 (``steps.band.PATCH_LIMIT``), and half of one goes off
+
+FEET_REACH = 3  # voxels from a sample up to which others are filled in with the help of its foot
 FAR = 2.6  # voxels: the distance of a sample without a foot point near it
 LEAST_SLOPE = 0.3  # of a sample whose foot point is used
 DISC = np.float32(0.2)  # voxels
 ROUNDS = 2
 RINGS = 2  # of samples amid a plateau that are raised, so that they lie beyond the band
 WITHIN = 1 - 1e-5  # share of the limit up to which a value is not cut off
-FILL_BYTES = 40  # per sample, measured
 CHUNK = 1 << 14  # samples that are worked on at a time, so that they stay in the cache
 CUBES: Triple = (
     1.0,
     1.0,
     1.0,
-)  # steps: spacings over the finest; a voxel is as long as the longest
+)  # steps: spacings over the finest; the longest is a voxel
+
+AROUND = 2  # samples to either side over which local slopes are averaged
+TYPICAL_ERROR = 0.1  # of a slope, relative: half the weight
+LEAST_WEIGHT = 1e-3
+FLAT, STEEP = 0.25, 4.0  # local slopes over the typical one
+NEARLY = 0.2  # from 1: slopes nearer to it count as 1, since dividing by them overshoots
+
+
+def mask_distances(inside: BoolArray) -> FloatArray:
+    """Return signed distances to the boundary of a mask, in voxels, negative inside.
+
+    ``inside`` and the result are (nx, ny, nz); values are from half a voxel to ``REACH - 0.5``.
+    """
+    roots = np.sqrt(np.arange(REACH * REACH + 1, dtype=np.float32)) - np.float32(0.5)
+    squared = _squared_distances(inside)
+    np.copyto(squared, _squared_distances(~inside), where=inside)
+    distances = np.empty(inside.shape, np.float32)
+    for plane, numbers in zip(distances, squared):  # one by one, to save memory
+        plane[...] = roots[numbers]
+    return np.negative(distances, out=distances, where=inside)
+
+
+def _squared_distances(marked: BoolArray) -> NDArray[np.uint8]:
+    """Return the squared distance of each sample to the nearest marked one, at most ``REACH``^2."""
+    squared = np.full(marked.shape, REACH * REACH, np.uint8)
+    squared[marked] = 0
+    for axis in range(3):
+        before = np.moveaxis(squared, axis, 0)
+        after = before.copy()
+        for step in range(1, min(REACH, len(before))):
+            np.minimum(after[step:], before[:-step] + np.uint8(step * step), out=after[step:])
+            np.minimum(after[:-step], before[step:] + np.uint8(step * step), out=after[:-step])
+        squared = np.moveaxis(after, 0, axis)
+    return squared
+
+
+def mask_planes(inside: SampleArray, h: float) -> DerivedPlanes:
+    """Return the distances of a mask in world units; ``h`` is the spacing."""
+    return DerivedPlanes(inside, mask_distances, REACH, unit=h, each=MASK_BYTES)
+
+
+def extremes_of_masks(h: float) -> Extremes:
+    """Return bounds of the distances of a mask."""
+    return (0.5 - REACH) * h, (REACH - 0.5) * h
 
 
 def filled_planes(values: SampleArray, spacing: Triple, limits: Extremes) -> DerivedPlanes:
-    """Return truncated distances with those that are missing filled in, made plane by plane.
+    """Return truncated distances with those that are missing filled in.
 
     ``values`` and ``spacing`` are in world units, ``limits`` the lowest and the highest value,
     where they were cut off.
@@ -41,17 +97,17 @@ def filled_planes(values: SampleArray, spacing: Triple, limits: Extremes) -> Der
     h = min(spacing)
     low, high = (limit / h for limit in limits)
     steps = (spacing[0] / h, spacing[1] / h, spacing[2] / h)
+    beside = ROUNDS * (max(_reach(steps)[:2]) + 1)
 
     def make(planes: NDArray[Any]) -> FloatArray:
         return fill_in(in_spacings(planes, h), low, high, steps)
 
-    beside = ROUNDS * (max(_reach(steps)[:2]) + 1)
     return DerivedPlanes(values, make, beside, unit=h, each=FILL_BYTES)
 
 
 def _reach(steps: Triple) -> list[int]:
     """Return how many samples along each axis the farthest offset is."""
-    return [int(REACH * max(steps) / step) for step in steps]
+    return [int(FEET_REACH * max(steps) / step) for step in steps]
 
 
 def without_plateaus(values: SampleArray, limits: Extremes, h: float) -> DerivedPlanes:
@@ -91,12 +147,12 @@ def fill_in(values: FloatArray, low: float, high: float, steps: Triple = CUBES) 
     """
     cut = (values <= low * WITHIN) | (values >= high * WITHIN)
     known = np.argwhere(~cut).astype(np.int32)
-    gradient = _gradient_within(values, cut, known, steps)
+    gradient = _gradient(values, known, steps, cut)
     for _ in range(ROUNDS):
         least = np.abs(np.where(values > 0, np.float32(high), np.float32(low)))
         distance = np.maximum(_distance_to_feet(values, known, gradient, cut, steps), least)
         values = np.where(cut, np.copysign(distance, values), values)
-        gradient = _gradient_at(values, known, steps)
+        gradient = _gradient(values, known, steps)
     return values
 
 
@@ -114,7 +170,7 @@ def _distance_to_feet(
     discs = np.pad(np.full(cut.shape, far, np.float32), margin)
     box = np.indices([2 * n + 1 for n in reach]).reshape(3, -1).T - np.array(reach)
     apart = np.sqrt(((box * np.array(steps)) ** 2).sum(1)) / max(steps)
-    offsets = box[(apart > 0) & (apart**2 <= (REACH + 0.3) ** 2)].astype(np.int32)
+    offsets = box[(apart > 0) & (apart**2 <= (FEET_REACH + 0.3) ** 2)].astype(np.int32)
     slope = np.sqrt((gradient**2).sum(1, dtype=np.float32))
     steep = np.flatnonzero(slope > LEAST_SLOPE)
     for start in range(0, len(steep), CHUNK):
@@ -159,25 +215,25 @@ def _approach(
     flat[where] = apart
 
 
-def _gradient_at(values: FloatArray, at: IntArray, steps: Triple) -> FloatArray:
-    """Return central differences at some samples, (n, 3); one-sided ones at the ends."""
-    gradient = np.empty((len(at), 3), np.float32)
-    for axis, step in enumerate(steps):
-        low, high = _ends(at, axis, values.shape[axis])
-        apart = (high[axis] - low[axis]) * np.float32(step)
-        gradient[:, axis] = (values[high] - values[low]) / np.maximum(apart, np.float32(step))
-    return gradient
+def _gradient(
+    values: FloatArray, at: IntArray, steps: Triple, cut: BoolArray | None = None
+) -> FloatArray:
+    """Return central differences at some samples, (n, 3); one-sided ones at the ends.
 
-
-def _gradient_within(values: FloatArray, cut: BoolArray, at: IntArray, steps: Triple) -> FloatArray:
-    """Return gradients at some samples, (n, 3), by differences to neighbours that were not cut off.
-
-    Where both were, the larger difference is a lower bound.
+    With ``cut``, so they are beside a sample that was cut off; amid two, the larger difference is a
+    lower bound.
     """
     gradient = np.empty((len(at), 3), np.float32)
     centre = values[tuple(at.T)]
     for axis, step in enumerate(steps):
-        low, high = _ends(at, axis, values.shape[axis])
+        before, after = list(at.T), list(at.T)
+        before[axis] = np.maximum(at[:, axis] - 1, 0)
+        after[axis] = np.minimum(at[:, axis] + 1, values.shape[axis] - 1)
+        low, high = tuple(before), tuple(after)
+        if cut is None:
+            apart = (high[axis] - low[axis]) * np.float32(step)
+            gradient[:, axis] = (values[high] - values[low]) / np.maximum(apart, np.float32(step))
+            continue
         ahead, back = values[high] - centre, centre - values[low]
         no_ahead = cut[high] | (high[axis] == at[:, axis])
         no_back = cut[low] | (low[axis] == at[:, axis])
@@ -188,8 +244,54 @@ def _gradient_within(values: FloatArray, cut: BoolArray, at: IntArray, steps: Tr
     return gradient
 
 
-def _ends(at: IntArray, axis: int, count: int) -> list[tuple[NDArray[Any], ...]]:
-    """Return the indices of the samples before and after some along an axis of ``count``."""
-    low, high = list(at.T), list(at.T)
-    low[axis], high[axis] = np.maximum(at[:, axis] - 1, 0), np.minimum(at[:, axis] + 1, count - 1)
-    return [tuple(low), tuple(high)]
+def normalised_planes(values: SampleArray, h: float, change: float) -> DerivedPlanes:
+    """Return values over their local slope: distances on the lattice.
+
+    ``h`` is what a step of the lattice is in the result, ``change`` the typical one from sample to
+    sample.
+    """
+
+    def make(planes: NDArray[Any]) -> FloatArray:
+        scaled = in_spacings(planes, change)
+        off = local_slopes(scaled) - 1
+        far: FloatArray = np.sign(off) * np.maximum(np.abs(off) - NEARLY, 0)
+        return np.divide(scaled, 1 + far)
+
+    return DerivedPlanes(values, make, AROUND + 2, unit=h, each=SLOPE_BYTES)
+
+
+def local_slopes(values: FloatArray) -> FloatArray:
+    """Return the mean length of the gradient round each sample, (nx, ny, nz).
+
+    It is weighted by how well it is known: at a kink the central difference is too short.
+    ``values`` are in spacings of their typical slope, so that results are about 1.
+    """
+    if min(values.shape) < 3:
+        return np.ones_like(values)
+    padded = np.pad(values, 2, mode="reflect", reflect_type="odd")
+    square, bend = np.zeros_like(values), np.zeros_like(values)
+    for axis in range(3):
+        inner = padded[tuple(slice(None) if n == axis else slice(2, -2) for n in range(3))]
+        lines = np.moveaxis(inner, axis, 0)
+        a, b, c, d, e = (
+            np.moveaxis(lines[step : len(lines) - 4 + step], 0, axis) for step in range(5)
+        )
+        square += ((d - b) / 2) ** 2
+        bend += np.abs(e - 4 * d + 6 * c - 4 * b + a)
+    length = np.clip(np.sqrt(square), FLAT, STEEP)
+    weight = 1 / (1 + (bend / (TYPICAL_ERROR * length)) ** 2) + LEAST_WEIGHT
+    trust: FloatArray = np.asarray(weight, np.float32)
+    total: FloatArray = np.asarray(trust * length, np.float32)
+    return np.divide(_box_sum(total), _box_sum(trust))
+
+
+def _box_sum(values: FloatArray) -> FloatArray:
+    """Return the sum over the samples up to ``AROUND`` away along each axis."""
+    for axis in range(3):
+        lines = np.moveaxis(values, axis, 0)
+        total = lines.copy()
+        for step in range(1, AROUND + 1):
+            total[step:] += lines[:-step]
+            total[:-step] += lines[step:]
+        values = np.moveaxis(total, 0, axis)
+    return values
