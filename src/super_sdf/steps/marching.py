@@ -227,7 +227,8 @@ def groups_of_planes(field: FineField) -> list[slice]:
     plane = field.voxel_ijk[core, 0]
     starts = core.start + np.flatnonzero(np.diff(plane, prepend=plane[:1] - 1))
     step = rows_in_chunk(len(field.blocks))
-    chosen = np.unique(np.searchsorted(starts, np.arange(core.start, core.stop, step)))
+    found = np.searchsorted(starts, np.arange(core.start, core.stop, step))
+    chosen = found[np.diff(found, prepend=-1) > 0]  # np.unique would load masked arrays
     bounds = [*starts[chosen[chosen < len(starts)]].tolist(), core.stop]
     return [slice(a, b) for a, b in pairwise(bounds)]
 
