@@ -17,7 +17,7 @@ from pathlib import Path
 from super_sdf.errors import FileError
 
 from .figures import FOLDER
-from .quoted import shown
+from .quoted import UNKNOWN, shown
 
 ROOT = Path(__file__).parents[1]
 PLACES = ("README.md", "docs/**/*.md", "src/super_sdf/models/*.md")
@@ -33,7 +33,7 @@ def documents(root: Path = ROOT) -> list[Path]:
 
 
 def rendered(text: str, folder: Path = FOLDER) -> str:
-    """Return a document with the figures as they were measured.
+    """Return a document with the figures as they were measured; others stay as they stand.
 
     Raises
     ------
@@ -45,6 +45,8 @@ def rendered(text: str, folder: Path = FOLDER) -> str:
 
     def replace(match: re.Match[str]) -> str:
         found = shown(match[2].strip(), folder)
+        if found == UNKNOWN and match[3].strip():
+            return match[0]
         is_block = "\n" in match[3] or "\n" in found
         return match[1] + (f"\n\n{found}\n\n" if is_block else found) + match[4]
 
