@@ -215,7 +215,7 @@ def test_a_grid_that_the_workers_do_not_see(cluster, network):
 REFUSED = {
     ("a.npz",): "a.npz cannot be read by several workers at once: --cluster takes .zarr and .npy; "
     "convert it on one machine (without --cluster), or save it as .zarr",
-    ("a.npy", "--axes", "zyx"): "axes is 'zyx', but workers read planes of x of a.npy: "
+    ("a.npy", "--axes", "zyx"): "--axes is zyx, but workers read planes of x of a.npy: "
     "convert it on one machine (without --cluster), or save it as .zarr",
     ("a.npy", "--save-field", "f.npz"): "--save-field writes one file from the first plane on: "
     "convert it on one machine (without --cluster)",
