@@ -97,7 +97,9 @@ def test_the_main_job_of_the_readme(tmp_path, monkeypatch):
 @pytest.fixture
 def grids(tmp_path, monkeypatch) -> None:
     """Write small files under the names of the examples, and stay in their folder."""
-    nibabel, nrrd = pytest.importorskip("nibabel"), pytest.importorskip("nrrd")
+    import nibabel
+    import nrrd
+
     monkeypatch.chdir(tmp_path)
     values = 0.5 * (np.linalg.norm(np.indices((13, 13, 13)) - 6.2, axis=0) - 4)
     np.save("field.npy", values)
