@@ -24,7 +24,7 @@ PLACES = ("README.md", "docs/**/*.md", "src/super_sdf/models/*.md")
 MARKED = re.compile(r"(<!-- figures: ([^>]+?) -->)(.*?)(<!-- /figures -->)", re.DOTALL)
 # Words of a text that looks back, outside of where history is kept.
 HISTORY = re.compile(r"of before|\bearlier\b|\bolder\b|\bwith \w+ blocks\b", re.IGNORECASE)
-WITH_HISTORY = ("CHANGELOG.md", "export")
+WITH_HISTORY = ("CHANGELOG.md", "export", "build", "dist", "site")  # the last three are made
 
 
 def documents(root: Path = ROOT) -> list[Path]:
