@@ -14,7 +14,7 @@ from ..cluster.connecting import connect
 from ..cluster.crew import Crew
 from ..cluster.serving import CheckWanted, ClusterWork
 from ..files.formats import find_format, split_member
-from ..machine.extras import EXTRAS, all_modules, missing_modules
+from ..machine.extras import EXTRAS, missing_modules
 from ..machine.pool import Death, Tasks
 from ..machine.resources import Resources
 from ..network.network import find_model, shipped_models
@@ -69,9 +69,9 @@ def needs_of(jobs: Sequence[Job], settings: Settings) -> Needs:
     if settings.check:
         modules.update(CERTIFICATE_MODULES)
     if settings.items:
-        modules.update(all_modules("report"))
+        modules.update(EXTRAS["report"])
     if any(job.options.simplifies for job in jobs):
-        modules.update(all_modules("simplify"))
+        modules.update(EXTRAS["simplify"])
     here = modules.difference(missing_modules(tuple(modules)))  # without the others, files fail
     network = settings.model, settings.precision, settings.device
     return Needs(*network, tuple(sorted(here)), files, settings.folder)

@@ -6,7 +6,7 @@ from importlib.util import find_spec
 
 from ..errors import FileError
 
-# Modules that each extra installs, besides those of the extra that it builds on.
+# Modules that each extra installs.
 EXTRAS = {
     "nifti": ("nibabel",),
     "nrrd": ("nrrd",),
@@ -23,16 +23,9 @@ EXTRAS = {
     "pyvista": ("pyvista",),
     "simplify": ("igl", "pyfqmr"),
     "eval": ("igl", "scipy"),
-    "report": (),
+    "report": ("igl", "pyfqmr"),
     "cluster": ("distributed",),
 }
-BUILT_ON = {"report": "simplify"}
-
-
-def all_modules(extra: str) -> tuple[str, ...]:
-    """Return the modules of an extra and of the one that it builds on."""
-    below = EXTRAS[BUILT_ON[extra]] if extra in BUILT_ON else ()
-    return (*below, *EXTRAS[extra])
 
 
 def missing_modules(modules: tuple[str, ...]) -> list[str]:
@@ -50,6 +43,6 @@ def check_modules(what: str, extra: str, modules: tuple[str, ...] | None = None)
 
     ``modules`` are the modules needed; by default all of the extra.
     """
-    missing = missing_modules(all_modules(extra) if modules is None else modules)
+    missing = missing_modules(EXTRAS[extra] if modules is None else modules)
     if missing:
         raise FileError(f"{what} needs {', '.join(missing)}: {how_to_install(extra)}")
