@@ -1,7 +1,7 @@
 """Procedural CAD parts to measure edges on: chamfers, fillets, drillings, ribs and pockets.
 
     python -m export.parts OUT [--count 24] [--seed 0] [--detail usual]
-    super-sdf evaluate OUT --turned 0 --experiments meshers --out report/
+    python -m lab figures --shapes FOLDER --parts OUT --only edges
 
 Writes closed meshes, PLY, with a box diagonal of 1. Part n is of kind n modulo 6, its measures
 drawn from a generator seeded by (seed, n): the same seed gives the same files. None of the kinds is

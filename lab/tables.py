@@ -49,7 +49,6 @@ EDGES = (
     *(TRIANGLES, Column("slivers %", "slivers", 100, 2), Column("min angle", "min_angle", 1, 2)),
 )
 SHORT = (CD, F1, NC, P2S, BACK)
-CLOSED = Column("closed", "closed", 1, 0)
 COST = (
     Column("mean s", "seconds", 1, 2),
     Column("slowest s", "seconds_max", 1, 2),

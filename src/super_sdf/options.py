@@ -475,6 +475,5 @@ LABELS = ("factor", "spacing", "origin", "direction", "axes", "max_memory")
 check_distance = OPTIONS["offset"].check
 check_cap = OPTIONS["cap"].check
 check_mesher = OPTIONS["mesher"].check
-check_inside = OPTIONS["inside"].check
 check_max_memory = OPTIONS["max_memory"].check
 check_threads = OPTIONS["threads"].check

@@ -76,7 +76,7 @@ class Expected(NamedTuple):
 
 
 class Report(NamedTuple):
-    """What a worker says of itself: what it lacks ("" if nothing), and what it has.
+    """A worker's report on itself: what is missing there ("" if nothing), and what it has.
 
     ``limit`` are the bytes at which Dask kills it, ``free`` those that are free on its machine.
     """

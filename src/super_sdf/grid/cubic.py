@@ -16,8 +16,8 @@ slopes and its values obey the two laws of distances:
   other, as those of a noisy field do.
 
 The slope is also kept near the differences along the line, so that a linear field which is no
-distance is reproduced. The experiment ``fields`` of ``super-sdf evaluate`` compares this with
-resampling by hand.
+distance is reproduced. ``python -m lab figures --only kinds`` compares this with resampling by
+hand.
 """
 
 from __future__ import annotations

@@ -271,7 +271,7 @@ class Few(list[tuple[NDArray[Any], ...]]):
 
 
 def spread_planes(first: int, last: int, most: int) -> list[int]:
-    """Return at most so many planes from ``first`` to ``last`` (inclusive), spread evenly."""
+    """Return evenly spread planes from ``first`` to ``last`` (inclusive), a limited number."""
     return sorted({int(i) for i in np.linspace(first, last, most)})
 
 
