@@ -13,10 +13,10 @@ import base64
 import io
 import lzma
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import accumulate
 from math import prod
-from typing import Any, NamedTuple
+from typing import Any
 from xml.parsers import expat
 
 import numpy as np
@@ -41,7 +41,8 @@ APPENDED = re.compile(rb"<AppendedData[^>]*>\s*_")
 KINDS = ("PointData", "CellData")
 MARKS = ("vtkGhostType", "vtkValidPointMask")
 
-Attributes = dict[str, str]
+Attributes = dict[str, Any]
+Piece = tuple[Attributes, dict[str, dict[str, Attributes]]]
 
 
 def read_vti(request: Request) -> Volume:
@@ -76,22 +77,6 @@ def read_vti(request: Request) -> Volume:
     return replace(volume, packed=min(sum(packed), file.size) if packed else None)
 
 
-@dataclass
-class Array:
-    """An array of a piece: the attributes of its element, and where the text in it is."""
-
-    attributes: Attributes
-    start: int = 0
-    end: int = 0
-
-
-class Piece(NamedTuple):
-    """The attributes of a piece, and its arrays by kind and name."""
-
-    attributes: Attributes
-    arrays: dict[str, dict[str, Array]]
-
-
 class _FoundError(Exception):
     """The data at the end of a file begins."""
 
@@ -99,19 +84,28 @@ class _FoundError(Exception):
 class Outline:
     """What the XML of a file says, up to the data at its end.
 
-    ``top`` and ``image`` are the attributes of the elements VTKFile and ImageData; ``appended`` is
-    the encoding of the data at the end, and where it begins.
+    ``top`` and ``image`` are the attributes of the elements VTKFile and ImageData. A piece is its
+    attributes, and those of its arrays by kind and name, with ``start`` and ``end`` of the text in
+    each. ``appended`` is the encoding of the data at the end, and where it begins.
     """
 
     def __init__(self, file: InputFile) -> None:
-        self.file = file
-        self.top: Attributes = {}
-        self.image: Attributes = {}
+        self.file, self.path = file, list[str]()
+        self.top, self.image, self.array = Attributes(), Attributes(), Attributes()
         self.pieces: list[Piece] = []
         self.appended: tuple[str | None, int] = (None, 0)
-        self.path: list[str] = []
-        self.array: Array | None = None
-        self._parse()
+        self.parser = expat.ParserCreate()
+        self.parser.StartElementHandler = self._start
+        self.parser.EndElementHandler = self._end
+        self.parser.StartDoctypeDeclHandler = self._refuse_doctype
+        try:
+            self._parse()
+        except _FoundError:
+            pass
+        except expat.ExpatError as error:
+            raise FileError(
+                f"{file.name} is no VTK image data, truncated or damaged: {error}"
+            ) from None
         if self.top.get("type") != "ImageData" or not self.image:
             raise FileError(f"{file.name} is no VTK image data, or damaged")
 
@@ -122,37 +116,23 @@ class Outline:
         """
         by_name: dict[str, tuple[str, str, bool]] = {}
         for kind in KINDS:
-            pairs = (pair for piece in self.pieces for pair in piece.arrays[kind].items())
-            for name, array in pairs:
-                is_scalar = array.attributes.get("NumberOfComponents", "1") == "1"
+            for name, array in (pair for _, arrays in self.pieces for pair in arrays[kind].items()):
+                is_scalar = array.get("NumberOfComponents", "1") == "1" and name not in MARKS
                 key = name if by_name.get(name, (kind,))[0] == kind else f"{kind}/{name}"
-                by_name[key] = kind, name, is_scalar and name not in MARKS
+                by_name[key] = kind, name, is_scalar
         return by_name
 
     def _parse(self) -> None:
-        """Parse the XML; document types, and so entities, are refused."""
-        parser = self.parser = expat.ParserCreate()
-        parser.StartElementHandler = self._start
-        parser.EndElementHandler = self._end
-        parser.StartDoctypeDeclHandler = self._refuse_doctype
-        try:
-            for place in range(0, self.file.size, PIECE):
-                text = self.file.read(place, PIECE).tobytes()
-                parser.Parse(text, place + PIECE >= self.file.size)
-                if place + len(text) - parser.CurrentByteIndex > LONGEST_TAG:
-                    raise FileError(f"{self.file.name} is damaged: a tag is too long")
-        except _FoundError:
-            pass
-        except expat.ExpatError as error:
-            raise FileError(
-                f"{self.file.name} is no VTK image data, truncated or damaged: {error}"
-            ) from None
+        for place in range(0, self.file.size, PIECE):
+            text = self.file.read(place, PIECE).tobytes()
+            self.parser.Parse(text, place + PIECE >= self.file.size)
+            if place + len(text) - self.parser.CurrentByteIndex > LONGEST_TAG:
+                raise FileError(f"{self.file.name} is damaged: a tag is too long")
 
-    def _refuse_doctype(self, *_: Any) -> None:
+    def _refuse_doctype(self, *_: Any) -> None:  # and so entities
         raise FileError(f"{self.file.name} has a document type: VTK image data has none")
 
     def _start(self, name: str, attributes: Attributes) -> None:
-        self._end_text()
         self.path.append(name)
         match self.path:
             case ["VTKFile"]:
@@ -160,14 +140,14 @@ class Outline:
             case [_, "ImageData"]:
                 self.image = attributes
             case [_, "ImageData", "Piece"]:
-                self.pieces.append(Piece(attributes, {kind: {} for kind in KINDS}))
+                self.pieces.append((attributes, {kind: {} for kind in KINDS}))
             case [_, "ImageData", "Piece", ("PointData" | "CellData") as kind, "DataArray"]:
-                arrays, label = self.pieces[-1].arrays[kind], attributes.get("Name", "")
+                arrays, label = self.pieces[-1][1][kind], attributes.get("Name", "")
                 if label in arrays:
                     raise FileError(
                         f"{self.file.name} holds {label} twice in a piece: save one time step"
                     )
-                self.array = arrays[label] = Array(attributes)
+                self.array = arrays[label] = attributes | {"start": 0, "end": 0}
                 self.parser.CharacterDataHandler = self._text
             case [_, "AppendedData"]:
                 place = self.parser.CurrentByteIndex
@@ -181,18 +161,15 @@ class Outline:
 
     def _text(self, text: str) -> None:
         """Note where the text of an array begins: at the first character."""
-        if self.array and text.strip():
-            self.array.start = self.parser.CurrentByteIndex + len(text) - len(text.lstrip())
+        if text.strip() and self.path[-1] == "DataArray":
+            place = self.parser.CurrentByteIndex
+            self.array["start"] = place + len(text) - len(text.lstrip())
             self.parser.CharacterDataHandler = None
 
-    def _end_text(self) -> None:
-        self.parser.CharacterDataHandler = None
-        if self.array:
-            self.array.end = self.parser.CurrentByteIndex
-            self.array = None
-
-    def _end(self, _: str) -> None:
-        self._end_text()
+    def _end(self, name: str) -> None:
+        if name == "DataArray":
+            self.array["end"] = self.parser.CurrentByteIndex
+            self.parser.CharacterDataHandler = None
         self.path.pop()
 
 
@@ -229,6 +206,8 @@ class Part:
     ``packed`` is the size of compressed data.
     """
 
+    packed: int | None = None
+
     def __init__(
         self,
         file: InputFile,
@@ -237,23 +216,21 @@ class Part:
         which: tuple[str, str],
         lattice: ImageLattice,
     ) -> None:
-        extent = _extent(piece.attributes, "Extent")
+        extent = _extent(piece[0], "Extent")
         self.shape = replace(lattice, extent=extent).shape
         self.low = tuple(extent[2 * axis] - lattice.extent[2 * axis] for axis in (2, 1, 0))
         self.high = tuple(low + size for low, size in zip(self.low, self.shape))
-        self.packed: int | None = None
-        array = piece.arrays[which[0]].get(which[1])
+        kind, name = which
+        array, self.name = piece[1][kind].get(name), f"{file.name}:{name}"
         inside = all(a >= 0 and b <= n for a, b, n in zip(self.low, self.high, lattice.shape))
         if array is None or not inside:
-            reason = "is not in the whole extent" if array else f"has no {which[1]}"
+            reason = "is not in the whole extent" if array else f"has no {name}"
             raise FileError(f"{file.name} is damaged: its piece {seen(extent)} {reason}")
-        about = array.attributes
-        if about.get("NumberOfComponents", "1") != "1" or about.get("type") not in TYPES:
-            raise GridError(f"{file.name}:{which[1]} is no array of one number per sample")
+        if array.get("NumberOfComponents", "1") != "1" or array.get("type") not in TYPES:
+            raise GridError(f"{self.name} is no array of one number per sample")
         order = {"LittleEndian": "<", "BigEndian": ">"}[outline.top.get("byte_order", "")]
-        self.dtype = np.dtype(order + TYPES[about["type"]])
-        self.word = np.dtype(order + {"UInt64": "u8"}.get(outline.top.get("header_type", ""), "u4"))
-        self.name = f"{file.name}:{which[1]}"
+        self.dtype = np.dtype(order + TYPES[array["type"]])
+        self.word = np.dtype(order + ("u8" if outline.top.get("header_type") == "UInt64" else "u4"))
         self.planes = self._planes(file, outline, array)
 
     def copy_to(self, planes: NDArray[Any], first: int) -> None:
@@ -264,14 +241,13 @@ class Part:
             part = self.planes(start - self.low[0], stop - self.low[0])
             planes[start - first : stop - first, rows, columns] = part
 
-    def _planes(self, file: InputFile, outline: Outline, array: Array) -> Planes:
-        form = array.attributes.get("format")
-        if form == "ascii":
-            return TextValues(file, array.start, array.end, self.dtype, self.shape).planes
-        source = Source(file, array.start, array.end, True)
-        if form == "appended":
+    def _planes(self, file: InputFile, outline: Outline, array: Attributes) -> Planes:
+        if array.get("format") == "ascii":
+            return TextValues(file, array["start"], array["end"], self.dtype, self.shape).planes
+        source = Source(file, array["start"], array["end"], True)
+        if array.get("format") == "appended":
             encoding, start = outline.appended
-            offset = array.attributes.get("offset", "").strip()
+            offset = array.get("offset", "").strip()
             if encoding not in ("raw", "base64") or not re.fullmatch("[0-9]{1,18}", offset):
                 raise FileError(f"{self.name} is damaged: its offset is {seen(offset)}")
             source = Source(file, start + int(offset), file.size, encoding == "base64")
