@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from io import FileIO
 from itertools import pairwise, product
 from math import prod
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,26 +74,26 @@ def unpacked(
             f"{volume.packed:,} bytes, like a zip bomb, and does not fit in memory; if it is a "
             "grid, save it as .npy"
         )
-    world = placement.world_axes
-    orders = [tuple(world.index(w) for w in order) for order in ((0, 1, 2), (0, 2, 1))]
+    order = _order(placement)
     budget = PIECE
     if volume.chunks:
         budget = BOX if left is None else max(min(BOX, left // LEAST_SHARE), PIECE)
-    layout = choose_layout(volume.shape, volume.unit, orders, budget // volume.dtype.itemsize)
+    box = _box(volume, order, budget // volume.dtype.itemsize)
     nx, ny, nz = placement.of_world(volume.shape)
     first, last = planes or (0, nx)
-    is_swapped = world[layout.order[1]] == 2  # z before y
+    is_swapped = placement.world_axes[order[1]] == 2  # z before y
     copy = (last - first, *((nz, ny) if is_swapped else (ny, nz)))
+    blocks = _blocks(volume, placement, (order, box), (first, last))
     if prod(copy) * volume.dtype.itemsize <= room:
         held = np.empty(copy, volume.dtype)
-        for start, block in _blocks(volume, placement, layout, (first, last)):
+        for start, block in blocks:
             held[tuple(slice(a, a + n) for a, n in zip(start, block.shape))] = block
         return held.transpose(0, 2, 1) if is_swapped else held
     shape = (last - first, ny, nz)
     file = _scratch_file(
         prod(copy) * volume.dtype.itemsize, f"{name}, {in_words_of(shape, volume.dtype)}"
     )
-    for start, block in _blocks(volume, placement, layout, (first, last)):
+    for start, block in blocks:
         for offset, piece in runs_of(block, start, copy):
             _write(file, offset, piece, name)
     return PlaneFile(InputFile(file, name), 0, shape, volume.dtype, swapped=is_swapped)
@@ -112,63 +112,46 @@ def _check_chunk(volume: Volume, name: str, left: int | None) -> None:
         )
 
 
-class Layout(NamedTuple):
-    """How an array is copied: axes in the order of the copy, the fastest last; samples of a box.
-
-    ``run`` is how many samples of a box are contiguous in the copy.
-    """
-
-    order: Sizes
-    box: Sizes
-    run: int
+def _order(placement: Placement) -> Sizes:
+    """Return the axes of an array in the order of its copy: x, then y and z as they follow."""
+    x, y, z = placement.of_world((0, 1, 2))
+    return x, min(y, z), max(y, z)
 
 
-def choose_layout(shape: Sizes, chunks: Sizes, orders: Sequence[Sizes], budget: int) -> Layout:
-    """Return the layout with the longest runs; the first of those that are equal.
-
-    A box has at most ``budget`` samples, or one chunk.
-    """
-    layouts = []
-    for order in orders:
-        box = [min(chunk, count) for chunk, count in zip(chunks, shape)]
-        for axis in reversed(order):
-            fitting = max(budget // (prod(box) // box[axis] * chunks[axis]), 1)
-            box[axis] = min(fitting * chunks[axis], shape[axis])
-        run = 1
-        for axis in reversed(order):
-            run *= box[axis]
-            if box[axis] < shape[axis]:
-                break
-        layouts.append(Layout(order, tuple(box), run))
-    return max(layouts, key=lambda layout: layout.run)
+def _box(volume: Volume, order: Sizes, budget: int) -> Sizes:
+    """Return the samples of a box along each axis: at most ``budget``, or one chunk."""
+    box = [min(chunk, count) for chunk, count in zip(volume.unit, volume.shape)]
+    for axis in reversed(order):
+        chunk = volume.unit[axis]
+        fitting = max(budget // (prod(box) // box[axis] * chunk), 1)
+        box[axis] = min(fitting * chunk, volume.shape[axis])
+    return tuple(box)
 
 
 def _blocks(
-    volume: Volume, placement: Placement, layout: Layout, planes: tuple[int, int]
+    volume: Volume, placement: Placement, layout: tuple[Sizes, Sizes], planes: tuple[int, int]
 ) -> Iterator[tuple[Sizes, NDArray[Any]]]:
     """Yield some planes of x of a volume box by box, each with its start in the copy."""
-    along, backwards = layout.order[0], placement.backwards
-    bounds = [(0, size) for size in volume.shape]
-    bounds[along] = planes
-    if backwards[along]:
-        bounds[along] = volume.shape[along] - planes[1], volume.shape[along] - planes[0]
+    order, size = layout
+    backwards = placement.backwards
+    bounds = [(0, count) for count in volume.shape]
+    bounds[order[0]] = planes
+    if backwards[order[0]]:
+        bounds[order[0]] = volume.shape[order[0]] - planes[1], volume.shape[order[0]] - planes[0]
     flipped = tuple(axis for axis in range(3) if backwards[axis])
-    for box in boxes_of(bounds, layout.box):
-        block = np.ascontiguousarray(np.flip(volume.box(box), flipped).transpose(layout.order))
+    for box in _boxes_of(bounds, size):
+        block = np.ascontiguousarray(np.flip(volume.box(box), flipped).transpose(order))
         start = [
             volume.shape[axis] - box[axis].stop if backwards[axis] else box[axis].start
-            for axis in layout.order
+            for axis in order
         ]
         start[0] -= planes[0]
         yield tuple(start), block
         del block  # before the next one is read
 
 
-def boxes_of(bounds: Sequence[tuple[int, int]], box: Sizes) -> Iterator[Box]:
-    """Yield boxes of a size that fill the samples between bounds along each axis.
-
-    They begin at multiples of their size, where chunks begin, but for the first ones.
-    """
+def _boxes_of(bounds: Sequence[tuple[int, int]], box: Sizes) -> Iterator[Box]:
+    """Yield boxes between bounds along each axis, cut at multiples of a size, as chunks are."""
     cuts = []
     for (low, high), size in zip(bounds, box):
         inner = range((low // size + 1) * size, high, size)
@@ -179,10 +162,7 @@ def boxes_of(bounds: Sequence[tuple[int, int]], box: Sizes) -> Iterator[Box]:
 def runs_of(
     block: NDArray[Any], start: Sizes, shape: Sizes
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Yield the bytes of a block that are contiguous in an array, and where they begin there.
-
-    The block is contiguous, its first sample is at ``start`` in an array of ``shape`` in C order.
-    """
+    """Yield the bytes of a block at ``start`` that are contiguous in an array, and where there."""
     _, b, c = shape
     apart = 1 if block.shape[2] == c else 2  # axes along which pieces are apart in the array
     if apart == 1 and block.shape[1] == b:
