@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruct, upsample
 from super_sdf.certificate.check import check_mesh
 from super_sdf.errors import GridError
-from super_sdf.files.expectation import count_by_plane, count_on_lattice
+from super_sdf.files.meshes import count_by_plane, count_on_lattice
 from super_sdf.grid.cubic import Resampled, cubic_grid, new_places, on_samples
 from super_sdf.mesh import join_meshes
 from super_sdf.pipeline import reconstruct_slabs

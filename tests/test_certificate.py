@@ -29,7 +29,7 @@ from super_sdf.certificate.check import (
 )
 from super_sdf.convert import ConvertOptions
 from super_sdf.errors import OptionError, OutOfMemoryError
-from super_sdf.files import plain_meshes
+from super_sdf.files import mesh_writers
 from super_sdf.machine import extras
 
 H = 1 / 24  # of the grids
@@ -357,7 +357,7 @@ def test_a_coloured_mesh_is_never_left_half_written(here, command, monkeypatch):
     def full(faces):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(plain_meshes, "_ply_rows", full)
+    monkeypatch.setattr(mesh_writers, "_ply_rows", full)
     Path("c.ply").write_text("old")
     before = sorted(os.listdir())
     code, out, err = command("check", "off.ply", "ball.npz", "--out", "c.ply", "--force")

@@ -298,7 +298,7 @@ def test_a_folder_without_permission_is_named(here, command, monkeypatch):
     assert command("upsample", "in.npy", "out.ply") == (1, "", want)
 
 
-@pytest.mark.parametrize("stage", ["pipeline.refine", "files.plain_meshes.write_split"])
+@pytest.mark.parametrize("stage", ["pipeline.refine", "files.mesh_writers.write_split"])
 def test_an_interrupt_at_any_stage_leaves_nothing(here, command, monkeypatch, stage):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
@@ -385,7 +385,7 @@ def test_each_option_is_in_the_table_once_and_each_mesh_format_in_the_help():
 
 
 def test_a_large_file_is_announced_unless_quiet(here, command, monkeypatch):
-    monkeypatch.setattr("super_sdf.files.expectation.LARGE", 1000)
+    monkeypatch.setattr("super_sdf.files.meshes.LARGE", 1000)
     _, _, err = command("upsample", "in.npy", "out.ply", "--quality", "fast")
     assert err.startswith("out.ply will have about 22,000 triangles, 423,168 bytes\nNote: ")
     options = "--quality", "fast", "--quiet", "--json"

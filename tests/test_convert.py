@@ -13,7 +13,7 @@ import super_sdf.convert
 from super_sdf import SdfGrid
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.errors import FileError, GridError, MeshError, WriteError
-from super_sdf.files import expectation
+from super_sdf.files import meshes
 from super_sdf.files.meshes import MESH_SUFFIXES
 from super_sdf.mesh import Mesh
 
@@ -144,7 +144,7 @@ def test_a_large_file_is_announced_before_the_work(monkeypatch):
     options = ConvertOptions(2)
     convert("in.npy", "out.ply", trilinear, options, announce=announced.append)
     assert announced == []
-    monkeypatch.setattr(expectation, "LARGE", 40_000)
+    monkeypatch.setattr(meshes, "LARGE", 40_000)
 
     def work(*_):
         assert announced == ["new.ply will have about 2,500 triangles, 47,424 bytes"]
@@ -155,9 +155,9 @@ def test_a_large_file_is_announced_before_the_work(monkeypatch):
 
 
 def test_a_file_that_its_disk_cannot_hold_is_refused_before_the_work(monkeypatch):
-    monkeypatch.setattr(expectation, "free_space", lambda path: 2e6)
+    monkeypatch.setattr(meshes, "free_space", lambda path: 2e6)
     convert("in.npy", "out.ply", trilinear, ConvertOptions(4))
-    monkeypatch.setattr(expectation, "free_space", lambda path: 1000)
+    monkeypatch.setattr(meshes, "free_space", lambda path: 1000)
     want = (
         "big.ply cannot be written: about 10,000 triangles take 189,696 bytes, 1,000 bytes are "
         "free there; use a smaller factor, or another folder"

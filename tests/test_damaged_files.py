@@ -23,7 +23,7 @@ from super_sdf import SdfGrid, read_grid
 from super_sdf.errors import SuperSdfError
 from super_sdf.files.formats import find_format
 from super_sdf.files.grids import open_volume
-from super_sdf.files.readers.metaimage import TYPES
+from super_sdf.files.readers.raw_files import TYPES
 from super_sdf.machine.memory import forget_peak, held_memory
 
 AFFINE = affine_of(np.eye(3))

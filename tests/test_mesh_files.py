@@ -13,7 +13,7 @@ from conftest import ball, trilinear
 from super_sdf import Mesh, SdfGrid, reconstruct, write_mesh
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.errors import FileError, GridError, OptionError
-from super_sdf.files import output, plain_meshes
+from super_sdf.files import mesh_writers, output
 from super_sdf.files.meshes import MESH_SUFFIXES, write_pieces
 
 
@@ -32,7 +32,7 @@ def test_formats_come_back_the_same(tmp_path, mesh, suffix):
 
 
 def test_ply_holds_the_very_numbers(tmp_path, mesh, monkeypatch):
-    monkeypatch.setattr(plain_meshes, "CHUNK", 1000)
+    monkeypatch.setattr(mesh_writers, "CHUNK", 1000)
     for dtype in (np.float32, np.float64):
         exact = Mesh(mesh.vertices.astype(dtype), mesh.faces)
         write_mesh(exact, tmp_path / "out.ply", force=True)
@@ -48,7 +48,7 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, mesh, monkeypatch):
     def fail(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("super_sdf.files.plain_meshes.write_split", fail)
+    monkeypatch.setattr("super_sdf.files.mesh_writers.write_split", fail)
     with pytest.raises(FileError, match=r"out\.ply cannot be written: No space left on device"):
         write_mesh(mesh, target, force=True)
     assert target.read_text() == "before" and os.listdir(tmp_path) == ["out.ply"]
@@ -75,7 +75,7 @@ def test_a_mesh_in_pieces_makes_the_same_file(mesh, tmp_path, monkeypatch, suffi
     one, other = tmp_path / f"one{suffix}", tmp_path / f"other{suffix}"
     write_mesh(mesh, one)
     monkeypatch.setattr(output, "SPOOL_BYTES", 1000)  # triangles go to a file beside
-    monkeypatch.setattr(plain_meshes, "STL_CHUNK", 100)
+    monkeypatch.setattr(mesh_writers, "STL_CHUNK", 100)
     write_pieces(in_pieces(mesh), other)
     assert one.read_bytes() == other.read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == [one.name, other.name]
@@ -226,7 +226,7 @@ def test_normals_of_stl_look_out_at_every_scale(tmp_path, mesh):
         write_mesh(
             Mesh(mesh.vertices * np.float32(scale), mesh.faces), tmp_path / "out.stl", force=True
         )
-        rows = np.fromfile(tmp_path / "out.stl", plain_meshes.STL_ROW, offset=84)
+        rows = np.fromfile(tmp_path / "out.stl", mesh_writers.STL_ROW, offset=84)
         a, b, c = (rows["corners"] / np.float32(scale)).astype(np.float64).transpose(1, 0, 2)
         normal = np.cross(b - a, c - a)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)

@@ -15,7 +15,7 @@ from solids import cube, joined, sphere, square, torus
 from super_sdf import Mesh, SdfGrid, read_grid, reconstruct, simplify_mesh
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.errors import NoSurfaceError, OptionError, OptionTypeError, OutOfMemoryError
-from super_sdf.files.plain_meshes import write_ply
+from super_sdf.files.mesh_writers import write_ply
 from super_sdf.machine import extras
 from super_sdf.machine.memory import held_memory
 from super_sdf.network.network import load_network

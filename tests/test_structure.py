@@ -26,7 +26,7 @@ READERS = {
     "files.readers.raw_files": {"mrcfile"},
     "files.readers.nrrd_file": {"nrrd"},
     "files.readers.tiff": {"tifffile"},
-    "files.readers.vdb_tree": {"numcodecs"},
+    "files.readers.vdb": {"numcodecs"},
     "files.readers.vti": {"vtkmodules"},
     "files.readers.vtk": {"vtkmodules"},
     "files.readers.zarr_files": {"zarr"},

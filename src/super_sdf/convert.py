@@ -18,9 +18,16 @@ from numpy.typing import NDArray
 
 from .arrays import Triple
 from .errors import MeshError
-from .files.expectation import CERTAIN_SHARE, Expectation, expect
 from .files.grids import read_grid
-from .files.meshes import check_format_holds, check_target, local_origin_note, write_pieces
+from .files.meshes import (
+    CERTAIN_SHARE,
+    Expectation,
+    check_format_holds,
+    check_target,
+    expect,
+    local_origin_note,
+    write_pieces,
+)
 from .files.output import check_apart, check_free
 from .files.regular import files_of
 from .grid.cubic import cubic_grid

@@ -19,8 +19,8 @@ from ..arrays import FloatArray
 from ..convert import Kept
 from ..errors import OptionError, OutOfMemoryError
 from ..files.grids import read_grid
+from ..files.mesh_writers import write_coloured_ply
 from ..files.output import check_free
-from ..files.plain_meshes import write_coloured_ply
 from ..files.regular import check_regular_file
 from ..grid.cubic import cubic_grid
 from ..grid.sdf_grid import SdfGrid

@@ -22,8 +22,8 @@ import numpy as np
 
 from ..convert import Conversion, convert_grid
 from ..errors import ClusterError, OptionError, SuperSdfError
-from ..files.expectation import Expectation
 from ..files.formats import split_member
+from ..files.meshes import Expectation
 from ..grid.cubic import check_has_offsets
 from ..grid.planes import Ranges, Result, SamplePlanes
 from ..grid.sdf_grid import SdfGrid, make_grid

@@ -1,7 +1,7 @@
-"""Writing mesh files. A target is checked before the work starts, and only complete files appear.
+"""Mesh files: the table of formats, checks of a target, and the expected size of a file.
 
-``FORMATS`` is the table of formats: a new one is a row there, and its writer. All write a mesh
-piece by piece and hold no more than one piece in memory.
+A target is checked before the work starts, and only complete files appear. A new format is a row of
+``FORMATS``, and its writer.
 
 Neighbouring vertices may be as close as a thousandth of the fine spacing. Far from the world origin
 float32 cannot resolve that and vertices would coincide: degenerate triangles, and a mesh that is no
@@ -14,34 +14,34 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Triple
-from ..errors import FileError, OptionError
+from ..arrays import BoolArray, Triple
+from ..errors import FileError, OptionError, WriteError
 from ..grid.placement import as_triple
-from ..grid.sdf_grid import SdfGrid
+from ..grid.planes import in_blocks, over_planes
+from ..grid.sdf_grid import SdfGrid, negated
+from ..machine.memory import in_words
 from ..mesh import CLEARANCE, Mesh, check_mesh, tells_vertices_apart, vertex_type
 from ..options import check_path
-from .output import check_free, replacing
-from .plain_meshes import write_obj, write_off, write_ply, write_stl
-from .scenes import write_3mf, write_glb
+from .mesh_writers import write_3mf, write_glb, write_obj, write_off, write_ply, write_stl
+from .output import check_free, free_space, replacing
+from .volume import triple
 
 WORLD_ORIGIN = (0.0, 0.0, 0.0)
 CHUNK = 1 << 16  # triangles checked at a time
 
 
 class MeshFormat(NamedTuple):
-    """A mesh file format.
+    """A mesh file format."""
 
-    ``write`` writes pieces of a mesh to a path; of a format that ``has_parts``, several meshes by
-    their names.
-    """
-
-    write: Callable[..., None]
+    write: Callable[..., None]  # pieces of a mesh to a path; of parts, several meshes by name
     bytes_per_triangle: int  # with its half of a vertex; approximate for text and archives
     single_precision: bool = False  # whether coordinates are float32
     local_origin: bool = False  # whether coordinates may be relative to a point
@@ -109,7 +109,9 @@ def write_mesh(mesh: Mesh, path: str | Path, *, force: bool = False) -> None:
     """
     check_mesh(mesh)
     path = check_target(check_path(path, "path"), force=force)
-    about = _local_origin(mesh, path)
+    about = WORLD_ORIGIN
+    if format_of(path).local_origin and mesh.vertices.dtype == np.float64 and len(mesh.vertices):
+        about = triple(mesh.vertices.min(0) / 2 + mesh.vertices.max(0) / 2)
     _check_mesh_holds(mesh, path, about)
     write_pieces([mesh], path, force=force, about=about)
 
@@ -124,9 +126,8 @@ def write_pieces(
 ) -> None:
     """Write a mesh that comes in pieces; triangles may use the vertices of earlier pieces.
 
-    Like ``write_mesh``, without checking that the format can hold the mesh: see
-    ``check_format_holds``. ``about`` is the local origin of the vertices, for formats that have
-    one. ``before_rename`` is called with the path of the complete file before it is renamed.
+    ``check_format_holds`` says whether the format can hold it, and ``about``, its local origin.
+    ``before_rename`` is called with the path of the complete file.
     """
     path = check_target(path, force=force)
     with replacing(path, force=force, before_rename=before_rename) as part:
@@ -139,25 +140,13 @@ def write_together(
     force: bool = False,
     about: Triple = WORLD_ORIGIN,
 ) -> None:
-    """Write files of meshes in pieces, by path and name: all of them, or none.
-
-    A file of several meshes must have a format with parts. Otherwise as ``write_pieces``.
-    """
+    """Write files of meshes in pieces, by path and name: all of them, or none."""
     with ExitStack() as files:
         for path, named in meshes.items():
             part = files.enter_context(replacing(check_target(path, force=force), force=force))
             format_of(path).write_named(named, part, about)
         for path in meshes:
             check_target(path, force=force)  # before the first of them appears
-
-
-def _local_origin(mesh: Mesh, path: Path) -> Triple:
-    """Return the local origin for a mesh in a file: the middle of its bounding box if needed."""
-    wide = mesh.vertices.dtype == np.float64 and len(mesh.vertices)
-    if not format_of(path).local_origin or not wide:
-        return WORLD_ORIGIN
-    x, y, z = mesh.vertices.min(0) / 2 + mesh.vertices.max(0) / 2
-    return float(x), float(y), float(z)
 
 
 def _check_mesh_holds(mesh: Mesh, path: Path, about: Triple) -> None:
@@ -187,10 +176,9 @@ def _flat_triangles(corners: NDArray[Any]) -> int:
 def check_format_holds(path: str | Path, grid: SdfGrid, factor: int) -> Triple:
     """Return the local origin for the vertices of a mesh file.
 
-    It is the world origin, or the middle of the grid if float32 resolves neighbouring vertices only
-    there and the format can store a local origin. Formats with double precision or text hold all
-    that ``mesh.vertex_type`` accepts. Raises FileError if the format does not resolve neighbouring
-    vertices, whatever the local origin, and GridError if not even float64 does.
+    It is the middle of the grid if float32 resolves neighbouring vertices only there and the format
+    can store it. Raises FileError if the format does not resolve them, whatever the local origin,
+    and GridError if not even float64 does.
     """
     mesh_format = format_of(path)
     if vertex_type(grid, factor) is np.float32 or not mesh_format.single_precision:
@@ -222,3 +210,115 @@ def local_origin_note(path: str | Path, about: Triple) -> tuple[str, ...]:
         f"{path} has single precision: its vertices are relative to {point}, "
         "the translation of its node",
     )
+
+
+# The size of a mesh before the work, from the sign changes of the coarse samples. A surface of area
+# A crosses 3/2 A / h^2 edges of a lattice of spacing h, averaged over its directions. So it crosses
+# K^2 times as many edges of the fine lattice as of the coarse one. Each crossed edge holds one
+# vertex, and a closed mesh has two triangles per vertex.
+
+SMALL = 10_000_000  # bytes; smaller sizes are printed in full
+LARGE = 200_000_000  # bytes of a file whose size is announced before the work
+# The estimate is within 8 % of the truth, or too low where parts are thin: the file certainly takes
+# half of it.
+CERTAIN_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """The estimated number of triangles of a mesh, and the size of its file in bytes.
+
+    ``by_plane``, (nx, 3) int64, has the edges along x, y and z that the surface crosses in each
+    plane of samples; those along x are those to the plane before.
+    """
+
+    triangles: int
+    size: int
+    by_plane: NDArray[np.int64] | None = None
+
+    def warning(self, path: str | Path) -> str | None:
+        """Return a sentence that announces a large file, None for others."""
+        if self.size < LARGE:
+            return None
+        return f"{path} will have about {_rounded(self.triangles):,} triangles, {_size(self.size)}"
+
+
+def expect(
+    grid: SdfGrid, factor: int, offset: float, path: str | Path, *, cap: bool = False
+) -> Expectation:
+    """Estimate the size of the mesh of a grid, and of its file; ``cap`` is as in ``reconstruct``.
+
+    Raises WriteError if half of that is more than the free disk space.
+    """
+    by_plane = count_by_plane(grid, offset, cap=cap)
+    triangles = 2 * factor**2 * round(count_on_lattice(grid, by_plane))
+    size = triangles * format_of(path).bytes_per_triangle
+    free = free_space(Path(path))
+    if CERTAIN_SHARE * size > free:
+        raise WriteError(
+            f"{path} cannot be written: about {_rounded(triangles):,} triangles take "
+            f"{_size(size)}, {_size(free)} are free there; use a smaller factor, or another "
+            "folder"
+        )
+    return Expectation(triangles, size, by_plane)
+
+
+def count_on_lattice(grid: SdfGrid, by_plane: NDArray[np.int64]) -> float:
+    """Estimate how many edges of the lattice that is refined the offset surface crosses.
+
+    Edges along an axis are as many as the cells of a plane across it.
+    """
+    counts: list[int] = by_plane.sum(0).tolist()
+    if grid.is_cubic or grid.field.on_lattice:
+        return sum(counts)
+    h, cell = grid.voxel_size, math.prod(grid.spacing)
+    return sum(count * cell / step / h**2 for count, step in zip(counts, grid.spacing))
+
+
+def count_by_plane(grid: SdfGrid, offset: float, *, cap: bool = False) -> NDArray[np.int64]:
+    """Count the edges with samples on different sides of the offset surface, (nx, 3).
+
+    With ``cap``, all is outside beyond the border of the grid. See ``Expectation.by_plane``.
+    """
+    count = partial(_crossings_of, grid.positive_inside, offset, cap)
+    ranges = [
+        (max(first - 1, 0), last, first > 0, last == len(grid.samples))
+        for first, last in in_blocks(grid.samples)
+    ]
+    return np.concatenate(list(over_planes(grid.samples, count, ranges)))
+
+
+def _crossings_of(
+    positive_inside: bool,
+    offset: float,
+    cap: bool,
+    planes: NDArray[Any],
+    has_before: bool,
+    is_end: bool,
+) -> NDArray[np.int64]:
+    """Count crossed edges plane by plane, (n, 3); ``has_before``: the first is the one before."""
+    with np.errstate(over="ignore"):  # an offset beyond float32 is beyond all values
+        inside = (negated(planes) if positive_inside else planes) <= offset
+    counted = inside[int(has_before) :]
+    x, y, z = (
+        _count(np.diff(part, axis=axis)) for axis, part in enumerate((inside, counted, counted))
+    )
+    if not has_before:
+        x = np.concatenate([_count(inside[:1]) * cap, x])
+    if cap:
+        y += _count(counted[:, [0, -1]])
+        z += _count(counted[:, :, [0, -1]])
+        x[-1] += is_end * np.count_nonzero(counted[-1])
+    return np.stack([x, y, z], axis=1)
+
+
+def _count(marks: BoolArray) -> NDArray[np.int64]:
+    return np.asarray(np.count_nonzero(marks, axis=(1, 2)))
+
+
+def _rounded(count: int) -> int:
+    return int(float(f"{count:.2g}"))
+
+
+def _size(count: int) -> str:
+    return in_words(count) if count >= SMALL else f"{count:,} bytes"

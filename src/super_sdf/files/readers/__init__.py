@@ -9,9 +9,8 @@ from collections.abc import Callable
 from ..volume import Request, Volume
 from .hdf5 import read_hdf5, read_mat, read_netcdf
 from .medical import read_analyze, read_dicom, read_mgh, read_nifti
-from .metaimage import read_metaimage
 from .nrrd_file import read_nrrd
-from .raw_files import read_mrc, read_sdf
+from .raw_files import read_metaimage, read_mrc, read_sdf
 from .tiff import read_tiff
 from .vdb import read_vdb
 from .vti import read_vti

@@ -1,21 +1,273 @@
 """OpenVDB level sets and densities: every voxel of the box round those that are not background.
 
-Voxel (i, j, k) is the sample at the grid's transform of (i, j, k). What a file has of a grid:
-flags of its compression, metadata, the transform and the tree (``vdb_tree``).
+Voxel (i, j, k) is the sample at the grid's transform of (i, j, k). A file has of each grid flags of
+its compression, metadata, the transform and the tree, as OpenVDB's source describes them (versions
+222 and later). The root of a tree maps corners to nodes of 4096^3 voxels, those hold nodes of
+128^3, and those leaves of 8^3. Where a node has no child it has a tile: one value for the whole
+cube. The file has the topology first, then the values of the leaves, packed one by one. Only where
+each leaf's values lie is kept; they are unpacked when a box of voxels is read.
 """
 
 from __future__ import annotations
 
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import BoolArray
 from ...errors import FileError, GridError
 from ...grid.planes import InputFile
 from ..volume import Box, Request, Volume, from_affine
-from .vdb_tree import LEAF, Coding, Cursor, Tree
+
+Ints = NDArray[np.int64]
+Tiles = tuple[Ints, Ints, NDArray[Any], BoolArray]  # corners, edges, values, which are active
+Leaves = tuple[Ints, NDArray[np.uint8]]  # corners, masks of active voxels
+
+ZIP, ACTIVE_MASK, BLOSC = 1, 2, 4  # flags of a grid's compression
+# How the inactive values of a node are stored: the first three have one, and a mask chooses between
+# two in the next three; the last stores every value.
+MINUS_BACKGROUND, ONE_VALUE, MASKED, MASKED_ONE, MASKED_TWO, ALL = 1, 2, 3, 4, 5, 6
+EDGES = (4096, 128)  # voxels along a child of the root, and along a child of that
+LEAF = 8
+PIECE = 1 << 20  # bytes read at a time
+ONES = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(1)  # bits of a byte
+
+
+class _Cursor:
+    """The bytes of a file, one after the other."""
+
+    def __init__(self, file: InputFile, place: int = 0) -> None:
+        self.file, self.place = file, place
+        self._start, self._held = 0, b""
+
+    def take(self, count: int) -> bytes:
+        if not 0 <= count <= self.file.size - self.place:
+            raise FileError(
+                f"{self.file.name} is truncated or damaged: {count:,} bytes are to follow byte "
+                f"{self.place:,} of {self.file.size:,}"
+            )
+        if not self._start <= self.place <= self.place + count <= self._start + len(self._held):
+            size = min(max(count, PIECE), self.file.size - self.place)
+            self._start, self._held = self.place, self.file.read(self.place, size).tobytes()
+        first = self.place - self._start
+        self.place += count
+        return self._held[first : first + count]
+
+    def skip(self, count: int) -> None:
+        self.take(0)
+        self.place += count
+
+    def unpack(self, layout: str) -> tuple[Any, ...]:
+        return struct.unpack("<" + layout, self.take(struct.calcsize("<" + layout)))
+
+    def number(self, layout: str) -> Any:
+        return self.unpack(layout)[0]
+
+    def text(self) -> str:
+        return self.take(self.number("I")).decode("utf-8", "replace")
+
+    def array(self, dtype: Any, count: int) -> NDArray[Any]:
+        return np.frombuffer(self.take(np.dtype(dtype).itemsize * count), dtype)
+
+
+@dataclass(frozen=True)
+class _Coding:
+    """How the values of a tree are stored: their type, its packing, and the background."""
+
+    dtype: np.dtype[Any]
+    stored: np.dtype[Any]
+    flags: int
+    background: float
+
+    def read(self, cursor: _Cursor, active: BoolArray) -> NDArray[Any]:
+        """Return the next values, one for each bit of a mask."""
+        values, selection, state = self._inactive(cursor, len(active))
+        packed = state != ALL and self.flags & ACTIVE_MASK
+        numbers = self._numbers(cursor, int(active.sum()) if packed else len(active))
+        if not packed:
+            return numbers
+        filled = np.full(len(active), values[0], self.dtype)
+        if selection is not None:
+            filled[selection] = values[1]
+        filled[active] = numbers
+        return filled
+
+    def skip(self, cursor: _Cursor, active: int) -> int:
+        """Skip the values of a leaf of ``active`` active voxels; return how others are stored."""
+        _, _, state = self._inactive(cursor, LEAF**3)
+        partly = state != ALL and self.flags & ACTIVE_MASK
+        cursor.skip(self._length(cursor, active if partly else LEAF**3)[0])
+        return state
+
+    def _inactive(self, cursor: _Cursor, count: int) -> tuple[list[float], BoolArray | None, int]:
+        """Return the inactive values, which voxels have the second one, and how they are stored."""
+        state = cursor.number("B")
+        if state > ALL:
+            raise FileError(f"{cursor.file.name} is damaged: a node's values are of kind {state}")
+        values = [-self.background if state else self.background, self.background]
+        stated = {ONE_VALUE: 1, MASKED_ONE: 1, MASKED_TWO: 2}.get(state, 0)
+        values[:stated] = cursor.array(self.dtype, stated).tolist()
+        masked = state in (MASKED, MASKED_ONE, MASKED_TWO)
+        return values, _bits(cursor.array("u1", count // 8)) if masked else None, state
+
+    def _length(self, cursor: _Cursor, count: int) -> tuple[int, bool]:
+        """Return how many bytes the next numbers take, and whether they are packed."""
+        if not self.flags & (ZIP | BLOSC) or (not count and self.stored != self.dtype):
+            return count * self.stored.itemsize, False
+        length = cursor.number("q")
+        return abs(length), length > 0
+
+    def _numbers(self, cursor: _Cursor, count: int) -> NDArray[Any]:
+        length, packed = self._length(cursor, count)
+        data, size = cursor.take(length), count * self.stored.itemsize
+        if packed:
+            data = _unpacked(data, size, self.flags & BLOSC)
+        if len(data) != size:
+            raise FileError(f"{cursor.file.name} is damaged: a node's values cannot be unpacked")
+        return np.frombuffer(data, self.stored).astype(self.dtype)
+
+
+def _bits(mask: NDArray[np.uint8]) -> BoolArray:
+    return np.unpackbits(mask, bitorder="little").astype(bool)
+
+
+def _unpacked(data: bytes, size: int, is_blosc: int) -> bytes:
+    """Return the bytes of a zlib stream or Blosc buffer; none if they are damaged."""
+    with suppress(zlib.error, RuntimeError, ValueError):
+        if not is_blosc:
+            stream = zlib.decompressobj()
+            unpacked = stream.decompress(data, size + 1)
+            return unpacked if stream.eof else b""
+        from numcodecs import blosc
+
+        # the header: four bytes, then the sizes unpacked, of a block, and packed
+        if len(data) >= 16 and struct.unpack_from("<I4xI", data, 4) == (size, len(data)):
+            return bytes(blosc.decompress(data))
+    return b""
+
+
+class _Tree:
+    """The T tiles and L leaves of a grid, which are read from a byte of a file on.
+
+    ``places`` are where the values of each leaf begin; a leaf that is ``whole`` may have inactive
+    voxels of other values than the background. ``coding`` makes the coding of a background.
+    """
+
+    def __init__(self, file: InputFile, place: int, coding: Callable[[float], _Coding]) -> None:
+        self.file, cursor = file, _Cursor(file, place)
+        buffers = cursor.number("I")
+        if buffers != 1:
+            raise FileError(f"{file.name} is damaged: its tree has {buffers} buffers, not one")
+        dtype = coding(0.0).dtype
+        self.coding = coding(float(cursor.array(dtype, 1)[0]))
+        corner, edge = np.empty((0, 3), np.int64), np.empty(0, np.int64)
+        tiles: list[Tiles] = [(corner, edge, np.empty(0, dtype), np.empty(0, bool))]
+        leaves: list[Leaves] = [(corner, np.empty((0, LEAF**3 // 8), np.uint8))]
+        for part in self._parts(cursor):
+            (tiles if len(part) == 4 else leaves).append(part)  # type: ignore[arg-type]
+        self.corners, self.edges, self.values, self.active = map(np.concatenate, zip(*tiles))
+        self.leaves, self.masks = map(np.concatenate, zip(*leaves))
+        counts = ONES[self.masks].sum(1)
+        self.places = np.empty(len(counts), np.int64)
+        self.whole = np.empty(len(counts), bool)
+        for leaf, count in enumerate(counts.tolist()):  # after the topology, each after its mask
+            cursor.skip(LEAF**3 // 8)
+            self.places[leaf] = cursor.place
+            self.whole[leaf] = self.coding.skip(cursor, count) != 0
+        cursor.skip(0)
+        self.active_count = int(counts.sum()) + int((self.edges[self.active] ** 3).sum())
+
+    def _parts(self, cursor: _Cursor) -> Iterator[Tiles | Leaves]:
+        tiles, children = cursor.unpack("II")
+        for _ in range(tiles):
+            corner = cursor.array("<i4", 3).astype(np.int64)[None]
+            value = cursor.array(self.coding.dtype, 1)
+            yield self._tiles(corner, EDGES[0], value, _bits(cursor.array("u1", 1))[:1])
+        for _ in range(children):
+            yield from self._node(cursor, cursor.array("<i4", 3).astype(np.int64), EDGES)
+
+    def _node(
+        self, cursor: _Cursor, corner: Ints, edges: tuple[int, ...]
+    ) -> Iterator[Tiles | Leaves]:
+        """Yield what is in a node whose children have the second edge, or are leaves."""
+        edge = edges[1] if len(edges) > 1 else LEAF
+        count = edges[0] // edge
+        child, active = (_bits(cursor.array("u1", count**3 // 8)) for _ in range(2))
+        values = self.coding.read(cursor, active)
+        corners = corner + edge * np.argwhere(np.ones((count,) * 3, bool))
+        yield self._tiles(corners[~child], edge, values[~child], active[~child])
+        if edge > LEAF:
+            for place in corners[child]:
+                yield from self._node(cursor, place, edges[1:])
+            return
+        masks = cursor.array("u1", 64 * int(child.sum()))
+        yield corners[child], masks.reshape(-1, LEAF**3 // 8)
+
+    def _tiles(self, corners: Ints, edge: int, values: NDArray[Any], active: BoolArray) -> Tiles:
+        """Return the tiles that are active, or have another value than the background."""
+        kept = active | (values != self.coding.background)
+        return corners[kept], np.full(int(kept.sum()), edge), values[kept], active[kept]
+
+    def bounds(self) -> tuple[Ints, Ints] | None:
+        """Return the first voxel and the one after the last that is no inactive background."""
+        by_axis = self.masks.reshape(-1, LEAF, LEAF)  # the bits of a byte are along z
+        z = np.bitwise_or.reduce(self.masks, axis=1)[:, None]
+        lines = [by_axis.any(2), by_axis.any(1), np.unpackbits(z, axis=1, bitorder="little")]
+        along = np.stack(lines, axis=1).astype(bool)  # (L, 3, 8): whether any voxel is active there
+        along[self.whole] = True
+        some = along.any((1, 2))
+        firsts, ends = along.argmax(2), LEAF - along[:, :, ::-1].argmax(2)
+        low = np.concatenate([self.corners, (self.leaves + firsts)[some]])
+        high = np.concatenate([self.corners + self.edges[:, None], (self.leaves + ends)[some]])
+        return (low.min(0), high.max(0)) if len(low) else None
+
+    def is_signed(self) -> bool:
+        """Return whether any tile, or any value of a leaf, is negative."""
+        cursor, leaves = _Cursor(self.file), range(len(self.leaves))
+        negative = any((self._values_of(cursor, leaf)[0] < 0).any() for leaf in leaves)
+        return negative or bool((self.values < 0).any())
+
+    def read(self, first: Ints, shape: tuple[int, ...], *, unknown: bool = False) -> NDArray[Any]:
+        """Return a box of voxels from ``first`` on; inactive background may be unknown, NaN."""
+        background = np.nan if unknown else self.coding.background
+        box = np.full(shape, background, self.coding.dtype)
+        for tile in np.flatnonzero(_touch(self.corners, self.edges[:, None], first, shape)):
+            edges = (int(self.edges[tile]),) * 3
+            _put(box, np.broadcast_to(self.values[tile], edges), self.corners[tile] - first)
+        cursor = _Cursor(self.file)
+        for leaf in np.flatnonzero(_touch(self.leaves, LEAF, first, shape)).tolist():
+            values, active = self._values_of(cursor, leaf)
+            if unknown:
+                values[~active & (values == self.coding.background)] = np.nan
+            _put(box, values.reshape(LEAF, LEAF, LEAF), self.leaves[leaf] - first)
+        return box
+
+    def _values_of(self, cursor: _Cursor, leaf: int) -> tuple[NDArray[Any], BoolArray]:
+        """Return the values of a leaf, and which are active, both (512,)."""
+        cursor.place = int(self.places[leaf])
+        active = _bits(self.masks[leaf])
+        return self.coding.read(cursor, active), active
+
+
+def _touch(corners: Ints, edges: Any, first: Ints, shape: tuple[int, ...]) -> BoolArray:
+    overlap = (corners < first + np.array(shape)) & (corners + edges > first)
+    return np.asarray(overlap.all(1))
+
+
+def _put(box: NDArray[Any], values: NDArray[Any], start: Ints) -> None:
+    """Copy what lies within the box of an array that begins at ``start`` there."""
+    low = np.maximum(start, 0)
+    high = np.minimum(start + values.shape, box.shape)
+    there = tuple(slice(a, b) for a, b in zip(low, high))
+    box[there] = values[tuple(slice(a, b) for a, b in zip(low - start, high - start))]
+
 
 MAGIC = 0x56444220
 OLDEST = 222  # version of the file format, of OpenVDB 3
@@ -38,13 +290,6 @@ MATRICES = ("AffineMap", "UnitaryMap")
 PICOGK_MM = 1000  # PicoGK states the size of a voxel in metres, and works in millimetres
 
 
-class _Entry(NamedTuple):
-    name: str
-    type: str
-    parent: str
-    place: int
-
-
 def read_vdb(request: Request) -> Volume:
     """Read a grid of floating-point values of a ``.vdb`` file.
 
@@ -53,18 +298,19 @@ def read_vdb(request: Request) -> Volume:
     """
     file = InputFile.open(request.path)
     entries = _entries(file)
-    usable = [entry for entry in entries if entry.type.removesuffix(HALF) in TYPES]
-    names = [entry.name for entry in usable]
-    entry = usable[names.index(request.choose(names, "grid of floating-point values"))]
-    flags, metadata, affine, place = _read_head(file, entry.place)
-    if entry.parent:  # whose tree it shares
-        places = [other.place for other in entries if other.name == entry.parent]
+    usable = [entry for entry in entries if entry[1].removesuffix(HALF) in TYPES]
+    names = [name for name, *_ in usable]
+    chosen = names.index(request.choose(names, "grid of floating-point values"))
+    _, kind, parent, place = usable[chosen]
+    flags, metadata, affine, place = _read_head(file, place)
+    if parent:  # whose tree it shares
+        places = [place for name, _, _, place in entries if name == parent]
         if not places:
-            raise FileError(f"{file.name} is damaged: it lacks the grid {entry.parent!r}")
+            raise FileError(f"{file.name} is damaged: it lacks the grid {parent!r}")
         flags, _, _, place = _read_head(file, places[0])
-    dtype = TYPES[entry.type.removesuffix(HALF)]
-    stored = np.dtype("<f2") if entry.type.endswith(HALF) else dtype
-    tree = Tree(file, place, partial(Coding, dtype, stored, flags))
+    dtype = TYPES[kind.removesuffix(HALF)]
+    stored = np.dtype("<f2") if kind.endswith(HALF) else dtype
+    tree = _Tree(file, place, partial(_Coding, dtype, stored, flags))
     stated = metadata.get("file_voxel_count", tree.active_count)
     if stated != tree.active_count:
         raise FileError(
@@ -74,8 +320,9 @@ def read_vdb(request: Request) -> Volume:
     return _volume(file, tree, metadata, affine)
 
 
-def _entries(file: InputFile) -> list[_Entry]:
-    cursor = Cursor(file)
+def _entries(file: InputFile) -> list[tuple[str, str, str, int]]:
+    """Return name, type, parent and place of each grid."""
+    cursor = _Cursor(file)
     if file.size < 12 or cursor.number("q") != MAGIC:
         raise FileError(f"{file.name} is no .vdb file: its first bytes are not OpenVDB's")
     version = cursor.number("I")
@@ -98,7 +345,7 @@ def _entries(file: InputFile) -> list[_Entry]:
     for _ in range(count):
         name, type_, parent = (cursor.text().replace("\x1e", "#") for _ in range(3))
         _, _, end = cursor.unpack("qqq")
-        entries.append(_Entry(name, type_, parent, cursor.place))
+        entries.append((name, type_, parent, cursor.place))
         if count > 1:
             cursor.place = end
             cursor.skip(0)
@@ -107,17 +354,17 @@ def _entries(file: InputFile) -> list[_Entry]:
 
 def _read_head(file: InputFile, place: int) -> tuple[int, dict[str, Any], NDArray[np.float64], int]:
     """Return compression, metadata and transform of a grid, and where its tree begins."""
-    cursor = Cursor(file, place)
+    cursor = _Cursor(file, place)
     flags = cursor.number("I")
     metadata = _read_metadata(cursor)
     return flags, metadata, _read_transform(cursor), cursor.place
 
 
-def _read_metadata(cursor: Cursor) -> dict[str, Any]:
+def _read_metadata(cursor: _Cursor) -> dict[str, Any]:
     metadata: dict[str, Any] = {}
     for _ in range(cursor.number("I")):
         name, type_ = cursor.text(), cursor.text()
-        data = Cursor(cursor.file, cursor.place + 4)
+        data = _Cursor(cursor.file, cursor.place + 4)
         cursor.skip(cursor.number("I"))
         if type_ == "string":
             metadata[name] = data.take(cursor.place - data.place).decode("utf-8", "replace")
@@ -126,7 +373,7 @@ def _read_metadata(cursor: Cursor) -> dict[str, Any]:
     return metadata
 
 
-def _read_transform(cursor: Cursor) -> NDArray[np.float64]:
+def _read_transform(cursor: _Cursor) -> NDArray[np.float64]:
     """Return the matrix (3, 4) from indices to world coordinates."""
     kind = cursor.text()
     if kind in MATRICES:
@@ -143,7 +390,7 @@ def _read_transform(cursor: Cursor) -> NDArray[np.float64]:
 
 
 def _volume(
-    file: InputFile, tree: Tree, metadata: dict[str, Any], affine: NDArray[np.float64]
+    file: InputFile, tree: _Tree, metadata: dict[str, Any], affine: NDArray[np.float64]
 ) -> Volume:
     bounds = tree.bounds()
     if bounds is None:
