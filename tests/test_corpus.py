@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from conftest import trilinear
 from corpus.case import Case, upsample
-from corpus.children import Child, kept_sessions
+from corpus.running import Child, kept_sessions
 from corpus.judge import judge, snapshot
-from corpus.making import THEMES, make_cases, spread
+from corpus.command import THEMES, make_cases, spread
 from corpus.meshes import CORNERS, FACES, binary_ply
 from corpus.random_fields import faults_of_field, faults_of_pieces, make_fields, mesh_of_field
-from corpus.reading import faults_of_mesh
+from corpus.judge import faults_of_mesh
 from corpus.running import Run, run_here
-from corpus.trying import try_case
+from corpus.judge import try_case
 
 from super_sdf import load_network
 from super_sdf.network.onnx import ort

@@ -1,4 +1,4 @@
-"""``.npz`` files: hostile archives, odd members, damaged bytes."""
+"""``.npz`` files: hostile archives, odd members, damaged bytes, odd places."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import warnings
 import zipfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from .case import Case, Content, ball, batch, npy, npz, rng_of, upsample
+from .case import Case, Content, ball, batch, mutate, npy, npz, rng_of, upsample
 from .grids import header, said
-from .mutation import mutate
 
 PACKED = {
     "stored": zipfile.ZIP_STORED,
@@ -109,14 +109,14 @@ def odd_archives() -> dict[str, bytes]:
 def cases(seed: int) -> Iterator[Case]:
     """Yield the cases of this theme."""
     for name, data in odd_archives().items():
-        yield upsample(f"archives/{name}", {"in.npz": data}, source="in.npz")
-        yield batch(f"archives/{name}-batch", {"in.npz": data}, source="in.npz")
+        yield upsample(f"archives/{name}", {"in.npz": data})
+        yield batch(f"archives/{name}-batch", {"in.npz": data})
     yield from _damaged(seed)
     yield from _bombs()
+    yield from _members()
 
 
 def _damaged(seed: int) -> Iterator[Case]:
-    """Yield archives of each packing with a few bytes changed, and truncated ones."""
     for packing, packed in PACKED.items():
         whole = archive(WHOLE.items(), packed)
         for number in range(110):
@@ -125,33 +125,64 @@ def _damaged(seed: int) -> Iterator[Case]:
             first = 0 if number % 3 else whole.find(b"PK\x01\x02")
             data = mutate(whole, rng, first, 200 if number % 3 == 1 else None)
             make = batch if number % 9 == 0 else upsample
-            yield make(name, {"in.npz": data}, source="in.npz")
+            yield make(name, {"in.npz": data})
         for number in range(15):
             name = f"archives/{packing}-cut-{number}"
             end = int(rng_of(name, seed).integers(len(whole)))
-            yield upsample(name, {"in.npz": whole[:end]}, source="in.npz")
+            yield upsample(name, {"in.npz": whole[:end]})
 
 
 def _bombs() -> Iterator[Case]:
     """Yield small archives of large arrays, in what they say or in what they hold."""
     huge = archive([("values.npy", header(said(shape="(3000, 3000, 3000)")))])
-    yield upsample("archives/says-108-GB", {"in.npz": huge}, source="in.npz")
+    yield upsample("archives/says-108-GB", {"in.npz": huge})
     for packing in ("deflate", "bzip2"):
-        large = bomb("values", (800, 800, 500), PACKED[packing])
-        bound = ("--max-memory", "500M")
-        yield upsample(
-            f"archives/bomb-{packing}", {"in.npz": large}, *bound, source="in.npz", alone=True
-        )
+        files = {"in.npz": bomb("values", (800, 800, 500), PACKED[packing])}
+        yield upsample(f"archives/bomb-{packing}", files, "--max-memory", "500M", alone=True)
     for key in ("spacing", "origin"):
-        yield upsample(
-            f"archives/bomb-{key}",
-            {"in.npz": bomb(key, (375_000_000,))},
-            source="in.npz",
-            alone=True,
-        )
-    yield batch(
-        "archives/bomb-batch",
-        {"in.npz": bomb("spacing", (375_000_000,))},
-        source="in.npz",
-        alone=True,
-    )
+        files = {"in.npz": bomb(key, (375_000_000,))}
+        yield upsample(f"archives/bomb-{key}", files, alone=True)
+    yield batch("archives/bomb-batch", {"in.npz": bomb("spacing", (375_000_000,))}, alone=True)
+
+
+def numbers() -> dict[str, Any]:
+    """Return odd things to find as spacing or origin."""
+    return {
+        **{f"float-{text}": float(text) for text in ("nan", "inf", "-inf", "0", "-1", "1e308")},
+        **{f"tiny-{text}": float(text) for text in ("5e-324", "1e-300", "1e-45", "1e-20")},
+        "int": 1,
+        "big-int": np.uint64(2**64 - 1),
+        "bool": True,
+        "text": "one",
+        "bytes": b"1.0",
+        "complex": 1 + 1j,
+        "none": np.array(None),
+        "empty": np.zeros(0),
+        "two": np.ones(2),
+        "three": np.ones(3),
+        "four": np.ones(4),
+        "unequal": np.array([1, 2, 3.0]),
+        "nearly": np.array([1, 1.0005, 1]),
+        "one-nan": np.array([1, np.nan, 1]),
+        "column": np.ones((3, 1)),
+        "matrix": np.eye(4),
+        "date": np.datetime64("2020-01-01"),
+        "structured": np.array([(1.0,)], [("h", "f8")]),
+        "half": np.float16(1),
+        "extended": np.longdouble("1e4000"),
+        "big-endian": np.array(1.0, ">f8"),
+        "fortran": np.asfortranarray(np.ones((1, 3))),
+    }
+
+
+def _members() -> Iterator[Case]:
+    for key in ("spacing", "origin"):
+        for name, number in numbers().items():
+            files = {"in.npz": npz(**{"values": ball(), key: number})}
+            yield upsample(f"archives/{key}-{name}", files, "--json")
+            yield batch(f"archives/{key}-{name}-batch", files)
+    for number, text in enumerate(("'<f4'", "'|O'", "", "(", "[" * 500, "'f4' 1", "0x", "\\")):
+        for key in ("values", "spacing"):
+            members = {**WHOLE, f"{key}.npy": header(said(text))}
+            files = {"in.npz": archive(members.items())}
+            yield upsample(f"archives/header-{key}-{number}", files)

@@ -20,27 +20,13 @@ Files = Mapping[str, Content]
 
 @dataclass(frozen=True)
 class Case:
-    """One run of the command line.
+    """One run of the command line, in a folder of its own."""
 
-    Attributes
-    ----------
-    name : str
-        Theme, a slash, and what is odd; unique.
-    words : tuple of str
-        The command line, after the name of the program; it runs in the folder of the files.
-    files : mapping
-        What lies in the folder, by path.
-    makes : tuple of str
-        Glob patterns of the paths that the command may make or change.
-    alone : bool
-        It may hang, crash or fill the memory: only in a child.
-    """
-
-    name: str
-    words: tuple[str, ...]
-    files: Files = field(default_factory=dict)
-    makes: tuple[str, ...] = ()
-    alone: bool = False
+    name: str  # theme, a slash, and what is odd; unique
+    words: tuple[str, ...]  # the command line, after the name of the program
+    files: Files = field(default_factory=dict)  # what lies in the folder, by path
+    makes: tuple[str, ...] = ()  # patterns of the paths that the command may make or change
+    alone: bool = False  # it may hang, crash or fill the memory: only in a child
 
     @property
     def theme(self) -> str:
@@ -64,44 +50,32 @@ class Case:
 
 
 def upsample(
-    name: str,
-    files: Files,
-    *options: str,
-    source: str = "in.npy",
-    target: str = "out.ply",
-    alone: bool = False,
+    name: str, files: Files, *options: str, source: str = "", target: str = "out.ply", **more: bool
 ) -> Case:
-    """Return a case of ``upsample`` with the small network."""
-    words = ("upsample", source, target, *small_network(options), *options)
-    return Case(name, words, files, made(target), alone)
+    """Return a case of ``upsample`` with the small network; by default of the first file."""
+    words = ("upsample", source or next(iter(files)), target, *_network(options), *options)
+    return Case(name, words, files, _made(target), **more)
 
 
-def batch(
-    name: str, files: Files, *options: str, source: str = "in.npy", alone: bool = False
-) -> Case:
+def batch(name: str, files: Files, *options: str, source: str = "", **more: bool) -> Case:
     """Return a case of ``batch`` in one process, into the folder ``out``."""
-    words = ("batch", source, "--out", "out", *small_network(options), "--jobs", "1", *options)
-    return Case(name, words, files, ("out", "out/*"), alone)
+    words = ("batch", source or next(iter(files)), "--out", "out", *_network(options))
+    return Case(name, (*words, "--jobs", "1", *options), files, ("out", "out/*"), **more)
 
 
 def sample(
-    name: str,
-    files: Files,
-    *options: str,
-    source: str,
-    target: str = "out.npz",
-    alone: bool = False,
+    name: str, files: Files, *options: str, source: str = "", target: str = "out.npz"
 ) -> Case:
-    """Return a case of ``sample``."""
-    return Case(name, ("sample", source, target, *options), files, made(target), alone)
+    """Return a case of ``sample``; libraries in C read the meshes."""
+    words = ("sample", source or next(iter(files)), target, *options)
+    return Case(name, words, files, _made(target), alone=True)
 
 
-def small_network(options: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the words for the small network, unless another is given."""
+def _network(options: tuple[str, ...]) -> tuple[str, ...]:
     return () if "--model" in options or "--quality" in options else ("--quality", "fast")
 
 
-def made(target: str) -> tuple[str, ...]:
+def _made(target: str) -> tuple[str, ...]:
     """Return the pattern of a target: a slash at its end means nothing to the commands."""
     return (escape(PurePath(target).as_posix()),)
 
@@ -130,3 +104,36 @@ def npz(**arrays: Any) -> bytes:
     file = io.BytesIO()
     np.savez(file, **arrays)
     return file.getvalue()
+
+
+ODD = bytes([0x00, 0xFF, 0x7F, 0x80, 0x0A, 0x0D, 0x20, 0x27, 0x28, 0x29, 0x2C, 0x2D, 0x30, 0x39])
+
+
+def mutate(data: bytes, rng: np.random.Generator, first: int = 0, last: int | None = None) -> bytes:
+    """Return the bytes with one to four changes between two positions."""
+    last = len(data) if last is None else min(last, len(data))
+    for _ in range(int(rng.integers(1, 5))):
+        if last <= first:
+            break
+        data = _change(data, rng, int(rng.integers(first, last)))
+        last = min(last, len(data))
+    return data
+
+
+def _change(data: bytes, rng: np.random.Generator, at: int) -> bytes:
+    length = int(rng.integers(1, 9))
+    match int(rng.integers(7)):
+        case 0:  # one bit
+            return data[:at] + bytes([data[at] ^ (1 << int(rng.integers(8)))]) + data[at + 1 :]
+        case 1:
+            return data[:at] + rng.bytes(1) + data[at + 1 :]
+        case 2:
+            return data[:at] + bytes([ODD[int(rng.integers(len(ODD)))]]) + data[at + 1 :]
+        case 3:
+            return data[:at] + rng.bytes(length) + data[at:]
+        case 4:
+            return data[:at] + data[at + length :]
+        case 5:  # a piece twice
+            return data[: at + length] + data[at:]
+        case _:
+            return data[:at] + b"\xff" * length + data[at + length :]

@@ -14,12 +14,33 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
+from . import archives, fields, grids, ledgers, manifests, meshes, models, options, scales, special
 from .case import Case
-from .children import Child
-from .making import make_cases, spread
-from .trying import Outcome, try_case
+from .judge import Outcome, try_case
+from .running import Child
+
+THEMES = (grids, archives, fields, scales, options, manifests, ledgers, models, meshes, special)
+ALONE = (models, meshes, special)  # all of them may hang or crash
+
+
+def make_cases(seed: int = 0) -> list[Case]:
+    """Return the whole corpus; the same for the same seed."""
+    return [
+        replace(case, alone=case.alone or theme in ALONE)
+        for theme in THEMES
+        for case in theme.cases(seed)
+    ]
+
+
+def spread(cases: list[Case], count: int, seed: int = 0) -> list[Case]:
+    """Return so many of the cases, evenly over the list; the seed says where it begins."""
+    step = max(1.0, len(cases) / count)
+    first = (seed * 0.618) % 1 * step
+    return [cases[int(first + k * step)] for k in range(min(count, len(cases)))]
+
 
 SHOWN = 25  # faults
 TELL = 100  # cases between two words on how far it is

@@ -12,7 +12,6 @@ Field = Callable[[np.random.Generator, tuple[int, ...]], np.ndarray]
 
 
 def _spotted(value: float, share: float) -> Field:
-    """Return the maker of a ball in which some samples are something else."""
 
     def make(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
         values = ball(shape)
@@ -23,7 +22,6 @@ def _spotted(value: float, share: float) -> Field:
 
 
 def _plane(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the distances to a plane that passes through samples, exactly or not."""
     normal = rng.integers(-2, 3, 3) if rng.random() < 0.7 else rng.normal(size=3)
     middle = np.array(shape)[:, None, None, None] // 2
     length = max(float(np.linalg.norm(normal)), 1e-9)

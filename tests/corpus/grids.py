@@ -7,8 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from .case import Case, ball, batch, npy, npz, rng_of, upsample
-from .mutation import mutate
+from .case import Case, ball, batch, mutate, npy, npz, rng_of, upsample
 
 DTYPES = "?bBhHiIlLqQefdgFDGSUOMmV"
 SHAPES = [
@@ -86,7 +85,6 @@ def cases(seed: int) -> Iterator[Case]:
 
 
 def _damaged(seed: int) -> Iterator[Case]:
-    """Yield files with a few bytes changed in the header, or anywhere, and truncated ones."""
     whole = npy(ball())
     for number in range(420):
         name = f"grids/damaged-{number}"
@@ -106,7 +104,6 @@ def _damaged(seed: int) -> Iterator[Case]:
 
 
 def _dtypes() -> Iterator[Case]:
-    """Yield every dtype in both byte orders and both axis orders, in both kinds of file."""
     for letter in DTYPES:
         for order in "<>":
             dtype = np.dtype(
@@ -123,13 +120,12 @@ def _dtypes() -> Iterator[Case]:
                 spaced = ("--spacing", "10")
                 yield upsample(name, {"in.npy": npy(array)}, *spaced)
                 yield upsample(f"{name}-inferred", {"in.npy": npy(array)}, "--factor", "2")
-                yield upsample(f"{name}-npz", {"in.npz": npz(values=array)}, source="in.npz")
+                yield upsample(f"{name}-npz", {"in.npz": npz(values=array)})
             yield batch(f"grids/batch-{letter}-{ord(order)}", {"in.npy": npy(values)}, *spaced)
     yield from _wide_integers()
 
 
 def _wide_integers() -> Iterator[Case]:
-    """Yield integers that no float holds, and the ends of each type."""
     for letter in "bBhHiIqQ":
         limits = np.iinfo(letter)
         for number, (low, high) in enumerate(
@@ -144,7 +140,6 @@ def _wide_integers() -> Iterator[Case]:
 
 
 def _shapes() -> Iterator[Case]:
-    """Yield odd shapes, with each factor."""
     for number, shape in enumerate(SIZES):
         values = ball(shape) if len(shape) == 3 else np.linspace(-1, 1, int(np.prod(shape)))
         files = {"in.npy": npy(values.reshape(shape))}

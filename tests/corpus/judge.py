@@ -1,4 +1,4 @@
-"""What is wrong with how a command ended: each fault a kind and a line."""
+"""What is wrong with how a command ended, and with the meshes that it made."""
 
 from __future__ import annotations
 
@@ -6,15 +6,62 @@ import builtins
 import json
 import os
 import re
+import tempfile
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from hashlib import blake2b
 from pathlib import Path
 from typing import NoReturn
 
+import numpy as np
+
 from .case import Case
-from .reading import SUFFIXES, count, faults_of_mesh
 from .running import Run
+
+SUFFIXES = (".ply", ".stl", ".obj", ".off", ".glb", ".3mf")
+
+
+def faults_of_mesh(path: Path, *, may_be_open: bool) -> list[str]:
+    """Return what is wrong with a mesh: vertices not finite or not distinct, edges open."""
+    import trimesh
+
+    try:
+        found = trimesh.load(path, process=False)
+        parts = list(getattr(found, "geometry", {"": found}).values())
+        vertices, faces = np.asarray(parts[0].vertices), np.asarray(parts[0].faces, np.int64)
+    except Exception as error:  # whatever a reader makes of the file, others would meet it too
+        return [f"cannot be read back: {type(error).__name__}: {error}"]
+    if len(parts) != 1 or not len(faces):
+        return ["holds no triangle" if len(parts) == 1 else f"holds {len(parts)} meshes"]
+    if not np.isfinite(vertices).all():
+        return [f"{int((~np.isfinite(vertices)).any(1).sum())} vertices are not finite"]
+    return list(_faults(vertices, faces, path.suffix == ".stl", may_be_open))
+
+
+def _faults(vertices: np.ndarray, faces: np.ndarray, is_soup: bool, may_be_open: bool):
+    used, at = np.unique(vertices + 0.0, axis=0, return_inverse=True)
+    if len(used) < len(vertices) and not is_soup:
+        yield "vertices at the same position"
+    faces = at.ravel()[faces]
+    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    if (start == end).any():
+        yield "triangles that have collapsed"
+    forward, times = np.unique(start * len(used) + end, return_counts=True)
+    if (times > 1).any():
+        yield "edges that two triangles run along in one direction"
+    if not may_be_open and len(np.setxor1d(forward, end * len(used) + start)):
+        yield "open edges that nothing was said of"
+
+
+def count(path: Path) -> tuple[int, int]:
+    """Return how many distinct vertices and how many triangles a mesh file holds."""
+    import trimesh
+
+    found = trimesh.load(path, process=False)
+    part = next(iter(getattr(found, "geometry", {"": found}).values()))
+    return len(np.unique(np.asarray(part.vertices) + 0.0, axis=0)), len(part.faces)
+
 
 TOO_MUCH = 1 << 30  # bytes more than before, for inputs of some kilobytes
 LEFT = re.compile(r"\.part$|^tmp|\.tmp$|^\.~")
@@ -72,7 +119,6 @@ def judge(case: Case, run: Run, folder: Path, before: Snapshot) -> list[Fault]:
 
 
 def _of_words(case: Case, run: Run) -> list[Fault]:
-    """Judge the exit code and what stands on standard error."""
     if run.code not in (0, 1, 2):
         return [Fault("code", f"exit code {run.code}")]
     lines = run.err.rstrip("\n").split("\n") if run.err.strip() else []
@@ -91,7 +137,6 @@ def _of_words(case: Case, run: Run) -> list[Fault]:
 
 
 def _names_a_bug(line: str) -> bool:
-    """Say whether a line shows a traceback, or one of Python's exceptions as the reason."""
     names = NAMED_BUG.findall(line.removeprefix("Error: "))
     kinds = (getattr(builtins, name, None) for name in names if name != "Warning")
     shown = any(isinstance(kind, type) and issubclass(kind, BaseException) for kind in kinds)
@@ -99,7 +144,6 @@ def _names_a_bug(line: str) -> bool:
 
 
 def _of_json(case: Case, run: Run) -> list[Fault]:
-    """Judge what was asked for as JSON: it is, and without NaN or Infinity."""
     if "--json" not in case.words or run.code == 2 or not run.out:
         return []
 
@@ -114,7 +158,6 @@ def _of_json(case: Case, run: Run) -> list[Fault]:
 
 
 def _of_files(case: Case, run: Run, before: Snapshot, after: Snapshot, folder: Path) -> list[Fault]:
-    """Judge what was made, what was left over, and what is not what it was."""
     new = [name for name in after if before.get(name) != after[name]]
     faults = [Fault("left over", _shape(n)) for n in new if LEFT.search(Path(n).name)]
     new = [name for name in new if not LEFT.search(Path(name).name)]
@@ -133,7 +176,6 @@ def _of_files(case: Case, run: Run, before: Snapshot, after: Snapshot, folder: P
 
 
 def _of_mesh(case: Case, run: Run, path: Path) -> list[Fault]:
-    """Judge a mesh that was written."""
     if not path.is_file():
         return []
     told_open = "runs out of the grid" in run.err + run.out or '"closed": false' in run.out
@@ -154,5 +196,27 @@ def _ledger_of(path: Path) -> str:
 
 
 def _shape(name: str) -> str:
-    """Return a name without the numbers of processes in it."""
     return re.sub(r"\d{2,}", "N", name)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a case ended, and what is wrong with that."""
+
+    case: Case
+    run: Run
+    faults: list[Fault]
+
+    def lines(self) -> list[str]:
+        """Return the faults, a line each."""
+        return [f"{self.case.name}\t{fault.kind}\t{fault.what}" for fault in self.faults]
+
+
+def try_case(case: Case, run_words: Callable[[Sequence[str], Path], Run]) -> Outcome:
+    """Build a case in an empty folder, run it and judge it."""
+    with tempfile.TemporaryDirectory(prefix="corpus-") as name:
+        folder = Path(os.path.realpath(name))
+        case.build(folder)
+        before = snapshot(folder)
+        run = run_words(case.words, folder)
+        return Outcome(case, run, judge(case, run, folder, before))

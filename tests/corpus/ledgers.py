@@ -8,9 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from .case import Case, Content, ball, batch, npy, rng_of
+from .case import Case, Content, ball, batch, mutate, npy, rng_of
 from .manifests import VALUES
-from .mutation import mutate
 
 GRID = {"in.npy": npy(ball())}
 ROW: dict[str, Any] = {
@@ -72,13 +71,11 @@ def cases(seed: int) -> Iterator[Case]:
 def _case(
     name: str, ledger: bytes | None, *options: str, alone: bool = False, **more: Content
 ) -> Case:
-    """Return a batch into a folder with this ledger."""
     files = {**GRID, **more} if ledger is None else {**GRID, "out/report.jsonl": ledger, **more}
     return batch(f"ledgers/{name}", files, *options, alone=alone)
 
 
 def _damaged(seed: int) -> Iterator[Case]:
-    """Yield ledgers with a few bytes changed."""
     whole = line() + line(out="other.ply") + line(status="failed", reason="why", output=None)
     for number in range(120):
         name = f"damaged-{number}"
@@ -87,7 +84,6 @@ def _damaged(seed: int) -> Iterator[Case]:
 
 
 def _occupied() -> Iterator[Case]:
-    """Yield output folders in which something is in the way."""
     in_the_way: dict[str, Content] = {
         "folder": lambda path: path.mkdir(),
         "loop": lambda path: path.symlink_to(path.name),

@@ -6,8 +6,7 @@ import json
 from collections.abc import Iterator
 from typing import Any
 
-from .case import Case, ball, batch, npy, rng_of
-from .mutation import mutate
+from .case import Case, ball, batch, mutate, npy, rng_of
 
 GRID = {"a.npy": npy(ball()), "b.npy": npy(ball((11, 12, 13)))}
 # What a value may be that is none of the right kind.
@@ -95,13 +94,11 @@ def cases(seed: int) -> Iterator[Case]:
 
 
 def _case(name: str, data: bytes, suffix: str = "jsonl", *options: str) -> Case:
-    """Return a batch of one manifest."""
     files = {f"list.{suffix}": data, **GRID}
-    return batch(f"manifests/{name}", files, *options, source=f"list.{suffix}")
+    return batch(f"manifests/{name}", files, *options)
 
 
 def _damaged(seed: int) -> Iterator[Case]:
-    """Yield manifests with a few bytes changed."""
     entries = [
         {"in": "a.npy", "out": "x/y.ply", "spacing": 1.0, "origin": [0, 0, 0], "factor": 2},
         {"in": "b.npy", "inside": "negative", "offset": 0.5, "cap": True},

@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from .case import Case, rng_of, sample
-from .mutation import mutate
+from .case import Case, mutate, rng_of, sample
 
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
 QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -164,11 +163,8 @@ def odd_files() -> dict[str, tuple[str, bytes]]:
 
 
 def _three(name: str, suffix: str, data: bytes, also_slow: bool) -> Iterator[Case]:
-    """Yield a mesh for ``sample``."""
     source = f"in.{suffix}"
     files = {source: data}
-    yield sample(f"meshes/{name}", files, "-n", "8", source=source, alone=True)
+    yield sample(f"meshes/{name}", files, "-n", "8", source=source)
     if also_slow:
-        yield sample(
-            f"meshes/{name}-open", files, "-n", "8", "--allow-open", source=source, alone=True
-        )
+        yield sample(f"meshes/{name}-open", files, "-n", "8", "--allow-open", source=source)

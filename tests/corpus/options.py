@@ -7,6 +7,16 @@ from collections.abc import Iterator
 from .case import Case, ball, batch, npy, sample, upsample
 from .meshes import CUBE
 
+LINES = [
+    *("upsample a b c", "batch", "batch in.npy", "batch --out out", "sample", "sample cube.ply"),
+    *("sample cube.ply out.npz", "info x", "info", "info --json", "info --device cuda", "info -h"),
+    *("sample -h", "sample cube.ply out.npz -n 8 --spacing 1"),
+    "sample cube.ply out.npz --frame unit --spacing 1",
+    "upsample in.npy out.ply --quality best --model none.onnx",
+    "upsample in.npy out.ply --device cuda",
+    "batch in.npy in.npy --out out --quality fast --jobs 1",
+    "batch in.npy ./in.npy --out out --quality fast --json --dry-run",
+]
 GRID = {"in.npy": npy(ball())}
 NUMBERS = [
     *("", " ", "x", "nan", "NaN", "inf", "-inf", "1e999", "-1", "0", "-0", "1e-400", "5e-324"),
@@ -27,7 +37,7 @@ NUMBERS = [
         "1,nan,1",
     ),
     *("1,2,3", "true", "4", "2", "3", "5", "7", "32", "64", "-4", "16", "2.0", "2147483648"),
-    *("9223372036854775808", "99999999999999"),
+    *("1,nan,1", "9223372036854775808", "99999999999999"),
 ]
 WORDS = [
     *("", " ", "x", "AUTO", "neg", "é", "a\nb", "\udcff", "-", "--", "n" * 5000, "0", "None"),
@@ -45,44 +55,24 @@ TARGETS = [
     *("-out.ply", "é.ply", "*.ply", " .ply", "out.ply.gz", "folder.ply", "there.ply"),
     *("folder.ply/x.ply", "n" * 250 + ".stl", "n" * 240 + ".obj", "CON.stl", "a:b.ply"),
 ]
-NUMBER_OPTIONS = {
-    "upsample": [
-        *("--factor", "--spacing", "--origin", "--offset", "--threads", "--simplify"),
-        "--triangles",
-    ],
-    "batch": [
-        *("--factor", "--spacing", "--origin", "--offset", "--threads", "--simplify"),
-        "--triangles",
-    ],
-    "sample": ["-n", "--spacing", "--padding", "--band"],
-}
+ALIKE = "--factor --spacing --origin --offset --threads --simplify --triangles"
+NUMBER_OPTIONS = {"upsample": ALIKE, "batch": ALIKE, "sample": "-n --spacing --padding --band"}
 WORD_OPTIONS = {
-    "upsample": [
-        "--inside",
-        "--mesher",
-        "--quality",
-        "--precision",
-        "--model",
-        "--device",
-        "--none",
-    ],
-    "batch": ["--format", "--inside", "--quality", "--model", "--none"],
-    "sample": ["--frame", "--none"],
-    "info": ["--device", "--none"],
+    "upsample": "--inside --mesher --quality --precision --model --device --none",
+    "batch": "--format --inside --quality --model --none",
+    "sample": "--frame --none",
+    "info": "--device --none",
 }
 
 
 def cases(seed: int) -> Iterator[Case]:
     """Yield the cases of this theme."""
     del seed
-    for command, options in NUMBER_OPTIONS.items():
-        for option in options:
-            for number, text in enumerate(NUMBERS):
-                yield _case(f"{command}{option}-{number}", command, option, text)
-    for command, options in WORD_OPTIONS.items():
-        for option in options:
-            for number, text in enumerate(WORDS):
-                yield _case(f"{command}{option}-{number}", command, option, text)
+    for texts, names in ((NUMBERS, NUMBER_OPTIONS), (WORDS, WORD_OPTIONS)):
+        for command, options in names.items():
+            for option in options.split():
+                for number, text in enumerate(texts):
+                    yield _case(f"{command}{option}-{number}", command, option, text)
     for number, text in enumerate(SIZES):
         yield _case(f"upsample-max-memory-{number}", "upsample", "--max-memory", text)
         yield _case(f"batch-max-memory-{number}", "batch", "--max-memory", text)
@@ -91,7 +81,6 @@ def cases(seed: int) -> Iterator[Case]:
 
 
 def _case(name: str, command: str, *options: str) -> Case:
-    """Return a case of a command that works but for these options."""
     name = f"options/{name}"
     huge = any(len(text) > 6 and text.isdigit() for text in options)
     if command == "upsample":
@@ -100,12 +89,11 @@ def _case(name: str, command: str, *options: str) -> Case:
         return batch(name, GRID, *options, alone=huge)
     if command == "sample":
         count = () if options[0] in ("-n", "--spacing") else ("-n", "8")
-        return sample(name, CUBE, *count, *options, source="cube.ply", alone=True)
+        return sample(name, CUBE, *count, *options, source="cube.ply")
     return Case(name, (command, *options))
 
 
 def _targets() -> Iterator[Case]:
-    """Yield targets that cannot be, or are taken."""
     taken = {"folder.ply/x": b"", "there.ply": b"somebody's", **GRID, **CUBE}
     for number, target in enumerate(TARGETS):
         for option in ([], ["--force"]):
@@ -113,42 +101,20 @@ def _targets() -> Iterator[Case]:
             yield upsample(f"options/target-{number}{suffix}", taken, *option, target=target)
         grid = target.replace(".ply", ".npz")
         name = f"options/sample-target-{number}"
-        yield sample(name, taken, "-n", "8", source="cube.ply", target=grid, alone=True)
+        yield sample(name, taken, "-n", "8", source="cube.ply", target=grid)
         words = ("batch", "in.npy", "--out", target.removesuffix(".ply"), "--quality", "fast")
         if target not in ("/", "..", "", ".", "~/no/out.ply", "in.npy"):
             yield Case(f"options/batch-out-{number}", (*words, "--jobs", "1"), taken, ("*",))
 
 
 def _lines() -> Iterator[Case]:
-    """Yield command lines that are odd as a whole."""
     lines = [
         *([""], ["x"], ["--x"], ["-h"], ["--version"], ["upsample"], ["upsample", "in.npy"]),
-        *(["upsample", "a", "b", "c"], ["batch"], ["batch", "in.npy"], ["batch", "--out", "out"]),
-        *(["sample"], ["sample", "cube.ply"], ["sample", "cube.ply", "out.npz"]),
-        *(["info", "x"], ["info"]),
-        *(["info", "--json"], ["info", "--device", "cuda"], ["info", "-h"], ["sample", "-h"]),
-        *(["sample", "cube.ply", "out.npz", "-n", "8", "--spacing", "1"],),
-        *(["sample", "cube.ply", "out.npz", "--frame", "unit", "--spacing", "1"],),
-        *(["upsample", "in.npy", "out.ply", "--quality", "best", "--model", "none.onnx"],),
-        *(["upsample", "in.npy", "out.ply", "--device", "cuda"], ["\udcff"]),
-        *(["upsample", "\udcff.npy", "out.ply"], ["upsample", "a\nb.npy", "out.ply"]),
-        *(["batch", "in.npy", "in.npy", "--out", "out", "--quality", "fast", "--jobs", "1"],),
-        *(
-            [
-                "batch",
-                "in.npy",
-                "./in.npy",
-                "--out",
-                "out",
-                "--quality",
-                "fast",
-                "--json",
-                "--dry-run",
-            ],
-        ),
+        *(["upsample", "\udcff.npy", "out.ply"], ["upsample", "a\nb.npy", "out.ply"], ["\udcff"]),
         *(["batch", "n" * 5000, "--out", "out"], ["upsample", "n" * 5000 + ".npy", "out.ply"]),
         *(["upsample", "n" * 300 + ".npy", "out.ply"], ["batch", "n" * 300 + ".npy", "--out", "o"]),
-        *(["sample", "n" * 300 + ".ply", "out.npz", "-n", "8"],),
+        ["sample", "n" * 300 + ".ply", "out.npz", "-n", "8"],
+        *map(str.split, LINES),
     ]
     for number, words in enumerate(lines):
         made = ("out.*", "out", "out/*", "o", "o/*")

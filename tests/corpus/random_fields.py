@@ -52,7 +52,6 @@ def make_fields(count: int, seed: int = 0) -> Iterator[RandomField]:
 
 
 def _draw_shape(rng: np.random.Generator) -> tuple[int, ...]:
-    """Return 2 to 16 samples a side, some hundreds in all: small ones meet all cases, and soon."""
     shape = rng.integers(2, 17, 3)
     while shape.prod() > MOST_SAMPLES:
         shape[shape.argmax()] = rng.integers(2, shape.max())

@@ -21,6 +21,7 @@ ORIGINS = [
     *("1e3", "5.4e6", "-5e5", "1e9", "1e12", "1e17", "1e30", "1e38", "1e39", "1e100", "1e308"),
     "-1e308",
 ]
+OFFSETS = ["0.001", "0.5", "-0.5", "1.5", "-1.5", "3", "-3", "3.59", "5", "9", "20", "1e-9"]
 FORMATS = ["ply", "stl", "obj", "off", "glb", "3mf"]
 
 
@@ -46,20 +47,18 @@ def cases(seed: int) -> Iterator[Case]:
 
 
 def _origins() -> Iterator[Case]:
-    """Yield grids far from the origin."""
     for spacing in (0.01, 0.1, 1.0, 1000.0):
         files = {"in.npz": npz(values=ball() * spacing, spacing=spacing)}
         for origin in ORIGINS:
             for suffix in FORMATS[: 6 if spacing in (0.1, 1.0) else 3]:
                 name = f"scales/{suffix}-{spacing}-at-{origin}"
                 at = ("--origin", f"{origin},0,0")
-                yield upsample(name, files, *at, source="in.npz", target=f"out.{suffix}")
+                yield upsample(name, files, *at, target=f"out.{suffix}")
     near = {"in.npz": npz(values=ball(), spacing=1.0, origin=np.array([-4.2, -5.1, 1e9]))}
-    yield upsample("scales/one-axis-far", near, source="in.npz", target="out.stl")
+    yield upsample("scales/one-axis-far", near, target="out.stl")
 
 
 def _mismatches() -> Iterator[Case]:
-    """Yield spacings, offsets and origins that have nothing to do with the values."""
     files = {"in.npy": npy(ball())}
     for number in SPACINGS:
         yield upsample(f"scales/spacing-{number}", files, "--spacing", number)
@@ -75,7 +74,7 @@ def _mismatches() -> Iterator[Case]:
                 f"scales/mixed-{number}-{sign}", {"in.npy": npy(values)}, "--spacing", "1"
             )
             yield upsample(f"scales/mixed-{number}-{sign}-i", {"in.npy": npy(values)})
-    for offset in (
+    for offset in [
         "0.001",
         "0.5",
         "-0.5",
@@ -88,7 +87,7 @@ def _mismatches() -> Iterator[Case]:
         "9",
         "20",
         "1e-9",
-    ):
+    ]:
         yield upsample(f"scales/at-{offset}", files, "--offset", offset)
         yield upsample(f"scales/at-{offset}-cap", files, "--offset", offset, "--cap")
         clamped = {"in.npy": npy(np.clip(ball(), -2, 2))}

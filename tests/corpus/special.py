@@ -11,7 +11,6 @@ from .case import Case, Content, ball, batch, npy, npz, sample, upsample
 
 
 def _socket(path: Path) -> None:
-    """Leave a socket at a path."""
     home = os.getcwd()
     os.chdir(path.parent)  # a socket's path may be 100 characters long and no more
     try:
@@ -22,7 +21,6 @@ def _socket(path: Path) -> None:
 
 
 def _closed(path: Path) -> None:
-    """Leave a file that only root can read."""
     path.write_bytes(npy(ball()))
     path.chmod(0)
 
@@ -33,7 +31,6 @@ def _closed_folder(path: Path) -> None:
 
 
 def _circle(path: Path) -> None:
-    """Leave a folder that holds links to itself and to what is above."""
     path.mkdir()
     (path / "in.npy").write_bytes(npy(ball()))
     (path / "me").symlink_to(".")
@@ -82,11 +79,11 @@ def cases(seed: int) -> Iterator[Case]:
         for suffix in ("npy", "npz"):
             at = {f"in.{suffix}": content}
             name = f"special/{kind}-{suffix}"
-            yield upsample(name, at, source=f"in.{suffix}", alone=True)
-            yield batch(f"{name}-batch", at, source=f"in.{suffix}", alone=True)
+            yield upsample(name, at)
+            yield batch(f"{name}-batch", at)
             inside = {f"grids/in.{suffix}": content, "grids/good.npy": GRID["good.npy"]}
-            yield batch(f"{name}-within", inside, source="grids", alone=True)
-            pattern = batch(f"{name}-pattern", inside, source=f"grids/*.{suffix}", alone=True)
+            yield batch(f"{name}-within", inside, source="grids")
+            pattern = batch(f"{name}-pattern", inside, source=f"grids/*.{suffix}")
             yield pattern
         yield from _meshes(kind, content)
         yield from _elsewhere(kind, content)
@@ -94,23 +91,19 @@ def cases(seed: int) -> Iterator[Case]:
 
 
 def _meshes(kind: str, content: Content) -> Iterator[Case]:
-    """Yield it as a mesh."""
     for suffix in ("ply", "stl", "obj"):
         at, source = {f"in.{suffix}": content}, f"in.{suffix}"
-        yield sample(f"special/{kind}-{suffix}-sample", at, "-n", "8", source=source, alone=True)
+        yield sample(f"special/{kind}-{suffix}-sample", at, "-n", "8", source=source)
 
 
 def _elsewhere(kind: str, content: Content) -> Iterator[Case]:
-    """Yield it as a list, as a network, as the reference, and where the output goes."""
     for suffix in ("txt", "jsonl"):
         at = {f"list.{suffix}": content}
-        yield batch(f"special/{kind}-{suffix}", {**GRID, **at}, source=f"list.{suffix}", alone=True)
+        yield batch(f"special/{kind}-{suffix}", {**GRID, **at})
     listed = {"list.jsonl": b'{"in": "in.npy"}\n{"in": "good.npy"}\n', "in.npy": content, **GRID}
-    yield batch(f"special/{kind}-listed", listed, source="list.jsonl", alone=True)
+    yield batch(f"special/{kind}-listed", listed, source="list.jsonl")
     model = ("upsample", "good.npy", "out.ply", "--model", "net.onnx")
-    yield Case(
-        f"special/{kind}-model", model, {**GRID, "net.onnx": content}, ("out.ply",), alone=True
-    )
+    yield Case(f"special/{kind}-model", model, {**GRID, "net.onnx": content}, ("out.ply",))
     if kind in DEVICES:
         return  # as a target: what follows links would write there
     for target in ("out.ply", "out.stl"):
@@ -119,24 +112,21 @@ def _elsewhere(kind: str, content: Content) -> Iterator[Case]:
             name = f"special/{kind}-target-{target[4:]}{''.join(option)}"
             words = ("upsample", "good.npy", target, "--quality", "fast", *option)
             made = (target, "nowhere")  # the latter where it is a link to there
-            yield Case(name, words, at, made, alone=True)
+            yield Case(name, words, at, made)
     words = ("upsample", "good.npy", "to/out.ply", "--quality", "fast")
     made = ("to/out.ply", "out.ply")  # the latter where it is a link to the folder itself
-    yield Case(f"special/{kind}-target-above", words, {**GRID, "to": content}, made, alone=True)
+    yield Case(f"special/{kind}-target-above", words, {**GRID, "to": content}, made)
 
 
 def _roots() -> Iterator[Case]:
-    """Yield folders and patterns that never end, and paths of the system."""
     circle = {"c": _circle}
     for source in ("c", "c/**/*.npy", "**/*.npy", "c/**", "c/*/*.npy", "**", "[", "c/[!a]n.npy"):
-        yield batch(f"special/circle-{source.replace('/', '-')}", circle, source=source, alone=True)
+        yield batch(f"special/circle-{source.replace('/', '-')}", circle, source=source)
     for number, target in enumerate(
         ("/proc/out.ply", "/sys/out.ply", "/proc/self/out.ply", "/none/out.ply")
     ):
-        yield upsample(
-            f"special/system-{number}", GRID, source="good.npy", target=target, alone=True
-        )
+        yield upsample(f"special/system-{number}", GRID, source="good.npy", target=target)
     for number, source in enumerate(("/dev/zero", "/dev/stdin", "/proc/self/maps", "~", "-", ".")):
-        yield upsample(f"special/source-{number}", {}, source=source, alone=True)
-        yield batch(f"special/source-{number}-batch", {}, source=source, alone=True)
-    yield upsample("special/root", {}, source="/", alone=True)
+        yield upsample(f"special/source-{number}", {}, source=source)
+        yield batch(f"special/source-{number}-batch", {}, source=source)
+    yield upsample("special/root", {}, source="/")
