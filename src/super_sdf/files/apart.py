@@ -58,7 +58,6 @@ class _Process:
         threading.Thread(target=self._watch, daemon=True).start()
 
     def ask(self, question: Any) -> Any:
-        """Return the answer to a question; an error that it meets is raised."""
         assert self.process.stdin and self.process.stdout
         try:
             pickle.dump(question, self.process.stdin)
@@ -71,7 +70,6 @@ class _Process:
         return answer
 
     def _watch(self) -> None:
-        """Kill the process when it holds too much, together with what this one took meanwhile."""
         if self.left is None:
             return
         while not self.ended.wait(STEP):

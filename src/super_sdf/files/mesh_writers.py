@@ -220,8 +220,6 @@ def _number_lines(line: str) -> ToBytes:
 
 
 def _index_lines(line: str, first: int = 0) -> ToBytes:
-    """Return what formats triangles as lines; vertex indices start at ``first``."""
-
     def to_bytes(rows: NDArray[Any]) -> bytes:
         numbers = rows.astype(np.int64) + first  # after the addition the last may exceed 32 bits
         return ((line * len(rows)) % tuple(numbers.ravel().tolist())).encode("ascii")
@@ -265,7 +263,7 @@ def write_glb(
     Vertices are float32, relative to the point ``about``, the translation of the nodes. Raises
     FileError if a mesh has no triangle, which glTF does not allow, or the file exceeds 4.29 GB.
     """
-    scene, size = Scene(about), JSON_BYTES * len(parts)
+    scene, size = _Scene(about), JSON_BYTES * len(parts)
     with path.open("wb") as file:
         file.write(bytes(HEADER_BYTES + size))
         for name, pieces in parts.items():
@@ -303,7 +301,7 @@ def _unsigned(faces: NDArray[Any]) -> bytes:
     return little_endian(faces.astype(np.uint32))
 
 
-class Scene:
+class _Scene:
     """The scene: a node and a mesh for each part, and the layout of the buffer."""
 
     def __init__(self, about: Triple) -> None:
@@ -317,7 +315,6 @@ class Scene:
         }
 
     def add(self, name: str, written: Written, box: _Shift) -> None:
-        """Add a part, whose vertices and indices follow those before."""
         scene, named = self.described, {"name": name} if name else {}
         mesh, first = len(scene["meshes"]), len(scene["accessors"])
         scene["scenes"][0]["nodes"].append(mesh)

@@ -150,7 +150,6 @@ def write_together(
 
 
 def _check_mesh_holds(mesh: Mesh, path: Path, about: Triple) -> None:
-    """Raise FileError if coordinates are not finite, or too close together for the format."""
     if not np.isfinite(mesh.vertices).all():
         raise FileError(f"{path} cannot be written: a vertex of the mesh is not finite")
     if not format_of(path).single_precision or mesh.vertices.dtype == np.float32:

@@ -218,7 +218,6 @@ def _known_members(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.Zi
 def _read_small(
     archive: zipfile.ZipFile, info: zipfile.ZipInfo, request: Request, key: str
 ) -> NDArray[Any]:
-    """Read an array of one number or three; of nine, for a direction."""
     member = Member(archive, info, f"{request.path}[{key}]")
     most, asked = (9, "nine numbers") if key == "direction" else (3, "one number or three")
     header = member.header

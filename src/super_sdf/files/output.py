@@ -72,13 +72,11 @@ def _kind_at(path: Path) -> int | None:
 
 
 def _check_not_protected(path: Path, mode: int | None) -> None:
-    """Raise WriteError if the file at a path is protected: a rename, or root, would replace it."""
     if mode is not None and not (mode & WRITABLE and os.access(path, os.W_OK)):
         raise WriteError(f"{path} is write-protected: allow writing to it, or give another name")
 
 
 def _behind_links(path: Path) -> Path:
-    """Return the file that is written: the target if the path is a link."""
     return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
@@ -157,7 +155,6 @@ def _stem(name: str) -> str:
 
 @contextmanager
 def _reserved_part(target: Path) -> Iterator[Path]:
-    """Create and lock this process's part of a target; remove it at the end if it still exists."""
     remove_abandoned_parts([target])
     part = part_path(target)
     try:

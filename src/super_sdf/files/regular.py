@@ -130,7 +130,6 @@ def files_of(path: str | Path) -> list[Path]:
 
 
 def _names_in(file: Path) -> Iterator[str]:
-    """Yield what may be the names of other files in a header or a network."""
     kind = file.suffix.lower()
     if kind == ".hdr":
         yield from (f"{file.stem}.img", f"{file.stem}.img.gz")

@@ -126,7 +126,6 @@ class Unpacker:
         return b"".join(pieces)
 
     def _unpack(self, most: int) -> bytes:
-        """Return at least one and at most ``most`` bytes; none at the end."""
         while not self._codec.eof:
             data, is_fed = b"", self._codec.needs_input
             try:

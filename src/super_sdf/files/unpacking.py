@@ -100,7 +100,6 @@ def unpacked(
 
 
 def _check_chunk(volume: Volume, name: str, left: int | None) -> None:
-    """Raise OutOfMemoryError if not even one chunk, or plane, of an array can be unpacked."""
     size = prod(volume.unit) * volume.dtype.itemsize
     if left is not None and COPIES * size > (left if volume.chunks else max(left, BOX)):
         parts = "chunks" if volume.chunks else "planes"
@@ -151,7 +150,6 @@ def _blocks(
 
 
 def _boxes_of(bounds: Sequence[tuple[int, int]], box: Sizes) -> Iterator[Box]:
-    """Yield boxes between bounds along each axis, cut at multiples of a size, as chunks are."""
     cuts = []
     for (low, high), size in zip(bounds, box):
         inner = range((low // size + 1) * size, high, size)

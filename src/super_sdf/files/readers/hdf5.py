@@ -101,10 +101,7 @@ def _may_be_grid(shape: tuple[int, ...] | None) -> bool:
 
 
 def _axes(values: Any, request: Request) -> Axes:
-    """Return what a dataset says of its axes: by ``axistags``, as ilastik writes them, or scales.
-
-    An axis has the name of its label, or of the first scale that is attached to it.
-    """
+    """Return what a dataset says of its axes: by ``axistags``, as of ilastik, or scales."""
     tags = json.loads(values.attrs.get("axistags", "{}")).get("axes", ())
     if len(tags) == values.ndim:
         keys = [str(tag.get("key", "")) for tag in tags]
@@ -139,7 +136,6 @@ def _check_stored(values: Any, request: Request) -> None:
 
 
 def _read_classic(request: Request) -> Volume:
-    """Read a NetCDF file of version 3 or lower, whose samples are mapped into memory."""
     from scipy.io import netcdf_file
 
     variables = request.files.enter_context(netcdf_file(request.path, mmap=True)).variables
@@ -163,7 +159,6 @@ def _read_classic(request: Request) -> Volume:
 
 
 def _read_5(request: Request) -> Volume:
-    """Read a MATLAB file of version 4 to 7: a variable is loaded whole."""
     from scipy.io import loadmat, whosmat
 
     listed = whosmat(request.path)

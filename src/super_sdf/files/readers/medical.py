@@ -90,7 +90,6 @@ def _opened(request: Request, path: Path) -> Any:
 def _proxied(
     path: Path, stream: Any, header: Any, place: Any, notes: tuple[str, ...] = ()
 ) -> Volume:
-    """Return the array that a header of nibabel describes; ``place`` is that of x, y and z."""
     from nibabel.arrayproxy import ArrayProxy
 
     size, is_packed = path.stat().st_size, isinstance(stream, gzip.GzipFile)
@@ -154,12 +153,8 @@ EVEN = 0.01  # share of the spacing by which slices may be off
 PARALLEL = 1e-4  # by which components of directions may differ
 
 
-class Slice(NamedTuple):
-    """A slice: a file and the frame in it, its place, and how its values are scaled.
-
-    ``across``, (2, 3), has the directions of the axes along a row and along a column; ``spacing``
-    is that of rows, and of columns; ``scale`` is slope and intercept.
-    """
+class _Slice(NamedTuple):
+    """A slice: a file and the frame in it, its place, and how its values are scaled."""
 
     path: Path
     frame: int
@@ -170,7 +165,6 @@ class Slice(NamedTuple):
     scale: tuple[float, float]
 
     def read(self) -> NDArray[Any]:
-        """Return its values as they are stored."""
         from pydicom.pixels.utils import pixel_array
 
         return np.asarray(pixel_array(self.path, index=self.frame))
@@ -215,7 +209,7 @@ def _series_in(folder: Path) -> dict[str, list[tuple[Path, Any]]]:
     return series
 
 
-def _slices(images: list[tuple[Path, Any]]) -> Iterator[Slice]:
+def _slices(images: list[tuple[Path, Any]]) -> Iterator[_Slice]:
     for path, header in images:
         if header.get("SamplesPerPixel", 1) != 1 or "ModalityLUTSequence" in header:
             raise GridError(f"{path.name} has colours or a table of values: give grey images")
@@ -230,8 +224,7 @@ def _slices(images: list[tuple[Path, Any]]) -> Iterator[Slice]:
             yield _slice(path, index, header, [frame, *shared, header])
 
 
-def _slice(path: Path, index: int, header: Any, groups: list[Any]) -> Slice:
-    """Return a frame of an image; what is stated of it is in the first group that has it."""
+def _slice(path: Path, index: int, header: Any, groups: list[Any]) -> _Slice:
     corner = _stated(groups, "PlanePositionSequence", "ImagePositionPatient")
     across = _stated(groups, "PlaneOrientationSequence", "ImageOrientationPatient")
     steps = _stated(groups, "PixelMeasuresSequence", "PixelSpacing")
@@ -241,7 +234,7 @@ def _slice(path: Path, index: int, header: Any, groups: list[Any]) -> Slice:
         _stated(groups, "PixelValueTransformationSequence", f"Rescale{name}")
         for name in ("Slope", "Intercept")
     )
-    return Slice(
+    return _Slice(
         *(path, index, (header.Rows, header.Columns), np.array(corner, np.float64)),
         np.array(across, np.float64).reshape(2, 3),
         (float(steps[0]), float(steps[1])),
@@ -255,12 +248,12 @@ def _stated(groups: list[Any], sequence: str, name: str) -> Any:
     return next((each[name].value for each in among if name in each), None)
 
 
-def _normal(each: Slice) -> NDArray[np.float64]:
+def _normal(each: _Slice) -> NDArray[np.float64]:
     normal: NDArray[np.float64] = np.cross(*each.across)
     return normal
 
 
-def _sorted(slices: list[Slice]) -> tuple[list[Slice], float]:
+def _sorted(slices: list[_Slice]) -> tuple[list[_Slice], float]:
     first = slices[0]
     normal = _normal(first)
     slices = sorted(slices, key=lambda each: float(each.corner @ normal))
@@ -287,7 +280,7 @@ def _sorted(slices: list[Slice]) -> tuple[list[Slice], float]:
     return slices, step
 
 
-def _check_steps(slices: list[Slice], steps: NDArray[np.float64], step: float) -> None:
+def _check_steps(slices: list[_Slice], steps: NDArray[np.float64], step: float) -> None:
     if not len(steps):
         raise GridError(f"{slices[0].path.name} is its only slice: give the folder of a series")
     off = np.abs(steps - step)
@@ -305,5 +298,5 @@ def _check_steps(slices: list[Slice], steps: NDArray[np.float64], step: float) -
         )
 
 
-def _named(slices: list[Slice], first: int) -> str:
+def _named(slices: list[_Slice], first: int) -> str:
     return f"{slices[first].path.name} and {slices[first + 1].path.name}"

@@ -223,7 +223,6 @@ def _steps(header: dict[str, Any], space: list[int]) -> tuple[Any, Any]:
 
 
 def _of_axes(values: Any, space: list[int], default: Any) -> Any:
-    """Return the values of a field for the axes in space; others if it is not stated for all."""
     is_stated = values is not None and len(values) > max(space)
     return [values[axis] for axis in space] if is_stated else default
 

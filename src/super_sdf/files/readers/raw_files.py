@@ -88,7 +88,7 @@ def read_metaimage(request: Request) -> Volume:
 
 
 class _Header:
-    """The fields of a header, up to that which names the data; ``rest`` follows, from ``length`` on."""
+    """The fields of a header up to that of the data; ``rest`` follows, from ``length`` on."""
 
     def __init__(self, text: bytes) -> None:
         self.fields: dict[str, str] = {}

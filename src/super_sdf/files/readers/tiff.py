@@ -61,7 +61,6 @@ def _check_other_files(file: Any, request: Request) -> None:
 
 
 def _reader(request: Request, series: Any) -> Planes:
-    """Return a function that reads planes: pages if each is a plane, else from the whole array."""
     pages, shape = series.pages, series.shape
     if len(pages) != shape[0] or tuple(pages[0].shape) != tuple(shape[1:]):
         request.check_loads(prod(shape) * np.dtype(series.dtype).itemsize, "tifffile")
@@ -78,7 +77,6 @@ def _reader(request: Request, series: Any) -> Planes:
 
 
 def _axes(file: Any, series: Any, order: str) -> tuple[Axes, tuple[str, ...]]:
-    """Return what a file says of the axes of an array, and a note on what is not taken of it."""
     is_named = order == "zyx" and sorted(series.axes) == ["X", "Y", "Z"]
     names = series.axes.lower() if is_named else order
     stated: dict[str, Stated] = _ome_axes(file) or _imagej_axes(file) or {}
@@ -129,7 +127,6 @@ def _resolution_unit(file: Any) -> str:
 
 
 def _pixel_note(file: Any) -> tuple[str, ...]:
-    """Return a sentence on a resolution that states x and y, but nothing of z; none without one."""
     sizes, unit = _pixel_sizes(file), _resolution_unit(file)
     if file.is_ome or not sizes or not unit:
         return ()

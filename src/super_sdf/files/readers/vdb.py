@@ -87,7 +87,6 @@ class _Coding:
     background: float
 
     def read(self, cursor: _Cursor, active: BoolArray) -> NDArray[Any]:
-        """Return the next values, one for each bit of a mask."""
         values, selection, state = self._inactive(cursor, len(active))
         packed = state != ALL and self.flags & ACTIVE_MASK
         numbers = self._numbers(cursor, int(active.sum()) if packed else len(active))
@@ -118,7 +117,6 @@ class _Coding:
         return values, _bits(cursor.array("u1", count // 8)) if masked else None, state
 
     def _length(self, cursor: _Cursor, count: int) -> tuple[int, bool]:
-        """Return how many bytes the next numbers take, and whether they are packed."""
         if not self.flags & (ZIP | BLOSC) or (not count and self.stored != self.dtype):
             return count * self.stored.itemsize, False
         length = cursor.number("q")
@@ -229,13 +227,11 @@ class _Tree:
         return (low.min(0), high.max(0)) if len(low) else None
 
     def is_signed(self) -> bool:
-        """Return whether any tile, or any value of a leaf, is negative."""
         cursor, leaves = _Cursor(self.file), range(len(self.leaves))
         negative = any((self._values_of(cursor, leaf)[0] < 0).any() for leaf in leaves)
         return negative or bool((self.values < 0).any())
 
     def read(self, first: Ints, shape: tuple[int, ...], *, unknown: bool = False) -> NDArray[Any]:
-        """Return a box of voxels from ``first`` on; inactive background may be unknown, NaN."""
         background = np.nan if unknown else self.coding.background
         box = np.full(shape, background, self.coding.dtype)
         for tile in np.flatnonzero(_touch(self.corners, self.edges[:, None], first, shape)):
@@ -250,7 +246,6 @@ class _Tree:
         return box
 
     def _values_of(self, cursor: _Cursor, leaf: int) -> tuple[NDArray[Any], BoolArray]:
-        """Return the values of a leaf, and which are active, both (512,)."""
         cursor.place = int(self.places[leaf])
         active = _bits(self.masks[leaf])
         return self.coding.read(cursor, active), active
@@ -262,7 +257,6 @@ def _touch(corners: Ints, edges: Any, first: Ints, shape: tuple[int, ...]) -> Bo
 
 
 def _put(box: NDArray[Any], values: NDArray[Any], start: Ints) -> None:
-    """Copy what lies within the box of an array that begins at ``start`` there."""
     low = np.maximum(start, 0)
     high = np.minimum(start + values.shape, box.shape)
     there = tuple(slice(a, b) for a, b in zip(low, high))
@@ -321,7 +315,6 @@ def read_vdb(request: Request) -> Volume:
 
 
 def _entries(file: InputFile) -> list[tuple[str, str, str, int]]:
-    """Return name, type, parent and place of each grid."""
     cursor = _Cursor(file)
     if file.size < 12 or cursor.number("q") != MAGIC:
         raise FileError(f"{file.name} is no .vdb file: its first bytes are not OpenVDB's")
@@ -353,7 +346,6 @@ def _entries(file: InputFile) -> list[tuple[str, str, str, int]]:
 
 
 def _read_head(file: InputFile, place: int) -> tuple[int, dict[str, Any], NDArray[np.float64], int]:
-    """Return compression, metadata and transform of a grid, and where its tree begins."""
     cursor = _Cursor(file, place)
     flags = cursor.number("I")
     metadata = _read_metadata(cursor)

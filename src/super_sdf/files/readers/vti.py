@@ -51,7 +51,7 @@ def read_vti(request: Request) -> Volume:
     What has several numbers a sample, and VTK's own marks, is read only if it is named.
     """
     file = InputFile.open(request.path)
-    outline = Outline(file)
+    outline = _Outline(file)
     arrays = outline.arrays()
     scalar = [name for name in arrays if arrays[name][2] or name == request.member]
     name = request.choose(scalar or list(arrays), "array of points or cells")
@@ -61,7 +61,7 @@ def read_vti(request: Request) -> Volume:
     origin = _numbers(outline.image, "Origin", 3, 0)
     turn = _numbers(outline.image, "Direction", 9, np.eye(3).ravel()).reshape(3, 3)
     lattice = ImageLattice(_extent(outline.image, "WholeExtent"), spacing, origin, turn, of_points)
-    parts = [Part(file, outline, piece, (kind, name), lattice) for piece in outline.pieces]
+    parts = [_Part(file, outline, piece, (kind, name), lattice) for piece in outline.pieces]
     _check_cover(parts, lattice.shape)
     if len({part.dtype for part in parts}) > 1:
         raise FileError(f"its pieces hold {name} in several types: save it in one")
@@ -81,7 +81,7 @@ class _FoundError(Exception):
     """The data at the end of a file begins."""
 
 
-class Outline:
+class _Outline:
     """What the XML of a file says, up to the data at its end.
 
     ``top`` and ``image`` are the attributes of the elements VTKFile and ImageData. A piece is its
@@ -160,7 +160,6 @@ class Outline:
                 raise _FoundError
 
     def _text(self, text: str) -> None:
-        """Note where the text of an array begins: at the first character."""
         if text.strip() and self.path[-1] == "DataArray":
             place = self.parser.CurrentByteIndex
             self.array["start"] = place + len(text) - len(text.lstrip())
@@ -173,7 +172,7 @@ class Outline:
         self.path.pop()
 
 
-class Source:
+class _Source:
     """Bytes between two places in a file, as they are or in base64."""
 
     def __init__(self, file: InputFile, start: int, end: int, is_text: bool) -> None:
@@ -183,7 +182,6 @@ class Source:
             self.size = self.size // 4 * 3
 
     def read(self, offset: int, count: int) -> NDArray[np.uint8]:
-        """Return ``count`` bytes from ``offset`` on, or fewer at the end."""
         if not self.is_text:
             place = self.start + offset
             return self.file.read(place, min(count, self.end - place))
@@ -193,13 +191,12 @@ class Source:
         data = base64.b64decode(text.rstrip() if stop == self.end else text, validate=True)
         return np.frombuffer(data, np.uint8)[offset - 3 * first :][:count]
 
-    def after(self, size: int) -> Source:
-        """Return what follows a section of some bytes, each of which has its own base64."""
+    def after(self, size: int) -> _Source:
         text = -(-size // 3) * 4 if self.is_text else size
-        return Source(self.file, self.start + text, self.end, self.is_text)
+        return _Source(self.file, self.start + text, self.end, self.is_text)
 
 
-class Part:
+class _Part:
     """An array of a piece, whose planes come in order, and where it is in the whole array.
 
     ``low`` and ``high`` are its first sample along each axis (z, y, x), and that after its last;
@@ -211,7 +208,7 @@ class Part:
     def __init__(
         self,
         file: InputFile,
-        outline: Outline,
+        outline: _Outline,
         piece: Piece,
         which: tuple[str, str],
         lattice: ImageLattice,
@@ -234,35 +231,34 @@ class Part:
         self.planes = self._planes(file, outline, array)
 
     def copy_to(self, planes: NDArray[Any], first: int) -> None:
-        """Copy the planes that this part has of those from ``first`` on."""
         start, stop = max(self.low[0], first), min(self.high[0], first + len(planes))
         if start < stop:
             _, rows, columns = (slice(*ends) for ends in zip(self.low, self.high))
             part = self.planes(start - self.low[0], stop - self.low[0])
             planes[start - first : stop - first, rows, columns] = part
 
-    def _planes(self, file: InputFile, outline: Outline, array: Attributes) -> Planes:
+    def _planes(self, file: InputFile, outline: _Outline, array: Attributes) -> Planes:
         if array.get("format") == "ascii":
             return TextValues(file, array["start"], array["end"], self.dtype, self.shape).planes
-        source = Source(file, array["start"], array["end"], True)
+        source = _Source(file, array["start"], array["end"], True)
         if array.get("format") == "appended":
             encoding, start = outline.appended
             offset = array.get("offset", "").strip()
             if encoding not in ("raw", "base64") or not re.fullmatch("[0-9]{1,18}", offset):
                 raise FileError(f"{self.name} is damaged: its offset is {seen(offset)}")
-            source = Source(file, start + int(offset), file.size, encoding == "base64")
+            source = _Source(file, start + int(offset), file.size, encoding == "base64")
         compressor = outline.top.get("compressor")
         read = self._blocks(source, compressor) if compressor else self._whole(source)
         return next_planes(read, self.shape, self.dtype)
 
-    def _words(self, source: Source, first: int, count: int) -> list[int]:
+    def _words(self, source: _Source, first: int, count: int) -> list[int]:
         size = self.word.itemsize
         if (first + count) * size > source.size:
             raise FileError(f"{self.name} is truncated: its data begins after the end of the file")
         data = source.read(first * size, count * size)
         return [int(number) for number in data.view(self.word)]
 
-    def _whole(self, source: Source) -> Read:
+    def _whole(self, source: _Source) -> Read:
         (size,) = self._words(source, 0, 1)
         start = self.word.itemsize
         self._check_size(size)
@@ -273,12 +269,11 @@ class Part:
         return bytes_from(source, start, start + size)
 
     def _check_size(self, size: int) -> None:
-        """Raise FileError unless data of some bytes is the array."""
         if size != prod(self.shape) * self.dtype.itemsize:
             promised = in_words_of(self.shape, self.dtype)
             raise FileError(f"{self.name} is damaged: {size:,} bytes for {promised}")
 
-    def _blocks(self, source: Source, compressor: str) -> Read:
+    def _blocks(self, source: _Source, compressor: str) -> Read:
         """Return a function that reads compressed data: blocks of one size, the last shorter."""
         count, size, last = self._words(source, 0, 3)
         sizes = [size] * (count - 1) + [last or size] if count < source.size else []
@@ -327,7 +322,7 @@ def _block(compressor: str, packed: Read, length: int, size: int, name: str) -> 
     return io.BytesIO(block.tobytes()).read
 
 
-def _check_cover(parts: list[Part], shape: tuple[int, ...]) -> None:
+def _check_cover(parts: list[_Part], shape: tuple[int, ...]) -> None:
     """Raise FileError if some samples are in no piece: VTK has 0 there, which is the surface."""
     cuts = [sorted({end for p in parts for end in (p.low[a], p.high[a])}) for a in range(3)]
     if prod(map(len, cuts)) > MOST_CELLS:

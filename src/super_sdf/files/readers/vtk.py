@@ -171,7 +171,6 @@ def _check_text(path: Path, promised: int) -> None:
 
 
 def _lattice(image: Any, of_points: bool, name: str, path: Path) -> ImageLattice:
-    """Return where the samples lie; raise GridError with a way out if they are no lattice."""
     if image.IsA("vtkImageData"):
         return ImageLattice.of_image(image, of_points)
     if not image.IsA("vtkRectilinearGrid"):

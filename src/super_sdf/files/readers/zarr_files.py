@@ -33,7 +33,7 @@ MOST_AXES = 5  # time, channel, and three of space
 
 def read_zarr(request: Request) -> Volume:
     """Read ``FOLDER.zarr``, or ``FOLDER.zarr:/ARRAY`` of a group; of OME-Zarr the finest level."""
-    files = ZarrFiles(request)
+    files = _Store(request)
     arrays = files.arrays()
     if "" not in arrays:
         name = _choose(files, arrays, request)
@@ -58,11 +58,8 @@ def _open(request: Request, name: str) -> Any:
     return array
 
 
-def _choose(files: ZarrFiles, arrays: dict[str, int], request: Request) -> str:
-    """Return the name of the array to read: of an image the finest level, unless another is named.
-
-    A name may be that of a group, such as that of one image of several.
-    """
+def _choose(files: _Store, arrays: dict[str, int], request: Request) -> str:
+    """Return the array to read: of an image the finest level, unless another is named."""
     before, named = "", (request.member or "").strip("/")
     is_group = bool(named) and any(name.startswith(f"{named}/") for name in arrays)
     if is_group:
@@ -79,8 +76,7 @@ def _choose(files: ZarrFiles, arrays: dict[str, int], request: Request) -> str:
     return asked.choose(names, "3D array").strip("/")
 
 
-def _volume(files: ZarrFiles, name: str, array: Any, request: Request) -> Volume:
-    """Return an array as a volume, without its axes of length 1 that are not in space."""
+def _volume(files: _Store, name: str, array: Any, request: Request) -> Volume:
     axes = _image_axes(files, name) if name else None
     attributes = dict(array.attrs)
     if axes and (not axes.are_in_space or len(axes.names) != array.ndim):
@@ -111,11 +107,8 @@ def _volume(files: ZarrFiles, name: str, array: Any, request: Request) -> Volume
     )
 
 
-def _named_axes(files: ZarrFiles, name: str, array: Any, request: Request) -> Axes:
-    """Return the axes of an array by the names of its dimensions, and by arrays of these names.
-
-    xarray writes the names as an attribute in format 2, in the metadata in format 3.
-    """
+def _named_axes(files: _Store, name: str, array: Any, request: Request) -> Axes:
+    """Return the axes of an array by the names of its dimensions, and by arrays of these names."""
     stated = getattr(array.metadata, "dimension_names", None) if array_version(array) > 2 else None
     names = stated or array.attrs.get("_ARRAY_DIMENSIONS") or ()
     if len(names) != array.ndim:
@@ -154,11 +147,8 @@ def _reader(array: Any, space: list[int]) -> ReadBox:
     return read_box
 
 
-def _image_axes(files: ZarrFiles, name: str) -> Axes | None:
-    """Return the axes of an array that is a level of an image of OME, None if it is of none.
-
-    The metadata is that of a group on the way there.
-    """
+def _image_axes(files: _Store, name: str) -> Axes | None:
+    """Return the axes of an array that is a level of an image of OME, None if it is of none."""
     parts = name.strip("/").split("/")
     for depth in range(len(parts)):
         for image in _multiscales(files.attributes("/".join(parts[:depth]))):
@@ -169,7 +159,6 @@ def _image_axes(files: ZarrFiles, name: str) -> Axes | None:
 
 
 def _multiscales(attributes: Document) -> list[Document]:
-    """Return the images that the attributes of a group describe, in version 0.5 under ``ome``."""
     about = attributes.get("ome", attributes)
     images = about.get("multiscales") if isinstance(about, dict) else None
     for entry in images or []:
@@ -184,7 +173,6 @@ def _levels(image: Document) -> list[str]:
 
 
 def _axes_of(image: Document, level: int) -> Axes:
-    """Return the axes of a level, placed by its transformations; the image's own come last."""
     stated = image.get("axes", ["z", "y", "x"])
     named = [axis if isinstance(axis, dict) else {"name": axis} for axis in stated]
     names = [str(axis.get("name", "")) for axis in named]
@@ -230,7 +218,7 @@ MOST_ABSENT = 1 << 20  # chunks: to look for them takes a minute
 Document = dict[str, Any]
 
 
-class ZarrFiles:
+class _Store:
     """The files of a Zarr store in a folder or a zip file, which may not lead out of it.
 
     ``sizes`` has the bytes that each file takes, by its key.
@@ -246,7 +234,6 @@ class ZarrFiles:
             self.sizes = {info.filename: info.compress_size for info in self.zip.infolist()}
 
     def _listed(self, folder: str, before: str) -> Iterator[tuple[str, int]]:
-        """Yield key and size of each file in a folder and below it."""
         for entry in os.scandir(folder):
             key = before + entry.name
             if entry.is_dir(follow_symlinks=False):
@@ -259,11 +246,9 @@ class ZarrFiles:
             yield key, entry.stat().st_size
 
     def open(self, key: str) -> IO[bytes]:
-        """Open a file of the store."""
         return self.zip.open(key) if self.zip else open(self.path / key, "rb")
 
     def document(self, key: str) -> Document:
-        """Return a file of metadata, a JSON object; an empty one if the store has none."""
         if key not in self.sizes:
             return {}
         with self.open(key) as file:
@@ -273,7 +258,6 @@ class ZarrFiles:
         return content
 
     def arrays(self) -> dict[str, int]:
-        """Return the number of axes of each array, by its path in the store."""
         counts = {}
         for key in self.sizes:
             path, _, name = key.rpartition("/")
@@ -284,12 +268,10 @@ class ZarrFiles:
         return counts
 
     def axes_of(self, path: str) -> int:
-        """Return the number of axes of an array, 0 if there is none at a path."""
         documents = (self.document(f"{path}/{name}") for name in (ARRAY_2, NODE_3))
         return max(len(about.get("shape", ())) for about in documents)
 
     def attributes(self, path: str) -> Document:
-        """Return the attributes of an array or a group."""
         before = f"{path}/" if path else ""
         stated = self.document(before + NODE_3).get("attributes") or {}
         return {**self.document(before + ATTRIBUTES_2), **stated}
@@ -373,7 +355,6 @@ def array_version(array: Any) -> int:
 
 
 def _codecs_of(about: Any) -> Iterator[str]:
-    """Yield the names of all codecs in the metadata of an array, also of those within others."""
     if isinstance(about, dict):
         for key in ("compressor", "filters", "codecs", "index_codecs"):
             listed: Any = about.get(key) or ()
