@@ -8,11 +8,10 @@ import os
 import re
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from fnmatch import fnmatch
 from hashlib import blake2b
 from pathlib import Path
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 
@@ -75,8 +74,7 @@ FAILED = re.compile(
 Snapshot = dict[str, str]
 
 
-@dataclass(frozen=True)
-class Fault:
+class Fault(NamedTuple):
     """Something that must not be: its kind, and what exactly."""
 
     kind: str
@@ -159,7 +157,7 @@ def _of_json(case: Case, run: Run) -> list[Fault]:
 
 def _of_files(case: Case, run: Run, before: Snapshot, after: Snapshot, folder: Path) -> list[Fault]:
     new = [name for name in after if before.get(name) != after[name]]
-    faults = [Fault("left over", _shape(n)) for n in new if LEFT.search(Path(n).name)]
+    faults = [Fault("left over", n) for n in new if LEFT.search(Path(n).name)]
     new = [name for name in new if not LEFT.search(Path(name).name)]
     allowed = [name for name in new if any(fnmatch(name, made) for made in case.makes)]
     faults += [Fault("made unasked", name) for name in new if name not in allowed]
@@ -179,8 +177,8 @@ def _of_mesh(case: Case, run: Run, path: Path) -> list[Fault]:
     if not path.is_file():
         return []
     told_open = "runs out of the grid" in run.err + run.out or '"closed": false' in run.out
-    in_batch = case.command == "batch"  # the ledger says it
-    told_open |= in_batch and '"closed": false' in _ledger_of(path)
+    for ledger in [folder / "report.jsonl" for folder in path.parents]:
+        told_open |= ledger.is_file() and '"closed": false' in ledger.read_text(errors="replace")
     faults = faults_of_mesh(path, may_be_open=told_open)
     said = COUNTS.search(run.err)
     if said and not faults:
@@ -190,26 +188,12 @@ def _of_mesh(case: Case, run: Run, path: Path) -> list[Fault]:
     return [Fault("mesh", f"{path.suffix}: {fault}") for fault in faults]
 
 
-def _ledger_of(path: Path) -> str:
-    ledgers = [folder / "report.jsonl" for folder in path.parents]
-    return "".join(ledger.read_text(errors="replace") for ledger in ledgers if ledger.is_file())
-
-
-def _shape(name: str) -> str:
-    return re.sub(r"\d{2,}", "N", name)
-
-
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(NamedTuple):
     """How a case ended, and what is wrong with that."""
 
     case: Case
     run: Run
     faults: list[Fault]
-
-    def lines(self) -> list[str]:
-        """Return the faults, a line each."""
-        return [f"{self.case.name}\t{fault.kind}\t{fault.what}" for fault in self.faults]
 
 
 def try_case(case: Case, run_words: Callable[[Sequence[str], Path], Run]) -> Outcome:

@@ -9,15 +9,13 @@ import resource
 import signal
 import sys
 import tempfile
-import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from super_sdf.network.onnx import ort
 
@@ -75,31 +73,15 @@ class HangError(BaseException):
     """The command did not end in time."""
 
 
-@dataclass(frozen=True)
-class Run:
-    """How a command ended.
+class Run(NamedTuple):
+    """How a command ended."""
 
-    Attributes
-    ----------
-    code : int
-        The exit code; negative if a signal ended the process.
-    out, err : str
-        What stood on the terminal, what compiled code wrote there too.
-    trace : str
-        Where an exception came out of the program, its type and text; empty if none did.
-    warned : tuple of str
-        Warnings that Python would have shown.
-    grown : int
-        Bytes that the process took more at its height than before.
-    """
-
-    code: int
-    out: str
+    code: int  # below 0 if a signal ended the process
+    out: str  # what stood on the terminal, what compiled code wrote there too
     err: str
-    trace: str = ""
-    warned: tuple[str, ...] = ()
-    seconds: float = 0.0
-    grown: int = 0
+    trace: str = ""  # where an exception came out of the program, its type and text
+    warned: tuple[str, ...] = ()  # that Python would have shown
+    grown: int = 0  # bytes that the process took more at its height than before
 
 
 def limit() -> float:
@@ -116,7 +98,7 @@ def run_here(words: Sequence[str], folder: Path) -> Run:
 
     if not _terminals:
         _terminals.append(Terminal())
-    terminal, start, code, trace = _terminals[0], time.perf_counter(), 0, ""
+    terminal, code, trace = _terminals[0], 0, ""
     before = _begin_memory()
     with (
         warnings.catch_warnings(record=True) as caught,
@@ -132,9 +114,12 @@ def run_here(words: Sequence[str], folder: Path) -> Run:
         except BaseException as error:  # whatever comes out is what is looked for
             code, trace = 1, describe(error)
     out, err = terminal.read()
-    warned = tuple(_say(entry) for entry in caught if not issubclass(entry.category, HIDDEN))
-    spent = time.perf_counter() - start
-    return Run(code, out, err, trace, warned, spent, _peak_memory() - before)
+    warned = tuple(
+        f"{entry.filename}:{entry.lineno}: {entry.message}"
+        for entry in caught
+        if not issubclass(entry.category, HIDDEN)
+    )
+    return Run(code, out, err, trace, warned, _status("VmHWM") - before)
 
 
 @contextmanager
@@ -169,28 +154,16 @@ def describe(error: BaseException) -> str:
     """Return where an exception came from, the last of our own lines first, and what it says."""
     frames = traceback.extract_tb(error.__traceback__)
     ours = [frame for frame in frames if f"{os.sep}super_sdf{os.sep}" in frame.filename]
-    places = []
-    for frame in [ours[-1] if ours else frames[-1], frames[-1]]:
-        path = Path(frame.filename)
-        places.append(f"{path.parent.name}/{path.name}:{frame.name}")
+    ends = [*ours[-1:], frames[-1]]
+    places = [f"{Path(each.filename).name}:{each.name}" for each in ends]
     text = str(error).splitlines()[0][:200] if str(error) else ""
     return f"{' < '.join(dict.fromkeys(places))}: {type(error).__name__}: {text}"
-
-
-def _say(entry: warnings.WarningMessage) -> str:
-    path = Path(entry.filename)
-    first = str(entry.message).splitlines()[0] if str(entry.message) else ""
-    return f"{path.parent.name}/{path.name}:{entry.lineno}: {entry.category.__name__}: {first}"
 
 
 def _begin_memory() -> int:
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
     return _status("VmRSS")
-
-
-def _peak_memory() -> int:
-    return _status("VmHWM")
 
 
 def _status(key: str) -> int:
