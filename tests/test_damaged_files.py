@@ -190,9 +190,6 @@ def test_sizes_that_no_file_has_are_refused_at_once(size, first):
 )
 def test_fields_of_metaimage_are_checked(line, said):
     assert refusal(mha(line)).startswith(said)
-
-
-def test_a_type_that_is_no_number_is_refused():
     write("a.mha", MHA.replace("MET_FLOAT", "MET_STRING"), "ElementDataFile = LOCAL\n", RAW)
     assert refusal("a.mha").startswith("a.mha: its ElementType is 'MET_STRING': give one of MET_")
 
@@ -259,9 +256,6 @@ def make_bomb(name: str, zeros: bytes) -> None:
     if name == "a.mha":
         text = MHA.replace("24 20 17", sizes).replace("MET_FLOAT", "MET_UCHAR")
         write(name, text, "CompressedData = True\nElementDataFile = LOCAL\n", zlib.compress(zeros))
-    elif name == "a.nrrd":
-        text = NRRD.replace("24 20 17", sizes).replace("float", "uchar")
-        write(name, text, "encoding: gzip\n\n", gzip.compress(zeros))
     elif name == "a.npz":
         np.savez_compressed(name, values=np.frombuffer(zeros, np.uint8).reshape(512, 512, 512))
     elif name == "a.nii.gz":
@@ -274,11 +268,7 @@ def make_bomb(name: str, zeros: bytes) -> None:
         packed = zlib.compress(zeros)
         text = (
             '<VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" header_type="UInt64"'
-        )
-        text += (
             ' compressor="vtkZLibDataCompressor"><ImageData WholeExtent="{0}"><Piece Extent="{0}">'
-        )
-        text += (
             '<PointData><DataArray type="UInt8" Name="d" format="appended" offset="0"/></PointData>'
         )
         text += '</Piece></ImageData><AppendedData encoding="raw">_'
@@ -413,12 +403,8 @@ def test_a_spacing_below_0_is_that_of_itk():
 @pytest.mark.parametrize("kind", TYPES)
 def test_every_type_of_metaimage_is_what_itk_reads(kind, order):
     lines = f"ElementType = {kind}\nDimSize = 4 3 2\n{order}\nElementDataFile = LOCAL\n"
-    data = (
-        np.random.default_rng(3)
-        .integers(0, 120, 24 * np.dtype(TYPES[kind]).itemsize)
-        .astype(np.uint8)
-        .tobytes()
-    )
+    size = 24 * np.dtype(TYPES[kind]).itemsize
+    data = np.random.default_rng(3).integers(0, 120, size, np.uint8).tobytes()
     write("a.mha", "ObjectType = Image\nNDims = 3\n", lines, data)
     with open_volume(Path("a.mha"), find_format("a.mha"), "xyz", (1 << 20, None)) as volume:
         values = volume.read(0, 2)

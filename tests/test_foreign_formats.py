@@ -168,10 +168,7 @@ def test_analyze_states_its_spacing_and_no_place():
     nibabel.save(nibabel.AnalyzeImage(sampled(AFFINE), np.diag([*STEPS, 1])), "a.hdr")
     grid = read_grid("a.hdr", origin=CORNER)
     check(grid, STEPS)
-    assert (
-        "Analyze files state no place and not which side is left: x, y and z are taken as"
-        in (grid.notes[0])
-    )
+    assert grid.notes[0].startswith("Analyze files state no place and not which side is left: x")
     assert read_grid("a.hdr").origin == (0, 0, 0)
     os.rename("a.img", "b.img")
     assert refusal("a.hdr") == "a.hdr: a.img does not exist"
@@ -271,9 +268,8 @@ def test_one_of_several_arrays_of_vtk():
     check(read_grid("a.vtk:distance"), STEPS)
     said = "a.vtk holds several arrays, distance, other, vector: give a.vtk:distance, say"
     assert refusal("a.vtk") == said
-    assert "its array 'vector' has shape (8160, 3) for (17, 20, 24) samples" in refusal(
-        "a.vtk:vector"
-    )
+    said = "its array 'vector' has shape (8160, 3) for (17, 20, 24) samples"
+    assert said in refusal("a.vtk:vector")
 
 
 def test_uneven_coordinates_are_refused_with_a_line_that_resamples():
@@ -377,13 +373,8 @@ def test_arrays_of_matlab(name):
     check(grid, STEPS)
     assert np.allclose(grid.direction, OBLIQUE)
     assert grid.notes[0].startswith("its axes are taken as x, y, z, the order of ndgrid; ")
-    save_mat(
-        name,
-        d=np.ascontiguousarray(sampled(AFFINE).T),
-        e=sampled(AFFINE),
-        text="hello",
-        flat=np.zeros((3, 4)),
-    )
+    arrays = {"d": np.ascontiguousarray(sampled(AFFINE).T), "e": sampled(AFFINE)}
+    save_mat(name, **arrays, text="hello", flat=np.zeros((3, 4)))
     check(read_grid(f"{name}:d", axes="zyx", spacing=STEPS, origin=CORNER), STEPS)
     check(read_grid(f"{name}:e", spacing=STEPS, origin=CORNER, direction=np.eye(3)), STEPS)
     assert refusal(name) == f"{name} holds several arrays, d, e: give {name}:d, say"
@@ -415,49 +406,41 @@ def test_one_of_several_series_in_a_folder():
 
 def test_missing_doubled_tilted_and_unplaced_slices_are_refused():
     images = slices_of(AFFINE)
-    save_slices("gap", [image for k, image in enumerate(images) if k != 6])
-    said = "gap: IM004 and IM011 are 1.8 mm apart, others 0.9: add the slices that are missing"
-    assert said in refusal("gap")
-    save_slices("twice", images)
+
+    def said(name, of=images):
+        save_slices(name, of)
+        return refusal(name)
+
+    gap = said("gap", of=[image for k, image in enumerate(images) if k != 6])
+    assert "gap: IM004 and IM011 are 1.8 mm apart, others 0.9: add the slices that are" in gap
     save_slices("twice", images[3:5], "b")
-    assert "twice: IM021 and b000 are at one place: put the slices of one volume" in refusal(
-        "twice"
-    )
-    save_slices("one", images[:1])
-    assert "one: IM000 is its only slice: give the folder of a series" in refusal("one")
+    assert "twice: IM021 and b000 are at one place: put the slices of one" in said("twice")
+    one = said("one", of=images[:1])
+    assert "one: IM000 is its only slice: give the folder of a series" in one
     assert find_format("one") is DICOM and is_grid("one")
-    assert refusal("one/IM000.dcm") == (
-        "one/IM000.dcm is a DICOM image: give the folder that holds its series"
-    )
+    file = "one/IM000.dcm"
+    assert refusal(file) == f"{file} is a DICOM image: give the folder that holds its series"
     for k, image in enumerate(images):
         image.ImagePositionPatient[1] += 0.2 * k
-    save_slices("leaning", images)
-    said = (
-        "leaning: its slices lie up to 3.2 mm beside one another, as with a tilted gantry: resample"
-    )
-    assert said in refusal("leaning")
+    aside = "its slices lie up to 3.2 mm beside one another, as with a tilted gantry: resample"
+    assert f"leaning: {aside}" in said("leaning")
     images[4].PixelSpacing = [1, 1]
-    save_slices("mixed", images)
-    assert "has another size, spacing or direction than" in refusal("mixed")
+    assert "has another size, spacing or direction than" in said("mixed")
     del images[4].PixelSpacing
-    save_slices("unplaced", images)
-    assert "unplaced: IM028 states no place: it is no slice of a volume" in refusal("unplaced")
+    assert "unplaced: IM028 states no place: it is no slice of a volume" in said("unplaced")
     images[4].SamplesPerPixel = 3
-    save_slices("rgb-in", images)
-    assert "rgb-in: IM028 has colours or a table of values: give grey images" in refusal("rgb-in")
+    assert "rgb: IM028 has colours or a table of values: give grey images" in said("rgb")
 
 
 def test_slope_and_intercept_of_each_slice():
     """Whole numbers stay whole; each slice has its own scale, as of PET."""
-    images = slices_of(AFFINE, RescaleSlope=1, RescaleIntercept=-1024)
-    save_slices("hounsfield", images)
-    grid = read_grid("hounsfield", level=-1024 + 1000)
-    assert grid.spacing == pytest.approx(STEPS)
-    for k, image in enumerate(slices_of(AFFINE)):
+    save_slices("hounsfield", slices_of(AFFINE, RescaleSlope=1, RescaleIntercept=-1024))
+    assert read_grid("hounsfield", level=-24).spacing == pytest.approx(STEPS)
+    images = slices_of(AFFINE)
+    for k, image in enumerate(images):
         image.RescaleSlope = 0.001 * (1 + k % 3)
         stored = np.frombuffer(image.PixelData, np.int16) / (1 + k % 3)
         image.PixelData = np.rint(stored).astype(np.int16).tobytes()
-        images[k] = image
     save_slices("pet", images)
     check(read_grid("pet"), STEPS, 2e-3)
 

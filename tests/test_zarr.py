@@ -3,7 +3,6 @@
 import json
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 import zarr
@@ -31,6 +30,13 @@ MODEL = ("--quality", "fast", "--spacing", "1", "-q")
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+
+
+def refusal(path, kind=GridError, **options):
+    """Return the message with which a store is refused."""
+    with pytest.raises(kind) as caught:
+        read_grid(path, **options)
+    return str(caught.value)
 
 
 @pytest.fixture(scope="module")
@@ -84,9 +90,7 @@ def test_a_chunk_that_does_not_fit_is_refused_before_it_is_read(monkeypatch, val
     store("a.zarr", values.T, chunks=(22, 26, 30))
     monkeypatch.setattr(grids, "held_memory", lambda: 0)
     size = 22 * 26 * 30 * 4
-    with pytest.raises(OutOfMemoryError) as caught:
-        read_grid("a.zarr", spacing=1, max_memory=3 * size - 1)
-    assert str(caught.value) == (
+    assert refusal("a.zarr", OutOfMemoryError, spacing=1, max_memory=3 * size - 1) == (
         "a.zarr is stored in chunks of 22 x 26 x 30 samples, 0 MB each, and to unpack one takes "
         "0 MB of memory, 0 MB are left; allow more (--max-memory), or store it in smaller chunks"
     )
@@ -105,10 +109,9 @@ def test_a_store_in_a_zip_file(values, command):
 
 
 @pytest.mark.filterwarnings("ignore:Consolidated metadata")
-@pytest.mark.parametrize("version", [2])
-def test_consolidated_groups(values, version):
-    zarr.open_group("g.zarr", mode="w", zarr_format=version)
-    store("g.zarr", values.T, version, name="a/b")
+def test_consolidated_groups(values):
+    zarr.open_group("g.zarr", mode="w", zarr_format=2)
+    store("g.zarr", values.T, 2, name="a/b")
     zarr.consolidate_metadata("g.zarr")
     np.testing.assert_array_equal(read_grid("g.zarr", spacing=1).values, values)
     assert read_grid("g.zarr:/a/b", spacing=1).shape == SHAPE
@@ -168,9 +171,7 @@ def test_axes_of_time_and_channel_have_length_one(values):
     np.testing.assert_array_equal(grid.values, values)
     two = np.stack([values.T, values.T])
     image("j.zarr", [(two, [scale(1, 1, 1, 1)])], axes="czyx")
-    with pytest.raises(GridError) as caught:
-        read_grid("j.zarr")
-    assert str(caught.value) == (
+    assert refusal("j.zarr") == (
         "j.zarr: its axis c has 2 entries, and a grid has three axes in space: store one of them "
         "as an array of its own"
     )
@@ -180,27 +181,25 @@ def test_an_array_without_metadata_may_begin_with_axes_of_length_one(values):
     store("a.zarr", values.T[None])
     np.testing.assert_array_equal(read_grid("a.zarr", spacing=1).values, values)
     store("b.zarr", np.stack([values.T] * 3), chunks=(1, 8, 8, 8))
-    with pytest.raises(GridError, match=r"b.zarr: its axis 0 has 3 entries, and a grid has three "):
-        read_grid("b.zarr", spacing=1)
+    said = "b.zarr: its axis 0 has 3 entries, and a grid has three "
+    assert refusal("b.zarr", spacing=1).startswith(said)
+    store("c.zarr", values[0])
+    said = "c.zarr: values have shape (26, 22): give three axes (x, y, z)"
+    assert refusal("c.zarr", spacing=1) == said
 
 
-def test_axes_in_another_order(values):
-    steps = [scale(1, 1, 1), translation(1, 2, 3)]
-    image("i.zarr", [(values, steps)], axes="xyz")
+@pytest.mark.parametrize("axes, origin", [("xyz", (1, 2, 3)), ("yxz", (2, 1, 3))])
+def test_axes_in_another_order(values, axes, origin):
+    array = values.transpose(["xyz".index(name) for name in axes])
+    image("i.zarr", [(array, [scale(1, 1, 1), translation(1, 2, 3)])], axes=axes)
     grid = read_grid("i.zarr")
-    assert grid.origin == (1, 2, 3)
-    np.testing.assert_array_equal(grid.values, values)
-    image("j.zarr", [(np.swapaxes(values, 0, 1), steps)], axes="yxz")
-    grid = read_grid("j.zarr")
-    assert grid.origin == (2, 1, 3)
+    assert grid.origin == origin
     np.testing.assert_array_equal(grid.values, values)
 
 
 def test_transformations_of_another_type_are_refused(values):
     image("i.zarr", [(values.T, [{"type": "affine", "affine": [1, 2]}])])
-    with pytest.raises(GridError) as caught:
-        read_grid("i.zarr")
-    assert str(caught.value) == (
+    assert refusal("i.zarr") == (
         "i.zarr: one of its coordinateTransformations has the type 'affine' and 2 numbers: give "
         "scale or translation, with one number for each of its 3 axes"
     )
@@ -211,10 +210,8 @@ def test_an_image_among_several(values):
     for name in ("0", "1"):
         zarr.open_group("b.zarr", mode="a")
         image(f"b.zarr/{name}", [(values.T, [scale(1, 1, 1), translation(5, 5, 5)])])
-    with pytest.raises(
-        FileError, match=r"b.zarr holds several arrays, /0/0, /1/0: give b.zarr:/0/0"
-    ):
-        read_grid("b.zarr")
+    said = "b.zarr holds several arrays, /0/0, /1/0: give b.zarr:/0/0"
+    assert refusal("b.zarr", FileError).startswith(said)
     assert read_grid("b.zarr:/1").origin == read_grid("b.zarr:/1/0").origin == (5, 5, 5)
 
 
@@ -224,15 +221,14 @@ def test_batch_finds_stores_in_folders_and_by_patterns(run_batch, values):
     store("in/deep/b.zarr", values.T, 2)
     with zarr.storage.ZipStore("in/c.zarr.zip", mode="w") as zipped:
         store(zipped, values.T)
-    assert run_batch("in", "--spacing", 1)[0] == 0
-    assert run_batch("in/**/*.zarr", "--spacing", 1, out="by-pattern")[0] == 0
-    made = sorted(path.relative_to("out").as_posix() for path in Path("out").rglob("*.ply"))
-    assert made == ["a.ply", "c.ply", "deep/b.ply"]
-    assert len({Path("out", name).read_bytes() for name in made}) == 1
-    made = sorted(
-        path.relative_to("by-pattern").as_posix() for path in Path("by-pattern").rglob("*.ply")
-    )
-    assert made == ["a.ply", "deep/b.ply"]
+    for out, pattern, want in (
+        ("out", "in", ["a.ply", "c.ply", "deep/b.ply"]),
+        ("by-pattern", "in/**/*.zarr", ["a.ply", "deep/b.ply"]),
+    ):
+        assert run_batch(pattern, "--spacing", 1, out=out)[0] == 0
+        made = sorted(path.relative_to(out).as_posix() for path in Path(out).rglob("*.ply"))
+        assert made == want
+        assert len({Path(out, name).read_bytes() for name in made}) == 1
 
 
 def test_info_of_a_file_prints_its_chunks(command, values):
@@ -267,18 +263,3 @@ def test_info_of_numpy_files(command, values):
     assert command("info", "no.zarr")[::2] == (1, "Error: no.zarr does not exist\n")
     want = "Error: a.npy and --check: give only one of them\n"
     assert command("info", "a.npy", "--check")[2] == want
-
-
-def test_arrays_of_fewer_axes_are_no_grids(values):
-    store("a.zarr", values[0])
-    with pytest.raises(GridError) as caught:
-        read_grid("a.zarr", spacing=1)
-    assert str(caught.value) == "a.zarr: values have shape (26, 22): give three axes (x, y, z)"
-
-
-@pytest.mark.parametrize("layout", ["last axis whole", "odd"])
-def test_chunks_of_hdf5(values, layout):
-    with h5py.File("a.h5", "w") as file:
-        chunks = LAYOUTS[layout]["chunks"]
-        file.create_dataset("d", data=values.T, chunks=chunks, compression="gzip")
-    np.testing.assert_array_equal(read_grid("a.h5", spacing=1).values, values)
