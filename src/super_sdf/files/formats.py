@@ -132,24 +132,18 @@ def check_library(format_: GridFormat) -> None:
         check_modules(f"{format_.name} ({format_.suffixes[0]})", format_.extra)
 
 
-def choose_axes(format_: GridFormat, given: str | None) -> str:
-    """Return the axis order of an array file: as given, else the convention of the format."""
-    if given is None:
-        return format_.axes or "xyz"
-    OPTIONS["axes"].check(given)
-    if format_.axes is None:
-        raise OptionError(
-            f"axes is {given!r}, but {format_.name} files state their axes: leave it out"
-        )
-    return given
+def choose_axes(format_: GridFormat, given: str | None, direction: object = None) -> str:
+    """Return the axis order of an array file: as given, else the convention of the format.
 
-
-def check_direction_given(format_: GridFormat, direction: object) -> None:
-    """Raise OptionError if a direction is given, but files of the format state it."""
-    if direction is not None and format_.axes is None:
-        raise OptionError(
-            f"direction is given, but {format_.name} files state their axes: leave it out"
-        )
+    Raises OptionError if it, or a direction, is given, but files of the format state it.
+    """
+    if given is not None:
+        OPTIONS["axes"].check(given)
+    for what, value in (("axes is {!r}", given), ("direction is given", direction)):
+        if value is not None and format_.axes is None:
+            said = f"{what.format(value)}, but {format_.name} files state their axes"
+            raise OptionError(f"{said}: leave it out")
+    return given or format_.axes or "xyz"
 
 
 def _listed(names: list[str]) -> str:

@@ -19,14 +19,7 @@ from ..grid.planes import InputFile, check_planes
 from ..grid.sdf_grid import SdfGrid, make_grid
 from ..machine.memory import ROOM_SHARE, held_memory, memory_bound
 from ..options import ReadOptions, Values, check_path
-from .formats import (
-    GridFormat,
-    check_direction_given,
-    check_library,
-    choose_axes,
-    find_format,
-    split_member,
-)
+from .formats import GridFormat, check_library, choose_axes, find_format, split_member
 from .numpy_files import NUMPY_READERS
 from .output import check_free, replacing
 from .regular import check_grid_file
@@ -101,8 +94,7 @@ def read_array(
     """Return values, place (``PLACE``, unless ``given``) and notes of a file: see ``read_grid``."""
     path = check_path(path, "path")
     format_ = find_format(path)
-    order = choose_axes(format_, axes)
-    check_direction_given(format_, given["direction"])
+    order = choose_axes(format_, axes, given["direction"])
     room, bound = unpacking_room(max_memory), memory_bound(max_memory)
     left = None if bound is None else bound - (held_memory() or 0)
     with open_volume(path, format_, order, (room, left)) as volume:
@@ -242,14 +234,12 @@ def describe_grid_file(path: str | Path) -> dict[str, Any]:
         "bytes": int(np.prod(shape, dtype=object)) * volume.dtype.itemsize,
         "axes in the file": "".join("xyz"[w] for w in placement.world_axes),
         **{key: _listed(place[key]) for key in PLACE},
-        "chunks": volume.chunks and list(volume.chunks),
+        **({"chunks": list(volume.chunks)} if volume.chunks else {}),
         **volume.about,
         "notes": list(volume.notes),
     }
     if facts["direction"] in (None, _listed(STRAIGHT)):
         del facts["direction"]
-    if not volume.chunks:
-        del facts["chunks"]
     return facts
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import warnings
 import zipfile
-from collections.abc import Callable
 from contextlib import suppress
 from copy import copy
 from dataclasses import replace
@@ -82,7 +81,6 @@ class _Head:
         self._read, self.taken = read, 0
 
     def read(self, count: int) -> bytes:
-        """Return the next bytes."""
         if count > LONGEST:
             raise ValueError(count)
         data = self._read(count)
@@ -229,6 +227,12 @@ def _read_small(
 
 
 def _read_blocks(archive: zipfile.ZipFile, request: Request) -> Volume:
+    """Return the truncated distances in cubes of voxels, at the keys of a hash map.
+
+    Voxel (x, y, z) of the block with key k is at ``voxel_size * (k * resolution + (x, y, z))``;
+    voxels without weight, and blocks that are missing, are unknown.
+    """
+
     def array(key: str) -> NDArray[Any]:
         if f"{key}.npy" not in archive.namelist():
             raise FileError(f"{request.path} is Open3D's VoxelBlockGrid, but has no key {key!r}")
@@ -239,15 +243,6 @@ def _read_blocks(archive: zipfile.ZipFile, request: Request) -> Volume:
             )
         return member.array()
 
-    return volume_of_blocks(array)
-
-
-def volume_of_blocks(array: Callable[[str], NDArray[Any]]) -> Volume:
-    """Return the truncated distances in cubes of voxels, at the keys of a hash map.
-
-    Voxel (x, y, z) of the block with key k is at ``voxel_size * (k * resolution + (x, y, z))``;
-    voxels without weight, and blocks that are missing, are unknown. ``array`` reads a key.
-    """
     keys = array("key").astype(np.int64)
     resolution, step = (array(name).item() for name in ("block_resolution", "voxel_size"))
     values, weights = (

@@ -219,15 +219,12 @@ def take_lock(file: int) -> bool | None:
 
 
 def _is_running(pid: int) -> bool:
-    """Return whether a process is running; False on Windows, where open files cannot be removed."""
-    if os.name == "nt":
+    if os.name == "nt":  # where open files cannot be removed
         return False
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True  # another user's
+    except OSError as error:
+        return not isinstance(error, ProcessLookupError)  # it may be another user's
     with suppress(OSError):  # a zombie has ended
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     return True
@@ -235,10 +232,9 @@ def _is_running(pid: int) -> bool:
 
 @contextmanager
 def spool_beside(part: Path) -> Iterator[IO[bytes]]:
-    """Open a temporary file beside a file that is being written, for what comes later in it.
+    """Open a temporary file without a name beside a file that is being written.
 
-    It has no name, so it disappears with the process, however that ends. Where the system cannot
-    create such files, it briefly has a name that ``remove_abandoned_parts`` recognises.
+    Where the system has no such files, ``remove_abandoned_parts`` recognises its name.
     """
     folder, name = str(part.parent), f"{part.name}."
     with tempfile.SpooledTemporaryFile(SPOOL_BYTES, dir=folder, prefix=name) as spool:

@@ -83,8 +83,8 @@ def reason_of(error: OSError) -> str:
     return reason or f"cannot be read: {error.strerror or error}"
 
 
-def check_store(path: Path) -> Path:
-    """Return the path if it is a readable Zarr folder, which has one of ``MARKS``."""
+def _check_store(path: Path) -> None:
+    """Raise FileError unless a path is a readable Zarr folder, which has one of ``MARKS``."""
     try:
         names = os.listdir(path)
     except NotADirectoryError:
@@ -95,7 +95,6 @@ def check_store(path: Path) -> Path:
     if mark is None:
         raise FileError(f"{path} is no Zarr store: it holds none of {', '.join(MARKS)}")
     check_regular_file(path / mark)
-    return path
 
 
 def is_store(path: str | Path) -> bool:
@@ -108,7 +107,7 @@ def check_grid_file(path: str | Path) -> None:
     file, _ = split_member(path)
     key = find_format(path).key
     if key == "zarr" and not file.name.lower().endswith(".zip"):
-        check_store(file)
+        _check_store(file)
     elif key != "dicom":
         check_regular_file(file)
 

@@ -42,9 +42,9 @@ def in_metres(unit: str) -> float | None:
 
 
 def in_one_unit(units: Sequence[str]) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
-    """Return factors from the units of x, y and z to the first that is stated, and a note on it.
+    """Return factors from the units of x, y and z to the first, None if unknown, and a note.
 
-    No factors are returned if that is not possible. An axis without a unit has that of the others.
+    An axis without a unit has that of the others.
     """
     stated = list(dict.fromkeys(filter(None, units)))
     if len(stated) <= 1:

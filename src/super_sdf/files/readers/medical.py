@@ -284,19 +284,15 @@ def _check_steps(slices: list[_Slice], steps: NDArray[np.float64], step: float) 
     if not len(steps):
         raise GridError(f"{slices[0].path.name} is its only slice: give the folder of a series")
     off = np.abs(steps - step)
-    worst = int(off.argmax())
-    nearest = int(steps.argmin())
+    worst, nearest = int(off.argmax()), int(steps.argmin())
+    names = [each.path.name for each in slices]
     if steps[nearest] <= EVEN * step:
         raise GridError(
-            f"{_named(slices, nearest)} are at one place: put the slices of one volume (one time, "
-            "one echo) into a folder"
+            f"{names[nearest]} and {names[nearest + 1]} are at one place: put the slices of one "
+            "volume (one time, one echo) into a folder"
         )
     if off[worst] > EVEN * step:
         raise GridError(
-            f"{_named(slices, worst)} are {steps[worst]:.6g} mm apart, others {step:.6g}: add the "
-            "slices that are missing, or resample the series in even steps"
+            f"{names[worst]} and {names[worst + 1]} are {steps[worst]:.6g} mm apart, others "
+            f"{step:.6g}: add the slices that are missing, or resample the series in even steps"
         )
-
-
-def _named(slices: list[_Slice], first: int) -> str:
-    return f"{slices[first].path.name} and {slices[first + 1].path.name}"

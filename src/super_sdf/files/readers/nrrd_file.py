@@ -223,7 +223,7 @@ def _steps(header: dict[str, Any], space: list[int]) -> tuple[Any, Any]:
 
 
 def _of_axes(values: Any, space: list[int], default: Any) -> Any:
-    is_stated = values is not None and len(values) > max(space)
+    is_stated = values is not None and len(values) > max(space)  # for all
     return [values[axis] for axis in space] if is_stated else default
 
 

@@ -16,6 +16,7 @@ import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import cached_property
 from math import prod
 from typing import IO, Any
 
@@ -34,7 +35,7 @@ MOST_AXES = 5  # time, channel, and three of space
 def read_zarr(request: Request) -> Volume:
     """Read ``FOLDER.zarr``, or ``FOLDER.zarr:/ARRAY`` of a group; of OME-Zarr the finest level."""
     files = _Store(request)
-    arrays = files.arrays()
+    arrays = files.arrays
     if "" not in arrays:
         name = _choose(files, arrays, request)
     elif request.member is None:
@@ -87,8 +88,8 @@ def _volume(files: _Store, name: str, array: Any, request: Request) -> Volume:
     stated = {} if axes else attributes
     axes = axes or _named_axes(files, name, array, request)
     space, place = placed(axes, stated, array.shape, request.axes)
-    shards, version = array_shards(array), array_version(array)
-    stored = files.chunks_of(name, counts_of(array.shape, shards or array.chunks))
+    shards, version = _shards(array), _version(array)
+    stored = files.chunks_of(name, _counts(array.shape, shards or array.chunks))
     if shards:
         files.check_sums(list(stored.values()))
     gaps = files.absent(array, name, stored)
@@ -109,7 +110,7 @@ def _volume(files: _Store, name: str, array: Any, request: Request) -> Volume:
 
 def _named_axes(files: _Store, name: str, array: Any, request: Request) -> Axes:
     """Return the axes of an array by the names of its dimensions, and by arrays of these names."""
-    stated = getattr(array.metadata, "dimension_names", None) if array_version(array) > 2 else None
+    stated = getattr(array.metadata, "dimension_names", None) if _version(array) > 2 else None
     names = stated or array.attrs.get("_ARRAY_DIMENSIONS") or ()
     if len(names) != array.ndim:
         names = ("",) * array.ndim
@@ -117,7 +118,7 @@ def _named_axes(files: _Store, name: str, array: Any, request: Request) -> Axes:
 
     def coordinates(axis: int) -> tuple[NDArray[Any] | None, Document]:
         path = f"{group}/{names[axis]}".lstrip("/")
-        if not name or not names[axis] or files.axes_of(path) != 1:
+        if not name or not names[axis] or files.arrays.get(path) != 1:
             return None, {}
         files.check_codecs(path)
         places = _open(request, path)
@@ -219,10 +220,7 @@ Document = dict[str, Any]
 
 
 class _Store:
-    """The files of a Zarr store in a folder or a zip file, which may not lead out of it.
-
-    ``sizes`` has the bytes that each file takes, by its key.
-    """
+    """The files of a store in a folder or zip file, which may not lead out of it: bytes by key."""
 
     def __init__(self, request: Request) -> None:
         self.path = request.path
@@ -248,7 +246,9 @@ class _Store:
     def open(self, key: str) -> IO[bytes]:
         return self.zip.open(key) if self.zip else open(self.path / key, "rb")
 
-    def document(self, key: str) -> Document:
+    def document(self, path: str, name: str) -> Document:
+        """Return the metadata of an array or a group, empty if the store has none of this name."""
+        key = f"{path}/{name}" if path else name
         if key not in self.sizes:
             return {}
         with self.open(key) as file:
@@ -257,30 +257,26 @@ class _Store:
             raise FileError(f"{self.path} is damaged: {key} is no JSON object")
         return content
 
+    @cached_property
     def arrays(self) -> dict[str, int]:
+        """The number of axes of each array, by its path."""
         counts = {}
         for key in self.sizes:
             path, _, name = key.rpartition("/")
             if name in (ARRAY_2, NODE_3):
-                about = self.document(key)
+                about = self.document(path, name)
                 if name == ARRAY_2 or about.get("node_type") == "array":
                     counts[path] = len(about.get("shape", ()))
         return counts
 
-    def axes_of(self, path: str) -> int:
-        documents = (self.document(f"{path}/{name}") for name in (ARRAY_2, NODE_3))
-        return max(len(about.get("shape", ())) for about in documents)
-
     def attributes(self, path: str) -> Document:
-        before = f"{path}/" if path else ""
-        stated = self.document(before + NODE_3).get("attributes") or {}
-        return {**self.document(before + ATTRIBUTES_2), **stated}
+        stated = self.document(path, NODE_3).get("attributes") or {}
+        return {**self.document(path, ATTRIBUTES_2), **stated}
 
     def check_codecs(self, path: str) -> None:
         """Raise FileError if an array names a codec that is not in the list."""
-        before = f"{path}/" if path else ""
-        for key in (before + ARRAY_2, before + NODE_3):
-            for codec in _codecs_of(self.document(key)):
+        for name in (ARRAY_2, NODE_3):
+            for codec in _codecs_of(self.document(path, name)):
                 if codec not in CODECS:
                     raise FileError(
                         f"{self.path} names the codec {seen(codec)}, which is not among those that "
@@ -299,9 +295,9 @@ class _Store:
 
     def absent(self, array: Any, path: str, stored: dict[tuple[int, ...], str]) -> tuple[int, int]:
         """Return how many chunks of an array are not stored, and how many it has."""
-        total = prod(counts_of(array.shape, array.chunks))
+        total = prod(_counts(array.shape, array.chunks))
         there = len(stored)
-        if array_shards(array):
+        if _shards(array):
             there = sum(self._in_shard(array, path, *shard) for shard in stored.items())
         if total - there > MOST_ABSENT:
             raise FileError(
@@ -312,14 +308,14 @@ class _Store:
 
     def _in_shard(self, array: Any, path: str, indices: tuple[int, ...], key: str) -> int:
         """Return how many chunks of a shard are stored, of those within the array."""
-        codec = self.document(f"{path}/{NODE_3}".lstrip("/"))["codecs"][0]["configuration"]
+        codec = self.document(path, NODE_3)["codecs"][0]["configuration"]
         shard, chunk = array.shards, array.chunks
         left = [min(n - i * s, s) for n, i, s in zip(array.shape, indices, shard)]
-        within = counts_of(left, chunk)
+        within = _counts(left, chunk)
         names = [str(step.get("name")) for step in codec["index_codecs"]]
         if names not in (["bytes"], ["bytes", "crc32c"]):
             return prod(within)  # its index cannot be read here
-        counts = counts_of(shard, chunk)
+        counts = _counts(shard, chunk)
         size = 16 * prod(counts) + CHECKSUM * (len(names) - 1)
         with self.open(key) as file:
             if codec.get("index_location", "end") == "end":
@@ -329,29 +325,23 @@ class _Store:
         return int((places[..., 0] != NOT_STORED).sum())
 
     def check_sums(self, keys: Sequence[str]) -> None:
-        """Read files of a zip file to their ends, where their checksums are compared.
-
-        zarr reads shards in parts, of which zip files have no checksum.
-        """
+        """Read shards in a zip file to their checksums: zarr reads parts, which have none."""
         for key in keys if self.zip else ():
             with self.open(key) as file:
                 while file.read(PIECE):
                     pass
 
 
-def counts_of(shape: Sequence[int], chunks: Sequence[int]) -> list[int]:
-    """Return how many chunks an array has along each axis."""
+def _counts(shape: Sequence[int], chunks: Sequence[int]) -> list[int]:
     return [-(-size // chunk) for size, chunk in zip(shape, chunks)]
 
 
-def array_shards(array: Any) -> tuple[int, ...] | None:
-    """Return the shape of an array's shards; None if it has none. Those of zarr 2 have none."""
-    return getattr(array, "shards", None)
+def _shards(array: Any) -> tuple[int, ...] | None:
+    return getattr(array, "shards", None)  # arrays of zarr 2 have none
 
 
-def array_version(array: Any) -> int:
-    """Return the Zarr format of an array, 2 or 3. Arrays of zarr 2 have no such metadata."""
-    return getattr(getattr(array, "metadata", None), "zarr_format", 2)
+def _version(array: Any) -> int:
+    return getattr(getattr(array, "metadata", None), "zarr_format", 2)  # as all arrays of zarr 2
 
 
 def _codecs_of(about: Any) -> Iterator[str]:
