@@ -189,49 +189,37 @@ def test_image_data_of_vtk_is_taken_too():
     assert grid_from_image(several, "b").shape == SIZES
 
 
-@pytest.mark.parametrize(
-    "arrays, scalars, message",
-    [
-        ({}, None, "the image holds no array of points or cells"),
-        ({"a": np.zeros(20 * 22 * 24)}, "b", "the image has no array 'b': it holds a"),
-        (
-            {"a": np.zeros((20 * 22 * 24, 3))},
-            None,
-            "the array 'a' of the image has 3 numbers per sample: give an array of one",
-        ),
-        (
-            {"a": np.zeros(7)},
-            None,
-            "the array 'a' of the image has 7 values for 10,560 samples",
-        ),
-        ({"a": np.zeros(20 * 22 * 24)}, None, "every value is 0: a constant field has no surface"),
-    ],
-)
-def test_what_is_no_array_of_samples_is_refused(arrays, scalars, message):
-    assert refusal(lambda: grid_from_image(plain(**arrays), scalars)) == message
+OF_NO_SAMPLES = {
+    "the image holds no array of points or cells": {},
+    "the array 'a' of the image has 3 numbers per sample: give an array of one": {
+        "a": np.zeros((20 * 22 * 24, 3))
+    },
+    "the array 'a' of the image has 7 values for 10,560 samples": {"a": np.zeros(7)},
+    "every value is 0: a constant field has no surface": {"a": np.zeros(20 * 22 * 24)},
+}
+
+
+@pytest.mark.parametrize("message", OF_NO_SAMPLES)
+def test_what_is_no_array_of_samples_is_refused(message):
+    assert refusal(lambda: grid_from_image(plain(**OF_NO_SAMPLES[message]))) == message
 
 
 def test_other_mistakes_are_one_line():
     image, _ = sphere()
     contour = image.super_sdf.contour
-    assert refusal(lambda: grid_from_image([1]), OptionTypeError) == (
-        "image is [1]: give VTK image data"
-    )
-    assert refusal(lambda: contour(scalars="b")) == (
-        "the image has no array 'b': it holds distance"
-    )
+    said = refusal(lambda: grid_from_image([1]), OptionTypeError)
+    assert said == "image is [1]: give VTK image data"
+    said = refusal(lambda: contour(scalars="b"))
+    assert said == "the image has no array 'b': it holds distance"
     assert refusal(lambda: contour(3), OptionError).startswith("factor is 3: ")
     network = load_network("fast")
-    assert refusal(lambda: contour(quality="best", network=network), OptionError) == (
-        "quality 'best' and a network are given: give only one"
-    )
+    said = refusal(lambda: contour(quality="best", network=network), OptionError)
+    assert said == "quality 'best' and a network are given: give only one"
     image.spacing = (0.2, 0.2, 0.2)
     assert refusal(contour).endswith("multiply the values, --scale 0.40123")
     image.spacing = (0.5, 0.5, 0.5)
-    flat = image.extract_subset((0, 19, 0, 21, 4, 4))
-    assert refusal(flat.super_sdf.contour) == (
-        "values have shape (1, 22, 20): give at least 2 samples on each axis"
-    )
+    said = refusal(image.extract_subset((0, 19, 0, 21, 4, 4)).super_sdf.contour)
+    assert said == "values have shape (1, 22, 20): give at least 2 samples on each axis"
     image["distance"] = np.abs(np.asarray(image["distance"])) + 3
     assert issubclass(NoSurfaceError, GridError) and refusal(contour)
 

@@ -30,17 +30,18 @@ def off_file(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
 
 def damaged(rng: random.Random, content: bytes) -> bytes:
     """Cut a file short, change bytes of it, or put something else in a place."""
-    changed = bytearray(content)
-    kind = rng.randrange(3)
+    changed, kind = bytearray(content), rng.randrange(3)
+
+    def somewhere() -> int:
+        return rng.randrange(min(len(changed), 10 ** rng.randrange(2, 6)))
+
     if kind == 0:
         return content[: rng.randrange(len(content))]
     if kind == 1:
         for _ in range(rng.randrange(1, 20)):
-            changed[rng.randrange(min(len(changed), 10 ** rng.randrange(2, 6)))] = rng.randrange(
-                256
-            )
+            changed[somewhere()] = rng.randrange(256)
         return bytes(changed)
-    start = rng.randrange(min(len(changed), 10 ** rng.randrange(2, 6)))
+    start = somewhere()
     changed[start : start + rng.randrange(50)] = rng.choice(PIECES)
     return bytes(changed)
 
@@ -100,15 +101,12 @@ def test_faces_of_vertices_that_are_not_there(tmp_path):
 @pytest.mark.parametrize("name", ["cloud.ply", "lines.obj", "empty.stl", "deep.gltf", "x.json"])
 def test_files_without_a_mesh(tmp_path, name):
     path = tmp_path / name
+    texts = {"lines.obj": "v 0 0 0\nv 1 0 0\nl 1 2\n", "deep.gltf": "[" * 99999}
+    path.write_text(texts.get(name, ""))
     if name == "cloud.ply":
         trimesh.PointCloud(np.eye(3)).export(path)
-    else:
-        path.write_text(
-            {"lines.obj": "v 0 0 0\nv 1 0 0\nl 1 2\n", "deep.gltf": "[" * 99999}.get(name, "")
-        )
-    with pytest.raises(
-        (FileError, MeshError), match=rf"{name} (holds no triangle|cannot be read|is empty)"
-    ):
+    said = rf"{name} (holds no triangle|cannot be read|is empty)"
+    with pytest.raises((FileError, MeshError), match=said):
         read_mesh(path)
 
 
@@ -118,11 +116,8 @@ def test_a_scene_is_one_mesh(tmp_path):
     scene.export(tmp_path / "two.glb")
     solid, notes = load_solid(tmp_path / "two.glb")
     assert notes == [] and solid.mesh.volume() == pytest.approx(2)
-    assert solid.is_inside(np.array([[0.0, 0, 0], [3, 3, 3], [1.5, 1.5, 1.5]])).tolist() == [
-        1,
-        1,
-        0,
-    ]
+    points = np.array([[0.0, 0, 0], [3, 3, 3], [1.5, 1.5, 1.5]])
+    assert solid.is_inside(points).tolist() == [1, 1, 0]
 
 
 @pytest.mark.parametrize("size", [1e-9, 1e-3, 1.0, 1e6, 1e25])
