@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from . import random_fields
 from .case import Case, ball, batch, npy, rng_of, upsample
 
 Field = Callable[[np.random.Generator, tuple[int, ...]], np.ndarray]
@@ -29,22 +30,15 @@ def _plane(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
 
 
 KINDS: dict[str, Field] = {
+    **random_fields.KINDS,
     "constant": lambda rng, shape: np.full(shape, rng.choice([0.0, -0.0, 1.0, -1.0, 1e-30])),
     "positive": lambda rng, shape: np.abs(ball(shape)) + 0.1,
     "negative": lambda rng, shape: -np.abs(ball(shape)) - 0.1,
     "unsigned": lambda rng, shape: np.abs(ball(shape)),
     "not-below-0": lambda rng, shape: np.maximum(ball(shape), 0),
     "not-above-0": lambda rng, shape: np.minimum(ball(shape), 0),
-    "random": lambda rng, shape: rng.normal(size=shape),
-    "uniform": lambda rng, shape: rng.uniform(-1, 1, shape),
-    "random-large": lambda rng, shape: rng.normal(size=shape) * 100,
-    "clamped": lambda rng, shape: np.clip(ball(shape), -rng.choice([0.1, 0.5, 1]), 1),
-    "clamped-random": lambda rng, shape: np.clip(rng.normal(size=shape), -0.3, 0.3),
-    "half-integer": lambda rng, shape: np.round(ball(shape) * 2) / 2,
-    "integer": lambda rng, shape: np.round(ball(shape)),
+    "uneven": lambda rng, shape: np.clip(ball(shape), -rng.choice([0.1, 0.5, 1]), 1),
     "occupancy": lambda rng, shape: np.where(ball(shape) < 0, -1.0, 1.0),
-    "three-values": lambda rng, shape: rng.integers(-1, 2, shape).astype(float),
-    "signs": lambda rng, shape: rng.choice([-1.0, 1.0], shape),
     "plane": _plane,
     "thin": lambda rng, shape: np.abs(_plane(rng, shape)) - rng.choice([0.01, 0.2, 0.5]),
     "box": lambda rng, shape: (
@@ -54,20 +48,16 @@ KINDS: dict[str, Field] = {
     "inf": _spotted(np.inf, 0.01),
     "minus-inf": _spotted(-np.inf, 0.3),
     "zeros": _spotted(0.0, 0.1),
-    "mostly-zeros": _spotted(0.0, 0.95),
     "minus-zeros": _spotted(-0.0, 0.3),
     "far": _spotted(1e4, 0.2),
-    "denormal": _spotted(1e-44, 0.2),
     "one-sample": lambda rng, shape: np.where(
         np.indices(shape).sum(0) == sum(shape) // 2, -0.3, 1.0
     ),
-    "corner": lambda rng, shape: np.linalg.norm(np.indices(shape), axis=0) - 2.4,
     "inside-out": lambda rng, shape: -ball(shape),
     "cut": lambda rng, shape: ball(shape, 0.8),
     "squared": lambda rng, shape: ball(shape) * np.abs(ball(shape)),
     "steep": lambda rng, shape: ball(shape) * 7,
     "checker": lambda rng, shape: np.where(np.indices(shape).sum(0) % 2, 0.5, -0.5),
-    "stripes": lambda rng, shape: np.where(np.indices(shape)[0] % 2, 1.0, -1.0),
     "gyroid": lambda rng, shape: np.sin(np.indices(shape)).sum(0) * 0.6,
     "anisotropic": lambda rng, shape: (
         np.linalg.norm((np.indices(shape).T - 5.3) * [1, 1, 3], axis=3).T - 3

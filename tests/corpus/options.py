@@ -97,8 +97,8 @@ def _targets() -> Iterator[Case]:
     taken = {"folder.ply/x": b"", "there.ply": b"somebody's", **GRID, **CUBE}
     for number, target in enumerate(TARGETS):
         for option in ([], ["--force"]):
-            suffix = "".join(option)
-            yield upsample(f"options/target-{number}{suffix}", taken, *option, target=target)
+            name = f"options/target-{number}{''.join(option)}"
+            yield upsample(name, taken, *option, source="in.npy", target=target)
         grid = target.replace(".ply", ".npz")
         name = f"options/sample-target-{number}"
         yield sample(name, taken, "-n", "8", source="cube.ply", target=grid)

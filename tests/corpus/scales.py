@@ -70,24 +70,10 @@ def _mismatches() -> Iterator[Case]:
         for sign in (1, -1):
             values = mixed.copy()
             values[0, 0, 0], values[-1] = sign * far, far
-            yield upsample(
-                f"scales/mixed-{number}-{sign}", {"in.npy": npy(values)}, "--spacing", "1"
-            )
-            yield upsample(f"scales/mixed-{number}-{sign}-i", {"in.npy": npy(values)})
-    for offset in [
-        "0.001",
-        "0.5",
-        "-0.5",
-        "1.5",
-        "-1.5",
-        "3",
-        "-3",
-        "3.59",
-        "5",
-        "9",
-        "20",
-        "1e-9",
-    ]:
+            name, odd = f"scales/mixed-{number}-{sign}", {"in.npy": npy(values)}
+            yield upsample(name, odd, "--spacing", "1")
+            yield upsample(f"{name}-i", odd)
+    for offset in OFFSETS:
         yield upsample(f"scales/at-{offset}", files, "--offset", offset)
         yield upsample(f"scales/at-{offset}-cap", files, "--offset", offset, "--cap")
         clamped = {"in.npy": npy(np.clip(ball(), -2, 2))}

@@ -83,23 +83,17 @@ def cases(seed: int) -> Iterator[Case]:
             yield batch(f"{name}-batch", at)
             inside = {f"grids/in.{suffix}": content, "grids/good.npy": GRID["good.npy"]}
             yield batch(f"{name}-within", inside, source="grids")
-            pattern = batch(f"{name}-pattern", inside, source=f"grids/*.{suffix}")
-            yield pattern
-        yield from _meshes(kind, content)
+            yield batch(f"{name}-pattern", inside, source=f"grids/*.{suffix}")
+        for suffix in ("ply", "stl", "obj"):
+            yield sample(f"special/{kind}-{suffix}-sample", {f"in.{suffix}": content}, "-n", "8")
         yield from _elsewhere(kind, content)
     yield from _roots()
-
-
-def _meshes(kind: str, content: Content) -> Iterator[Case]:
-    for suffix in ("ply", "stl", "obj"):
-        at, source = {f"in.{suffix}": content}, f"in.{suffix}"
-        yield sample(f"special/{kind}-{suffix}-sample", at, "-n", "8", source=source)
 
 
 def _elsewhere(kind: str, content: Content) -> Iterator[Case]:
     for suffix in ("txt", "jsonl"):
         at = {f"list.{suffix}": content}
-        yield batch(f"special/{kind}-{suffix}", {**GRID, **at})
+        yield batch(f"special/{kind}-{suffix}", {**at, **GRID})
     listed = {"list.jsonl": b'{"in": "in.npy"}\n{"in": "good.npy"}\n', "in.npy": content, **GRID}
     yield batch(f"special/{kind}-listed", listed, source="list.jsonl")
     model = ("upsample", "good.npy", "out.ply", "--model", "net.onnx")
