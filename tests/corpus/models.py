@@ -5,49 +5,38 @@ They are written without the package ``onnx``; numbers are those of the fields i
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
+from onnx_files import DOUBLE, FLOAT, INT32, declared, entry, metadata, node
+from onnx_files import INPUTS as CONTRACT
 
 from .case import Case, ball, mutate, npy, rng_of
 
-FLOAT, INT32, INT64, DOUBLE = 1, 6, 7, 11
-KINDS = {"f": FLOAT, "i": INT32, "l": INT64, "d": DOUBLE}
-Value = tuple[str, int, tuple[int | str, ...]]
-"""A name, its type, and its shape: a number or a name for each axis."""
-
-INPUTS: tuple[Value, ...] = (
-    ("patches", FLOAT, ("V", 27)),
-    ("neighbours", INT32, ("V", 27)),
-    ("voxels", INT32, ("D",)),
-    ("offsets", FLOAT, ("Q", 3)),
-)
-OUTPUTS: tuple[Value, ...] = (("values", FLOAT, ("D", "Q")),)
-Node = tuple[str, Sequence[str], Sequence[str]]
-"""An operator, what goes in and what comes out."""
-
+INT64 = 7
+MINUS = 1 << 64  # what a number below 0 is written with
+INPUTS = tuple((name, *kind) for name, kind in CONTRACT.items())
+OUTPUTS = (("values", FLOAT, "D", "Q"),)
 # The middle sample of each voxel, whatever the offset; ``extra`` is added, 0 unless told.
-NODES: tuple[Node, ...] = (
-    ("Gather", ("patches", "voxels"), ("chosen",)),
-    ("MatMul", ("chosen", "middle"), ("column",)),
-    ("MatMul", ("offsets", "slope"), ("along",)),
-    ("Transpose", ("along",), ("row",)),
-    ("Add", ("column", "row"), ("sum",)),
-    ("Add", ("sum", "extra"), ("values",)),
+NODES = (
+    ("Gather", ("patches", "voxels"), "chosen"),
+    ("MatMul", ("chosen", "middle"), "column"),
+    ("MatMul", ("offsets", "slope"), "along"),
+    ("Transpose", ("along",), "row"),
+    ("Add", ("column", "row"), "sum"),
+    ("Add", ("sum", "extra"), "values"),
 )
 METADATA = {"format_version": "1", "receptive_field": "1", "name": "corpus"}
 
 
-@dataclass(frozen=True)
-class Net:
+class Net(NamedTuple):
     """What stands in the file of a network."""
 
-    nodes: Sequence[Node] = NODES
-    inputs: Sequence[Value] = INPUTS
-    outputs: Sequence[Value] = OUTPUTS
-    metadata: Mapping[str, str | bytes] = field(default_factory=lambda: METADATA)
+    nodes: Sequence[tuple[str, tuple[str, ...], str]] = NODES
+    inputs: Sequence[tuple[str | int, ...]] = INPUTS
+    outputs: Sequence[tuple[str | int, ...]] = OUTPUTS
+    metadata: Mapping[str, str | bytes] = METADATA
     extra: float = 0.0
     opset: int = 17
     ir_version: int = 8
@@ -55,61 +44,22 @@ class Net:
 
     def to_bytes(self) -> bytes:
         """Return the file."""
-        parts = [_number(1, self.ir_version), _bytes(7, self._graph())]
-        parts.append(_bytes(8, _bytes(1, self.domain) + _number(2, self.opset)))
-        parts += [_bytes(14, _bytes(1, k) + _bytes(2, v)) for k, v in self.metadata.items()]
-        return b"".join(parts)
+        opset = entry(1, self.domain) + entry(2, self.opset % MINUS)
+        head = entry(1, self.ir_version % MINUS) + entry(7, self._graph()) + entry(8, opset)
+        return head + metadata(self.metadata)
 
     def _graph(self) -> bytes:
-        middle = np.zeros((27, 1), np.float32)
-        middle[13] = 1
-        tensors = {
-            "middle": middle,
-            "slope": np.zeros((3, 1), np.float32),
-            "extra": np.array(self.extra, np.float32),
-        }
-        parts = [_bytes(1, _node(*node)) for node in self.nodes]
-        parts.append(_bytes(2, "net"))
-        parts += [_bytes(5, _tensor(name, array)) for name, array in tensors.items()]
-        parts += [_bytes(11, _value(*value)) for value in self.inputs]
-        parts += [_bytes(12, _value(*value)) for value in self.outputs]
-        return b"".join(parts)
-
-
-def _varint(number: int) -> bytes:
-    number &= (1 << 64) - 1
-    out = bytearray()
-    while number > 127:
-        out.append(number & 127 | 128)
-        number >>= 7
-    return bytes([*out, number])
-
-
-def _number(key: int, number: int) -> bytes:
-    return _varint(key << 3) + _varint(number)
-
-
-def _bytes(key: int, data: bytes | str) -> bytes:
-    raw = data.encode() if isinstance(data, str) else data
-    return _varint(key << 3 | 2) + _varint(len(raw)) + raw
-
-
-def _node(operator: str, inputs: Iterable[str], outputs: Iterable[str]) -> bytes:
-    parts = [_bytes(1, name) for name in inputs] + [_bytes(2, name) for name in outputs]
-    return b"".join([*parts, _bytes(4, operator)])
+        middle = (np.arange(27) == 13)[:, None]
+        tensors = {"middle": middle, "slope": np.zeros((3, 1)), "extra": np.array(self.extra)}
+        parts = [*(node(*each, {}) for each in self.nodes), entry(2, "net")]
+        parts += [entry(5, _tensor(name, array)) for name, array in tensors.items()]
+        parts += [declared(11, *each) for each in self.inputs]
+        return b"".join([*parts, *(declared(12, *each) for each in self.outputs)])
 
 
 def _tensor(name: str, array: np.ndarray) -> bytes:
-    dims = b"".join(_number(1, n) for n in array.shape)
-    raw = array.astype("<f4").tobytes() if array.ndim else struct.pack("<f", array)
-    return dims + _number(2, FLOAT) + _bytes(8, name) + _bytes(9, raw)
-
-
-def _value(name: str, kind: int, shape: Sequence[int | str]) -> bytes:
-    axes = [_number(1, n) if isinstance(n, int) else _bytes(2, n) for n in shape]
-    dims = b"".join(_bytes(1, axis) for axis in axes)
-    tensor = _number(1, kind) + _bytes(2, dims)
-    return _bytes(1, name) + _bytes(2, _bytes(1, tensor))
+    dims = b"".join(entry(1, n) for n in array.shape)
+    return dims + entry(2, FLOAT) + entry(8, name) + entry(9, array.astype("<f4").tobytes())
 
 
 GRID = {"in.npy": npy(ball())}
@@ -123,51 +73,49 @@ KEYS = ["format_version", "receptive_field", "training_factors", "value_scaling"
 
 def odd_nets() -> dict[str, Net]:
     """Return networks that are not what is wanted, or answer what nothing can be made of."""
-    numbers = {
-        text: float(text) for text in ["nan", "inf", "-inf", "3e38", "-3e38", "1e-45", "1", "-5"]
-    }
-    nets = {f"adds-{text}": Net(extra=number) for text, number in numbers.items()}
+    texts = ("nan", "inf", "-inf", "3e38", "-3e38", "1e-45", "1", "-5")
+    nets = {f"adds-{text}": Net(extra=float(text)) for text in texts}
     for operator in ("Sqrt", "Log", "Reciprocal", "Exp", "Neg", "Floor", "Sign", "Acos", "Nothing"):
-        nodes = (*NODES[:-1], (operator, ("sum",), ("values",)))
+        nodes = (*NODES[:-1], (operator, ("sum",), "values"))
         nets[f"ends-with-{operator}"] = Net(nodes)
     for number in range(4):
         others = [value for k, value in enumerate(INPUTS) if k != number]
-        name, kind, shape = INPUTS[number]
+        name, kind, *shape = INPUTS[number]
         wrong = DOUBLE if kind == FLOAT else INT64
         changed = {
             "missing": others,
-            "renamed": [*others, (f"{name}s", kind, shape)],
-            "other-type": [*others, (name, wrong, shape)],
-            "flat": [*others, (name, kind, ("N",))],
-            "deep": [*others, (name, kind, ("V", 27, 1, 1))],
-            "fixed": [*others, (name, kind, (1, *shape[1:]))],
-            "narrow": [*others, (name, kind, ("V", 26))],
-            "negative": [*others, (name, kind, (-1, 27))],
+            "renamed": [*others, (f"{name}s", kind, *shape)],
+            "other-type": [*others, (name, wrong, *shape)],
+            "flat": [*others, (name, kind, "N")],
+            "deep": [*others, (name, kind, "V", 27, 1, 1)],
+            "fixed": [*others, (name, kind, 1, *shape[1:])],
+            "narrow": [*others, (name, kind, "V", 26)],
+            "negative": [*others, (name, kind, MINUS - 1, 27)],
             "twice": [*INPUTS, INPUTS[number]],
         }
         nets |= {f"{name}-{what}": Net(inputs=inputs) for what, inputs in changed.items()}
     outputs = {
         "none": (),
-        "renamed": (("result", FLOAT, ("D", "Q")),),
-        "double": (("values", DOUBLE, ("D", "Q")),),
-        "integer": (("values", INT32, ("D", "Q")),),
-        "two": (*OUTPUTS, ("sum", FLOAT, ("D", "Q"))),
-        "flat": (("values", FLOAT, ("D",)),),
-        "fixed": (("values", FLOAT, (1, 1)),),
+        "renamed": (("result", FLOAT, "D", "Q"),),
+        "double": (("values", DOUBLE, "D", "Q"),),
+        "integer": (("values", INT32, "D", "Q"),),
+        "two": (*OUTPUTS, ("sum", FLOAT, "D", "Q")),
+        "flat": (("values", FLOAT, "D"),),
+        "fixed": (("values", FLOAT, 1, 1),),
     }
     nets |= {f"output-{what}": Net(outputs=values) for what, values in outputs.items()}
-    for name, last in {
-        "one-column": ("Identity", ("column",), ("values",)),
-        "one-row": ("Identity", ("row",), ("values",)),
-        "too-many": ("Identity", ("chosen",), ("values",)),
-        "turned": ("Transpose", ("sum",), ("values",)),
-        "scalar": ("ReduceSum", ("sum",), ("values",)),
-        "shape": ("Shape", ("sum",), ("values",)),
-        "itself": ("Add", ("values", "sum"), ("values",)),
-        "unknown": ("Identity", ("nobody",), ("values",)),
-        "nothing": ("Identity", (), ("values",)),
+    for name, (operator, *inputs) in {
+        "one-column": ("Identity", "column"),
+        "one-row": ("Identity", "row"),
+        "too-many": ("Identity", "chosen"),
+        "turned": ("Transpose", "sum"),
+        "scalar": ("ReduceSum", "sum"),
+        "shape": ("Shape", "sum"),
+        "itself": ("Add", "values", "sum"),
+        "unknown": ("Identity", "nobody"),
+        "nothing": ("Identity",),
     }.items():
-        nets[f"gives-{name}"] = Net((*NODES[:-1], last))
+        nets[f"gives-{name}"] = Net((*NODES[:-1], (operator, tuple(inputs), "values")))
     nets |= {f"opset-{n}": Net(opset=n) for n in (0, 1, 6, 9999, -1, 2**63)}
     nets |= {f"ir-{n}": Net(ir_version=n) for n in (0, 1, 99, -1)}
     return nets | {"empty": Net(()), "domain": Net(domain="some.where"), "bare": Net(metadata={})}
