@@ -74,14 +74,14 @@ def unpacked(
             f"{volume.packed:,} bytes, like a zip bomb, and does not fit in memory; if it is a "
             "grid, save it as .npy"
         )
-    order = _order(placement)
+    x, y, z = placement.of_world((0, 1, 2))
+    order, is_swapped = (x, min(y, z), max(y, z)), z < y
     budget = PIECE
     if volume.chunks:
         budget = BOX if left is None else max(min(BOX, left // LEAST_SHARE), PIECE)
     box = _box(volume, order, budget // volume.dtype.itemsize)
     nx, ny, nz = placement.of_world(volume.shape)
     first, last = planes or (0, nx)
-    is_swapped = placement.world_axes[order[1]] == 2  # z before y
     copy = (last - first, *((nz, ny) if is_swapped else (ny, nz)))
     blocks = _blocks(volume, placement, (order, box), (first, last))
     if prod(copy) * volume.dtype.itemsize <= room:
@@ -109,12 +109,6 @@ def _check_chunk(volume: Volume, name: str, left: int | None) -> None:
             f"one takes {in_words(COPIES * size)} of memory, {in_words(max(left, 0))} are left; "
             "allow more (--max-memory), or store it in smaller chunks"
         )
-
-
-def _order(placement: Placement) -> Sizes:
-    """Return the axes of an array in the order of its copy: x, then y and z as they follow."""
-    x, y, z = placement.of_world((0, 1, 2))
-    return x, min(y, z), max(y, z)
 
 
 def _box(volume: Volume, order: Sizes, budget: int) -> Sizes:

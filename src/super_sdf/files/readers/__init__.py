@@ -18,21 +18,10 @@ from .vtk import read_vtk, read_vtkhdf
 from .zarr_files import read_zarr
 
 READERS: dict[str, Callable[[Request], Volume]] = {
-    "nifti": read_nifti,
-    "nrrd": read_nrrd,
-    "metaimage": read_metaimage,
-    "vti": read_vti,
-    "tiff": read_tiff,
-    "hdf5": read_hdf5,
-    "zarr": read_zarr,
-    "vdb": read_vdb,
-    "sdf": read_sdf,
-    "mgh": read_mgh,
-    "analyze": read_analyze,
-    "mrc": read_mrc,
-    "vtk": read_vtk,
-    "vtkhdf": read_vtkhdf,
-    "mat": read_mat,
-    "netcdf": read_netcdf,
-    "dicom": read_dicom,
+    read.__name__.removeprefix("read_"): read
+    for read in (
+        *(read_nifti, read_nrrd, read_metaimage, read_vti, read_tiff, read_hdf5, read_zarr),
+        *(read_vdb, read_sdf, read_mgh, read_analyze, read_mrc, read_vtk, read_vtkhdf, read_mat),
+        *(read_netcdf, read_dicom),
+    )
 }

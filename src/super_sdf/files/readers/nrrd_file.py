@@ -38,6 +38,9 @@ CENTERING = (
 TEXT = ("ascii", "text", "txt")
 IN_SPACE = ("domain", "space", "???", "none")  # kinds of axes; others are lists, vectors, time
 CODECS = {"gzip": "gzip", "gz": "gzip", "bzip2": "bz2", "bz2": "bz2"}
+# Fields in one spelling of those that the format allows
+SPELT = {"centers": "centerings", "axismins": "axis mins", "axismaxs": "axis maxs"}
+SPELT |= {each: each.replace(" ", "") for each in ("data file", "line skip", "byte skip")}
 
 
 def read_nrrd(request: Request) -> Volume:
@@ -46,7 +49,7 @@ def read_nrrd(request: Request) -> Volume:
 
     file = InputFile.open(request.path)
     beginning = io.BytesIO(file.read(0, LONGEST).tobytes())
-    header = {_plain(name): value for name, value in nrrd.read_header(beginning).items()}
+    header = {SPELT.get(name, name): value for name, value in nrrd.read_header(beginning).items()}
     sizes = tuple(int(size) for size in header["sizes"])
     if len(sizes) < 3 or header["dimension"] != len(sizes):
         raise GridError(f"{request.path} has shape {sizes}: give a file of three axes (x, y, z)")
@@ -115,13 +118,6 @@ def _segments(header: dict[str, Any], layer: int) -> str:
         if re.fullmatch(r"Segment\d+_Layer", key) and value.strip() == str(layer)
     ]
     return f" ({seen(', '.join(segments))})" if segments else ""
-
-
-def _plain(name: str) -> str:
-    """Return the name of a field in one spelling of those that the format allows."""
-    spelt = {"centers": "centerings", "axismins": "axis mins", "axismaxs": "axis maxs"}
-    spelt |= {each: each.replace(" ", "") for each in ("data file", "line skip", "byte skip")}
-    return spelt.get(name, name)
 
 
 def _dtype(nrrd: Any, header: dict[str, Any]) -> np.dtype[Any]:
