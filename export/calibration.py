@@ -18,10 +18,7 @@ from export.augment import USUAL, Prepared, augment, augment_mask
 from export.batches import batch_of, encode
 from export.dataset import fill_shard
 from export.network import Block, SuperSdfNet
-from super_sdf.grid.sdf_grid import SdfGrid
 from super_sdf.network.network import load_network
-from super_sdf.steps.nodes import block_offsets
-from super_sdf.steps.survey import survey
 
 THIN = 0.05  # share of thin solids, as in training
 SAMPLES = 200
@@ -37,13 +34,10 @@ class Ranges:
     expanded: Tensor  # (hidden,) likewise
 
     @classmethod
-    def of_zeros(cls, block: Block) -> Ranges:
-        """Return ranges that contain only 0."""
+    def watching(cls, block: Block) -> Ranges:
+        """Return ranges that contain only 0, and are extended whenever the block runs."""
         zeros = torch.zeros(block.expand.in_features)
-        return cls(zeros, zeros, zeros, torch.zeros(block.expand.out_features))
-
-    def watch(self, block: Block) -> None:
-        """Extend the ranges whenever the block runs on some voxels."""
+        self = cls(zeros, zeros, zeros, torch.zeros(block.expand.out_features))
 
         def see_conv(module: nn.Module, given: tuple[Tensor, ...], made: Tensor) -> None:
             if not len(made):
@@ -59,6 +53,7 @@ class Ranges:
 
         block.conv.register_forward_hook(see_conv)
         block.expand.register_forward_hook(see_expand)
+        return self
 
     def join(self, others: Sequence[Ranges]) -> Ranges:
         """Return the ranges with those of the features widened to contain others'."""
@@ -84,30 +79,18 @@ def find_ranges(net: SuperSdfNet, samples: list[Prepared]) -> list[Ranges]:
     Blocks beside and behind a gate read the same features: they have the same ranges.
     """
     watched = copy.deepcopy(net)
-    ranges = [Ranges.of_zeros(block) for block in watched.all_blocks()]
-    for block, block_ranges in zip(watched.all_blocks(), ranges):
-        block_ranges.watch(block)
+    ranges = [Ranges.watching(block) for block in watched.all_blocks()]
     for sample in samples:
         encode(watched, batch_of([sample]))
     first = net.config.blocks - net.config.gated
     return ranges[:first] + [each.join(ranges[first:]) for each in ranges[first:]]
 
 
-def ball(radius: float = 35.0) -> Prepared:
-    """Return the band of a ball; the targets are empty."""
-    shape = (int(2 * radius + 8),) * 3
-    distance = np.linalg.norm(np.indices(shape) - (shape[0] - 1) / 2, axis=0) - radius
-    band = survey(SdfGrid.trusted(distance.astype(np.float32), 1.0))
-    patches, table, voxels = band.network_inputs()
-    targets = np.zeros((len(voxels), 0), np.float32)
-    return Prepared(band.voxel_ijk, patches, table, voxels, block_offsets(4), targets)
-
-
-def distance_apart(one: Path, other: Path, samples: Sequence[Prepared] = ()) -> np.ndarray:
-    """Return the differences between the values of two files on samples or a ball, in voxels."""
+def distance_apart(one: Path, other: Path, samples: Sequence[Prepared]) -> np.ndarray:
+    """Return the differences between the values of two files on samples, in voxels."""
     pair = [load_network(path, device="cpu") for path in (one, other)]
     apart = []
-    for sample in samples or [ball(15.0)]:
+    for sample in samples:
         rows = (array.astype(np.int32) for array in (sample.table, sample.voxels))
         arrays = (sample.patches, *rows, sample.offsets)
         first, second = (network(*arrays) for network in pair)

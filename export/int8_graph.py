@@ -14,8 +14,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, numpy_helper
 
-from export.onnx_graph import EARLY, rows_of
-from export.writer import Writer
+from export.onnx_graph import EARLY, Writer, rows_of
 
 ONE = "int8_one"
 NONE = "int8_none"

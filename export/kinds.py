@@ -20,11 +20,11 @@ import numpy as np
 from export.arguments import Parser, at_least
 from export.augment import prepare
 from export.dataset import Sample, draw_mesh, find_meshes, make_sample
+from export.recipe import Errors, measure
 from export.shapes.draws import unit_sized
 from export.shapes.families import FAMILIES, Family
 from export.shapes.solid import is_usable, mesh_of
 from export.to_onnx import read_network
-from export.train import Errors, measure
 from super_sdf import Mesh
 
 RANGES = ((7.0, 17.0), (17.0, 41.0), (41.0, 100.0))  # voxels along the diagonal

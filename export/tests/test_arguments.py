@@ -12,7 +12,7 @@ import pytest
 
 from export import dataset, train
 from export.dataset import find_meshes, mesh_order, read_shard
-from export.train import Store
+from export.store import Store
 from super_sdf.errors import FileError
 
 
