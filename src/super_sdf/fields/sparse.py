@@ -40,12 +40,6 @@ LISTS = ("voxels", "sample_voxels", "sample_distances", "border_inside")
 KEYS = (*HEAD, "values", *LISTS)
 
 
-def exact_type(voxel_size: float) -> type[np.float32] | type[np.float64]:
-    """Return the type in which world units are exact: float32 if they only change exponents."""
-    power = math.frexp(voxel_size)[0] == 0.5 and 1e-20 < voxel_size < 1e20
-    return np.float32 if power else np.float64
-
-
 class SparseWriter:
     """Writes a field slab by slab: blocks to the archive, voxels and samples to temporary files."""
 
@@ -92,7 +86,9 @@ class SparseWriter:
 
     def _begin(self, field: FineField) -> None:
         grid, side = field.placed, field.factor + 1
-        exact = exact_type(grid.voxel_size)
+        # float32 is exact where world units only change exponents
+        is_power = math.frexp(grid.voxel_size)[0] == 0.5 and 1e-20 < grid.voxel_size < 1e20
+        exact = np.float32 if is_power else np.float64
         self.types = {**dict.fromkeys(LISTS, np.int32), "values": exact, "sample_distances": exact}
         head = (
             *(VERSION, field.shape, field.factor),
