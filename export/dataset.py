@@ -32,9 +32,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from export.arguments import Parser, at_least, share
-from export.shapes import random_solid
 from export.shapes.draws import draw_sway
-from export.shapes.families import FAMILIES
+from export.shapes.solid import FAMILIES, random_solid
 from super_sdf import Mesh, SdfGrid
 from super_sdf.errors import FileError
 from super_sdf.files.regular import check_regular_file
@@ -282,7 +281,6 @@ def main() -> None:
 
 
 def fill_store(options: argparse.Namespace) -> None:
-    """Make the missing shards."""
     files = mesh_order(options.seed, *find_meshes(options.meshes), options.count + SHARD)
     options.out.mkdir(parents=True, exist_ok=True)
     for number in range(-(-options.count // SHARD)):

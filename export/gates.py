@@ -73,7 +73,6 @@ def correlation(net: SuperSdfNet, samples: list[Prepared], encoded: list[Encoded
 
 
 def rows_of_table(file: Path, folder: Path, shares: tuple[float, ...]) -> Iterator[str]:
-    """Yield a row for each share, and the rank correlation."""
     net = read_network(file)
     if not net.config.gated:
         raise OptionError(f"{file} has no gate: give a network that was trained with --gated")

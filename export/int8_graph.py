@@ -48,7 +48,6 @@ class IntWriter(Writer):
         return self.op("QuantizeLinear", value, ONE, NONE)
 
     def layer(self, value: str, layer: IntLayer, label: str) -> str:
-        """Add an integer linear layer."""
         scales = self.constant(layer.scales, f"{label}.scales")
         operands = [self.op("DequantizeLinear", value, ONE, NONE)]
         # onnxruntime fuses the operators only if the zero points, all 0, are explicit

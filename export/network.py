@@ -45,7 +45,6 @@ class NetworkConfig:
 
     @property
     def receptive_field(self) -> int:
-        """Voxels in each direction that a prediction depends on."""
         return self.blocks + 1
 
 
@@ -185,7 +184,6 @@ class Trunk(nn.Module):
         return self.raw(offsets) - self.raw(torch.zeros_like(offsets[:1]))
 
     def raw(self, offsets: Tensor) -> Tensor:
-        """Evaluate the layers on the offsets and their sines and cosines."""
         angles = (offsets[:, :, None] * self.waves).flatten(1)
         return self.layers(torch.cat([offsets, angles.sin(), angles.cos()], 1))
 
@@ -239,7 +237,6 @@ class Encoded:
     doubts: Tensor | None = None  # (V,) logarithm of what is lost with these
 
     def some(self, rows: Tensor) -> Encoded:
-        """Return some of the voxels."""
         return Encoded(*(None if all_ is None else all_[rows] for all_ in vars(self).values()))
 
 
@@ -320,11 +317,9 @@ class SuperSdfNet(nn.Module):
             part.requires_grad_(requires_grad=True)
 
     def all_blocks(self) -> nn.ModuleList:
-        """Return all blocks, also the one before the gate."""
         return nn.ModuleList([*self.blocks, *([self.early] if self.config.gated else [])])
 
     def trained(self) -> list[nn.Parameter]:
-        """Return the parameters that training changes."""
         return [p for p in self.parameters() if p.requires_grad]
 
     def decode(self, voxels: Encoded, offsets: Tensor) -> Tensor:

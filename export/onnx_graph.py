@@ -42,7 +42,6 @@ class Writer:
         self.constants: list[onnx.TensorProto] = []
 
     def op(self, kind: str, *inputs: str, **attributes: Any) -> str:
-        """Add a node with one output."""
         name = f"{self.prefix}{kind.lower()}_{len(self.nodes)}"
         self.nodes.append(helper.make_node(kind, inputs, [name], name=name, **attributes))
         return name
@@ -79,12 +78,10 @@ class Graph(Writer):
         return name
 
     def layer(self, value: str, layer: torch.nn.Linear) -> str:
-        """Add a linear layer (torch keeps its weight transposed)."""
         product = self.op("MatMul", value, self.parameter(layer.weight, transposed=True))
         return self.op("Add", product, self.parameter(layer.bias))
 
     def two_layers(self, value: str, first: torch.nn.Linear, second: torch.nn.Linear) -> str:
-        """Add two linear layers with a rectifier between them."""
         return self.layer(self.op("Relu", self.layer(value, first)), second)
 
     def silu(self, value: str) -> str:
@@ -121,7 +118,6 @@ def rows_of(name: str, kind: int, *width: int | str) -> Declared:
 
 
 def build_graph(net: SuperSdfNet) -> onnx.GraphProto:
-    """Build the graph of the network."""
     graph = Graph(net)
     rows = graph.op("Shape", "patches", start=0, end=1)
     numbers, there = chunked_voxels(graph, rows)

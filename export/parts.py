@@ -44,7 +44,6 @@ def disc(radius: float, x: float = 0.0, y: float = 0.0) -> CrossSection:
 
 
 def rectangle(wide: float, long: float, x: float = 0.0, y: float = 0.0) -> CrossSection:
-    """Return a rectangle round a point."""
     return CrossSection.square([wide, long], True).translate([x, y])
 
 
@@ -219,7 +218,6 @@ def draw_part(number: int, seed: int = 0, detail: str = "usual") -> tuple[str, M
 
 
 def write_parts(out: Path, count: int = COUNT, seed: int = 0, detail: str = "usual") -> list[Path]:
-    """Write parts into a folder, which is made if it is missing; return their paths."""
     out.mkdir(parents=True, exist_ok=True)
     parts = [draw_part(number, seed, detail) for number in range(count)]
     paths = [out / f"{name}.ply" for name, _ in parts]

@@ -70,7 +70,6 @@ class Residents:
         return len(self.counts)
 
     def add(self, gathered: dict[str, np.ndarray]) -> None:
-        """Take in samples, as from ``gather_samples``."""
         self.band_counts = np.append(self.band_counts, gathered.pop("band_counts"))
         self.counts = np.append(self.counts, gathered.pop("counts"))
         for name, rows in gathered.items():

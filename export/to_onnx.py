@@ -22,8 +22,8 @@ import onnx
 import torch
 from onnx import helper, numpy_helper
 
+from export.augment import draw_samples
 from export.batches import singly
-from export.calibration import draw_samples
 from export.dormant import dormant_share
 from export.network import NetworkConfig, SuperSdfNet
 from export.onnx_graph import build_graph
@@ -62,7 +62,6 @@ def read_weights(path: Path) -> dict[str, torch.Tensor]:
 
 
 def write_model(net: SuperSdfNet, path: Path, card: dict[str, Any]) -> None:
-    """Write the graph and the metadata."""
     imports = [helper.make_opsetid("", OPSET)]
     model = helper.make_model(build_graph(net), opset_imports=imports, ir_version=9)
     model.producer_name = "super-sdf"
@@ -93,7 +92,6 @@ def parity(net: SuperSdfNet, path: Path, seed: int = 0) -> float:
 
 
 def load_run(folder: Path) -> SuperSdfNet:
-    """Return the network of a run, with averaged weights."""
     state = torch.load(folder / "checkpoint.pt", weights_only=True)
     net = SuperSdfNet(NetworkConfig(**state["config"]))
     net.load_state_dict(state["average"])
@@ -124,7 +122,6 @@ def rewrite(source: Path, target: Path) -> None:
 
 
 def read_network(path: Path) -> SuperSdfNet:
-    """Return the network in an exported file."""
     weights = read_weights(path)
     trunk, inputs = weights["trunk.layers.0.weight"].shape
     channels = len(weights["correction.weight"][0])
@@ -144,12 +141,10 @@ def read_network(path: Path) -> SuperSdfNet:
 
 
 def read_inputs(path: Path) -> str:
-    """Return what the network in an exported file was trained on."""
     return read_card(path).get("inputs", DISTANCES)
 
 
 def read_card(path: Path) -> dict[str, str]:
-    """Return the metadata of an exported file."""
     return {prop.key: prop.value for prop in onnx.load(path).metadata_props}
 
 

@@ -103,7 +103,6 @@ class Run:
         part.rename(self.path)
 
     def resume(self) -> None:
-        """Continue from the checkpoint, if there is one."""
         if self.path.exists():
             state = torch.load(self.path, weights_only=True, map_location=self.device)
             self.net.load_state_dict(state["net"])
@@ -113,7 +112,6 @@ class Run:
             self.step, self.seconds = state["step"], state["seconds"]
 
     def start_from(self, weights: dict[str, Tensor]) -> None:
-        """Take over the values of a network of the same sizes, or of smaller ones."""
         grow_from(self.net, weights)
         self.average.load_state_dict(self.net.state_dict())
 
@@ -148,7 +146,6 @@ class Run:
         return torch.cat([losses.cpu() for losses, _ in found])
 
     def _gradients(self, batch: Batch, weights: Tensor) -> tuple[Tensor, Sequence[Tensor]]:
-        """Return the loss of each window, and the gradients of their weighted sum."""
         with autocast(self.device):
             losses = window_losses(self.net, batch, self.recipe)
         total = (weights * losses).sum()
@@ -195,7 +192,6 @@ def train(run: Run, store: Store, minutes: float, seed: int, began: float | None
 
 
 def take_step(run: Run, store: Store, rng: np.random.Generator, spent: float) -> float:
-    """Train on the next batch of a store; return the loss."""
     drawn, batches = store.draw_batch(rng, run.recipe, run.threads)
     loss, losses = run.advance(batches, spent)
     store.sampler.record(drawn, losses)
@@ -278,7 +274,6 @@ def run_training(options: argparse.Namespace) -> None:
 
 
 def network_of(options: argparse.Namespace) -> SuperSdfNet:
-    """Return a fresh network of the size that is asked for."""
     size = SIZES[options.size]
     config = replace(
         size,
@@ -293,7 +288,6 @@ def network_of(options: argparse.Namespace) -> SuperSdfNet:
 
 
 def recipe_of(options: argparse.Namespace) -> Recipe:
-    """Return the hyperparameters that are asked for."""
     drawn = {name: getattr(options, name) for name in ("shifted", "noisy", "truncated")}
     recipe = replace(
         RECIPE,

@@ -7,15 +7,14 @@ import onnx
 import pytest
 import torch
 
-from export.augment import prepare
+from export.augment import draw_samples, prepare
 from export.batches import batch_of, encode
-from export.calibration import distance_apart, draw_samples
 from export.dormant import dormant_share, rectified_layers
 from export.gates import correlation, encode_first, measure_at, rows_of_table, threshold_of
 from export.grow import grow_from, without_blocks
 from export.network import GatherMatMul, SuperSdfNet
 from export.onnx_graph import THRESHOLD
-from export.quantize import quantize
+from export.quantize import distance_apart, quantize
 from export.recipe import RECIPE, batch_losses, measure, window_losses
 from export.resident import Residents, gather_samples
 from export.tests.small_net import SMALL

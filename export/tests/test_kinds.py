@@ -6,7 +6,7 @@ import pytest
 from export.dataset import SIZES, draw_pose
 from export.kinds import RANGES, draw_windows, drawn_from, format_table
 from export.recipe import Errors
-from export.shapes.families import FAMILIES
+from export.shapes.solid import FAMILIES
 
 
 def test_a_table_has_the_kind_with_the_largest_error_first():

@@ -10,7 +10,7 @@ from manifold3d import CrossSection
 
 from export import parts
 from export.shapes.edges import CHAMFER
-from export.shapes.families import FAMILIES
+from export.shapes.solid import FAMILIES
 from export.tests.test_shapes import check_closed, check_size
 from lab.edges import EdgeCurves
 from lab.metrics import face_vectors

@@ -5,9 +5,18 @@ import onnx
 import pytest
 import torch
 
-from export.calibration import distance_apart, draw_samples, find_ranges
+from export.augment import draw_samples
 from export.network import NetworkConfig, SuperSdfNet
-from export.quantize import LEVELS, MOST, quantize, steps_of, whole_block, whole_layer
+from export.quantize import (
+    LEVELS,
+    MOST,
+    distance_apart,
+    find_ranges,
+    quantize,
+    steps_of,
+    whole_block,
+    whole_layer,
+)
 from export.to_onnx import make_card, write_model
 from super_sdf.network.network import load_network, shipped_models
 from super_sdf.network.onnx import ort

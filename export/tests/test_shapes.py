@@ -9,10 +9,8 @@ from scipy.ndimage import label
 
 from export.shapes import solid as shapes
 from export.shapes.draws import log_uniform, unit_sized
-from export.shapes.families import FAMILIES, draw_family
-from export.shapes.organic import grid
-from export.shapes.sculpted import STEP, bumps, put_spikes, relief, skin_waves, wrinkles
-from export.shapes.solid import MAX_FACES, random_solid, without_crumbs
+from export.shapes.organic import STEP, bumps, grid, put_spikes, relief, skin_waves, wrinkles
+from export.shapes.solid import FAMILIES, MAX_FACES, draw_family, random_solid, without_crumbs
 from super_sdf import Mesh
 
 SEEDS = range(20)

@@ -49,7 +49,7 @@ from export.recipe import (
     make_optimisers,
     sample_errors,
 )
-from export.run_log import draw_history, read_log
+from export.run_log import read_log
 from export.store import Store
 from export.tests.small_net import SMALL, small_net
 from export.to_onnx import (
@@ -283,16 +283,6 @@ def test_steps_that_a_resumed_run_takes_again_count_once(tmp_path):
     path.write_text("")
     with pytest.raises(FileError, match=f"^{path} is empty: give the log.csv of a run$"):
         read_log(path)
-
-
-def test_consecutive_runs_are_drawn_one_after_the_other(tmp_path, capsys):
-    for name, start in (("one", 0.02), ("two", 0.016)):
-        lines = [f"{1000 * n},{600 * n},5,.1,{start / n},.02,.04,.01" for n in (1, 2)]
-        (tmp_path / name).write_text("\n".join(lines))
-    figure = draw_history([tmp_path / "one", tmp_path / "two"], 0.015)
-    one, two, *_ = (line.get_xydata() for line in figure.axes[0].lines[::2])
-    np.testing.assert_allclose(one, [[1 / 6, 0.02], [1 / 3, 0.01]])
-    np.testing.assert_allclose(two, [[1 / 2, 0.016], [2 / 3, 0.008]])
 
 
 def test_noisy_are_the_voxels_whose_neighbours_are_no_distance(samples):
