@@ -22,9 +22,7 @@ class Parser(argparse.ArgumentParser):
         """Exit with code 1 and one line if a file or its content is invalid."""
         try:
             yield
-        except SuperSdfError as error:
-            self.exit(1, f"Error: {error}\n")
-        except OSError as error:
+        except (SuperSdfError, OSError) as error:
             self.exit(1, f"Error: {error}\n")
 
 

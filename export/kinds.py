@@ -42,10 +42,6 @@ def drawn_from(family: Family) -> Draw:
     return draw
 
 
-def drawn_from_files(files: list[Path]) -> Draw:
-    return lambda rng: draw_mesh(rng, files[rng.integers(len(files))])
-
-
 def draw_windows(
     rng: np.random.Generator, draw: Draw, sizes: tuple[float, float], count: int
 ) -> list[Sample]:
@@ -84,7 +80,8 @@ def measure_kinds(options: argparse.Namespace) -> dict[str, list[Errors]]:
     net = read_network(options.model)
     kinds = {name: drawn_from(family) for name, family in FAMILIES.items()}
     if options.meshes:
-        kinds["meshes"] = drawn_from_files(find_meshes(options.meshes)[1])
+        files = find_meshes(options.meshes)[1]
+        kinds["meshes"] = lambda rng: draw_mesh(rng, files[rng.integers(len(files))])
     rows: dict[str, list[Errors]] = {}
     for number, (kind, draw) in enumerate(kinds.items()):
         rng = np.random.default_rng([options.seed, number])

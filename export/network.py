@@ -210,8 +210,8 @@ class Gate(nn.Module):
     def rows(self, doubts: Tensor, patches: Tensor, share: float | None = None) -> Tensor:
         """Return the rows of the voxels where it is open, (n,).
 
-        With ``share`` the threshold is that which this share of these voxels exceeds, and the
-        kept one moves a little to that which ``USUAL_SHARE`` exceeds.
+        With ``share`` that share of the voxels exceeds the threshold, and the kept threshold moves
+        a little to that which ``USUAL_SHARE`` exceeds.
         """
         near = patches[:, CENTRE].abs() <= DECODE_LIMIT
         threshold = self.threshold

@@ -139,16 +139,10 @@ def steps_of(width: Tensor) -> Array:
 def whole_layer(
     weight: Tensor, bias: Tensor, steps: Array, out: Array, zeros: Array | None = None
 ) -> IntLayer:
-    """Quantize a layer.
+    """Quantize a layer, ``values @ weight + bias``, (K, n) and (n,).
 
-    Parameters
-    ----------
-    weight, bias : (K, n), (n,)
-        The layer, ``values @ weight + bias``.
-    steps, out : (K,), (n,)
-        Quantization steps of its inputs and of its outputs.
-    zeros : (C,), optional
-        Zero points of the inputs, repeated if K > C. Default: 0.
+    ``steps`` (K,) and ``out`` (n,) are those of its inputs and outputs, ``zeros`` (C,) the zero
+    points of the inputs, repeated if K > C.
     """
     scaled = weight.detach().double().numpy() * steps[:, None] / out
     start = bias.detach().double().numpy() / out

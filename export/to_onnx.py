@@ -41,13 +41,7 @@ DORMANT = 0.01  # largest accepted share of dormant units
 
 
 def read_weights(path: Path) -> dict[str, torch.Tensor]:
-    """Return the parameters and buffers of an exported file, to continue training from.
-
-    Raises
-    ------
-    ModelError
-        If its blocks are in int8.
-    """
+    """Return the parameters and buffers of an exported file; ModelError if its blocks are int8."""
     graphs = [onnx.load(path).graph]
     graphs += [a.g for node in graphs[0].node for a in node.attribute if a.name == "body"]
     arrays = {i.name: numpy_helper.to_array(i).copy() for g in graphs for i in g.initializer}
@@ -99,13 +93,7 @@ def load_run(folder: Path) -> SuperSdfNet:
 
 
 def rewrite(source: Path, target: Path) -> None:
-    """Write the weights and the metadata of an exported file with the current graph.
-
-    Raises
-    ------
-    SystemExit
-        If the values differ by more than rounding.
-    """
+    """Write an exported file with the current graph; SystemExit if values change too much."""
     card, net = read_card(source), read_network(source)
     want = load_network(source, device="cpu")(*noisy_ball())
     fresh = target.with_suffix(".new.onnx")  # the target may be the source
@@ -149,13 +137,7 @@ def read_card(path: Path) -> dict[str, str]:
 
 
 def check_awake(net: SuperSdfNet) -> None:
-    """Refuse a network with dormant units: a smaller one would do as well.
-
-    Raises
-    ------
-    SystemExit
-        If more than ``DORMANT`` of the rectified units react to no voxel of procedural shapes.
-    """
+    """Exit if many units react to no voxel of procedural shapes: a smaller network would do."""
     samples = draw_samples(masks=not net.config.keeps_samples)
     share = dormant_share(net, singly(net, [sample for sample in samples if len(sample.voxels)]))
     if share > DORMANT:
@@ -200,17 +182,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="the .onnx file")
     parser.add_argument("--data", default="not given", help="what it was trained on")
     parser.add_argument("--accuracy", default="not measured", help="measured figures, in words")
-    parser.add_argument(
-        "--exact",
-        action="store_const",
-        dest="inputs",
-        const=EXACT_DISTANCES,
-        default=DISTANCES,
-        help="the network was trained on hardly any noisy samples: noisy grids are for another one",
-    )
-    parser.add_argument(
-        "--threshold", type=float, help="of the gate, if not that of the run: see export.gates"
-    )
+    exact = "it was trained on hardly any noisy samples: noisy grids are for another network"
+    parser.add_argument("--exact", action="store_true", help=exact)
+    gate = "of the gate, if not that of the run: see export.gates"
+    parser.add_argument("--threshold", type=float, help=gate)
     options = parser.parse_args()
     if options.source:
         rewrite(options.source, options.out)
@@ -219,8 +194,9 @@ def main() -> None:
     if options.threshold is not None:
         net.gate.threshold.fill_(options.threshold)
     check_awake(net)
-    said = options.data, options.accuracy, options.inputs
-    write_model(net, options.out, make_card(net, options.out.stem, *said))
+    inputs = EXACT_DISTANCES if options.exact else DISTANCES
+    card = make_card(net, options.out.stem, options.data, options.accuracy, inputs)
+    write_model(net, options.out, card)
     difference = parity(net, options.out)
     if difference > PARITY:
         options.out.unlink()

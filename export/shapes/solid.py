@@ -137,15 +137,8 @@ def mesh_of(solid: Manifold) -> Mesh:
 def random_solid(rng: np.random.Generator, families: Sequence[str] = ()) -> Mesh:
     """Draw a closed solid with outward faces, its bounding box centred and of diagonal 1.
 
-    It is of the families named, or of any.
-
-    The same state of ``rng`` gives the same solid. About one solid in 300 touches or intersects
-    itself, where a bent wall or a level set is very thin; `export.dataset` refuses those.
-
-    Raises
-    ------
-    RuntimeError
-        If 20 candidates in a row are empty, too thin or of too many faces.
+    It is of the families named, or of any. The same state of ``rng`` gives the same solid. About
+    one solid in 300 touches or intersects itself, where a bent wall or a level set is very thin.
     """
     for _ in range(ATTEMPTS):
         solid = draw_candidate(rng, families)

@@ -9,7 +9,6 @@ import torch
 
 from export.augment import draw_samples, prepare
 from export.batches import batch_of, encode
-from export.dormant import dormant_share, rectified_layers
 from export.gates import correlation, encode_first, measure_at, rows_of_table, threshold_of
 from export.grow import grow_from, without_blocks
 from export.network import GatherMatMul, SuperSdfNet
@@ -84,7 +83,8 @@ def test_voxels_that_go_no_deeper_are_as_they_were_for_those_that_do(net):
     torch.testing.assert_close(blended[7:8], want)
 
 
-def test_the_gradient_of_a_convolution_with_voxels_around():
+def test_the_gradient_of_a_convolution_with_voxels_around(monkeypatch):
+    monkeypatch.setattr("export.network.CHUNK", 5)
     patches, table = ball_tensors()
     rows = torch.arange(40, 52)
     place = torch.arange(len(patches) + 1) + len(rows)
@@ -176,17 +176,6 @@ def test_the_int8_file_is_near_and_runs_every_layer_in_whole_numbers(net, file, 
         assert kinds[f"block{number}"] == ["Gather", "Gather", "Reshape", *layers, *rounding]
 
 
-def test_blocks_of_the_start_are_left_out():
-    weights = {f"blocks.{n}.conv.bias": torch.tensor([n]) for n in range(5)}
-    kept = without_blocks({**weights, "branch.bias": torch.tensor([9])}, [1, 3])
-    assert {name: int(array) for name, array in kept.items()} == {
-        "blocks.0.conv.bias": 0,
-        "blocks.1.conv.bias": 2,
-        "blocks.2.conv.bias": 4,
-        "branch.bias": 9,
-    }
-
-
 @pytest.fixture(scope="module")
 def prepared(samples):
     return [prepare(sample) for sample in samples]
@@ -239,13 +228,3 @@ def test_a_network_without_a_gate_has_no_thresholds(tmp_path):
     file = shipped_models()["fast"]
     with pytest.raises(OptionError, match=r"fast.onnx has no gate: give a network .* --gated$"):
         next(rows_of_table(file, tmp_path, (0.5,)))
-
-
-def test_units_behind_the_gate_and_of_it_may_be_dormant(net, prepared):
-    layers = rectified_layers(net)
-    assert [entry.layer for entry in layers if entry.layer is net.gate.layers[0]]
-    with torch.no_grad():
-        for entry in layers:
-            entry.bias[:4] = -1e4
-    units = sum(len(entry.bias) for entry in layers)
-    assert dormant_share(net, [batch_of(prepared[:1])]) >= 4 * len(layers) / units

@@ -11,10 +11,7 @@ from export.quantize import (
     LEVELS,
     MOST,
     distance_apart,
-    find_ranges,
     quantize,
-    steps_of,
-    whole_block,
     whole_layer,
 )
 from export.to_onnx import make_card, write_model
@@ -67,17 +64,6 @@ def test_layers_without_weights_keep_their_bias():
     bias = torch.tensor([3.0, 0.0])
     layer = whole_layer(torch.zeros(4, 2), bias, np.ones(4), np.ones(2))
     np.testing.assert_allclose(layer.bias * layer.scales, bias, rtol=1e-6)
-
-
-def test_what_is_read_fits_into_a_byte(calibration):
-    block = SuperSdfNet(SMALL).blocks[0]
-    net = SuperSdfNet(SMALL)
-    ranges = find_ranges(net, calibration)[0]
-    whole = whole_block(block, ranges)
-    for value in (ranges.low, ranges.high):
-        read = value.numpy() / whole.steps + whole.zeros
-        assert read.min() > -1 and read.max() < LEVELS + 1
-    assert (steps_of(torch.zeros(3)) > 0).all()
 
 
 def test_the_int8_file_is_near_the_float32_one_and_carries_its_card(files, calibration):

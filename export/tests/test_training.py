@@ -69,7 +69,7 @@ from super_sdf.neighbourhood import CENTRE, NEIGHBOURHOOD
 from super_sdf.network.contract import EXACT_DISTANCES, INPUTS
 from super_sdf.network.network import shipped_models
 from super_sdf.network.onnx import CHUNK_INPUT
-from super_sdf.steps.band import find_band, is_lipschitz, neighbour_table
+from super_sdf.steps.band import is_lipschitz, neighbour_table
 from super_sdf.steps.nodes import block_offsets
 from super_sdf.truth.solid import Solid
 
@@ -204,20 +204,6 @@ def test_meshes_come_once_each_with_a_sixth_of_prisms():
     assert len(order) == len(set(order)) == 600
     assert set(others) < set(order)
     assert len(set(mesh_order(0, prisms, others, 1200)[600:]) & set(prisms)) == 100
-
-
-@pytest.mark.parametrize("chunk", [5, 1000])
-def test_the_gradient_of_the_neighbour_convolution(chunk, monkeypatch):
-    monkeypatch.setattr("export.network.CHUNK", chunk)
-    field = np.random.default_rng(0).normal(0, 3, (4, 4, 4)).astype(np.float32)
-    voxels = find_band(field)
-    table = neighbour_table(voxels, (4, 4, 4))
-    table = torch.from_numpy(np.where(table < 0, len(voxels), table))
-    features = torch.randn(len(voxels), 3, dtype=torch.double, requires_grad=True)
-    weight = torch.randn(81, 2, dtype=torch.double, requires_grad=True)
-    assert torch.autograd.gradcheck(
-        lambda f, w: GatherMatMul.apply(f, w, table, features[:0]), (features, weight)
-    )
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
