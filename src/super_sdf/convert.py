@@ -122,35 +122,18 @@ def convert(
     save_field: str | Path | None = None,
     keep: bool = False,
 ) -> Conversion:
-    """Convert a grid file to a mesh file.
+    """Convert a grid file to a mesh file, in formats of ``read_grid`` and ``write_mesh``.
 
-    Parameters
-    ----------
-    source, target : path
-        The grid file and the mesh file, in formats of ``read_grid`` and ``write_mesh``.
-    network : Network
-        From ``load_network``; it can be used for any number of files.
-    options : ConvertOptions
-        How the grid is read, refined and meshed.
-    force : bool
-        Replace the target, and the field's file, if they exist.
-    progress : callable, optional
-        Called with (done, total), see ``progress.Progress``; an exception in it ends the work.
-    before_rename : callable, optional
-        Called with the path of the finished temporary file, before it is renamed to ``target``.
-    announce : callable, optional
-        Called before the work with a sentence on the size of the mesh file, if it will be large.
-    save_field : path, optional
-        A file for the refined field, in a format of ``write_field``. It and the mesh file are both
-        complete at the end, or neither is written.
-    keep : bool
-        Keep grid, band and mesh for a check, so that it need not read them again.
+    ``force`` replaces the target, and the field's file, if they exist. ``progress`` is called with
+    (done, total), see ``progress.Progress``; an exception in it ends the work. ``before_rename`` is
+    called with the path of the finished temporary file, before it is renamed to ``target``;
+    ``announce`` before the work with a sentence on the size of the mesh file, if it will be large.
+    ``save_field`` is a file for the refined field, in a format of ``write_field``: it and the mesh
+    file are both complete at the end, or neither is written. ``keep`` keeps grid, band and mesh for
+    a check, so that it need not read them again.
 
-    Raises
-    ------
-    SuperSdfError
-        As in ``read_grid``, ``upsample``, ``simplify_mesh`` and ``write_mesh``; MeshError if slabs
-        do not meet. Nothing is written then.
+    SuperSdfError as in ``read_grid``, ``upsample``, ``simplify_mesh`` and ``write_mesh``; MeshError
+    if slabs do not meet. Nothing is written then.
     """
     watch = Stopwatch()
     if options.simplifies:
@@ -211,10 +194,7 @@ def describe_place(grid: SdfGrid) -> dict[str, Any]:
 def _field_file(
     path: str | Path | None, grid: SdfGrid, options: ConvertOptions, *, force: bool
 ) -> AbstractContextManager[FieldFile | None]:
-    """Return the file to write the refined field to, which appears at the end; None without a path.
-
-    SuperSdfError if the file exists, its suffix is unknown, or the field would not fit.
-    """
+    """Return the file to write the refined field to, which appears at the end; None without."""
     if path is None:
         return nullcontext()
     # imported here, since few conversions write a field, and the start is part of each
@@ -400,10 +380,7 @@ def torn(count: int, where: str, *pieces: Piece) -> MeshError:
 def find_warnings(
     grid: SdfGrid, offset: float, counts: dict[str, int], *, is_open: bool
 ) -> list[str]:
-    """Return a sentence on each thing that may be wrong with the mesh of a grid.
-
-    Only distances can be noisy, or contradict each other.
-    """
+    """Return a sentence on each thing that may be wrong with the mesh of a grid."""
     warnings = []
     if is_open and grid.field.unseen is not None:
         warnings.append("the surface ends where samples are unknown, and is open there")
@@ -412,7 +389,7 @@ def find_warnings(
     if grid.low >= offset:
         thin = "no sample lies inside: the solid is thinner than the spacing"
         warnings.append(f"{thin}, and its mesh may have holes")
-    if grid.field.kind in (MASK, SCALED):
+    if grid.field.kind in (MASK, SCALED):  # only distances can be noisy, or contradict each other
         return warnings
     if counts["noisy_voxels"]:
         share = in_percent(counts["noisy_voxels"], counts["band_voxels"])

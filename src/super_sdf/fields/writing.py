@@ -149,14 +149,11 @@ def check_field_fits(path: Path, shape: Shape, max_memory: int | None = None) ->
 
 
 class FieldFile:
-    """A file of a field that is being written; errors name it.
-
-    ``place`` has spacing and origin of the fine lattice, once there is a field.
-    """
+    """A file of a field that is being written; errors name it."""
 
     def __init__(self, path: Path, shape: Shape, writer: Any) -> None:
         self.path, self.shape, self.writer = path, shape, writer
-        self.place: dict[str, Any] = {}
+        self.place: dict[str, Any] = {}  # spacing and origin of the lattice, once there is a field
 
     def add(self, field: FineField) -> None:
         """Write the own planes of a slab's field."""
@@ -173,7 +170,7 @@ class FieldFile:
             self.writer.finish()
 
     def report(self) -> dict[str, Any]:
-        """Return what was written, as it stands in JSON."""
+        """Return what was written, for JSON."""
         return {"path": str(self.path), "shape": list(self.shape), **self.place}
 
 

@@ -300,7 +300,6 @@ def network_for(network: Decoder, kind: str) -> Decoder:
 
 @lru_cache(maxsize=4)
 def _load_once(name: str, device: str, threads: int, symmetries: int, precision: str) -> Network:
-    """Load a network for a kind."""
     if name not in shipped_models():
         raise FileError(f"the network {name!r} is missing: {NO_NETWORKS}")
     loaded = load_network(name, device=device, threads=threads, precision=precision)

@@ -66,11 +66,10 @@ def without_unused(vertices: NDArray[Any], faces: NDArray[Any]) -> Mesh:
 
 
 def merged(mesh: Mesh) -> Mesh:
-    """Merge vertices at the same position and drop unused ones.
+    """Merge vertices within ``MERGE_DISTANCE``, for meshes under 1 that share of their size.
 
-    Vertices within ``MERGE_DISTANCE`` are merged; for meshes smaller than 1, within that share of
-    their size. Unlike in trimesh, normals and textures do not keep vertices separate: a mesh is not
-    open along its seams.
+    Unlike in trimesh, normals and textures do not keep vertices separate: a mesh is not open along
+    its seams. Unused vertices are dropped.
     """
     from trimesh.grouping import unique_rows
 
@@ -92,10 +91,7 @@ def are_distinct(rows: NDArray[np.int64]) -> bool:
 
 
 def _check_archive(path: Path, max_memory: int | None) -> None:
-    """Raise OutOfMemoryError if a zip file unpacks to more than fits in memory.
-
-    zipfile reads no more of a member than its entry says.
-    """
+    """Raise OutOfMemoryError if a zip file, by its entries, unpacks to more than fits in memory."""
     bound = memory_bound(max_memory)
     if bound is None or not zipfile.is_zipfile(path):
         return
@@ -113,7 +109,7 @@ def _check_archive(path: Path, max_memory: int | None) -> None:
 
 
 def _load(path: Path) -> tuple[NDArray[np.float64], NDArray[Any]]:
-    """Return vertices (n, 3) and faces (m, 3) as trimesh reads them, unchecked."""
+    """Return vertices (n, 3) and faces (m, 3) as they stand."""
     try:
         plain = read_plain_ply(path) if path.suffix.lower() == ".ply" else None
         return plain or _load_with_trimesh(path)
