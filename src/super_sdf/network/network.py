@@ -217,9 +217,8 @@ def find_model(model: str | Path, precision: str = AUTO_PRECISION) -> tuple[Path
     if precision == INT8:
         path = path.with_name(f"{int8_name(path.stem)}.onnx")  # beside the float32 file
         if not os.path.lexists(path):
-            raise OptionError(
-                f"{model} has no int8 variant, {path}: write one with export.quantize"
-            )
+            lacks = f"{model} has no int8 variant, {path}"
+            raise OptionError(f"{lacks}: write one with export.quantize")
     if not os.path.lexists(path):
         names = ", ".join(QUALITIES)
         raise FileError(f"no model {str(model)!r}: give an ONNX file or one of: {names}")
