@@ -25,7 +25,7 @@ class Recipe:
     batch_voxels: int = 12_000  # small enough for the arrays of a step to stay in cache
     average_decay: float = 0.998  # of the averaged weights, per step
     voxel_power: float = 0.5  # of the number of voxels of a sample, for its weight in a batch
-    spread: float = 3.0  # of the chances of windows, by their loss; 1: equal (``sampler``)
+    spread: float = 3.0  # of the chances of windows, by their loss; 1: equal (``store``)
     reach: float = 0.5  # half voxels: decay length of the weight away from the surface ...
     far_weight: float = 0.25  # ... to this
     gradient_weight: float = 0.5

@@ -60,7 +60,8 @@ class Residents:
 
     def __init__(self, device: str) -> None:
         self.device = device
-        self.arrays: dict[str, Tensor] = {}
+        self.arrays: dict[str, Tensor] = {}  # with room for more rows
+        self.filled: dict[str, int] = {}  # rows of each
         self.band_counts = self.counts = np.zeros(0, np.int64)  # of each sample
         self.symmetries = torch.from_numpy(cube_symmetries()).float().to(device)
         places = np.stack([turned_places(symmetry) for symmetry in cube_symmetries()])
@@ -74,8 +75,13 @@ class Residents:
         self.counts = np.append(self.counts, gathered.pop("counts"))
         for name, rows in gathered.items():
             new = torch.from_numpy(np.ascontiguousarray(rows)).to(self.device)
-            held = self.arrays.get(name, new[:0])
-            self.arrays[name] = torch.cat([held, new])
+            held, start = self.arrays.get(name, new[:0]), self.filled.get(name, 0)
+            end = start + len(new)
+            if end > len(held):
+                room = held.new_empty(3 * end // 2 - len(held), *held.shape[1:])
+                held = torch.cat([held, room])
+            held[start:end] = new
+            self.arrays[name], self.filled[name] = held, end
 
     def batch(self, drawn: Sequence[int], turns: Sequence[int]) -> Batch:
         """Return some samples, each turned by one of the 48 symmetries."""
