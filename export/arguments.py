@@ -15,7 +15,6 @@ class Parser(argparse.ArgumentParser):
     """An argument parser that reports an error in one line, without the usage."""
 
     def error(self, message: str) -> NoReturn:
-        """Print the error and exit with code 2."""
         self.exit(2, f"Error: {message}\n")
 
     @contextmanager
@@ -23,14 +22,11 @@ class Parser(argparse.ArgumentParser):
         """Exit with code 1 and one line if a file or its content is invalid."""
         try:
             yield
-        except SuperSdfError as error:
-            self.exit(1, f"Error: {error}\n")
-        except OSError as error:
+        except (SuperSdfError, OSError) as error:
             self.exit(1, f"Error: {error}\n")
 
 
 def share(text: str) -> float:
-    """Parse a number from 0 to 1."""
     number = float(text)
     if not 0 <= number <= 1:
         raise argparse.ArgumentTypeError(f"{text}: give a number from 0 to 1")
@@ -38,7 +34,6 @@ def share(text: str) -> float:
 
 
 def positive(text: str) -> float:
-    """Parse a finite number greater than 0."""
     number = float(text)
     if not 0 < number < math.inf:
         raise argparse.ArgumentTypeError(f"{text}: give a number greater than 0")

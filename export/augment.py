@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from export.dataset import Sample
+from export.dataset import Sample, fill_shard
 from super_sdf.grid.derived import mask_distances
 from super_sdf.neighbourhood import cube_symmetries, turn
 from super_sdf.steps.band import find_band, gather_patches, neighbour_table
@@ -46,18 +46,15 @@ class Prepared:
 
 
 def augment(rng: np.random.Generator, sample: Sample, shares: Shares) -> Prepared:
-    """Change and turn a sample at random, and gather it."""
     return turned(rng, change(rng, sample, shares))
 
 
 def change(rng: np.random.Generator, sample: Sample, shares: Shares) -> Prepared:
-    """Change a sample at random and gather it."""
     changed = noisy(rng, shifted(rng, inverted(rng, sample, shares), shares), shares)
     return truncated(rng, prepare(changed), shares)
 
 
 def augment_mask(rng: np.random.Generator, sample: Sample) -> Prepared:
-    """Make a mask of a sample, at a random level, and gather it."""
     return turned(rng, prepare(masked(rng, sample)))
 
 
@@ -84,7 +81,6 @@ def prepare(sample: Sample) -> Prepared:
 
 
 def inverted(rng: np.random.Generator, sample: Sample, shares: Shares) -> Sample:
-    """Swap inside and outside."""
     if rng.random() >= shares.inverted:
         return sample
     return replace(sample, window=-sample.window, targets=-sample.targets)
@@ -140,3 +136,16 @@ def turned(rng: np.random.Generator, sample: Prepared) -> Prepared:
     patches, table, offsets = turn(symmetry, sample.patches, sample.table, sample.offsets)
     ijk = sample.ijk @ symmetry.T
     return replace(sample, ijk=ijk, patches=patches, table=table, offsets=offsets)
+
+
+THIN = 0.05  # share of thin solids, as in training
+
+
+def draw_samples(count: int = 200, seed: int = 0, *, masks: bool = False) -> list[Prepared]:
+    """Return samples of procedural shapes, some noisy, some truncated; or masks of them."""
+    rng = np.random.default_rng(seed)
+    samples = fill_shard(rng, [], 1.0, THIN, count)
+    if masks:
+        shown = [augment_mask(rng, sample) for sample in samples]
+        return [sample for sample in shown if len(sample.voxels)]  # thin ones may vanish
+    return [augment(rng, sample, USUAL) for sample in samples]

@@ -84,7 +84,6 @@ def neighbours_with_targets(sample: Prepared) -> np.ndarray:
 
 
 def batch_of(samples: Sequence[Prepared], device: torch.device | str = "cpu") -> Batch:
-    """Return samples side by side."""
     counts = [len(sample.voxels) for sample in samples]
     starts = np.cumsum([0] + [len(sample.patches) for sample in samples])
     copies = [copies_of_queries(sample.offsets) for sample in samples]

@@ -32,9 +32,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from export.arguments import Parser, at_least, share
-from export.shapes import random_solid
 from export.shapes.draws import draw_sway
-from export.shapes.families import FAMILIES
+from export.shapes.solid import FAMILIES, random_solid
 from super_sdf import Mesh, SdfGrid
 from super_sdf.errors import FileError
 from super_sdf.files.regular import check_regular_file
@@ -99,9 +98,8 @@ def make_sample(
 ) -> Sample | None:
     """Sample a shape; return None if no sample is near the surface, or all are inside.
 
-    A shape so thin that no sample lies inside is kept: its distances reveal it. Also None if the
-    lowest sample is not between the two bounds ``lowest`` (in spacings). ``sizes`` is the range of
-    the shape's diagonal.
+    Also None if the lowest sample is not between the bounds ``lowest`` (in spacings). A shape so
+    thin that no sample lies inside is kept: its distances reveal it.
     """
     posed = draw_pose(rng, mesh, sizes)
     shape, first = draw_window(rng, posed)
@@ -154,13 +152,7 @@ def write_shard(path: Path, samples: list[Sample]) -> None:
 
 
 def read_shard(path: Path) -> Iterator[Sample]:
-    """Yield the samples of a shard.
-
-    Raises
-    ------
-    FileError
-        If it is damaged or not a shard.
-    """
+    """Yield the samples of a shard; FileError if it is damaged or not a shard."""
     try:
         with np.load(check_regular_file(path)) as file:
             shard = dict(file)
@@ -176,13 +168,7 @@ def read_shard(path: Path) -> Iterator[Sample]:
 
 
 def find_meshes(folder: Path | None) -> tuple[list[Path], list[Path]]:
-    """Return the files of simple prisms (under 128 faces, by file size) and all others.
-
-    Raises
-    ------
-    FileError
-        If the folder does not exist or has no .ply file, or one of them is not a regular file.
-    """
+    """Return the files of simple prisms (under 128 faces, by file size) and all others."""
     if folder is None:
         return [], []
     if not folder.is_dir():
@@ -236,19 +222,17 @@ def fill_shard(
     families: Sequence[str] = (),
 ) -> list[Sample]:
     """Make the samples of a shard; a procedural shape replaces a mesh without a usable sample."""
-
-    def draw_solid() -> Mesh:
-        return random_solid(rng, families)
-
     samples: list[Sample] = []
     for number in range(count):
         if rng.random() < thin:
             samples.append(make_thin_sample(rng, families))
             continue
         drawn = not files or rng.random() < procedural
-        sample = make_sample(rng, draw_solid() if drawn else draw_mesh(rng, files[number]))
+        sample = make_sample(
+            rng, random_solid(rng, families) if drawn else draw_mesh(rng, files[number])
+        )
         while sample is None:
-            sample = make_sample(rng, draw_solid())
+            sample = make_sample(rng, random_solid(rng, families))
         samples.append(sample)
     return samples
 
@@ -256,33 +240,22 @@ def fill_shard(
 def main() -> None:
     """Fill a store; existing shards are kept."""
     parser = Parser(description=__doc__.split("\n")[0])
-    parser.add_argument("--meshes", type=Path, help="folder of closed .ply meshes")
-    parser.add_argument(
-        "--procedural",
-        type=share,
-        default=0.3,
-        help="share of procedural shapes when --meshes is given",
-    )
-    parser.add_argument(
-        "--families",
-        nargs="+",
-        choices=FAMILIES,
-        metavar="NAME",
-        default=(),
-        help="families of the procedural shapes; one named twice is drawn twice as often "
-        f"(default: all, which are {', '.join(FAMILIES)})",
-    )
-    parser.add_argument("--thin", type=share, default=0.05, help="share of thin solids")
-    parser.add_argument("--out", type=Path, required=True, help="folder for the shards")
-    parser.add_argument("--count", type=at_least(1), default=5000, help="samples to make")
-    parser.add_argument("--seed", type=at_least(0), default=0)
+    add = parser.add_argument
+    add("--meshes", type=Path, help="folder of closed .ply meshes")
+    add("--procedural", type=share, default=0.3, help="share of procedural shapes beside --meshes")
+    named = "families of the procedural shapes; one named twice is drawn twice as often "
+    named += f"(default: all, which are {', '.join(FAMILIES)})"
+    add("--families", nargs="+", choices=FAMILIES, metavar="NAME", default=(), help=named)
+    add("--thin", type=share, default=0.05, help="share of thin solids")
+    add("--out", type=Path, required=True, help="folder for the shards")
+    add("--count", type=at_least(1), default=5000, help="samples to make")
+    add("--seed", type=at_least(0), default=0)
     options = parser.parse_args()
     with parser.one_line_errors():
         fill_store(options)
 
 
 def fill_store(options: argparse.Namespace) -> None:
-    """Make the missing shards."""
     files = mesh_order(options.seed, *find_meshes(options.meshes), options.count + SHARD)
     options.out.mkdir(parents=True, exist_ok=True)
     for number in range(-(-options.count // SHARD)):

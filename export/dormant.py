@@ -41,7 +41,6 @@ class Rectified:
 
     @property
     def bias(self) -> nn.Parameter:
-        """The units' biases, (units,)."""
         return self.layer.bias
 
     def incoming(self, array: Tensor) -> Tensor:
@@ -98,7 +97,6 @@ def reacting(net: SuperSdfNet, batches: Sequence[Batch]) -> list[Tensor]:
 
 
 def dormant_share(net: SuperSdfNet, batches: Sequence[Batch]) -> float:
-    """Return the share of rectified units that react to no voxel of these samples."""
     return 1 - float(torch.cat(reacting(net, batches)).float().mean())
 
 
@@ -113,8 +111,8 @@ def revive(
     On other samples the network's values change by the contribution of these units, which is small
     because they react rarely.
     """
-    layers, known = rectified_layers(net), reacting(net, batches)
-    asleep = [torch.nonzero(~units)[:, 0] for units in known]
+    layers = rectified_layers(net)
+    asleep = [torch.nonzero(~units)[:, 0] for units in reacting(net, batches)]
     for entry, units in zip(layers, asleep):
         restart(entry, units, optimisers)
     with watching(layers) as seen:

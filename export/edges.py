@@ -11,15 +11,13 @@ how much. The rows are kept in ``--out``; with ``--fit`` alone they are fitted a
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from export.arguments import Parser, at_least, share
 from export.dataset import draw_mesh, find_meshes
-from export.shapes import random_solid
+from export.shapes.solid import random_solid
 from lab.metrics import face_vectors
 from lab.shapes import Case, Setting, Shape
 from super_sdf.errors import SuperSdfError
@@ -45,17 +43,14 @@ PENALTY = 1.0  # of the squares of the weights of the standardised evidence
 STEPS = 30  # of Newton's method
 
 
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """Candidates of some shapes: the shape of each, its evidence (n, e), and its gain (n, 2).
+Triangles = tuple[np.ndarray, np.ndarray]
+"""The patch of each triangle, (t,), and its corners in fine spacings, (t, 3, 3)."""
+Rows = dict[str, np.ndarray]
+"""The ``shape`` of each candidate, (n,), its ``evidence``, (n, e), and its ``gain``, (n, 2).
 
-    A gain is by how much nearer the surface is with a vertex on the edge, in coarse voxels, and by
-    how much 1 - cosine of its normals is less.
-    """
-
-    shape: np.ndarray
-    evidence: np.ndarray
-    gain: np.ndarray
+A gain is by how much nearer the surface is with a vertex on the edge, in coarse voxels, and by how
+much 1 - cosine of its normals is less.
+"""
 
 
 def draw_case(rng: np.random.Generator, paths: list[Path], procedural: float, number: int) -> Case:
@@ -79,18 +74,11 @@ def rows_of(case: Case, network: Network) -> tuple[np.ndarray, np.ndarray]:
     if not len(candidates.patch):
         return candidates.evidence, np.empty((0, 2))
     without, with_all = surfaces(patches, own, candidates)
-    gain = [
-        errors_before - errors_after
-        for errors_before, errors_after in zip(
-            errors_of(case.shape.solid, without, len(patches.row), field, case.grid),
-            errors_of(case.shape.solid, with_all, len(patches.row), field, case.grid),
-        )
-    ]
-    return candidates.evidence, np.stack(gain, 1)[candidates.patch]
-
-
-Triangles = tuple[np.ndarray, np.ndarray]
-"""The patch of each triangle, (t,), and its corners in fine spacings, (t, 3, 3)."""
+    before, after = (
+        np.stack(errors_of(case.shape.solid, some, len(patches.row), field, case.grid), 1)
+        for some in (without, with_all)
+    )
+    return candidates.evidence, (before - after)[candidates.patch]
 
 
 def surfaces(patches: Patches, own: Planes, candidates: Candidates) -> tuple[Triangles, Triangles]:
@@ -133,41 +121,30 @@ def gather(options: argparse.Namespace) -> Rows:
     prisms, others = find_meshes(options.meshes)
     paths = [*prisms[: len(others) // 5], *others]
     parts: list[tuple[np.ndarray, ...]] = []
-    for number, (evidence, gain) in enumerate(usable(rng, network, paths, options)):
-        parts.append((np.full(len(evidence), number), evidence, gain))
-        rows = Rows(*(np.concatenate(arrays) for arrays in zip(*parts)))
-        if number % 10 == 9 or number + 1 == options.count:
-            np.savez(options.out, shape=rows.shape, evidence=rows.evidence, gain=rows.gain)
-            print(f"{number + 1} shapes, {len(rows.shape)} candidates", flush=True)
-    return rows
-
-
-def usable(
-    rng: np.random.Generator, network: Network, paths: list[Path], options: argparse.Namespace
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield the rows of ``count`` shapes."""
-    found = 0
-    while found < options.count:
+    while (number := len(parts)) < options.count:
         try:
-            rows = rows_of(draw_case(rng, paths, options.procedural, found), network)
+            case = draw_case(rng, paths, options.procedural, number)
+            evidence, gain = rows_of(case, network)
         except SuperSdfError:
             continue
-        found += 1
-        yield rows
+        parts.append((np.full(len(evidence), number), evidence, gain))
+        print(f"{number + 1} shapes, {len(evidence)} candidates of the last", flush=True)
+    rows = dict(zip(("shape", "evidence", "gain"), map(np.concatenate, zip(*parts))))
+    np.savez(options.out, **rows)
+    return rows
 
 
 def fit_rule(rows: Rows, bias: float = 0.0) -> Rule:
     """Return the logistic regression of which surface is better on the evidence.
 
     A candidate weighs by how much is gained or lost, and less where its shape has many more than
-    others. ``bias`` is added to the scores: what is
-    under 0 keeps marching cubes where the two are close.
+    others. ``bias`` is added to the scores: under 0 it keeps marching cubes where both are close.
     """
-    gain = rows.gain @ (1 / np.array([DISTANCE, TURN]))
+    gain = rows["gain"] @ (1 / np.array([DISTANCE, TURN]))
     weight = np.minimum(np.abs(gain), MOST)
-    weight *= np.minimum(1, MOST_OF_SHAPE / np.bincount(rows.shape)[rows.shape])
-    mean, spread = rows.evidence.mean(0), np.maximum(rows.evidence.std(0), 1e-9)
-    design = np.c_[np.ones(len(gain)), (rows.evidence - mean) / spread]
+    weight *= np.minimum(1, MOST_OF_SHAPE / np.bincount(rows["shape"])[rows["shape"]])
+    mean, spread = rows["evidence"].mean(0), np.maximum(rows["evidence"].std(0), 1e-9)
+    design = np.c_[np.ones(len(gain)), (rows["evidence"] - mean) / spread]
     found = np.zeros(design.shape[1])
     penalty = PENALTY * np.diag(np.r_[0, np.ones(len(mean))])
     for _ in range(STEPS):
@@ -181,11 +158,11 @@ def fit_rule(rows: Rows, bias: float = 0.0) -> Rule:
 
 def report(rows: Rows, rule: Rule) -> str:
     """Return the gains of all candidates, of those that a rule keeps, and of the best ones."""
-    kept = rule.score(rows.evidence) > 0
-    best = rows.gain @ (1 / np.array([DISTANCE, TURN])) > 0
+    kept = rule.score(rows["evidence"]) > 0
+    best = rows["gain"] @ (1 / np.array([DISTANCE, TURN])) > 0
     lines = [
-        f"{name}: {which.sum()} candidates, {rows.gain[which, 0].sum():.0f} voxels nearer, "
-        f"1 - cosine less by {rows.gain[which, 1].sum():.0f}"
+        f"{name}: {which.sum()} candidates, {rows['gain'][which, 0].sum():.0f} voxels nearer, "
+        f"1 - cosine less by {rows['gain'][which, 1].sum():.0f}"
         for name, which in (("all", kept | True), ("kept", kept), ("best", best))
     ]
     return "\n".join(lines)
@@ -202,7 +179,7 @@ def main() -> None:
     parser.add_argument("--bias", type=float, default=0.0, help="added to the scores")
     parser.add_argument("--seed", type=at_least(0), default=0)
     options = parser.parse_args()
-    rows = Rows(**np.load(options.out)) if options.fit else gather(options)
+    rows = dict(np.load(options.out)) if options.fit else gather(options)
     rule = fit_rule(rows, options.bias)
     print(report(rows, rule))
     print(f"Rule({rule.bias:.3f}, ({', '.join(f'{weight:.3f}' for weight in rule.weights)}))")

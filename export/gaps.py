@@ -37,11 +37,6 @@ def read_rows(reports: Sequence[Path], size: int) -> dict[str, dict[str, Row]]:
     """Return the measurements at a size, by method and shape; the first report that has one counts.
 
     Only exact samples of whole shapes, refined once by 4: not those of experiments.
-
-    Raises
-    ------
-    FileError
-        If a folder is no report.
     """
     setting = asdict(Setting(size)).items()
     found: dict[str, dict[str, Row]] = {method: {} for method in COMPARED}

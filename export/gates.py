@@ -19,16 +19,9 @@ from export.arguments import Parser, share
 from export.augment import Prepared
 from export.batches import batch_of, encode, predict, singly
 from export.network import Encoded, SuperSdfNet
-from export.recipe import RECIPE
+from export.recipe import RECIPE, Errors, batch_losses, sample_errors
+from export.store import Store
 from export.to_onnx import read_network
-from export.train import (
-    HELD_OUT,
-    Errors,
-    Store,
-    batch_losses,
-    check_store,
-    sample_errors,
-)
 from super_sdf.errors import OptionError
 from super_sdf.neighbourhood import CENTRE
 from super_sdf.steps.band import DECODE_LIMIT
@@ -80,18 +73,15 @@ def correlation(net: SuperSdfNet, samples: list[Prepared], encoded: list[Encoded
 
 
 def rows_of_table(file: Path, folder: Path, shares: tuple[float, ...]) -> Iterator[str]:
-    """Yield a row for each share, and the rank correlation."""
-    check_store(folder, HELD_OUT)
     net = read_network(file)
     if not net.config.gated:
         raise OptionError(f"{file} has no gate: give a network that was trained with --gated")
-    samples = Store(folder, HELD_OUT, most=0).held_out
+    samples = Store(folder, most=0).held_out
     encoded = encode_first(net, samples)
     for part in shares:
         threshold = threshold_of(encoded, part)
         band, errors = measure_at(net, samples, encoded, threshold)
-        values = f"{errors.everywhere:.5f} | {errors.near:.5f} | {errors.normal:.4f}"
-        yield f"| {threshold:.4g} | {band:.3f} | {values} |"
+        yield f"| {threshold:.4g} | {band:.3f} | {' | '.join(errors.cells())} |"
     found = correlation(net, samples, encoded)
     yield f"Rank correlation of what the gate says with the loss of a voxel: {found:.2f}"
 

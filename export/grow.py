@@ -27,35 +27,31 @@ FUNCTIONS = "trunk.layers.4."  # the last layer of the trunk: a row for each coe
 def grow_from(net: SuperSdfNet, weights: dict[str, Tensor]) -> None:
     """Give a fresh network the values of a smaller one, or of one of its sizes.
 
-    Raises
-    ------
-    OptionError
-        If a layer of the smaller network has more units, or it has more blocks.
+    OptionError if that has more blocks, or a layer of it more units.
     """
-    check_blocks(net, weights)
-    channels = len(weights["correction.weight"][0])
-    for name, parameter in net.named_parameters():
-        if name not in weights:
-            if ".reduce." in name:  # of a new block
-                parameter.zero_()
-        elif name.startswith(FUNCTIONS):
-            place_functions(parameter, weights[name], channels, net.config.channels)
-        elif ".conv.weight" in name:
-            places = net.blocks[0].conv.weight.shape[0] // net.config.channels
-            by_place = parameter.view(places, -1, parameter.shape[1])
-            place_units(by_place.mT, weights[name].view(places, channels, -1).mT, name)
-        else:
-            place_units(parameter, weights[name], name)
-
-
-def check_blocks(net: SuperSdfNet, weights: dict[str, Tensor]) -> None:
-    """Raise OptionError if a network has fewer blocks than the weights it is to get."""
     blocks = len({name.split(".")[1] for name in weights if name.startswith("blocks.")})
     if blocks > net.config.blocks:
         raise OptionError(
             f"--start has a network of {blocks} blocks, more than the {net.config.blocks} of this "
             f"size: give --blocks {blocks}"
         )
+    channels = len(weights["correction.weight"][0])
+    for name, parameter in net.named_parameters():
+        if name not in weights:
+            if ".reduce." in name:  # of a new block
+                parameter.zero_()
+        elif name.startswith(FUNCTIONS):
+            # the first rows belong to the channels, the rest to the units of the branch
+            kept, moved = weights[name][:channels], weights[name][channels:]
+            parameter.zero_()
+            parameter[:channels] = kept
+            parameter[net.config.channels : net.config.channels + len(moved)] = moved
+        elif ".conv.weight" in name:
+            places = net.blocks[0].conv.weight.shape[0] // net.config.channels
+            by_place = parameter.view(places, -1, parameter.shape[1])
+            place_units(by_place.mT, weights[name].view(places, channels, -1).mT, name)
+        else:
+            place_units(parameter, weights[name], name)
 
 
 def without_blocks(weights: dict[str, Tensor], left_out: Collection[int]) -> dict[str, Tensor]:
@@ -87,13 +83,3 @@ def place_units(new: Tensor, old: Tensor, name: str) -> None:
     outputs, inputs = old.shape[-2:]
     new[..., :outputs, :inputs] = old
     new[..., :outputs, inputs:] = 0
-
-
-def place_functions(new: Tensor, old: Tensor, old_channels: int, channels: int) -> None:
-    """Write the rows of the old functions; the others become 0.
-
-    The first rows belong to the channels, the rest to the units of the branch.
-    """
-    new.zero_()
-    new[:old_channels] = old[:old_channels]
-    new[channels : channels + len(old) - old_channels] = old[old_channels:]

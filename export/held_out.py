@@ -7,32 +7,24 @@ So a shipped network can be compared with one in training. Networks for masks ar
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 from export.arguments import Parser
 from export.batches import singly
 from export.dormant import dormant_share
+from export.recipe import measure
+from export.store import Store
 from export.to_onnx import read_inputs, read_network
-from export.train import HELD_OUT, Errors, Store, check_store, measure
 
 HEADER = "| network | everywhere | near | normal | dormant |\n| --- | ---: | ---: | ---: | ---: |"
 
 
-def format_row(name: str, errors: Errors, dormant: float) -> str:
-    """Return a row of the table; the first two errors are in voxels."""
-    near = f"{errors.everywhere:.5f} | {errors.near:.5f} | {errors.normal:.4f}"
-    return f"| {name} | {near} | {100 * dormant:.2f} % |"
-
-
-def measure_files(files: list[Path], folder: Path) -> Iterator[str]:
-    """Yield the row of each file; held-out shards only are read."""
-    check_store(folder, HELD_OUT)
-    for file in files:
-        net = read_network(file)
-        samples = Store(folder, HELD_OUT, most=0, inputs=read_inputs(file)).held_out
-        dormant = dormant_share(net, singly(net, samples))
-        yield format_row(file.name, measure(net, samples), dormant)
+def row_of(file: Path, folder: Path) -> str:
+    """Return the row of a file; the first two errors are in voxels."""
+    net = read_network(file)
+    samples = Store(folder, most=0, inputs=read_inputs(file)).held_out
+    dormant = 100 * dormant_share(net, singly(net, samples))
+    return f"| {file.name} | {' | '.join(measure(net, samples).cells())} | {dormant:.2f} % |"
 
 
 def main() -> None:
@@ -43,8 +35,8 @@ def main() -> None:
     options = parser.parse_args()
     with parser.one_line_errors():
         print(HEADER)
-        for row in measure_files(options.files, options.store):
-            print(row, flush=True)
+        for file in options.files:
+            print(row_of(file, options.store), flush=True)
 
 
 if __name__ == "__main__":

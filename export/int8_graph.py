@@ -14,8 +14,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, numpy_helper
 
-from export.onnx_graph import EARLY, rows_of
-from export.writer import Writer
+from export.onnx_graph import EARLY, Writer, rows_of
 
 ONE = "int8_one"
 NONE = "int8_none"
@@ -49,7 +48,6 @@ class IntWriter(Writer):
         return self.op("QuantizeLinear", value, ONE, NONE)
 
     def layer(self, value: str, layer: IntLayer, label: str) -> str:
-        """Add an integer linear layer."""
         scales = self.constant(layer.scales, f"{label}.scales")
         operands = [self.op("DequantizeLinear", value, ONE, NONE)]
         # onnxruntime fuses the operators only if the zero points, all 0, are explicit

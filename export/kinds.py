@@ -20,11 +20,10 @@ import numpy as np
 from export.arguments import Parser, at_least
 from export.augment import prepare
 from export.dataset import Sample, draw_mesh, find_meshes, make_sample
+from export.recipe import Errors, measure
 from export.shapes.draws import unit_sized
-from export.shapes.families import FAMILIES, Family
-from export.shapes.solid import is_usable, mesh_of
+from export.shapes.solid import FAMILIES, Family, is_usable, mesh_of
 from export.to_onnx import read_network
-from export.train import Errors, measure
 from super_sdf import Mesh
 
 RANGES = ((7.0, 17.0), (17.0, 41.0), (41.0, 100.0))  # voxels along the diagonal
@@ -43,15 +42,9 @@ def drawn_from(family: Family) -> Draw:
     return draw
 
 
-def drawn_from_files(files: list[Path]) -> Draw:
-    """Return a function that draws one of the meshes."""
-    return lambda rng: draw_mesh(rng, files[rng.integers(len(files))])
-
-
 def draw_windows(
     rng: np.random.Generator, draw: Draw, sizes: tuple[float, float], count: int
 ) -> list[Sample]:
-    """Return windows of one kind whose diagonals are in a range; unusable ones are drawn again."""
     windows: list[Sample] = []
     while len(windows) < count:
         sample = make_sample(rng, draw(rng), sizes=sizes)
@@ -84,11 +77,11 @@ def main() -> None:
 
 
 def measure_kinds(options: argparse.Namespace) -> dict[str, list[Errors]]:
-    """Return the errors of each kind in each range of sizes."""
     net = read_network(options.model)
     kinds = {name: drawn_from(family) for name, family in FAMILIES.items()}
     if options.meshes:
-        kinds["meshes"] = drawn_from_files(find_meshes(options.meshes)[1])
+        files = find_meshes(options.meshes)[1]
+        kinds["meshes"] = lambda rng: draw_mesh(rng, files[rng.integers(len(files))])
     rows: dict[str, list[Errors]] = {}
     for number, (kind, draw) in enumerate(kinds.items()):
         rng = np.random.default_rng([options.seed, number])

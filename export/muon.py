@@ -10,7 +10,6 @@ Jordan et al.: Muon, an optimizer for hidden layers in neural networks, 2024.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -22,37 +21,26 @@ class StackedMuon(torch.optim.Muon):
 
     @torch.no_grad()
     def step(self, closure: Any = None) -> None:
-        """Update all matrices."""
         for group in self.param_groups:
-            for matrices in by_shape(group["params"]):
+            by_shape: dict[torch.Size, list[nn.Parameter]] = {}
+            for matrix in group["params"]:
+                by_shape.setdefault(matrix.shape, []).append(matrix)
+            for matrices in by_shape.values():
                 self._update(matrices, group)
 
     def _update(self, matrices: list[nn.Parameter], group: dict[str, Any]) -> None:
         """Update matrices of one shape."""
+        for matrix in matrices:
+            if "momentum_buffer" not in self.state[matrix]:
+                self.state[matrix]["momentum_buffer"] = torch.zeros_like(matrix)
         grads = [matrix.grad for matrix in matrices]
-        moments = [self._moment(matrix) for matrix in matrices]
+        moments = [self.state[matrix]["momentum_buffer"] for matrix in matrices]
         torch._foreach_lerp_(moments, grads, 1 - group["momentum"])
         ahead = torch._foreach_lerp(grads, moments, group["momentum"])
         updates = orthogonal(torch.stack(ahead), group["ns_coefficients"], group["ns_steps"])
         rate = group["lr"] * 0.2 * max(matrices[0].shape) ** 0.5  # match_rms_adamw
         torch._foreach_mul_(matrices, 1 - group["lr"] * group["weight_decay"])
         torch._foreach_add_(matrices, list(updates.to(matrices[0].dtype)), alpha=-rate)
-
-    def _moment(self, matrix: nn.Parameter) -> Tensor:
-        """Return the running mean of a matrix's gradient."""
-        state = self.state[matrix]
-        if "momentum_buffer" not in state:
-            state["momentum_buffer"] = torch.zeros_like(matrix)
-        moment: Tensor = state["momentum_buffer"]
-        return moment
-
-
-def by_shape(matrices: Iterable[nn.Parameter]) -> list[list[nn.Parameter]]:
-    """Return the matrices in lists of one shape each."""
-    lists: dict[torch.Size, list[nn.Parameter]] = {}
-    for matrix in matrices:
-        lists.setdefault(matrix.shape, []).append(matrix)
-    return list(lists.values())
 
 
 def orthogonal(matrices: Tensor, coefficients: tuple[float, float, float], steps: int) -> Tensor:

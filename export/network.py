@@ -21,7 +21,7 @@ can be distances. The distances of a mask are right to half a voxel only, and no
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -45,12 +45,7 @@ class NetworkConfig:
 
     @property
     def receptive_field(self) -> int:
-        """Voxels in each direction that a prediction depends on."""
         return self.blocks + 1
-
-    def as_dict(self) -> dict[str, int]:
-        """Return the sizes by name, for a checkpoint."""
-        return asdict(self)
 
 
 SIZES = {
@@ -66,7 +61,7 @@ CHUNK = 1024  # voxels gathered at a time on a CPU, so that their columns stay i
 
 
 class GatherMatMul(torch.autograd.Function):
-    """``gather(features, table) @ weight``, differentiated without a scatter.
+    """``columns_of(pad(features), table) @ weight``, differentiated without a scatter.
 
     If u is v's neighbour at place k, then v is u's neighbour at place 26 - k. So the gradient is a
     convolution, too, with the places reversed, and no scatter-add is needed. The columns are
@@ -94,7 +89,7 @@ class GatherMatMul(torch.autograd.Function):
 
 
 def convolve(features: Tensor, weight: Tensor, table: Tensor) -> Tensor:
-    """Return ``gather(features, table) @ weight``, (V, C_out), without all columns at once."""
+    """Return the columns of features times a weight, (V, C_out), without all columns at once."""
     out = features.new_empty(len(table), weight.shape[1])
     for part, columns in gathered(features, table):
         torch.mm(columns, weight, out=out[part])
@@ -120,13 +115,8 @@ def gathered(features: Tensor, table: Tensor) -> Iterator[tuple[slice, Tensor]]:
         yield part, columns_of(padded, table[part])
 
 
-def gather(features: Tensor, table: Tensor) -> Tensor:
-    """Return the features of all 27 neighbours side by side, zeros for absent ones (index V)."""
-    return columns_of(pad(features), table)
-
-
 def pad(features: Tensor) -> Tensor:
-    """Append the row of zeros that stands for an absent voxel."""
+    """Append the row of zeros that stands for an absent voxel, index V."""
     return torch.cat([features, features.new_zeros(1, features.shape[1])])
 
 
@@ -169,17 +159,8 @@ class Block(nn.Module):
 
     def forward(self, features: Tensor, table: Tensor, *around: Tensor) -> Tensor:
         """Map (V, C) to (V, C)."""
-        return features + self.reduce(
-            self.activate(self.expand(self.mix(features, table, *around)))
-        )
-
-    def mix(self, features: Tensor, table: Tensor, *around: Tensor) -> Tensor:
-        """Apply the neighbour convolution and its rectifier."""
-        return self.activate(self.conv(features, table, *around))
-
-    def activate(self, values: Tensor) -> Tensor:
-        """Apply the rectifier that follows both layers."""
-        return torch.relu(values)
+        mixed = torch.relu(self.conv(features, table, *around))
+        return features + self.reduce(torch.relu(self.expand(mixed)))
 
 
 class Trunk(nn.Module):
@@ -203,7 +184,6 @@ class Trunk(nn.Module):
         return self.raw(offsets) - self.raw(torch.zeros_like(offsets[:1]))
 
     def raw(self, offsets: Tensor) -> Tensor:
-        """Evaluate the layers on the offsets and their sines and cosines."""
         angles = (offsets[:, :, None] * self.waves).flatten(1)
         return self.layers(torch.cat([offsets, angles.sin(), angles.cos()], 1))
 
@@ -230,8 +210,8 @@ class Gate(nn.Module):
     def rows(self, doubts: Tensor, patches: Tensor, share: float | None = None) -> Tensor:
         """Return the rows of the voxels where it is open, (n,).
 
-        With ``share`` the threshold is that which this share of these voxels exceeds, and the
-        kept one moves a little to that which ``USUAL_SHARE`` exceeds.
+        With ``share`` that share of the voxels exceeds the threshold, and the kept threshold moves
+        a little to that which ``USUAL_SHARE`` exceeds.
         """
         near = patches[:, CENTRE].abs() <= DECODE_LIMIT
         threshold = self.threshold
@@ -257,12 +237,7 @@ class Encoded:
     doubts: Tensor | None = None  # (V,) logarithm of what is lost with these
 
     def some(self, rows: Tensor) -> Encoded:
-        """Return some of the voxels."""
         return Encoded(*(None if all_ is None else all_[rows] for all_ in vars(self).values()))
-
-    def after_first(self) -> Encoded:
-        """Return the voxels as if none went deeper."""
-        return replace(self, features=self.early)
 
 
 def is_noisy(patches: Tensor, table: Tensor) -> Tensor:
@@ -342,19 +317,18 @@ class SuperSdfNet(nn.Module):
             part.requires_grad_(requires_grad=True)
 
     def all_blocks(self) -> nn.ModuleList:
-        """Return all blocks, also the one before the gate."""
         return nn.ModuleList([*self.blocks, *([self.early] if self.config.gated else [])])
 
     def trained(self) -> list[nn.Parameter]:
-        """Return the parameters that training changes."""
         return [p for p in self.parameters() if p.requires_grad]
 
     def decode(self, voxels: Encoded, offsets: Tensor) -> Tensor:
         """Return the values (D, Q) of voxels at offsets (Q, 3)."""
         with in_float32(offsets):
-            correction = self.correction(voxels.features.float()) * voxels.noisy
-            residual = self.residual(voxels.features.float(), offsets)
-            return residual + self.base(voxels.patches, offsets) + correction
+            features = voxels.features.float()
+            residual = self.coefficients(features) @ self.trunk(offsets).T
+            base = voxels.patches @ interpolation_weights(offsets).T
+            return residual + base + self.correction(features) * voxels.noisy
 
     def decode_parts(self, voxels: Encoded, counts: list[int], offsets: Tensor) -> Tensor:
         """Return the values (D, Q) of samples side by side, each at its offsets, (B, Q, 3).
@@ -369,17 +343,9 @@ class SuperSdfNet(nn.Module):
             values = torch.cat([some @ weights.T for some, weights in parts])
             return values + self.correction(features) * voxels.noisy
 
-    def residual(self, features: Tensor, offsets: Tensor) -> Tensor:
-        """Return the residual over the interpolation, (D, Q); 0 at the sample."""
-        return self.coefficients(features) @ self.trunk(offsets).T
-
     def coefficients(self, features: Tensor) -> Tensor:
         """Return the coefficients of the functions of the offset, (D, functions)."""
         return torch.cat([features, torch.relu(self.branch(features))], 1)
-
-    def base(self, patches: Tensor, offsets: Tensor) -> Tensor:
-        """Return the interpolation, (D, Q)."""
-        return patches @ interpolation_weights(offsets).T
 
     def forward(self, patches: Tensor, table: Tensor, voxels: Tensor, offsets: Tensor) -> Tensor:
         """Return the values (D, Q) of the voxels (D,) at the offsets (Q, 3)."""

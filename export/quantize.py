@@ -12,22 +12,22 @@ steps would make the values of a voxel depend on all others in the call.
 from __future__ import annotations
 
 import argparse
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import onnx
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
-from export.augment import Prepared
-from export.calibration import (
-    Ranges,
-    distance_apart,
-    draw_samples,
-    find_ranges,
-)
+from export.augment import Prepared, draw_samples
+from export.batches import batch_of, encode
 from export.int8_graph import IntBlock, IntLayer, replace_blocks
-from export.network import Block
+from export.network import Block, SuperSdfNet
 from export.to_onnx import read_card, read_network, write_model
+from super_sdf.network.network import load_network
 
 LEVELS = 255  # of the inputs of a layer: uint8
 # Two products must fit into 16 bits, in which processors without VNNI add them with saturation.
@@ -39,10 +39,73 @@ LARGEST_ERROR = 0.01  # voxels, mean difference from float32 at which a file is 
 Array = np.ndarray
 
 
+@dataclass
+class Ranges:
+    """Minimum and maximum of each channel at the inputs of the three layers of a block."""
+
+    low: Tensor  # (C,) features
+    high: Tensor  # (C,)
+    mixed: Tensor  # (C,) maximum; after a rectifier the minimum is 0
+    expanded: Tensor  # (hidden,) likewise
+
+    @classmethod
+    def watching(cls, block: Block) -> Ranges:
+        """Return ranges that contain only 0, and are extended whenever the block runs."""
+        zeros = torch.zeros(block.expand.in_features)
+        self = cls(zeros, zeros, zeros, torch.zeros(block.expand.out_features))
+
+        def see_conv(module: nn.Module, given: tuple[Tensor, ...], made: Tensor) -> None:
+            if not len(made):
+                return
+            for features in (given[0], *given[2:]):  # of its voxels, and of those around
+                self.low = torch.minimum(self.low, features.amin(0))
+                self.high = torch.maximum(self.high, features.amax(0))
+            self.mixed = torch.maximum(self.mixed, made.amax(0))
+
+        def see_expand(module: nn.Module, given: tuple[Tensor, ...], made: Tensor) -> None:
+            if len(made):
+                self.expanded = torch.maximum(self.expanded, made.amax(0))
+
+        block.conv.register_forward_hook(see_conv)
+        block.expand.register_forward_hook(see_expand)
+        return self
+
+    def join(self, others: Sequence[Ranges]) -> Ranges:
+        """Return the ranges with those of the features widened to contain others'."""
+        low = torch.stack([other.low for other in others]).amin(0)
+        high = torch.stack([other.high for other in others]).amax(0)
+        return replace(self, low=low, high=high)
+
+
+@torch.no_grad()
+def find_ranges(net: SuperSdfNet, samples: list[Prepared]) -> list[Ranges]:
+    """Return the ranges of each block on these samples.
+
+    Blocks beside and behind a gate read the same features: they have the same ranges.
+    """
+    watched = copy.deepcopy(net)
+    ranges = [Ranges.watching(block) for block in watched.all_blocks()]
+    for sample in samples:
+        encode(watched, batch_of([sample]))
+    first = net.config.blocks - net.config.gated
+    return ranges[:first] + [each.join(ranges[first:]) for each in ranges[first:]]
+
+
+def distance_apart(one: Path, other: Path, samples: Sequence[Prepared]) -> np.ndarray:
+    """Return the differences between the values of two files on samples, in voxels."""
+    pair = [load_network(path, device="cpu") for path in (one, other)]
+    apart = []
+    for sample in samples:
+        rows = (array.astype(np.int32) for array in (sample.table, sample.voxels))
+        arrays = (sample.patches, *rows, sample.offsets)
+        first, second = (network(*arrays) for network in pair)
+        apart.append(np.abs(first - second).ravel() / 2)
+    return np.concatenate(apart)
+
+
 def quantize(
     source: Path, target: Path, samples: list[Prepared], accuracy: str = "not measured"
 ) -> None:
-    """Write the int8 variant of a file, with its metadata."""
     net = read_network(source)
     changed = {"name": target.stem, "precision": "int8", "accuracy": accuracy}
     write_model(net, target, {**read_card(source), **changed})
@@ -54,7 +117,6 @@ def quantize(
 
 
 def whole_block(block: Block, ranges: Ranges) -> IntBlock:
-    """Quantize the three layers of a block."""
     steps = steps_of(ranges.high - ranges.low)
     zeros = np.rint(-ranges.low.numpy() / steps).clip(0, LEVELS)
     mixed, expanded = steps_of(ranges.mixed), steps_of(ranges.expanded)
@@ -77,16 +139,10 @@ def steps_of(width: Tensor) -> Array:
 def whole_layer(
     weight: Tensor, bias: Tensor, steps: Array, out: Array, zeros: Array | None = None
 ) -> IntLayer:
-    """Quantize a layer.
+    """Quantize a layer, ``values @ weight + bias``, (K, n) and (n,).
 
-    Parameters
-    ----------
-    weight, bias : (K, n), (n,)
-        The layer, ``values @ weight + bias``.
-    steps, out : (K,), (n,)
-        Quantization steps of its inputs and of its outputs.
-    zeros : (C,), optional
-        Zero points of the inputs, repeated if K > C. Default: 0.
+    ``steps`` (K,) and ``out`` (n,) are those of its inputs and outputs, ``zeros`` (C,) the zero
+    points of the inputs, repeated if K > C.
     """
     scaled = weight.detach().double().numpy() * steps[:, None] / out
     start = bias.detach().double().numpy() / out

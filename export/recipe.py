@@ -1,4 +1,4 @@
-"""How a network is trained: loss, optimisers, learning rates; README has what was tried."""
+"""How a network is trained and measured: loss, optimisers, rates, errors on held-out samples."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from export.augment import USUAL, Shares
+from export.augment import USUAL, Prepared, Shares
+from export.batches import Batch, encode, means, predict, singly
 from export.dataset import CORNERS
 from export.muon import StackedMuon
-from export.network import SuperSdfNet
+from export.network import Encoded, SuperSdfNet
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class Recipe:
     batch_voxels: int = 12_000  # small enough for the arrays of a step to stay in cache
     average_decay: float = 0.998  # of the averaged weights, per step
     voxel_power: float = 0.5  # of the number of voxels of a sample, for its weight in a batch
-    spread: float = 3.0  # of the chances of windows, by their loss; 1: equal (``sampler``)
+    spread: float = 3.0  # of the chances of windows, by their loss; 1: equal (``store``)
     reach: float = 0.5  # half voxels: decay length of the weight away from the surface ...
     far_weight: float = 0.25  # ... to this
     gradient_weight: float = 0.5
@@ -34,15 +35,6 @@ class Recipe:
     revive_steps: int = 300  # between restarts of dormant units; 0 for never
     revive_until: float = 0.8  # share of the budget: restarted units need time to learn
     shares: Shares = USUAL
-
-    def at(self, rate: float, shares: Shares) -> Recipe:
-        """Return the recipe with rates times ``rate`` and these shares of changed samples."""
-        return replace(
-            self,
-            hidden_rate=rate * self.hidden_rate,
-            outer_rate=rate * self.outer_rate,
-            shares=shares,
-        )
 
 
 RECIPE = Recipe()
@@ -66,6 +58,29 @@ def voxel_losses(prediction: Tensor, target: Tensor, recipe: Recipe) -> Tensor:
     corners = nearness(target[:, : 4 * CORNERS : 4], recipe)
     apart = (differences(prediction) - differences(target)).abs().sum(2)
     return loss + recipe.gradient_weight * (corners * apart).mean(1)
+
+
+def window_losses(net: SuperSdfNet, batch: Batch, recipe: Recipe) -> Tensor:
+    """Return the loss of each sample of a batch, (B,).
+
+    Of a gated network, at a share of voxels drawn at random, it is also that after the first
+    blocks, and the error of what the gate says of this.
+    """
+    if not net.config.gated:
+        return means(batch_losses(net, batch, encode(net, batch), recipe), batch)
+    low, high = recipe.shares_gated
+    encoded = encode(net, batch, low + (high - low) * float(torch.rand(())))
+    of_first = batch_losses(net, batch, replace(encoded, features=encoded.early), recipe)
+    apart = encoded.doubts[batch.voxels] - of_first.detach().log()
+    loss = recipe.first_weight * of_first + recipe.gate_weight * apart.abs()
+    if high:
+        loss = loss + batch_losses(net, batch, encoded, recipe)
+    return means(loss, batch)
+
+
+def batch_losses(net: SuperSdfNet, batch: Batch, encoded: Encoded, recipe: Recipe) -> Tensor:
+    """Return the loss of each voxel with targets of a batch, (D,)."""
+    return voxel_losses(predict(net, batch, encoded), batch.targets, recipe)
 
 
 def relative_weights(voxels: list[int], recipe: Recipe) -> Tensor:
@@ -94,3 +109,38 @@ def rate_factor(spent: float, recipe: Recipe) -> float:
     """Return the rate over its peak after this share of the budget: warm-up, then half a cosine."""
     cosine = 0.5 * (1 + np.cos(np.pi * min(spent, 1.0)))
     return float(min(spent / recipe.warm_up, cosine) + 1e-3)
+
+
+NEAR = 0.5  # half voxels from the surface: limit for normals; half of it for values
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Mean errors on held-out samples; the first two in voxels."""
+
+    everywhere: float
+    near: float  # within an eighth of a voxel of the surface
+    normal: float  # 1 - cosine between the gradients near the surface
+
+    def cells(self) -> list[str]:
+        return [f"{self.everywhere:.5f}", f"{self.near:.5f}", f"{self.normal:.4f}"]
+
+
+def measure(net: SuperSdfNet, samples: list[Prepared]) -> Errors:
+    """Return the errors on held-out samples, in float32, as the exported network computes."""
+    with torch.no_grad():
+        errors = [
+            sample_errors(predict(net, batch, encode(net, batch)), batch.targets)
+            for batch in singly(net, samples)
+        ]
+    return Errors(*np.nanmean(errors, axis=0).tolist())
+
+
+def sample_errors(prediction: Tensor, target: Tensor) -> list[float]:
+    """Return the errors of one sample; NaN where nothing is near the surface."""
+    error = (prediction - target).abs() / 2
+    corners = target[:, : 4 * CORNERS : 4].abs() < NEAR
+    got, wanted = differences(prediction)[corners], differences(target)[corners]
+    cosine = torch.nn.functional.cosine_similarity(got, wanted, dim=1)
+    near = error[target.abs() < NEAR / 2]
+    return [float(error.mean()), float(near.mean()), float(1 - cosine.mean())]

@@ -8,7 +8,7 @@ some cases also changed (``augment``), and stays on the device. A batch is drawn
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,58 +23,36 @@ from super_sdf.neighbourhood import cube_symmetries, turned_places
 MOST_COPIES = 20 * CORNERS + 8 * FINE_NODES + ANYWHERE
 
 
-class Rows:
-    """An array on a device that rows are appended to."""
+def gather_samples(samples: Sequence[Prepared]) -> dict[str, np.ndarray]:
+    """Return samples one after the other; indices are within each, -1 for none.
 
-    def __init__(self, device: str) -> None:
-        self.device, self.count = device, 0
-        self.held: Tensor | None = None
-
-    def append(self, rows: np.ndarray) -> None:
-        """Append rows (n, ...)."""
-        new = torch.from_numpy(np.ascontiguousarray(rows)).to(self.device)
-        if self.held is None:
-            self.held = new
-        end = self.count + len(new)
-        if end > len(self.held):
-            room = self.held.new_empty(3 * end // 2 - self.count, *self.held.shape[1:])
-            self.held = torch.cat([self.held[: self.count], room])
-        self.held[self.count : end] = new
-        self.count = end
-
-    def __getitem__(self, rows: Tensor) -> Tensor:
-        """Return some rows."""
-        assert self.held is not None
-        return self.held[rows]
-
-
-@dataclass(frozen=True, eq=False)
-class Gathered:
-    """Samples one after the other, as they are kept."""
-
-    arrays: dict[str, np.ndarray]
-    band_counts: np.ndarray  # voxels of the band of each sample, (N,)
-    counts: np.ndarray  # of them, those with targets, (N,)
-
-    def __len__(self) -> int:
-        """Return the number of samples."""
-        return len(self.counts)
-
-
-def gather_samples(samples: Sequence[Prepared]) -> Gathered:
-    """Gather samples, each with at least one voxel that has targets.
-
-    Raises
-    ------
-    ValueError
-        If queries have more copies than there is room for.
+    ``band_counts`` and ``counts`` are the voxels of the band of each sample, (N,), and those of
+    them with targets. ValueError if queries have more copies than there is room for.
     """
     each = [arrays_of(sample) for sample in samples]
-    return Gathered(
-        {name: np.concatenate([arrays[name] for arrays in each]) for name in each[0]},
-        np.array([len(sample.patches) for sample in samples], np.int64),
-        np.array([len(sample.voxels) for sample in samples], np.int64),
-    )
+    return {name: np.concatenate([arrays[name] for arrays in each]) for name in each[0]}
+
+
+def arrays_of(sample: Prepared) -> dict[str, np.ndarray]:
+    copies, queries = copies_of_queries(sample.offsets), len(sample.offsets)
+    if len(copies.query) > MOST_COPIES:
+        raise ValueError(
+            f"{queries} queries have {len(copies.query)} copies, more than {MOST_COPIES}: "
+            "draw them with dataset.draw_offsets"
+        )
+    copies = copies.padded(MOST_COPIES, queries)
+    return {
+        "patches": sample.patches,
+        "table": sample.table,
+        "voxels": sample.voxels.astype(np.int32),
+        "near": neighbours_with_targets(sample).astype(np.int32),
+        "targets": sample.targets.astype(np.float16),
+        "query": copies.query[None],
+        "place": copies.place[None],
+        "moved": copies.moved[None],
+        "band_counts": np.array([len(sample.patches)]),
+        "counts": np.array([len(sample.voxels)]),
+    }
 
 
 class Residents:
@@ -82,24 +60,28 @@ class Residents:
 
     def __init__(self, device: str) -> None:
         self.device = device
-        names = ["patches", "table", "voxels", "near", "targets", "query", "place", "moved"]
-        self.arrays = {name: Rows(device) for name in names}
-        self.band_counts = np.zeros(0, np.int64)  # voxels of the band of each sample
-        self.counts = np.zeros(0, np.int64)  # of them, those with targets
+        self.arrays: dict[str, Tensor] = {}  # with room for more rows
+        self.filled: dict[str, int] = {}  # rows of each
+        self.band_counts = self.counts = np.zeros(0, np.int64)  # of each sample
         self.symmetries = torch.from_numpy(cube_symmetries()).float().to(device)
         places = np.stack([turned_places(symmetry) for symmetry in cube_symmetries()])
         self.places = torch.from_numpy(places).long().to(device)
 
     def __len__(self) -> int:
-        """Return the number of samples."""
         return len(self.counts)
 
-    def add(self, gathered: Gathered) -> None:
-        """Take in samples."""
-        for name, rows in self.arrays.items():
-            rows.append(gathered.arrays[name])
-        self.band_counts = np.append(self.band_counts, gathered.band_counts)
-        self.counts = np.append(self.counts, gathered.counts)
+    def add(self, gathered: dict[str, np.ndarray]) -> None:
+        self.band_counts = np.append(self.band_counts, gathered.pop("band_counts"))
+        self.counts = np.append(self.counts, gathered.pop("counts"))
+        for name, rows in gathered.items():
+            new = torch.from_numpy(np.ascontiguousarray(rows)).to(self.device)
+            held, start = self.arrays.get(name, new[:0]), self.filled.get(name, 0)
+            end = start + len(new)
+            if end > len(held):
+                room = held.new_empty(3 * end // 2 - len(held), *held.shape[1:])
+                held = torch.cat([held, room])
+            held[start:end] = new
+            self.arrays[name], self.filled[name] = held, end
 
     def batch(self, drawn: Sequence[int], turns: Sequence[int]) -> Batch:
         """Return some samples, each turned by one of the 48 symmetries."""
@@ -123,29 +105,7 @@ class Residents:
         )
 
 
-def arrays_of(sample: Prepared) -> dict[str, np.ndarray]:
-    """Return what is kept of a sample, indices within it, -1 for none."""
-    copies, queries = copies_of_queries(sample.offsets), len(sample.offsets)
-    if len(copies.query) > MOST_COPIES:
-        raise ValueError(
-            f"{queries} queries have {len(copies.query)} copies, more than {MOST_COPIES}: "
-            "draw them with dataset.draw_offsets"
-        )
-    copies = copies.padded(MOST_COPIES, queries)
-    return {
-        "patches": sample.patches,
-        "table": sample.table,
-        "voxels": sample.voxels.astype(np.int32),
-        "near": neighbours_with_targets(sample).astype(np.int32),
-        "targets": sample.targets.astype(np.float16),
-        "query": copies.query[None],
-        "place": copies.place[None],
-        "moved": copies.moved[None],
-    }
-
-
-@dataclass(frozen=True, eq=False)
-class Parts:
+class Parts(NamedTuple):
     """Rows of several samples side by side."""
 
     rows: Tensor  # (n,) in the whole array

@@ -1,13 +1,7 @@
-"""The logs of runs: their lines, and held-out errors against time as pictures.
-
-    python -m export.run_log export/logs/nine-*.csv --shipped 0.01558 --out history.png
-
-draws runs that each went on from the network of the one before on one axis of hours.
-"""
+"""The log of a run: its lines, and loss, held-out errors and dormant units as a picture."""
 
 from __future__ import annotations
 
-import argparse
 import csv
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,13 +10,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from export.arguments import Parser, positive
 from super_sdf.errors import FileError
 
 LOG_COLUMNS = ("step", "seconds", "samples", "loss", "held-out", "near", "normal", "dormant")
 ERRORS = ("held-out", "near", "normal")
-
-
 Log = dict[str, NDArray[np.float64]]
 
 
@@ -48,14 +39,7 @@ def read_log(path: Path) -> Log:
     return dict(zip(LOG_COLUMNS, lines[counts].T, strict=True))
 
 
-def measured(log: Log) -> Log:
-    """Return the lines of a log on which held-out errors stand."""
-    is_measured = np.isfinite(log["held-out"])
-    return {name: column[is_measured] for name, column in log.items()}
-
-
 def plot_run(log: Log, path: Path) -> None:
-    """Plot loss, held-out errors and dormant units of one run against minutes."""
     figure = Figure(figsize=(12, 4), layout="constrained")
     for ax, names in zip(figure.subplots(1, 3), (["loss"], ERRORS, ["dormant"])):
         for name in names:
@@ -64,34 +48,3 @@ def plot_run(log: Log, path: Path) -> None:
         ax.set(xlabel="minutes", yscale="linear" if "dormant" in names else "log")
         ax.legend()
     figure.savefig(path, dpi=100)
-
-
-def draw_history(paths: Sequence[Path], shipped: float | None) -> Figure:
-    """Draw the held-out errors of consecutive runs against the hours spent on all of them."""
-    figure = Figure(figsize=(7, 4), layout="constrained")
-    ax, before = figure.subplots(), 0.0
-    for log in map(read_log, paths):
-        lines = measured(log)
-        ax.plot((before + lines["seconds"]) / 3600, lines["held-out"], marker=".")
-        before += log["seconds"][-1]
-        ax.axvline(before / 3600, color="0.85", zorder=0)
-    if shipped is not None:
-        ax.axhline(shipped, color="0.4", linestyle="--", label="the network shipped before")
-        ax.legend()
-    ax.set(xlabel="hours of training, all runs", ylabel="mean held-out error (voxels)")
-    return figure
-
-
-def main() -> None:
-    """Plot consecutive runs."""
-    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("logs", nargs="+", type=Path, help="log.csv of each run, in order")
-    parser.add_argument("--shipped", type=positive, help="error to compare with, in voxels")
-    parser.add_argument("--out", type=Path, required=True, help="the picture")
-    options = parser.parse_args()
-    with parser.one_line_errors():
-        draw_history(options.logs, options.shipped).savefig(options.out, dpi=100)
-
-
-if __name__ == "__main__":
-    main()

@@ -22,8 +22,8 @@ import onnx
 import torch
 from onnx import helper, numpy_helper
 
+from export.augment import draw_samples
 from export.batches import singly
-from export.calibration import draw_samples
 from export.dormant import dormant_share
 from export.network import NetworkConfig, SuperSdfNet
 from export.onnx_graph import build_graph
@@ -41,13 +41,7 @@ DORMANT = 0.01  # largest accepted share of dormant units
 
 
 def read_weights(path: Path) -> dict[str, torch.Tensor]:
-    """Return the parameters and buffers of an exported file, to continue training from.
-
-    Raises
-    ------
-    ModelError
-        If its blocks are in int8.
-    """
+    """Return the parameters and buffers of an exported file; ModelError if its blocks are int8."""
     graphs = [onnx.load(path).graph]
     graphs += [a.g for node in graphs[0].node for a in node.attribute if a.name == "body"]
     arrays = {i.name: numpy_helper.to_array(i).copy() for g in graphs for i in g.initializer}
@@ -62,7 +56,6 @@ def read_weights(path: Path) -> dict[str, torch.Tensor]:
 
 
 def write_model(net: SuperSdfNet, path: Path, card: dict[str, Any]) -> None:
-    """Write the graph and the metadata."""
     imports = [helper.make_opsetid("", OPSET)]
     model = helper.make_model(build_graph(net), opset_imports=imports, ir_version=9)
     model.producer_name = "super-sdf"
@@ -93,7 +86,6 @@ def parity(net: SuperSdfNet, path: Path, seed: int = 0) -> float:
 
 
 def load_run(folder: Path) -> SuperSdfNet:
-    """Return the network of a run, with averaged weights."""
     state = torch.load(folder / "checkpoint.pt", weights_only=True)
     net = SuperSdfNet(NetworkConfig(**state["config"]))
     net.load_state_dict(state["average"])
@@ -101,13 +93,7 @@ def load_run(folder: Path) -> SuperSdfNet:
 
 
 def rewrite(source: Path, target: Path) -> None:
-    """Write the weights and the metadata of an exported file with the current graph.
-
-    Raises
-    ------
-    SystemExit
-        If the values differ by more than rounding.
-    """
+    """Write an exported file with the current graph; SystemExit if values change too much."""
     card, net = read_card(source), read_network(source)
     want = load_network(source, device="cpu")(*noisy_ball())
     fresh = target.with_suffix(".new.onnx")  # the target may be the source
@@ -124,7 +110,6 @@ def rewrite(source: Path, target: Path) -> None:
 
 
 def read_network(path: Path) -> SuperSdfNet:
-    """Return the network in an exported file."""
     weights = read_weights(path)
     trunk, inputs = weights["trunk.layers.0.weight"].shape
     channels = len(weights["correction.weight"][0])
@@ -144,23 +129,15 @@ def read_network(path: Path) -> SuperSdfNet:
 
 
 def read_inputs(path: Path) -> str:
-    """Return what the network in an exported file was trained on."""
     return read_card(path).get("inputs", DISTANCES)
 
 
 def read_card(path: Path) -> dict[str, str]:
-    """Return the metadata of an exported file."""
     return {prop.key: prop.value for prop in onnx.load(path).metadata_props}
 
 
 def check_awake(net: SuperSdfNet) -> None:
-    """Refuse a network with dormant units: a smaller one would do as well.
-
-    Raises
-    ------
-    SystemExit
-        If more than ``DORMANT`` of the rectified units react to no voxel of procedural shapes.
-    """
+    """Exit if many units react to no voxel of procedural shapes: a smaller network would do."""
     samples = draw_samples(masks=not net.config.keeps_samples)
     share = dormant_share(net, singly(net, [sample for sample in samples if len(sample.voxels)]))
     if share > DORMANT:
@@ -205,17 +182,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="the .onnx file")
     parser.add_argument("--data", default="not given", help="what it was trained on")
     parser.add_argument("--accuracy", default="not measured", help="measured figures, in words")
-    parser.add_argument(
-        "--exact",
-        action="store_const",
-        dest="inputs",
-        const=EXACT_DISTANCES,
-        default=DISTANCES,
-        help="the network was trained on hardly any noisy samples: noisy grids are for another one",
-    )
-    parser.add_argument(
-        "--threshold", type=float, help="of the gate, if not that of the run: see export.gates"
-    )
+    exact = "it was trained on hardly any noisy samples: noisy grids are for another network"
+    parser.add_argument("--exact", action="store_true", help=exact)
+    gate = "of the gate, if not that of the run: see export.gates"
+    parser.add_argument("--threshold", type=float, help=gate)
     options = parser.parse_args()
     if options.source:
         rewrite(options.source, options.out)
@@ -224,8 +194,9 @@ def main() -> None:
     if options.threshold is not None:
         net.gate.threshold.fill_(options.threshold)
     check_awake(net)
-    said = options.data, options.accuracy, options.inputs
-    write_model(net, options.out, make_card(net, options.out.stem, *said))
+    inputs = EXACT_DISTANCES if options.exact else DISTANCES
+    card = make_card(net, options.out.stem, options.data, options.accuracy, inputs)
+    write_model(net, options.out, card)
     difference = parity(net, options.out)
     if difference > PARITY:
         options.out.unlink()

@@ -48,11 +48,6 @@ def test_a_spacing_that_the_values_contradict_is_refused(make, unit, spacing):
         assert make(values * unit * float(scale), spacing).notes[:-1] == ()
 
 
-def test_grid_and_make_grid_are_the_same_grid():
-    one, other = SdfGrid(VALUES, 1.0), make_grid(VALUES, spacing=1.0, origin=0)
-    assert repr(one) == repr(other) and one.notes == other.notes == ()
-
-
 def test_what_does_not_change_is_no_unit():
     board = np.where(np.indices((3, 3, 64))[2] % 2, 1.0, -1.0)  # opposite neighbours are equal
     board[2, 2, 2] = -1.5
@@ -203,11 +198,6 @@ def test_mesh_and_field_say_what_they_are_in_a_line():
     assert repr(network) == said.replace("field 5", f"field {network.receptive_field}")
     for thing in (GRID, field, mesh, network):
         assert "\n" not in repr(thing) and len(repr(thing)) < 160
-
-
-def test_dir_lists_the_public_names():
-    assert dir(super_sdf) == super_sdf.__all__
-    assert {"make_grid", "reconstruct", "write_mesh"} <= set(dir(super_sdf))
 
 
 def test_an_editable_install_is_a_path_that_type_checkers_follow():

@@ -6,8 +6,8 @@ import warnings
 
 import numpy as np
 import pytest
-from conftest import ball, trilinear
-from onnx_files import DOUBLE, FLOAT, INPUTS, metadata, write_network
+from conftest import ball
+from onnx_files import DOUBLE, FLOAT, metadata, write_network
 
 from super_sdf import load_network, reconstruct, upsample
 from super_sdf.errors import DeviceError, FileError, ModelError, OptionError
@@ -23,21 +23,6 @@ def network_inputs(grid):
     voxels = find_band(field)
     rows = np.arange(len(voxels), dtype=np.int32)
     return gather_patches(field, voxels), neighbour_table(voxels, grid.shape), rows
-
-
-def test_the_card_describes_the_network():
-    card = load_network("base").card
-    for key in (
-        "receptive_field",
-        "value_scaling",
-        "training_factors",
-        "trained_on",
-        "trained_from_commit",
-        "accuracy",
-        "licence",
-        "parameters",
-    ):
-        assert card[key], key
 
 
 def test_a_prediction_depends_on_the_receptive_field_and_no_more():
@@ -59,7 +44,9 @@ def test_shipped_networks_are_small_and_fulfil_the_contract():
     assert {name.removesuffix("-int8") for name in shipped_models()} == names
     for name, path in shipped_models().items():
         assert path.stat().st_size < 20e6
-        assert load_network(name, precision="float32").card["name"] == name
+        card = load_network(name, precision="float32").card
+        assert card["name"] == name and card["receptive_field"] and card["parameters"]
+        assert card["trained_on"] and card["trained_from_commit"] and card["accuracy"]
 
 
 @pytest.mark.parametrize("factor", [4, 8])
@@ -73,19 +60,13 @@ def test_a_prediction_depends_neither_on_threads_nor_on_the_other_voxels_decoded
         np.testing.assert_array_equal(two(patches, table, some, offsets), values[some])
 
 
-def test_int8_is_near_float32_and_its_card_has_the_precision():
-    patches, table, rows = network_inputs(ball())
-    one, other = (load_network(precision=precision) for precision in ("float32", "int8"))
-    assert other.card["precision"] == "int8" and other.device == "cpu"
-    given = patches, table, rows, block_offsets(4)
-    apart = np.abs(one(*given) - other(*given)) / 2  # voxels
-    assert 0 < apart.mean() < 2e-3 and apart.max() < 0.05
-
-
 def test_shipped_networks_run_in_int8_on_the_cpu_and_other_files_as_they_are(tmp_path):
+    given = *network_inputs(ball()), block_offsets(4)
     for quality in QUALITIES:
-        assert load_network(quality, device="cpu").precision == "int8"
-        assert load_network(quality, device="cpu", precision="float32").precision == "float32"
+        whole, real = (load_network(quality, precision=p) for p in ("auto", "float32"))
+        assert (whole.precision, whole.device, real.precision) == ("int8", "cpu", "float32")
+        apart = np.abs(whole(*given) - real(*given)) / 2  # voxels
+        assert 0 < apart.mean() < 3e-3 and apart.max() < 0.06
     own = shutil.copy(shipped_models()["base"], tmp_path / "own.onnx")
     shutil.copy(shipped_models()["base-int8"], tmp_path / "own-int8.onnx")
     assert load_network(own, device="cpu").precision == "float32"
@@ -177,13 +158,6 @@ def test_a_network_with_another_output_is_refused(tmp_path, name):
     assert "\n" not in str(caught.value)
 
 
-def test_a_network_with_other_inputs_is_refused(tmp_path):
-    inputs = {**INPUTS, "more\nlines": (FLOAT, "V")}
-    path = write_network(tmp_path / "own.onnx", inputs=inputs)
-    with pytest.raises(ModelError, match=r"is no super-sdf network of format 1 \(format 1, inp"):
-        load_network(path, device="cpu")
-
-
 INFINITE = [("Sub", ("sum", "sum"), "zero", {}), ("Div", ("sum", "zero"), "values", {})]
 NAN = [
     ("Abs", ("sum",), "above", {}),
@@ -235,14 +209,6 @@ def test_the_values_of_a_function_as_network_are_checked_too(given, what):
     wanted = r" instead of float32 of shape \(4, 3\), \(voxels, offsets\)$"
     with pytest.raises(ModelError, match=f"^the network gave {what}{wanted}"):
         check_output(given, (4, 3))
-
-
-def test_a_function_may_return_double_precision_in_any_memory_order():
-    def doubled(*inputs):
-        return np.asfortranarray(trilinear(*inputs), np.float64)
-
-    one, two = reconstruct(ball(), trilinear), reconstruct(ball(), doubled)
-    np.testing.assert_array_equal(one.vertices, two.vertices)
 
 
 DEEP, LONG = "[" * 100_000, "7" * 5000

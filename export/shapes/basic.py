@@ -42,7 +42,6 @@ def primitive(rng: np.random.Generator) -> Manifold:
 
 
 def csg(rng: np.random.Generator) -> Manifold:
-    """Draw unions and differences of primitives."""
     solid = turned(rng, primitive(rng))
     for _ in range(rng.integers(1, 8)):
         part = turned(rng, primitive(rng)).scale([rng.uniform(0.3, 1)] * 3)

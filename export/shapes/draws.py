@@ -32,7 +32,6 @@ def turned(rng: np.random.Generator, solid: Manifold) -> Manifold:
 
 
 def joined(solids: Sequence[Manifold]) -> Manifold:
-    """Return the union of solids."""
     return Manifold.batch_boolean(solids, OpType.Add)
 
 
@@ -73,7 +72,6 @@ def draw_sway(rng: np.random.Generator, strength: float) -> Callable[[np.ndarray
 
 
 def swayed(rng: np.random.Generator, solid: Manifold, strength: float) -> Manifold:
-    """Move each point of a solid by sine waves of the position: see ``draw_sway``."""
     return solid.warp_batch(draw_sway(rng, strength))
 
 

@@ -35,7 +35,6 @@ def miters(ring: np.ndarray) -> np.ndarray:
 
 
 def area(ring: np.ndarray) -> float:
-    """Return the signed area of a ring (n, 2)."""
     after = np.roll(ring, -1, axis=0)
     return float((ring[:, 0] * after[:, 1] - ring[:, 1] * after[:, 0]).sum() / 2)
 
@@ -93,7 +92,6 @@ def smooth(outline: CrossSection, radius: float, segments: int = 48) -> CrossSec
 
 
 def pierced(rng: np.random.Generator, outline: CrossSection) -> CrossSection:
-    """Cut up to four holes into an outline."""
     for _ in range(rng.choice([0, 1, 2, 4])):
         hole = draw_outline(rng).scale([log_uniform(rng, 0.1, 0.4)] * 2)
         outline -= hole.translate(list(rng.uniform(-0.3, 0.3, 2)))

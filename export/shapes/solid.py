@@ -1,27 +1,53 @@
 """Procedural closed solids: training without mesh data.
 
-`random_solid` draws a family (see ``families``), adds features of another scale to about half of
+`random_solid` draws from a family, a function that draws one kind of solid, about one unit long and
+anywhere in space. It adds features of another scale to about half of
 the solids, bends some, and scales the result to a bounding box diagonal of 1.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from manifold3d import Error, Manifold
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from export.shapes.basic import primitive
+from export.shapes.basic import csg, facets, lathe, primitive, prism, rounded
 from export.shapes.draws import joined, log_uniform, swayed, turned, twisted, unit_sized
-from export.shapes.families import draw_family
+from export.shapes.edges import chamfered, filleted
+from export.shapes.mechanical import gear, plate, repeated, ribs, text, threads
+from export.shapes.organic import blends, blobs, creature, displaced, gyroid, sculpture
+from export.shapes.slender import frame, lattice, pipe, section, shell, thin
 from super_sdf import Mesh
 
 ATTEMPTS = 20  # about one candidate in a hundred fails, mostly by too many faces
 MAX_FACES = 70_000  # the finest reliefs have some 50,000
 MIN_VOLUME = 1e-4  # of the cubed diagonal; the thinnest shells and frames hold some 1e-3
 TOLERANCE = 1e-5  # of the diagonal; shorter edges only spoil the normals of their triangles
+
+
+Family = Callable[[np.random.Generator], Manifold]
+
+MACHINED: tuple[Family, ...] = (
+    prism, csg, lathe, rounded, facets,
+    filleted, chamfered,
+    plate, gear, repeated, threads, ribs,
+    shell, frame, pipe, thin, section, lattice, text,
+)  # fmt: skip
+GROWN: tuple[Family, ...] = (blobs, gyroid, blends, creature, displaced, sculpture)
+FAMILIES: dict[str, Family] = {family.__name__: family for family in (*MACHINED, *GROWN)}
+
+GROWN_SHARE = 0.4  # few of the meshes at hand have smooth, irregular shapes
+
+
+def draw_family(rng: np.random.Generator, names: Sequence[str] = ()) -> Family:
+    """Draw a family: one of those named, equally likely each time they are, or of all."""
+    if names:
+        return FAMILIES[names[rng.integers(len(names))]]
+    families = GROWN if rng.random() < GROWN_SHARE else MACHINED
+    return families[rng.integers(len(families))]
 
 
 def bent(rng: np.random.Generator, solid: Manifold) -> Manifold:
@@ -104,7 +130,6 @@ def without_crumbs(mesh: Mesh) -> Mesh:
 
 
 def mesh_of(solid: Manifold) -> Mesh:
-    """Return the surface of a solid."""
     drawn = solid.to_mesh64()
     return Mesh(drawn.vert_properties[:, :3], drawn.tri_verts.astype(np.int32))
 
@@ -112,15 +137,8 @@ def mesh_of(solid: Manifold) -> Mesh:
 def random_solid(rng: np.random.Generator, families: Sequence[str] = ()) -> Mesh:
     """Draw a closed solid with outward faces, its bounding box centred and of diagonal 1.
 
-    It is of the families named, or of any.
-
-    The same state of ``rng`` gives the same solid. About one solid in 300 touches or intersects
-    itself, where a bent wall or a level set is very thin; `export.dataset` refuses those.
-
-    Raises
-    ------
-    RuntimeError
-        If 20 candidates in a row are empty, too thin or of too many faces.
+    It is of the families named, or of any. The same state of ``rng`` gives the same solid. About
+    one solid in 300 touches or intersects itself, where a bent wall or a level set is very thin.
     """
     for _ in range(ATTEMPTS):
         solid = draw_candidate(rng, families)

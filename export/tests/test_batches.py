@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from export.augment import CLEAN, augment, prepare
+from export.augment import prepare
 from export.batches import Batch, batch_of, copies_of_queries, encode, predict
 from export.dataset import Sample
 from export.tests.small_net import small_net
@@ -49,13 +49,6 @@ def test_the_copies_of_a_query_are_the_same_point_in_other_voxels():
     assert np.abs(moved).max() <= 1
 
 
-def test_a_query_inside_every_voxel_is_decoded_as_it_is():
-    sample, net = prepare(ball_sample()), small_net()
-    offsets = np.random.default_rng(0).uniform(-0.9, 0.9, (6, 3)).astype(np.float32)
-    inside = replace(sample, offsets=offsets, targets=sample.targets[:, :6])
-    torch.testing.assert_close(predicted(net, inside), alone(net, sample, offsets))
-
-
 def test_shared_nodes_have_the_mean_that_the_runtime_gives_them():
     sample, net = prepare(ball_sample()), small_net()
     with torch.no_grad():
@@ -76,16 +69,6 @@ def test_samples_side_by_side_have_their_own_values():
     got = predict(net, batch, encode(net, batch)).split(batch.counts)
     for values, sample in zip(got, (one, other)):
         torch.testing.assert_close(values, predicted(net, sample), atol=1e-5, rtol=0)
-
-
-def test_a_turned_sample_shares_the_same_nodes():
-    rng, net = np.random.default_rng(3), small_net()
-    for weight in net.parameters():
-        torch.nn.init.zeros_(weight)  # interpolation alone turns with the cube
-    want = predicted(net, prepare(ball_sample()))
-    for _ in range(5):
-        got = predicted(net, augment(rng, ball_sample(), CLEAN))
-        torch.testing.assert_close(got, want, atol=1e-5, rtol=0)
 
 
 def test_the_gradient_reaches_the_voxels_that_share_a_node():

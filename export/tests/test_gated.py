@@ -7,22 +7,18 @@ import onnx
 import pytest
 import torch
 
-from export.augment import prepare
+from export.augment import draw_samples, prepare
 from export.batches import batch_of, encode
-from export.calibration import distance_apart, draw_samples
-from export.dormant import dormant_share, rectified_layers
 from export.gates import correlation, encode_first, measure_at, rows_of_table, threshold_of
 from export.grow import grow_from, without_blocks
 from export.network import GatherMatMul, SuperSdfNet
 from export.onnx_graph import THRESHOLD
-from export.quantize import quantize
-from export.recipe import RECIPE
+from export.quantize import distance_apart, quantize
+from export.recipe import RECIPE, batch_losses, measure, window_losses
 from export.resident import Residents, gather_samples
 from export.tests.small_net import SMALL
 from export.tests.test_resident import turned_one_by_one
-from export.tests.test_training import some_samples
 from export.to_onnx import make_card, noisy_ball, parity, read_network, write_model
-from export.train import batch_losses, measure, window_losses
 from super_sdf.errors import OptionError
 from super_sdf.neighbourhood import CENTRE
 from super_sdf.network.contract import INPUTS
@@ -87,7 +83,8 @@ def test_voxels_that_go_no_deeper_are_as_they_were_for_those_that_do(net):
     torch.testing.assert_close(blended[7:8], want)
 
 
-def test_the_gradient_of_a_convolution_with_voxels_around():
+def test_the_gradient_of_a_convolution_with_voxels_around(monkeypatch):
+    monkeypatch.setattr("export.network.CHUNK", 5)
     patches, table = ball_tensors()
     rows = torch.arange(40, 52)
     place = torch.arange(len(patches) + 1) + len(rows)
@@ -179,29 +176,18 @@ def test_the_int8_file_is_near_and_runs_every_layer_in_whole_numbers(net, file, 
         assert kinds[f"block{number}"] == ["Gather", "Gather", "Reshape", *layers, *rounding]
 
 
-def test_blocks_of_the_start_are_left_out():
-    weights = {f"blocks.{n}.conv.bias": torch.tensor([n]) for n in range(5)}
-    kept = without_blocks({**weights, "branch.bias": torch.tensor([9])}, [1, 3])
-    assert {name: int(array) for name, array in kept.items()} == {
-        "blocks.0.conv.bias": 0,
-        "blocks.1.conv.bias": 2,
-        "blocks.2.conv.bias": 4,
-        "branch.bias": 9,
-    }
-
-
 @pytest.fixture(scope="module")
-def samples():
-    return [prepare(sample) for sample in some_samples()]
+def prepared(samples):
+    return [prepare(sample) for sample in samples]
 
 
-def test_samples_on_a_device_have_the_same_losses_and_the_gate_learns(net, samples):
+def test_samples_on_a_device_have_the_same_losses_and_the_gate_learns(net, prepared):
     residents = Residents("cpu")
-    residents.add(gather_samples(samples))
+    residents.add(gather_samples(prepared))
     found = []
     for batch in (
         residents.batch([2, 0, 1, 2], [0, 5, 17, 40]),
-        batch_of(list(turned_one_by_one(samples))),
+        batch_of(list(turned_one_by_one(prepared))),
     ):
         torch.manual_seed(3)
         found.append(window_losses(net, batch, RECIPE))
@@ -211,29 +197,29 @@ def test_samples_on_a_device_have_the_same_losses_and_the_gate_learns(net, sampl
         assert part.weight.grad.abs().max() > 0
 
 
-def test_errors_at_a_threshold_are_those_of_the_network_with_it(net, samples):
+def test_errors_at_a_threshold_are_those_of_the_network_with_it(net, prepared):
     with torch.no_grad():
-        encoded = encode_first(net, samples)
+        encoded = encode_first(net, prepared)
         seen = []
         for share in (0.0, 0.3, 1.0):
             threshold = threshold_of(encoded, share)
-            seen.append(measure_at(net, samples, encoded, threshold))
-            assert seen[-1][1] == measure(net, samples)
-    can_hold = np.mean([len(each.voxels) for each in samples])
-    can_hold /= np.mean([len(each.patches) for each in samples])
+            seen.append(measure_at(net, prepared, encoded, threshold))
+            assert seen[-1][1] == measure(net, prepared)
+    can_hold = np.mean([len(each.voxels) for each in prepared])
+    can_hold /= np.mean([len(each.patches) for each in prepared])
     assert [band for band, _ in seen] == pytest.approx([0, 0.3 * can_hold, can_hold], abs=0.02)
     assert len({errors for _, errors in seen}) == 3
 
 
-def test_what_the_gate_says_is_ranked_against_the_loss(net, samples):
+def test_what_the_gate_says_is_ranked_against_the_loss(net, prepared):
     with torch.no_grad():
-        encoded = encode_first(net, samples)
-        batch = batch_of(samples)
+        encoded = encode_first(net, prepared)
+        batch = batch_of(prepared)
         losses = batch_losses(net, batch, encode(net, batch), RECIPE)
-    ends = np.cumsum([len(each.voxels) for each in samples])[:-1].tolist()
-    for each, first, loss in zip(samples, encoded, losses.tensor_split(ends)):
+    ends = np.cumsum([len(each.voxels) for each in prepared])[:-1].tolist()
+    for each, first, loss in zip(prepared, encoded, losses.tensor_split(ends)):
         first.doubts[each.voxels] = -loss
-    assert correlation(net, samples, encoded) == pytest.approx(-1)
+    assert correlation(net, prepared, encoded) == pytest.approx(-1)
 
 
 def test_a_network_without_a_gate_has_no_thresholds(tmp_path):
@@ -242,13 +228,3 @@ def test_a_network_without_a_gate_has_no_thresholds(tmp_path):
     file = shipped_models()["fast"]
     with pytest.raises(OptionError, match=r"fast.onnx has no gate: give a network .* --gated$"):
         next(rows_of_table(file, tmp_path, (0.5,)))
-
-
-def test_units_behind_the_gate_and_of_it_may_be_dormant(net, samples):
-    layers = rectified_layers(net)
-    assert [entry.layer for entry in layers if entry.layer is net.gate.layers[0]]
-    with torch.no_grad():
-        for entry in layers:
-            entry.bias[:4] = -1e4
-    units = sum(len(entry.bias) for entry in layers)
-    assert dormant_share(net, [batch_of(samples[:1])]) >= 4 * len(layers) / units

@@ -2,7 +2,7 @@
 
 import torch
 
-from export.muon import StackedMuon, by_shape, orthogonal
+from export.muon import StackedMuon, orthogonal
 
 RATE = {"lr": 0.01, "weight_decay": 1e-3, "adjust_lr_fn": "match_rms_adamw"}
 SHAPES = [(32, 12), (12, 32), (32, 12), (12, 12), (32, 12)]
@@ -36,16 +36,6 @@ def test_a_run_of_torchs_muon_goes_on():
     after.load_state_dict(before.state_dict())
     for mine, theirs in zip(other, one):
         torch.testing.assert_close(after.state[mine], before.state[theirs])
-
-
-def test_matrices_of_a_shape_are_together_in_their_order():
-    given = matrices()
-    grouped = by_shape(given)
-    assert [[id(matrix) for matrix in group] for group in grouped] == [
-        [id(given[0]), id(given[2]), id(given[4])],
-        [id(given[1])],
-        [id(given[3])],
-    ]
 
 
 def test_singular_values_become_equal():

@@ -5,9 +5,15 @@ import onnx
 import pytest
 import torch
 
-from export.calibration import distance_apart, draw_samples, find_ranges
+from export.augment import draw_samples
 from export.network import NetworkConfig, SuperSdfNet
-from export.quantize import LEVELS, MOST, quantize, steps_of, whole_block, whole_layer
+from export.quantize import (
+    LEVELS,
+    MOST,
+    distance_apart,
+    quantize,
+    whole_layer,
+)
 from export.to_onnx import make_card, write_model
 from super_sdf.network.network import load_network, shipped_models
 from super_sdf.network.onnx import ort
@@ -16,12 +22,12 @@ SMALL = NetworkConfig(channels=16, blocks=3, hidden=32, functions=24, trunk=16, 
 
 
 @pytest.fixture(scope="module")
-def samples():
+def calibration():
     return draw_samples(6)
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory, samples):
+def files(tmp_path_factory, calibration):
     """A network in float32, and twice in int8."""
     torch.manual_seed(0)
     net = SuperSdfNet(SMALL)
@@ -30,8 +36,8 @@ def files(tmp_path_factory, samples):
     folder = tmp_path_factory.mktemp("files")
     paths = [folder / name for name in ("small.onnx", "small-int8.onnx", "again.onnx")]
     write_model(net, paths[0], make_card(net, "small", "nothing", "none"))
-    quantize(paths[0], paths[1], samples)
-    quantize(paths[0], paths[2], samples)
+    quantize(paths[0], paths[1], calibration)
+    quantize(paths[0], paths[2], calibration)
     return paths
 
 
@@ -60,19 +66,8 @@ def test_layers_without_weights_keep_their_bias():
     np.testing.assert_allclose(layer.bias * layer.scales, bias, rtol=1e-6)
 
 
-def test_what_is_read_fits_into_a_byte(samples):
-    block = SuperSdfNet(SMALL).blocks[0]
-    net = SuperSdfNet(SMALL)
-    ranges = find_ranges(net, samples)[0]
-    whole = whole_block(block, ranges)
-    for value in (ranges.low, ranges.high):
-        read = value.numpy() / whole.steps + whole.zeros
-        assert read.min() > -1 and read.max() < LEVELS + 1
-    assert (steps_of(torch.zeros(3)) > 0).all()
-
-
-def test_the_int8_file_is_near_the_float32_one_and_carries_its_card(files):
-    assert distance_apart(*files[:2]).mean() < 3e-3
+def test_the_int8_file_is_near_the_float32_one_and_carries_its_card(files, calibration):
+    assert distance_apart(*files[:2], calibration).mean() < 3e-3
     card = load_network(files[1]).card
     assert (card["name"], card["precision"], card["receptive_field"]) == ("small-int8", "int8", 4)
     assert load_network(files[0], precision="int8").card == card  # the one beside it

@@ -8,30 +8,17 @@ from manifold3d import Manifold
 from scipy.ndimage import label
 
 from export.shapes import solid as shapes
-from export.shapes.draws import log_uniform, unit_sized
-from export.shapes.families import FAMILIES, draw_family
-from export.shapes.organic import grid
-from export.shapes.sculpted import STEP, bumps, put_spikes, relief, skin_waves, wrinkles
-from export.shapes.solid import MAX_FACES, random_solid, without_crumbs
+from export.shapes.draws import unit_sized
+from export.shapes.organic import STEP, bumps, grid, put_spikes, relief, skin_waves, wrinkles
+from export.shapes.solid import FAMILIES, MAX_FACES, draw_family, random_solid, without_crumbs
 from super_sdf import Mesh
 
 SEEDS = range(20)
 
 
-def directed_edges(mesh: Mesh) -> np.ndarray:
-    """Return the directed edges of all faces, (3 m, 2)."""
-    return mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-
-
-def as_mesh(solid: Manifold) -> Mesh:
-    """Return vertices and faces of a solid."""
-    mesh = solid.to_mesh64()
-    return Mesh(mesh.vert_properties[:, :3], mesh.tri_verts.astype(np.int32))
-
-
 def check_closed(mesh: Mesh) -> None:
     """Each directed edge occurs once, and so does its opposite; every vertex is used."""
-    edges = directed_edges(mesh)
+    edges = mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     there = {tuple(edge) for edge in edges.tolist()}
     assert len(there) == len(edges)
     assert there == {(b, a) for a, b in there}
@@ -82,13 +69,6 @@ def test_same_seed_same_solid() -> None:
         assert np.array_equal(first.faces, second.faces)
 
 
-def test_stream_of_solids_varies() -> None:
-    """One generator gives a new solid each time."""
-    rng = np.random.default_rng(0)
-    volumes = [round(random_solid(rng).volume(), 6) for _ in range(10)]
-    assert len(set(volumes)) == 10
-
-
 def test_only_named_families_are_drawn_each_as_often_as_it_is_named() -> None:
     """Names are drawn from alone, and a repeated one more often."""
     rng = np.random.default_rng(0)
@@ -129,15 +109,7 @@ def test_crumbs_go_and_cavities_stay() -> None:
     box = Manifold.cube([1, 1, 1], True)
     hollow = box - box.scale([0.8, 0.8, 0.8])
     crumb = Manifold.cube([0.1, 0.1, 0.1]).translate([2, 0, 0])
-    mesh = without_crumbs(as_mesh(hollow + crumb))
+    mesh = without_crumbs(shapes.mesh_of(hollow + crumb))
     check_closed(mesh)
     assert mesh.volume() == pytest.approx(1 - 0.8**3)
     assert mesh.vertices.max() == 0.5
-
-
-def test_log_uniform_stays_between() -> None:
-    """Draws stay in range, with the geometric mean as their median."""
-    rng = np.random.default_rng(0)
-    drawn = [log_uniform(rng, 0.01, 1) for _ in range(400)]
-    assert min(drawn) >= 0.01 and max(drawn) <= 1
-    assert np.median(drawn) == pytest.approx(0.1, rel=0.3)

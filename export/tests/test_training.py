@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 from export.augment import (
     CLEAN,
@@ -39,19 +38,19 @@ from export.network import (
     SIZES,
     GatherMatMul,
     SuperSdfNet,
-    gather,
+    columns_of,
     interpolation_weights,
     is_noisy,
+    pad,
 )
 from export.recipe import (
     RECIPE,
     differences,
     make_optimisers,
-    rate_factor,
-    relative_weights,
+    sample_errors,
 )
-from export.run_log import draw_history, read_log
-from export.shapes import random_solid
+from export.run_log import read_log
+from export.store import Store
 from export.tests.small_net import SMALL, small_net
 from export.to_onnx import (
     check_awake,
@@ -63,16 +62,15 @@ from export.to_onnx import (
     rewrite,
     write_model,
 )
-from export.train import Run, Store, divide, log, sample_errors, take_step, train
+from export.train import Run, autocast, take_step, train
 from super_sdf import Mesh, load_network
 from super_sdf.errors import FileError, OptionError
 from super_sdf.neighbourhood import CENTRE, NEIGHBOURHOOD
 from super_sdf.network.contract import EXACT_DISTANCES, INPUTS
 from super_sdf.network.network import shipped_models
 from super_sdf.network.onnx import CHUNK_INPUT
-from super_sdf.steps.band import find_band, is_lipschitz, neighbour_table
+from super_sdf.steps.band import is_lipschitz, neighbour_table
 from super_sdf.steps.nodes import block_offsets
-from super_sdf.truth.sampling import sample_grid
 from super_sdf.truth.solid import Solid
 
 
@@ -88,34 +86,6 @@ def box_distance(points, low=(-0.3, -0.2, -0.1), high=(0.4, 0.3, 0.2)):
     beyond = np.maximum(np.array(low) - points, points - np.array(high))
     outside = np.linalg.norm(np.maximum(beyond, 0), axis=1)
     return outside + np.minimum(beyond.max(1), 0)
-
-
-def test_distances_of_a_box_are_exact():
-    points = np.random.default_rng(0).uniform(-0.6, 0.6, (5000, 3))
-    found = Solid(box()).signed_distance(points)
-    np.testing.assert_allclose(found, box_distance(points), atol=1e-12)
-
-
-def test_a_grid_has_the_right_sign_near_and_far():
-    turn = Rotation.from_euler("xyz", [0.3, 0.5, 0.7]).as_matrix()
-    turned = box().transformed(turn, np.zeros(3))
-    values = sample_grid(Solid(turned), ((24, 25, 26), 0.06, np.full(3, -0.7)))
-    points = (np.indices((24, 25, 26)).reshape(3, -1).T * 0.06 - 0.7) @ turn
-    np.testing.assert_allclose(values.ravel(), box_distance(points), atol=1e-7)
-
-
-def some_samples(count=3):
-    rng = np.random.default_rng(0)
-    samples = []
-    while len(samples) < count:
-        sample = make_sample(rng, random_solid(rng, ["csg", "blobs"]))
-        samples += [sample] if sample else []
-    return samples
-
-
-@pytest.fixture(scope="module")
-def samples():
-    return some_samples()
 
 
 def test_targets_are_the_distance_at_the_query_points():
@@ -141,13 +111,6 @@ def test_signs_are_right_where_a_mesh_intersects_itself():
     )
     found = signed_distance(rng, Solid(both), points)
     np.testing.assert_array_equal(found < 0, inside < 0)
-
-
-def test_what_no_sample_lies_in_is_kept():
-    sheet = box((-0.5, -0.5, -1e-3), (0.5, 0.5, 1e-3))
-    samples = [make_sample(np.random.default_rng(seed), sheet) for seed in range(10)]
-    missed = [sample for sample in samples if sample and (sample.window > 0).all()]
-    assert any((sample.targets < 0).any() for sample in missed)
 
 
 def test_thin_solids_have_hardly_a_sample_inside():
@@ -213,11 +176,6 @@ def test_a_mask_keeps_the_side_of_every_sample_and_exact_targets(samples):
     assert not np.array_equal(masked(rng, sample).window, mask.window)
 
 
-def test_a_window_without_two_sides_makes_no_mask(samples):
-    alone = replace(samples[0], window=np.full_like(samples[0].window, 4.0))
-    assert len(prepare_mask(alone).voxels) == 0
-
-
 def test_a_network_for_masks_corrects_every_sample_also_as_a_file(tmp_path, samples):
     net = SuperSdfNet(replace(SMALL, keeps_samples=False))
     torch.nn.init.constant_(net.correction.bias, 0.5)
@@ -231,37 +189,6 @@ def test_a_network_for_masks_corrects_every_sample_also_as_a_file(tmp_path, samp
     write_model(net, path, make_card(net, "mask", "nothing", "none"))
     assert parity(net, path) < 2e-4 and load_network(path).card["inputs"] == "masks"
     assert not read_network(path).config.keeps_samples
-
-
-def test_a_card_says_that_a_network_is_for_exact_distances(tmp_path):
-    net, path = small_net(), tmp_path / "exact.onnx"
-    write_model(net, path, make_card(net, "exact", "nothing", "none", EXACT_DISTANCES))
-    assert load_network(path).card["inputs"] == "exact distances"
-    assert read_network(path).config.keeps_samples
-    assert "inputs" not in make_card(net, "any", "nothing", "none")
-
-
-def test_a_store_of_masks_has_masks_held_out_and_drawn(tmp_path, samples):
-    write_shard(tmp_path / "shard-0-0000.npz", samples[:1])
-    write_shard(tmp_path / "shard-0-0001.npz", samples[1:])
-    store = Store(tmp_path, 1, inputs="masks")
-    _, (batch,) = store.draw_batch(np.random.default_rng(0), replace(RECIPE, batch_voxels=1), 1)
-    for sample in (*store.held_out, batch):
-        assert abs(sample.patches[:, CENTRE]).min() == 1
-
-
-def test_noise_may_push_voxels_with_targets_out_of_the_band(samples):
-    sample = samples[0]
-    window = sample.window.copy()
-    window[tuple(sample.voxel_ijk[0])] = 5.0
-    prepared = prepare(replace(sample, window=window))
-    assert len(prepared.voxels) == len(prepared.targets) == len(sample.voxel_ijk) - 1
-    np.testing.assert_array_equal(prepared.ijk[prepared.voxels], sample.voxel_ijk[1:])
-
-
-def test_a_batch_has_the_tables_of_its_samples():
-    one, two = np.array([[-1, 0], [1, -1]]), np.array([[0, -1]])
-    np.testing.assert_array_equal(batch_table([one, two]), [[3, 0], [1, 3], [2, 3]])
 
 
 def test_differences_are_the_gradient_of_a_linear_field():
@@ -279,25 +206,11 @@ def test_meshes_come_once_each_with_a_sixth_of_prisms():
     assert len(set(mesh_order(0, prisms, others, 1200)[600:]) & set(prisms)) == 100
 
 
-@pytest.mark.parametrize("chunk", [5, 1000])
-def test_the_gradient_of_the_neighbour_convolution(chunk, monkeypatch):
-    monkeypatch.setattr("export.network.CHUNK", chunk)
-    field = np.random.default_rng(0).normal(0, 3, (4, 4, 4)).astype(np.float32)
-    voxels = find_band(field)
-    table = neighbour_table(voxels, (4, 4, 4))
-    table = torch.from_numpy(np.where(table < 0, len(voxels), table))
-    features = torch.randn(len(voxels), 3, dtype=torch.double, requires_grad=True)
-    weight = torch.randn(81, 2, dtype=torch.double, requires_grad=True)
-    assert torch.autograd.gradcheck(
-        lambda f, w: GatherMatMul.apply(f, w, table, features[:0]), (features, weight)
-    )
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_a_convolution_gathers_some_voxels_after_others(dtype, monkeypatch):
     table = torch.randint(0, 101, (100, 27))  # 100: no voxel
     features, weight = torch.randn(100, 4).to(dtype), torch.randn(108, 3).to(dtype)
-    whole = gather(features, table) @ weight
+    whole = columns_of(pad(features), table) @ weight
     monkeypatch.setattr("export.network.CHUNK", 7)
     torch.testing.assert_close(GatherMatMul.apply(features, weight, table, features[:0]), whole)
 
@@ -347,18 +260,6 @@ def test_the_held_out_errors_of_the_truth_are_zero(samples):
     np.testing.assert_allclose(off, [0.1, 0.1, 0], atol=1e-6)  # in voxels
 
 
-def test_a_log_is_drawn(tmp_path, samples):
-    write_shard(tmp_path / "shard-0-0000.npz", samples)
-    write_shard(tmp_path / "shard-0-0001.npz", samples[:1])
-    run = Run(tmp_path, SuperSdfNet(SMALL))
-    store = Store(tmp_path, 1)
-    for run.step in (900, 1000):
-        log(run, store, 0.5, measured=run.step == 1000)
-    columns = read_log(tmp_path / "log.csv")
-    assert np.isnan(columns["held-out"][0]) and all(np.isfinite(c[1]) for c in columns.values())
-    assert (tmp_path / "loss.png").stat().st_size > 1000
-
-
 def test_steps_that_a_resumed_run_takes_again_count_once(tmp_path):
     path = tmp_path / "log.csv"
     path.write_text("100,10,5,.3\n200,20,5,.2\n300,30,5,.1\n200,21,5,.25\n300,31,5,.15\n")
@@ -368,16 +269,6 @@ def test_steps_that_a_resumed_run_takes_again_count_once(tmp_path):
     path.write_text("")
     with pytest.raises(FileError, match=f"^{path} is empty: give the log.csv of a run$"):
         read_log(path)
-
-
-def test_consecutive_runs_are_drawn_one_after_the_other(tmp_path, capsys):
-    for name, start in (("one", 0.02), ("two", 0.016)):
-        lines = [f"{1000 * n},{600 * n},5,.1,{start / n},.02,.04,.01" for n in (1, 2)]
-        (tmp_path / name).write_text("\n".join(lines))
-    figure = draw_history([tmp_path / "one", tmp_path / "two"], 0.015)
-    one, two, *_ = (line.get_xydata() for line in figure.axes[0].lines[::2])
-    np.testing.assert_allclose(one, [[1 / 6, 0.02], [1 / 3, 0.01]])
-    np.testing.assert_allclose(two, [[1 / 2, 0.016], [2 / 3, 0.008]])
 
 
 def test_noisy_are_the_voxels_whose_neighbours_are_no_distance(samples):
@@ -394,94 +285,12 @@ def test_noisy_are_the_voxels_whose_neighbours_are_no_distance(samples):
     np.testing.assert_array_equal(noisy, near)
 
 
-def test_the_rate_warms_up_and_anneals():
-    factors = [rate_factor(spent, RECIPE) for spent in np.linspace(0, 1, 101)]
-    assert factors[0] < 2e-3 and factors[-1] < 2e-3
-    assert 0.9 < max(factors) <= 1.001
-
-
-def test_a_recipe_with_other_rates_and_less_noise():
-    shares = replace(RECIPE.shares, noisy=0.1)
-    recipe = RECIPE.at(0.5, shares)
-    assert (recipe.hidden_rate, recipe.outer_rate) == (2e-3, 1e-3)
-    assert recipe.shares == shares
-    assert RECIPE.at(1.0, RECIPE.shares) == RECIPE
-
-
-def test_a_sample_counts_by_the_root_of_its_voxels():
-    assert relative_weights([16, 4], RECIPE).tolist() == pytest.approx([2 / 3, 1 / 3])
-    assert relative_weights([16, 4], replace(RECIPE, voxel_power=0.0)).tolist() == [0.5, 0.5]
-
-
-def test_the_onnx_file_agrees_with_torch_and_carries_its_card(tmp_path):
-    net = small_net()
-    write_model(net, tmp_path / "small.onnx", make_card(net, "small", "nothing", "none"))
-    assert parity(net, tmp_path / "small.onnx") < 2e-4
-    assert load_network(tmp_path / "small.onnx").card["receptive_field"] == 3
-
-
-def test_the_chunk_is_a_matter_of_who_runs_the_file(tmp_path):
-    write_model(small_net(), tmp_path / "small.onnx", make_card(small_net(), "small", "", ""))
-    session = load_network(tmp_path / "small.onnx", device="cpu").session
-    feeds = dict(zip(INPUTS, noisy_ball()))
-    want = session.run(None, feeds)[0]
-    for rows in (7, 512, len(feeds["patches"]), 10**4):
-        got = session.run(None, {**feeds, CHUNK_INPUT: np.array([rows])})[0]
-        np.testing.assert_allclose(got, want, atol=1e-5)
-
-
 def test_a_file_is_written_anew_with_the_same_values_and_card(tmp_path):
     shipped = shipped_models()["fast"]
     rewrite(shipped, tmp_path / "fast.onnx")
     one, other = load_network(shipped, device="cpu"), load_network(tmp_path / "fast.onnx")
     assert one.card == other.card and [path.name for path in tmp_path.iterdir()] == ["fast.onnx"]
     np.testing.assert_allclose(one(*noisy_ball()), other(*noisy_ball()), rtol=0, atol=2e-6)
-
-
-def test_training_can_start_from_an_onnx_file(tmp_path):
-    net = small_net()
-    write_model(net, tmp_path / "small.onnx", make_card(net, "small", "nothing", "none"))
-    run = Run(tmp_path, SuperSdfNet(SMALL))
-    run.start_from(read_weights(tmp_path / "small.onnx"))
-    for one, other in zip(net.parameters(), run.average.parameters()):
-        torch.testing.assert_close(one, other)
-
-
-def test_a_deeper_network_starts_with_the_values_of_the_file(tmp_path):
-    net = small_net()
-    write_model(net, tmp_path / "small.onnx", make_card(net, "small", "nothing", "none"))
-    run = Run(tmp_path, SuperSdfNet(replace(SMALL, blocks=SMALL.blocks + 2)))
-    run.start_from(read_weights(tmp_path / "small.onnx"))
-    arrays = [torch.from_numpy(array) for array in noisy_ball()]
-    with torch.no_grad():
-        torch.testing.assert_close(run.net(*arrays), net(*arrays))
-        torch.testing.assert_close(run.average(*arrays), net(*arrays))
-
-
-def test_a_wider_network_starts_with_the_values_of_the_file_and_with_new_units(tmp_path):
-    net = small_net()
-    write_model(net, tmp_path / "small.onnx", make_card(net, "small", "nothing", "none"))
-    wide = replace(SMALL, channels=12, hidden=20, blocks=SMALL.blocks + 1, functions=40)
-    run = Run(tmp_path, SuperSdfNet(wide))
-    run.start_from(read_weights(tmp_path / "small.onnx"))
-    arrays = [torch.from_numpy(array) for array in noisy_ball()]
-    values = run.net(*arrays)
-    with torch.no_grad():
-        torch.testing.assert_close(values, net(*arrays))
-    values.square().mean().backward()  # what reads the new units begins to learn at once
-    assert run.net.blocks[0].expand.weight.grad[:, SMALL.channels :].abs().max() > 0
-    assert run.net.blocks[1].conv.weight.grad.view(27, 12, 12)[:, SMALL.channels :].abs().max() > 0
-    assert run.net.trunk.layers[-1].weight.grad[SMALL.functions :].abs().max() > 0
-
-
-def test_no_network_starts_from_a_larger_one(tmp_path):
-    write_model(small_net(), tmp_path / "small.onnx", make_card(small_net(), "small", "", ""))
-    run = Run(tmp_path, SuperSdfNet(replace(SMALL, hidden=12)))
-    with pytest.raises(OptionError, match=r"stem.0.weight is \(16, 27\), more than the \(12, 27\)"):
-        run.start_from(read_weights(tmp_path / "small.onnx"))
-    run = Run(tmp_path, SuperSdfNet(replace(SMALL, blocks=1)))
-    with pytest.raises(OptionError, match=r"of 2 blocks, more than the 1 of this size: .* 2$"):
-        run.start_from(read_weights(tmp_path / "small.onnx"))
 
 
 def put_to_sleep(net, units=3):
@@ -543,11 +352,6 @@ def test_threads_share_a_batch_and_find_the_same_gradients(tmp_path, samples, mo
         torch.testing.assert_close(one, two, rtol=1e-4, atol=1e-6)
 
 
-def test_every_window_of_a_batch_is_given_to_one_thread():
-    assert divide([3, 9, 5, 2], 2) == [[1], [2, 0, 3]]
-    assert divide([7], 2) == [[0]]
-
-
 def test_a_network_with_dead_units_is_not_exported(samples, monkeypatch):
     net = small_net()
     monkeypatch.setattr("export.to_onnx.draw_samples", lambda **_: [prepare(samples[0])])
@@ -561,3 +365,63 @@ def test_a_network_with_dead_units_is_not_exported(samples, monkeypatch):
 @pytest.mark.parametrize("name", SIZES)
 def test_a_size_is_that_of_the_shipped_network(name):
     assert read_network(shipped_models()[name]).config == SIZES[name]
+
+
+def test_the_onnx_file_agrees_with_torch_in_chunks_of_any_size(small_file):
+    network = load_network(small_file, device="cpu")
+    assert parity(small_net(), small_file) < 2e-4 and network.card["receptive_field"] == 3
+    feeds = dict(zip(INPUTS, noisy_ball()))
+    want = network.session.run(None, feeds)[0]
+    for rows in (7, 512, 10**4):
+        got = network.session.run(None, {**feeds, CHUNK_INPUT: np.array([rows])})[0]
+        np.testing.assert_allclose(got, want, atol=1e-5)
+
+
+def test_a_card_says_what_a_network_is_for(small_file):
+    net = small_net()
+    assert "inputs" not in make_card(net, "any", "nothing", "none")
+    write_model(net, small_file, make_card(net, "exact", "nothing", "none", EXACT_DISTANCES))
+    assert load_network(small_file).card["inputs"] == "exact distances"
+
+
+@pytest.mark.parametrize("channels", [SMALL.channels, 12])
+def test_a_larger_network_starts_with_the_values_of_the_file(tmp_path, small_file, channels):
+    """What reads new units begins to learn at once."""
+    larger = replace(SMALL, channels=channels, hidden=20, blocks=SMALL.blocks + 1, functions=40)
+    run, net = Run(tmp_path, SuperSdfNet(larger)), small_net()
+    run.start_from(read_weights(small_file))
+    arrays = [torch.from_numpy(array) for array in noisy_ball()]
+    values = run.net(*arrays)
+    with torch.no_grad():
+        torch.testing.assert_close(values, net(*arrays))
+        torch.testing.assert_close(run.average(*arrays), net(*arrays))
+    values.square().mean().backward()
+    conv = run.net.blocks[1].conv.weight.grad.view(27, channels, channels)
+    assert run.net.blocks[0].expand.weight.grad[SMALL.hidden :].abs().max() == 0  # not yet read
+    assert run.net.blocks[0].reduce.weight.grad[:, SMALL.hidden :].abs().max() > 0
+    assert channels == SMALL.channels or conv[:, SMALL.channels :].abs().max() > 0
+    assert run.net.trunk.layers[-1].weight.grad[SMALL.functions :].abs().max() > 0
+
+
+def test_no_network_starts_from_a_larger_one(tmp_path, small_file):
+    run = Run(tmp_path, SuperSdfNet(replace(SMALL, hidden=12)))
+    with pytest.raises(OptionError, match=r"stem.0.weight is \(16, 27\), more than the \(12, 27\)"):
+        run.start_from(read_weights(small_file))
+    run = Run(tmp_path, SuperSdfNet(replace(SMALL, blocks=1)))
+    with pytest.raises(OptionError, match=r"of 2 blocks, more than the 1 of this size: .* 2$"):
+        run.start_from(read_weights(small_file))
+
+
+@pytest.mark.parametrize(
+    ("found", "expected"),
+    [
+        ({"avx2": True, "avx512_bf16": False}, torch.float32),
+        ({"avx2": True, "avx512_bf16": True}, torch.bfloat16),
+        ({"architecture": "aarch64"}, torch.float32),
+    ],
+)
+def test_a_step_is_computed_in_bfloat16_where_the_processor_has_it(monkeypatch, found, expected):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: found)
+    layer = torch.nn.Linear(4, 4)
+    with autocast("cpu"):
+        assert layer(torch.ones(2, 4)).dtype == expected

@@ -49,7 +49,6 @@ from .topology import OpenEdges
 
 if TYPE_CHECKING:
     from .fields.writing import FieldFile
-    from .simplification.simplify import Simplified
 
 CAPPED = (
     "the solid runs out of the grid: its surface is closed along the border (leave it open with "
@@ -65,10 +64,7 @@ COUNTS = (
 )
 
 MakePieces = Callable[[Expectation, Progress | None], Iterator[Piece]]
-"""Yields the mesh of a grid in pieces, in order, made while they are taken.
-
-It is called with the expected size of the mesh, and a callback for progress.
-"""
+"""Yields the mesh of a grid in pieces, in order, made while they are taken."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,57 +78,26 @@ class Kept:
 
 @dataclass(frozen=True)
 class Conversion:
-    """The result of a conversion.
+    """The result of a conversion."""
 
-    Attributes
-    ----------
-    grid : SdfGrid
-        The grid, as it was read.
-    counts : dict
-        The counts named in ``COUNTS``, and ``expected_triangles`` and ``expected_bytes``.
-    bounds : two Triples
-        The lowest and the highest coordinates of the vertices, in world units.
-    closed : bool
-        Whether the mesh has no open edge, counted while it is written (``topology.OpenEdges``). If
-        not, the surface leaves the grid and is not capped.
-    notes, warnings : tuple of str
-        Sentences on what was inferred, and on what may be wrong with the result.
-    capped : bool
-        Whether the solid runs out of the grid, and its surface was closed along the border.
-    simplified : dict, optional
-        Of a simplified mesh, what ``Simplified.report`` returns; distances are in voxels.
-    seconds : dict
-        Seconds per stage.
-    saved_field : dict, optional
-        The path of the refined field, and shape, spacing and origin of the fine lattice.
-    engine : dict
-        Who did the work, if that was not this process.
-    kept : Kept, optional
-        What a check of the mesh needs, if it was asked for and is small enough.
-    """
-
-    grid: SdfGrid
-    counts: dict[str, int]
-    bounds: tuple[Triple, Triple]
-    closed: bool
-    capped: bool
-    warnings: tuple[str, ...]
-    simplified: dict[str, Any] | None
-    notes: tuple[str, ...] = ()
-    seconds: dict[str, float] = field(default_factory=dict)
-    saved_field: dict[str, Any] | None = None
-    engine: dict[str, Any] = field(default_factory=dict)
-    kept: Kept | None = None
+    grid: SdfGrid  # as it was read
+    counts: dict[str, int]  # those of ``COUNTS``, ``expected_triangles`` and ``expected_bytes``
+    bounds: tuple[Triple, Triple]  # lowest and highest coordinates, in world units
+    closed: bool  # no edge is open; else the surface leaves the grid and is not capped
+    capped: bool  # the solid runs out of the grid, and was closed along the border
+    warnings: tuple[str, ...]  # on what may be wrong with the result
+    simplified: dict[str, Any] | None  # ``Simplified.report``; distances in voxels
+    notes: tuple[str, ...] = ()  # on what was inferred
+    seconds: dict[str, float] = field(default_factory=dict)  # per stage
+    saved_field: dict[str, Any] | None = None  # its path; shape, spacing, origin of the lattice
+    engine: dict[str, Any] = field(default_factory=dict)  # who did the work, if not this process
+    kept: Kept | None = None  # for a check, if it was asked for and is small enough
 
     def remarks(self) -> list[str]:
         """Return sentences on what the mesh has that the samples do not show, or lacks."""
         dropped, lone = self.counts["dropped_pieces"], self.counts["lone_samples"]
-        is_mask = self.grid.field.kind == MASK
-        return (
-            [CAPPED] * self.capped
-            + [f"{DROPPED}: {dropped}"] * (dropped > 0)
-            + [f"{LONE}: {lone}"] * (lone > 0 and is_mask)
-        )
+        said = [CAPPED] * self.capped + [f"{DROPPED}: {dropped}"] * (dropped > 0)
+        return said + [f"{LONE}: {lone}"] * (lone > 0 and self.grid.field.kind == MASK)
 
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
@@ -164,35 +129,18 @@ def convert(
     save_field: str | Path | None = None,
     keep: bool = False,
 ) -> Conversion:
-    """Convert a grid file to a mesh file.
+    """Convert a grid file to a mesh file, in formats of ``read_grid`` and ``write_mesh``.
 
-    Parameters
-    ----------
-    source, target : path
-        The grid file and the mesh file, in formats of ``read_grid`` and ``write_mesh``.
-    network : Network
-        From ``load_network``; it can be used for any number of files.
-    options : ConvertOptions
-        How the grid is read, refined and meshed.
-    force : bool
-        Replace the target, and the field's file, if they exist.
-    progress : callable, optional
-        Called with (done, total), see ``progress.Progress``; an exception in it ends the work.
-    before_rename : callable, optional
-        Called with the path of the finished temporary file, before it is renamed to ``target``.
-    announce : callable, optional
-        Called before the work with a sentence on the size of the mesh file, if it will be large.
-    save_field : path, optional
-        A file for the refined field, in a format of ``write_field``. It and the mesh file are both
-        complete at the end, or neither is written.
-    keep : bool
-        Keep grid, band and mesh for a check, so that it need not read them again.
+    ``force`` replaces the target, and the field's file, if they exist. ``progress`` is called with
+    (done, total), see ``progress.Progress``; an exception in it ends the work. ``before_rename`` is
+    called with the path of the finished temporary file, before it is renamed to ``target``;
+    ``announce`` before the work with a sentence on the size of the mesh file, if it will be large.
+    ``save_field`` is a file for the refined field, in a format of ``write_field``: it and the mesh
+    file are both complete at the end, or neither is written. ``keep`` keeps grid, band and mesh for
+    a check, so that it need not read them again.
 
-    Raises
-    ------
-    SuperSdfError
-        As in ``read_grid``, ``upsample``, ``simplify_mesh`` and ``write_mesh``; MeshError if slabs
-        do not meet. Nothing is written then.
+    SuperSdfError as in ``read_grid``, ``upsample``, ``simplify_mesh`` and ``write_mesh``; MeshError
+    if slabs do not meet. Nothing is written then.
     """
     watch = Stopwatch()
     if options.simplifies:
@@ -253,10 +201,7 @@ def describe_place(grid: SdfGrid) -> dict[str, Any]:
 def _field_file(
     path: str | Path | None, grid: SdfGrid, options: ConvertOptions, *, force: bool
 ) -> AbstractContextManager[FieldFile | None]:
-    """Return the file to write the refined field to, which appears at the end; None without a path.
-
-    SuperSdfError if the file exists, its suffix is unknown, or the field would not fit.
-    """
+    """Return the file to write the refined field to, which appears at the end; None without."""
     if path is None:
         return nullcontext()
     # imported here, since few conversions write a field, and the start is part of each
@@ -290,12 +235,11 @@ def convert_grid(
     check_can_close(grid, cap=options.cap)
     check_apart(target, files_of(source))
     check_target(target, force=force)
-    finer = options.factor
     lattice = cubic_grid(grid, options.offset)
-    about = check_format_holds(target, lattice, finer)
-    expected = expect(grid, finer, options.offset, target, cap=options.cap)
-    if options.simplifies:
-        from .simplification.simplify import check_room  # here, as few conversions need it
+    about = check_format_holds(target, lattice, options.factor)
+    expected = expect(grid, options.factor, options.offset, target, cap=options.cap)
+    if options.simplifies:  # imported here, as few conversions need it
+        from .simplification.simplify import check_room, simplify_mesh
 
         least = int(expected.triangles * CERTAIN_SHARE)
         check_room(least, options.max_memory, estimated=True)
@@ -306,27 +250,19 @@ def convert_grid(
     shown = part_of(progress, 0, SHARE_BEFORE) if options.simplifies else progress
     meshes = tally.count(make(expected, shown), watch)
     if options.simplifies:
-        simplified = _simplify(meshes, grid, options, part_of(progress, SHARE_BEFORE, 1))
+        simplified = simplify_mesh(
+            join_meshes(list(meshes)),
+            error=None if options.simplify is None else options.simplify * grid.voxel_size,
+            triangles=options.triangles,
+            max_memory=options.max_memory,
+            progress=share_of(part_of(progress, SHARE_BEFORE, 1)),
+        )
         meshes = iter([simplified.mesh])
         tally.replace(simplified.mesh)
         watch.lap("simplify")
     meshes = keeper.copies(meshes) if keeper else meshes
     write_pieces(meshes, target, force=force, about=about, before_rename=before_rename)
     watch.lap("write")
-    done = describe(grid, options, expected, tally, simplified)
-    notes = (*lattice.notes, *local_origin_note(target, about))
-    kept = keeper.kept(grid) if keeper else None
-    return replace(done, notes=notes, seconds=watch.seconds, kept=kept)
-
-
-def describe(
-    grid: SdfGrid,
-    options: ConvertOptions,
-    expected: Expectation,
-    tally: Tally,
-    simplified: Simplified | None,
-) -> Conversion:
-    """Return the result of a conversion."""
     counts = {name: tally.counts[name] for name in COUNTS}
     counts |= {"expected_triangles": expected.triangles, "expected_bytes": expected.size}
     warnings = find_warnings(grid, options.offset, counts, is_open=tally.is_open)
@@ -335,24 +271,12 @@ def describe(
         counts,
         bounds=(as_triple(tally.low, "low"), as_triple(tally.high, "high")),
         closed=simplified.mesh.is_closed() if simplified else not tally.is_open,
-        warnings=(*warnings, *(simplified.warnings if simplified else ())),
         capped=options.cap and tally.leaves,
+        warnings=(*warnings, *(simplified.warnings if simplified else ())),
         simplified=simplified.report(grid.voxel_size) if simplified else None,
-    )
-
-
-def _simplify(
-    meshes: Iterable[Mesh], grid: SdfGrid, options: ConvertOptions, progress: Progress | None
-) -> Simplified:
-    """Return the simplified mesh of all pieces."""
-    from .simplification.simplify import simplify_mesh
-
-    return simplify_mesh(
-        join_meshes(list(meshes)),
-        error=None if options.simplify is None else options.simplify * grid.voxel_size,
-        triangles=options.triangles,
-        max_memory=options.max_memory,
-        progress=share_of(progress),
+        notes=(*lattice.notes, *local_origin_note(target, about)),
+        seconds=watch.seconds,
+        kept=keeper.kept(grid) if keeper else None,
     )
 
 
@@ -366,7 +290,7 @@ class Keeper:
         self.meshes: list[Mesh] = []
 
     def take_band(self, band: Band) -> None:
-        """Keep the band of the grid."""
+        """Keep the band."""
         self.band = band
 
     def copies(self, meshes: Iterable[Mesh]) -> Iterator[Mesh]:
@@ -440,7 +364,7 @@ class Tally:
         self.last = replace(piece, meshes=[])
 
     def _extend_box(self, vertices: NDArray[Any]) -> None:
-        """Extend the bounding box axis by axis: five times as fast as ``min(0)``."""
+        """Extend the box axis by axis: five times as fast as ``min(0)``."""
         for axis, coordinates in enumerate(vertices.T if len(vertices) else ()):
             self.low[axis] = min(self.low[axis], coordinates.min())
             self.high[axis] = max(self.high[axis], coordinates.max())
@@ -463,33 +387,25 @@ def torn(count: int, where: str, *pieces: Piece) -> MeshError:
 def find_warnings(
     grid: SdfGrid, offset: float, counts: dict[str, int], *, is_open: bool
 ) -> list[str]:
-    """Return a sentence on each thing that may be wrong with the mesh of a grid.
-
-    Only distances can be noisy, or contradict each other.
-    """
+    """Return a sentence on each thing that may be wrong with the mesh of a grid."""
     warnings = []
     if is_open and grid.field.unseen is not None:
         warnings.append("the surface ends where samples are unknown, and is open there")
     elif is_open:
         warnings.append("the surface runs out of the grid and is open there (close it with --cap)")
     if grid.low >= offset:
-        warnings.append(
-            "no sample lies inside: the solid is thinner than the spacing, and its mesh may have "
-            "holes"
-        )
-    if grid.field.kind in (MASK, SCALED):
+        thin = "no sample lies inside: the solid is thinner than the spacing"
+        warnings.append(f"{thin}, and its mesh may have holes")
+    if grid.field.kind in (MASK, SCALED):  # only distances can be noisy, or contradict each other
         return warnings
     if counts["noisy_voxels"]:
         share = in_percent(counts["noisy_voxels"], counts["band_voxels"])
-        warnings.append(
-            f"in {share} of the band the values differ by more than distances can: they "
-            "are taken as noisy there, and corrected"
-        )
-    if counts["pinned_nodes"]:
-        warnings.append(
-            f"{counts['pinned_nodes']} fine values contradict the coarse ones around them and were "
-            "given their sign: the input is no distance field there"
-        )
+        differ = f"in {share} of the band the values differ by more than distances can"
+        warnings.append(f"{differ}: they are taken as noisy there, and corrected")
+    if pinned := counts["pinned_nodes"]:
+        contradict = f"{pinned} fine values contradict the coarse ones around them"
+        way = "were given their sign: the input is no distance field there"
+        warnings.append(f"{contradict} and {way}")
     return warnings
 
 

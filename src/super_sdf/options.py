@@ -31,13 +31,12 @@ DEVICES = (AUTO, "cpu", "cuda")
 AUTO_PRECISION, FLOAT32, INT8 = AUTO, "float32", "int8"
 PRECISIONS = (AUTO_PRECISION, FLOAT32, INT8)
 DEFAULT_QUALITY = "base"
+# The file of a shipped network, and the number of cube symmetries that are averaged.
 QUALITIES = {"fast": ("fast", 1), "base": ("base", 1), "best": ("base", 4)}
-"""The file of a shipped network, and the number of cube symmetries that are averaged."""
 MAX_FACTOR = 16
 UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9}
 
-Check = Callable[[Any, str], Any]
-"""Returns a value; raises OptionError if it is wrong, by the option's name."""
+Check = Callable[[Any, str], Any]  # returns a value; OptionError, by its name, if it is wrong
 
 
 def _whole(least: float, way_out: str, kind: str = "a whole number") -> Check:
@@ -102,18 +101,12 @@ def _flag(value: Any, name: str) -> bool:
     return bool(value)
 
 
-def _as_given(value: Any, name: str) -> Any:
-    return value
-
-
 def check_factor(factor: Any, name: str = "factor") -> int:
     """Return the factor; OptionError unless it is an even number from 2 to 16."""
-    whole: int = _whole(-inf, "")(factor, name)
-    if not 2 <= whole <= MAX_FACTOR or whole % 2:
-        raise OptionError(
-            f"{name} is {seen(whole)}: give an even number from 2 to {MAX_FACTOR} "
-            "(an odd one has no node on the samples)"
-        )
+    way_out = f"an even number from 2 to {MAX_FACTOR} (an odd one has no node on the samples)"
+    whole: int = _whole(2, way_out)(factor, name)
+    if whole > MAX_FACTOR or whole % 2:
+        raise OptionError(f"{name} is {seen(whole)}: give {way_out}")
     return whole
 
 
@@ -133,17 +126,16 @@ def check_path(path: Any, name: str) -> Path:
 
 
 def check_network(network: Any) -> None:
-    """Raise OptionTypeError if ``network`` cannot be called."""
+    """Raise OptionTypeError if it cannot be called."""
     if not callable(network):
         raise OptionTypeError(f"network is {seen(network)}: give one from load_network()")
 
 
 def check_progress(progress: Any) -> None:
-    """Raise OptionTypeError if ``progress`` is neither None nor callable."""
+    """Raise OptionTypeError if it is neither None nor callable."""
     if progress is not None and not callable(progress):
-        raise OptionTypeError(
-            f"progress is {seen(progress)}: give a function of (done, total), in thousandths"
-        )
+        way_out = "give a function of (done, total), in thousandths"
+        raise OptionTypeError(f"progress is {seen(progress)}: {way_out}")
 
 
 def check_goal(
@@ -159,26 +151,23 @@ def check_goal(
         raise OptionError(
             f"{names[0]} {seen(error)} and {names[1]} {seen(triangles)}: give only one of them"
         )
-    return (
-        OPTIONS["simplify"].check(error, names[0]),
-        OPTIONS["triangles"].check(triangles, names[1]),
-    )
+    error = OPTIONS["simplify"].check(error, names[0])
+    return error, OPTIONS["triangles"].check(triangles, names[1])
 
 
-def parse_numbers(text: str) -> tuple[float, ...]:
-    """Parse one number, or three separated by commas."""
-    with suppress(ValueError):
-        if len(numbers := tuple(map(float, text.split(",")))) in (1, 3):
-            return numbers
-    raise ValueError("give one number, or three separated by commas")
+def _parse_numbers(counts: tuple[int, ...], way_out: str) -> Callable[[str], tuple[float, ...]]:
+    """Return a parser of numbers separated by commas."""
+
+    def parse(text: str) -> tuple[float, ...]:
+        with suppress(ValueError):
+            if len(numbers := tuple(map(float, text.split(",")))) in counts:
+                return numbers
+        raise ValueError(f"give {way_out}")
+
+    return parse
 
 
-def parse_direction(text: str) -> tuple[float, ...]:
-    """Parse nine numbers separated by commas."""
-    with suppress(ValueError):
-        if len(numbers := tuple(map(float, text.split(",")))) == 9:
-            return numbers
-    raise ValueError("give nine numbers separated by commas, row by row")
+_one_or_three = _parse_numbers((1, 3), "one number, or three separated by commas")
 
 
 def parse_label(text: str) -> int | str:
@@ -194,38 +183,23 @@ def parse_labels(text: str) -> str | list[int | str]:
 def parse_size(text: str) -> int:
     """Parse a number of bytes, such as "1500M" or "4G"; the units are powers of ten."""
     number, unit = (text, "") if text[-1:].isdigit() else (text[:-1], text[-1:].upper())
-    try:
-        size = int(float(number) * UNITS[unit])
-    except (KeyError, ValueError, OverflowError):
-        size = 0
-    if size <= 0:
-        raise ValueError("give a number of bytes such as 1500M or 4G")
-    return size
+    with suppress(KeyError, ValueError, OverflowError):
+        if (size := int(float(number) * UNITS[unit])) > 0:
+            return size
+    raise ValueError("give a number of bytes such as 1500M or 4G")
 
 
 class Option(NamedTuple):
-    """A row of the table; ``name`` is its name in Python and in the lists of a batch.
+    """A row of the table."""
 
-    Attributes
-    ----------
-    check : callable
-        Checks a value that is not None.
-    parse : type or callable
-        Makes the value of text on the command line; ValueError says what to give instead.
-    choices : tuple of str
-        All values, if there are only some.
-    off : str
-        The name of a flag's opposite on the command line.
-    """
-
-    name: str
+    name: str  # in Python and in the lists of a batch
     default: Any
     help: str
-    check_value: Check
-    parse: Callable[[str], Any]
+    check_value: Check  # of a value that is not None
+    parse: Callable[[str], Any]  # of text; ValueError says what to give instead
     metavar: str | None = None
-    choices: tuple[str, ...] = ()
-    off: str = ""
+    choices: tuple[str, ...] = ()  # all values, if there are only some
+    off: str = ""  # a flag's opposite on the command line
 
     def check(self, value: Any, name: str = "") -> Any:
         """Return a value, by another name in messages; OptionError if it is wrong."""
@@ -264,14 +238,14 @@ class ReadOptions:
         "between axes; distances are resampled to the finest then. Default: from the file, else "
         "estimated from the values.",
         _numbers((1, 3), "one number, or three"),
-        parse_numbers,
+        _one_or_three,
         metavar="H",
     )
     origin: tuple[float, ...] | None = _option(
         None,
         "World position of sample (0, 0, 0). Default: from the file, else 0,0,0.",
         _numbers((1, 3), "one number, or three"),
-        parse_numbers,
+        _one_or_three,
         metavar="X,Y,Z",
     )
     direction: tuple[float, ...] | None = _option(
@@ -280,7 +254,7 @@ class ReadOptions:
         "mirrored rotation, as nine numbers with commas, row by row. Files of other formats than "
         "NumPy, TIFF, HDF5 and Zarr state it.",
         _numbers((9,), "nine numbers, row by row"),
-        parse_direction,
+        _parse_numbers((9,), "nine numbers separated by commas, row by row"),
         metavar="MATRIX",
     )
     axes: str | None = _choice(
@@ -341,9 +315,8 @@ class ReadOptions:
         if self.label is not None and self.level is not None:
             raise OptionError(f"label {self.label} and level {self.level:g}: give only one of them")
         if self.label is not None and self.field not in (AUTO, MASK):
-            raise OptionError(
-                f"label {self.label} and field {self.field}: the samples of a label are a mask"
-            )
+            said = f"label {self.label} and field {self.field}"
+            raise OptionError(f"{said}: the samples of a label are a mask")
 
     def reading(self) -> dict[str, Any]:
         """Return the keywords of ``read_grid``."""
@@ -351,8 +324,7 @@ class ReadOptions:
 
     def values(self) -> Values:
         """Return what the values are: keywords of ``make_grid``."""
-        kept = {name: getattr(self, name) for name in Values.__annotations__}
-        return cast(Values, kept)
+        return cast(Values, {name: getattr(self, name) for name in Values.__annotations__})
 
 
 @dataclass(frozen=True)
@@ -408,7 +380,6 @@ class ConvertOptions(ReadOptions):
     )
 
     def __post_init__(self) -> None:
-        """Check the values; OptionError names the first that is wrong, or contradicts another."""
         super().__post_init__()
         if self.simplifies:
             check_goal(self.simplify, self.triangles, ("simplify", "triangles"))
@@ -442,7 +413,7 @@ class NetworkOptions:
     model: str | None = _option(
         None,
         "Use the network in this ONNX file instead of --quality.",
-        _as_given,
+        lambda value, name: value,
         metavar="FILE",
     )
     device: str = _choice(

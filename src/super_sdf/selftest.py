@@ -8,8 +8,10 @@ from __future__ import annotations
 import platform
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,13 +22,7 @@ from .grid.sdf_grid import make_grid
 from .machine.extras import EXTRAS, how_to_install, missing_modules
 from .machine.memory import free_memory
 from .network.device import available_devices, check_cuda, describe_gpu, onnxruntime_version
-from .network.network import (
-    MASK_MODEL,
-    NO_NETWORKS,
-    float32_name,
-    load_network,
-    shipped_models,
-)
+from .network.network import MASK_MODEL, NO_NETWORKS, float32_name, load_network, shipped_models
 from .options import AUTO, FLOAT32, MASK
 from .steps.nodes import block_offsets
 from .steps.survey import survey
@@ -48,23 +44,18 @@ class Finding:
     figures: Mapping[str, float] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Ball:
-    """The inputs of a network for a ball, the exact distances (D, Q), and how far it may be off.
-
-    The last two are in voxels.
-    """
+class Ball(NamedTuple):
+    """A ball as the inputs of a network."""
 
     inputs: tuple[FloatArray, IntArray, IntArray, FloatArray]
-    exact: FloatArray
-    allowed: float
+    exact: FloatArray  # distances (D, Q) in voxels
+    allowed: float  # how far off a network may be, in voxels
 
 
 def run_checks(device: str = AUTO) -> Iterator[Finding]:
     """Run all checks and yield their results.
 
-    Without CUDA, the device "cuda" is a failure, and so is "auto" if the installed onnxruntime was
-    built for CUDA; "cpu" skips it.
+    Without CUDA "cuda" is a failure, and "auto" if onnxruntime was built for CUDA; "cpu" skips it.
     """
     yield check_versions()
     yield check_memory()
@@ -92,18 +83,15 @@ def check_versions() -> Finding:
     )
     if not (is_installed("onnxruntime") and is_installed("onnxruntime-gpu")):
         return Finding(OK, "versions", says)
-    remedy = "uninstall both, then install one"
-    says += f"; onnxruntime and onnxruntime-gpu are both installed: {remedy}"
+    says += "; onnxruntime and onnxruntime-gpu are both installed: uninstall both, then install one"
     return Finding(FAILED, "versions", says)
 
 
 def is_installed(package: str) -> bool:
     """Return whether a package is installed, by its metadata."""
-    try:
-        version(package)
-    except PackageNotFoundError:
-        return False
-    return True
+    with suppress(PackageNotFoundError):
+        return bool(version(package))
+    return False
 
 
 def check_memory() -> Finding:
@@ -180,8 +168,7 @@ def judge(
 
 def check_extra(name: str, modules: tuple[str, ...]) -> Finding:
     """Report whether the modules of an extra are installed."""
-    missing = missing_modules(modules)
-    if missing:
+    if missing := missing_modules(modules):
         says = f"no {', '.join(missing)}: {how_to_install(name)}"
         return Finding(MISSING, f"extra {name}", says)
     return Finding(OK, f"extra {name}", ", ".join(modules))

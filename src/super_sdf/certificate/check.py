@@ -108,20 +108,19 @@ class Certificate:
             f"samples: {len(touching.values):,} exact near the surface, {touching.cut_off:,} cut "
             f"off and {touching.noisy:,} noisy left out",
         ]
-        return [*lines, *self._residual_lines(), *self._fault_lines()]
-
-    def _residual_lines(self) -> list[str]:
-        if not self.has_evidence:
-            return ["residual: unknown, since no sample is exact"]
-        figures = self.touching.summary()
-        at = ", ".join(f"{x:.6g}" for x in figures["largest_at"])
-        return [
-            f"residual in voxels: mean {figures['mean']:.4f}, 99th percentile "
-            f"{figures['p99']:.4f}, largest {figures['largest_signed']:+.4f} at ({at})",
-            f"above {NOTICEABLE:g} voxel: {figures['share_above_tenth']:.2%} of the samples "
-            f"({figures['share_not_touching']:.2%} not touching, "
-            f"{figures['share_pierced']:.2%} pierced)",
-        ]
+        if self.has_evidence:
+            figures = touching.summary()
+            at = ", ".join(f"{x:.6g}" for x in figures["largest_at"])
+            lines += [
+                f"residual in voxels: mean {figures['mean']:.4f}, 99th percentile "
+                f"{figures['p99']:.4f}, largest {figures['largest_signed']:+.4f} at ({at})",
+                f"above {NOTICEABLE:g} voxel: {figures['share_above_tenth']:.2%} of the samples "
+                f"({figures['share_not_touching']:.2%} not touching, "
+                f"{figures['share_pierced']:.2%} pierced)",
+            ]
+        else:
+            lines.append("residual: unknown, since no sample is exact")
+        return [*lines, *self._fault_lines()]
 
     def _fault_lines(self) -> list[str]:
         """Return the faults in one line, and what was not looked for."""
@@ -147,10 +146,7 @@ class Certificate:
         return "; ".join([residual, *(self.faults() or ["no faults"])])
 
     def residuals_at(self, vertices: NDArray[Any]) -> FloatArray:
-        """Return the residual at positions on the mesh, (n,), in voxels; NaN where it is unknown.
-
-        See ``touching.vertex_residuals``.
-        """
+        """Return ``touching.vertex_residuals`` at positions on the mesh."""
         return vertex_residuals(vertices, self.touching, self.grid)
 
 
@@ -197,18 +193,8 @@ def check_files(
 ) -> Certificate:
     """Check a mesh file against the grid file that it was made from; see ``check_mesh``.
 
-    Parameters
-    ----------
-    mesh, grid : path
-    options : ConvertOptions
-        Those that the mesh was made with: how the grid is read, the offset, the memory bound.
-    kept : Kept, optional
-        What the conversion kept, instead of reading the files again.
-
-    Raises
-    ------
-    SuperSdfError
-        As ``read_mesh``, ``read_grid`` and ``check_mesh`` raise it.
+    ``options`` are those that the mesh was made with: how the grid is read, the offset, the memory
+    bound. What the conversion ``kept`` is used instead of reading the files again.
     """
     kept = read_for_check(mesh, grid, options, kept)
     return check_kept(kept, options, intersections=intersections, processes=processes)
@@ -230,23 +216,10 @@ def check_mesh(
 ) -> Certificate:
     """Check a mesh against the grid that it was made from.
 
-    Parameters
-    ----------
-    mesh : Mesh
-        Vertices at the same position must be one vertex, as ``read_mesh`` returns them.
-    grid : SdfGrid
-        Coarse signed distances.
-    options : ConvertOptions
-        Of these: the offset and the memory bound.
-    intersections : bool
-        Count self-intersections, which takes up to half of the time.
-
-    Raises
-    ------
-    GridError
-        If the grid has no surface at the offset.
-    OutOfMemoryError
-        If the search trees would not fit in memory.
+    Vertices at the same position must be one vertex, as ``read_mesh`` returns them. Of the options
+    the offset and the memory bound count. To count self-intersections takes up to half of the time.
+    GridError if the grid has no surface at the offset; OutOfMemoryError if the search trees would
+    not fit in memory.
     """
     return check_kept(Kept(grid, mesh), options, intersections=intersections)
 

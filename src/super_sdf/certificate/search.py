@@ -20,6 +20,7 @@ from ..errors import SuperSdfError
 from ..machine.pool import Death, Pool
 from ..machine.serving import Work
 from ..mesh import Mesh
+from ..truth.mesh_files import without_unused
 from ..truth.solid import Distances, Points, Solid
 
 FACES_IN_SLAB = 1 << 19
@@ -55,7 +56,8 @@ def search(
 
     Slabs look up to the distance ``reach``; points farther away are looked up in the whole mesh.
     """
-    slabs = MeshSlabs(mesh, points, reach, counts=intersections and can_count())
+    can_count = hasattr(igl.predicates, "find_self_intersections")  # in this version of libigl
+    slabs = MeshSlabs(mesh, points, reach, counts=intersections and can_count)
     total, n = 0, len(points)
     distances, feet, cosines = np.empty(n), np.empty((n, 3)), np.empty(n)
     for rows, part in _search_all(slabs, min(processes, len(slabs))):
@@ -85,11 +87,6 @@ def self_intersections(mesh: Mesh) -> int | None:
     return search(mesh, np.empty((0, 3)), 0.0, intersections=True).intersections
 
 
-def can_count() -> bool:
-    """Return whether this version of libigl finds self-intersections."""
-    return hasattr(igl.predicates, "find_self_intersections")
-
-
 class MeshSlabs:
     """A queue of slabs along the longest axis, in which about equally many triangles begin.
 
@@ -115,17 +112,9 @@ class MeshSlabs:
         near = (self.low < last + self.reach) & (self.high >= first - self.reach)
         along = self.points[:, self.axis]
         rows = np.flatnonzero((along >= first) & (along < last))
-        mesh = _part_of(self.mesh, np.flatnonzero(near))
+        mesh = without_unused(self.mesh.vertices, self.mesh.faces[near])
+        mesh = Mesh(mesh.vertices.astype(np.float64), mesh.faces)
         return MeshSlab(mesh, self.axis, first, last, self.points[rows], rows, self.counts)
-
-
-def _part_of(mesh: Mesh, rows: NDArray[np.intp]) -> Mesh:
-    """Return some of a mesh's triangles with vertices of their own, float64."""
-    faces = mesh.faces[rows]
-    used = np.zeros(len(mesh.vertices), bool)
-    used[faces] = True
-    numbers = np.cumsum(used, dtype=np.int32) - 1
-    return Mesh(mesh.vertices[used].astype(np.float64), numbers[faces])
 
 
 def _search_all(slabs: MeshSlabs, processes: int) -> Iterator[tuple[NDArray[np.intp], Found]]:

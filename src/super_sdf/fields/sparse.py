@@ -38,12 +38,7 @@ LONGEST = 1 << 20  # samples along an axis
 HEAD = ("version", "shape", "factor", "spacing", "origin", "direction", "offset", "leaves")
 LISTS = ("voxels", "sample_voxels", "sample_distances", "border_inside")
 KEYS = (*HEAD, "values", *LISTS)
-
-
-def exact_type(voxel_size: float) -> type[np.float32] | type[np.float64]:
-    """Return the type in which world units are exact: float32 if they only change exponents."""
-    power = math.frexp(voxel_size)[0] == 0.5 and 1e-20 < voxel_size < 1e20
-    return np.float32 if power else np.float64
+NOT_FINITE = "not all values are finite"
 
 
 class SparseWriter:
@@ -92,7 +87,9 @@ class SparseWriter:
 
     def _begin(self, field: FineField) -> None:
         grid, side = field.placed, field.factor + 1
-        exact = exact_type(grid.voxel_size)
+        # float32 is exact where world units only change exponents
+        is_power = math.frexp(grid.voxel_size)[0] == 0.5 and 1e-20 < grid.voxel_size < 1e20
+        exact = np.float32 if is_power else np.float64
         self.types = {**dict.fromkeys(LISTS, np.int32), "values": exact, "sample_distances": exact}
         head = (
             *(VERSION, field.shape, field.factor),
@@ -138,10 +135,8 @@ class NoSamples(SamplePlanes):
 
     def read(self, first: int, last: int) -> NDArray[Any]:
         """Raise FileError: there is nothing to read."""
-        raise FileError(
-            f"{self.name} holds the refined field without the coarse samples: read "
-            "those from their own file"
-        )
+        said = f"{self.name} holds the refined field without the coarse samples"
+        raise FileError(f"{said}: read those from their own file")
 
 
 def read_field(path: str | Path) -> FineField:
@@ -185,29 +180,25 @@ class _Reader:
     def read(self) -> FineField:
         missing = [key for key in KEYS if key not in self.members]
         if missing:
-            raise FileError(f"{self.name} is no refined field: it has no key {missing[0]!r}")
+            raise self._no_field(f"it has no key {missing[0]!r}")
         version = int(self._array("version", "iu", ()))
         if version != VERSION:
-            raise FileError(
-                f"{self.name} has format version {version}, this program reads {VERSION}: use a "
-                "newer one"
-            )
+            said = f"has format version {version}, this program reads {VERSION}"
+            raise FileError(f"{self.name} {said}: use a newer one")
         shape = tuple(map(int, self._array("shape", "iu", (3,))))
         if not 2 <= min(shape) <= max(shape) <= LONGEST:
-            raise FileError(f"{self.name} is no refined field: its grid has the shape {shape}")
+            raise self._no_field(f"its grid has the shape {shape}")
         try:
             factor, grid = check_factor(int(self._array("factor", "iu", ()))), self._grid(shape)
         except (GridError, OptionError) as error:
-            raise FileError(f"{self.name} is no refined field: {error}") from None
+            raise self._no_field(str(error)) from None
         voxels = self._voxels("voxels", shape)
         if not len(voxels):
-            raise FileError(f"{self.name} is no refined field: it has no blocks")
+            raise self._no_field("it has no blocks")
         blocks = self._blocks(len(voxels), factor, grid)
         parts = share_parts(neighbour_table(voxels, shape))
         if not copies_agree(blocks, parts, factor):
-            raise FileError(
-                f"{self.name}[values] is damaged: blocks differ at nodes that they share"
-            )
+            raise self._damaged("values", "blocks differ at nodes that they share")
         samples = self._voxels("sample_voxels", shape)
         distance = self._array("sample_distances", "f", (len(samples),))
         return FineField(
@@ -230,9 +221,7 @@ class _Reader:
         at_border = ((voxels == 0) | (voxels == np.array(shape) - 1)).any(1)
         numbers = (np.ravel_multi_index(tuple(ijk.T), shape) for ijk in (voxels, blocks))
         if not at_border.all() or np.isin(*numbers).any():
-            raise FileError(
-                f"{self.name}[border_inside] is damaged: not all are border voxels without a block"
-            )
+            raise self._damaged("border_inside", "not all are border voxels without a block")
         return voxels
 
     def _grid(self, shape: tuple[int, ...]) -> SdfGrid:
@@ -250,9 +239,7 @@ class _Reader:
         inside = ((voxels >= 0) & (voxels < shape)).all()
         number = (voxels[:, 0] * shape[1] + voxels[:, 1]) * shape[2] + voxels[:, 2]
         if not inside or (np.diff(number) <= 0).any():
-            raise FileError(
-                f"{self.name}[{key}] is damaged: its voxels are not in order in the grid"
-            )
+            raise self._damaged(key, "its voxels are not in order in the grid")
         return np.ascontiguousarray(voxels, np.int32)
 
     def _blocks(self, count: int, factor: int, grid: SdfGrid) -> FloatArray:
@@ -268,11 +255,14 @@ class _Reader:
             values = _in_half_voxels(np.frombuffer(data, dtype), grid)
             blocks[:, rows] = values.reshape(-1, nodes).T
         if not np.isfinite(blocks).all():
-            raise self._not_finite("values")
+            raise self._damaged("values", NOT_FINITE)
         return blocks
 
-    def _not_finite(self, key: str) -> FileError:
-        return FileError(f"{self.name}[{key}] is damaged: not all values are finite")
+    def _no_field(self, why: str) -> FileError:
+        return FileError(f"{self.name} is no refined field: {why}")
+
+    def _damaged(self, key: str, why: str) -> FileError:
+        return FileError(f"{self.name}[{key}] is damaged: {why}")
 
     def _array(self, key: str, kinds: str, shape: tuple[int | None, ...]) -> NDArray[Any]:
         """Return an array of one of some kinds and of a shape, in which None is any length."""
@@ -280,7 +270,7 @@ class _Reader:
         check_fits(member.header.size, f"{self.name}[{key}]", "read it on a larger machine")
         array = member.array()
         if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise self._not_finite(key)
+            raise self._damaged(key, NOT_FINITE)
         return array
 
     def _open(self, key: str, kinds: str, shape: tuple[int | None, ...]) -> Member:
@@ -294,9 +284,7 @@ class _Reader:
         if not fits or header.dtype.kind not in kinds or header.fortran_order:
             raise FileError(f"{name} is {header}: it belongs to no refined field")
         if header.size != member.left:
-            raise FileError(
-                f"{name} is damaged: its header promises {header}, but {member.left:,} follow"
-            )
+            raise self._damaged(key, f"its header promises {header}, but {member.left:,} follow")
         return member
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from math import prod
@@ -25,12 +24,11 @@ from .sparse import SparseWriter
 
 CHUNK = 1 << 20  # values at a time, but at least a plane
 BYTES = 4  # of a value
-STDERR = 2
 Shape = tuple[int, int, int]
 
 
 class NpyWriter:
-    """Writes the planes of the fine lattice slab by slab to an ``.npy`` file."""
+    """Writes the planes of the fine lattice, slab by slab."""
 
     def __init__(self, part: Path, shape: Shape, files: ExitStack) -> None:
         self.file: IO[bytes] = files.enter_context(part.open("wb"))
@@ -67,6 +65,7 @@ class VtiWriter:
     def finish(self) -> None:
         """Write the file."""
         from vtkmodules.util.numpy_support import numpy_to_vtk
+        from vtkmodules.vtkCommonCore import vtkObject
         from vtkmodules.vtkCommonDataModel import vtkImageData
         from vtkmodules.vtkCommonMisc import vtkErrorCode
         from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
@@ -85,8 +84,10 @@ class VtiWriter:
         writer.SetInputData(image)
         writer.EncodeAppendedDataOff()
         writer.SetCompressorTypeToNone()
-        with _discarded_stderr():  # VTK's log
-            written = writer.Write()
+        logs = vtkObject.GetGlobalWarningDisplay()
+        vtkObject.GlobalWarningDisplayOff()
+        written = writer.Write()
+        vtkObject.SetGlobalWarningDisplay(logs)
         if not written:
             reason = vtkErrorCode.GetStringFromErrorCode(writer.GetErrorCode())
             raise OSError(f"VTK says {reason!r}")
@@ -100,24 +101,6 @@ def _own_planes(field: FineField) -> Iterator[tuple[int, FloatArray]]:
     step = max(CHUNK // (lattice.shape[1] * lattice.shape[2]), 1)
     for start in range(first, last, step):
         yield start, lattice.read(start, min(start + step, last))
-
-
-@contextmanager
-def _discarded_stderr() -> Iterator[None]:
-    """Discard what libraries in C++ write to file descriptor 2, if there is one."""
-    try:
-        kept = os.dup(STDERR)
-    except OSError:  # it is closed already
-        yield
-        return
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, STDERR)
-        yield
-    finally:
-        os.dup2(kept, STDERR)
-        os.close(kept)
-        os.close(nowhere)
 
 
 WRITERS: dict[str, Any] = {".npz": SparseWriter, ".npy": NpyWriter, ".vti": VtiWriter}
@@ -166,14 +149,11 @@ def check_field_fits(path: Path, shape: Shape, max_memory: int | None = None) ->
 
 
 class FieldFile:
-    """A file of a field that is being written; errors name it.
-
-    ``place`` has spacing and origin of the fine lattice, once there is a field.
-    """
+    """A file of a field that is being written; errors name it."""
 
     def __init__(self, path: Path, shape: Shape, writer: Any) -> None:
         self.path, self.shape, self.writer = path, shape, writer
-        self.place: dict[str, Any] = {}
+        self.place: dict[str, Any] = {}  # spacing and origin of the lattice, once there is a field
 
     def add(self, field: FineField) -> None:
         """Write the own planes of a slab's field."""
@@ -190,7 +170,7 @@ class FieldFile:
             self.writer.finish()
 
     def report(self) -> dict[str, Any]:
-        """Return what was written, as it stands in JSON."""
+        """Return what was written, for JSON."""
         return {"path": str(self.path), "shape": list(self.shape), **self.place}
 
 

@@ -39,10 +39,7 @@ MAX_SHOWN = 60  # characters of metadata in messages
 
 
 def one_voxel() -> dict[str, Any]:
-    """Return the inputs of a trial run: one voxel without neighbours, and two offsets.
-
-    There are two offsets so that an output with its axes swapped is noticed.
-    """
+    """Return the inputs of a trial run; two offsets, to notice an output with its axes swapped."""
     return {
         "patches": np.zeros((1, 27), np.float32),
         "neighbours": np.full((1, 27), -1, np.int32),

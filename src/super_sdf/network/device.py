@@ -12,7 +12,7 @@ import io
 import subprocess
 import sys
 from collections.abc import Mapping
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -33,16 +33,12 @@ CUDA_OPTIONS = {
 
 @dataclass(frozen=True, eq=False)
 class OpenedSession:
-    """An open session, where it runs, and what the user should know about the choice.
-
-    ``failure`` is the error of the trial run, empty if it succeeded: the file may be a network with
-    another contract.
-    """
+    """An open session, where it runs, and what the user should know about the choice."""
 
     session: ort.InferenceSession
     device: str
     notes: tuple[str, ...] = ()
-    failure: str = ""
+    failure: str = ""  # of the trial run: the file may be a network with another contract
 
 
 def open_session(
@@ -144,10 +140,9 @@ def check_cuda() -> None:
 
 
 def _missing_library() -> str | None:
-    """Return the first library that onnxruntime's CUDA provider needs and that is not installed.
+    """Return the first library that onnxruntime's CUDA provider lacks, by trying to load it.
 
-    This tries to load the provider, since each version needs other libraries. None if nothing is
-    missing, or on systems whose loader does not name files (Windows).
+    None if nothing is missing, or on systems whose loader does not name files (Windows).
     """
     if hasattr(ort, "preload_dlls"):  # since 1.21; finds libraries that pip installed
         with redirect_stdout(io.StringIO()):  # it prints
@@ -168,11 +163,10 @@ def has_gpu() -> bool:
 
 def has_driver() -> bool:
     """Return whether the NVIDIA driver's library can be loaded."""
-    try:
+    with suppress(OSError):
         ctypes.CDLL(DRIVER)
-    except OSError:
-        return False
-    return True
+        return True
+    return False
 
 
 def describe_gpu() -> str | None:

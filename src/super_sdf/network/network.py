@@ -10,7 +10,7 @@ import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -57,37 +57,17 @@ KIND_MODELS = (MASK_MODEL, NOISY_MODEL)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Network:
-    """A loaded network; safe to call from several threads.
-
-    Attributes
-    ----------
-    card : dict
-        The file's metadata: receptive field, training factors, data, commit, accuracy.
-    device : str
-        Where it runs: "cpu" or "cuda".
-    symmetries : int
-        Number of symmetries of the cube over which the values are averaged.
-    threads : int
-        CPU threads; 0 for one per core.
-    notes : tuple of str
-        What the user should know about device and threads.
-    pace : Pace
-        The time that runs take, measured in earlier ones.
-    shipped : bool
-        Whether it came with the package and was trained on distances.
-    reports_progress : bool
-        True: a call takes ``progress``, see ``decoder.Decoder``.
-    """
+    """A loaded network; safe to call from several threads."""
 
     session: ort.InferenceSession
-    card: Mapping[str, Any]
-    device: str
-    symmetries: int = 1
-    threads: int = 0
-    notes: tuple[str, ...] = ()
-    pace: Pace = field(default_factory=Pace, repr=False)
-    shipped: bool = False
-    reports_progress: ClassVar[bool] = True
+    card: Mapping[str, Any]  # receptive field, training factors, data, commit, accuracy
+    device: str  # "cpu" or "cuda"
+    symmetries: int = 1  # of the cube, over which the values are averaged
+    threads: int = 0  # of the CPU; 0 for one per core
+    notes: tuple[str, ...] = ()  # what the user should know about device and threads
+    pace: Pace = field(default_factory=Pace, repr=False)  # of earlier runs
+    shipped: bool = False  # whether it came with the package and was trained on distances
+    reports_progress: ClassVar[bool] = True  # a call takes ``progress``, see ``decoder.Decoder``
 
     def __repr__(self) -> str:
         threads = self.threads or "all"
@@ -139,7 +119,8 @@ class Network:
         mean = np.zeros((len(voxels), len(offsets)), np.float32)
         for number, symmetry in enumerate(cube_symmetries()[: self.symmetries]):
             turned, turned_table, moved = turn(symmetry, patches, table, offsets)
-            values = self._run(turned, turned_table, voxels, moved, self._within(progress, number))
+            within = progress and partial(_within, progress, number, self.symmetries)
+            values = self._run(turned, turned_table, voxels, moved, within)
             with np.errstate(invalid="ignore"):  # the caller checks for infinities
                 values /= self.symmetries
                 mean += values
@@ -154,12 +135,10 @@ class Network:
         offsets: FloatArray,
         progress: ShareCallback | None,
     ) -> FloatArray:
-        """Run the session once; only a long run is timed, and reports its progress.
-
-        With fewer voxels than offsets, the order of onnxruntime's sums would depend on the number
-        of threads, so voxels are repeated until there are as many as offsets.
-        """
+        """Run the session once; only a long run is timed, and reports its progress."""
         count = len(voxels)
+        # With fewer voxels than offsets, the order of onnxruntime's sums would depend on the number
+        # of threads.
         voxels = np.resize(voxels, max(count, len(offsets)))
         feeds = dict(zip(INPUTS, (patches, table, voxels, offsets)))
         work = work_of(len(patches), len(voxels), len(offsets))
@@ -172,10 +151,6 @@ class Network:
         values = self._run_session(feeds, watch)
         self.pace.learn(work, time.perf_counter() - begun)
         return values[:count]
-
-    def _within(self, progress: ShareCallback | None, number: int) -> ShareCallback | None:
-        """Return a callback for the share of a run among those over all symmetries."""
-        return progress and (lambda share: progress((number + share) / self.symmetries))
 
     def _run_session(self, feeds: Mapping[str, Any], poll: Poll = lambda: None) -> FloatArray:
         """Run the session on its device."""
@@ -191,6 +166,11 @@ class Network:
         offsets = len(part["offsets"])  # at least this many voxels are decoded, see _run
         work = work_of(rows, max(len(part["voxels"]), offsets), offsets)
         self.pace.learn(work, time.perf_counter() - begun)
+
+
+def _within(progress: ShareCallback, number: int, count: int, share: float) -> None:
+    """Report the share of a run, one of ``count``, among all of them."""
+    progress((number + share) / count)
 
 
 def crop_inputs(feeds: Mapping[str, Any], rows: int) -> dict[str, Any]:
@@ -211,7 +191,7 @@ def shipped_models() -> dict[str, Path]:
 
 
 def int8_name(name: str) -> str:
-    """Return the name of the int8 variant of a network."""
+    """Return the name of a network's int8 variant."""
     return f"{name}-{INT8}"
 
 
@@ -237,9 +217,8 @@ def find_model(model: str | Path, precision: str = AUTO_PRECISION) -> tuple[Path
     if precision == INT8:
         path = path.with_name(f"{int8_name(path.stem)}.onnx")  # beside the float32 file
         if not os.path.lexists(path):
-            raise OptionError(
-                f"{model} has no int8 variant, {path}: write one with export.quantize"
-            )
+            lacks = f"{model} has no int8 variant, {path}"
+            raise OptionError(f"{lacks}: write one with export.quantize")
     if not os.path.lexists(path):
         names = ", ".join(QUALITIES)
         raise FileError(f"no model {str(model)!r}: give an ONNX file or one of: {names}")
@@ -320,31 +299,23 @@ def network_for(network: Decoder, kind: str) -> Decoder:
 
 @lru_cache(maxsize=4)
 def _load_once(name: str, device: str, threads: int, symmetries: int, precision: str) -> Network:
-    """Load a network for a kind."""
     if name not in shipped_models():
         raise FileError(f"the network {name!r} is missing: {NO_NETWORKS}")
     loaded = load_network(name, device=device, threads=threads, precision=precision)
     return loaded.averaged(symmetries)
 
 
-BALL_SIDE, BALL_CENTRE, BALL_RADIUS = (
-    12,
-    5.63,
-    4.0,
-)  # of a ball, in index units; the centre is not on a sample
+# Of a ball, in index units; the centre is not on a sample.
+BALL_SIDE, BALL_CENTRE, BALL_RADIUS = 12, 5.63, 4.0
 
 
 class Fingerprint(NamedTuple):
-    """What a network computes, and where.
+    """What a network computes, and where."""
 
-    ``digest`` is the SHA-256 of its values on a small ball; ``device`` is "cpu" or "cuda",
-    ``processor`` the model of the processor, and ``precision`` "float32" or "int8".
-    """
-
-    digest: str
-    device: str
+    digest: str  # SHA-256 of its values on a small ball
+    device: str  # "cpu" or "cuda"
     processor: str
-    precision: str
+    precision: str  # "float32" or "int8"
 
 
 def fingerprint_of(model: str, precision: str, device: str) -> Fingerprint:

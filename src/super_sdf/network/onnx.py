@@ -33,8 +33,7 @@ SWITCH = "ORT_DISABLE_TELEMETRY"  # a variable that onnxruntime reads once, when
 def without_telemetry() -> Iterator[None]:
     """Switch off onnxruntime's telemetry while it is imported, unless the user set the variable.
 
-    The variable is removed afterwards, so that child processes see the user's own environment. It
-    has no effect if other code imported onnxruntime before.
+    It is removed afterwards, so that child processes see the user's own environment.
     """
     if SWITCH in os.environ:
         yield
@@ -47,11 +46,7 @@ def without_telemetry() -> Iterator[None]:
 
 
 def first_line(error: Exception) -> str:
-    """Return the message of an onnxruntime error in one line.
-
-    For a failure of CUDA this is the part of interest in a long line of source files and template
-    arguments.
-    """
+    """Return the message of an onnxruntime error in one line; of CUDA's, the part of interest."""
     failure = re.search(r"CUDA failure \d+: [^;\n]*", str(error))
     if failure:
         return failure[0].strip()
@@ -122,11 +117,10 @@ def run_bound(
     chunk: int = CUDA_CHUNK,
     poll: Poll = lambda: None,
 ) -> FloatArray:
-    """Run a session with its inputs and its output on a device, and return the output.
+    """Run a session as ``run_on_cpu`` does, with its inputs and its output on a device.
 
     Each input is copied to the device once and the output back once, nothing more. ``chunk`` is the
-    number of rows of the neighbour table per chunk, for networks that have this input. Everything
-    else is as in ``run_on_cpu``.
+    number of rows of the neighbour table per chunk, for networks that have this input.
     """
     options = ort.RunOptions()
     if place == "cuda":
@@ -207,7 +201,7 @@ class Pace:
         self.seconds: float | None = None
 
     def learn(self, work: float, seconds: float) -> None:
-        """Record the seconds that a run took for its work."""
+        """Record a run."""
         self.seconds = seconds / work
 
     def watch(self, work: float, progress: ShareCallback) -> Callable[[], None]:

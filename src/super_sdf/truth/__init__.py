@@ -1,4 +1,1 @@
-"""Exact distances to meshes, for ``sample``, ``evaluate`` and training; needs the extra ``eval``.
-
-It may import ``grid``, ``mesh`` and ``machine``.
-"""
+"""Exact distances to meshes, for ``sample``, for measuring and for training; extra ``eval``."""

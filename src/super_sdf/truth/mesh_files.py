@@ -37,16 +37,9 @@ def read_mesh(path: str | Path, max_memory: int | None = None) -> Mesh:
     """Read any mesh file that trimesh reads, with merged float64 vertices.
 
     ``max_memory`` is how many bytes this process may hold, by default a share of the free memory.
-
-    Raises
-    ------
-    FileError
-        If the file is missing or no mesh can be read from it.
-    OutOfMemoryError
-        If it is an archive, such as ``.3mf``, that unpacks to more than fits in memory.
-    MeshError
-        If it has no triangles, faces with missing vertices, or coordinates that are not finite or
-        larger than ``LARGEST_COORDINATE``.
+    FileError if no mesh can be read from the file; OutOfMemoryError if it is an archive, such as
+    ``.3mf``, that unpacks to more than fits in memory; MeshError if it has no triangles, faces with
+    missing vertices, or coordinates that are not finite or larger than ``LARGEST_COORDINATE``.
     """
     path = check_regular_file(path)
     _check_archive(path, max_memory)
@@ -56,34 +49,32 @@ def read_mesh(path: str | Path, max_memory: int | None = None) -> Mesh:
     if faces.min() < 0 or faces.max() >= len(vertices):
         wrong = faces.min() if faces.min() < 0 else faces.max()
         raise MeshError(f"{path} has a face of vertex {wrong}, of {len(vertices):,}: repair it")
-    used = vertices[used_vertices(len(vertices), faces)]
-    if not np.isfinite(used).all():
+    mesh = without_unused(vertices, faces)
+    if not np.isfinite(mesh.vertices).all():
         raise MeshError(f"{path} holds coordinates that are not finite: repair it first")
-    largest = np.abs(used).max()
+    largest = np.abs(mesh.vertices).max()
     if largest > LARGEST_COORDINATE:
         raise MeshError(f"{path} reaches to {largest:.3g}: scale it to coordinates under 1e30")
-    return merged(Mesh(vertices, faces.astype(np.int32)))
+    return merged(mesh)
 
 
-def used_vertices(count: int, faces: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return which of ``count`` vertices are corners of faces (m, 3), (count,)."""
-    used = np.zeros(count, bool)
+def without_unused(vertices: NDArray[Any], faces: NDArray[Any]) -> Mesh:
+    """Return a mesh of these faces, and of the vertices that are corners of them, in order."""
+    used = np.zeros(len(vertices), bool)
     used[faces] = True
-    return used
+    return Mesh(vertices[used], (np.cumsum(used, dtype=np.int32) - 1)[faces])
 
 
 def merged(mesh: Mesh) -> Mesh:
-    """Merge vertices at the same position and drop unused ones.
+    """Merge vertices within ``MERGE_DISTANCE``, for meshes under 1 that share of their size.
 
-    Vertices within ``MERGE_DISTANCE`` are merged; for meshes smaller than 1, within that share of
-    their size. Unlike in trimesh, normals and textures do not keep vertices separate: a mesh is not
-    open along its seams.
+    Unlike in trimesh, normals and textures do not keep vertices separate: a mesh is not open along
+    its seams. Unused vertices are dropped.
     """
     from trimesh.grouping import unique_rows
 
-    used = used_vertices(len(mesh.vertices), mesh.faces)
-    faces = (np.cumsum(used, dtype=np.int32) - 1)[mesh.faces]
-    vertices = mesh.vertices[used]
+    mesh = without_unused(mesh.vertices, mesh.faces)
+    vertices, faces = mesh.vertices, mesh.faces
     step = MERGE_DISTANCE * min(1.0, float(np.ptp(vertices, axis=0).max()))
     step = max(step, float(np.abs(vertices).max()) * SMALLEST_STEP) or 1.0
     places = np.round(vertices / step).astype(np.int64)
@@ -100,10 +91,7 @@ def are_distinct(rows: NDArray[np.int64]) -> bool:
 
 
 def _check_archive(path: Path, max_memory: int | None) -> None:
-    """Raise OutOfMemoryError if a zip file unpacks to more than fits in memory.
-
-    zipfile reads no more of a member than its entry says.
-    """
+    """Raise OutOfMemoryError if a zip file, by its entries, unpacks to more than fits in memory."""
     bound = memory_bound(max_memory)
     if bound is None or not zipfile.is_zipfile(path):
         return
@@ -121,7 +109,7 @@ def _check_archive(path: Path, max_memory: int | None) -> None:
 
 
 def _load(path: Path) -> tuple[NDArray[np.float64], NDArray[Any]]:
-    """Return vertices (n, 3) and faces (m, 3) as trimesh reads them, unchecked."""
+    """Return vertices (n, 3) and faces (m, 3) as they stand."""
     try:
         plain = read_plain_ply(path) if path.suffix.lower() == ".ply" else None
         return plain or _load_with_trimesh(path)

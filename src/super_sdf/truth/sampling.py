@@ -70,21 +70,9 @@ def fitted_layout(
 ) -> Layout:
     """Return the layout of a grid around a mesh, in the units of the mesh.
 
-    Parameters
-    ----------
-    mesh : Mesh
-        The mesh to sample.
-    n : int, optional
-        Samples along the longest axis of its bounding box. Give this or ``spacing``.
-    spacing : float, optional
-        Distance between samples.
-    padding : float
-        Least number of voxels between the box and the outermost samples.
-
-    Raises
-    ------
-    OptionError
-        If not exactly one of n and spacing is given, or a number is out of range.
+    Give the samples ``n`` along the longest axis of its bounding box, or the ``spacing``.
+    ``padding`` is the least number of voxels between the box and the outermost samples. OptionError
+    if not exactly one of n and spacing is given, or a number is out of range.
     """
     if (n is None) == (spacing is None):
         raise OptionError("give either the number of samples or the spacing")
@@ -127,26 +115,9 @@ def sample_grid(
 ) -> FloatArray:
     """Return the signed distance at every sample of a grid, (nx, ny, nz) float32, negative inside.
 
-    Parameters
-    ----------
-    solid : Solid
-        The solid to sample.
-    layout : shape, spacing and origin
-        ``world = origin + spacing * ijk``.
-    band : float
-        Distance in voxels up to which values are exact (to float32); they are clamped there.
-    progress : callable, optional
-        Called with (cubes done, all cubes).
-
-    Raises
-    ------
-    OptionError
-        If the band is under 1.5 voxels, which the pipeline needs.
-    MeshError
-        If the distances would be too small or too large for float32, or the grid is so far from
-        the origin that float64 does not resolve neighbouring samples.
-    OutOfMemoryError
-        If the grid would not fit in memory.
+    ``band`` is the distance in voxels up to which values are exact (to float32); they are clamped
+    there. ``progress`` is called with (cubes done, all cubes). OptionError if the band is under 1.5
+    voxels, which the pipeline needs; MeshError from ``check_scale``; OutOfMemoryError.
     """
     shape, spacing, _ = layout
     check_numbers(band=band)
@@ -157,7 +128,10 @@ def sample_grid(
     corners = np.argwhere(np.ones([-(-n // EDGE) for n in shape], bool)) * EDGE
     for start in range(0, len(corners), CHUNK):
         chunk = corners[start : start + CHUNK]
-        _write_cubes(values, chunk, _sample_cubes(solid, chunk, layout, band * spacing))
+        cubes = _sample_cubes(solid, chunk, layout, band * spacing)
+        for (i, j, k), cube in zip(chunk, cubes):
+            part = values[i : i + EDGE, j : j + EDGE, k : k + EDGE]
+            part[...] = cube[tuple(map(slice, part.shape))]
         if progress:
             progress(min(start + CHUNK, len(corners)), len(corners))
     return values
@@ -168,10 +142,8 @@ def check_scale(layout: Layout) -> None:
     shape, spacing, origin = layout
     reach = spacing * max(shape)
     if not (spacing > SMALLEST and reach < LARGEST):
-        raise MeshError(
-            f"a spacing of {spacing:g} and an extent of {reach:g} are beyond what float32 holds: "
-            "scale the mesh"
-        )
+        said = f"a spacing of {spacing:g} and an extent of {reach:g}"
+        raise MeshError(f"{said} are beyond what float32 holds: scale the mesh")
     away = float(np.abs(origin).max()) + reach
     if np.spacing(away) > POSITION_ERROR * spacing:
         raise MeshError(
@@ -228,9 +200,3 @@ def _signed(solid: Solid, points: Points, spacing: float) -> NDArray[np.float64]
         side = np.concatenate([[False], solid.is_inside(points[first])])
         inside |= side[regions]
     return np.where(inside, -found, found)
-
-
-def _write_cubes(values: FloatArray, corners: NDArray[np.int64], cubes: FloatArray) -> None:
-    for (i, j, k), cube in zip(corners, cubes):
-        part = values[i : i + EDGE, j : j + EDGE, k : k + EDGE]
-        part[...] = cube[tuple(map(slice, part.shape))]

@@ -34,13 +34,10 @@ def normalise(mesh: Mesh) -> Mesh:
 
 
 class Solid:
-    """The solid that a mesh encloses, with search trees for fast queries.
+    """The solid that a mesh, facing outward, encloses, with search trees for fast queries.
 
-    Parameters
-    ----------
-    mesh : Mesh
-        Triangles, facing outward. Where pieces overlap the solid is their union, but distances are
-        to the nearest triangle even if that is inside another piece.
+    Where pieces overlap the solid is their union, but distances are to the nearest triangle even if
+    that is inside another piece.
     """
 
     def __init__(self, mesh: Mesh) -> None:
@@ -128,13 +125,9 @@ def count_unbalanced_edges(faces: NDArray[np.int32]) -> int:
 def load_solid(path: str | Path, *, allow_open: bool = False) -> tuple[Solid, list[str]]:
     """Read a mesh file as a solid; return it with notes on its faults.
 
-    An inverted mesh is reversed; overlapping pieces are united.
-
-    Raises
-    ------
-    FileError, MeshError
-        If it cannot be read, is flat, or is open and ``allow_open`` is not set. With
-        ``allow_open`` the sign comes from the generalised winding number, a guess near the holes.
+    An inverted mesh is reversed; overlapping pieces are united. FileError or MeshError if it cannot
+    be read, is flat, or is open and ``allow_open`` is not set. With ``allow_open`` the sign comes
+    from the generalised winding number, a guess near the holes.
     """
     solid, notes = Solid(read_mesh(path)), []
     low, high = solid.mesh.vertices.min(0), solid.mesh.vertices.max(0)
