@@ -27,7 +27,13 @@ if TYPE_CHECKING:
 NOT_WITH_LABELS = ("save_field", "check", "report", "cluster", "jobs")
 
 
-def upsample(source: str, target: str, chosen: ConvertOptions, options: dict[str, Any], network=None) -> None:
+def upsample(
+    source: str,
+    target: str,
+    chosen: ConvertOptions,
+    options: dict[str, Any],
+    network: Future[Network],
+) -> None:
     """Convert a grid, check its mesh and write its page if asked for, and print the result."""
     run = Upsampling(source, target, chosen, options, network)
     run.convert()
