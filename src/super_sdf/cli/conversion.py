@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -132,6 +133,14 @@ def load_chosen(options: dict[str, Any]) -> Network:
 
     chosen = {name: options[name] for name in ("device", "threads", "precision")}
     return load_network(chosen_model(options), **chosen)
+
+
+def start_loading(options: dict[str, Any]) -> Future[Network]:
+    """Load the network that the options choose in a thread, while other modules are imported."""
+    from ..network.network import load_network
+
+    chosen = {name: options[name] for name in ("device", "threads", "precision")}
+    return ThreadPoolExecutor(1).submit(load_network, chosen_model(options), **chosen)
 
 
 def make_options(options: dict[str, Any]) -> ConvertOptions:

@@ -14,6 +14,7 @@ from .conversion import (
     conversion_options,
     labels_option,
     make_options,
+    start_loading,
 )
 from .view import report_option
 
@@ -68,8 +69,9 @@ def upsample_command(source: str, target: str, **options: Any) -> None:
     """Convert one grid to a mesh."""
     with one_line_errors(target, options["save_field"], options["report"]):
         chosen = make_options(options)
+        network = start_loading(options)
         # here, since help and wrong options do without NumPy
         from .upsampling import upsample, upsample_labels
 
         run = upsample if options["labels"] is None else upsample_labels
-        run(source, target, chosen, options)
+        run(source, target, chosen, options, network)

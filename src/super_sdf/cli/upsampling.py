@@ -27,9 +27,15 @@ if TYPE_CHECKING:
 NOT_WITH_LABELS = ("save_field", "check", "report", "cluster", "jobs")
 
 
-def upsample(source: str, target: str, chosen: ConvertOptions, options: dict[str, Any]) -> None:
+def upsample(
+    source: str,
+    target: str,
+    chosen: ConvertOptions,
+    options: dict[str, Any],
+    network: Future[Network],
+) -> None:
     """Convert a grid, check its mesh and write its page if asked for, and print the result."""
-    run = Upsampling(source, target, chosen, options)
+    run = Upsampling(source, target, chosen, options, network)
     run.convert()
     with raising_interrupts():
         if options["check"]:
@@ -96,14 +102,14 @@ class Upsampling:
     """One run of the command: its options, its result, and the time of each stage."""
 
     def __init__(
-        self, source: str, target: str, chosen: ConvertOptions, options: dict[str, Any]
+        self, source: str, target: str, chosen: ConvertOptions, options: dict[str, Any], network
     ) -> None:
         watch = Stopwatch()
         self.source, self.target, self.options = source, target, options
         self.chosen, self.model = chosen, chosen_model(options)
         check_arguments(source, target, self.chosen, options)
         watch.lap("start")
-        self.network = load_chosen(options)
+        self.network = network.result()
         watch.lap("load network")
         self.seconds = watch.seconds
         self.result: Conversion

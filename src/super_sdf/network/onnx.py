@@ -17,6 +17,7 @@ import re
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from math import ceil
 from threading import Event, Thread
 from typing import Any
 
@@ -24,6 +25,7 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..errors import DeviceError
+from ..machine.threads import count_cores
 from ..progress import ShareCallback
 
 SWITCH = "ORT_DISABLE_TELEMETRY"  # a variable that onnxruntime reads once, when it is imported
@@ -71,10 +73,10 @@ __all__ = ["ort"]
 SHRINK = "memory.enable_memory_arena_shrinkage"
 SMALL = 20_000  # voxels ...
 SMALL_OUTPUT = 5_000_000  # ... and values of a run after which the arena is not shrunk
-# An optional fifth input of networks: the rows of the neighbour table per chunk. On a CPU what 256
-# rows gather stays in the cache. A GPU waits between chunks, so it gets large ones: this many rows
-# of 27 * 64 gathered floats take 113 MB.
-CHUNK_INPUT, CPU_CHUNK, CUDA_CHUNK = "chunk", 256, 16384
+# An optional fifth input of networks: the rows of the neighbour table per chunk. With fewer rows for
+# each core than this the cores wait for each other, with more what they gather leaves the cache. A
+# GPU waits between chunks, so it gets large ones: of 27 * 64 gathered floats a row, 113 MB.
+CHUNK_INPUT, CORE_CHUNK, CPU_CHUNK, CUDA_CHUNK = "chunk", 512, 4096, 16384
 POLL_INTERVAL = 0.1  # seconds
 
 VALUES_PER_VOXEL = 300  # decoding this many values takes as long as encoding a voxel
@@ -101,13 +103,23 @@ def run_on_cpu(
         binding = session.io_binding()
         for name, array in feeds.items():
             binding.bind_cpu_input(name, array)
-        chunk = ort.OrtValue.ortvalue_from_numpy(np.array([CPU_CHUNK]))
+        rows = cpu_chunk(len(feeds["patches"]), session.get_session_options().intra_op_num_threads)
+        chunk = ort.OrtValue.ortvalue_from_numpy(np.array([rows]))
         if takes_chunk(session):
             binding.bind_ortvalue_input(CHUNK_INPUT, chunk)
         output = session.get_outputs()[0].name
         binding.bind_output(output, "cpu", 0, np.float32, values.shape, values.ctypes.data)
     _run(session, binding, options, "cpu", poll, keep=(feeds, chunk, values))
     return values
+
+
+def cpu_chunk(voxels: int, threads: int) -> int:
+    """Return the rows per chunk for a number of threads, 0 for all cores: chunks of equal size.
+
+    Rows are filled up to whole chunks, by at least one.
+    """
+    most = min(CORE_CHUNK * (threads or count_cores()), CPU_CHUNK)
+    return ceil((voxels + 1) / ceil((voxels + 1) / most))
 
 
 def run_bound(
