@@ -29,6 +29,7 @@ import trimesh
 from super_sdf.machine.threads import count_cores
 from super_sdf.mesh import Mesh
 
+from . import parser_of
 from .mixed_grids import BROKEN, Placed, write_broken, write_mixed
 from .processes import describe_machine
 from .shapes import spread
@@ -142,9 +143,7 @@ def count_equal(place: Place, names: Sequence[str]) -> int:
 
 def main() -> int:
     """Print the machine and a Markdown table; exit code 1 if anything is wrong."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--count", type=int, default=500, help="grids, broken ones not counted")
     parser.add_argument("--sizes", type=int, nargs="+", default=[16, 24, 32, 48, 64, 96, 128])
     parser.add_argument("--kills", type=int, default=3)

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from super_sdf.options import DEFAULT_MESHER, MESHERS
 
+from . import parser_of
 from .processes import Taken, describe_machine, run_python, upsample_words
 
 Plane = Callable[[float, NDArray[np.float64], NDArray[np.float64], int], NDArray[np.float64]]
@@ -178,9 +179,7 @@ def try_dense(name: str, folder: Path, *, follow: bool) -> list[str]:
 
 def parse() -> argparse.Namespace:
     """Parse the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--fields", nargs="*", choices=FIELDS, default=USUAL)
     parser.add_argument("--dense", nargs="*", choices=DENSE, default=tuple(DENSE))
     parser.add_argument("--follow", action="store_true", help="allow what a refusal advises, too")

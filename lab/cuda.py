@@ -9,7 +9,6 @@ from a grid to its mesh. All grids are noisy balls. If CUDA does not run, one li
 
 from __future__ import annotations
 
-import argparse
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -24,6 +23,8 @@ from super_sdf.network.network import Network
 from super_sdf.options import QUALITIES
 from super_sdf.steps.nodes import block_offsets
 from super_sdf.steps.survey import survey
+
+from . import parser_of
 
 RUNS = 3
 SHAPES = 40  # for the memory
@@ -127,7 +128,7 @@ def compare_pipeline(device: str, sizes: Sequence[int]) -> None:
 
 def main() -> None:
     """Print all tables, or one line that says why CUDA does not run."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128, 256])
     parser.add_argument("--device", default="cuda", help="cpu tries this command itself")
     arguments = parser.parse_args()

@@ -9,13 +9,13 @@ number in a sentence between ``<!-- figures: NAME.COLUMN WORDS -->`` and ``<!-- 
 
 from __future__ import annotations
 
-import argparse
 import re
 from collections.abc import Iterator
 from pathlib import Path
 
 from super_sdf.errors import FileError
 
+from . import parser_of
 from .figures import FOLDER
 from .quoted import UNKNOWN, shown
 
@@ -66,9 +66,7 @@ def lines_that_look_back(root: Path = ROOT) -> Iterator[str]:
 
 def main() -> int:
     """Rewrite the documents, or compare them."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--check", action="store_true", help="write nothing")
     parser.add_argument("--figures", type=Path, default=FOLDER, help="folder of the JSON files")
     words = parser.parse_args()

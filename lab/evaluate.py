@@ -15,7 +15,6 @@ earlier evaluation, which is resumed:
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Sequence
@@ -28,6 +27,7 @@ from super_sdf.machine.threads import count_cores
 from super_sdf.mesh import Mesh
 from super_sdf.options import AUTO_PRECISION, DEFAULT_QUALITY, PRECISIONS
 
+from . import parser_of
 from .measuring import NO_SETTING, Task, network_of
 from .methods import FLOOR, METHODS, OURS, make_surface
 from .plots import draw_plots
@@ -258,9 +258,7 @@ def add_jobs(parser: argparse.ArgumentParser) -> None:
 
 def main() -> int:
     """Measure what is missing and report; exit code 1 if a shape was left out."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("meshes", type=Path, nargs="+", help="mesh files, or folders of them")
     parser.add_argument("--out", type=Path, required=True, help="folder for the report")
     parser.add_argument("--sizes", type=int, nargs="+", default=[32, 64, 128])

@@ -13,7 +13,6 @@ disk fills up (a RAM disk, which only root may mount); run again it must be comp
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import random
@@ -33,6 +32,7 @@ from shutil import rmtree
 import numpy as np
 import psutil
 
+from . import parser_of
 from .batch import workers_of
 from .mixed_grids import write_mixed
 from .processes import describe_machine
@@ -255,9 +255,7 @@ def tally(name: str, runs: int, kinds: Sequence[str], once: Callable[[str], Coun
 
 def main() -> int:
     """Run all trials; exit code 1 if any file was incomplete or left over."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--terms", type=int, default=100, help="runs ended by SIGTERM")
     parser.add_argument("--kills", type=int, default=100, help="runs ended by SIGKILL")
     parser.add_argument("--full", type=int, default=50, help="runs with a limit on files")

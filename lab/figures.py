@@ -12,7 +12,6 @@ method, network, code, and for times the machine), so a run that was killed goes
 
 from __future__ import annotations
 
-import argparse
 import datetime
 import hashlib
 import json
@@ -33,7 +32,7 @@ from super_sdf.machine.threads import count_cores
 from super_sdf.network.network import find_model
 from super_sdf.options import DEFAULT_QUALITY, QUALITIES
 
-from . import costs, others, quoted
+from . import costs, others, parser_of, quoted
 from .evaluate import Results, add_jobs, progress_lines, tasks_of
 from .kinds import KINDS
 from .measuring import Task, digest_of_ours
@@ -339,9 +338,7 @@ def rounded(value: Any) -> Any:
 
 def main() -> None:
     """Measure the figures, write their files, and print their tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--shapes", type=Path, nargs="+", required=True, help="meshes, or folders")
     parser.add_argument("--parts", type=Path, nargs="*", default=[], help="CAD parts")
     parser.add_argument("--only", nargs="+", choices=FIGURES, metavar="NAME",

@@ -32,6 +32,7 @@ from super_sdf.slabs import preparing
 from super_sdf.slabs.cutting import Slab, cut
 from super_sdf.steps.survey import Band
 
+from . import parser_of
 from .processes import write_grid
 from .shapes import Shape, find_meshes
 
@@ -68,7 +69,7 @@ def write_meshes(
 
 def parse() -> argparse.Namespace:
     """Return the arguments."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("meshes", nargs="+", type=Path, help="closed meshes, or folders of them")
     parser.add_argument("--sizes", nargs="+", type=int, default=[32, 64])
     parser.add_argument("--slabs", nargs="+", type=int, default=[1])

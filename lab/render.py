@@ -24,8 +24,9 @@ from super_sdf.pipeline import upsample
 from super_sdf.truth.mesh_files import read_mesh
 from super_sdf.truth.solid import Solid
 
+from . import parser_of
 from .cross_sections import check_section, find_plane, render_section
-from .drawing import AXES, COLOURS, Layout, Panel, check_numbers, render_panels, vertex_errors
+from .drawing import AXES, COLOURS, Panel, check_numbers, render_panels, vertex_errors
 from .page import check_page
 
 # Options that apply to one kind of source only, with their defaults.
@@ -35,9 +36,7 @@ FOR_MESHES = {"colour": COLOURS[0], "reference": None, "top": None, "up": "z", "
 
 def parse() -> argparse.Namespace:
     """Return the arguments."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("sources", metavar="MESH", type=Path, nargs="+", help="meshes, or one grid")
     parser.add_argument("target", metavar="OUT.png", type=Path)
     parser.add_argument("--colour", choices=COLOURS, help="by light, face normal or distance")
@@ -83,7 +82,7 @@ def take_defaults(
 
 def render_meshes(words: argparse.Namespace) -> None:
     """Draw meshes side by side; with a reference, coloured by their distance to it."""
-    check_numbers(zoom=words.zoom, top=words.top)
+    check_numbers(words.zoom, words.top)
     check_page(words.size, len(words.sources))
     if words.top is not None and words.colour != "error":
         raise OptionError("--top is the end of the colour bar: give it with --colour error")
@@ -95,9 +94,8 @@ def render_meshes(words: argparse.Namespace) -> None:
         Panel(mesh, name, None if truth is None else vertex_errors(mesh, truth))
         for name, mesh in meshes
     ]
-    layout = Layout(zoom=words.zoom, size=words.size)
-    chosen = {name: getattr(words, name) for name in ("colour", "up", "top", "force")}
-    render_panels(panels, words.target, layout=layout, **chosen)
+    names = ("colour", "up", "size", "zoom", "top", "force")
+    render_panels(panels, words.target, **{name: getattr(words, name) for name in names})
 
 
 def render_grid(words: argparse.Namespace) -> None:

@@ -23,6 +23,7 @@ from pathlib import Path
 
 from super_sdf.errors import SuperSdfError
 
+from . import parser_of
 from .costs import ORDERS, report_of, time_command, time_dense
 from .processes import describe_machine, write_grid, write_torus
 from .shapes import Shape, find_meshes, spread
@@ -58,9 +59,7 @@ def torus_row(n: int, limit: str, folder: Path, options: list[str]) -> list[str]
 def main() -> None:
     """Print the machine and Markdown tables."""
     words, options = split_words()
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("meshes", type=Path, nargs="*", help="files or folders")
     parser.add_argument("--sizes", type=int, nargs="+", default=[32, 64, 128])
     parser.add_argument("--shapes", type=int, default=10, help="spread over the list")

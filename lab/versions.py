@@ -29,6 +29,8 @@ from pathlib import Path
 
 from super_sdf.machine.threads import count_cores
 
+from . import parser_of
+
 ROOT = Path(__file__).parents[1]
 PYTHONS = ["3.10", "3.11", "3.12", "3.13", "3.14"]
 RELEASES = ["oldest", "2025-11-01", "2026-07-01", "newest"]
@@ -127,7 +129,7 @@ def find_python(version: str) -> str:
 
 def parse() -> argparse.Namespace:
     """Return the arguments."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--pythons", nargs="+", default=PYTHONS)
     parser.add_argument("--releases", nargs="+", default=RELEASES)
     parser.add_argument("--only", nargs="+", help="these cells, PYTHON:RELEASES, instead of all")

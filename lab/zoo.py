@@ -11,7 +11,6 @@ and ``MARGIN`` voxels. Needs the extra test.
 
 from __future__ import annotations
 
-import argparse
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -27,6 +26,7 @@ from super_sdf.errors import SuperSdfError
 from super_sdf.network.decoder import Decoder
 from super_sdf.truth.solid import Solid
 
+from . import parser_of
 from .kinds import without_unknown
 from .metrics import sample_surface
 from .surfaces import closed_isosurface
@@ -593,7 +593,7 @@ def problem(sample: Kind, outcomes: list[Outcome]) -> str:
 
 def main() -> None:
     """Print a table of kinds and sizes, and what is wrong."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
     parser.add_argument("--only", default="", help="kinds whose names hold this")
     parser.add_argument("--threads", type=int, default=1)
