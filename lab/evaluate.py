@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import sys
 import time
+from argparse import ArgumentParser
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -249,7 +250,7 @@ def progress_lines() -> OnTask:
     return show
 
 
-def add_jobs(parser: argparse.ArgumentParser) -> None:
+def add_jobs(parser: ArgumentParser) -> None:
     """Add the option of the number of processes."""
     parser.add_argument(
         "--jobs", type=int, default=count_cores(), help="processes at a time; 0: in this one"

@@ -19,7 +19,6 @@ import random
 import resource
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -33,11 +32,9 @@ import numpy as np
 import psutil
 
 from . import parser_of
-from .batch import workers_of
-from .mixed_grids import write_mixed
+from .batch import COMMAND, workers_of, write_grids
 from .processes import describe_machine
 
-COMMAND = [sys.executable, "-m", "super_sdf"]
 SUFFIXES = (".ply", ".stl", ".obj", ".glb", ".3mf")
 LONG_ENOUGH = 120.0  # seconds; every run is shorter
 AT_ONCE = 0.5  # seconds in which a run ends that was about to end anyway
@@ -165,7 +162,7 @@ class Many:
 
     def __init__(self, folder: Path, count: int, size: int) -> None:
         self.grids, self.meshes = folder / "grids", folder / "meshes"
-        write_mixed(self.grids, count, [size])
+        write_grids(self.grids, count, [size])
         begun = time.perf_counter()
         _, output = self.start().communicate()
         if output:

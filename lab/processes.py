@@ -19,6 +19,7 @@ from super_sdf.machine.processor import described, processor_name
 from super_sdf.machine.threads import count_cores
 from super_sdf.truth.sampling import sample_solid, unit_layout
 
+from .forms import torus
 from .shapes import Shape
 
 MAJOR, MINOR = 0.28, 0.11  # radii of the torus of ``write_torus``
@@ -124,8 +125,7 @@ def write_torus(path: Path, n: int) -> Path:
     """Write the distances to a torus of area 1.2 at the voxel centres of the unit cube, .npy."""
     centres = ((np.arange(n) + 0.5) / n - 0.5).astype(np.float32)
     field = np.lib.format.open_memmap(path, "w+", np.float32, (n, n, n))
-    for i, x in enumerate(centres):
-        ring = np.hypot(x, centres)[:, None] - np.float32(MAJOR)
-        field[i] = np.hypot(ring, centres) - np.float32(MINOR)
+    for plane, x in zip(field, centres):
+        plane[:] = torus(x, centres[:, None], centres, MAJOR, MINOR)
     field.flush()
     return path
