@@ -73,8 +73,8 @@ FORMS: dict[str, Form] = {
     "ellipsoid": lambda x, y, z: ellipsoid(x, y, z, 0.4, 0.25, 0.15),
     "quadric": quadric,
     "cut quadric": lambda x, y, z: np.maximum(quadric(x, y, z), x + 0.4 * y - 0.1),
-    "smooth difference": lambda x, y, z: -smooth_union(
-        -ball(x, y, z, -0.08, 0.3), ball(x, y, z, 0.2, 0.2), 0.1
+    "smooth difference": lambda x, y, z: (
+        -smooth_union(-ball(x, y, z, -0.08, 0.3), ball(x, y, z, 0.2, 0.2), 0.1)
     ),
     "smooth union": lambda x, y, z: smooth_union(
         ball(x, y, z, -0.15, 0.2), ball(x, y, z, 0.15, 0.2), 0.1
