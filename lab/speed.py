@@ -92,7 +92,7 @@ def print_speed(given: argparse.Namespace, options: list[str], folder: Path) -> 
             ours = " ".join(["super-sdf", *options])
             found.setdefault(ours, []).append(time_command(grid, options, given.runs))
             for name, order in ORDERS.items() if given.dense else ():
-                row = time_dense(grid, order, 1)
+                row = time_dense(grid, order)
                 found.setdefault(f"SciPy zoom, {name}", []).append(row)
             if given.stages:
                 report = report_of(grid, "--inside", "negative", *options)
