@@ -17,7 +17,6 @@ from lab.kinds import (
     KINDS,
     RATIOS,
     level_set,
-    mesh_kind,
     samples_of,
     without_unknown,
 )
@@ -34,7 +33,7 @@ TASK = Task(Path(), Setting(16), (), "fast")
 
 def mesh_of(name, case, network):
     method, _, kind = name.partition(" on ")
-    return mesh_kind(method, KINDS[kind], case, network)
+    return BY_METHOD[method](KINDS[kind], case, network)
 
 
 @pytest.fixture(scope="module")
