@@ -36,10 +36,11 @@ from .rows import Row, Rows
 from .runner import LeftOut, OnTask, complete
 from .shapes import Case, Setting, Shape, find_meshes, spread
 from .tables import (
-    cost_table,
-    edge_table,
+    COST,
+    EDGES,
     empty_lines,
     gap_line,
+    mean_table,
     shape_table,
     surface_table,
     win_line,
@@ -67,7 +68,7 @@ voxel. The edge distance is that of points on the reference's edges to the resul
 coarse voxels: its mean. The angles, in degrees, are those between the result's normals and that of
 the nearest triangle of the reference, within a coarse voxel of the reference's edges ("near") and
 beyond. Slivers are triangles with an angle under 5 degrees; the min angle is the mean over the
-shapes of the smallest. "Shapes" counts those with edges that were measured."""
+shapes of the smallest. Shapes without edges do not count."""
 
 
 class Results:
@@ -168,9 +169,9 @@ def write_report(
         lines = [*wins, gap_line(by_method), *empty_lines(by_method)]
         parts += [f"## {setting}", surface_table(by_method, setting.size), *filter(None, lines)]
     parts += ["## Edges and triangles", EDGE_LINES]
-    parts += [f"**{s}**\n\n{edge_table(found)}" for s, found in by_setting.items()]
+    parts += [f"**{s}**\n\n{mean_table(found, EDGES)}" for s, found in by_setting.items()]
     parts += ["## Time and memory", describe_machine(), COST_LINES]
-    parts += [f"**{s}**\n\n{cost_table(found)}" for s, found in by_setting.items()]
+    parts += [f"**{s}**\n\n{mean_table(found, COST)}" for s, found in by_setting.items()]
     plots = draw_plots({s.size: found for s, found in by_setting.items()}, out / "plots")
     parts += ["## Plots", *(f"![{text}](plots/{name})" for name, text in plots.items())]
     if up and OURS in like.methods:

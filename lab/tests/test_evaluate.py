@@ -295,7 +295,7 @@ def test_tables_show_means_gaps_and_what_has_no_surface():
     assert "| 0.250 |" in mine and mine.endswith("| 1 of 2 | 2 of 2 |")
     assert any("*PoNQ, published, Thingi30*" in line for line in lines)
     assert tables.empty_lines(by_method) == ["No surface (a dot stands in), MC: b."]
-    assert "| MC | 2 | 0.001 | 0.001 |" in tables.edge_table(by_method)
+    assert "| MC | 0.001 | 0.001 |" in tables.mean_table(by_method, tables.EDGES)
     assert tables.label_of("ours-sharp/4@base:float32") == "super-sdf, sharp, base, float32, 1/4"
 
 
