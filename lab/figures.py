@@ -352,7 +352,3 @@ def main() -> None:
         path = write(name, FIGURES[name][0](bench), bench, words.out)
         for table, text in quoted.tables_of(path).items():
             print(f"{table}\n\n{text}\n", flush=True)
-
-
-if __name__ == "__main__":
-    main()

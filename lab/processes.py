@@ -105,12 +105,7 @@ def median_of(measure: Callable[[], tuple[float, float]], runs: int) -> dict[str
 
 def timed(words: Sequence[str], runs: int) -> dict[str, float]:
     """Return the median of the seconds and the largest peak in MB of a process."""
-
-    def once() -> tuple[float, float]:
-        taken = run_python(words)
-        return taken.seconds, taken.peak_mb
-
-    return median_of(once, runs)
+    return median_of(lambda: ((taken := run_python(words)).seconds, taken.peak_mb), runs)
 
 
 def write_grid(shape: Shape, size: int, folder: Path) -> Path:

@@ -34,8 +34,8 @@ FOR_GRIDS = {"axis": "z", "at": None, "factor": 4}
 FOR_MESHES = {"colour": COLOURS[0], "reference": None, "top": None, "up": "z", "zoom": 1.0}
 
 
-def parse() -> argparse.Namespace:
-    """Return the arguments."""
+def main() -> None:
+    """Draw what is given."""
     parser = parser_of(__doc__)
     parser.add_argument("sources", metavar="MESH", type=Path, nargs="+", help="meshes, or one grid")
     parser.add_argument("target", metavar="OUT.png", type=Path)
@@ -49,12 +49,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--at", type=float, help="for a grid: world position on that axis")
     parser.add_argument("--factor", type=int, help="for a grid: refinement per axis")
     parser.add_argument("--force", action="store_true", help="replace OUT.png if it exists")
-    return parser.parse_args()
-
-
-def main() -> None:
-    """Draw what is given."""
-    words = parse()
+    words = parser.parse_args()
     grids = [source for source in words.sources if is_grid(source)]
     if words.target.suffix.lower() != ".png":
         raise OptionError(f"{words.target} is not a picture file: give .png")
@@ -63,21 +58,14 @@ def main() -> None:
     check_free(words.target, force=words.force)
     inputs = [*words.sources, *filter(None, [words.reference])]
     check_apart(words.target, [file for each in inputs for file in files_of(each)])
-    take_defaults(words, FOR_MESHES if grids else FOR_GRIDS, FOR_GRIDS if grids else FOR_MESHES)
-    (render_grid if grids else render_meshes)(words)
-
-
-def take_defaults(
-    words: argparse.Namespace, others: dict[str, object], own: dict[str, object]
-) -> None:
-    """Fill in what was not given; raise OptionError if what was given applies to the other kind."""
-    for name in others:
+    for name in FOR_MESHES if grids else FOR_GRIDS:
         if getattr(words, name) is not None:
-            drawn = "a grid" if own is FOR_GRIDS else "meshes"
+            drawn = "a grid" if grids else "meshes"
             raise OptionError(f"--{name} does not apply to {drawn}: leave it out")
-    for name, default in own.items():
+    for name, default in (FOR_GRIDS if grids else FOR_MESHES).items():
         if getattr(words, name) is None:
             setattr(words, name, default)
+    (render_grid if grids else render_meshes)(words)
 
 
 def render_meshes(words: argparse.Namespace) -> None:
@@ -88,12 +76,10 @@ def render_meshes(words: argparse.Namespace) -> None:
         raise OptionError("--top is the end of the colour bar: give it with --colour error")
     if (words.colour == "error") != (words.reference is not None):
         raise OptionError("--colour error and --reference MESH go together: give both or neither")
-    meshes = [(source.name, read_mesh(source)) for source in words.sources]
+    meshes = {source: read_mesh(source) for source in words.sources}
     truth = Solid(read_mesh(words.reference)) if words.reference else None
-    panels = [
-        Panel(mesh, name, None if truth is None else vertex_errors(mesh, truth))
-        for name, mesh in meshes
-    ]
+    panels = [Panel(mesh, source.name, truth and vertex_errors(mesh, truth))
+              for source, mesh in meshes.items()]  # fmt: skip
     names = ("colour", "up", "size", "zoom", "top", "force")
     render_panels(panels, words.target, **{name: getattr(words, name) for name in names})
 

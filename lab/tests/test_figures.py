@@ -10,7 +10,7 @@ from solids import cube, saved, torus
 
 from lab import documents, figures, quoted
 from lab.__main__ import main as lab
-from lab.documents import lines_that_look_back, rendered
+from lab.documents import rendered
 from super_sdf.errors import FileError
 
 MACHINE = {
@@ -101,23 +101,6 @@ def describe(content: dict) -> str:
         f"{on['processor']}, {on['cores']} cores, {on['system']}, Python {on['python']}, "
         f"NumPy {on['numpy']}, onnxruntime {on['onnxruntime']}"
     )
-
-
-def test_documents_speak_of_today():
-    assert list(lines_that_look_back()) == []
-
-
-def test_lines_that_look_back_are_found(tmp_path):
-    (tmp_path / "export").mkdir()
-    for name in ("CHANGELOG.md", "export/LOG.md"):
-        (tmp_path / name).write_text("the network of before\n")
-    text = "fine\nthe network of before\nwith nine blocks, say\nan older one\nbeforehand\n"
-    (tmp_path / "page.md").write_text(text)
-    assert list(lines_that_look_back(tmp_path)) == [
-        "page.md:2: the network of before",
-        "page.md:3: with nine blocks, say",
-        "page.md:4: an older one",
-    ]
 
 
 @pytest.fixture
