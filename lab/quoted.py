@@ -38,7 +38,7 @@ from .tables import (
 )
 
 UNKNOWN = "(not measured)"
-SHORT = (F1, NC, THERE, BACK, CD, EF1, BY_KEY["field_mae"])
+SHORT = (F1, NC, THERE, BACK, EF1, BY_KEY["field_mae"])
 VOXELS = Column("mean distance", "voxels", 1, 4)
 SECONDS, PEAK = Column("seconds", "seconds", 1, 2), Column("peak MB", "peak_mb", 1, 0)
 EDGE_COLUMNS = (F1, NC, THERE, BACK, *EDGES[:-1])
