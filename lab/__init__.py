@@ -8,3 +8,12 @@
 Everything that is measured goes through one runner of processes (``runner``, ``processes``), one
 file of rows (``rows``) and one module of tables (``tables``).
 """
+
+import argparse
+
+
+def parser_of(text: str) -> argparse.ArgumentParser:
+    """Return the parser of a command's options; its help is the text of its module."""
+    return argparse.ArgumentParser(
+        description=text, formatter_class=argparse.RawDescriptionHelpFormatter
+    )

@@ -19,19 +19,24 @@ import argparse
 import json
 import re
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from super_sdf.options import DEFAULT_MESHER, MESHERS
 
+from . import parser_of
+from .forms import ball
 from .processes import Taken, describe_machine, run_python, upsample_words
 
-Plane = Callable[[float, NDArray[np.float64], NDArray[np.float64], int], NDArray[np.float64]]
-TURN = 2 * np.pi / 24  # radians per sample of the gyroids among the dense grids
+Values = NDArray[np.float64]
+Plane = Callable[[float, Values, Values, int], Values]
+TURN = 2 * np.pi / 24  # radians per sample of the gyroid among the dense grids
 # Shape, type, spacing and limit in bytes of grids with a surface nearly everywhere, or cut off.
 DENSE = {
     "noise": ((197, 197, 197), "float32", 4, 400_000_000),
@@ -49,42 +54,35 @@ HEAD = (
 )
 
 
-def ball(x: float, y: NDArray[np.float64], z: NDArray[np.float64], n: int) -> NDArray[np.float64]:
+def sphere(x: float, y: Values, z: Values, n: int) -> Values:
     """Return a plane of distances to a ball, n samples a side."""
-    return np.sqrt(x**2 + y**2 + z**2) - 0.4 * n
+    return ball(x, y, z, 0, 0.4 * n)
 
 
-def gyroid(
-    x: float,
-    y: NDArray[np.float64],
-    z: NDArray[np.float64],
-    n: int,
-    turn: float | None = None,
-) -> NDArray[np.float64]:
+def gyroid(x: float, y: Values, z: Values, n: int, turn: float = 0) -> Values:
     """Return roughly the distance to a gyroid, truncated at 3; ``turn``: radians per sample."""
     turn = turn or 8 * np.pi / n
     sines, cosines = zip(*((np.sin(turn * axis), np.cos(turn * axis)) for axis in (x, y, z)))
     value = sum(sines[a] * cosines[(a + 1) % 3] for a in range(3))
     slopes = [cosines[a] * cosines[(a + 1) % 3] - sines[a - 1] * sines[a] for a in range(3)]
     slope = np.sqrt(sum(slope**2 for slope in slopes))
-    distance: NDArray[np.float64] = np.clip(value / (turn * np.maximum(slope, 0.5)), -3, 3)
-    return distance
+    return np.clip(value / (turn * np.maximum(slope, 0.5)), -3, 3)
 
 
 FIELDS: dict[str, Plane] = {
-    "ball": ball,
+    "ball": sphere,
     "gyroid": gyroid,
     "wall": lambda x, y, z, n: np.full((n, n), abs(x) - 1.7),
     "wall across z": lambda x, y, z, n: np.broadcast_to(np.abs(z) - 1.7, (n, n)),
-    "mask": lambda x, y, z, n: np.where(ball(x, y, z, n) < 0, 1.0, 0.0),
-    "truncated": lambda x, y, z, n: np.clip(ball(x, y, z, n), -1, 1),
-    "spline": lambda x, y, z, n: np.clip(ball(x, y, z, n), -0.5, 0.5),
-    "scaled": lambda x, y, z, n: ball(x, y, z, n) * (1 + ball(x, y, z, n) / (3 * n)),
+    "mask": lambda x, y, z, n: np.where(sphere(x, y, z, n) < 0, 1.0, 0.0),
+    "truncated": lambda x, y, z, n: np.clip(sphere(x, y, z, n), -1, 1),
+    "spline": lambda x, y, z, n: np.clip(sphere(x, y, z, n), -0.5, 0.5),
+    "scaled": lambda x, y, z, n: sphere(x, y, z, n) * (1 + sphere(x, y, z, n) / (3 * n)),
 }
 USUAL = tuple(FIELDS)[:4]
 
 
-def dense_plane(name: str, i: int, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def dense_plane(name: str, i: int, shape: tuple[int, ...]) -> Values:
     """Return plane ``i`` of a grid of ``DENSE``."""
     rng = np.random.default_rng(i)
     y, z = np.indices(shape[1:]).astype(np.float64)
@@ -97,27 +95,23 @@ def dense_plane(name: str, i: int, shape: tuple[int, ...]) -> NDArray[np.float64
     if name == "dense gyroid":
         return gyroid(i, y, z, 0, TURN)
     n = shape[0] / 2
-    return np.clip(np.sqrt((i - n) ** 2 + (y - n) ** 2 + (z - n) ** 2) - 0.8 * n, -3, 3)
+    return np.clip(ball(i - n, y - n, z - n, 0, 0.8 * n), -3, 3)
+
+
+def write_planes(path: Path, shape: Sequence[int], dtype: str, plane: Callable[[int], Any]) -> Path:
+    """Write a grid plane by plane as ``.npy``."""
+    array = np.lib.format.open_memmap(path, "w+", np.dtype(dtype), tuple(shape))
+    for i in range(shape[0]):
+        array[i] = plane(i)
+    array.flush()
+    return path
 
 
 def write_field(field: str, n: int, path: Path) -> Path:
-    """Write a field of n samples along each axis, spacing 1, as ``.npy``."""
+    """Write a field of n samples along each axis, spacing 1."""
     at = np.arange(n) - n / 2 + 0.63
-    array = np.lib.format.open_memmap(path, "w+", np.float32, (n, n, n))
-    for plane, x in zip(array, at):
-        plane[:] = FIELDS[field](x, at[:, None], at[None, :], n)
-    array.flush()
-    return path
-
-
-def write_dense(name: str, path: Path) -> Path:
-    """Write a grid of ``DENSE``."""
-    shape, dtype, _, _ = DENSE[name]
-    array = np.lib.format.open_memmap(path, "w+", np.dtype(dtype), shape)
-    for i, plane in enumerate(array):
-        plane[:] = dense_plane(name, i, shape)
-    array.flush()
-    return path
+    return write_planes(path, (n, n, n), "float32",
+                        lambda i: FIELDS[field](at[i], at[:, None], at[None, :], n))  # fmt: skip
 
 
 def advised(refusal: str) -> int | None:
@@ -165,8 +159,9 @@ class Trial:
 
 def try_dense(name: str, folder: Path, *, follow: bool) -> list[str]:
     """Try a grid of ``DENSE``, and what its refusal advises; return the rows that exceed."""
-    shape, _, spacing, limit = DENSE[name]
-    grid = write_dense(name, folder / "grid.npy")
+    shape, dtype, spacing, limit = DENSE[name]
+    plane = partial(dense_plane, name, shape=shape)
+    grid = write_planes(folder / "grid.npy", shape, dtype, plane)
     cells = [name, f"{shape[0]}^3", "4", "int8"]
     options = ["--spacing", str(spacing), "--device", "cpu", "--precision", "int8"]
     trial = Trial(cells, grid, options, ".ply")
@@ -178,9 +173,7 @@ def try_dense(name: str, folder: Path, *, follow: bool) -> list[str]:
 
 def parse() -> argparse.Namespace:
     """Parse the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--fields", nargs="*", choices=FIELDS, default=USUAL)
     parser.add_argument("--dense", nargs="*", choices=DENSE, default=tuple(DENSE))
     parser.add_argument("--follow", action="store_true", help="allow what a refusal advises, too")
@@ -206,9 +199,8 @@ def main() -> int:
     for field, size in product(words.fields, words.sizes):
         with tempfile.TemporaryDirectory() as folder:
             grid = write_field(field, size, Path(folder) / "grid.npy")
-            for factor, precision, suffix in product(
-                words.factors, words.precisions, words.suffixes
-            ):
+            kinds = product(words.factors, words.precisions, words.suffixes)
+            for factor, precision, suffix in kinds:
                 options = ["--factor", str(factor), "--precision", precision, "--device", "cpu"]
                 options += ["--spacing", "1", "--mesher", words.mesher]
                 cells = [field, f"{size}^3", str(factor), precision]

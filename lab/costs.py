@@ -7,11 +7,11 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import nnls
@@ -42,7 +42,7 @@ OPTIONS: dict[str, tuple[str, ...]] = {
 ORDERS = {"scipy": 3, "trilinear": 1}  # of SciPy's zoom
 MODELS = ("fast", "noisy", "mask", "base")
 MEMORY_FIELDS = ("ball", "gyroid", "wall")
-FACTORS = (2, 4, 8, 16)
+FACTORS = {2: 1, 4: 1, 8: 2, 16: 4}  # and by how much the grids are smaller
 
 
 def time_command(grid: Path, options: Sequence[str], runs: int) -> Row:
@@ -63,10 +63,9 @@ def time_warm(grid: Path, network: Decoder, runs: int) -> Row:
     return median_of(once, runs)
 
 
-def time_dense(grid: Path, order: int, runs: int) -> Row:
+def time_dense(grid: Path, order: int) -> Row:
     """Return the same of SciPy's zoom to the same fine nodes and scikit-image's marching cubes."""
-    target = str(grid.with_suffix(".ply"))
-    return timed(["-m", "lab.costs", str(grid), target, str(order)], runs)
+    return timed(["-m", "lab.costs", str(grid), str(grid.with_suffix(".ply")), str(order)], runs=1)
 
 
 def convert_densely(source: str, target: str, order: str, factor: int = 4) -> None:
@@ -82,13 +81,7 @@ def convert_densely(source: str, target: str, order: str, factor: int = 4) -> No
 
 
 def report_of(grid: Path, *options: str) -> Row:
-    """Convert a grid in a process; return what ``--json`` says, and its seconds and peak.
-
-    Raises
-    ------
-    SuperSdfError
-        If the command fails.
-    """
+    """Convert a grid in a process; return what ``--json`` says, and its seconds and peak."""
     taken = run_python(upsample_words(grid, "--json", *options))
     report: Row = json.loads(taken.printed)
     return {**report, "wall": taken.seconds, "peak": taken.peak}
@@ -107,33 +100,30 @@ def speed_rows(bench: Bench) -> list[Row]:
 def sized_rows(bench: Bench, size: int, folder: Path) -> list[Row]:
     """Return the rows of a size."""
     found: dict[str, list[Row]] = {}
-    paths, own = spread(bench.shapes, TIMED), Row()
+    paths = spread(bench.shapes, TIMED)
     for path in paths:
         grid = write_grid(Shape.read(path), size, folder)
         words = {"time": path.stem, "size": size, "runs": bench.runs}
-
-        def take(
-            name: str, key: Row, measure: Callable[..., Row], *given: Any, words: Row = words
-        ) -> Row:
-            row = bench.timed({**words, **key}, partial(measure, *given))
-            found.setdefault(name, []).append(row)
-            return row
-
-        for name, options in OPTIONS.items():
-            more = [*options, *model_of(bench, name)]
-            row = take(name, {"option": name}, time_command, grid, more, bench.runs)
-            own = row if name == "default" else own
+        plans: dict[str, Callable[[], Row]] = {
+            name: partial(time_command, grid, [*options, *model_of(bench, name)], bench.runs)
+            for name, options in OPTIONS.items()
+        }
         network = network_of(bench.network, "auto", 0)
-        take("warm", {"option": "warm"}, time_warm, grid, network, bench.runs)
-        if path != paths[0]:
-            continue
-        for name, order in ORDERS.items() if size > bench.small else ():
-            take(name, {"option": name}, time_dense, grid, order, 1)
-            found[name].append(own)
-        for name, precision in product(MODELS, ("int8", "float32")):
-            key = {"network": name, "precision": precision}
-            take(f"network {name} {precision}", key, network_row, grid, name, precision, bench)
-    return [{"size": size, "option": name, **cost_of(name, rows)} for name, rows in found.items()]
+        plans["warm"] = partial(time_warm, grid, network, bench.runs)
+        if path == paths[0] and size > bench.small:
+            plans |= {name: partial(time_dense, grid, order) for name, order in ORDERS.items()}
+        for name, measure in plans.items():
+            found.setdefault(name, []).append(bench.timed({**words, "option": name}, measure))
+        if path == paths[0]:
+            for name, precision in product(MODELS, ("int8", "float32")):
+                key = {"network": name, "precision": precision}
+                measure = partial(network_row, grid, name, precision, bench)
+                row = bench.timed({**words, **key}, measure)
+                found[f"network {name} {precision}"] = [row]
+    own = found["default"][0]
+    return [
+        {"size": size, "option": name, **cost_of(name, rows, own)} for name, rows in found.items()
+    ]
 
 
 def model_of(bench: Bench, option: str) -> list[str]:
@@ -141,23 +131,16 @@ def model_of(bench: Bench, option: str) -> list[str]:
     return ["--model", bench.network] if bench.network != "base" and option != "fast" else []
 
 
-def cost_of(option: str, rows: Sequence[Row]) -> Row:
-    """Return the figures of an option over shapes."""
+def cost_of(option: str, rows: Sequence[Row], own: Row) -> Row:
+    """Return the figures of an option over shapes; ``own`` is ours on the first one."""
     if option.startswith("network"):
         return {key: rows[0][key] for key in ("us_per_voxel", "stages", "band_voxels")}
-    if option in ORDERS:
-        other, own = rows
-        over = {f"over_{k}": other[k] / own[k] for k in ("seconds", "peak_mb")}
-        return {"seconds": other["seconds"], "peak_mb": other["peak_mb"], **over, **beside(own)}
-    seconds = [row["seconds"] for row in rows]
     peak = max(row["peak_mb"] for row in rows)
-    mean = statistics.mean(seconds)
-    return {"seconds": mean, "slowest": max(seconds), "peak_mb": peak, "shapes": len(rows)}
-
-
-def beside(own: Row) -> Row:
-    """Return ours on the same grid."""
-    return {"ours_seconds": own["seconds"], "ours_peak_mb": own["peak_mb"]}
+    if option in ORDERS:
+        (row,) = rows
+        over = {f"over_{key}": row[key] / own[key] for key in ("seconds", "peak_mb")}
+        return {"seconds": row["seconds"], "peak_mb": peak, **over}
+    return {"seconds": statistics.mean(row["seconds"] for row in rows), "peak_mb": peak}
 
 
 def network_row(grid: Path, name: str, precision: str, bench: Bench) -> Row:
@@ -168,24 +151,21 @@ def network_row(grid: Path, name: str, precision: str, bench: Bench) -> Row:
     model = bench.network if name == "base" else name
     options = ("--inside", "negative", "--model", model, "--precision", precision)
     reports = [report_of(grid, *options) for _ in range(bench.runs + 1)][1:]
-    stages = {
+    medians = {
         stage: statistics.median(report["seconds"][stage] for report in reports)
         for stage in reports[0]["seconds"]
     }
     voxels = reports[0]["band_voxels"]
-    return {"us_per_voxel": 1e6 * stages["network"] / voxels, "stages": stages,
-            "band_voxels": voxels}  # fmt: skip
+    rate = 1e6 * medians["network"] / voxels
+    return {"us_per_voxel": rate, "stages": medians, "band_voxels": voxels}
 
 
-def large_rows(bench: Bench, folder: Path, n: int = 0) -> list[Row]:
+def large_rows(bench: Bench, folder: Path) -> list[Row]:
     """Return the rows of a large torus, for several limits of memory."""
-    n, rows, grid = n or LARGE * bench.sizes[-1] // 128, [], folder / "torus.npy"
+    n, rows, grid = LARGE * bench.sizes[-1] // 128, [], folder / "torus.npy"
     for limit in LIMITS:
-        words = {"torus": n, "limit": limit}
-
-        name = "torus" if limit == LIMITS[0] else f"torus-{limit}"
-        row = bench.timed(words, partial(large_row, grid, limit, n, bench))
-        rows.append({"size": n, "option": name, "limit": limit, **row})
+        row = bench.timed({"torus": n, "limit": limit}, partial(large_row, grid, limit, n, bench))
+        rows.append({"size": n, "option": f"torus-{limit}", "limit": limit, **row})
     return rows
 
 
@@ -198,32 +178,23 @@ def large_row(grid: Path, limit: str, n: int, bench: Bench) -> Row:
         report = report_of(grid, *options)
     except SuperSdfError as refusal:
         return {"refused": str(refusal)}
-    counts = {key: report[key] for key in ("slabs", "band_voxels", "triangles")}
     costs = {"seconds": report["wall"], "peak_mb": report["peak"] / 1e6}
-    return {**counts, **costs, "planned_mb": report["planned_bytes"] / 1e6}
+    costs["planned_mb"] = report["planned_bytes"] / 1e6
+    return {**{key: report[key] for key in ("slabs", "band_voxels", "triangles")}, **costs}
 
 
 def memory_rows(bench: Bench) -> list[Row]:
     """Fit the peak of processes by bytes per voxel that the network sees, and per decoded one."""
     rows = []
     with tempfile.TemporaryDirectory() as folder:
-        for factor in FACTORS:
-            found = [
-                bench.timed(
-                    {"memory": field, "size": size, "factor": factor},
-                    partial(memory_row, field, size, factor, Path(folder), bench),
-                )
-                for field in MEMORY_FIELDS
-                for size in memory_sizes(bench, factor)
-            ]
+        for factor, share in FACTORS.items():  # fewer samples for a larger factor
+            largest, found = bench.sizes[-1] * 2 // share, []
+            for field, size in product(MEMORY_FIELDS, (max(largest // 2, 12), max(largest, 16))):
+                key = {"memory": field, "size": size, "factor": factor}
+                measure = partial(memory_row, field, size, factor, Path(folder), bench)
+                found.append(bench.timed(key, measure))
             rows.append({"factor": factor, **fitted(found)})
     return rows
-
-
-def memory_sizes(bench: Bench, factor: int) -> tuple[int, int]:
-    """Return the sizes of the grids: fewer samples for a larger factor."""
-    largest = bench.sizes[-1] * 2 // (1 if factor <= 4 else 2 if factor == 8 else 4)
-    return max(largest // 2, 12), max(largest, 16)
 
 
 def memory_row(field: str, size: int, factor: int, folder: Path, bench: Bench) -> Row:
@@ -236,9 +207,8 @@ def memory_row(field: str, size: int, factor: int, folder: Path, bench: Bench) -
     return {key: report[key] for key in ("band_voxels", "decoded_voxels", "peak", "planned_bytes")}
 
 
-def fitted(rows: Iterable[Row]) -> Row:
+def fitted(rows: Sequence[Row]) -> Row:
     """Return bytes per seen voxel, per decoded voxel and the rest, by least squares."""
-    rows = list(rows)
     voxels = np.array([[r["band_voxels"], r["decoded_voxels"], 1e6] for r in rows], float)
     peaks = np.array([row["peak"] for row in rows], float)
     (seen, decoded, rest), _ = nnls(voxels / peaks[:, None], np.ones(len(rows)))

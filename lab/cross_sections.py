@@ -31,6 +31,7 @@ INCHES = 7.0  # width of a panel; the pixels per inch follow from the size in pi
 SECTIONS = 2  # most sections side by side
 TALLEST = 3  # greatest ratio of a panel's height to its width
 STRIP = 1.35  # inches for titles, labels and the colour bar
+BAR_TITLE = f"signed distance (negative inside); colours end at {LIMIT:g} voxels, black line: 0"
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,10 +48,9 @@ class Section:
 
     def box(self) -> tuple[float, float, float, float]:
         """Return left, right, bottom and top of all cells."""
-        (left, bottom), (wide, high) = self.first, self.step
-        count, rows = self.values.shape
-        right, top = left + wide * (count - 0.5), bottom + high * (rows - 0.5)
-        return left - wide / 2, right, bottom - high / 2, top
+        low = np.array(self.first) - np.array(self.step) / 2
+        high = low + np.array(self.step) * self.values.shape
+        return low[0], high[0], low[1], high[1]
 
 
 def render_section(
@@ -64,25 +64,16 @@ def render_section(
     force: bool = True,
 ) -> None:
     """Draw a cross-section of a grid, and beside it the same section refined, as a PNG file."""
-    check_section(size)
-    index = find_plane(grid, axis, at)
-    figure = _draw(_titled_sections(grid, field, axis, index), axis, grid.voxel_size, size)
-    number = AXES.index(axis)
-    position = own_origin(grid)[number] + grid.spacing[number] * index
-    along = "" if grid.is_straight else ", along the grid's own axes"
-    figure.suptitle(f"section at {axis} = {position:.4g}{along}")
-    write_picture(figure, target, force=force)
-
-
-def _titled_sections(
-    grid: SdfGrid, field: FineField | None, axis: str, index: int
-) -> dict[str, Section]:
-    """Return the sections to draw, by title: the samples, and the refined field if given."""
+    index, number = find_plane(grid, axis, at), AXES.index(axis)
     sections = {f"{' x '.join(map(str, grid.shape))} samples": coarse_section(grid, axis, index)}
     if field is not None:
         title = f"refined {field.factor} times (grey: far from the surface, not refined)"
         sections[title] = fine_section(field, grid, axis, index)
-    return sections
+    figure = _draw(sections, axis, grid.voxel_size, size)
+    position = own_origin(grid)[number] + grid.spacing[number] * index
+    along = "" if grid.is_straight else ", along the grid's own axes"
+    figure.suptitle(f"section at {axis} = {position:.4g}{along}")
+    write_picture(figure, target, force=force)
 
 
 def check_section(size: int) -> None:
@@ -95,11 +86,13 @@ def find_plane(grid: SdfGrid, axis: str = "z", at: float | None = None) -> int:
 
     Without a position, the middle one of the planes that the surface crosses.
     """
-    if axis not in AXES:
-        raise OptionError(f"axis is {axis!r}: give one of {', '.join(AXES)}")
     number = AXES.index(axis)
     if at is None:
-        return _middle_plane(grid, number)
+        planes = np.moveaxis(grid.values, number, 0)
+        crossed = np.flatnonzero([plane.min() <= 0 < plane.max() for plane in planes])
+        if not len(crossed):  # the surface passes between the samples, if there is one
+            return int(np.argmin([np.abs(plane).min() for plane in planes]))
+        return int(crossed[np.abs(crossed - (crossed[0] + crossed[-1]) / 2).argmin()])
     first, step, count = own_origin(grid)[number], grid.spacing[number], grid.shape[number]
     index = (at - first) / step
     if not -0.5 <= index <= count - 0.5:
@@ -117,65 +110,45 @@ def own_origin(grid: SdfGrid) -> tuple[float, float, float]:
 
 def coarse_section(grid: SdfGrid, axis: str, index: int) -> Section:
     """Return the plane of samples with this index along an axis."""
-    number = AXES.index(axis)
-    values = np.take(grid.values, index, axis=number).astype(np.float64)
-    across, along = _others(number)
-    origin = own_origin(grid)
-    first = origin[across], origin[along]
-    return Section(values, first, (grid.spacing[across], grid.spacing[along]))
+    values = np.take(grid.values, index, axis=AXES.index(axis)).astype(np.float64)
+    across, along = _plane_of(axis)
+    origin, spacing = own_origin(grid), grid.spacing
+    return Section(values, (origin[across], origin[along]), (spacing[across], spacing[along]))
 
 
 def fine_section(field: FineField, grid: SdfGrid, axis: str, index: int) -> Section:
     """Return the fine values on the plane of nodes that coincides with a plane of samples."""
-    lattice = cubic_grid(grid)
-    if field.shape != lattice.shape:
-        shape = " x ".join(map(str, field.shape))
-        raise OptionError(f"the field refines a grid of {shape}: give that grid")
-    number = AXES.index(axis)
-    origin = own_origin(lattice)
-    (left, bottom), (wide, high) = (
-        [at[n] for n in _others(number)] for at in (origin, lattice.spacing)
-    )
-    first = left - wide / 2, bottom - high / 2
+    lattice, number, factor = cubic_grid(grid), AXES.index(axis), field.factor
     plane = round(index * grid.spacing[number] / lattice.spacing[number])
-    plane = min(plane, lattice.shape[number] - 1)
-    values = _node_plane(field, number, plane) * (lattice.voxel_size / 2)
-    return Section(values, first, (wide / field.factor, high / field.factor))
+    values = _node_plane(field, axis, min(plane, lattice.shape[number] - 1))
+    origin, spacing = own_origin(lattice), lattice.spacing
+    (left, wide), (bottom, high) = ((origin[n], spacing[n]) for n in _plane_of(axis))
+    first, step = (left - wide / 2, bottom - high / 2), (wide / factor, high / factor)
+    return Section(values * (lattice.voxel_size / 2), first, step)
 
 
-def _middle_plane(grid: SdfGrid, number: int) -> int:
-    """Return the plane nearest to the middle of all planes that the surface crosses."""
-    planes = np.moveaxis(grid.values, number, 0)
-    crossed = np.flatnonzero([plane.min() <= 0 < plane.max() for plane in planes])
-    if not len(crossed):  # the surface passes between the samples, if there is one
-        return int(np.argmin([np.abs(plane).min() for plane in planes]))
-    return int(crossed[np.abs(crossed - (crossed[0] + crossed[-1]) / 2).argmin()])
-
-
-def _node_plane(field: FineField, number: int, index: int) -> NDArray[np.float64]:
+def _node_plane(field: FineField, axis: str, index: int) -> NDArray[np.float64]:
     """Return the values, in half voxels, on the middle nodes of a plane of voxels; else NaN."""
-    factor = field.factor
-    across, along = _others(number)
+    factor, number, (across, along) = field.factor, AXES.index(axis), _plane_of(axis)
     in_grid = ((field.voxel_ijk >= 0) & (field.voxel_ijk < np.array(field.shape))).all(1)
     rows = np.flatnonzero(in_grid & (field.voxel_ijk[:, number] == index))
     blocks = field.blocks[:, rows].T.reshape(-1, *(factor + 1,) * 3)
-    values = np.take(blocks, factor // 2, axis=number + 1)
     place = factor * field.voxel_ijk[rows, :, None] + np.arange(factor + 1)
     plane = np.full((factor * field.shape[across] + 1, factor * field.shape[along] + 1), np.nan)
+    values = np.take(blocks, factor // 2, axis=number + 1)
     plane[place[:, across, :, None], place[:, along, None, :]] = values
     return plane
 
 
-def _others(number: int) -> tuple[int, int]:
+def _plane_of(axis: str) -> tuple[int, int]:
     """Return the two axes of a section's plane: to the right, and up."""
-    across, along = (other for other in range(3) if other != number)
+    across, along = (other for other in range(3) if other != AXES.index(axis))
     return across, along
 
 
 def _draw(sections: dict[str, Section], axis: str, voxel: float, size: int) -> Figure:
     """Draw sections side by side under their titles, with one colour bar."""
-    boxes = [section.box() for section in sections.values()]
-    left, right, bottom, top = boxes[0]
+    left, right, bottom, top = next(iter(sections.values())).box()
     tall = float(np.clip((top - bottom) / (right - left), 0.3, TALLEST))
     inches = INCHES * len(sections), INCHES * tall + STRIP
     figure = Figure(figsize=inches, dpi=size / INCHES, layout="constrained")
@@ -183,37 +156,20 @@ def _draw(sections: dict[str, Section], axis: str, voxel: float, size: int) -> F
     for ax, (title, section) in zip(plots, sections.items()):
         image = _draw_section(ax, section, LIMIT * voxel)
         ax.set(title=title, aspect="equal", xlim=(left, right), ylim=(bottom, top))
-        ax.set_xlabel(AXES[_others(AXES.index(axis))[0]])
-    plots[0].set_ylabel(AXES[_others(AXES.index(axis))[1]])
-    _add_bar(figure, image, list(plots))
+        ax.set_xlabel(AXES[_plane_of(axis)[0]])
+    plots[0].set_ylabel(AXES[_plane_of(axis)[1]])
+    where = {"ax": list(plots), "location": "bottom", "shrink": 0.5, "aspect": 35, "pad": 0.03}
+    figure.colorbar(image, extend="both", **where).set_label(BAR_TITLE)
     return figure
 
 
 def _draw_section(ax: Axes, section: Section, limit: float) -> AxesImage:
     """Draw the values of a section, and their zero line."""
-    known = np.ma.masked_invalid(section.values.T)
+    known, scale = np.ma.masked_invalid(section.values.T), {"vmin": -limit, "vmax": limit}
     ax.set_facecolor(UNKNOWN)
-    image = ax.imshow(
-        known,
-        origin="lower",
-        extent=section.box(),
-        interpolation="nearest",
-        cmap=COLOUR_MAP,
-        vmin=-limit,
-        vmax=limit,
-    )
+    image = ax.imshow(known, COLOUR_MAP, origin="lower", extent=section.box(),
+                      interpolation="nearest", **scale)  # fmt: skip
     if known.count() and known.min() <= 0 < known.max():
-        ax.contour(
-            section.places(0), section.places(1), known, levels=[0], colors="black", linewidths=1.4
-        )
+        x, y = section.places(0), section.places(1)
+        ax.contour(x, y, known, levels=[0], colors="black", linewidths=1.4)
     return image
-
-
-def _add_bar(figure: Figure, image: AxesImage, plots: list[Any]) -> None:
-    """Add a colour bar below all plots."""
-    bar = figure.colorbar(
-        image, ax=plots, location="bottom", extend="both", shrink=0.5, aspect=35, pad=0.03
-    )
-    bar.set_label(
-        f"signed distance (negative inside); colours end at {LIMIT:g} voxels, black line: 0"
-    )

@@ -9,7 +9,6 @@ from a grid to its mesh. All grids are noisy balls. If CUDA does not run, one li
 
 from __future__ import annotations
 
-import argparse
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -24,6 +23,9 @@ from super_sdf.network.network import Network
 from super_sdf.options import QUALITIES
 from super_sdf.steps.nodes import block_offsets
 from super_sdf.steps.survey import survey
+
+from . import parser_of
+from .tables import markdown
 
 RUNS = 3
 SHAPES = 40  # for the memory
@@ -56,32 +58,23 @@ def best_seconds(work: Callable[..., Any], *arguments: Any) -> float:
 
 def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     """Print a Markdown table."""
-    print(f"\n{title}\n\n| {' | '.join(head)} |\n|{' ---: |' * len(head)}")
-    for row in rows:
-        print(f"| {' | '.join(str(cell) for cell in row)} |", flush=True)
+    print(f"\n{title}\n\n{markdown(head, [list(map(str, row)) for row in rows])}", flush=True)
 
 
 def compare_values(device: str, sizes: Sequence[int]) -> None:
     """Print the difference between the values of CUDA and of the CPU, and both times."""
-    rows = []
+    rows, places = [], ("cpu", device)
     for quality in QUALITIES:
-        here, there = (
-            load_network(quality, device=place, precision="float32") for place in ("cpu", device)
-        )
+        networks = [load_network(quality, device=at, precision="float32") for at in places]
         for size in sizes:
             inputs = network_inputs(size)
-            apart = np.abs(here(*inputs) - there(*inputs)).max() / 2
-            seconds = [best_seconds(network, *inputs) for network in (here, there)]
-            shown = [f"{1e6 * value / len(inputs[0]):.2f}" for value in seconds]
-            rows.append([quality, f"{size}^3", f"{len(inputs[0]):,}", *shown, f"{apart:.1e}"])
-    head = [
-        "network",
-        "grid",
-        "voxels",
-        "CPU us per voxel",
-        f"{device} us per voxel",
-        "difference, voxels",
-    ]
+            here, there = (network(*inputs) for network in networks)
+            seconds = [best_seconds(network, *inputs) for network in networks]
+            rates = [f"{1e6 * value / len(inputs[0]):.2f}" for value in seconds]
+            apart = f"{np.abs(here - there).max() / 2:.1e}"
+            rows.append([quality, f"{size}^3", f"{len(inputs[0]):,}", *rates, apart])
+    rates = [f"{at} us per voxel" for at in ("CPU", device)]
+    head = ["network", "grid", "voxels", *rates, "difference, voxels"]
     print_table("Values and speed of the network", head, rows)
 
 
@@ -110,8 +103,7 @@ def run_part(network: Network, inputs: Sequence[np.ndarray], share: float) -> No
 
 def used_memory() -> str:
     """Return the GPU memory in use, according to nvidia-smi."""
-    answer = query_gpu("memory.used")
-    return answer[0] if answer else "unknown"
+    return (query_gpu("memory.used") or ["unknown"])[0]
 
 
 def compare_pipeline(device: str, sizes: Sequence[int]) -> None:
@@ -127,7 +119,7 @@ def compare_pipeline(device: str, sizes: Sequence[int]) -> None:
 
 def main() -> None:
     """Print all tables, or one line that says why CUDA does not run."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128, 256])
     parser.add_argument("--device", default="cuda", help="cpu tries this command itself")
     arguments = parser.parse_args()

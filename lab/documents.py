@@ -9,37 +9,27 @@ number in a sentence between ``<!-- figures: NAME.COLUMN WORDS -->`` and ``<!-- 
 
 from __future__ import annotations
 
-import argparse
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 from super_sdf.errors import FileError
 
+from . import parser_of
 from .figures import FOLDER
 from .quoted import UNKNOWN, shown
 
 ROOT = Path(__file__).parents[1]
 PLACES = ("README.md", "docs/**/*.md", "src/super_sdf/models/*.md")
 MARKED = re.compile(r"(<!-- figures: ([^>]+?) -->)(.*?)(<!-- /figures -->)", re.DOTALL)
-# Words of a text that looks back, outside of where history is kept.
-HISTORY = re.compile(r"of before|\bearlier\b|\bolder\b|\bwith \w+ blocks\b", re.IGNORECASE)
-WITH_HISTORY = ("CHANGELOG.md", "export", "build", "dist", "site")  # the last three are made
 
 
-def documents(root: Path = ROOT) -> list[Path]:
+def documents() -> list[Path]:
     """Return the documents that show figures."""
-    return sorted(path for place in PLACES for path in root.glob(place))
+    return sorted(path for place in PLACES for path in ROOT.glob(place))
 
 
 def rendered(text: str, folder: Path = FOLDER) -> str:
-    """Return a document with the figures as they were measured; others stay as they stand.
-
-    Raises
-    ------
-    FileError
-        If a marker names no figure, or does not end.
-    """
+    """Return a document with the figures as they were measured; others stay as they stand."""
     if len(MARKED.findall(text)) != len(re.findall(r"<!-- figures: ", text)):
         raise FileError("a marker of figures is not ended by <!-- /figures -->")
 
@@ -53,22 +43,9 @@ def rendered(text: str, folder: Path = FOLDER) -> str:
     return MARKED.sub(replace, text)
 
 
-def lines_that_look_back(root: Path = ROOT) -> Iterator[str]:
-    """Yield the lines of documents that speak of what was, with file and number."""
-    for path in sorted(root.rglob("*.md")):
-        place = path.relative_to(root)
-        if place.parts[0] in WITH_HISTORY or any(part.startswith(".") for part in place.parts):
-            continue
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
-            if HISTORY.search(line):
-                yield f"{place}:{number}: {line.strip()}"
-
-
 def main() -> int:
     """Rewrite the documents, or compare them."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--check", action="store_true", help="write nothing")
     parser.add_argument("--figures", type=Path, default=FOLDER, help="folder of the JSON files")
     words = parser.parse_args()

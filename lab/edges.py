@@ -60,15 +60,8 @@ class EdgeCurves:
         return cls(mesh.vertices, edges, drawn[order_in_space(drawn)])
 
     def distance(self, points: Points) -> Distances:
-        """Return the distance of points (k, 3) to the nearest edge, (k,).
-
-        It is exact: a search among points is slow where many are equally far, as those of a circle
-        are from its axis.
-        """
-        distances: Distances = np.sqrt(
-            igl.point_mesh_squared_distance(points, self.vertices, self.edges)[0]
-        )
-        return distances
+        """Return the exact distance of points (k, 3) to the nearest edge, (k,)."""
+        return np.sqrt(igl.point_mesh_squared_distance(points, self.vertices, self.edges)[0])
 
 
 def sample_edges(
@@ -122,15 +115,12 @@ def edge_among_nearest(drawn: SurfacePoints, index: Indices) -> BoolArray:
     nearby = drawn.tree.query(points, EDGE_NEIGHBOURS, distance_upper_bound=EDGE_RADIUS)[1]
     # Missing neighbours have the index n; the point itself replaces them, which is no edge.
     nearby = np.where(nearby == len(drawn.points), index[:, None], nearby)
-    columns = [is_turned(drawn.normals, index, column) for column in nearby.T]
-    found: BoolArray = np.any(columns, axis=0)
-    return found
+    return np.any([is_turned(drawn.normals, index, column) for column in nearby.T], axis=0)
 
 
 def is_turned(normals: Points, one: Indices, other: Indices) -> BoolArray:
     """Return for pairs (p,) of normals (n, 3) whether they make an edge, whatever their signs."""
-    turned: BoolArray = np.abs(np.einsum("pd,pd->p", normals[one], normals[other])) < SHARP_COSINE
-    return turned
+    return np.abs(np.einsum("pd,pd->p", normals[one], normals[other])) < SHARP_COSINE
 
 
 def compare_edges(reference: EdgeCurves, result: Points) -> Numbers:
@@ -142,10 +132,8 @@ def compare_edges(reference: EdgeCurves, result: Points) -> Numbers:
         return {"ecd": None, "ef1": None}
     result = result if len(result) else DOT.points
     there, back = cKDTree(result).query(reference.drawn)[0], reference.distance(result)
-    return {
-        "ecd": float(np.mean(there**2) + np.mean(back**2)),
-        "ef1": edge_f1(there, back, EDGE_DISTANCE),
-    }
+    ecd = float(np.mean(there**2) + np.mean(back**2))
+    return {"ecd": ecd, "ef1": edge_f1(there, back, EDGE_DISTANCE)}
 
 
 def edge_f1(there: Distances, back: Distances, reach: float) -> float:
@@ -185,27 +173,13 @@ def compare_angles(
     if not drawn.normals.any():
         near_angle = NO_NORMAL_ANGLE if len(edges.edges) else None
         return {"angle_near": near_angle, "angle_beyond": NO_NORMAL_ANGLE}
-    angles = normal_angles(face_vectors(reference)[nearest], drawn.normals)
+    vectors = face_vectors(reference)[nearest]
+    dot = np.einsum("nd,nd->n", vectors, drawn.normals)
+    with np.errstate(invalid="ignore"):  # NaN where a triangle has no area and so no normal
+        angles = np.degrees(np.arccos(np.clip(dot / np.linalg.norm(vectors, axis=1), -1, 1)))
     near = np.zeros(len(angles), bool)
     if len(edges.edges):
         near = edges.distance(drawn.points) < spacing
-    return {"angle_near": mean_known(angles[near]), "angle_beyond": mean_known(angles[~near])}
-
-
-def normal_angles(vectors: Points, normals: Points) -> Distances:
-    """Return the angle, (n,) in degrees, of the vector of each triangle, (n, 3), to a unit normal.
-
-    It is NaN where the triangle has no area and so no normal.
-    """
-    lengths = np.linalg.norm(vectors, axis=1)
-    dot = np.einsum("nd,nd->n", vectors, normals)
-    with np.errstate(invalid="ignore"):
-        cosine = np.clip(dot / lengths, -1, 1)
-    angles: Distances = np.degrees(np.arccos(cosine))
-    return angles
-
-
-def mean_known(figures: Distances) -> float | None:
-    """Return the mean of the figures that are not NaN, None if there are none."""
-    known = figures[~np.isnan(figures)]
-    return float(known.mean()) if len(known) else None
+    known = ~np.isnan(angles)
+    parts = {"angle_near": angles[near & known], "angle_beyond": angles[~near & known]}
+    return {name: float(part.mean()) if len(part) else None for name, part in parts.items()}

@@ -15,9 +15,9 @@ earlier evaluation, which is resumed:
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
+from argparse import ArgumentParser
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,9 +25,9 @@ from pathlib import Path
 from super_sdf.errors import FileError, OptionError, SuperSdfError, seen
 from super_sdf.files.output import replacing
 from super_sdf.machine.threads import count_cores
-from super_sdf.mesh import Mesh
 from super_sdf.options import AUTO_PRECISION, DEFAULT_QUALITY, PRECISIONS
 
+from . import parser_of
 from .measuring import NO_SETTING, Task, network_of
 from .methods import FLOOR, METHODS, OURS, make_surface
 from .plots import draw_plots
@@ -36,10 +36,11 @@ from .rows import Row, Rows
 from .runner import LeftOut, OnTask, complete
 from .shapes import Case, Setting, Shape, find_meshes, spread
 from .tables import (
-    cost_table,
-    edge_table,
+    COST,
+    EDGES,
     empty_lines,
     gap_line,
+    mean_table,
     shape_table,
     surface_table,
     win_line,
@@ -67,7 +68,7 @@ voxel. The edge distance is that of points on the reference's edges to the resul
 coarse voxels: its mean. The angles, in degrees, are those between the result's normals and that of
 the nearest triangle of the reference, within a coarse voxel of the reference's edges ("near") and
 beyond. Slivers are triangles with an angle under 5 degrees; the min angle is the mean over the
-shapes of the smallest. "Shapes" counts those with edges that were measured."""
+shapes of the smallest. Shapes without edges do not count."""
 
 
 class Results:
@@ -75,13 +76,7 @@ class Results:
 
     A failure is not a score, and methods are compared on the same shapes: if a method failed on a
     shape in a setting, the shape is left out of that setting for all methods, and named.
-
-    Attributes
-    ----------
-    left_out : list of LeftOut
-        Shapes that could not be read, or failed in some setting.
-    floors : dict of rows
-        The reference against itself, by shape; shapes without it are nowhere.
+    ``floors`` are the references against themselves, by shape.
     """
 
     def __init__(self, tasks: Sequence[Task], rows: Rows, left_out: Sequence[LeftOut] = ()) -> None:
@@ -129,6 +124,16 @@ def tasks_of(paths: Sequence[Path], settings: Sequence[Setting], like: Task) -> 
     return floors + [replace(like, path=p, setting=s) for s in settings for p in paths]
 
 
+def results_of(
+    tasks: Sequence[Task], rows: Rows, jobs: int, on_task: OnTask | None = None
+) -> Results:
+    """Measure what the rows lack; return the results, and name on stderr what was left out."""
+    results = Results(tasks, rows, complete(tasks, rows, jobs, on_task))
+    for entry in results.left_out:
+        print(f"Left out: {entry.shape}: {entry.reason}", file=sys.stderr)
+    return results
+
+
 def check_folder(out: Path) -> None:
     """Raise FileError unless a folder is new, empty or made by an evaluation."""
     if out.exists() and not out.is_dir():
@@ -146,13 +151,12 @@ def check_folder(out: Path) -> None:
 
 
 def write_report(
-    results: Results, like: Task, sizes: Sequence[int], out: Path, up: str | None
+    results: Results, like: Task, settings: Sequence[Setting], out: Path, up: str | None
 ) -> Path:
     """Write report.md, shapes.md, plots and pictures; return the path of report.md.
 
     ``up`` is the axis that points up in the pictures; None: none are drawn.
     """
-    settings = [replace(like.setting, size=size) for size in sizes]
     by_setting = {s: results.by_method(s, (*like.methods, FLOOR)) for s in settings}
     parts = [f"# Quality of super-sdf on {len(results.floors)} shapes", PROTOCOL_LINES]
     if like.turned is not None:
@@ -165,19 +169,16 @@ def write_report(
         lines = [*wins, gap_line(by_method), *empty_lines(by_method)]
         parts += [f"## {setting}", surface_table(by_method, setting.size), *filter(None, lines)]
     parts += ["## Edges and triangles", EDGE_LINES]
-    parts += [f"**{s}**\n\n{edge_table(found)}" for s, found in by_setting.items()]
+    parts += [f"**{s}**\n\n{mean_table(found, EDGES)}" for s, found in by_setting.items()]
     parts += ["## Time and memory", describe_machine(), COST_LINES]
-    parts += [f"**{s}**\n\n{cost_table(found)}" for s, found in by_setting.items()]
+    parts += [f"**{s}**\n\n{mean_table(found, COST)}" for s, found in by_setting.items()]
     plots = draw_plots({s.size: found for s, found in by_setting.items()}, out / "plots")
     parts += ["## Plots", *(f"![{text}](plots/{name})" for name, text in plots.items())]
     if up and OURS in like.methods:
         parts += picture_lines(results, like, settings[0], out, up)
-    notes = [
-        f"- {name}: {'; '.join(row['notes'])}."
-        for name, row in results.floors.items()
-        if row["notes"]
-    ]
-    parts += ["## Notes on the shapes", "\n".join(notes)] if notes else []
+    notes = {name: "; ".join(row["notes"]) for name, row in results.floors.items()}
+    lines = [f"- {name}: {said}." for name, said in notes.items() if said]
+    parts += ["## Notes on the shapes", "\n".join(lines)] if lines else []
     shapes = [f"## {s}\n\n{shape_table(found)}" for s, found in by_setting.items()]
     write_page(out / "shapes.md", shapes)
     return write_page(out / "report.md", parts)
@@ -196,8 +197,7 @@ def picture_lines(results: Results, like: Task, setting: Setting, out: Path, up:
     They are ranked by F1 over the floor's F1, which is low on large surfaces: there 100,000 points
     are far apart.
     """
-    floors = results.floors
-    ranked = results.of(setting, OURS)
+    floors, ranked = results.floors, results.of(setting, OURS)
     ranked.sort(key=lambda row: row["f1"] / floors[row["shape"]]["f1"], reverse=True)
     shown = ranked if len(ranked) < 2 * EXTREMES else [*ranked[:EXTREMES], *ranked[-EXTREMES:]]
     paths, folder = {task.path.stem: task.path for task in results.tasks}, out / "pictures"
@@ -222,19 +222,12 @@ def draw_shape(task: Task, folder: Path, up: str) -> None:
     shape = Shape.read(task.path, task.turned)
     case, network = Case(shape, task.setting), network_of(*task.network(OURS), task.threads)
     coarse, ours = (make_surface(name, case, network).mesh for name in ("mc", OURS))
-    panels = [
-        Panel(coarse, titled(coarse, f"marching cubes of {task.setting.size}^3")),
-        Panel(ours, titled(ours, "super-sdf")),
-        Panel(shape.mesh, "reference"),
-        Panel(ours, "error of super-sdf", vertex_errors(ours, shape.solid)),
-    ]
+    titles = {f"marching cubes of {task.setting.size}^3": coarse, "super-sdf": ours}
+    panels = [Panel(m, f"{t}: no surface" * (not len(m.faces)) or t) for t, m in titles.items()]
+    panels += [Panel(shape.mesh, "reference")]
+    panels += [Panel(ours, "error of super-sdf", vertex_errors(ours, shape.solid))]
     target, top = folder / f"{shape.name}.png", ERROR_TOP * case.spacing
     render_panels(panels, target, colour="error", up=up, top=top, unit="box diagonal 1")
-
-
-def titled(mesh: Mesh, title: str) -> str:
-    """Return the title of a panel, which says so if the mesh is empty."""
-    return title if len(mesh.faces) else f"{title}: no surface"
 
 
 def progress_lines() -> OnTask:
@@ -249,7 +242,7 @@ def progress_lines() -> OnTask:
     return show
 
 
-def add_jobs(parser: argparse.ArgumentParser) -> None:
+def add_jobs(parser: ArgumentParser) -> None:
     """Add the option of the number of processes."""
     parser.add_argument(
         "--jobs", type=int, default=count_cores(), help="processes at a time; 0: in this one"
@@ -258,18 +251,14 @@ def add_jobs(parser: argparse.ArgumentParser) -> None:
 
 def main() -> int:
     """Measure what is missing and report; exit code 1 if a shape was left out."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("meshes", type=Path, nargs="+", help="mesh files, or folders of them")
     parser.add_argument("--out", type=Path, required=True, help="folder for the report")
     parser.add_argument("--sizes", type=int, nargs="+", default=[32, 64, 128])
     parser.add_argument("--factor", type=int, default=4)
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--limit", type=int, help="use only this many meshes, spread over the list")
-    parser.add_argument(
-        "--turned", type=int, metavar="SEED", help="turn every mesh at random first"
-    )
+    parser.add_argument("--turned", type=int, metavar="SEED", help="turn meshes at random first")
     parser.add_argument("--model", default=DEFAULT_QUALITY, help="shipped network or ONNX file")
     parser.add_argument("--precision", choices=PRECISIONS, default=AUTO_PRECISION)
     parser.add_argument("--up", choices=("x", "y", "z"), default="z", help="upward in pictures")
@@ -290,15 +279,11 @@ def main() -> int:
     like = Task(paths[0], settings[0], methods, words.model, words.precision, threads, words.turned)
     check_folder(words.out)
     tasks, rows = tasks_of(paths, settings, like), Rows(words.out / ROWS)
-    left_out = complete(tasks, rows, words.jobs, None if words.quiet else progress_lines())
-    results = Results(tasks, rows, left_out)
-    for entry in results.left_out:
-        print(f"Left out: {entry.shape}: {entry.reason}", file=sys.stderr)
+    results = results_of(tasks, rows, words.jobs, None if words.quiet else progress_lines())
     if not results.floors:
         raise FileError("no shape could be measured")
-    sizes = [setting.size for setting in settings]
     up = None if words.no_pictures else words.up
-    path = write_report(results, like, sizes, words.out, up)
+    path = write_report(results, like, settings, words.out, up)
     if not words.quiet:
         print(path.read_text(encoding="utf-8"))
     return int(bool(results.left_out))

@@ -13,14 +13,12 @@ disk fills up (a RAM disk, which only root may mount); run again it must be comp
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import random
 import resource
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -33,11 +31,10 @@ from shutil import rmtree
 import numpy as np
 import psutil
 
-from .batch import workers_of
-from .mixed_grids import write_mixed
+from . import parser_of
+from .batch import COMMAND, workers_of, write_grids
 from .processes import describe_machine
 
-COMMAND = [sys.executable, "-m", "super_sdf"]
 SUFFIXES = (".ply", ".stl", ".obj", ".glb", ".3mf")
 LONG_ENOUGH = 120.0  # seconds; every run is shorter
 AT_ONCE = 0.5  # seconds in which a run ends that was about to end anyway
@@ -53,6 +50,17 @@ DISK_BYTES = 4 << 20
 BALLAST = "ballast"  # a file that fills the disk until the first run is over
 OWN_FILES = {"report.jsonl", ".super-sdf-batch", ".super-sdf-batch.lock"}
 HARMLESS = ("whole", "right", "left beside")
+OPTIONS = {
+    "--terms": (100, "runs ended by SIGTERM"),
+    "--kills": (100, "runs ended by SIGKILL"),
+    "--full": (50, "runs with a limit on files"),
+    "--checks": (80, "runs with --check and --report"),
+    "--batches": (200, "batches that are disturbed"),
+    "--disks": (50, "batches on a disk that fills"),
+    "--size": (24, "samples along each axis"),
+    "--count": (8, "grids of a batch"),
+    "--seed": (0, "of the random moments"),
+}
 Process = subprocess.Popen[bytes]
 Counts = Counter[str]
 
@@ -60,16 +68,16 @@ Counts = Counter[str]
 def start(words: Sequence[object], limit: int | None = None) -> Process:
     """Start a command, with a limit on the size of files if one is given."""
     lower = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (limit, limit))
-    before = None if limit is None else lower
-    command = [*COMMAND, *map(str, words)]
-    return subprocess.Popen(command, stderr=subprocess.PIPE, preexec_fn=before)
+    words, before = [*COMMAND, *map(str, words)], None if limit is None else lower
+    return subprocess.Popen(words, stderr=subprocess.PIPE, preexec_fn=before)
 
 
 class Single:
     """A folder with the grid of a ball, and the meshes of undisturbed runs in every format."""
 
     def __init__(self, folder: Path, size: int) -> None:
-        self.folder, self.grid, self.page = folder / "out", folder / "g.npy", folder / "page.html"
+        self.folder, self.grid = folder / "out", folder / "g.npy"
+        self.checks = "--check", "--report", folder / "page.html"
         self.folder.mkdir()
         ijk = np.indices((size,) * 3, dtype=np.float32)
         ball = np.linalg.norm(ijk - np.float32(size / 2 - 0.4), axis=0) - size / 3
@@ -79,8 +87,7 @@ class Single:
         self.writing: dict[str, float] = {}  # the seconds of these from the first file on
         self.turn = 0
         for suffix in SUFFIXES:
-            begun = time.perf_counter()
-            process = self.start(suffix)
+            begun, process = time.perf_counter(), self.start(suffix)
             self.wait_for_file(process)
             first_file = time.perf_counter()
             process.wait(LONG_ENOUGH)
@@ -89,7 +96,7 @@ class Single:
             self.whole[suffix] = self.target(suffix).read_bytes()
             self.target(suffix).unlink()
         begun = time.perf_counter()
-        self.start(".ply", None, "--check", "--report", self.page).wait(LONG_ENOUGH)
+        self.start(".ply", None, *self.checks).wait(LONG_ENOUGH)
         self.checking = time.perf_counter() - begun
         self.target(".ply").unlink()
 
@@ -143,7 +150,7 @@ class Single:
 
     def check(self, suffix: str) -> Counts:
         """End a run that checks the mesh at a random moment."""
-        process = self.start(suffix, None, "--check", "--report", self.page)
+        process = self.start(suffix, None, *self.checks)
         target = self.target(suffix)
         time.sleep(random.uniform(0, 1) * self.checking)
         process.send_signal(signal.SIGTERM)
@@ -165,7 +172,7 @@ class Many:
 
     def __init__(self, folder: Path, count: int, size: int) -> None:
         self.grids, self.meshes = folder / "grids", folder / "meshes"
-        write_mixed(self.grids, count, [size])
+        write_grids(self.grids, count, [size])
         begun = time.perf_counter()
         _, output = self.start().communicate()
         if output:
@@ -255,33 +262,21 @@ def tally(name: str, runs: int, kinds: Sequence[str], once: Callable[[str], Coun
 
 def main() -> int:
     """Run all trials; exit code 1 if any file was incomplete or left over."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--terms", type=int, default=100, help="runs ended by SIGTERM")
-    parser.add_argument("--kills", type=int, default=100, help="runs ended by SIGKILL")
-    parser.add_argument("--full", type=int, default=50, help="runs with a limit on files")
-    parser.add_argument("--checks", type=int, default=80, help="runs with --check and --report")
-    parser.add_argument("--batches", type=int, default=200, help="batches that are disturbed")
-    parser.add_argument("--disks", type=int, default=50, help="batches on a disk that fills")
-    parser.add_argument("--size", type=int, default=24, help="samples along each axis")
-    parser.add_argument("--count", type=int, default=8, help="grids of a batch")
-    parser.add_argument("--seed", type=int, default=0, help="of the random moments")
+    parser = parser_of(__doc__)
+    for name, (default, what) in OPTIONS.items():
+        parser.add_argument(name, type=int, default=default, help=what)
     words = parser.parse_args()
     random.seed(words.seed)
     print(describe_machine(), flush=True)
     with tempfile.TemporaryDirectory() as name:
         single = Single(Path(name), words.size)
+        many = Many(Path(name), words.count, words.size)
         good = [
             tally("SIGTERM", words.terms, SUFFIXES, partial(single.kill, signal.SIGTERM)),
             tally("SIGKILL", words.kills, SUFFIXES, partial(single.kill, signal.SIGKILL)),
             tally("full disk", words.full, SUFFIXES, single.fill),
             tally("SIGTERM in checks", words.checks, SUFFIXES, single.check),
+            tally("batch", words.batches, list(KILLS), many.disturb),
+            tally("disk of a batch", words.disks, LIMITS, many.disturb),
         ]
-        if words.batches or words.disks:
-            many = Many(Path(name), words.count, words.size)
-            good += [
-                tally("batch", words.batches, list(KILLS), many.disturb),
-                tally("disk of a batch", words.disks, LIMITS, many.disturb),
-            ]
     return int(not all(good))

@@ -12,7 +12,6 @@ method, network, code, and for times the machine), so a run that was killed goes
 
 from __future__ import annotations
 
-import argparse
 import datetime
 import hashlib
 import json
@@ -21,7 +20,6 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -33,14 +31,13 @@ from super_sdf.machine.threads import count_cores
 from super_sdf.network.network import find_model
 from super_sdf.options import DEFAULT_QUALITY, QUALITIES
 
-from . import costs, others, quoted
-from .evaluate import Results, add_jobs, progress_lines, tasks_of
+from . import costs, others, parser_of, quoted
+from .evaluate import Results, add_jobs, progress_lines, results_of, tasks_of
 from .kinds import KINDS
 from .measuring import Task, digest_of_ours
 from .methods import FLOOR, ON
 from .processes import describe_machine, machine
 from .rows import Row, Rows
-from .runner import complete
 from .shapes import Setting, draw_halves, find_meshes, spread
 from .tables import BY_KEY, COST, gap_closed, mean_of, means, win_line
 
@@ -50,7 +47,7 @@ FEW = 10  # shapes of the smaller figures, spread over all
 BASELINES = ("mc", "mc-lewiner", "trilinear", "bspline")
 NETWORKS = ("ours@fast", "ours@noisy", "ours", "ours@base:float32", "ours@best")
 GAPS = ("f1", "nc", "p2s", "p2s_back")
-LATE = 900.0  # seconds for another method on a shape
+LATE, FEW_PARTS = 900.0, 6  # seconds for another method on a part, and parts
 
 
 @dataclass(frozen=True)
@@ -70,34 +67,31 @@ class Bench:
         """The size of the smaller figures."""
         return self.sizes[0]
 
-    @cached_property
+    @property
     def few(self) -> tuple[Path, ...]:
         """Some of the shapes."""
         return spread(self.shapes, FEW)
 
-    def given(self, name: str) -> tuple[Path, ...]:
-        """Return the shapes of a set."""
-        if name == "parts" and not self.parts:
-            raise OptionError("the CAD parts are needed: make them, python -m export.parts PARTS, "
-                              "and give --parts PARTS")  # fmt: skip
-        return self.parts if name == "parts" else self.shapes
-
     def measured(
         self,
-        paths: Sequence[Path],
+        name: str,
         settings: Sequence[Setting],
         methods: Sequence[str],
-        **options: Any,
+        limit: float | None = None,
     ) -> Results:
-        """Return the measurements of methods on shapes in settings; measure what is missing."""
-        threads = max(1, count_cores() // max(self.jobs, 1))
-        like = Task(paths[0], settings[0], tuple(methods), self.network, threads=threads, **options)
-        tasks = tasks_of(paths, settings, like)
-        left_out = complete(tasks, self.rows, self.jobs, progress_lines())
-        results = Results(tasks, self.rows, left_out)
-        for entry in results.left_out:
-            print(f"Left out: {entry.shape}: {entry.reason}", file=sys.stderr)
-        return results
+        """Return the measurements of methods on a set, "parts", "few" or "validation", in settings.
+
+        What is missing is measured. Parts are turned.
+        """
+        paths = {"parts": self.parts, "few": self.few}.get(name, self.shapes)
+        paths = paths[:FEW_PARTS] if limit else paths
+        if not paths:
+            raise OptionError("the CAD parts are needed: make them, python -m export.parts PARTS, "
+                              "and give --parts PARTS")  # fmt: skip
+        threads, turned = max(1, count_cores() // max(self.jobs, 1)), 0 if name == "parts" else None
+        like = Task(paths[0], settings[0], tuple(methods), self.network, threads=threads,
+                    turned=turned, limit=limit)  # fmt: skip
+        return results_of(tasks_of(paths, settings, like), self.rows, self.jobs, progress_lines())
 
     def kept(self, key: Mapping[str, Any], measure: Callable[[], Mapping[str, Any]]) -> Row:
         """Return the row of a key with the code and the network; measure it if there is none."""
@@ -134,7 +128,7 @@ def quality(bench: Bench) -> list[Row]:
     methods = [*BASELINES, *NETWORKS, "bound"]
     if bench.network != DEFAULT_QUALITY:  # the others do not change with it
         methods = [*BASELINES, "ours", "bound"]
-    results = bench.measured(bench.shapes, [Setting(n) for n in bench.sizes], methods)
+    results = bench.measured("validation", [Setting(n) for n in bench.sizes], methods)
     names = [path.stem for path in bench.shapes]
     rows = []
     for size in bench.sizes:
@@ -160,8 +154,8 @@ def edges(bench: Bench) -> list[Row]:
         *(("validation", n, 4, both) for n in sizes),
     )
     for name, size, factor, methods in plans:
-        setting, turned = Setting(size, factor), 0 if name == "parts" else None
-        results = bench.measured(bench.given(name), [setting], methods, turned=turned)
+        setting = Setting(size, factor)
+        results = bench.measured(name, [setting], methods)
         for method in methods:
             word = method.replace("ours-sharp", "sharp").replace("ours", "marching")
             word += f"-{factor}" if factor != 4 else ""
@@ -174,23 +168,20 @@ def peers(bench: Bench) -> list[Row]:
     """Measure dual contouring of distances, and ours with as many triangles."""
     other = "dual-contouring"
     methods, setting = (other, f"ours/{other}", f"ours-sharp/{other}"), Setting(bench.small)
-    parts = bench.given("parts")[:6]
-    results = bench.measured(parts, [setting], methods, turned=0, limit=LATE)
+    results = bench.measured("parts", [setting], methods, LATE)
     return [{"method": m, **summary(results.of(setting, m))} for m in methods]
 
 
 def kinds(bench: Bench) -> list[Row]:
     """Measure grids that are not exact distances, by us and by what people do today."""
-    rows, size = [], bench.small
+    rows, setting = [], Setting(bench.small)
     masks = {name: kind for name, kind in KINDS.items() if kind.group == "mask"}
-    for name, paths, some in (("shapes", bench.few, KINDS), ("parts", bench.parts, masks)):
+    sets = {"shapes": ("few", KINDS), **({"parts": ("parts", masks)} if bench.parts else {})}
+    for name, (paths, some) in sets.items():
         methods = [f"{method}{ON}{kind}" for kind in some for method in some[kind].methods]
-        if not paths:
-            continue
-        turned = 0 if name == "parts" else None
-        results = bench.measured(paths, [Setting(size)], methods, turned=turned)
+        results = bench.measured(paths, [setting], methods)
         for title in dict.fromkeys(kind.title for kind in some.values()):
-            rows += kind_rows(results, Setting(size), name, title)
+            rows += kind_rows(results, setting, name, title)
     return rows + others.form_rows(bench) + others.slice_rows(bench)
 
 
@@ -245,16 +236,14 @@ def few_rows(
     bench: Bench, word: str, settings: Mapping[Any, Setting], methods: Sequence[str]
 ) -> list[Row]:
     """Return a row for each setting and method, on some of the shapes."""
-    results = bench.measured(bench.few, list(settings.values()), methods)
+    results = bench.measured("few", list(settings.values()), methods)
     rows = []
     for value, setting in settings.items():
         found = results.by_method(setting, methods)
         for method, measured in found.items():
-            gap = None
-            if "bound" in found:
-                gap = gap_closed(measured, found["bspline"], found["bound"], "f1")
-            row = {word: value, "method": name_of(method), **summary(measured), "gap_f1": gap}
-            rows.append(row)
+            gap = gap_closed(measured, found["bspline"], found.get("bound", []), "f1")
+            words = {word: value, "method": name_of(method)}
+            rows.append({**words, **summary(measured), "gap_f1": gap})
     return rows
 
 
@@ -263,8 +252,7 @@ def simplify(bench: Bench) -> list[Row]:
     rows, setting = [], Setting(bench.small)
     methods = ("ours", "ours/within", "ours-sharp", "ours-sharp/within")
     for name in ("parts", "validation"):
-        turned = 0 if name == "parts" else None
-        results = bench.measured(bench.given(name), [setting], methods, turned=turned)
+        results = bench.measured(name, [setting], methods)
         for method in methods:
             mesher = "sharp" if "sharp" in method else "marching"
             words = {"set": name, "mesher": mesher, "simplified": "within" in method}
@@ -272,56 +260,46 @@ def simplify(bench: Bench) -> list[Row]:
     return rows
 
 
-@dataclass(frozen=True)
-class Figure:
-    """What is measured, and by which networks; whether it takes long for what few ask for."""
-
-    measure: Callable[[Bench], list[Row]]
-    networks: tuple[str, ...] = ("base",)
-    is_rare: bool = False
-
-
-FIGURES = {
-    "quality": Figure(quality, ("fast", "base", "best", "noisy")),
-    "edges": Figure(edges),
-    "kinds": Figure(kinds, ("base", "mask", "noisy")),
-    "noise": Figure(noise, ("base", "noisy")),
-    "scale": Figure(scale),
-    "factors": Figure(factors),
-    "simplify": Figure(simplify),
-    "check": Figure(others.check_rows),
-    "speed": Figure(costs.speed_rows, ("fast", "base", "best", "mask", "noisy")),
-    "memory": Figure(costs.memory_rows),
-    "peers": Figure(peers, is_rare=True),
+# How each is measured, and by which networks.
+FIGURES: dict[str, tuple[Callable[[Bench], list[Row]], tuple[str, ...]]] = {
+    "quality": (quality, ("fast", "base", "best", "noisy")),
+    "edges": (edges, ("base",)),
+    "kinds": (kinds, ("base", "mask", "noisy")),
+    "noise": (noise, ("base", "noisy")),
+    "scale": (scale, ("base",)),
+    "factors": (factors, ("base",)),
+    "simplify": (simplify, ("base",)),
+    "check": (others.check_rows, ("base",)),
+    "speed": (costs.speed_rows, ("fast", "base", "best", "mask", "noisy")),
+    "memory": (costs.memory_rows, ("base",)),
+    "peers": (peers, ("base",)),
 }
+RARE = ("peers",)  # takes long for what few ask for
 
 
 def digests(networks: Iterable[str], chosen: str) -> dict[str, str]:
     """Return the SHA-256 of the files of networks, the int8 ones that the CPU runs."""
     found = {}
     for name in networks:
-        model = QUALITIES.get(name, (name, 1))[0]
-        path, _ = find_model(chosen if name == DEFAULT_QUALITY else model, "auto")
-        found[name] = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+        model = chosen if name == DEFAULT_QUALITY else QUALITIES.get(name, (name, 1))[0]
+        found[name] = hashlib.sha256(find_model(model, "auto")[0].read_bytes()).hexdigest()[:12]
     return found
 
 
 def commit() -> str:
     """Return the commit of the sources; "unknown" outside of a clone."""
     words = ["git", "-C", str(FOLDER.parent), "rev-parse", "--short=9", "HEAD"]
-    done = subprocess.run(words, capture_output=True, text=True)
-    return done.stdout.strip() or "unknown"
+    return subprocess.run(words, capture_output=True, text=True).stdout.strip() or "unknown"
 
 
 def write(name: str, rows: list[Row], bench: Bench, out: Path) -> Path:
     """Write a figure's file."""
-    day = datetime.datetime.now(datetime.timezone.utc).date().isoformat()
     content = {
         "name": name,
-        "networks": digests(FIGURES[name].networks, bench.network),
+        "networks": digests(FIGURES[name][1], bench.network),
         "commit": commit(),
         "machine": machine(),
-        "date": day,
+        "date": datetime.datetime.now(datetime.timezone.utc).date().isoformat(),
         "shapes": len(bench.shapes),
         "rows": [{key: rounded(value) for key, value in row.items()} for row in rows],
     }
@@ -333,15 +311,14 @@ def write(name: str, rows: list[Row], bench: Bench, out: Path) -> Path:
 
 def rounded(value: Any) -> Any:
     """Return a number with six digits, so that a file holds what a table could show."""
-    return float(f"{value:.6g}") if isinstance(value, float) and np.isfinite(value) else (
-        None if isinstance(value, float) else value)  # fmt: skip
+    if not isinstance(value, float):
+        return value
+    return float(f"{value:.6g}") if np.isfinite(value) else None
 
 
 def main() -> None:
     """Measure the figures, write their files, and print their tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--shapes", type=Path, nargs="+", required=True, help="meshes, or folders")
     parser.add_argument("--parts", type=Path, nargs="*", default=[], help="CAD parts")
     parser.add_argument("--only", nargs="+", choices=FIGURES, metavar="NAME",
@@ -371,11 +348,7 @@ def main() -> None:
         words.jobs,
         words.runs,
     )
-    for name in words.only or [name for name, one in FIGURES.items() if not one.is_rare]:
-        path = write(name, FIGURES[name].measure(bench), bench, words.out)
+    for name in words.only or [name for name in FIGURES if name not in RARE]:
+        path = write(name, FIGURES[name][0](bench), bench, words.out)
         for table, text in quoted.tables_of(path).items():
             print(f"{table}\n\n{text}\n", flush=True)
-
-
-if __name__ == "__main__":
-    main()

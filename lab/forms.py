@@ -1,7 +1,7 @@
-"""Fields that are no distances, by formula, as people write them; and the true surface of each.
+"""Solids in closed form, as functions of x, y and z, negative inside; and the true surface of each.
 
-The formulas are the usual ones (https://iquilezles.org/articles/distfunctions): exact forms,
-bounds, and smooth combinations of them. The solids lie in the unit cube around the origin.
+The formulas are the usual ones (https://iquilezles.org/articles/distfunctions): exact distances,
+bounds of them, and smooth combinations. By default they lie in the unit cube around the origin.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ def ball(x, y, z, at: float, radius: float) -> np.ndarray:
     return np.sqrt((x - at) ** 2 + y**2 + z**2) - radius
 
 
-def torus(x, y, z) -> np.ndarray:
+def torus(x, y, z, major: float = 0.3, minor: float = 0.12) -> np.ndarray:
     """Return the distance to a torus round the z axis."""
-    return np.hypot(np.hypot(x, y) - 0.3, z) - 0.12
+    return np.hypot(np.hypot(x, y) - major, z) - minor
 
 
 def ellipsoid(x, y, z, *axes: float) -> np.ndarray:
@@ -47,25 +47,20 @@ def smooth_union(one: np.ndarray, other: np.ndarray, width: float) -> np.ndarray
     return np.minimum(one, other) - blend**2 * width / 4
 
 
-def smooth_difference(one: np.ndarray, other: np.ndarray, width: float) -> np.ndarray:
-    """Return one less the other, with a smooth edge."""
-    return -smooth_union(-one, other, width)
-
-
 def quadric(x, y, z) -> np.ndarray:
     """Return the polynomial of an ellipsoid."""
     return (x / 0.4) ** 2 + (y / 0.25) ** 2 + (z / 0.2) ** 2 - 1
 
 
-def gyroid(x, y, z) -> np.ndarray:
-    """Return a gyroid within a ball."""
-    a, b, c = 15 * x, 15 * y, 15 * z
+def gyroid(x, y, z, turn: float = 15) -> np.ndarray:
+    """Return a gyroid of ``turn`` radians a side, within a ball."""
+    a, b, c = turn * x, turn * y, turn * z
     wave = np.sin(a) * np.cos(b) + np.sin(b) * np.cos(c) + np.sin(c) * np.cos(a)
-    return np.maximum(wave, 15 * ball(x, y, z, 0, 0.4))
+    return np.maximum(wave, turn * ball(x, y, z, 0, 0.4))
 
 
 def blobs(x, y, z) -> np.ndarray:
-    """Return the sum of Gaussians, as of metaballs, less a level; positive inside is turned."""
+    """Return .6 less the sum of some Gaussians, as of metaballs."""
     places = ((-0.15, 0.0, 0.0), (0.15, 0.05, 0.0), (0.0, -0.15, 0.1))
     return 0.6 - sum(
         np.exp(-((x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2) / 0.02) for a, b, c in places
@@ -78,8 +73,8 @@ FORMS: dict[str, Form] = {
     "ellipsoid": lambda x, y, z: ellipsoid(x, y, z, 0.4, 0.25, 0.15),
     "quadric": quadric,
     "cut quadric": lambda x, y, z: np.maximum(quadric(x, y, z), x + 0.4 * y - 0.1),
-    "smooth difference": lambda x, y, z: smooth_difference(
-        ball(x, y, z, -0.08, 0.3), ball(x, y, z, 0.2, 0.2), 0.1
+    "smooth difference": lambda x, y, z: (
+        -smooth_union(-ball(x, y, z, -0.08, 0.3), ball(x, y, z, 0.2, 0.2), 0.1)
     ),
     "smooth union": lambda x, y, z: smooth_union(
         ball(x, y, z, -0.15, 0.2), ball(x, y, z, 0.15, 0.2), 0.1
@@ -92,15 +87,11 @@ FORMS: dict[str, Form] = {
 }
 
 
-def lattice(size: int) -> tuple[np.ndarray, ...]:
-    """Return x, y and z of the samples of a grid of the unit cube, (n, n, n) each."""
-    line = (np.arange(size) + 0.5) / size - 0.5
-    return tuple(np.meshgrid(line, line, line, indexing="ij"))
-
-
 def sample(form: Form, size: int) -> tuple[np.ndarray, float, float]:
-    """Return the samples of a form, their spacing, and the coordinate of the first one."""
-    return form(*lattice(size)).astype(np.float32), 1 / size, 0.5 / size - 0.5
+    """Return the samples of a form in the unit cube, their spacing, and the first's coordinate."""
+    line = (np.arange(size) + 0.5) / size - 0.5
+    values = form(*np.meshgrid(line, line, line, indexing="ij"))
+    return values.astype(np.float32), 1 / size, 0.5 / size - 0.5
 
 
 def true_surface(form: Form) -> Mesh:

@@ -9,17 +9,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from super_sdf.arrays import BoolArray, FloatArray
+from super_sdf.arrays import FloatArray
 from super_sdf.errors import GridError
 from super_sdf.grid.field import AUTO, SCALED
 from super_sdf.grid.sdf_grid import SdfGrid, make_grid
-from super_sdf.mesh import Mesh
 from super_sdf.network.decoder import Decoder
 from super_sdf.pipeline import reconstruct
 from super_sdf.truth.solid import Solid
@@ -30,12 +29,6 @@ from .surfaces import EMPTY, Surface, closed_isosurface, interpolate_spline, str
 Array = NDArray[Any]
 
 CUTS = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0)  # voxels
-UNEVEN_CUTS = (1.0, 2.5)  # voxels, inside and outside
-UNKNOWN = 2.0  # voxels from which on values are NaN
-UNIT = 0.01  # of values in another unit
-WAVES = 2.0  # periods of the varying slope along an axis of the grid
-SLOPES = (0.5, 1.5)  # least and largest of the varying slope
-NOISES = (0.1, 0.25)  # amplitudes, voxels
 INTEGERS = 30_000.0  # of the diagonal, in steps of whole numbers of 16 bits
 RATIOS = (1.5, 5.0)  # of the coarse spacing to the others
 MOST_BY_HAND = 2.0  # ratio up to which grids are resampled by hand to the finest spacing
@@ -77,14 +70,8 @@ class Kind:
         """What the kind is called in ``KINDS`` and in the rows of an evaluation."""
         return f"{self.title}, {self.axis}" if self.axis else self.title
 
-    @property
-    def is_scaled(self) -> bool:
-        """Whether a user says ``--field scaled`` if the default call is refused."""
-        return self.group == "scaled"
 
-
-@dataclass(frozen=True, eq=False)
-class FieldSamples:
+class FieldSamples(NamedTuple):
     """The values of a kind for a case."""
 
     values: Array  # (nx, ny, nz)
@@ -118,68 +105,16 @@ def without_unknown(values: FloatArray) -> FloatArray:
     return values[tuple(nearest)]
 
 
-def exact(case: Case) -> Array:
-    """Return the exact distances."""
-    return case.coarse
-
-
-def mask(case: Case) -> Array:
-    """Return 1 inside and 0 outside, uint8."""
-    return (case.coarse <= 0).astype(np.uint8)
-
-
-def truncated(case: Case, *, inside: float, outside: float) -> Array:
-    """Return distances that are cut off at a number of voxels on either side."""
-    h = case.spacing
-    return np.clip(case.coarse, -inside * h, outside * h)
-
-
-def partly_unknown(case: Case, *, beyond: float) -> Array:
-    """Return distances that are NaN beyond some voxels from the surface."""
-    return np.where(np.abs(case.coarse) <= beyond * case.spacing, case.coarse, np.float32(np.nan))
-
-
-def scaled(case: Case, *, unit: float) -> Array:
-    """Return distances in another unit."""
-    return case.coarse * np.float32(unit)
-
-
-def integers(case: Case) -> Array:
-    """Return distances in whole numbers of 16 bits."""
-    return np.rint(case.coarse * INTEGERS).astype(np.int16)
-
-
 def saturating(case: Case) -> Array:
     """Return w tanh(d/w) of distances d, w two voxels: slope 1 at the surface, less beyond."""
     width = np.float32(2 * case.spacing)
     return width * np.tanh(case.coarse / width)
 
 
-def steepening(case: Case) -> Array:
-    """Return d + d^2 of distances d, in sides of the grid: slope 1 at the surface, more outside.
-
-    It is monotone, since no distance inside is beyond half of the side.
-    """
-    side = np.float32(case.side)
-    return case.coarse + case.coarse**2 / side
-
-
 def varying(case: Case) -> Array:
-    """Return distances times a smooth factor of the position, within ``SLOPES``."""
+    """Return distances times a smooth factor of the position, .5 to 1.5, in two waves."""
     place = (np.indices(case.coarse.shape).sum(0) + 1.5) / case.setting.size
-    low, high = SLOPES
-    factor = (low + high) / 2 + (high - low) / 2 * np.sin(2 * np.pi * WAVES * place)
-    return (case.coarse * factor).astype(np.float32)
-
-
-def occupancy(case: Case) -> Array:
-    """Return 1 / (1 + exp(d / h)) of distances d: 1 deep inside, 1/2 on the surface."""
-    return (0.5 - 0.5 * np.tanh(case.coarse / (2 * case.spacing))).astype(np.float32)
-
-
-def shares(case: Case) -> Array:
-    """Return about the share of each voxel that is inside: 1/2 - d/h, between 0 and 1."""
-    return np.clip(0.5 - case.coarse / case.spacing, 0, 1).astype(np.float32)
+    return (case.coarse * (1 + 0.5 * np.sin(4 * np.pi * place))).astype(np.float32)
 
 
 def noisy(case: Case, *, amplitude: float) -> Array:
@@ -210,8 +145,8 @@ def sample_box(solid: Solid, shape: tuple[int, int, int], side: float) -> FloatA
 
 def truncated_kind(title: str, inside: float, outside: float) -> Kind:
     """Return the kind of distances cut off at these voxels."""
-    make = partial(truncated, inside=inside, outside=outside)
-    return Kind("truncated", f"cut off at {title}", make)
+    return Kind("truncated", f"cut off at {title}", lambda case: np.clip(
+        case.coarse, -inside * case.spacing, outside * case.spacing))  # fmt: skip
 
 
 def unequal_kind(ratio: float, axis: str) -> Kind:
@@ -222,65 +157,59 @@ def unequal_kind(ratio: float, axis: str) -> Kind:
 
 
 HALF: dict[str, Any] = {"level": 0.5, "options": {"level": 0.5}}
+PERCENT = np.float32(0.01)
 ALL_KINDS = (
-    Kind("exact", "exact", exact),
-    Kind("mask", "mask", mask, MASKS, level=0.5),
+    Kind("exact", "exact", lambda case: case.coarse),
+    Kind("mask", "mask", lambda case: (case.coarse <= 0).astype(np.uint8), MASKS, level=0.5),
     *(truncated_kind(f"{cut:g}", cut, cut) for cut in CUTS),
-    truncated_kind("-1 and 2.5", *UNEVEN_CUTS),
-    Kind("truncated", f"unknown beyond {UNKNOWN:g}", partial(partly_unknown, beyond=UNKNOWN)),
-    Kind("scaled", "d/100, no spacing given", partial(scaled, unit=UNIT), unit=UNIT),
-    Kind("scaled", "d/100, spacing given", partial(scaled, unit=UNIT)),
-    Kind("exact", "int16, no spacing given", integers, unit=INTEGERS),
+    truncated_kind("-1 and 2.5", 1.0, 2.5),
+    Kind("truncated", "unknown beyond 2", lambda case: np.where(
+        np.abs(case.coarse) <= 2 * case.spacing, case.coarse, np.float32(np.nan))),
+    Kind("scaled", "d/100, no spacing given", lambda case: case.coarse * PERCENT, unit=0.01),
+    Kind("scaled", "d/100, spacing given", lambda case: case.coarse * PERCENT),
+    Kind("exact", "int16, no spacing given", lambda case: np.rint(
+        case.coarse * INTEGERS).astype(np.int16), unit=INTEGERS),
     Kind("scaled", "2h tanh(d/2h)", saturating),
-    Kind("scaled", "d + d^2", steepening),
+    # monotone, since no distance inside is beyond half of the side
+    Kind("scaled", "d + d^2", lambda case: case.coarse + case.coarse**2 / np.float32(case.side)),
     Kind("scaled", "d times 0.5 to 1.5", varying),
-    Kind("density", "1/(1 + exp(d/h))", occupancy, **HALF),
-    Kind("density", "share of the voxel", shares, **HALF),
-    *(Kind("noisy", f"noise of {noise:g}", partial(noisy, amplitude=noise)) for noise in NOISES),
+    Kind("density", "1/(1 + exp(d/h))", lambda case: (
+        0.5 - 0.5 * np.tanh(case.coarse / (2 * case.spacing))).astype(np.float32), **HALF),
+    Kind("density", "share of the voxel", lambda case: np.clip(
+        0.5 - case.coarse / case.spacing, 0, 1).astype(np.float32), **HALF),
+    *(Kind("noisy", f"noise of {n:g}", partial(noisy, amplitude=n)) for n in (0.1, 0.25)),
     *(unequal_kind(ratio, axis) for ratio in RATIOS for axis in AXES),
-)
+)  # fmt: skip
 KINDS = {kind.name: kind for kind in ALL_KINDS}
 
 
 # What is done with the values of a kind.
 
 
-def coarse_of_kind(kind: Kind, case: Case, network: Decoder) -> Surface:
-    """Mesh the values by marching cubes, as they are."""
-    return coarse_mesh(samples_of(kind, case), partial(level_set, kind))
+def coarse_surface(
+    kind: Kind, case: Case, network: Decoder, change: Callable[[Array], FloatArray] | None = None
+) -> Surface:
+    """Mesh the values by marching cubes, as they are or changed."""
+    values, spacing, origin = samples_of(kind, case)
+    found = change(values) if change else level_set(kind, values)
+    return Surface(closed_isosurface(found, spacing, origin))
 
 
-def coarse_mesh(samples: FieldSamples, change: Callable[[Array], FloatArray]) -> Surface:
-    """Mesh changed values by marching cubes."""
-    field = change(samples.values)
-    return Surface(closed_isosurface(field, samples.spacing, samples.origin))
+def transformed(mask: Array) -> FloatArray:
+    """Return SciPy's distances of a mask, in voxels, half a voxel less on either side."""
+    out, into = (ndimage.distance_transform_edt(side) for side in (mask == 0, mask > 0))
+    return np.where(mask > 0, 0.5 - into, out - 0.5).astype(np.float32)
+
+
+def smoothed(mask: Array, width: float) -> FloatArray:
+    """Return 1/2 less the values of a mask, smoothed by a Gaussian of a width in voxels."""
+    return 0.5 - ndimage.gaussian_filter(mask.astype(np.float32), width, mode="nearest")
 
 
 def spline_of_kind(kind: Kind, case: Case, network: Decoder) -> Surface:
     """Mesh the cubic B-spline of the values at the fine nodes."""
-    field = interpolate_spline(level_set(kind, samples_of(kind, case).values), case.factor, 3)
-    return Surface(closed_isosurface(field, case.fine, case.low))
-
-
-def transform_of_mask(kind: Kind, case: Case, network: Decoder) -> Surface:
-    """Mesh SciPy's distance transform of a mask by marching cubes."""
-    return coarse_mesh(samples_of(kind, case), lambda values: distances_of(values > 0))
-
-
-def distances_of(inside: BoolArray) -> FloatArray:
-    """Return SciPy's distances of a mask, in voxels, half a voxel less on either side."""
-    out, into = (ndimage.distance_transform_edt(side) for side in (~inside, inside))
-    return np.where(inside, 0.5 - into, out - 0.5).astype(np.float32)
-
-
-def smoothed_mask(kind: Kind, case: Case, network: Decoder, *, width: float) -> Surface:
-    """Mesh a mask by marching cubes, smoothed by a Gaussian of a width in voxels."""
-    return coarse_mesh(samples_of(kind, case), partial(smoothed, width=width))
-
-
-def smoothed(values: Array, width: float) -> FloatArray:
-    """Return 1/2 less the smoothed values of a mask, negative inside."""
-    return 0.5 - ndimage.gaussian_filter(values.astype(np.float32), width, mode="nearest")
+    found = interpolate_spline(level_set(kind, samples_of(kind, case).values), case.factor, 3)
+    return Surface(closed_isosurface(found, case.fine, case.low))
 
 
 def our_surface_of_kind(kind: Kind, case: Case, network: Decoder) -> Surface:
@@ -288,47 +217,35 @@ def our_surface_of_kind(kind: Kind, case: Case, network: Decoder) -> Surface:
 
     If the default call is refused, and the kind is scaled, ``--field scaled`` is tried. ``facts``
     has what the values were taken as and whether the user had to say so, or why they were refused.
+    Without a spacing the mesh is in units of the values.
     """
+    values, spacing, origin = samples_of(kind, case)
+    placed = {"spacing": spacing, "origin": origin} if kind.unit is None else {}
     refusals = []
-    for told in (AUTO, SCALED) if kind.is_scaled else (AUTO,):
+    for told in (AUTO, SCALED) if kind.group == "scaled" else (AUTO,):
         try:
-            grid = grid_of(kind, case, told)
+            grid = make_grid(values, field=told, **kind.options, **placed)
             mesh = reconstruct(grid, network, factor=case.factor, cap=True)
         except GridError as problem:
             refusals.append(str(problem))
         else:
             facts = {"taken_as": grid.field.kind, "told": told != AUTO}
-            return Surface(placed(mesh, kind, case), facts=facts)
+            return Surface(mesh if placed else stretched(mesh, 1 / kind.unit, origin), facts=facts)
     return Surface(EMPTY, facts={"refused": refusals[0]})
-
-
-def grid_of(kind: Kind, case: Case, told: str) -> SdfGrid:
-    """Return the grid of a kind's values; ``told`` is the value of ``--field``."""
-    samples, options = samples_of(kind, case), dict(kind.options)
-    if kind.unit is None:
-        options |= {"spacing": samples.spacing, "origin": samples.origin}
-    return make_grid(samples.values, field=told, **options)
-
-
-def placed(mesh: Mesh, kind: Kind, case: Case) -> Mesh:
-    """Return a mesh in the frame of the case; without a spacing it was in units of the values."""
-    if kind.unit is None:
-        return mesh
-    return stretched(mesh, 1 / kind.unit, samples_of(kind, case).origin)
 
 
 def resampled_by_hand(
     kind: Kind, case: Case, network: Decoder, *, order: int, finest: bool
 ) -> Surface:
     """Mesh with super-sdf what SciPy resampled to one spacing; ``order`` is that of the spline."""
-    samples = samples_of(kind, case)
-    h = samples.spacing.min() if finest else samples.spacing.max()
-    step = h / samples.spacing
-    shape = np.rint((np.array(samples.values.shape) - 1) / step).astype(int) + 1
+    values, spacing, origin = samples_of(kind, case)
+    h = spacing.min() if finest else spacing.max()
+    step = h / spacing
+    shape = np.rint((np.array(values.shape) - 1) / step).astype(int) + 1
     values = ndimage.affine_transform(
-        samples.values, step, output_shape=tuple(shape), order=order, mode="nearest"
+        values, step, output_shape=tuple(shape), order=order, mode="nearest"
     )
-    grid = SdfGrid.trusted(values, h, samples.origin)
+    grid = SdfGrid.trusted(values, h, origin)
     try:
         return Surface(reconstruct(grid, network, factor=case.factor, cap=True))
     except GridError as problem:
@@ -336,17 +253,15 @@ def resampled_by_hand(
 
 
 BY_METHOD: dict[str, Callable[[Kind, Case, Decoder], Surface]] = {
-    "mc": coarse_of_kind,
-    "mc-distances": transform_of_mask,
-    **{f"mc-gaussian-{width:g}": partial(smoothed_mask, width=width) for width in WIDTHS},
+    "mc": coarse_surface,
+    "mc-distances": partial(coarse_surface, change=transformed),
+    **{
+        f"mc-gaussian-{width:g}": partial(coarse_surface, change=partial(smoothed, width=width))
+        for width in WIDTHS
+    },
     "bspline": spline_of_kind,
     "linear-finest": partial(resampled_by_hand, order=1, finest=True),
     "spline-finest": partial(resampled_by_hand, order=3, finest=True),
     "spline-coarsest": partial(resampled_by_hand, order=3, finest=False),
     "ours": our_surface_of_kind,
 }
-
-
-def mesh_kind(method: str, kind: Kind, case: Case, network: Decoder) -> Surface:
-    """Return the surface that a method makes of a kind of grid."""
-    return BY_METHOD[method](kind, case, network)

@@ -28,7 +28,7 @@ from super_sdf.network.network import (
     shipped_models,
 )
 from super_sdf.options import AUTO_PRECISION, DEFAULT_QUALITY
-from super_sdf.truth.solid import Distances, Solid
+from super_sdf.truth.solid import Solid
 
 from . import edges, metrics
 from .methods import FLOOR, ON, make_surface
@@ -44,7 +44,7 @@ VOXEL_NUMBERS = ("efv", "edge_distance", "angle_near", "angle_beyond")
 # Methods whose results do not depend on the code and the networks of this package.
 OF_OTHERS = (
     *("mc", "mc-lewiner", "mc-distances", "trilinear", "bspline", "bound"),
-    *(FLOOR, "rfta", "dual-contouring"),
+    *(FLOOR, "dual-contouring"),
 )
 # Folders of the package whose code does not change any surface.
 NOT_THE_METHOD = {"batch", "certificate", "cli", "cluster", "pages"}
@@ -124,12 +124,12 @@ def measure_method(
         network = network or network_of(*task.network(method), task.threads)
         forget_peak()
         held, clock = held_memory(), time.perf_counter()
-        surface = Surface(shape.mesh) if case is None else make_surface(method, case, network)
+        surface = make_surface(method, case, network) if case else Surface(shape.mesh)
         seconds, peak = time.perf_counter() - clock, held_memory(peak=True)
         if ON in method:
             figures = measure_on_kind(shape, surface.mesh)
         else:
-            figures = measure_surface(shape, surface.mesh, None if case is None else case.spacing)
+            figures = measure_surface(shape, surface.mesh, case.spacing if case else None)
         figures |= measure_field(case, surface)
     except Exception as problem:  # named in the report; the other shapes still count
         return {"error": reason_of(problem)}
@@ -150,50 +150,21 @@ def reason_of(problem: Exception) -> str:
     return f"{type(problem).__name__}: {message}{place}"
 
 
-@dataclass(frozen=True, eq=False)
-class Compared:
-    """A result, the points drawn from it, and how far both surfaces are from each other's points.
-
-    ``there`` are the distances of the reference's points to the result, ``back`` those of the
-    result's points to the reference, and ``nearest`` its triangles nearest to them.
-    """
-
-    result: Solid
-    drawn: metrics.SurfacePoints
-    there: Distances
-    back: Distances
-    nearest: metrics.Indices
-
-    @classmethod
-    def of(cls, shape: Shape, mesh: Mesh) -> Compared:
-        """Compare a result with a shape; a mesh without faces counts as a dot at the origin."""
-        result = Solid(mesh)
-        drawn = metrics.sample_surface(mesh, shape.seed(RESULT_POINTS)).ordered()
-        there = metrics.distance_or_dot(result, shape.drawn.points)
-        return cls(result, drawn, there, *metrics.nearest_or_dot(shape.solid, drawn.points))
-
-    def figures(self, shape: Shape) -> Measurement:
-        """Return the figures of every result."""
-        mesh = self.result.mesh
-        return {
-            **metrics.compare_samples(shape.drawn, self.drawn),
-            **metrics.compare_distances(self.there, self.back),
-            "closed": mesh.is_closed(),
-            "outward": mesh.volume() > 0,
-            "faces": len(mesh.faces),
-        }
-
-
 def measure_surface(shape: Shape, mesh: Mesh, spacing: float | None) -> Measurement:
     """Return the figures of a result's mesh; a mesh without faces counts as a dot at the origin.
 
     ``spacing`` is that of the coarse grid; without one, figures in voxels are None.
     """
-    found = Compared.of(shape, mesh)
+    figures, result, drawn, nearest = compare(shape, mesh)
+    in_voxels: Measurement = dict.fromkeys(VOXEL_NUMBERS)
+    if spacing is not None:
+        seed = shape.seed(RESULT_EDGES)
+        in_voxels = edges.compare_in_voxels(shape.sharp, result, seed, spacing)
+        in_voxels |= edges.compare_angles(shape.mesh, nearest, shape.sharp, drawn, spacing)
     return {
-        **found.figures(shape),
-        **edges.compare_edges(shape.sharp, edges.edge_points(found.drawn)),
-        **measure_edges(shape, found.result, found.drawn, found.nearest, spacing),
+        **figures,
+        **edges.compare_edges(shape.sharp, edges.edge_points(drawn)),
+        **in_voxels,
         **metrics.compare_triangles(mesh),
     }
 
@@ -204,30 +175,24 @@ def measure_on_kind(shape: Shape, mesh: Mesh) -> Measurement:
     Without edges and angles it takes half the time.
     """
     return {
-        **Compared.of(shape, mesh).figures(shape),
+        **compare(shape, mesh)[0],
         "volume_off": mesh.volume() / shape.mesh.volume() - 1,
         "pieces": count_components(mesh.faces, len(mesh.vertices)),
         "pieces_of_reference": count_components(shape.mesh.faces, len(shape.mesh.vertices)),
     }
 
 
-def measure_edges(
-    shape: Shape,
-    result: Solid,
-    drawn: metrics.SurfacePoints,
-    nearest: metrics.Indices,
-    spacing: float | None,
-) -> Measurement:
-    """Return the figures of edges and normals that have the coarse voxel as their unit.
-
-    ``nearest`` are the reference's triangles that are nearest to the points drawn.
-    """
-    if spacing is None:
-        return dict.fromkeys(VOXEL_NUMBERS)
-    return {
-        **edges.compare_in_voxels(shape.sharp, result, shape.seed(RESULT_EDGES), spacing),
-        **edges.compare_angles(shape.mesh, nearest, shape.sharp, drawn, spacing),
-    }
+def compare(
+    shape: Shape, mesh: Mesh
+) -> tuple[Measurement, Solid, metrics.SurfacePoints, metrics.Indices]:
+    """Return the figures of every result, its solid, its points, and the shape's nearest faces."""
+    result = Solid(mesh)
+    drawn = metrics.sample_surface(mesh, shape.seed(RESULT_POINTS)).ordered()
+    there = metrics.distance_or_dot(result, shape.drawn.points)
+    back, nearest = metrics.nearest_or_dot(shape.solid, drawn.points)
+    state = {"closed": mesh.is_closed(), "outward": mesh.volume() > 0, "faces": len(mesh.faces)}
+    figures = metrics.compare_samples(shape.drawn, drawn)
+    return {**figures, **metrics.compare_distances(there, back), **state}, result, drawn, nearest
 
 
 def measure_field(case: Case | None, surface: Surface) -> Measurement:
@@ -251,13 +216,9 @@ def digest_of_ours(model: str, precision: str = AUTO_PRECISION) -> str:
     digest = hashlib.sha256(str(symmetries).encode())
     shipped = shipped_models().items()
     for_kinds = [path for name, path in shipped if float32_name(name) in KIND_MODELS]
-    for path in [network, *for_kinds, *code_of_method()]:
+    package = Path(super_sdf.__file__).parent
+    files = sorted(package.rglob("*.py"))
+    code = [p for p in files if p.relative_to(package).parts[0] not in NOT_THE_METHOD]
+    for path in [network, *for_kinds, *code]:
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
-
-
-def code_of_method() -> list[Path]:
-    """Return the source files that a surface may depend on."""
-    package = Path(super_sdf.__file__).parent
-    files = package.rglob("*.py")
-    return sorted(p for p in files if p.relative_to(package).parts[0] not in NOT_THE_METHOD)

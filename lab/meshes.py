@@ -14,7 +14,6 @@ file with the commit to compare with first.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 import shutil
@@ -32,13 +31,18 @@ from super_sdf.slabs import preparing
 from super_sdf.slabs.cutting import Slab, cut
 from super_sdf.steps.survey import Band
 
+from . import parser_of
 from .processes import write_grid
 from .shapes import Shape, find_meshes
 
 
 def digest(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    """Return the SHA-256 of a file, however large."""
+    found = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 24):
+            found.update(block)
+    return found.hexdigest()
 
 
 @contextmanager
@@ -66,21 +70,16 @@ def write_meshes(
                 yield f"{path.stem} {size}" + f" in {count} slabs" * (count > 1), target
 
 
-def parse() -> argparse.Namespace:
-    """Return the arguments."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+def main() -> None:
+    """Write the digests, or compare them with those in a file; exit code 1 if any differs."""
+    parser = parser_of(__doc__)
     parser.add_argument("meshes", nargs="+", type=Path, help="closed meshes, or folders of them")
     parser.add_argument("--sizes", nargs="+", type=int, default=[32, 64])
     parser.add_argument("--slabs", nargs="+", type=int, default=[1])
     parser.add_argument("--out", type=Path, help="write the digests to this JSON file")
     parser.add_argument("--keep", type=Path, help="keep the mesh files in this folder")
     parser.add_argument("--against", type=Path, help="compare them with this JSON file")
-    return parser.parse_args()
-
-
-def main() -> None:
-    """Write the digests, or compare them with those in a file; exit code 1 if any differs."""
-    options, network = parse(), digest(find_model(DEFAULT_QUALITY)[0])
+    options, network = parser.parse_args(), digest(find_model(DEFAULT_QUALITY)[0])
     before = json.loads(options.against.read_text()) if options.against else None
     if before and before["network"] != network:
         raise SystemExit(f"{options.against} is of another network: {before['network'][:12]}...")

@@ -30,7 +30,7 @@ from super_sdf.steps.nodes import block_ijk, share_parts
 from super_sdf.steps.survey import survey
 from super_sdf.truth.sampling import grid_points
 
-from .kinds import KINDS, mesh_kind
+from .kinds import BY_METHOD, KINDS
 from .shapes import Case
 from .surfaces import EMPTY, Surface, interpolate_spline, isosurface
 
@@ -49,7 +49,6 @@ LABELS = {
     OURS: "super-sdf",
     "bound": "bound: true distance at the nodes",
     FLOOR: "floor: the reference against itself",
-    "rfta": "RFTA",
     "dual-contouring": "dual contouring of distances",
 }
 
@@ -87,11 +86,6 @@ def our_surface(case: Case, network: Decoder, *, mesher: str = DEFAULT_MESHER) -
     return Surface(mesh, lambda: band_field(case.grid, network, factor))
 
 
-def simplified_to(mesh: Mesh, triangles: int) -> Mesh:
-    """Simplify a mesh to a number of triangles."""
-    return simplify_mesh(mesh, triangles=triangles).mesh if triangles < len(mesh.faces) else mesh
-
-
 def band_field(grid: SdfGrid, network: Decoder, factor: int) -> FloatArray:
     """Return our distances at the fine nodes in the band's blocks, NaN elsewhere, (K n + 1)^3.
 
@@ -111,7 +105,7 @@ def sharp_isosurface(field: FloatArray, spacing: float, low: float) -> Mesh:
     """Mesh a dense field, (4 n + 1)^3, by the mesher that keeps edges; see ``isosurface``."""
     if not field.min() < 0 < field.max():
         return EMPTY
-    field = even_sided(field)
+    field = np.pad(field, [(0, (nodes + 1) % 2) for nodes in field.shape], mode="edge")  # even
     factor = FACTOR_OF_BLOCKS if (len(field) - 1) % FACTOR_OF_BLOCKS == 0 else 2
     shape = tuple((nodes - 1) // factor for nodes in field.shape)
     block = block_ijk(factor)
@@ -129,24 +123,10 @@ def sharp_isosurface(field: FloatArray, spacing: float, low: float) -> Mesh:
     return extract_mesh(fine, grid, mesher=SHARP)
 
 
-def even_sided(field: FloatArray) -> FloatArray:
-    """Return a field with an even number of cells along each side; the last node is repeated."""
-    return np.pad(field, [(0, (nodes + 1) % 2) for nodes in field.shape], mode="edge")
-
-
 def _node_of_blocks(field: FloatArray, node: IntArray, factor: int) -> FloatArray:
     """Return one node of every block of a dense field."""
     first = tuple(slice(start, start + n - factor, factor) for start, n in zip(node, field.shape))
     return field[first]
-
-
-def reach_for_the_arcs(case: Case, network: Decoder) -> Surface:
-    """Mesh the grid with Reach for the Arcs (Sellán et al. 2024), with its defaults."""
-    from gpytoolbox import reach_for_the_arcs
-
-    values = np.ravel(case.grid.values).astype(np.float64)
-    vertices, faces = reach_for_the_arcs(grid_points(case.layout), values)
-    return Surface(Mesh(np.asarray(vertices), np.asarray(faces, np.int32)))
 
 
 def dual_contouring(case: Case, network: Decoder) -> Surface:
@@ -175,7 +155,6 @@ BY_NAME: dict[str, Method] = {
     **METHODS,
     f"{OURS}-{SHARP}": partial(our_surface, mesher=SHARP),
     f"bound-{SHARP}": partial(bound_surface, mesher=SHARP),
-    "rfta": reach_for_the_arcs,
     "dual-contouring": dual_contouring,
 }
 
@@ -184,14 +163,15 @@ def make_surface(method: str, case: Case, network: Decoder) -> Surface:
     """Return the surface that a method makes of a case."""
     name, _, kind = method.partition("@")[0].partition(ON)
     if kind:
-        return mesh_kind(name, KINDS[kind], case, network)
+        return BY_METHOD[name](KINDS[kind], case, network)
     name, _, share = name.partition("/")
     if name not in BY_NAME:
         raise OptionError(f"method is {method!r}: give one of {', '.join(BY_NAME)}")
     surface = BY_NAME[name](case, network)
-    if not share:
-        return surface
+    mesh, count = surface.mesh, len(surface.mesh.faces)
     if share == WITHIN:
-        return Surface(simplify_mesh(surface.mesh, error=ERROR * case.spacing).mesh)
-    count = len(surface.mesh.faces) // int(share) if share.isdigit() else case.triangles[share]
-    return Surface(simplified_to(surface.mesh, count))
+        return Surface(simplify_mesh(mesh, error=ERROR * case.spacing).mesh)
+    if share:
+        wanted = count // int(share) if share.isdigit() else case.triangles[share]
+        return Surface(simplify_mesh(mesh, triangles=wanted).mesh) if wanted < count else surface
+    return surface

@@ -9,6 +9,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Sequence
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,7 +43,6 @@ POINTS = 20_000
 FACTOR = 4
 SLICES, RATIOS, CUTS = 24, (1.5, 2.5, 5.0), (0.5, 1.0, 2.0)
 MOST_PARTS = 4
-WORST = 0.05  # share of the vertices
 
 
 def distance(truth: Mesh, mesh: Mesh, spacing: float) -> float:
@@ -73,15 +73,12 @@ def ours(values: Values, spacing: Any, low: Any, network: Decoder) -> tuple[Mesh
 def form_rows(bench: Bench) -> list[Row]:
     """Measure closed forms that are no distances."""
     rows = []
-    for name in FORMS:
-        for size in bench.sizes[:2]:
-            words = {"set": "forms", "kind": name, "size": size}
-            found = bench.kept(words, partial(measure_form, name, size, bench))
-            facts = {"taken_as": found["taken_as"]}
-            rows += [
-                {**words, "method": method, "voxels": found[method], **facts}
-                for method in ("mc", "bspline", "ours")
-            ]
+    for name, size in product(FORMS, bench.sizes[:2]):
+        words = {"set": "forms", "kind": name, "size": size}
+        found = bench.kept(words, partial(measure_form, name, size, bench))
+        facts = {"taken_as": found["taken_as"]}
+        for method in ("mc", "bspline", "ours"):
+            rows.append({**words, "method": method, "voxels": found[method], **facts})
     return rows
 
 
@@ -125,15 +122,14 @@ def measure_slices(path: Path, ratio: float, bench: Bench) -> Row:
     values = sample_box(shape.solid, (fine, fine, SLICES), 1.0).astype(float)
     spacing = 1 / np.array(values.shape)
     network = network_of(bench.network, "auto", 0)
-    return {
-        "methods": {
-            method: {
-                "distance": distance(shape.mesh, mesh, float(spacing[2])),
-                "pieces": count_components(mesh.faces, len(mesh.vertices)),
-            }
-            for method, mesh in sliced_meshes(values, spacing, network)
+    found = {}
+    for method, mesh in sliced_meshes(values, spacing, network):
+        off = distance(shape.mesh, mesh, float(spacing[2]))
+        found[method] = {
+            "distance": off,
+            "pieces": count_components(mesh.faces, len(mesh.vertices)),
         }
-    }
+    return {"methods": found}
 
 
 def sliced_meshes(values: Values, spacing: Values, network: Decoder) -> Iterator[tuple[str, Mesh]]:
@@ -168,44 +164,28 @@ def resliced(values: Values, ratio: float, order: int) -> Values:
 def check_rows(bench: Bench) -> list[Row]:
     """Measure how well the residuals of ``super-sdf check`` predict the true error of a mesh.
 
-    ``shapes``: over shapes, Spearman's rank correlation of the mean residual with the mean error
-    both ways. ``vertices``: the same over the vertices of a shape, the median over shapes.
-    ``found``: how many of the worst twentieth of the vertices are among the worst by residual.
+    By Spearman's rank correlation: over ``shapes``, of the mean residual with the mean error both
+    ways; of the ``largest`` of each; over the ``vertices`` of a shape, the median over shapes.
     """
     rows = []
     for size in bench.sizes[:2]:
-        found = [
-            bench.kept(
-                {"check": path.stem, "size": size}, partial(measure_check, path, size, bench)
-            )
-            for path in bench.shapes
-        ]
-        mean = [row["mean"] for row in found]
-        rows.append(
-            {
-                "size": size,
-                "shapes": rank(mean, [row["both_ways"] for row in found]),
-                "one_way": rank(mean, [row["error"] for row in found]),
-                "largest": rank([r["largest"] for r in found], [r["max_error"] for r in found]),
-                **quantiles("vertices", [row["vertices"] for row in found]),
-                **quantiles("found", [row["found"] for row in found]),
-                **quantiles("ratio", [row["both_ways"] / row["mean"] for row in found]),
-                "above": sum(row["max_error"] < row["largest"] for row in found),
-                "grids": len(found),
-            }
-        )
+        found = []
+        for path in bench.shapes:
+            words = {"check": path.stem, "size": size}
+            found.append(bench.kept(words, partial(measure_check, path, size, bench)))
+        columns = {key: [row[key] for row in found] for key in found[0]}
+        ranks = {
+            "shapes": rank(columns["mean"], columns["both_ways"]),
+            "largest": rank(columns["largest"], columns["max_error"]),
+            "vertices": float(np.median(columns["vertices"])),
+        }
+        rows.append({"size": size, "grids": len(found), **ranks})
     return rows
 
 
 def rank(one: Sequence[float], other: Sequence[float]) -> float:
     """Return Spearman's rank correlation; NaN of fewer than two."""
     return float(spearmanr(one, other).statistic) if len(one) > 1 else float("nan")
-
-
-def quantiles(name: str, values: Sequence[float]) -> Row:
-    """Return the median, and the tenth and ninetieth percentile."""
-    low, middle, high = map(float, np.quantile(values, [0.1, 0.5, 0.9]))
-    return {name: middle, f"{name}_low": low, f"{name}_high": high}
 
 
 def measure_check(path: Path, size: int, bench: Bench) -> Row:
@@ -218,21 +198,16 @@ def measure_check(path: Path, size: int, bench: Bench) -> Row:
         network, options = network_of(bench.network, "auto", 0), ConvertOptions(inside="negative")
         convert(grid, grid.with_suffix(".ply"), network, options, force=True)
         found = check_files(grid.with_suffix(".ply"), grid, options, intersections=False)
-    mesh = found.mesh
+    mesh, summary = found.mesh, found.touching.summary()
     true = shape.solid.distance(mesh.vertices.astype(np.float64))
     said = np.abs(found.residuals_at(mesh.vertices))
     known = np.isfinite(said)
-    said, true_known = said[known], true[known]
-    worst = [values >= np.quantile(values, 1 - WORST) for values in (said, true_known)]
     drawn = sample_surface(mesh, shape.seed(RESULT_POINTS)).points
     there = distance_or_dot(Solid(mesh), shape.drawn.points)
     surfaces = compare_distances(there, distance_or_dot(shape.solid, drawn))
-    summary = found.touching.summary()
     return {
         **{name: float(summary[name]) for name in ("mean", "largest")},
-        "error": float(true.mean()) * size,
         "both_ways": surfaces["p2s"] * size,
         "max_error": surfaces["max"] * size,
-        "vertices": rank(said, true_known),
-        "found": float((worst[0] & worst[1]).sum() / worst[1].sum()),
+        "vertices": rank(said[known], true[known]),
     }

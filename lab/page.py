@@ -30,11 +30,11 @@ BYTES_PER_PIXEL = 24  # of the page
 DPI = 72  # so that a font size in points is one in pixels
 
 
-def check_page(size: int, count: int, columns: int | None = None) -> None:
+def check_page(size: int, count: int, columns: int = COLUMNS) -> None:
     """Raise if a page of ``count`` pictures of ``size`` pixels is too large to draw."""
     if not 0 < size <= LARGEST_SIZE:
         raise OptionError(f"size is {size}: give 1 to {LARGEST_SIZE} pixels")
-    across = min(count, columns or COLUMNS)
+    across = min(count, columns)
     wide, tall = across * size, -(-count // across) * size
     what = f"a picture of {wide:,} x {tall:,} pixels"
     if max(wide, tall) > LARGEST_SIDE:
@@ -50,20 +50,9 @@ def write_picture(figure: Figure, target: Path, *, force: bool = True) -> None:
 
 
 class Page:
-    """A white page with rows of pictures of one size, each under its title, and a legend.
+    """A figure of pictures, (height, width, 3) each; ``size`` is a picture's long side in pixels.
 
-    Parameters
-    ----------
-    size : int
-        Pixels along the long side of a picture; the font size follows from it.
-    images : sequence of (height, width, 3) uint8
-        The pictures.
-    titles : sequence of str
-        The text above each.
-    columns : int or None
-        Most pictures in a row; ``COLUMNS`` if None.
-    foot : float
-        Height of the legend, in lines of text.
+    ``foot`` is the height of the legend, in lines of text; the font size follows from ``size``.
     """
 
     def __init__(
@@ -72,46 +61,38 @@ class Page:
         images: Sequence[Image],
         titles: Sequence[str],
         *,
-        columns: int | None,
-        foot: float,
+        columns: int = COLUMNS,
+        foot: float = 0.0,
     ) -> None:
         self.type_size = max(size / 30, 9.0)
-        self.gap = size // 30 + 1
-        self.strip = round(2 * self.type_size) if any(titles) else 0
+        self.gap = gap = size // 30 + 1
+        strip = round(2 * self.type_size) if any(titles) else 0
         self.foot = round(foot * self.type_size)
         self.tall, self.wide = images[0].shape[:2]
-        across = min(len(images), columns or COLUMNS)
+        across = min(len(images), columns)
         rows = -(-len(images) // across)
-        self.width = across * (self.wide + self.gap) + self.gap
-        self.height = rows * (self.strip + self.tall + self.gap) + self.gap + self.foot
+        self.width = across * (self.wide + gap) + gap
+        self.height = rows * (strip + self.tall + gap) + gap + self.foot
         # plus half a pixel, since the size of the page is rounded down
         inches = (self.width + 0.5) / DPI, (self.height + 0.5) / DPI
         self.figure = Figure(figsize=inches, dpi=DPI, facecolor="white")
         FigureCanvasAgg(self.figure)
         for number, (image, title) in enumerate(zip(images, titles)):
-            self._put(image, title, *divmod(number, across))
-
-    def _put(self, image: Image, title: str, row: int, column: int) -> None:
-        """Draw a picture at its row and column, under its title."""
-        left = self.gap + column * (self.wide + self.gap)
-        high = self.height - self.gap - row * (self.strip + self.tall + self.gap)
-        self.figure.figimage(image, left, high - self.strip - self.tall, origin="upper")
-        self._write(title, left + self.wide / 2, high - self.strip / 2, 1.0, self.wide)
+            row, column = divmod(number, across)
+            left = gap + column * (self.wide + gap)
+            high = self.height - gap - row * (strip + self.tall + gap)
+            self.figure.figimage(image, left, high - strip - self.tall, origin="upper")
+            self._write(title, left + self.wide / 2, high - strip / 2, 1.0, self.wide)
 
     def _write(self, line: str, x: float, y: float, scale: float, room: float) -> None:
         """Write a line centred on (x, y), in pixels; smaller if it is wider than ``room``."""
-        text = self.figure.text(
-            x / self.width,
-            y / self.height,
-            line,
-            ha="center",
-            va="center",
-            size=scale * self.type_size,
-            parse_math=False,  # file names may hold dollar signs
-        )
+        size = scale * self.type_size
+        at = x / self.width, y / self.height
+        # file names may hold dollar signs, which are no formulas
+        text = self.figure.text(*at, line, ha="center", va="center", size=size, parse_math=False)
         wide = text.get_window_extent().width
         if wide > room:
-            text.set_fontsize(scale * self.type_size * room / wide)
+            text.set_fontsize(size * room / wide)
 
     def add_line(self, line: str, y: float | None = None) -> None:
         """Add a line of text at the foot of the page."""
@@ -123,9 +104,8 @@ class Page:
         unit = self.type_size
         wide = min(1.2 * max(self.wide, self.tall), 0.8 * self.width)
         left, below = (self.width - wide) / 2, 2.0 * unit
-        page = self.width, self.height
-        box = left / page[0], below / page[1], wide / page[0], 0.8 * unit / page[1]
-        ax = self.figure.add_axes(box)
+        box = np.divide((left, below, wide, 0.8 * unit), (self.width, self.height) * 2)
+        ax = self.figure.add_axes(tuple(box))
         self.figure.colorbar(
             ScalarMappable(Normalize(0, top), matplotlib.colormaps[COLOUR_MAP]),
             cax=ax,

@@ -11,7 +11,6 @@ every triangle shows.
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from PIL import Image
 
 from super_sdf import Mesh, load_network, read_grid, reconstruct
 
+from . import parser_of
 from .drawing import Frame, Panel, draw_panel, view_axes
 from .methods import make_surface
 from .page import Page, write_picture
@@ -68,8 +68,8 @@ def frames_of(
     axes = upright @ turn.T  # directions in the turned part's world
     points = mesh.vertices @ axes.T
     low, high = points.min(0), points.max(0)
-    whole = Frame(axes, (low + high) / 2, float((high - low)[:2].max()) / 2 * MARGIN, (1.0, 1.0))
-    return whole, Frame(axes, upright @ middle, half, (1.0, 1.0))
+    whole = Frame(axes, (low + high) / 2, float((high - low)[:2].max()) / 2 * MARGIN)
+    return whole, Frame(axes, upright @ middle, half)
 
 
 def mark(image: NDArray[np.uint8], whole: Frame, close: Frame) -> None:
@@ -102,7 +102,7 @@ def draw_parts(folder: Path, target: Path) -> None:
     """Draw the rows of three parts, as one PNG file with a palette."""
     images = [image for place in PLACES for image in row_of(folder, place)]
     titles = [title for place in PLACES for title in (place.part, *METHODS)]
-    page = Page(PIXELS, images, titles, columns=1 + len(METHODS), foot=0.0)
+    page = Page(PIXELS, images, titles, columns=1 + len(METHODS))
     write_picture(page.figure, target)
     Image.open(target).convert("RGB").quantize(COLOURS).save(target, optimize=True)
 
@@ -123,15 +123,13 @@ def draw_example(source: Path, target: Path) -> None:
     meshes = columns.values()
     images = [draw_panel(Panel(mesh), frame, LARGE_PIXELS) for frame in frames for mesh in meshes]
     titles = [f"{name}, {len(mesh.faces):,} triangles" for name, mesh in columns.items()]
-    page = Page(LARGE_PIXELS, images, [*titles, "", ""], columns=2, foot=0.0)
+    page = Page(LARGE_PIXELS, images, [*titles, "", ""], columns=2)
     write_picture(page.figure, target)
 
 
 def main() -> None:
     """Draw the picture of a grid, or of a folder of parts."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("source", nargs="?", type=Path, default=EXAMPLE)
     parser.add_argument("out", nargs="?", type=Path)
     words = parser.parse_args()

@@ -37,14 +37,11 @@ MEASURES = (
 def draw_plots(by_size: BySize, folder: Path) -> dict[str, str]:
     """Draw all plots into a folder; return their titles by file name."""
     folder.mkdir(exist_ok=True)
-    plots = {
-        "resolution.png": ("Quality against resolution", draw_resolution),
-        "distribution.png": ("F1 of every shape, sorted", draw_distribution),
-    }
-    for name, (_, draw) in plots.items():
+    plots = {"resolution.png": draw_resolution, "distribution.png": draw_distribution}
+    for name, draw in plots.items():
         with replacing(folder / name) as part:
             draw(by_size).savefig(part, format="png", dpi=110)
-    return {name: title for name, (title, _) in plots.items()}
+    return dict(zip(plots, ("Quality against resolution", "F1 of every shape, sorted")))
 
 
 def draw_resolution(by_size: BySize) -> Figure:
@@ -69,9 +66,8 @@ def draw_distribution(by_size: BySize) -> Figure:
     for ax, (size, by_method) in zip(axes, by_size.items()):
         for method in drawn(by_size):
             figures = sorted(row["f1"] for row in by_method[method])
-            ax.plot(
-                range(1, len(figures) + 1), figures, color=COLOURS[method], label=LABELS[method]
-            )
+            numbers, label = range(1, len(figures) + 1), LABELS[method]
+            ax.plot(numbers, figures, color=COLOURS[method], label=label)
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         ax.set(xlabel="shapes, worst first", ylabel="F1 at 0.003", title=f"{size}^3", ylim=(0, 1))
     return with_legend(figure, axes[0])
@@ -93,7 +89,6 @@ def make_axes(count: int) -> tuple[Figure, Sequence[Any]]:
 
 def with_legend(figure: Figure, ax: Any) -> Figure:
     """Put one legend below all plots of a figure; return the figure."""
-    figure.legend(
-        *ax.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False
-    )
+    handles = ax.get_legend_handles_labels()
+    figure.legend(*handles, loc="outside lower center", ncols=3, frameon=False)
     return figure

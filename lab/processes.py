@@ -19,6 +19,7 @@ from super_sdf.machine.processor import described, processor_name
 from super_sdf.machine.threads import count_cores
 from super_sdf.truth.sampling import sample_solid, unit_layout
 
+from .forms import torus
 from .shapes import Shape
 
 MAJOR, MINOR = 0.28, 0.11  # radii of the torus of ``write_torus``
@@ -104,12 +105,7 @@ def median_of(measure: Callable[[], tuple[float, float]], runs: int) -> dict[str
 
 def timed(words: Sequence[str], runs: int) -> dict[str, float]:
     """Return the median of the seconds and the largest peak in MB of a process."""
-
-    def once() -> tuple[float, float]:
-        taken = run_python(words)
-        return taken.seconds, taken.peak_mb
-
-    return median_of(once, runs)
+    return median_of(lambda: ((taken := run_python(words)).seconds, taken.peak_mb), runs)
 
 
 def write_grid(shape: Shape, size: int, folder: Path) -> Path:
@@ -124,8 +120,7 @@ def write_torus(path: Path, n: int) -> Path:
     """Write the distances to a torus of area 1.2 at the voxel centres of the unit cube, .npy."""
     centres = ((np.arange(n) + 0.5) / n - 0.5).astype(np.float32)
     field = np.lib.format.open_memmap(path, "w+", np.float32, (n, n, n))
-    for i, x in enumerate(centres):
-        ring = np.hypot(x, centres)[:, None] - np.float32(MAJOR)
-        field[i] = np.hypot(ring, centres) - np.float32(MINOR)
+    for plane, x in zip(field, centres):
+        plane[:] = torus(x, centres[:, None], centres, MAJOR, MINOR)
     field.flush()
     return path

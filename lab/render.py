@@ -24,8 +24,9 @@ from super_sdf.pipeline import upsample
 from super_sdf.truth.mesh_files import read_mesh
 from super_sdf.truth.solid import Solid
 
+from . import parser_of
 from .cross_sections import check_section, find_plane, render_section
-from .drawing import AXES, COLOURS, Layout, Panel, check_numbers, render_panels, vertex_errors
+from .drawing import AXES, COLOURS, Panel, check_numbers, render_panels, vertex_errors
 from .page import check_page
 
 # Options that apply to one kind of source only, with their defaults.
@@ -33,11 +34,9 @@ FOR_GRIDS = {"axis": "z", "at": None, "factor": 4}
 FOR_MESHES = {"colour": COLOURS[0], "reference": None, "top": None, "up": "z", "zoom": 1.0}
 
 
-def parse() -> argparse.Namespace:
-    """Return the arguments."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def main() -> None:
+    """Draw what is given."""
+    parser = parser_of(__doc__)
     parser.add_argument("sources", metavar="MESH", type=Path, nargs="+", help="meshes, or one grid")
     parser.add_argument("target", metavar="OUT.png", type=Path)
     parser.add_argument("--colour", choices=COLOURS, help="by light, face normal or distance")
@@ -50,12 +49,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--at", type=float, help="for a grid: world position on that axis")
     parser.add_argument("--factor", type=int, help="for a grid: refinement per axis")
     parser.add_argument("--force", action="store_true", help="replace OUT.png if it exists")
-    return parser.parse_args()
-
-
-def main() -> None:
-    """Draw what is given."""
-    words = parse()
+    words = parser.parse_args()
     grids = [source for source in words.sources if is_grid(source)]
     if words.target.suffix.lower() != ".png":
         raise OptionError(f"{words.target} is not a picture file: give .png")
@@ -64,40 +58,30 @@ def main() -> None:
     check_free(words.target, force=words.force)
     inputs = [*words.sources, *filter(None, [words.reference])]
     check_apart(words.target, [file for each in inputs for file in files_of(each)])
-    take_defaults(words, FOR_MESHES if grids else FOR_GRIDS, FOR_GRIDS if grids else FOR_MESHES)
-    (render_grid if grids else render_meshes)(words)
-
-
-def take_defaults(
-    words: argparse.Namespace, others: dict[str, object], own: dict[str, object]
-) -> None:
-    """Fill in what was not given; raise OptionError if what was given applies to the other kind."""
-    for name in others:
+    for name in FOR_MESHES if grids else FOR_GRIDS:
         if getattr(words, name) is not None:
-            drawn = "a grid" if own is FOR_GRIDS else "meshes"
+            drawn = "a grid" if grids else "meshes"
             raise OptionError(f"--{name} does not apply to {drawn}: leave it out")
-    for name, default in own.items():
+    for name, default in (FOR_GRIDS if grids else FOR_MESHES).items():
         if getattr(words, name) is None:
             setattr(words, name, default)
+    (render_grid if grids else render_meshes)(words)
 
 
 def render_meshes(words: argparse.Namespace) -> None:
     """Draw meshes side by side; with a reference, coloured by their distance to it."""
-    check_numbers(zoom=words.zoom, top=words.top)
+    check_numbers(words.zoom, words.top)
     check_page(words.size, len(words.sources))
     if words.top is not None and words.colour != "error":
         raise OptionError("--top is the end of the colour bar: give it with --colour error")
     if (words.colour == "error") != (words.reference is not None):
         raise OptionError("--colour error and --reference MESH go together: give both or neither")
-    meshes = [(source.name, read_mesh(source)) for source in words.sources]
+    meshes = {source: read_mesh(source) for source in words.sources}
     truth = Solid(read_mesh(words.reference)) if words.reference else None
-    panels = [
-        Panel(mesh, name, None if truth is None else vertex_errors(mesh, truth))
-        for name, mesh in meshes
-    ]
-    layout = Layout(zoom=words.zoom, size=words.size)
-    chosen = {name: getattr(words, name) for name in ("colour", "up", "top", "force")}
-    render_panels(panels, words.target, layout=layout, **chosen)
+    panels = [Panel(mesh, source.name, truth and vertex_errors(mesh, truth))
+              for source, mesh in meshes.items()]  # fmt: skip
+    names = ("colour", "up", "size", "zoom", "top", "force")
+    render_panels(panels, words.target, **{name: getattr(words, name) for name in names})
 
 
 def render_grid(words: argparse.Namespace) -> None:

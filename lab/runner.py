@@ -49,12 +49,10 @@ def complete(
     of_shape: dict[Any, list[Task]] = {}
     for task in tasks:
         left = tuple(m for m in task.methods if not rows.is_final(task.key(m), task.limit))
-        if left:
-            alone = (
-                task if task.limit else None
-            )  # the limit is for this task, and all that is in it
-            left = task.methods if alone else left
-            group = of_shape.setdefault((task.path, task.turned, alone), [])
+        if left and task.limit:  # which is for this task alone, and all that is in it
+            of_shape[task] = [task]
+        elif left:
+            group = of_shape.setdefault((task.path, task.turned), [])
             group.append(replace(task, methods=left))
     left_out: list[LeftOut] = []
     with ThreadPoolExecutor(max(jobs, 1)) as pool:
@@ -119,13 +117,9 @@ class Ended:
 def run_process(tasks: Mapping[int, Task], rows: Rows) -> Ended:
     """Run a process that measures tasks of a shape, by number, and keep its rows."""
     limit = next(iter(tasks.values())).limit
-    process = subprocess.Popen(
-        [sys.executable, *WORKER],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [ROOT, *sys.path]))},
-    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [ROOT, *sys.path]))}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    process = subprocess.Popen([sys.executable, *WORKER], env=environment, **pipes)
     ended = Ended()
 
     def end() -> None:
@@ -137,7 +131,8 @@ def run_process(tasks: Mapping[int, Task], rows: Rows) -> Ended:
     clock.start()
     try:
         with suppress(BrokenPipeError):
-            process.stdin.write(json.dumps({n: as_message(task) for n, task in tasks.items()}))
+            messages = {n: {**asdict(task), "path": str(task.path)} for n, task in tasks.items()}
+            process.stdin.write(json.dumps(messages))
             process.stdin.close()
         for line in process.stdout:
             take(line, tasks, rows, ended)
@@ -148,8 +143,8 @@ def run_process(tasks: Mapping[int, Task], rows: Rows) -> Ended:
     if ended.is_late:
         ended.reason = f"over the limit of {limit:g} s"
     elif code:
-        while_read = "" if ended.has_read else "while it was read "
-        ended.reason = f"{while_read}its process {how_it_ended(code)}"
+        how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with {code}"
+        ended.reason = f"{'' if ended.has_read else 'while it was read '}its process {how}"
     return ended
 
 
@@ -167,25 +162,12 @@ def take(line: str, tasks: Mapping[int, Task], rows: Rows, ended: Ended) -> None
         ended.done.add((number, method))
 
 
-def how_it_ended(code: int) -> str:
-    """Return what an exit code says."""
-    return f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with {code}"
-
-
-def as_message(task: Task) -> dict[str, Any]:
-    """Return a task as JSON can hold it."""
-    return {**asdict(task), "path": str(task.path)}
-
-
-def from_message(message: dict[str, Any]) -> Task:
-    """Return the task of a message."""
-    message |= {"path": Path(message["path"]), "setting": Setting(**message["setting"])}
-    return Task(**{**message, "methods": tuple(message["methods"])})
-
-
 def main() -> None:
     """Measure the tasks on stdin; print what was measured, a line of JSON each."""
-    tasks = {int(n): from_message(m) for n, m in json.loads(sys.stdin.read()).items()}
+    tasks = {}
+    for number, task in json.loads(sys.stdin.read()).items():
+        task |= {"path": Path(task["path"]), "setting": Setting(**task["setting"])}
+        tasks[int(number)] = Task(**{**task, "methods": tuple(task["methods"])})
     first = next(iter(tasks.values()))
 
     def tell(what: str, number: int = 0, method: str = "", figures: Any = None) -> None:

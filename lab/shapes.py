@@ -61,12 +61,9 @@ class Setting:
             raise OptionError(f"size is {seen(self.size)}: give at most {LARGEST_SIZE:,} samples")
 
     def __str__(self) -> str:
-        if not self.size:
-            return "reference"
-        parts = [f"{self.size}^3", f"factor {self.factor}"]
-        parts += [f"noise {self.noise:g}"] if self.noise else []
-        parts += [f"scale {self.scale:g}"] if self.scale else []
-        return ", ".join(parts)
+        parts = {"noise": self.noise, "scale": self.scale}
+        more = "".join(f", {name} {value:g}" for name, value in parts.items() if value)
+        return f"{self.size}^3, factor {self.factor}{more}" if self.size else "reference"
 
 
 class Shape:
@@ -88,10 +85,8 @@ class Shape:
         before it is put into the frame.
         """
         solid, notes = load_solid(path)
-        mesh = solid.mesh
-        if turned is not None:
-            mesh = mesh.transformed(turn_of(path.stem, turned), np.zeros(3))
-        shape = cls(path.stem, mesh)
+        turn = np.eye(3) if turned is None else turn_of(path.stem, turned)
+        shape = cls(path.stem, solid.mesh.transformed(turn, np.zeros(3)))
         shape.notes = notes
         return shape
 
@@ -130,7 +125,8 @@ class Case:
         what = f"measuring {setting.size}^3 refined to {nodes:,} nodes"
         check_fits(nodes * BYTES_PER_NODE, what, "use smaller sizes or fewer --jobs")
         self.shape, self.setting, self.factor = shape, setting, setting.factor
-        self.side = side_of(shape.mesh, setting.scale)
+        longest = float(np.ptp(shape.mesh.vertices, axis=0).max())
+        self.side = longest / setting.scale if setting.scale else 1.0
         self.low = -self.side / 2
         self.layout = unit_layout(setting.size, self.side)
         _, self.spacing, origin = self.layout
@@ -169,13 +165,6 @@ class Case:
         return exact_field(self)
 
 
-def side_of(mesh: Mesh, scale: float) -> float:
-    """Return the side of the grid's cube in which a normalised mesh has a given scale."""
-    if not scale:
-        return 1.0
-    return float(np.ptp(mesh.vertices, axis=0).max()) / scale
-
-
 def spread_to_nodes(voxels: BoolArray, factor: int) -> BoolArray:
     """Return the mask of the fine nodes, (K n + 1)^3, in the blocks of a mask of voxels, n^3."""
     for axis in range(3):
@@ -187,12 +176,6 @@ def spread_to_nodes(voxels: BoolArray, factor: int) -> BoolArray:
     return voxels
 
 
-def spread_samples(samples: FloatArray, factor: int) -> FloatArray:
-    """Return for each fine node the sample of a voxel that it lies in, (K n + 1)^3."""
-    nearest = [np.minimum(np.arange(factor * n + 1) // factor, n - 1) for n in samples.shape]
-    return samples[np.ix_(*nearest)]
-
-
 def exact_field(case: Case) -> FloatArray:
     """Return the signed distances at the fine nodes, (K n + 1)^3.
 
@@ -202,7 +185,8 @@ def exact_field(case: Case) -> FloatArray:
     """
     factor = case.factor
     reach = 3**0.5 * (0.5 + 1 / factor) * case.spacing
-    field = spread_samples(case.coarse, factor)
+    nearest = [np.minimum(np.arange(factor * n + 1) // factor, n - 1) for n in case.coarse.shape]
+    field = case.coarse[np.ix_(*nearest)]
     nodes = np.argwhere(case.band | spread_to_nodes(np.abs(case.coarse) < reach, factor))
     samples = np.minimum(nodes // factor, case.setting.size - 1)
     steps = nodes - factor * (samples + 0.5)
@@ -228,22 +212,15 @@ def signed_from_samples(
     return np.where(inside, -distance, distance)
 
 
-def meshes_in(folder: Path) -> list[Path]:
-    """Return the mesh files of a folder, sorted by name."""
-    try:
-        paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in MESH_SUFFIXES)
-    except OSError as error:
-        raise FileError(f"{folder} cannot be read: {error.strerror}") from error
-    if not paths:
-        raise FileError(f"{folder} holds no mesh: give {', '.join(MESH_SUFFIXES)}")
-    return paths
-
-
 def find_meshes(sources: Sequence[Path]) -> tuple[Path, ...]:
     """Return the given mesh files, and those in the given folders, sorted by name."""
     paths: list[Path] = []
     for source in sources:
-        inside = meshes_in(source) if source.is_dir() else [source]
+        inside = [source]
+        if source.is_dir():
+            inside = sorted(p for p in source.iterdir() if p.suffix.lower() in MESH_SUFFIXES)
+        if not inside:
+            raise FileError(f"{source} holds no mesh: give {', '.join(MESH_SUFFIXES)}")
         paths += [check_regular_file(path) for path in inside]
     names = [path.stem for path in paths]
     twice = next((name for name in names if names.count(name) > 1), None)

@@ -14,7 +14,6 @@ grid is a torus; the mesh must be the same file for every limit: compare its dig
 from __future__ import annotations
 
 import argparse
-import hashlib
 import statistics
 import sys
 import tempfile
@@ -23,17 +22,12 @@ from pathlib import Path
 
 from super_sdf.errors import SuperSdfError
 
+from . import parser_of
 from .costs import ORDERS, report_of, time_command, time_dense
+from .meshes import digest
 from .processes import describe_machine, write_grid, write_torus
 from .shapes import Shape, find_meshes, spread
 from .tables import markdown
-
-
-def split_words() -> tuple[list[str], list[str]]:
-    """Return the words before ``--`` on the command line, and those after it."""
-    words = sys.argv[1:]
-    end = words.index("--") if "--" in words else len(words)
-    return words[:end], words[end + 1 :]
 
 
 def torus_row(n: int, limit: str, folder: Path, options: list[str]) -> list[str]:
@@ -45,22 +39,17 @@ def torus_row(n: int, limit: str, folder: Path, options: list[str]) -> list[str]
         report = report_of(grid, "--spacing", str(1 / n), "--max-memory", limit, *options)
     except SuperSdfError as refusal:
         return [f"{n}^3", limit, f"refused: {refusal}", *["-"] * 6]
-    with target.open("rb") as file:
-        digest = hashlib.sha256()
-        while block := file.read(1 << 24):
-            digest.update(block)
     peak, planned = report["peak"], report["planned_bytes"]
     counts = [str(report["slabs"]), f"{report['band_voxels']:,}", f"{report['triangles']:,}"]
     costs = [f"{report['wall']:.1f}", f"{peak / 1e6:,.0f}", f"{planned / peak - 1:+.0%}"]
-    return [f"{n}^3", limit, *counts, *costs, digest.hexdigest()[:8]]
+    return [f"{n}^3", limit, *counts, *costs, digest(target)[:8]]
 
 
 def main() -> None:
     """Print the machine and Markdown tables."""
-    words, options = split_words()
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    end = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
+    words, options = sys.argv[1:end], sys.argv[end + 1 :]
+    parser = parser_of(__doc__)
     parser.add_argument("meshes", type=Path, nargs="*", help="files or folders")
     parser.add_argument("--sizes", type=int, nargs="+", default=[32, 64, 128])
     parser.add_argument("--shapes", type=int, default=10, help="spread over the list")
@@ -93,7 +82,7 @@ def print_speed(given: argparse.Namespace, options: list[str], folder: Path) -> 
             ours = " ".join(["super-sdf", *options])
             found.setdefault(ours, []).append(time_command(grid, options, given.runs))
             for name, order in ORDERS.items() if given.dense else ():
-                row = time_dense(grid, order, 1)
+                row = time_dense(grid, order)
                 found.setdefault(f"SciPy zoom, {name}", []).append(row)
             if given.stages:
                 report = report_of(grid, "--inside", "negative", *options)
@@ -108,7 +97,3 @@ def print_speed(given: argparse.Namespace, options: list[str], folder: Path) -> 
     if stages:
         cells = ([stage, *(f"{by[n]:.3f}" for n in given.sizes)] for stage, by in stages.items())
         print(f"\n{markdown(['seconds', *(f'{n}^3' for n in given.sizes)], cells)}")
-
-
-if __name__ == "__main__":
-    main()

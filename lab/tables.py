@@ -89,19 +89,11 @@ def cells(figures: Mapping[str, Any], columns: Sequence[Column]) -> list[str]:
     return [column.cell(figures.get(column.key)) for column in columns]
 
 
-def table(
-    titles: Sequence[str],
-    columns: Sequence[Column],
-    rows: Iterable[tuple[Sequence[str], Mapping[str, Any]]],
-) -> str:
-    """Return a table; each row has some words and figures by the keys of the columns."""
-    shown = ([*words, *cells(figures, columns)] for words, figures in rows)
-    return markdown([*titles, *(column.title for column in columns)], shown)
-
-
-def count_row(rows: Sequence[Row]) -> list[str]:
-    """Return how many of the meshes are closed, and how many face outward."""
-    return [f"{sum(row[key] for row in rows)} of {len(rows)}" for key in ("closed", "outward")]
+def mean_table(by_method: Mapping[str, Sequence[Row]], columns: Sequence[Column]) -> str:
+    """Return a table of the means of methods."""
+    rows = ([label_of(name), *cells(means(found, columns), columns)] for name, found in
+            by_method.items())  # fmt: skip
+    return markdown(["method", *(column.title for column in columns)], rows)
 
 
 def surface_table(by_method: Mapping[str, Sequence[Row]], size: int) -> str:
@@ -112,6 +104,11 @@ def surface_table(by_method: Mapping[str, Sequence[Row]], size: int) -> str:
     ]
     titles = ["method", *(column.title for column in SURFACE), "closed", "outward"]
     return markdown(titles, [*rows, *published_rows(size, SURFACE, 2)])
+
+
+def count_row(rows: Sequence[Row]) -> list[str]:
+    """Return how many of the meshes are closed, and how many face outward."""
+    return [f"{sum(row[key] for row in rows)} of {len(rows)}" for key in ("closed", "outward")]
 
 
 def published_rows(size: int, columns: Sequence[Column], more: int = 0) -> list[list[str]]:
@@ -137,15 +134,6 @@ def label_of(method: str) -> str:
     return ", ".join(words)
 
 
-def edge_table(by_method: Mapping[str, Sequence[Row]]) -> str:
-    """Return a table of edges, angles and triangles."""
-    rows = []
-    for name, measured in by_method.items():
-        known = sum(row.get("edge_distance") is not None for row in measured)
-        rows.append(([label_of(name), str(known) if known else "-"], means(measured, EDGES)))
-    return table(["method", "shapes"], EDGES, rows)
-
-
 def shape_table(by_method: Mapping[str, Sequence[Row]]) -> str:
     """Return the table of all shapes, with a row for each shape and method."""
     columns = (*SURFACE, *(column for column in EDGES if column not in SURFACE))
@@ -156,12 +144,6 @@ def shape_table(by_method: Mapping[str, Sequence[Row]]) -> str:
         for name, row in zip(by_method, measured)
     ]
     return markdown(titles, rows)
-
-
-def cost_table(by_method: Mapping[str, Sequence[Row]]) -> str:
-    """Return a table of time and memory."""
-    rows = (([label_of(name)], means(rows, COST)) for name, rows in by_method.items())
-    return table(["method"], COST, rows)
 
 
 def gap_closed(

@@ -23,11 +23,13 @@ import subprocess
 import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
 from super_sdf.machine.threads import count_cores
+
+from . import parser_of
+from .tables import markdown
 
 ROOT = Path(__file__).parents[1]
 PYTHONS = ["3.10", "3.11", "3.12", "3.13", "3.14"]
@@ -47,38 +49,32 @@ class UnavailableError(Exception):
     """There is no such interpreter or release."""
 
 
-@dataclass(frozen=True)
-class Trial:
-    """What every environment is made from, and what runs in it."""
-
-    wheel: Path
-    extras: list[str]
-    tests: list[str]
-
-    def run(self, python: str, releases: str, folder: Path) -> str:
-        """Return the SHA-256 of the mesh.
-
-        Raises
-        ------
-        UnavailableError
-            If there is no such environment.
-        RuntimeError
-            If anything fails in it, with its last lines.
-        """
-        own = folder / "venv" / "bin" / "python"
-        uv("venv", "--python", find_python(python), str(folder / "venv"))
-        # the dependencies by name, too: "oldest" is for what is asked for by name
-        asked = ["-r", "pyproject.toml", *(f"--extra={extra}" for extra in self.extras)]
-        asked += [str(self.wheel), *(FOR_TESTS if self.tests else ())]
-        install = ["pip", "install", "--python", str(own), "--only-binary", ":all:"]
-        uv(*install, *chosen(releases), *asked)
-        print(run([own, "-c", SAYS], folder).strip(), file=sys.stderr, flush=True)
-        mesh, command = folder / "part.ply", [own, "-m", "super_sdf"]
-        run([*command, "upsample", ROOT / "examples" / "part.npz", mesh, "--factor", "4"], folder)
-        run([*command, "info", "--check"], folder)
-        if self.tests:
-            run([own, "-m", "pytest", "-p", "no:cacheprovider", *self.tests], ROOT)
-        return hashlib.sha256(mesh.read_bytes()).hexdigest()
+def try_cell(cell: tuple[str, str], wheel: Path, given: argparse.Namespace) -> tuple[str, str]:
+    """Return what stands in a cell, the start of the mesh's SHA-256, and what failed."""
+    python, releases = cell
+    try:
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            own = folder / "venv" / "bin" / "python"
+            uv("venv", "--python", find_python(python), str(folder / "venv"))
+            # the dependencies by name, too: "oldest" is for what is asked for by name
+            asked = ["-r", "pyproject.toml", *(f"--extra={extra}" for extra in given.extras)]
+            asked += [str(wheel), *(FOR_TESTS if given.tests else ())]
+            install = ["pip", "install", "--python", str(own), "--only-binary", ":all:"]
+            uv(*install, *chosen(releases), *asked)
+            print(run([own, "-c", SAYS], folder).strip(), file=sys.stderr, flush=True)
+            mesh, command = folder / "part.ply", [own, "-m", "super_sdf"]
+            run([*command, "upsample", ROOT / "examples" / "part.npz", mesh], folder)
+            run([*command, "info", "--check"], folder)
+            if given.tests:
+                run([own, "-m", "pytest", "-p", "no:cacheprovider", *given.tests], ROOT)
+            found, failure = hashlib.sha256(mesh.read_bytes()).hexdigest()[:8], ""
+    except UnavailableError:
+        found, failure = "-", ""
+    except RuntimeError as error:
+        found, failure = "fails", f"Python {python}, {releases}: {error}"
+    print(f"{':'.join(cell)} {found}", file=sys.stderr, flush=True)
+    return found, failure
 
 
 def run(command: list[str | Path], folder: Path) -> str:
@@ -125,9 +121,9 @@ def find_python(version: str) -> str:
     return version
 
 
-def parse() -> argparse.Namespace:
-    """Return the arguments."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+def main() -> None:
+    """Print the table; exit code 1 if anything failed or differs, or if nothing was tried."""
+    parser = parser_of(__doc__)
     parser.add_argument("--pythons", nargs="+", default=PYTHONS)
     parser.add_argument("--releases", nargs="+", default=RELEASES)
     parser.add_argument("--only", nargs="+", help="these cells, PYTHON:RELEASES, instead of all")
@@ -135,42 +131,19 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--tests", nargs="+", default=TESTS, help="test files to run")
     parser.add_argument("--jobs", type=int, default=count_cores(), help="environments at a time")
     parser.add_argument("--no-tests", action="store_const", const=[], dest="tests")
-    return parser.parse_args()
-
-
-def attempt(trial: Trial, cell: tuple[str, str]) -> tuple[str, str]:
-    """Return what stands in a cell of the table, and what failed."""
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            found, failure = trial.run(*cell, Path(folder))[:8], ""
-    except UnavailableError:
-        found, failure = "-", ""
-    except RuntimeError as error:
-        found, failure = "fails", f"Python {cell[0]}, {cell[1]}: {error}"
-    print(f"{':'.join(cell)} {found}", file=sys.stderr, flush=True)
-    return found, failure
-
-
-def write_table(cells: dict[tuple[str, str], str]) -> None:
-    """Print a row a Python, a column a choice of releases."""
-    columns = list(dict.fromkeys(what for _, what in cells))
-    print(f"| Python | {' | '.join(columns)} |\n| ---{' | ---' * len(columns)} |")
-    for python in dict.fromkeys(python for python, _ in cells):
-        row = [cells.get((python, what), "") for what in columns]
-        print(f"| {python} | {' | '.join(row)} |")
-
-
-def main() -> None:
-    """Print the table; exit code 1 if anything failed or differs, or if nothing was tried."""
-    options = parse()
-    pairs = list(product(options.pythons, options.releases))
-    if options.only:
-        pairs = [tuple(pair.split(":")) for pair in options.only]
-    with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(options.jobs) as pool:
+    given = parser.parse_args()
+    pairs = list(product(given.pythons, given.releases))
+    if given.only:
+        pairs = [tuple(pair.split(":")) for pair in given.only]
+    with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(given.jobs) as pool:
         uv("build", "--wheel", "--out-dir", name, str(ROOT))
-        trial = Trial(next(Path(name).glob("*.whl")), options.extras, options.tests)
-        found = list(pool.map(lambda pair: attempt(trial, pair), pairs))
-    write_table({pair: cell for pair, (cell, _) in zip(pairs, found)})
+        wheel = next(Path(name).glob("*.whl"))
+        found = list(pool.map(lambda pair: try_cell(pair, wheel, given), pairs))
+    cells = {pair: cell for pair, (cell, _) in zip(pairs, found)}
+    columns = list(dict.fromkeys(releases for _, releases in pairs))
+    pythons = dict.fromkeys(python for python, _ in pairs)
+    rows = ([python, *(cells.get((python, each), "") for each in columns)] for python in pythons)
+    print(markdown(["Python", *columns], rows))
     failures = [failure for _, failure in found if failure]
     passed = [cell for cell, _ in found if cell not in ("-", "fails")]
     print(f"{len(passed)} passed, {len(failures)} failed; different meshes: {len(set(passed))}")

@@ -20,7 +20,8 @@ from super_sdf.cli.main import cli
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
 CARDS = sorted((ROOT / "src" / "super_sdf" / "models").glob("*.md"))
-PAGES = [README, ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md")), *CARDS]
+PAGES = [README, ROOT / "CHANGELOG.md", ROOT / "examples" / "README.md", *CARDS,
+         *sorted((ROOT / "docs").rglob("*.md"))]  # fmt: skip
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 # Documents speak of today: what was, and what it was like, is in the history of the repository.
 HISTORY = (

@@ -54,30 +54,50 @@ def rooms() -> list[set[str]]:
     return [set(re.findall(r"`(\w+)/?`", cell)) for cell in cells]
 
 
+def name_of(path: Path) -> str:
+    """Return the name by which a file of this repository is imported."""
+    root = PACKAGE.parent if path.is_relative_to(PACKAGE) else ROOT
+    return ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__")
+
+
+NAMES = {name_of(path): module for module, path in MODULES.items()}
+FILES = {name_of(path): path for room in BESIDE for path in (ROOT / room).rglob("*.py")}
+
+
 @cache
-def imported(path: Path) -> tuple[set[str], set[str]]:
-    """Return what a file imports anywhere: its package's modules, without its name, and others."""
-    own_names: set[str] = set()
-    others: set[str] = set()
-    inside = path.is_relative_to(PACKAGE)
-    here = path.relative_to(PACKAGE).with_suffix("").parts if inside else ()
-    for node in ast.walk(ast.parse(path.read_text())):
+def imported(path: Path, when_run: bool = False) -> set[str]:
+    """Return the modules that a file imports anywhere, or not only for type checkers."""
+    found: set[str] = set()
+    package = name_of(path.parent / "__init__.py").split(".")
+    for node in imports(ast.parse(path.read_text()), when_run):
         if isinstance(node, ast.Import):
-            others |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and not node.level:
-            others.add(node.module or "")
-        elif isinstance(node, ast.ImportFrom):
-            before = here[: len(here) - node.level]
-            module = ".".join([*before, *([node.module] if node.module else [])])
-            below = {f"{module}.{alias.name}".lstrip(".") for alias in node.names}
-            own_names |= (below & set(MODULES)) or {module or "__init__"}
-    return own_names, others
+            found |= {alias.name for alias in node.names}
+            continue
+        base = package[: len(package) - node.level + 1] if node.level else []
+        whole = ".".join([*base, *([node.module] if node.module else [])])
+        below = {f"{whole}.{alias.name}" for alias in node.names}
+        found |= (below & (NAMES.keys() | FILES.keys())) or {whole}
+    return found
+
+
+def imports(tree: ast.AST, when_run: bool) -> Iterator[ast.Import | ast.ImportFrom]:
+    """Yield the statements that import."""
+    if when_run and isinstance(tree, ast.If) and "TYPE_CHECKING" in ast.unparse(tree.test):
+        return
+    if isinstance(tree, (ast.Import, ast.ImportFrom)):
+        yield tree
+    for child in ast.iter_child_nodes(tree):
+        yield from imports(child, when_run)
 
 
 def own(path: Path) -> set[str]:
     """Return the modules of the package that one of its files imports."""
-    packages = {name.removesuffix(".__init__"): name for name in MODULES}
-    return {packages.get(name, name) for name in imported(path)[0]} & set(MODULES)
+    return {NAMES[name] for name in imported(path) if name in NAMES}
+
+
+def tops(path: Path) -> set[str]:
+    """Return the packages, of others, that a file imports."""
+    return {name.split(".")[0] for name in imported(path)} - {"super_sdf"}
 
 
 def test_the_tour_names_every_room_once():
@@ -97,43 +117,14 @@ def test_no_room_has_a_circle():
     TopologicalSorter({module: own(path) - {module} for module, path in MODULES.items()}).prepare()
 
 
-def beside(package: str) -> dict[str, set[str]]:
-    """Return the modules of a package beside the wheel, and what each imports of ``BESIDE``."""
-    found = {}
-    for path in (ROOT / package).rglob("*.py"):
-        name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-        here = list(path.relative_to(ROOT).parts[:-1])
-        modules = set()
-        for node in runtime_imports(ast.parse(path.read_text())):
-            if isinstance(node, ast.Import):
-                modules |= {alias.name for alias in node.names}
-                continue
-            base = here[: len(here) - node.level + 1] if node.level else []
-            whole = ".".join([*base, *([node.module] if node.module else [])])
-            modules |= {whole, *(f"{whole}.{alias.name}" for alias in node.names)}
-        found[name] = {module for module in modules if module.split(".")[0] in BESIDE}
-    return found
-
-
-def runtime_imports(tree: ast.AST) -> Iterator[ast.Import | ast.ImportFrom]:
-    """Yield the imports of a module, but for those that only type checkers see."""
-    if isinstance(tree, ast.If) and "TYPE_CHECKING" in ast.unparse(tree.test):
-        return
-    if isinstance(tree, (ast.Import, ast.ImportFrom)):
-        yield tree
-    for child in ast.iter_child_nodes(tree):
-        yield from runtime_imports(child)
-
-
 def test_what_is_beside_the_package_has_no_circle_and_is_not_imported_by_it():
     """``export`` may import ``lab``, and both the package; never the other way round."""
-    graph = {**beside("lab"), **beside("export")}
-    own = {name: {m for m in modules if m in graph} - {name} for name, modules in graph.items()}
-    TopologicalSorter(own).prepare()
-    of_lab = set().union(*beside("lab").values())
-    assert not [module for module in of_lab if module.split(".")[0] == "export"]
-    foreign = {m: imported(path)[1] for m, path in MODULES.items()}
-    assert not [m for m, names in foreign.items() if {n.split(".")[0] for n in names} & BESIDE]
+    graph = {name: imported(path, when_run=True) for name, path in FILES.items()}
+    known = {name: modules & graph.keys() - {name} for name, modules in graph.items()}
+    TopologicalSorter(known).prepare()
+    of_lab = set().union(*(known[name] for name in graph if name.startswith("lab.")))
+    assert not [name for name in of_lab if name.startswith("export")]
+    assert not [module for module, path in MODULES.items() if tops(path) & BESIDE]
 
 
 @pytest.mark.parametrize("module", MODULES)
@@ -150,8 +141,7 @@ def test_the_runtime_needs_few_packages(module):
     allowed.add("typing_extensions")  # for type checkers alone, which have it
     others = {"batch.lock": {"filelock"}, "machine.memory": {"psutil"}, **READERS}
     allowed |= others.get(module, set())
-    foreign = imported(MODULES[module])[1]
-    assert {name.split(".")[0] for name in foreign} <= allowed
+    assert tops(MODULES[module]) <= allowed
 
 
 @pytest.mark.parametrize("room", sorted({room_of(m) for m in MODULES if "." in m}))
@@ -166,7 +156,7 @@ def test_onnxruntime_is_imported_in_one_place():
         path.name
         for room in rooms
         for path in room.rglob("*.py")
-        if "onnxruntime" in imported(path)[1]
+        if "onnxruntime" in imported(path)
     }
     assert importing == {"onnx.py"}
 

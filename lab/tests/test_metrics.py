@@ -9,7 +9,7 @@ from solids import cube, inverted, sphere, square
 from lab import metrics
 from lab.surfaces import EMPTY
 from super_sdf import Mesh
-from super_sdf.truth.solid import Solid, normalise
+from super_sdf.truth.solid import Solid
 
 N = metrics.SAMPLE_COUNT
 
@@ -66,21 +66,6 @@ def test_a_shape_inside_out_has_opposite_normals() -> None:
     assert figures["signed_nc"] == pytest.approx(-1, abs=0.001)
 
 
-@pytest.mark.parametrize(
-    ("faces", "expected"),
-    [
-        ([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]], 0),  # a tetrahedron
-        ([[0, 1, 2], [0, 3, 1], [1, 3, 2]], 3 * 2),  # open: each edge counts in both directions
-        ([[0, 1, 2], [0, 2, 1]], 0),
-        ([[0, 1, 2], [0, 1, 2]], 3 + 3 * 2),  # used twice, and without a partner
-        ([[0, 0, 1]], 1),  # a point; the edge from 0 to 1 is used once in each direction
-    ],
-)
-def test_open_edges_are_counted(faces: list[list[int]], expected: int) -> None:
-    mesh = Mesh(np.zeros((4, 3)), np.array(faces, np.int32))
-    assert mesh.open_edges() == expected and mesh.is_closed() == (expected == 0)
-
-
 def test_an_empty_result_is_a_dot_at_the_origin() -> None:
     drawn = metrics.sample_surface(cube(), (7, 0))
     dot = metrics.sample_surface(EMPTY, (7, 1))
@@ -94,30 +79,15 @@ def test_an_empty_result_is_a_dot_at_the_origin() -> None:
     assert not EMPTY.is_closed() and EMPTY.volume() == 0
 
 
-def test_an_order_in_space_keeps_the_points_and_brings_neighbours_together() -> None:
-    drawn = metrics.sample_surface(sphere(), (7, 0))
-    ordered = drawn.ordered()
-    order = metrics.order_in_space(drawn.points)
-    np.testing.assert_array_equal(np.sort(order), np.arange(N))
-    np.testing.assert_array_equal(ordered.points, drawn.points[order])
-    np.testing.assert_array_equal(ordered.normals, drawn.normals[order])
-    steps = [np.linalg.norm(np.diff(p.points, axis=0), axis=1).mean() for p in (drawn, ordered)]
-    assert steps[1] < steps[0] / 20
-    assert not len(metrics.order_in_space(np.zeros((0, 3))))
-
-
-def test_one_search_gives_both_distances_and_triangles() -> None:
-    points = np.random.default_rng(7).normal(size=(100, 3))
-    distances, faces = metrics.nearest_or_dot(Solid(cube()), points)
-    np.testing.assert_array_equal(distances, Solid(cube()).distance(points))
-    np.testing.assert_array_equal(faces, Solid(cube()).nearest_face(points))
-    radii, none = metrics.nearest_or_dot(Solid(EMPTY), points)
-    np.testing.assert_allclose(radii**2, (points**2).sum(1))
-    assert set(none) == {-1}
-
-
-def test_the_frame() -> None:
-    moved = Mesh(cube().vertices * [3, 4, 12] + 5, cube().faces)
-    framed = normalise(moved).vertices
-    np.testing.assert_allclose(framed.max(0), np.array([3, 4, 12]) / 26)
-    np.testing.assert_allclose(framed.min(0), -np.array([3, 4, 12]) / 26)
+@pytest.mark.parametrize(
+    ("faces", "expected"),
+    [
+        ([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]], 0),  # a tetrahedron
+        ([[0, 1, 2], [0, 3, 1], [1, 3, 2]], 3 * 2),  # open: each edge counts in both directions
+        ([[0, 1, 2], [0, 1, 2]], 3 + 3 * 2),  # used twice, and without a partner
+        ([[0, 0, 1]], 1),  # a point; the edge from 0 to 1 is used once in each direction
+    ],
+)
+def test_open_edges_are_counted(faces: list[list[int]], expected: int) -> None:
+    mesh = Mesh(np.zeros((4, 3)), np.array(faces, np.int32))
+    assert mesh.open_edges() == expected and mesh.is_closed() == (expected == 0)
