@@ -14,9 +14,9 @@ from conftest import ball
 from onnx_files import entry
 
 from super_sdf.batch import job as batch_job
-from super_sdf.batch.fingerprint import fingerprint, is_unchanged
-from super_sdf.batch.job import Result
-from super_sdf.batch.plan import Batch, Settings
+from super_sdf.batch.job import Result, Settings
+from super_sdf.batch.ledger import fingerprint, is_unchanged
+from super_sdf.batch.plan import Batch
 from super_sdf.cli.batch_report import describe_progress, duration
 from super_sdf.convert import convert
 from super_sdf.files.regular import files_of
@@ -350,7 +350,7 @@ def test_content_is_read_only_where_time_or_path_differ(monkeypatch):
     assert fingerprint(Path("in")) is None and is_unchanged(Path("in/none"), None)
     assert not is_unchanged(path, None) and not is_unchanged(Path("in/none"), known)
     assert not is_unchanged(path, {**known, "sha256": "", "mtime_ns": 0})
-    monkeypatch.setattr("super_sdf.batch.fingerprint.fingerprint", lambda path: 1 / 0)
+    monkeypatch.setattr("super_sdf.batch.ledger.fingerprint", lambda path: 1 / 0)
     assert is_unchanged(path, known) and not is_unchanged(path, {**known, "size": 1})
 
 

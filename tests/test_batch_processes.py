@@ -16,12 +16,12 @@ from processes import PATIENCE, all_end, larger_grids, start_command, wait_for_l
 
 from super_sdf.batch import job as batch_job
 from super_sdf.batch.inputs import find_jobs
-from super_sdf.batch.plan import Settings
+from super_sdf.batch.job import Settings
 from super_sdf.batch.run import Queue, Run, choose_workers, useful_workers
 from super_sdf.convert import ConvertOptions
 from super_sdf.machine.memory import held_memory
 from super_sdf.machine.pool import Death, Pool
-from super_sdf.machine.threads import count_cores
+from super_sdf.machine.resources import Resources, allot_each, count_cores
 
 pytestmark = pytest.mark.usefixtures("grid_folder")
 SMALL = (*FAST, "--factor", 2, "--spacing", 1)
@@ -102,7 +102,7 @@ def test_as_many_processes_as_cores_and_memory_allow(monkeypatch):
     assert choose_workers("cuda", 100) == 1 and count_cores() >= 1
 
 
-HOLD = "import sys; from pathlib import Path; from super_sdf.batch.lock import folder_lock\n"
+HOLD = "import sys; from pathlib import Path; from super_sdf.batch.ledger import folder_lock\n"
 HOLD += "with folder_lock(Path('out')): print('held', flush=True); sys.stdin.read()"
 
 
@@ -122,7 +122,7 @@ def test_where_a_file_system_has_no_locks_a_batch_runs_without(run_batch, monkey
     def refuse(self, *_, **__):
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
-    monkeypatch.setattr("super_sdf.batch.lock.FileLock.acquire", refuse)
+    monkeypatch.setattr("super_sdf.batch.ledger.FileLock.acquire", refuse)
     assert run_batch("in/a.npy")[0] == 0 and len(rows()) == 1
 
 
@@ -130,7 +130,7 @@ def test_a_lock_file_that_cannot_be_written_is_named(run_batch, monkeypatch):
     def refuse(self, *_, **__):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
-    monkeypatch.setattr("super_sdf.batch.lock.FileLock.acquire", refuse)
+    monkeypatch.setattr("super_sdf.batch.ledger.FileLock.acquire", refuse)
     assert run_batch("in/a.npy") == (1, "", "Error: out cannot be written: Permission denied\n")
 
 
@@ -184,20 +184,20 @@ def test_fail_fast_begins_nothing_more_in_several_processes(monkeypatch):
     batch = Run(
         find_jobs(["in"], ".ply", ConvertOptions()).jobs, Settings(Path("out"), fail_fast=True)
     )
-    queue = Queue(batch, 2)
+    queue = Queue(batch)
     assert len(queue) == 4
     first = queue.popleft()
     batch._take(first, batch_job.failed_row(first, "why"))
     assert len(queue) == 0 and len(batch.batch.waiting) == 3
 
 
-def test_the_bound_is_read_once_and_shared_by_those_that_run(monkeypatch):
-    bounds = iter([10**9])
-    monkeypatch.setattr("super_sdf.batch.run.memory_bound", lambda asked: next(bounds))
-    monkeypatch.setattr("super_sdf.batch.run.held_memory", lambda: 10**8)
+def test_the_bound_is_shared_by_those_that_run(monkeypatch):
+    monkeypatch.setattr("super_sdf.machine.resources.memory_bound", lambda asked: asked)
+    monkeypatch.setattr("super_sdf.machine.resources.held_memory", lambda: 10**8)
+    assert allot_each(3, 1, 10**9) == Resources(1, 3 * 10**8)
     Path("out").mkdir()
     run = Run(find_jobs(["in"], ".ply", ConvertOptions()).jobs, Settings(Path("out")))
-    queue = Queue(run, 3)
+    queue = Queue(run, 3 * 10**8)
     assert [queue.popleft().options.max_memory for _ in range(4)] == 4 * [3 * 10**8]
 
 

@@ -23,8 +23,8 @@ from processes import PATIENCE, all_end, larger_grids, start_command, wait_for_l
 from super_sdf import __version__
 from super_sdf.cluster import checking, connecting
 from super_sdf.cluster import crew as crew_module
-from super_sdf.cluster.checking import Expected, Needs, check_some, check_workers
-from super_sdf.cluster.connecting import connect, share_of
+from super_sdf.cluster.checking import Expected, Needs, check_some, check_workers, share_of
+from super_sdf.cluster.connecting import connect
 from super_sdf.cluster.crew import Crew
 from super_sdf.errors import ClusterError, DeviceError
 from super_sdf.machine.pool import Death
@@ -390,8 +390,7 @@ def test_workers_without_the_package_or_with_other_sources_are_named():
     want = f"has other sources of super-sdf {__version__} than are here: install the same state "
     assert checking.judge_sources("0") == f"{want}there and restart it"
     assert checking.judge_sources(checking.digest_of_sources()) == ""
-    faults = {"tcp://a": "is old", "tcp://b": "is new", "tcp://c": "is old"}
-    assert checking.name_workers(faults) == "worker tcp://a and 1 other is old"
+    assert checking.first_of(["tcp://a", "tcp://b"]) == "worker tcp://a and 1 other"
 
 
 def test_other_versions_of_what_computes_are_a_warning():
@@ -458,11 +457,15 @@ def test_a_folder_that_is_not_shared_is_noticed():
 
 
 def test_a_worker_plans_with_what_its_machine_and_dask_allow():
-    assert share_of(Resources(0), 4, None, None) == Resources(4, None)
-    assert share_of(Resources(0), 1, 10**9, 10**10) == Resources(1, 75 * 10**7)
-    assert share_of(Resources(0), 1, 10**10, 10**9) == Resources(1, 6 * 10**8)
-    assert share_of(Resources(2, 10**9), 1, 10**10, 1) == Resources(2, 10**9)
-    assert share_of(Resources(2, 10**9), 1, 10**9, None) == Resources(2, 75 * 10**7)
+    def share(asked, threads, limit, free, neighbours=1):
+        report = checking.Report("", "host", {}, limit, free)
+        return share_of(asked, threads, report, neighbours)
+
+    assert share(Resources(0), 4, None, None) == Resources(4, None)
+    assert share(Resources(0), 1, 10**9, 10**10) == Resources(1, 75 * 10**7)
+    assert share(Resources(0), 1, 10**10, 2 * 10**9, 2) == Resources(1, 6 * 10**8)
+    assert share(Resources(2, 10**9), 1, 10**10, 1) == Resources(2, 10**9)
+    assert share(Resources(2, 10**9), 1, 10**9, None) == Resources(2, 75 * 10**7)
 
 
 def test_many_inputs_are_looked_at_in_part():

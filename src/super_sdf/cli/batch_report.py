@@ -15,7 +15,7 @@ import click
 from .common import print_stderr, print_stdout
 
 if TYPE_CHECKING:
-    from ..batch.job import Row
+    from ..batch.ledger import Row
     from ..batch.plan import Batch
     from ..batch.run import OnFile
 

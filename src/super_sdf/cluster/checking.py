@@ -27,15 +27,16 @@ import numpy as np
 from .. import __version__
 from ..errors import ClusterError, SuperSdfError, WriteError
 from ..machine.extras import missing_modules
-from ..machine.memory import free_memory, reuse_freed
+from ..machine.memory import SHARE, free_memory, reuse_freed
+from ..machine.pool import settle_signals
 from ..machine.resources import Resources
-from ..machine.serving import settle_signals
 from ..network.device import onnxruntime_version
 from ..network.network import Fingerprint, find_model, fingerprint_of, shipped_models
 from ..options import AUTO_PRECISION
-from .connecting import Cluster, share_of
+from .connecting import Cluster
 
 MOST_FILES = 100  # whose presence each worker checks
+PAUSE_SHARE = 0.75  # of a worker's limit: Dask gives it no more work at 0.8, and kills it at 0.95
 VERSION = "super_sdf:__version__"
 PACKAGE = Path(__file__).parent.parent
 PROBE = ".super-sdf-probe-"  # a file in the output folder while the workers are checked
@@ -105,7 +106,9 @@ def check_workers(cluster: Cluster, needs: Needs) -> Checked:
     """Check all workers that the cluster has now; ClusterError if one of them lacks something."""
     checked = check_some(cluster, needs, cluster.workers())
     if checked.faults:
-        raise ClusterError(name_workers(checked.faults))
+        fault = next(iter(checked.faults.values()))
+        those = [address for address, text in checked.faults.items() if text == fault]
+        raise ClusterError(f"{first_of(those)} {fault}")
     if not checked.members:
         raise ClusterError(f"the workers at {cluster.address} ended before they were checked")
     return checked
@@ -133,17 +136,36 @@ def check_some(
     # The first call needs nothing of this package, the second no more than one function of it.
     good = ask(list(threads), judge_version, pkgutil.resolve_name, VERSION)
     good = ask(list(good), judge_sources, digest_of_sources)
-    sizes = {path: size_of(path) for path in some_of(needs.files)}
+    sizes = {path: _size_of(path) for path in some_of(needs.files)}
     with probing(needs.folder) as probe:
         expected = Expected(needs, needs.digests_of_models(), sizes, probe, cluster.is_local)
-        reports = ask(list(good), judge_report, report_to, expected)
+        reports = ask(list(good), judge_report, _report_to, expected)
     network = needs.model, needs.precision, needs.device
     values = ask(list(reports), judge_values, fingerprint_of, *network)
     first = first or next(iter(values.items()), None)
     faults.update(differing(first, values))
     reports = {a: report for a, report in reports.items() if a in values and a not in faults}
-    members = members_of(cluster, reports, threads)
+    on_host = Counter(report.host for report in reports.values())
+    members = {
+        address: cluster.limits
+        if cluster.is_local
+        else share_of(cluster.limits, threads[address], report, on_host[report.host])
+        for address, report in reports.items()
+    }
     return Checked(members, first, faults, warnings_of(reports))
+
+
+def share_of(limits: Resources, threads: int, report: Report, neighbours: int) -> Resources:
+    """Return what a worker at an address may use, given what was asked for.
+
+    Dask gave it ``threads``; ``neighbours`` share the free memory of its machine, itself included.
+    """
+    rooms = [int(PAUSE_SHARE * report.limit)] if report.limit else []
+    if limits.memory is not None:
+        rooms.append(limits.memory)
+    elif report.free:
+        rooms.append(int(SHARE * (report.free // neighbours)))
+    return Resources(limits.threads or threads, min(rooms, default=None))
 
 
 def judge_version(answer: Any) -> str:
@@ -151,7 +173,7 @@ def judge_version(answer: Any) -> str:
     if isinstance(answer, ImportError):
         return f"does not have super-sdf: install version {__version__} of it there"
     if isinstance(answer, Exception):
-        return f"cannot import super-sdf ({describe(answer)}): install {__version__} there"
+        return f"cannot import super-sdf ({_describe(answer)}): install {__version__} there"
     if answer != __version__:
         return (
             f"has super-sdf {answer}, and here is {__version__}: install the same version there "
@@ -174,14 +196,14 @@ def judge_report(report: Any) -> str:
     """Return what a worker says that it lacks, "" if nothing."""
     if isinstance(report, Report):
         return report.fault
-    return f"cannot be checked ({describe(report)}): restart it"
+    return f"cannot be checked ({_describe(report)}): restart it"
 
 
 def judge_values(answer: Any) -> str:
     """Return why a worker cannot run the network, "" if it can."""
     if isinstance(answer, Fingerprint):
         return ""
-    why = answer if isinstance(answer, SuperSdfError) else describe(answer)
+    why = answer if isinstance(answer, SuperSdfError) else _describe(answer)
     return f"cannot run the network: {why}"
 
 
@@ -195,14 +217,13 @@ def differing(
             way = "use workers with the same kind of processor"
             way = "give --device cpu" if found.device != first[1].device else way
             faults[address] = (
-                f"({runs_on(found)}) gets other values from the network than worker {first[0]} "
-                f"({runs_on(first[1])}), so that meshes would differ or be torn: {way}"
+                f"({_runs_on(found)}) gets other values from the network than worker {first[0]} "
+                f"({_runs_on(first[1])}), so that meshes would differ or be torn: {way}"
             )
     return faults
 
 
-def runs_on(found: Fingerprint) -> str:
-    """Describe what computed values, and the values."""
+def _runs_on(found: Fingerprint) -> str:
     return f"{found.processor}, {found.precision} on {found.device}, {found.digest[:8]}"
 
 
@@ -220,12 +241,6 @@ def warnings_of(reports: Mapping[str, Report]) -> list[str]:
     return warnings
 
 
-def name_workers(faults: Mapping[str, str]) -> str:
-    """Return the first fault, with the workers that have it."""
-    fault = next(iter(faults.values()))
-    return f"{first_of([address for address, text in faults.items() if text == fault])} {fault}"
-
-
 def first_of(addresses: Sequence[str]) -> str:
     """Return the first of some workers, and how many others there are."""
     more = len(addresses) - 1
@@ -233,21 +248,7 @@ def first_of(addresses: Sequence[str]) -> str:
     return f"worker {addresses[0]}{others}"
 
 
-def members_of(
-    cluster: Cluster, reports: Mapping[str, Report], threads: Mapping[str, int]
-) -> dict[str, Resources]:
-    """Return what each worker may use; the free memory of a machine is shared equally."""
-    if cluster.is_local:
-        return dict.fromkeys(reports, cluster.limits)
-    on_host = Counter(report.host for report in reports.values())
-    members = {}
-    for address, report in reports.items():
-        free = None if report.free is None else report.free // on_host[report.host]
-        members[address] = share_of(cluster.limits, threads[address], report.limit, free)
-    return members
-
-
-def report_to(expected: Expected, dask_worker: Any) -> Report:
+def _report_to(expected: Expected, dask_worker: Any) -> Report:
     """Return the report of a worker; called in it, on its main thread."""
     reuse_freed()
     if expected.is_local:
@@ -270,7 +271,7 @@ def what_is_lacking(expected: Expected) -> str:
     if lacking := missing_modules(expected.needs.modules):
         return f"lacks {', '.join(lacking)}: install there what is installed here"
     for path, here in expected.sizes.items():
-        size = size_of(path)
+        size = _size_of(path)
         if size is None and here is not None:
             return f"does not see {path}: put the inputs where all machines see them by this path"
         if size != here:
@@ -303,7 +304,7 @@ def some_of(files: Sequence[Path]) -> Sequence[Path]:
     return files[:: max(1, -(-len(files) // MOST_FILES))]
 
 
-def size_of(path: Path) -> int | None:
+def _size_of(path: Path) -> int | None:
     """Return the bytes of a file, -1 for a folder, None if there is none."""
     try:
         return -1 if path.is_dir() else path.stat().st_size
@@ -342,7 +343,6 @@ def why_unusable(path: Path, text: str) -> str:
     return ""
 
 
-def describe(error: Any) -> str:
-    """Describe an exception in one line."""
+def _describe(error: Any) -> str:
     first = next(iter(str(error).splitlines()), "")
     return f"{type(error).__name__}: {first}" if isinstance(error, Exception) else repr(error)
