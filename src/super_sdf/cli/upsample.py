@@ -173,20 +173,21 @@ class Upsampling:
         )
 
     def _convert_there(self, progress: Progress | None) -> Conversion:
-        from ..cluster.bricks import Loading, convert_on_cluster
+        from ..cluster.bricks import convert_on_cluster
+        from ..cluster.checking import Needs
         from ..cluster.connecting import connect
 
         options, model = self.options, self.model
         if model not in QUALITIES:
             model = str(Path(model).absolute())
-        loading = Loading(model, options["precision"], options["device"])
+        needs = Needs(model, options["precision"], options["device"])
         limits = {"threads": options["threads"], "max_memory": options["max_memory"]}
         with connect(options["cluster"], workers=options["jobs"], **limits) as cluster:
             return convert_on_cluster(
                 self.source,
                 self.target,
                 cluster,
-                loading,
+                needs,
                 self.chosen,
                 force=options["force"],
                 progress=progress,

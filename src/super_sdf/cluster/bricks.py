@@ -51,14 +51,6 @@ BYTES_PER_TRIANGLE = 18  # with its half of a vertex
 LOOKED = 0.1  # share of the time until the bricks are cut
 
 
-class Loading(NamedTuple):
-    """How a worker loads its network: see ``load_network``."""
-
-    model: str
-    precision: str
-    device: str
-
-
 class RangesTask(NamedTuple):
     """A function, and the ranges of planes of which it is called with the samples."""
 
@@ -100,7 +92,7 @@ class BrickWork:
     """What works at bricks, in a worker."""
 
     source: Source
-    loading: Loading
+    needs: Needs
     limits: Resources
 
     def __call__(self, task: RangesTask | MeshTask, check: CheckWanted) -> Any:
@@ -117,9 +109,10 @@ class BrickWork:
     @cached_property
     def network(self) -> Network:
         """The network, loaded for the first mesh."""
-        model, precision, device = self.loading
-        threads = self.limits.threads
-        return load_network(model, device=device, threads=threads, precision=precision)
+        needs, threads = self.needs, self.limits.threads
+        return load_network(
+            needs.model, device=needs.device, threads=threads, precision=needs.precision
+        )
 
     def mesh(self, task: MeshTask, check: CheckWanted) -> Meshed:
         """Return the mesh of a brick."""
@@ -196,7 +189,7 @@ def convert_on_cluster(
     source: str | Path,
     target: str | Path,
     cluster: Cluster,
-    loading: Loading,
+    needs: Needs,
     options: ConvertOptions,
     *,
     force: bool = False,
@@ -205,9 +198,9 @@ def convert_on_cluster(
 ) -> Conversion:
     """Convert a grid file to a mesh file on the workers of a cluster; see ``convert``.
 
-    ``announce`` also gets sentences about workers, while the work goes on. ClusterError if a worker
-    lacks something, such as the file, or the cluster is lost; OptionError if the values need the
-    whole grid at once.
+    ``needs`` name the network; ``announce`` also gets sentences about workers, while the work goes
+    on. ClusterError if a worker lacks something, such as the file, or the cluster is lost;
+    OptionError if the values need the whole grid at once.
     """
     watch, told = Stopwatch(), dict[str, None]()
 
@@ -219,9 +212,10 @@ def convert_on_cluster(
     file, member = split_member(Path(source))
     path = f"{file.absolute()}" + (f":{member}" if member is not None else "")
     placed = Source(path, options.axes, options.direction is not None, secrets.token_hex(8))
-    needs = Needs(*loading, () if placed.is_npy else ("zarr",), (file.absolute(),))
+    modules = () if placed.is_npy else ("zarr",)
+    needs = replace(needs, modules=modules, files=(file.absolute(),))
     opened(placed)  # what cannot be read is said before the workers are checked
-    with Crew(cluster, needs, partial(BrickWork, placed, loading), warn) as crew:
+    with Crew(cluster, needs, partial(BrickWork, placed, needs), warn) as crew:
         bricks = _Bricks(crew, _read_stored(placed, crew, options), options)
         try:
             done = convert_grid(

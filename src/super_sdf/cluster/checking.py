@@ -15,7 +15,7 @@ import signal
 import socket
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
@@ -77,16 +77,14 @@ class Expected(NamedTuple):
 
 
 class Report(NamedTuple):
-    """A worker's report on itself: what is missing there ("" if nothing), and what it has.
-
-    ``limit`` are the bytes at which Dask kills it, ``free`` those that are free on its machine.
-    """
+    """A worker's report on itself: what is wrong there ("" if nothing), and what it has."""
 
     fault: str
     host: str
     versions: dict[str, str]
-    limit: int | None = None
-    free: int | None = None
+    limit: int | None = None  # bytes at which Dask kills it
+    free: int | None = None  # bytes that are free on its machine
+    values: Fingerprint | None = None  # of the network, if nothing is wrong
 
 
 @dataclass(frozen=True)
@@ -126,25 +124,25 @@ def check_some(
     """
     faults: dict[str, str] = {}
 
-    def ask(workers: Sequence[str], judge: Callable[[Any], str], *call: Any) -> dict[str, Any]:
+    def ask(workers: Iterable[str], judge: Callable[[Any], str], *call: Any) -> dict[str, Any]:
         """Return the answers that are right; keep the faults of the others."""
-        answers = cluster.run(*call, workers=list(workers)) if workers else {}
+        asked = list(workers)
+        answers = cluster.run(*call, workers=asked) if asked else {}
         there = {address: a for address, a in answers.items() if not isinstance(a, OSError)}
         faults.update({a: fault for a, answer in there.items() if (fault := judge(answer))})
         return {address: answer for address, answer in there.items() if address not in faults}
 
     # The first call needs nothing of this package, the second no more than one function of it.
-    good = ask(list(threads), judge_version, pkgutil.resolve_name, VERSION)
-    good = ask(list(good), judge_sources, digest_of_sources)
+    good = ask(threads, judge_version, pkgutil.resolve_name, VERSION)
+    good = ask(good, judge_sources, digest_of_sources)
     sizes = {path: _size_of(path) for path in some_of(needs.files)}
     with probing(needs.folder) as probe:
         expected = Expected(needs, needs.digests_of_models(), sizes, probe, cluster.is_local)
-        reports = ask(list(good), judge_report, _report_to, expected)
-    network = needs.model, needs.precision, needs.device
-    values = ask(list(reports), judge_values, fingerprint_of, *network)
+        reports = ask(good, judge_report, _report_to, expected)
+    values = {address: report.values for address, report in reports.items()}
     first = first or next(iter(values.items()), None)
     faults.update(differing(first, values))
-    reports = {a: report for a, report in reports.items() if a in values and a not in faults}
+    reports = {a: report for a, report in reports.items() if a not in faults}
     on_host = Counter(report.host for report in reports.values())
     members = {
         address: cluster.limits
@@ -169,16 +167,14 @@ def share_of(limits: Resources, threads: int, report: Report, neighbours: int) -
 
 
 def judge_version(answer: Any) -> str:
-    """Return what is wrong with the version of super-sdf that a worker has, "" if nothing."""
+    """Return what is wrong with the super-sdf of a worker, "" if nothing."""
     if isinstance(answer, ImportError):
         return f"does not have super-sdf: install version {__version__} of it there"
     if isinstance(answer, Exception):
         return f"cannot import super-sdf ({_describe(answer)}): install {__version__} there"
     if answer != __version__:
-        return (
-            f"has super-sdf {answer}, and here is {__version__}: install the same version there "
-            "and here"
-        )
+        both = f"{answer}, and here is {__version__}"
+        return f"has super-sdf {both}: install the same version there and here"
     return ""
 
 
@@ -197,14 +193,6 @@ def judge_report(report: Any) -> str:
     if isinstance(report, Report):
         return report.fault
     return f"cannot be checked ({_describe(report)}): restart it"
-
-
-def judge_values(answer: Any) -> str:
-    """Return why a worker cannot run the network, "" if it can."""
-    if isinstance(answer, Fingerprint):
-        return ""
-    why = answer if isinstance(answer, SuperSdfError) else _describe(answer)
-    return f"cannot run the network: {why}"
 
 
 def differing(
@@ -255,9 +243,14 @@ def _report_to(expected: Expected, dask_worker: Any) -> Report:
         with suppress(ValueError, AttributeError):  # not the main thread, or Windows
             settle_signals()
             signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the batch hears it, too
-    limit = dask_worker.memory_manager.memory_limit
-    fault = what_is_lacking(expected)
-    return Report(fault, socket.gethostname(), versions(), limit or None, free_memory())
+    limit, needs, values = dask_worker.memory_manager.memory_limit or None, expected.needs, None
+    if not (fault := what_is_lacking(expected)):
+        try:
+            values = fingerprint_of(needs.model, needs.precision, needs.device)
+        except Exception as error:
+            why = str(error) if isinstance(error, SuperSdfError) else _describe(error)
+            fault = f"cannot run the network: {why}"
+    return Report(fault, socket.gethostname(), versions(), limit, free_memory(), values)
 
 
 def what_is_lacking(expected: Expected) -> str:
