@@ -51,7 +51,6 @@ def convert_on_cluster(
 
 
 def _absolute(settings: Settings) -> Settings:
-    """Return settings whose paths hold in any working folder."""
     model = settings.model
     path, _ = find_model(model, settings.precision)
     if path not in shipped_models().values():

@@ -129,7 +129,6 @@ class Planner:
 
 
 def _identity(path: Path) -> tuple[int, int]:
-    """Return what two names of one file have in common."""
     state = path.stat()
     return state.st_dev, state.st_ino
 

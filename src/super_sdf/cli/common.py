@@ -167,7 +167,7 @@ def _file_at(path: str | os.PathLike[str]) -> tuple[int, int] | None:
 
 
 def _what_is_written(before: dict[str, tuple[int, int] | None]) -> str:
-    """Return which files are not those of before, as the end of a sentence; "" for no files."""
+    """Return which files are not those of before, as the end of a sentence."""
     written = [path for path, file in before.items() if _file_at(path) != file]
     if not written:
         return "; nothing was written" if before else ""

@@ -269,10 +269,9 @@ def what_is_lacking(expected: Expected) -> str:
             return f"does not see {path}: put the inputs where all machines see them by this path"
         if size != here:
             return f"sees another {path}: its folder has to be the same on all machines"
-    if expected.probe and (why := why_unusable(*expected.probe)):
-        folder = expected.needs.folder
-        return f"{why}: write to a folder that all machines share under {folder}"
-    return ""
+    why = why_unusable(*expected.probe) if expected.probe else ""
+    folder = expected.needs.folder
+    return why and f"{why}: write to a folder that all machines share under {folder}"
 
 
 def versions() -> dict[str, str]:

@@ -88,7 +88,6 @@ def _groups(controller: str) -> Iterator[Path]:
 
 
 def _left_in(group: Path) -> int | None:
-    """Return the bytes that a group of version 2 or 1 leaves, None without a limit."""
     for limit_name, used_name, cache_name in (
         ("memory.max", "memory.current", "inactive_file"),
         ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
@@ -104,7 +103,6 @@ def _left_in(group: Path) -> int | None:
 
 
 def _cores_of(group: Path) -> float:
-    """Return how many cores' worth of time a group of version 2 or 1 may use."""
     with suppress(OSError, ValueError):  # as above
         quota, period = (group / "cpu.max").read_text().split()
         return int(quota) / int(period)

@@ -211,7 +211,6 @@ def entry_of_report(name: str, report: Mapping[str, Any], item: Item | None) -> 
 
 
 def _counts(report: Mapping[str, Any]) -> str:
-    """Return triangles and grid in one line, as far as they are known."""
     said = [f"{report['triangles']:,} triangles"] if "triangles" in report else []
     if "closed" in report:
         said.append("closed" if report["closed"] else "open")
@@ -221,7 +220,6 @@ def _counts(report: Mapping[str, Any]) -> str:
 
 
 def _facts(report: Mapping[str, Any]) -> list[list[str]]:
-    """Return what is known of a conversion, label by label."""
     texts = {
         "grid": report.get("input") or report.get("in"),
         "mesh": report.get("output"),
