@@ -29,7 +29,7 @@ import psutil
 import trimesh
 from numpy.typing import NDArray
 
-from super_sdf.machine.threads import count_cores
+from super_sdf.machine.resources import count_cores
 from super_sdf.mesh import Mesh
 
 from . import forms, parser_of

@@ -26,7 +26,7 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import product
 from pathlib import Path
 
-from super_sdf.machine.threads import count_cores
+from super_sdf.machine.resources import count_cores
 
 from . import parser_of
 from .tables import markdown

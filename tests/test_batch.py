@@ -14,9 +14,9 @@ from conftest import ball
 from onnx_files import entry
 
 from super_sdf.batch import job as batch_job
-from super_sdf.batch.fingerprint import fingerprint, is_unchanged
-from super_sdf.batch.job import Result
-from super_sdf.batch.plan import Batch, Settings
+from super_sdf.batch.job import Result, Settings
+from super_sdf.batch.ledger import fingerprint, is_unchanged
+from super_sdf.batch.plan import Batch
 from super_sdf.cli.batch_report import describe_progress, duration
 from super_sdf.convert import convert
 from super_sdf.files.regular import files_of
@@ -137,14 +137,6 @@ def test_each_label_has_a_mesh_of_its_own(run_batch):
     assert run_batch("list.jsonl") == (0, "", want)
 
 
-def write_raw(path, radius=3.0):
-    """Write the samples of a ball alone; keep the time of a file that was there."""
-    before = os.stat(path).st_mtime_ns if os.path.exists(path) else None
-    ball(12, radius).values.astype("<f4").transpose().tofile(path)
-    if before:
-        os.utime(path, ns=(before + 1, before + 1))
-
-
 MHD = "ObjectType = Image\nNDims = 3\nDimSize = 12 12 12\nElementType = MET_FLOAT\n"
 NRRD = "NRRD0004\ntype: float\ndimension: 3\nsizes: 12 12 12\nendian: little\nencoding: raw\n"
 SLICES = "\n".join(f"part {z}.raw" for z in range(12))
@@ -178,18 +170,6 @@ def test_the_fingerprint_of_a_header_covers_its_data(name):
         assert not is_unchanged(Path(name), known)
         Path(part).write_text("x")
         assert is_unchanged(Path(name), known)
-
-
-def test_changed_data_beside_a_header_is_converted_again(run_batch):
-    Path("scans").mkdir()
-    Path("scans/x.mhd").write_text(HEADERS["x.mhd"][0])
-    assert run_batch("scans")[0] == 1  # no data
-    write_raw("scans/part of it.raw")
-    assert run_batch("scans")[0] == 0
-    before = Path("out/x.ply").read_bytes()
-    assert "nothing to do" in run_batch("scans")[2]
-    write_raw("scans/part of it.raw", 4.0)
-    assert run_batch("scans")[0] == 0 and Path("out/x.ply").read_bytes() != before
 
 
 def test_the_fingerprint_of_a_network_covers_weights_beside_it():
@@ -341,17 +321,6 @@ def test_options_are_checked_before_the_work(run_batch, command):
     Path("bad.onnx").write_text("x")
     code, _, err = command("batch", "in", "--out", "out", "--jobs", 2, "--model", "bad.onnx")
     assert code == 1 and err.startswith("Error: bad.onnx is no ONNX file that onnxruntime can run")
-
-
-def test_content_is_read_only_where_time_or_path_differ(monkeypatch):
-    path = Path("in/a.npy")
-    known = fingerprint(path)
-    assert known["size"] == path.stat().st_size and is_unchanged(path, known, same_path=False)
-    assert fingerprint(Path("in")) is None and is_unchanged(Path("in/none"), None)
-    assert not is_unchanged(path, None) and not is_unchanged(Path("in/none"), known)
-    assert not is_unchanged(path, {**known, "sha256": "", "mtime_ns": 0})
-    monkeypatch.setattr("super_sdf.batch.fingerprint.fingerprint", lambda path: 1 / 0)
-    assert is_unchanged(path, known) and not is_unchanged(path, {**known, "size": 1})
 
 
 def test_progress_has_rate_and_time_left(run_batch, monkeypatch):

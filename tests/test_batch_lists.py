@@ -66,39 +66,24 @@ LISTS = {
     "offset, cap, mesher, simplify, triangles",
     '{"in": "a.npy", "simplify": 1, "triangles": 9}': "list.jsonl, line 1: simplify 1.0 and "
     "triangles 9: give only one of them",
-    '{"in": "a.npy", "triangles": 9.5}': "list.jsonl, line 1: 'triangles' is 9.5: give a whole "
-    "number",
     '\n{"in": "a.npy", "factor": 3}': "list.jsonl, line 2: 'factor' is 3: give an even number from "
     "2 to 16 (an odd one has no node on the samples)",
-    '{"in": "a.npy", "spacing": [1, 2]}': "list.jsonl, line 1: 'spacing' is [1, 2]: give one "
-    "number, or three",
-    '{"in": "a.npy", "offset": "1"}': "list.jsonl, line 1: 'offset' is '1': give a number, "
-    "in world units",
-    '{"in": "a.npy", "inside": "out"}': "list.jsonl, line 1: 'inside' is 'out': give one of auto, "
-    "negative, positive",
     '{"in": "a.npy", "cap": 1}': "list.jsonl, line 1: 'cap' is 1: give True or False, "
     "in JSON true or false",
     '{"in": "a.npy", "out": "a.xyz"}': "list.jsonl, line 1: 'out' is 'a.xyz': give a file, one of "
     ".ply, .stl, .obj, .off, .glb, .3mf",
     '{"in": "."}': "list.jsonl, line 1: 'in' is '.': give the path of a grid",
-    '{"in": "../.."}': "list.jsonl, line 1: 'in' is '../..': give the path of a grid",
     '{"in": "a\\u0000.npy"}': "list.jsonl, line 1: 'in' is 'a\\x00.npy': no file can have this "
     "name",
     '{"in": "a\\ud800.npy"}': "list.jsonl, line 1: 'in' is 'a\\ud800.npy': no file can have this "
     "name",
-    '{"in": "a.npy", "out": "\\udfff.ply"}': "list.jsonl, line 1: 'out' is '\\udfff.ply': no file "
-    "can have this name",
     '{"in": "a.npy", "offset": 1' + 400 * "0" + "}": "list.jsonl, line 1: 'offset' is 1"
     + 56 * "0"
     + "...: give a finite number, in world units",
     '{"in": "a.npy", "factor": 1' + 5000 * "0" + "}": "list.jsonl, line 1 is no JSON: Exceeds the "
     "limit (4300 digits) for integer string conversion: value has 5001 digits; use "
     "sys.set_int_max_str_digits() to increase the limit",
-    '{"in": "a.npy", "offset": 1e999}': "list.jsonl, line 1: 'offset' is inf: give a finite "
-    "number, in world units",
     '{"in": "a.npy", "offset": NaN}': "list.jsonl, line 1: NaN is no number: give a finite one",
-    '{"in": "a.npy", "label": 0.5}': "list.jsonl, line 1: 'label' is 0.5: give a whole number, "
-    "-2^63 to 2^64 - 1",
     '{"in": "a.npy", "in": "b.npy"}': "list.jsonl, line 1: 'in' is there twice: give it once",
     100_000 * "[": 'list.jsonl, line 1 is nested too deeply: give an object, {"in": "a.npy"}',
     f'"{10_000_000 * "x"}"': 'list.jsonl, line 1 is "'
@@ -108,12 +93,8 @@ LISTS = {
     + '": give an object, {"in": "a.npy"}',
     '{"in": "a.npy", "out": "report.jsonl/x.ply"}': "a.npy would become report.jsonl/x.ply, but "
     "the first of these names is the batch's own: rename it",
-    '{"in": "a.npy", "out": ".super-sdf-batch.lock/x.ply"}': "a.npy would become "
-    ".super-sdf-batch.lock/x.ply, but the first of these names is the batch's own: rename it",
     '{"in": "a.npy", "out": "a/../../b.ply"}': "list.jsonl, line 1: 'out' is 'a/../../b.ply': give "
     "a path within the output folder",
-    '{"in": "a.npy", "out": "../a.ply"}': "list.jsonl, line 1: 'out' is '../a.ply': give a path "
-    "within the output folder",
 }
 
 

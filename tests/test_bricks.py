@@ -15,14 +15,15 @@ from test_slabs import bad_samples, rod
 
 from super_sdf import load_network
 from super_sdf.cluster import bricks, stored
-from super_sdf.cluster.bricks import BrickWork, Loading, convert_on_cluster
+from super_sdf.cluster.bricks import BrickWork, convert_on_cluster
+from super_sdf.cluster.checking import Needs
 from super_sdf.cluster.connecting import connect
 from super_sdf.cluster.stored import Source, StoredPlanes
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.errors import ClusterError, GridError, MeshError, OptionError
 from super_sdf.grid.planes import DerivedPlanes
 
-LOADING = Loading("fast", "auto", "cpu")
+NETWORK = Needs("fast", "auto", "cpu")
 LAYOUTS = {"cubes": (8, 8, 8), "first axis whole": (15, 14, 3), "npy": None}
 
 
@@ -40,7 +41,8 @@ def network():
 @pytest.fixture(autouse=True)
 def many_bricks(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(bricks, "MESH_BRICKS", 5)
+    monkeypatch.setattr(bricks, "MESH_BRICKS", 2)
+    monkeypatch.setattr(bricks, "PASS_BRICKS", 1)
 
 
 def store(values, chunks):
@@ -64,7 +66,7 @@ def both(cluster, network, values, chunks, **options):
 
 def on_cluster(cluster, source, chosen, target="there.ply", **more):
     """Convert on a cluster."""
-    return convert_on_cluster(source, target, cluster, LOADING, chosen, force=True, **more)
+    return convert_on_cluster(source, target, cluster, NETWORK, chosen, force=True, **more)
 
 
 def check_same(here, there):
@@ -87,14 +89,13 @@ def test_the_mesh_is_that_of_one_machine(cluster, network, layout, mesher):
 TURNED = (0, -1, 0, 1, 0, 0, 0, 0, 1)
 FIELDS = {
     "leaves the grid, positive inside": (-rod()[4:52, :10], {"cap": False}),
-    "offset": (rod(), {"offset": 1.3}),
     "bad samples, spacing inferred": (bad_samples(rod()) * 0.25, {"spacing": None}),
     "label": ((rod() < 0) * np.int16(6), {"label": 6.0}),
     "truncated": (np.clip(rod(), -1.2, 1.2), {}),
     "level": (100 - rod() * 10, {"level": 100.0, "scale": 0.1}),
     "integers, placed": (
         np.rint(rod() * 40).astype(np.int16),
-        {"scale": 1 / 40, "origin": (3.0, 4.0, 5.0), "direction": TURNED},
+        {"scale": 1 / 40, "origin": (3.0, 4.0, 5.0), "direction": TURNED, "offset": 1.3},
     ),
 }
 
@@ -143,6 +144,7 @@ class TwoProcessors(BrickWork):
 def test_bricks_of_processors_that_round_differently_are_an_error(cluster, network, monkeypatch):
     cluster.client.wait_for_workers(2)  # one that was killed comes back; bricks depend on it
     monkeypatch.setattr(bricks, "BrickWork", TwoProcessors)
+    monkeypatch.setattr(bricks, "MESH_BRICKS", 5)
     said = refusal(cluster, network, rod(), factor=2)
     assert re.fullmatch(
         r"the mesh is torn, with 110 open edges at plane 29, between planes 24 to 28 \(\S+:\d+\) "
@@ -267,23 +269,17 @@ def test_layers_are_unpacked_once_and_samples_travel_by_their_path(monkeypatch):
     stored.close_stores()
 
 
-def test_spacing_origin_and_direction_of_the_store(cluster, network):
-    """The array's own axes run backwards, so planes of x begin at its end."""
-    made = zarr.create_array("b.zarr", shape=rod().T.shape, chunks=(8, 8, 8), dtype="f8")
-    made[:] = rod().T
-    made.attrs.update(spacing=0.5, origin=[1, 2, 3], direction=[-1, 0, 0, 0, -1, 0, 0, 0, 1])
-    chosen = ConvertOptions(factor=2, scale=0.5)
-    here = convert("b.zarr", "here.ply", network, chosen)
-    check_same(here, on_cluster(cluster, "b.zarr", chosen))
-
-
 def test_a_file_that_changed_since_the_last_conversion(cluster, network):
-    """Workers stay, but what they have unpacked of the file does not."""
+    """Workers stay, but what they have unpacked of the file does not.
+
+    The array's own axes run backwards, so planes of x begin at its end.
+    """
+    chosen = ConvertOptions(factor=2, scale=0.5)
     for values in (rod(), rod() - 0.2):
         made = zarr.create_array(
             "b.zarr", shape=values.T.shape, chunks=(8, 8, 8), dtype="f8", overwrite=True
         )
         made[:] = values.T
-        chosen = ConvertOptions(factor=2, spacing=(1.0,))
-        here = convert("b.zarr", "here.ply", network, chosen, force=True)
-        check_same(here, on_cluster(cluster, "b.zarr", chosen))
+        made.attrs.update(spacing=0.5, origin=[1, 2, 3], direction=[-1, 0, 0, 0, -1, 0, 0, 0, 1])
+        there = on_cluster(cluster, "b.zarr", chosen)
+    check_same(convert("b.zarr", "here.ply", network, chosen), there)

@@ -20,8 +20,8 @@ from super_sdf import load_network
 from super_sdf.batch import page as batch_page
 from super_sdf.cli.main import cli
 from super_sdf.convert import ConvertOptions
-from super_sdf.pages.entries import entry_of
 from super_sdf.pages.html import make_page, viewed_page, write_page
+from super_sdf.pages.items import entry_of
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 WITHOUT_GPU = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")

@@ -313,7 +313,7 @@ def test_an_interrupt_at_any_stage_leaves_nothing(here, command, monkeypatch, st
     "step, options, written",
     [
         (
-            "cli.upsampling.Upsampling.print_report",
+            "cli.upsample.Upsampling.print_report",
             ("--save-field", "f.npz"),
             "out.ply and f.npz are written",
         ),

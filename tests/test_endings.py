@@ -95,7 +95,11 @@ LINES = {
 
 @pytest.mark.parametrize(
     "script, more, number",
-    [*((STAGE, "; nothing was written", number) for number in LINES), (IMPORT, "", signal.SIGTERM)],
+    [
+        (STAGE, "; nothing was written", signal.SIGINT),
+        (STAGE, "; nothing was written", signal.SIGHUP),
+        (IMPORT, "", signal.SIGTERM),
+    ],
 )
 def test_a_signal_leaves_a_line_its_exit_code_and_no_file(script, more, number):
     words = [sys.executable, "-c", script, *QUICK]

@@ -6,7 +6,7 @@ from conftest import ball, trilinear
 
 from super_sdf import SdfGrid, extract_mesh, reconstruct, upsample
 from super_sdf.errors import OptionError
-from super_sdf.machine import index_width
+from super_sdf.machine import resources
 from super_sdf.slabs.cutting import check_vertices
 from super_sdf.steps.nodes import number_parts, share_parts
 from super_sdf.steps.survey import survey
@@ -26,7 +26,7 @@ def test_nodes_are_counted_beyond_32_bits():
 def test_too_many_vertices_are_refused_before_an_index_overflows():
     """The vertices of earlier slabs count, and the last valid index is used."""
     field = upsample(ball(), trilinear, 2)
-    room = index_width.MAX_INDEX - len(extract_mesh(field, ball()).vertices)
+    room = resources.MAX_INDEX - len(extract_mesh(field, ball()).vertices)
     assert extract_mesh(field, ball(), first_vertex=room).faces.min() == room
     message = r"^there are 2,147,483,648 vertices, but 32-bit indices allow only 2,147,483,647: use"
     with pytest.raises(OptionError, match=message):
@@ -38,9 +38,9 @@ def test_far_too_many_vertices_are_refused_before_the_network_runs(monkeypatch):
     vertices = len(reconstruct(ball(30, 11.0), trilinear, 4).vertices)
     estimate = band.count_crossings() * 4**2
     assert 0.8 < estimate / vertices < 1.25
-    monkeypatch.setattr(index_width, "MAX_INDEX", estimate // 2)
+    monkeypatch.setattr(resources, "MAX_INDEX", estimate // 2)
     check_vertices(band, 4)
-    monkeypatch.setattr(index_width, "MAX_INDEX", estimate // 2 - 1)
+    monkeypatch.setattr(resources, "MAX_INDEX", estimate // 2 - 1)
     with pytest.raises(OptionError, match=rf"there are {estimate // 2:,} vertices or more, but"):
         check_vertices(band, 4)
 
@@ -51,7 +51,7 @@ def test_a_plane_that_holds_everything_is_meshed_in_chunks_to_the_same_mesh(monk
     grid = SdfGrid(np.abs(i - 3.6) - 1.3 + 0.01 * np.sin(j + k), 1.0)
     meshes = []
     for chunk in (1 << 19, 2000):
-        monkeypatch.setattr("super_sdf.machine.threads.CHUNK", chunk)
+        monkeypatch.setattr("super_sdf.machine.resources.CHUNK", chunk)
         meshes.append(reconstruct(grid, trilinear, factor, cap=True))
     np.testing.assert_array_equal(meshes[0].faces, meshes[1].faces)
     np.testing.assert_array_equal(meshes[0].vertices, meshes[1].vertices)

@@ -15,7 +15,7 @@ from test_slabs import in_pieces, rod
 
 from super_sdf import SdfGrid, extract_mesh, load_network, options, reconstruct, upsample
 from super_sdf.convert import ConvertOptions
-from super_sdf.machine import threads
+from super_sdf.machine import resources
 from super_sdf.mesh import join_meshes
 from super_sdf.slabs import cutting
 from super_sdf.steps import meshers
@@ -117,8 +117,8 @@ def test_groups_and_threads_change_nothing(network, monkeypatch, factor):
     field = upsample(grid, network, factor)
     mesher = meshers.BY_NAME["sharp"]
     one = join_meshes(mesher.extract(field, grid, 7, 1))
-    monkeypatch.setattr(threads, "CHUNK", 5000)
-    monkeypatch.setattr(threads, "MIN_PER_THREAD", 1000)
+    monkeypatch.setattr(resources, "CHUNK", 5000)
+    monkeypatch.setattr(resources, "MIN_PER_THREAD", 1000)
     for groups, number in ((1, 2), (4, 1), (9, 3)):
         size = sum(sharp.voxel_bytes(factor)) * len(field.voxel_ijk)
         monkeypatch.setattr(sharp, "GROUP_BYTES", size // groups)

@@ -18,9 +18,17 @@ from super_sdf.certificate.check import FULL, check_mesh
 from super_sdf.convert import ConvertOptions, Kept
 from super_sdf.grid.cubic import cubic_grid
 from super_sdf.pages import meshes
-from super_sdf.pages.entries import certificate_facts, entry_of, entry_of_report
 from super_sdf.pages.html import is_page, make_page, write_page
-from super_sdf.pages.items import Item, item_of, read_head, read_meshes, write_item
+from super_sdf.pages.items import (
+    Item,
+    certificate_facts,
+    entry_of,
+    entry_of_report,
+    item_of,
+    read_head,
+    read_meshes,
+    write_item,
+)
 from super_sdf.pages.meshes import coarse_surface, packed_mesh, residual_bytes, thumbnail
 from super_sdf.steps.survey import survey
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from super_sdf import SdfGrid, load_network, make_grid, pipeline, reconstruct
 from super_sdf.errors import OutOfMemoryError
-from super_sdf.machine import threads
+from super_sdf.machine import resources
 from super_sdf.machine.resources import Resources
 from super_sdf.mesh import Mesh, join_meshes
 from super_sdf.pipeline import reconstruct_slabs
@@ -106,9 +106,9 @@ def test_slabs_need_all_the_planes_beside_them(network, monkeypatch):
 @pytest.mark.parametrize("field, factor", [("noisy", 2), ("bad samples", 4)])
 def test_threads_change_nothing(monkeypatch, field, factor):
     grid = SdfGrid.trusted(FIELDS[field], (1.0,) * 3, (1.0, 2.0, 3.0))
-    monkeypatch.setattr(threads, "CHUNK", 5000)
-    monkeypatch.setattr(threads, "MIN_PER_THREAD", 1000)
-    monkeypatch.setattr(threads, "count_cores", lambda: 3)
+    monkeypatch.setattr(resources, "CHUNK", 5000)
+    monkeypatch.setattr(resources, "MIN_PER_THREAD", 1000)
+    monkeypatch.setattr(resources, "count_cores", lambda: 3)
     meshes = [reconstruct(grid, with_threads(number), factor) for number in (1, 2, 3)]
     for mesh in meshes[1:]:
         np.testing.assert_array_equal(mesh.faces, meshes[0].faces)

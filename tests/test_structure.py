@@ -139,7 +139,7 @@ def test_no_string_names_a_module(module):
 def test_the_runtime_needs_few_packages(module):
     allowed = {"click", "numpy", "onnxruntime", "trimesh"} | set(sys.stdlib_module_names)
     allowed.add("typing_extensions")  # for type checkers alone, which have it
-    others = {"batch.lock": {"filelock"}, "machine.memory": {"psutil"}, **READERS}
+    others = {"batch.ledger": {"filelock"}, "machine.memory": {"psutil"}, **READERS}
     allowed |= others.get(module, set())
     assert tops(MODULES[module]) <= allowed
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from fnmatch import fnmatch
 from pathlib import Path, PurePath
 from typing import NamedTuple
@@ -20,13 +20,10 @@ from ..files.meshes import check_mesh_suffix
 from ..files.regular import is_store, reason_of
 from ..options import ConvertOptions
 from .job import Job
-from .ledger import NAME, STARTED_NAME
-from .lock import LOCK_NAME
+from .ledger import LOCK_NAME, NAME, STARTED_NAME
 from .manifest import read_manifest
 
 MANIFEST_SUFFIXES = (".txt", ".jsonl")
-OnError = Callable[[OSError], None]
-"""Called with the error of a folder that cannot be read."""
 
 
 class Inputs(NamedTuple):
@@ -43,13 +40,12 @@ def find_jobs(arguments: Sequence[str], suffix: str, options: ConvertOptions) ->
     have other options. OptionError if an argument names no grid, or if two inputs would become one
     output; FileError if a manifest, or the only folder, cannot be read.
     """
-    search = Search(suffix, options)
+    search = _Search(suffix, options)
     jobs = _each_once([job for argument in arguments for job in search.expand(argument)])
     for kind in {PurePath(job.target).suffix for job in jobs}:
         check_mesh_suffix(Path(f"*{kind}"))
     for job in jobs:
-        first = PurePath(job.target).parts[0].casefold()
-        if first in (LOCK_NAME, NAME, STARTED_NAME):
+        if PurePath(job.target).parts[0].casefold() in (LOCK_NAME, NAME, STARTED_NAME):
             raise OptionError(
                 f"{job.source} would become {job.target}, but the first of these names is the "
                 "batch's own: rename it"
@@ -57,7 +53,21 @@ def find_jobs(arguments: Sequence[str], suffix: str, options: ConvertOptions) ->
     return Inputs(jobs, list(dict.fromkeys(search.unread)))
 
 
-class Search:
+def _each_once(jobs: Iterable[Job]) -> list[Job]:
+    """Return the jobs without repetitions; raise OptionError for two inputs of one output."""
+    by_target: dict[str, Job] = {}
+    for job in jobs:
+        other = by_target.setdefault(os.path.normcase(job.target), job)
+        same = os.path.abspath(other.source) == os.path.abspath(job.source)
+        if not (same and other.options == job.options):
+            raise OptionError(
+                f"{other.source} and {job.source} would both become {job.target}: rename one, or "
+                "give 'out' in a .jsonl manifest"
+            )
+    return list(by_target.values())
+
+
+class _Search:
     """Expands arguments into jobs; ``unread`` lists the folders that could not be read."""
 
     def __init__(self, suffix: str, options: ConvertOptions) -> None:
@@ -70,13 +80,15 @@ class Search:
         if is_store(path):
             return self._below(path.parent, [path], argument)
         if argument and os.path.isdir(path):
-            return self._below(path, files_below(path, self._note), argument)
+            return self._below(path, self._files_below(path), argument)
         if suffix in MANIFEST_SUFFIXES and os.path.isfile(path):
             return read_manifest(path, self.suffix, self.options)
         if is_grid(path) and os.path.lexists(file := split_member(path)[0]):
             return self._below(file.parent, [path], argument)
         if glob.has_magic(argument):
-            return self._below(fixed_part(path), matches(path, self._note), argument)
+            first = next(i for i, part in enumerate(path.parts) if glob.has_magic(part))
+            root = Path(*path.parts[:first])
+            return self._below(root, self._matches(root, path.parts[first:]), argument)
         if not argument or not os.path.lexists(path):
             raise OptionError(
                 f"{argument or repr(argument)} does not exist: give grids, folders, patterns or a "
@@ -99,87 +111,52 @@ class Search:
             if self.unread:
                 raise FileError(" ".join(self.unread[-1]))
             raise OptionError(f"{argument} holds no grid ({', '.join(GRID_SUFFIXES)})")
-        targets = (
-            mesh_path(path.relative_to(root), self.suffix, self.options.label) for path in grids
-        )
+        label = self.options.label
+        targets = (mesh_path(path.relative_to(root), self.suffix, label) for path in grids)
         return [Job(p, target.as_posix(), self.options) for p, target in zip(grids, targets)]
 
-    def _note(self, error: OSError) -> None:
-        self.unread.append((str(error.filename), reason_of(error)))
+    def _walk(self, folder: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
+        """Walk down a folder as ``os.walk``, noting what cannot be read; nothing for a file."""
 
+        def note(error: OSError) -> None:
+            if not isinstance(error, (NotADirectoryError, FileNotFoundError)):
+                self.unread.append((str(error.filename), reason_of(error)))
 
-def _each_once(jobs: Iterable[Job]) -> list[Job]:
-    """Return the jobs without repetitions; raise OptionError for two inputs of one output."""
-    by_target: dict[str, Job] = {}
-    for job in jobs:
-        other = by_target.setdefault(os.path.normcase(job.target), job)
-        same = os.path.abspath(other.source) == os.path.abspath(job.source)
-        if not (same and other.options == job.options):
-            raise OptionError(
-                f"{other.source} and {job.source} would both become {job.target}: rename one, or "
-                "give 'out' in a .jsonl manifest"
-            )
-    return list(by_target.values())
+        for path, folders, names in os.walk(folder, onerror=note):
+            yield Path(path), folders, names
 
+    def _files_below(self, folder: Path) -> Iterator[Path]:
+        """Yield what is below a folder and no folder itself, or a folder that is a grid."""
+        for path, folders, names in self._walk(folder):
+            stores = [name for name in folders if is_store(path / name)]
+            folders[:] = [name for name in folders if name not in stores]
+            yield from (path / name for name in (*stores, *names))
 
-def files_below(folder: Path, on_error: OnError) -> Iterator[Path]:
-    """Yield everything below a folder that is not a folder itself, or a folder that is a grid."""
-    for path, folders, names in os.walk(folder, onerror=on_error):
-        stores = [name for name in folders if is_store(Path(path, name))]
-        folders[:] = [name for name in folders if name not in stores]
-        yield from (Path(path, name) for name in stores)
-        yield from (Path(path, name) for name in names)
+    def _matches(self, root: Path, parts: Sequence[str]) -> list[Path]:
+        """Return the paths that the parts of a glob pattern match below a folder, each once."""
+        paths = [root]
+        for part in parts:
+            paths = list(dict.fromkeys(path for s in paths for path in self._step(s, part)))
+        return paths
 
+    def _step(self, path: Path, part: str) -> Iterator[Path]:
+        """Yield the paths in a folder that match one part of a pattern, as in a shell."""
+        if part == "**":
+            yield from self._visible_below(path)
+        elif glob.has_magic(part):
+            _, folders, names = next(self._walk(path), (path, [], []))
+            for name in (*folders, *names):
+                if fnmatch(name, part) and (part.startswith(".") or not name.startswith(".")):
+                    yield path / name
+        elif os.path.lexists(path / part):
+            yield path / part
 
-def matches(pattern: Path, on_error: OnError) -> list[Path]:
-    """Return the paths that a glob pattern matches, each once; ``**`` matches any folders."""
-    root = fixed_part(pattern)
-    paths = [root]
-    for part in pattern.parts[len(root.parts) :]:
-        found = [path for start in paths for path in _step(start, part, on_error)]
-        paths = list(dict.fromkeys(found))
-    return paths
-
-
-def fixed_part(pattern: Path) -> Path:
-    """Return the folder before the first part of a path that has wildcards."""
-    parts = pattern.parts
-    first = next(i for i, part in enumerate(parts) if glob.has_magic(part))
-    return Path(*parts[:first])
-
-
-def _step(path: Path, part: str, on_error: OnError) -> Iterator[Path]:
-    """Yield the paths in a folder that match one part of a pattern."""
-    if part == "**":
-        yield from _visible_below(path, on_error)
-    elif glob.has_magic(part):
-        yield from (path / name for name in _names(path, on_error) if _fits(name, part))
-    elif os.path.lexists(path / part):
-        yield path / part
-
-
-def _visible_below(path: Path, on_error: OnError) -> Iterator[Path]:
-    """Yield a path, and everything below it that is not hidden."""
-    yield path
-    for folder, folders, names in os.walk(path, onerror=on_error):
-        below = (Path(folder, name) for name in folders if not name.startswith("."))
-        kept = [path for path in below if not path.is_symlink()]
-        folders[:] = [path.name for path in kept if not is_store(path)]
-        yield from kept
-        yield from (Path(folder, name) for name in names if not name.startswith("."))
-
-
-def _names(path: Path, on_error: OnError) -> list[str]:
-    """Return the names in a folder; none if it is a file."""
-    try:
-        return os.listdir(path)
-    except (NotADirectoryError, FileNotFoundError):
-        return []
-    except OSError as error:
-        on_error(error)
-        return []
-
-
-def _fits(name: str, part: str) -> bool:
-    """Return whether a name matches; hidden ones only if the pattern starts with a dot."""
-    return fnmatch(name, part) and (part.startswith(".") or not name.startswith("."))
+    def _visible_below(self, path: Path) -> Iterator[Path]:
+        """Yield a path, and everything below it that is not hidden."""
+        yield path
+        for folder, folders, names in self._walk(path):
+            kept = [folder / name for name in folders if not name.startswith(".")]
+            kept = [below for below in kept if not below.is_symlink()]
+            folders[:] = [below.name for below in kept if not is_store(below)]
+            yield from kept
+            yield from (folder / name for name in names if not name.startswith("."))

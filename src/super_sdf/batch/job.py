@@ -11,23 +11,34 @@ from typing import Any, NamedTuple
 from ..convert import Conversion, ConvertOptions, convert
 from ..errors import FileError, GridError, OptionError, WriteError
 from ..files.regular import check_grid_file
-from ..network.decoder import Decoder
+from ..network.network import Network, load_network
+from ..options import AUTO_PRECISION
 from ..progress import Progress
-from .fingerprint import Fingerprint, fingerprint
+from .ledger import Fingerprint, Row, fingerprint
 
-Row = dict[str, Any]
-"""A line of the ledger, ``report.jsonl``.
 
-in, out : absolute path of the input; path of the output, relative to the output folder
-status, reason : "ok" and None, or "failed" and why
-retry : whether another run may succeed with the same input and options
-content, output : fingerprints of the input and of the mesh
-options : digest of all that the mesh depends on, besides the input
-mesher : what made the triangles
-simplified : with ``--simplify`` or ``--triangles``, triangles before and after, and distances
-check : with ``--check`` the certificate, or why there is none
-seconds : time in all; that of each stage is in ``stages``
-"""
+@dataclass(frozen=True)
+class Settings:
+    """How a batch is run; the network is named as for ``load_network``."""
+
+    folder: Path  # of the outputs
+    model: str = "base"
+    precision: str = AUTO_PRECISION
+    device: str = "auto"
+    threads: int = 0  # of each worker process; 0: chosen by the number of cores
+    workers: int = 0
+    force: bool = False  # convert everything again; replace files that are not as a batch made them
+    retry: bool = False  # try inputs again that failed before
+    fail_fast: bool = False  # start nothing more after the first failure
+    check: bool = False  # against the samples; meshes without a certificate are made again
+    items: Path | None = None  # the folder for what a page shows of each mesh
+    cluster: str | None = None  # "local", or the address of a scheduler: where files are converted
+
+    def load_network(self, threads: int) -> Network:
+        """Return the network of a worker."""
+        return load_network(
+            self.model, device=self.device, threads=threads, precision=self.precision
+        )
 
 
 @dataclass(frozen=True)
@@ -43,15 +54,6 @@ class Job:
     replace: bool = False
 
 
-@dataclass(frozen=True)
-class Outputs:
-    """The output folder; whether meshes are checked; the folder for what a page shows of them."""
-
-    folder: Path
-    check: bool = False
-    items: Path | None = None
-
-
 class Result(NamedTuple):
     """A job and its row, of this run or an earlier one."""
 
@@ -64,19 +66,23 @@ class Result(NamedTuple):
         return one_line(reason if source in reason else f"{source}: {reason}")
 
 
-def attempt(job: Job, outputs: Outputs, network: Decoder, progress: Progress | None = None) -> Row:
+def attempt(
+    job: Job, settings: Settings, network: Network, progress: Progress | None = None
+) -> Row:
     """Convert a file and return its row; an error becomes a row, too.
 
     A mesh that has appeared since the plan is replaced by the same mesh only: it was made by a
     process that was killed before the row was written. An exception in ``progress`` ends the work.
     """
-    start, target = time.perf_counter(), outputs.folder / job.target
+    start, target = time.perf_counter(), settings.folder / job.target
     content, printed = fingerprint(job.source), []
     has_appeared = not job.replace and os.path.lexists(target)
 
     def note(part: Path) -> None:
-        printed.append(_print_of_mesh(part))
-        if has_appeared and printed[0]["sha256"] != (fingerprint(target) or {}).get("sha256"):
+        if (mesh_print := fingerprint(part)) is None:
+            raise WriteError(f"{part} cannot be read again")
+        printed.append(mesh_print)
+        if has_appeared and mesh_print["sha256"] != (fingerprint(target) or {}).get("sha256"):
             raise WriteError(
                 f"{target} exists and is not what this batch makes: remove it or use --force"
             )
@@ -92,16 +98,16 @@ def attempt(job: Job, outputs: Outputs, network: Decoder, progress: Progress | N
             force=job.replace or has_appeared,
             progress=progress,
             before_rename=note,
-            keep=outputs.check or outputs.items is not None,
+            keep=settings.check or settings.items is not None,
         )
     except Exception as error:  # a bug that one file shows must not cost the others
         by_input = isinstance(error, (GridError, OptionError, FileError))
         retry = not by_input or isinstance(error, WriteError)
         row = failed_row(job, _reason(error), retry=retry, content=content)
-        return {**row, "seconds": _since(start)}
+        return {**row, "seconds": round(time.perf_counter() - start, 4)}
     certificate = {}
-    if outputs.items or outputs.check:
-        certificate = {"check": _certify(job, done, printed[0], outputs)}
+    if settings.items or settings.check:
+        certificate = {"check": _certify(job, done, printed[0], settings)}
     return {
         **_paths(job),
         "status": "ok",
@@ -112,40 +118,29 @@ def attempt(job: Job, outputs: Outputs, network: Decoder, progress: Progress | N
         "mesher": job.options.mesher,
         **done.report(),
         **certificate,
-        "seconds": _since(start),
+        "seconds": round(time.perf_counter() - start, 4),
         "stages": {stage: round(spent, 4) for stage, spent in done.seconds.items()},
     }
 
 
-def _certify(
-    job: Job, done: Conversion, mesh_print: Fingerprint, outputs: Outputs
-) -> dict[str, Any]:
+def _certify(job: Job, done: Conversion, mesh: Fingerprint, settings: Settings) -> dict[str, Any]:
     """Return the certificate of a finished mesh, or under ``error`` why it has none.
 
-    With ``items`` of the outputs, what a page shows of the mesh is written there.
+    What a page shows of the mesh is written into the folder for that, if there is one.
     """
     from ..certificate.check import check_files
 
-    files = outputs.folder / job.target, job.source, job.options
+    files = settings.folder / job.target, job.source, job.options
     try:
-        if outputs.items is None:
+        if settings.items is None:
             return check_files(*files, kept=done.kept).report()
-        from ..pages.items import item_of_files
-        from .items import Items
+        from ..pages.items import item_of_files, keep_item
 
         item = item_of_files(*files, done.kept)
-        Items(outputs.items).add(item, job.target, mesh_print)
+        keep_item(item, settings.items, job.target, mesh["sha256"])
         return item.certificate or {}
     except Exception as error:  # the mesh is good all the same
         return {"error": _reason(error)}
-
-
-def _print_of_mesh(part: Path) -> Fingerprint:
-    """Return the fingerprint of a finished mesh, before it is moved to its name."""
-    mesh_print = fingerprint(part)
-    if mesh_print is None:
-        raise WriteError(f"{part} cannot be read again")
-    return mesh_print
 
 
 def _make_folder(folder: Path) -> None:
@@ -164,31 +159,21 @@ def failed_row(job: Job, reason: str, *, retry: bool = True, content: Any = None
 
 
 def _paths(job: Job) -> Row:
-    """Return the entries that every row begins with."""
     return {"in": os.path.abspath(job.source), "out": job.target}
 
 
-def _since(start: float) -> float:
-    return round(time.perf_counter() - start, 4)
-
-
 def _reason(error: Exception) -> str:
-    """Return what went wrong, in one line."""
-    if isinstance(error, MemoryError) and not _is_ours(error):
-        return "out of memory: use a smaller --factor or grid"
-    if isinstance(error, OSError) and not _is_ours(error):  # no bug: a name too long, say
-        return f"the system refuses it: {error.strerror or error}"
+    """Return what went wrong, in one line; the package's own messages are for users as they are."""
     first = one_line(next(iter(str(error).splitlines()), ""))
-    return first if _is_ours(error) else f"{type(error).__name__}: {first}"
-
-
-def _is_ours(error: Exception) -> bool:
-    """Return whether an error is of this package's own classes, whose messages are for users."""
-    return type(error).__module__ == GridError.__module__
+    if type(error).__module__ == GridError.__module__:
+        return first
+    if isinstance(error, MemoryError):
+        return "out of memory: use a smaller --factor or grid"
+    if isinstance(error, OSError):  # no bug: a name too long, say
+        return f"the system refuses it: {error.strerror or error}"
+    return f"{type(error).__name__}: {first}"
 
 
 def one_line(text: str) -> str:
     """Return a text as one printable line; other characters, as in file names, are escaped."""
-    if text.isprintable():
-        return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

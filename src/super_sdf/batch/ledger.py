@@ -1,8 +1,9 @@
-"""The ledger ``report.jsonl``: a JSON line for every file that was converted, or failed.
+"""What a batch remembers: fingerprints of files, and the ledger of its output folder; its lock.
 
-Lines are appended, and the last one of an output counts. A killed process leaves at most the line
-that it was writing unfinished, which is cut off before the next one is written. Damage by a power
-cut shows in the sizes and hashes in the lines.
+The ledger, ``report.jsonl``, has a JSON line for every file that was converted, or failed. Lines
+are appended, and the last one of an output counts. A killed process leaves at most the line that it
+was writing unfinished, which is cut off before the next one is written. Damage by a power cut shows
+in the sizes and hashes in the lines.
 
 A file of the same form beside it has the names of the outputs that are started, and is empty when
 nothing is unfinished: so the next batch knows what a killed one left, and which mesh may be its own
@@ -11,18 +12,39 @@ although it has no row.
 
 from __future__ import annotations
 
+import errno
+import hashlib
 import os
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path, PurePath
 from typing import Any
 
-from ..errors import FileError, WriteError
-from ..files.output import remove_abandoned_parts
-from ..machine.records import RecordFile, parse_line
-from .fingerprint import Fingerprint, is_fingerprint, is_unchanged
-from .job import Row
+from filelock import FileLock, Timeout
 
-NAME, STARTED_NAME = "report.jsonl", ".super-sdf-batch"
+from ..errors import FileError, WriteError
+from ..files.formats import split_member
+from ..files.output import remove_abandoned_parts
+from ..files.regular import files_of, is_store
+from ..machine.records import RecordFile, parse_line
+
+NAME, STARTED_NAME, LOCK_NAME = "report.jsonl", ".super-sdf-batch", ".super-sdf-batch.lock"
+Fingerprint = dict[str, Any]
+"""``sha256``, ``size`` in bytes and ``mtime_ns`` of a file, as written in JSON."""
+
+Row = dict[str, Any]
+"""A line of the ledger.
+
+in, out : absolute path of the input; path of the output, relative to the output folder
+status, reason : "ok" and None, or "failed" and why
+retry : whether another run may succeed with the same input and options
+content, output : fingerprints of the input and of the mesh
+options : digest of all that the mesh depends on, besides the input
+mesher : what made the triangles
+simplified : with ``--simplify`` or ``--triangles``, triangles before and after, and distances
+check : with ``--check`` the certificate, or why there is none
+seconds : time in all; that of each stage is in ``stages``
+"""
 TYPES: dict[str, tuple[type, ...]] = {
     "in": (str,),
     "out": (str,),
@@ -32,6 +54,88 @@ TYPES: dict[str, tuple[type, ...]] = {
     "options": (str,),
 }
 ROW_START = b'{"in": "'  # of every line
+CHUNK = 1 << 20  # bytes read at a time
+# What the system answers where the file system has no locks, as some of networks: a batch runs
+# without one there.
+NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP}
+
+
+def file_state(path: Path, files: list[Path] | None = None) -> tuple[int, int]:
+    """Return size and time of the last change, in ns; of several files the sums.
+
+    ``path`` may name an array in the file; ``files`` are those that are read for it.
+    """
+    states = [file.stat() for file in files or files_of(path)]
+    return sum(s.st_size for s in states), sum(s.st_mtime_ns for s in states)
+
+
+def fingerprint(path: Path) -> Fingerprint | None:
+    """Return the fingerprint of a file, None if it cannot be read or is no regular file.
+
+    Of a Zarr folder it covers the names and contents of all files in it; of a header or a network
+    also those of the files that it names.
+    """
+    file, _ = split_member(path)
+    digest = hashlib.sha256()
+    try:
+        if not (is_store(file) or file.is_file()):  # opening a pipe would block
+            return None
+        files = files_of(path)
+        size, changed = file_state(path, files)  # before reading, so that a change meanwhile shows
+        for part in files:
+            if part != file:
+                digest.update(os.fsencode(os.path.relpath(part, file)) + b"\0")
+            with part.open("rb", buffering=0) as opened:
+                left = os.fstat(opened.fileno()).st_size  # files of the system may have no end
+                while left > 0 and (chunk := opened.read(min(CHUNK, left))):
+                    digest.update(chunk)
+                    left -= len(chunk)
+    except OSError:
+        return None
+    return {"sha256": digest.hexdigest(), "size": size, "mtime_ns": changed}
+
+
+def is_unchanged(path: Path, known: Fingerprint | None, *, same_path: bool = True) -> bool:
+    """Return whether a file still has a known fingerprint; None stands for an unreadable file.
+
+    Its content is read only if the modification time or the path is another.
+    """
+    if known is None:
+        file, _ = split_member(path)
+        return not ((os.path.isfile(file) or is_store(file)) and os.access(file, os.R_OK))
+    with suppress(OSError):
+        size, changed = file_state(path)
+        if size == known["size"]:
+            is_same = same_path and changed == known["mtime_ns"]
+            return bool(is_same or (fingerprint(path) or {}).get("sha256") == known["sha256"])
+    return False
+
+
+@contextmanager
+def folder_lock(folder: Path) -> Iterator[None]:
+    """Make an output folder and hold its lock within the block; FileError if a batch has it.
+
+    It is the operating system's lock on an open file, so it ends with its process in any case.
+    """
+    path = folder / LOCK_NAME
+    lock = FileLock(path, timeout=0)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _check_is_regular(path)
+        lock.acquire()
+    except Timeout:
+        raise FileError(
+            f"{folder} is in use by another batch: wait for it, or give another"
+        ) from None
+    except OSError as error:
+        if isinstance(error, FileError):
+            raise
+        if error.errno not in NO_LOCKS:
+            raise WriteError(f"{folder} cannot be written: {error.strerror}") from error
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 class Ledger:
@@ -43,23 +147,23 @@ class Ledger:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.path = folder, folder / NAME
+        self.folder = folder
         self.rows: dict[str, Row] = {}
         self.written: dict[str, Fingerprint] = {}
         self.started, self.left = set[str](), set[str]()
-        self.file, self.journal = RecordFile(self.path), RecordFile(folder / STARTED_NAME)
-        if os.path.exists(self.path):
+        self.file, self.journal = RecordFile(folder / NAME), RecordFile(folder / STARTED_NAME)
+        if os.path.exists(self.file.path):
             self._read()
         self._read_left()
 
     def start(self, target: str) -> None:
         """Note that an output is about to be written."""
-        self._append(self.journal, target)
+        _append(self.journal, target)
         self.started.add(target)
 
     def add(self, row: Row) -> None:
         """Keep a row, in memory and in the file."""
-        self._append(self.file, row)
+        _append(self.file, row)
         self._take(row)
 
     def remove_parts(self) -> None:
@@ -79,16 +183,8 @@ class Ledger:
         path, known = self.folder / target, self.written.get(target)
         return os.path.lexists(path) and not (known and is_unchanged(path, known))
 
-    def _append(self, file: RecordFile, record: Any) -> None:
-        try:
-            file.append(record)
-        except OSError as error:
-            raise WriteError(f"{file.path} cannot be written: {error.strerror}") from error
-
     def _read_left(self) -> None:
-        path = self.journal.path
-        if os.path.exists(path) and not path.is_file():  # opening a pipe would block
-            raise FileError(f"{path} is no regular file: remove it")
+        _check_is_regular(self.journal.path)
         with suppress(OSError):
             for name in self.journal.read():
                 # unfinished files are removed nowhere else
@@ -96,21 +192,21 @@ class Ledger:
                     self.left |= set() if PurePath(name).is_absolute() else {name}
 
     def _read(self) -> None:
-        is_report = False
+        path, is_report = self.file.path, False
         try:
-            if self.path.is_file():  # opening a pipe would block
-                for record in self.file.read():
-                    if is_row(record):
-                        is_report = True
-                        self._take(record)
-                is_first = not self.file.whole_bytes
-                is_report |= is_first and is_unfinished_row(self.file.unfinished)
+            if path.is_file():  # opening a pipe would block
+                for row in filter(is_row, self.file.read()):
+                    is_report = True
+                    self._take(row)
+                if not self.file.whole_bytes:  # it may be the beginning of the first row
+                    start = self.file.unfinished
+                    is_report = start.startswith(ROW_START) or ROW_START.startswith(start)
+                    is_report &= parse_line(start) is None
         except OSError as error:
-            raise FileError(f"{self.path} cannot be read: {error.strerror}") from error
+            raise FileError(f"{path} cannot be read: {error.strerror}") from error
         if not is_report:
             raise FileError(
-                f"{self.path} is not a batch's report: move it, or give another folder for the "
-                "meshes"
+                f"{path} is not a batch's report: move it, or give another folder for the meshes"
             )
 
     def _take(self, row: Row) -> None:
@@ -122,12 +218,6 @@ class Ledger:
             self.started.discard(target)  # otherwise its process may have died after writing it
 
 
-def is_unfinished_row(text: bytes) -> bool:
-    """Return whether a file's only text can be the beginning of a row; no text can be, too."""
-    is_start = text.startswith(ROW_START) or ROW_START.startswith(text)
-    return is_start and parse_line(text) is None
-
-
 def is_row(record: Any) -> bool:
     """Return whether a parsed line is a row, with all the keys that are looked up in one."""
     if not isinstance(record, dict):
@@ -135,8 +225,25 @@ def is_row(record: Any) -> bool:
     if not all(type(record.get(key, record)) in types for key, types in TYPES.items()):
         return False
     content, output = (record.get(key, record) for key in ("content", "output"))
-    if content is not None and not is_fingerprint(content):
+    if content is not None and not _is_fingerprint(content):
         return False
     if record["status"] == "ok":
-        return is_fingerprint(output) and type(record.get("closed")) is bool
+        return _is_fingerprint(output) and type(record.get("closed")) is bool
     return record["status"] == "failed" and output is None
+
+
+def _is_fingerprint(value: Any) -> bool:
+    types = {"sha256": str, "size": int, "mtime_ns": int}
+    return isinstance(value, dict) and all(type(value.get(k)) is t for k, t in types.items())
+
+
+def _check_is_regular(path: Path) -> None:
+    if os.path.exists(path) and not path.is_file():  # opening a pipe would block
+        raise FileError(f"{path} is no regular file: remove it")
+
+
+def _append(file: RecordFile, record: Any) -> None:
+    try:
+        file.append(record)
+    except OSError as error:
+        raise WriteError(f"{file.path} cannot be written: {error.strerror}") from error

@@ -28,15 +28,7 @@ LONGEST = 240  # characters of a line or an error that a message quotes
 
 
 def read_manifest(path: Path, suffix: str, options: ConvertOptions) -> list[Job]:
-    """Return a job for each line.
-
-    Raises
-    ------
-    FileError
-        If the file cannot be read.
-    OptionError
-        If a line is not valid; the message has its number.
-    """
+    """Return a job for each line; OptionError with the number of one that is not valid."""
     jobs = []
     for number, line in _lines(path):
         where = f"{path}, line {number}"
@@ -44,7 +36,7 @@ def read_manifest(path: Path, suffix: str, options: ConvertOptions) -> list[Job]
         try:
             jobs.append(_job(entry, path.parent, suffix, options))
         except OptionError as error:
-            raise OptionError(f"{where}: {shorten(str(error))}") from None
+            raise OptionError(f"{where}: {_shorten(str(error))}") from None
     if not jobs:
         raise OptionError(f"{path} names no file: give a path a line")
     return jobs
@@ -67,23 +59,23 @@ def _parse(line: str, where: str) -> Entry:
     try:
         entry = json.loads(line, object_pairs_hook=_unique_keys, parse_constant=_refuse_constant)
     except OptionError as error:
-        raise OptionError(f"{where}: {shorten(str(error))}") from None
+        raise OptionError(f"{where}: {_shorten(str(error))}") from None
     except ValueError as error:
         raise OptionError(f"{where} is no JSON: {error}") from None
     except RecursionError:
         raise OptionError(f"{where} is nested too deeply: {USAGE}") from None
     if not isinstance(entry, dict):
-        raise OptionError(f"{where} is {shorten(line)}: {USAGE}")
+        raise OptionError(f"{where} is {_shorten(line)}: {USAGE}")
     return entry
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> Entry:
-    """Return an object of JSON; raise OptionError if it has a key twice."""
-    names = [name for name, _ in pairs]
-    for name in names:
-        if names.count(name) > 1:
+    entry: Entry = {}
+    for name, value in pairs:
+        if name in entry:
             raise OptionError(f"{name!r} is there twice: give it once")
-    return dict(pairs)
+        entry[name] = value
+    return entry
 
 
 def _refuse_constant(name: str) -> float:
@@ -91,7 +83,7 @@ def _refuse_constant(name: str) -> float:
     raise OptionError(f"{name} is no number: give a finite one")
 
 
-def shorten(text: str) -> str:
+def _shorten(text: str) -> str:
     """Return a text for a message; the middle of a long one is left out."""
     half = LONGEST // 2
     return text if len(text) <= LONGEST else f"{text[:half]}...{text[-half:]}"
@@ -110,14 +102,12 @@ def _job(entry: Entry, home: Path, suffix: str, options: ConvertOptions) -> Job:
     if asked.keys() & {"simplify", "triangles"}:  # one of them replaces the other
         asked = {"simplify": None, "triangles": None, **asked}
     chosen = replace(options, **asked)
-    if target is None:
-        name = _default_target(source, suffix, chosen.label)
-    else:
-        name = _check_target(target)
+    named = target is not None
+    name = _given_target(target) if named else _target_of(source, suffix, chosen.label)
     return Job(home / source, name.as_posix(), chosen)
 
 
-def _default_target(source: str, suffix: str, label: int | None) -> PurePath:
+def _target_of(source: str, suffix: str, label: int | None) -> PurePath:
     """Return the path of a mesh in the output folder: that of the grid below the manifest."""
     if PurePath(source).name in ("", ".."):
         raise OptionError(f"'in' is {source!r}: give the path of a grid")
@@ -125,8 +115,7 @@ def _default_target(source: str, suffix: str, label: int | None) -> PurePath:
     return PurePath(path.name) if path.is_absolute() or ".." in path.parts else path
 
 
-def _check_target(target: Any) -> PurePath:
-    """Return the path given for a mesh; raise OptionError if it leaves the output folder, say."""
+def _given_target(target: Any) -> PurePath:
     path = PurePath(target) if isinstance(target, str) else PurePath()
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise OptionError(f"'out' is {target!r}: give a file, one of {', '.join(MESH_SUFFIXES)}")

@@ -11,15 +11,14 @@ from pathlib import Path
 
 from ..cluster.checking import Needs
 from ..cluster.connecting import connect
-from ..cluster.crew import Crew
-from ..cluster.serving import CheckWanted, ClusterWork
+from ..cluster.crew import CheckWanted, ClusterWork, Crew
 from ..files.formats import find_format, split_member
 from ..machine.extras import EXTRAS, missing_modules
 from ..machine.pool import Death, Tasks
 from ..machine.resources import Resources
 from ..network.network import find_model, shipped_models
-from .job import Job, Outputs, Row, attempt, failed_row
-from .plan import Settings
+from .job import Job, Settings, attempt, failed_row
+from .ledger import Row
 
 CERTIFICATE_MODULES = ("igl", "scipy")
 
@@ -38,11 +37,11 @@ def convert_on_cluster(
     cluster can be reached, its workers lack something, or it is lost.
     """
     address, memory = str(settings.cluster), jobs[0].options.max_memory
-    settings = absolute(settings)
-    prepare = partial(prepare_on_cluster, settings, Path.cwd())
+    settings = _absolute(settings)
+    prepare = partial(_prepare, settings, Path.cwd())
     with (
         connect(address, workers=workers, threads=settings.threads, max_memory=memory) as cluster,
-        Crew(cluster, needs_of(jobs, settings), prepare, warn) as crew,
+        Crew(cluster, _needs_of(jobs, settings), prepare, warn) as crew,
         closing(crew.completed(queue)) as results,
     ):
         for job, row in results:
@@ -51,8 +50,7 @@ def convert_on_cluster(
             yield job, row
 
 
-def absolute(settings: Settings) -> Settings:
-    """Return settings whose paths hold in any working folder."""
+def _absolute(settings: Settings) -> Settings:
     model = settings.model
     path, _ = find_model(model, settings.precision)
     if path not in shipped_models().values():
@@ -61,8 +59,7 @@ def absolute(settings: Settings) -> Settings:
     return replace(settings, folder=settings.folder.absolute(), items=items, model=model)
 
 
-def needs_of(jobs: Sequence[Job], settings: Settings) -> Needs:
-    """Return what the jobs need of every worker."""
+def _needs_of(jobs: Sequence[Job], settings: Settings) -> Needs:
     files = [Path(os.path.abspath(split_member(job.source)[0])) for job in jobs]
     extras = {find_format(job.source).extra for job in jobs}
     modules = {module for extra in extras if extra for module in EXTRAS[extra]}
@@ -77,17 +74,13 @@ def needs_of(jobs: Sequence[Job], settings: Settings) -> Needs:
     return Needs(*network, tuple(sorted(here)), files, settings.folder)
 
 
-def prepare_on_cluster(settings: Settings, base: Path, limits: Resources) -> ClusterWork:
-    """Load the network in a worker; return the function that converts a job and returns its row.
-
-    Paths of settings are absolute, those of jobs relative to ``base``.
-    """
+def _prepare(settings: Settings, base: Path, limits: Resources) -> ClusterWork:
+    """Load the network in a worker; return what converts a job, whose path is relative to base."""
     network = settings.load_network(limits.threads)
-    outputs = Outputs(settings.folder, settings.check, settings.items)
 
     def work(job: Job, check_wanted: CheckWanted) -> Row:
         options = replace(job.options, max_memory=limits.memory)
         placed = replace(job, source=base / job.source, options=options)
-        return attempt(placed, outputs, network, lambda done, total: check_wanted())
+        return attempt(placed, settings, network, lambda done, total: check_wanted())
 
     return work

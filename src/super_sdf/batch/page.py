@@ -11,12 +11,23 @@ from pathlib import Path
 from urllib.parse import quote
 
 from ..errors import SuperSdfError
-from ..pages.entries import Entry, entry_of, entry_of_report
 from ..pages.html import make_page, write_page
-from ..pages.items import Item, item_of_files, read_meshes
-from .fingerprint import is_unchanged
-from .items import Items, item_name, items_folder
-from .job import Job, Row
+from ..pages.items import (
+    Entry,
+    Item,
+    entry_of,
+    entry_of_report,
+    find_item,
+    item_name,
+    item_of_files,
+    item_path,
+    items_folder,
+    keep_item,
+    read_meshes,
+    remove_items,
+)
+from .job import Job
+from .ledger import Row, is_unchanged
 from .plan import Batch
 
 MOST_WITHIN = 5_000_000  # bytes of meshes that a page may hold itself
@@ -30,8 +41,7 @@ class BatchPage:
     """
 
     def __init__(self, path: Path, batch: Batch, jobs: Sequence[Job], rows: dict[str, Row]) -> None:
-        self.path, self.batch, self.meshes = path, batch, batch.settings.folder
-        self.kept = Items(items_folder(path))
+        self.path, self.batch, self.folder = path, batch, items_folder(path)
         self.jobs = {job.target: job for job in jobs}
         self.rows = rows | {result.job.target: result.row for result in batch.failures()}
         finished = {result.job.target for result in (*batch.results(), *batch.failures())}
@@ -43,35 +53,39 @@ class BatchPage:
         """Write the page; with ``draw``, make first what is missing of the meshes of this run."""
         for job in self.unfinished:
             self.rows.pop(job.target, None)
+        meshes = self.batch.settings.folder
         items = {
             name: self.item(row, draw)
             for name, row in self.rows.items()
-            if row["status"] == "ok" and is_unchanged(self.meshes / name, row["output"])
+            if row["status"] == "ok" and is_unchanged(meshes / name, row["output"])
         }
         drawn = {name: item for name, item in items.items() if item and item.size}
         within = draw and sum(item.size for item in drawn.values()) <= MOST_WITHIN
-        entries = self.entries(items, within)
+        entries = self._entries(items, within)
         entries.sort(key=lambda entry: (_rank(entry), entry["name"]))
-        packed = {item_name(name): read_meshes(self.kept.path(name)) for name in drawn if within}
+        packed = {
+            item_name(name): read_meshes(item_path(self.folder, name)) for name in drawn if within
+        }
         said = {"title": title, "lead": lead, "alert": alert, "notes": self.batch.notes}
         facts = {**said, "summary": _tiles(entries), "files": entries}
         write_page(make_page(facts, packed, beside=not within), self.path, force=force)
         if within:
-            self.kept.remove(items)
+            remove_items(self.folder, items)
 
     def item(self, row: Row, draw: bool) -> Item | None:
         """Return the item of a mesh without its meshes; made now if there is none and it can be."""
-        found, job = self.kept.find(row["out"], row["output"]), self.jobs.get(row["out"])
+        name, digest = row["out"], row["output"]["sha256"]
+        found, job = find_item(self.folder, name, digest), self.jobs.get(name)
         if found or not draw or job is None:
             return found
         with suppress(SuperSdfError):  # then it is not shown
-            made = item_of_files(self.meshes / row["out"], job.source, job.options)
-            self.kept.add(made, row["out"], row["output"])
-        return self.kept.find(row["out"], row["output"])
+            made = item_of_files(self.batch.settings.folder / name, job.source, job.options)
+            keep_item(made, self.folder, name, digest)
+        return find_item(self.folder, name, digest)
 
-    def entries(self, items: dict[str, Item | None], within: bool) -> list[Entry]:
+    def _entries(self, items: dict[str, Item | None], within: bool) -> list[Entry]:
         """Return the entries of all files, in no order."""
-        folder = None if within else f"{quote(self.kept.folder.name)}/"
+        folder = None if within else f"{quote(self.folder.name)}/"
         return [
             *(_entry_of_item(self.rows[name], item, folder) for name, item in items.items()),
             *(_entry_of_failure(row) for row in self.rows.values() if row["status"] != "ok"),

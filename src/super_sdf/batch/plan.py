@@ -12,35 +12,9 @@ from pathlib import Path
 
 from .. import __version__
 from ..files.regular import files_of
-from ..network.network import Network, find_model, load_network
-from ..options import AUTO_PRECISION
-from .fingerprint import file_state, fingerprint, is_unchanged
-from .job import Job, Result, Row, failed_row
-from .ledger import Ledger
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How a batch is run; the network is named as for ``load_network``."""
-
-    folder: Path  # of the outputs
-    model: str = "base"
-    precision: str = AUTO_PRECISION
-    device: str = "auto"
-    threads: int = 0  # of each worker process; 0: chosen by the number of cores
-    workers: int = 0
-    force: bool = False  # convert everything again; replace files that are not as a batch made them
-    retry: bool = False  # try inputs again that failed before
-    fail_fast: bool = False  # start nothing more after the first failure
-    check: bool = False  # against the samples; meshes without a certificate are made again
-    items: Path | None = None  # the folder for what a page shows of each mesh
-    cluster: str | None = None  # "local", or the address of a scheduler: where files are converted
-
-    def load_network(self, threads: int) -> Network:
-        """Return the network of a worker."""
-        return load_network(
-            self.model, device=self.device, threads=threads, precision=self.precision
-        )
+from ..network.network import find_model
+from .job import Job, Result, Settings, failed_row
+from .ledger import Ledger, Row, file_state, fingerprint, is_unchanged
 
 
 @dataclass
@@ -75,22 +49,20 @@ class Batch:
 class Planner:
     """Decides which jobs are to be done: those not done with the same content and options."""
 
-    def __init__(self, settings: Settings, ledger: Ledger) -> None:
-        self.settings, self.ledger = settings, ledger
-        self.jobs: Sequence[Job] = ()
+    def __init__(self, jobs: Sequence[Job], settings: Settings, ledger: Ledger) -> None:
+        self.jobs, self.settings, self.ledger = jobs, settings, ledger
         path, symmetries = find_model(settings.model, settings.precision)
         network = fingerprint(path)
         self.network = network and network["sha256"], symmetries
 
-    def plan(self, jobs: Sequence[Job]) -> Batch:
+    def plan(self) -> Batch:
         """Return the jobs sorted into done, failed for good, refused, and to be done.
 
         The largest come first, so that no worker starts one when the others have finished. Jobs
         that an earlier run started and never finished come last: they may have killed it.
         """
         batch = Batch(self.settings)
-        self.jobs = jobs
-        for job in jobs:
+        for job in self.jobs:
             row = self._known(job) or self._refused(job)
             if row is None:
                 batch.waiting.append(job)
@@ -111,28 +83,32 @@ class Planner:
         settings = [job.options.digest(), self.network, __version__]
         return hashlib.sha256(json.dumps(settings).encode()).hexdigest()
 
+    def may_replace(self, job: Job) -> bool:
+        """Return whether a job may replace the existing file: if a batch made it as it is."""
+        known = self.ledger.written.get(job.target)
+        return self.settings.force or bool(known and is_unchanged(self._path(job), known))
+
     def _known(self, job: Job) -> Row | None:
         """Return the row of an earlier run, None if there is none that still holds."""
         row = self.ledger.rows.get(job.target)
         if row is None or self.settings.force or row["options"] != self.digest(job):
             return None
-        if row["retry"] or (row["status"] != "ok" and self.settings.retry):
+        is_ok = row["status"] == "ok"
+        if row["retry"] or (not is_ok and self.settings.retry):
             return None
         same_path = row["in"] == os.path.abspath(job.source)
         if not is_unchanged(job.source, row["content"], same_path=same_path):
             return None
-        if row["status"] == "ok" and not is_unchanged(self._path(job), row["output"]):
+        if is_ok and not is_unchanged(self._path(job), row["output"]):
             return None
-        if row["status"] == "ok" and self.settings.check and "check" not in row:
-            return None
-        return row
+        return None if is_ok and self.settings.check and "check" not in row else row
 
     def _refused(self, job: Job) -> Row | None:
         """Return a failed row if the output exists and may not be replaced, else None."""
         path = self._path(job)
         if not os.path.lexists(path):
             return None
-        if os.path.exists(path) and (read := self.inputs.get(_identity(path))):
+        if os.path.exists(path) and (read := self._inputs.get(_identity(path))):
             reason = f"{path} is the same file as {read}: remove that link"
         elif job.target in self.ledger.left or self.may_replace(job):
             return None
@@ -142,13 +118,8 @@ class Planner:
             reason = f"{path} exists and {why}: remove it or use --force"
         return {**failed_row(job, reason), "options": self.digest(job)}
 
-    def may_replace(self, job: Job) -> bool:
-        """Return whether a job may replace the existing file: if a batch made it as it is."""
-        known = self.ledger.written.get(job.target)
-        return self.settings.force or bool(known and is_unchanged(self._path(job), known))
-
     @cached_property
-    def inputs(self) -> dict[tuple[int, int], Path]:
+    def _inputs(self) -> dict[tuple[int, int], Path]:
         """The files that the jobs read, by their identity."""
         files = (file for job in self.jobs for file in files_of(job.source))
         return {_identity(file): file for file in files if file.is_file()}
@@ -158,14 +129,8 @@ class Planner:
 
 
 def _identity(path: Path) -> tuple[int, int]:
-    """Return what two names of one file have in common."""
     state = path.stat()
     return state.st_dev, state.st_ino
-
-
-def preview(jobs: Sequence[Job], settings: Settings) -> Batch:
-    """Return the plan of a batch, writing nothing."""
-    return Planner(settings, Ledger(settings.folder)).plan(jobs)
 
 
 def expected_work(job: Job) -> float:

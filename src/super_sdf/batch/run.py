@@ -14,14 +14,13 @@ from contextlib import closing
 from dataclasses import replace
 from functools import partial
 
-from ..machine.memory import free_memory, held_memory, memory_bound
-from ..machine.pool import Death, Pool
-from ..machine.serving import Work
-from ..machine.threads import count_cores
+from ..machine.memory import free_memory
+from ..machine.pool import Death, Pool, Work
+from ..machine.resources import allot_each, count_cores
 from ..network.device import available_devices
-from .job import Job, Outputs, Result, Row, attempt, failed_row
-from .ledger import Ledger
-from .plan import Batch, Planner, Settings, expected_work
+from .job import Job, Result, Settings, attempt, failed_row
+from .ledger import Ledger, Row
+from .plan import Batch, Planner, expected_work
 
 # In units of ``expected_work``: done in the time that worker processes would take to start.
 SMALL_BATCH = 30_000
@@ -32,10 +31,7 @@ OnFile = Callable[[Batch], None]
 """Called after each file, with the batch as it stands."""
 
 Results = Generator[tuple[Job, Row | Death], None, None]
-"""Jobs as they end, each with its row, or with a Death if its process ended.
-
-What converts the jobs of a ``Queue`` yields this: this process, processes, or a cluster.
-"""
+"""Jobs as they end, each with its row, or with a Death if its process ended."""
 
 
 class Run:
@@ -44,8 +40,8 @@ class Run:
     def __init__(self, jobs: Sequence[Job], settings: Settings) -> None:
         self.settings = settings
         self.ledger = Ledger(settings.folder)
-        self.planner = Planner(settings, self.ledger)
-        self.batch = self.planner.plan(jobs)
+        self.planner = Planner(jobs, settings, self.ledger)
+        self.batch = self.planner.plan()
         self.died: set[str] = set()  # outputs whose worker died once
 
     def complete(
@@ -57,7 +53,10 @@ class Run:
         among the notes.
         """
         start = time.perf_counter()
-        self._note_refused()
+        for job, row in self.batch.failed_before:  # refused outputs that the ledger does not have
+            known = self.ledger.rows.get(job.target, {})
+            if row is not known and row["reason"] != known.get("reason"):
+                self.ledger.add(row)
         self.ledger.remove_parts()
         try:
             with closing(self._convert(warn or self.batch.notes.append)) as results:
@@ -75,21 +74,21 @@ class Run:
         if not self.batch.waiting or self.is_over():
             return
         workers = self._count_workers()
+        memory = self.batch.waiting[0].options.max_memory
         if settings.cluster is not None:
             from .on_cluster import convert_on_cluster
 
             jobs = list(self.batch.waiting)
-            yield from convert_on_cluster(Queue(self, 1), jobs, settings, workers, warn)
-            return
-        threads = settings.threads or (max(1, count_cores() // workers) if workers > 1 else 0)
-        queue = Queue(self, workers)
-        if workers > 1:
-            yield from Pool(queue, partial(prepare_worker, settings, threads)).results(workers)
-            return
-        work = prepare_worker(settings, threads)
-        while len(queue):
-            job = queue.popleft()
-            yield job, work(job, lambda value: None)
+            yield from convert_on_cluster(Queue(self), jobs, settings, workers, warn)
+        elif workers > 1:  # decided once, before the workers fill the memory
+            share = allot_each(workers, settings.threads, memory)
+            prepare = partial(prepare_worker, settings, share.threads)
+            yield from Pool(Queue(self, share.memory), prepare).results(workers)
+        else:
+            work, queue = prepare_worker(settings, settings.threads), Queue(self)
+            while len(queue):
+                job = queue.popleft()
+                yield job, work(job)
 
     def _count_workers(self) -> int:
         """Return how many processes convert files; on a cluster of this machine also for few."""
@@ -105,15 +104,6 @@ class Run:
     def is_over(self) -> bool:
         """Return whether no further job may be started."""
         return self.settings.fail_fast and bool(self.batch.failures())
-
-    def start(self, job: Job) -> Job:
-        """Note in the ledger that a job starts; return it with ``replace`` decided.
-
-        It is decided now because the output may have changed since the plan was made.
-        """
-        self.ledger.start(job.target)
-        exists = os.path.lexists(self.settings.folder / job.target)
-        return replace(job, replace=exists and self.planner.may_replace(job))
 
     def _take(self, job: Job, result: Row | Death) -> None:
         """Keep the row of a job; if its worker died, try the job once more, after the others."""
@@ -133,42 +123,35 @@ class Run:
         (self.batch.done if row["status"] == "ok" else self.batch.failed).append(Result(job, row))
         self.batch.work_done += expected_work(job)
 
-    def _note_refused(self) -> None:
-        """Put the refused outputs into the ledger, unless they are there with the same reason."""
-        for job, row in self.batch.failed_before:
-            known = self.ledger.rows.get(job.target, {})
-            if row is not known and row["reason"] != known.get("reason"):
-                self.ledger.add(row)
-
 
 class Queue:
-    """The jobs of a run that were not started yet, each with its share of the memory.
+    """The jobs of a run that were not started yet; each may hold so many bytes, if that is given.
 
-    The memory bound is determined once, before the workers fill the memory, and divided by them.
+    Whether a job may replace its output is decided when it starts: that may have changed meanwhile.
     """
 
-    def __init__(self, run: Run, workers: int) -> None:
-        self.run, self.workers = run, workers
-        self.bound = memory_bound(run.batch.waiting[0].options.max_memory)
-        if self.bound is not None and workers > 1:
-            self.bound = max(1, self.bound - (held_memory() or 0)) // workers
+    def __init__(self, run: Run, memory: int | None = None) -> None:
+        self.run, self.memory = run, memory
 
     def __len__(self) -> int:
         return 0 if self.run.is_over() else len(self.run.batch.waiting)
 
     def popleft(self) -> Job:
-        """Start the next job and return it."""
-        job = self.run.start(self.run.batch.waiting.pop(0))
-        if self.workers == 1:
+        """Note in the ledger that the next job starts, and return it."""
+        run = self.run
+        job = run.batch.waiting.pop(0)
+        run.ledger.start(job.target)
+        exists = os.path.lexists(run.settings.folder / job.target)
+        job = replace(job, replace=exists and run.planner.may_replace(job))
+        if self.memory is None:
             return job
-        return replace(job, options=replace(job.options, max_memory=self.bound))
+        return replace(job, options=replace(job.options, max_memory=self.memory))
 
 
 def prepare_worker(settings: Settings, threads: int) -> Work:
     """Load the network; return the function that converts a job and returns its row."""
     network = settings.load_network(threads)
-    outputs = Outputs(settings.folder, settings.check, settings.items)
-    return lambda job, tell: attempt(job, outputs, network)
+    return lambda job: attempt(job, settings, network)
 
 
 def choose_workers(device: str, jobs: int, max_memory: int | None = None) -> int:
@@ -187,8 +170,7 @@ def useful_workers(asked: int, jobs: int, max_memory: int | None = None) -> tupl
         (count_cores(), "this process may use no more cores"),
     ]
     if max_memory is not None:
-        limits.append(
-            (max(1, max_memory // MIN_BYTES_PER_WORKER), "--max-memory has no room for more")
-        )
+        room = max(1, max_memory // MIN_BYTES_PER_WORKER)
+        limits.append((room, "--max-memory has no room for more"))
     most, cause = min(limits)
     return min(asked, most), None if asked <= most else f"--jobs {asked} is cut to {most}: {cause}"

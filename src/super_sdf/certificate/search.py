@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SuperSdfError
-from ..machine.pool import Death, Pool
-from ..machine.serving import Work
+from ..machine.pool import Death, Pool, Work
 from ..mesh import Mesh
 from ..truth.mesh_files import without_unused
 from ..truth.solid import Distances, Points, Solid
@@ -133,7 +132,7 @@ def _search_all(slabs: MeshSlabs, processes: int) -> Iterator[tuple[NDArray[np.i
 
 def _prepare() -> Work:
     """Return what works at a slab: each worker process calls this once."""
-    return lambda slab, tell: _search_slab(slab)
+    return _search_slab
 
 
 def _search_slab(slab: MeshSlab) -> Found:

@@ -14,22 +14,26 @@ from ..files.formats import NAMED, list_formats
 from ..machine.extras import check_modules
 from ..options import MESH_FORMATS
 from .batch_report import print_plan, print_summary, progress_line, sentence
-from .common import CONTEXT, InterruptedCommand, one_line_errors, print_stderr, print_warning
-from .conversion import (
+from .common import (
+    CONTEXT,
+    InterruptedCommand,
     check_can_check,
     check_cluster,
     check_option,
+    check_page,
     chosen_model,
     cluster_option,
     conversion_options,
     make_options,
+    one_line_errors,
+    print_stderr,
+    report_option,
 )
 from .interrupts import describe_interrupt, exit_code, raising_interrupts
-from .view import check_page, report_option
 
 if TYPE_CHECKING:
-    from ..batch.job import Job
-    from ..batch.plan import Batch, Settings
+    from ..batch.job import Job, Settings
+    from ..batch.plan import Batch
     from ..batch.run import Run
 
 HELP = f"""Convert many grids to meshes in the folder DIR, each as upsample would.
@@ -107,8 +111,9 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
     start, page = time.perf_counter(), options["report"]
     chosen, suffix = make_options(options), f".{options['kind']}"
     from ..batch.inputs import find_jobs
-    from ..batch.items import items_folder
-    from ..batch.plan import Settings, preview
+    from ..batch.job import Settings
+    from ..batch.ledger import Ledger
+    from ..batch.plan import Planner
     from ..network.network import find_model
 
     if options["check"]:
@@ -117,8 +122,7 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
     jobs, unread = find_jobs(sources, suffix, chosen)
     if any(job.options.simplifies for job in jobs):  # a list may say so
         check_modules("simplify", "simplify")
-    if page:
-        check_batch_page(page, jobs, folder, force=options["force"])
+    items = check_batch_page(page, jobs, folder, force=options["force"]) if page else None
     model = chosen_model(options)
     find_model(model, options["precision"])
     taken = "precision", "device", "threads", "cluster", "force", "retry", "fail_fast", "check"
@@ -126,11 +130,11 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
         folder,
         model,
         workers=options["jobs"],
-        items=items_folder(page) if page else None,
+        items=items,
         **{name: options[name] for name in taken},
     )
     if options["dry_run"]:
-        plan = preview(jobs, settings)
+        plan = Planner(jobs, settings, Ledger(folder)).plan()
         plan.unread = unread
         print_plan(plan, options["as_json"])
         return
@@ -141,37 +145,40 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
         sys.exit(1)
 
 
-def check_batch_page(page: Path, jobs: list[Job], folder: Path, *, force: bool) -> None:
-    """Raise if the page or the folder beside it cannot be written.
+def check_batch_page(page: Path, jobs: list[Job], folder: Path, *, force: bool) -> Path:
+    """Return the folder beside a page for its meshes; raise if one of them cannot be written.
 
     A page that super-sdf wrote may be replaced, so that a batch can be resumed.
     """
-    from ..batch.items import items_folder
+    check_modules("--report", "report")
     from ..files.regular import files_of
     from ..pages.html import is_page
+    from ..pages.items import items_folder
 
-    check_modules("--report", "report")
     files = (path for job in jobs for path in (*files_of(job.source), folder / job.target))
     check_page("--report", page, files, force=force or is_page(page))
     beside = items_folder(page)
     if beside.exists() and not beside.is_dir():
         raise WriteError(f"{beside}, for the meshes of the page, is no folder: move it")
+    return beside
 
 
 def complete(
     jobs: list[Job], settings: Settings, options: dict[str, Any], unread: list[tuple[str, str]]
 ) -> Batch:
     """Run the batch and write its page; an interrupt reports how many files are done."""
-    from ..batch.lock import folder_lock
+    from ..batch.ledger import folder_lock
     from ..batch.run import Run
 
     with raising_interrupts(), folder_lock(settings.folder):
         run = Run(jobs, settings)
         run.batch.unread = unread
         total = len(run.batch.waiting)
+        # in place of a progress line, if one is shown
+        cleared = "\r\x1b[K" if sys.stderr is not None and sys.stderr.isatty() else ""
         try:
             with progress_line(total, options["quiet"]) as progress, raising_interrupts():
-                run.complete(progress, print_warning)
+                run.complete(progress, lambda text: print_stderr(f"{cleared}Warning: {text}"))
             write_page(run, jobs, options["report"])
         except KeyboardInterrupt as error:
             try:

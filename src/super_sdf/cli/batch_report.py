@@ -15,7 +15,7 @@ import click
 from .common import print_stderr, print_stdout
 
 if TYPE_CHECKING:
-    from ..batch.job import Row
+    from ..batch.ledger import Row
     from ..batch.plan import Batch
     from ..batch.run import OnFile
 
@@ -65,35 +65,34 @@ def print_plan(plan: Batch, as_json: bool) -> None:
     """Print what would be done with each file, and the counts."""
     from ..batch.job import one_line
 
-    refused = [result for result in plan.failed_before if result.row["retry"]]
-    failed = [result for result in plan.failed_before if not result.row["retry"]]
-    jobs = {"to_do": plan.waiting, "done_before": [job for job, _ in plan.done_before]}
-    report = {
-        **{
-            kind: [{"in": os.path.abspath(job.source), "out": job.target} for job in some]
-            for kind, some in jobs.items()
-        },
-        "failed_before": [_failure(result.row) for result in failed],
-        "refused": [_failure(result.row) for result in refused],
-        "unread": [{"in": path, "reason": reason} for path, reason in plan.unread],
+    report: dict[str, list[dict[str, Any]]] = {
+        kind: [] for kind in ("to_do", "done_before", "failed_before", "refused", "unread")
     }
-    words = {kind: kind.replace("_", " ") for kind in report}
-    lines = [
-        one_line(f"{words[kind]}: {job.source} -> {plan.settings.folder / job.target}")
-        for kind, some in jobs.items()
-        for job in some
-    ]
-    lines += [f"failed before: {result.failure()}" for result in failed]
-    lines += [f"refused: {result.failure()}" for result in refused]
-    lines += [one_line(f"unread: {path} {reason}") for path, reason in plan.unread]
+    lines = []
+
+    def note(kind: str, entry: dict[str, Any], said: str) -> None:
+        report[kind].append(entry)
+        lines.append(one_line(f"{kind.replace('_', ' ')}: {said}"))
+
+    done = [job for job, _ in plan.done_before]
+    for kind, jobs in (("to_do", plan.waiting), ("done_before", done)):
+        for job in jobs:
+            entry = {"in": os.path.abspath(job.source), "out": job.target}
+            note(kind, entry, f"{job.source} -> {plan.settings.folder / job.target}")
+    for result in sorted(plan.failed_before, key=lambda result: result.row["retry"]):
+        kind = "refused" if result.row["retry"] else "failed_before"
+        note(kind, _failure(result.row), result.failure())
+    for path, reason in plan.unread:
+        note("unread", {"in": path, "reason": reason}, f"{path} {reason}")
     for text in [json.dumps(report, indent=2)] if as_json else lines:
         print_stdout(text, "nothing was written")
-    counted = [kind for kind in report if kind != "unread" or plan.unread]
-    print_stderr(", ".join(f"{len(report[kind])} {words[kind]}" for kind in counted))
+    counted = {
+        kind: len(entries) for kind, entries in report.items() if entries or kind != "unread"
+    }
+    print_stderr(", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in counted.items()))
 
 
 def _failure(row: Row) -> dict[str, Any]:
-    """Return the JSON entry of a file that failed."""
     return {"in": row["in"], "out": row["out"], "reason": row["reason"]}
 
 
@@ -117,8 +116,7 @@ def remarks(batch: Batch) -> list[str]:
 
     Open meshes are left out: the summary counts them.
     """
-    rows = [result.row for result in batch.done]
-    report = batch.settings.folder / "report.jsonl"
+    rows, report = [result.row for result in batch.done], batch.settings.folder / "report.jsonl"
     simplified = [row for row in rows if "simplified" in row]
     inferred = sum(bool(row["inferred"]) for row in rows)
     unreached = sum(bool(row["simplified"]["warnings"]) for row in simplified)
@@ -139,7 +137,6 @@ def remarks(batch: Batch) -> list[str]:
 
 
 def _describe_simplified(rows: list[Row]) -> str:
-    """Describe in one line how much simpler meshes are in all, and the largest distance."""
     figures = [row["simplified"] for row in rows]
     before, after = (sum(f[key] for f in figures) for key in ("triangles_before", "triangles"))
     distances = [
@@ -152,7 +149,6 @@ def _describe_simplified(rows: list[Row]) -> str:
 
 
 def _check_lines(rows: list[Row]) -> list[str]:
-    """Return in a line what the certificates of new meshes say, and in one how many are missing."""
     checked = [row for row in rows if row["check"].get("residual")]
     means = [(row["check"]["residual"]["mean"], row["out"]) for row in checked]
     lines, missing = [], len(rows) - len(means)

@@ -11,8 +11,15 @@ import click
 
 from ..machine.extras import check_modules
 from ..options import GRID, ConvertOptions, parse_size
-from .common import CONTEXT, one_line_errors, print_stderr, print_stdout
-from .conversion import CHECK_MODULES, Parsed, table_options
+from .common import (
+    CHECK_MODULES,
+    CONTEXT,
+    Parsed,
+    one_line_errors,
+    print_stderr,
+    print_stdout,
+    table_options,
+)
 from .interrupts import raising_interrupts
 
 EXAMPLES = """\b

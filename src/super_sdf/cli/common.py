@@ -1,19 +1,113 @@
-"""What all commands share: help layout, one-line errors, output to stdout and stderr."""
+"""What commands share: options from the table, one-line errors, output to stdout and stderr."""
 
 from __future__ import annotations
 
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from ..errors import OptionError, SuperSdfError, seen
+from ..machine.extras import check_modules
+from ..options import OPTIONS, UPSAMPLE, ConvertOptions, Option, parse_labels
 from .interrupts import describe_interrupt, exit_code
 
+if TYPE_CHECKING:
+    from ..network.network import Network
+
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
+PAGES = (".html", ".htm")
+CHECK_MODULES = ("igl",)  # of the extra report, for certificates
+
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+"""Adds options to a command."""
+
+
+class Parsed(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.2
+    """A value that a function makes of text; its ValueError says what to give instead."""
+
+    name = "text"
+
+    def __init__(self, parse: Callable[[str], Any]) -> None:
+        self.parse = parse
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the value of text."""
+        try:
+            return self.parse(value)
+        except ValueError as error:
+            self.fail(f"{value!r}: {error}", param, ctx)
+
+
+def table_options(*names: str) -> Decorator:
+    """Return what adds options of the table to a command, in this order."""
+
+    def add(command: Callable[..., Any]) -> Callable[..., Any]:
+        for name in reversed(names):
+            command = _from_table(OPTIONS[name])(command)
+        return command
+
+    return add
+
+
+def _from_table(option: Option) -> Decorator:
+    """Return an option of a command; flags are off by their opposite."""
+    word = f"--{option.name.replace('_', '-')}"
+    if option.off:
+        return click.option(f"{word}/--{option.off}", default=option.default, help=option.help)
+    kind: Any = option.parse
+    if option.choices:
+        kind = click.Choice(option.choices)
+    elif kind is int and option.default == 0:  # as many as there are
+        kind = click.IntRange(0)
+    elif kind not in (int, float, str):
+        kind = Parsed(kind)
+    return click.option(
+        word,
+        type=kind,
+        default=option.default,
+        show_default=option.default is not None,
+        metavar=option.metavar,
+        help=option.help,
+    )
+
+
+conversion_options = table_options(*UPSAMPLE)
+check_option = click.option(
+    "--check",
+    is_flag=True,
+    help="Check each mesh against its samples, as check does. Needs the extra report.",
+)
+labels_option = click.option(
+    "--labels",
+    type=Parsed(parse_labels),
+    metavar="all|N,N",
+    help="Mesh all labels of a label image but 0, or those listed, each with a closed mesh; "
+    "neighbours share their walls. OUT.glb and OUT.3mf hold all as parts; for OUT.ply and others "
+    "each label N has its own file, OUT-N.ply.",
+)
+cluster_option = click.option(
+    "--cluster",
+    metavar="ADDRESS",
+    help="Convert on the workers of the Dask scheduler at ADDRESS, such as tcp://10.0.0.1:8786, or "
+    "with 'local' on Dask workers of this machine. --max-memory is then the limit of each worker "
+    "at an ADDRESS. Needs the extra cluster.",
+)
+report_option = click.option(
+    "--report",
+    type=click.Path(path_type=Path),
+    metavar="PAGE.html",
+    help="Also write a page for the browser: figures, times, warnings, the check of each mesh, and "
+    "a 3-D view of it beside coarse marching cubes. Needs the extra report.",
+)
 
 
 class InterruptedCommand(BaseException):  # as KeyboardInterrupt, no error
@@ -75,7 +169,7 @@ def _file_at(path: str | os.PathLike[str]) -> tuple[int, int] | None:
 
 
 def _what_is_written(before: dict[str, tuple[int, int] | None]) -> str:
-    """Return which files are not those of before, as the end of a sentence; "" for no files."""
+    """Return which files are not those of before, as the end of a sentence."""
     written = [path for path, file in before.items() if _file_at(path) != file]
     if not written:
         return "; nothing was written" if before else ""
@@ -98,12 +192,6 @@ def print_stderr(line: str) -> None:
         click.echo(line.replace("\n", " "), err=True)
 
 
-def print_warning(text: str) -> None:
-    """Print a warning to stderr, in place of a progress line if one is shown there."""
-    cleared = "\r\x1b[K" if sys.stderr is not None and sys.stderr.isatty() else ""
-    print_stderr(f"{cleared}Warning: {text}")
-
-
 def print_stdout(text: str, kept: str) -> None:
     """Print the result that the user asked for; ``kept`` says which output exists if that fails."""
     try:
@@ -112,3 +200,67 @@ def print_stdout(text: str, kept: str) -> None:
         raise click.ClickException(
             f"stdout cannot be written: {error.strerror or error}; {kept}"
         ) from error
+
+
+def check_page(option: str, page: Path, others: Iterable[str | Path], *, force: bool) -> None:
+    """Raise if a page cannot be written, or is one of the others, the inputs and outputs."""
+    from ..files.output import check_apart, check_free
+
+    if page.suffix.lower() not in PAGES:
+        raise OptionError(f"{page} is not a page: give {option} a file {' or '.join(PAGES)}")
+    check_free(page, force=force)
+    check_apart(page, others)
+
+
+def check_can_check() -> None:
+    """Raise FileError if the library for ``--check`` is missing."""
+    check_modules("--check", "report", CHECK_MODULES)
+
+
+def check_cluster(options: dict[str, Any]) -> None:
+    """Raise an error if ``--cluster`` cannot be used, or not with the other options."""
+    address, jobs = options["cluster"], options.get("jobs", 0)
+    if address is None:
+        return
+    if not address.strip():
+        raise OptionError("--cluster is empty: give local or the address of a Dask scheduler")
+    if jobs and address != "local":
+        raise OptionError(
+            f"--jobs {jobs} is for workers of this machine: those at {address} are as many as "
+            "were started there; give only one of --jobs and that --cluster"
+        )
+    check_modules("--cluster", "cluster")
+
+
+def chosen_model(options: dict[str, Any]) -> str:
+    """Return the value of ``--model`` or ``--quality``; OptionError if both were given."""
+    if options["model"] is None:
+        return str(options["quality"])
+    given = click.get_current_context().get_parameter_source("quality")
+    if given is not ParameterSource.DEFAULT:
+        raise OptionError(
+            f"--model {options['model']} replaces --quality {options['quality']}: give only one "
+            "of them"
+        )
+    return str(options["model"])
+
+
+def load_chosen(options: dict[str, Any]) -> Network:
+    """Load the network that the options of a command choose; import the rest meanwhile."""
+    from ..network.network import load_network
+
+    chosen = {name: options[name] for name in ("device", "threads", "precision")}
+    with ThreadPoolExecutor(1) as pool:
+        loading = pool.submit(load_network, chosen_model(options), **chosen)
+        import_module("super_sdf.convert")  # onnxruntime needs no interpreter while it loads
+        return loading.result()
+
+
+def make_options(options: dict[str, Any]) -> ConvertOptions:
+    """Return the conversion's options, picked from all options of a command."""
+    taken = [name for name in UPSAMPLE if hasattr(ConvertOptions, name)]
+    chosen = ConvertOptions(**{name: options[name] for name in taken})
+    if chosen.simplifies:
+        word = "--simplify" if chosen.triangles is None else "--triangles"
+        check_modules(word, "simplify")
+    return chosen

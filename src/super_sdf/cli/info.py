@@ -73,7 +73,6 @@ def print_grid(source: str, as_json: bool) -> None:
 
 
 def _in_words(value: Any) -> str:
-    """Return a value of the description as text."""
     if value is None:
         return "not stated"
     if isinstance(value, list):
@@ -121,14 +120,19 @@ def print_facts(as_json: bool) -> bool:
 
 
 def gather_facts() -> dict[str, Any]:
-    """Return versions, devices and the networks' cards."""
+    """Return versions, devices and the networks' cards, or under ``fault`` why one cannot load."""
     import platform
 
     from ..network.device import available_devices
-    from ..network.network import NO_NETWORKS, shipped_models
+    from ..network.network import NO_NETWORKS, load_network, shipped_models
     from ..network.onnx import ort
 
-    models = {name: load_card(name) for name in shipped_models()}
+    models: dict[str, dict[str, Any]] = {}
+    for name in shipped_models():
+        try:
+            models[name] = dict(load_network(name, device="cpu", precision=FLOAT32).card)
+        except SuperSdfError as error:
+            models[name] = {"fault": str(error)}
     facts = {
         "super-sdf": __version__,
         "python": platform.python_version(),
@@ -138,13 +142,3 @@ def gather_facts() -> dict[str, Any]:
         "models": models,
     }
     return facts if models else {**facts, "fault": NO_NETWORKS}
-
-
-def load_card(name: str) -> dict[str, Any]:
-    """Return the metadata of a shipped network, or under ``fault`` why it cannot be loaded."""
-    from ..network.network import load_network
-
-    try:
-        return dict(load_network(name, device="cpu", precision=FLOAT32).card)  # its own file
-    except SuperSdfError as error:
-        return {"fault": str(error)}

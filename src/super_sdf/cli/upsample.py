@@ -1,22 +1,43 @@
-"""The command ``upsample``: one grid file to one mesh file."""
+"""The command ``upsample``: one grid file to one mesh file, or an image to the meshes of labels."""
 
 from __future__ import annotations
 
-from typing import Any
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..errors import OptionError, SuperSdfError
 from ..files.formats import NAMED, list_formats
-from .common import CONTEXT, one_line_errors
-from .conversion import (
+from ..machine.extras import check_modules
+from ..options import QUALITIES, ConvertOptions
+from ..progress import Progress, Stopwatch
+from .common import (
+    CONTEXT,
+    check_can_check,
+    check_cluster,
     check_option,
+    check_page,
+    chosen_model,
     cluster_option,
     conversion_options,
     labels_option,
+    load_chosen,
     make_options,
-    start_loading,
+    one_line_errors,
+    print_stderr,
+    print_stdout,
+    progress_bar,
+    report_option,
 )
-from .view import report_option
+from .interrupts import raising_interrupts
+
+if TYPE_CHECKING:
+    from ..certificate.check import Certificate
+    from ..convert import Conversion
+    from ..network.network import Network
 
 HELP = f"""Refine the signed distance grid IN and write its surface as the mesh OUT.
 
@@ -32,6 +53,7 @@ Examples:
   super-sdf upsample scan.h5:/distance part.ply --spacing 0.5
   super-sdf upsample organs.nii.gz organs.glb --labels all
 """
+NOT_WITH_LABELS = ("save_field", "check", "report", "cluster", "jobs")
 
 
 @click.command(
@@ -69,9 +91,250 @@ def upsample_command(source: str, target: str, **options: Any) -> None:
     """Convert one grid to a mesh."""
     with one_line_errors(target, options["save_field"], options["report"]):
         chosen = make_options(options)
-        network = start_loading(options)
-        # here, since help and wrong options do without NumPy
-        from .upsampling import upsample, upsample_labels
+        if options["labels"] is None:
+            Upsampling(source, target, chosen, options).complete()
+        else:
+            upsample_labels(source, target, chosen, options)
 
-        run = upsample if options["labels"] is None else upsample_labels
-        run(source, target, chosen, options, network)
+
+class Upsampling:
+    """One run of the command: its options, its result, and the time of each stage."""
+
+    def __init__(
+        self, source: str, target: str, chosen: ConvertOptions, options: dict[str, Any]
+    ) -> None:
+        watch = Stopwatch()
+        self.source, self.target, self.options = source, target, options
+        self.chosen, self.model = chosen, chosen_model(options)
+        self._check_arguments()
+        watch.lap("start")
+        self.network = load_chosen(options)
+        watch.lap("load network")
+        self.seconds = watch.seconds
+        self.result: Conversion
+        self.certificate: Certificate | None = None
+
+    def complete(self) -> None:
+        """Convert the grid, check its mesh and write its page if asked for, print the result."""
+        options = self.options
+        with raising_interrupts(), progress_bar("upsampling", options["quiet"]) as progress:
+            convert = self._convert_here if options["cluster"] is None else self._convert_there
+            self.result = convert(progress)
+        self.seconds |= self.result.seconds
+        with raising_interrupts():
+            if options["check"]:
+                self._check()
+            if options["report"]:
+                self._write_page()
+            self.print_report()
+
+    def _check_arguments(self) -> None:
+        """Raise an error for what can be seen to fail before the work."""
+        from ..files.meshes import check_target
+        from ..files.regular import files_of
+
+        options, force = self.options, self.options["force"]
+        check_target(self.target, force=force)
+        outputs: list[str] = [self.target]
+        if options["save_field"] is not None:
+            from ..fields.writing import check_field_target
+
+            check_field_target(options["save_field"], force=force)
+            outputs.append(options["save_field"])
+        if options["check"]:
+            check_can_check()
+        if options["report"]:
+            check_modules("--report", "report")
+            files: list[str | Path] = [*files_of(self.source), *outputs]
+            check_page("--report", options["report"], files, force=force)
+        if options["cluster"] is not None:
+            check_cluster(options)
+            from ..cluster.bricks import check_can_brick
+
+            check_can_brick(self.source, self.chosen, options["save_field"])
+        elif options["jobs"]:
+            raise OptionError(
+                f"--jobs {options['jobs']} is for --cluster local: give that, too, or leave it out"
+            )
+
+    def _convert_here(self, progress: Progress | None) -> Conversion:
+        from ..convert import convert
+
+        return convert(
+            self.source,
+            self.target,
+            self.network,
+            self.chosen,
+            force=self.options["force"],
+            progress=progress,
+            announce=self._announce,
+            save_field=self.options["save_field"],
+            keep=bool(self.options["check"] or self.options["report"]),
+        )
+
+    def _convert_there(self, progress: Progress | None) -> Conversion:
+        from ..cluster.bricks import convert_on_cluster
+        from ..cluster.checking import Needs
+        from ..cluster.connecting import connect
+
+        options, model = self.options, self.model
+        if model not in QUALITIES:
+            model = str(Path(model).absolute())
+        needs = Needs(model, options["precision"], options["device"])
+        limits = {"threads": options["threads"], "max_memory": options["max_memory"]}
+        with connect(options["cluster"], workers=options["jobs"], **limits) as cluster:
+            return convert_on_cluster(
+                self.source,
+                self.target,
+                cluster,
+                needs,
+                self.chosen,
+                force=options["force"],
+                progress=progress,
+                announce=self._announce,
+            )
+
+    def _announce(self, line: str) -> None:
+        """Print, before the work, what may make the user stop it; the bar is redrawn below."""
+        if not self.options["quiet"]:
+            print_stderr(f"\r{line}\x1b[K" if sys.stderr.isatty() else line)
+
+    def _check(self) -> None:
+        """Check the finished mesh against its samples."""
+        from ..certificate.check import check_files
+
+        watch, threads = Stopwatch(), self.options["threads"]
+        files = self.target, self.source, self.chosen
+        try:
+            self.certificate = check_files(*files, kept=self.result.kept, processes=threads)
+        except SuperSdfError as error:
+            raise type(error)(f"{error}; {self.target} is written, but not checked") from error
+        watch.lap("check")
+        self.seconds |= watch.seconds
+
+    def _write_page(self) -> None:
+        """Write the page; what cannot be shown in it is said there."""
+        from ..pages.html import page_of_conversion, write_page
+
+        watch, threads = Stopwatch(), self.options["threads"]
+        report = {**self._report(), "notes": [*self.result.remarks(), *self.network.notes]}
+        given = self.chosen, self.result.kept, self.certificate
+        text = page_of_conversion(report, *given, processes=threads)
+        write_page(text, self.options["report"], force=self.options["force"])
+        watch.lap("page")
+        self.seconds |= watch.seconds
+
+    def print_report(self) -> None:
+        """Print notes, warnings and a summary to stderr, and with ``--json`` JSON to stdout."""
+        report, result = self._report(), self.result
+        if self.options["as_json"]:
+            print_stdout(json.dumps(report, indent=2), f"{self.target} is written")
+        if self.options["quiet"]:
+            return
+        for note in (*result.notes, *result.remarks(), *self.network.notes):
+            print_stderr(f"Note: {note}")
+        for warning in result.warnings:
+            print_stderr(f"Warning: {warning}")
+        if self.options["verbose"]:
+            for key in ("shape", "spacing", "origin", "device", "band_voxels", "nodes"):
+                print_stderr(f"{key.replace('_', ' ')}: {report[key]}")
+            for stage, seconds in self.seconds.items():
+                print_stderr(f"{stage}: {seconds:.3f} s")
+        print_stderr(f"{self.target}: {_describe_mesh(result, sum(self.seconds.values()))}")
+        if result.saved_field:
+            print_stderr(f"{self.options['save_field']}: {_describe_field(result.saved_field)}")
+        if result.simplified:
+            print_stderr(f"Simplified: {_describe_simplified(result.simplified)}")
+        if self.certificate:
+            print_stderr(f"Check: {self.certificate.summary()}")
+        if self.options["report"]:
+            print_stderr(f"Report: {self.options['report']}")
+
+    def _report(self) -> dict[str, Any]:
+        """Return counts, times and notes as ``--json`` prints them."""
+        shown = ("factor", "offset", "mesher")
+        return {
+            "input": self.source,
+            "output": self.target,
+            **{name: getattr(self.chosen, name) for name in shown},
+            **_describe_network(self.model, self.network),
+            **self.result.report(),
+            **({"check": self.certificate.report()} if self.certificate else {}),
+            "seconds": _rounded(self.seconds),
+        }
+
+
+def upsample_labels(
+    source: str, target: str, chosen: ConvertOptions, options: dict[str, Any]
+) -> None:
+    """Convert the labels of an image to meshes, and print what was made."""
+    from ..label_files import check_options, convert_labels
+
+    watch, model = Stopwatch(), chosen_model(options)
+    check_options(chosen, [name for name in NOT_WITH_LABELS if options[name]])
+    network, labels, force = load_chosen(options), options["labels"], options["force"]
+    watch.lap("load network")
+    with raising_interrupts(), progress_bar("upsampling", options["quiet"]) as progress:
+        made = convert_labels(
+            source, target, network, labels, chosen, force=force, progress=progress
+        )
+    watch.lap("convert")
+    if options["as_json"]:
+        report = {
+            "input": source,
+            "output": target,
+            "factor": chosen.factor,
+            **_describe_network(model, network),
+            **made,
+            "seconds": _rounded(watch.seconds),
+        }
+        print_stdout(json.dumps(report, indent=2), "the meshes are written")
+    if options["quiet"]:
+        return
+    for note in (*made["inferred"], *network.notes):
+        print_stderr(f"Note: {note}")
+    for row in made["labels"]:
+        print_stderr(
+            f"{row['output']}: label {row['label']}, {row['vertices']:,} vertices, "
+            f"{row['triangles']:,} triangles, closed, volume {row['volume']:.6g}"
+        )
+    print_stderr(f"{len(made['labels'])} labels, {sum(watch.seconds.values()):.1f} s")
+
+
+def _describe_network(model: str, network: Network) -> dict[str, Any]:
+    return {
+        "model": model,
+        "precision": network.precision,
+        "device": network.device,
+        "device_notes": list(network.notes),
+    }
+
+
+def _rounded(seconds: dict[str, float]) -> dict[str, float]:
+    return {stage: round(spent, 4) for stage, spent in seconds.items()}
+
+
+def _describe_mesh(result: Conversion, seconds: float) -> str:
+    counts = result.counts
+    low, high = (f"({', '.join(f'{x:.6g}' for x in corner)})" for corner in result.bounds)
+    closed = "closed" if result.closed else "open"
+    return (
+        f"{counts['vertices']:,} vertices, {counts['triangles']:,} triangles, {closed}, "
+        f"from {low} to {high}, {seconds:.1f} s"
+    )
+
+
+def _describe_field(field: dict[str, Any]) -> str:
+    shape = " x ".join(map(str, field["shape"]))
+    spacing, origin = (", ".join(f"{x:.12g}" for x in field[k]) for k in ("spacing", "origin"))
+    return f"the refined field, lattice {shape}, spacing {spacing}, origin {origin}"
+
+
+def _describe_simplified(simplified: dict[str, Any]) -> str:
+    """Describe in one line how much simpler a mesh is and how far from the unsimplified one."""
+    off = simplified["deviation"]
+    return (
+        f"from {simplified['triangles_before']:,} to {simplified['triangles']:,} triangles; "
+        f"largest distance {off['largest']:.4f} voxels from the unsimplified mesh to this one, "
+        f"{off['largest_back']:.4f} back; mean {off['mean']:.4f} and {off['mean_back']:.4f}"
+    )

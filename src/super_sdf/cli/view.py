@@ -1,44 +1,30 @@
-"""The command ``view`` and the option ``--report``: pages for the browser, each in one file."""
+"""The command ``view``: a page for the browser, in one file."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
 
-from ..errors import OptionError
 from ..machine.extras import check_modules
-from .common import CONTEXT, one_line_errors, print_stderr
-from .conversion import conversion_options, load_chosen, make_options
+from .common import (
+    CONTEXT,
+    check_page,
+    conversion_options,
+    load_chosen,
+    make_options,
+    one_line_errors,
+    print_stderr,
+)
 from .interrupts import raising_interrupts
 
-PAGES = (".html", ".htm")
 EXAMPLES = """\b
 Examples:
   super-sdf view part.npz
   super-sdf view part.ply other.stl --out page.html --no-browser
 """
-
-report_option = click.option(
-    "--report",
-    type=click.Path(path_type=Path),
-    metavar="PAGE.html",
-    help="Also write a page for the browser: figures, times, warnings, the check of each mesh, and "
-    "a 3-D view of it beside coarse marching cubes. Needs the extra report.",
-)
-
-
-def check_page(option: str, page: Path, others: Iterable[str | Path], *, force: bool) -> None:
-    """Raise if a page cannot be written, or is one of the others, the inputs and outputs."""
-    from ..files.output import check_apart, check_free
-
-    if page.suffix.lower() not in PAGES:
-        raise OptionError(f"{page} is not a page: give {option} a file {' or '.join(PAGES)}")
-    check_free(page, force=force)
-    check_apart(page, others)
 
 
 @click.command(
@@ -71,7 +57,10 @@ def view_command(sources: tuple[str, ...], **options: Any) -> None:
         page = write_view(sources, options)
     print_stderr(page.as_uri())
     if not options["no_browser"]:
-        open_browser(page)
+        import webbrowser
+
+        if not webbrowser.open(page.as_uri()):
+            print_stderr("Note: no browser can be started here: open that address in yours")
 
 
 def write_view(sources: tuple[str, ...], options: dict[str, Any]) -> Path:
@@ -91,11 +80,3 @@ def write_view(sources: tuple[str, ...], options: dict[str, Any]) -> Path:
         page = page or Path(mkdtemp(prefix="super-sdf-"), "view.html")
         write_page(text, page, force=options["force"])
     return page.absolute()
-
-
-def open_browser(page: Path) -> None:
-    """Open a page in the browser of this user, or say that there is none."""
-    import webbrowser
-
-    if not webbrowser.open(page.as_uri()):
-        print_stderr("Note: no browser can be started here: open that address in yours")

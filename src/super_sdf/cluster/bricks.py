@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,10 +27,9 @@ from ..files.meshes import Expectation
 from ..grid.cubic import check_has_offsets
 from ..grid.planes import Ranges, Result, SamplePlanes
 from ..grid.sdf_grid import SdfGrid, make_grid
-from ..machine.index_width import check_count
 from ..machine.memory import give_back, held_memory, memory_bound
 from ..machine.pool import Death
-from ..machine.resources import Resources
+from ..machine.resources import Resources, check_count
 from ..mesh import vertex_type
 from ..network.network import Network, load_network
 from ..options import ConvertOptions
@@ -43,24 +42,13 @@ from ..steps.cap import check_all_seen
 from ..steps.survey import BYTES_PER_VOXEL, Glance, look_at_band, no_surface
 from .checking import Needs
 from .connecting import Cluster
+from .crew import CheckWanted, Crew
 from .stored import WAY_OUT, Source, Store, StoredPlanes, check_source, close_stores, opened
-
-if TYPE_CHECKING:
-    from .crew import Crew
-    from .serving import CheckWanted
 
 PASS_BRICKS, MESH_BRICKS = 4, 2  # for each worker: one that dies costs little
 BAND_SHARE, MESH_SHARE = 0.25, 0.125  # of a worker's memory, for the band of a brick, for its mesh
 BYTES_PER_TRIANGLE = 18  # with its half of a vertex
 LOOKED = 0.1  # share of the time until the bricks are cut
-
-
-class Loading(NamedTuple):
-    """How a worker loads its network: see ``load_network``."""
-
-    model: str
-    precision: str
-    device: str
 
 
 class RangesTask(NamedTuple):
@@ -104,7 +92,7 @@ class BrickWork:
     """What works at bricks, in a worker."""
 
     source: Source
-    loading: Loading
+    needs: Needs
     limits: Resources
 
     def __call__(self, task: RangesTask | MeshTask, check: CheckWanted) -> Any:
@@ -121,9 +109,10 @@ class BrickWork:
     @cached_property
     def network(self) -> Network:
         """The network, loaded for the first mesh."""
-        model, precision, device = self.loading
-        threads = self.limits.threads
-        return load_network(model, device=device, threads=threads, precision=precision)
+        needs, threads = self.needs, self.limits.threads
+        return load_network(
+            needs.model, device=needs.device, threads=threads, precision=needs.precision
+        )
 
     def mesh(self, task: MeshTask, check: CheckWanted) -> Meshed:
         """Return the mesh of a brick."""
@@ -172,11 +161,11 @@ class ClusterPlanes(StoredPlanes):
         """Yield what a function makes of ranges of ``samples``, in order, made by the workers."""
         bricks = groupby(ranges, lambda planes: sum(planes[:2]) // 2 // self.brick)
         tasks = [RangesTask(samples, work, tuple(group)) for _, group in bricks]
-        for results in in_order(self.crew, tasks):
+        for results in _in_order(self.crew, tasks):
             yield from results
 
 
-def in_order(crew: Crew, tasks: list[Any]) -> Iterator[Any]:
+def _in_order(crew: Crew, tasks: list[Any]) -> Iterator[Any]:
     """Yield the results of tasks; ClusterError if workers died of one."""
     for task, result in zip(tasks, crew.in_order(tasks)):
         if isinstance(result, Death):
@@ -190,10 +179,7 @@ def in_order(crew: Crew, tasks: list[Any]) -> Iterator[Any]:
 
 
 def check_can_brick(source: str, options: ConvertOptions, save_field: Any = None) -> None:
-    """Raise OptionError if a grid cannot be converted brick by brick with some options.
-
-    Called before anything is started.
-    """
+    """Raise OptionError if a grid cannot be converted brick by brick with some options."""
     check_source(Source(source, options.axes))
     if save_field is not None:
         raise OptionError(f"--save-field writes one file from the first plane on: {WAY_OUT}")
@@ -203,7 +189,7 @@ def convert_on_cluster(
     source: str | Path,
     target: str | Path,
     cluster: Cluster,
-    loading: Loading,
+    needs: Needs,
     options: ConvertOptions,
     *,
     force: bool = False,
@@ -212,12 +198,10 @@ def convert_on_cluster(
 ) -> Conversion:
     """Convert a grid file to a mesh file on the workers of a cluster; see ``convert``.
 
-    ``announce`` also gets sentences about workers, while the work goes on. ClusterError if a worker
-    lacks something, such as the file, or the cluster is lost; OptionError if the values need the
-    whole grid at once.
+    ``needs`` name the network; ``announce`` also gets sentences about workers, while the work goes
+    on. ClusterError if a worker lacks something, such as the file, or the cluster is lost;
+    OptionError if the values need the whole grid at once.
     """
-    from .crew import Crew
-
     watch, told = Stopwatch(), dict[str, None]()
 
     def warn(text: str) -> None:
@@ -228,10 +212,11 @@ def convert_on_cluster(
     file, member = split_member(Path(source))
     path = f"{file.absolute()}" + (f":{member}" if member is not None else "")
     placed = Source(path, options.axes, options.direction is not None, secrets.token_hex(8))
-    needs = Needs(*loading, () if placed.is_npy else ("zarr",), (file.absolute(),))
+    modules = () if placed.is_npy else ("zarr",)
+    needs = replace(needs, modules=modules, files=(file.absolute(),))
     opened(placed)  # what cannot be read is said before the workers are checked
-    with Crew(cluster, needs, partial(BrickWork, placed, loading), warn) as crew:
-        bricks = Bricks(crew, read_stored(placed, crew, options), options)
+    with Crew(cluster, needs, partial(BrickWork, placed, needs), warn) as crew:
+        bricks = _Bricks(crew, _read_stored(placed, crew, options), options)
         try:
             done = convert_grid(
                 bricks.grid,
@@ -253,7 +238,7 @@ def convert_on_cluster(
     return replace(done, warnings=(*done.warnings, *told), engine=engine)
 
 
-def read_stored(source: Source, crew: Crew, options: ConvertOptions) -> SdfGrid:
+def _read_stored(source: Source, crew: Crew, options: ConvertOptions) -> SdfGrid:
     """Return the grid in a file, whose samples the workers read."""
     store = opened(source)
     given = {name: getattr(options, name) for name in ("spacing", "origin", "direction")}
@@ -262,19 +247,15 @@ def read_stored(source: Source, crew: Crew, options: ConvertOptions) -> SdfGrid:
     grid = make_grid(
         ClusterPlanes(source, store, crew),
         **place,
-        inside=options.inside,
-        field=options.field,
-        label=options.label,
-        level=options.level,
-        scale=options.scale,
+        **options.values(),
     )
-    check_is_local(grid)
+    _check_is_local(grid)
     check_has_offsets(grid, options.offset)
     check_all_seen(grid, WAY_OUT)
     return grid.noted(notes)
 
 
-class Bricks:
+class _Bricks:
     """The mesh of a grid, made by the workers; ``workers`` has the most that each has held."""
 
     def __init__(self, crew: Crew, grid: SdfGrid, options: ConvertOptions) -> None:
@@ -325,13 +306,13 @@ class Bricks:
         return [MeshTask(grid, planes, seen.summary, options) for planes in parts]
 
     def _meshed(self, tasks: list[MeshTask]) -> Iterator[Meshed]:
-        for made in in_order(self.crew, tasks):
+        for made in _in_order(self.crew, tasks):
             self.workers[made.worker] = {"peak_bytes": made.peak, "max_memory": made.bound}
             yield made
             del made  # before the next one is taken
 
 
-def check_is_local(grid: SdfGrid) -> None:
+def _check_is_local(grid: SdfGrid) -> None:
     """Raise OptionError if the mesh of some planes depends on more than the planes beside them."""
     if grid.field.smooth is not None:
         raise OptionError(

@@ -15,7 +15,7 @@ import signal
 import socket
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
@@ -27,15 +27,16 @@ import numpy as np
 from .. import __version__
 from ..errors import ClusterError, SuperSdfError, WriteError
 from ..machine.extras import missing_modules
-from ..machine.memory import free_memory, reuse_freed
+from ..machine.memory import SHARE, free_memory, reuse_freed
+from ..machine.pool import settle_signals
 from ..machine.resources import Resources
-from ..machine.serving import settle_signals
 from ..network.device import onnxruntime_version
 from ..network.network import Fingerprint, find_model, fingerprint_of, shipped_models
 from ..options import AUTO_PRECISION
-from .connecting import Cluster, share_of
+from .connecting import Cluster
 
 MOST_FILES = 100  # whose presence each worker checks
+PAUSE_SHARE = 0.75  # of a worker's limit: Dask gives it no more work at 0.8, and kills it at 0.95
 VERSION = "super_sdf:__version__"
 PACKAGE = Path(__file__).parent.parent
 PROBE = ".super-sdf-probe-"  # a file in the output folder while the workers are checked
@@ -76,16 +77,14 @@ class Expected(NamedTuple):
 
 
 class Report(NamedTuple):
-    """A worker's report on itself: what is missing there ("" if nothing), and what it has.
-
-    ``limit`` are the bytes at which Dask kills it, ``free`` those that are free on its machine.
-    """
+    """A worker's report on itself: what is wrong there ("" if nothing), and what it has."""
 
     fault: str
     host: str
     versions: dict[str, str]
-    limit: int | None = None
-    free: int | None = None
+    limit: int | None = None  # bytes at which Dask kills it
+    free: int | None = None  # bytes that are free on its machine
+    values: Fingerprint | None = None  # of the network, if nothing is wrong
 
 
 @dataclass(frozen=True)
@@ -105,7 +104,9 @@ def check_workers(cluster: Cluster, needs: Needs) -> Checked:
     """Check all workers that the cluster has now; ClusterError if one of them lacks something."""
     checked = check_some(cluster, needs, cluster.workers())
     if checked.faults:
-        raise ClusterError(name_workers(checked.faults))
+        fault = next(iter(checked.faults.values()))
+        those = [address for address, text in checked.faults.items() if text == fault]
+        raise ClusterError(f"{first_of(those)} {fault}")
     if not checked.members:
         raise ClusterError(f"the workers at {cluster.address} ended before they were checked")
     return checked
@@ -123,40 +124,57 @@ def check_some(
     """
     faults: dict[str, str] = {}
 
-    def ask(workers: Sequence[str], judge: Callable[[Any], str], *call: Any) -> dict[str, Any]:
+    def ask(workers: Iterable[str], judge: Callable[[Any], str], *call: Any) -> dict[str, Any]:
         """Return the answers that are right; keep the faults of the others."""
-        answers = cluster.run(*call, workers=list(workers)) if workers else {}
+        asked = list(workers)
+        answers = cluster.run(*call, workers=asked) if asked else {}
         there = {address: a for address, a in answers.items() if not isinstance(a, OSError)}
         faults.update({a: fault for a, answer in there.items() if (fault := judge(answer))})
         return {address: answer for address, answer in there.items() if address not in faults}
 
     # The first call needs nothing of this package, the second no more than one function of it.
-    good = ask(list(threads), judge_version, pkgutil.resolve_name, VERSION)
-    good = ask(list(good), judge_sources, digest_of_sources)
-    sizes = {path: size_of(path) for path in some_of(needs.files)}
+    good = ask(threads, judge_version, pkgutil.resolve_name, VERSION)
+    good = ask(good, judge_sources, digest_of_sources)
+    sizes = {path: _size_of(path) for path in some_of(needs.files)}
     with probing(needs.folder) as probe:
         expected = Expected(needs, needs.digests_of_models(), sizes, probe, cluster.is_local)
-        reports = ask(list(good), judge_report, report_to, expected)
-    network = needs.model, needs.precision, needs.device
-    values = ask(list(reports), judge_values, fingerprint_of, *network)
+        reports = ask(good, judge_report, _report_to, expected)
+    values = {address: report.values for address, report in reports.items()}
     first = first or next(iter(values.items()), None)
     faults.update(differing(first, values))
-    reports = {a: report for a, report in reports.items() if a in values and a not in faults}
-    members = members_of(cluster, reports, threads)
+    reports = {a: report for a, report in reports.items() if a not in faults}
+    on_host = Counter(report.host for report in reports.values())
+    members = {
+        address: cluster.limits
+        if cluster.is_local
+        else share_of(cluster.limits, threads[address], report, on_host[report.host])
+        for address, report in reports.items()
+    }
     return Checked(members, first, faults, warnings_of(reports))
 
 
+def share_of(limits: Resources, threads: int, report: Report, neighbours: int) -> Resources:
+    """Return what a worker at an address may use, given what was asked for.
+
+    Dask gave it ``threads``; ``neighbours`` share the free memory of its machine, itself included.
+    """
+    rooms = [int(PAUSE_SHARE * report.limit)] if report.limit else []
+    if limits.memory is not None:
+        rooms.append(limits.memory)
+    elif report.free:
+        rooms.append(int(SHARE * (report.free // neighbours)))
+    return Resources(limits.threads or threads, min(rooms, default=None))
+
+
 def judge_version(answer: Any) -> str:
-    """Return what is wrong with the version of super-sdf that a worker has, "" if nothing."""
+    """Return what is wrong with the super-sdf of a worker, "" if nothing."""
     if isinstance(answer, ImportError):
         return f"does not have super-sdf: install version {__version__} of it there"
     if isinstance(answer, Exception):
-        return f"cannot import super-sdf ({describe(answer)}): install {__version__} there"
+        return f"cannot import super-sdf ({_describe(answer)}): install {__version__} there"
     if answer != __version__:
-        return (
-            f"has super-sdf {answer}, and here is {__version__}: install the same version there "
-            "and here"
-        )
+        both = f"{answer}, and here is {__version__}"
+        return f"has super-sdf {both}: install the same version there and here"
     return ""
 
 
@@ -174,15 +192,7 @@ def judge_report(report: Any) -> str:
     """Return what a worker says that it lacks, "" if nothing."""
     if isinstance(report, Report):
         return report.fault
-    return f"cannot be checked ({describe(report)}): restart it"
-
-
-def judge_values(answer: Any) -> str:
-    """Return why a worker cannot run the network, "" if it can."""
-    if isinstance(answer, Fingerprint):
-        return ""
-    why = answer if isinstance(answer, SuperSdfError) else describe(answer)
-    return f"cannot run the network: {why}"
+    return f"cannot be checked ({_describe(report)}): restart it"
 
 
 def differing(
@@ -195,14 +205,13 @@ def differing(
             way = "use workers with the same kind of processor"
             way = "give --device cpu" if found.device != first[1].device else way
             faults[address] = (
-                f"({runs_on(found)}) gets other values from the network than worker {first[0]} "
-                f"({runs_on(first[1])}), so that meshes would differ or be torn: {way}"
+                f"({_runs_on(found)}) gets other values from the network than worker {first[0]} "
+                f"({_runs_on(first[1])}), so that meshes would differ or be torn: {way}"
             )
     return faults
 
 
-def runs_on(found: Fingerprint) -> str:
-    """Describe what computed values, and the values."""
+def _runs_on(found: Fingerprint) -> str:
     return f"{found.processor}, {found.precision} on {found.device}, {found.digest[:8]}"
 
 
@@ -220,12 +229,6 @@ def warnings_of(reports: Mapping[str, Report]) -> list[str]:
     return warnings
 
 
-def name_workers(faults: Mapping[str, str]) -> str:
-    """Return the first fault, with the workers that have it."""
-    fault = next(iter(faults.values()))
-    return f"{first_of([address for address, text in faults.items() if text == fault])} {fault}"
-
-
 def first_of(addresses: Sequence[str]) -> str:
     """Return the first of some workers, and how many others there are."""
     more = len(addresses) - 1
@@ -233,30 +236,21 @@ def first_of(addresses: Sequence[str]) -> str:
     return f"worker {addresses[0]}{others}"
 
 
-def members_of(
-    cluster: Cluster, reports: Mapping[str, Report], threads: Mapping[str, int]
-) -> dict[str, Resources]:
-    """Return what each worker may use; the free memory of a machine is shared equally."""
-    if cluster.is_local:
-        return dict.fromkeys(reports, cluster.limits)
-    on_host = Counter(report.host for report in reports.values())
-    members = {}
-    for address, report in reports.items():
-        free = None if report.free is None else report.free // on_host[report.host]
-        members[address] = share_of(cluster.limits, threads[address], report.limit, free)
-    return members
-
-
-def report_to(expected: Expected, dask_worker: Any) -> Report:
+def _report_to(expected: Expected, dask_worker: Any) -> Report:
     """Return the report of a worker; called in it, on its main thread."""
     reuse_freed()
     if expected.is_local:
         with suppress(ValueError, AttributeError):  # not the main thread, or Windows
             settle_signals()
             signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the batch hears it, too
-    limit = dask_worker.memory_manager.memory_limit
-    fault = what_is_lacking(expected)
-    return Report(fault, socket.gethostname(), versions(), limit or None, free_memory())
+    limit, needs, values = dask_worker.memory_manager.memory_limit or None, expected.needs, None
+    if not (fault := what_is_lacking(expected)):
+        try:
+            values = fingerprint_of(needs.model, needs.precision, needs.device)
+        except Exception as error:
+            why = str(error) if isinstance(error, SuperSdfError) else _describe(error)
+            fault = f"cannot run the network: {why}"
+    return Report(fault, socket.gethostname(), versions(), limit, free_memory(), values)
 
 
 def what_is_lacking(expected: Expected) -> str:
@@ -270,15 +264,14 @@ def what_is_lacking(expected: Expected) -> str:
     if lacking := missing_modules(expected.needs.modules):
         return f"lacks {', '.join(lacking)}: install there what is installed here"
     for path, here in expected.sizes.items():
-        size = size_of(path)
+        size = _size_of(path)
         if size is None and here is not None:
             return f"does not see {path}: put the inputs where all machines see them by this path"
         if size != here:
             return f"sees another {path}: its folder has to be the same on all machines"
-    if expected.probe and (why := why_unusable(*expected.probe)):
-        folder = expected.needs.folder
-        return f"{why}: write to a folder that all machines share under {folder}"
-    return ""
+    why = why_unusable(*expected.probe) if expected.probe else ""
+    folder = expected.needs.folder
+    return why and f"{why}: write to a folder that all machines share under {folder}"
 
 
 def versions() -> dict[str, str]:
@@ -303,7 +296,7 @@ def some_of(files: Sequence[Path]) -> Sequence[Path]:
     return files[:: max(1, -(-len(files) // MOST_FILES))]
 
 
-def size_of(path: Path) -> int | None:
+def _size_of(path: Path) -> int | None:
     """Return the bytes of a file, -1 for a folder, None if there is none."""
     try:
         return -1 if path.is_dir() else path.stat().st_size
@@ -342,7 +335,6 @@ def why_unusable(path: Path, text: str) -> str:
     return ""
 
 
-def describe(error: Any) -> str:
-    """Describe an exception in one line."""
+def _describe(error: Any) -> str:
     first = next(iter(str(error).splitlines()), "")
     return f"{type(error).__name__}: {first}" if isinstance(error, Exception) else repr(error)

@@ -14,17 +14,16 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
+
+import dask
+from distributed import Client, Nanny, Scheduler, SpecCluster, Worker
+from distributed.comm import core as comm
+from distributed.security import Security
 
 from ..errors import ClusterError
-from ..machine.extras import check_modules
-from ..machine.memory import SHARE, held_memory, memory_bound
-from ..machine.resources import Resources
-from ..machine.serving import ending_signals_blocked, python_flags
-from ..machine.threads import count_cores
-
-if TYPE_CHECKING:
-    from distributed import Client
+from ..machine.pool import ending_signals_blocked, python_flags
+from ..machine.resources import Resources, allot_each, count_cores
 
 LOCAL = "local"
 CONNECT_SECONDS = 5  # that a scheduler has to answer
@@ -32,7 +31,6 @@ FIRST_WORKER_SECONDS = 10  # that a cluster has to show a worker
 CLOSE_SECONDS = 5  # that the workers of this machine have to end
 HARD_LIMIT = 1.25  # of the memory that a worker of this machine plans with: above, it is killed
 LEAST_HARD_LIMIT = 5 * 10**8  # an idle worker holds a third of it
-PAUSE_SHARE = 0.75  # of a worker's limit: Dask gives it no more work at 0.8, and kills it at 0.95
 LOGGERS = ("distributed", "tornado", "asyncio", "bokeh")
 CONFIG = {
     "distributed.worker.memory.target": False,
@@ -50,6 +48,20 @@ CONFIG = {
     "distributed.nanny.pre-spawn-environ": {},  # it would stay in the environment of this process
 }
 Answer = TypeVar("Answer")
+
+
+class QuietScheduler(Scheduler):
+    """A scheduler without a dashboard; Dask's answers at port 8787 even without any page."""
+
+    def start_http_server(self, *_: Any, **__: Any) -> None:
+        """Open no port."""
+
+
+class QuietWorker(Worker):
+    """A worker without a dashboard."""
+
+    def start_http_server(self, *_: Any, **__: Any) -> None:
+        """Open no port."""
 
 
 @dataclass(frozen=True)
@@ -103,58 +115,36 @@ def connect(
     its share of the cores, or those that Dask gave it. ``max_memory`` are the bytes of all workers
     together for "local", else of each. ClusterError if nobody answers, or there is no worker.
     """
-    check_modules("--cluster", "cluster")
     with ExitStack() as stack:
-        stack.enter_context(silence())
+        stack.enter_context(_silence())
+        server: Any = address
+        limits = Resources(threads, max_memory)
         if address == LOCAL:
-            import dask
-
             count = workers or count_cores()
-            limits = share_equally(count, threads, max_memory)
+            limits = allot_each(count, threads, max_memory)
             stack.enter_context(dask.config.set(CONFIG))
             hard = max(int(HARD_LIMIT * (limits.memory or 0)), LEAST_HARD_LIMIT)
-            server = stack.enter_context(local_cluster(count, hard if max_memory else 0))
-        else:
-            limits, server = Resources(threads, max_memory), address
-        client = stack.enter_context(open_client(server, address))
+            server = stack.enter_context(_local_cluster(count, hard if max_memory else 0))
+        client = stack.enter_context(_open_client(server, address))
         cluster = Cluster(client, address, limits)
-        wait_for_a_worker(cluster)
+        with suppress(TimeoutError, asyncio.TimeoutError):  # the same from Python 3.11 on
+            client.wait_for_workers(1, timeout=FIRST_WORKER_SECONDS)
+        if not cluster.workers():
+            raise ClusterError(
+                f"the Dask scheduler at {address} has no workers: start some with "
+                f"'dask worker {address}'"
+            )
         yield cluster
 
 
-def share_equally(count: int, threads: int, max_memory: int | None) -> Resources:
-    """Return the share of each of some processes in the threads and memory of this machine."""
-    bound = memory_bound(max_memory)
-    if bound is not None:
-        bound = max(1, bound - (held_memory() or 0)) // count
-    return Resources(threads or max(1, count_cores() // count), bound)
-
-
-def share_of(limits: Resources, threads: int, limit: int | None, free: int | None) -> Resources:
-    """Return what a worker at an address may use, given what was asked for.
-
-    Dask gave it ``threads`` and kills it at ``limit`` bytes; ``free`` is its part of the memory
-    that is free on its machine.
-    """
-    rooms = [int(share * size) for share, size in ((PAUSE_SHARE, limit), (SHARE, free)) if size]
-    if limits.memory is not None:
-        rooms = [limits.memory, *(rooms[:1] if limit else [])]
-    return Resources(limits.threads or threads, min(rooms, default=None))
-
-
 @contextmanager
-def local_cluster(count: int, killed_at: int) -> Iterator[Any]:
+def _local_cluster(count: int, killed_at: int) -> Iterator[SpecCluster]:
     """Run worker processes on this machine, each killed at some bytes of memory; 0: no limit.
 
     They listen on the loopback interface only, and open no dashboard. Signals are held back while
     they start: none may start without being known here, and what they inherit keeps a Ctrl-C in the
     terminal from them.
     """
-    import dask
-    from distributed import Nanny, SpecCluster
-
-    from .serving import QuietScheduler, QuietWorker
-
     host, silence_logs = "127.0.0.1", logging.CRITICAL
     scheduler = {"cls": QuietScheduler, "options": {"host": host, "port": 0, "dashboard": False}}
     options = {"host": host, "nthreads": 1, "memory_limit": killed_at, "silence_logs": silence_logs}
@@ -164,7 +154,7 @@ def local_cluster(count: int, killed_at: int) -> Iterator[Any]:
         dask.config.set({"temporary-directory": scratch}),
         python_flags(),  # as long as workers may be started again
     ):
-        start_quiet_tracker()
+        _start_quiet_tracker()
         with ending_signals_blocked():
             workers = dict.fromkeys(range(count), worker)
             cluster = SpecCluster(workers, scheduler, silence_logs=silence_logs)
@@ -175,7 +165,7 @@ def local_cluster(count: int, killed_at: int) -> Iterator[Any]:
                 cluster.close(timeout=CLOSE_SECONDS)
 
 
-def start_quiet_tracker() -> None:
+def _start_quiet_tracker() -> None:
     """Start Python's resource tracker so that it says nothing of Dask's semaphores after a signal.
 
     It runs as long as this process, and hears the SIGHUP of a terminal that is closed.
@@ -193,13 +183,11 @@ def start_quiet_tracker() -> None:
 
 
 @contextmanager
-def open_client(server: Any, address: str) -> Iterator[Client]:
+def _open_client(server: Any, address: str) -> Iterator[Client]:
     """Connect to a scheduler; ClusterError if it does not answer."""
-    from distributed import Client
-
     try:
         if address != LOCAL:
-            asyncio.run(greet(server))
+            asyncio.run(_greet(server))
         client = Client(server, timeout=CONNECT_SECONDS, set_as_default=False)
     except Exception as error:  # of many kinds: a bad address, a refused or silent port, TLS
         is_silent = isinstance(error, (OSError, asyncio.TimeoutError)) or not str(error)
@@ -215,32 +203,16 @@ def open_client(server: Any, address: str) -> Iterator[Client]:
             client.close(timeout=CLOSE_SECONDS)
 
 
-async def greet(address: str) -> None:
+async def _greet(address: str) -> None:
     """Raise if a scheduler does not return a greeting in time: a Client would wait for ever."""
-    from distributed.comm.core import connect
-    from distributed.security import Security
-
     arguments = Security().get_connection_args("client")
-    comm = await asyncio.wait_for(connect(address, **arguments), CONNECT_SECONDS)
-    await comm.close()
-
-
-def wait_for_a_worker(cluster: Cluster) -> None:
-    """Raise ClusterError if the cluster shows no worker within a while."""
-    with suppress(TimeoutError, asyncio.TimeoutError):  # the same from Python 3.11 on
-        cluster.client.wait_for_workers(1, timeout=FIRST_WORKER_SECONDS)
-    if not cluster.workers():
-        raise ClusterError(
-            f"the Dask scheduler at {cluster.address} has no workers: start some with "
-            f"'dask worker {cluster.address}'"
-        )
+    peer = await asyncio.wait_for(comm.connect(address, **arguments), CONNECT_SECONDS)
+    await peer.close()
 
 
 @contextmanager
-def silence() -> Iterator[None]:
+def _silence() -> Iterator[None]:
     """Keep Dask's log messages and warnings from the terminal within the block."""
-    import distributed  # noqa: F401, it sets the levels of its loggers
-
     names = [name for name in logging.root.manager.loggerDict if name.split(".")[0] in LOGGERS]
     loggers = [logging.getLogger(name) for name in (*LOGGERS, *names)]
     levels = [logger.level for logger in loggers]

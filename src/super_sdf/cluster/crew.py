@@ -1,9 +1,10 @@
-"""The checked workers of a cluster, which share tasks.
+"""The checked workers of a cluster, which share tasks; and what runs in them.
 
 Dask distributes the tasks, and gives those of a worker that died to another one, as often as its
 scheduler allows (``allowed-failures``). Each task asks for the run as a resource, of which each
 worker has one once it was checked: so it works at one task at a time, and a worker that comes later
-is checked before it gets one.
+is checked before it gets one. A task ends early when nobody wants its result any more, as after
+Ctrl-C or when the process that asked for it was killed: otherwise it would go on writing.
 """
 
 from __future__ import annotations
@@ -16,17 +17,25 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import suppress
 from itertools import islice
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
+
+from distributed import Future, KilledWorker, Worker, get_worker, wait
+from distributed.core import Status
 
 from ..errors import ClusterError, SuperSdfError
 from ..machine.pool import Death, Tasks
 from ..machine.resources import Resources
 from .checking import Needs, check_some, check_workers, first_of
 from .connecting import Cluster
-from .serving import ClusterPrepare, admit, forget, work_here
 
-if TYPE_CHECKING:
-    from distributed import Future
+CheckWanted = Callable[[], None]
+"""Raises ``UnwantedError`` if nobody wants the result of the task any more; cheap."""
+
+ClusterWork = Callable[[Any, CheckWanted], Any]
+"""Works at a task; returns the result, which is pickled."""
+
+ClusterPrepare = Callable[[Resources], ClusterWork]
+"""Called once in each worker, to load a network, say; returns what works at the tasks."""
 
 CANCELLED = concurrent.futures.CancelledError, asyncio.CancelledError
 Task = TypeVar("Task")
@@ -34,6 +43,13 @@ LOOK_SECONDS = 0.5  # between two looks at which workers there are
 RESULT_SECONDS = 2.0  # that a result may take from a worker until it is looked whether that lives
 PATIENCE_SECONDS = 60.0  # without any worker
 AHEAD = 2  # tasks for each worker, where results are taken in order
+
+_limits: dict[str, Resources] = {}  # of this process, if it is a worker, by run
+_prepared: dict[str, ClusterWork] = {}
+
+
+class UnwantedError(SuperSdfError):
+    """Nobody wants the result of a task any more."""
 
 
 class Crew:
@@ -45,11 +61,7 @@ class Crew:
     """
 
     def __init__(
-        self,
-        cluster: Cluster,
-        needs: Needs,
-        prepare: ClusterPrepare,
-        warn: Callable[[str], None],
+        self, cluster: Cluster, needs: Needs, prepare: ClusterPrepare, warn: Callable[[str], None]
     ) -> None:
         self.cluster, self.needs, self.prepare, self.warn = cluster, needs, prepare, warn
         self.run = f"super-sdf-{secrets.token_hex(8)}"
@@ -69,12 +81,7 @@ class Crew:
     def __exit__(self, *error: object) -> None:
         with suppress(SuperSdfError):  # the connection may be lost
             if not self.cluster.is_local:
-                self.cluster.run(forget, self.run, workers=list(self.members))
-
-    def _admit(self, members: dict[str, Resources]) -> None:
-        for address, limits in members.items():
-            self.cluster.run(admit, self.run, limits, workers=[address])
-        self.members.update(members)
+                self.cluster.run(_forget, self.run, workers=list(self.members))
 
     def completed(self, tasks: Tasks[Task]) -> Generator[tuple[Task, Any], None, None]:
         """Yield the tasks of a queue with their results as they are completed.
@@ -106,23 +113,26 @@ class Crew:
                 given.extend(self._submit(task) for task in islice(waiting, room))
                 if not given:
                     return
-                if self._wait(list(given)[:1]):
+                if self._wait([given[0]]):
                     yield self._result(given.popleft())
         finally:
             self._cancel(given)
+
+    def _admit(self, members: dict[str, Resources]) -> None:
+        for address, limits in members.items():
+            self.cluster.run(_admit, self.run, limits, workers=[address])
+        self.members.update(members)
 
     def _submit(self, task: Any) -> Future[Any]:
         self.submitted += 1
         key, submit = f"{self.run}-{self.submitted}", self.cluster.client.submit
         wanted = {self.run: 1}
         return self.cluster.ask(
-            lambda: submit(work_here, self.run, self.prepare, task, key=key, resources=wanted)
+            lambda: submit(_work, self.run, self.prepare, task, key=key, resources=wanted)
         )
 
     def _wait(self, futures: Iterable[Future[Any]]) -> set[Future[Any]]:
         """Wait a moment for futures; return those that are done, and look after the workers."""
-        from distributed import wait
-
         done: set[Future[Any]] = set()
         with suppress(TimeoutError, asyncio.TimeoutError):  # the same from Python 3.11 on
             try:
@@ -137,8 +147,6 @@ class Crew:
 
     def _result(self, future: Future[Any]) -> Any:
         """Return the result of a future that is done, or a Death."""
-        from distributed import KilledWorker
-
         while True:
             try:
                 return future.result(timeout=RESULT_SECONDS)
@@ -177,3 +185,36 @@ class Crew:
         """Tell the scheduler that nobody waits for futures: their tasks end at their next check."""
         with suppress(Exception):  # the connection may be lost: then the scheduler knows it, too
             self.cluster.client.cancel(list(futures))
+
+
+async def _admit(run: str, limits: Resources, dask_worker: Worker) -> None:
+    """Let this worker take the tasks of a run, one at a time: they ask for the run as a resource.
+
+    A pause makes the scheduler look again which of the waiting tasks this worker can take.
+    """
+    _limits[run] = limits
+    dask_worker.status = Status.paused
+    await dask_worker.set_resources(**{run: 1})
+    dask_worker.status = Status.running
+
+
+def _work(run: str, prepare: ClusterPrepare, task: Any) -> Any:
+    """Work at a task in this worker, prepared once for each run; return its result."""
+    worker = get_worker()
+    key = worker.get_current_task()
+
+    def check_wanted() -> None:
+        state = worker.state.tasks.get(key)
+        if state is None or state.state == "cancelled":
+            raise UnwantedError("nobody waits for the result any more")
+
+    check_wanted()
+    if run not in _prepared:
+        _prepared[run] = prepare(_limits[run])
+    return _prepared[run](task, check_wanted)
+
+
+def _forget(run: str) -> None:
+    """Free what was prepared in this worker for a run."""
+    _prepared.pop(run, None)
+    _limits.pop(run, None)

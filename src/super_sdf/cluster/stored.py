@@ -6,7 +6,6 @@ stays unpacked, in memory or in a temporary file, since each pass over the grid 
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -95,28 +94,21 @@ class Store:
     def __init__(self, source: Source) -> None:
         self.source = source
         self.files = ExitStack()
-        self.layers: OrderedDict[int, SampleArray] = OrderedDict()
+        self.layers: dict[int, SampleArray] = {}
         self.bound: int | None = None
-        if source.is_npy:
-            self._open_npy()
-        else:
-            self._open_volume()
-
-    def _open_npy(self) -> None:
-        """Open an .npy file in C order."""
-        path = Path(self.source.path)
-        with open_volume(path, find_format(path), "xyz", (0, None)) as volume:
-            if volume.axes != "xyz":
-                raise FileError(f"{path} is in Fortran order: save it in C order, or {WAY_OUT}")
-        self.shape, self.dtype = volume.shape, volume.dtype
-        self.planes: Any = volume.stored
-        self.layer = 1
-
-    def _open_volume(self) -> None:
-        """Open a store that a library reads."""
-        path = Path(self.source.path)
+        path = Path(source.path)
         self.format = find_format(path)
-        axes = choose_axes(self.format, self.source.axes)
+        if source.is_npy:
+            with open_volume(path, self.format, "xyz", (0, None)) as volume:
+                if volume.axes != "xyz":
+                    raise FileError(f"{path} is in Fortran order: save it in C order, or {WAY_OUT}")
+            self.shape, self.dtype = volume.shape, volume.dtype
+            self.planes: Any = volume.stored
+        else:
+            self._open_volume(path, choose_axes(self.format, source.axes))
+
+    def _open_volume(self, path: Path, axes: str) -> None:
+        """Open a store that a library reads."""
         volume = self.files.enter_context(open_volume(path, self.format, axes, (0, None)))
         self.volume = volume.turned(axes) if self.source.has_direction else volume
         self.placement = find_placement(self.volume, str(path))
@@ -127,10 +119,7 @@ class Store:
         self.layer = unit * max(PIECE // (ny * nz * self.dtype.itemsize * unit), 1)
 
     def place(self, given: dict[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
-        """Return the place in the world as ``make_grid`` takes it, and notes.
-
-        ``given`` holds what replaces that of the file, or None.
-        """
+        """Return the place in the world, ``given`` or that of the file, and notes."""
         if self.source.is_npy:
             return given, ()
         return place_in_world(self.volume, self.placement, given), self.volume.notes
@@ -149,12 +138,13 @@ class Store:
         """Return the layer that begins at a plane, unpacked once if there is room for it."""
         if start not in self.layers:
             try:
-                self.layers[start] = self._unpacked(start)
+                layer = self._unpacked(start)
             except OutOfMemoryError:
                 if not self.layers:
                     raise
                 self.layers.clear()  # make room on the disk
-                self.layers[start] = self._unpacked(start)
+                layer = self._unpacked(start)
+            self.layers[start] = layer
         return self.layers[start]
 
     def _unpacked(self, start: int) -> SampleArray:

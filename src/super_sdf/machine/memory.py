@@ -12,19 +12,14 @@ from contextlib import suppress
 from pathlib import Path
 
 from ..errors import OutOfMemoryError
-from .containers import left_memory
+from .system import left_memory
 
 SYSTEM = Path("/proc/meminfo")
 PROCESS = Path("/proc/self/status")
 MOUNTS = Path("/proc/self/mountinfo")
-
-# Parameters of glibc's mallopt, from malloc.h.
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
-
-# Of the memory that is free, the share that is taken unless a bound is given.
-SHARE = 0.6
-# Of what a bound leaves, the share that an unpacked array may take.
-ROOM_SHARE = 0.25
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's mallopt, from malloc.h
+SHARE = 0.6  # of the memory that is free, the share that is taken unless a bound is given
+ROOM_SHARE = 0.25  # of what a bound leaves, the share that an unpacked array may take
 
 
 def free_memory() -> int | None:
@@ -36,10 +31,8 @@ def free_memory() -> int | None:
         sizes = _read_sizes(SYSTEM)
     except OSError:
         return _by_psutil("free")
-    if "MemAvailable" not in sizes:
-        return None
-    left = left_memory()
-    return sizes["MemAvailable"] if left is None else min(sizes["MemAvailable"], left)
+    rooms = [room for room in (sizes.get("MemAvailable"), left_memory()) if room is not None]
+    return min(rooms) if "MemAvailable" in sizes else None
 
 
 def memory_bound(max_memory: int | None = None) -> int | None:
@@ -89,8 +82,7 @@ def _by_psutil(what: str, pid: int | None = None) -> int | None:
 
 def _peak_elsewhere() -> int | None:
     """Return the peak of this process since its start: Windows tells psutil, others getrusage."""
-    peak = _by_psutil("peak_wset")
-    if peak is not None:
+    if (peak := _by_psutil("peak_wset")) is not None:
         return peak
     with suppress(ImportError):
         import resource

@@ -7,40 +7,43 @@ of a worker that dies is known, and what it was sending when it died harms no ot
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
-import time
+import sys
+import threading
 from collections.abc import Callable, Generator, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from multiprocessing import util
 from multiprocessing.connection import Connection, wait
-from multiprocessing.context import BaseContext
 from multiprocessing.process import BaseProcess
+from multiprocessing.spawn import get_executable
+from pathlib import Path
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 from ..errors import SuperSdfError
-from .serving import (
-    ClockStarted,
-    Final,
-    Prepare,
-    PrepareFailed,
-    Ready,
-    ending_signals_blocked,
-    python_flags,
-    serve,
-)
 
 Task = TypeVar("Task")
 TaskOut = TypeVar("TaskOut", covariant=True)
 MAX_FAILED_STARTS = 5  # workers in a row that end before they are ready
 EXIT_SECONDS = 10.0  # that a worker has to exit after it closed its pipe
+# It works on every system and beside the threads of onnxruntime, unlike forking this process.
 SPAWN = multiprocessing.get_context("spawn")
+# ``python -c``, which multiprocessing starts, imports from the current folder unless told not to.
+# Python 3.10 knows only -I: what that leaves out, multiprocessing hands over with the path.
+SAFE_PATH = "-P" if sys.version_info >= (3, 11) else "-I"
+
+Work = Callable[[Any], Any]
+"""Works at a task; returns its result."""
+
+Prepare = Callable[[], Work]
+"""Called once in each worker, to load a network, say; returns what works at the tasks."""
 
 
 class Death(NamedTuple):
-    """The final result of a task whose worker died, or was killed at the task's time limit."""
+    """The result of a task whose worker died."""
 
     cause: str
-    is_late: bool = False
 
 
 class Tasks(Protocol[TaskOut]):
@@ -55,27 +58,12 @@ class Tasks(Protocol[TaskOut]):
 
 @dataclass(eq=False)
 class Worker(Generic[Task]):
-    """A worker process, the pipe to it, its current task, and when that has to be finished."""
+    """A worker process, the pipe to it, and its current task."""
 
     process: BaseProcess
     pipe: Connection
     is_ready: bool = False
     task: Task | None = None
-    deadline: float | None = None
-
-
-@dataclass(frozen=True)
-class PoolOptions(Generic[Task]):
-    """How a pool runs its workers.
-
-    ``time_limit`` returns the seconds that a task may take from ``ClockStarted`` on. Spawning works
-    on every system and is safe beside the threads of onnxruntime, unlike forking this process. A
-    worker that is not reused takes one task alone.
-    """
-
-    time_limit: Callable[[Task], float | None] = lambda task: None
-    start_method: BaseContext = SPAWN
-    is_reused: bool = True
 
 
 class Pool(Generic[Task]):
@@ -85,27 +73,20 @@ class Pool(Generic[Task]):
     results are pickled.
     """
 
-    def __init__(
-        self, tasks: Tasks[Task], prepare: Prepare, options: PoolOptions[Task] | None = None
-    ) -> None:
+    def __init__(self, tasks: Tasks[Task], prepare: Prepare) -> None:
         self.tasks, self.prepare = tasks, prepare
-        self.options: PoolOptions[Task] = options or PoolOptions()
         self.workers: dict[Connection, Worker[Task]] = {}
         self.failed_starts = 0
 
     def results(self, count: int) -> Generator[tuple[Task, Any], None, None]:
-        """Run the tasks in ``count`` workers.
+        """Run the tasks in ``count`` workers; yield each with its result, or a Death.
 
-        Yields the partial results of each task as they arrive, then its final result or a Death;
         SuperSdfError if no worker can be started, or what ``prepare`` raised.
         """
         try:
             while self._start_workers(count):
-                deadlines = [w.deadline for w in self.workers.values() if w.deadline is not None]
-                left = max(min(deadlines) - time.monotonic(), 0) if deadlines else None
-                for pipe in wait(list(self.workers), left):
+                for pipe in wait(list(self.workers)):
                     yield from self._receive(self.workers[pipe])  # type: ignore[index]
-                yield from self._kill_late_workers()
         finally:
             for worker in list(self.workers.values()):
                 self._stop(worker)
@@ -127,11 +108,8 @@ class Pool(Generic[Task]):
         return is_busy or len(self.tasks) > 0
 
     def _start_worker(self) -> None:
-        context = self.options.start_method
-        ours, theirs = context.Pipe()
-        process = context.Process(  # type: ignore[attr-defined]
-            target=serve, args=(theirs, self.prepare), daemon=True
-        )
+        ours, theirs = SPAWN.Pipe()
+        process = SPAWN.Process(target=_serve, args=(theirs, self.prepare), daemon=True)
         try:
             # no process may start without being noted here
             with python_flags(), ending_signals_blocked():
@@ -144,7 +122,7 @@ class Pool(Generic[Task]):
             theirs.close()
 
     def _receive(self, worker: Worker[Task]) -> Iterator[tuple[Task, Any]]:
-        """Take a message from a worker; yield the result that it brings, if any."""
+        """Take a message from a worker, see ``_serve``; yield the result, if it is one."""
         try:
             message = worker.pipe.recv()
         except Exception as error:
@@ -152,25 +130,13 @@ class Pool(Generic[Task]):
                 worker.process.join(EXIT_SECONDS)  # killed at once, it would lose its exit code
             yield from self._report_death(worker)  # else what it sent cannot be unpickled
             return
-        if isinstance(message, PrepareFailed):
-            raise message.error
-        if isinstance(message, Ready):
+        if worker.task is not None:
+            yield worker.task, message
+        elif message is not None:
+            raise message
+        else:
             worker.is_ready, self.failed_starts = True, 0
-            self._assign_task(worker)
-        elif worker.task is not None:
-            if isinstance(message.value, ClockStarted):
-                limit = self.options.time_limit(worker.task)
-                worker.deadline = None if limit is None else time.monotonic() + limit
-            yield worker.task, message.value
-            if isinstance(message, Final):
-                worker.task = worker.deadline = None
-                if self.options.is_reused:
-                    self._assign_task(worker)
-                else:
-                    self._stop(worker)
-
-    def _assign_task(self, worker: Worker[Task]) -> None:
-        """Give a worker the next task, or stop it if there is none."""
+        worker.task = None
         if not len(self.tasks):
             self._stop(worker)
             return
@@ -178,28 +144,19 @@ class Pool(Generic[Task]):
         with suppress(OSError):  # it has died: the next read from its pipe will show that
             worker.pipe.send(worker.task)
 
-    def _kill_late_workers(self) -> Iterator[tuple[Task, Death]]:
-        """Kill the workers whose tasks are over their time limits; yield those tasks."""
-        now = time.monotonic()
-        for worker in list(self.workers.values()):
-            if worker.deadline is not None and worker.task is not None and worker.deadline <= now:
-                self._stop(worker)
-                limit = self.options.time_limit(worker.task)
-                yield worker.task, Death(f"over the limit of {limit:g} s", is_late=True)
-
     def _report_death(self, worker: Worker[Task]) -> Iterator[tuple[Task, Death]]:
         """Remove a dead worker; yield the task that it was working at."""
         self._stop(worker)
         cause = describe_exit(worker.process.exitcode)
-        if not worker.is_ready:
+        if worker.task is not None:
+            yield worker.task, Death(cause)
+        elif not worker.is_ready:
             self.failed_starts += 1
             if self.failed_starts == MAX_FAILED_STARTS:
                 raise SuperSdfError(
                     f"{MAX_FAILED_STARTS} processes in a row ended before they were ready; the "
                     f"last one {cause}: try --jobs 1"
                 )
-        elif worker.task is not None:
-            yield worker.task, Death(cause)
 
     def _stop(self, worker: Worker[Task]) -> None:
         """Kill a worker if it still runs."""
@@ -218,3 +175,83 @@ def describe_exit(code: int | None) -> str:
         hint = " (most likely out of memory)" if name == "SIGKILL" else ""
         return f"was killed by {name}{hint}"
     return f"was killed by signal {-code}"
+
+
+def _serve(pipe: Connection, prepare: Prepare) -> None:
+    """Run a worker process: take tasks from the pipe and send their results, until it closes.
+
+    The first message is None if it is ready, or why no worker can be.
+    """
+    settle_signals()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    with suppress(EOFError, ConnectionError):  # the parent has ended, or needs no more workers
+        try:
+            work = prepare()
+        except Exception as error:  # even a bug is reported by the parent in one line
+            line = f"{type(error).__name__}: {error}".split("\n")[0]
+            pipe.send(error if isinstance(error, SuperSdfError) else SuperSdfError(line))
+            return
+        pipe.send(None)
+        while True:
+            pipe.send(work(pipe.recv()))
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent ends, even by a kill: an orphan would go on writing."""
+    if parent := multiprocessing.parent_process():
+        wait([parent.sentinel])
+        os._exit(1)
+
+
+def settle_signals() -> None:
+    """Ignore Ctrl-C, which the parent handles, and unblock what it had blocked at the start."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, ending_signals())
+
+
+def ending_signals() -> set[signal.Signals]:
+    """Return the signals of this system that ask a process to end; Windows has no SIGHUP."""
+    names = ("SIGINT", "SIGTERM", "SIGHUP")
+    return {getattr(signal, name) for name in names if hasattr(signal, name)}
+
+
+@contextmanager
+def ending_signals_blocked() -> Iterator[None]:
+    """Block the signals that end in this thread and in processes that it starts.
+
+    Windows cannot block signals; nothing happens there.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    from multiprocessing import resource_tracker
+
+    resource_tracker.ensure_running()  # otherwise it lifts the block when it is first needed
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ending_signals())
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def python_flags(*flags: str) -> Iterator[None]:
+    """Start Pythons within the block with ``SAFE_PATH`` and other flags, from whatever thread."""
+    usual = util._args_from_interpreter_flags  # type: ignore[attr-defined]
+    util._args_from_interpreter_flags = lambda: [*usual(), SAFE_PATH, *flags]  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        util._args_from_interpreter_flags = usual  # type: ignore[attr-defined]
+
+
+def isolated_python(code: str) -> list[str]:
+    """Return the command of a Python that runs ``code`` and finds modules where this one does.
+
+    It takes nothing from the current folder.
+    """
+    own, here = str(Path(__file__).resolve().parents[2]), os.getcwd()
+    folders = [own, *(path for path in sys.path if path and os.path.abspath(path) != here)]
+    start = f"import sys; sys.path[:0] = sys.argv[1:]; {code}"
+    return [get_executable(), "-I", "-c", start, *folders]

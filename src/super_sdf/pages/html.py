@@ -24,8 +24,7 @@ from ..files.formats import is_grid
 from ..files.output import replacing
 from ..network.decoder import Decoder
 from ..truth.mesh_files import read_mesh
-from .entries import Entry, entry_of, entry_of_report, numbers, tiles
-from .items import Item, item_of_files
+from .items import Entry, Item, entry_of, entry_of_report, item_of_files, numbers, tiles
 
 HOME = Path(__file__).parent
 SCRIPTS = ("three.min.js", "viewer.js", "page.js")

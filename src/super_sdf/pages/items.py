@@ -1,4 +1,4 @@
-"""Items: what a page shows of one result besides its facts, and the files that hold them.
+"""What a page shows of each result: its entry, labels and texts, and its item, all the rest.
 
 The file of an item is a script, since a page that was opened from a file may load scripts and
 nothing else. Its first line is a comment with all but the meshes, so that a page of many files is
@@ -7,7 +7,10 @@ made without reading these; the second one hands the meshes to the page.
 
 from __future__ import annotations
 
+import hashlib
 import json
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +18,7 @@ from typing import Any
 from ..certificate.check import Certificate, band_of, check_kept, read_for_check
 from ..convert import ConvertOptions, Kept
 from ..errors import SuperSdfError
-from ..files.output import replacing
+from ..files.output import naming, replacing
 from ..grid.cubic import cubic_grid
 from ..mesh import Mesh
 from .meshes import coarse_surface, packed_mesh, thumbnail
@@ -24,6 +27,24 @@ RESULT, COARSE = "super-sdf", "marching cubes of the samples"
 LONGEST_HEAD = 1 << 20  # bytes of a file's first line
 COMMENT = b"// "
 CALL = "superSdfMeshes"  # the function of ``page.js``
+LISTS = ("facts", "certificate", "stages", "faults", "notes", "warnings", "remarks")
+NUMBERS = ("seconds", "residual", "thumbnail", "meshes")
+COUNTED = ("vertices", "triangles", "band_voxels", "decoded_voxels", "noisy_voxels", "slabs")
+NOT_DRAWN = "not drawn: run the command again for its picture and its meshes"
+
+Entry = dict[str, Any]
+"""A file in the JSON of a page.
+
+id : what its meshes are found by
+name, detail : what it is, and the grid and the mesh
+status : "ok", "failed" or "waiting"; of a failed one ``reason``
+line : counts in one line
+seconds, residual : for sorting; None if unknown
+thumbnail : a data URL or None
+facts, certificate, stages : lists of label and text
+faults, notes, warnings, remarks : lists of sentences
+meshes : "page", "beside" or None: where its meshes are
+"""
 
 
 @dataclass
@@ -96,6 +117,43 @@ def item_of(
     return item
 
 
+def items_folder(page: Path) -> Path:
+    """Return the folder beside a page for items: OUT-files beside OUT.html."""
+    return page.with_name(f"{page.stem}-files")
+
+
+def item_name(target: str) -> str:
+    """Return the name of an item by its output: 16 hexadecimal digits."""
+    return hashlib.sha256(target.encode("utf-8", "surrogatepass")).hexdigest()[:16]
+
+
+def item_path(folder: Path, target: str) -> Path:
+    """Return the file of the item of an output."""
+    return folder / f"{item_name(target)}.js"
+
+
+def keep_item(item: Item, folder: Path, target: str, sha256: str) -> None:
+    """Write the item of an output whose mesh file has this hash; the folder is made for it."""
+    item.made_of = sha256
+    with naming(folder):
+        folder.mkdir(exist_ok=True)
+    write_item(item, item_path(folder, target))
+
+
+def find_item(folder: Path, target: str, sha256: str) -> Item | None:
+    """Return the item of an output without its meshes; None if there is none of this mesh."""
+    item = read_head(item_path(folder, target))
+    return item if item and item.made_of == sha256 else None
+
+
+def remove_items(folder: Path, targets: Iterable[str]) -> None:
+    """Remove the items of some outputs, and the folder if nothing else is in it."""
+    with suppress(OSError):
+        for target in targets:
+            item_path(folder, target).unlink(missing_ok=True)
+        folder.rmdir()
+
+
 def write_item(item: Item, path: Path) -> None:
     """Write the file of an item, complete or not at all; its stem is the id that the page uses."""
     size = sum(len(mesh["data"]) for mesh in item.meshes)
@@ -120,3 +178,106 @@ def read_meshes(path: Path) -> list[dict[str, Any]]:
     _, call = path.read_bytes().split(b"\n", 1)
     meshes: list[dict[str, Any]] = json.loads(call[call.index(b"[") : call.rindex(b"]") + 1])
     return meshes
+
+
+def entry_of(name: str, status: str = "ok", **known: Any) -> Entry:
+    """Return an entry with what is known of a file; the rest is empty."""
+    empty: Entry = {"id": "", "name": name, "status": status, "reason": "", "line": ""}
+    return empty | dict.fromkeys(NUMBERS) | {key: [] for key in LISTS} | known
+
+
+def entry_of_report(name: str, report: Mapping[str, Any], item: Item | None) -> Entry:
+    """Return the entry of a mesh by its report, as ``Conversion.report`` has it, and its item.
+
+    ``report`` may also have ``seconds``, in all or per stage; ``stages``; ``check``, a certificate;
+    and ``input``, ``output``, ``model`` and the like.
+    """
+    stages = report["stages"] if "stages" in report else report.get("seconds", {})
+    certificate = report.get("check") or (item.certificate if item else None) or {}
+    return entry_of(
+        name,
+        line=_counts(report),
+        seconds=report["seconds"] if "stages" in report else sum(stages.values()),
+        residual=(certificate.get("residual") or {}).get("mean"),
+        facts=_facts(report),
+        stages=[[stage, f"{spent:.2f} s"] for stage, spent in stages.items()],
+        certificate=certificate_facts(certificate),
+        faults=certificate.get("faults", []),
+        notes=[*report.get("inferred", []), *report.get("notes", [])],
+        warnings=list(report.get("warnings", [])),
+        thumbnail=item.thumbnail if item else None,
+        remarks=item.remarks if item else [NOT_DRAWN],
+    )
+
+
+def _counts(report: Mapping[str, Any]) -> str:
+    said = [f"{report['triangles']:,} triangles"] if "triangles" in report else []
+    if "closed" in report:
+        said.append("closed" if report["closed"] else "open")
+    if "shape" in report:
+        said.append(f"from {' x '.join(map(str, report['shape']))} samples")
+    return ", ".join(said)
+
+
+def _facts(report: Mapping[str, Any]) -> list[list[str]]:
+    texts = {
+        "grid": report.get("input") or report.get("in"),
+        "mesh": report.get("output"),
+        "samples": " x ".join(map(str, report.get("shape", ()))),
+        "spacing": numbers(report.get("spacing", ())),
+        "origin": numbers(report.get("origin", ())),
+        "values": (report.get("field") or {}).get("kind"),
+        **{key: report.get(key) for key in ("factor", "mesher", "model", "precision", "device")},
+        **{key.replace("_", " "): f"{report[key]:,}" for key in COUNTED if key in report},
+        "bounds": " to ".join(f"({numbers(corner)})" for corner in report.get("bounds", ())),
+    }
+    if simplified := report.get("simplified"):
+        off = simplified["deviation"]
+        texts["simplified"] = (
+            f"from {simplified['triangles_before']:,} triangles; largest distance "
+            f"{off['largest']:.4f} voxels, {off['largest_back']:.4f} back"
+        )
+    return [[label, str(text)] for label, text in texts.items() if text not in (None, "")]
+
+
+def tiles(entry: Entry) -> list[list[str]]:
+    """Return the figures for the head of a page of one file."""
+    shown = [row for row in entry["certificate"] if row[0] in ("mean residual", "largest residual")]
+    faults = [["faults", str(len(entry["faults"]) or "none")]] if shown else []
+    line = [["result", entry["line"]]] if entry["line"] else []
+    return [*line, ["time", f"{entry['seconds']:.1f} s"], *shown, *faults]
+
+
+def certificate_facts(found: Mapping[str, Any]) -> list[list[str]]:
+    """Return what a certificate says, label by label; or why there is none."""
+    if "error" in found:
+        return [["not checked", found["error"]]]
+    if not found:
+        return []
+    surface, residual = found["surface"], found["residual"]
+    rows = [["checked", f"{found['samples']['exact']:,} exact samples near the surface"]]
+    if residual:
+        rows += [
+            ["mean residual", f"{residual['mean']:.4f} voxels"],
+            ["99th percentile", f"{residual['p99']:.4f} voxels"],
+            ["largest residual", f"{residual['largest_signed']:+.4f} voxels"],
+            ["above 0.1 voxel", f"{residual['share_above_tenth']:.2%} of the samples"],
+        ]
+    else:
+        rows.append(["residual", "unknown, since no sample is exact"])
+    kinds = ("closed", "oriented", "manifold")
+    qualities = [("" if surface[key] else "not ") + key for key in kinds]
+    pairs = surface["self_intersections"]
+    return [
+        *rows,
+        ["surface", ", ".join(qualities)],
+        ["components", f"{surface['components']:,}"],
+        ["self-intersections", "not counted" if pairs is None else f"{pairs:,}"],
+        ["volume", f"{surface['volume']:.6g}"],
+        ["area", f"{surface['area']:.6g}"],
+    ]
+
+
+def numbers(values: Iterable[float]) -> str:
+    """Return coordinates with commas, to six digits."""
+    return ", ".join(f"{value:.6g}" for value in values)

@@ -47,12 +47,13 @@ def packed_mesh(
 
     With a certificate that has evidence, the residuals at its vertices are in it.
     """
-    small = reduced(mesh, MOST_TRIANGLES, max_memory)
-    caption = f"{title}: {len(mesh.faces):,} triangles"
-    if len(small.faces) < len(mesh.faces):
+    small, caption = mesh, f"{title}: {len(mesh.faces):,} triangles"
+    if len(mesh.faces) > MOST_TRIANGLES:  # in one pass, unlike ``simplify_mesh``: only to be seen
+        check_room(len(mesh.faces), max_memory)
+        small = collapse_to(mesh, np.zeros(len(mesh.faces), bool), MOST_TRIANGLES)
         caption += f", shown simplified to {len(small.faces):,}"
-    low, step, places = quantised(small.vertices)
-    parts = [differences(places.T), differences(small.faces.astype(np.uint32))]
+    low, step, places = _quantised(small.vertices)
+    parts = [_differences(places.T), _differences(small.faces.astype(np.uint32))]
     has_residuals = certificate is not None and certificate.has_evidence
     if certificate and has_residuals:
         parts.append(residual_bytes(certificate.residuals_at(small.vertices)).tobytes())
@@ -67,20 +68,7 @@ def packed_mesh(
     }
 
 
-def reduced(mesh: Mesh, triangles: int, max_memory: int | None = None) -> Mesh:
-    """Return a mesh of at most about ``triangles`` triangles, to be looked at.
-
-    In one pass and not measured, unlike ``simplify_mesh``: it may be no manifold any more.
-    """
-    if len(mesh.faces) <= triangles:
-        return mesh
-    check_room(len(mesh.faces), max_memory)
-    return collapse_to(mesh, np.zeros(len(mesh.faces), bool), triangles)
-
-
-def quantised(
-    vertices: NDArray[Any],
-) -> tuple[NDArray[np.float64], float, NDArray[np.uint16]]:
+def _quantised(vertices: NDArray[Any]) -> tuple[NDArray[np.float64], float, NDArray[np.uint16]]:
     """Return the lowest corner, the step, and positions in steps from it, (n, 3)."""
     if not len(vertices):
         return np.zeros(3), 1.0, np.zeros((0, 3), np.uint16)
@@ -90,7 +78,7 @@ def quantised(
     return low, step, np.rint((wide - low) / step).astype(np.uint16)
 
 
-def differences(rows: NDArray[Any]) -> bytes:
+def _differences(rows: NDArray[Any]) -> bytes:
     """Return the differences of consecutive unsigned numbers, row by row; they compress better."""
     flat = np.ascontiguousarray(rows).ravel()
     return np.diff(flat, prepend=flat.dtype.type(0)).astype(flat.dtype.newbyteorder("<")).tobytes()

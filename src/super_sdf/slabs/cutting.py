@@ -22,10 +22,9 @@ from numpy.typing import NDArray
 
 from ..errors import OutOfMemoryError
 from ..grid.sdf_grid import SdfGrid
-from ..machine import index_width
+from ..machine import resources as limits
 from ..machine.memory import ROOM_SHARE, advised, give_back, held_memory, in_words
-from ..machine.resources import Resources
-from ..machine.threads import CHUNK, rows_in_chunk
+from ..machine.resources import CHUNK, Resources, rows_in_chunk
 from ..network.decoder import NETWORK_BYTES
 from ..options import DEFAULT_MESHER, SHARP
 from ..steps import bounds, debris, spheres
@@ -121,7 +120,7 @@ def _ways(
 
 def check_vertices(band: Band, factor: int) -> None:
     """Raise OptionError if the mesh will certainly have more vertices than 32-bit numbers."""
-    if int(band.decoded_before[-1]) * 3 * factor**3 > index_width.MAX_INDEX:
+    if int(band.decoded_before[-1]) * 3 * factor**3 > limits.MAX_INDEX:
         check_crossings(band.count_crossings(), factor)
 
 
@@ -131,7 +130,7 @@ def check_crossings(crossings: int, factor: int) -> None:
     The surface crosses about K^2 times as many edges of the fine lattice as of the coarse one. Half
     of this estimate is certain; the exact number is checked when the vertices have been counted.
     """
-    index_width.check_count(crossings * factor**2 // 2, "vertices or more")
+    limits.check_count(crossings * factor**2 // 2, "vertices or more")
 
 
 def peak_bytes(

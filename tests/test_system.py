@@ -1,0 +1,187 @@
+"""What a system says of processor and control groups, and what follows, by files that stand in."""
+
+import hashlib
+import os
+import platform
+
+import numpy as np
+import pytest
+
+from super_sdf import load_network
+from super_sdf.cli.entry import main
+from super_sdf.machine import memory, resources, system
+from super_sdf.machine.system import bound_of_cores, left_memory
+from super_sdf.network.network import Network, find_model, fingerprint_of, small_ball
+
+CORE_2 = "fpu sse sse2 pni ssse3 cx16"
+NEHALEM = f"{CORE_2} sse4_1 sse4_2 popcnt"
+SANDY_BRIDGE = f"{NEHALEM} avx"
+HASWELL = f"{SANDY_BRIDGE} avx2 fma"
+
+
+@pytest.fixture
+def describe(monkeypatch, tmp_path):
+    """Let the system describe another processor."""
+
+    def go(text):
+        (tmp_path / "cpuinfo").write_text(text)
+        monkeypatch.setattr(system, "CPUINFO", str(tmp_path / "cpuinfo"))
+
+    return go
+
+
+def x86(flags, name="A (R) processor @ 2.60GHz"):
+    """Return the description of a machine of two cores."""
+    return f"processor\t: 0\nmodel name\t: {name}\nflags\t: {flags}\n\nflags\t: mmx\n"
+
+
+ARM = "processor\t: 0\nFeatures\t: fp asimd\nCPU part\t: 0xd0c\n\n"
+AUTO = {
+    "AVX2": (x86(HASWELL), "base-int8"),
+    "AVX without AVX2": (x86(SANDY_BRIDGE), "base"),
+    "no AVX": (x86(NEHALEM), "base-int8"),
+    "ARM": (ARM, "base-int8"),
+    "nothing": ("", "base-int8"),
+}
+
+
+@pytest.mark.parametrize("kind", AUTO)
+def test_auto_is_float32_where_int8_is_slower(describe, kind):
+    text, want = AUTO[kind]
+    describe(text)
+    assert find_model("base")[0].stem == want
+    assert find_model("base", "int8")[0].stem == "base-int8"
+    assert find_model("base", "float32")[0].stem == "base"
+
+
+def test_the_name_of_the_processor(describe, monkeypatch):
+    describe(x86(HASWELL))
+    assert system.processor_name() == "A (R) processor @ 2.60GHz"
+    monkeypatch.setattr(system, "CPUINFO", "missing")
+    assert system.processor_name() == (platform.processor() or platform.machine())
+    assert system.described() == {} and not system.lacks_avx2()
+
+
+def test_a_processor_that_numpy_cannot_run_on_ends_in_a_line(describe, monkeypatch):
+    monkeypatch.setattr(os, "_exit", lambda code: pytest.fail("the command was run"))
+    describe(x86(CORE_2))
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == (
+        "Error: this processor has no SSE4.1, SSE4.2, POPCNT, and NumPy and onnxruntime need "
+        "x86-64-v2: use another machine; a virtual one needs the host's processor (-cpu host)"
+    )
+
+
+@pytest.mark.parametrize("text", [x86(NEHALEM), ARM, ""])
+def test_other_processors_go_on(describe, text):
+    describe(text)
+    system.check_processor()
+
+
+def test_the_small_ball_is_one():
+    """The network gives its distances, and each voxel's neighbours have the patches beside it."""
+    patches, table, voxels, offsets = small_ball()
+    assert patches.shape == table.shape == (624, 27) and len(voxels) == 624
+    there = table >= 0
+    middle = patches[:, 13]
+    np.testing.assert_array_equal(middle[table[there]], patches[there])
+    assert (np.abs(patches[~there]) >= 3).all() and (np.abs(middle) < 3).all()
+    values = load_network("fast")(patches, table, voxels, offsets)
+    centre = np.flatnonzero((offsets == 0).all(1))
+    np.testing.assert_allclose(values[:, centre[0]], middle, atol=0.1)
+
+
+def test_the_fingerprint_is_that_of_the_chosen_network_and_of_nothing_else(monkeypatch):
+    found = fingerprint_of("fast", "auto", "cpu")
+    assert found == fingerprint_of("fast", "int8", "cpu")
+    network = load_network("fast", device="cpu", threads=2)
+    assert found.digest == hashlib.sha256(network(*small_ball()).tobytes()).hexdigest()
+    assert found[1:] == ("cpu", system.processor_name(), "int8")
+    others = {
+        fingerprint_of(*name, "cpu").digest for name in [("fast", "float32"), ("base", "auto")]
+    }
+    assert len(others | {found.digest}) == 3
+    exact = Network.__call__
+    monkeypatch.setattr(Network, "__call__", lambda *given: exact(*given) * np.float32(1 + 2**-20))
+    assert fingerprint_of("fast", "auto", "cpu").digest != found.digest
+
+
+MB = 10**6
+
+
+@pytest.fixture
+def groups(tmp_path, monkeypatch):
+    """Write the files of control groups, by their paths below /sys/fs/cgroup."""
+
+    def write(own, files):
+        (tmp_path / "own").write_text(own)
+        for name, text in files.items():
+            path = tmp_path / "fs" / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(f"{text}\n")
+        monkeypatch.setattr(system, "GROUPS", tmp_path / "fs")
+        monkeypatch.setattr(system, "OWN", tmp_path / "own")
+
+    return write
+
+
+def group(name, most, taken, kept=0):
+    """Return a group's files, version 2."""
+    names = "memory.max", "memory.current", "memory.stat"
+    texts = most, taken, f"anon 5\ninactive_file {kept}\nactive_file 7"
+    return {f"{name}{file}": text for file, text in zip(names, texts)}
+
+
+def old_group(name, most, taken, kept):
+    """Return a group's files, version 1."""
+    names = "limit_in_bytes", "usage_in_bytes", "stat"
+    texts = most, taken, f"inactive_file 1\ntotal_inactive_file {kept}"
+    return {f"memory/{name}memory.{file}": text for file, text in zip(names, texts)}
+
+
+@pytest.mark.parametrize(
+    "own, files, want",
+    [
+        ("0::/", {}, None),
+        ("0::/", group("", "max", 5), None),
+        ("0::/", group("", 500 * MB, 450 * MB, 400 * MB), 450 * MB),
+        ("0::/", group("", 500 * MB, 600 * MB), 0),
+        ("0::/a/b", group("a/b/", "max", 9) | group("a/", 100, 30) | group("", 300, 250), 50),
+        ("0::/a/b", group("a/b/", 90, "what?") | group("a/", 100, 30), 70),
+        ("0::/not/mounted/here", group("", 100, 40), 60),
+        ("4:memory:/a\n1:cpu:/", old_group("a/", 100, 80, 70) | old_group("", 2**63, 90, 0), 90),
+        ("3:cpu,cpuacct:/\n4:memory:/gone\n0::/", old_group("", 100, 80, 0), 20),
+    ],
+)
+def test_memory_that_is_left(groups, own, files, want):
+    groups(own, files)
+    assert left_memory() == want
+
+
+def test_free_memory_is_what_the_group_leaves(groups):
+    groups("0::/", group("", 80 * MB, 70 * MB, 65 * MB))
+    assert memory.free_memory() == 75 * MB
+
+
+def test_without_control_groups_nothing_is_bounded(monkeypatch, tmp_path):
+    monkeypatch.setattr(system, "OWN", tmp_path / "none")
+    assert left_memory() is None and bound_of_cores() == float("inf")
+
+
+@pytest.mark.parametrize(
+    "own, files, want",
+    [
+        ("0::/", {"cpu.max": "max 100000"}, 8),
+        ("0::/", {"cpu.max": "150000 100000"}, 2),
+        ("0::/a", {"cpu.max": "300000 100000", "a/cpu.max": "10000 100000"}, 1),
+        ("2:cpu,cpuacct:/", {"cpu/cpu.cfs_quota_us": -1, "cpu/cpu.cfs_period_us": 100000}, 8),
+        ("2:cpu,cpuacct:/", {"cpu/cpu.cfs_quota_us": 300000, "cpu/cpu.cfs_period_us": 100000}, 3),
+    ],
+)
+def test_threads_are_cut_to_the_cores_that_are_left(groups, monkeypatch, own, files, want):
+    groups(own, files)
+    monkeypatch.setattr(resources, "cores_of_system", lambda: 8)
+    assert resources.count_cores() == want
+    assert resources.useful_threads(200) == resources.useful_threads(0) == want
+    assert resources.useful_threads(1) == 1
