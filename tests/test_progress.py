@@ -126,6 +126,9 @@ class EndlessSession:
     def get_overridable_initializers(self):
         return []
 
+    def get_session_options(self):
+        return SimpleNamespace(intra_op_num_threads=1)
+
     def run_with_iobinding(self, binding, options):
         self.at_begin()
         while not options.terminate:

@@ -73,9 +73,9 @@ __all__ = ["ort"]
 SHRINK = "memory.enable_memory_arena_shrinkage"
 SMALL = 20_000  # voxels ...
 SMALL_OUTPUT = 5_000_000  # ... and values of a run after which the arena is not shrunk
-# An optional fifth input of networks: the rows of the neighbour table per chunk. With fewer for each
-# core than this the cores wait for each other, with more what they gather leaves the cache. A GPU
-# waits between chunks, so it gets large ones: with 27 * 64 gathered floats a row, 113 MB.
+# An optional fifth input of networks: the rows of the neighbour table per chunk. With fewer a core
+# than this, cores wait for each other; with more, what they gather leaves the cache. A GPU waits
+# between chunks, so it gets large ones: with 27 * 64 gathered floats a row, 113 MB.
 CHUNK_INPUT, CORE_CHUNK, CPU_CHUNK, CUDA_CHUNK = "chunk", 512, 4096, 16384
 POLL_INTERVAL = 0.1  # seconds
 
