@@ -137,10 +137,7 @@ def convert_labels(
 
 
 def label_paths(target: str | Path, labels: list[int]) -> list[Path]:
-    """Return the file of each label: the target itself, if it can have parts.
-
-    OptionError if they are too many.
-    """
+    """Return the file of each label: the target itself, if it can have parts."""
     path = Path(target)
     if format_of(path).has_parts:
         return [path] * len(labels)

@@ -45,7 +45,7 @@ NODE_BYTES, CELL_BYTES = 14, 250
 
 @dataclass(frozen=True, eq=False)
 class LabelPiece:
-    """A piece of the mesh of a label; ``volume`` is its share of what all pieces enclose.
+    """A piece of the mesh of a label, and its share of the volume that all pieces enclose.
 
     Faces number the vertices of all pieces of the label so far.
     """
@@ -203,10 +203,7 @@ class Work:
     bands: list[Band]
 
     def plan(self) -> list[tuple[int, int]]:
-        """Return the planes of each slab, of few slabs that fit in memory.
-
-        OutOfMemoryError if not even slabs of one plane fit.
-        """
+        """Return the planes of each slab, of few slabs that fit in memory."""
         count = self.image.grid.shape[0]
         before = np.zeros(count + 1, np.int64)
         for band, box in zip(self.bands, self.image.boxes):
@@ -246,10 +243,7 @@ class Work:
     def pieces(
         self, planes: tuple[int, int], written: NDArray[np.int64], progress: Progress | None
     ) -> Iterator[LabelPiece]:
-        """Yield the meshes of labels in some planes.
-
-        ``written``, (L + 1,), has the vertices of each label so far; those here are added.
-        """
+        """Yield the meshes of labels in some planes, and count the vertices ``written`` of each."""
         grid = self.image.grid
         parts = self._parts(planes, progress)
         field = put_together(parts, next(parts)[1], grid.shape, self.factor, planes)

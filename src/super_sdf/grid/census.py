@@ -70,10 +70,9 @@ LEAST_JUMP = 0.3  # of the range of labels: so far some neighbours are apart
 
 @dataclass(frozen=True, eq=False)
 class Looked:
-    """What was looked at beside the surface.
+    """Samples (n, 5, 5, 5) round some beside the surface.
 
-    ``around`` (n, 5, 5, 5) are the samples round some that have one on the other side beside them,
-    ``cut`` (2,) the shares of samples that are, as their six neighbours, the lowest or highest.
+    ``cut`` (2,) are the shares that are, as their six neighbours, the lowest or the highest.
     """
 
     around: Floats
@@ -164,10 +163,7 @@ class Census:
         return self.numbers.low, self.numbers.high
 
     def border_shares(self) -> tuple[float, float, float]:
-        """Return the shares of the samples on the faces that are below 0, above 0, and the lowest.
-
-        One on an edge counts for each of its faces.
-        """
+        """Return the shares of the faces below 0, above 0, and at the lowest; edges count twice."""
         nx, ny, nz = map(int, self.shape)
         below, above, at_lowest = self.numbers.border.tolist()
         size = 2 * (nx * ny + ny * nz + nz * nx)
@@ -226,8 +222,7 @@ class Census:
     def are_labels(self) -> bool:
         """Whether values look like labels: whole numbers of which regions jump to others.
 
-        At the boundary of a region, a sample hardly ever lies between a lower and a higher
-        neighbour; those of images and distances do.
+        At a boundary, samples hardly ever lie between a lower and a higher neighbour.
         """
         planes = self._answers("labels")
         if not planes or None in planes:
@@ -309,12 +304,10 @@ def _ask_together(samples: SampleArray, questions: list[Question]) -> list[list[
 def _answer_all(
     works: list[Callable[..., Any]], slab: NDArray[Any], ranges: list[Ranges]
 ) -> list[list[Any]]:
-    """Return the answers to all questions about the ranges of some planes."""
     return [[work(slab[a:b], *more) for a, b, *more in mine] for work, mine in zip(works, ranges)]
 
 
 def _together(shape: Shape) -> int:
-    """Return how many planes are looked at together."""
     return max(TOGETHER // (shape[1] * shape[2]), 1)
 
 
@@ -325,7 +318,6 @@ def _numbers(shape: Shape) -> Question:
 
 
 def _numbers_of(planes: NDArray[Any], is_first: bool, is_last: bool) -> Numbers:
-    """Return the numbers of some planes, the first and the last of the grid perhaps."""
     number = int if planes.dtype.kind in "iu" else float  # floats do not tell large ones apart
     low, high, infinite = number(planes.min()), number(planes.max()), 0
     if not (is_finite := isfinite(low) and isfinite(high)):
@@ -359,10 +351,9 @@ def _patches(shape: Shape) -> Question:
 
 
 def _around_surface(slab: NDArray[Any], number: int) -> tuple[NDArray[Any], ...]:
-    """Return the samples round those that have one on the other side beside them.
+    """Return samples (n, 5, 5, 5) of the middle of five planes beside the surface, and ranks (n,).
 
-    ``slab`` has five planes; the samples are those of the middle one, which begins with sample
-    ``number``: (n,) ranks, (n, 5, 5, 5).
+    ``number`` is that of the first sample of the middle plane.
     """
     slab = np.asarray(slab)
     near = slab[1:4]
@@ -446,7 +437,6 @@ def _pairs(shape: Shape) -> Question:
 
 
 def _pairs_of(rows: slice, slab: NDArray[Any]) -> Floats:
-    """Return samples of some rows of the first of two planes with those beside them, (2, n)."""
     row = slab[0, rows]
     beside = slab[1, rows], slab[0, 1:][rows]
     parts = [np.stack([row, other]).reshape(2, -1) for other in beside]

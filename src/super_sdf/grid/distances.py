@@ -102,7 +102,6 @@ def by_kind(taken: Interpreted, census: Census, request: Request, notes: list[st
 
 
 def _in_another_unit(taken: Interpreted, census: Census, notes: list[str]) -> Interpreted | None:
-    """Return distances that only have another unit than the spacing, in the spacing's."""
     spacing, looked = taken.spacing, census.looked
     if not is_cubic(spacing):
         return None
@@ -151,16 +150,12 @@ def of_slope(
 
 
 def _cut_at(taken: Interpreted, evidence: Evidence) -> float:
-    """Return at how many voxels from the surface values are cut off; infinite if they are not.
-
-    Where the spacings differ, voxels are as long as the longest one.
-    """
+    """Return at how many of the longest spacings values are cut off; infinite if they are not."""
     low, high = _uncut(taken.extremes, evidence)
     return min(-low, high) / max(steps_of(taken.spacing))
 
 
 def _uncut(extremes: Extremes, evidence: Evidence) -> Extremes:
-    """Return where values are cut off: infinite where they are not."""
     low, high = extremes
     return (low if evidence.cut_low else -np.inf), (high if evidence.cut_high else np.inf)
 
@@ -168,7 +163,6 @@ def _uncut(extremes: Extremes, evidence: Evidence) -> Extremes:
 def _truncated(
     taken: Interpreted, evidence: Evidence, request: Request, notes: list[str]
 ) -> Interpreted:
-    """Return truncated distances, the missing ones filled in if that helps."""
     at, (low, high) = _cut_at(taken, evidence), _uncut(taken.extremes, evidence)
     exact = (-high, -low) if taken.positive_inside else (low, high)
     field = Field(TRUNCATED, request.wanted.field == TRUNCATED, exact, evidence=evidence.report())
@@ -189,7 +183,6 @@ def _truncated(
 def _projective(
     taken: Interpreted, evidence: Evidence, request: Request, notes: list[str]
 ) -> Interpreted:
-    """Return values of uneven slope, as fused depth images have: their spline has the surface."""
     notes.append(
         "values taken as truncated (--field truncated), and none as exact, since their slope is "
         "uneven, as that of fused depth images: the surface is that of their cubic spline"

@@ -251,10 +251,9 @@ def weigh(looked: Looked, spacing: Triple) -> Evidence:
 
 
 def _known_slopes(lines: Floats, third: Floats, fourth: Floats) -> tuple[float, float]:
-    """Return the typical slope of lines (n, 3, 5), and how it changes away from the surface.
+    """Return the typical slope of lines (n, 3, 5), NaN if few tell, and how it changes farther off.
 
-    Slopes are exact but for fifth derivatives, and known where third and fourth differences (n, 3)
-    are small: no kink is among the samples. The first is NaN if too few are known.
+    Slopes are known where third and fourth differences (n, 3) are small: no kink is near.
     """
     a, b, middle, d, e = np.moveaxis(lines, -1, 0)
     slope = np.sqrt((((8 * (d - b) - (e - a)) / 12) ** 2).sum(1))
@@ -269,10 +268,9 @@ def _known_slopes(lines: Floats, third: Floats, fourth: Floats) -> tuple[float, 
 
 
 def _contradict(around: Floats, steps: Floats, noise: float) -> BoolArray:
-    """Return which samples differ from several others by more than distances can, (n,).
+    """Return which samples (n,) differ from several round them by more than distances can.
 
-    ``around`` (n, 5, 5, 5) has each sample in the middle, ``steps`` are the spacings, and ``noise``
-    is its standard deviation, all in the largest spacing. Rounding explains its last digit.
+    Lengths are in the largest spacing; ``noise`` is a standard deviation.
     """
     matters = MATTERS * min(steps)
     boxes = np.clip(around.reshape(len(around), 5**3), -matters, matters)
@@ -286,10 +284,10 @@ def _contradict(around: Floats, steps: Floats, noise: float) -> BoolArray:
 
 
 def slope_within(looked: Looked, spacing: Triple) -> float:
-    """Return the typical slope between a sample and its neighbours, none of them cut off.
+    """Return the typical slope between samples none of which is cut off; NaN if too few tell.
 
-    Of the pairs beside the surface, the steepest along an axis gives the slope. It is NaN if there
-    are too few samples that change along all axes: those may all be at corners.
+    Of the pairs beside the surface, the steepest along an axis gives the slope; samples that do not
+    change along all axes may all be at corners.
     """
     low, high = looked.extremes
     line = looked.lines[..., 1:4]
@@ -303,8 +301,8 @@ def slope_within(looked: Looked, spacing: Triple) -> float:
 def is_projective(looked: Looked, spacing: Triple) -> bool:
     """Return whether values that are cut off were measured along lines of sight.
 
-    So are the fused depth images of a scan: beside the surface their slope is that of a distance
-    only where it was seen straight on, whatever their unit.
+    Beside the surface the slope of fused depth images is that of a distance only where it was seen
+    straight on, whatever their unit.
     """
     if not looked.is_cut.any():
         return False
@@ -319,7 +317,6 @@ def is_projective(looked: Looked, spacing: Triple) -> bool:
 
 
 def _are_whole(lines: Floats, looked: Looked) -> BoolArray:
-    """Return of which lines, (n, 3, m), no sample is cut off, (n,)."""
     ends = zip(looked.extremes, looked.is_cut, (-1, 1))
     low, high = (end if is_cut else sign * np.inf for end, is_cut, sign in ends)
     return np.asarray(((lines > low) & (lines < high)).all((1, 2)))

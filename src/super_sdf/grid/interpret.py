@@ -46,10 +46,7 @@ STEP, STEP_TAIL = 0.85, 0.05
 def interpret(
     samples: SampleArray, wanted: ReadOptions, spacing: ArrayLike | None, notes: list[str]
 ) -> Interpreted:
-    """Return distances for the values of a grid; ``notes`` gets sentences on what was inferred.
-
-    GridError if the values have no surface, or contradict the spacing.
-    """
+    """Return distances for the values of a grid; ``notes`` gets sentences on what was inferred."""
     request = Request(wanted, None if spacing is None else check_spacing(spacing), wanted.inside)
     check_kind(samples.dtype, samples.shape)
     if wanted.label is not None:
@@ -79,7 +76,6 @@ def _interpreted(
     request: Request,
     notes: list[str],
 ) -> Interpreted:
-    """Return the distances of samples that are all known."""
     wanted, (low, high) = request.wanted, census.extremes
     if low == high:
         raise GridError(f"every value is {low:.6g}: a constant field has no surface")
@@ -102,7 +98,6 @@ def _interpreted(
 
 
 def _of_bools(census: Census, request: Request, notes: list[str]) -> Interpreted:
-    """Return the distances of samples that are true or false."""
     low, high = census.extremes
     if low == high:
         raise GridError(f"every value is {bool(low)}: a constant field has no surface")
@@ -125,7 +120,6 @@ def _about_zero(
 
 
 def _no_level(given: SampleArray, wanted: ReadOptions, low: float, high: float) -> GridError:
-    """Return the error for a level that no value is above, or none below."""
     level = float(wanted.level or 0)
     low, high = (x / (wanted.scale or 1) + level for x in (low, high))
     return GridError(
@@ -159,7 +153,6 @@ def _known(
 def _by_evidence(
     samples: SampleArray, census: Census, request: Request, notes: list[str]
 ) -> Interpreted:
-    """Return distances for values that are no mask at first sight, by what the samples show."""
     looked = census.looked
     if request.is_auto and request.is_density and _is_step(looked):
         notes.append("the densities jump from one side of the level to the other")
@@ -210,10 +203,7 @@ def as_sample(label: int, dtype: np.dtype[Any]) -> Any:
 
 
 def _is_step(looked: Looked) -> bool:
-    """Return whether densities jump over the level from sample to sample, with no ramp between.
-
-    Then where the surface lies between two samples does not show in their values.
-    """
+    """Return whether densities jump over the level from sample to sample, with no ramp between."""
     pairs = np.stack([looked.lines[..., 1:3], looked.lines[..., 2:4]]).reshape(-1, 2)
     across: NDArray[np.float64] = pairs[(pairs[:, 0] > 0) != (pairs[:, 1] > 0)]
     if len(across) < ENOUGH:
@@ -225,10 +215,9 @@ def _is_step(looked: Looked) -> bool:
 def _of_signs(
     samples: SampleArray, census: Census, request: Request, notes: list[str], zeros: int = 0
 ) -> Interpreted:
-    """Return the distances of the mask that the signs of numbers make.
+    """Return the distances of the mask that the signs make; 0 is on the side ``zeros``.
 
-    Samples that are 0 have the sign ``zeros``; if that is 0, that of the one side or, of both
-    sides, that of the inside.
+    If that is 0, it is on the one side or, of both sides, on the inside.
     """
     low, high = census.extremes
     if low > 0 or high < 0:
@@ -250,9 +239,8 @@ def _above(samples: SampleArray, level: float) -> SampleArray:
 
 
 def _of_mask(mask: SampleArray, lower: float, request: Request, notes: list[str]) -> Interpreted:
-    """Return the distances of a mask, which says on which side of a level each sample is.
+    """Return the distances, on its lattice, of which samples are on the upper side of a level.
 
-    They are distances on its lattice, whatever the spacings: a mask shows none in the world.
     ``lower`` is the share of the grid's border that is on the lower side.
     """
     positive = request.inside == "positive"

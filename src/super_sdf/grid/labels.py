@@ -35,7 +35,7 @@ class PartOfPlanes(SamplePlanes):
         self.shape, self.dtype = tuple(s.stop - s.start for s in box), np.dtype(source.dtype)
 
     def read(self, first: int, last: int) -> NDArray[Any]:
-        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
+        """Return planes ``first`` to ``last`` (exclusive)."""
         start = self.box[0].start
         planes: NDArray[Any] = np.asarray(self.source[start + first : start + last])
         return planes[:, self.box[1], self.box[2]]
@@ -43,18 +43,10 @@ class PartOfPlanes(SamplePlanes):
 
 @dataclass(frozen=True, eq=False)
 class LabelImage:
-    """Samples with labels, of which some are to be meshed.
+    """Samples with labels, of which some are to be meshed, and their place, without samples.
 
-    Attributes
-    ----------
-    samples : array or SamplePlanes
-        The label of each sample.
-    labels : (L,) array
-        Those to be meshed, in ascending order, in the type of the samples.
-    boxes : list of L + 1 boxes
-        The samples on which each of them depends; first, those of what is beside all of them.
-    grid : SdfGrid
-        Their place in the world, without samples.
+    ``labels`` (L,) ascend. ``boxes`` are L + 1 parts of the grid: those on which what is beside all
+    labels depends, and then each label.
     """
 
     samples: SampleArray
@@ -83,10 +75,7 @@ class LabelImage:
         return [int(label) for label in self.labels]
 
     def border(self, planes: tuple[int, int]) -> IntArray:
-        """Return the samples on the grid's border in some planes, and the number of their label.
-
-        The result is (b, 4) int32; numbers are those of ``mask``.
-        """
+        """Return indices of border samples in some planes and the number of their mask, (b, 4)."""
         parts = [np.empty((0, 4), np.int64)]
         for plane in range(*planes):
             some = np.ones(self.grid.shape[1:], bool)
@@ -107,15 +96,7 @@ def make_labels(
     direction: ArrayLike | None = None,
     notes: tuple[str, ...] = (),
 ) -> LabelImage:
-    """Return the label image of an array; the parameters are those of ``reconstruct_labels``.
-
-    Raises
-    ------
-    GridError
-        If the values are no whole numbers, or a label is missing.
-    OptionError
-        If ``labels`` are no labels, or too many.
-    """
+    """Return the label image of an array; the parameters are those of ``reconstruct_labels``."""
     wanted = check_labels(labels)
     given = placed(values, spacing, origin)
     samples = as_samples(given.values)
@@ -155,13 +136,7 @@ def _box(low: list[int], high: list[int]) -> Box:
 
 
 def check_labels(labels: Any) -> str | list[int]:
-    """Return labels in ascending order, each once; "all" for all.
-
-    Raises
-    ------
-    OptionError
-        If they are none, or too many.
-    """
+    """Return labels in ascending order, each once; "all" for all."""
     if isinstance(labels, str) and labels == ALL:
         return ALL
     if isinstance(labels, (str, bytes)) or not hasattr(labels, "__iter__"):
@@ -176,11 +151,6 @@ def find_labels(samples: SampleArray, wanted: list[int] | None) -> dict[Any, NDA
     """Return the box of each label, (2, 3) lowest and highest indices, by its sample, in order.
 
     ``wanted`` are some labels; None are all but 0. The samples are read once.
-
-    Raises
-    ------
-    GridError
-        If one is missing, or if there are none or too many.
     """
     keep = [as_sample(label, samples.dtype) for label in wanted or ()]
     listed = np.array([value for value in keep if value is not None], samples.dtype)
@@ -223,7 +193,6 @@ def _runs(plane: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.intp], NDArray[
 
 
 def _check_whole(values: NDArray[Any]) -> None:
-    """Raise GridError if a value is no whole number."""
     if values.dtype.kind != "f":
         return
     wrong = values[(np.rint(values) != values) | ~np.isfinite(values)]

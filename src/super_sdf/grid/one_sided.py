@@ -46,10 +46,7 @@ UNSIGNED = "unsigned distances have no inside"
 
 
 def find_fault(census: Census, spacing: Triple) -> str:
-    """Return why values on one side of 0 cannot be distances to a thin solid; empty if they can.
-
-    ``spacing`` is that of each axis; the fault is ``FAR``, ``BEYOND`` or ``UNSIGNED``.
-    """
+    """Return why values on one side of 0 are no distances to a thin solid; empty if they can be."""
     extremes, values = census.extremes, census.samples
     steps = np.array(spacing) / max(spacing)
     scale = (1 if extremes[0] >= 0 else -1) / max(spacing)
@@ -82,11 +79,7 @@ class Walls(NamedTuple):
 
 
 def _look_near_walls(values: SampleArray, scale: float, steps: Floats) -> Walls:
-    """Return what lies near 0, reading each plane once.
-
-    ``scale`` is the factor of the values to spacings, positive outside; ``steps`` are the spacings
-    of the axes, over the coarsest.
-    """
+    """Return what lies near 0, reading each plane once; ``scale`` makes outside positive."""
     nth = 1
     while np.prod([-(-count // nth) for count in values.shape], dtype=float) > MOST_FLOODED:
         nth += 1
@@ -118,7 +111,6 @@ def _look_near_walls(values: SampleArray, scale: float, steps: Floats) -> Walls:
 
 
 def _patches_near(slab: Floats, limit: float) -> list[Floats]:
-    """Return the patches of some inner samples near 0 of the middle one of three planes."""
     inner = slab[1, 1:-1, 1:-1]
     near = np.flatnonzero(inner <= limit)
     if not len(near):
@@ -146,7 +138,6 @@ def find_walls(lines: Floats) -> tuple[BoolArray, Floats]:
 
 
 def _are_distances(patches: Floats, steps: Floats) -> bool:
-    """Return whether most samples change by no more than distances can."""
     change = np.abs(patches - patches[:, CENTRE, None])
     most = LIPSCHITZ * np.linalg.norm(NEIGHBOURHOOD * steps, axis=1) + NO_THICKNESS
     return bool((change <= most).all(1).mean() >= LIPSCHITZ_SHARE)
@@ -155,8 +146,8 @@ def _are_distances(patches: Floats, steps: Floats) -> bool:
 def _touch_walls(patches: Floats, steps: Floats) -> bool:
     """Return whether most samples' spheres touch a point that lies in none of the others.
 
-    The direction to it is that in which the field falls, measured on the far side of each sample:
-    on the near side there may be the wall.
+    The field falls towards it, measured on the far side of each sample: on the near side there may
+    be the wall.
     """
     centre = patches[:, CENTRE, None]
     after, before = patches[:, CENTRE + STRIDES], patches[:, CENTRE - STRIDES]

@@ -22,10 +22,10 @@ RUN_BYTES = 32  # per sample of a plane, to number its runs
 class Regions:
     """Regions of marked samples, and of which sides the others beside them are.
 
-    ``planes`` yields what ``runs_of_plane`` returns of each plane. ``before`` (nx + 1,) are the
-    runs before each plane, and in all. Of each run, (n,), are ``start``, its first sample in C
-    order, ``size``, its length, and ``root``, the first run of its region; and whether this has
-    ``positive`` known samples beside it, ``negative`` ones or 0, and both or none (``unsure``).
+    ``planes`` are those of ``runs_of_plane``; ``before`` (nx + 1,) counts their runs. Of each run
+    are ``start``, its first sample in C order, ``size``, and ``root``, the first run of its region;
+    and whether this has ``positive`` samples beside it, ``negative`` ones or 0, and both or none
+    (``unsure``).
     """
 
     def __init__(
@@ -62,7 +62,6 @@ class Regions:
         return _numbered(marked, int(self.before[i]))
 
     def _has(self, runs: Ints) -> BoolArray:
-        """Return which runs are in the region of one of some runs."""
         has = np.zeros(len(self.root), bool)
         has[self.root[runs]] = True
         return has[self.root]
@@ -81,7 +80,7 @@ def runs_of_plane(is_marked: IsMarked, slab: NDArray[Any]) -> tuple[Any, ...] | 
 
     They are the number of runs of the plane before; start and size of the plane's; pairs that
     touch, (2, n); and those beside positive samples and others. Runs are counted from the first of
-    the plane before. None if no sample is marked in both planes.
+    the plane before. None if no sample is NaN in both planes.
     """
     plane = slab[-1]
     if is_marked is np.isnan and not _has_nan(slab):
@@ -106,7 +105,6 @@ def _has_nan(slab: NDArray[Any]) -> bool:
 
 
 def _begins(marked: BoolArray) -> BoolArray:
-    """Return where runs begin along the rows of a plane."""
     begins = marked.copy()
     begins[:, 1:] &= ~marked[:, :-1]
     return begins

@@ -157,7 +157,6 @@ def _measure(everywhere: Gradients, beside: Gradients) -> float:
 
 
 def _infer_spacing(measured: float, shape: tuple[int, ...], notes: list[str]) -> Triple:
-    """Return the measured spacing, or a usual one close to it."""
     if not LEAST_SPACING <= measured <= MOST_SPACING:
         raise GridError(
             f"spacing not given: the values change by {measured:.6g} from sample to sample; give "
@@ -202,16 +201,11 @@ def _check_unit(census: Census, spacing: Triple, notes: list[str], is_cut: bool)
 
 
 def _agree(measured: float, h: float) -> bool:
-    """Return whether the values change by about as much as the spacing."""
     return h / TOLERATED <= measured <= h * TOLERATED
 
 
 def way_out(census: Census, spacing: Triple | None = None, fault: str = UNSIGNED) -> str:
-    """Return a clause that names the option to try next for values that are refused.
-
-    ``spacing`` is that of each axis, if it is given; ``fault`` that of distances on one side of 0,
-    see ``one_sided.find_fault``.
-    """
+    """Return a clause that names the option to try next for values that are refused."""
     if census.are_labels:
         return choose_label(census.samples)
     steps = _steps(census)

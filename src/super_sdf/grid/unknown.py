@@ -76,7 +76,7 @@ class KnownPlanes(SamplePlanes):
         return UnseenPlanes(self.source, self.regions) if self.beside else None
 
     def read(self, first: int, last: int) -> NDArray[Any]:
-        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
+        """Return planes ``first`` to ``last`` (exclusive)."""
         start, stop = max(first - self.beside, 0), min(last + self.beside, len(self))
         planes = np.array(self.source[start:stop])
         low, high = self.limits
@@ -98,7 +98,6 @@ class KnownPlanes(SamplePlanes):
 
 
 def _continued(planes: NDArray[Any], limits: Extremes) -> NDArray[Any]:
-    """Return planes in which samples are continued linearly over ``LAYERS`` that are NaN."""
     for _ in range(LAYERS if np.isnan(planes).any() else 0):
         total, count = np.zeros(planes.shape), np.zeros(planes.shape, np.int8)
         for axis in range(3):
@@ -123,7 +122,7 @@ class UnseenPlanes(SamplePlanes):
         self.source, self.regions, self.shape = source, regions, tuple(source.shape)
 
     def read(self, first: int, last: int) -> BoolArray:
-        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
+        """Return planes ``first`` to ``last`` (exclusive)."""
         planes = np.isnan(self.source[first:last])
         for i, unknown in enumerate(planes, first):
             unknown[unknown] = self.regions.unsure[self.regions.runs_of(i, unknown)[unknown]]
@@ -155,7 +154,7 @@ class SeenPlanes(SamplePlanes):
         self.shape = tuple(source.shape)
 
     def read(self, first: int, last: int) -> NDArray[Any]:
-        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
+        """Return planes ``first`` to ``last`` (exclusive)."""
         planes = np.array(self.source[first:last], np.float64)
         for i, plane in enumerate(planes, first):
             marked = self.regions.is_marked(plane)
@@ -169,10 +168,7 @@ class SeenPlanes(SamplePlanes):
 
 
 def filled(census: Census, notes: list[str]) -> KnownPlanes:
-    """Return samples of which the unknown ones are replaced, and say so in the notes.
-
-    GridError if no sample is known, or one that is infinite is beside the surface.
-    """
+    """Return samples of which the unknown ones are replaced, and say so in the notes."""
     samples, numbers, regions = census.samples, census.numbers, census.unknown
     low, high = finite_extremes(census)
     nan = int(regions.size.sum())
@@ -283,10 +279,7 @@ def _least_steep(pairs: Floats, ordered: Floats, has: BoolArray, extreme: BoolAr
 
 
 def _is_cut_near(pairs: Floats, value: float, steepest: float, extremes: Extremes) -> bool:
-    """Return whether the sign changes from one extreme to the other, and others are near a value.
-
-    So it does where values are cut off near the surface, or what is unseen was filled in by hand.
-    """
+    """Return whether the sign changes between the extremes, and others are near a value."""
     crossing = pairs[:, (pairs[0] > 0) != (pairs[1] > 0)]
     others = pairs[~_are_any(pairs, extremes)]
     near = np.abs(others - value).min(initial=np.inf) < JUMP * steepest
@@ -306,7 +299,6 @@ def _steepest(pairs: Floats, value: float, extremes: Extremes) -> float:
 
 
 def _check_jumps(census: Census, value: float, count: int, limit: float) -> None:
-    """Raise GridError if the sign changes mostly by jumps from where values are cut off."""
     pairs = census.pairs[:, (census.pairs[0] > 0) != (census.pairs[1] > 0)]
     jumps = _are_jumps(pairs, limit, census.extremes) & (pairs == value).any(0)
     if jumps.mean() > MIXED and jumps.sum() >= LEAST_JUMPS:
@@ -317,7 +309,6 @@ def _check_jumps(census: Census, value: float, count: int, limit: float) -> None
 
 
 def _are_any(values: Floats, some: tuple[float, ...]) -> BoolArray:
-    """Return which values are one of some."""
     are_any = np.zeros(values.shape, bool)
     for one in some:
         are_any |= values == one
