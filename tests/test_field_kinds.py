@@ -15,13 +15,14 @@ from super_sdf.errors import GridError, OptionError, OutOfMemoryError
 from super_sdf.grid import planes
 from super_sdf.grid.census import Census
 from super_sdf.grid.derived import fill_in, local_slopes, mask_distances, mask_planes
-from super_sdf.grid.field import FIELDS, weigh
+from super_sdf.grid.field import weigh
 from super_sdf.grid.planes import reading_bytes
 from super_sdf.grid.transforms import find_transform
 from super_sdf.machine import memory
 from super_sdf.machine.resources import Resources
 from super_sdf.mesh import join_meshes
 from super_sdf.network.network import network_for, shipped_models
+from super_sdf.options import FIELDS
 from super_sdf.pipeline import reconstruct_slabs
 from super_sdf.slabs import preparing
 from super_sdf.slabs.cutting import cut

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from super_sdf.errors import GridError
 from super_sdf.grid.census import Census
-from super_sdf.grid.one_sided import BEYOND, FAR, find_walls
+from super_sdf.grid.refusals import BEYOND, FAR, find_walls
 from super_sdf.grid.sdf_grid import make_grid
 
 N = 32
@@ -128,7 +128,7 @@ def test_thickness_is_what_the_distances_leave(thickness, shift, axis):
 def test_large_unsigned_fields_are_told_from_fewer_samples(monkeypatch):
     x, y, z = (np.arange(64, dtype=np.float32) - 31.3)[:, None, None], *np.ogrid[:64, :64]
     values = np.abs(np.sqrt(x**2 + (y - 32) ** 2 + (z - 32) ** 2) - 20)
-    monkeypatch.setattr("super_sdf.grid.one_sided.MOST_FLOODED", values.size // 5)
+    monkeypatch.setattr("super_sdf.grid.refusals.MOST_FLOODED", values.size // 5)
     with pytest.raises(GridError, match="unsigned distances have no inside: mesh the shell"):
         make_grid(values, spacing=1)
 

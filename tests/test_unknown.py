@@ -21,10 +21,10 @@ from super_sdf import (
 )
 from super_sdf.errors import GridError
 from super_sdf.grid.census import Census
-from super_sdf.grid.field import FIELDS
 from super_sdf.grid.regions import components
 from super_sdf.grid.unknown import filled
 from super_sdf.mesh import join_meshes
+from super_sdf.options import FIELDS
 
 FACES = ndimage.generate_binary_structure(3, 1)
 

@@ -20,7 +20,6 @@ from numpy.typing import ArrayLike, NDArray
 from .arrays import IntArray
 from .errors import OptionError, OutOfMemoryError, seen
 from .files.grids import read_array
-from .grid.field import MASK
 from .grid.labels import ALL, LabelImage, check_labels, make_labels
 from .machine.index_width import check_count
 from .machine.memory import advised, give_back, held_memory, in_words
@@ -29,7 +28,7 @@ from .mesh import Mesh, join_meshes, vertex_type
 from .neighbourhood import CENTRE
 from .network.decoder import Adapter, Decoder, adapt
 from .network.network import network_for
-from .options import check_factor, check_max_memory, check_network, check_progress
+from .options import MASK, check_factor, check_max_memory, check_network, check_progress
 from .pipeline import refine
 from .progress import Progress, StepCounter, part_of
 from .slabs.cutting import Slab, equal_parts, slab_bytes, slab_of

@@ -23,15 +23,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import BoolArray, Triple
-from ..options import AUTO as AUTO
-from ..options import EXACT as EXACT
-from ..options import FIELDS as FIELDS
-from ..options import MASK as MASK
-from ..options import NOISY as NOISY
-from ..options import SCALED as SCALED
-from ..options import TRUNCATED as TRUNCATED
-from ..options import ReadOptions
-from .census import BESIDE, Extremes, Looked
+from ..options import EXACT, ReadOptions
+from .census import BESIDE, Census, Extremes, Looked
 from .placement import check_spacing, steps_of
 from .planes import SampleArray, changed
 from .slopes import BENT as STRAIGHT
@@ -112,33 +105,31 @@ class Field:
         return {"kind": self.kind, "given": self.given, **self.evidence}
 
 
-class Request(NamedTuple):
-    """What the user says of the values, checked; the spacing is None if it is unknown."""
+@dataclass(frozen=True, eq=False)
+class Case:
+    """Samples, what they show, what the user says of them, and sentences on what is inferred.
 
+    What is near unknown samples may be continued, which shows nothing: see ``census``. The spacing
+    is None if it is unknown.
+    """
+
+    samples: SampleArray
+    census: Census
     wanted: ReadOptions
     spacing: Triple | None
-    inside: str
-
-    @property
-    def is_auto(self) -> bool:
-        """Whether the samples are to show what the values are."""
-        return self.wanted.field == AUTO
+    notes: list[str]
 
     @property
     def is_density(self) -> bool:
         """Whether the values are densities, from which a level was taken."""
         return self.wanted.level is not None
 
-    def above_is_inside(self) -> Request:
-        """Return the request with what is above a level inside, unless the user says otherwise."""
-        return self._replace(inside="positive") if self.inside == AUTO else self
-
-    def with_spacing(self, spacing: float, why: str, notes: list[str]) -> Request:
-        """Return the request with a spacing if none is given, and why in a note."""
+    def with_spacing(self, spacing: float, why: str) -> Triple:
+        """Return the spacing that is given, else one that is taken, and why in a note."""
         if self.spacing is not None:
-            return self
-        notes.append(f"spacing not given: taken as {spacing:.6g}, {why}")
-        return self._replace(spacing=check_spacing(spacing))
+            return self.spacing
+        self.notes.append(f"spacing not given: taken as {spacing:.6g}, {why}")
+        return check_spacing(spacing)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +169,11 @@ class Evidence(NamedTuple):
     cut_low: bool  # whether values are cut off at the lowest
     cut_high: bool
     digit: float  # the last one of the values: slopes are known no better
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether values are cut off."""
+        return self.cut_low or self.cut_high
 
     @property
     def is_scaled(self) -> bool:

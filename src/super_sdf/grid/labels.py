@@ -11,14 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import BoolArray, IntArray
 from ..errors import GridError, OptionError, seen
-from ..options import ReadOptions, check_label
+from ..options import MASK, check_label
 from .derived import REACH, extremes_of_masks, mask_planes
-from .field import MASK, NONE_EXACT, Field, Request
+from .field import NONE_EXACT, Field
 from .interpret import as_sample, labelled
 from .placement import as_samples, check_kind, check_spacing, is_cubic, placed
 from .planes import NoPlanes, SampleArray, SamplePlanes, changed
+from .refusals import MOST_NAMED
 from .sdf_grid import SdfGrid
-from .spacing import MOST_NAMED
 
 ALL = "all"
 MOST_LABELS = 1000  # more values than these are densities
@@ -104,9 +104,9 @@ def make_labels(
     boxes = find_labels(samples, None if isinstance(wanted, str) else wanted)
     added: list[str] = []
     steps = None if given.spacing is None else check_spacing(given.spacing)
-    request = Request(ReadOptions(), steps, "auto")
-    request = request.with_spacing(1, "since labels show none (give --spacing)", added)
-    assert request.spacing is not None
+    if steps is None:
+        added.append("spacing not given: taken as 1, since labels show none (give --spacing)")
+        steps = (1.0, 1.0, 1.0)
     if given.origin is None:
         added.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
     ends, shape = np.array(list(boxes.values())), np.array(samples.shape)
@@ -119,12 +119,12 @@ def make_labels(
     low, high = np.vstack([low.min(0), low]), np.vstack([high.max(0), high])
     grid = SdfGrid.trusted(
         NoPlanes(samples.shape, samples.dtype),
-        request.spacing,
+        steps,
         0.0 if given.origin is None else given.origin,
         (*notes, *added),
         direction=direction,
-        extremes=extremes_of_masks(min(request.spacing)),
-        field=Field(MASK, True, NONE_EXACT, on_lattice=not is_cubic(request.spacing)),
+        extremes=extremes_of_masks(min(steps)),
+        field=Field(MASK, True, NONE_EXACT, on_lattice=not is_cubic(steps)),
     )
     around = [_box(*pair) for pair in zip(low.tolist(), high.tolist())]
     return LabelImage(samples, np.array(list(boxes), samples.dtype), around, grid)
