@@ -107,6 +107,7 @@ class SamplePlanes(ABC):
 
     ndim = 3
     travels = False  # whether another process can read the samples for itself
+    beside = 0  # planes to either side on which those that are made depend
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     name: str
@@ -135,7 +136,7 @@ class SamplePlanes(ABC):
     @property
     def block(self) -> int:
         """Planes that are made at a time when iterating over all."""
-        return max(BLOCK_BYTES // self.plane_bytes, 1)
+        return max(BLOCK_BYTES // self.plane_bytes, 2 * self.beside, 1)
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
         for first in range(0, len(self), self.block):
@@ -314,11 +315,6 @@ class DerivedPlanes(SamplePlanes):
         self.source, self.make, self.beside = source, make, beside
         self.unit, self.each = unit, each
         self.shape, self.dtype = tuple(source.shape), np.dtype(dtype)
-
-    @property
-    def block(self) -> int:
-        """Planes that are made at a time: more, if each needs some beside it."""
-        return max(super().block, 2 * self.beside)
 
     def over(
         self, samples: SamplePlanes, work: Callable[..., Result], ranges: Ranges

@@ -59,11 +59,6 @@ class KnownPlanes(SamplePlanes):
         self.beside = 2 * LAYERS if regions.unsure.any() else 0
 
     @property
-    def block(self) -> int:
-        """Planes that are made at a time: more, if each needs some beside it."""
-        return max(super().block, 2 * self.beside)
-
-    @property
     def not_continued(self) -> KnownPlanes:
         """The same without continuations, which say nothing of the field."""
         planes = KnownPlanes(self.source, self.regions, self.limits, self.outside)
