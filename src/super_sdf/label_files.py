@@ -23,8 +23,7 @@ from .files.meshes import (
 from .files.output import check_apart, naming
 from .files.regular import files_of
 from .files.volume import PLACE
-from .grid.labels import ALL
-from .labels import LabelPiece, find_image, label_slabs
+from .labels import ALL, LabelPiece, find_image, label_slabs
 from .mesh import Mesh
 from .network.decoder import Decoder
 from .options import LABELS, OPTIONS, ConvertOptions
