@@ -143,14 +143,6 @@ def test_chunks_change_nothing(monkeypatch):
         assert np.array_equal(cube_of(spacing).values, values)
 
 
-def test_axes_are_swapped_with_the_array():
-    """Resampling along x is resampling along z of the array in reverse order."""
-    values = sampled((1.0, 0.2, 0.2))
-    along_x = Resampled(values, (1.0, 0.2, 0.2), 0, 0.2).loaded
-    along_z = Resampled(values.T, (0.2, 0.2, 1.0), 2, 0.2).loaded
-    assert np.allclose(along_x, along_z.T, atol=1e-12)
-
-
 def test_places_start_on_the_first_sample_and_end_on_the_last():
     assert np.array_equal(new_places(3, 1.0, 0.5), [0, 0.5, 1, 1.5, 2])
     assert np.allclose(new_places(3, 1.5, 1.0), [0, 2 / 3, 4 / 3, 2])
@@ -225,11 +217,6 @@ def test_the_note_names_what_is_resampled():
         "the spacing differs between axes: the values are resampled along y from 0.6 and z from 1 "
         "to 0.4, the finest, to 25 x 19 x 26 samples"
     )
-
-
-def test_equal_spacings_are_not_resampled():
-    grid = make_grid(sampled((0.4, 0.4, 0.4)), spacing=(0.4, 0.4, 0.4003))
-    assert cubic_grid(grid) is grid
 
 
 def test_interpolated_values_do_not_make_a_noisy_field(network):

@@ -1,7 +1,5 @@
 """Masks, densities, truncated and scaled fields on grids whose spacings differ."""
 
-import json
-
 import nibabel
 import numpy as np
 import pytest
@@ -148,15 +146,6 @@ def test_a_second_run_and_a_saved_field_keep_the_spacings(tmp_path):
     write_field(field, tmp_path / "field.npz")
     want, mesh = extract_mesh(field), extract_mesh(read_field(tmp_path / "field.npz"))
     np.testing.assert_array_equal(mesh.vertices, want.vertices)
-
-
-def test_the_command_takes_a_label_image_with_thick_slices(tmp_path, command):
-    np.save(tmp_path / "labels.npy", np.where(two_parts() < 0, 3, 0))
-    words = "upsample", tmp_path / "labels.npy", tmp_path / "out.ply", "--label", "3", "--json"
-    code, out, _ = command(*map(str, words), "--spacing", "1,1,2.5")
-    report = json.loads(out)
-    assert code == 0 and report["spacing"] == [1, 1, 2.5] and report["closed"]
-    assert report["expected_triangles"] == pytest.approx(report["triangles"], rel=0.25)
 
 
 def test_a_label_image_with_thick_slices_is_at_its_place_in_the_world(tmp_path):

@@ -21,8 +21,6 @@ from super_sdf import (
 )
 from super_sdf.errors import GridError
 from super_sdf.grid.census import Census
-from super_sdf.grid.regions import components
-from super_sdf.grid.unknown import filled
 from super_sdf.mesh import join_meshes
 from super_sdf.options import FIELDS
 
@@ -48,11 +46,6 @@ def test_the_sides_of_regions_are_those_of_scipys_components():
                 runs = regions.runs_of(i, unknown[i])
                 np.testing.assert_array_equal(found[runs[unknown[i]]], want[i][unknown[i]])
         assert regions.size.sum() == unknown.sum()
-
-
-def test_components_join_whatever_the_order_of_the_pairs():
-    chain = np.array([[5, 3, 9, 1], [3, 9, 1, 7]])
-    np.testing.assert_array_equal(components(10, chain), [0, 1, 2, 1, 4, 1, 6, 1, 8, 1])
 
 
 @pytest.mark.parametrize("hollow", [np.nan, -np.inf])
@@ -300,12 +293,3 @@ def test_fused_depth_images_are_meshed_by_their_spline(unseen, scale):
     assert grid.field.kind == "truncated" and grid.field.is_uneven
     assert grid.field.exact == (0, 0) and "their slope is uneven" in grid.notes[-1]
     assert reconstruct(grid, trilinear, 2, cap=True).is_closed()
-
-
-def test_filling_in_reads_planes_one_by_one():
-    values = truncated()
-    values[0] = np.nan
-    notes: list[str] = []
-    planes = filled(Census(values), notes)
-    assert planes.shape == values.shape and planes.limits == (-2, 2)
-    assert (planes[0] == 2).all() and np.isnan(values[0]).all()

@@ -307,7 +307,7 @@ def _ask_together(samples: SampleArray, questions: list[Question]) -> list[list[
     """Return the answers to questions of samples, each plane of which is read once."""
     count, each = samples.shape[0], _planes_together(tuple(samples.shape))
     least = READ_SAMPLES // (samples.shape[1] * samples.shape[2])
-    step = each * -(-max(least, 2 * getattr(samples, "beside", 1)) // each)
+    step = each * -(-max(least, 2 * max(getattr(samples, "beside", 1), 1)) // each)
     ranges = []
     for first in range(0, count, step):
         low = max(first - BESIDE, 0)

@@ -82,10 +82,9 @@ def choose_spacing(
     GridError if the values change by more than the given spacing allows, or show none. Values that
     are cut off may change by less along an axis with a large spacing.
     """
-    beside, everywhere = census.beside, census.everywhere
     if given is not None:
-        notes = _check_given(census, given, is_cut) if len(beside.bend) else []
-        return given, notes
+        return given, _check_given(census, given, is_cut) if len(census.beside.bend) else []
+    beside, everywhere = census.beside, census.everywhere
     unequal = beside.of_axes or everywhere.of_axes
     agree = len(everywhere.bend) < ENOUGH or everywhere.agree_with(everywhere.typical_length)
     each = everywhere.spacing if unequal or not agree else None
@@ -193,9 +192,10 @@ def as_distances(case: Case, *, is_cut: bool = False) -> Interpreted:
     spacing, notes = choose_spacing(census, case.spacing, is_cut=is_cut)
     case.notes.extend(notes)
     if census.is_one_sided:  # if the user says which side is inside, there may be an offset
-        fault = UNSIGNED if is_density(census, spacing) else ""
         if case.wanted.inside == AUTO:
             fault = find_fault(census, steps_of(spacing))
+        else:
+            fault = UNSIGNED if is_density(census, spacing) else ""
         if fault:
             raise refusal(census, spacing, fault)
     field = Field(NOISY, exact=NONE_EXACT) if case.wanted.field == NOISY else Field()

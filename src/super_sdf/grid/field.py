@@ -65,40 +65,20 @@ STEEPEST, MOST_STEEP, FEW = 0.95, 1.07, 10
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """The kind of a field.
-
-    Attributes
-    ----------
-    kind : str
-        One of ``FIELDS``, but not "auto".
-    given : bool
-        Whether the user said so; otherwise the samples show it.
-    exact : two floats
-        Only samples between these, in world units, negative inside, may be exact distances.
-    smooth : array or Planes, optional
-        Of a scaled field: the values whose cubic spline has the surface, negative inside.
-    has_kinks : bool
-        Whether a scaled field is mostly a distance, so that the network may refine its kinks.
-    is_uneven : bool
-        Whether the slope of that field jumps, as that of fused depth images.
-    on_lattice : bool
-        Whether the values are distances on the lattice of the samples, in steps of the finest
-        spacing, and not in the world. Then no axis is resampled if the spacings differ.
-    evidence : dict
-        What the samples show, for ``--json``.
-    unseen : bool array or Planes, optional
-        Samples that are unknown and may hide the surface: it ends there, and cannot be closed.
-    """
+    """The kind of a field, one of ``FIELDS`` but "auto", and what follows from it."""
 
     kind: str = EXACT
-    given: bool = False
+    given: bool = False  # whether the user said so; otherwise the samples show it
+    # Only samples between these, in world units, negative inside, may be exact distances.
     exact: Extremes = (-np.inf, np.inf)
-    smooth: SampleArray | None = None
-    has_kinks: bool = False
-    is_uneven: bool = False
+    smooth: SampleArray | None = None  # values whose spline has the surface, negative inside
+    has_kinks: bool = False  # whether it is mostly a distance, of which a network refines kinks
+    is_uneven: bool = False  # whether its slope jumps, as that of fused depth images
+    # Whether the values are distances on the lattice of the samples, in steps of the finest
+    # spacing, and not in the world. Then no axis is resampled if the spacings differ.
     on_lattice: bool = False
-    evidence: dict[str, Any] = field(default_factory=dict)
-    unseen: SampleArray | None = None
+    evidence: dict[str, Any] = field(default_factory=dict)  # what the samples show, for ``--json``
+    unseen: SampleArray | None = None  # which may hide the surface: it ends there, and stays open
 
     def report(self) -> dict[str, Any]:
         """Return kind and evidence as a dictionary that can be written as JSON."""
