@@ -249,14 +249,6 @@ def test_the_size_of_the_mesh_is_estimated_on_the_lattice(network):
         assert len(reconstruct(grid, network).faces) == pytest.approx(triangles, rel=0.05)
 
 
-def test_thin_parts_without_a_sample_inside(network):
-    spacing = (0.4, 0.4, 0.6)
-    grid = make_grid(sampled(spacing, slab_of(3.31, 0.03, 3.27)), spacing=spacing)
-    assert grid.low > 0
-    mesh = reconstruct(grid, network)
-    assert len(mesh.faces) and mesh.is_closed()
-
-
 @pytest.mark.parametrize("spacing", SPACINGS)
 def test_unsigned_fields_are_refused(spacing):
     with pytest.raises(GridError, match="unsigned distances have no inside: mesh the shell"):

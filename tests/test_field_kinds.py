@@ -328,32 +328,20 @@ def test_samples_of_a_mask_keep_their_side(network):
     assert reconstruct(grid, network).is_closed()
 
 
-def test_a_network_of_the_package_is_replaced_for_masks():
-    network = load_network("fast", device="cpu", threads=1)
-    assert network_for(network, "exact") is network
-    assert network_for(trilinear, "mask") is trilinear
-    found = network_for(network, "mask")
-    assert found.card["inputs"] == "masks" and found.threads == network.threads
-    assert network_for(found, "mask") is found
-
-
 @pytest.mark.parametrize("precision", ["float32", "int8"])
-def test_a_network_for_exact_distances_is_replaced_where_they_are_noisy(precision):
+def test_a_network_of_the_package_is_replaced_by_that_for_the_kind(precision, tmp_path):
     network = load_network("base", device="cpu", threads=1, precision=precision)
-    assert network_for(network, "truncated") is network
-    found = network_for(network, "noisy")
-    assert found.card["name"].split("-")[0] == "noisy" and found.threads == network.threads
-    assert found.card.get("precision", "float32") == precision
-    assert network_for(found, "noisy") is found
+    assert network_for(network, "exact") is network_for(network, "truncated") is network
+    masks, noise = (network_for(network, kind) for kind in ("mask", "noisy"))
+    assert masks.card["inputs"] == "masks" and noise.card["name"].split("-")[0] == "noisy"
+    for kind, found in (("mask", masks), ("noisy", noise)):
+        assert found.threads == network.threads and network_for(found, kind) is found
+    assert noise.card.get("precision", "float32") == precision
     assert network_for(load_network("best", device="cpu"), "noisy").symmetries == 4
-
-
-def test_a_network_that_was_trained_on_noise_and_one_of_the_users_own_refine_it(tmp_path):
-    fast = load_network("fast", device="cpu", threads=1)
-    assert network_for(fast, "noisy") is fast
     own = shutil.copy(shipped_models()["base"], tmp_path / "own.onnx")
-    network = load_network(own, device="cpu", threads=1)
-    assert network_for(network, "noisy") is network
+    trained = load_network("fast", device="cpu")  # on noise, too
+    for kept in (trained, load_network(own, device="cpu"), trilinear):
+        assert network_for(kept, "noisy") is kept
 
 
 def test_the_network_for_masks_is_nearer_than_marching_cubes():

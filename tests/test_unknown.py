@@ -15,7 +15,6 @@ from super_sdf import (
     extract_mesh,
     load_network,
     make_grid,
-    read_grid,
     reconstruct,
     upsample,
 )
@@ -64,17 +63,6 @@ def test_unknown_far_samples_are_taken_as_cut_off_on_their_side(hollow):
         f"{limits[1]:.6g}"
     )
     assert grid.field.kind == "truncated" and reconstruct(grid, trilinear).is_closed()
-
-
-def test_the_mesh_is_that_of_the_grid_that_was_filled_in_by_hand(tmp_path):
-    known = truncated()
-    unknown = np.abs(known) >= 2
-    by_hand = np.clip(known, known[~unknown].min(), known[~unknown].max())
-    np.save(tmp_path / "grid.npy", np.where(unknown, np.nan, known))
-    grid = read_grid(tmp_path / "grid.npy", spacing=1.0, origin=0.0)
-    np.testing.assert_array_equal(grid.planes(9, 12), by_hand[9:12])
-    mesh, want = (reconstruct(g, trilinear) for g in (grid, make_grid(by_hand, **PLACE)))
-    np.testing.assert_array_equal(mesh.vertices, want.vertices)
 
 
 def test_densities_may_be_unknown_outside_what_was_seen():

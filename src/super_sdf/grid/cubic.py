@@ -34,7 +34,7 @@ from ..errors import GridError
 from ..neighbourhood import NEIGHBOURHOOD
 from .placement import EQUAL_SPACING
 from .planes import SampleArray, SamplePlanes
-from .sdf_grid import SdfGrid
+from .sdf_grid import SdfGrid, with_fields
 
 Floats = NDArray[np.float64]
 
@@ -65,17 +65,16 @@ def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
         )
     level = -offset if grid.positive_inside else offset
     samples, spacing = _resample(grid.samples, grid.spacing, level)
-    extremes = (-grid.high, -grid.low) if grid.positive_inside else (grid.low, grid.high)
-    return SdfGrid.trusted(
-        samples,
-        spacing,
-        grid.origin,
-        (*grid.notes, _describe_resampling(grid, samples.shape)),
-        direction=grid.direction,
-        positive_inside=grid.positive_inside,
-        extremes=extremes,
-        field=grid.field,
+    coarser = " and ".join(
+        f"{name} from {h:.6g}"
+        for name, h in zip("xyz", grid.spacing)
+        if h > grid.voxel_size * (1 + EQUAL_SPACING)
     )
+    note = (
+        f"the spacing differs between axes: the values are resampled along {coarser} to "
+        f"{grid.voxel_size:.6g}, the finest, to {' x '.join(map(str, samples.shape))} samples"
+    )
+    return with_fields(grid, samples=samples, spacing=spacing, notes=(*grid.notes, note))
 
 
 def check_has_offsets(grid: SdfGrid, offset: float) -> None:
@@ -88,19 +87,6 @@ def check_has_offsets(grid: SdfGrid, offset: float) -> None:
             "solid itself (--offset 0), sample the mesh (super-sdf sample), and mesh that grid "
             "with the offset"
         )
-
-
-def _describe_resampling(grid: SdfGrid, shape: tuple[int, ...]) -> str:
-    coarser = [
-        f"{name} from {h:.6g}"
-        for name, h in zip("xyz", grid.spacing)
-        if h > grid.voxel_size * (1 + EQUAL_SPACING)
-    ]
-    size = " x ".join(map(str, shape))
-    return (
-        f"the spacing differs between axes: the values are resampled along {' and '.join(coarser)} "
-        f"to {grid.voxel_size:.6g}, the finest, to {size} samples"
-    )
 
 
 def sampled_places(grid: SdfGrid) -> NDArray[np.intp]:
@@ -221,7 +207,9 @@ class Lines:
             if cell != before:
                 first = slopes[1] if cell == before + 1 else self.slope(cell)
                 before, slopes = cell, (first, self.slope(cell + 1))
-            smooth = _hermite(low, high, slopes[0] * self.h, slopes[1] * self.h, share)
+            rest, (rise, rise_after) = 1 - share, (slope * self.h for slope in slopes)
+            smooth = low * ((1 + 2 * share) * rest**2) + high * ((1 + 2 * rest) * share**2)
+            smooth = smooth + (rise * rest - rise_after * share) * (share * rest)
             values[n] = self._with_walls(cell, share, level, smooth)
             reach = near + share * self.h, near + (1 - share) * self.h
             is_near[n] = (np.abs(low - level) < reach[0]) & (np.abs(high - level) < reach[1])
@@ -300,13 +288,6 @@ class Lines:
                 np.fmin(high, sample + apart, out=high)
         kept: Floats = np.where(low <= high, np.clip(values, low, high), values)
         return kept
-
-
-def _hermite(low: Floats, high: Floats, rise: Floats, rise_after: Floats, share: float) -> Floats:
-    rest = 1 - share
-    ends = low * ((1 + 2 * share) * rest**2) + high * ((1 + 2 * rest) * share**2)
-    curve: Floats = ends + (rise * rest - rise_after * share) * (share * rest)
-    return curve
 
 
 def new_places(count: int, h: float, step: float) -> Floats:

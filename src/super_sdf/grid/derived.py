@@ -37,11 +37,7 @@ ROUNDS = 2
 RINGS = 2  # of samples amid a plateau that are raised, so that they lie beyond the band
 WITHIN = 1 - 1e-5  # share of the limit up to which a value is not cut off
 CHUNK = 1 << 14  # samples that are worked on at a time, so that they stay in the cache
-CUBES: Triple = (
-    1.0,
-    1.0,
-    1.0,
-)  # steps: spacings over the finest; the longest is a voxel
+CUBES: Triple = (1.0, 1.0, 1.0)  # steps: spacings over the finest; the longest is a voxel
 
 AROUND = 2  # samples to either side over which local slopes are averaged
 TYPICAL_ERROR = 0.1  # of a slope, relative: half the weight

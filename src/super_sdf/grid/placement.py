@@ -52,16 +52,17 @@ def as_triple(number: ArrayLike, name: str) -> Triple:
 def check_spacing(spacing: ArrayLike) -> Triple:
     """Return the spacing as three floats; GridError unless they are positive and within range."""
     triple = as_triple(spacing, "spacing")
+    said = f"spacing is {', '.join(f'{number:g}' for number in triple)}"
     if min(triple) <= 0:
-        raise GridError(f"spacing is {_join(triple)}: it must be greater than 0")
+        raise GridError(f"{said}: it must be greater than 0")
     if not LEAST_SPACING <= min(triple) <= max(triple) <= MOST_SPACING:
         raise GridError(
-            f"spacing is {_join(triple)}: give lengths in a unit in which it is between "
+            f"{said}: give lengths in a unit in which it is between "
             f"{LEAST_SPACING:g} and {MOST_SPACING:g}"
         )
     if max(triple) > min(triple) * MOST_UNEQUAL:
         raise GridError(
-            f"spacing is {_join(triple)}: the largest may be {MOST_UNEQUAL:g} times the smallest; "
+            f"{said}: the largest may be {MOST_UNEQUAL:g} times the smallest; "
             "leave out samples along the finer axes"
         )
     return triple
@@ -75,10 +76,6 @@ def is_cubic(spacing: Triple) -> bool:
 def steps_of(spacing: Triple) -> Triple:
     """Return the spacing of each axis, the mean if they are nearly equal."""
     return (sum(spacing) / 3,) * 3 if is_cubic(spacing) else spacing
-
-
-def _join(triple: tuple[float, ...]) -> str:
-    return ", ".join(f"{number:g}" for number in triple)
 
 
 def check_direction(direction: ArrayLike | None) -> Direction:

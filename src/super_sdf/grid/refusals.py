@@ -70,7 +70,10 @@ def find_fault(census: Census, spacing: Triple) -> str:
     patches, total, thin, coarse = _look_near_walls(values, scale, steps)
     if not len(patches):
         return BEYOND
-    if not (_are_distances(patches, steps) and _touch_walls(patches, steps)):
+    change = np.abs(patches - patches[:, CENTRE, None])
+    most = LIPSCHITZ * np.linalg.norm(NEIGHBOURHOOD * steps, axis=1) + NO_THICKNESS
+    are_distances = (change <= most).all(1).mean() >= LIPSCHITZ_SHARE
+    if not (are_distances and _touch_walls(patches, steps)):
         return UNSIGNED
     if len(thin) > UNSIGNED_SHARE * total:
         beyond = max(-float(np.quantile(thin, LEAST_THICKNESS)), 0.0)
@@ -148,12 +151,6 @@ def find_walls(lines: Floats) -> tuple[BoolArray, Floats]:
     thickness = slope - left - right
     walls = (falling > STEEP) & (rising > STEEP) & (thickness >= -STEEP * slope)
     return walls, thickness[walls]
-
-
-def _are_distances(patches: Floats, steps: Floats) -> bool:
-    change = np.abs(patches - patches[:, CENTRE, None])
-    most = LIPSCHITZ * np.linalg.norm(NEIGHBOURHOOD * steps, axis=1) + NO_THICKNESS
-    return bool((change <= most).all(1).mean() >= LIPSCHITZ_SHARE)
 
 
 def _touch_walls(patches: Floats, steps: Floats) -> bool:

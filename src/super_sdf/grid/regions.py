@@ -47,7 +47,10 @@ class Regions:
                 self.before[i + 1] += len(start)
         self.start, self.size, joined, *sides = (np.concatenate(x, axis=-1) for x in zip(*parts))
         self.root = components(len(self.start), joined)
-        self.positive, self.negative = (self._has(side) for side in sides)
+        has = np.zeros((2, len(self.root)), bool)
+        for row, side in zip(has, sides):
+            row[self.root[side]] = True
+        self.positive, self.negative = has[:, self.root]
         self.unsure: BoolArray = self.positive == self.negative
 
     @classmethod
@@ -60,11 +63,6 @@ class Regions:
     def runs_of(self, i: int, marked: BoolArray) -> Ints:
         """Return the run that each sample of plane ``i`` is in, (ny, nz); -1 for others."""
         return _numbered(marked, int(self.before[i]))
-
-    def _has(self, runs: Ints) -> BoolArray:
-        has = np.zeros(len(self.root), bool)
-        has[self.root[runs]] = True
-        return has[self.root]
 
 
 def with_the_one_before(samples: SampleArray) -> Iterator[NDArray[Any]]:
@@ -83,8 +81,10 @@ def runs_of_plane(is_marked: IsMarked, slab: NDArray[Any]) -> tuple[Any, ...] | 
     the plane before. None if no sample is NaN in both planes.
     """
     plane = slab[-1]
-    if is_marked is np.isnan and not _has_nan(slab):
-        return None
+    if is_marked is np.isnan:  # the sum of squares tells fastest
+        with np.errstate(over="ignore", under="ignore"):
+            if slab.dtype.kind != "f" or not np.isnan(np.vdot(slab, slab)):
+                return None
     marked = is_marked(slab)
     former = _begins(marked[0]).sum() if len(slab) > 1 else 0
     runs, start = _numbered(marked[-1], int(former)), np.flatnonzero(_begins(marked[-1]))
@@ -96,12 +96,6 @@ def runs_of_plane(is_marked: IsMarked, slab: NDArray[Any]) -> tuple[Any, ...] | 
     pairs, positive, negative = zip(*(_beside(*side) for side in sides))
     joined = np.concatenate(pairs, axis=1)
     return former, start, size, joined, np.concatenate(positive), np.concatenate(negative)
-
-
-def _has_nan(slab: NDArray[Any]) -> bool:
-    """Return whether a sample is NaN, by the sum of squares, which is the fastest."""
-    with np.errstate(over="ignore", under="ignore"):
-        return slab.dtype.kind == "f" and bool(np.isnan(np.vdot(slab, slab)))
 
 
 def _begins(marked: BoolArray) -> BoolArray:

@@ -145,7 +145,7 @@ class SdfGrid:
 
     def noted(self, notes: tuple[str, ...]) -> SdfGrid:
         """Return the same grid with more sentences on it, before those on what was inferred."""
-        return _with(self, notes=(*notes, *self.notes)) if notes else self
+        return with_fields(self, notes=(*notes, *self.notes)) if notes else self
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.shape))
@@ -314,7 +314,7 @@ def _checked(samples: SampleArray) -> Census:
     return census
 
 
-def _with(grid: SdfGrid, **fields: Any) -> SdfGrid:
+def with_fields(grid: SdfGrid, **fields: Any) -> SdfGrid:
     """Return a grid with other fields, taken as they are."""
     other = copy(grid)
     vars(other).update(fields)
@@ -323,7 +323,7 @@ def _with(grid: SdfGrid, **fields: Any) -> SdfGrid:
 
 def without_samples(grid: SdfGrid) -> SdfGrid:
     """Return a grid that knows all but its samples: their shape and type, place and field."""
-    return _with(grid, samples=NoPlanes(grid.shape, grid.samples.dtype))
+    return with_fields(grid, samples=NoPlanes(grid.shape, grid.samples.dtype))
 
 
 def negated(values: NDArray[Any]) -> NDArray[Any]:

@@ -44,15 +44,10 @@ class Transform(NamedTuple):
 
 
 class Apart(NamedTuple):
-    """Where values follow from the sides: at samples at which exact distances may not.
+    """Whether values follow from the sides at samples at which exact distances may not."""
 
-    Their nearest one of another side is not along an axis: exact distances to planes half-way
-    between samples are others there. Or it is, but farther than the next (``beyond``): so are those
-    to all but planes at 45 degrees.
-    """
-
-    apart: bool
-    beyond: bool
+    apart: bool  # from an axis: exact distances to planes half-way between samples are others there
+    beyond: bool  # the next one along an axis: so are those to all but planes at 45 degrees
 
 
 def find_transform(looked: Looked, spacing: Triple | None) -> Transform | None:
