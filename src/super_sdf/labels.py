@@ -57,7 +57,6 @@ NO_ROWS = np.empty((0, 27), np.int32)
 # Memory of the walls in bytes: per node of a block and label, per cell of a side of a voxel.
 NODE_BYTES, CELL_BYTES = 14, 250
 
-
 Box = tuple[slice, slice, slice]
 
 

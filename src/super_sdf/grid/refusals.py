@@ -218,7 +218,7 @@ def way_out(census: Census, spacing: Triple | None = None, fault: str = UNSIGNED
 
 
 def refusal(census: Census, spacing: Triple | None, fault: str = UNSIGNED) -> GridError:
-    """Return the error for values without both sides; ``fault`` is that of ``one_sided``."""
+    """Return the error for values without both sides; ``fault`` is that of ``find_fault``."""
     low, high = census.extremes
     side, end, at = ("below", "smallest", low) if low >= 0 else ("above", "largest", high)
     advice = way_out(census, spacing, fault)
