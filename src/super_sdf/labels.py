@@ -27,7 +27,7 @@ from .grid.placement import as_samples, check_kind, check_spacing, is_cubic, pla
 from .grid.planes import NoPlanes, SampleArray, SamplePlanes, changed
 from .grid.refusals import named
 from .grid.sdf_grid import SdfGrid
-from .machine.index_width import check_count
+from .machine.resources import check_count
 from .machine.memory import advised, give_back, held_memory, in_words
 from .machine.resources import Resources, allot
 from .mesh import Mesh, join_meshes, vertex_type

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, Triple
 from ..errors import GridError
-from ..machine.threads import chunks_of
+from ..machine.resources import chunks_of
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 from .census import CUT_OFF, Census
 from .planes import SampleArray, changed, spread_planes

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray, IntArray
-from ..machine.threads import map_chunks
+from ..machine.resources import map_chunks
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 from . import foot_points
 from .band import MAX_DISTANCE

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import BoolArray
-from ...machine.threads import map_chunks
+from ...machine.resources import map_chunks
 from ..field import FineField, SampleSpheres
 from .fans import Placed, unfolded
 from .patches import Index, Patches, dilate
