@@ -143,14 +143,6 @@ def test_chunks_change_nothing(monkeypatch):
         assert np.array_equal(cube_of(spacing).values, values)
 
 
-def test_axes_are_swapped_with_the_array():
-    """Resampling along x is resampling along z of the array in reverse order."""
-    values = sampled((1.0, 0.2, 0.2))
-    along_x = Resampled(values, (1.0, 0.2, 0.2), 0, 0.2).loaded
-    along_z = Resampled(values.T, (0.2, 0.2, 1.0), 2, 0.2).loaded
-    assert np.allclose(along_x, along_z.T, atol=1e-12)
-
-
 def test_places_start_on_the_first_sample_and_end_on_the_last():
     assert np.array_equal(new_places(3, 1.0, 0.5), [0, 0.5, 1, 1.5, 2])
     assert np.allclose(new_places(3, 1.5, 1.0), [0, 2 / 3, 4 / 3, 2])
@@ -227,11 +219,6 @@ def test_the_note_names_what_is_resampled():
     )
 
 
-def test_equal_spacings_are_not_resampled():
-    grid = make_grid(sampled((0.4, 0.4, 0.4)), spacing=(0.4, 0.4, 0.4003))
-    assert cubic_grid(grid) is grid
-
-
 def test_interpolated_values_do_not_make_a_noisy_field(network):
     """A thin plate across the coarse axis: what lies between its samples is a guess."""
     spacing = (0.25, 0.25, 0.75)
@@ -260,14 +247,6 @@ def test_the_size_of_the_mesh_is_estimated_on_the_lattice(network):
         grid = make_grid(sampled(spacing), spacing=spacing)
         triangles = 2 * 4**2 * count_on_lattice(grid, count_by_plane(grid, 0.0))
         assert len(reconstruct(grid, network).faces) == pytest.approx(triangles, rel=0.05)
-
-
-def test_thin_parts_without_a_sample_inside(network):
-    spacing = (0.4, 0.4, 0.6)
-    grid = make_grid(sampled(spacing, slab_of(3.31, 0.03, 3.27)), spacing=spacing)
-    assert grid.low > 0
-    mesh = reconstruct(grid, network)
-    assert len(mesh.faces) and mesh.is_closed()
 
 
 @pytest.mark.parametrize("spacing", SPACINGS)

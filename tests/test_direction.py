@@ -10,7 +10,7 @@ from conftest import trilinear
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from super_sdf import SdfGrid, extract_mesh, make_grid, read_grid, reconstruct, upsample
+from super_sdf import SdfGrid, make_grid, read_grid, reconstruct
 from super_sdf.errors import GridError, OptionError
 from super_sdf.files.grids import write_grid
 from super_sdf.files.meshes import check_format_holds
@@ -44,13 +44,6 @@ def test_the_mesh_of_a_turned_grid_is_the_turned_mesh(angles, mirrored, mesher):
     assert mesh.volume() == pytest.approx(straight.volume(), rel=1e-5) and mesh.volume() > 0
     faces = straight.faces[:, ::-1] if mirrored else straight.faces
     assert np.array_equal(mesh.faces, faces)
-
-
-def test_a_field_is_meshed_with_the_direction_of_its_grid():
-    grid = make_grid(pear(), spacing=0.5, direction=turn(0.1, 0.2, 0.3) @ MIRROR)
-    mesh = extract_mesh(upsample(grid, trilinear), grid)
-    other = reconstruct(grid, trilinear)
-    assert np.array_equal(mesh.vertices, other.vertices) and np.array_equal(mesh.faces, other.faces)
 
 
 def test_the_identity_changes_nothing():

@@ -15,18 +15,17 @@ from super_sdf.errors import GridError, OptionError, OutOfMemoryError
 from super_sdf.grid import planes
 from super_sdf.grid.census import Census
 from super_sdf.grid.derived import fill_in, local_slopes, mask_distances, mask_planes
-from super_sdf.grid.field import FIELDS, weigh
+from super_sdf.grid.field import weigh
 from super_sdf.grid.planes import reading_bytes
-from super_sdf.grid.transforms import find_transform
-from super_sdf.machine import memory
 from super_sdf.machine.resources import Resources
 from super_sdf.mesh import join_meshes
 from super_sdf.network.network import network_for, shipped_models
+from super_sdf.options import FIELDS
 from super_sdf.pipeline import reconstruct_slabs
 from super_sdf.slabs import preparing
 from super_sdf.slabs.cutting import cut
 from super_sdf.steps import spline
-from super_sdf.steps.nodes import block_ijk, hold_sides
+from super_sdf.steps.nodes import block_ijk
 from super_sdf.steps.spline import network_share, node_weights, prefilter, spline_blocks
 from super_sdf.steps.survey import WINDOW_SAMPLES, plan_reading, survey
 
@@ -67,19 +66,6 @@ def smooth_union(n: int = 48) -> np.ndarray:
     return n * (np.minimum(one, other) - blend**2 * 0.15 / 4)
 
 
-def transforms(inside: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the distance transforms of a mask that people make."""
-    out, into = (ndimage.distance_transform_edt(side) for side in (~inside, inside))
-    return {
-        "both sides": out - into,
-        "both sides, less half a voxel": np.where(inside, 0.5 - into, out - 0.5),
-        "positive inside": into - out,
-        "inside only": into,
-        "outside only": out,
-        "in other units": (0.37 * (out - into)).astype(np.float32),
-    }
-
-
 def noisy(values: np.ndarray, amplitude: float = 0.25) -> np.ndarray:
     return values + np.random.default_rng(0).uniform(-amplitude, amplitude, values.shape)
 
@@ -90,6 +76,8 @@ def thin_frame() -> np.ndarray:
 
 
 MASK = torus() < 0
+OUT, INTO = (ndimage.distance_transform_edt(side) for side in (~MASK, MASK))
+TRANSFORMS = {"both sides": OUT - INTO, "inside only": INTO, "in other units": 0.37 * (OUT - INTO)}
 WAVES = 1 + 0.5 * np.sin(4 * np.pi * sum(lattice(32)))
 KINDS = {
     "a torus": (torus(), "exact"),
@@ -117,7 +105,7 @@ KINDS = {
     "bytes": (MASK.astype(np.uint8), "mask"),
     "255": (MASK * np.float32(255), "mask"),
     "signs": (np.where(MASK, -1.0, 1.0), "mask"),
-    **{f"transform: {name}": (values, "mask") for name, values in transforms(MASK).items()},
+    **{f"transform: {name}": (values, "mask") for name, values in TRANSFORMS.items()},
 }
 
 
@@ -138,7 +126,7 @@ def test_exact_distances_are_passed_on_as_they_are():
     assert grid.field.exact == (-np.inf, np.inf)
 
 
-@pytest.mark.parametrize("unit", [0.01, 0.5])
+@pytest.mark.parametrize("unit", [0.01, 0.91, 1.04])
 def test_distances_in_another_unit_are_exact_in_that_of_the_spacing(unit):
     values = (unit * box()).astype(np.float32)
     grid = make_grid(values, **PLACE)
@@ -172,21 +160,13 @@ def test_the_user_may_overrule_the_evidence(field):
 
 
 def test_distances_of_a_mask_are_those_of_scipy():
-    inside = ndimage.gaussian_filter(np.random.default_rng(0).normal(size=(23, 20, 17)), 2) > 0
-    want = transforms(inside)["both sides, less half a voxel"]
-    np.testing.assert_allclose(mask_distances(inside), np.clip(want, -3.5, 3.5), atol=1e-6)
-
-
-@pytest.mark.parametrize("name", transforms(MASK))
-def test_a_distance_transform_gives_its_step_away(name):
-    values = transforms(MASK)[name]
-    transform = find_transform(Census(values).looked, None)
-    assert transform.step == pytest.approx(0.37 if "units" in name else 1)
+    want = np.clip(np.where(MASK, 0.5 - INTO, OUT - 0.5), -3.5, 3.5)
+    np.testing.assert_allclose(mask_distances(MASK), want, atol=1e-6)
 
 
 def test_all_forms_of_a_mask_give_the_same_mesh():
     forms = [MASK, MASK.astype(np.uint8), np.where(MASK, -1.0, 1.0), MASK * 7.0]
-    forms += transforms(MASK).values()
+    forms += TRANSFORMS.values()
     meshes = [reconstruct(make_grid(form, **PLACE), trilinear) for form in forms]
     for mesh in meshes[1:]:
         np.testing.assert_array_equal(mesh.vertices, meshes[0].vertices)
@@ -296,13 +276,6 @@ def test_the_shares_of_voxels_inside_are_cut_off():
     assert np.abs(np.hypot(np.hypot(x, y) - 0.3, z) - 0.12).mean() * 32 < 0.05
 
 
-def test_the_scale_is_the_unit_of_the_values():
-    plain = make_grid(torus() / 32, spacing=1 / 32, origin=0)
-    scaled = make_grid(torus() * 25.4, spacing=1 / 32, origin=0, scale=1 / 25.4 / 32)
-    assert scaled.field.kind == "exact"
-    np.testing.assert_allclose(scaled.values, plain.values, atol=1e-6)
-
-
 BAD = {
     "field is 'wrong': give one of auto, exact, truncated, mask, scaled, noisy": {"field": "wrong"},
     "label is 'a': give a whole number, -2^63 to 2^64 - 1": {"label": "a"},
@@ -330,15 +303,15 @@ def test_a_mask_is_no_grid_without_make_grid():
             SdfGrid(values, 1.0)
 
 
-def test_a_mask_of_one_value_is_refused():
+def test_a_mask_shows_no_spacing_and_one_value_no_surface():
+    notes = make_grid(MASK).notes + make_grid(TRANSFORMS["in other units"]).notes
+    said = "spacing not given: taken as "
+    assert [note[len(said) :] for note in notes if note.startswith(said)] == [
+        "1, since a mask shows none (give --spacing)",
+        "0.37, the step of the transform",
+    ]
     with pytest.raises(GridError, match="every value is False: a constant field has no surface"):
         make_grid(np.zeros((5, 5, 5), bool), **PLACE)
-
-
-def test_a_mask_shows_no_spacing():
-    assert make_grid(MASK).notes[0] == (
-        "spacing not given: taken as 1, since a mask shows none (give --spacing)"
-    )
 
 
 def opposite(patches, table, voxels, offsets):
@@ -355,43 +328,20 @@ def test_samples_of_a_mask_keep_their_side(network):
     assert reconstruct(grid, network).is_closed()
 
 
-def test_sides_that_are_right_are_not_touched():
-    band = survey(make_grid(MASK, **PLACE))
-    patches, table, voxels = band.network_inputs()
-    offsets = (block_ijk(4) / 2 - 1).astype(np.float32)
-    blocks = np.zeros((125, len(voxels) + 1), np.float32)
-    blocks[:, :-1] = trilinear(patches, table, voxels, offsets).T
-    before = blocks.copy()
-    assert hold_sides(blocks, 4, patches, voxels) == 0
-    np.testing.assert_array_equal(blocks, before)
-
-
-def test_a_network_of_the_package_is_replaced_for_masks():
-    network = load_network("fast", device="cpu", threads=1)
-    assert network_for(network, "exact") is network
-    assert network_for(trilinear, "mask") is trilinear
-    found = network_for(network, "mask")
-    assert found.card["inputs"] == "masks" and found.threads == network.threads
-    assert network_for(found, "mask") is found
-
-
 @pytest.mark.parametrize("precision", ["float32", "int8"])
-def test_a_network_for_exact_distances_is_replaced_where_they_are_noisy(precision):
+def test_a_network_of_the_package_is_replaced_by_that_for_the_kind(precision, tmp_path):
     network = load_network("base", device="cpu", threads=1, precision=precision)
-    assert network_for(network, "truncated") is network
-    found = network_for(network, "noisy")
-    assert found.card["name"].split("-")[0] == "noisy" and found.threads == network.threads
-    assert found.card.get("precision", "float32") == precision
-    assert network_for(found, "noisy") is found
+    assert network_for(network, "exact") is network_for(network, "truncated") is network
+    masks, noise = (network_for(network, kind) for kind in ("mask", "noisy"))
+    assert masks.card["inputs"] == "masks" and noise.card["name"].split("-")[0] == "noisy"
+    for kind, found in (("mask", masks), ("noisy", noise)):
+        assert found.threads == network.threads and network_for(found, kind) is found
+    assert noise.card.get("precision", "float32") == precision
     assert network_for(load_network("best", device="cpu"), "noisy").symmetries == 4
-
-
-def test_a_network_that_was_trained_on_noise_and_one_of_the_users_own_refine_it(tmp_path):
-    fast = load_network("fast", device="cpu", threads=1)
-    assert network_for(fast, "noisy") is fast
     own = shutil.copy(shipped_models()["base"], tmp_path / "own.onnx")
-    network = load_network(own, device="cpu", threads=1)
-    assert network_for(network, "noisy") is network
+    trained = load_network("fast", device="cpu")  # on noise, too
+    for kept in (trained, load_network(own, device="cpu"), trilinear):
+        assert network_for(kept, "noisy") is kept
 
 
 def test_the_network_for_masks_is_nearer_than_marching_cubes():
@@ -424,13 +374,6 @@ def test_distances_over_their_truncation_get_their_unit_back(low):
     assert grid.notes[0].startswith("the values are divided by their slope, 0.6")
     kept = np.abs(box()) < 0.9
     np.testing.assert_allclose(grid.values[kept], 1.5 * box()[kept], rtol=0.03)
-
-
-def test_only_samples_that_were_not_cut_off_are_exact():
-    grid = make_grid(np.clip(box(), -1, 2), **PLACE)
-    band = survey(grid)
-    values = band.patches[band.exact, 13] / 2
-    assert values.min() > -1 and values.max() < 2 and band.exact.sum() > 1000
 
 
 @pytest.mark.parametrize("unit", [0.01, 37])
@@ -498,28 +441,6 @@ def test_any_number_of_slabs_and_threads_gives_the_same_mesh(name, monkeypatch):
     np.testing.assert_array_equal(mesh.faces, want.faces)
 
 
-def test_derived_planes_are_made_when_they_are_read(monkeypatch):
-    grid = make_grid(MASK, **PLACE)
-    np.testing.assert_array_equal(grid.planes(5, 9), grid.values[5:9])
-    np.testing.assert_array_equal(np.stack(list(grid.samples)), grid.values)
-    monkeypatch.setattr(memory, "free_memory", lambda: 1)
-    assert grid.samples[3].shape == MASK[3].shape
-
-
-def test_noise_is_told_from_a_wrong_slope():
-    for values, noisy_, scaled in ((noisy(box()), True, False), (smooth_union(), False, True)):
-        found = weigh(Census(values).looked, (1.0, 1.0, 1.0))
-        assert (found.is_noisy, found.is_scaled) == (noisy_, scaled)
-
-
-def test_the_command_says_what_the_values_are(tmp_path, command):
-    np.save(tmp_path / "mask.npy", MASK)
-    words = "upsample", tmp_path / "mask.npy", tmp_path / "out.ply", "--spacing", "1", "--json"
-    code, out, err = command(*map(str, words))
-    assert code == 0 and json.loads(out)["field"] == {"kind": "mask", "given": False}
-    assert "Note: values taken as a mask (--field mask): they show the surface to half a" in err
-
-
 def test_the_command_takes_labels_levels_and_scales(tmp_path, command):
     np.save(tmp_path / "labels.npy", np.where(MASK, 3, 0) + 2 * (box() < -9))
     np.save(tmp_path / "grid.npy", 100 - 40 * ball(24, 8).values)
@@ -568,13 +489,6 @@ def test_values_on_one_side_of_0_are_a_mask_only_with_zeros():
         )
 
 
-def test_plateaus_of_truncated_distances_are_not_refined():
-    grid = make_grid(np.clip(box(48), -0.5, 0.5), **PLACE)
-    band = survey(grid)
-    assert len(band.voxel_ijk) == (np.abs(grid.values) < 1.5).sum() < 0.3 * 48**3
-    assert reconstruct(grid, trilinear).is_closed()
-
-
 @pytest.mark.parametrize("name", ["truth", "cut off at 1", "a smooth union", "cut off at 0.5"])
 def test_planes_are_the_same_in_whatever_strips_they_are_made(name, monkeypatch):
     grid = make_grid(KINDS[name][0], **PLACE)
@@ -617,35 +531,6 @@ def torus_at(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
     return np.hypot(np.hypot(x, y) - 6.7, z) - 2.8
 
 
-def marched(values: np.ndarray) -> np.ndarray:
-    """Return what first-order fast marching makes of values (as scikit-fmm 2025.6.23 does)."""
-    padded = np.pad(values, 1, mode="edge")
-    beside = [
-        np.stack([np.roll(padded, s, a)[(slice(1, -1),) * 3] for s in (1, -1)]) for a in range(3)
-    ]
-    crossed = [np.where(b * values < 0, np.abs(values), np.inf) for b in beside]
-    crossed = [(c / (np.abs(values) + np.abs(b))).min(0) for c, b in zip(crossed, beside)]
-    inverse = sum(1 / cross**2 for cross in crossed)
-    known = inverse > 0
-    far = np.where(known, 1 / np.sqrt(np.maximum(inverse, 1e-9)), 99.0)
-    for _ in range(40):
-        padded = np.pad(far, 1, constant_values=99.0)
-        low = np.sort(
-            [
-                np.minimum(*(np.roll(padded, s, a)[(slice(1, -1),) * 3] for s in (1, -1)))
-                for a in range(3)
-            ],
-            axis=0,
-        )
-        solved = low[0] + 1
-        for count in (2, 3):
-            total, squares = low[:count].sum(0), (low[:count] ** 2).sum(0)
-            root = np.sqrt(np.maximum(total**2 - count * (squares - 1), 0))
-            solved = np.where(solved > low[count - 1], (total + root) / count, solved)
-        far = np.where(known, far, np.minimum(far, solved))
-    return np.copysign(far, values)
-
-
 NEARLY = {
     "slopes of .9 to 1.1": lambda d: d * (1 + 0.1 * np.sin(np.indices(d.shape).sum(0) / 4)),
     "another unit, .91": lambda d: 0.91 * d,
@@ -666,15 +551,9 @@ def test_samples_that_contradict_each_other_are_told_from_noise_and_exact_ones()
     corner = np.maximum(exact, np.indices((24,) * 3)[0] - 12.2)  # no distance beyond the edge
     for values in (exact, corner, noisy(exact, 0.05), np.round(exact, 1), exact.astype(np.float16)):
         assert not weigh(Census(values).looked, (1.0, 1.0, 1.0)).is_contradictory
-    assert weigh(Census(marched(exact)).looked, (1.0, 1.0, 1.0)).is_contradictory
-
-
-@pytest.mark.parametrize("unit", [0.91, 1.04])
-def test_distances_of_a_slope_near_1_are_divided_by_it(unit):
-    exact = torus_at(*np.indices((24,) * 3))
-    grid = make_grid(unit * exact, **PLACE)
-    assert grid.field.kind == "exact" and "in another unit" in grid.notes[0]
-    np.testing.assert_allclose(grid.values, exact, rtol=0.003)
+    other = (np.abs(np.indices((24,) * 3) - 11.6) ** 2.5).sum(0) ** 0.4 - 7.3  # by another norm
+    assert weigh(Census(other).looked, (1.0, 1.0, 1.0)).is_contradictory
+    assert make_grid(other, **PLACE).field.kind == "scaled"
 
 
 @pytest.mark.parametrize("filled", [0.1, 1.4])

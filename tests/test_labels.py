@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import random
 from collections import Counter
 from pathlib import Path
 
@@ -20,8 +19,6 @@ from super_sdf.errors import GridError, OptionError, OutOfMemoryError
 from super_sdf.label_files import MOST_FILES, label_paths
 from super_sdf.labels import Work, reconstruct_labels
 from super_sdf.slabs.cutting import equal_parts
-from super_sdf.steps.cell_cases import FACES
-from super_sdf.steps.walls import walls
 
 CAP = 0.02 / 4  # of a voxel, at most: how far outside the border a surface is closed
 
@@ -95,28 +92,6 @@ def corners_of(mesh):
         first = corners.index(min(corners))
         found[tuple(corners[first:] + corners[:first])] += 1
     return found
-
-
-def test_the_walls_in_a_cell_bound_each_label_once():
-    draw = random.Random(0)
-    for _ in range(500):
-        label = [draw.randrange(draw.choice([2, 3, 4, 8])) for _ in range(8)]
-        rank = [sorted(set(label)).index(x) for x in label]
-        joined = 0
-        for n, face in enumerate(FACES):
-            a, b, c, d = (rank[corner] for corner in face)
-            joined |= int(a == c != b == d and draw.random() < 0.5) << n
-        rows = walls(sum(x << 3 * corner for corner, x in enumerate(rank)), joined)
-        for one in set(rank):
-            edges = Counter()
-            for *points, low, high in rows.tolist():
-                if one in (rank[low], rank[high]):
-                    turned = points if one == rank[low] else points[::-1]
-                    edges.update(zip(turned, turned[1:] + turned[:1]))
-            assert set(edges.values()) <= {1}
-            loose = [edge for edge in edges if edge[::-1] not in edges]
-            assert Counter(start for start, _ in loose) == Counter(end for _, end in loose)
-            assert 18 not in {point for edge in loose for point in edge}  # the point in the cell
 
 
 @pytest.mark.parametrize("name, factor", [("noise", 4), *((name, 2) for name in IMAGES)])

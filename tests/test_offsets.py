@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from conftest import ball
 
 from super_sdf import load_network, make_grid, reconstruct
 from super_sdf.errors import GridError
@@ -41,21 +40,6 @@ def test_an_offset_grows_the_solid_whichever_sign_its_inside_has(network, offset
     mesh = reconstruct(grid, network, 2, offset=0.5 * offset)
     assert mesh.is_closed()
     assert mesh.volume() == pytest.approx(cube_volume(offset) / 8, rel=0.02)
-
-
-@pytest.mark.parametrize("offset", [-0.7, 3.0])
-def test_balls_have_the_volume_of_balls(network, offset):
-    mesh = reconstruct(ball(20, 5.0), network, 2, offset=offset)
-    assert mesh.is_closed()
-    assert mesh.volume() == pytest.approx(4 / 3 * np.pi * (5 + offset) ** 3, rel=0.02)
-
-
-def test_both_signs_give_the_same_mesh(network):
-    one, other = (
-        reconstruct(make_grid(sign * cube(), spacing=1), network, 2, offset=0.8) for sign in (1, -1)
-    )
-    np.testing.assert_array_equal(one.vertices, other.vertices)
-    np.testing.assert_array_equal(one.faces, other.faces)
 
 
 @pytest.mark.parametrize("sign", [1, -1])

@@ -646,35 +646,6 @@ def metaimage(packed: bool = True) -> bytes:
     return Path("itk.mha").read_bytes()
 
 
-@pytest.mark.parametrize("change", ["none", "no size"])
-def test_a_flipped_bit_in_a_packed_metaimage_is_found(change):
-    """In its data all; in the names of its fields all that would change the place."""
-    whole = metaimage()
-    if change == "no size":
-        whole = re.sub(rb"CompressedDataSize = \d+\n", b"", whole)
-    start = whole.index(b"LOCAL\n") + 6
-    right = read_grid("itk.mha")
-    rng = np.random.default_rng(3)
-    places = [(p, 1 << int(rng.integers(8))) for p in rng.integers(start, len(whole), 40)]
-    for name in (b"Offset", b"ElementSpacing", b"TransformMatrix", b"DimSize", b"CompressedData ="):
-        at = whole.index(name)
-        places += [(at + int(rng.integers(len(name))), 1 << int(rng.integers(7))) for _ in range(6)]
-    found = 0
-    for place, bit in places:
-        damaged = bytearray(whole)
-        damaged[place] ^= bit
-        Path("a.mha").write_bytes(damaged)
-        try:
-            grid = read_grid("a.mha")
-        except (FileError, GridError) as error:
-            assert str(error).startswith("a.mha") and "\n" not in str(error)
-            found += 1
-            continue
-        assert np.array_equal(grid.values, right.values)
-        assert (grid.spacing, grid.origin) == (right.spacing, right.origin)
-    assert found > len(places) / 2
-
-
 def test_what_a_metaimage_may_leave_out_or_call_otherwise():
     whole = metaimage(packed=False)
     for name in (b"Offset", b"Origin", b"Position"):

@@ -1,8 +1,5 @@
 """Masks, densities, truncated and scaled fields on grids whose spacings differ."""
 
-import json
-
-import nibabel
 import numpy as np
 import pytest
 from conftest import trilinear
@@ -13,7 +10,6 @@ from super_sdf import (
     fine_grid,
     make_grid,
     read_field,
-    read_grid,
     reconstruct,
     upsample,
     write_field,
@@ -148,27 +144,6 @@ def test_a_second_run_and_a_saved_field_keep_the_spacings(tmp_path):
     write_field(field, tmp_path / "field.npz")
     want, mesh = extract_mesh(field), extract_mesh(read_field(tmp_path / "field.npz"))
     np.testing.assert_array_equal(mesh.vertices, want.vertices)
-
-
-def test_the_command_takes_a_label_image_with_thick_slices(tmp_path, command):
-    np.save(tmp_path / "labels.npy", np.where(two_parts() < 0, 3, 0))
-    words = "upsample", tmp_path / "labels.npy", tmp_path / "out.ply", "--label", "3", "--json"
-    code, out, _ = command(*map(str, words), "--spacing", "1,1,2.5")
-    report = json.loads(out)
-    assert code == 0 and report["spacing"] == [1, 1, 2.5] and report["closed"]
-    assert report["expected_triangles"] == pytest.approx(report["triangles"], rel=0.25)
-
-
-def test_a_label_image_with_thick_slices_is_at_its_place_in_the_world(tmp_path):
-    """TURN is mirrored, as the axes of many scanners are against those of NIfTI."""
-    affine = np.eye(4)
-    affine[:3, :3], affine[:3, 3] = TURN * SPACING, ORIGIN
-    image = nibabel.Nifti1Image(np.where(two_parts() < 0, 3, 1).astype(np.int16), affine)
-    nibabel.save(image, tmp_path / "labels.nii.gz")
-    mesh = reconstruct(read_grid(tmp_path / "labels.nii.gz", label=3), trilinear)
-    found = np.abs(off(mesh, TURN))
-    assert mesh.is_closed() and found.mean() < 0.6
-    assert mesh.volume() == pytest.approx(volume(), rel=0.03)
 
 
 @pytest.mark.parametrize("cut", [0.5, 1, 2])

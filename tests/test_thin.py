@@ -5,13 +5,9 @@ import json
 import numpy as np
 import pytest
 import trimesh
-from conftest import ball
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from super_sdf.errors import GridError
-from super_sdf.grid.census import Census
-from super_sdf.grid.one_sided import BEYOND, FAR, find_walls
+from super_sdf.grid.refusals import BEYOND, FAR
 from super_sdf.grid.sdf_grid import make_grid
 
 N = 32
@@ -116,26 +112,12 @@ def test_what_only_looks_thin_is_refused_in_one_line(name, spacing):
     assert want in message
 
 
-@settings(max_examples=20)
-@given(st.floats(0.02, 0.9), st.floats(-0.04, 0.04), st.integers(0, 2))
-def test_thickness_is_what_the_distances_leave(thickness, shift, axis):
-    values = np.moveaxis(np.abs(Z + shift) - thickness / 2, 2, axis)
-    walls, found = find_walls(np.moveaxis(values, axis, 0))
-    assert walls.sum() == N * N
-    np.testing.assert_allclose(found, thickness, atol=1e-12)
-
-
 def test_large_unsigned_fields_are_told_from_fewer_samples(monkeypatch):
     x, y, z = (np.arange(64, dtype=np.float32) - 31.3)[:, None, None], *np.ogrid[:64, :64]
     values = np.abs(np.sqrt(x**2 + (y - 32) ** 2 + (z - 32) ** 2) - 20)
-    monkeypatch.setattr("super_sdf.grid.one_sided.MOST_FLOODED", values.size // 5)
+    monkeypatch.setattr("super_sdf.grid.refusals.MOST_FLOODED", values.size // 5)
     with pytest.raises(GridError, match="unsigned distances have no inside: mesh the shell"):
         make_grid(values, spacing=1)
-
-
-def test_the_spacing_of_a_thin_part_is_that_of_the_samples_away_from_it():
-    for name, values in THIN.items():
-        assert Census(values).everywhere.typical_length == pytest.approx(1, abs=0.01), name
 
 
 def test_a_given_spacing_is_believed_of_a_thin_part():
@@ -162,12 +144,6 @@ def test_thin_solids_are_meshed_with_a_warning(tmp_path, monkeypatch, command):
         "no sample lies inside: the solid is thinner than the spacing, and its mesh may have holes"
     )
     assert f"Warning: {warning}" in err
-
-
-def test_solids_with_samples_inside_are_meshed_without_a_warning(tmp_path, monkeypatch, command):
-    monkeypatch.chdir(tmp_path)
-    np.save("ball.npy", ball().values)
-    assert json.loads(command("upsample", "ball.npy", "a.ply", "--json")[1])["warnings"] == []
 
 
 @pytest.mark.parametrize("options", [{}, {"scale": 0.08}, {"inside": "negative"}])

@@ -215,21 +215,6 @@ def test_densities_of_thick_slices_have_their_spline(dtype, unit, metre):
     assert np.abs(off).mean() < 0.08 * 0.2
 
 
-def test_large_labels_are_not_merged():
-    ids = 864691135000000000, 864691135000000001
-    labels = np.zeros((20, 20, 20), np.uint64)
-    labels[4:12, 4:12, 4:12] = ids[0]
-    labels[13:17, 13:17, 13:17] = ids[1]
-    for label in ids:
-        found = make_grid(labels, spacing=1.0, origin=0, label=label).values < 0
-        np.testing.assert_array_equal(found, labels == np.uint64(label))
-    with pytest.raises(GridError):
-        make_grid(labels, spacing=1.0, origin=0)
-    two = np.where(labels == ids[0], *np.array(ids[::-1], np.uint64))
-    grid = make_grid(two, spacing=1.0, origin=0)
-    np.testing.assert_array_equal(grid.values < 0, labels == np.uint64(ids[0]))
-
-
 @pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.float32, np.float64, bool])
 def test_two_slices_are_a_mask(dtype):
     mask = np.zeros((20, 18, 2), bool)

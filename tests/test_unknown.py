@@ -15,16 +15,13 @@ from super_sdf import (
     extract_mesh,
     load_network,
     make_grid,
-    read_grid,
     reconstruct,
     upsample,
 )
 from super_sdf.errors import GridError
 from super_sdf.grid.census import Census
-from super_sdf.grid.field import FIELDS
-from super_sdf.grid.regions import components
-from super_sdf.grid.unknown import filled
 from super_sdf.mesh import join_meshes
+from super_sdf.options import FIELDS
 
 FACES = ndimage.generate_binary_structure(3, 1)
 
@@ -50,11 +47,6 @@ def test_the_sides_of_regions_are_those_of_scipys_components():
         assert regions.size.sum() == unknown.sum()
 
 
-def test_components_join_whatever_the_order_of_the_pairs():
-    chain = np.array([[5, 3, 9, 1], [3, 9, 1, 7]])
-    np.testing.assert_array_equal(components(10, chain), [0, 1, 2, 1, 4, 1, 6, 1, 8, 1])
-
-
 @pytest.mark.parametrize("hollow", [np.nan, -np.inf])
 def test_unknown_far_samples_are_taken_as_cut_off_on_their_side(hollow):
     known = truncated()
@@ -71,17 +63,6 @@ def test_unknown_far_samples_are_taken_as_cut_off_on_their_side(hollow):
         f"{limits[1]:.6g}"
     )
     assert grid.field.kind == "truncated" and reconstruct(grid, trilinear).is_closed()
-
-
-def test_the_mesh_is_that_of_the_grid_that_was_filled_in_by_hand(tmp_path):
-    known = truncated()
-    unknown = np.abs(known) >= 2
-    by_hand = np.clip(known, known[~unknown].min(), known[~unknown].max())
-    np.save(tmp_path / "grid.npy", np.where(unknown, np.nan, known))
-    grid = read_grid(tmp_path / "grid.npy", spacing=1.0, origin=0.0)
-    np.testing.assert_array_equal(grid.planes(9, 12), by_hand[9:12])
-    mesh, want = (reconstruct(g, trilinear) for g in (grid, make_grid(by_hand, **PLACE)))
-    np.testing.assert_array_equal(mesh.vertices, want.vertices)
 
 
 def test_densities_may_be_unknown_outside_what_was_seen():
@@ -300,12 +281,3 @@ def test_fused_depth_images_are_meshed_by_their_spline(unseen, scale):
     assert grid.field.kind == "truncated" and grid.field.is_uneven
     assert grid.field.exact == (0, 0) and "their slope is uneven" in grid.notes[-1]
     assert reconstruct(grid, trilinear, 2, cap=True).is_closed()
-
-
-def test_filling_in_reads_planes_one_by_one():
-    values = truncated()
-    values[0] = np.nan
-    notes: list[str] = []
-    planes = filled(Census(values), notes)
-    assert planes.shape == values.shape and planes.limits == (-2, 2)
-    assert (planes[0] == 2).all() and np.isnan(values[0]).all()

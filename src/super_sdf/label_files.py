@@ -23,8 +23,7 @@ from .files.meshes import (
 from .files.output import check_apart, naming
 from .files.regular import files_of
 from .files.volume import PLACE
-from .grid.labels import ALL
-from .labels import LabelPiece, find_image, label_slabs
+from .labels import ALL, LabelPiece, find_image, label_slabs
 from .mesh import Mesh
 from .network.decoder import Decoder
 from .options import LABELS, OPTIONS, ConvertOptions
@@ -137,10 +136,7 @@ def convert_labels(
 
 
 def label_paths(target: str | Path, labels: list[int]) -> list[Path]:
-    """Return the file of each label: the target itself, if it can have parts.
-
-    OptionError if they are too many.
-    """
+    """Return the file of each label: the target itself, if it can have parts."""
     path = Path(target)
     if format_of(path).has_parts:
         return [path] * len(labels)

@@ -17,18 +17,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .arrays import IntArray
-from .errors import OptionError, OutOfMemoryError, seen
+from .arrays import BoolArray, IntArray
+from .errors import GridError, OptionError, OutOfMemoryError, seen
 from .files.grids import read_array
-from .grid.field import MASK
-from .grid.labels import ALL, LabelImage, check_labels, make_labels
+from .grid.derived import REACH, extremes_of_masks, mask_planes
+from .grid.field import NONE_EXACT, Field
+from .grid.interpret import as_sample, labelled
+from .grid.placement import as_samples, check_kind, check_spacing, is_cubic, placed
+from .grid.planes import NoPlanes, SampleArray, SamplePlanes, changed
+from .grid.refusals import named
+from .grid.sdf_grid import SdfGrid
 from .machine.memory import advised, give_back, held_memory, in_words
 from .machine.resources import Resources, allot, check_count
 from .mesh import Mesh, join_meshes, vertex_type
 from .neighbourhood import CENTRE
 from .network.decoder import Adapter, Decoder, adapt
 from .network.network import network_for
-from .options import check_factor, check_max_memory, check_network, check_progress
+from .options import (
+    MASK,
+    check_factor,
+    check_label,
+    check_max_memory,
+    check_network,
+    check_progress,
+)
 from .pipeline import refine
 from .progress import Progress, StepCounter, part_of
 from .slabs.cutting import Slab, equal_parts, slab_bytes, slab_of
@@ -36,15 +48,85 @@ from .steps.nodes import VoxelIndex
 from .steps.survey import Band, survey
 from .steps.walls import Labels, Part, absent_parts, extract_walls, put_together
 
+ALL = "all"
+MOST_LABELS = 1000  # more values than these are densities
+MARGIN = REACH + 1  # samples beside a label on which its distances, and those beside them, depend
 BAND_SHARE = 0.05  # of the time
 NO_ROWS = np.empty((0, 27), np.int32)
 # Memory of the walls in bytes: per node of a block and label, per cell of a side of a voxel.
 NODE_BYTES, CELL_BYTES = 14, 250
 
+Box = tuple[slice, slice, slice]
+
+
+class PartOfPlanes(SamplePlanes):
+    """The samples in a box of another array."""
+
+    def __init__(self, source: SampleArray, box: Box) -> None:
+        self.source, self.box, self.name = source, box, "the grid"
+        self.shape, self.dtype = tuple(s.stop - s.start for s in box), np.dtype(source.dtype)
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Return planes ``first`` to ``last`` (exclusive)."""
+        start = self.box[0].start
+        planes: NDArray[Any] = np.asarray(self.source[start + first : start + last])
+        return planes[:, self.box[1], self.box[2]]
+
+
+@dataclass(frozen=True, eq=False)
+class LabelImage:
+    """Samples with labels, of which some are to be meshed, and their place, without samples.
+
+    ``labels`` (L,) ascend. ``boxes`` are L + 1 parts of the grid: those on which what is beside all
+    labels depends, and then each label.
+    """
+
+    samples: SampleArray
+    labels: NDArray[Any]
+    boxes: list[Box]
+    grid: SdfGrid
+
+    def mask(self, number: int) -> SdfGrid:
+        """Return distances to label ``labels[number - 1]``, in its box; 0 is beside all labels."""
+        part = PartOfPlanes(self.samples, self.boxes[number])
+        labels, label = self.labels, self.labels[number - 1]
+
+        def chosen(planes: NDArray[Any]) -> BoolArray:
+            return planes == label if number else ~np.isin(planes, labels)
+
+        h = self.grid.voxel_size
+        return SdfGrid.trusted(
+            mask_planes(changed(part, chosen, np.bool_), h),
+            self.grid.spacing,
+            extremes=extremes_of_masks(h),
+            field=self.grid.field,
+        )
+
+    @property
+    def corners(self) -> IntArray:
+        """The lowest indices of each box, (L + 1, 3)."""
+        return np.array([[side.start for side in box] for box in self.boxes], np.int32)
+
+    def names(self) -> list[int]:
+        """Return the labels as whole numbers."""
+        return [int(label) for label in self.labels]
+
+    def border(self, planes: tuple[int, int]) -> IntArray:
+        """Return indices of border samples in some planes and the number of their mask, (b, 4)."""
+        parts = [np.empty((0, 4), np.int64)]
+        for plane in range(*planes):
+            some = np.ones(self.grid.shape[1:], bool)
+            some[1:-1, 1:-1] = plane in (0, self.grid.shape[0] - 1)
+            values = np.asarray(self.samples[plane])[some]
+            at = np.searchsorted(self.labels, values).clip(max=len(self.labels) - 1)
+            number = np.where(self.labels[at] == values, at + 1, 0)
+            parts.append(np.column_stack([np.full(len(values), plane), np.argwhere(some), number]))
+        return np.concatenate(parts).astype(np.int32)
+
 
 @dataclass(frozen=True, eq=False)
 class LabelPiece:
-    """A piece of the mesh of a label; ``volume`` is its share of what all pieces enclose.
+    """A piece of the mesh of a label, and its share of the volume that all pieces enclose.
 
     Faces number the vertices of all pieces of the label so far.
     """
@@ -126,13 +208,105 @@ def find_image(
     max_memory: int | None,
 ) -> LabelImage:
     """Return the label image of an array or a file; ``place`` has spacing, origin and direction."""
-    labels = check_labels(labels)
+    wanted, notes = check_labels(labels), []
     if isinstance(values, (str, PathLike)):
         place = read_array(values, place, axes, max_memory)
-        values = place.pop("values")
+        values, notes = place["values"], list(place["notes"])
     elif axes is not None:
         raise OptionError(f"axes is {seen(axes)}: that is for files; transpose the array")
-    return make_labels(values, labels, **place)
+    given = placed(values, place["spacing"], place["origin"])
+    samples = as_samples(given.values)
+    check_kind(samples.dtype, samples.shape)
+    boxes = find_labels(samples, None if isinstance(wanted, str) else wanted)
+    if given.spacing is None:
+        notes.append("spacing not given: taken as 1, since labels show none (give --spacing)")
+    if given.origin is None:
+        notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
+    ends, shape = np.array(list(boxes.values())), np.array(samples.shape)
+    is_cut = (ends[:, 0] == 0).any(1) | (ends[:, 1] == shape - 1).any(1)
+    cut = [int(label) for label, leaves in zip(boxes, is_cut) if leaves]
+    if cut:
+        notes.append(
+            f"solids of labels run out of the grid: closed along the border ({named(cut)})"
+        )
+    low, high = np.maximum(ends[:, 0] - MARGIN, 0), np.minimum(ends[:, 1] + MARGIN + 1, shape)
+    low, high = np.vstack([low.min(0), low]), np.vstack([high.max(0), high])
+    around = [
+        (slice(a, d), slice(b, e), slice(c, f))
+        for a, b, c, d, e, f in np.hstack([low, high]).tolist()
+    ]
+    steps = check_spacing(1.0 if given.spacing is None else given.spacing)
+    grid = SdfGrid.trusted(
+        NoPlanes(samples.shape, samples.dtype),
+        steps,
+        0.0 if given.origin is None else given.origin,
+        tuple(notes),
+        direction=place["direction"],
+        extremes=extremes_of_masks(min(steps)),
+        field=Field(MASK, True, NONE_EXACT, on_lattice=not is_cubic(steps)),
+    )
+    return LabelImage(samples, np.array(list(boxes), samples.dtype), around, grid)
+
+
+def check_labels(labels: Any) -> str | list[int]:
+    """Return labels in ascending order, each once; "all" for all."""
+    if isinstance(labels, str) and labels == ALL:
+        return ALL
+    if isinstance(labels, (str, bytes)) or not hasattr(labels, "__iter__"):
+        raise OptionError(f"labels is {seen(labels)}: give all, or some labels such as 1,2,3")
+    chosen = sorted({check_label(label, "labels") for label in labels})
+    if not 0 < len(chosen) <= MOST_LABELS:
+        raise OptionError(f"labels are {len(chosen):,}: give 1 to {MOST_LABELS:,} at a time")
+    return chosen
+
+
+def find_labels(samples: SampleArray, wanted: list[int] | None) -> dict[Any, NDArray[np.int64]]:
+    """Return the box of each label, (2, 3) lowest and highest indices, by its sample, in order.
+
+    ``wanted`` are some labels; None are all but 0. The samples are read once.
+    """
+    keep = [as_sample(label, samples.dtype) for label in wanted or ()]
+    listed = np.array([value for value in keep if value is not None], samples.dtype)
+    boxes: dict[Any, NDArray[np.int64]] = {}
+    others = False
+    for plane, values in enumerate(samples):
+        runs, low, high = _runs(values)
+        if runs.dtype.kind == "f" and len(wrong := runs[(np.rint(runs) != runs) | np.isinf(runs)]):
+            raise GridError(
+                f"a value is {wrong[0]:g}: labels are whole numbers; choose what is above a value "
+                "with --level if they are densities"
+            )
+        some = runs != 0 if wanted is None else np.isin(runs, listed)
+        others |= not some.all()
+        kinds, of_run = np.unique(runs[some], return_inverse=True)
+        low, high = low[some], high[some]
+        for number, value in enumerate(kinds[: MOST_LABELS + 1].tolist()):
+            mine = of_run == number
+            ends = np.array([[plane, *low[mine].min(0)], [plane, *high[mine].max(0)]])
+            box = boxes.setdefault(value, ends)
+            box[0], box[1] = np.minimum(box[0], ends[0]), np.maximum(box[1], ends[1])
+        if len(boxes) > MOST_LABELS:
+            raise GridError(
+                f"the values are more than {MOST_LABELS:,} different whole numbers: choose some of "
+                "them (--labels 1,2,3) if they are labels, or a --level if they are densities"
+            )
+    for label in wanted or ():
+        if label not in boxes:
+            labelled(samples, label)  # raises
+    if not boxes or (len(boxes) == 1 and not others):
+        only = int(next(iter(boxes), 0))
+        raise GridError(f"every sample has the label {only}: there is no surface")
+    return dict(sorted(boxes.items()))
+
+
+def _runs(plane: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.intp], NDArray[np.intp]]:
+    """Return the runs of equal samples in the rows of a plane: values, and both ends (n, 2)."""
+    begins = np.ones(plane.shape, bool)
+    np.not_equal(plane[:, 1:], plane[:, :-1], out=begins[:, 1:])
+    low = np.argwhere(begins)
+    ends = np.ones(plane.shape, bool)
+    ends[:, :-1] = begins[:, 1:]
+    return plane[begins], low, np.argwhere(ends)
 
 
 def label_slabs(
@@ -172,23 +346,11 @@ def _bands(image: LabelImage, resources: Resources) -> list[Band]:
     bands = [survey(image.mask(nth), 0.0, resources) for nth in range(len(image.labels) + 1)]
     keys = [
         VoxelIndex(band.voxel_ijk + low, image.grid.shape).keys
-        for band, low in zip(bands, corners_of(image))
+        for band, low in zip(bands, image.corners)
     ]
     found, times = np.unique(np.concatenate(keys[1:]), return_counts=True)
     several = np.isin(keys[0], found[times > 1])
     return [replace(bands[0], decoded=several), *bands[1:]]
-
-
-def volumes(vertices: NDArray[Any], faces: IntArray) -> NDArray[np.float64]:
-    """Return the volumes between triangles (m, 3) and the origin, (m,), positive if seen inside."""
-    a, b, c = (vertices[corner] for corner in faces.T)
-    found: NDArray[np.float64] = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
-    return found
-
-
-def corners_of(image: LabelImage) -> IntArray:
-    """Return the lowest indices of each box, (L + 1, 3)."""
-    return np.array([[side.start for side in box] for box in image.boxes], np.int32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,10 +364,7 @@ class Work:
     bands: list[Band]
 
     def plan(self) -> list[tuple[int, int]]:
-        """Return the planes of each slab, of few slabs that fit in memory.
-
-        OutOfMemoryError if not even slabs of one plane fit.
-        """
+        """Return the planes of each slab, of few slabs that fit in memory."""
         count = self.image.grid.shape[0]
         before = np.zeros(count + 1, np.int64)
         for band, box in zip(self.bands, self.image.boxes):
@@ -245,10 +404,7 @@ class Work:
     def pieces(
         self, planes: tuple[int, int], written: NDArray[np.int64], progress: Progress | None
     ) -> Iterator[LabelPiece]:
-        """Yield the meshes of labels in some planes.
-
-        ``written``, (L + 1,), has the vertices of each label so far; those here are added.
-        """
+        """Yield the meshes of labels in some planes, and count the vertices ``written`` of each."""
         grid = self.image.grid
         parts = self._parts(planes, progress)
         field = put_together(parts, next(parts)[1], grid.shape, self.factor, planes)
@@ -257,7 +413,8 @@ class Work:
         world: NDArray[Any] = grid.to_world(places / self.factor - 0.5)
         world = world.astype(vertex_type(grid, self.factor))
         middle = grid.to_world((np.array(grid.shape) - 1) / 2)
-        volume = volumes(world - middle, faces)
+        a, b, c = ((world - middle)[corner] for corner in faces.T)
+        volume = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6  # to the middle, seen from inside
         if grid.is_mirrored:
             faces, volume = faces[:, ::-1], -volume
         yield from self._by_label(world, faces, volume, sides, before, written)
@@ -302,7 +459,7 @@ class Work:
             around = slab.decoded
             table = band.network_inputs(around)[1] if own.start < own.stop else NO_ROWS
             table = table[own.start - around.start : own.stop - around.start]
-            voxel_ijk = band.voxel_ijk[own] + corners_of(self.image)[number]
+            voxel_ijk = band.voxel_ijk[own] + self.image.corners[number]
             inside = band.patches[own, CENTRE] <= 0
             absent = absent_parts(table.T.copy(), voxel_ijk, inside, self.image.grid.shape)
             blocks = np.full(((self.factor + 1) ** 3, len(voxel_ijk)), np.nan, np.float32)

@@ -19,7 +19,6 @@ from dataclasses import replace
 import numpy as np
 
 from . import options
-from .grid.field import MASK
 from .grid.sdf_grid import SdfGrid, check_grid
 from .machine.memory import give_back
 from .mesh import Mesh, join_meshes
@@ -78,7 +77,7 @@ def refine(
     fit_to_spheres(blocks, parts, factor, spheres, index, threads)
     del spheres
     keep_within_bounds(blocks, parts, factor, own_ijk, band.trusted, threads)
-    if band.kind == MASK:
+    if band.kind == options.MASK:
         hold_sides(blocks, factor, patches, voxels)
     skipped = signs_of_skipped(parts, own_ijk, patches, voxels, band.shape)
     pinned = pin_to_skipped(blocks[:, :-1], parts, factor, skipped)

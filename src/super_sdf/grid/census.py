@@ -1,18 +1,7 @@
 """One pass over the planes of a grid: all that is asked of its samples before they are meshed.
 
 Each question is about some ranges of planes, so that its parts are answered wherever these are
-read:
-
-numbers     the extremes, what is not finite, the border, whether there are two values only
-unknown     the runs of NaN
-patches     5 x 5 x 5 samples round some beside the surface
-plateaus    samples amid others of the same extreme value
-beside      gradients beside the surface
-everywhere  gradients where the field is not bent
-labels      whole numbers, and how they change
-pairs       some neighbours
-
-An array in memory is asked when an answer is needed.
+read. An array in memory is asked when an answer is needed.
 """
 
 from __future__ import annotations
@@ -70,10 +59,9 @@ LEAST_JUMP = 0.3  # of the range of labels: so far some neighbours are apart
 
 @dataclass(frozen=True, eq=False)
 class Looked:
-    """What was looked at beside the surface.
+    """Samples (n, 5, 5, 5) round some beside the surface.
 
-    ``around`` (n, 5, 5, 5) are the samples round some that have one on the other side beside them,
-    ``cut`` (2,) the shares of samples that are, as their six neighbours, the lowest or highest.
+    ``cut`` (2,) are the shares that are, as their six neighbours, the lowest or the highest.
     """
 
     around: Floats
@@ -121,13 +109,14 @@ class Census:
         is_file = isinstance(samples, SamplePlanes | np.memmap)
         self._kept = _small(samples) if is_file else samples
         if self._kept is None:
-            names = ("numbers", "unknown") if samples.dtype == np.bool_ else tuple(QUESTIONS)
-            questions = [QUESTIONS[name](self.shape) for name in names]
-            self._given = dict(zip(names, _ask_together(samples, questions)))
+            questions = _questions(self.shape)
+            if samples.dtype == np.bool_:
+                questions = {name: questions[name] for name in ("numbers", "unknown")}
+            self._given = dict(zip(questions, _ask_together(samples, list(questions.values()))))
 
     def _answers(self, name: str) -> Any:
         if name not in self._given:
-            self._given[name] = self._ask(QUESTIONS[name](self.shape))
+            self._given[name] = self._ask(_questions(self.shape)[name])
         return self._given[name]
 
     def _ask(self, question: Question) -> list[Any]:
@@ -164,10 +153,7 @@ class Census:
         return self.numbers.low, self.numbers.high
 
     def border_shares(self) -> tuple[float, float, float]:
-        """Return the shares of the samples on the faces that are below 0, above 0, and the lowest.
-
-        One on an edge counts for each of its faces.
-        """
+        """Return the shares of the faces below 0, above 0, and at the lowest; edges count twice."""
         nx, ny, nz = map(int, self.shape)
         below, above, at_lowest = self.numbers.border.tolist()
         size = 2 * (nx * ny + ny * nz + nz * nx)
@@ -226,8 +212,7 @@ class Census:
     def are_labels(self) -> bool:
         """Whether values look like labels: whole numbers of which regions jump to others.
 
-        At the boundary of a region, a sample hardly ever lies between a lower and a higher
-        neighbour; those of images and distances do.
+        At a boundary, samples hardly ever lie between a lower and a higher neighbour.
         """
         planes = self._answers("labels")
         if not planes or None in planes:
@@ -281,11 +266,48 @@ class Question(NamedTuple):
     answers: list[Any]
 
 
+def _questions(shape: Shape) -> dict[str, Question]:
+    """Return all that is asked of the samples of a grid."""
+    count, size, step = shape[0], shape[1] * shape[2], _planes_together(shape)
+    numbers = [(i, min(i + step, count), i == 0, i + step >= count) for i in range(0, count, step)]
+    far, near = (  # planes with others beside them; none of a narrow grid
+        spread_planes(n, count - 1 - n, LOOKED_PLANES) if min(shape) > 2 * n else []
+        for n in (BESIDE, 1)
+    )
+    spread = spread_planes(0, count - 1, GRADIENT_PLANES)
+    inner = ([i for i in spread if 0 < i < count - 1] or [1]) if min(shape) > 2 else []
+    each = -(-len(inner) * size // MOST_GRADIENTS)
+    first = spread_planes(0, count - 2, PAIR_PLANES)
+    rows = slice(0, shape[1] - 1, -(-len(first) * size // MOST_PAIRS))
+    before = [(max(i - 1, 0), i + 1) for i in range(count)]
+    around = [(i - BESIDE, i + BESIDE + 1, i * size) for i in far]
+    return {
+        "numbers": Question(numbers, _numbers_of, []),
+        "unknown": Question(before, partial(runs_of_plane, np.isnan), []),
+        "patches": Question(around, _around_surface, Few(MOST_LOOKED_AT)),
+        "plateaus": Question([(i - 1, i + 2) for i in far], _amid_equal, []),
+        "beside": _beside(shape, spread),
+        "everywhere": Question([(i - 1, i + 2, each) for i in inner], gradients_where_straight, []),
+        "labels": Question([(i - 1, i + 2) for i in near], _at_boundaries, []),
+        "pairs": Question([(i, i + 2) for i in first], partial(_pairs_of, rows), []),
+    }
+
+
+def _beside(shape: Shape, planes: Iterable[int]) -> Question:
+    count, size = shape[0], shape[1] * shape[2]
+    ranges = [(max(i - 1, 0), min(i + 2, count), min(i, 1), i * size) for i in planes]
+    return Question(ranges, gradients_beside_surface, Few(MOST_BESIDE))
+
+
+def _planes_together(shape: Shape) -> int:
+    return max(TOGETHER // (shape[1] * shape[2]), 1)
+
+
 def _ask_together(samples: SampleArray, questions: list[Question]) -> list[list[Any]]:
     """Return the answers to questions of samples, each plane of which is read once."""
-    count, each = samples.shape[0], _together(tuple(samples.shape))
+    count, each = samples.shape[0], _planes_together(tuple(samples.shape))
     least = READ_SAMPLES // (samples.shape[1] * samples.shape[2])
-    step = each * -(-max(least, 2 * getattr(samples, "beside", 1)) // each)
+    step = each * -(-max(least, 2 * max(getattr(samples, "beside", 1), 1)) // each)
     ranges = []
     for first in range(0, count, step):
         low = max(first - BESIDE, 0)
@@ -309,23 +331,10 @@ def _ask_together(samples: SampleArray, questions: list[Question]) -> list[list[
 def _answer_all(
     works: list[Callable[..., Any]], slab: NDArray[Any], ranges: list[Ranges]
 ) -> list[list[Any]]:
-    """Return the answers to all questions about the ranges of some planes."""
     return [[work(slab[a:b], *more) for a, b, *more in mine] for work, mine in zip(works, ranges)]
 
 
-def _together(shape: Shape) -> int:
-    """Return how many planes are looked at together."""
-    return max(TOGETHER // (shape[1] * shape[2]), 1)
-
-
-def _numbers(shape: Shape) -> Question:
-    step, count = _together(shape), shape[0]
-    ranges = [(i, min(i + step, count), i == 0, i + step >= count) for i in range(0, count, step)]
-    return Question(ranges, _numbers_of, [])
-
-
 def _numbers_of(planes: NDArray[Any], is_first: bool, is_last: bool) -> Numbers:
-    """Return the numbers of some planes, the first and the last of the grid perhaps."""
     number = int if planes.dtype.kind in "iu" else float  # floats do not tell large ones apart
     low, high, infinite = number(planes.min()), number(planes.max()), 0
     if not (is_finite := isfinite(low) and isfinite(high)):
@@ -340,29 +349,10 @@ def _numbers_of(planes: NDArray[Any], is_first: bool, is_last: bool) -> Numbers:
     return Numbers(low, high, is_finite, infinite, has_two, np.sum(border, 0))
 
 
-def _unknown(shape: Shape) -> Question:
-    ranges = [(max(i - 1, 0), i + 1) for i in range(shape[0])]
-    return Question(ranges, partial(runs_of_plane, np.isnan), [])
-
-
-def _inner(shape: Shape, beside: int) -> list[int]:
-    """Return planes, spread evenly, that have some beside them; none of a narrow grid."""
-    if min(shape) <= 2 * beside:
-        return []
-    return spread_planes(beside, shape[0] - 1 - beside, LOOKED_PLANES)
-
-
-def _patches(shape: Shape) -> Question:
-    size = shape[1] * shape[2]
-    ranges = [(i - BESIDE, i + BESIDE + 1, i * size) for i in _inner(shape, BESIDE)]
-    return Question(ranges, _around_surface, Few(MOST_LOOKED_AT))
-
-
 def _around_surface(slab: NDArray[Any], number: int) -> tuple[NDArray[Any], ...]:
-    """Return the samples round those that have one on the other side beside them.
+    """Return samples (n, 5, 5, 5) of the middle of five planes beside the surface, and ranks (n,).
 
-    ``slab`` has five planes; the samples are those of the middle one, which begins with sample
-    ``number``: (n,) ranks, (n, 5, 5, 5).
+    ``number`` is that of the first sample of the middle plane.
     """
     slab = np.asarray(slab)
     near = slab[1:4]
@@ -378,10 +368,6 @@ def _around_surface(slab: NDArray[Any], number: int) -> tuple[NDArray[Any], ...]
     return ranks[some], as_clamped(boxes[j, k])
 
 
-def _plateaus(shape: Shape) -> Question:
-    return Question([(i - 1, i + 2) for i in _inner(shape, BESIDE)], _amid_equal, [])
-
-
 def _amid_equal(slab: NDArray[Any]) -> tuple[tuple[Any, Any], list[int], int]:
     """Return the extremes of the middle plane of three, how many are amid these, and of all."""
     middle = slab[1]
@@ -394,26 +380,6 @@ def _amid_equal(slab: NDArray[Any]) -> tuple[tuple[Any, Any], list[int], int]:
         amid[:, 1:-1] &= middle[:, :-2] == end
         counts.append(int(amid[BESIDE:-BESIDE, BESIDE:-BESIDE].sum()))
     return ends, counts, amid[BESIDE:-BESIDE, BESIDE:-BESIDE].size
-
-
-def _beside(shape: Shape, planes: Iterable[int] | None = None) -> Question:
-    count, size = shape[0], shape[1] * shape[2]
-    ranges = [
-        (max(i - 1, 0), min(i + 2, count), min(i, 1), i * size)
-        for i in planes or spread_planes(0, count - 1, GRADIENT_PLANES)
-    ]
-    return Question(ranges, gradients_beside_surface, Few(MOST_BESIDE))
-
-
-def _everywhere(shape: Shape) -> Question:
-    planes = [i for i in spread_planes(0, shape[0] - 1, GRADIENT_PLANES) if 0 < i < shape[0] - 1]
-    planes = (planes or [1]) if min(shape) > 2 else []
-    step = -(-len(planes) * shape[1] * shape[2] // MOST_GRADIENTS)
-    return Question([(i - 1, i + 2, step) for i in planes], gradients_where_straight, [])
-
-
-def _labels(shape: Shape) -> Question:
-    return Question([(i - 1, i + 2) for i in _inner(shape, 1)], _at_boundaries, [])
 
 
 def _at_boundaries(slab: NDArray[Any]) -> tuple[Any, Any, NDArray[np.int64], float] | None:
@@ -439,28 +405,9 @@ def _at_boundaries(slab: NDArray[Any]) -> tuple[Any, Any, NDArray[np.int64], flo
     return low, high, np.array(counts), jump
 
 
-def _pairs(shape: Shape) -> Question:
-    planes = spread_planes(0, shape[0] - 2, PAIR_PLANES)
-    rows = slice(0, shape[1] - 1, -(-len(planes) * shape[1] * shape[2] // MOST_PAIRS))
-    return Question([(i, i + 2) for i in planes], partial(_pairs_of, rows), [])
-
-
 def _pairs_of(rows: slice, slab: NDArray[Any]) -> Floats:
-    """Return samples of some rows of the first of two planes with those beside them, (2, n)."""
     row = slab[0, rows]
     beside = slab[1, rows], slab[0, 1:][rows]
     parts = [np.stack([row, other]).reshape(2, -1) for other in beside]
     parts.append(np.stack([row[:, :-1], row[:, 1:]]).reshape(2, -1))
     return np.concatenate(parts, axis=1).astype(np.float64)
-
-
-QUESTIONS: dict[str, Callable[[Shape], Question]] = {
-    "numbers": _numbers,
-    "unknown": _unknown,
-    "patches": _patches,
-    "plateaus": _plateaus,
-    "beside": _beside,
-    "everywhere": _everywhere,
-    "labels": _labels,
-    "pairs": _pairs,
-}

@@ -34,7 +34,7 @@ from ..errors import GridError
 from ..neighbourhood import NEIGHBOURHOOD
 from .placement import EQUAL_SPACING
 from .planes import SampleArray, SamplePlanes
-from .sdf_grid import SdfGrid
+from .sdf_grid import SdfGrid, with_fields
 
 Floats = NDArray[np.float64]
 
@@ -50,12 +50,10 @@ CHUNK = 1 << 18  # samples that are worked on at a time, about
 
 
 def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
-    """Return a grid on the lattice that is refined: the grid itself, if its spacings are equal.
+    """Return a grid on the lattice that is refined: the same if it is cubic or ``on_lattice``.
 
-    So is that of a field that is no distance in the world, but on its own lattice (``Field``).
-    Other samples are made when they are read. Only values near the offset of the surface to be
-    meshed, in world units, are as accurate as they can be. GridError if there is one, and the
-    values are no distances in the world.
+    Other samples are made when they are read. Only values near the offset of the surface are as
+    accurate as they can be. GridError if there is an offset, and the values are no distances.
     """
     if grid.is_cubic or grid.field.on_lattice:
         check_has_offsets(grid, offset)
@@ -67,17 +65,16 @@ def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
         )
     level = -offset if grid.positive_inside else offset
     samples, spacing = _resample(grid.samples, grid.spacing, level)
-    extremes = (-grid.high, -grid.low) if grid.positive_inside else (grid.low, grid.high)
-    return SdfGrid.trusted(
-        samples,
-        spacing,
-        grid.origin,
-        (*grid.notes, _describe_resampling(grid, samples.shape)),
-        direction=grid.direction,
-        positive_inside=grid.positive_inside,
-        extremes=extremes,
-        field=grid.field,
+    coarser = " and ".join(
+        f"{name} from {h:.6g}"
+        for name, h in zip("xyz", grid.spacing)
+        if h > grid.voxel_size * (1 + EQUAL_SPACING)
     )
+    note = (
+        f"the spacing differs between axes: the values are resampled along {coarser} to "
+        f"{grid.voxel_size:.6g}, the finest, to {' x '.join(map(str, samples.shape))} samples"
+    )
+    return with_fields(grid, samples=samples, spacing=spacing, notes=(*grid.notes, note))
 
 
 def check_has_offsets(grid: SdfGrid, offset: float) -> None:
@@ -92,24 +89,8 @@ def check_has_offsets(grid: SdfGrid, offset: float) -> None:
         )
 
 
-def _describe_resampling(grid: SdfGrid, shape: tuple[int, ...]) -> str:
-    coarser = [
-        f"{name} from {h:.6g}"
-        for name, h in zip("xyz", grid.spacing)
-        if h > grid.voxel_size * (1 + EQUAL_SPACING)
-    ]
-    size = " x ".join(map(str, shape))
-    return (
-        f"the spacing differs between axes: the values are resampled along {' and '.join(coarser)} "
-        f"to {grid.voxel_size:.6g}, the finest, to {size} samples"
-    )
-
-
 def sampled_places(grid: SdfGrid) -> NDArray[np.intp]:
-    """Return the places of ``NEIGHBOURHOOD`` round a sample of a cubic grid that hold samples, too.
-
-    They are those across the axes that were resampled.
-    """
+    """Return the places of ``NEIGHBOURHOOD`` that hold samples, too: across resampled axes."""
     samples, across = grid.samples, np.ones(27, bool)
     while isinstance(samples, Resampled):
         across &= NEIGHBOURHOOD[:, samples.axis] == 0
@@ -129,8 +110,7 @@ def on_samples(grid: SdfGrid, voxel_ijk: NDArray[np.int32]) -> BoolArray:
 def _resample(samples: SampleArray, spacing: Triple, level: float) -> tuple[SampleArray, Triple]:
     """Return samples at the finest spacing on all axes, and their spacing.
 
-    Axes whose spacing is the finest up to 0.1 % are left as they are. The coarsest axis comes last,
-    since the finer the others are, the better they tell its slopes.
+    The coarsest axis comes last: the finer the others are, the better they tell its slopes.
     """
     h, steps = min(spacing), list(spacing)
     for axis in np.argsort(spacing, kind="stable").tolist():
@@ -143,8 +123,8 @@ def _resample(samples: SampleArray, spacing: Triple, level: float) -> tuple[Samp
 class Resampled(SamplePlanes):
     """Samples interpolated along one axis, from the first on, alike in whatever parts are read.
 
-    ``step`` is the new spacing along the axis, ``level`` the value at which the surface will be
-    meshed. The new samples lie at ``places``, in old spacings; those ``on_sample`` are old ones.
+    ``level`` is the value at which the surface will be meshed. The new samples, at ``step``, lie at
+    ``places``, in old spacings; those ``on_sample`` are old ones.
     """
 
     dtype = np.dtype(np.float64)
@@ -162,7 +142,7 @@ class Resampled(SamplePlanes):
         )
 
     def read(self, first: int, last: int) -> Floats:
-        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz) float64."""
+        """Return planes ``first`` to ``last`` (exclusive)."""
         out = np.empty((max(last - first, 0), *self.shape[1:]))
         if len(out) and self.axis == 0:
             self._read_between(first, out)
@@ -171,7 +151,6 @@ class Resampled(SamplePlanes):
         return out
 
     def _read_between(self, first: int, out: Floats) -> None:
-        """Fill planes from the planes of samples before and after them, some rows at a time."""
         places = self.places[first : first + len(out)]
         low = max(int(places[0]) - EXTRA, 0)
         block = np.asarray(self.source[low : int(places[-1]) + 2 + EXTRA])
@@ -179,7 +158,6 @@ class Resampled(SamplePlanes):
             out[:, rows] = self._interpolate(block, rows, places - low, (1, 2))
 
     def _read_within(self, first: int, out: Floats) -> None:
-        """Fill planes from the samples in them and in those beside them, some planes at a time."""
         low = max(first - REACH, 0)
         block = np.asarray(self.source[low : first + len(out) + REACH])
         lines = np.moveaxis(block, self.axis, 0)
@@ -191,10 +169,9 @@ class Resampled(SamplePlanes):
     def _interpolate(
         self, block: NDArray[Any], asked: slice, places: Floats, across: tuple[int, int]
     ) -> Floats:
-        """Return the values at places on the lines of a block, whose first axis they run along.
+        """Return values on lines along the first axis of a block, ``asked`` of its second axis.
 
-        ``asked`` are the lines along the second axis, ``across`` the axes of the grid that are the
-        second and the third of the block.
+        ``across`` are the axes of the grid that are the second and the third of the block.
         """
         start = max(asked.start - REACH, 0)
         h = self.spacing[self.axis]
@@ -208,8 +185,7 @@ class Resampled(SamplePlanes):
 class Lines:
     """Lines of samples (n, p, q), along the first axis, and the laws of distances on them.
 
-    Values are asked of those in the slice ``asked`` of the second axis; the others are beside them.
-    ``h`` is the spacing along the lines, ``steps`` those across.
+    Only those ``asked`` of the second axis are interpolated; ``steps`` are the spacings across.
     """
 
     def __init__(self, samples: Floats, asked: slice, h: float, steps: tuple[float, float]) -> None:
@@ -217,10 +193,7 @@ class Lines:
         self.around = np.pad(samples, ((0, 0), *((REACH, REACH),) * 2), constant_values=np.nan)
 
     def values_at(self, places: Floats, level: float, near: float) -> Floats:
-        """Return the values at places along all asked lines, (m, p, q).
-
-        Those within ``near`` of a ``level`` are kept within their bounds.
-        """
+        """Return the values (m, p, q) at places, within their bounds if ``near`` the ``level``."""
         cells = np.minimum(places.astype(int), len(self.samples) - 2)
         shares = places - cells
         values = np.empty((len(places), *self.samples[0, self.asked].shape))
@@ -234,7 +207,9 @@ class Lines:
             if cell != before:
                 first = slopes[1] if cell == before + 1 else self.slope(cell)
                 before, slopes = cell, (first, self.slope(cell + 1))
-            smooth = _hermite(low, high, slopes[0] * self.h, slopes[1] * self.h, share)
+            rest, (rise, rise_after) = 1 - share, (slope * self.h for slope in slopes)
+            smooth = low * ((1 + 2 * share) * rest**2) + high * ((1 + 2 * rest) * share**2)
+            smooth = smooth + (rise * rest - rise_after * share) * (share * rest)
             values[n] = self._with_walls(cell, share, level, smooth)
             reach = near + share * self.h, near + (1 - share) * self.h
             is_near[n] = (np.abs(low - level) < reach[0]) & (np.abs(high - level) < reach[1])
@@ -243,11 +218,10 @@ class Lines:
         return values
 
     def _with_walls(self, cell: int, share: float, level: float, smooth: Floats) -> Floats:
-        """Return values between samples ``cell`` and the next, (p, q), through thin walls, too.
+        """Return values (p, q) after sample ``cell``: ``smooth`` unless there is a thin wall.
 
-        If the field falls towards the surface, rises behind it, and neither sample is within, the
-        straight lines from both sides meet beyond the surface: there is a wall. ``smooth`` is the
-        value elsewhere.
+        There is one if the field falls towards the surface, rises behind it, and the straight lines
+        from both sides meet beyond it.
         """
         before, low, high, after = (self._sample(cell + n) - level for n in range(-1, 3))
         side = np.sign(low)
@@ -272,7 +246,7 @@ class Lines:
         return bounded
 
     def _sample(self, i: int) -> Floats:
-        """Return sample i of the asked lines; beyond their ends, it is extrapolated linearly."""
+        """Return sample i of the asked lines, extrapolated linearly beyond their ends."""
         end = min(max(i, 0), len(self.samples) - 1)
         inner = end + 1 if i < 0 else end - 1
         sample: Floats = self.samples[end, self.asked]
@@ -281,10 +255,7 @@ class Lines:
         return sample
 
     def _steepness(self, i: int) -> tuple[Floats, Floats]:
-        """Return the least and the largest slope along the lines at sample i, where |grad| = 1.
-
-        Across the lines, the slope is between the differences to both neighbours.
-        """
+        """Return the least and the largest slope along the lines at sample i, where |grad| = 1."""
         least: Any = 0.0
         most: Any = 0.0
         for axis, step in enumerate(self.steps):
@@ -319,16 +290,8 @@ class Lines:
         return kept
 
 
-def _hermite(low: Floats, high: Floats, rise: Floats, rise_after: Floats, share: float) -> Floats:
-    """Return the cubic polynomial with two values and two slopes, at a share of the way."""
-    rest = 1 - share
-    ends = low * ((1 + 2 * share) * rest**2) + high * ((1 + 2 * rest) * share**2)
-    curve: Floats = ends + (rise * rest - rise_after * share) * (share * rest)
-    return curve
-
-
 def new_places(count: int, h: float, step: float) -> Floats:
-    """Return where new samples lie along an axis, in spacings from the first of ``count`` samples.
+    """Return where new samples lie along an axis, in old spacings.
 
     The last one lies as near to the last sample as it can, and takes its value if it is beyond.
     """
@@ -340,7 +303,6 @@ def new_places(count: int, h: float, step: float) -> Floats:
 
 
 def _chunks(count: int, each: int) -> Iterator[slice]:
-    """Yield slices of ``count`` rows of ``each`` samples, so that they have about ``CHUNK``."""
     step = max(CHUNK // max(each, 1), 1)
     for start in range(0, count, step):
         yield slice(start, min(start + step, count))

@@ -37,11 +37,7 @@ ROUNDS = 2
 RINGS = 2  # of samples amid a plateau that are raised, so that they lie beyond the band
 WITHIN = 1 - 1e-5  # share of the limit up to which a value is not cut off
 CHUNK = 1 << 14  # samples that are worked on at a time, so that they stay in the cache
-CUBES: Triple = (
-    1.0,
-    1.0,
-    1.0,
-)  # steps: spacings over the finest; the longest is a voxel
+CUBES: Triple = (1.0, 1.0, 1.0)  # steps: spacings over the finest; the longest is a voxel
 
 AROUND = 2  # samples to either side over which local slopes are averaged
 TYPICAL_ERROR = 0.1  # of a slope, relative: half the weight
@@ -51,10 +47,7 @@ NEARLY = 0.2  # from 1: slopes nearer to it count as 1, since dividing by them o
 
 
 def mask_distances(inside: BoolArray) -> FloatArray:
-    """Return signed distances to the boundary of a mask, in voxels, negative inside.
-
-    ``inside`` and the result are (nx, ny, nz); values are from half a voxel to ``REACH - 0.5``.
-    """
+    """Return distances to the boundary of a mask, in voxels, negative inside, of 0.5 to 3.5."""
     roots = np.sqrt(np.arange(REACH * REACH + 1, dtype=np.float32)) - np.float32(0.5)
     squared = _squared_distances(inside)
     np.copyto(squared, _squared_distances(~inside), where=inside)
@@ -89,11 +82,7 @@ def extremes_of_masks(h: float) -> Extremes:
 
 
 def filled_planes(values: SampleArray, spacing: Triple, limits: Extremes) -> DerivedPlanes:
-    """Return truncated distances with those that are missing filled in.
-
-    ``values`` and ``spacing`` are in world units, ``limits`` the lowest and the highest value,
-    where they were cut off.
-    """
+    """Return truncated distances, cut off at ``limits``, with those that are missing filled in."""
     h = min(spacing)
     low, high = (limit / h for limit in limits)
     steps = (spacing[0] / h, spacing[1] / h, spacing[2] / h)
@@ -106,15 +95,13 @@ def filled_planes(values: SampleArray, spacing: Triple, limits: Extremes) -> Der
 
 
 def _reach(steps: Triple) -> list[int]:
-    """Return how many samples along each axis the farthest offset is."""
     return [int(FEET_REACH * max(steps) / step) for step in steps]
 
 
 def without_plateaus(values: SampleArray, limits: Extremes, h: float) -> DerivedPlanes:
-    """Return truncated distances, larger where all samples round one were cut off alike.
+    """Return truncated distances, raised by h where all samples round one were cut off alike.
 
-    They are too far from the surface to matter, however near it they were cut off. From sample to
-    sample they change by no more than the spacing h, as distances do.
+    Those are too far from the surface to matter, however near it they were cut off.
     """
 
     def make(planes: NDArray[Any]) -> NDArray[np.float64]:
@@ -130,7 +117,6 @@ def without_plateaus(values: SampleArray, limits: Extremes, h: float) -> Derived
 
 
 def _all_around(marked: BoolArray) -> BoolArray:
-    """Return which samples and the up to 26 round them are all marked."""
     for axis in range(3):
         lines = np.moveaxis(marked, axis, 0)
         among = lines.copy()
@@ -159,10 +145,10 @@ def fill_in(values: FloatArray, low: float, high: float, steps: Triple = CUBES) 
 def _distance_to_feet(
     values: FloatArray, known: IntArray, gradient: FloatArray, cut: BoolArray, steps: Triple
 ) -> FloatArray:
-    """Return the distance of each sample that was ``cut`` off to the nearest foot point of another.
+    """Return the distance of each sample to the nearest foot point of the ``known``, (n, 3).
 
-    It is ``FAR`` voxels at most. At a foot point the surface is taken as a disc of radius ``DISC``:
-    it goes on between them. ``known`` (n, 3) are the others, ``gradient`` (n, 3) is theirs.
+    It is ``FAR`` voxels at most. At a foot point the surface is taken as a disc: it goes on
+    between them.
     """
     far, reach = np.float32(FAR * max(steps)), _reach(steps)
     margin = [(n, n) for n in reach]
@@ -193,11 +179,10 @@ def _approach(
     way: FloatArray,
     normal: FloatArray,
 ) -> None:
-    """Take the samples at an offset from some nearer to the surface by the foot points of these.
+    """Bring samples at an ``offset`` from some ``at`` places nearer by the foot points of these.
 
-    ``nearest`` and ``discs`` have the distance to the nearest foot point so far, and to its disc;
-    they are changed in place. ``at`` says where the samples are in these, ``way`` (3, n) is from
-    their foot points to the samples at the offset, ``normal`` (3, n) their gradient's direction.
+    Changes ``nearest`` and ``discs``, the distances to the nearest foot point so far and to its
+    disc. ``way`` (3, n) is from the foot points to the samples, ``normal`` their direction.
     """
     flat, flat_discs = nearest.reshape(-1), discs.reshape(-1)
     strides = np.array([nearest.shape[1] * nearest.shape[2], nearest.shape[2], 1])
@@ -218,10 +203,9 @@ def _approach(
 def _gradient(
     values: FloatArray, at: IntArray, steps: Triple, cut: BoolArray | None = None
 ) -> FloatArray:
-    """Return central differences at some samples, (n, 3); one-sided ones at the ends.
+    """Return central differences at samples, (n, 3); one-sided ones at ends, and beside ``cut``.
 
-    With ``cut``, so they are beside a sample that was cut off; amid two, the larger difference is a
-    lower bound.
+    Amid two cut ones, the larger difference is a lower bound.
     """
     gradient = np.empty((len(at), 3), np.float32)
     centre = values[tuple(at.T)]
@@ -245,11 +229,7 @@ def _gradient(
 
 
 def normalised_planes(values: SampleArray, h: float, change: float) -> DerivedPlanes:
-    """Return values over their local slope: distances on the lattice.
-
-    ``h`` is what a step of the lattice is in the result, ``change`` the typical one from sample to
-    sample.
-    """
+    """Return values over their local slope: distances on the lattice, of which a step is h."""
 
     def make(planes: NDArray[Any]) -> FloatArray:
         scaled = in_spacings(planes, change)

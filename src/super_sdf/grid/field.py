@@ -23,15 +23,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import BoolArray, Triple
-from ..options import AUTO as AUTO
-from ..options import EXACT as EXACT
-from ..options import FIELDS as FIELDS
-from ..options import MASK as MASK
-from ..options import NOISY as NOISY
-from ..options import SCALED as SCALED
-from ..options import TRUNCATED as TRUNCATED
-from ..options import ReadOptions
-from .census import BESIDE, Extremes, Looked
+from ..options import EXACT, ReadOptions
+from .census import BESIDE, Census, Extremes, Looked
 from .placement import check_spacing, steps_of
 from .planes import SampleArray, changed
 from .slopes import BENT as STRAIGHT
@@ -72,73 +65,51 @@ STEEPEST, MOST_STEEP, FEW = 0.95, 1.07, 10
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """The kind of a field.
-
-    Attributes
-    ----------
-    kind : str
-        One of ``FIELDS``, but not "auto".
-    given : bool
-        Whether the user said so; otherwise the samples show it.
-    exact : two floats
-        Only samples between these, in world units, negative inside, may be exact distances.
-    smooth : array or Planes, optional
-        Of a scaled field: the values whose cubic spline has the surface, negative inside.
-    has_kinks : bool
-        Whether a scaled field is mostly a distance, so that the network may refine its kinks.
-    is_uneven : bool
-        Whether the slope of that field jumps, as that of fused depth images.
-    on_lattice : bool
-        Whether the values are distances on the lattice of the samples, in steps of the finest
-        spacing, and not in the world. Then no axis is resampled if the spacings differ.
-    evidence : dict
-        What the samples show, for ``--json``.
-    unseen : bool array or Planes, optional
-        Samples that are unknown and may hide the surface: it ends there, and cannot be closed.
-    """
+    """The kind of a field, one of ``FIELDS`` but "auto", and what follows from it."""
 
     kind: str = EXACT
-    given: bool = False
+    given: bool = False  # whether the user said so; otherwise the samples show it
+    # Only samples between these, in world units, negative inside, may be exact distances.
     exact: Extremes = (-np.inf, np.inf)
-    smooth: SampleArray | None = None
-    has_kinks: bool = False
-    is_uneven: bool = False
+    smooth: SampleArray | None = None  # values whose spline has the surface, negative inside
+    has_kinks: bool = False  # whether it is mostly a distance, of which a network refines kinks
+    is_uneven: bool = False  # whether its slope jumps, as that of fused depth images
+    # Whether the values are distances on the lattice of the samples, in steps of the finest
+    # spacing, and not in the world. Then no axis is resampled if the spacings differ.
     on_lattice: bool = False
-    evidence: dict[str, Any] = field(default_factory=dict)
-    unseen: SampleArray | None = None
+    evidence: dict[str, Any] = field(default_factory=dict)  # what the samples show, for ``--json``
+    unseen: SampleArray | None = None  # which may hide the surface: it ends there, and stays open
 
     def report(self) -> dict[str, Any]:
         """Return kind and evidence as a dictionary that can be written as JSON."""
         return {"kind": self.kind, "given": self.given, **self.evidence}
 
 
-class Request(NamedTuple):
-    """What the user says of the values, checked; the spacing is None if it is unknown."""
+@dataclass(frozen=True, eq=False)
+class Case:
+    """Samples, what they show, what the user says of them, and sentences on what is inferred.
 
+    What is near unknown samples may be continued, which shows nothing: see ``census``. The spacing
+    is None if it is unknown.
+    """
+
+    samples: SampleArray
+    census: Census
     wanted: ReadOptions
     spacing: Triple | None
-    inside: str
-
-    @property
-    def is_auto(self) -> bool:
-        """Whether the samples are to show what the values are."""
-        return self.wanted.field == AUTO
+    notes: list[str]
 
     @property
     def is_density(self) -> bool:
         """Whether the values are densities, from which a level was taken."""
         return self.wanted.level is not None
 
-    def above_is_inside(self) -> Request:
-        """Return the request with what is above a level inside, unless the user says otherwise."""
-        return self._replace(inside="positive") if self.inside == AUTO else self
-
-    def with_spacing(self, spacing: float, why: str, notes: list[str]) -> Request:
-        """Return the request with a spacing if none is given, and why in a note."""
+    def with_spacing(self, spacing: float, why: str) -> Triple:
+        """Return the spacing that is given, else one that is taken, and why in a note."""
         if self.spacing is not None:
-            return self
-        notes.append(f"spacing not given: taken as {spacing:.6g}, {why}")
-        return self._replace(spacing=check_spacing(spacing))
+            return self.spacing
+        self.notes.append(f"spacing not given: taken as {spacing:.6g}, {why}")
+        return check_spacing(spacing)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +149,11 @@ class Evidence(NamedTuple):
     cut_low: bool  # whether values are cut off at the lowest
     cut_high: bool
     digit: float  # the last one of the values: slopes are known no better
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether values are cut off."""
+        return self.cut_low or self.cut_high
 
     @property
     def is_scaled(self) -> bool:
@@ -251,10 +227,9 @@ def weigh(looked: Looked, spacing: Triple) -> Evidence:
 
 
 def _known_slopes(lines: Floats, third: Floats, fourth: Floats) -> tuple[float, float]:
-    """Return the typical slope of lines (n, 3, 5), and how it changes away from the surface.
+    """Return the typical slope of lines (n, 3, 5), NaN if few tell, and how it changes farther off.
 
-    Slopes are exact but for fifth derivatives, and known where third and fourth differences (n, 3)
-    are small: no kink is among the samples. The first is NaN if too few are known.
+    Slopes are known where third and fourth differences (n, 3) are small: no kink is near.
     """
     a, b, middle, d, e = np.moveaxis(lines, -1, 0)
     slope = np.sqrt((((8 * (d - b) - (e - a)) / 12) ** 2).sum(1))
@@ -269,10 +244,9 @@ def _known_slopes(lines: Floats, third: Floats, fourth: Floats) -> tuple[float, 
 
 
 def _contradict(around: Floats, steps: Floats, noise: float) -> BoolArray:
-    """Return which samples differ from several others by more than distances can, (n,).
+    """Return which samples (n,) differ from several round them by more than distances can.
 
-    ``around`` (n, 5, 5, 5) has each sample in the middle, ``steps`` are the spacings, and ``noise``
-    is its standard deviation, all in the largest spacing. Rounding explains its last digit.
+    Lengths are in the largest spacing; ``noise`` is a standard deviation.
     """
     matters = MATTERS * min(steps)
     boxes = np.clip(around.reshape(len(around), 5**3), -matters, matters)
@@ -286,10 +260,10 @@ def _contradict(around: Floats, steps: Floats, noise: float) -> BoolArray:
 
 
 def slope_within(looked: Looked, spacing: Triple) -> float:
-    """Return the typical slope between a sample and its neighbours, none of them cut off.
+    """Return the typical slope between samples none of which is cut off; NaN if too few tell.
 
-    Of the pairs beside the surface, the steepest along an axis gives the slope. It is NaN if there
-    are too few samples that change along all axes: those may all be at corners.
+    Of the pairs beside the surface, the steepest along an axis gives the slope; samples that do not
+    change along all axes may all be at corners.
     """
     low, high = looked.extremes
     line = looked.lines[..., 1:4]
@@ -303,8 +277,8 @@ def slope_within(looked: Looked, spacing: Triple) -> float:
 def is_projective(looked: Looked, spacing: Triple) -> bool:
     """Return whether values that are cut off were measured along lines of sight.
 
-    So are the fused depth images of a scan: beside the surface their slope is that of a distance
-    only where it was seen straight on, whatever their unit.
+    Beside the surface the slope of fused depth images is that of a distance only where it was seen
+    straight on, whatever their unit.
     """
     if not looked.is_cut.any():
         return False
@@ -319,7 +293,6 @@ def is_projective(looked: Looked, spacing: Triple) -> bool:
 
 
 def _are_whole(lines: Floats, looked: Looked) -> BoolArray:
-    """Return of which lines, (n, 3, m), no sample is cut off, (n,)."""
     ends = zip(looked.extremes, looked.is_cut, (-1, 1))
     low, high = (end if is_cut else sign * np.inf for end, is_cut, sign in ends)
     return np.asarray(((lines > low) & (lines < high)).all((1, 2)))

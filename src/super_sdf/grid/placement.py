@@ -35,13 +35,7 @@ EVEN = 1e-3  # of a step: how far coordinates may be from even ones, besides the
 
 
 def as_triple(number: ArrayLike, name: str) -> Triple:
-    """Return one number or three as three floats.
-
-    Raises
-    ------
-    GridError
-        If ``number``, which the message calls ``name``, is neither or not finite.
-    """
+    """Return one number or three as three finite floats; ``name`` is that in messages."""
     try:
         array = np.asarray(number)
         if array.dtype.kind not in "fiu":  # booleans and strings are refused
@@ -56,24 +50,19 @@ def as_triple(number: ArrayLike, name: str) -> Triple:
 
 
 def check_spacing(spacing: ArrayLike) -> Triple:
-    """Return the spacing as three floats.
-
-    Raises
-    ------
-    GridError
-        If they are not positive, out of range, or one is more than 50 times another.
-    """
+    """Return the spacing as three floats; GridError unless they are positive and within range."""
     triple = as_triple(spacing, "spacing")
+    said = f"spacing is {', '.join(f'{number:g}' for number in triple)}"
     if min(triple) <= 0:
-        raise GridError(f"spacing is {_join(triple)}: it must be greater than 0")
+        raise GridError(f"{said}: it must be greater than 0")
     if not LEAST_SPACING <= min(triple) <= max(triple) <= MOST_SPACING:
         raise GridError(
-            f"spacing is {_join(triple)}: give lengths in a unit in which it is between "
+            f"{said}: give lengths in a unit in which it is between "
             f"{LEAST_SPACING:g} and {MOST_SPACING:g}"
         )
     if max(triple) > min(triple) * MOST_UNEQUAL:
         raise GridError(
-            f"spacing is {_join(triple)}: the largest may be {MOST_UNEQUAL:g} times the smallest; "
+            f"{said}: the largest may be {MOST_UNEQUAL:g} times the smallest; "
             "leave out samples along the finer axes"
         )
     return triple
@@ -89,23 +78,8 @@ def steps_of(spacing: Triple) -> Triple:
     return (sum(spacing) / 3,) * 3 if is_cubic(spacing) else spacing
 
 
-def _join(triple: tuple[float, ...]) -> str:
-    return ", ".join(f"{number:g}" for number in triple)
-
-
 def check_direction(direction: ArrayLike | None) -> Direction:
-    """Return a direction row by row; None is along the world's axes.
-
-    Parameters
-    ----------
-    direction : (3, 3) array_like or nine numbers, row by row
-        The columns are unit vectors at right angles; they may be mirrored.
-
-    Raises
-    ------
-    GridError
-        If it is something else.
-    """
+    """Return a direction, nine numbers or (3, 3), row by row; None is along the world's axes."""
     if direction is None:
         return STRAIGHT
     try:
@@ -159,16 +133,8 @@ def placed(
 ) -> Placed:
     """Return samples and their place in the world; of a ``DataArray``, from its coordinates.
 
-    A spacing or an origin that is given replaces that of the coordinates. Anything but an array of
-    xarray is returned as it is.
-
-    Raises
-    ------
-    GridError
-        If the dimensions are not x, y and z in any order, besides some of length 1; if their
-        coordinates are not evenly spaced numbers; if ``values`` is a ``Dataset``.
-    OutOfMemoryError
-        If the array is one of Dask and does not fit in memory.
+    A spacing or an origin that is given replaces that of the coordinates. Dimensions are x, y and z
+    in any order, besides some of length 1.
     """
     xarray: Any = sys.modules.get("xarray")
     if xarray is None or not isinstance(values, (xarray.DataArray, xarray.Dataset)):
@@ -182,7 +148,6 @@ def placed(
 
 
 def _axes_in_order(array: Any) -> Any:
-    """Return an array with the dimensions x, y, z, or with those that have no names."""
     if array.ndim < len(AXES):
         check_kind(array.dtype, array.shape)  # raises
     wanted = UNNAMED if set(array.dims) == set(UNNAMED) else AXES
@@ -202,7 +167,6 @@ def _axes_in_order(array: Any) -> Any:
 
 
 def _at_coordinates(array: Any, spacing: ArrayLike | None, origin: ArrayLike | None) -> Placed:
-    """Return an array along increasing coordinates, and the place that they give it."""
     names = [x for x in array.dims if x in array.coords and array.coords[x].dims == (x,)]
     if array.chunks is not None:
         check_fits(array.nbytes, "the array of Dask, whole,", "save it as .npy and give its path")
@@ -226,13 +190,7 @@ def _at_coordinates(array: Any, spacing: ArrayLike | None, origin: ArrayLike | N
 
 
 def even_steps(name: str, coordinates: NDArray[Any]) -> tuple[float, float]:
-    """Return the first of some coordinates, and the step from one to the next.
-
-    Raises
-    ------
-    GridError
-        If they are not numbers, or not evenly spaced.
-    """
+    """Return the first of some coordinates, and the step; GridError unless they are even."""
     if coordinates.dtype.kind not in "fiu":
         raise GridError(
             f"coordinates of {name!r} have dtype {coordinates.dtype}: give numbers, in the unit of "
@@ -262,13 +220,7 @@ def even_steps(name: str, coordinates: NDArray[Any]) -> tuple[float, float]:
 
 
 def as_samples(values: ArrayLike | SamplePlanes) -> SampleArray:
-    """Return samples as an array; ``SamplePlanes`` are returned as they are.
-
-    Raises
-    ------
-    GridError
-        If they make no array.
-    """
+    """Return samples as an array; ``SamplePlanes`` are returned as they are."""
     if isinstance(values, SamplePlanes):
         return values
     try:

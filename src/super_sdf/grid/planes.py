@@ -70,10 +70,7 @@ class InputFile:
             raise FileError(f"{self.name} changed while it was read: read it when it is complete")
 
     def read_into(self, out: NDArray[Any], offset: int) -> None:
-        """Fill a contiguous array with the bytes of the file from ``offset`` on.
-
-        FileError if the file changed, ends too early, or cannot be read.
-        """
+        """Fill a contiguous array with the bytes from ``offset`` on; FileError if that fails."""
         view = out.view(np.uint8).reshape(-1).data
         while view:
             count = self._read_some(view, offset)
@@ -110,6 +107,7 @@ class SamplePlanes(ABC):
 
     ndim = 3
     travels = False  # whether another process can read the samples for itself
+    beside = 0  # planes to either side on which those that are made depend
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     name: str
@@ -138,7 +136,7 @@ class SamplePlanes(ABC):
     @property
     def block(self) -> int:
         """Planes that are made at a time when iterating over all."""
-        return max(BLOCK_BYTES // self.plane_bytes, 1)
+        return max(BLOCK_BYTES // self.plane_bytes, 2 * self.beside, 1)
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
         for first in range(0, len(self), self.block):
@@ -185,10 +183,7 @@ class SamplePlanes(ABC):
 
 
 class PlaneFile(SamplePlanes):
-    """A 3D array in a file, from byte ``offset`` on, whose planes are read when they are needed.
-
-    If it is ``swapped``, the last two axes are so in the file: (nx, nz, ny).
-    """
+    """A 3D array in a file from byte ``offset`` on; if ``swapped``, it is (nx, nz, ny) there."""
 
     def __init__(
         self,
@@ -224,11 +219,7 @@ SampleArray: TypeAlias = NDArray[Any] | SamplePlanes
 def over_planes(
     samples: SampleArray, work: Callable[..., Result], ranges: Ranges
 ) -> Iterator[Result]:
-    """Yield what a function makes of some ranges of planes, in order.
-
-    ``work`` takes the planes of a range, and what the range has besides its ends. The planes are
-    read here, unless the samples say who does that: see ``SamplePlanes.over``.
-    """
+    """Yield what a function makes of ranges of planes, in order; see ``SamplePlanes.over``."""
     if isinstance(samples, SamplePlanes):
         yield from samples.over(samples, work, ranges)
         return
@@ -249,8 +240,7 @@ def lowest(ranks: NDArray[np.uint64], most: int) -> NDArray[np.bool_] | slice:
 class Few(list[tuple[NDArray[Any], ...]]):
     """Arrays of rows, of which few are held: of at most ``most`` samples, those of lowest rank.
 
-    Each part has the ranks of n samples, and arrays of n rows. What is kept depends on the samples
-    alone, not on the parts.
+    Each part has the ranks of n samples, and arrays of n rows; how they are parted does not matter.
     """
 
     def __init__(self, most: int) -> None:
@@ -326,11 +316,6 @@ class DerivedPlanes(SamplePlanes):
         self.unit, self.each = unit, each
         self.shape, self.dtype = tuple(source.shape), np.dtype(dtype)
 
-    @property
-    def block(self) -> int:
-        """Planes that are made at a time: more, if each needs some beside it."""
-        return max(super().block, 2 * self.beside)
-
     def over(
         self, samples: SamplePlanes, work: Callable[..., Result], ranges: Ranges
     ) -> Iterator[Result]:
@@ -351,7 +336,7 @@ class DerivedPlanes(SamplePlanes):
         return bool(getattr(self.source, "travels", False))
 
     def read(self, first: int, last: int) -> NDArray[Any]:
-        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
+        """Return planes ``first`` to ``last`` (exclusive)."""
         low, high = max(first - self.beside, 0), min(last + self.beside, len(self))
         if last <= first:
             return np.empty((0, *self.shape[1:]), self.dtype)

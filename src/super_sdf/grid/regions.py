@@ -22,10 +22,10 @@ RUN_BYTES = 32  # per sample of a plane, to number its runs
 class Regions:
     """Regions of marked samples, and of which sides the others beside them are.
 
-    ``planes`` yields what ``runs_of_plane`` returns of each plane. ``before`` (nx + 1,) are the
-    runs before each plane, and in all. Of each run, (n,), are ``start``, its first sample in C
-    order, ``size``, its length, and ``root``, the first run of its region; and whether this has
-    ``positive`` known samples beside it, ``negative`` ones or 0, and both or none (``unsure``).
+    ``planes`` are those of ``runs_of_plane``; ``before`` (nx + 1,) counts their runs. Of each run
+    are ``start``, its first sample in C order, ``size``, and ``root``, the first run of its region;
+    and whether this has ``positive`` samples beside it, ``negative`` ones or 0, and both or none
+    (``unsure``).
     """
 
     def __init__(
@@ -47,7 +47,10 @@ class Regions:
                 self.before[i + 1] += len(start)
         self.start, self.size, joined, *sides = (np.concatenate(x, axis=-1) for x in zip(*parts))
         self.root = components(len(self.start), joined)
-        self.positive, self.negative = (self._has(side) for side in sides)
+        has = np.zeros((2, len(self.root)), bool)
+        for row, side in zip(has, sides):
+            row[self.root[side]] = True
+        self.positive, self.negative = has[:, self.root]
         self.unsure: BoolArray = self.positive == self.negative
 
     @classmethod
@@ -60,12 +63,6 @@ class Regions:
     def runs_of(self, i: int, marked: BoolArray) -> Ints:
         """Return the run that each sample of plane ``i`` is in, (ny, nz); -1 for others."""
         return _numbered(marked, int(self.before[i]))
-
-    def _has(self, runs: Ints) -> BoolArray:
-        """Return which runs are in the region of one of some runs."""
-        has = np.zeros(len(self.root), bool)
-        has[self.root[runs]] = True
-        return has[self.root]
 
 
 def with_the_one_before(samples: SampleArray) -> Iterator[NDArray[Any]]:
@@ -81,11 +78,13 @@ def runs_of_plane(is_marked: IsMarked, slab: NDArray[Any]) -> tuple[Any, ...] | 
 
     They are the number of runs of the plane before; start and size of the plane's; pairs that
     touch, (2, n); and those beside positive samples and others. Runs are counted from the first of
-    the plane before. None if no sample is marked in both planes.
+    the plane before. None if no sample is NaN in both planes.
     """
     plane = slab[-1]
-    if is_marked is np.isnan and not _has_nan(slab):
-        return None
+    if is_marked is np.isnan:  # the sum of squares tells fastest
+        with np.errstate(over="ignore", under="ignore"):
+            if slab.dtype.kind != "f" or not np.isnan(np.vdot(slab, slab)):
+                return None
     marked = is_marked(slab)
     former = _begins(marked[0]).sum() if len(slab) > 1 else 0
     runs, start = _numbered(marked[-1], int(former)), np.flatnonzero(_begins(marked[-1]))
@@ -99,14 +98,7 @@ def runs_of_plane(is_marked: IsMarked, slab: NDArray[Any]) -> tuple[Any, ...] | 
     return former, start, size, joined, np.concatenate(positive), np.concatenate(negative)
 
 
-def _has_nan(slab: NDArray[Any]) -> bool:
-    """Return whether a sample is NaN, by the sum of squares, which is the fastest."""
-    with np.errstate(over="ignore", under="ignore"):
-        return slab.dtype.kind == "f" and bool(np.isnan(np.vdot(slab, slab)))
-
-
 def _begins(marked: BoolArray) -> BoolArray:
-    """Return where runs begin along the rows of a plane."""
     begins = marked.copy()
     begins[:, 1:] &= ~marked[:, :-1]
     return begins

@@ -11,9 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Triple
 from ..errors import GridError, OptionTypeError, seen
-from ..options import ReadOptions
+from ..options import AUTO, ReadOptions
 from .census import Census, Extremes, not_finite
-from .field import AUTO, Field
+from .distances import check_negative_inside, choose_spacing
+from .field import Field
 from .interpret import interpret
 from .placement import (
     STRAIGHT,
@@ -28,7 +29,6 @@ from .placement import (
     placed,
 )
 from .planes import NoPlanes, SampleArray, SamplePlanes
-from .spacing import check_negative_inside, choose_spacing
 
 MASK_HINT = "a mask holds no distances; make a grid of it with make_grid or read_grid"
 
@@ -102,9 +102,10 @@ class SdfGrid:
         if census.has_two_values:
             raise GridError(f"the only values are {low:.6g} and {high:.6g}: {MASK_HINT}")
         check_negative_inside(census)
-        notes: list[str] = []
-        chosen = choose_spacing(census, check_spacing(spacing), notes)
-        self._set(samples, (chosen, given.origin, direction), tuple(notes), census.extremes)
+        chosen, notes = choose_spacing(census, check_spacing(spacing))
+        place, extremes = (chosen, given.origin, tuple(notes)), census.extremes
+        grid = self.trusted(samples, *place, direction=direction, extremes=extremes)
+        vars(self).update(vars(grid))
 
     @classmethod
     def trusted(
@@ -127,28 +128,12 @@ class SdfGrid:
         """
         given = placed(values, spacing, origin)
         samples = as_samples(given.values)
-        extremes = extremes or _checked(samples).extremes
+        low, high = extremes or _checked(samples).extremes
         grid = object.__new__(cls)
-        place = check_spacing(spacing), given.origin, direction
-        grid._set(samples, place, notes, extremes, positive_inside, field)
-        return grid
-
-    def _set(
-        self,
-        samples: SampleArray,
-        place: tuple[Triple, ArrayLike | None, ArrayLike | None],
-        notes: tuple[str, ...],
-        extremes: Extremes,
-        positive_inside: bool = False,
-        field: Field | None = None,
-    ) -> None:
-        """Set all fields."""
-        low, high = extremes
-        spacing, origin, direction = place
-        vars(self).update(
+        vars(grid).update(
             samples=samples,
-            spacing=spacing,
-            origin=as_triple(0.0 if origin is None else origin, "origin"),
+            spacing=check_spacing(spacing),
+            origin=as_triple(0.0 if given.origin is None else given.origin, "origin"),
             direction=check_direction(direction),
             notes=notes,
             positive_inside=positive_inside,
@@ -156,12 +141,11 @@ class SdfGrid:
             high=-low if positive_inside else high,
             field=field or Field(),
         )
+        return grid
 
     def noted(self, notes: tuple[str, ...]) -> SdfGrid:
         """Return the same grid with more sentences on it, before those on what was inferred."""
-        if not notes:
-            return self
-        return _with(self, notes=(*notes, *self.notes))
+        return with_fields(self, notes=(*notes, *self.notes)) if notes else self
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.shape))
@@ -291,10 +275,9 @@ def make_grid(
     OptionError
         If ``inside`` or ``field`` is not one of these, or another option is no number.
     """
-    notes: list[str] = []
     wanted = ReadOptions(inside=inside, field=field, label=label, level=level, scale=scale)
     given = placed(values, spacing, origin)
-    taken = interpret(as_samples(given.values), wanted, given.spacing, notes)
+    taken, notes = interpret(as_samples(given.values), wanted, given.spacing)
     origin = given.origin
     if origin is None:
         notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
@@ -331,7 +314,7 @@ def _checked(samples: SampleArray) -> Census:
     return census
 
 
-def _with(grid: SdfGrid, **fields: Any) -> SdfGrid:
+def with_fields(grid: SdfGrid, **fields: Any) -> SdfGrid:
     """Return a grid with other fields, taken as they are."""
     other = copy(grid)
     vars(other).update(fields)
@@ -340,7 +323,7 @@ def _with(grid: SdfGrid, **fields: Any) -> SdfGrid:
 
 def without_samples(grid: SdfGrid) -> SdfGrid:
     """Return a grid that knows all but its samples: their shape and type, place and field."""
-    return _with(grid, samples=NoPlanes(grid.shape, grid.samples.dtype))
+    return with_fields(grid, samples=NoPlanes(grid.shape, grid.samples.dtype))
 
 
 def negated(values: NDArray[Any]) -> NDArray[Any]:

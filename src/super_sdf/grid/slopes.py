@@ -59,11 +59,10 @@ def distinct(values: NDArray[Any]) -> NDArray[Any]:
 
 @dataclass(frozen=True, eq=False)
 class Gradients:
-    """Gradients of a field at some samples.
+    """Gradients (n, 3) of a field at some samples, in index units, and how bent it is there.
 
-    ``vectors`` (n, 3) are central differences in index units, one-sided ones at the ends of the
-    grid. ``bend`` (n,) is the sum of the absolute second differences over their length: 0 for a
-    linear field, infinite where opposite neighbours are equal.
+    ``bend`` (n,) is the sum of the absolute second differences over their length: 0 for a linear
+    field, infinite where opposite neighbours are equal.
     """
 
     vectors: Floats
@@ -80,10 +79,7 @@ class Gradients:
 
     @cached_property
     def straighter(self) -> BoolArray:
-        """Which are in the less bent half of the field, (n,); of enough, those below ``STRAIGHT``.
-
-        Thin walls, edges and noise bend the field, and make its gradient too short or too long.
-        """
+        """Which are in the less bent half of the field, (n,); of enough, below ``STRAIGHT``."""
         limit = median(self.bend)
         if (self.bend < STRAIGHT).sum() >= ENOUGH:
             limit = min(limit, STRAIGHT)
@@ -153,9 +149,9 @@ class Gradients:
 
 
 def gradients_beside_surface(slab: NDArray[Any], middle: int, number: int) -> tuple[Any, ...]:
-    """Return ranks, gradients (n, 3) and bends (n,) at samples next to the surface in a plane.
+    """Return ranks, gradients (n, 3) and bends (n,) beside the surface in the ``middle`` plane.
 
-    The slab has the planes beside it, too. ``number`` is that of the plane's first sample.
+    ``number`` is that of the plane's first sample.
     """
     slab = np.asarray(slab)
     inside = slab <= 0
@@ -179,10 +175,9 @@ def gradients_beside_surface(slab: NDArray[Any], middle: int, number: int) -> tu
 
 
 def gradients_where_straight(slab: NDArray[Any], step: int) -> tuple[Floats, Floats]:
-    """Return gradients (n, 3) and bends (n,) in every ``step``-th inner row of the middle plane.
+    """Return gradients (n, 3) and bends (n,) in every ``step``-th row where the field is not bent.
 
-    They are those at samples at which the field is not bent. Where the values are constant, as
-    those of a truncated field are, there is no gradient.
+    Where the values are constant, as those of a truncated field are, there is no gradient.
     """
     inner = slice(1, -1, step), slice(1, -1)
     above = slab[2][inner], slab[1, 2::step, 1:-1], slab[1, 1:-1:step, 2:]

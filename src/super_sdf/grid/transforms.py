@@ -44,22 +44,14 @@ class Transform(NamedTuple):
 
 
 class Apart(NamedTuple):
-    """Where values follow from the sides: at samples at which exact distances may not.
+    """Whether values follow from the sides at samples at which exact distances may not."""
 
-    Their nearest one of another side is not along an axis: exact distances to planes half-way
-    between samples are others there. Or it is, but farther than the next (``beyond``): so are those
-    to all but planes at 45 degrees.
-    """
-
-    apart: bool
-    beyond: bool
+    apart: bool  # from an axis: exact distances to planes half-way between samples are others there
+    beyond: bool  # the next one along an axis: so are those to all but planes at 45 degrees
 
 
 def find_transform(looked: Looked, spacing: Triple | None) -> Transform | None:
-    """Return what transform of a mask values are, by samples beside the surface; None if of none.
-
-    ``spacing`` is that of each axis, if it is known.
-    """
+    """Return what transform of a mask the values beside the surface are; None if of none."""
     steps = np.ones(3) if spacing is None or is_cubic(spacing) else np.array(spacing)
     steps = steps / steps.min()
     patches = looked.around[:: len(looked.around) // MOST_PATCHES + 1]
@@ -115,10 +107,10 @@ def _of_both_sides(
 def _with_zeros(
     patches: Floats, steps: Floats, clipped: Floats, unit: float, side: int, *, is_flat: bool
 ) -> Transform | None:
-    """Return the transform if samples beside the surface are 0 on one side.
+    """Return the transform if samples beside the surface are 0 on one side, the other is ``side``.
 
-    ``side`` is the sign of the others there. Values that are ``is_flat`` beyond the second sample
-    may be the shares of voxels that are inside, 0, 1/2 and 1.
+    Values that are ``is_flat`` beyond the second sample may be the shares of voxels that are
+    inside, 0, 1/2 and 1.
     """
     signs = np.sign(patches)
     one_sided = clipped.min() == 0
@@ -140,10 +132,7 @@ def _with_zeros(
 
 
 def _euclidean(steps: Floats, unit: float) -> Iterator[tuple[Measure, float]]:
-    """Yield the Euclidean measures, in the world, and on the lattice if that is another one.
-
-    ``unit`` is the least value. With each is the spacing that it shows.
-    """
+    """Yield Euclidean measures, in the world and on the lattice, and the spacings they show."""
     yield partial(_length, steps), unit
     if steps.max() > 1 + ZERO:
         yield partial(_length, np.ones(3)), unit
@@ -173,10 +162,7 @@ def _weighted(weight: float, offsets: NDArray[np.int64]) -> Floats:
 def _follow(
     patches: Floats, sides: Floats, measure: Measure, less: tuple[float, float], clipped: Floats
 ) -> Apart | None:
-    """Return where values follow from the sides, less something on either; None if they do not.
-
-    ``clipped`` are the largest values.
-    """
+    """Return where values follow from the sides, ``less`` something on either; None if nowhere."""
     nearest, straight = _nearest(sides, measure)
     values = patches[:, INNER, INNER, INNER].reshape(nearest.shape)
     nearest -= np.where(values < 0, *less)
@@ -192,9 +178,9 @@ def _follow(
 
 
 def _nearest(sides: Floats, measure: Measure) -> tuple[Floats, BoolArray]:
-    """Return how far the nearest sample of another side is, NaN if it may be out of the patch.
+    """Return how far from inner samples (m, 27) the nearest of another side is; if along an axis.
 
-    It is that of the inner samples, (m, 27); and whether it is along an axis.
+    It is NaN if it may be out of the patch.
     """
     flat = sides.reshape(len(sides), -1)
     inner = AROUND[np.abs(AROUND).max(1) < BESIDE]
@@ -243,15 +229,11 @@ def _is_stepped(sides: Floats) -> bool:
 
 
 def _at(patches: BoolArray, offset: NDArray[np.int64]) -> BoolArray:
-    """Return the samples at an offset from the middle of patches (m, 3, 3, 3)."""
     return np.asarray(patches[(..., *(1 + offset))])
 
 
 def _side_of_zeros(sides: Floats) -> int:
-    """Return the sign of the side that zeros are the border of, 0 if that does not show.
-
-    Each of them has a neighbour of the other side then, but not of its own side.
-    """
+    """Return the sign of the side that zeros border, with no neighbour there; 0 if unclear."""
     zero = sides[:, INNER, INNER, INNER] == 0
     lone = [_count_lone(sides != sign, zero) for sign in (-1, 1)]
     return int(np.sign(lone[1] - lone[0]))

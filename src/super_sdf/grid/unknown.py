@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from ..arrays import BoolArray
 from ..errors import GridError
@@ -38,30 +38,41 @@ FEW_SPANS = 3.0  # times what few values span is more than they change by
 MANY = 4096  # samples among which different values are counted
 ENOUGH = 30  # changes from which the steepest is known
 LEAST_JUMPS = 6  # beside one value
+SIDES = slice(1, None), slice(None, -1)  # of two samples beside each other
 
 Floats = NDArray[np.float64]
 
 
-class KnownPlanes(SamplePlanes):
+class _OfRegions(SamplePlanes):
+    """Samples of which those in some regions are others, when they are read."""
+
+    name = "the grid"
+
+    def __init__(
+        self, source: SampleArray, regions: Regions, dtype: DTypeLike | None = None
+    ) -> None:
+        self.source, self.regions = source, regions
+        self.shape, self.dtype = tuple(source.shape), np.dtype(dtype or source.dtype)
+
+    def working_bytes(self, planes: int) -> int:
+        """Return about how much memory making that many planes takes."""
+        read, copies = planes + 2 * self.beside, 10 if self.beside else 2
+        return copies * read * self.plane_bytes + RUN_BYTES * self.shape[1] * self.shape[2]
+
+
+class KnownPlanes(_OfRegions):
     """Samples whose unknown ones are replaced by the cut-off of their side, when they are read.
 
     Where both sides are near, the samples are continued linearly over ``LAYERS`` unknown ones;
     farther away, unknown ones get ``outside``, one of the two ``limits``.
     """
 
-    name = "the grid"
-
     def __init__(
         self, source: SampleArray, regions: Regions, limits: Extremes, outside: float
     ) -> None:
-        self.source, self.regions, self.limits, self.outside = source, regions, limits, outside
-        self.shape, self.dtype = tuple(source.shape), source.dtype
+        super().__init__(source, regions)
+        self.limits, self.outside = limits, outside
         self.beside = 2 * LAYERS if regions.unsure.any() else 0
-
-    @property
-    def block(self) -> int:
-        """Planes that are made at a time: more, if each needs some beside it."""
-        return max(super().block, 2 * self.beside)
 
     @property
     def not_continued(self) -> KnownPlanes:
@@ -73,10 +84,10 @@ class KnownPlanes(SamplePlanes):
     @property
     def unseen(self) -> SampleArray | None:
         """Which samples are unknown and have both sides, or none, beside their region."""
-        return UnseenPlanes(self.source, self.regions) if self.beside else None
+        return UnseenPlanes(self.source, self.regions, bool) if self.beside else None
 
     def read(self, first: int, last: int) -> NDArray[Any]:
-        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
+        """Return planes ``first`` to ``last`` (exclusive)."""
         start, stop = max(first - self.beside, 0), min(last + self.beside, len(self))
         planes = np.array(self.source[start:stop])
         low, high = self.limits
@@ -91,14 +102,8 @@ class KnownPlanes(SamplePlanes):
         planes[np.isnan(planes)] = self.outside
         return planes[first - start : last - start]
 
-    def working_bytes(self, planes: int) -> int:
-        """Return about how much memory making that many planes takes."""
-        plane, copies = self.shape[1] * self.shape[2], 10 if self.beside else 2
-        return copies * (planes + 2 * self.beside) * self.plane_bytes + RUN_BYTES * plane
-
 
 def _continued(planes: NDArray[Any], limits: Extremes) -> NDArray[Any]:
-    """Return planes in which samples are continued linearly over ``LAYERS`` that are NaN."""
     for _ in range(LAYERS if np.isnan(planes).any() else 0):
         total, count = np.zeros(planes.shape), np.zeros(planes.shape, np.int8)
         for axis in range(3):
@@ -113,17 +118,11 @@ def _continued(planes: NDArray[Any], limits: Extremes) -> NDArray[Any]:
     return planes
 
 
-class UnseenPlanes(SamplePlanes):
+class UnseenPlanes(_OfRegions):
     """Which samples are unknown, with both sides beside their region, or none."""
 
-    name = "the grid"
-    dtype = np.dtype(bool)
-
-    def __init__(self, source: SampleArray, regions: Regions) -> None:
-        self.source, self.regions, self.shape = source, regions, tuple(source.shape)
-
     def read(self, first: int, last: int) -> BoolArray:
-        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
+        """Return planes ``first`` to ``last`` (exclusive)."""
         planes = np.isnan(self.source[first:last])
         for i, unknown in enumerate(planes, first):
             unknown[unknown] = self.regions.unsure[self.regions.runs_of(i, unknown)[unknown]]
@@ -142,20 +141,17 @@ class UnseenPlanes(SamplePlanes):
         )
 
 
-class SeenPlanes(SamplePlanes):
+class SeenPlanes(_OfRegions):
     """Samples that are NaN in some regions of a value, when they are read."""
-
-    name = "the grid"
-    dtype = np.dtype(np.float64)
 
     def __init__(
         self, source: SampleArray, regions: Regions, unseen: BoolArray, value: float
     ) -> None:
-        self.source, self.regions, self.unseen, self.value = source, regions, unseen, value
-        self.shape = tuple(source.shape)
+        super().__init__(source, regions, np.float64)
+        self.unseen, self.value = unseen, value
 
     def read(self, first: int, last: int) -> NDArray[Any]:
-        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
+        """Return planes ``first`` to ``last`` (exclusive)."""
         planes = np.array(self.source[first:last], np.float64)
         for i, plane in enumerate(planes, first):
             marked = self.regions.is_marked(plane)
@@ -163,16 +159,9 @@ class SeenPlanes(SamplePlanes):
             plane[marked] = np.where(self.unseen[runs], np.nan, plane[marked])
         return planes
 
-    def working_bytes(self, planes: int) -> int:
-        """Return about how much memory making that many planes takes."""
-        return 2 * planes * self.plane_bytes + RUN_BYTES * self.shape[1] * self.shape[2]
-
 
 def filled(census: Census, notes: list[str]) -> KnownPlanes:
-    """Return samples of which the unknown ones are replaced, and say so in the notes.
-
-    GridError if no sample is known, or one that is infinite is beside the surface.
-    """
+    """Return samples of which the unknown ones are replaced, and say so in the notes."""
     samples, numbers, regions = census.samples, census.numbers, census.unknown
     low, high = finite_extremes(census)
     nan = int(regions.size.sum())
@@ -203,20 +192,18 @@ def finite_extremes(census: Census) -> Extremes:
 
 def _check_infinite(samples: SampleArray) -> None:
     """Raise GridError if infinite samples are beside the surface."""
-    parts = [np.empty((0, 3), np.int64)]
+    beside: set[tuple[int, int, int]] = set()
     for i, slab in enumerate(with_the_one_before(samples)):
-        plane = slab[-1]
-        pairs = [((0, 0, 1), plane[:, 1:], plane[:, :-1]), ((0, 1, 0), plane[1:], plane[:-1])]
-        pairs += [((1, 0, 0), plane, slab[0])] if i else []
-        for step, one, other in pairs:
+        at = np.indices(slab.shape)
+        at[0] += i + 1 - len(slab)
+        for axis in range(3):
+            one, other = (np.moveaxis(slab, axis, 0)[side] for side in SIDES)
             crossed = ~(np.isnan(one) | np.isnan(other)) & ((one > 0) != (other > 0))
-            for values, shift in ((one, step), (other, (0, 0, 0))):
-                jk = np.argwhere(crossed & np.isinf(values))
-                plane_of = np.full((len(jk), 1), i - step[0])
-                parts.append(np.concatenate([plane_of, jk], axis=1) + np.array(shift))
-    beside = np.unique(np.concatenate(parts), axis=0)
-    if len(beside):
-        i, j, k = (int(index) for index in beside[0])
+            for values, side in zip((one, other), SIDES):
+                places = np.moveaxis(at, axis + 1, 1)[:, side][:, crossed & np.isinf(values)]
+                beside |= set(map(tuple, places.T.tolist()))
+    if beside:
+        i, j, k = min(beside)
         raise GridError(
             f"values[{i}, {j}, {k}] is {samples[i][j, k]!s}, and a sample beside it has the other "
             f"sign, as at {len(beside):,} infinite samples: where the surface passes between them "
@@ -254,7 +241,7 @@ def _suspects(pairs: Floats, extremes: Extremes) -> list[tuple[float, float]]:
     often = values[counts >= ENOUGH][np.argsort(counts[counts >= ENOUGH])[-FREQUENT:]]
     changes = np.abs(pairs[1] - pairs[0])
     ordered = np.sort(changes)
-    extreme = _are_any(pairs, extremes)
+    extreme = np.isin(pairs, extremes)
     changes[extreme[0] & extreme[1]] = 0  # values that are cut off near the surface
     suspects = []
     for value in sorted({0.0, *extremes, *often.tolist()}):
@@ -283,19 +270,16 @@ def _least_steep(pairs: Floats, ordered: Floats, has: BoolArray, extreme: BoolAr
 
 
 def _is_cut_near(pairs: Floats, value: float, steepest: float, extremes: Extremes) -> bool:
-    """Return whether the sign changes from one extreme to the other, and others are near a value.
-
-    So it does where values are cut off near the surface, or what is unseen was filled in by hand.
-    """
+    """Return whether the sign changes between the extremes, and others are near a value."""
     crossing = pairs[:, (pairs[0] > 0) != (pairs[1] > 0)]
-    others = pairs[~_are_any(pairs, extremes)]
+    others = pairs[~np.isin(pairs, extremes)]
     near = np.abs(others - value).min(initial=np.inf) < JUMP * steepest
-    return bool(near and _are_any(crossing, extremes).all(0).mean() > FILLED_IN)
+    return bool(near and np.isin(crossing, extremes).all(0).mean() > FILLED_IN)
 
 
 def _steepest(pairs: Floats, value: float, extremes: Extremes) -> float:
     """Return the steepest change of samples without a value, or all that they span, if few tell."""
-    rest, inner = pairs[pairs != value], pairs[~_are_any(pairs, (value, *extremes))]
+    rest, inner = pairs[pairs != value], pairs[~np.isin(pairs, (value, *extremes))]
     changes = np.abs(pairs[1] - pairs[0])[(pairs != value).all(0)]
     span = np.ptp(inner) if len(inner) else 0.0  # larger changes are those to another such value
     changes = changes[(changes > 0) & (changes <= span)]
@@ -306,7 +290,6 @@ def _steepest(pairs: Floats, value: float, extremes: Extremes) -> float:
 
 
 def _check_jumps(census: Census, value: float, count: int, limit: float) -> None:
-    """Raise GridError if the sign changes mostly by jumps from where values are cut off."""
     pairs = census.pairs[:, (census.pairs[0] > 0) != (census.pairs[1] > 0)]
     jumps = _are_jumps(pairs, limit, census.extremes) & (pairs == value).any(0)
     if jumps.mean() > MIXED and jumps.sum() >= LEAST_JUMPS:
@@ -316,21 +299,13 @@ def _check_jumps(census: Census, value: float, count: int, limit: float) -> None
         )
 
 
-def _are_any(values: Floats, some: tuple[float, ...]) -> BoolArray:
-    """Return which values are one of some."""
-    are_any = np.zeros(values.shape, bool)
-    for one in some:
-        are_any |= values == one
-    return are_any
-
-
 def _are_jumps(pairs: Floats, limit: float, extremes: Extremes) -> BoolArray:
     """Return which pairs (2, n) differ by more than a limit, but for those of both extremes.
 
     Values that are cut off near the surface, or filled in by hand, go from one to the other.
     """
     large: BoolArray = np.abs(pairs[1] - pairs[0]) > limit
-    return large & ~_are_any(pairs, extremes).all(0)
+    return large & ~np.isin(pairs, extremes).all(0)
 
 
 def _unseen_runs(
@@ -369,7 +344,7 @@ def _count_beside(
         for one, values, other, others in sides:
             at = (one >= 0) & (other < 0) & np.isfinite(others)
             pairs = np.stack([values[at], others[at]]).astype(np.float64)
-            count(0, one[at][~_are_any(pairs, extremes).all(0)])
+            count(0, one[at][~np.isin(pairs, extremes).all(0)])
             count(1, one[at][_are_jumps(pairs, limit, extremes)])
             count(2, one[at][pairs[1] > 0])
         if len(before) == 2:

@@ -19,7 +19,6 @@ import numpy as np
 from ..arrays import FloatArray, IntArray
 from ..errors import DeviceError, FileError, ModelError, OptionError
 from ..files.regular import check_regular_file
-from ..grid.field import MASK, NOISY
 from ..machine.resources import cores_of_system, useful_threads
 from ..machine.system import lacks_avx2, processor_name
 from ..neighbourhood import NEIGHBOURHOOD, cube_symmetries, turn
@@ -28,6 +27,8 @@ from ..options import (
     DEFAULT_QUALITY,
     FLOAT32,
     INT8,
+    MASK,
+    NOISY,
     OPTIONS,
     QUALITIES,
     check_path,

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import OptionError
-from ..grid.field import EXACT, NOISY, NONE_EXACT, Field
+from ..grid.field import NONE_EXACT, Field
 from ..grid.planes import SamplePlanes
 from ..grid.sdf_grid import SdfGrid
 from ..machine.resources import chunks_of
+from ..options import EXACT, NOISY
 from .band import rescale
 from .nodes import (
     BARELY_INSIDE,

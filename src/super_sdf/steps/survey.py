@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import NoSurfaceError, OutOfMemoryError
 from ..grid.cubic import Resampled, on_samples, sampled_places
-from ..grid.field import EXACT, MASK
 from ..grid.planes import (
     SampleArray,
     over_planes,
@@ -33,6 +32,7 @@ from ..grid.sdf_grid import SdfGrid, negated, without_samples
 from ..machine.memory import held_memory, in_words
 from ..machine.resources import ONE_THREAD, Resources, chunks_of, over_threads
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
+from ..options import EXACT, MASK
 from .band import (
     BLOCK_PLANES,
     BLOCK_SAMPLES,
