@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from super_sdf import SdfGrid, load_network, make_grid, pipeline, reconstruct
 from super_sdf.errors import OutOfMemoryError
+from super_sdf.grid.field import Field
 from super_sdf.machine import threads
 from super_sdf.machine.resources import Resources
 from super_sdf.mesh import Mesh, join_meshes
@@ -191,7 +192,7 @@ def test_the_plan_counts_how_distances_are_made_and_the_spline():
         assert band.peak > len(band.voxel_ijk) * 123 + len(band.beyond.number) * 12
     slabs = [cutting.whole(mask)]
     assert peak_bytes(replace(mask, peak=10**12), slabs, 4) == 10**12
-    fitted = replace(exact, smooth=exact.patches, exact=np.zeros_like(exact.exact))
+    fitted = replace(exact, field=Field(smooth=exact.patches), exact=np.zeros_like(exact.exact))
     assert slab_bytes(exact, *whole_of(exact)) > slab_bytes(fitted, *whole_of(fitted))
     large = replace(fitted, shape=(512, 512, 512))
     assert slab_bytes(large, *whole_of(fitted)) > 60 << 20

@@ -32,7 +32,14 @@ from ..steps import bounds, debris, spheres
 from ..steps.marching import LOOKUP_BYTES, lookups_at_once
 from ..steps.meshers import BY_NAME, Mesher
 from ..steps.spline import spline_bytes
-from ..steps.survey import Band, band_bytes, look_at_band, outline, plan_reading
+from ..steps.survey import (
+    Band,
+    band_bytes,
+    count_crossings,
+    look_at_band,
+    outline,
+    plan_reading,
+)
 
 DEFAULT = BY_NAME[DEFAULT_MESHER]
 SURFACE_SHARE, DOUBT = 0.25, "is this a distance field?"  # of which few samples are
@@ -122,7 +129,7 @@ def _ways(
 def check_vertices(band: Band, factor: int) -> None:
     """Raise OptionError if the mesh will certainly have more vertices than 32-bit numbers."""
     if int(band.decoded_before[-1]) * 3 * factor**3 > index_width.MAX_INDEX:
-        check_crossings(band.count_crossings(), factor)
+        check_crossings(count_crossings(band.patches), factor)
 
 
 def check_crossings(crossings: int, factor: int) -> None:
@@ -246,12 +253,13 @@ def slab_bytes(
         name: each[0] * voxels + (each[1] + each[2] * nodes) * own + fixed
         for name, each in STAGES.items()
     }
-    needs["spline"] += spline_bytes(band.shape) if band.smooth is not None else 0
-    if band.smooth is not None and not band.exact.any():
+    is_smooth = band.field.smooth is not None
+    needs["spline"] += spline_bytes(band.shape) if is_smooth else 0
+    if is_smooth and not band.exact.any():
         del needs["fit"]  # there are no spheres
     extra = _sharp_bytes if mesher == SHARP else _lookup_bytes
     needs["mesh"] += extra(band, planes, own, factor, threads)
-    if band.smooth is None or band.has_kinks:  # the network decodes no fewer voxels than offsets
+    if not is_smooth or band.field.has_kinks:  # the network decodes no fewer voxels than offsets
         network = network_bytes[0] * voxels + network_bytes[1] * max(own, nodes) * nodes
         needs["network"] = network + BYTES_PER_OFFSET * nodes + NETWORK_FIXED
     return int(max(needs.values()))

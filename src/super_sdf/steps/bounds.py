@@ -78,7 +78,7 @@ def samples_beyond(rescaled: FloatArray, first: int, limits: tuple[float, float]
         return NONE_BEYOND
     low, high = np.asarray(limits, np.float32).clip(-FARTHEST, FARTHEST)
     found = (rescaled > low) & (rescaled < high)
-    found &= ~((rescaled > -HALF_BAND) & (rescaled < HALF_BAND))
+    found &= np.abs(rescaled) >= HALF_BAND
     return SamplesBeyond(np.flatnonzero(found) + first, rescaled[found])
 
 

@@ -47,13 +47,13 @@ def interpolate(
     Of a field that is far from a distance, or was cut off, the network adds nothing. ``inputs`` are
     those of ``decode``, for the voxels (D, 3).
     """
-    assert band.smooth is not None
+    smooth, uneven = band.field.smooth, band.field.is_uneven
+    assert smooth is not None
     patches, table, voxels = inputs
-    size, uneven = band.half_voxel, band.is_uneven
-    blocks, share = spline_blocks(band.smooth, own_ijk, factor, size, uneven=uneven)
+    blocks, share = spline_blocks(smooth, own_ijk, factor, band.half_voxel, uneven=uneven)
     blocks[:, :-1] -= np.float32(band.level)
     some = np.flatnonzero(share)
-    if band.has_kinks and len(some):
+    if band.field.has_kinks and len(some):
         kinked = patches, table, voxels[some]
         added = decode(network, kinked, block_offsets(factor), None, threads)[:, :-1]
         blocks[:, some] += share[some] * (added - blocks[:, some])
