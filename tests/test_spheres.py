@@ -7,11 +7,13 @@ from conftest import ball, trilinear
 from super_sdf import SdfGrid, load_network, pipeline, reconstruct
 from super_sdf.steps.band import MAX_DISTANCE, neighbour_table
 from super_sdf.steps.field import FineField
-from super_sdf.steps.foot_points import find_foot_points, sample_trilinear, spheres_of_band
 from super_sdf.steps.nodes import VoxelIndex, block_ijk, share_parts
 from super_sdf.steps.spheres import (
+    find_foot_points,
     fit_to_spheres,
     prolong,
+    sample_trilinear,
+    spheres_of_band,
 )
 from super_sdf.steps.survey import survey
 

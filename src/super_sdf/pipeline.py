@@ -34,7 +34,6 @@ from .steps.bounds import keep_within_bounds
 from .steps.cap import check_can_close, close, seen_octants
 from .steps.debris import count_between, drop_debris
 from .steps.field import FineField, SampleSpheres
-from .steps.foot_points import spheres_of_band
 from .steps.meshers import extract_pieces, find_mesher
 from .steps.nodes import (
     VoxelIndex,
@@ -46,7 +45,7 @@ from .steps.nodes import (
     share_parts,
     signs_of_skipped,
 )
-from .steps.spheres import fit_to_spheres
+from .steps.spheres import fit_to_spheres, spheres_of_band
 from .steps.spline import interpolate
 from .steps.survey import Band, no_surface
 

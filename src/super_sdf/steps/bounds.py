@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,16 +54,11 @@ REACH_IN_VOXELS = 2
 Rows = NDArray[np.intp]
 
 
-@dataclass(frozen=True, eq=False)
-class SamplesBeyond:
-    """Samples between the band and ``FARTHEST`` that can be exact.
+class SamplesBeyond(NamedTuple):
+    """Samples between the band and ``FARTHEST`` that can be exact."""
 
-    ``number``, (n,) int64, is the number of each in C order of the grid, ascending; ``value``, (n,)
-    float32, are their values.
-    """
-
-    number: NDArray[np.int64]
-    value: FloatArray
+    number: NDArray[np.int64]  # (n,), in C order of the grid, ascending
+    value: FloatArray  # (n,)
 
 
 NONE_BEYOND = SamplesBeyond(np.zeros(0, np.int64), np.zeros(0, np.float32))
@@ -148,7 +144,11 @@ def keep_within_bounds(
                 bounded[:, here] = moved.T
 
     map_chunks(work, len(voxel_ijk), CHUNK // BOX_ROWS, threads)
-    np.copyto(blocks, bounded, where=~(thin | _any_beside(thin, parts)))
+    kept = thin.copy()  # and the blocks that share a face with a thin wall
+    for stride in STRIDES:
+        for place in (CENTRE - int(stride), CENTRE + int(stride)):
+            kept[:-1] |= thin[parts.table[place]]
+    np.copyto(blocks, bounded, where=~kept)
     average_shared(blocks, parts, factor, threads)
 
 
@@ -267,12 +267,3 @@ def loses_wall(values: FloatArray, moved: FloatArray) -> BoolArray:
     inside = values <= 0
     lost: BoolArray = (inside & (moved > 0)).sum(1) > MOST_LOST * inside.sum(1)
     return lost
-
-
-def _any_beside(flags: BoolArray, parts: SharedParts) -> BoolArray:
-    """Return which blocks share a face with a block of a flag, (D + 1,); the last flag is False."""
-    found = np.zeros_like(flags)
-    for stride in STRIDES:
-        for place in (CENTRE - int(stride), CENTRE + int(stride)):
-            found[:-1] |= flags[parts.table[place]]
-    return found
