@@ -20,7 +20,7 @@ from ...machine.threads import chunks_of, map_chunks
 from ...neighbourhood import CENTRE, STRIDES
 from ..cell_cases import loop_table
 from ..field import FineField
-from ..marching import Crossings, cells_low_nodes, edge_shifts, edge_steps, part_of_edge
+from ..marching import Crossings, cells_low_nodes, edge_steps, edge_table, owners_of
 from ..nodes import block_ijk
 
 Index = NDArray[np.int64]
@@ -118,7 +118,7 @@ def find_patches(
     slot, edge_at = _edges_of(field, crossings, voxels)
     some = voxels[crossings.cell_row]
     case = crossings.case[some]
-    count = table.count[case]
+    count = table.times[case]
     cell = np.repeat(np.arange(len(count)), count)
     loop = table.first[case[cell]] + nth_of_row(cell, count)
     row = crossings.cell_row[some][cell]
@@ -142,20 +142,12 @@ def _edges_of(field: FineField, crossings: Crossings, voxels: BoolArray) -> tupl
 
     Before it comes the place of each voxel in the table, (D,).
     """
-    edges = 3 * len(field.blocks)
-    other = voxels[crossings.other_row]
-    row, edge = crossings.other_row[other], crossings.other_edge[other].astype(np.int64)
-    place = field.parts.owner[part_of_edge(field.factor)[edge], row]
-    owner = field.parts.table[place, row]
+    others = np.flatnonzero(voxels[crossings.other_row])
     listed = voxels.copy()
-    listed[owner] = True
+    listed[owners_of(field, crossings, others)[1]] = True
     slot: Index = np.cumsum(listed) - 1
-    edge_at = np.empty(int(listed.sum()) * edges, np.int32)  # unset entries are not read
     own = np.flatnonzero(listed[crossings.own_row])
-    edge_at[slot[crossings.own_row[own]] * edges + crossings.own_edge[own]] = own
-    same_edge = slot[owner] * edges + edge - edge_shifts(field.factor)[place]
-    edge_at[slot[row] * edges + edge] = edge_at[same_edge]
-    return slot, edge_at
+    return slot, edge_table(field, crossings, slot.take, int(listed.sum()), own, others, own)
 
 
 def dilate(patches: Patches, chosen: BoolArray, rings: int, count: int) -> BoolArray:
