@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from super_sdf.steps.sharp.fans import Placed, triangles_of, unfolded
-from super_sdf.steps.sharp.patches import Patches
+from super_sdf.steps.sharp.patches import Patches, Placed, triangles_of, unfolded
 
 SQUARES = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0], [2, 1, 0]], float)
 

@@ -27,10 +27,17 @@ from ...neighbourhood import CENTRE, STRIDES
 from ..field import FineField
 from ..marching import Crossings, edge_ends, lattice_positions
 from ..nodes import block_ijk
-from .patches import Index, Patches, dilate, pairs_in_patches
-
-Vectors = NDArray[np.float64]
-Numbers = NDArray[np.float64]
+from .patches import (
+    Index,
+    Numbers,
+    Patches,
+    Vectors,
+    dilate,
+    dot,
+    length,
+    pairs_in_patches,
+    unit,
+)
 
 ROUNDS = 4  # in each, every crossing looks at those it shares a patch with
 ROUGH = 0.02  # 1 - cosine of normals in a patch from which a crossing is not trusted
@@ -43,24 +50,6 @@ SETTLED = 0.3  # trust from which a crossing keeps its own plane, unless ...
 SMOOTHED_RINGS = 1  # ... it lies within these of one that does not
 PAIR_TEMPORARIES = 24  # numbers per pair of crossings in a round
 TEMPORARIES = 256  # numbers per crossing in the computation of its plane
-
-
-def dot(a: Vectors, b: Vectors) -> Numbers:
-    """Return the products of vectors, (n,)."""
-    product: Numbers = a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
-    return product
-
-
-def length(vectors: Vectors) -> Numbers:
-    """Return the lengths of vectors, (n,)."""
-    lengths: Numbers = np.sqrt(dot(vectors, vectors))
-    return lengths
-
-
-def unit(vectors: Vectors) -> Vectors:
-    """Return vectors of length 1; 0 stays 0."""
-    units: Vectors = vectors / np.maximum(length(vectors), 1e-12)[..., None]
-    return units
 
 
 def sums(row: NDArray[np.int64], vectors: Vectors, count: int) -> Vectors:
