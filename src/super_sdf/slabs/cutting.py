@@ -48,15 +48,11 @@ REACH_IN_VOXELS = spheres.REACH_IN_VOXELS + bounds.REACH_IN_VOXELS + debris.REAC
 
 @dataclass(frozen=True)
 class Slab:
-    """A slab: its own planes, from the first to before the second, and rows of the band.
+    """A slab: planes and rows of the band."""
 
-    Of the rows ``decoded``, the voxels that can hold the surface are decoded; the network sees the
-    rows ``seen``.
-    """
-
-    planes: tuple[int, int]
-    decoded: slice
-    seen: slice
+    planes: tuple[int, int]  # its own, from the first to before the second
+    decoded: slice  # rows of which those that can hold the surface are decoded
+    seen: slice  # rows that the network sees
 
 
 def whole(band: Band) -> Slab:
@@ -135,8 +131,7 @@ def check_vertices(band: Band, factor: int) -> None:
 def check_crossings(crossings: int, factor: int) -> None:
     """Raise OptionError if this number of crossed coarse edges makes too many vertices for sure.
 
-    The surface crosses about K^2 times as many edges of the fine lattice as of the coarse one. Half
-    of this estimate is certain; the exact number is checked when the vertices have been counted.
+    The surface crosses about K^2 times as many edges of the fine lattice; half of them certainly.
     """
     index_width.check_count(crossings * factor**2 // 2, "vertices or more")
 
@@ -150,13 +145,8 @@ def peak_bytes(
     mesher: Mesher = DEFAULT,
 ) -> int:
     """Return the peak memory of the process in bytes: what it holds now plus the largest slab."""
-    held = held_memory() or band.patches.nbytes
-    needs = (
-        slab_bytes(
-            band, slab.seen, slab.decoded, slab.planes, factor, network_bytes, threads, mesher.name
-        )
-        for slab in slabs
-    )
+    held, rest = held_memory() or band.patches.nbytes, (factor, network_bytes, threads, mesher.name)
+    needs = (slab_bytes(band, slab.seen, slab.decoded, slab.planes, *rest) for slab in slabs)
     return max(held + max(needs), band.peak)
 
 
@@ -177,10 +167,7 @@ def cut(
 
 
 def equal_parts(before: NDArray[np.int64], pieces: int) -> list[tuple[int, int]]:
-    """Cut planes into at most some pieces with about the same number of decoded voxels.
-
-    ``before``, (n + 1,), are the decoded voxels before each plane, and all.
-    """
+    """Cut planes into at most some pieces with about equally many of what is ``before`` each."""
     share = before / max(int(before[-1]), 1)
     inner = np.searchsorted(share, np.arange(1, pieces) / pieces)
     last = len(before) - 1
@@ -202,9 +189,9 @@ def ways_to_cut(
 def slab_of(band: Band, first: int, last: int, receptive_field: int, beside: int) -> Slab:
     """Return the slab of planes ``first`` to before ``last``, with the rows it depends on."""
     beside += REACH_IN_VOXELS
+    more = beside + receptive_field
     decoded = band.rows(first - beside, last + beside)
-    beside += receptive_field
-    return Slab((first, last), decoded, band.rows(first - beside, last + beside))
+    return Slab((first, last), decoded, band.rows(first - more, last + more))
 
 
 def _does_not_fit(
@@ -242,10 +229,9 @@ def slab_bytes(
     threads: int = 1,
     mesher: str = DEFAULT_MESHER,
 ) -> int:
-    """Return the peak memory of the work on a slab, in bytes beyond what the process holds already.
+    """Return the peak memory of the work on a ``Slab``, in bytes beyond what is held already.
 
-    ``seen`` and ``decoded`` are rows of the band, see ``cutting.Slab``, ``planes`` those of the
-    slab alone; ``network_bytes`` is the memory of the network per voxel that it sees and per value.
+    ``network_bytes`` is the memory of the network per voxel that it sees and per value.
     """
     voxels, own, nodes = seen.stop - seen.start, band.count_decoded(decoded), (factor + 1) ** 3
     fixed = FIXED_BYTES + THREAD_BYTES * min(threads, own * nodes // CHUNK + 1)
@@ -275,10 +261,7 @@ def _lookup_bytes(band: Band, planes: Range, decoded: int, factor: int, threads:
 
 
 def _sharp_bytes(band: Band, planes: Range, decoded: int, factor: int, threads: int) -> int:
-    """Return the bytes of the sharp mesher on as many groups as it works on at once.
-
-    Where edges are is not known yet: every voxel of the planes beside a group may be near one.
-    """
+    """Return the bytes of the sharp mesher: every voxel beside a group may be near an edge."""
     from ..steps.sharp.mesher import GROUP_BYTES, groups_at_once, voxel_bytes
 
     beside = BY_NAME[SHARP].planes_beside(factor)
