@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import ball
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from super_sdf.errors import GridError
 from super_sdf.grid.census import Census
-from super_sdf.grid.one_sided import BEYOND, FAR, find_walls
+from super_sdf.grid.one_sided import BEYOND, FAR
 from super_sdf.grid.sdf_grid import make_grid
 
 N = 32
@@ -114,15 +112,6 @@ def test_what_only_looks_thin_is_refused_in_one_line(name, spacing):
         if "unsigned" in name or "shrank" in name:
             want = "mesh the shell round the surface with --inside negative --offset 1"
     assert want in message
-
-
-@settings(max_examples=20)
-@given(st.floats(0.02, 0.9), st.floats(-0.04, 0.04), st.integers(0, 2))
-def test_thickness_is_what_the_distances_leave(thickness, shift, axis):
-    values = np.moveaxis(np.abs(Z + shift) - thickness / 2, 2, axis)
-    walls, found = find_walls(np.moveaxis(values, axis, 0))
-    assert walls.sum() == N * N
-    np.testing.assert_allclose(found, thickness, atol=1e-12)
 
 
 def test_large_unsigned_fields_are_told_from_fewer_samples(monkeypatch):
