@@ -8,7 +8,7 @@ on in bricks, or too large.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import chain, pairwise
@@ -428,13 +428,6 @@ def _patches_of(
         yield ijk[kept], patches[kept]
 
 
-def check_jumps(jumps: list[tuple[Jumps, Jumps]], grid: SdfGrid, offset: float) -> None:
-    """Raise GridError if no sample is near an offset, or fill values begin near it."""
-    if not any(up.near for up, _ in jumps):
-        raise no_surface(grid, offset)
-    check_not_filled(jumps, offset, grid.voxel_size)
-
-
 def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:
     """Return the error for a grid without a surface at an offset."""
     return NoSurfaceError(
@@ -448,6 +441,13 @@ def count_crossings(patches: FloatArray) -> int:
     return sum(
         int(np.count_nonzero(inside != (patches[:, CENTRE + step] <= 0))) for step in STRIDES
     )
+
+
+def check_jumps(jumps: list[tuple[Jumps, Jumps]], grid: SdfGrid, offset: float) -> None:
+    """Raise GridError if no sample is near an offset, or fill values begin near it."""
+    if not any(up.near for up, _ in jumps):
+        raise no_surface(grid, offset)
+    check_not_filled(jumps, offset, grid.voxel_size)
 
 
 class Glance(NamedTuple):
@@ -476,20 +476,15 @@ def look_at_band(grid: SdfGrid, offset: float, planes: int = 0) -> Glance:
     # resampled ones are made here, and say so
     known = grid if isinstance(samples, Resampled) else without_samples(grid)
     parts = list(over_planes(samples, partial(_glance, known, offset), ranges))
-    jumps = list(chain.from_iterable(part.jumps for part in parts))
+    summaries, voxels, decoded, beyond, crossings, jumps = zip(*parts)
+    all_jumps = list(chain(*jumps))
     if offset:
-        check_jumps(jumps, grid, offset)
-    return Glance(
-        _of_all([part.summary for part in parts]),
-        list(chain.from_iterable(part.voxels for part in parts)),
-        list(chain.from_iterable(part.decoded for part in parts)),
-        sum(part.beyond for part in parts),
-        sum(part.crossings for part in parts),
-        jumps,
-    )
+        check_jumps(all_jumps, grid, offset)
+    counts = list(chain(*voxels)), list(chain(*decoded)), sum(beyond), sum(crossings)
+    return Glance(_of_all(summaries), *counts, all_jumps)
 
 
-def _of_all(summaries: list[BandSummary]) -> BandSummary:
+def _of_all(summaries: Sequence[BandSummary]) -> BandSummary:
     return BandSummary(
         sum(part.voxels for part in summaries),
         sum(part.noisy for part in summaries),

@@ -209,8 +209,7 @@ def mean_along_chain(patches: Patches, evidence: Vectors, count: int) -> Vectors
 def move_beside(patches: Patches, own: Planes, candidates: Candidates, sure: BoolArray) -> Vectors:
     """Return the positions of all crossings, (n, 3), those beside sure features on settled planes.
 
-    The move fades with the distance from the feature: where it ended at once, crossings that lie
-    close together would come apart, and make a step.
+    The move fades with the distance from the feature: otherwise there would be a step.
     """
     distance = distance_from(
         patches, candidates.patch[sure], candidates.vertex[sure], own.point, MOVED_RINGS
@@ -225,10 +224,7 @@ def move_beside(patches: Patches, own: Planes, candidates: Candidates, sure: Boo
 def distance_from(
     patches: Patches, features: Index, vertex: Vectors, point: Vectors, rings: int
 ) -> Numbers:
-    """Return the distance of crossings to the nearest vertex of a feature, (n,).
-
-    It is infinite for crossings that are not within some rings of patches round a feature.
-    """
+    """Return the distance of crossings to a feature's vertex within some rings of patches, (n,)."""
     distance: Numbers = np.full(len(point), np.inf)
     nearest = np.full(len(point), -1, np.int64)
     known = np.full(len(patches.row), -1, np.int64)
