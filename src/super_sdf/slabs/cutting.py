@@ -115,11 +115,17 @@ def refuse_band(
 def _ways(
     band: Band, receptive_field: int | None, beside: int, planes: tuple[int, int] | None = None
 ) -> Iterator[list[Slab]]:
-    """Yield the whole band, and then, if the receptive field is known, more and more slabs."""
+    """Yield the whole band, and, if the receptive field is known, more and more slabs of planes."""
     if planes is None:
         yield [whole(band)]
-    if receptive_field is not None:
-        yield from ways_to_cut(band, receptive_field, beside, planes)
+    if receptive_field is None:
+        return
+    first, last = planes or (0, band.shape[0])
+    for pieces in range(1, max(last - first, 2)):
+        yield cut(band, pieces, receptive_field, beside, planes)
+    decoding = np.flatnonzero(np.diff(band.decoded_before[first : last + 1])) + first
+    bounds = [first, *decoding.tolist()[1:], last]  # each slab decodes something
+    yield [slab_of(band, low, high, receptive_field, beside) for low, high in pairwise(bounds)]
 
 
 def check_vertices(band: Band, factor: int) -> None:
@@ -172,18 +178,6 @@ def equal_parts(before: NDArray[np.int64], pieces: int) -> list[tuple[int, int]]
     inner = np.searchsorted(share, np.arange(1, pieces) / pieces)
     last = len(before) - 1
     return list(pairwise(sorted(set(np.clip([0, *inner, last], 0, last).tolist()))))
-
-
-def ways_to_cut(
-    band: Band, receptive_field: int, beside: int, planes: tuple[int, int] | None = None
-) -> Iterator[list[Slab]]:
-    """Yield cuts into more and more slabs, down to slabs of one plane."""
-    first, last = planes or (0, band.shape[0])
-    for pieces in range(1, max(last - first, 2)):
-        yield cut(band, pieces, receptive_field, beside, planes)
-    decoding = np.flatnonzero(np.diff(band.decoded_before[first : last + 1])) + first
-    bounds = [first, *decoding.tolist()[1:], last]  # each slab decodes something
-    yield [slab_of(band, low, high, receptive_field, beside) for low, high in pairwise(bounds)]
 
 
 def slab_of(band: Band, first: int, last: int, receptive_field: int, beside: int) -> Slab:

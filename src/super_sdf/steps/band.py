@@ -113,10 +113,7 @@ def _dilate(mask: BoolArray) -> BoolArray:
 
 
 def pad_by_extrapolation(rescaled: FloatArray) -> FloatArray:
-    """Return the grid padded by one sample on every side, extrapolated linearly, clipped to 3 h.
-
-    Steps that no distance makes are not continued: a grid that was padded has such on its border.
-    """
+    """Return the grid padded by one, extrapolated linearly but at jumps, clipped to 3 h."""
     padded = np.pad(np.clip(rescaled, -2 * PATCH_LIMIT, 2 * PATCH_LIMIT), 1)
     for axis in range(3):
         planes = np.moveaxis(padded, axis, 0)
@@ -165,10 +162,7 @@ def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, ...]) -> IntArray:
 def plane_blocks(
     shape: tuple[int, ...], first: int = 0, last: int | None = None, least: int = BLOCK_PLANES
 ) -> Iterator[tuple[int, int]]:
-    """Yield (start, stop) of blocks of planes with about ``BLOCK_SAMPLES`` samples each.
-
-    They have at least ``least`` planes: more, if planes are made of many others beside them.
-    """
+    """Yield (start, stop) of blocks of ``BLOCK_SAMPLES`` samples or of ``least`` planes."""
     step = max(BLOCK_SAMPLES // (shape[1] * shape[2]), least)
     end = shape[0] if last is None else last
     for start in range(first, end, step):
@@ -338,10 +332,7 @@ def check_not_filled(found: list[tuple[Jumps, Jumps]], offset: float, voxel_size
 def _too_near(
     offset: float, voxel_size: float, end: float, needed: float, *, outwards: bool
 ) -> GridError:
-    """Return the error for an offset too near ``end``, where the distances end (world units).
-
-    ``needed`` is how far they must reach, in half voxels.
-    """
+    """Return the error for distances that end (world units) within ``needed`` half voxels."""
     room = needed / 2 * voxel_size
     limit, which = (end - room, "largest") if outwards else (end + room, "smallest")
     works = f"the {which} that works is {limit:.6g}" if limit * end > 0 else "only 0 works"

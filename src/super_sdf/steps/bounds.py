@@ -95,10 +95,7 @@ class TrustedSamples:
     limits: tuple[float, float]  # between these, samples beyond the band can be exact
 
     def box(self, low: IntArray, high: IntArray) -> FloatArray:
-        """Return the samples from index ``low`` (3,) to before ``high``, NaN where there is none.
-
-        The box may exceed the grid.
-        """
+        """Return the samples from index ``low`` (3,) to before ``high``, NaN where none is."""
         box = np.full(high - low, np.nan, np.float32)
         planes = slice(*np.searchsorted(self.voxel_ijk[:, 0], [low[0], high[0]]))
         exact = np.flatnonzero(self.exact[planes]) + planes.start
@@ -166,11 +163,7 @@ def cut_to_boxes(voxel_ijk: IntArray, rows: slice) -> Iterator[slice]:
 def samples_around(
     voxel_ijk: IntArray, samples: TrustedSamples
 ) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
-    """Return a box of samples (l,), NaN where none is trusted; where those of voxels (n, 3) are.
-
-    That is the place of each voxel's own sample, (n,), and the steps from there to the samples
-    around, (m,), in the order of ``sample_places``.
-    """
+    """Return a box of samples (l,), the places of voxels' (n,), and steps to those around, (m,)."""
     low = voxel_ijk.min(0) - REACH_OF_SAMPLES
     box = samples.box(low, voxel_ijk.max(0) + REACH_OF_SAMPLES + 1)
     strides = np.array([box.shape[1] * box.shape[2], box.shape[2], 1])
@@ -231,20 +224,14 @@ def move_out(
 
 @lru_cache
 def nodes_to_look_at(factor: int) -> Rows:
-    """Return the nodes of a block at its corners and in the middle of edges, faces and itself.
-
-    These 27 are filled up to 32 by the last.
-    """
+    """Return the 27 nodes at the ends and in the middle of a block, filled up to 32 by the last."""
     nodes = np.flatnonzero((block_ijk(factor) % (factor // 2) == 0).all(1))
     return np.pad(nodes, (0, 5), mode="edge")
 
 
 @lru_cache
 def sample_places() -> tuple[IntArray, FloatArray]:
-    """Return the steps from a block's own sample to those around, (m, 3), and distances, (m,).
-
-    The nearest is first: the sample itself.
-    """
+    """Return the steps from a sample to those around, (m, 3), itself first, and distances, (m,)."""
     reach = REACH_OF_SAMPLES
     steps = np.indices((2 * reach + 1,) * 3).reshape(3, -1).T - reach
     distance = 2 * np.linalg.norm(steps, axis=1)

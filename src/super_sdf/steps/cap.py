@@ -37,10 +37,7 @@ WAY_OUT = (
 
 
 def close(field: FineField, *, cap: bool, beside: int = 1) -> FineField:
-    """Return the field whose isosurface is closed where it should be.
-
-    Where the solid leaves the grid, that is if ``cap`` is set. See ``close_at_border``.
-    """
+    """Return the field closed where it should be; where the solid leaves the grid, with ``cap``."""
     if field.octants is not None:  # it ends where samples are unknown, and cannot be closed
         return field
     if field.leaves:

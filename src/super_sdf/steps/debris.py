@@ -61,10 +61,7 @@ class Lattice:
         return found
 
     def _copies(self, node: Nodes, upper: NDArray[np.intp]) -> Nodes:
-        """Return where nodes are in one of the up to eight blocks that share them.
-
-        ``upper``, (3,), says which block it is where two blocks meet: 1 the one after the face.
-        """
+        """Return where nodes are in one of the blocks that share them: ``upper`` 1 after a face."""
         voxel = (node - 1 + upper) // self.factor
         row, inner = self.index.find(voxel), node - self.factor * voxel
         side = self.factor + 1
@@ -110,10 +107,7 @@ def count_between(plane: IntArray, planes: tuple[int, int]) -> int:
 
 
 def find_seeds(blocks: FloatArray, factor: int, parts: SharedParts) -> Nodes:
-    """Return the nodes, as voxel and place in its block (n, 2), at which a small piece may begin.
-
-    The nodes before such a node have the other sign, along each axis, and so has one of the next K.
-    """
+    """Return the nodes, as voxel and place in its block (n, 2), at which small pieces may begin."""
     side, count = factor + 1, blocks.shape[1] - 1
 
     def seeds_of(rows: slice) -> Nodes:
@@ -143,10 +137,7 @@ def find_seeds(blocks: FloatArray, factor: int, parts: SharedParts) -> Nodes:
 
 
 def small_pieces(lattice: Lattice, seeds: Nodes) -> tuple[Nodes, Nodes]:
-    """Return the pieces of at most K nodes along each axis that begin at seeds.
-
-    They are the nodes of all, (m, 3), one piece after the other, and how many each has.
-    """
+    """Return the nodes (m, 3) of pieces of at most K nodes per axis from seeds, and sizes."""
     index, factor = lattice.index, lattice.factor
     voxel = np.stack(np.unravel_index(index.keys[seeds[:, 0]], index.shape), 1)
     start = factor * voxel + block_ijk(factor)[seeds[:, 1]]

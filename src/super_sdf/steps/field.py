@@ -148,10 +148,7 @@ class FineField:
 
     @cached_property
     def node_ijk(self) -> IntArray:
-        """The indices of all nodes in the fine lattice, in the order of ``values``, (n, 3) int32.
-
-        Node (i, j, k) is at the coarse index ``(i, j, k) / K - 1/2``.
-        """
+        """The indices of all nodes in the fine lattice, in the order of ``values``, (n, 3)."""
         ijk = np.empty((self.parts.count_nodes(self.factor), 3), np.int32)
         ijk[self.numbers] = self._block_node_ijk(slice(None))
         return ijk

@@ -149,10 +149,7 @@ def _split(
 
 
 def _crossed_edges(inside: BoolArray) -> NDArray[np.intp]:
-    """Return the crossed edges of blocks, as flat indices into a table (n, 3 Q).
-
-    ``inside`` is (K+1, K+1, K+1, n), True at inside nodes.
-    """
+    """Return the crossed edges of blocks (K+1, K+1, K+1, n), flat in a table (n, 3 Q)."""
     crossed = np.zeros((3, *inside.shape), bool)
     np.not_equal(inside[1:], inside[:-1], out=crossed[0, :-1])
     np.not_equal(inside[:, 1:], inside[:, :-1], out=crossed[1, :, :-1])
@@ -225,10 +222,7 @@ def lookups_at_once(voxels: int, widest: int, threads: int) -> int:
 def lattice_positions(
     field: FineField, row: IntArray, edge: NDArray[np.int16]
 ) -> NDArray[np.float64]:
-    """Return where the surface crosses edges of blocks, (3, n), in fine spacings from node 0.
-
-    By linear interpolation, ``CLEARANCE`` away from both ends.
-    """
+    """Return where the surface crosses edges of blocks, (3, n), in fine spacings from node 0."""
     axis, node = np.divmod(edge, np.int16(len(field.blocks)))
     low = field.blocks[node, row].astype(np.float64)
     high = field.blocks[edge_ends(field.factor)[edge], row].astype(np.float64)
@@ -259,10 +253,7 @@ def to_world(positions: NDArray[np.float64], field: FineField, grid: SdfGrid) ->
 
 @lru_cache
 def edge_ends(factor: int) -> NDArray[np.intp]:
-    """Return the node at the far end of each edge of a block, (3 Q,).
-
-    Edges that leave the block have a number here too, which is not used.
-    """
+    """Return the node at the far end of each edge, (3 Q,); that of edges that leave is not used."""
     return (np.arange((factor + 1) ** 3) + strides(factor)[:, None]).ravel()
 
 
@@ -354,10 +345,7 @@ def edge_steps(factor: int) -> NDArray[np.int64]:
 
 @lru_cache
 def _flat_triangles(factor: int) -> tuple[IntArray, IntArray, NDArray[np.int64]]:
-    """Return the triangles of all cases: how many, the first of each, and edges, (n, 3).
-
-    Edges are counted from the number of the cell's low node.
-    """
+    """Return the triangles of all cases: how many, the first, edges from the cell's low node."""
     counts, table = triangle_table()
     edge = edge_steps(factor)
     used = np.arange(table.shape[1]) < counts[:, None]

@@ -103,10 +103,7 @@ class VoxelIndex:
 
 
 def rows_among(voxels: IntArray, count: int) -> IntArray:
-    """Return the row in ``voxels`` of each of ``count`` voxels, -1 if it is not among them.
-
-    One more -1 at the end of (count + 1,) is for the index -1 of absent neighbours.
-    """
+    """Return the row in ``voxels`` of each of ``count`` voxels, or -1; one more -1 at the end."""
     row_of = np.full(count + 1, -1, np.int32)
     row_of[voxels] = np.arange(len(voxels), dtype=np.int32)
     return row_of
@@ -188,10 +185,7 @@ def copies_agree(blocks: FloatArray, parts: SharedParts, factor: int) -> bool:
 def _average_group(
     blocks: FloatArray, table: IntArray, factor: int, axes: tuple[bool, ...]
 ) -> None:
-    """Average the nodes at the block's ends along ``axes`` and inside along the other axes.
-
-    With one such axis they are the interiors of faces, with two of edges, with three the corners.
-    """
+    """Average the nodes at the block's ends along ``axes`` and inside along the other axes."""
     places, nodes_at = _nodes_of_group(factor, axes)
     kind = np.float32 if len(places) == 2 else np.float64
     means = []

@@ -361,10 +361,7 @@ def _mean_at_nodes(
 def _shrunk_mean(
     weight: NDArray[np.float64], total: NDArray[np.float64], squares: NDArray[np.float64]
 ) -> FloatArray:
-    """Return the means of values, shrunk towards 0 by little weight or large variance, (n,).
-
-    Given are the weighted sums of 1, of the values and of their squares, (n,) each.
-    """
+    """Return the means, (n,), by sums of weights, values and squares, shrunk if these disagree."""
     mean = total / np.maximum(weight, 1e-9)
     variance = np.maximum(squares / np.maximum(weight, 1e-9) - mean**2, 0)
     agreement = mean**2 / np.maximum(mean**2 + VARIANCE_PENALTY * variance, 1e-12)

@@ -287,10 +287,7 @@ def make_band(
 
 
 def _is_decoded(kind: Field, patches: FloatArray, lipschitz: BoolArray) -> BoolArray:
-    """Return which voxels of a field are decoded.
-
-    In a mask, only those round which samples lie on both sides hold the surface.
-    """
+    """Return which voxels of a field are decoded; of a mask those with samples on both sides."""
     if kind.smooth is not None:  # no distances: what they say of the voxels is not certain
         return np.ones(len(patches), bool)
     return has_both_sides(patches) if kind.kind == MASK else can_hold_surface(patches, lipschitz)
@@ -328,11 +325,11 @@ def outline(
 
 
 class Block(NamedTuple):
-    """What is found in a block of planes: ``parts`` in C order, and the jumps if they matter."""
+    """What is found in a block of planes."""
 
     leaves: bool  # whether a sample on the grid's border is inside
-    jumps: list[tuple[Jumps, Jumps]]
-    parts: Any  # a list or an iterator of ``BandPart``
+    jumps: list[tuple[Jumps, Jumps]]  # with an offset
+    parts: Any  # a list or an iterator of ``BandPart``, in C order
 
 
 def look_at_block(
@@ -406,10 +403,7 @@ def _windows(shape: tuple[int, ...], own: slice) -> Iterator[tuple[Window, Windo
 def _patches_of(
     window: FloatArray, inner: Window, hidden: BoolArray | None = None
 ) -> Iterator[tuple[NDArray[np.int64], FloatArray]]:
-    """Yield active voxels among some planes and rows of a window, and the samples round them.
-
-    Those that are ``hidden``, and values that were filled in are left out.
-    """
+    """Yield active voxels of a window that are not ``hidden``, nor filled in, and their patches."""
     active = is_active(window)[inner]
     if hidden is not None:
         active &= ~hidden

@@ -248,10 +248,7 @@ class Halves:
 
 
 def _cells(field: Labelled, border: IntArray) -> Cells:
-    """Return the low nodes, (n, 3), and labels, (n, 8), of the cells in which walls are, in order.
-
-    Those beyond the border are included.
-    """
+    """Return the low nodes, (n, 3), and labels, (n, 8), of the cells in which walls are."""
     voxel_ijk, holder = _closed(field, border)
     corners = holder.reshape(*(field.factor + 1,) * 3, -1)
     low, high = corners, corners
@@ -268,10 +265,7 @@ def _cells(field: Labelled, border: IntArray) -> Cells:
 
 
 def _closed(field: Labelled, border: IntArray) -> tuple[IntArray, Labels]:
-    """Return voxels and the labels of their nodes, with those beyond the border, which have none.
-
-    See ``cap``: the voxels on the border that are all of one label count, too.
-    """
+    """Return voxels and the labels of their nodes, with those beyond the border: see ``cap``."""
     shape, factor = np.array(field.shape), field.factor
     filled = border[(border[:, 3] > 0) & (field.index.find(border[:, :3]) < 0)]
     of_filled = np.broadcast_to(filled[:, 3].astype(np.int16), (len(field.holder), len(filled)))
@@ -296,10 +290,7 @@ def _closed(field: Labelled, border: IntArray) -> tuple[IntArray, Labels]:
 def _connect(
     field: Labelled, cells: Cells, base: Keys, lattice: Halves
 ) -> tuple[Keys, Labels, BoolArray]:
-    """Return the triangles of cells as names of points, and the labels on both sides.
-
-    The last array, (m, 3), says which points are not on edges.
-    """
+    """Return the triangles as names of points, the labels beside, and which are not on edges."""
     case, of_cell = np.unique(_cases(field, cells), return_inverse=True)
     tables = [walls(int(number) & (1 << 24) - 1, int(number) >> 24) for number in case]
     counts = np.array([len(table) for table in tables], np.int64)

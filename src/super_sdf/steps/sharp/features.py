@@ -134,10 +134,7 @@ def _measure(
 
 
 def is_sharp(patches: Patches, normal: Vectors, trust: Numbers) -> BoolArray:
-    """Return which patches, (P,), have normals that differ by more than ``SHARP_COSINE``.
-
-    Only where the field is a distance at every crossing: of others normals say little.
-    """
+    """Return which patches, (P,), turn by ``SHARP_COSINE``, where the slope is about 1."""
     sides = patches.crossing.shape[1]
     # Where all are within half that angle of the first, no two differ by more.
     pairs = [(0, other) for other in range(1, sides)]

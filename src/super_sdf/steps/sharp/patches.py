@@ -60,10 +60,7 @@ def unit(vectors: Vectors) -> Vectors:
 
 
 def voxels_near_kinks(field: FineField, rows: slice, threads: int = 1) -> BoolArray:
-    """Return the voxels, (D,), in or beside which the gradient turns by more than ``TURN``.
-
-    Only voxels of these rows are looked at; the others are False.
-    """
+    """Return the voxels, (D,), of some rows in or beside which the gradient turns by ``TURN``."""
     chunks = map_chunks(
         lambda some: _ranges(
             field.blocks[:, rows.start + some.start : rows.start + some.stop], field.factor
@@ -87,10 +84,7 @@ def voxels_near_kinks(field: FineField, rows: slice, threads: int = 1) -> BoolAr
 
 
 def _ranges(blocks: FloatArray, factor: int) -> tuple[FloatArray, FloatArray]:
-    """Return the smallest and largest differences along each axis, (3, n), of blocks (Q, n).
-
-    They are slopes, 1 for a distance; NaN for blocks without nodes near the surface.
-    """
+    """Return the least and largest slopes along each axis, (3, n), near the surface; else NaN."""
     near = np.abs(blocks) < np.float32(NEAR_SURFACE * 2 / factor)
     cube = np.where(near, blocks, np.float32(np.nan)).reshape(*(factor + 1,) * 3, -1)
     low, high = np.empty((2, 3, blocks.shape[1]), np.float32)
@@ -168,10 +162,7 @@ def find_patches(
 
 
 def _edges_of(field: FineField, crossings: Crossings, voxels: BoolArray) -> tuple[Index, IntArray]:
-    """Return the crossings on the edges of some voxels' blocks, set only where there is one.
-
-    Before it comes the place of each voxel in the table, (D,).
-    """
+    """Return the voxels' places in a table, (D,), and it: the crossings on their edges."""
     others = np.flatnonzero(voxels[crossings.other_row])
     listed = voxels.copy()
     listed[owners_of(field, crossings, others)[1]] = True
@@ -192,10 +183,7 @@ def dilate(patches: Patches, chosen: BoolArray, rings: int, count: int) -> BoolA
 
 
 def pairs_in_patches(patches: Patches) -> tuple[Index, Index]:
-    """Return every ordered pair of crossings of a patch, in the order of the patches.
-
-    Two crossings on a face that two cells share come twice.
-    """
+    """Return every ordered pair of crossings of a patch; those on a common face come twice."""
     sides = patches.crossing.shape[1]
     places = np.nonzero(~np.eye(sides, dtype=bool))
     empty = np.empty(0, np.int64)
@@ -260,10 +248,7 @@ def _sides_of(patches: Patches, placed: Placed) -> Sides:
 
 
 def unfolded(patches: Patches, placed: Placed) -> Placed:
-    """Return the vertices with those moved inwards that lie beyond a side of their fan.
-
-    There a triangle of the fan faces away from the planes at both of its crossings.
-    """
+    """Return the vertices, those that lie beyond a side of their fan moved inwards."""
     sides = _sides_of(patches, placed)
     corners = sides.start, sides.end, sides.peak
     facing = np.maximum(placed.facing(corners, sides.start), placed.facing(corners, sides.end))

@@ -151,10 +151,7 @@ def _slope(values: tuple[Numbers, ...]) -> Numbers:
 
 @lru_cache
 def _walks(factor: int) -> list[list[tuple[Index, Index]]]:
-    """Return where walks of -2, -1, 1 and 2 nodes along each axis end, from each node of a block.
-
-    Each is the place of the neighbouring voxel, (Q,), and the node in its block, (Q,).
-    """
+    """Return the neighbours, (Q,), and nodes, (Q,), -2, -1, 1 and 2 nodes away along each axis."""
     side = factor + 1
 
     def walk(axis: int, step: int) -> tuple[Index, Index]:

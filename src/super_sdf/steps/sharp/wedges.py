@@ -131,10 +131,7 @@ def find_spheres(wedges: Wedges, spheres: SampleSpheres) -> Nearby:
 
 
 def contact_of(wedges: Wedges, near: Nearby) -> Contact:
-    """Return how spheres stand to edges now.
-
-    None must touch a corner: the cone of three normals is narrow, and few samples lie in it.
-    """
+    """Return how spheres stand to edges now; none must touch a corner: few samples could."""
     wedge = near.wedge
     away, convex = wedges.point[wedge] - near.centre, wedges.convex[wedge]
     along = np.where(wedges.corner[wedge], 0, dot(away, wedges.tangent[wedge]))
