@@ -26,7 +26,7 @@ import numpy as np
 import psutil
 import trimesh
 
-from super_sdf.machine.threads import count_cores
+from super_sdf.machine.resources import count_cores
 from super_sdf.mesh import Mesh
 
 from .mixed_grids import BROKEN, Placed, write_broken, write_mixed

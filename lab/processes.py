@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from super_sdf.errors import SuperSdfError
-from super_sdf.machine.processor import described, processor_name
-from super_sdf.machine.threads import count_cores
+from super_sdf.machine.system import described, processor_name
+from super_sdf.machine.resources import count_cores
 from super_sdf.truth.sampling import sample_solid, unit_layout
 
 from .shapes import Shape

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-from super_sdf.machine.threads import count_cores
+from super_sdf.machine.resources import count_cores
 
 ROOT = Path(__file__).parents[1]
 PYTHONS = ["3.10", "3.11", "3.12", "3.13", "3.14"]

@@ -21,7 +21,7 @@ from super_sdf.batch.run import Queue, Run, choose_workers, useful_workers
 from super_sdf.convert import ConvertOptions
 from super_sdf.machine.memory import held_memory
 from super_sdf.machine.pool import Death, Pool
-from super_sdf.machine.threads import count_cores
+from super_sdf.machine.resources import count_cores
 
 pytestmark = pytest.mark.usefixtures("grid_folder")
 SMALL = (*FAST, "--factor", 2, "--spacing", 1)

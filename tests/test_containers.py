@@ -4,7 +4,7 @@ import pytest
 
 from super_sdf.machine import containers, memory
 from super_sdf.machine import threads as chunks
-from super_sdf.machine.containers import bound_of_cores, left_memory
+from super_sdf.machine.system import bound_of_cores, left_memory
 
 MB = 10**6
 

@@ -51,7 +51,7 @@ def test_a_plane_that_holds_everything_is_meshed_in_chunks_to_the_same_mesh(monk
     grid = SdfGrid(np.abs(i - 3.6) - 1.3 + 0.01 * np.sin(j + k), 1.0)
     meshes = []
     for chunk in (1 << 19, 2000):
-        monkeypatch.setattr("super_sdf.machine.threads.CHUNK", chunk)
+        monkeypatch.setattr("super_sdf.machine.resources.CHUNK", chunk)
         meshes.append(reconstruct(grid, trilinear, factor, cap=True))
     np.testing.assert_array_equal(meshes[0].faces, meshes[1].faces)
     np.testing.assert_array_equal(meshes[0].vertices, meshes[1].vertices)

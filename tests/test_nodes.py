@@ -61,7 +61,7 @@ def test_nodes_have_one_number_for_each_position(seed, factor):
 
 @pytest.mark.parametrize(("factor", "threads"), [(2, 3), (4, 1)])
 def test_shared_nodes_are_plain_means_in_every_block(monkeypatch, factor, threads):
-    monkeypatch.setattr("super_sdf.machine.threads.MIN_PER_THREAD", 1)
+    monkeypatch.setattr("super_sdf.machine.resources.MIN_PER_THREAD", 1)
     voxels, table = some_voxels(7)
     blocks = np.random.default_rng(0).normal(size=((factor + 1) ** 3, len(voxels) + 1))
     blocks = blocks.astype(np.float32)

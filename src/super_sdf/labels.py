@@ -22,7 +22,7 @@ from .errors import OptionError, OutOfMemoryError, seen
 from .files.grids import read_array
 from .grid.field import MASK
 from .grid.labels import ALL, LabelImage, check_labels, make_labels
-from .machine.index_width import check_count
+from .machine.resources import check_count
 from .machine.memory import advised, give_back, held_memory, in_words
 from .machine.resources import Resources, allot
 from .mesh import Mesh, join_meshes, vertex_type

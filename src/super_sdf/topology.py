@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import IntArray
-from .machine.threads import chunks_of
+from .machine.resources import chunks_of
 from .mesh import Mesh
 
 TEMPORARIES = 8  # for chunks of 2^16 triangles: smaller ones may span as many vertices

@@ -17,7 +17,7 @@ from functools import partial
 from ..machine.memory import free_memory, held_memory, memory_bound
 from ..machine.pool import Death, Pool
 from ..machine.serving import Work
-from ..machine.threads import count_cores
+from ..machine.resources import count_cores
 from ..network.device import available_devices
 from .job import Job, Outputs, Result, Row, attempt, failed_row
 from .ledger import Ledger

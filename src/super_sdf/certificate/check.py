@@ -26,7 +26,7 @@ from ..grid.cubic import cubic_grid
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import give_back, held_memory, in_words, memory_bound
 from ..machine.resources import allot
-from ..machine.threads import useful_threads
+from ..machine.resources import useful_threads
 from ..mesh import Mesh
 from ..options import ConvertOptions, check_distance, check_max_memory
 from ..steps.survey import Band, no_surface, survey

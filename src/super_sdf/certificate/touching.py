@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..grid.sdf_grid import SdfGrid
-from ..machine.threads import chunks_of
+from ..machine.resources import chunks_of
 from ..mesh import Mesh
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD
 from ..steps.band import plane_blocks, rescale

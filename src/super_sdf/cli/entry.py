@@ -10,7 +10,7 @@ import os
 import sys
 from contextlib import suppress
 
-from ..machine.processor import check_processor
+from ..machine.system import check_processor
 from .interrupts import ending_at_once
 
 # Writing to a descriptor that is open for reading fails, as writing to a closed one does.

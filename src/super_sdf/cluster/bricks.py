@@ -27,7 +27,7 @@ from ..files.formats import split_member
 from ..grid.cubic import check_has_offsets
 from ..grid.planes import Ranges, Result, SamplePlanes
 from ..grid.sdf_grid import SdfGrid, make_grid
-from ..machine.index_width import check_count
+from ..machine.resources import check_count
 from ..machine.memory import give_back, held_memory, memory_bound
 from ..machine.pool import Death
 from ..machine.resources import Resources

@@ -21,7 +21,7 @@ from ..machine.extras import check_modules
 from ..machine.memory import SHARE, held_memory, memory_bound
 from ..machine.resources import Resources
 from ..machine.serving import ending_signals_blocked, python_flags
-from ..machine.threads import count_cores
+from ..machine.resources import count_cores
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, Triple
-from ..machine.threads import chunks_of
+from ..machine.resources import chunks_of
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 from .census import Census
 from .planes import SampleArray

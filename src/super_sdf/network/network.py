@@ -20,8 +20,8 @@ from ..arrays import FloatArray, IntArray
 from ..errors import DeviceError, FileError, ModelError, OptionError
 from ..files.regular import check_regular_file
 from ..grid.field import MASK, NOISY
-from ..machine.processor import lacks_avx2, processor_name
-from ..machine.threads import cores_of_system, useful_threads
+from ..machine.system import lacks_avx2, processor_name
+from ..machine.resources import cores_of_system, useful_threads
 from ..neighbourhood import NEIGHBOURHOOD, cube_symmetries, turn
 from ..options import (
     AUTO_PRECISION,

@@ -25,7 +25,7 @@ from ..grid.sdf_grid import SdfGrid
 from ..machine import index_width
 from ..machine.memory import ROOM_SHARE, advised, give_back, held_memory, in_words
 from ..machine.resources import Resources
-from ..machine.threads import CHUNK, rows_in_chunk
+from ..machine.resources import CHUNK, rows_in_chunk
 from ..network.decoder import NETWORK_BYTES
 from ..options import DEFAULT_MESHER, SHARP
 from ..steps import bounds, debris, spheres

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import GridError
 from ..grid.sdf_grid import SdfGrid
-from ..machine.threads import chunks_of
+from ..machine.resources import chunks_of
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD
 
 HALF_BAND = 3.0  # Eq. 2 after Eq. 4: 1.5 h

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
-from ..machine.threads import CHUNK, chunks_of, map_chunks
+from ..machine.resources import CHUNK, chunks_of, map_chunks
 from ..neighbourhood import CENTRE, STRIDES
 from .band import HALF_BAND
 from .nodes import SharedParts, average_shared, block_ijk, block_offsets

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
-from ..machine.threads import map_chunks
+from ..machine.resources import map_chunks
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 from .field import SampleSpheres
 from .nodes import BARELY_INSIDE, BARELY_OUTSIDE, SharedParts, VoxelIndex, block_ijk

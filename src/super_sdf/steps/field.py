@@ -18,7 +18,7 @@ from ..errors import OptionError
 from ..grid.field import EXACT, NOISY, NONE_EXACT, Field
 from ..grid.planes import SamplePlanes
 from ..grid.sdf_grid import SdfGrid
-from ..machine.threads import chunks_of
+from ..machine.resources import chunks_of
 from .band import rescale
 from .nodes import (
     BARELY_INSIDE,

@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, IntArray
 from ..grid.sdf_grid import SdfGrid
-from ..machine.index_width import check_count
-from ..machine.threads import map_chunks, map_threads, rows_in_chunk
+from ..machine.resources import check_count
+from ..machine.resources import map_chunks, map_threads, rows_in_chunk
 from ..mesh import CLEARANCE, Mesh, vertex_type
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 from .cap import octant_of_cells

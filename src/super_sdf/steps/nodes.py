@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray, Signs
-from ..machine.index_width import check_count
-from ..machine.threads import map_threads, worthwhile_threads
+from ..machine.resources import check_count
+from ..machine.resources import map_threads, worthwhile_threads
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 
 # The value of a node of which only the sign is known, and the least of a mask's sample, in half

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
-from ..machine.threads import map_chunks
+from ..machine.resources import map_chunks
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 from .band import MAX_DISTANCE, MIN_SLOPE
 from .nodes import SharedParts, VoxelIndex, nodes_of_part, number_parts

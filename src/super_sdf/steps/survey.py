@@ -32,7 +32,7 @@ from ..grid.planes import (
 from ..grid.sdf_grid import SdfGrid, negated, without_samples
 from ..machine.memory import held_memory, in_words
 from ..machine.resources import ONE_THREAD, Resources
-from ..machine.threads import chunks_of, over_threads
+from ..machine.resources import chunks_of, over_threads
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 from .band import (
     BLOCK_PLANES,

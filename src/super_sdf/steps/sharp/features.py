@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import BoolArray
-from ...machine.threads import map_chunks
+from ...machine.resources import map_chunks
 from ..field import FineField, SampleSpheres
 from .patches import Index, Numbers, Patches, Placed, Vectors, dilate, dot, length, unfolded
 from .planes import Planes, settle_planes

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from ...arrays import BoolArray, IntArray
 from ...grid.sdf_grid import SdfGrid
-from ...machine.index_width import check_count
-from ...machine.threads import map_chunks, map_threads
+from ...machine.resources import check_count
+from ...machine.resources import map_chunks, map_threads
 from ...mesh import CLEARANCE, Mesh, vertex_type
 from ..field import FineField
 from ..marching import (

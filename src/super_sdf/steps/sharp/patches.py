@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import BoolArray, FloatArray, IntArray
-from ...machine.threads import chunks_of, map_chunks
+from ...machine.resources import chunks_of, map_chunks
 from ...neighbourhood import CENTRE, STRIDES
 from ..cell_cases import loop_table
 from ..field import FineField

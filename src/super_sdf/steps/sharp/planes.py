@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import BoolArray, IntArray
-from ...machine.threads import chunks_of, map_chunks, rows_in_chunk
+from ...machine.resources import chunks_of, map_chunks, rows_in_chunk
 from ...neighbourhood import CENTRE, STRIDES
 from ..field import FineField
 from ..marching import Crossings, edge_ends, lattice_positions
