@@ -27,9 +27,15 @@ from super_sdf.pipeline import upsample
 from super_sdf.steps.cap import close_at_border
 from super_sdf.steps.field import FineField
 from super_sdf.steps.marching import find_crossings, to_world
-from super_sdf.steps.sharp.fans import Placed, fan_triangles, flat_triangles, unfolded
 from super_sdf.steps.sharp.features import Candidates, Rule, find_candidates, move_beside
-from super_sdf.steps.sharp.patches import Patches, find_patches
+from super_sdf.steps.sharp.patches import (
+    Patches,
+    Placed,
+    fan_triangles,
+    find_patches,
+    flat_triangles,
+    unfolded,
+)
 from super_sdf.steps.sharp.planes import Planes, planes_at_crossings
 from super_sdf.truth.solid import Solid
 

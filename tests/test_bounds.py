@@ -9,13 +9,8 @@ from conftest import ball, trilinear
 from super_sdf import SdfGrid, pipeline, reconstruct
 from super_sdf.steps.band import HALF_BAND, neighbour_table
 from super_sdf.steps.bounds import (
-    BOX_SAMPLES,
-    FARTHEST,
-    MOST_LOST,
     bounded_values,
-    cut_to_boxes,
     keep_within_bounds,
-    loses_wall,
     samples_around,
 )
 from super_sdf.steps.nodes import average_shared, block_ijk, share_parts
@@ -80,25 +75,6 @@ def test_the_bound_of_one_sample_is_its_distance_less_that_to_the_node():
     np.testing.assert_allclose(moved[0], wanted, atol=1e-6)
 
 
-def test_the_samples_beyond_the_band_are_those_within_four_voxels():
-    grid = ball()
-    rescaled = 2 * grid.values
-    found = survey(grid).beyond
-    size = np.abs(rescaled)
-    wanted = np.flatnonzero((size >= HALF_BAND) & (size < FARTHEST))
-    np.testing.assert_array_equal(found.number, wanted)
-    np.testing.assert_allclose(found.value, rescaled.ravel()[wanted], rtol=1e-6)
-
-
-def test_voxels_along_a_diagonal_are_cut_into_small_boxes():
-    diagonal = np.arange(2000, dtype=np.int32)[:, None].repeat(3, 1)
-    parts = list(cut_to_boxes(diagonal, slice(100, 2000)))
-    assert [part.start for part in parts] == [100, *(part.stop for part in parts[:-1])]
-    assert parts[-1].stop == 2000 and len(parts) == 16
-    assert max(part.stop - part.start + 8 for part in parts) ** 3 <= BOX_SAMPLES
-    assert list(cut_to_boxes(diagonal[:40], slice(0, 40))) == [slice(0, 40)]
-
-
 def test_samples_that_contradict_others_set_no_bounds():
     """Values that grow faster than distances are none."""
     grid = ball()
@@ -108,17 +84,6 @@ def test_samples_that_contradict_others_set_no_bounds():
     own = np.abs(exact[:, exact.shape[1] // 2])
     moved = bounded_values(wrong, 4, around(voxel_ijk, band.trusted))
     np.testing.assert_array_equal(moved[own < 1.5], wrong[own < 1.5])
-
-
-def test_a_wall_is_lost_where_much_of_the_inside_is():
-    inside = np.full((4, 100), -1, np.float32)
-    inside[:, 50:] = 1
-    moved = inside.copy()
-    for row, lost in enumerate([0, 7, 8, 50]):  # of 50
-        moved[row, :lost] = 0.1
-    assert pytest.approx(7.5) == MOST_LOST * 50
-    assert loses_wall(inside, moved).tolist() == [False, False, True, True]
-    assert not loses_wall(np.abs(inside), np.abs(inside)).any()
 
 
 def test_copies_of_shared_nodes_stay_equal_and_samples_keep_their_values():

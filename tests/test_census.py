@@ -63,7 +63,7 @@ def test_a_grid_is_read_at_most_three_times(name, small, monkeypatch):
     assert grid.field.kind == kind
     band, reads = survey(grid), counted.reads.copy()
     whole = survey(make_grid(values, spacing=1.0, origin=0.0))
-    assert np.array_equal(band.patches, whole.patches) and band.kind == whole.kind
+    assert np.array_equal(band.patches, whole.patches) and band.field.kind == whole.field.kind
     # blocks of the survey share two planes, and those of filled samples some more
     assert np.median(reads) <= 3 and (reads <= 6).all()
 

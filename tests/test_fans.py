@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from super_sdf.steps.sharp.fans import Placed, triangles_of, unfolded
-from super_sdf.steps.sharp.patches import Patches
+from super_sdf.steps.sharp.patches import Patches, Placed, triangles_of, unfolded
 
 SQUARES = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0], [2, 1, 0]], float)
 
@@ -55,18 +54,3 @@ def test_the_side_of_two_fans_is_kept_where_turning_would_fold_the_surface() -> 
     edges = edges_of(triangles)
     assert {(1, 2), (2, 1)} <= edges
     assert not {(6, 7), (7, 6)} & edges
-
-
-@pytest.mark.parametrize("peak", [[1.5, 0.5, 0], [1.5, 2, 0]])
-def test_both_have_the_same_border(peak: list[float]) -> None:
-    _, triangles = triangles_of(TWO, placed([0.5, 0.5, 0], peak))
-    edges = edges_of(triangles)
-    assert len(triangles) == 8
-    assert {e for e in edges if e[::-1] not in edges} == {
-        (0, 1),
-        (1, 4),
-        (4, 5),
-        (5, 2),
-        (2, 3),
-        (3, 0),
-    }

@@ -14,7 +14,6 @@ from super_sdf.certificate.surface import count_components
 from super_sdf.mesh import CLEARANCE
 from super_sdf.steps.band import neighbour_table
 from super_sdf.steps.cell_cases import (
-    CORNERS,
     EDGE_AXIS,
     EDGE_START,
     FACES,
@@ -52,15 +51,6 @@ def test_every_case_uses_exactly_its_crossed_edges():
         assert set(table[case, : counts[case]].ravel().tolist()) == crossed
 
 
-@pytest.mark.parametrize("corner", range(8))
-def test_one_inside_corner_gives_one_triangle_that_faces_away(corner):
-    counts, table = triangle_table()
-    assert counts[1 << corner] == 1
-    middle = CORNERS[list(EDGE_START)] + 0.5 * np.eye(3)[list(EDGE_AXIS)]
-    a, b, c = middle[table[1 << corner, 0]]
-    assert np.cross(b - a, c - a) @ (CORNERS[corner] - a) < 0
-
-
 @pytest.mark.parametrize("face", FACES)
 @pytest.mark.parametrize(("inner", "outer", "pieces"), [(-3, 2, 1), (-2, 3, 2), (-2, 2, 2)])
 def test_a_face_joins_its_inside_corners_where_its_saddle_is_inside(face, inner, outer, pieces):
@@ -71,15 +61,6 @@ def test_a_face_joins_its_inside_corners_where_its_saddle_is_inside(face, inner,
     lattice[1:3, 1:3, 1:3] = corners.reshape(2, 2, 2)
     mesh = extract_mesh(*dense_field(lattice))
     assert mesh.is_closed() and count_components(mesh.faces, len(mesh.vertices)) == pieces
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_the_negative_field_has_the_same_surface_from_inside(seed):
-    """Joined inside corners are separated outside ones; nothing prefers either side."""
-    lattice = np.random.default_rng(seed).normal(size=(13, 11, 15)).astype(np.float32)
-    mesh, reverse = extract_mesh(*dense_field(lattice)), extract_mesh(*dense_field(-lattice))
-    np.testing.assert_allclose(mesh.vertices, reverse.vertices, atol=1e-6)
-    assert len(mesh.faces) == len(reverse.faces)
 
 
 @pytest.mark.parametrize("thickness", [0.9, 1.2])
@@ -99,18 +80,6 @@ def test_vertices_are_those_of_scikit_image(seed):
     want = np.unique(np.round(want, 5), axis=0)
     assert len(mesh.vertices) == len(want)
     assert cKDTree(want).query(mesh.vertices)[0].max() < 2 * CLEARANCE
-
-
-def test_a_smooth_surface_is_that_of_scikit_image():
-    ijk = np.indices((33, 33, 33)) - 16.3
-    lattice = (np.hypot(np.hypot(ijk[0], ijk[1]) - 9, ijk[2]) - 4).astype(np.float32)
-    mesh = extract_mesh(*dense_field(lattice))
-    verts, faces, _, _ = marching_cubes(lattice, 0.0, method="lorensen")
-    a, b, c = verts[faces].transpose(1, 0, 2).astype(np.float64)
-    want = abs(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
-    assert mesh.volume() == pytest.approx(want, rel=1e-3)  # diagonals of quads differ
-    assert len(mesh.faces) == len(faces)
-    assert mesh.open_edges() == 0
 
 
 fields = hnp.arrays(

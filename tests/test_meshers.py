@@ -7,21 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from batches import rows
-from conftest import ball
 from corpus.random_fields import facets
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_slabs import in_pieces, rod
+from test_slabs import assert_same, in_pieces, joined, rod
 
 from super_sdf import SdfGrid, extract_mesh, load_network, options, reconstruct, upsample
-from super_sdf.convert import ConvertOptions
 from super_sdf.machine import resources
 from super_sdf.mesh import join_meshes
 from super_sdf.slabs import cutting
 from super_sdf.steps import meshers
 from super_sdf.steps.marching import extract_pieces
 from super_sdf.steps.sharp import mesher as sharp
-from super_sdf.steps.survey import survey
 
 
 @pytest.fixture(scope="module")
@@ -45,22 +42,6 @@ FIELDS = {
     "bar that leaves the grid": bar()[6:50, :10],
     "rod": rod()[:40],
 }
-
-
-def assert_same(mesh, other):
-    np.testing.assert_array_equal(mesh.faces, other.faces)
-    np.testing.assert_array_equal(mesh.vertices, other.vertices)
-
-
-def joined(pieces):
-    return join_meshes([mesh for piece in pieces for mesh in piece.meshes])
-
-
-def test_there_is_one_list_of_names_and_one_default():
-    assert tuple(meshers.BY_NAME) == options.MESHERS
-    assert all(mesher.name == name for name, mesher in meshers.BY_NAME.items())
-    assert ConvertOptions.mesher == options.DEFAULT_MESHER
-    assert cutting.DEFAULT.name == options.DEFAULT_MESHER
 
 
 def test_each_name_gives_its_mesh(network):
@@ -127,38 +108,6 @@ def test_groups_and_threads_change_nothing(network, monkeypatch, factor):
         assert_same(join_meshes(pieces), one)
 
 
-def test_memory_bounds_change_nothing(bare_plan):
-    class Alone:  # a new one for every run, so that its threads do not count as held
-        receptive_field = 1
-        threads = 1
-        memory_bytes = (0.0, 0.0)
-
-        def __call__(self, *inputs):
-            from conftest import trilinear
-
-            return trilinear(*inputs)
-
-    grid = SdfGrid.trusted(FIELDS["bar"], 1.0)
-    band = survey(grid)
-    mesher = meshers.BY_NAME["sharp"]
-    need = cutting.peak_bytes(band, [cutting.whole(band)], 4, Alone.memory_bytes, 1, mesher)
-    plain = cutting.peak_bytes(band, [cutting.whole(band)], 4, Alone.memory_bytes, 1)
-    assert need > plain
-    whole = reconstruct(grid, Alone(), mesher="sharp", max_memory=need)
-    for share in (0.98, 0.9):
-        bound = 10**8 + int(share * (need - 10**8))
-        pieces = list(meshed_in(grid, Alone(), bound))
-        assert len(pieces) > 1
-        assert_same(joined(pieces), whole)
-
-
-def meshed_in(grid, network, max_memory):
-    """Return the pieces of a grid with edges, within a bound."""
-    from super_sdf.pipeline import reconstruct_slabs
-
-    return reconstruct_slabs(grid, network, mesher="sharp", max_memory=max_memory)
-
-
 def test_the_command_takes_a_mesher_and_says_which(tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)
     np.save("in.npy", FIELDS["bar"])
@@ -183,8 +132,3 @@ def test_a_batch_with_another_mesher_is_made_again(run_batch):
     Path("list.jsonl").write_text('{"in": "in/a.npy", "out": "a.ply", "mesher": "marching"}')
     assert "nothing to do" not in run_batch("list.jsonl", "--mesher", "sharp")[2]
     assert [row["mesher"] for row in rows()] == ["marching", "sharp", "marching"]
-
-
-def test_a_ball_has_no_edges_for_either(network):
-    plain, sharp = (reconstruct(ball(), network, mesher=name) for name in ("marching", "sharp"))
-    np.testing.assert_array_equal(plain.vertices, sharp.vertices)

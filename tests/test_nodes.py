@@ -59,16 +59,6 @@ def test_nodes_have_one_number_for_each_position(seed, factor):
     assert pairs.shape[1] == len(different)
 
 
-def test_nodes_belong_to_the_first_voxel_that_has_them_and_come_in_its_order():
-    voxels, table = some_voxels(3)
-    field = field_of(voxels, table, 4)
-    owner = np.full(field.parts.count_nodes(4), len(voxels))
-    np.minimum.at(owner, field.numbers, np.arange(len(voxels))[:, None])
-    assert (np.diff(owner) >= 0).all()
-    for row in range(len(voxels) + 1):
-        assert field.parts.count_nodes(4, slice(0, row)) == (owner < row).sum()
-
-
 @pytest.mark.parametrize(("factor", "threads"), [(2, 3), (4, 1)])
 def test_shared_nodes_are_plain_means_in_every_block(monkeypatch, factor, threads):
     monkeypatch.setattr("super_sdf.machine.resources.MIN_PER_THREAD", 1)

@@ -31,7 +31,7 @@ def test_loops_make_the_triangles_of_the_table():
     loops, (counts, table) = loop_table(), triangle_table()
     for case in range(len(counts)):
         made = []
-        for loop in range(loops.first[case], loops.first[case] + loops.count[case]):
+        for loop in range(loops.first[case], loops.first[case] + loops.times[case]):
             places = loops.triangles[loop, : loops.sides[loop] - 2]
             made += loops.edges[loop][places].tolist()
         assert made == table[case, : counts[case]].tolist()

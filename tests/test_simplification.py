@@ -21,7 +21,7 @@ from super_sdf.machine.memory import held_memory
 from super_sdf.network.network import load_network
 from super_sdf.simplification import collapsing, simplify
 from super_sdf.simplification.collapsing import collapse_within
-from super_sdf.simplification.measuring import Original, points_on
+from super_sdf.simplification.measuring import Original
 from super_sdf.topology import irregular_places
 
 QUICK = ("--quality", "fast", "--factor", 2)
@@ -146,17 +146,6 @@ def test_the_deviation_is_that_of_shifted_squares():
     half = Mesh(low.vertices * [0.5, 1, 1], low.faces)  # the part beyond is up to a half away
     found = Original(low).deviation(half)
     assert found == pytest.approx((0.5, 0.125, 0, 0), abs=2e-3)
-
-
-def test_the_points_on_a_mesh_lie_on_it_dense_and_stand_for_its_area():
-    mesh = joined(cube(), torus(12, 8))
-    points, weights = (np.concatenate(parts) for parts in zip(*points_on(mesh, 0.05)))
-    tree = Original(mesh).solid
-    assert tree.distance(points).max() < 1e-12
-    area = trimesh.Trimesh(mesh.vertices, mesh.faces).area
-    assert weights.sum() == pytest.approx(area, rel=0.02)
-    apart = np.random.default_rng(0).random((200, 3)) * [1, 1, 0] - 0.5  # on a side of the cube
-    assert np.linalg.norm(points - apart[:, None], axis=2).min(1).max() < 0.05
 
 
 def test_kept_triangles_are_kept_and_joined_again():

@@ -6,12 +6,11 @@ from conftest import ball, trilinear
 
 from super_sdf import SdfGrid, load_network, pipeline, reconstruct
 from super_sdf.steps.band import MAX_DISTANCE, neighbour_table
-from super_sdf.steps.field import FineField
-from super_sdf.steps.foot_points import find_foot_points, sample_trilinear, spheres_of_band
 from super_sdf.steps.nodes import VoxelIndex, block_ijk, share_parts
 from super_sdf.steps.spheres import (
+    find_foot_points,
     fit_to_spheres,
-    prolong,
+    spheres_of_band,
 )
 from super_sdf.steps.survey import survey
 
@@ -88,19 +87,6 @@ def test_samples_beyond_the_band_that_were_cut_off_have_no_spheres(limit):
     np.testing.assert_allclose(spheres.distance, exact, atol=1e-5)
 
 
-def test_a_linear_field_is_sampled_exactly():
-    _, _, position = blocks_of(ball())
-    slope = np.array([0.48, -0.6, 0.64])
-    rng = np.random.default_rng(0)
-    rows = rng.integers(position.shape[1], size=100).astype(np.int32)
-    place = rng.random((3, 100)).astype(np.float32)
-    blocks = with_zeros((position @ slope).astype(np.float32))
-    value, gradient = sample_trilinear(blocks, rows, place, 4)
-    low = position[0, rows]
-    np.testing.assert_allclose(value, (low + 2 * place.T) @ slope, atol=1e-4)
-    np.testing.assert_allclose(gradient.T * 4 / 2, np.tile(slope, (100, 1)), atol=1e-3)
-
-
 @pytest.mark.parametrize("bias", [-0.2, 0.1])
 def test_a_constant_error_is_corrected(bias):
     samples, parts, position = blocks_of(ball())
@@ -110,14 +96,6 @@ def test_a_constant_error_is_corrected(bias):
     off = np.abs(fitted(biased, parts, samples) - exact)[np.abs(exact) < 0.3]
     assert off.max() < 0.4 * abs(bias)
     assert off.mean() < 0.2 * abs(bias)
-
-
-@pytest.mark.parametrize("factor", [2, 4])
-def test_copies_of_a_shared_node_stay_equal(factor):
-    samples, parts, position = blocks_of(ball(), factor)
-    moved = fitted(distance_to_ball(position), parts, samples, factor)[:, :-1]
-    field = FineField((20,) * 3, factor, np.empty((0, 3)), moved, parts, (0, 20))
-    np.testing.assert_array_equal(field.values[field.numbers], moved.T)
 
 
 def test_exact_samples_are_kept():
@@ -151,19 +129,6 @@ def test_truncated_samples_are_not_exact():
     band = survey(SdfGrid.trusted(np.clip(grid.values, -0.25, 0.25), grid.spacing))
     np.testing.assert_array_equal(band.exact, np.abs(band.patches[:, 13]) < 0.5)
     assert band.exact.any()
-
-
-@pytest.mark.parametrize("factor", [2, 4])
-def test_a_linear_function_is_prolonged_exactly(factor):
-    _, _, fine = blocks_of(ball(), factor)
-    _, _, coarse = blocks_of(ball(), 2)
-    slope = np.array([0.48, -0.6, 0.64])
-    prolonged = prolong((coarse @ slope).astype(np.float32), 2, factor)
-    np.testing.assert_allclose(prolonged, fine @ slope, atol=1e-4)
-    ends = [0, factor]  # nodes of the coarse lattice keep their bits
-    whole = prolonged.reshape(*(factor + 1,) * 3, -1)[np.ix_(ends, ends, ends)]
-    corners = (coarse @ slope).astype(np.float32).reshape(3, 3, 3, -1)[::2, ::2, ::2]
-    np.testing.assert_array_equal(whole, corners)
 
 
 def test_the_fit_improves_an_interpolated_ball(monkeypatch):

@@ -33,7 +33,6 @@ from .steps.bounds import keep_within_bounds
 from .steps.cap import check_can_close, close, seen_octants
 from .steps.debris import count_between, drop_debris
 from .steps.field import FineField, SampleSpheres
-from .steps.foot_points import spheres_of_band
 from .steps.meshers import extract_pieces, find_mesher
 from .steps.nodes import (
     VoxelIndex,
@@ -45,7 +44,7 @@ from .steps.nodes import (
     share_parts,
     signs_of_skipped,
 )
-from .steps.spheres import fit_to_spheres
+from .steps.spheres import fit_to_spheres, spheres_of_band
 from .steps.spline import interpolate
 from .steps.survey import Band, no_surface
 
@@ -62,8 +61,9 @@ def refine(
     steps = steps or StepCounter()
     patches, table, voxels = inputs = band.network_inputs(slab.seen, slab.decoded)
     seen_ijk, exact = band.voxel_ijk[slab.seen], np.flatnonzero(band.exact[slab.seen])
+    unseen = band.field.unseen
     own_ijk = seen_ijk[voxels]
-    if band.smooth is None:
+    if band.field.smooth is None:
         progress = steps.within("network")
         blocks = decode(network, inputs, block_offsets(factor), progress, threads)  # Eqs. 3, 5
     else:
@@ -77,7 +77,7 @@ def refine(
     fit_to_spheres(blocks, parts, factor, spheres, index, threads)
     del spheres
     keep_within_bounds(blocks, parts, factor, own_ijk, band.trusted, threads)
-    if band.kind == options.MASK:
+    if band.field.kind == options.MASK:
         hold_sides(blocks, factor, patches, voxels)
     skipped = signs_of_skipped(parts, own_ijk, patches, voxels, band.shape)
     pinned = pin_to_skipped(blocks[:, :-1], parts, factor, skipped)
@@ -88,14 +88,14 @@ def refine(
     return replace(
         field,
         band_voxels=len(band.voxel_ijk),
-        noisy_voxels=band.noisy_voxels,
+        noisy_voxels=band.count_noisy(),
         pinned=int(pinned[field.own_rows].sum()),
         dropped=count_between(dropped, slab.planes),
         lone=count_between(lone, slab.planes),
         spheres=touching,
         decoded_voxels=int(band.decoded_before[-1]),
         leaves=band.leaves,
-        octants=None if band.unseen is None else seen_octants(band.unseen, own_ijk),
+        octants=None if unseen is None else seen_octants(unseen, own_ijk),
     )
 
 

@@ -18,21 +18,11 @@ MARKS = 1 << 46  # 2^7 of them can be summed in float64 without rounding
 
 @dataclass(frozen=True)
 class Edges:
-    """Numbers of edges that are not shared by exactly two triangles of the same orientation.
+    """Numbers of edges that are not shared by exactly two triangles of the same orientation."""
 
-    Attributes
-    ----------
-    open_edges : int
-        Edges of one triangle.
-    crowded_edges : int
-        Edges of more than two triangles: not manifold.
-    flipped_edges : int
-        Edges of two triangles that pass them in the same direction: not consistently oriented.
-    """
-
-    open_edges: int
-    crowded_edges: int
-    flipped_edges: int
+    open_edges: int  # of one triangle
+    crowded_edges: int  # of more than two triangles: not manifold
+    flipped_edges: int  # of two triangles that pass them in the same direction
 
 
 def without_collapsed(faces: IntArray) -> IntArray:
@@ -216,7 +206,8 @@ def irregular_places(mesh: Mesh) -> NDArray[np.float64]:
     unpaired = np.flatnonzero(opposite < 0)
     start, end = faces.ravel()[unpaired], np.roll(faces, -1, axis=1).ravel()[unpaired]
     pinched = np.flatnonzero(fans > 1)
-    both = np.concatenate([pinched, _doubled(positions), _corners_of_doubled(faces)])
+    doubled = _doubled(np.sort(faces, axis=1).astype(np.float64))
+    both = np.concatenate([pinched, _doubled(positions), faces[doubled].astype(np.intp).ravel()])
     ends = np.concatenate([start, both]), np.concatenate([end, both])
     return np.concatenate([positions[ends[0]], positions[ends[1]]], axis=1)
 
@@ -225,11 +216,3 @@ def _doubled(rows: NDArray[np.float64]) -> NDArray[np.intp]:
     """Return the rows that are equal to another row."""
     _, inverse, uses = np.unique(row_keys(rows), return_inverse=True, return_counts=True)
     return np.flatnonzero(uses[inverse] > 1)
-
-
-def _corners_of_doubled(faces: IntArray) -> NDArray[np.intp]:
-    """Return the corners of triangles that have the same three corners as another one."""
-    corners: NDArray[np.intp] = faces.astype(np.intp)[
-        _doubled(np.sort(faces, axis=1).astype(np.float64))
-    ].ravel()
-    return corners

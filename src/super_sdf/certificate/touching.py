@@ -104,7 +104,7 @@ def exact_samples(band: Band, grid: SdfGrid) -> Samples:
     exact = np.flatnonzero(trusted)
     # if none is exact, too many are no distances for any to be taken for one
     count = len(band.exact) if band.sampled is None else int(np.count_nonzero(band.sampled))
-    noisy = band.noisy_voxels if len(exact) else count
+    noisy = band.count_noisy() if len(exact) else count
     ijk = band.voxel_ijk[exact]
     cut_off, distances = count - len(exact) - noisy, values[exact] * np.float32(0.5)
     return Samples(cut_off, noisy, ijk, grid.to_world(ijk), distances)

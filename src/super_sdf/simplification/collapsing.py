@@ -61,7 +61,13 @@ def within(
     """Return a mesh within a distance of the original one, and a warning if it is not simpler."""
     result = mesh
     for _ in range(MOST_PASSES):
-        coarser = _one_pass(result, original, error, rounds)
+        coarser = None
+        for halving in range(HALVINGS):
+            distance = PLANE_DISTANCE * error / 2**halving
+            collapse = partial(collapse_within, result, distance=distance)
+            coarser = _keeping(result, collapse, rounds, partial(original.beyond, distance=error))
+            if coarser is not None:
+                break
         if coarser is None or len(coarser.faces) >= len(result.faces):
             break
         before, result = len(result.faces), coarser
@@ -71,17 +77,6 @@ def within(
         return mesh, ("the mesh was not simplified: none of its triangles can be spared within the "
                       "error",)  # fmt: skip
     return result, ()
-
-
-def _one_pass(base: Mesh, original: Original, error: float, rounds: Rounds) -> Mesh | None:
-    """Return a coarser mesh than ``base`` within the distance of the original one, or None."""
-    for halving in range(HALVINGS):
-        distance = PLANE_DISTANCE * error / 2**halving
-        collapse = partial(collapse_within, base, distance=distance)
-        result = _keeping(base, collapse, rounds, lambda result: original.beyond(result, error))
-        if result is not None:
-            return result
-    return None
 
 
 def down_to(mesh: Mesh, triangles: int, rounds: Rounds) -> tuple[Mesh, tuple[str, ...]]:
@@ -132,7 +127,11 @@ def _keeping(
         result = collapse(kept)
         if not len(result.faces):
             return None
-        faults = _new_faults(before, irregular_places(result))
+        places = irregular_places(result)
+        made = places[~np.isin(row_keys(places), row_keys(before))]
+        lost = before[~np.isin(row_keys(before), row_keys(places))]
+        lost = lost[(lost[:, :3] != lost[:, 3:]).any(1)]  # open edges that are none any more
+        faults = np.concatenate([made, lost]).reshape(-1, 3)
         wrong = np.concatenate([faults, too_far(result)])
         if not len(wrong):
             return result if same_topology(result, base) else None
@@ -143,31 +142,19 @@ def _keeping(
     return None
 
 
-def _new_faults(before: Points, after: Points) -> Points:
-    """Return the points, (n, 3), where a mesh has irregular places, (k, 6), that it had not before.
-
-    Also those where it had open edges before and has none.
-    """
-    ours, theirs = row_keys(after), row_keys(before)
-    made, lost = after[~np.isin(ours, theirs)], before[~np.isin(theirs, ours)]
-    lost = lost[(lost[:, :3] != lost[:, 3:]).any(1)]
-    return np.concatenate([made, lost]).reshape(-1, 3)
-
-
 def same_topology(one: Mesh, other: Mesh) -> bool:
     """Return whether both meshes have as many components with the same Euler characteristics.
 
-    That of the whole mesh alone does not change when a ball and a hole are lost.
+    That of the whole mesh alone does not change when a ball and a hole are lost. Open edges count.
     """
-    return np.array_equal(_euler_numbers(one), _euler_numbers(other))
 
+    def euler_numbers(mesh: Mesh) -> NDArray[np.int64]:
+        used, faces = _renumbered(mesh.faces)
+        _, component = np.unique(vertex_components(faces, len(used)), return_inverse=True)
+        vertices, triangles = np.bincount(component), np.bincount(component[faces[:, 0]])
+        return np.sort(2 * vertices - triangles)
 
-def _euler_numbers(mesh: Mesh) -> NDArray[np.int64]:
-    """Return twice the Euler characteristic of each component plus its open edges, (k,), sorted."""
-    used, faces = _renumbered(mesh.faces)
-    _, component = np.unique(vertex_components(faces, len(used)), return_inverse=True)
-    vertices, triangles = np.bincount(component), np.bincount(component[faces[:, 0]])
-    return np.sort(2 * vertices - triangles)
+    return np.array_equal(euler_numbers(one), euler_numbers(other))
 
 
 def collapse_within(mesh: Mesh, kept: BoolArray, distance: float) -> Mesh:
@@ -204,46 +191,30 @@ def _collapse(mesh: Mesh, kept: BoolArray, unit: float, options: dict[str, Any])
     """
     middle = mesh.vertices.mean(0, dtype=np.float64)
     scaled = (mesh.vertices - middle) / unit
-    used, faces = _renumbered(mesh.faces[~kept])
-    moved, collapsed = _run_pyfqmr(scaled[used], faces, options)
+    used, collapsed = _renumbered(mesh.faces[~kept])
+    moved = scaled[used]
+    if len(collapsed):
+        with ONE_AT_A_TIME:
+            library = Simplify()
+            library.setMesh(moved, collapsed)
+            library.simplify_mesh(preserve_border=True, verbose=False, **options)
+            moved, collapsed, _ = library.getMesh()
     held = np.unique(mesh.faces[kept])
-    there = _position_rows(moved, scaled[held])  # rows of held vertices among the moved, or -1
+    _, found, at = np.intersect1d(row_keys(moved), row_keys(scaled[held]), return_indices=True)
+    same = (moved[found] == scaled[held[at]]).all(1)
+    there = np.full(len(held), -1, np.intp)  # rows of held vertices among the moved
+    there[at[same]] = found[same]
     vertices = (moved * unit + middle).astype(mesh.vertices.dtype)
     vertices[there[there >= 0]] = mesh.vertices[held[there >= 0]]
     extra = held[there < 0]
     number = np.full(len(scaled), -1, np.int32)
     number[held] = there
     number[extra] = len(moved) + np.arange(len(extra))
-    return Mesh(
-        np.concatenate([vertices, mesh.vertices[extra]]),
-        np.concatenate([collapsed, number[mesh.faces[kept]]]),
-    )
-
-
-def _run_pyfqmr(
-    vertices: Points, faces: IntArray, options: dict[str, Any]
-) -> tuple[Points, IntArray]:
-    """Return the vertices (n, 3) and faces (m, 3) that pyfqmr makes; open edges stay."""
-    if not len(faces):
-        return np.zeros((0, 3)), np.zeros((0, 3), np.int32)
-    with ONE_AT_A_TIME:
-        library = Simplify()
-        library.setMesh(vertices, faces)
-        library.simplify_mesh(preserve_border=True, verbose=False, **options)
-        moved, collapsed, _ = library.getMesh()
-    return moved, collapsed.astype(np.int32)
+    faces = np.concatenate([collapsed.astype(np.int32), number[mesh.faces[kept]]])
+    return Mesh(np.concatenate([vertices, mesh.vertices[extra]]), faces)
 
 
 def _renumbered(faces: IntArray) -> tuple[NDArray[np.intp], IntArray]:
     """Return the vertices that faces (m, 3) use, and the faces with these numbered from 0."""
     used, numbers = np.unique(faces.ravel(), return_inverse=True)
     return used.astype(np.intp), numbers.astype(np.int32).reshape(-1, 3)
-
-
-def _position_rows(points: Points, wanted: Points) -> NDArray[np.intp]:
-    """Return in which row of ``points`` each of the ``wanted`` points is, -1 where it is none."""
-    rows = np.full(len(wanted), -1, np.intp)
-    _, found, at = np.intersect1d(row_keys(points), row_keys(wanted), return_indices=True)
-    same = (points[found] == wanted[at]).all(1)
-    rows[at[same]] = found[same]
-    return rows

@@ -78,7 +78,10 @@ def points_within(mesh: Mesh, step: float) -> Iterator[tuple[Points, Distances, 
     They are the middles of a pattern of cells on each triangle: as many along its longest side, and
     across, as are needed to be no wider than a step.
     """
-    apex, low, high, area = _on_longest_side(mesh.vertices.astype(np.float64)[mesh.faces])
+    corners, row = mesh.vertices.astype(np.float64)[mesh.faces], np.arange(len(mesh.faces))
+    sides = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, 1, axis=1), axis=2)
+    apex, low, high = (corners[row, (sides.argmax(1) + turn) % 3] for turn in range(3))
+    area = np.linalg.norm(np.cross(low - apex, high - apex), axis=1) / 2
     side = np.linalg.norm(high - low, axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         across = np.where(side > 0, 2 * area / side, 0)
@@ -94,11 +97,3 @@ def points_within(mesh: Mesh, step: float) -> Iterator[tuple[Points, Distances, 
         # cells are narrower, and so stand for less, towards the apex
         weight = area[face] * 2 * (1 - v[:, 0]) / (along[face] * rows[face])
         yield base + v * (apex[face] - base), weight, face
-
-
-def _on_longest_side(corners: Points) -> tuple[Points, Points, Points, Distances]:
-    """Return of triangles (m, 3, 3) the corner opposite their longest side, its ends, the area."""
-    sides = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, 1, axis=1), axis=2)
-    first, row = sides.argmax(1), np.arange(len(corners))
-    apex, low, high = (corners[row, (first + turn) % 3] for turn in range(3))
-    return apex, low, high, np.linalg.norm(np.cross(low - apex, high - apex), axis=1) / 2

@@ -112,7 +112,7 @@ def simplify_mesh(
     """
     check_mesh(mesh)
     error, triangles = check_goal(error, triangles)
-    check_can_simplify()
+    check_modules("simplifying", "simplify")
     check_room(len(mesh.faces), check_max_memory(max_memory))
     from .collapsing import Rounds, down_to, within
     from .measuring import Original
@@ -128,11 +128,6 @@ def simplify_mesh(
     if progress:
         progress(1.0)
     return Simplified(result, len(mesh.faces), deviation, warnings)
-
-
-def check_can_simplify(what: str = "simplifying") -> None:
-    """Raise FileError if the extra ``simplify`` is not installed; ``what`` begins the message."""
-    check_modules(what, "simplify")
 
 
 def check_room(triangles: int, max_memory: int | None, *, estimated: bool = False) -> None:

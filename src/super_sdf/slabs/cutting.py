@@ -31,7 +31,14 @@ from ..steps import bounds, debris, spheres
 from ..steps.marching import LOOKUP_BYTES, lookups_at_once
 from ..steps.meshers import BY_NAME, Mesher
 from ..steps.spline import spline_bytes
-from ..steps.survey import Band, band_bytes, look_at_band, outline, plan_reading
+from ..steps.survey import (
+    Band,
+    band_bytes,
+    count_crossings,
+    look_at_band,
+    outline,
+    plan_reading,
+)
 
 DEFAULT = BY_NAME[DEFAULT_MESHER]
 SURFACE_SHARE, DOUBT = 0.25, "is this a distance field?"  # of which few samples are
@@ -40,15 +47,11 @@ REACH_IN_VOXELS = spheres.REACH_IN_VOXELS + bounds.REACH_IN_VOXELS + debris.REAC
 
 @dataclass(frozen=True)
 class Slab:
-    """A slab: its own planes, from the first to before the second, and rows of the band.
+    """A slab: planes and rows of the band."""
 
-    Of the rows ``decoded``, the voxels that can hold the surface are decoded; the network sees the
-    rows ``seen``.
-    """
-
-    planes: tuple[int, int]
-    decoded: slice
-    seen: slice
+    planes: tuple[int, int]  # its own, from the first to before the second
+    decoded: slice  # rows of which those that can hold the surface are decoded
+    seen: slice  # rows that the network sees
 
 
 def whole(band: Band) -> Slab:
@@ -111,24 +114,29 @@ def refuse_band(
 def _ways(
     band: Band, receptive_field: int | None, beside: int, planes: tuple[int, int] | None = None
 ) -> Iterator[list[Slab]]:
-    """Yield the whole band, and then, if the receptive field is known, more and more slabs."""
+    """Yield the whole band, and, if the receptive field is known, more and more slabs of planes."""
     if planes is None:
         yield [whole(band)]
-    if receptive_field is not None:
-        yield from ways_to_cut(band, receptive_field, beside, planes)
+    if receptive_field is None:
+        return
+    first, last = planes or (0, band.shape[0])
+    for pieces in range(1, max(last - first, 2)):
+        yield cut(band, pieces, receptive_field, beside, planes)
+    decoding = np.flatnonzero(np.diff(band.decoded_before[first : last + 1])) + first
+    bounds = [first, *decoding.tolist()[1:], last]  # each slab decodes something
+    yield [slab_of(band, low, high, receptive_field, beside) for low, high in pairwise(bounds)]
 
 
 def check_vertices(band: Band, factor: int) -> None:
     """Raise OptionError if the mesh will certainly have more vertices than 32-bit numbers."""
     if int(band.decoded_before[-1]) * 3 * factor**3 > limits.MAX_INDEX:
-        check_crossings(band.count_crossings(), factor)
+        check_crossings(count_crossings(band.patches), factor)
 
 
 def check_crossings(crossings: int, factor: int) -> None:
     """Raise OptionError if this number of crossed coarse edges makes too many vertices for sure.
 
-    The surface crosses about K^2 times as many edges of the fine lattice as of the coarse one. Half
-    of this estimate is certain; the exact number is checked when the vertices have been counted.
+    The surface crosses about K^2 times as many edges of the fine lattice; half of them certainly.
     """
     limits.check_count(crossings * factor**2 // 2, "vertices or more")
 
@@ -142,13 +150,8 @@ def peak_bytes(
     mesher: Mesher = DEFAULT,
 ) -> int:
     """Return the peak memory of the process in bytes: what it holds now plus the largest slab."""
-    held = held_memory() or band.patches.nbytes
-    needs = (
-        slab_bytes(
-            band, slab.seen, slab.decoded, slab.planes, factor, network_bytes, threads, mesher.name
-        )
-        for slab in slabs
-    )
+    held, rest = held_memory() or band.patches.nbytes, (factor, network_bytes, threads, mesher.name)
+    needs = (slab_bytes(band, slab.seen, slab.decoded, slab.planes, *rest) for slab in slabs)
     return max(held + max(needs), band.peak)
 
 
@@ -169,34 +172,19 @@ def cut(
 
 
 def equal_parts(before: NDArray[np.int64], pieces: int) -> list[tuple[int, int]]:
-    """Cut planes into at most some pieces with about the same number of decoded voxels.
-
-    ``before``, (n + 1,), are the decoded voxels before each plane, and all.
-    """
+    """Cut planes into at most some pieces with about equally many of what is ``before`` each."""
     share = before / max(int(before[-1]), 1)
     inner = np.searchsorted(share, np.arange(1, pieces) / pieces)
     last = len(before) - 1
     return list(pairwise(sorted(set(np.clip([0, *inner, last], 0, last).tolist()))))
 
 
-def ways_to_cut(
-    band: Band, receptive_field: int, beside: int, planes: tuple[int, int] | None = None
-) -> Iterator[list[Slab]]:
-    """Yield cuts into more and more slabs, down to slabs of one plane."""
-    first, last = planes or (0, band.shape[0])
-    for pieces in range(1, max(last - first, 2)):
-        yield cut(band, pieces, receptive_field, beside, planes)
-    decoding = np.flatnonzero(np.diff(band.decoded_before[first : last + 1])) + first
-    bounds = [first, *decoding.tolist()[1:], last]  # each slab decodes something
-    yield [slab_of(band, low, high, receptive_field, beside) for low, high in pairwise(bounds)]
-
-
 def slab_of(band: Band, first: int, last: int, receptive_field: int, beside: int) -> Slab:
     """Return the slab of planes ``first`` to before ``last``, with the rows it depends on."""
     beside += REACH_IN_VOXELS
+    more = beside + receptive_field
     decoded = band.rows(first - beside, last + beside)
-    beside += receptive_field
-    return Slab((first, last), decoded, band.rows(first - beside, last + beside))
+    return Slab((first, last), decoded, band.rows(first - more, last + more))
 
 
 def _does_not_fit(
@@ -234,10 +222,9 @@ def slab_bytes(
     threads: int = 1,
     mesher: str = DEFAULT_MESHER,
 ) -> int:
-    """Return the peak memory of the work on a slab, in bytes beyond what the process holds already.
+    """Return the peak memory of the work on a ``Slab``, in bytes beyond what is held already.
 
-    ``seen`` and ``decoded`` are rows of the band, see ``cutting.Slab``, ``planes`` those of the
-    slab alone; ``network_bytes`` is the memory of the network per voxel that it sees and per value.
+    ``network_bytes`` is the memory of the network per voxel that it sees and per value.
     """
     voxels, own, nodes = seen.stop - seen.start, band.count_decoded(decoded), (factor + 1) ** 3
     fixed = FIXED_BYTES + THREAD_BYTES * min(threads, own * nodes // CHUNK + 1)
@@ -245,12 +232,13 @@ def slab_bytes(
         name: each[0] * voxels + (each[1] + each[2] * nodes) * own + fixed
         for name, each in STAGES.items()
     }
-    needs["spline"] += spline_bytes(band.shape) if band.smooth is not None else 0
-    if band.smooth is not None and not band.exact.any():
+    is_smooth = band.field.smooth is not None
+    needs["spline"] += spline_bytes(band.shape) if is_smooth else 0
+    if is_smooth and not band.exact.any():
         del needs["fit"]  # there are no spheres
     extra = _sharp_bytes if mesher == SHARP else _lookup_bytes
     needs["mesh"] += extra(band, planes, own, factor, threads)
-    if band.smooth is None or band.has_kinks:  # the network decodes no fewer voxels than offsets
+    if not is_smooth or band.field.has_kinks:  # the network decodes no fewer voxels than offsets
         network = network_bytes[0] * voxels + network_bytes[1] * max(own, nodes) * nodes
         needs["network"] = network + BYTES_PER_OFFSET * nodes + NETWORK_FIXED
     return int(max(needs.values()))
@@ -266,10 +254,7 @@ def _lookup_bytes(band: Band, planes: Range, decoded: int, factor: int, threads:
 
 
 def _sharp_bytes(band: Band, planes: Range, decoded: int, factor: int, threads: int) -> int:
-    """Return the bytes of the sharp mesher on as many groups as it works on at once.
-
-    Where edges are is not known yet: every voxel of the planes beside a group may be near one.
-    """
+    """Return the bytes of the sharp mesher: every voxel beside a group may be near an edge."""
     from ..steps.sharp.mesher import GROUP_BYTES, groups_at_once, voxel_bytes
 
     beside = BY_NAME[SHARP].planes_beside(factor)

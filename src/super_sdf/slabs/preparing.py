@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 from ..errors import OptionError
 from ..grid.cubic import cubic_grid
@@ -18,6 +19,9 @@ from ..steps.field import FineField, border_is_crossed
 from ..steps.meshers import Mesher
 from ..steps.survey import Band, BandTooLargeError, no_surface, survey
 from .cutting import DEFAULT, Slab, peak_bytes, plan_slabs, planes_needed, refuse_band
+
+Plan: TypeAlias = tuple[int, int | None, Resources, tuple[float, float], Mesher]
+"""The factor, the receptive field, the resources, the network's bytes, the mesher."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +59,9 @@ def prepare(
     chosen = adapt(network_for(network, grid.field.kind))
     resources = allot(chosen.threads, max_memory)
     lattice, reach = cubic_grid(grid, offset), None if at_once else chosen.receptive_field
-    plan = factor, reach, resources, chosen.memory_bytes, mesher
+    plan: Plan = factor, reach, resources, chosen.memory_bytes, mesher
     if part is None:
-        band = find_surface(lattice, offset, *plan)
+        band = _find_surface(lattice, offset, plan)
         slabs = plan_slabs(band, *plan)
     elif reach is None:
         raise OptionError(
@@ -77,25 +81,13 @@ def prepare(
     return Run(lattice, offset, chosen, factor, mesher, band, slabs, planned, threads, steps)
 
 
-def find_surface(
-    grid: SdfGrid,
-    offset: float,
-    factor: int,
-    receptive_field: int | None,
-    resources: Resources,
-    network_bytes: tuple[float, float],
-    mesher: Mesher = DEFAULT,
-) -> Band:
-    """Return the band of a grid; GridError if no voxel can hold a surface.
-
-    The parameters are those of ``plan_slabs``, for what is said if it does not fit in memory.
-    """
-    vertex_type(grid, factor)  # raises if not even float64 resolves the vertices
+def _find_surface(grid: SdfGrid, offset: float, plan: Plan) -> Band:
+    """Return the band of a grid; GridError if no voxel can hold a surface."""
+    vertex_type(grid, plan[0])  # raises if not even float64 resolves the vertices
     band = None
     with suppress(BandTooLargeError):  # and free what it holds
-        band = survey(grid, offset, resources)  # Eqs. 2 and 4
+        band = survey(grid, offset, plan[2])  # Eqs. 2 and 4
     if band is None:
-        plan = factor, receptive_field, resources, network_bytes, mesher
         raise refuse_band(grid, offset, *plan)
     if not band.decoded.any():
         raise no_surface(grid, offset)

@@ -1,4 +1,4 @@
-"""The band of voxels near the surface, their patches and their neighbour table (Eqs. 2 and 4).
+"""The band of voxels near the surface: its samples and what they can be used for (Eqs. 2 and 4).
 
 Everything here is in index space with values in half voxels: a voxel has side 2, a distance of
 one spacing h is 2, and the band is ``abs(value) < 3``.
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import GridError
 from ..grid.sdf_grid import SdfGrid
-from ..machine.resources import map_chunks
+from ..machine.resources import chunks_of
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD
 
 HALF_BAND = 3.0  # Eq. 2 after Eq. 4: 1.5 h
@@ -60,19 +60,21 @@ def rescale(
     distance in world units, positive outwards, of the surface that becomes the zero level (Sec.
     5.3). Read are planes ``first`` to before ``last``, all by default.
     """
-    planes = grid.planes(first, grid.shape[0] if last is None else last)
-    return rescale_planes(planes, grid.voxel_size, offset)
+    return rescale_planes(grid.planes(first, grid.shape[0] if last is None else last), grid, offset)
 
 
-def rescale_planes(planes: NDArray[Any], voxel_size: float, offset: float = 0.0) -> FloatArray:
-    """Return samples, negative inside, in half voxels of a size: see ``rescale``."""
+def rescale_planes(planes: NDArray[Any], grid: SdfGrid, offset: float) -> FloatArray:
+    """Return planes of a grid's samples, negative inside, in half voxels: see ``rescale``."""
     rescaled = np.empty(planes.shape, np.float32)
-    scale = 2.0 / voxel_size
+    scale = 2.0 / grid.voxel_size
     limit = float(np.finfo(np.float32).max) / 4 / scale
+    is_huge = grid.low < offset - limit or grid.high > offset + limit
     for plane, out in zip(planes, rescaled):  # plane by plane: in cache, and no second copy
         shifted = plane.astype(np.float64)
-        np.clip(shifted, offset - limit, offset + limit, out=shifted)
-        shifted -= offset
+        if is_huge:
+            np.clip(shifted, offset - limit, offset + limit, out=shifted)
+        if offset:
+            shifted -= offset
         np.multiply(shifted, scale, out=out, casting="same_kind")
     return rescaled
 
@@ -89,9 +91,12 @@ def is_active(rescaled: FloatArray) -> BoolArray:
     Where the input does, both voxels are added: a surface must pass between them.
     """
     active = np.abs(rescaled) < HALF_BAND
-    outside = rescaled > 0
-    above, below = outside & ~active, ~(outside | active)
-    if (above & _dilate(below)).any():
+    above, below = rescaled >= HALF_BAND, rescaled <= -HALF_BAND
+    corners = above.view(np.uint8) | below.view(np.uint8) << 1
+    for axis in range(3):  # of a cell
+        lines = np.moveaxis(corners, axis, 0)
+        corners = np.moveaxis(lines[1:] | lines[:-1], 0, axis)
+    if (corners == 3).any():
         active |= (above & _dilate(below)) | (below & _dilate(above))
     return active
 
@@ -108,10 +113,7 @@ def _dilate(mask: BoolArray) -> BoolArray:
 
 
 def pad_by_extrapolation(rescaled: FloatArray) -> FloatArray:
-    """Return the grid padded by one sample on every side, extrapolated linearly, clipped to 3 h.
-
-    Steps that no distance makes are not continued: a grid that was padded has such on its border.
-    """
+    """Return the grid padded by one, extrapolated linearly but at jumps, clipped to 3 h."""
     padded = np.pad(np.clip(rescaled, -2 * PATCH_LIMIT, 2 * PATCH_LIMIT), 1)
     for axis in range(3):
         planes = np.moveaxis(padded, axis, 0)
@@ -160,10 +162,7 @@ def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, ...]) -> IntArray:
 def plane_blocks(
     shape: tuple[int, ...], first: int = 0, last: int | None = None, least: int = BLOCK_PLANES
 ) -> Iterator[tuple[int, int]]:
-    """Yield (start, stop) of blocks of planes with about ``BLOCK_SAMPLES`` samples each.
-
-    They have at least ``least`` planes: more, if planes are made of many others beside them.
-    """
+    """Yield (start, stop) of blocks of ``BLOCK_SAMPLES`` samples or of ``least`` planes."""
     step = max(BLOCK_SAMPLES // (shape[1] * shape[2]), least)
     end = shape[0] if last is None else last
     for start in range(first, end, step):
@@ -185,10 +184,11 @@ def is_lipschitz(patches: FloatArray, places: Iterable[int] = range(27)) -> Bool
     everywhere in a noisy field, and in many places of a field that is not a distance.
     ``places`` are those of a patch that are compared with its centre.
     """
-    centre = patches[:, CENTRE]
     keeps = np.ones(len(patches), bool)
-    for column in places:
-        keeps &= np.abs(patches[:, column] - centre) <= MAX_DIFFERENCE[column]
+    for rows in chunks_of(len(patches), 4 * 27):  # in cache
+        centre = patches[rows, CENTRE]
+        for column in places:
+            keeps[rows] &= np.abs(patches[rows, column] - centre) <= MAX_DIFFERENCE[column]
     return keeps
 
 
@@ -228,18 +228,13 @@ def can_hold_surface(patches: FloatArray, lipschitz: BoolArray) -> BoolArray:
 
 @dataclass(frozen=True)
 class BandSummary:
-    """What the band of a whole grid says of its samples, whichever part of it is worked on.
+    """What the band of a whole grid says of its samples, whichever part of it is worked on."""
 
-    ``voxels`` tell by their samples whether the field is noisy; round the ``noisy`` ones samples
-    differ by more than distances can. ``low`` and ``high`` are the lowest and the highest sample,
-    in half voxels; ``leaves`` is whether a sample on the border of the grid is inside.
-    """
-
-    voxels: int
-    noisy: int
-    low: float
+    voxels: int  # they tell by their samples whether the field is noisy
+    noisy: int  # those round which samples differ by more than distances can
+    low: float  # the lowest and the highest sample, in half voxels
     high: float
-    leaves: bool = False
+    leaves: bool = False  # whether a sample on the border of the grid is inside
 
     @property
     def is_noisy(self) -> bool:
@@ -248,50 +243,27 @@ class BandSummary:
 
 
 def summarise(sample: FloatArray, lipschitz: BoolArray, leaves: bool = False) -> BandSummary:
-    """Return the summary of samples (V,), some of which tell by ``lipschitz`` how noisy they are.
-
-    No sample is at infinity.
-    """
+    """Return the summary of samples, some of which tell by ``lipschitz`` how noisy they are."""
     noisy = len(lipschitz) - int(np.count_nonzero(lipschitz))
     low, high = float(sample.min(initial=np.inf)), float(sample.max(initial=-np.inf))
     return BandSummary(len(lipschitz), noisy, low, high, leaves)
 
 
-def exact_samples(
-    patches: FloatArray,
-    lipschitz: BoolArray,
-    threads: int = 1,
-    sampled: BoolArray | None = None,
-    whole: BandSummary | None = None,
-) -> BoolArray:
+def exact_samples(patches: FloatArray, lipschitz: BoolArray, whole: BandSummary) -> BoolArray:
     """Return which samples of a band can be taken as exact distances, (V,) bool.
 
-    Those that are ``sampled``, not interpolated, tell by ``lipschitz`` (``is_lipschitz``) whether
-    the field is noisy; all by default. ``whole`` is of the band of the whole grid, if the patches
-    (V, 27) are those of a part of it.
+    A truncated sample has the largest value of its sign in the whole band, and no neighbour towards
+    which the field is as steep as a distance.
     """
     sample = patches[:, CENTRE]
-    whole = whole or summarise(sample, lipschitz if sampled is None else lipschitz[sampled])
-    if not len(patches) or whole.is_noisy:
-        return np.zeros(len(patches), bool)
+    exact: BoolArray = lipschitz & (np.abs(sample) < MAX_DISTANCE) & (not whole.is_noisy)
     limits = np.float32(whole.low), np.float32(whole.high)
-    near = np.abs(sample) < MAX_DISTANCE
-    cut_off = map_chunks(lambda rows: is_cut_off(patches[rows], limits), len(patches), 27, threads)
-    exact: BoolArray = lipschitz & near & ~np.concatenate(cut_off)
+    at_limit = np.flatnonzero(exact & (sample == np.where(sample > 0, limits[1], limits[0])))
+    for rows in chunks_of(len(at_limit), 27):
+        some = at_limit[rows]
+        slope = np.abs(patches[some] - sample[some, None]) / np.maximum(MAX_DIFFERENCE, 1)
+        exact[some] = slope.max(1) >= MIN_SLOPE
     return exact
-
-
-def is_cut_off(patches: FloatArray, limits: tuple[np.float32, np.float32]) -> BoolArray:
-    """Return which samples were truncated, (V,) bool.
-
-    A truncated sample has the largest value of its sign, and no neighbour towards which the field
-    is as steep as a distance. ``limits`` are the lowest and the highest sample.
-    """
-    sample = patches[:, CENTRE]
-    at_limit = sample == np.where(sample > 0, limits[1], limits[0])
-    slope = np.abs(patches - sample[:, None]) / np.maximum(MAX_DIFFERENCE, 1)
-    cut_off: BoolArray = at_limit & (slope.max(1) < MIN_SLOPE)
-    return cut_off
 
 
 # Neighbouring samples of noisy distances differ by up to twice the spacing (4 half voxels); a
@@ -308,29 +280,22 @@ ROUNDING, UNSAMPLED = 1e-3, 0.1
 class Jumps(NamedTuple):
     """Counts of the samples near an offset, and of those with a jump to a neighbour."""
 
-    edges: int  # samples near the offset with a jump to a neighbour
-    near: int  # samples near the offset
+    edges: int
+    near: int
     end: float  # the farthest with a jump, in half voxels from the offset; -inf if there is none
 
 
 def check_not_cut_off(patches: FloatArray, offset: float, voxel_size: float) -> None:
     """Raise GridError if the distances are truncated within 1.5 voxels of an offset.
 
-    ``patches`` (V, 27) are the samples round voxels of the band there, in half voxels from it.
+    ``patches`` (V, 27) are the samples round voxels of the band there. A distance never equals all
+    its neighbours.
     """
     centre = patches[:, CENTRE]
-    cut_off = is_flat(patches) & (np.abs(centre) < CUT_OFF_MARGIN - ROUNDING)
+    cut_off = (patches == centre[:, None]).all(1) & (np.abs(centre) < CUT_OFF_MARGIN - ROUNDING)
     if cut_off.any():
         end = offset + float(centre[cut_off][0]) * voxel_size / 2
-        raise too_near(offset, voxel_size, end, CUT_OFF_MARGIN, outwards=end > 0)
-
-
-def is_flat(patches: FloatArray) -> BoolArray:
-    """Return which samples equal all their neighbours, (V,) bool: a distance never does."""
-    flat = np.ones(len(patches), bool)
-    for column in range(27):
-        flat &= patches[:, column] == patches[:, CENTRE]
-    return flat
+        raise _too_near(offset, voxel_size, end, CUT_OFF_MARGIN, outwards=end > 0)
 
 
 def find_jumps(rescaled: FloatArray, own: tuple[slice, ...]) -> tuple[Jumps, Jumps]:
@@ -338,21 +303,20 @@ def find_jumps(rescaled: FloatArray, own: tuple[slice, ...]) -> tuple[Jumps, Jum
 
     Samples are counted in ``own``; those beside them only show whether there is a jump.
     """
-    return _jumps_up(rescaled, own), _jumps_up(-rescaled, own)
 
+    def jumps_up(rescaled: FloatArray) -> Jumps:
+        jumps = np.zeros(rescaled.shape, bool)
+        for axis in range(3):
+            values, found = np.moveaxis(rescaled, axis, 0), np.moveaxis(jumps, axis, 0)
+            step = values[1:] - values[:-1]
+            found[:-1] |= step > MIN_JUMP
+            found[1:] |= step < -MIN_JUMP
+        near = np.abs(rescaled[own]) < PATCH_LIMIT
+        found = jumps[own] & near
+        end = float(rescaled[own][found].max(initial=-np.inf))
+        return Jumps(int(found.sum()), int(near.sum()), end)
 
-def _jumps_up(rescaled: FloatArray, own: tuple[slice, ...]) -> Jumps:
-    """Return the jumps upwards."""
-    jumps = np.zeros(rescaled.shape, bool)
-    for axis in range(3):
-        values, found = np.moveaxis(rescaled, axis, 0), np.moveaxis(jumps, axis, 0)
-        step = values[1:] - values[:-1]
-        found[:-1] |= step > MIN_JUMP
-        found[1:] |= step < -MIN_JUMP
-    rescaled, jumps = rescaled[own], jumps[own]
-    near = np.abs(rescaled) < PATCH_LIMIT
-    jumps &= near
-    return Jumps(int(jumps.sum()), int(near.sum()), float(rescaled[jumps].max(initial=-np.inf)))
+    return jumps_up(rescaled), jumps_up(-rescaled)
 
 
 def check_not_filled(found: list[tuple[Jumps, Jumps]], offset: float, voxel_size: float) -> None:
@@ -362,16 +326,13 @@ def check_not_filled(found: list[tuple[Jumps, Jumps]], offset: float, voxel_size
         reach = max(part.end for part in parts)
         if count > MAX_JUMP_SHARE * near and reach < FILL_MARGIN - UNSAMPLED:
             end = offset + side * reach * voxel_size / 2
-            raise too_near(offset, voxel_size, end, FILL_MARGIN, outwards=side > 0)
+            raise _too_near(offset, voxel_size, end, FILL_MARGIN, outwards=side > 0)
 
 
-def too_near(
+def _too_near(
     offset: float, voxel_size: float, end: float, needed: float, *, outwards: bool
 ) -> GridError:
-    """Return the error for an offset too near ``end``, where the distances end (world units).
-
-    ``needed`` is how far they must reach, in half voxels.
-    """
+    """Return the error for distances that end (world units) within ``needed`` half voxels."""
     room = needed / 2 * voxel_size
     limit, which = (end - room, "largest") if outwards else (end + room, "smallest")
     works = f"the {which} that works is {limit:.6g}" if limit * end > 0 else "only 0 works"

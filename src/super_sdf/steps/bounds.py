@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,16 +54,11 @@ REACH_IN_VOXELS = 2
 Rows = NDArray[np.intp]
 
 
-@dataclass(frozen=True, eq=False)
-class SamplesBeyond:
-    """Samples between the band and ``FARTHEST`` that can be exact.
+class SamplesBeyond(NamedTuple):
+    """Samples between the band and ``FARTHEST`` that can be exact."""
 
-    ``number``, (n,) int64, is the number of each in C order of the grid, ascending; ``value``, (n,)
-    float32, are their values.
-    """
-
-    number: NDArray[np.int64]
-    value: FloatArray
+    number: NDArray[np.int64]  # (n,), in C order of the grid, ascending
+    value: FloatArray  # (n,)
 
 
 NONE_BEYOND = SamplesBeyond(np.zeros(0, np.int64), np.zeros(0, np.float32))
@@ -78,7 +74,7 @@ def samples_beyond(rescaled: FloatArray, first: int, limits: tuple[float, float]
         return NONE_BEYOND
     low, high = np.asarray(limits, np.float32).clip(-FARTHEST, FARTHEST)
     found = (rescaled > low) & (rescaled < high)
-    found &= ~((rescaled > -HALF_BAND) & (rescaled < HALF_BAND))
+    found &= np.abs(rescaled) >= HALF_BAND
     return SamplesBeyond(np.flatnonzero(found) + first, rescaled[found])
 
 
@@ -99,10 +95,7 @@ class TrustedSamples:
     limits: tuple[float, float]  # between these, samples beyond the band can be exact
 
     def box(self, low: IntArray, high: IntArray) -> FloatArray:
-        """Return the samples from index ``low`` (3,) to before ``high``, NaN where there is none.
-
-        The box may exceed the grid.
-        """
+        """Return the samples from index ``low`` (3,) to before ``high``, NaN where none is."""
         box = np.full(high - low, np.nan, np.float32)
         planes = slice(*np.searchsorted(self.voxel_ijk[:, 0], [low[0], high[0]]))
         exact = np.flatnonzero(self.exact[planes]) + planes.start
@@ -148,7 +141,11 @@ def keep_within_bounds(
                 bounded[:, here] = moved.T
 
     map_chunks(work, len(voxel_ijk), CHUNK // BOX_ROWS, threads)
-    np.copyto(blocks, bounded, where=~(thin | _any_beside(thin, parts)))
+    kept = thin.copy()  # and the blocks that share a face with a thin wall
+    for stride in STRIDES:
+        for place in (CENTRE - int(stride), CENTRE + int(stride)):
+            kept[:-1] |= thin[parts.table[place]]
+    np.copyto(blocks, bounded, where=~kept)
     average_shared(blocks, parts, factor, threads)
 
 
@@ -166,11 +163,7 @@ def cut_to_boxes(voxel_ijk: IntArray, rows: slice) -> Iterator[slice]:
 def samples_around(
     voxel_ijk: IntArray, samples: TrustedSamples
 ) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
-    """Return a box of samples (l,), NaN where none is trusted; where those of voxels (n, 3) are.
-
-    That is the place of each voxel's own sample, (n,), and the steps from there to the samples
-    around, (m,), in the order of ``sample_places``.
-    """
+    """Return a box of samples (l,), the places of voxels' (n,), and steps to those around, (m,)."""
     low = voxel_ijk.min(0) - REACH_OF_SAMPLES
     box = samples.box(low, voxel_ijk.max(0) + REACH_OF_SAMPLES + 1)
     strides = np.array([box.shape[1] * box.shape[2], box.shape[2], 1])
@@ -231,20 +224,14 @@ def move_out(
 
 @lru_cache
 def nodes_to_look_at(factor: int) -> Rows:
-    """Return the nodes of a block at its corners and in the middle of edges, faces and itself.
-
-    These 27 are filled up to 32 by the last.
-    """
+    """Return the 27 nodes at the ends and in the middle of a block, filled up to 32 by the last."""
     nodes = np.flatnonzero((block_ijk(factor) % (factor // 2) == 0).all(1))
     return np.pad(nodes, (0, 5), mode="edge")
 
 
 @lru_cache
 def sample_places() -> tuple[IntArray, FloatArray]:
-    """Return the steps from a block's own sample to those around, (m, 3), and distances, (m,).
-
-    The nearest is first: the sample itself.
-    """
+    """Return the steps from a sample to those around, (m, 3), itself first, and distances, (m,)."""
     reach = REACH_OF_SAMPLES
     steps = np.indices((2 * reach + 1,) * 3).reshape(3, -1).T - reach
     distance = 2 * np.linalg.norm(steps, axis=1)
@@ -267,12 +254,3 @@ def loses_wall(values: FloatArray, moved: FloatArray) -> BoolArray:
     inside = values <= 0
     lost: BoolArray = (inside & (moved > 0)).sum(1) > MOST_LOST * inside.sum(1)
     return lost
-
-
-def _any_beside(flags: BoolArray, parts: SharedParts) -> BoolArray:
-    """Return which blocks share a face with a block of a flag, (D + 1,); the last flag is False."""
-    found = np.zeros_like(flags)
-    for stride in STRIDES:
-        for place in (CENTRE - int(stride), CENTRE + int(stride)):
-            found[:-1] |= flags[parts.table[place]]
-    return found

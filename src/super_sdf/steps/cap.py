@@ -37,11 +37,7 @@ WAY_OUT = (
 
 
 def close(field: FineField, *, cap: bool, beside: int = 1) -> FineField:
-    """Return the field whose isosurface is closed where it should be.
-
-    Where the solid leaves the grid, it is closed along the border if ``cap`` is set. ``beside`` is
-    as in ``close_at_border``.
-    """
+    """Return the field closed where it should be; where the solid leaves the grid, with ``cap``."""
     if field.octants is not None:  # it ends where samples are unknown, and cannot be closed
         return field
     if field.leaves:
@@ -56,10 +52,10 @@ def close(field: FineField, *, cap: bool, beside: int = 1) -> FineField:
 def close_at_border(field: FineField, beside: int = 1) -> FineField:
     """Surround the grid with outside voxels, so that the surface is closed along the border.
 
-    Adds the border voxels inside the solid that were not decoded, and a layer of outside voxels
-    beyond the border. Nodes beyond the border are placed on it (see ``marching``), so the cap is
-    flat. A slab is closed in its own planes and in the planes ``beside`` them on which its mesh
-    depends, and in one more before, which owns vertices of those.
+    Added are the border voxels inside the solid that were not decoded, and a layer beyond, whose
+    nodes are placed on the border (see ``marching``), so the cap is flat. A slab is closed in its
+    own planes, in those ``beside`` on which its mesh depends, and in one more before, which owns
+    vertices of those.
     """
     return _close(field, find_border_inside(field, *_planes_beside(field, beside)), beside)
 
@@ -69,15 +65,21 @@ def find_border_inside(field: FineField, first: int, last: int) -> IntArray:
 
     The planes must be some whose voxels the field has.
     """
-    found = field.border_inside
-    if found is not None:
-        return found[(found[:, 0] >= first) & (found[:, 0] < last)]
-    known = field.voxel_ijk[field.rows(first, last)]
-    return _filled_border(field.placed, field.offset, first, last, known)
+    if field.border_inside is not None:
+        plane = field.border_inside[:, 0]
+        return field.border_inside[(plane >= first) & (plane < last)]
+    grid, found = field.placed, [np.empty((0, 3), np.int64)]
+    for low, high in plane_blocks(grid.shape, first, last):
+        inside = rescale(grid, field.offset, low, high) <= 0
+        inner = slice(max(1 - low, 0), min(grid.shape[0] - 1, high) - low)
+        inside[inner, 1:-1, 1:-1] = False
+        known = field.voxel_ijk[field.rows(low, high)]
+        inside[known[:, 0] - low, known[:, 1], known[:, 2]] = False
+        found.append(np.argwhere(inside) + np.array([low, 0, 0]))
+    return np.concatenate(found).astype(np.int32)
 
 
 def _planes_beside(field: FineField, beside: int) -> tuple[int, int]:
-    """Return the planes on which the mesh of a slab depends, from the first to before the last."""
     return max(field.planes[0] - beside - 1, 0), min(field.planes[1] + beside, field.shape[0])
 
 
@@ -112,10 +114,7 @@ def _set_blocks(
     parts: SharedParts,
     factor: int,
 ) -> None:
-    """Set the blocks of some voxels, and the nodes that other blocks share with them, in place.
-
-    The values, (Q, n) or one number, are those of the n columns of ``blocks`` (Q, D).
-    """
+    """Set the blocks of some voxels, columns of ``blocks``, and what others share with them."""
     values = np.broadcast_to(values, (len(blocks), len(columns)))
     nodes = nodes_of_part(factor)
     for part, sharing in enumerate(SHARING):
@@ -124,21 +123,6 @@ def _set_blocks(
             there = np.flatnonzero(neighbour >= 0)
             seen = nodes[seen_from(part, place)]
             blocks[seen[:, None], neighbour[there]] = values[nodes[part][:, None], there]
-
-
-def _filled_border(
-    grid: SdfGrid, offset: float, first: int, last: int, known: IntArray
-) -> IntArray:
-    """Return the border voxels (n, 3) of some planes that are inside and not in ``known``."""
-    found = []
-    for low, high in plane_blocks(grid.shape, first, last):
-        inside = rescale(grid, offset, low, high) <= 0
-        inner = slice(max(1 - low, 0), min(grid.shape[0] - 1, high) - low)
-        inside[inner, 1:-1, 1:-1] = False
-        here = known[(known[:, 0] >= low) & (known[:, 0] < high)]
-        inside[here[:, 0] - low, here[:, 1], here[:, 2]] = False
-        found.append(np.argwhere(inside) + np.array([low, 0, 0]))
-    return np.concatenate([np.empty((0, 3)), *found]).astype(np.int32)
 
 
 def outer_voxels(voxel_ijk: IntArray, shape: tuple[int, int, int]) -> IntArray:

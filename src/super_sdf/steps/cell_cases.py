@@ -18,9 +18,9 @@ the Ambiguity in Marching Cubes", 1991.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from functools import cache, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +42,7 @@ EDGE_BETWEEN = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Choices:
+class Choices(NamedTuple):
     """The cases that cells with the same corners inside can have."""
 
     ambiguous: NDArray[np.uint8]  # (256,), a bit for each of ``FACES``: whether it is ambiguous
@@ -91,18 +90,14 @@ def triangle_table() -> tuple[IntArray, IntArray]:
     return counts, table
 
 
-@dataclass(frozen=True, eq=False)
-class LoopTable:
+class LoopTable(NamedTuple):
     """The loops of all cases, one after the other: each is a patch of the surface in a cell."""
 
-    # count, first: (C,), how many loops a case has, and which is its first
-    count: NDArray[np.int64]
-    first: NDArray[np.int64]
+    times: NDArray[np.int64]  # (C,), how many loops a case has
+    first: NDArray[np.int64]  # (C,), which is its first
     sides: NDArray[np.int64]  # (L,), how many edges a loop has
-    # (L, S), its cell edges in order, counter-clockwise from outside; -1 after the last
-    edges: NDArray[np.int64]
-    # (L, T, 3), places in the loop of its triangles' corners; there are ``sides - 2``
-    triangles: NDArray[np.int64]
+    edges: NDArray[np.int64]  # (L, S), in order, counter-clockwise from outside; -1 after the last
+    triangles: NDArray[np.int64]  # (L, T, 3), places in the loop; there are ``sides - 2``
 
 
 @lru_cache(maxsize=1)
@@ -161,50 +156,30 @@ def triangulate(loop: tuple[int, ...]) -> list[tuple[int, int, int]]:
     edges of a face: along the first axis of a lower face, along the second of an upper one. A face
     is a lower one of one cell and an upper one of the other, so both never have the same diagonal.
     """
-    try:
-        return _cut(loop, _lie_on_no_face)
-    except _CannotCutError:
-        return _cut(loop, _may_lie_on_a_face)
+    return _cut(loop, on_faces=False) or _cut(loop, on_faces=True) or []
 
 
-def _cut(loop: tuple[int, ...], allowed: Callable[[int, int], bool]) -> list[tuple[int, int, int]]:
-    """Return the triangles of a loop, cut along allowed diagonals."""
+def _cut(loop: tuple[int, ...], on_faces: bool) -> list[tuple[int, int, int]] | None:
+    """Return the triangles of a loop, cut along diagonals that may be; None if there are none."""
     if len(loop) < 3:
         return []
-    first, last = loop[0], loop[-1]
     for middle in range(1, len(loop) - 1):
         left, right = loop[: middle + 1], loop[middle:]
-        if all(len(part) == 2 or allowed(part[0], part[-1]) for part in (left, right)):
-            try:
-                parts = _cut(left, allowed) + _cut(right, allowed)
-            except _CannotCutError:
-                continue
-            return [(first, loop[middle], last), *parts]
-    raise _CannotCutError
+        if all(len(x) == 2 or _may_join(x[0], x[-1], on_faces) for x in (left, right)):
+            some, others = _cut(left, on_faces), _cut(right, on_faces)
+            if some is not None and others is not None:
+                return [(loop[0], loop[middle], loop[-1]), *some, *others]
+    return None
 
 
-class _CannotCutError(Exception):
-    """Raised for a part of a loop that cannot be triangulated; another middle may work."""
-
-
-def _lie_on_no_face(a: int, b: int) -> bool:
-    """Return whether two cell edges lie on no common face."""
-    return _common_face(a, b) is None
-
-
-def _may_lie_on_a_face(a: int, b: int) -> bool:
+@lru_cache(maxsize=288)
+def _may_join(a: int, b: int, on_faces: bool) -> bool:
     """Return whether a diagonal may join two cell edges, if need be on a face."""
-    face = _common_face(a, b)
+    ends = {EDGE_START[a], EDGE_START[a] + _STEP[EDGE_AXIS[a]]}
+    ends |= {EDGE_START[b], EDGE_START[b] + _STEP[EDGE_AXIS[b]]}
+    face = next((n for n, corners in enumerate(FACES) if ends <= set(corners)), None)
     if face is None:
         return True
     axis, is_upper = divmod(face, 2)
     along = [other for other in range(3) if other != axis][is_upper]
-    return EDGE_AXIS[a] == EDGE_AXIS[b] == along
-
-
-@lru_cache(maxsize=144)
-def _common_face(a: int, b: int) -> int | None:
-    """Return the face on which two cell edges lie, None if there is none."""
-    ends = {EDGE_START[a], EDGE_START[a] + _STEP[EDGE_AXIS[a]]}
-    ends |= {EDGE_START[b], EDGE_START[b] + _STEP[EDGE_AXIS[b]]}
-    return next((n for n, face in enumerate(FACES) if ends <= set(face)), None)
+    return on_faces and EDGE_AXIS[a] == EDGE_AXIS[b] == along

@@ -22,8 +22,8 @@ from ..arrays import BoolArray, FloatArray, IntArray
 from ..machine.resources import map_chunks
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 from .field import SampleSpheres
-from .foot_points import CELL
 from .nodes import BARELY_INSIDE, BARELY_OUTSIDE, SharedParts, VoxelIndex, block_ijk
+from .spheres import CELL
 
 TOLERANCE = 0.2  # a sphere is touched by surfaces up to so far from it
 LARGEST_SPHERE = 2.0  # farther samples say little of a small piece
@@ -57,14 +57,11 @@ class Lattice:
         found = np.full(len(node), -1)
         for upper in CELL:
             left = np.flatnonzero(found < 0)
-            found[left] = self.copies(node[left], upper)
+            found[left] = self._copies(node[left], upper)
         return found
 
-    def copies(self, node: Nodes, upper: NDArray[np.intp]) -> Nodes:
-        """Return where nodes are in one of the up to eight blocks that share them.
-
-        ``upper``, (3,), says which block it is where two blocks meet: 1 the one after the face.
-        """
+    def _copies(self, node: Nodes, upper: NDArray[np.intp]) -> Nodes:
+        """Return where nodes are in one of the blocks that share them: ``upper`` 1 after a face."""
         voxel = (node - 1 + upper) // self.factor
         row, inner = self.index.find(voxel), node - self.factor * voxel
         side = self.factor + 1
@@ -74,23 +71,8 @@ class Lattice:
     def set(self, node: Nodes, values: FloatArray) -> None:
         """Set the value of nodes (n, 3) in all blocks that share them."""
         for upper in CELL:
-            at = self.copies(node, upper)
+            at = self._copies(node, upper)
             self.blocks.ravel()[at[at >= 0]] = values[at >= 0]
-
-
-@dataclass(frozen=True, eq=False)
-class Pieces:
-    """Small pieces: ``node[start[n] : start[n + 1]]``, (m, 3), are the nodes of the n-th."""
-
-    node: Nodes
-    start: Nodes
-
-    def __len__(self) -> int:
-        return len(self.start) - 1
-
-    def spread(self, values: BoolArray) -> BoolArray:
-        """Return for each node the value of its piece."""
-        return np.repeat(values, np.diff(self.start))
 
 
 def drop_debris(
@@ -99,30 +81,24 @@ def drop_debris(
     """Give the nodes of small pieces that nothing supports the opposite sign, in ``blocks``.
 
     Returned are the planes of voxels in which small pieces begin: of those that were dropped, and
-    of those that stay because a sample lies in them.
+    of those that stay because a sample that is not 0 lies in them.
     """
     lattice = Lattice(blocks, factor, index)
-    pieces = small_pieces(lattice, find_seeds(blocks, factor, parts))
-    first = (np.maximum(pieces.node[pieces.start[:-1], 0] - 1, 0) // factor).astype(np.int32)
-    at = lattice.find(pieces.node)
-    values = lattice.blocks.ravel().take(at)
-    held = _hold_samples(pieces, values, factor)
-    loose = at[pieces.spread(~held)]
-    dropped = np.zeros(len(pieces), bool)
+    node, sizes = small_pieces(lattice, find_seeds(blocks, factor, parts))
+    start = np.cumsum(sizes) - sizes
+    first = (np.maximum(node[start, 0] - 1, 0) // factor).astype(np.int32)
+    at = lattice.find(node)
+    values = blocks.ravel().take(at)
+    on_sample = ((node - factor // 2) % factor == 0).all(1) & (np.abs(values) > BARELY_OUTSIDE)
+    held = np.add.reduceat(on_sample, start, dtype=int) > 0 if len(start) else start > 0
+    loose = at[np.repeat(~held, sizes)]
+    dropped = np.zeros(len(start), bool)
     for n in np.flatnonzero(~held):
-        some = slice(pieces.start[n], pieces.start[n + 1])
-        dropped[n] = not is_supported(lattice, pieces.node[some], values[some], loose, spheres)
-    gone = pieces.spread(dropped)
-    lattice.set(pieces.node[gone], np.where(values[gone] <= 0, BARELY_OUTSIDE, BARELY_INSIDE))
+        some = slice(start[n], start[n] + sizes[n])
+        dropped[n] = not is_supported(lattice, node[some], values[some], loose, spheres)
+    gone = np.repeat(dropped, sizes)
+    lattice.set(node[gone], np.where(values[gone] <= 0, BARELY_OUTSIDE, BARELY_INSIDE))
     return first[dropped], first[held]
-
-
-def _hold_samples(pieces: Pieces, values: FloatArray, factor: int) -> BoolArray:
-    """Return in which pieces a sample lies that is not 0, (n,); ``values`` are those of nodes."""
-    if not len(pieces):
-        return np.zeros(0, bool)
-    held = ((pieces.node - factor // 2) % factor == 0).all(1) & (np.abs(values) > BARELY_OUTSIDE)
-    return np.logical_or.reduceat(held, pieces.start[:-1])
 
 
 def count_between(plane: IntArray, planes: tuple[int, int]) -> int:
@@ -131,10 +107,7 @@ def count_between(plane: IntArray, planes: tuple[int, int]) -> int:
 
 
 def find_seeds(blocks: FloatArray, factor: int, parts: SharedParts) -> Nodes:
-    """Return the nodes, as voxel and place in its block (n, 2), at which a small piece may begin.
-
-    The nodes before such a node have the other sign, along each axis, and so has one of the next K.
-    """
+    """Return the nodes, as voxel and place in its block (n, 2), at which small pieces may begin."""
     side, count = factor + 1, blocks.shape[1] - 1
 
     def seeds_of(rows: slice) -> Nodes:
@@ -148,37 +121,29 @@ def find_seeds(blocks: FloatArray, factor: int, parts: SharedParts) -> Nodes:
         return np.stack([at[:, 3] + rows.start, place], 1)
 
     seeds = np.concatenate([np.empty((0, 2), np.int64), *map_chunks(seeds_of, count, len(blocks))])
-    for axis in range(3):
-        seeds = seeds[_ends_soon(blocks, factor, parts, seeds, axis)]
+    for axis in range(3):  # one of the next K nodes has the other sign
+        row, place = seeds.T
+        inner = block_ijk(factor)[place, axis]
+        beyond = parts.table[CENTRE + STRIDES[axis]].take(row)
+        inside = blocks[place, row] <= 0
+        ends = np.zeros(len(seeds), bool)
+        for ahead in range(1, factor + 1):
+            over = inner + ahead > factor
+            node = place + (factor + 1) ** (2 - axis) * (ahead - factor * over)
+            at = np.where(over, beyond, row)
+            ends |= ((blocks[node, at] <= 0) != inside) & (at >= 0)
+        seeds = seeds[ends]
     return seeds
 
 
-def _ends_soon(
-    blocks: FloatArray, factor: int, parts: SharedParts, seeds: Nodes, axis: int
-) -> BoolArray:
-    """Return after which seeds one of the next K nodes along an axis has the other sign."""
-    row, place = seeds.T
-    inner = block_ijk(factor)[place, axis]
-    step = (factor + 1) ** (2 - axis)
-    beyond = parts.table[CENTRE + STRIDES[axis]].take(row)
-    inside = blocks[place, row] <= 0
-    found = np.zeros(len(seeds), bool)
-    for ahead in range(1, factor + 1):
-        over = inner + ahead > factor
-        at = np.where(over, beyond, row)
-        found |= ((blocks[place + step * (ahead - factor * over), at] <= 0) != inside) & (at >= 0)
-    return found
-
-
-def small_pieces(lattice: Lattice, seeds: Nodes) -> Pieces:
-    """Return the pieces of at most K nodes along each axis that begin at seeds."""
+def small_pieces(lattice: Lattice, seeds: Nodes) -> tuple[Nodes, Nodes]:
+    """Return the nodes (m, 3) of pieces of at most K nodes per axis from seeds, and sizes."""
     index, factor = lattice.index, lattice.factor
     voxel = np.stack(np.unravel_index(index.keys[seeds[:, 0]], index.shape), 1)
     start = factor * voxel + block_ijk(factor)[seeds[:, 1]]
     found = [_grow(lattice, start[some : some + SEEDS]) for some in range(0, len(start), SEEDS)]
-    nodes = np.concatenate([np.empty((0, 3), np.int64), *(node for node, _ in found)])
-    sizes = np.concatenate([np.empty(0, np.int64), *(size for _, size in found)])
-    return Pieces(nodes, np.append(0, np.cumsum(sizes)))
+    nodes, sizes = zip((np.empty((0, 3), np.int64), np.empty(0, np.int64)), *found)
+    return np.concatenate(nodes), np.concatenate(sizes)
 
 
 def _grow(lattice: Lattice, start: Nodes) -> tuple[Nodes, Nodes]:
@@ -189,11 +154,16 @@ def _grow(lattice: Lattice, start: Nodes) -> tuple[Nodes, Nodes]:
     reach = lattice.factor
     width = 2 * reach + 1
     box = width**3
+
+    def unpack(number: Nodes) -> tuple[Nodes, Nodes]:
+        seed, step = np.divmod(number, box)
+        return seed, np.stack(np.unravel_index(step, (width,) * 3), 1) - reach
+
     small = np.ones(len(start), bool)
     front = np.arange(len(start)) * box + box // 2
     known = front
     while len(front):
-        seed, step = _unpack(front, width)
+        seed, step = unpack(front)
         beside = (step[:, None] + NEIGHBOURHOOD).reshape(-1, 3)
         at = lattice.find(start[seed].repeat(27, 0) + beside).reshape(-1, 27)
         joined = joined_nodes(lattice.blocks.ravel().take(at), at >= 0)
@@ -204,17 +174,22 @@ def _grow(lattice: Lattice, start: Nodes) -> tuple[Nodes, Nodes]:
         small[seed[ends | (number % box < box // 2)]] = False
         front = np.setdiff1d(number[small[seed]], known)
         known = np.concatenate([known[small[known // box]], front])
-    known = np.sort(known[small[known // box]])
-    seed, step = _unpack(known, width)
-    return _of_size(seed, start[seed] + step, reach)
+    seed, step = unpack(np.sort(known[small[known // box]]))
+    node = start[seed] + step
+    if not len(seed):
+        return node, seed
+    starts = np.flatnonzero(np.diff(seed, prepend=-1))
+    sizes = np.diff(starts, append=len(seed))
+    extent = np.maximum.reduceat(node, starts) - np.minimum.reduceat(node, starts)
+    fits = (extent < reach).all(1)
+    return node[np.repeat(fits, sizes)], sizes[fits]
 
 
 def joined_nodes(values: FloatArray, known: BoolArray) -> BoolArray:
     """Return with which of the nodes around them nodes are joined in the surface, (n, 27).
 
     They are with nodes of their sign next to them, and with those across a face of a cell if the
-    face says so (``marching.choose_cases``). Nodes in no block, not ``known``, have the sign of
-    those beside.
+    face says so (``marching``). Nodes in no block, not ``known``, have the sign of those beside.
     """
     here = values[:, CENTRE]
     same = ((values <= 0) == (here <= 0)[:, None]) | ~known
@@ -226,23 +201,6 @@ def joined_nodes(values: FloatArray, known: BoolArray) -> BoolArray:
         joined[:, place] = same[:, place] & ~same[:, one] & ~same[:, other]
         joined[:, place] &= np.where(here <= 0, excess > 0, excess >= 0)
     return joined
-
-
-def _unpack(number: Nodes, width: int) -> tuple[Nodes, Nodes]:
-    """Return the seeds and the steps from them, (n, 3), of nodes' numbers."""
-    seed, step = np.divmod(number, width**3)
-    return seed, np.stack(np.unravel_index(step, (width,) * 3), 1) - width // 2
-
-
-def _of_size(piece: Nodes, node: Nodes, most: int) -> tuple[Nodes, Nodes]:
-    """Return the nodes of the pieces of at most ``most`` nodes along each axis, and their sizes."""
-    if not len(piece):
-        return node, piece
-    starts = np.flatnonzero(np.diff(piece, prepend=-1))
-    sizes = np.diff(starts, append=len(piece))
-    extent = np.maximum.reduceat(node, starts) - np.minimum.reduceat(node, starts)
-    fits = (extent < most).all(1)
-    return node[np.repeat(fits, sizes)], sizes[fits]
 
 
 def is_supported(

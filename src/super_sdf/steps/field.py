@@ -13,13 +13,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, IntArray
+from ..arrays import FloatArray, IntArray
 from ..errors import OptionError
 from ..grid.field import NONE_EXACT, Field
 from ..grid.planes import SamplePlanes
 from ..grid.sdf_grid import SdfGrid
 from ..machine.resources import chunks_of
-from ..options import EXACT, NOISY
 from .band import rescale
 from .nodes import (
     BARELY_INSIDE,
@@ -149,10 +148,7 @@ class FineField:
 
     @cached_property
     def node_ijk(self) -> IntArray:
-        """The indices of all nodes in the fine lattice, in the order of ``values``, (n, 3) int32.
-
-        Node (i, j, k) is at the coarse index ``(i, j, k) / K - 1/2``.
-        """
+        """The indices of all nodes in the fine lattice, in the order of ``values``, (n, 3)."""
         ijk = np.empty((self.parts.count_nodes(self.factor), 3), np.int32)
         ijk[self.numbers] = self._block_node_ijk(slice(None))
         return ijk
@@ -233,8 +229,7 @@ def border_is_crossed(field: FineField, beside: int = 0) -> bool:
     """Return whether the surface crosses the border of the grid, in the field's planes.
 
     The border is that of the fine lattice, half a voxel beyond the outermost samples. So it may be
-    crossed though all samples on the border are outside. ``beside`` is how many planes to look at
-    on either side of the field's own.
+    crossed though all samples on it are outside. ``beside`` further planes are looked at, too.
     """
     rows = field.rows(field.planes[0] - beside, field.planes[1] + beside)
     side = block_ijk(field.factor)
@@ -276,31 +271,21 @@ class FineLattice(SamplePlanes):
     def _interpolate(self, planes: FloatArray, first: int) -> None:
         """Fill planes of nodes from ``first`` on with interpolated samples, in half voxels."""
         factor, grid = self.field.factor, self.field.placed
-        last = first + len(planes)
-        low, share = places_of_nodes(first, last, factor, grid.shape[0])
-        nearest = voxels_of_nodes(first, last, factor, grid.shape[0])
-        start, stop = int(low[0]), int(low[-1]) + 2
-        samples = rescale(grid, self.field.offset, start, stop)
+        across = [_places_of_nodes(0, n, factor, m) for n, m in zip(self.shape, grid.shape)][1:]
+        low, share, nearest = _places_of_nodes(first, first + len(planes), factor, grid.shape[0])
+        start = int(low[0])
+        samples = rescale(grid, self.field.offset, start, int(low[-1]) + 2)
         for plane, before, beyond, voxel in zip(planes, low - start, share, nearest - start):
-            plane[...] = self._refined(samples[before : before + 2], beyond)
-            outside = self._spread(samples[voxel] > 0)
+            values = samples[before] * (1 - beyond) + samples[before + 1] * beyond
+            outside = samples[voxel] > 0
+            for axis, (lower, upper, inner) in enumerate(across):
+                part = upper[:, None] if axis == 0 else upper
+                refined = values.take(lower, axis) * (1 - part)
+                refined += values.take(lower + 1, axis) * part
+                values, outside = refined, outside.take(inner, axis)
+            plane[...] = values
             np.maximum(plane, BARELY_OUTSIDE, out=plane, where=outside)
             np.minimum(plane, BARELY_INSIDE, out=plane, where=~outside)
-
-    def _refined(self, pair: FloatArray, share: np.float32) -> FloatArray:
-        """Return the plane of nodes at a share between two planes of samples."""
-        plane: FloatArray = pair[0] * (1 - share) + pair[1] * share
-        for axis, samples in enumerate(plane.shape):
-            nodes = self.field.factor * samples + 1
-            plane = interpolate(plane, *places_of_nodes(0, nodes, self.field.factor, samples), axis)
-        return plane
-
-    def _spread(self, mask: BoolArray) -> BoolArray:
-        """Return for each node of a plane the mask of the voxel that it lies in."""
-        for axis, samples in enumerate(mask.shape):
-            nodes = self.field.factor * samples + 1
-            mask = mask.take(voxels_of_nodes(0, nodes, self.field.factor, samples), axis)
-        return mask
 
     def _set_blocks(self, planes: FloatArray, first: int) -> None:
         """Write the refined values over the planes of nodes from ``first`` on."""
@@ -319,31 +304,18 @@ class FineLattice(SamplePlanes):
             flat[corner + face[:, None]] = values[:, here]
 
 
-def places_of_nodes(
+def _places_of_nodes(
     first: int, last: int, factor: int, samples: int
-) -> tuple[NDArray[np.int64], FloatArray]:
-    """Return for nodes of an axis the sample before each, and how far beyond it in spacings.
+) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.int64]]:
+    """Return for nodes of an axis the sample before each, how far beyond it, and its voxel.
 
-    The share is 0 to 1, or -1/2 to 3/2 in the half voxels beyond the outermost samples.
+    That is 0 to 1 spacing, or -1/2 to 3/2 in the half voxels beyond the outermost samples. A node
+    on a face lies in the second voxel.
     """
     place = np.arange(first, last) / factor - 0.5
     low = np.clip(np.floor(place), 0, samples - 2).astype(np.int64)
-    return low, (place - low).astype(np.float32)
-
-
-def voxels_of_nodes(first: int, last: int, factor: int, samples: int) -> NDArray[np.int64]:
-    """Return for nodes of an axis the voxel that each lies in; on a face, the second one."""
-    return np.minimum(np.arange(first, last) // factor, samples - 1)
-
-
-def interpolate(
-    plane: FloatArray, low: NDArray[np.int64], share: FloatArray, axis: int
-) -> FloatArray:
-    """Return a plane interpolated linearly along an axis, at ``share`` beyond the rows ``low``."""
-    beyond = share[:, None] if axis == 0 else share
-    result: FloatArray = plane.take(low, axis) * (1 - beyond)
-    result += plane.take(low + 1, axis) * beyond
-    return result
+    voxel = np.minimum(np.arange(first, last) // factor, samples - 1)
+    return low, (place - low).astype(np.float32), voxel
 
 
 def lattice_shape(shape: tuple[int, int, int], factor: int) -> tuple[int, int, int]:

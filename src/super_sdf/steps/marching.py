@@ -18,6 +18,7 @@ Its number in another block that shares it, or relative to a cell, therefore dif
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -26,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, IntArray
+from ..arrays import BoolArray, IntArray
 from ..grid.sdf_grid import SdfGrid
 from ..machine.resources import check_count, map_chunks, map_threads, rows_in_chunk
 from ..mesh import CLEARANCE, Mesh, vertex_type
@@ -47,11 +48,7 @@ NO_FACES = np.empty((0, 3), np.int32)
 def extract_pieces(
     field: FineField, grid: SdfGrid, first_vertex: int = 0, threads: int = 1
 ) -> list[Mesh]:
-    """Return the zero level of a field as triangles in world coordinates, in one or more pieces.
-
-    Vertices lie on lattice edges, by linear interpolation. A node with value 0 is inside. The
-    arguments are those of ``meshers.extract_mesh``.
-    """
+    """Return the zero level of a field, in one or more pieces: see ``meshers.extract_mesh``."""
     core = field.own_rows
     before = field.plane_before(core).start if core.start < core.stop else core.start
     rows = slice(before, core.stop)
@@ -63,7 +60,9 @@ def extract_pieces(
     at_once = lookups_at_once(len(field.voxel_ijk), widest, threads)
 
     def mesh_of(group: slice) -> Mesh:
-        vertices = place_vertices(field, grid, crossings, group)
+        own = crossings.own(group)
+        edges = crossings.own_row[own], crossings.own_edge[own]
+        vertices = to_world(lattice_positions(field, *edges), field, grid)
         return Mesh(vertices, connect(field, crossings, group, first))
 
     meshes = map_threads(mesh_of, groups, at_once)
@@ -74,30 +73,17 @@ def extract_pieces(
 class Crossings:
     """Edges and cells that the surface crosses in the blocks of some voxels, in their order."""
 
-    # own_row, own_edge: (n,), voxels, and crossed edges of their blocks that the voxel owns: each
-    # has a vertex
-    own_row: IntArray
-    own_edge: NDArray[np.int16]
-    # other_row, other_edge: (m,), voxels, and crossed edges of their blocks that another voxel owns
-    other_row: IntArray
-    other_edge: NDArray[np.int16]
-    # cell_row, cell, case: (c,), voxels, crossed cells of their blocks, and the cases of these
-    # cells (``cell_cases``)
-    cell_row: IntArray
-    cell: NDArray[np.int16]
-    case: NDArray[np.int16]
+    own_row: IntArray  # (n,), voxels ...
+    own_edge: NDArray[np.int16]  # (n,), ... and crossed edges that they own: each has a vertex
+    other_row: IntArray  # (m,), voxels ...
+    other_edge: NDArray[np.int16]  # (m,), ... and crossed edges of theirs that another voxel owns
+    cell_row: IntArray  # (c,), voxels ...
+    cell: NDArray[np.int16]  # (c,), ... crossed cells of their blocks ...
+    case: NDArray[np.int16]  # (c,), ... and the cases of these cells (``cell_cases``)
 
     def own(self, rows: slice) -> slice:
         """Return which of the own edges belong to some voxels."""
         return _between(self.own_row, rows)
-
-    def others(self, rows: slice) -> slice:
-        """Return which of the other edges some voxels have."""
-        return _between(self.other_row, rows)
-
-    def cells(self, rows: slice) -> slice:
-        """Return which of the cells some voxels have."""
-        return _between(self.cell_row, rows)
 
 
 def _between(sorted_rows: IntArray, rows: slice) -> slice:
@@ -156,19 +142,13 @@ def _are_edges_of(
 def _split(
     places: NDArray[np.intp], rows: IntArray, width: int
 ) -> tuple[IntArray, NDArray[np.int16]]:
-    """Split flat indices into a table of ``width`` columns: the voxel of the row, and the column.
-
-    ``rows`` are the voxels of the table's rows.
-    """
+    """Return the row and the column of flat indices into a table; ``rows`` names its rows."""
     line = places // width
     return rows[line], (places - line * width).astype(np.int16)
 
 
 def _crossed_edges(inside: BoolArray) -> NDArray[np.intp]:
-    """Return the crossed edges of blocks, as flat indices into a table (n, 3 Q).
-
-    ``inside`` is (K+1, K+1, K+1, n), True at inside nodes.
-    """
+    """Return the crossed edges of blocks (K+1, K+1, K+1, n), flat in a table (n, 3 Q)."""
     crossed = np.zeros((3, *inside.shape), bool)
     np.not_equal(inside[1:], inside[:-1], out=crossed[0, :-1])
     np.not_equal(inside[:, 1:], inside[:, :-1], out=crossed[1, :, :-1])
@@ -177,10 +157,7 @@ def _crossed_edges(inside: BoolArray) -> NDArray[np.intp]:
 
 
 def _corners_inside(inside: BoolArray) -> NDArray[np.uint8]:
-    """Return a bit for each corner of all cells of blocks, (n K^3,), voxel by voxel.
-
-    ``inside`` is (K+1, K+1, K+1, n), True at inside nodes.
-    """
+    """Return a bit for each corner of all cells of such blocks, (n K^3,), voxel by voxel."""
     bits: NDArray[Any] = inside.view(np.uint8)
     bits = bits[:, :, :-1] | bits[:, :, 1:] << 1
     bits = bits[:, :-1] | bits[:, 1:] << 2
@@ -235,20 +212,10 @@ def groups_of_planes(field: FineField) -> list[slice]:
 def lookups_at_once(voxels: int, widest: int, threads: int) -> int:
     """Return how many threads may hold a vertex lookup table at the same time.
 
-    A table may be large, since one plane may hold the whole surface. All tables together, of
-    ``widest`` voxels each, take at most twice the memory of the values of all ``voxels``; if even
-    two would take more, there is one thread.
+    A table may be large, since one plane may hold the whole surface. All tables, of ``widest``
+    voxels each, take at most twice the memory of the values of all ``voxels``, or there is one.
     """
     return max(min(8 * voxels // max(LOOKUP_BYTES * widest, 1), threads), 1)
-
-
-def place_vertices(
-    field: FineField, grid: SdfGrid, crossings: Crossings, rows: slice
-) -> NDArray[Any]:
-    """Return the vertices on the edges that some voxels own, (n, 3), in world units."""
-    own = crossings.own(rows)
-    row, edge = crossings.own_row[own], crossings.own_edge[own]
-    return to_world(lattice_positions(field, row, edge), field, grid)
 
 
 def lattice_positions(
@@ -256,14 +223,18 @@ def lattice_positions(
 ) -> NDArray[np.float64]:
     """Return where the surface crosses edges of blocks, (3, n), in fine spacings from node 0."""
     axis, node = np.divmod(edge, np.int16(len(field.blocks)))
-    share = _crossing(field.blocks[node, row], field.blocks[edge_ends(field.factor)[edge], row])
+    low = field.blocks[node, row].astype(np.float64)
+    high = field.blocks[edge_ends(field.factor)[edge], row].astype(np.float64)
+    share = np.clip(low / (low - high), CLEARANCE, 1 - CLEARANCE)
     positions = np.empty((3, len(row)))
     for along, samples in enumerate(field.shape):
         voxel, runs = field.voxel_ijk[row, along], axis == along
         start = field.factor * voxel + block_ijk(field.factor)[node, along]
         positions[along] = start + np.where(runs, share, 0.0)
-        if ((voxel < 0) | (voxel >= samples)).any():  # voxels of a cap
-            positions[along] = _onto_border(start, runs, share, samples * field.factor)
+        if ((voxel < 0) | (voxel >= samples)).any():  # voxels of a cap: moved onto the border
+            ends = -CAP_HEIGHT, samples * field.factor + CAP_HEIGHT
+            begin, end = (np.clip(x.astype(np.float64), *ends) for x in (start, start + runs))
+            positions[along] = begin + share * (end - begin)
     return positions
 
 
@@ -281,43 +252,31 @@ def to_world(positions: NDArray[np.float64], field: FineField, grid: SdfGrid) ->
 
 @lru_cache
 def edge_ends(factor: int) -> NDArray[np.intp]:
-    """Return the node at the far end of each edge of a block, (3 Q,).
-
-    Edges that leave the block have a number here too, which is not used.
-    """
+    """Return the node at the far end of each edge, (3 Q,); that of edges that leave is not used."""
     return (np.arange((factor + 1) ** 3) + strides(factor)[:, None]).ravel()
-
-
-def _crossing(low: FloatArray, high: FloatArray) -> NDArray[np.float64]:
-    """Return where on edges the linear interpolation is 0, (n,), 0 to 1 from the low end.
-
-    It stays ``CLEARANCE`` away from both ends.
-    """
-    low64, high64 = low.astype(np.float64), high.astype(np.float64)
-    return np.clip(low64 / (low64 - high64), CLEARANCE, 1 - CLEARANCE)
-
-
-def _onto_border(
-    start: IntArray, runs: BoolArray, share: NDArray[np.float64], last: int
-) -> NDArray[np.float64]:
-    """Return coordinates along an axis of vertices, with nodes beyond the border moved onto it."""
-    low = np.clip(start.astype(np.float64), -CAP_HEIGHT, last + CAP_HEIGHT)
-    high = np.clip(start + runs.astype(np.float64), -CAP_HEIGHT, last + CAP_HEIGHT)
-    return low + share * (high - low)
 
 
 def connect(field: FineField, crossings: Crossings, rows: slice, first: int) -> IntArray:
     """Return the triangles (m, 3) in some whole planes, in the order of voxels and cells.
 
-    ``first`` is the vertex number of the first of ``crossings``' own edges.
+    ``first`` is the vertex number of the first of ``crossings``' own edges. The lookup table of
+    vertices begins at the plane before; of that it has only the edges that each voxel owns.
     """
-    before = field.plane_before(rows).start
-    edges = 3 * len(field.blocks)
-    vertex_at = number_edges(field, crossings, before, rows, first)
-    some = crossings.cells(rows)
+    before = np.int64(field.plane_before(rows).start)
+    own = crossings.own(slice(int(before), rows.stop))
+    vertex_at = edge_table(
+        field,
+        crossings,
+        lambda row: row - before,
+        rows.stop - int(before),
+        own,
+        _between(crossings.other_row, rows),
+        np.arange(first + own.start, first + own.stop),
+    )
+    some = _between(crossings.cell_row, rows)
     case = crossings.case[some]
     counts, starts, table = _flat_triangles(field.factor)
-    low = (crossings.cell_row[some] - before) * np.int64(edges)
+    low = (crossings.cell_row[some] - before) * (3 * len(field.blocks))
     low += cells_low_nodes(field.factor)[crossings.cell[some]]
     times = counts[case]
     nth = np.arange(times.sum()) + np.repeat(starts[case] - (np.cumsum(times) - times), times)
@@ -325,26 +284,37 @@ def connect(field: FineField, crossings: Crossings, rows: slice, first: int) -> 
     return faces
 
 
-def number_edges(
-    field: FineField, crossings: Crossings, before: int, rows: slice, first: int
+def edge_table(
+    field: FineField,
+    crossings: Crossings,
+    slot: Callable[[NDArray[Any]], NDArray[np.int64]],
+    count: int,
+    own: slice | NDArray[np.intp],
+    others: slice | NDArray[np.intp],
+    numbers: NDArray[Any],
 ) -> IntArray:
-    """Return the vertex lookup table: the vertex on each edge of some voxels' blocks, (n 3 Q,).
+    """Return a number for each crossed edge of some blocks, (count 3 Q,); other entries are unset.
 
-    Only entries of crossed edges are set. The table begins at voxel ``before``, the first of the
-    plane before; of that plane it has only the edges that each voxel owns.
+    ``numbers`` are those of the ``own`` edges; the ``others`` look them up in the blocks of their
+    owners. ``slot`` returns the places of voxels in the table.
     """
     edges = 3 * len(field.blocks)
-    vertex_at = np.empty((rows.stop - before) * edges, np.int32)  # unset entries are not read
-    own = crossings.own(slice(before, rows.stop))
-    at = (crossings.own_row[own] - np.int64(before)) * edges + crossings.own_edge[own]
-    vertex_at[at] = np.arange(first + own.start, first + own.stop)
-    others = crossings.others(rows)
+    number_at = np.empty(count * edges, np.int32)
+    number_at[slot(crossings.own_row[own]) * edges + crossings.own_edge[own]] = numbers
     row, edge = crossings.other_row[others], crossings.other_edge[others].astype(np.int64)
-    place = field.parts.owner[part_of_edge(field.factor)[edge], row]
-    owner = field.parts.table[place, row] - np.int64(before)
-    same_edge = owner * edges + edge - edge_shifts(field.factor)[place]
-    vertex_at[(row - np.int64(before)) * edges + edge] = vertex_at.take(same_edge)
-    return vertex_at
+    place, owner = owners_of(field, crossings, others)
+    same_edge = slot(owner) * edges + edge - edge_shifts(field.factor)[place]
+    number_at[slot(row) * edges + edge] = number_at.take(same_edge)
+    return number_at
+
+
+def owners_of(
+    field: FineField, crossings: Crossings, others: slice | NDArray[np.intp]
+) -> tuple[NDArray[np.int8], IntArray]:
+    """Return the places and the rows of the voxels that own other edges."""
+    row = crossings.other_row[others]
+    place = field.parts.owner[part_of_edge(field.factor)[crossings.other_edge[others]], row]
+    return place, field.parts.table[place, row]
 
 
 @lru_cache
@@ -374,10 +344,7 @@ def edge_steps(factor: int) -> NDArray[np.int64]:
 
 @lru_cache
 def _flat_triangles(factor: int) -> tuple[IntArray, IntArray, NDArray[np.int64]]:
-    """Return the triangles of all cases: how many, the first of each, and edges, (n, 3).
-
-    Edges are counted from the number of the cell's low node.
-    """
+    """Return the triangles of all cases: how many, the first, edges from the cell's low node."""
     counts, table = triangle_table()
     edge = edge_steps(factor)
     used = np.arange(table.shape[1]) < counts[:, None]

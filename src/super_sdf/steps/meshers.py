@@ -107,12 +107,10 @@ def extract_pieces(
 ) -> list[Mesh]:
     """Return the mesh of ``extract_mesh`` as a list of one or more pieces, in order.
 
-    ``grid`` has the lattice of the field: it is from ``cubic_grid``.
+    ``grid`` has the lattice of the field: it is from ``cubic_grid``. Mirrored axes turn triangles
+    inward, so these are turned over.
     """
     pieces = mesher.extract(field, grid, first_vertex, threads)
-    return [turned_over(piece) for piece in pieces] if grid.is_mirrored else pieces
-
-
-def turned_over(mesh: Mesh) -> Mesh:
-    """Return a mesh with its triangles in reverse order: mirrored axes turn them inward."""
-    return Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]))
+    if not grid.is_mirrored:
+        return pieces
+    return [Mesh(piece.vertices, np.ascontiguousarray(piece.faces[:, ::-1])) for piece in pieces]

@@ -102,11 +102,7 @@ class VoxelIndex:
 
 
 def rows_among(voxels: IntArray, count: int) -> IntArray:
-    """Return the row in ``voxels`` of each of ``count`` voxels, -1 if it is not among them.
-
-    The result, (count + 1,) int32, has one more -1 at the end, for the index -1 of absent
-    neighbours.
-    """
+    """Return the row in ``voxels`` of each of ``count`` voxels, or -1; one more -1 at the end."""
     row_of = np.full(count + 1, -1, np.int32)
     row_of[voxels] = np.arange(len(voxels), dtype=np.int32)
     return row_of
@@ -142,10 +138,10 @@ def share_parts(table: IntArray) -> SharedParts:
 
 
 def number_parts(parts: SharedParts, sizes: NDArray[np.int64]) -> tuple[IntArray, int]:
-    """Number the nodes of all parts, in the order of the voxels that own them.
+    """Return the number of the first node of each part, (27, D) int32, and the number of nodes.
 
-    Returns the number of the first node of each part, (27, D) int32, and the number of nodes, given
-    the nodes per part, (27,). OptionError if there are more nodes than 32-bit numbers.
+    They come in the order of the voxels that own them; ``sizes``, (27,), are the nodes per part.
+    OptionError if there are more nodes than 32-bit numbers.
     """
     owned = parts.owned()
     count = check_count(int(np.count_nonzero(owned, axis=1) @ sizes), "nodes")
@@ -188,10 +184,7 @@ def copies_agree(blocks: FloatArray, parts: SharedParts, factor: int) -> bool:
 def _average_group(
     blocks: FloatArray, table: IntArray, factor: int, axes: tuple[bool, ...]
 ) -> None:
-    """Average the nodes at the block's ends along ``axes`` and inside along the other axes.
-
-    With one such axis they are the interiors of faces, with two of edges, with three the corners.
-    """
+    """Average the nodes at the block's ends along ``axes`` and inside along the other axes."""
     places, nodes_at = _nodes_of_group(factor, axes)
     kind = np.float32 if len(places) == 2 else np.float64
     means = []
@@ -218,9 +211,8 @@ def _nodes_of_group(
 ) -> tuple[list[IntArray], list[NDArray[np.intp]]]:
     """Return the places that a shared node can have in a block, and the block's nodes there.
 
-    The same node is at another place in each of the blocks that share it. A place is (3,) int32: 1
-    at the block's high end of an axis, 0 at its low end and along axes that are not shared. Places
-    come in the order of the voxels that see the node there.
+    A place is (3,) int32: 1 at the block's high end of an axis, 0 at its low end and along axes
+    that are not shared. Places come in the order of the voxels that see the node there.
     """
     block = block_ijk(factor)
     ends = [(1, 0) if shared else (0,) for shared in axes]
@@ -257,8 +249,8 @@ def signs_of_skipped(
 ) -> Signs:
     """Return the signs of the neighbours (27, D) of decoded voxels that were not decoded.
 
-    It is 1 outside, -1 inside, and 0 for those that were decoded, and beyond the grid. The decoded
-    voxels (D, 3) are the rows ``voxels`` of the band, with the samples ``patches`` (V, 27).
+    It is 1 outside, -1 inside, 0 for the others. The decoded voxels (D, 3) are the rows ``voxels``
+    of the band, with the samples ``patches`` (V, 27).
     """
     signs = np.zeros(parts.table.shape, np.int8)
     inner = [(ijk != 0, ijk != n - 1) for ijk, n in zip(np.ascontiguousarray(voxel_ijk.T), shape)]
@@ -277,9 +269,8 @@ def pin_to_skipped(
     """Give the nodes shared with a skipped voxel that voxel's sign, in ``blocks`` (Q, D).
 
     A skipped voxel holds no surface, so all its nodes have its sign. Once they do, no sign change
-    reaches the boundary of the decoded voxels, and the isosurface has no hole there. Skipped voxels
-    that share a node have the same sign. Returned is for each voxel the number of nodes that it
-    owns whose sign was changed, (D,).
+    reaches the boundary of the decoded voxels, and the isosurface has no hole there. Returned is
+    how many nodes that each voxel owns were changed, (D,).
     """
     changed = np.zeros(skipped.shape[1], np.int64)
     for part, nodes in enumerate(nodes_of_part(factor)):

@@ -47,13 +47,13 @@ def interpolate(
     Of a field that is far from a distance, or was cut off, the network adds nothing. ``inputs`` are
     those of ``decode``, for the voxels (D, 3).
     """
-    assert band.smooth is not None
+    smooth, uneven = band.field.smooth, band.field.is_uneven
+    assert smooth is not None
     patches, table, voxels = inputs
-    size, uneven = band.half_voxel, band.is_uneven
-    blocks, share = spline_blocks(band.smooth, own_ijk, factor, size, uneven=uneven)
+    blocks, share = spline_blocks(smooth, own_ijk, factor, band.half_voxel, uneven=uneven)
     blocks[:, :-1] -= np.float32(band.level)
     some = np.flatnonzero(share)
-    if band.has_kinks and len(some):
+    if band.field.has_kinks and len(some):
         kinked = patches, table, voxels[some]
         added = decode(network, kinked, block_offsets(factor), None, threads)[:, :-1]
         blocks[:, some] += share[some] * (added - blocks[:, some])
@@ -93,7 +93,8 @@ def spline_blocks(
                 if uneven:
                     jumps = (roughness(strip * np.float32(0.5)) - JUMPING) / (JUMPED - JUMPING)
                     straight = np.pad(strip, 2, mode="reflect", reflect_type="odd")
-                    linear = _evaluate(straight, at + 2, linear_weights(factor))
+                    between = np.clip(1 - _from_samples(factor), 0, None).astype(np.float32)
+                    linear = _evaluate(straight, at + 2, between)
                     found += np.clip(jumps, 0, 1)[tuple(at.T)] * (linear - found)
                 blocks[:, rows.start + which] = found
     return blocks, share
@@ -152,20 +153,17 @@ def roughness(values: FloatArray) -> FloatArray:
     return total
 
 
+def _from_samples(factor: int) -> NDArray[np.float64]:
+    """Return how far the nodes along an axis are from samples -2 to 2, (K + 1, 5)."""
+    return np.abs(np.arange(factor + 1)[:, None] / factor - 0.5 - np.arange(-2, 3))
+
+
 def node_weights(factor: int) -> NDArray[np.float32]:
     """Return the weights of the coefficients at -2 to 2 samples for the nodes along an axis."""
-    at = np.arange(factor + 1)[:, None] / factor - 0.5 - np.arange(-2, 3)
-    far = np.abs(at)
+    far = _from_samples(factor)
     near = 2 / 3 - far**2 + far**3 / 2
     weights = np.where(far < 1, near, np.clip(2 - far, 0, None) ** 3 / 6)
     return weights.astype(np.float32)
-
-
-def linear_weights(factor: int) -> NDArray[np.float32]:
-    """Return the weights of samples at -2 to 2 for nodes that are interpolated linearly."""
-    at = np.arange(factor + 1)[:, None] / factor - 0.5 - np.arange(-2, 3)
-    weights: NDArray[np.float32] = np.clip(1 - np.abs(at), 0, None).astype(np.float32)
-    return weights
 
 
 def _evaluate(coefficients: FloatArray, ijk: IntArray, weights: NDArray[np.float32]) -> FloatArray:
@@ -194,8 +192,7 @@ def _evaluate(coefficients: FloatArray, ijk: IntArray, weights: NDArray[np.float
 def network_share(values: FloatArray) -> FloatArray:
     """Return the share of the network's values round each sample; ``values`` are in voxels.
 
-    It is 0 where the field is smooth, since the spline is nearer there, and where its slope is not
-    1, since the network knows distances only.
+    It is 0 where the field is smooth, and where its slope is not 1: a network knows distances only.
     """
     kinked = np.clip((roughness(values) - SMOOTH) / (KINKED - SMOOTH), 0, 1)
     off = np.abs(local_slopes(values) - 1)

@@ -8,8 +8,8 @@ on in bricks, or too large.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import chain, pairwise
 from typing import Any, NamedTuple, TypeAlias
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import NoSurfaceError, OutOfMemoryError
 from ..grid.cubic import Resampled, on_samples, sampled_places
+from ..grid.field import Field
 from ..grid.planes import (
     SampleArray,
     over_planes,
@@ -32,7 +33,7 @@ from ..grid.sdf_grid import SdfGrid, negated, without_samples
 from ..machine.memory import held_memory, in_words
 from ..machine.resources import ONE_THREAD, Resources, chunks_of, over_threads
 from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
-from ..options import EXACT, MASK
+from ..options import MASK
 from .band import (
     BLOCK_PLANES,
     BLOCK_SAMPLES,
@@ -66,7 +67,7 @@ FAR = 1e30  # half voxels: no sample of the band is there
 BandPart: TypeAlias = tuple[IntArray, FloatArray, NDArray[np.int64], FloatArray]
 """Some of the band's voxels and their patches; numbers and values of samples beyond it."""
 
-NONE_ACTIVE: tuple[IntArray, FloatArray] = np.empty((0, 3), np.int32), np.empty((0, 27), np.float32)
+NO_VOXELS: tuple[IntArray, FloatArray] = np.empty((0, 3), np.int32), np.empty((0, 27), np.float32)
 
 
 class BandTooLargeError(OutOfMemoryError):
@@ -80,34 +81,21 @@ class Band:
     shape: tuple[int, int, int]  # samples of the grid along each axis
     voxel_ijk: IntArray  # (V, 3), the voxels, in C order
     patches: FloatArray  # (V, 27), the samples round each voxel, in half voxels
-    # lipschitz, decoded, exact: (V,), which patches can be distances; which voxels can hold the
-    # surface, and so are decoded; which own samples can be taken as exact distances
-    lipschitz: BoolArray
-    decoded: BoolArray
-    exact: BoolArray
+    lipschitz: BoolArray  # (V,), which patches can be distances
+    decoded: BoolArray  # (V,), which voxels can hold the surface, and so are decoded
+    exact: BoolArray  # (V,), which own samples can be taken as exact distances
     # samples beyond the band may be exact distances if they lie between these, in half voxels
-    limits: tuple[float, float] = (0.0, 0.0)
+    limits: tuple[float, float]
     # (V,), which own values are samples of a grid that was resampled; None if all are
     sampled: BoolArray | None = None
     # whether a sample on the border of the grid is inside: then the solid leaves the grid
     leaves: bool = False
-    kind: str = EXACT  # what the field is, see ``grid.field``
-    # smooth, is_uneven, has_kinks: the field that is meshed by its cubic spline, in world units;
-    # whether it is interpolated linearly where it jumps; and whether the network may refine it
-    # where it is not smooth
-    smooth: SampleArray | None = None
-    is_uneven: bool = False
-    has_kinks: bool = False
-    # half_voxel, level: half a spacing in world units, by which these are divided; and what is zero
-    # then
-    half_voxel: float = 1.0
-    level: float = 0.0
-    # peak, unpacked: the memory of the process in bytes while the band was found; those of a
-    # temporary file
-    peak: int = 0
-    unpacked: int = 0
+    field: Field = field(default_factory=Field)  # what the values are
+    half_voxel: float = 1.0  # half a spacing in world units, by which the values are divided
+    level: float = 0.0  # what is zero then
+    peak: int = 0  # the memory of the process in bytes while the band was found
+    unpacked: int = 0  # bytes of a temporary file
     beyond: SamplesBeyond = NONE_BEYOND  # the samples a few voxels farther away
-    unseen: SampleArray | None = None  # the samples at which the surface ends, see ``Field``
 
     @cached_property
     def trusted(self) -> TrustedSamples:
@@ -117,13 +105,8 @@ class Band:
             self.shape, self.voxel_ijk, sample, self.exact, self.beyond, self.limits
         )
 
-    @property
-    def noisy_voxels(self) -> int:
-        """The number of voxels whose own samples differ from others by more than distances can."""
-        return self.count_noisy(self.all_rows)
-
-    def count_noisy(self, rows: slice) -> int:
-        """Return the number of noisy voxels among some rows."""
+    def count_noisy(self, rows: slice = slice(None)) -> int:
+        """Count the voxels whose own samples differ from others by more than distances can."""
         noisy = ~self.lipschitz if self.sampled is None else ~self.lipschitz & self.sampled
         return int(np.count_nonzero(noisy[rows]))
 
@@ -152,14 +135,6 @@ class Band:
         """Return the number of decoded voxels among ``rows``, which must be whole planes."""
         first, last = np.searchsorted(self.voxels_before, [rows.start, rows.stop])
         return int(self.decoded_before[last] - self.decoded_before[first])
-
-    def count_crossings(self) -> int:
-        """Count the pairs of samples next to each other along an axis with the surface between."""
-        inside = self.patches[:, CENTRE] <= 0
-        return sum(
-            int(np.count_nonzero(inside != (self.patches[:, CENTRE + step] <= 0)))
-            for step in STRIDES
-        )
 
     def network_inputs(
         self, seen: slice | None = None, decoded: slice | None = None
@@ -190,39 +165,33 @@ def survey(
     With ``among``, only these planes are looked at, the offset is not checked, and ``whole`` is
     what ``look_at_band`` says of the whole grid.
     """
-    sizes: list[int] = []
-    jumps: list[tuple[Jumps, Jumps]] = []
-    leaving: list[bool] = []
     held = held_memory() or 0
     planes, reading = plan_reading(grid.samples, held, resources)
 
-    def read(block: tuple[int, int]) -> list[BandPart]:
-        seen = jumps if among is None else None
-        around = slice(max(block[0] - 1, 0), block[1] + 1)
-        parts = list(band_of_samples(grid, offset, grid.samples[around], block, seen, leaving))
-        sizes.append(sum(band_bytes(len(ijk), len(value)) for ijk, _, _, value in parts))
-        if sum(sizes) + reading > _room(resources.memory, held):
-            raise BandTooLargeError(
-                f"the band of the first {block[1]:,} planes already takes "
-                f"{in_words(sum(sizes) + reading)} of memory, and "
-                f"{in_words(resources.memory or 0)} may be used in all; is this a distance field? "
-                "If so, allow more (--max-memory)"
-            )
-        return parts
+    def read(block: tuple[int, int]) -> Block:
+        around = grid.samples[max(block[0] - 1, 0) : block[1] + 1]
+        found = look_at_block(grid, offset, around, block, is_checked=among is None)
+        return found._replace(parts=list(found.parts))
 
     first, last = among or (0, grid.shape[0])
     blocks = list(plane_blocks(grid.shape, first, last, planes))
-    voxel_ijk, patches, number, value = _put_together(over_threads(read, blocks, resources.threads))
+    jumps: list[tuple[Jumps, Jumps]] = []
+    gathered, leaves, size = _Gathered(), False, reading
+    for (_, end), found in zip(blocks, over_threads(read, blocks, resources.threads)):
+        leaves, jumps = leaves or found.leaves, jumps + found.jumps
+        size += sum(band_bytes(len(ijk), len(value)) for ijk, _, _, value in found.parts)
+        if size > _room(resources.memory, held):
+            raise BandTooLargeError(
+                f"the band of the first {end:,} planes already takes {in_words(size)} of memory, "
+                f"and {in_words(resources.memory or 0)} may be used in all; is this a distance "
+                "field? If so, allow more (--max-memory)"
+            )
+        gathered.add(found.parts)
     if offset and among is None:
         check_jumps(jumps, grid, offset)
-    band = make_band(grid.shape, voxel_ijk, patches, resources.threads, whole)
-    if isinstance(grid.samples, Resampled):
-        band = look_at_samples(band, grid, resources.threads)
-    leaves = any(leaving) if whole is None else whole.leaves
-    beyond = SamplesBeyond(number, value)
-    peak, unpacked = held + reading + sum(sizes), unpacked_bytes(grid.samples)
-    band = replace(band, leaves=leaves, peak=peak, unpacked=unpacked, beyond=beyond)
-    return limit_to_field(band, grid, offset)
+    band = make_band(grid, offset, gathered.all(), whole)
+    vars(band).update(peak=held + size, leaves=leaves if whole is None else whole.leaves)
+    return band
 
 
 def band_bytes(voxels: int, beyond: int) -> int:
@@ -230,32 +199,29 @@ def band_bytes(voxels: int, beyond: int) -> int:
     return voxels * BYTES_PER_VOXEL + beyond * BYTES_BEYOND
 
 
-def _put_together(blocks: Iterable[list[BandPart]]) -> BandPart:
-    """Return what was found in all blocks, as one.
+class _Gathered:
+    """The parts of a band put together; each is freed when it was taken, so none is held twice."""
 
-    The arrays grow, and each part is freed when it was taken, so that nothing is held twice.
-    """
-    voxel_ijk, patches = NONE_ACTIVE
-    number, value = NONE_BEYOND.number, NONE_BEYOND.value
-    whole: BandPart = (voxel_ijk.copy(), patches.copy(), number.copy(), value.copy())
-    waiting: list[BandPart] = []
-    for parts in blocks:
+    def __init__(self) -> None:
+        nothing = (*NO_VOXELS, NONE_BEYOND.number, NONE_BEYOND.value)
+        self.arrays: list[NDArray[Any]] = [array.copy() for array in nothing]
+        self.waiting: list[BandPart] = []
+
+    def add(self, parts: list[BandPart]) -> None:
+        """Take parts out of a list."""
         while parts:
-            waiting.append(parts.pop(0))
-            if sum(len(part[0]) + len(part[2]) for part in waiting) > APPENDED:
-                _append(whole, waiting)
-    _append(whole, waiting)
-    return whole
+            self.waiting.append(parts.pop(0))
+            if sum(len(part[0]) + len(part[2]) for part in self.waiting) > APPENDED:
+                self.all()
 
-
-def _append(whole: BandPart, parts: list[BandPart]) -> None:
-    """Append parts to what was found, and empty the list."""
-    arrays: tuple[NDArray[Any], ...] = whole
-    for array, rows in zip(arrays, zip(*parts)):
-        count = len(array)
-        array.resize((count + sum(map(len, rows)), *array.shape[1:]), refcheck=False)
-        np.concatenate(rows, out=array[count:])
-    parts.clear()
+    def all(self) -> list[NDArray[Any]]:
+        """Return the arrays of all parts."""
+        for array, rows in zip(self.arrays, zip(*self.waiting)):
+            count = len(array)
+            array.resize((count + sum(map(len, rows)), *array.shape[1:]), refcheck=False)
+            np.concatenate(rows, out=array[count:])
+        self.waiting.clear()
+        return self.arrays
 
 
 def plan_reading(samples: SampleArray, held: int, resources: Resources) -> tuple[int, int]:
@@ -277,34 +243,54 @@ def plan_reading(samples: SampleArray, held: int, resources: Resources) -> tuple
     raise planes_too_large(samples, held + need, resources.memory or 0)
 
 
-def limit_to_field(band: Band, grid: SdfGrid, offset: float) -> Band:
-    """Return the band of a grid of any kind: what is exact in it, and what is decoded.
+def _room(bound: int | None, held: int) -> float:
+    """Return how many bytes a bound leaves; if the process holds more than it, all of the bound."""
+    if bound is None:
+        return np.inf
+    return bound - held if held < bound else bound
 
-    In a mask, only the voxels round which samples lie on both sides hold the surface.
+
+def make_band(
+    grid: SdfGrid, offset: float, found: list[NDArray[Any]], whole: BandSummary | None = None
+) -> Band:
+    """Return the band of a grid: what is exact in it, and what is decoded.
+
+    ``found`` are the arrays of a ``BandPart``; ``whole`` is of the band of the whole grid, if these
+    are a part of it. In a resampled grid samples are trusted by samples alone: interpolated values
+    do not tell whether the samples are noisy. Where they do not contradict others they count as
+    exact, since thin parts need them (docs/guides/formats.md).
     """
-    field, scale = grid.field, 2 / grid.voxel_size
-    level = offset * scale
-    band = replace(band, limits=limits_beyond(grid, offset), unseen=field.unseen)
-    if field.kind == EXACT:
-        return band
-    sample = band.patches[:, CENTRE]
+    voxel_ijk, patches, number, value = found
+    sample, lipschitz, sampled = patches[:, CENTRE], is_lipschitz(patches), None
+    decoded = _is_decoded(grid.field, patches, lipschitz)
+    if isinstance(grid.samples, Resampled):
+        sampled, whole = on_samples(grid, voxel_ijk), None
+        lipschitz[sampled] = is_lipschitz(patches[sampled], sampled_places(grid))
+    whole = whole or summarise(sample, lipschitz if sampled is None else lipschitz[sampled])
+    exact = exact_samples(patches, lipschitz, whole)
     low, high = _exact_between(grid, offset)
-    decoded = band.decoded
-    if field.kind == MASK:
-        decoded = has_both_sides(band.patches)
-    if field.smooth is not None:  # no distances: what they say of the voxels is not certain
-        decoded = np.ones_like(band.decoded)
-    return replace(
-        band,
-        exact=band.exact & (sample > low) & (sample < high),
-        decoded=decoded,
-        kind=field.kind,
-        smooth=field.smooth,
-        has_kinks=field.has_kinks,
-        is_uneven=field.is_uneven,
-        half_voxel=1 / scale,
-        level=level,
+    return Band(
+        grid.shape,
+        voxel_ijk,
+        patches,
+        lipschitz,
+        decoded,
+        exact & (sample > low) & (sample < high),
+        limits_beyond(grid, offset),
+        sampled,
+        field=grid.field,
+        half_voxel=grid.voxel_size / 2,
+        level=offset * 2 / grid.voxel_size,
+        unpacked=unpacked_bytes(grid.samples),
+        beyond=SamplesBeyond(number, value),
     )
+
+
+def _is_decoded(kind: Field, patches: FloatArray, lipschitz: BoolArray) -> BoolArray:
+    """Return which voxels of a field are decoded; of a mask those with samples on both sides."""
+    if kind.smooth is not None:  # no distances: what they say of the voxels is not certain
+        return np.ones(len(patches), bool)
+    return has_both_sides(patches) if kind.kind == MASK else can_hold_surface(patches, lipschitz)
 
 
 def _exact_between(grid: SdfGrid, offset: float) -> tuple[float, float]:
@@ -325,129 +311,99 @@ def limits_beyond(grid: SdfGrid, offset: float) -> tuple[float, float]:
     return max(low, lowest), min(high, highest)
 
 
-def _room(bound: int | None, held: int) -> float:
-    """Return how many bytes a bound leaves; if the process holds more than it, all of the bound."""
-    if bound is None:
-        return np.inf
-    return bound - held if held < bound else bound
-
-
 def outline(
     grid: SdfGrid, offset: float, threads: int, voxels: list[int], decoded: list[int]
 ) -> Band:
     """Return a band without its voxels, of which there are some in each plane, for a plan."""
-    none = np.zeros(0, bool)
-    band = limit_to_field(Band(grid.shape, *NONE_ACTIVE, none, none, none), grid, offset)
+    nothing: list[NDArray[Any]] = [*NO_VOXELS, NONE_BEYOND.number, NONE_BEYOND.value]
+    band = make_band(grid, offset, nothing)
     _, reading = plan_reading(grid.samples, 0, Resources(threads))
-    band = replace(
-        band,
-        exact=np.ones(1, bool),  # perhaps some are
-        peak=(held_memory() or 0) + reading,
-        unpacked=unpacked_bytes(grid.samples),
-    )
     known = {"voxels_before": voxels, "decoded_before": decoded}
     vars(band).update({name: np.append(0, np.cumsum(counts)) for name, counts in known.items()})
+    vars(band).update(exact=np.ones(1, bool), peak=(held_memory() or 0) + reading)  # some may be
     return band
 
 
-def make_band(
-    shape: tuple[int, int, int],
-    voxel_ijk: IntArray,
-    patches: FloatArray,
-    threads: int = 1,
-    whole: BandSummary | None = None,
-) -> Band:
-    """Return the band of voxels (V, 3) with patches (V, 27), in half voxels.
+class Block(NamedTuple):
+    """What is found in a block of planes."""
 
-    ``whole`` is of the band of the whole grid, if this is a part of it.
-    """
-    lipschitz = is_lipschitz(patches)
-    decoded = can_hold_surface(patches, lipschitz)
-    exact = exact_samples(patches, lipschitz, threads, whole=whole)
-    return Band(shape, voxel_ijk, patches, lipschitz, decoded, exact)
+    leaves: bool  # whether a sample on the grid's border is inside
+    jumps: list[tuple[Jumps, Jumps]]  # with an offset
+    parts: Any  # a list or an iterator of ``BandPart``, in C order
 
 
-def look_at_samples(band: Band, grid: SdfGrid, threads: int = 1) -> Band:
-    """Return the band of a resampled grid, in which samples are trusted by samples alone.
-
-    Interpolated values do not tell whether the samples are noisy. Where they do not contradict
-    others they count as exact, since thin parts need them (docs/guides/formats.md).
-    """
-    sampled, lipschitz = on_samples(grid, band.voxel_ijk), band.lipschitz.copy()
-    lipschitz[sampled] = is_lipschitz(band.patches[sampled], sampled_places(grid))
-    exact = exact_samples(band.patches, lipschitz, threads, sampled)
-    return replace(band, lipschitz=lipschitz, exact=exact, sampled=sampled)
-
-
-def band_of_samples(
+def look_at_block(
     grid: SdfGrid,
     offset: float,
     samples: NDArray[Any],
     planes: tuple[int, int],
-    jumps: list[tuple[Jumps, Jumps]] | None,
-    leaving: list[bool],
-) -> Iterator[BandPart]:
-    """Yield what is found in some planes, in C order, given their samples and those beside them.
+    is_checked: bool = True,
+) -> Block:
+    """Return what is found in some planes, given their samples and those beside them.
 
-    Whether a sample on the grid's border is inside is appended to ``leaving``. With an offset, the
-    distances are checked for truncation, and their jumps are appended to ``jumps``, if it is a
-    list.
+    With an offset, the distances are checked for truncation, and their jumps are found, if it
+    ``is_checked``.
     """
     low, high = max(planes[0] - 1, 0), min(planes[1] + 1, grid.shape[0])
-    samples = negated(samples) if grid.positive_inside else samples
-    rescaled = rescale_planes(samples, grid.voxel_size, offset)
-    del samples
-    leaving.append(_has_inside_on_border(rescaled, low == 0, high == grid.shape[0]))
-    limits, start = limits_beyond(grid, offset), np.array([low, 0, 0], np.int64)
+    rescaled = rescale_planes(negated(samples) if grid.positive_inside else samples, grid, offset)
     unseen = None if grid.field.unseen is None else np.asarray(grid.field.unseen[low:high])
-    for block, rows in _windows(rescaled.shape, slice(planes[0] - low, planes[1] - low)):
-        corner = np.array([max(block.start - 1, 0), max(rows.start - 1, 0), 0], np.int64)
-        window = rescaled[corner[0] : block.stop + 1, corner[1] : rows.stop + 1]
-        inner = _shifted(block, corner[0]), _shifted(rows, corner[1])
-        if offset and jumps is not None:  # at 0 there is no better offset to suggest
-            jumps.append(find_jumps(window, inner))
-        number = ((low + block.start) * grid.shape[1] + rows.start) * grid.shape[2]
-        mine = window[inner]
-        hidden = None
-        if unseen is not None:
-            hidden = unseen[corner[0] :, corner[1] :][inner]
-            mine = np.where(hidden, np.float32(FAR), mine)
-        beyond = samples_beyond(mine, number, limits)
-        yield *NONE_ACTIVE, beyond.number, beyond.value
-        for ijk, patches in _patches_of(window, inner, hidden):
-            if offset and jumps is not None:
-                check_not_cut_off(patches, offset, grid.voxel_size)
-            ijk += start + corner
-            yield ijk.astype(np.int32), patches, NONE_BEYOND.number, NONE_BEYOND.value
+    sides = [rescaled[:, [0, -1]], rescaled[:, :, [0, -1]]]
+    sides += [rescaled[0]] * (low == 0) + [rescaled[-1]] * (high == grid.shape[0])
+    windows = list(_windows(rescaled.shape, slice(planes[0] - low, planes[1] - low)))
+    is_checked = is_checked and offset != 0  # at 0 there is no better offset to suggest
+    limits = limits_beyond(grid, offset)
+
+    def parts() -> Iterator[BandPart]:
+        for around, inner in windows:
+            window = rescaled[around]
+            own, hidden = window[inner], None if unseen is None else unseen[around][inner]
+            if hidden is not None:
+                own = np.where(hidden, np.float32(FAR), own)
+            corner = np.array([low + around[0].start, around[1].start, 0])
+            own_corner = corner + np.array([inner[0].start, inner[1].start, 0])
+            first = int(np.ravel_multi_index(own_corner.tolist(), grid.shape))
+            beyond = samples_beyond(own, first, limits)
+            yield *NO_VOXELS, beyond.number, beyond.value
+            for ijk, patches in _patches_of(window, inner, hidden):
+                if is_checked:
+                    check_not_cut_off(patches, offset, grid.voxel_size)
+                voxel_ijk = (ijk + corner).astype(np.int32)
+                yield voxel_ijk, patches, NONE_BEYOND.number, NONE_BEYOND.value
+
+    return Block(
+        any(bool((side <= 0).any()) for side in sides),
+        [find_jumps(rescaled[around], inner) for around, inner in windows if is_checked],
+        parts(),
+    )
 
 
-def _shifted(range_: slice, start: int) -> slice:
-    """Return a slice counted from ``start``."""
-    return slice(range_.start - start, range_.stop - start)
+Window: TypeAlias = tuple[slice, slice]
+"""Some planes, and some rows of each."""
 
 
-def _windows(shape: tuple[int, ...], inner: slice) -> Iterator[tuple[slice, slice]]:
-    """Yield the planes and rows of a block that are worked on at a time, in C order.
+def _windows(shape: tuple[int, ...], own: slice) -> Iterator[tuple[Window, Window]]:
+    """Yield what is worked on at a time in the ``own`` planes of a block, in C order.
 
-    They are the ``inner`` planes of it, of large ones some rows of each.
+    It is all of them, or, of large ones, some rows of each: the window with the samples beside
+    them, and where they are in it.
     """
-    if np.prod(shape, dtype=float) <= WINDOW_SAMPLES:
-        yield inner, slice(0, shape[1])
-        return
-    step = max(WINDOW_SAMPLES // (3 * shape[2]) - 2, 1)
-    for i in range(inner.start, inner.stop):
-        for first in range(0, shape[1], step):
-            yield slice(i, i + 1), slice(first, min(first + step, shape[1]))
+    blocks, step = [own], shape[1]
+    if np.prod(shape, dtype=float) > WINDOW_SAMPLES:
+        blocks = [slice(i, i + 1) for i in range(own.start, own.stop)]
+        step = max(WINDOW_SAMPLES // (3 * shape[2]) - 2, 1)
+    for planes in blocks:
+        for start in range(0, shape[1], step):
+            stop, low = min(start + step, shape[1]), max(start - 1, 0)
+            before = max(planes.start - 1, 0)
+            inner = slice(planes.start - before, planes.stop - before)
+            around = slice(before, planes.stop + 1), slice(low, stop + 1)
+            yield around, (inner, slice(start - low, stop - low))
 
 
 def _patches_of(
-    window: FloatArray, inner: tuple[slice, slice], hidden: BoolArray | None = None
+    window: FloatArray, inner: Window, hidden: BoolArray | None = None
 ) -> Iterator[tuple[NDArray[np.int64], FloatArray]]:
-    """Yield active voxels among some planes and rows of a window, and the samples round them.
-
-    Those that are ``hidden``, of these planes and rows, and values that were filled in are left
-    out.
-    """
+    """Yield active voxels of a window that are not ``hidden``, nor filled in, and their patches."""
     active = is_active(window)[inner]
     if hidden is not None:
         active &= ~hidden
@@ -466,20 +422,6 @@ def _patches_of(
         yield ijk[kept], patches[kept]
 
 
-def check_jumps(jumps: list[tuple[Jumps, Jumps]], grid: SdfGrid, offset: float) -> None:
-    """Raise GridError if no sample is near an offset, or fill values begin near it."""
-    if not any(up.near for up, _ in jumps):
-        raise no_surface(grid, offset)
-    check_not_filled(jumps, offset, grid.voxel_size)
-
-
-def _has_inside_on_border(rescaled: FloatArray, first: bool, last: bool) -> bool:
-    """Return whether a sample on the border is inside, in planes with the first or last or not."""
-    sides = [rescaled[:, [0, -1]], rescaled[:, :, [0, -1]]]
-    ends = [rescaled[0]] * first + [rescaled[-1]] * last
-    return any(bool((side <= 0).any()) for side in (*sides, *ends))
-
-
 def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:
     """Return the error for a grid without a surface at an offset."""
     return NoSurfaceError(
@@ -487,19 +429,30 @@ def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:
     )
 
 
-class Glance(NamedTuple):
-    """What is seen of the band in some planes, without keeping it.
+def count_crossings(patches: FloatArray) -> int:
+    """Count the pairs of samples next to each other along an axis with the surface between."""
+    inside = patches[:, CENTRE] <= 0
+    return sum(
+        int(np.count_nonzero(inside != (patches[:, CENTRE + step] <= 0))) for step in STRIDES
+    )
 
-    Of each plane the voxels, and those that are decoded; the samples beyond the band that can be
-    exact; see ``Band.count_crossings``; and, with an offset, the jumps.
-    """
+
+def check_jumps(jumps: list[tuple[Jumps, Jumps]], grid: SdfGrid, offset: float) -> None:
+    """Raise GridError if no sample is near an offset, or fill values begin near it."""
+    if not any(up.near for up, _ in jumps):
+        raise no_surface(grid, offset)
+    check_not_filled(jumps, offset, grid.voxel_size)
+
+
+class Glance(NamedTuple):
+    """What is seen of the band in some planes, without keeping it."""
 
     summary: BandSummary
-    voxels: list[int]
-    decoded: list[int]
-    beyond: int
-    crossings: int
-    jumps: list[tuple[Jumps, Jumps]]
+    voxels: list[int]  # of each plane
+    decoded: list[int]  # of each plane
+    beyond: int  # samples beyond the band that can be exact
+    crossings: int  # see ``count_crossings``
+    jumps: list[tuple[Jumps, Jumps]]  # with an offset
 
 
 def look_at_band(grid: SdfGrid, offset: float, planes: int = 0) -> Glance:
@@ -516,9 +469,8 @@ def look_at_band(grid: SdfGrid, offset: float, planes: int = 0) -> Glance:
     ]
     # resampled ones are made here, and say so
     known = grid if isinstance(samples, Resampled) else without_samples(grid)
-    look = partial(_glance, known, offset)
-    parts = zip(*over_planes(samples, look, ranges))
-    summaries, voxels, decoded, beyond, crossings, jumps = map(list, parts)
+    parts = list(over_planes(samples, partial(_glance, known, offset), ranges))
+    summaries, voxels, decoded, beyond, crossings, jumps = zip(*parts)
     all_jumps = list(chain(*jumps))
     if offset:
         check_jumps(all_jumps, grid, offset)
@@ -526,7 +478,7 @@ def look_at_band(grid: SdfGrid, offset: float, planes: int = 0) -> Glance:
     return Glance(_of_all(summaries), *counts, all_jumps)
 
 
-def _of_all(summaries: list[BandSummary]) -> BandSummary:
+def _of_all(summaries: Sequence[BandSummary]) -> BandSummary:
     return BandSummary(
         sum(part.voxels for part in summaries),
         sum(part.noisy for part in summaries),
@@ -538,22 +490,16 @@ def _of_all(summaries: list[BandSummary]) -> BandSummary:
 
 def _glance(grid: SdfGrid, offset: float, planes: NDArray[Any], inner: tuple[int, int]) -> Glance:
     """Return what is seen in the planes ``inner``, given with those beside them."""
-    jumps: list[tuple[Jumps, Jumps]] = []
-    leaving: list[bool] = []
-    first, last = inner
-    voxels, decoded = np.zeros((2, last - first), np.int64)
+    block = look_at_block(grid, offset, planes, inner)
+    voxels, decoded = np.zeros((2, inner[1] - inner[0]), np.int64)
     beyond = crossings = 0
     summaries: list[BandSummary] = []
-    for ijk, patches, _, value in band_of_samples(grid, offset, planes, inner, jumps, leaving):
-        lipschitz = is_lipschitz(patches)
-        held = can_hold_surface(patches, lipschitz)
-        band = limit_to_field(
-            Band(grid.shape, ijk, patches, lipschitz, held, lipschitz), grid, offset
-        )
-        plane = ijk[:, 0] - first
-        voxels += np.bincount(plane, minlength=last - first)
-        decoded += np.bincount(plane[band.decoded], minlength=last - first)
-        beyond, crossings = beyond + len(value), crossings + band.count_crossings()
-        summaries.append(summarise(patches[:, CENTRE], lipschitz, leaving[0]))
+    for ijk, patches, _, value in block.parts:
+        lipschitz, plane = is_lipschitz(patches), ijk[:, 0] - inner[0]
+        is_decoded = _is_decoded(grid.field, patches, lipschitz)
+        voxels += np.bincount(plane, minlength=len(voxels))
+        decoded += np.bincount(plane[is_decoded], minlength=len(voxels))
+        beyond, crossings = beyond + len(value), crossings + count_crossings(patches)
+        summaries.append(summarise(patches[:, CENTRE], lipschitz, block.leaves))
     summary = _of_all(summaries)
-    return Glance(summary, voxels.tolist(), decoded.tolist(), beyond, crossings, jumps)
+    return Glance(summary, voxels.tolist(), decoded.tolist(), beyond, crossings, block.jumps)

@@ -3,19 +3,16 @@
 At every node of the fine lattice the label whose field is lowest holds the node: in a tie the lower
 label, 0 last. Label 0 is what is beside all others; its field is minus that of a label, unless two
 others or more could hold the node. A label cannot hold a node of a voxel round which no sample has
-it. Where two neighbouring nodes have different labels, the wall crosses the edge between them where
-the difference of the two fields is 0, by linear interpolation: both labels get the very same
-vertex. So the surface of each label is closed, and there is
-neither gap nor overlap between two.
+it. A wall crosses the edge between two nodes of different labels where the difference of the two
+fields is 0, by linear interpolation: both labels get the very same vertex. So the surface of each
+label is closed, and there is neither gap nor overlap between two.
 
-A wall crosses the edges of the cell whose ends have different labels. On a face with two labels it
-runs as in ``cell_cases``. Where three labels or four meet on a face, a point on it is joined to all
-edges that are crossed, unless two opposite corners have the same label: they are joined, and each
-of the others is cut off. This depends on the face alone, so both cells beside it agree.
-
-The segments on all faces bound the walls. A loop of them between the same two labels is cut into
+On a face with two labels the wall runs as in ``cell_cases``. Where three labels or four meet on a
+face, a point on it is joined to all edges that are crossed, unless two opposite corners have the
+same label: they are joined, and each of the others is cut off. This depends on the face alone, so
+both cells beside it agree. A loop of these segments between the same two labels is cut into
 triangles as in ``cell_cases``; all that hang together by points on faces are joined to one point in
-the cell. So each triangle has a label on either side.
+the cell.
 
 A vertex is named by its place in the lattice of half the fine spacing, which tells points on edges,
 on faces and in cells apart. They are in the order of these names, and triangles in that of the
@@ -75,6 +72,10 @@ def _on_face(n: int, label: list[int], joined: int) -> Iterator[Segment]:
     """Yield the segments on face ``n`` with these labels at its corners."""
     high, kinds = max(label), len(set(label))
     edge = [EDGE_BETWEEN[frozenset((FACES[n][at - 1], FACES[n][at]))] for at in range(4)]
+
+    def turned(start: int, end: int, inside: int, outside: int) -> Segment:
+        return (start, end, inside, outside) if inside > outside else (end, start, outside, inside)
+
     if kinds == 2:
         inside = tuple(int(x == high) for x in label)
         for start, end in segments(n, inside, joined).items():
@@ -82,16 +83,11 @@ def _on_face(n: int, label: list[int], joined: int) -> Iterator[Segment]:
     elif kinds > 2 and (label[0] == label[2] or label[1] == label[3]):
         first = int(label[0] == label[2])  # the first corner that is cut off
         for at in (first, first + 2):
-            yield _turned(edge[at], edge[(at + 1) % 4], label[at], label[at - 1])
+            yield turned(edge[at], edge[(at + 1) % 4], label[at], label[at - 1])
     elif kinds > 2:
         for at in range(4):
             if label[at] != label[at - 1]:
-                yield _turned(edge[at], FACE_POINTS + n, label[at], label[at - 1])
-
-
-def _turned(start: int, end: int, inside: int, outside: int) -> Segment:
-    """Return a segment with the higher label inside."""
-    return (start, end, inside, outside) if inside > outside else (end, start, outside, inside)
+                yield turned(edge[at], FACE_POINTS + n, label[at], label[at - 1])
 
 
 def _triangles(rows: list[Segment]) -> Iterator[tuple[int, ...]]:
@@ -181,10 +177,7 @@ def put_together(
     planes: tuple[int, int],
 ) -> Labelled:
     """Return the fields of labels in some planes."""
-    number, every = [0], [ground]
-    for label, part in parts:
-        number.append(label)
-        every.append(part)
+    number, every = zip((0, ground), *parts)
     counts = [len(part.voxel_ijk) for part in every]
     places = np.concatenate([part.voxel_ijk for part in every])
     keys, row = np.unique(VoxelIndex(places, shape).keys, return_inverse=True)
@@ -199,7 +192,7 @@ def put_together(
 
 
 def _holders(
-    number: list[int], parts: list[Part], rows: list[NDArray[np.intp]], count: int
+    number: tuple[int, ...], parts: tuple[Part, ...], rows: list[NDArray[np.intp]], count: int
 ) -> Labels:
     """Return the label that holds each node of ``count`` voxels, (Q, D); forget unused values."""
     size = len(parts[0].blocks)
@@ -253,19 +246,9 @@ class Halves:
         keys: Keys = (place.astype(np.int64) + self.beyond) @ self.strides
         return keys
 
-    def is_odd(self, keys: Keys) -> BoolArray:
-        """Return along which axes places are between nodes, (n, 3)."""
-        i, rest = np.divmod(keys, self.strides[0])
-        j, k = np.divmod(rest, self.strides[1])
-        odd: BoolArray = np.stack([i, j, k], 1) % 2 == 1
-        return odd
-
 
 def _cells(field: Labelled, border: IntArray) -> Cells:
-    """Return the cells in which walls are, those beyond the border included, in order.
-
-    They are the low nodes, (n, 3) int64, and the labels at the corners, (n, 8) int16.
-    """
+    """Return the low nodes, (n, 3), and labels, (n, 8), of the cells in which walls are."""
     voxel_ijk, holder = _closed(field, border)
     corners = holder.reshape(*(field.factor + 1,) * 3, -1)
     low, high = corners, corners
@@ -282,10 +265,7 @@ def _cells(field: Labelled, border: IntArray) -> Cells:
 
 
 def _closed(field: Labelled, border: IntArray) -> tuple[IntArray, Labels]:
-    """Return voxels and the labels of their nodes, with those beyond the border, which have none.
-
-    See ``cap``: the voxels on the border that are all of one label count, too.
-    """
+    """Return voxels and the labels of their nodes, with those beyond the border: see ``cap``."""
     shape, factor = np.array(field.shape), field.factor
     filled = border[(border[:, 3] > 0) & (field.index.find(border[:, :3]) < 0)]
     of_filled = np.broadcast_to(filled[:, 3].astype(np.int16), (len(field.holder), len(filled)))
@@ -310,10 +290,7 @@ def _closed(field: Labelled, border: IntArray) -> tuple[IntArray, Labels]:
 def _connect(
     field: Labelled, cells: Cells, base: Keys, lattice: Halves
 ) -> tuple[Keys, Labels, BoolArray]:
-    """Return the triangles of cells as names of points, and the labels on both sides.
-
-    The last array, (m, 3), says which points are not on edges.
-    """
+    """Return the triangles as names of points, the labels beside, and which are not on edges."""
     case, of_cell = np.unique(_cases(field, cells), return_inverse=True)
     tables = [walls(int(number) & (1 << 24) - 1, int(number) >> 24) for number in case]
     counts = np.array([len(table) for table in tables], np.int64)
@@ -328,7 +305,11 @@ def _connect(
 
 
 def _cases(field: Labelled, cells: Cells) -> Keys:
-    """Return the case of each cell: the ranks of its labels, and which faces join (``walls``)."""
+    """Return the case of each cell: the ranks of its labels, and which faces join (``walls``).
+
+    A face joins its corners with the higher label where the difference of the labels' fields,
+    interpolated bilinearly, is so at its saddle: see ``marching.choose_cases``.
+    """
     label, ordered = cells[1], np.sort(cells[1], axis=1)
     rank = np.zeros(label.shape, np.int64)
     for nth in range(1, 8):
@@ -338,26 +319,15 @@ def _cases(field: Labelled, cells: Cells) -> Keys:
     for n, face in enumerate(FACES):
         a, b, c, d = label[:, face].T
         unsure = np.flatnonzero((a == c) & (b == d) & (a != b))
-        case[unsure] |= _joins(field, cells, unsure, face).astype(np.int64) << (24 + n)
+        low, holder = cells[0][unsure], np.stack([a, b])[:, unsure]
+        between = np.sort(holder, axis=0)
+        one, other = (
+            np.prod([field.apart(low, low + CORNERS[at], between, own) for at in corners], axis=0)
+            for corners, own in zip((face[::2], face[1::2]), holder)
+        )
+        joined = np.where(holder[0] > holder[1], one > other, other > one)
+        case[unsure] |= joined.astype(np.int64) << (24 + n)
     return case
-
-
-def _joins(
-    field: Labelled, cells: Cells, some: NDArray[np.intp], face: tuple[int, ...]
-) -> BoolArray:
-    """Return whether a face of some cells joins its corners with the higher label.
-
-    It does where the difference of the labels' fields, interpolated bilinearly, is so at its
-    saddle: see ``marching.choose_cases``.
-    """
-    low, label = cells[0][some], cells[1][some[:, None], list(face[:2])].T
-    between = np.sort(label, axis=0)
-    saddle = [
-        np.prod([field.apart(low, low + CORNERS[at], between, holder) for at in corners], axis=0)
-        for corners, holder in zip((face[::2], face[1::2]), label)
-    ]
-    joined: BoolArray = np.where(label[0] > label[1], saddle[0] > saddle[1], saddle[1] > saddle[0])
-    return joined
 
 
 def _edge_points(
@@ -394,7 +364,8 @@ def _inner_points(
     keys: Keys, places: NDArray[np.float64], used: Keys, lattice: Halves
 ) -> tuple[Keys, NDArray[np.float64]]:
     """Return points with those on faces, and then those in cells: means of the ones beside them."""
-    odd = lattice.is_odd(used)
+    i, rest = np.divmod(used, lattice.strides[0])
+    odd = np.stack([i, *np.divmod(rest, lattice.strides[1])], 1) % 2 == 1  # between nodes
     for axes in (2, 3):
         some = odd.sum(1) == axes
         total, times = np.zeros((np.count_nonzero(some), 3)), np.zeros(np.count_nonzero(some))

@@ -7,11 +7,11 @@ Elsewhere the mesh is that of marching cubes, and it is a closed manifold for th
 
 In steps:
 
-    patches     finds voxels where the field's gradient turns, and lists the patches in their cells
+    patches     finds voxels where the field's gradient turns, lists the patches in their cells, and
+                joins them to triangles in the end
     planes      gives each crossing the plane of its face, not rounded off as the field is at edges
     wedges      meets these planes, and moves the point so that it agrees with the samples' spheres
     features    tells edges from rounded ground, and moves the vertices beside them
-    fans        joins the vertices to triangles
     mesher      does all of this, for some planes at a time
 
 Reference: Kobbelt, Botsch, Schwanecke and Seidel, "Feature Sensitive Surface Extraction from Volume

@@ -2,12 +2,11 @@
 
 1. Candidates are patches whose planes differ, by the settled planes of the faces beside.
 2. Each gets the point where these planes meet, moved so that the samples' spheres agree.
-3. ``evidence`` gathers what speaks for an edge there and what against it: flat ground on both
+3. ``evidence_of`` gathers what speaks for an edge there and what against it: flat ground on both
    sides, spheres that touch or are pierced. It is averaged along the chain of candidates, since an
    edge has a length, and weighed by a logistic rule.
 4. Beside features of which the rule is sure, vertices are moved onto the settled planes.
-5. A feature's vertex that would fold the surface goes half way back to the middle of its patch
-   (``fans``).
+5. A feature's vertex that would fold the surface goes half way back to the middle of its patch.
 
 The rule was fitted by ``export.edges`` on shapes with and without edges, to whether a vertex on the
 edge brings the surface nearer to the true one.
@@ -25,19 +24,9 @@ from numpy.typing import NDArray
 from ...arrays import BoolArray
 from ...machine.resources import map_chunks
 from ..field import FineField, SampleSpheres
-from .fans import Placed, unfolded
-from .patches import Index, Patches, dilate
-from .planes import Numbers, Planes, Vectors, dot, length, settle_planes
-from .wedges import (
-    Contact,
-    Nearby,
-    Wedges,
-    contact_of,
-    count_by_wedge,
-    find_spheres,
-    lean,
-    wedges_of,
-)
+from .patches import Index, Numbers, Patches, Placed, Vectors, dilate, dot, length, unfolded
+from .planes import Planes, settle_planes
+from .wedges import Nearby, Wedges, contact_of, find_spheres, lean, wedges_of
 
 SHARP_COSINE = 0.85  # normals of a patch that differ by more, 32 degrees, may make a feature
 HALF_ANGLE_COSINE = 0.962  # of a little less than half that angle
@@ -136,21 +125,16 @@ def _measure(
     ijk = field.voxel_ijk[patches.row].astype(np.int64)
     corners = planes.point[patches.crossing] / field.factor, planes.normal[patches.crossing]
     wedges = wedges_of(ijk, *corners, patches.there)
-    spheres = field.spheres or SampleSpheres(
-        field.shape, np.empty((0, 3), np.int32), np.empty(0, np.float32)
-    )
-    nearby = find_spheres(wedges, spheres)
+    none = np.empty((0, 3), np.int32), np.empty(0, np.float32)
+    nearby = find_spheres(wedges, field.spheres or SampleSpheres(field.shape, *none))
     leaned = lean(wedges, nearby)
     evidence = evidence_of(patches, planes, own, wedges, leaned, nearby)
-    count = count_by_wedge(nearby, np.ones(len(nearby.wedge), bool), len(evidence))
+    count = nearby.count_of(np.ones(len(nearby.wedge), bool), len(evidence))
     return leaned.point, evidence, count
 
 
 def is_sharp(patches: Patches, normal: Vectors, trust: Numbers) -> BoolArray:
-    """Return which patches, (P,), have normals that differ by more than ``SHARP_COSINE``.
-
-    Only where the field is a distance at every crossing: of others normals say little.
-    """
+    """Return which patches, (P,), turn by ``SHARP_COSINE``, where the slope is about 1."""
     sides = patches.crossing.shape[1]
     # Where all are within half that angle of the first, no two differ by more.
     pairs = [(0, other) for other in range(1, sides)]
@@ -183,11 +167,14 @@ def evidence_of(
     touched, and how many; how far the spheres moved the point; the cosine of the normals, and how
     far it is under -0.2, as on a blade; the logarithm of the trust in the field; 1 if convex.
     """
-    contact = contact_of(wedges, nearby)
+    contact, count = contact_of(wedges, nearby), len(patches.row)
     trust = np.where(patches.there, planes.trust[patches.crossing], np.inf).min(1)
     steady = np.where(patches.there, own.trust[patches.crossing], np.inf).min(1)
-    pierced = _deepest(nearby, contact, len(trust))
-    touched = _touched(nearby, contact, len(trust))
+    pierced: Numbers = np.full(count, -0.1)
+    close = contact.is_close
+    np.maximum.at(pierced, nearby.wedge[close], -contact.gap[close])
+    touching = contact.in_cone & (np.abs(contact.gap) < TOUCHING)
+    touched = nearby.count_of(touching & (np.abs(contact.along) < TOUCHED_ALONG), count)
     support = np.log(trust + 1e-3)
     columns = (
         *(support, np.maximum(support - np.log(0.1), 0)),
@@ -199,20 +186,6 @@ def evidence_of(
         start.convex > 0,
     )
     return np.stack(columns, 1).astype(np.float64)
-
-
-def _deepest(nearby: Nearby, contact: Contact, count: int) -> Numbers:
-    """Return by how much a sphere close by is pierced by each edge, (count,); -0.1 if by none."""
-    close = contact.is_close
-    deepest: Numbers = np.full(count, -0.1)
-    np.maximum.at(deepest, nearby.wedge[close], -contact.gap[close])
-    return deepest
-
-
-def _touched(nearby: Nearby, contact: Contact, count: int) -> NDArray[np.int32]:
-    """Return how many spheres touch each edge that must, (count,)."""
-    touching = contact.in_cone & (np.abs(contact.gap) < TOUCHING)
-    return count_by_wedge(nearby, touching & (np.abs(contact.along) < TOUCHED_ALONG), count)
 
 
 def mean_along_chain(patches: Patches, evidence: Vectors, count: int) -> Vectors:
@@ -233,8 +206,7 @@ def mean_along_chain(patches: Patches, evidence: Vectors, count: int) -> Vectors
 def move_beside(patches: Patches, own: Planes, candidates: Candidates, sure: BoolArray) -> Vectors:
     """Return the positions of all crossings, (n, 3), those beside sure features on settled planes.
 
-    The move fades with the distance from the feature: where it ended at once, crossings that lie
-    close together would come apart, and make a step.
+    The move fades with the distance from the feature: otherwise there would be a step.
     """
     distance = distance_from(
         patches, candidates.patch[sure], candidates.vertex[sure], own.point, MOVED_RINGS
@@ -249,10 +221,7 @@ def move_beside(patches: Patches, own: Planes, candidates: Candidates, sure: Boo
 def distance_from(
     patches: Patches, features: Index, vertex: Vectors, point: Vectors, rings: int
 ) -> Numbers:
-    """Return the distance of crossings to the nearest vertex of a feature, (n,).
-
-    It is infinite for crossings that are not within some rings of patches round a feature.
-    """
+    """Return the distance of crossings to a feature's vertex within some rings of patches, (n,)."""
     distance: Numbers = np.full(len(point), np.inf)
     nearest = np.full(len(point), -1, np.int64)
     known = np.full(len(patches.row), -1, np.int64)

@@ -9,7 +9,7 @@ Positions are in fine spacings, from node (0, 0, 0) of the fine lattice.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import accumulate, pairwise
+from itertools import accumulate, chain, pairwise
 from typing import Any
 
 import numpy as np
@@ -29,10 +29,19 @@ from ..marching import (
     lattice_positions,
     to_world,
 )
-from .fans import Placed, triangles_of
 from .features import CHAIN_ROUNDS, MOVED_RINGS, RINGS, is_sharp, place_features
-from .patches import Index, Patches, beside, find_patches, nth_of_row, voxels_near_kinks
-from .planes import ROUNDS, Vectors, planes_at_crossings
+from .patches import (
+    Index,
+    Patches,
+    Placed,
+    Vectors,
+    beside,
+    find_patches,
+    nth_of_row,
+    triangles_of,
+    voxels_near_kinks,
+)
+from .planes import ROUNDS, planes_at_crossings
 
 # Cells to every side that a vertex depends on: gradients reach 2 cells, a patch is 1 wide, and so
 # is the fan beside.
@@ -50,7 +59,7 @@ def extract_pieces(
 ) -> list[Mesh]:
     """Return the mesh with edges and corners, group by group of the field's own planes."""
     at_once = min(threads, groups_at_once(field.planes, field.shape))
-    kinked = find_kinks(field, threads)
+    kinked = voxels_near_kinks(field, _rows_around(field), threads)
     groups = groups_of_planes(field, kinked, at_once)
     if len(groups) == 1:
         return extract_group(field, grid, kinked, first_vertex, at_once)
@@ -58,8 +67,12 @@ def extract_pieces(
     def mesh_of(planes: PlaneRange) -> list[Mesh]:
         return extract_group(replace(field, planes=planes), grid, kinked, 0, 1)
 
-    meshes = map_threads(mesh_of, groups, at_once)
-    return number_after(first_vertex, [mesh for group in meshes for mesh in group])
+    meshes = list(chain.from_iterable(map_threads(mesh_of, groups, at_once)))
+    counts = [len(mesh.vertices) for mesh in meshes]
+    check_count(first_vertex + sum(counts), "vertices")
+    for mesh, before in zip(meshes, accumulate(counts, initial=first_vertex)):
+        np.add(mesh.faces, np.int32(before), out=mesh.faces)
+    return meshes
 
 
 def groups_at_once(planes: PlaneRange, shape: tuple[int, ...]) -> int:
@@ -75,7 +88,7 @@ def groups_of_planes(field: FineField, kinked: BoolArray, threads: int) -> list[
     """
     first, last = field.planes
     plain, edged = voxel_bytes(field.factor)
-    size = plain + edged * near_kinks(field, kinked)[field.own_rows]
+    size = plain + edged * _near_kinks(field, kinked)[field.own_rows]
     before = np.cumsum(np.bincount(field.voxel_ijk[field.own_rows, 0] - first, size, last - first))
     thick = (last - first) // (2 * planes_beside(field.factor))
     count = max(-int(-before[-1] // GROUP_BYTES), min(threads, thick), 1)
@@ -84,20 +97,24 @@ def groups_of_planes(field: FineField, kinked: BoolArray, threads: int) -> list[
 
 
 def voxel_bytes(factor: int) -> tuple[int, int]:
-    """Return the bytes that a voxel takes in a group, and how many more if it is near a kink.
-
-    Measured on a ball and on a field of turned cubes, three voxels wide.
-    """
+    """Return the measured bytes that a voxel takes in a group, and how many more near a kink."""
     return 82 * factor**2, 350 * factor**2
 
 
-def number_after(first_vertex: int, meshes: list[Mesh]) -> list[Mesh]:
-    """Return meshes that each count vertices from 0 numbered one after the other, in place."""
-    counts = [len(mesh.vertices) for mesh in meshes]
-    check_count(first_vertex + sum(counts), "vertices")
-    for mesh, before in zip(meshes, accumulate(counts, initial=first_vertex)):
-        np.add(mesh.faces, np.int32(before), out=mesh.faces)
-    return meshes
+def planes_beside(factor: int) -> int:
+    """Return how many coarse planes to either side a slab's mesh depends on."""
+    return -(-(REACH_IN_CELLS + 1) // factor) + REACH_IN_VOXELS
+
+
+def _rows_around(field: FineField) -> slice:
+    """Return the rows of the field's own planes and of those that they depend on."""
+    beside = planes_beside(field.factor)
+    return field.rows(field.planes[0] - beside, field.planes[1] + beside)
+
+
+def _near_kinks(field: FineField, chosen: BoolArray) -> BoolArray:
+    """Return the voxels, (D,), that are examined if edges may be in chosen ones."""
+    return beside(field, chosen, -(-(RINGS + 1) // field.factor))
 
 
 def extract_group(
@@ -105,8 +122,8 @@ def extract_group(
 ) -> list[Mesh]:
     """Return the mesh of a field's planes with its edges and corners, as a list of one piece.
 
-    Vertices and faces are numbered as by ``marching.extract_pieces``; ``kinked`` is from
-    ``find_kinks``, for this field or one of more planes.
+    Vertices are numbered voxel by voxel, on the edges that it owns, then of its features.
+    ``kinked`` is from ``voxels_near_kinks``, for this field or one of more planes.
     """
     rows = _rows_around(field)
     before = field.plane_before(rows).start if rows.start < rows.stop else rows.start
@@ -114,8 +131,20 @@ def extract_group(
     if not len(crossings.own_row):
         return [Mesh(np.empty((0, 3), vertex_type(grid, field.factor)), NO_FACES)]
     examined = examine(field, crossings, rows, kinked, threads)
-    numbers = _number_vertices(field, crossings, examined, first_vertex)
-    vertices = _vertices(field, crossings, examined, numbers, first_vertex)
+    count, row = len(field.voxel_ijk) + 1, examined.patches.row[examined.placed.feature]
+    edges = np.bincount(crossings.own_row, minlength=count)
+    peaks = np.bincount(row, minlength=count)
+    first = np.cumsum(edges + peaks) - edges - peaks
+    core = field.own_rows
+    own = int(first[core.stop] - first[core.start])
+    check_count(first_vertex + own, "vertices")
+    first += first_vertex - first[core.start]
+    numbers = (
+        first[crossings.own_row] + nth_of_row(crossings.own_row, edges),  # of crossings
+        first[row] + edges[row] + nth_of_row(row, peaks),  # of features
+    )
+    mine = slice(first_vertex, first_vertex + own)
+    vertices = _vertices(field, crossings, examined, numbers, mine)
     faces = _faces(field, crossings, examined, numbers)
     return [Mesh(to_world(vertices.T, field, grid), faces)]
 
@@ -130,40 +159,23 @@ class Examined:
     placed: Placed  # where the vertices on these crossings and on the features belong
 
 
-def find_kinks(field: FineField, threads: int = 1) -> BoolArray:
-    """Return the voxels, (D,), in which an edge may be, in all planes that the mesh depends on."""
-    return voxels_near_kinks(field, _rows_around(field), threads)
-
-
-def near_kinks(field: FineField, chosen: BoolArray) -> BoolArray:
-    """Return the voxels, (D,), that are examined if edges may be in chosen ones."""
-    return beside(field, chosen, -(-(RINGS + 1) // field.factor))
-
-
 def examine(
     field: FineField, crossings: Crossings, rows: slice, kinked: BoolArray, threads: int = 1
 ) -> Examined:
-    """Look for edges and corners in and beside voxels in which a patch of the surface turns."""
-    here = within(np.arange(len(kinked)), rows)
-    turning = turning_voxels(field, crossings, kinked & here, threads)
-    voxels = near_kinks(field, turning) & here
+    """Look for edges and corners in and beside kinked voxels in which a patch turns as at one."""
+    here = _within(np.arange(len(kinked)), rows)
+    patches, used = find_patches(field, crossings, kinked & here)
+    own = planes_at_crossings(field, crossings, used, threads)
+    turning = np.zeros(len(kinked), bool)
+    turning[patches.row[is_sharp(patches, own.normal, own.trust)]] = True
+
+    voxels = _near_kinks(field, turning) & here
     patches, used = find_patches(field, crossings, voxels)
     own = planes_at_crossings(field, crossings, used, threads)
     placed = place_features(patches, own, turning, field, threads)
     position = _kept_in_grid(placed.position, own.point, field)
     peak = _kept_in_grid(placed.peak, patches.low[placed.feature] + 0.5, field)
     return Examined(voxels, patches, used, replace(placed, position=position, peak=peak))
-
-
-def turning_voxels(
-    field: FineField, crossings: Crossings, kinked: BoolArray, threads: int = 1
-) -> BoolArray:
-    """Return which of the kinked voxels, (D,), hold a patch whose normals differ as at an edge."""
-    patches, used = find_patches(field, crossings, kinked)
-    own = planes_at_crossings(field, crossings, used, threads)
-    turning = np.zeros(len(kinked), bool)
-    turning[patches.row[is_sharp(patches, own.normal, own.trust)]] = True
-    return turning
 
 
 def _kept_in_grid(position: Vectors, start: Vectors, field: FineField) -> Vectors:
@@ -178,73 +190,40 @@ def _kept_in_grid(position: Vectors, start: Vectors, field: FineField) -> Vector
     return np.where(at_border, border, np.clip(position, CLEARANCE, last - CLEARANCE))
 
 
-def planes_beside(factor: int) -> int:
-    """Return how many coarse planes to either side a slab's mesh depends on."""
-    return -(-(REACH_IN_CELLS + 1) // factor) + REACH_IN_VOXELS
-
-
-def _rows_around(field: FineField) -> slice:
-    """Return the rows of the field's own planes and of those that they depend on."""
-    beside = planes_beside(field.factor)
-    return field.rows(field.planes[0] - beside, field.planes[1] + beside)
-
-
-@dataclass(frozen=True, eq=False)
-class Numbers:
-    """The numbers of vertices: voxel by voxel, on edges that it owns, then of its features."""
-
-    of_crossing: Index  # (n,), of the vertex on each crossing
-    of_feature: Index  # (f,), of the vertex of each feature
-    own: int  # how many belong to the field's own voxels
-
-
-def _number_vertices(
-    field: FineField, crossings: Crossings, examined: Examined, first_vertex: int
-) -> Numbers:
-    """Number the vertices: the first of the field's own voxels is ``first_vertex``."""
-    count, row = len(field.voxel_ijk) + 1, examined.patches.row[examined.placed.feature]
-    edges = np.bincount(crossings.own_row, minlength=count)
-    peaks = np.bincount(row, minlength=count)
-    before = np.cumsum(edges + peaks) - edges - peaks
-    core = field.own_rows
-    own = int(before[core.stop] - before[core.start])
-    check_count(first_vertex + own, "vertices")
-    before += first_vertex - before[core.start]
-    of_crossing = before[crossings.own_row] + nth_of_row(crossings.own_row, edges)
-    return Numbers(of_crossing, before[row] + edges[row] + nth_of_row(row, peaks), own)
+def _within(row: NDArray[Any], rows: slice) -> BoolArray:
+    inside: BoolArray = (row >= rows.start) & (row < rows.stop)
+    return inside
 
 
 def _vertices(
-    field: FineField, crossings: Crossings, examined: Examined, numbers: Numbers, first_vertex: int
+    field: FineField,
+    crossings: Crossings,
+    examined: Examined,
+    numbers: tuple[Index, Index],
+    own: slice,
 ) -> Vectors:
-    """Return the vertices of the field's own voxels, (n, 3), in fine spacings."""
-    vertices = np.empty((numbers.own, 3))
+    """Return the vertices of the field's ``own`` voxels, (n, 3), in fine spacings."""
+    vertices = np.empty((own.stop - own.start, 3))
     mine = crossings.own(field.own_rows)
 
     def place(some: slice) -> None:
         rows = slice(mine.start + some.start, mine.start + some.stop)
         plain = lattice_positions(field, crossings.own_row[rows], crossings.own_edge[rows])
-        vertices[numbers.of_crossing[rows] - first_vertex] = plain.T
+        vertices[numbers[0][rows] - own.start] = plain.T
 
     map_chunks(place, mine.stop - mine.start, TEMPORARIES)
     used, placed = examined.used, examined.placed
     for row, number, position in (
-        (crossings.own_row[used], numbers.of_crossing[used], placed.position),
-        (examined.patches.row[placed.feature], numbers.of_feature, placed.peak),
+        (crossings.own_row[used], numbers[0][used], placed.position),
+        (examined.patches.row[placed.feature], numbers[1], placed.peak),
     ):
-        core = within(row, field.own_rows)
-        vertices[number[core] - first_vertex] = position[core]
+        core = _within(row, field.own_rows)
+        vertices[number[core] - own.start] = position[core]
     return vertices
 
 
-def within(row: NDArray[Any], rows: slice) -> BoolArray:
-    """Return which rows lie in a slice."""
-    inside: BoolArray = (row >= rows.start) & (row < rows.stop)
-    return inside
-
-
 def _faces(
-    field: FineField, crossings: Crossings, examined: Examined, numbers: Numbers
+    field: FineField, crossings: Crossings, examined: Examined, numbers: tuple[Index, Index]
 ) -> IntArray:
     """Return the triangles of the field's own voxels, plane by plane.
 
@@ -255,13 +234,13 @@ def _faces(
     cells = (crossings.cell_row[plain], crossings.cell[plain], crossings.case[plain])
     smooth = replace(crossings, cell_row=cells[0], cell=cells[1], case=cells[2])
     patch, corners = triangles_of(examined.patches, examined.placed)
-    faces = np.concatenate([numbers.of_crossing[examined.used], numbers.of_feature])[corners]
+    faces = np.concatenate([numbers[0][examined.used], numbers[1]])[corners]
     row = examined.patches.row[patch]
     parts = [NO_FACES]
     for plane in range(*field.planes):
         rows = field.rows(plane, plane + 1)
         if rows.start < rows.stop:
-            parts.append(numbers.of_crossing[connect(field, smooth, rows, 0)].astype(np.int32))
+            parts.append(numbers[0][connect(field, smooth, rows, 0)].astype(np.int32))
             start, stop = np.searchsorted(row, [rows.start, rows.stop])
             parts.append(faces[start:stop].astype(np.int32))
     return np.concatenate(parts)

@@ -1,16 +1,25 @@
-"""Voxels that may hold an edge, and the patches of the surface in their cells.
+"""Voxels that may hold an edge, the patches of the surface in their cells, and their triangles.
 
 On a fine grid almost all of a surface is smooth. Finding that out block by block, by the largest
 and smallest differences along each axis, takes a tenth of the time of looking for edges.
 
 A patch is a piece of the surface in one cell: a loop of crossed lattice edges, from one to the
 next across the faces of the cell. Two cells that share a face share the crossings on it.
+
+The triangles of a patch are those of marching cubes, or a fan round the vertex of a feature. The
+side that two fans share is turned, so that it joins their vertices and runs along the edge. Not
+where this would fold the surface: the triangles of a face should look as its planes do. Vertices
+of the mesh are numbered here by crossing, then by feature.
+
+Positions are in fine spacings, from node (0, 0, 0) of the fine lattice.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, cast
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,20 +29,38 @@ from ...machine.resources import chunks_of, map_chunks
 from ...neighbourhood import CENTRE, STRIDES
 from ..cell_cases import loop_table
 from ..field import FineField
-from ..marching import Crossings, cells_low_nodes, edge_shifts, edge_steps, part_of_edge
+from ..marching import Crossings, cells_low_nodes, edge_steps, edge_table, owners_of
 from ..nodes import block_ijk
 
 Index = NDArray[np.int64]
+Vectors = NDArray[np.float64]
+Numbers = NDArray[np.float64]
 NEAR_SURFACE = 2.0  # fine spacings: differences between nodes nearer than this count
 TURN = 0.35  # of a component of the gradient, over a voxel and those beside it
 TEMPORARIES = 8  # numbers per node of a block
+PULL = 0.5  # share of the way to the middle of its crossings that a vertex which folds its fan goes
+
+
+def dot(a: Vectors, b: Vectors) -> Numbers:
+    """Return the products of vectors, (n,)."""
+    product: Numbers = a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+    return product
+
+
+def length(vectors: Vectors) -> Numbers:
+    """Return the lengths of vectors, (n,)."""
+    lengths: Numbers = np.sqrt(dot(vectors, vectors))
+    return lengths
+
+
+def unit(vectors: Vectors) -> Vectors:
+    """Return vectors of length 1; 0 stays 0."""
+    units: Vectors = vectors / np.maximum(length(vectors), 1e-12)[..., None]
+    return units
 
 
 def voxels_near_kinks(field: FineField, rows: slice, threads: int = 1) -> BoolArray:
-    """Return the voxels, (D,), in or beside which the gradient turns by more than ``TURN``.
-
-    Only voxels of these rows are looked at; the others are False.
-    """
+    """Return the voxels, (D,), of some rows in or beside which the gradient turns by ``TURN``."""
     chunks = map_chunks(
         lambda some: _ranges(
             field.blocks[:, rows.start + some.start : rows.start + some.stop], field.factor
@@ -57,10 +84,7 @@ def voxels_near_kinks(field: FineField, rows: slice, threads: int = 1) -> BoolAr
 
 
 def _ranges(blocks: FloatArray, factor: int) -> tuple[FloatArray, FloatArray]:
-    """Return the smallest and largest differences along each axis, (3, n), of blocks (Q, n).
-
-    They are slopes, 1 for a distance; NaN for blocks without nodes near the surface.
-    """
+    """Return the least and largest slopes along each axis, (3, n), near the surface; else NaN."""
     near = np.abs(blocks) < np.float32(NEAR_SURFACE * 2 / factor)
     cube = np.where(near, blocks, np.float32(np.nan)).reshape(*(factor + 1,) * 3, -1)
     low, high = np.empty((2, 3, blocks.shape[1]), np.float32)
@@ -118,7 +142,7 @@ def find_patches(
     slot, edge_at = _edges_of(field, crossings, voxels)
     some = voxels[crossings.cell_row]
     case = crossings.case[some]
-    count = table.count[case]
+    count = table.times[case]
     cell = np.repeat(np.arange(len(count)), count)
     loop = table.first[case[cell]] + nth_of_row(cell, count)
     row = crossings.cell_row[some][cell]
@@ -138,24 +162,13 @@ def find_patches(
 
 
 def _edges_of(field: FineField, crossings: Crossings, voxels: BoolArray) -> tuple[Index, IntArray]:
-    """Return the crossings on the edges of some voxels' blocks, set only where there is one.
-
-    Before it comes the place of each voxel in the table, (D,).
-    """
-    edges = 3 * len(field.blocks)
-    other = voxels[crossings.other_row]
-    row, edge = crossings.other_row[other], crossings.other_edge[other].astype(np.int64)
-    place = field.parts.owner[part_of_edge(field.factor)[edge], row]
-    owner = field.parts.table[place, row]
+    """Return the voxels' places in a table, (D,), and it: the crossings on their edges."""
+    others = np.flatnonzero(voxels[crossings.other_row])
     listed = voxels.copy()
-    listed[owner] = True
+    listed[owners_of(field, crossings, others)[1]] = True
     slot: Index = np.cumsum(listed) - 1
-    edge_at = np.empty(int(listed.sum()) * edges, np.int32)  # unset entries are not read
     own = np.flatnonzero(listed[crossings.own_row])
-    edge_at[slot[crossings.own_row[own]] * edges + crossings.own_edge[own]] = own
-    same_edge = slot[owner] * edges + edge - edge_shifts(field.factor)[place]
-    edge_at[slot[row] * edges + edge] = edge_at[same_edge]
-    return slot, edge_at
+    return slot, edge_table(field, crossings, slot.take, int(listed.sum()), own, others, own)
 
 
 def dilate(patches: Patches, chosen: BoolArray, rings: int, count: int) -> BoolArray:
@@ -170,10 +183,7 @@ def dilate(patches: Patches, chosen: BoolArray, rings: int, count: int) -> BoolA
 
 
 def pairs_in_patches(patches: Patches) -> tuple[Index, Index]:
-    """Return every ordered pair of crossings of a patch, in the order of the patches.
-
-    Two crossings on a face that two cells share come twice.
-    """
+    """Return every ordered pair of crossings of a patch; those on a common face come twice."""
     sides = patches.crossing.shape[1]
     places = np.nonzero(~np.eye(sides, dtype=bool))
     empty = np.empty(0, np.int64)
@@ -191,3 +201,127 @@ def nth_of_row(row: NDArray[Any], counts: NDArray[Any]) -> Index:
     first: Index = np.cumsum(counts) - counts
     nth: Index = np.arange(len(row)) - first[row]
     return nth
+
+
+Triangles = tuple[Index, Index]
+"""Patches (t,), and the corners of a triangle of each, (t, 3)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Where the vertices of patches are."""
+
+    # position, normal: (n, 3), of the crossings: positions, and the normals of their planes
+    position: Vectors
+    normal: Vectors
+    feature: Index  # (f,), the patches that hold an edge or a corner
+    peak: Vectors  # (f, 3), the vertices on these
+
+    @cached_property
+    def points(self) -> Vectors:
+        """All vertices in the order of their numbers, (n + f, 3)."""
+        return np.concatenate([self.position, self.peak])
+
+    def facing(self, corners: tuple[Index, Index, Index], crossing: Index) -> Numbers:
+        """Return the cosine between triangles, corners (t,) each, and the planes of crossings."""
+        a, b, c = (self.points[corner] for corner in corners)
+        return dot(unit(np.cross(b - a, c - a)), self.normal[crossing])
+
+
+class Sides(NamedTuple):
+    """The sides of fans: patches, first and second crossing, vertex of the feature, (s,) each."""
+
+    patch: Index
+    start: Index
+    end: Index
+    peak: Index
+
+
+def _sides_of(patches: Patches, placed: Placed) -> Sides:
+    """Return the sides of all patches with a feature, fan by fan."""
+    sides = patches.sides[placed.feature]
+    fan = np.repeat(np.arange(len(sides)), sides)
+    patch, nth = placed.feature[fan], nth_of_row(fan, sides)
+    start = patches.crossing[patch, nth]
+    end = patches.crossing[patch, (nth + 1) % patches.sides[patch]]
+    return Sides(patch, start, end, len(placed.position) + fan)
+
+
+def unfolded(patches: Patches, placed: Placed) -> Placed:
+    """Return the vertices, those that lie beyond a side of their fan moved inwards."""
+    sides = _sides_of(patches, placed)
+    corners = sides.start, sides.end, sides.peak
+    facing = np.maximum(placed.facing(corners, sides.start), placed.facing(corners, sides.end))
+    folded = np.zeros(len(placed.feature), bool)
+    folded[sides.peak[facing < 0] - len(placed.position)] = True
+    mine, count = patches.crossing[placed.feature], patches.sides[placed.feature]
+    points = np.where((mine >= 0)[..., None], placed.position[mine], 0)
+    middle = points.sum(1) / count[:, None]
+    inwards = np.where(folded[:, None], PULL * (middle - placed.peak), 0)
+    return replace(placed, peak=placed.peak + inwards)
+
+
+def triangles_of(patches: Patches, placed: Placed) -> Triangles:
+    """Return the triangles of all patches, in their order."""
+    flat = np.ones(len(patches.row), bool)
+    flat[placed.feature] = False
+    parts = [flat_triangles(patches, flat), *fan_triangles(patches, placed)]
+    patch = np.concatenate([rows for rows, _ in parts])
+    corners = np.concatenate([triangles for _, triangles in parts])
+    order = np.argsort(patch, kind="stable")
+    return patch[order], corners[order]
+
+
+def flat_triangles(patches: Patches, chosen: BoolArray) -> Triangles:
+    """Return the triangles of patches without a feature: those of marching cubes."""
+    rows = np.flatnonzero(chosen)
+    patch = np.repeat(rows, patches.sides[rows] - 2)
+    nth = nth_of_row(patch, np.bincount(patch, minlength=len(chosen)))
+    corners = loop_table().triangles[patches.loop[patch], nth]
+    return patch, np.take_along_axis(patches.crossing[patch], corners, 1)
+
+
+def fan_triangles(patches: Patches, placed: Placed) -> Iterator[Triangles]:
+    """Yield the triangles of patches with a feature: fans, and pairs across turned sides."""
+    sides = _sides_of(patches, placed)
+    one, other = _turned(sides, placed)
+    kept = np.ones(len(sides.patch), bool)
+    kept[one] = kept[other] = False
+    yield sides.patch[kept], np.stack([sides.start, sides.end, sides.peak], 1)[kept]
+    a, b, peak, beyond = sides.start[other], sides.end[other], sides.peak[other], sides.peak[one]
+    yield sides.patch[other], np.stack([a, beyond, peak], 1)
+    yield sides.patch[other], np.stack([b, peak, beyond], 1)
+
+
+def _turned(sides: Sides, placed: Placed) -> tuple[Index, Index]:
+    """Return the sides that are turned, as rows of the earlier fan's and of the later one's."""
+
+    def worst(*pairs: tuple[tuple[Index, Index, Index], Index]) -> Numbers:
+        least: Numbers = np.min([placed.facing(*pair) for pair in pairs], axis=0)
+        return least
+
+    one, other = _shared(sides)
+    a, b, peak, beyond = sides.start[other], sides.end[other], sides.peak[other], sides.peak[one]
+    turned = worst(((a, beyond, peak), a), ((b, peak, beyond), b))
+    near, far = (a, b, peak), (b, a, beyond)
+    better = turned > np.minimum(worst((near, a), (near, b), (far, a), (far, b)), 0)
+    return one[better], other[better]
+
+
+def _shared(sides: Sides) -> tuple[Index, Index]:
+    """Return the sides that two fans share, as rows of the earlier and of the later one.
+
+    Two fans that share two sides, across an ambiguous face, keep both: turned, their vertices would
+    be joined twice.
+    """
+    size = int(max(sides.start.max(initial=0), sides.end.max(initial=0))) + 1
+    key, reverse = sides.start * size + sides.end, sides.end * size + sides.start
+    order = np.argsort(key)
+    last = max(len(key) - 1, 0)
+    partner = order[np.minimum(np.searchsorted(key[order], reverse), last)]
+    one = np.flatnonzero((key[partner] == reverse) & (np.arange(len(key)) < partner))
+    other = partner[one]
+    joined = sides.peak[one] * (int(sides.peak.max(initial=0)) + 1) + sides.peak[other]
+    _, index, times = np.unique(joined, return_inverse=True, return_counts=True)
+    once = times[index] == 1
+    return one[once], other[once]

@@ -27,10 +27,17 @@ from ...neighbourhood import CENTRE, STRIDES
 from ..field import FineField
 from ..marching import Crossings, edge_ends, lattice_positions
 from ..nodes import block_ijk
-from .patches import Index, Patches, dilate, pairs_in_patches
-
-Vectors = NDArray[np.float64]
-Numbers = NDArray[np.float64]
+from .patches import (
+    Index,
+    Numbers,
+    Patches,
+    Vectors,
+    dilate,
+    dot,
+    length,
+    pairs_in_patches,
+    unit,
+)
 
 ROUNDS = 4  # in each, every crossing looks at those it shares a patch with
 ROUGH = 0.02  # 1 - cosine of normals in a patch from which a crossing is not trusted
@@ -43,24 +50,6 @@ SETTLED = 0.3  # trust from which a crossing keeps its own plane, unless ...
 SMOOTHED_RINGS = 1  # ... it lies within these of one that does not
 PAIR_TEMPORARIES = 24  # numbers per pair of crossings in a round
 TEMPORARIES = 256  # numbers per crossing in the computation of its plane
-
-
-def dot(a: Vectors, b: Vectors) -> Numbers:
-    """Return the products of vectors, (n,)."""
-    product: Numbers = a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
-    return product
-
-
-def length(vectors: Vectors) -> Numbers:
-    """Return the lengths of vectors, (n,)."""
-    lengths: Numbers = np.sqrt(dot(vectors, vectors))
-    return lengths
-
-
-def unit(vectors: Vectors) -> Vectors:
-    """Return vectors of length 1; 0 stays 0."""
-    units: Vectors = vectors / np.maximum(length(vectors), 1e-12)[..., None]
-    return units
 
 
 def sums(row: NDArray[np.int64], vectors: Vectors, count: int) -> Vectors:
@@ -98,29 +87,25 @@ def planes_at_crossings(
 def _planes_of_chunk(
     field: FineField, row: IntArray, edge: NDArray[np.int16]
 ) -> tuple[Vectors, Vectors, Numbers]:
-    """Return the arrays of ``Planes`` for some edges of voxels' blocks."""
+    """Return the arrays of ``Planes`` for some edges of voxels' blocks.
+
+    Normals are between the gradients at both ends, in which they trust if the slope is about 1.
+    """
     axis, node = np.divmod(edge.astype(np.int64), len(field.blocks))
     low_ijk = block_ijk(field.factor)[node]
     position = lattice_positions(field, row, edge).T
     start = (field.factor * field.voxel_ijk[row] + low_ijk)[np.arange(len(row)), axis]
     share = np.clip(position[np.arange(len(row)), axis] - start, 0, 1)
-    gradients = _gradient(field, row, node), _gradient(field, row, edge_ends(field.factor)[edge])
-    return position, *_mean_normal(*gradients, share)
-
-
-def _mean_normal(low: Vectors, high: Vectors, share: Numbers) -> tuple[Vectors, Numbers]:
-    """Return normals (n, 3) between the gradients at both ends of edges, and the trust in them."""
-    trust = [_near_one(length(gradient)) for gradient in (low, high)]
+    low, high = (_gradient(field, row, end) for end in (node, edge_ends(field.factor)[edge]))
+    trust = [
+        square_falloff((length(gradient) - 1) / SLOPE_ERROR) + LEAST_TRUST
+        for gradient in (low, high)
+    ]
     weight = (1 - share) * trust[0], share * trust[1]
     agree = dot(unit(low), unit(high)) > 0.9
     mean = low * weight[0][:, None] + high * weight[1][:, None]
     nearer = np.where((weight[0] >= weight[1])[:, None], low, high)
-    return unit(np.where(agree[:, None], mean, nearer)), np.maximum(*trust)
-
-
-def _near_one(slope: Numbers) -> Numbers:
-    """Return how near slopes are to that of a distance: 1 at 1, quickly less beside it."""
-    return square_falloff((slope - 1) / SLOPE_ERROR) + LEAST_TRUST
+    return position, unit(np.where(agree[:, None], mean, nearer)), np.maximum(*trust)
 
 
 def square_falloff(off: Numbers) -> Numbers:
@@ -135,12 +120,15 @@ def _gradient(field: FineField, row: IntArray, node: Index) -> Vectors:
     Along each axis by the parabola through three of five nodes that bends least: it does not
     straddle a kink.
     """
-    gradient = np.empty((len(row), 3))
-    here = _value(field, row, node)
+
+    def values(row: NDArray[Any], node: NDArray[Any]) -> Numbers:
+        found: Numbers = field.blocks[node, row].astype(np.float64)
+        found[row < 0] = np.nan  # there is no block
+        return found
+
+    gradient, here = np.empty((len(row), 3)), values(row, node)
     for axis, walk in enumerate(_walks(field.factor)):
-        a, b, d, e = (
-            _value(field, field.parts.table[place[node], row], end[node]) for place, end in walk
-        )
+        a, b, d, e = (values(field.parts.table[place[node], row], end[node]) for place, end in walk)
         gradient[:, axis] = _slope((a, b, here, d, e))
     return gradient * (field.factor / 2)
 
@@ -161,19 +149,9 @@ def _slope(values: tuple[Numbers, ...]) -> Numbers:
     return slope
 
 
-def _value(field: FineField, row: NDArray[Any], node: NDArray[Any]) -> Numbers:
-    """Return the values of nodes of blocks, (n,); NaN where there is no block, row -1."""
-    values: Numbers = field.blocks[node, row].astype(np.float64)
-    values[row < 0] = np.nan
-    return values
-
-
 @lru_cache
 def _walks(factor: int) -> list[list[tuple[Index, Index]]]:
-    """Return where walks of -2, -1, 1 and 2 nodes along each axis end, from each node of a block.
-
-    Each is the place of the neighbouring voxel, (Q,), and the node in its block, (Q,).
-    """
+    """Return the neighbours, (Q,), and nodes, (Q,), -2, -1, 1 and 2 nodes away along each axis."""
     side = factor + 1
 
     def walk(axis: int, step: int) -> tuple[Index, Index]:
@@ -194,7 +172,11 @@ def settle_planes(patches: Patches, own: Planes) -> Planes:
     weighted by trust, by how alike the normals are, and by how near it lies to the plane.
     """
     one, other = pairs_in_patches(patches)
-    trust = own.trust * square_falloff(_roughness(own, one, other) / ROUGH) + LEAST_TRUST
+    rough: Numbers = np.zeros(len(own.trust))  # the largest 1 - cosine in patches
+    for some in chunks_of(len(one), PAIR_TEMPORARIES):
+        turned = 1 - dot(own.normal[one[some]], own.normal[other[some]])
+        np.maximum.at(rough, one[some], turned)
+    trust = own.trust * square_falloff(rough / ROUGH) + LEAST_TRUST
     planes = Planes(own.point, own.normal, trust)
     unsettled = np.any((trust < SETTLED)[patches.crossing] & patches.there, axis=1)
     beside = dilate(patches, cast(BoolArray, unsettled), SMOOTHED_RINGS, len(trust))
@@ -211,15 +193,6 @@ def settle_planes(patches: Patches, own: Planes) -> Planes:
         ]
         planes = Planes(*(np.concatenate(arrays) for arrays in zip(*parts)))
     return planes
-
-
-def _roughness(own: Planes, one: Index, other: Index) -> Numbers:
-    """Return the largest 1 - cosine of each crossing's normal and those in its patches, (n,)."""
-    rough: Numbers = np.zeros(len(own.trust))
-    for some in chunks_of(len(one), PAIR_TEMPORARIES):
-        turned = 1 - dot(own.normal[one[some]], own.normal[other[some]])
-        np.maximum.at(rough, one[some], turned)
-    return rough
 
 
 def _settle_once(

@@ -1,15 +1,7 @@
 """Edges and corners that lean on the samples' spheres.
 
-An exact sample x with distance d is the centre of a sphere of radius |d| that the surface touches
-and does not pierce. The foot point of a sample in the cone of normals of an edge, outside a convex
-one or inside a concave one, lies on the edge: its sphere says where the edge is, and whether there
-is one at all. In steps:
-
-1. ``wedges_of`` reads the two faces, their edge's direction and the point where all planes meet
-   off the planes of a patch.
-2. ``find_spheres`` lists the spheres that pass near each edge.
-3. ``lean`` moves each point so that the planes and the spheres agree.
-4. ``Contact`` says how well the spheres agree with the result.
+The foot point of a sample in the cone of normals of an edge, outside a convex one or inside a
+concave one, lies on the edge: its sphere says where the edge is, and whether there is one at all.
 
 References
 ----------
@@ -24,13 +16,15 @@ Positions and lengths are in coarse spacings, from node (0, 0, 0) of the fine la
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import BoolArray, IntArray
 from ..field import SampleSpheres
-from .planes import Numbers, Vectors, dot, length, square_falloff, sums, unit
+from .patches import Numbers, Vectors, dot, length, unit
+from .planes import square_falloff, sums
 
 ALONG = 0.6  # distance along an edge at which a sphere counts for a quarter
 FARTHEST_ALONG = 1.8
@@ -69,17 +63,19 @@ class Wedges:
         return dot(self.sides[:, 0], self.sides[:, 1])
 
 
-@dataclass(frozen=True, eq=False)
-class Nearby:
+class Nearby(NamedTuple):
     """Pairs of a wedge and a sphere that passes near it, in the order of the wedges."""
 
     wedge: NDArray[np.int64]  # (n,)
     centre: Vectors  # (n, 3), the sample
     distance: Numbers  # (n,), its signed distance
 
+    def count_of(self, which: BoolArray, count: int) -> IntArray:
+        """Return how many of the chosen spheres each of ``count`` wedges has."""
+        return np.bincount(self.wedge[which], minlength=count).astype(np.int32)
 
-@dataclass(frozen=True, eq=False)
-class Contact:
+
+class Contact(NamedTuple):
     """How spheres stand to the edges that they are near."""
 
     direction: Vectors  # (n, 3), from the sample to the edge, of unit length
@@ -90,10 +86,7 @@ class Contact:
 
     @property
     def is_close(self) -> BoolArray:
-        """Whether the sphere is so near along the edge that this may not pierce it.
-
-        Further on the edge may have ended, at a corner, or turned.
-        """
+        """Whether the sphere may not be pierced: further on, the edge may have ended or turned."""
         return np.abs(self.along) < CLOSE_BY
 
 
@@ -111,22 +104,16 @@ def wedges_of(
     inverse = np.where(values > RANK * values[:, -1:], 1 / np.maximum(values, 1e-9), 0)
     step = np.einsum("pij,pj->pi", vectors, inverse * np.einsum("pij,pi->pj", vectors, right))
     peak = middle + step
-    one, other = _most_different(normal, there)
+    cosine = np.einsum("pei,pfi->pef", normal, normal)
+    cosine[~(there[:, :, None] & there[:, None, :])] = 2
+    least = cosine.reshape(len(cosine), there.shape[1] ** 2).argmin(1)
+    one, other = np.divmod(least, there.shape[1])
     row = np.arange(len(peak))
     sides = np.stack([normal[row, one], normal[row, other]], 1)
     above = dot(point[row, one] - peak, sides[:, 1]) + dot(point[row, other] - peak, sides[:, 0])
     convex = np.where(above < 0, 1.0, -1.0)
     corner = values[:, 0] > RANK * values[:, -1]
     return Wedges(voxel, peak, vectors[:, :, 0], corner, sides, convex, stiffness)
-
-
-def _most_different(normal: Vectors, there: BoolArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the places of the two normals of each patch whose cosine is least, (f,) each."""
-    cosine = np.einsum("pei,pfi->pef", normal, normal)
-    cosine[~(there[:, :, None] & there[:, None, :])] = 2
-    least = cosine.reshape(len(cosine), there.shape[1] ** 2).argmin(1)
-    one, other = np.divmod(least, there.shape[1])
-    return one, other
 
 
 def find_spheres(wedges: Wedges, spheres: SampleSpheres) -> Nearby:
@@ -139,68 +126,42 @@ def find_spheres(wedges: Wedges, spheres: SampleSpheres) -> Nearby:
     near = Nearby(wedge, centre, distance)
     contact = contact_of(wedges, near)
     kept = np.abs(contact.gap) < FARTHEST_SPHERE
-    kept &= (np.abs(contact.along) < FARTHEST_ALONG) & (np.abs(near.distance) < LARGEST_RADIUS)
-    return Nearby(wedge[kept], near.centre[kept], near.distance[kept])
+    kept &= (np.abs(contact.along) < FARTHEST_ALONG) & (np.abs(distance) < LARGEST_RADIUS)
+    return Nearby(wedge[kept], centre[kept], distance[kept])
 
 
 def contact_of(wedges: Wedges, near: Nearby) -> Contact:
-    """Return how spheres stand to edges now."""
+    """Return how spheres stand to edges now; none must touch a corner: few samples could."""
     wedge = near.wedge
-    away = wedges.point[wedge] - near.centre
+    away, convex = wedges.point[wedge] - near.centre, wedges.convex[wedge]
     along = np.where(wedges.corner[wedge], 0, dot(away, wedges.tangent[wedge]))
     across = away - along[:, None] * wedges.tangent[wedge]
     direction, radius = unit(across), length(across)
-    return Contact(
-        direction,
-        along,
-        radius - np.abs(near.distance),
-        _in_cone(wedges, near, -direction) & (radius > LEAST_RADIUS),
-    )
-
-
-def _in_cone(wedges: Wedges, near: Nearby, direction: Vectors) -> BoolArray:
-    """Return whether directions from edges to samples, (n, 3), lie between the two normals.
-
-    Never at a corner: the cone of three normals is narrow, and few samples lie in it.
-    """
-    wedge = near.wedge
-    outward = direction * wedges.convex[wedge, None]
+    outward = -direction * convex[:, None]
     first, second = (dot(outward, wedges.sides[wedge, side]) for side in (0, 1))
     cosine = wedges.cosine[wedge]
-    between = (first > cosine * second) & (second > cosine * first)
-    faces_it: BoolArray = np.sign(near.distance) == wedges.convex[wedge]
-    return between & faces_it & ~wedges.corner[wedge]
+    in_cone = (first > cosine * second) & (second > cosine * first) & ~wedges.corner[wedge]
+    in_cone &= (np.sign(near.distance) == convex) & (radius > LEAST_RADIUS)
+    return Contact(direction, along, radius - np.abs(near.distance), in_cone)
 
 
 def lean(wedges: Wedges, near: Nearby) -> Wedges:
-    """Return the wedges with points at which planes and spheres agree best."""
-    start = wedges.point
+    """Return the wedges with points at which planes and spheres agree best, by least squares."""
+    start, count, wedge = wedges.point, len(wedges.point), near.wedge
     hold = wedges.stiffness * HOLD
-    along = wedges.tangent[:, :, None] * wedges.tangent[:, None, :]
-    hold = hold + 1e-3 * IDENTITY + np.where(wedges.corner, 0, 1e3)[:, None, None] * along
+    tangent = wedges.tangent[:, :, None] * wedges.tangent[:, None, :]
+    hold = hold + 1e-3 * IDENTITY + np.where(wedges.corner, 0, 1e3)[:, None, None] * tangent
     for _ in range(ITERATIONS):
-        matrix, pull = _pull_of_spheres(wedges, near)
+        direction, along, gap, in_cone = contact = contact_of(wedges, near)
+        counts = in_cone | (contact.is_close & (gap < -PIERCED))
+        weight = counts * square_falloff(along / ALONG) / (1 + (gap / OFF_SPHERE) ** 2)
+        pull = -sums(wedge, (weight * gap)[:, None] * direction, count)
+        rows = [
+            sums(wedge, (weight * component)[:, None] * direction, count)
+            for component in direction.T
+        ]
         back = np.einsum("pij,pj->pi", wedges.stiffness * HOLD, start - wedges.point)
-        step = np.linalg.solve(hold + matrix, (pull + back)[..., None])[..., 0]
+        step = np.linalg.solve(hold + np.stack(rows, 1), (pull + back)[..., None])[..., 0]
         point = wedges.point + np.clip(step, -LONGEST_STEP, LONGEST_STEP)
         wedges = replace(wedges, point=point)
     return wedges
-
-
-def _pull_of_spheres(wedges: Wedges, near: Nearby) -> tuple[Vectors, Vectors]:
-    """Return matrix (f, 3, 3) and right side (f, 3) of the spheres' part in the least squares."""
-    count, wedge, contact = len(wedges.point), near.wedge, contact_of(wedges, near)
-    counts = contact.in_cone | (contact.is_close & (contact.gap < -PIERCED))
-    off = contact.gap / OFF_SPHERE
-    weight = counts * square_falloff(contact.along / ALONG) / (1 + off * off)
-    pull = -sums(wedge, (weight * contact.gap)[:, None] * contact.direction, count)
-    rows = [
-        sums(wedge, (weight * contact.direction[:, axis])[:, None] * contact.direction, count)
-        for axis in range(3)
-    ]
-    return np.stack(rows, 1), pull
-
-
-def count_by_wedge(near: Nearby, which: BoolArray, count: int) -> IntArray:
-    """Return how many of the chosen spheres each of ``count`` wedges has."""
-    return np.bincount(near.wedge[which], minlength=count).astype(np.int32)
