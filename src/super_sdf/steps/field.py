@@ -19,6 +19,7 @@ from ..grid.field import NONE_EXACT, Field
 from ..grid.planes import SamplePlanes
 from ..grid.sdf_grid import SdfGrid
 from ..machine.resources import chunks_of
+from ..options import EXACT, NOISY
 from .band import rescale
 from .nodes import (
     BARELY_INSIDE,
