@@ -90,7 +90,7 @@ def test_copies_of_shared_nodes_stay_equal_and_samples_keep_their_values():
     band, voxel_ijk, exact = blocks_of(ball())
     table = neighbour_table(band.voxel_ijk, band.shape)
     voxels = np.flatnonzero(band.decoded)
-    parts = share_parts(pipeline.rows_among(voxels, len(table))[table[voxels]])
+    parts = share_parts(pipeline.nodes.rows_among(voxels, len(table))[table[voxels]])
     wrong = exact + np.random.default_rng(0).normal(0, 0.2, exact.shape).astype(np.float32)
     wrong[:, 62] = exact[:, 62]
     blocks = np.pad(wrong.T, ((0, 0), (0, 1)))

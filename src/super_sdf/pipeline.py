@@ -28,22 +28,13 @@ from .network.network import load_network
 from .progress import STEPS, Progress, StepCounter
 from .slabs.cutting import Slab
 from .slabs.preparing import Piece, Run, describe_piece, prepare
+from .steps import nodes
 from .steps.band import BandSummary
 from .steps.bounds import keep_within_bounds
 from .steps.cap import check_can_close, close, seen_octants
 from .steps.debris import count_between, drop_debris
 from .steps.field import FineField, SampleSpheres
 from .steps.meshers import extract_pieces, find_mesher
-from .steps.nodes import (
-    VoxelIndex,
-    average_shared,
-    block_offsets,
-    hold_sides,
-    pin_to_skipped,
-    rows_among,
-    share_parts,
-    signs_of_skipped,
-)
 from .steps.spheres import fit_to_spheres, spheres_of_band
 from .steps.spline import interpolate
 from .steps.survey import Band, no_surface
@@ -61,26 +52,25 @@ def refine(
     steps = steps or StepCounter()
     patches, table, voxels = inputs = band.network_inputs(slab.seen, slab.decoded)
     seen_ijk, exact = band.voxel_ijk[slab.seen], np.flatnonzero(band.exact[slab.seen])
-    unseen = band.field.unseen
     own_ijk = seen_ijk[voxels]
     if band.field.smooth is None:
-        progress = steps.within("network")
-        blocks = decode(network, inputs, block_offsets(factor), progress, threads)  # Eqs. 3, 5
+        progress, offsets = steps.within("network"), nodes.block_offsets(factor)
+        blocks = decode(network, inputs, offsets, progress, threads)  # Eqs. 3, 5
     else:
         blocks = interpolate(band, network, factor, own_ijk, inputs, threads)
     steps.finish("network")
 
-    parts = share_parts(rows_among(voxels, len(table))[table[voxels]])
-    index = VoxelIndex(own_ijk, band.shape)
-    average_shared(blocks, parts, factor, threads)  # Eq. 7
+    parts = nodes.share_parts(nodes.rows_among(voxels, len(table))[table[voxels]])
+    index = nodes.VoxelIndex(own_ijk, band.shape)
+    nodes.average_shared(blocks, parts, factor, threads)  # Eq. 7
     spheres = spheres_of_band(seen_ijk, patches, exact, band.shape, band.limits, threads)
     fit_to_spheres(blocks, parts, factor, spheres, index, threads)
     del spheres
     keep_within_bounds(blocks, parts, factor, own_ijk, band.trusted, threads)
     if band.field.kind == options.MASK:
-        hold_sides(blocks, factor, patches, voxels)
-    skipped = signs_of_skipped(parts, own_ijk, patches, voxels, band.shape)
-    pinned = pin_to_skipped(blocks[:, :-1], parts, factor, skipped)
+        nodes.hold_sides(blocks, factor, patches, voxels)
+    skipped = nodes.signs_of_skipped(parts, own_ijk, patches, voxels, band.shape)
+    pinned = nodes.pin_to_skipped(blocks[:, :-1], parts, factor, skipped)
     touching = SampleSpheres(band.shape, seen_ijk[exact], patches[exact, CENTRE].copy())
     dropped, lone = drop_debris(blocks, factor, parts, index, touching)
     steps.finish("nodes")
@@ -95,7 +85,7 @@ def refine(
         spheres=touching,
         decoded_voxels=int(band.decoded_before[-1]),
         leaves=band.leaves,
-        octants=None if unseen is None else seen_octants(unseen, own_ijk),
+        octants=None if band.field.unseen is None else seen_octants(band.field.unseen, own_ijk),
     )
 
 
