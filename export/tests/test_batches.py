@@ -11,8 +11,7 @@ from export.dataset import Sample
 from export.tests.small_net import small_net
 from super_sdf.neighbourhood import CENTRE, NEIGHBOURHOOD
 from super_sdf.network.decoder import to_blocks
-from super_sdf.pipeline import rows_among
-from super_sdf.steps.nodes import average_shared, block_offsets, share_parts
+from super_sdf.steps.nodes import average_shared, block_offsets, rows_among, share_parts
 
 
 def ball_sample(factor=4):
