@@ -8,7 +8,6 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -252,7 +251,8 @@ def load_chosen(options: dict[str, Any]) -> Network:
     chosen = {name: options[name] for name in ("device", "threads", "precision")}
     with ThreadPoolExecutor(1) as pool:
         loading = pool.submit(load_network, chosen_model(options), **chosen)
-        import_module("super_sdf.convert")  # onnxruntime needs no interpreter while it loads
+        from .. import convert  # noqa: F401  # onnxruntime needs no interpreter while it loads
+
         return loading.result()
 
 
