@@ -12,7 +12,7 @@ import click
 from ..errors import OptionError, SuperSdfError
 from ..files.formats import NAMED, list_formats
 from ..machine.extras import check_modules
-from ..options import QUALITIES, ConvertOptions
+from ..options import MESH_FORMATS, QUALITIES, ConvertOptions
 from ..progress import Progress, Stopwatch
 from .common import (
     CONTEXT,
@@ -44,7 +44,7 @@ HELP = f"""Refine the signed distance grid IN and write its surface as the mesh 
 IN is a grid file: {list_formats()}. FILE:NAME names one of several arrays in a {NAMED}
 file. An .npz file has the keys values, spacing, origin and direction.
 
-OUT is a .ply, .stl, .obj, .off, .glb or .3mf file.
+OUT is a mesh file: {', '.join(f'.{name}' for name in MESH_FORMATS[:-1])} or .{MESH_FORMATS[-1]}.
 """
 EXAMPLES = """\b
 Examples:
