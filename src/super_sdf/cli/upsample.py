@@ -44,7 +44,7 @@ HELP = f"""Refine the signed distance grid IN and write its surface as the mesh 
 IN is a grid file: {list_formats()}. FILE:NAME names one of several arrays in a {NAMED}
 file. An .npz file has the keys values, spacing, origin and direction.
 
-OUT is a mesh file: {', '.join(f'.{name}' for name in MESH_FORMATS[:-1])} or .{MESH_FORMATS[-1]}.
+OUT is a mesh file: {", ".join(f".{name}" for name in MESH_FORMATS[:-1])} or .{MESH_FORMATS[-1]}.
 """
 EXAMPLES = """\b
 Examples:
