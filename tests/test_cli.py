@@ -51,7 +51,7 @@ def test_json_has_counts_times_and_findings(here, command):
     assert (code, err) == (0, "")
     assert report["origin"] == [1, 2, 3] and report["inferred"] == [] and report["warnings"] == []
     assert report["triangles"] > report["vertices"] > report["band_voxels"] > 0
-    stages = ["start", "load network", "read", "band", "network", "nodes", "isosurface", "write"]
+    stages = ["load network", "read", "band", "network", "nodes", "isosurface", "write"]
     assert list(report["seconds"]) == stages
 
 

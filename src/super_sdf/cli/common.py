@@ -244,8 +244,8 @@ def chosen_model(options: dict[str, Any]) -> str:
     return str(options["model"])
 
 
-def load_chosen(options: dict[str, Any]) -> Network:
-    """Load the network that the options of a command choose; import the rest meanwhile."""
+def load_chosen(options: dict[str, Any], meanwhile: Callable[[], None] = lambda: None) -> Network:
+    """Load the network that a command's options choose; import the rest, and more, meanwhile."""
     from ..network.network import load_network
 
     chosen = {name: options[name] for name in ("device", "threads", "precision")}
@@ -253,6 +253,7 @@ def load_chosen(options: dict[str, Any]) -> Network:
         loading = pool.submit(load_network, chosen_model(options), **chosen)
         from .. import convert  # noqa: F401  # onnxruntime needs no interpreter while it loads
 
+        meanwhile()
         return loading.result()
 
 

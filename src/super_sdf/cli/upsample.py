@@ -106,9 +106,7 @@ class Upsampling:
         watch = Stopwatch()
         self.source, self.target, self.options = source, target, options
         self.chosen, self.model = chosen, chosen_model(options)
-        self._check_arguments()
-        watch.lap("start")
-        self.network = load_chosen(options)
+        self.network = load_chosen(options, meanwhile=self._check_arguments)
         watch.lap("load network")
         self.seconds = watch.seconds
         self.result: Conversion
