@@ -136,7 +136,7 @@ def test_on_windows_signals_are_not_blocked(monkeypatch):
     assert work([2], square, 1) == {2: 4}
 
 
-@pytest.mark.parametrize("flag", {"-I", pool.SAFE_PATH})
+@pytest.mark.parametrize("flag", sorted({"-I", pool.SAFE_PATH}))
 def test_no_process_runs_files_of_the_current_folder(tmp_path, flag):
     """Python 3.10 has no other flag than -I, which must not keep workers from ``PYTHONPATH``."""
     code = f"""
