@@ -28,7 +28,7 @@ from super_sdf.neighbourhood import CENTRE
 from super_sdf.network.onnx import CHUNK_INPUT
 from super_sdf.steps.band import DECODE_LIMIT, MAX_DIFFERENCE
 
-CHUNK = 512  # voxels at a time; on a CPU 256 to 2048 differ by a few percent
+CHUNK = 512  # voxels at a time; the runtime chooses its own, see ``cpu_chunk``
 EARLY = "_early"  # the block for voxels that go no deeper
 THRESHOLD = "gate.threshold"  # an input with a default, like the chunk
 

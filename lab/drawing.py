@@ -171,7 +171,7 @@ def draw_panel(
     import pyvista  # takes a second
     from vtkmodules.vtkCommonCore import vtkLogger as log  # noqa: N813
 
-    log.SetStderrVerbosity(log.VERBOSITY_ERROR)  # VTK warns of no display, and draws without one
+    log.SetStderrVerbosity(log.VERBOSITY_ERROR)  # no warning that there is no display
     look: dict[str, Any] = SHADED
     if colour == "normal":
         look = {"scalars": face_colours(panel.mesh), "rgb": True, "lighting": False}

@@ -13,6 +13,7 @@ from super_sdf import load_network, reconstruct, upsample
 from super_sdf.errors import DeviceError, FileError, ModelError, OptionError
 from super_sdf.network.decoder import check_output, to_blocks
 from super_sdf.network.network import KIND_MODELS, Network, shipped_models
+from super_sdf.network.onnx import CORE_CHUNK, CPU_CHUNK, cpu_chunk
 from super_sdf.options import QUALITIES
 from super_sdf.steps.band import find_band, gather_patches, neighbour_table, rescale
 from super_sdf.steps.nodes import block_offsets
@@ -275,3 +276,12 @@ def test_a_path_that_is_no_model_file_is_an_error_of_one_line(tmp_path, command,
     assert (code, out, err.count("\n")) == (1, "", 1) and err.startswith("Error: ")
     assert "own.onnx" in err or kind in ("long", "NUL")
     assert not (tmp_path / "out.ply").exists()
+
+
+@pytest.mark.parametrize("voxels", [1, 511, 512, 1023, 1024, 50_000])
+@pytest.mark.parametrize("threads", [1, 2, 64])
+def test_chunks_on_the_cpu_are_equal_and_leave_a_row_free(voxels, threads):
+    rows = cpu_chunk(voxels, threads)
+    chunks = -(-(voxels + 1) // rows)
+    assert rows <= min(CORE_CHUNK * threads, CPU_CHUNK)
+    assert chunks * rows - (voxels + 1) < chunks  # less than a row of each is padding

@@ -172,7 +172,7 @@ def refusal(path: Path, content: bytes, kind: type[Exception] = FileError) -> st
 
 
 def test_damaged_leaves_and_lengths(tmp_path):
-    """Of voxels that it states and lacks, of a string of 4 GB, and of no voxel at all."""
+    """The file states more voxels than it holds, a string of 4 GB, or no voxel at all."""
     path, hundred = tmp_path / "a.vdb", mask(*range(100), size=512)
     leaf = bytes([0]) + np.ones(100, "<f4").tobytes()
     said = refusal(path, one_leaf(leaf, hundred, flags=ACTIVE_MASK, count=188574))

@@ -33,7 +33,7 @@ def make_cases(seed: int = 0) -> list[Case]:
 
 
 def spread(cases: list[Case], count: int, seed: int = 0) -> list[Case]:
-    """Return so many of the cases, evenly over the list; the seed says where it begins."""
+    """Return ``count`` cases at even steps along the list; the seed decides the first."""
     step = max(1.0, len(cases) / count)
     first = (seed * 0.618) % 1 * step
     return [cases[int(first + k * step)] for k in range(min(count, len(cases)))]

@@ -125,7 +125,7 @@ class Run:
 
 
 class Queue:
-    """The jobs of a run that were not started yet; each may hold so many bytes, if that is given.
+    """The jobs of a run that were not started yet, and the bytes that each may hold, if limited.
 
     Whether a job may replace its output is decided when it starts: that may have changed meanwhile.
     """

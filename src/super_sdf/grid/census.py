@@ -267,7 +267,7 @@ class Question(NamedTuple):
 
 
 def _questions(shape: Shape) -> dict[str, Question]:
-    """Return all that is asked of the samples of a grid."""
+    """Return by name the work of the census: which planes each part needs, and who answers."""
     count, size, step = shape[0], shape[1] * shape[2], _planes_together(shape)
     numbers = [(i, min(i + step, count), i == 0, i + step >= count) for i in range(0, count, step)]
     far, near = (  # planes with others beside them; none of a narrow grid

@@ -50,7 +50,7 @@ VALUE_BYTES = 8.0
 USUAL_CHANNELS = 64  # of a network whose card does not say
 SYMMETRY_BYTES = (600.0, 4.0)
 NO_NETWORKS = "super-sdf was installed without its networks: install it again"
-TRIAL_ROWS = 1024  # voxels of a run on the CPU that measures the pace: two chunks
+TRIAL_ROWS = 1024  # voxels of a run on the CPU that measures the pace
 MASK_MODEL, NOISY_MODEL = "mask", "noisy"
 KIND_MODELS = (MASK_MODEL, NOISY_MODEL)
 """The shipped networks that replace others for a kind of field."""
