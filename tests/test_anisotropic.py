@@ -219,6 +219,11 @@ def test_the_note_names_what_is_resampled():
     )
 
 
+def test_equal_spacings_are_not_resampled():
+    grid = make_grid(sampled((0.4, 0.4, 0.4)), spacing=(0.4, 0.4, 0.4003))
+    assert cubic_grid(grid) is grid
+
+
 def test_interpolated_values_do_not_make_a_noisy_field(network):
     """A thin plate across the coarse axis: what lies between its samples is a guess."""
     spacing = (0.25, 0.25, 0.75)

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 import trimesh
+from conftest import ball
 
 from super_sdf.errors import GridError
 from super_sdf.grid.refusals import BEYOND, FAR
@@ -153,3 +154,9 @@ def test_the_level_that_is_named_for_densities_is_one_of_the_values(width, optio
     values = 1 / (1 + np.exp((np.linalg.norm(steps, axis=0) - 8) / width))
     with pytest.raises(GridError, match=rf"{DENSITY}0\.5 --inside positive"):
         make_grid(values, spacing=1.0, **options)
+
+
+def test_solids_with_samples_inside_are_meshed_without_a_warning(tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    np.save("ball.npy", ball().values)
+    assert json.loads(command("upsample", "ball.npy", "a.ply", "--json")[1])["warnings"] == []
