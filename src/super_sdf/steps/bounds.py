@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -37,7 +38,9 @@ REACH_OF_SAMPLES = 4  # voxels from a block's sample to those that bound its val
 # A sample counts where the block's own sample is this close to its bound. Nearly all bounds that
 # values exceed are so, and one in ten of the others.
 SLACK = 1.0
-MARGIN = 0.05  # a sphere as near to the values at 27 nodes is looked at: others lie between
+# A block stays as it is unless a value at 27 of its nodes is so far beyond a bound. Otherwise the
+# spheres that are nearly as far as these values count: other nodes lie between.
+EXCEEDED, MARGIN = 0.002, 0.05
 CONTRADICTION = 0.02  # that far beyond a bound, one of two samples is no distance
 # With larger cells the fit to the spheres makes up for what linear cells cut off, and bounds, which
 # hold for true distances, would undo half of that.
@@ -119,7 +122,7 @@ def keep_within_bounds(
     samples: TrustedSamples,
     threads: int = 1,
 ) -> None:
-    """Move values to the nearest ones that the samples around allow.
+    """Move values that clearly exceed the samples' bounds to the nearest that these allow.
 
     Samples keep their values, and so do blocks whose own sample is not trusted, but for the nodes
     that they share with others, which are averaged again. Where no sample beyond the band can be
@@ -128,25 +131,33 @@ def keep_within_bounds(
     """
     if factor < LEAST_FACTOR or not reach_beyond(samples.limits) or not samples.exact.any():
         return
-    bounded, thin = blocks.copy(), np.zeros(blocks.shape[1], bool)
+    thin = np.zeros(blocks.shape[1], bool)
 
-    def work(rows: slice) -> None:
+    def work(rows: slice) -> list[tuple[Rows, FloatArray]]:
+        moves = []
         for group in cut_to_boxes(voxel_ijk, rows):
             flat, start, steps = samples_around(voxel_ijk[group], samples)
             for some in chunks_of(len(start), max(SPHERES * len(blocks), TEMPORARIES)):
                 here = slice(group.start + some.start, group.start + some.stop)
                 values = np.ascontiguousarray(blocks[:, here].T)
                 moved = bounded_values(values, factor, flat.take(start[some, None] + steps))
-                thin[here] = loses_wall(values, moved)
-                bounded[:, here] = moved.T
+                changed = np.flatnonzero((moved != values).any(1))
+                moved = moved[changed]
+                thin[here.start + changed] = loses_wall(values[changed], moved)
+                moves.append((here.start + changed, moved))
+        return moves
 
-    map_chunks(work, len(voxel_ijk), CHUNK // BOX_ROWS, threads)
+    moves = map_chunks(work, len(voxel_ijk), CHUNK // BOX_ROWS, threads)
     kept = thin.copy()  # and the blocks that share a face with a thin wall
     for stride in STRIDES:
         for place in (CENTRE - int(stride), CENTRE + int(stride)):
             kept[:-1] |= thin[parts.table[place]]
-    np.copyto(blocks, bounded, where=~kept)
-    average_shared(blocks, parts, factor, threads)
+    touched = np.zeros(blocks.shape[1], bool)
+    for rows, moved in chain.from_iterable(moves):
+        free = ~kept[rows]
+        blocks[:, rows[free]] = moved[free].T
+        touched[parts.table[:, rows[free]]] = True
+    average_shared(blocks, parts, factor, threads, np.flatnonzero(touched[:-1]))
 
 
 def cut_to_boxes(voxel_ijk: IntArray, rows: slice) -> Iterator[slice]:
@@ -180,7 +191,7 @@ def bounded_values(values: FloatArray, factor: int, around: FloatArray) -> Float
     slack = np.subtract(around, own)
     np.abs(slack, out=slack)
     np.subtract(sample_places()[1], slack, out=slack)
-    row, place = np.nonzero(slack < SLACK)
+    row, place = np.divmod(np.flatnonzero(slack < SLACK), slack.shape[1])
     sample = around[row, place]
     for side in (1, -1):
         some = np.flatnonzero(side * sample > 0)
@@ -202,16 +213,19 @@ def move_out(
     ``place`` where its centre is, as a row of ``sample_places``.
     """
     looked_at, to_nodes = nodes_to_look_at(factor), node_distances(factor)
-    depth = values[:, looked_at].take(row, 0)
-    depth -= sample[:, None]
-    depth *= -side
-    depth -= to_nodes[:, looked_at].take(place, 0)
-    near = (depth > -MARGIN).view(np.uint64)  # eight nodes in each number
-    reaching = np.flatnonzero(near[:, 0] | near[:, 1] | near[:, 2] | near[:, 3])
+    reached = (np.float32(-side) * values[:, looked_at]).take(row, 0)
+    reached += np.abs(sample)[:, None]  # nearer to the centre, a node exceeds its bound
+    apart = to_nodes[:, looked_at]
+    exceeded = np.zeros(len(values), bool)
+    exceeded[row[_any_node(reached > (apart + np.float32(EXCEEDED)).take(place, 0))]] = True
+    near = np.flatnonzero(exceeded[row])
+    far_enough = (apart - np.float32(MARGIN)).take(place.take(near), 0)
+    reaching = near[_any_node(reached.take(near, 0) > far_enough)]
     row, place, sample = row.take(reaching), place.take(reaching), sample.take(reaching)
     count = np.bincount(row, minlength=len(values))
     first = np.cumsum(count) - count
     most = np.argsort(-count, kind="stable")  # blocks with many spheres first
+    most = most[: np.count_nonzero(count)]
     beyond, tightest = (np.subtract, np.maximum) if side > 0 else (np.add, np.minimum)
     moved = values.take(most, 0)
     for nth, blocks in enumerate(np.cumsum(np.bincount(count)[::-1])[-2::-1]):
@@ -220,6 +234,12 @@ def move_out(
         beyond(sample.take(some)[:, None], bound, out=bound)
         tightest(moved[:blocks], bound, out=moved[:blocks])
     values[most] = moved
+
+
+def _any_node(nodes: BoolArray) -> BoolArray:
+    """Return which rows of (k, 32) have a node that is True, (k,)."""
+    eight = nodes.view(np.uint64)  # eight nodes in each number
+    return (eight[:, 0] | eight[:, 1] | eight[:, 2] | eight[:, 3]).astype(bool)
 
 
 @lru_cache

@@ -156,16 +156,23 @@ def number_parts(parts: SharedParts, sizes: NDArray[np.int64]) -> tuple[IntArray
     return starts, count
 
 
-def average_shared(blocks: FloatArray, parts: SharedParts, factor: int, threads: int = 1) -> None:
+def average_shared(
+    blocks: FloatArray,
+    parts: SharedParts,
+    factor: int,
+    threads: int = 1,
+    rows: NDArray[np.intp] | None = None,
+) -> None:
     """Set each copy of a shared node to the mean of the copies (Eq. 7), in ``blocks`` (Q, D + 1).
 
-    Sums are taken in the order of the voxels and in double precision (in single for two numbers,
-    whose sum does not depend on the order), so that all copies get the same bits and the result
-    does not depend on how the work was divided.
+    Given ``rows``, only those of their blocks are set. Sums are taken in the order of the voxels
+    and in double precision (in single for two numbers, whose sum does not depend on the order), so
+    that all copies get the same bits and the result does not depend on how the work was divided.
     """
     groups = [axes for axes in product((False, True), repeat=3) if any(axes)]
     threads = worthwhile_threads(blocks.size, threads)
-    map_threads(lambda axes: _average_group(blocks, parts.table, factor, axes), groups, threads)
+    some = slice(0, blocks.shape[1] - 1) if rows is None else rows
+    map_threads(lambda axes: _average_group(blocks, parts, factor, axes, some), groups, threads)
 
 
 def copies_agree(blocks: FloatArray, parts: SharedParts, factor: int) -> bool:
@@ -182,27 +189,28 @@ def copies_agree(blocks: FloatArray, parts: SharedParts, factor: int) -> bool:
 
 
 def _average_group(
-    blocks: FloatArray, table: IntArray, factor: int, axes: tuple[bool, ...]
+    blocks: FloatArray,
+    parts: SharedParts,
+    factor: int,
+    axes: tuple[bool, ...],
+    rows: slice | NDArray[np.intp],
 ) -> None:
     """Average the nodes at the block's ends along ``axes`` and inside along the other axes."""
     places, nodes_at = _nodes_of_group(factor, axes)
     kind = np.float32 if len(places) == 2 else np.float64
     means = []
     for own in places:
-        total: NDArray[Any] = np.zeros((len(nodes_at[0]), table.shape[1]), kind)
-        times: NDArray[Any] = np.zeros(table.shape[1], kind)
+        total: NDArray[Any] = np.zeros((len(nodes_at[0]), len(parts.table[0, rows])), kind)
+        times: NDArray[Any] = np.zeros(total.shape[1], kind)
         for other, nodes in zip(places, nodes_at):
-            if other is own:
-                total += blocks[nodes, :-1]
-                times += 1
-                continue
-            voxel = table[CENTRE + int((own - other) @ STRIDES)].astype(np.intp)
+            voxel = parts.table[CENTRE + int((own - other) @ STRIDES), rows].astype(np.intp)
             times += voxel >= 0
             for row, node in enumerate(nodes):
-                total[row] += blocks[node].take(voxel)
+                total[row] += blocks[node, rows] if other is own else blocks[node].take(voxel)
         means.append((total / times).astype(np.float32))
     for nodes, mean in zip(nodes_at, means):
-        blocks[nodes, :-1] = mean
+        for node, values in zip(nodes, mean):
+            blocks[node, rows] = values
 
 
 @lru_cache

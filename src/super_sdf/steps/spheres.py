@@ -51,13 +51,13 @@ TEMPORARIES = 64  # numbers per sample in the search for its foot point
 PRIOR_WEIGHT = 0.2  # of the assumption that the error is 0, in foot points
 VARIANCE_PENALTY = 0.5  # how strongly disagreement of the errors reduces their mean
 CORNER_PARTS = np.flatnonzero(np.abs(NEIGHBOURHOOD).all(1))
-MEANS = (1, 2, 2)  # cells along a block of the lattices at which errors are averaged, in turn
+MEANS = {1: 1, 2: 2}  # how often errors are averaged on lattices of so many cells along a block
 
 # The fitted values of a block depend on this many planes of voxels to either side: one each time
 # that errors are averaged, for the foot points in the blocks beside; then the foot points' samples,
 # and the blocks in which these were searched for; and one for the averaging of shared nodes.
 SAMPLE_TO_FOOT = 2  # voxels: (MAX_DISTANCE + BEYOND) / 2, rounded
-REACH_IN_VOXELS = len(MEANS) + 2 * SAMPLE_TO_FOOT + 1
+REACH_IN_VOXELS = sum(MEANS.values()) + 2 * SAMPLE_TO_FOOT + 1
 
 CELL = np.indices((2, 2, 2)).reshape(3, 8).T
 """The corners of a cell, (8, 3)."""
@@ -321,24 +321,24 @@ def find_correction(feet: FootPoints, parts: SharedParts) -> FloatArray:
     """
     numbers, count = number_parts(parts, np.ones(27, np.int64))
     left, correction = feet.values, np.zeros(numbers.shape, np.float32)
-    for turn, cells in enumerate(MEANS, 1):
-        mean, at, shares = _mean_at_nodes(feet, left, numbers, count, cells)
-        if turn < len(MEANS):
+    for cells, turns in MEANS.items():
+        at, shares = _nodes_round(feet, numbers, cells)
+        own = numbers[CORNER_PARTS] if cells == 1 else numbers
+        for _ in range(turns):
+            mean = _mean_at_nodes(left, at, shares * feet.weights, count)
+            correction += prolong(mean.take(own), cells, 2)
             left = left - (mean.take(at) * shares).sum(0)
         del at, shares
-        own = numbers[CORNER_PARTS] if cells == 1 else numbers
-        correction += prolong(mean.take(own), cells, 2)
     return correction
 
 
-def _mean_at_nodes(
-    feet: FootPoints, values: FloatArray, numbers: IntArray, count: int, cells: int
-) -> tuple[FloatArray, NDArray[np.intp], FloatArray]:
-    """Return the weighted mean at each node of values (n,) at foot points in the cells round it.
+def _nodes_round(
+    feet: FootPoints, numbers: IntArray, cells: int
+) -> tuple[NDArray[np.intp], FloatArray]:
+    """Return the 8 nodes round each foot point, (8, n), and its trilinear weights there, (8, n).
 
-    The nodes, 0 to ``count - 1``, have ``numbers`` (27, D) by the part of each block; with 1 cell
-    along a block they are the corners of blocks, with 2 all parts. Returned are the mean, (count,);
-    the 8 nodes round each foot point, (8, n), and its trilinear weights for them, (8, n).
+    The nodes have ``numbers`` (27, D) by the part of each block; with 1 cell along a block they are
+    the corners of blocks, with 2 all parts.
     """
     low, within = _find_cell(feet.place, cells)
     step = STRIDES * (2 // cells)
@@ -348,14 +348,24 @@ def _mean_at_nodes(
     at *= numbers.shape[1]  # in place: these arrays are the largest of the fit
     at += feet.rows
     at[:] = numbers.ravel().take(at)
-    weight = (shares * feet.weights).astype(np.float64)
+    return at, shares
+
+
+def _mean_at_nodes(
+    values: FloatArray, at: NDArray[np.intp], weights: FloatArray, count: int
+) -> FloatArray:
+    """Return the mean at each of ``count`` nodes, (count,), of values (n,).
+
+    The ``weights`` (8, n) are of each value for the 8 nodes ``at``, (8, n).
+    """
+    weight = weights.astype(np.float64)
     sums: list[NDArray[np.float64]] = []
     for _ in range(3):  # of weights, values and squares
         total: NDArray[Any] = np.bincount(at.ravel(), weight.ravel(), count)
         sums.append(total)
         weight *= values
     means = map_chunks(lambda some: _shrunk_mean(*(s[some] for s in sums)), count, 8)
-    return np.concatenate(means), at, shares
+    return np.concatenate(means)
 
 
 def _shrunk_mean(
