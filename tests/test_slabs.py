@@ -156,6 +156,20 @@ def test_less_memory_makes_more_slabs_and_too_little_is_refused(bare_plan):
     assert len(plan_slabs(band, 4, 2, Resources(memory=None))) == 1
 
 
+def test_a_large_band_is_cut_where_that_costs_hardly_more(monkeypatch):
+    band, free = survey(SdfGrid.trusted(rod(112), (1.0,) * 3)), Resources(memory=None)
+    monkeypatch.setattr(cutting, "LARGE", len(band.voxel_ijk) // 4)
+
+    def seen(pieces):
+        slabs = cut(band, pieces, receptive_field=2, beside=1)
+        return sum(slab.seen.stop - slab.seen.start for slab in slabs)
+
+    for most, want in ((seen(2) - 1, 1), (seen(2), 2), (seen(3), 3), (10**9, 4)):
+        monkeypatch.setattr(cutting, "SEEN_AGAIN", most / len(band.voxel_ijk))
+        assert len(plan_slabs(band, 4, 2, free)) == want
+        assert len(plan_slabs(band, 4, None, free)) == 1
+
+
 def test_a_band_larger_than_memory_is_refused_while_it_is_read():
     with pytest.raises(
         OutOfMemoryError, match=r"the band of the first \d+ planes already takes \d MB of memory, "

@@ -13,9 +13,9 @@ The memory model, ``slab_bytes``, is measured by ``python -m lab figures --only 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,8 @@ from ..steps.survey import (
 
 DEFAULT = BY_NAME[DEFAULT_MESHER]
 SURFACE_SHARE, DOUBT = 0.25, "is this a distance field?"  # of which few samples are
+# Slabs cost no time if they see at most so many times as many voxels as one, each of them many.
+SEEN_AGAIN, LARGE = 1.15, 250_000
 REACH_IN_VOXELS = spheres.REACH_IN_VOXELS + bounds.REACH_IN_VOXELS + debris.REACH_IN_VOXELS
 
 
@@ -74,7 +76,7 @@ def plan_slabs(
     mesher: Mesher = DEFAULT,
     planes: tuple[int, int] | None = None,
 ) -> list[Slab]:
-    """Return the fewest slabs that fit in memory, in order."""
+    """Return the fewest slabs that fit in memory, in order; more where they take no more time."""
     check_vertices(band, factor)
     bound, need = resources.memory, 0
     beside = mesher.planes_beside(factor)
@@ -114,17 +116,24 @@ def refuse_band(
 def _ways(
     band: Band, receptive_field: int | None, beside: int, planes: tuple[int, int] | None = None
 ) -> Iterator[list[Slab]]:
-    """Yield the whole band, and, if the receptive field is known, more and more slabs of planes."""
-    if planes is None:
+    """Yield the whole band, and, if the receptive field is known, more and more slabs of planes.
+
+    The first are as many as take no more time than one.
+    """
+    least = 1 if receptive_field is None else count_free(band, receptive_field, beside, planes)
+    if planes is None and least == 1:
         yield [whole(band)]
     if receptive_field is None:
         return
     first, last = planes or (0, band.shape[0])
-    for pieces in range(1, max(last - first, 2)):
+    for pieces in range(least, max(last - first, 2)):
         yield cut(band, pieces, receptive_field, beside, planes)
     decoding = np.flatnonzero(np.diff(band.decoded_before[first : last + 1])) + first
     bounds = [first, *decoding.tolist()[1:], last]  # each slab decodes something
-    yield [slab_of(band, low, high, receptive_field, beside) for low, high in pairwise(bounds)]
+    yield [
+        slab_of(band, low, high, receptive_field, beside)
+        for low, high in itertools.pairwise(bounds)
+    ]
 
 
 def check_vertices(band: Band, factor: int) -> None:
@@ -176,7 +185,24 @@ def equal_parts(before: NDArray[np.int64], pieces: int) -> list[tuple[int, int]]
     share = before / max(int(before[-1]), 1)
     inner = np.searchsorted(share, np.arange(1, pieces) / pieces)
     last = len(before) - 1
-    return list(pairwise(sorted(set(np.clip([0, *inner, last], 0, last).tolist()))))
+    return list(itertools.pairwise(sorted(set(np.clip([0, *inner, last], 0, last).tolist()))))
+
+
+def count_free(
+    band: Band, receptive_field: int, beside: int, planes: tuple[int, int] | None = None
+) -> int:
+    """Return into how many slabs planes are cut in no more time: few voxels are seen twice."""
+
+    def seen(pieces: int) -> int:
+        slabs = cut(band, pieces, receptive_field, beside, planes)
+        return sum(slab.seen.stop - slab.seen.start for slab in slabs)
+
+    once = seen(1)
+    return next(
+        pieces
+        for pieces in itertools.count(1)
+        if once < LARGE * (pieces + 1) or seen(pieces + 1) > SEEN_AGAIN * once
+    )
 
 
 def slab_of(band: Band, first: int, last: int, receptive_field: int, beside: int) -> Slab:
