@@ -252,8 +252,10 @@ def load_chosen(options: dict[str, Any], meanwhile: Callable[[], None] = lambda:
     with ThreadPoolExecutor(1) as pool:
         loading = pool.submit(load_network, chosen_model(options), **chosen)
         from .. import convert  # noqa: F401  # onnxruntime needs no interpreter while it loads
+        from ..steps.cell_cases import triangle_table
 
         meanwhile()
+        triangle_table()  # it is kept
         return loading.result()
 
 
