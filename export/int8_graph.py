@@ -14,7 +14,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, numpy_helper
 
-from export.onnx_graph import EARLY, Writer, rows_of
+from export.onnx_graph import EARLY, Writer, declared, rows_of
 
 ONE = "int8_one"
 NONE = "int8_none"
@@ -31,10 +31,10 @@ class IntLayer:
 
 @dataclass(frozen=True, eq=False)
 class IntBlock:
-    """A residual block. Its features f are quantized as ``f / steps + zeros``, from 0 to 255."""
+    """A residual block. Its features f are quantized as ``f / step + zero``, from 0 to 255."""
 
-    steps: np.ndarray  # (C,) float32
-    zeros: np.ndarray  # (C,) uint8
+    step: np.float32
+    zero: np.uint8
     conv: IntLayer
     expand: IntLayer
     reduce: IntLayer
@@ -68,13 +68,15 @@ def replace_blocks(graph: onnx.GraphProto, blocks: list[IntBlock]) -> None:
     made_by = {name: node for node in graph.node for name in node.output}
     rounded: dict[str, str] = {}
     for scan, block in zip(scans, blocks, strict=True):
-        gathered = gathered_by(scan, made_by)
+        read = made_by[body_of(scan).node[1].input[0]]  # the first node gathers the table
+        gathered = made_by[read.input[2]] if read.op_type == "ScatterND" else read
         source = gathered.input[0]
         if source not in rounded:  # two blocks may read the same features
             rounded[source] = add_rounded(body_of(made_by[source]), block)
             made_by[source].output.append(rounded[source])
         gathered.input[0] = rounded[source]
-        replace_layers(body_of(scan), block)
+        keep_absent(graph, read, block)
+        replace_layers(scan, block)
 
 
 def body_of(scan: onnx.NodeProto) -> onnx.GraphProto:
@@ -85,40 +87,48 @@ def body_of(scan: onnx.NodeProto) -> onnx.GraphProto:
 def add_rounded(body: onnx.GraphProto, block: IntBlock) -> str:
     """Let a body return its features rounded, too, for the next block; return their name.
 
-    Rounded here they are still in cache. Absent voxels, exactly 0, become its zero points.
+    Rounded here they are still in cache.
     """
     features = body.output[0]
     writer = IntWriter(f"{body.name}_rounded_")
-    scaled = writer.op("Mul", features.name, writer.constant(1 / block.steps, "rates"))
-    moved = writer.op("Add", scaled, writer.constant(block.zeros.astype(np.float32), "zeros"))
-    rounded = writer.quantize(moved)
+    step, zero = writer.constant(block.step, "step"), writer.constant(block.zero, "zero")
+    rounded = writer.op("QuantizeLinear", features.name, step, zero)
     body.node.extend(writer.nodes)
     body.initializer.extend(writer.constants)
-    body.output.append(rows_of(rounded, TensorProto.UINT8, len(block.steps)))
+    body.output.append(rows_of(rounded, TensorProto.UINT8, len(block.reduce.scales)))
     return f"{rounded}_chunks"
 
 
-def gathered_by(scan: onnx.NodeProto, made_by: dict[str, onnx.NodeProto]) -> onnx.NodeProto:
-    """Return the node that flattens the features, (n, chunk, C), that a block gathers.
+def keep_absent(graph: onnx.GraphProto, read: onnx.NodeProto, block: IntBlock) -> None:
+    """Set the last row that a block reads, which index -1 refers to, to the zero point."""
+    writer, name = IntWriter(f"{read.name}_absent_"), read.output[0]
+    read.output[0] = f"{name}_written"
+    row = np.full((1, len(block.reduce.scales)), block.zero)
+    given = read.output[0], writer.constant(np.array([[-1]])), writer.constant(row)
+    writer.op("ScatterND", *given)
+    writer.nodes[0].output[0] = name
+    graph.node.insert(list(graph.node).index(read) + 1, writer.nodes[0])
+    graph.initializer.extend(writer.constants)
+    width = len(block.reduce.scales)  # shapes of one name: it is changed in place
+    for value in (f"{name}_written", name):
+        graph.value_info.append(declared(value, TensorProto.UINT8, ["padded", width]))
 
-    Those of some voxels only are written onto those of all.
-    """
-    flat = made_by[body_of(scan).node[1].input[0]]  # the first node gathers the table
-    return made_by[flat.input[2]] if flat.op_type == "ScatterND" else flat
 
-
-def replace_layers(body: onnx.GraphProto, block: IntBlock) -> None:
-    """Replace the layers of a block by integer ones; gathering and the residual sum stay."""
-    table, gather, reshape, *layers, kept, added = body.node
+def replace_layers(scan: onnx.NodeProto, block: IntBlock) -> None:
+    """Replace the layers of a block by integer ones, without the mask of the padding."""
+    body = body_of(scan)
+    table, gather, reshape, *_, kept, added = body.node
     shape = next(array for array in body.initializer if array.name == reshape.input[1])
     writer = IntWriter(f"{body.name}_int8_")
     value = reshape.output[0]
     for label, layer in (("conv", block.conv), ("expand", block.expand)):
         value = writer.quantize(writer.layer(value, layer, label))
     writer.layer(value, block.reduce, "reduce")
-    writer.nodes[-1].output[0] = layers[-1].output[0]
-    nodes = [table, gather, reshape, *writer.nodes, kept, added]
+    writer.nodes[-1].output[0] = kept.output[0]
+    nodes = [table, gather, reshape, *writer.nodes, added]
     constants = [shape, *writer.constants]
     del body.node[:], body.initializer[:]
     body.node.extend(nodes)
     body.initializer.extend(constants)
+    del scan.input[2], body.input[2]
+    next(a for a in scan.attribute if a.name == "num_scan_inputs").i = 2

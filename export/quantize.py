@@ -76,6 +76,10 @@ class Ranges:
         high = torch.stack([other.high for other in others]).amax(0)
         return replace(self, low=low, high=high)
 
+    def in_units(self, units: Tensor) -> Ranges:
+        """Return the ranges of features in these units."""
+        return replace(self, low=self.low / units, high=self.high / units)
+
 
 @torch.no_grad()
 def find_ranges(net: SuperSdfNet, samples: list[Prepared]) -> list[Ranges]:
@@ -107,24 +111,54 @@ def quantize(
     source: Path, target: Path, samples: list[Prepared], accuracy: str = "not measured"
 ) -> None:
     net = read_network(source)
+    ranges = find_ranges(net, samples)
+    units = units_of(ranges)
+    net, ranges = in_units(net, units), [each.in_units(units) for each in ranges]
     changed = {"name": target.stem, "precision": "int8", "accuracy": accuracy}
     write_model(net, target, {**read_card(source), **changed})
     model = onnx.load(target)
-    blocks = [whole_block(*pair) for pair in zip(net.all_blocks(), find_ranges(net, samples))]
+    blocks = [whole_block(*pair) for pair in zip(net.all_blocks(), ranges)]
     replace_blocks(model.graph, blocks)
     onnx.checker.check_model(model)
     onnx.save(model, target)
 
 
+def units_of(ranges: Sequence[Ranges]) -> Tensor:
+    """Return a unit for each channel of the features, (C,), in which their ranges are alike."""
+    most = torch.stack([torch.maximum(-each.low, each.high) for each in ranges])
+    units = (most / most.square().mean(1, keepdim=True).sqrt().clamp(min=1e-30)).amax(0)
+    return units.clamp(min=LEAST_STEP * units.max())
+
+
+@torch.no_grad()
+def in_units(net: SuperSdfNet, units: Tensor) -> SuperSdfNet:
+    """Return a network with the same values whose features are in these units."""
+    net, count = copy.deepcopy(net), len(units)
+    for block in net.all_blocks():
+        block.conv.weight *= units.repeat(27)[:, None]
+    for layer in (net.stem[2], *(block.reduce for block in net.all_blocks())):
+        layer.weight /= units[:, None]
+        layer.bias /= units
+    gates = [net.gate.layers[0]] if net.config.gated else []
+    for layer in (net.branch, net.correction, *gates):
+        layer.weight *= units
+    last = net.trunk.layers[-1]
+    last.weight[:count] *= units[:, None]
+    last.bias[:count] *= units
+    return net
+
+
 def whole_block(block: Block, ranges: Ranges) -> IntBlock:
-    steps = steps_of(ranges.high - ranges.low)
-    zeros = np.rint(-ranges.low.numpy() / steps).clip(0, LEVELS)
+    low, high = float(ranges.low.min()), float(ranges.high.max())
+    step = np.float32((high - low) / LEVELS or 1)
+    zero = np.uint8(np.rint(-low / step).clip(0, LEVELS))
     mixed, expanded = steps_of(ranges.mixed), steps_of(ranges.expanded)
-    plain = np.ones(len(steps))
+    plain, steps = np.ones(len(ranges.low)), np.full(len(block.conv.weight), step)
+    zeros = np.full(len(plain), float(zero))
     return IntBlock(
-        steps,
-        zeros.astype(np.uint8),
-        whole_layer(block.conv.weight, block.conv.bias, np.tile(steps, 27), mixed, zeros),
+        step,
+        zero,
+        whole_layer(block.conv.weight, block.conv.bias, steps, mixed, zeros),
         whole_layer(block.expand.weight.T, block.expand.bias, mixed, expanded),
         whole_layer(block.reduce.weight.T, block.reduce.bias, expanded, plain),
     )
