@@ -50,7 +50,7 @@ class NetworkConfig:
 
 SIZES = {
     "fast": NetworkConfig(blocks=4, functions=192),
-    "base": NetworkConfig(channels=96, blocks=16, hidden=192, functions=320),
+    "base": NetworkConfig(channels=96, blocks=12, hidden=192, functions=320, gated=6),
     "noisy": NetworkConfig(blocks=9),
     "mask": NetworkConfig(blocks=9, keeps_samples=False),
 }
