@@ -6,6 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from super_sdf.options import MESH_FORMATS
+
 from .case import Case, ball, batch, npy, npz, upsample
 
 VALUES = [
@@ -22,7 +24,6 @@ ORIGINS = [
     "-1e308",
 ]
 OFFSETS = ["0.001", "0.5", "-0.5", "1.5", "-1.5", "3", "-3", "3.59", "5", "9", "20", "1e-9"]
-FORMATS = ["ply", "stl", "obj", "off", "glb", "3mf"]
 
 
 def cases(seed: int) -> Iterator[Case]:
@@ -39,7 +40,7 @@ def cases(seed: int) -> Iterator[Case]:
         yield upsample(f"scales/cap-{value}", files, *given, "--cap", "--factor", "8")
         yield upsample(f"scales/offset-{value}", files, *given, "--offset", repr(value))
         yield batch(f"scales/batch-{value}", files, *given)
-        for suffix in FORMATS:
+        for suffix in MESH_FORMATS:
             name = f"scales/{suffix}-{value}"
             yield upsample(name, files, *given, target=f"out.{suffix}")
     yield from _origins()
@@ -50,7 +51,7 @@ def _origins() -> Iterator[Case]:
     for spacing in (0.01, 0.1, 1.0, 1000.0):
         files = {"in.npz": npz(values=ball() * spacing, spacing=spacing)}
         for origin in ORIGINS:
-            for suffix in FORMATS[: 6 if spacing in (0.1, 1.0) else 3]:
+            for suffix in MESH_FORMATS[: None if spacing in (0.1, 1.0) else 3]:
                 name = f"scales/{suffix}-{spacing}-at-{origin}"
                 at = ("--origin", f"{origin},0,0")
                 yield upsample(name, files, *at, target=f"out.{suffix}")

@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 from ..errors import OptionError
 from ..machine.extras import check_modules
-from ..options import OPTIONS
+from ..options import MESH_FORMATS, OPTIONS
 
 # What people give by mistake: surfaces, which have to be sampled first.
-MESH_SUFFIXES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf", ".3mf", ".step", ".stp")
+SURFACES = (*(f".{name}" for name in MESH_FORMATS), ".gltf", ".step", ".stp")
 # What is no grid file here, and the way out: {0} is the file, {1} its name without the suffix.
 WAYS_OUT = {
     ".nvdb": "is NanoVDB: make OpenVDB of it with OpenVDB's tool nanovdb_convert {0} {1}.vdb",
@@ -79,7 +79,7 @@ def find_format(path: str | Path) -> GridFormat:
         return DICOM
     if file.suffix.lower() in WAYS_OUT:
         raise OptionError(f"{path} {WAYS_OUT[file.suffix.lower()].format(file, file.stem)}")
-    if str(path).lower().endswith(MESH_SUFFIXES):
+    if str(path).lower().endswith(SURFACES):
         raise OptionError(
             f"{path} is a mesh, not a grid: sample it first with "
             f"super-sdf sample {path} {PurePath(path).stem}.npz"
