@@ -276,16 +276,16 @@ def test_tables_show_means_gaps_and_what_has_no_surface():
         "bound": [row("a", 1.0), row("b", 0.8)],
         "mc": [row("a", 0.5), row("b", 0.0, faces=0, closed=False, efv=None)],
     }
-    assert "F1 33 %" in tables.gap_line(by_method)
-    assert tables.win_line(by_method["ours"], by_method["bspline"]) == (
-        "super-sdf beats B-spline in F1 on 1 of 2. Not on: b (0.600, B-spline 0.700)."
-    )
-    lines = tables.surface_table(by_method, 32).splitlines()
-    mine = next(line for line in lines if line.startswith("| MC |"))
-    assert "| 0.250 |" in mine and mine.endswith("| 1 of 2 | 2 of 2 |")
-    assert any("*PoNQ, published, Thingi30*" in line for line in lines)
-    assert tables.empty_lines(by_method) == ["No surface (a dot stands in), MC: b."]
-    assert "| MC | 0.001 | 0.001 |" in tables.mean_table(by_method, tables.EDGES)
+    halves = {"all": ["a", "b"], "choose": ["b"], "final": []}
+    wins, gaps = evaluate.comparisons(by_method, halves)
+    assert wins == "super-sdf beats B-spline in F1 on 1 of 2. Not on: b (0.600, B-spline 0.700)."
+    assert "| all (2) | 0.7, 33.3 % |" in gaps and "| choose (1) | 0.6, -100.0 % |" in gaps
+    assert "final" not in gaps
+    lines = tables.surface_table([{"method": "mc", **tables.summary(by_method["mc"])}], 32)
+    mine = next(line for line in lines.splitlines() if line.startswith("| MC |"))
+    assert "| 0.250 |" in mine and mine.endswith("| 1 of 2 |")
+    assert "*PoNQ, published, Thingi30*" in lines
+    assert evaluate.odd_meshes(by_method) == ["No surface (a dot stands in), MC: b."]
     assert tables.label_of("ours-sharp/4@base:float32") == "super-sdf, sharp, base, float32, 1/4"
 
 
