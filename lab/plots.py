@@ -9,8 +9,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from super_sdf.files.output import replacing
-
+from .drawing import write_picture
 from .methods import FLOOR, LABELS, OURS
 from .rows import Row
 from .tables import mean_of
@@ -39,8 +38,7 @@ def draw_plots(by_size: BySize, folder: Path) -> dict[str, str]:
     folder.mkdir(exist_ok=True)
     plots = {"resolution.png": draw_resolution, "distribution.png": draw_distribution}
     for name, draw in plots.items():
-        with replacing(folder / name) as part:
-            draw(by_size).savefig(part, format="png", dpi=110)
+        write_picture(draw(by_size), folder / name)
     return dict(zip(plots, ("Quality against resolution", "F1 of every shape, sorted")))
 
 
@@ -80,7 +78,7 @@ def drawn(by_size: BySize) -> list[str]:
 
 def make_axes(count: int) -> tuple[Figure, Sequence[Any]]:
     """Return a figure with ``count`` plots side by side, and their axes."""
-    figure = Figure(figsize=(max(4.2 * count, 7), 5.2), layout="constrained")
+    figure = Figure(figsize=(max(4.2 * count, 7), 5.2), dpi=110, layout="constrained")
     axes = figure.subplots(1, count, squeeze=False)[0]
     for ax in axes:
         ax.grid(alpha=0.3)
