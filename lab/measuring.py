@@ -63,10 +63,6 @@ class Task:
     turned: int | None = None  # seed by which the shape is turned at random
     limit: float | None = None  # seconds
 
-    def __str__(self) -> str:
-        named = [str(self.setting), *(self.methods if self.limit else [])]
-        return f"{self.path.stem} ({', '.join(named)})"
-
     def network(self, method: str) -> tuple[str, str]:
         """Return model and precision of a method."""
         model, _, precision = method.partition("@")[2].partition(":")
