@@ -77,17 +77,3 @@ def test_an_empty_result_is_a_dot_at_the_origin() -> None:
     exact = distances(cube(), EMPTY, drawn, dot)
     assert exact["p2s_back"] == pytest.approx(0.5)
     assert not EMPTY.is_closed() and EMPTY.volume() == 0
-
-
-@pytest.mark.parametrize(
-    ("faces", "expected"),
-    [
-        ([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]], 0),  # a tetrahedron
-        ([[0, 1, 2], [0, 3, 1], [1, 3, 2]], 3 * 2),  # open: each edge counts in both directions
-        ([[0, 1, 2], [0, 1, 2]], 3 + 3 * 2),  # used twice, and without a partner
-        ([[0, 0, 1]], 1),  # a point; the edge from 0 to 1 is used once in each direction
-    ],
-)
-def test_open_edges_are_counted(faces: list[list[int]], expected: int) -> None:
-    mesh = Mesh(np.zeros((4, 3)), np.array(faces, np.int32))
-    assert mesh.open_edges() == expected and mesh.is_closed() == (expected == 0)
