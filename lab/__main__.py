@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 from importlib import import_module
+from pathlib import Path
+from types import ModuleType
 
 COMMANDS = {
     "evaluate": "measure the quality on your own meshes",
@@ -21,6 +23,14 @@ COMMANDS = {
 }
 
 
+def module_of(command: str) -> ModuleType:
+    """Return the module of a command; the corpus is beside the tests that run a part of it."""
+    if command == "corpus":
+        sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+        return import_module("corpus.command")
+    return import_module(f"lab.{command}")
+
+
 def main() -> int:
     """Run a command; return the exit code."""
     command, *words = sys.argv[1:] or ["--help"]
@@ -32,7 +42,7 @@ def main() -> int:
 
     sys.argv = [f"python -m lab {command}", *words]
     try:
-        return import_module(f"lab.{command}").main() or 0
+        return module_of(command).main() or 0
     except OptionError as error:
         print(f"Error: {error}", file=sys.stderr)
         return 2

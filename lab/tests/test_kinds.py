@@ -150,9 +150,9 @@ def refusing(*refused: str):
     return make
 
 
-def test_a_refusal_is_recorded_and_is_no_failure(case, fast, monkeypatch):
+def test_a_refusal_is_recorded_and_is_no_failure(case, monkeypatch):
     monkeypatch.setattr(field_methods, "make_grid", refusing("auto", "scaled"))
-    found = measure_method(case.shape, case, "ours on d + d^2", TASK, fast)
+    found = measure_method(case.shape, case, "ours on d + d^2", TASK)
     assert found["error"] is None and found["refused"] == "not with auto"
     assert found["faces"] == 0 and found["pieces"] == 0 and "taken_as" not in found
 
@@ -167,12 +167,12 @@ def test_scaled_is_said_only_after_a_refusal_and_only_of_scaled_kinds(case, fast
     assert facts == {"taken_as": "exact", "told": False}
 
 
-def test_what_does_not_fit_in_memory_is_a_failure_and_no_refusal(case, fast, monkeypatch):
+def test_what_does_not_fit_in_memory_is_a_failure_and_no_refusal(case, monkeypatch):
     def full(*_, **__):
         raise OutOfMemoryError("too large")
 
     monkeypatch.setattr(field_methods, "reconstruct", full)
-    found = measure_method(case.shape, case, "ours on exact", TASK, fast)
+    found = measure_method(case.shape, case, "ours on exact", TASK)
     assert found == {"error": "too large"}
 
 
