@@ -1,5 +1,7 @@
 """Unknown far samples, NaN or infinite: their side, their cut-off, and what is refused."""
 
+import warnings
+
 import numpy as np
 import pytest
 import trimesh
@@ -63,6 +65,15 @@ def test_unknown_far_samples_are_taken_as_cut_off_on_their_side(hollow):
         f"{limits[1]:.6g}"
     )
     assert grid.field.kind == "truncated" and reconstruct(grid, trilinear).is_closed()
+
+
+def test_a_signalling_nan_is_unknown_and_numpy_warns_of_nothing():
+    values, plain = truncated(), truncated()
+    values.view(np.uint32)[0, 0, :5], plain[0, 0, :5] = 0x7FA00001, np.nan
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        grid = make_grid(values, **PLACE)
+    np.testing.assert_array_equal(grid.values, make_grid(plain, **PLACE).values)
 
 
 def test_densities_may_be_unknown_outside_what_was_seen():

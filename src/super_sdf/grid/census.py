@@ -35,6 +35,7 @@ from .slopes import (
     Floats,
     Gradients,
     as_clamped,
+    as_float64,
     gradients_beside_surface,
     gradients_where_straight,
     mark_crossings,
@@ -230,9 +231,8 @@ class Census:
 
 def not_finite(values: SampleArray) -> GridError:
     """Return the error for samples of which some are NaN or infinite, which names the first."""
-    with np.errstate(over="ignore", invalid="ignore"):  # of long doubles
-        bad = (np.argwhere(~np.isfinite(plane.astype(np.float64))) for plane in values)
-        i, (j, k) = next((i, places[0]) for i, places in enumerate(bad) if len(places))
+    bad = (np.argwhere(~np.isfinite(as_float64(plane))) for plane in values)
+    i, (j, k) = next((i, places[0]) for i, places in enumerate(bad) if len(places))
     return GridError(
         f"values[{i}, {j}, {k}] is {values[i][j, k]!s}: every sample must be finite; "
         "replace unknown far samples by a large distance of the right sign"
@@ -410,4 +410,4 @@ def _pairs_of(rows: slice, slab: NDArray[Any]) -> Floats:
     beside = slab[1, rows], slab[0, 1:][rows]
     parts = [np.stack([row, other]).reshape(2, -1) for other in beside]
     parts.append(np.stack([row[:, :-1], row[:, 1:]]).reshape(2, -1))
-    return np.concatenate(parts, axis=1).astype(np.float64)
+    return as_float64(np.concatenate(parts, axis=1))

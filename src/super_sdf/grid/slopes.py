@@ -208,4 +208,10 @@ def mark_crossings(sides: NDArray[Any], marks: BoolArray) -> None:
 
 def as_clamped(samples: NDArray[Any]) -> Floats:
     """Return samples as float64, clamped to ``LARGEST_VALUE``."""
-    return np.clip(samples.astype(np.float64), -LARGEST_VALUE, LARGEST_VALUE)
+    return np.clip(as_float64(samples), -LARGEST_VALUE, LARGEST_VALUE)
+
+
+def as_float64(samples: NDArray[Any]) -> Floats:
+    """Return samples as float64; NumPy warns of signalling NaN and of large long doubles."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return samples.astype(np.float64)

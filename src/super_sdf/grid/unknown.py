@@ -22,7 +22,7 @@ from ..errors import GridError
 from .census import Census, Extremes, not_finite
 from .planes import SampleArray, SamplePlanes
 from .regions import RUN_BYTES, Ints, Regions, with_the_one_before
-from .slopes import distinct, quantile
+from .slopes import as_float64, distinct, quantile
 
 LAYERS = 3  # of unknown samples to which the surface beside them is continued
 WAY_OUT = "replace each by a distance of the right sign (the cut-off value of its side)"
@@ -152,7 +152,7 @@ class SeenPlanes(_OfRegions):
 
     def read(self, first: int, last: int) -> NDArray[Any]:
         """Return planes ``first`` to ``last`` (exclusive)."""
-        planes = np.array(self.source[first:last], np.float64)
+        planes = as_float64(self.source[first:last])
         for i, plane in enumerate(planes, first):
             marked = self.regions.is_marked(plane)
             runs = self.regions.runs_of(i, marked)[marked]
