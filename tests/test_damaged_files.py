@@ -59,9 +59,7 @@ def nrrd_file(*lines: str, data: bytes = RAW, name: str = "a.nrrd") -> str:
 
 def refusal(name: str, **options: object) -> str:
     """Return the one line with which a file is refused."""
-    with pytest.raises(SuperSdfError) as caught:
-        read_grid(name, **options)
-    said = str(caught.value)
+    said = refusal(SuperSdfError, read_grid, name, **options)
     assert name in said and len(said.splitlines()) == 1 and len(said) < 400
     return said
 

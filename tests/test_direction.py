@@ -85,9 +85,7 @@ def test_index_and_world_are_inverse():
     ],
 )
 def test_what_is_no_direction_is_refused(direction, message):
-    with pytest.raises(GridError) as caught:
-        make_grid(pear(), spacing=0.5, direction=direction)
-    assert str(caught.value) == message
+    assert refusal(GridError, make_grid, pear(), spacing=0.5, direction=direction) == message
 
 
 def test_the_precision_follows_the_coordinates_of_the_turned_grid():

@@ -183,9 +183,7 @@ def test_a_label_is_a_mask_of_its_samples():
 
 def test_labels_without_a_choice_are_refused():
     for field in ("auto", "exact", "scaled"):
-        with pytest.raises(GridError) as caught:
-            make_grid(MASK * 2 + (box() < 0), **PLACE, field=field)
-        assert str(caught.value) == (
+        assert refusal(GridError, make_grid, MASK * 2 + (box() < 0), **PLACE, field=field) == (
             "no solid is chosen: they look like labels (0, 1, 2, 3): choose one with --label 1"
         )
 
@@ -232,9 +230,7 @@ def test_labels_are_whole_numbers_of_up_to_64_bits(dtype, label, other):
 )
 def test_a_label_is_never_rounded(dtype, values, label, listed):
     labels = np.where(MASK, *np.array(values, dtype))
-    with pytest.raises(GridError) as caught:
-        make_grid(labels, **PLACE, label=label)
-    assert str(caught.value) == f"no sample has the label {label}: the labels are {listed}"
+    assert refusal(GridError, make_grid, labels, **PLACE, label=label) == f"no sample has the label {label}: the labels are {listed}"
 
 
 def test_densities_have_their_surface_at_a_level():
@@ -292,9 +288,7 @@ BAD = {
 
 @pytest.mark.parametrize("message", BAD)
 def test_wrong_options_are_refused(message):
-    with pytest.raises(OptionError) as caught:
-        make_grid(torus(), **PLACE, **BAD[message])
-    assert str(caught.value) == message
+    assert refusal(OptionError, make_grid, torus(), **PLACE, **BAD[message]) == message
 
 
 def test_a_mask_is_no_grid_without_make_grid():
@@ -480,9 +474,7 @@ def test_values_on_one_side_of_0_are_a_mask_only_with_zeros():
         (depth - 1, "below", "-2.39 --inside negative"),
         (1 - depth, "above", "2.39 --inside positive"),
     ):
-        with pytest.raises(GridError) as caught:
-            make_grid(values, **PLACE, field="mask")
-        assert str(caught.value) == (
+        assert refusal(GridError, make_grid, values, **PLACE, field="mask") == (
             f"every value is {side} 0 (they go from {values.min():.6g} to {values.max():.6g}), so "
             "their signs make no mask: they look like densities: give the level of their surface, "
             f"such as --level {level}"

@@ -57,9 +57,7 @@ def folder(tmp_path, monkeypatch):
 
 def refusal(path: str, **options: Any) -> str:
     """Return the one line with which a file is refused."""
-    with pytest.raises(SuperSdfError) as caught:
-        read_grid(path, **options)
-    said = str(caught.value)
+    said = refusal(SuperSdfError, read_grid, path, **options)
     assert len(said.splitlines()) == 1
     return said
 

@@ -86,9 +86,7 @@ def changed_cube(index: int, coordinate: float) -> np.ndarray:
 )
 def test_meshes_that_are_none(tmp_path, vertices, faces, message):
     path = off_file(tmp_path / "box.off", vertices, faces)
-    with pytest.raises(SuperSdfError) as caught:
-        read_mesh(path)
-    assert str(caught.value).startswith(f"{path} {message}")
+    assert refusal(SuperSdfError, read_mesh, path).startswith(f"{path} {message}")
 
 
 def test_faces_of_vertices_that_are_not_there(tmp_path):

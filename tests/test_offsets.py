@@ -65,9 +65,7 @@ def test_an_offset_near_the_truncation_is_refused_with_one_that_works(
 def test_the_suggested_offset_works(network):
     for scale in (1.0, 0.1, 1 / 3, 1e-5):
         grid = make_grid(np.clip(cube(scale), -3 * scale, 3 * scale), spacing=scale)
-        with pytest.raises(GridError) as caught:
-            reconstruct(grid, network, 2, offset=2.2 * scale)
-        largest = float(str(caught.value).split()[-1])
+        largest = float(refusal(GridError, reconstruct, grid, network, 2, offset=2.2 * scale).split()[-1])
         mesh = reconstruct(grid, network, 2, offset=largest)
         assert mesh.volume() == pytest.approx(cube_volume(1.5) * scale**3, rel=0.02)
 

@@ -90,9 +90,7 @@ def test_scales_beyond_are_refused(spacing):
 )
 def test_an_origin_too_far_for_the_spacing_is_refused(spacing, origin):
     grid = make_grid(ball(12, 3.0).values.astype(float) * spacing, spacing=spacing, origin=origin)
-    with pytest.raises(GridError) as caught:
-        reconstruct(grid, trilinear, 2)
-    assert str(caught.value) == (
+    assert refusal(GridError, reconstruct, grid, trilinear, 2) == (
         f"the grid reaches to {origin + 12 * spacing:.6g}, too far from the origin for its "
         f"spacing, {spacing:g}: vertices could not be told apart; give a nearer origin"
     )

@@ -95,9 +95,7 @@ FIELDS = {f"unsigned {name}": values for name, values in UNSIGNED.items()} | NO_
 @pytest.mark.parametrize("name", FIELDS)
 @pytest.mark.parametrize("spacing", [None, 1.0])
 def test_what_only_looks_thin_is_refused_in_one_line(name, spacing):
-    with pytest.raises(GridError) as caught:
-        make_grid(FIELDS[name], spacing=spacing)
-    message = str(caught.value)
+    message = refusal(GridError, make_grid, FIELDS[name], spacing=spacing)
     assert message.startswith("no value is below 0 (the smallest is ") and "\n" not in message
     far, beyond = "a ball that grew away never near", "off the border a ball beyond the border"
     if name in far:

@@ -86,9 +86,7 @@ def test_an_unknown_region_between_inside_and_outside_cannot_be_closed():
         "96 of the unknown samples are in regions that touch both sides of the surface: it is open "
         "there"
     )
-    with pytest.raises(GridError) as caught:
-        reconstruct(grid, trilinear, cap=True)
-    assert str(caught.value) == (
+    assert refusal(GridError, reconstruct, grid, trilinear, cap=True) == (
         "96 samples are unknown, values[14, 0, 20] the first, in regions that touch samples on "
         "both sides of the surface, so whether they are inside is unknown; end the surface there "
         "(--open), or replace each by a distance of the right sign (the cut-off value of its side)"

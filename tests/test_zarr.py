@@ -34,9 +34,7 @@ def folder(tmp_path, monkeypatch):
 
 def refusal(path, kind=GridError, **options):
     """Return the message with which a store is refused."""
-    with pytest.raises(kind) as caught:
-        read_grid(path, **options)
-    return str(caught.value)
+    return refusal(kind, read_grid, path, **options)
 
 
 @pytest.fixture(scope="module")
