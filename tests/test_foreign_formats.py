@@ -636,7 +636,7 @@ def test_a_changed_pair_of_files_is_converted_again(command):
 
 
 def test_a_missing_library_is_named_with_the_command_that_installs_it(monkeypatch):
-    names = [name for name in (*SUFFIXES, "series") if find_format(name).extra or name == "series"]
+    names = [*(name for name in SUFFIXES if find_format(name).extra), "series"]
     for name in names:
         save_any(name)
     monkeypatch.setattr("super_sdf.machine.extras.find_spec", lambda module: None)
