@@ -434,6 +434,6 @@ def test_no_library_is_imported_for_numpy_files():
         "f = numpy.linalg.norm(numpy.indices((9, 9, 9)) - 4.1, axis=0) - 2.5;"
         "numpy.save('a.npy', f); read_grid('a.npy');"
         "assert not {'nibabel', 'nrrd', 'SimpleITK', 'vtkmodules', 'tifffile', 'h5py', 'zarr',"
-        " 'numcodecs', 'super_sdf.files.readers'} & set(sys.modules)"
+        " 'numcodecs', 'xarray', 'pandas', 'super_sdf.files.readers'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", script], check=True)
