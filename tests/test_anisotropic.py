@@ -9,13 +9,10 @@ import trimesh
 from conftest import trilinear
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.ndimage import map_coordinates
 from test_slabs import in_pieces
 
 from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruct, upsample
 from super_sdf.certificate.check import check_mesh
-from super_sdf.errors import GridError
-from super_sdf.files.meshes import count_by_plane, count_on_lattice
 from super_sdf.grid.cubic import Resampled, cubic_grid, new_places, on_samples
 from super_sdf.mesh import join_meshes
 from super_sdf.steps.survey import survey
@@ -43,20 +40,6 @@ def cube_of(spacing) -> SdfGrid:
 @pytest.fixture(scope="module")
 def network():
     return load_network("fast")
-
-
-@pytest.mark.parametrize("spacing", SPACINGS)
-def test_resampled_values_are_nearer_than_linear_ones(spacing):
-    cube = cube_of(spacing)
-    assert cube.spacing == (min(spacing),) * 3
-    places = cube.to_world(np.moveaxis(np.indices(cube.shape), 0, -1))
-    inner = (places <= BOX).all(-1) & (np.abs(pear(places)) < 1.5 * min(spacing))
-    off = np.abs(cube.values - pear(places))[inner]
-    corners = make_grid(sampled(spacing), spacing=spacing)
-    index = np.moveaxis(places / spacing, -1, 0)
-    linear = np.abs(map_coordinates(corners.values, index, order=1, mode="nearest") - pear(places))
-    assert off.mean() < 0.5 * linear[inner].mean()
-    assert off.max() < 0.5 * max(spacing)
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.2])
@@ -227,19 +210,6 @@ def test_the_certificate_counts_samples_only(network):
     assert found.voxel_size == 0.3 and not found.faults()
     assert np.abs(found.touching.residuals).mean() < 0.02
     assert np.allclose(pear(found.touching.points), found.touching.values * 0.3, atol=1e-6)
-
-
-def test_the_size_of_the_mesh_is_estimated_on_the_lattice(network):
-    for spacing in ((0.3, 0.3, 0.6), (0.9, 0.3, 0.3)):
-        grid = make_grid(sampled(spacing), spacing=spacing)
-        triangles = 2 * 4**2 * count_on_lattice(grid, count_by_plane(grid, 0.0))
-        assert len(reconstruct(grid, network).faces) == pytest.approx(triangles, rel=0.05)
-
-
-@pytest.mark.parametrize("spacing", SPACINGS[:2])
-def test_unsigned_fields_are_refused(spacing):
-    with pytest.raises(GridError, match="unsigned distances have no inside: mesh the shell"):
-        make_grid(np.abs(sampled(spacing)), spacing=spacing)
 
 
 def test_the_command_says_what_it_resamples(folder, command):

@@ -5,8 +5,7 @@ import pytest
 from conftest import ball, refusal
 
 from super_sdf.errors import GridError, OptionError
-from super_sdf.grid.sdf_grid import SdfGrid, make_grid
-from super_sdf.steps.band import rescale
+from super_sdf.grid.sdf_grid import make_grid
 
 
 def torus(n: int, unit: float = 1.0) -> np.ndarray:
@@ -34,19 +33,6 @@ def test_usual_spacings_are_recognised(unit, want, said):
     grid = make_grid(torus(64, unit))
     assert grid.spacing == pytest.approx((want,) * 3, rel=0.003)
     assert any(f"spacing not given: {said}" in note for note in grid.notes)
-
-
-def test_what_is_given_is_taken_silently():
-    grid = make_grid(torus(32), spacing=1 / 32, origin=(1, 2, 3))
-    assert grid.spacing == (1 / 32,) * 3 and grid.origin == (1.0, 2.0, 3.0) and grid.notes == ()
-
-
-def test_planes_are_negative_inside_whatever_was_stored():
-    values = np.arange(24, dtype=np.uint8).reshape(4, 3, 2)
-    grid = SdfGrid.trusted(values, 1.0, positive_inside=True)
-    np.testing.assert_array_equal(grid.planes(1, 3), -values[1:3].astype(float))
-    assert (grid.low, grid.high) == (-23, 0)
-    np.testing.assert_array_equal(rescale(grid, -10, 1, 3), 2 * (10 - values[1:3].astype(float)))
 
 
 @pytest.mark.parametrize("inside, flips", [("auto", True), ("positive", True), ("negative", False)])

@@ -60,16 +60,6 @@ def test_the_identity_changes_nothing():
         assert np.array_equal(reconstruct(grid, trilinear).vertices, plain.vertices)
 
 
-def test_index_and_world_are_inverse():
-    direction = turn(1, 2, 3) @ MIRROR
-    grid = SdfGrid.trusted(pear(), (0.5, 0.7, 0.9), ORIGIN, direction=direction)
-    places = np.random.default_rng(0).uniform(0, 15, (50, 3))
-    world = grid.to_world(places)
-    assert np.abs(grid.to_index(world) - places).max() < 1e-12
-    column = np.array(grid.direction)[:, 1] * 0.7
-    assert np.allclose(grid.to_world(np.array([[0, 1, 0]]))[0] - ORIGIN, column)
-
-
 @pytest.mark.parametrize(
     "direction, message",
     [

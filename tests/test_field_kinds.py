@@ -171,14 +171,6 @@ def test_all_forms_of_a_mask_give_the_same_mesh():
         np.testing.assert_array_equal(mesh.faces, meshes[0].faces)
 
 
-def test_a_label_is_a_mask_of_its_samples():
-    labels = np.where(MASK, 3, 0)
-    labels[:2] = 2
-    grid = make_grid(labels, **PLACE, label=3)
-    np.testing.assert_array_equal(grid.values, make_grid(MASK, **PLACE).values)
-    assert make_grid(labels, **PLACE, label=3, inside="negative").values[16, 16, 16] < 0
-
-
 @pytest.mark.parametrize("spacing", [(1, 1, 1), (0.5, 1, 1)])
 @pytest.mark.parametrize("dtype", [np.uint8, np.int64])
 def test_labels_without_a_choice_are_refused(dtype, spacing):
@@ -256,16 +248,6 @@ def test_densities_with_a_ramp_have_the_surface_of_their_spline():
     grid = make_grid(blurred, level=500)
     assert grid.field.kind == "scaled"
     assert grid.notes[1].startswith("spacing not given: taken as 1, since densities show none")
-
-
-def test_the_shares_of_voxels_inside_are_cut_off():
-    shares = np.clip(0.5 - torus(), 0, 1)
-    grid = make_grid(shares, spacing=2.5, origin=0, level=0.5)
-    assert grid.field.kind == "truncated"
-    assert grid.notes[1].startswith("the values are divided by their slope")
-    mesh = reconstruct(grid, trilinear)
-    x, y, z = (mesh.vertices.T / 2.5 + 0.5) / 32 - 0.5
-    assert np.abs(np.hypot(np.hypot(x, y) - 0.3, z) - 0.12).mean() * 32 < 0.05
 
 
 BAD = {

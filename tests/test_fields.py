@@ -456,26 +456,6 @@ def test_both_files_appear_or_neither(broken, suffix, command, monkeypatch):
         assert Path(target).read_bytes() == b"another program's"
 
 
-def by_hand(grid, network, factor, **options):
-    """Refine a grid, and its dense fine lattice again, as a user would with two commands."""
-    write_field(upsample(grid, network, factor), "first.npy", force=True)
-    half = np.array(grid.origin) - np.array(grid.spacing) / 2
-    spacing = tuple(h / factor for h in grid.spacing)
-    second = make_grid(np.load("first.npy"), spacing=spacing, origin=half)
-    return reconstruct(second, network, factor, **options)
-
-
-@pytest.mark.parametrize(
-    "name, mesher, cap",
-    [("whole", "marching", False), ("leaving", "sharp", True), ("tip", "marching", True),
-     ("leaving", "marching", False)],
-)  # fmt: skip
-def test_the_fine_grid_is_refined_as_the_saved_one(name, mesher, cap):
-    grid, options = GRIDS[name](), {"cap": cap, "mesher": mesher}
-    twice = reconstruct(fine_grid(upsample(grid, trilinear, 2)), trilinear, 2, **options)
-    assert same(twice, by_hand(grid, trilinear, 2, **options))
-
-
 TURNED = [[0.0, 0.0, 1.0], [0.8, 0.6, 0.0], [0.6, -0.8, 0.0]]  # mirrored
 
 

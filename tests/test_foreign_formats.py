@@ -348,12 +348,6 @@ def test_one_of_several_variables_and_uneven_ones():
     check(read_grid("bare.nc", spacing=STEPS, origin=CORNER), STEPS)
 
 
-def test_a_mask_in_netcdf_keeps_its_type():
-    (array_of() < 0).astype(np.uint8).to_netcdf("a.nc")
-    grid = read_grid("a.nc")
-    assert grid.spacing == pytest.approx(STEPS) and any("mask" in note for note in grid.notes)
-
-
 # MATLAB
 
 
@@ -558,6 +552,7 @@ FILES = [*SUFFIXES, "itk.h5", "text.vtk", "v3.nc", "v73.mat"]
 @pytest.mark.parametrize("name", FILES)
 def test_a_truncated_file_is_refused_in_one_line(name, capfd):
     save_any(name)
+    assert read_grid(name, field="mask").low < 0  # in a process of its own
     whole = Path(name).read_bytes()
     Path(name).write_bytes(whole[: int(0.9 * len(whole))])
     capfd.readouterr()

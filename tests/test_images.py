@@ -50,17 +50,6 @@ def in_cells(image: pyvista.ImageData, centre: np.ndarray) -> pyvista.ImageData:
     return image
 
 
-@pytest.mark.parametrize("direction", DIRECTIONS)
-def test_a_sphere_comes_out_where_the_image_has_it(direction):
-    image, centre = sphere(direction, (3, -2, 7))
-    surface = image.super_sdf.contour(2, network=trilinear)
-    assert type(surface) is pyvista.PolyData
-    assert surface.is_all_triangles and surface.is_manifold
-    assert np.abs(np.linalg.norm(surface.points - centre, axis=1) - RADIUS).max() < 0.06
-    outward = np.einsum("ij,ij->i", surface.face_normals, surface.cell_centers().points - centre)
-    assert (outward > 0).all()
-
-
 @pytest.mark.parametrize(
     "direction, where",
     [*((direction, "points") for direction in DIRECTIONS), ("turned and mirrored", "cells")],

@@ -122,13 +122,6 @@ def test_a_given_spacing_is_believed_of_a_thin_part():
     assert make_grid(walls, spacing=1.0, origin=0, inside="negative").notes == ()
 
 
-@pytest.mark.parametrize("turned", [(2, 1, 0), (1, 2, 0)])
-@pytest.mark.parametrize("name", sorted(THIN))
-def test_the_axes_may_come_in_any_order(name, turned):
-    values = THIN[name].transpose(turned)
-    assert make_grid(values, inside="negative").spacing == (1.0, 1.0, 1.0)
-
-
 def test_thin_solids_alone_are_meshed_with_a_warning(folder, command):
     np.save("thin.npy", THIN["plate"])
     np.save("ball.npy", ball().values)

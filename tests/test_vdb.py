@@ -79,23 +79,6 @@ def test_a_density_keeps_its_tiles_and_is_meshed_at_a_level():
     assert grid.shape == (44, 36, 28)
 
 
-def test_where_the_background_is_0_inactive_voxels_are_unknown():
-    """A dense array of the distance to a ball of radius 6 about 9.5, as copyFromArray keeps it."""
-    values, *place = voxels(DATA / "dense.vdb")
-    exact = distance(values, *place, [((9.5,) * 3, 6.0)])
-    np.testing.assert_allclose(values, exact, atol=1e-5)
-    assert values.shape == (20, 20, 20)
-
-
-def test_the_voxels_of_picogk_have_their_size_and_place():
-    """A ball of radius 6 voxels at index (3, 4, 5); its metadata says 0.0005 m, so 0.5 mm."""
-    values, *place = voxels(DATA / "picogk.vdb")
-    exact = distance(values, *place, [((1.5, 2.0, 2.5), 3.0)])
-    np.testing.assert_allclose(values, exact.clip(-1.5, 1.5), atol=1e-5)
-    grid = read_grid(DATA / "picogk.vdb")
-    assert "voxels of 0.5 mm, as PicoGK states: the mesh is in millimetres" in grid.notes
-
-
 def text(words: str) -> bytes:
     return struct.pack("<I", len(words)) + words.encode()
 

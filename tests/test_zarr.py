@@ -9,7 +9,7 @@ import zarr
 from conftest import ball, refusal
 
 from super_sdf import read_grid
-from super_sdf.errors import FileError, GridError, OutOfMemoryError
+from super_sdf.errors import FileError, GridError
 from super_sdf.files import grids, unpacking, volume
 
 SHAPE = (30, 26, 22)  # x, y, z
@@ -44,18 +44,6 @@ def store(path, array, version=3, name=None, **layout):
     return made
 
 
-@pytest.mark.parametrize(
-    "version, layout",
-    [(2, {"chunks": (22, 1, 30)}), (3, {"chunks": (4, 4, 4), "shards": (16, 8, 8)})],
-)
-def test_the_mesh_is_that_of_the_npy_for_every_chunking(command, values, version, layout):
-    np.save("a.npy", values)
-    store("a.zarr", values.T, version, **layout)
-    for source in ("a.npy", "a.zarr"):
-        assert command("upsample", source, f"{source}.ply", *MODEL) == (0, "", "")
-    assert Path("a.zarr.ply").read_bytes() == Path("a.npy.ply").read_bytes()
-
-
 @pytest.mark.parametrize("axes, room", [("xyz", 0), ("zyx", 10**9)])
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_each_chunk_is_read_once(monkeypatch, values, axes, room, layout):
@@ -78,17 +66,6 @@ def test_each_chunk_is_read_once(monkeypatch, values, axes, room, layout):
             assert part.start % chunk == 0
             assert part.stop % chunk == 0 or part.stop == count
     assert (touched == 1).all()
-
-
-def test_a_chunk_that_does_not_fit_is_refused_before_it_is_read(monkeypatch, values):
-    store("a.zarr", values.T, chunks=(22, 26, 30))
-    monkeypatch.setattr(grids, "held_memory", lambda: 0)
-    size = 22 * 26 * 30 * 4
-    assert said_of("a.zarr", OutOfMemoryError, spacing=1, max_memory=3 * size - 1) == (
-        "a.zarr is stored in chunks of 22 x 26 x 30 samples, 0 MB each, and to unpack one takes "
-        "0 MB of memory, 0 MB are left; allow more (--max-memory), or store it in smaller chunks"
-    )
-    assert read_grid("a.zarr", spacing=1, max_memory=3 * size).shape == SHAPE
 
 
 def test_a_store_in_a_zip_file(values, command):
@@ -175,15 +152,6 @@ def test_an_array_without_metadata_may_begin_with_axes_of_length_one(values):
     store("c.zarr", values[0])
     said = "c.zarr: values have shape (26, 22): give three axes (x, y, z)"
     assert said_of("c.zarr", spacing=1) == said
-
-
-@pytest.mark.parametrize("axes, origin", [("xyz", (1, 2, 3)), ("yxz", (2, 1, 3))])
-def test_axes_in_another_order(values, axes, origin):
-    array = values.transpose(["xyz".index(name) for name in axes])
-    image("i.zarr", [(array, [scale(1, 1, 1), translation(1, 2, 3)])], axes=axes)
-    grid = read_grid("i.zarr")
-    assert grid.origin == origin
-    np.testing.assert_array_equal(grid.values, values)
 
 
 def test_transformations_of_another_type_are_refused(values):
