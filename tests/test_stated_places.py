@@ -27,7 +27,8 @@ from numpy.typing import ArrayLike
 
 from super_sdf import SdfGrid, read_grid
 from super_sdf.errors import FileError, GridError
-from super_sdf.files.grids import describe_grid_file
+from super_sdf.files.formats import find_format
+from super_sdf.files.grids import describe_grid_file, open_volume
 from super_sdf.files.readers.axes import in_metres
 
 SIZES = 24, 20, 17  # along x, y, z
@@ -214,6 +215,24 @@ def test_zarr_by_xarray_has_names_and_coordinates(order, down, version):
     bare = placed(order).drop_vars(["x", "y", "z"]).to_dataset()
     bare.to_zarr("b.zarr", zarr_format=version)
     check(read_grid("b.zarr", spacing=STEPS, origin=FIRST))
+
+
+@pytest.mark.parametrize("dtype, offset, version", [("i2", 0.5, 2), ("u2", -40.0, 3)])
+def test_numbers_that_stand_for_values(dtype, offset, version):
+    """As xarray packs values: whole numbers, with a scale and an offset, one of them NaN."""
+    array = placed("zxy").where(placed("zxy") < 2.5)
+    packed = {"dtype": dtype, "scale_factor": 0.002, "add_offset": offset, "_FillValue": 0}
+    about = {"encoding": {"sdf": packed}, "zarr_format": version}
+    array.to_dataset().to_zarr("a.zarr", **about)
+    want = xarray.open_zarr("a.zarr").sdf.values
+    path = Path("a.zarr")
+    with open_volume(path, find_format(path), "zyx", (10**9, None)) as volume:
+        values = volume.box(tuple(slice(0, n) for n in volume.shape))
+    assert 1000 < np.isnan(want).sum() < want.size - 1000
+    np.testing.assert_allclose(values, want, rtol=0, atol=1e-6)
+    placed("zxy").to_dataset().to_zarr("b.zarr", **about)
+    grid = read_grid("b.zarr")
+    assert np.abs(grid.values - sampled()).max() < 0.0011 and np.allclose(grid.spacing, STEPS)
 
 
 def test_names_that_are_not_x_y_z_are_told():
