@@ -75,7 +75,7 @@ def test_random_fields_in_slabs_and_bricks_are_closed_where_they_are_called_so(m
 
 def test_the_corpus_is_large_and_the_same_each_time(cases):
     names = [case.name for case in cases]
-    assert len(names) > 4500 and len(set(names)) == len(names)
+    assert len(names) > 4000 and len(set(names)) == len(names)
     again = [(case.name, case.words, list(case.files)) for case in make_cases()]
     assert again == [(case.name, case.words, list(case.files)) for case in cases]
 

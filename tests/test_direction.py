@@ -60,28 +60,21 @@ def test_the_identity_changes_nothing():
         assert np.array_equal(reconstruct(grid, trilinear).vertices, plain.vertices)
 
 
-@pytest.mark.parametrize(
-    "direction, message",
-    [
-        ((1, 0, 0), "direction is (1, 0, 0): give nine numbers, row by row, or a 3 x 3 matrix"),
-        (
-            np.diag([1, 1, 2]),
-            "direction is 1, 0, 0; 0, 1, 0; 0, 0, 2: column 3 has length 2; give unit vectors at "
-            "right angles, or resample a sheared grid",
-        ),
-        (
-            [[1, 0.6, 0], [0, 0.8, 0], [0, 0, 1]],
-            "direction is 1, 0.6, 0; 0, 0.8, 0; 0, 0, 1: columns 1 and 2 are not at right angles; "
-            "give unit vectors at right angles, or resample a sheared grid",
-        ),
-        (
-            np.full((3, 3), np.nan),
-            "direction is nan, nan, nan; nan, nan, nan; nan, nan, nan: it must be finite",
-        ),
-    ],
-)
-def test_what_is_no_direction_is_refused(direction, message):
-    assert refusal(GridError, make_grid, pear(), spacing=0.5, direction=direction) == message
+RIGHT = "give unit vectors at right angles, or resample a sheared grid"
+NO_DIRECTION = {
+    "(1, 0, 0): give nine numbers, row by row, or a 3 x 3 matrix": (1, 0, 0),
+    f"1, 0, 0; 0, 1, 0; 0, 0, 2: column 3 has length 2; {RIGHT}": np.diag([1, 1, 2]),
+    f"1, 0.6, 0; 0, 0.8, 0; 0, 0, 1: columns 1 and 2 are not at right angles; {RIGHT}": (
+        [[1, 0.6, 0], [0, 0.8, 0], [0, 0, 1]]
+    ),
+    "nan, nan, nan; nan, nan, nan; nan, nan, nan: it must be finite": np.full((3, 3), np.nan),
+}
+
+
+@pytest.mark.parametrize("said", NO_DIRECTION)
+def test_what_is_no_direction_is_refused(said):
+    place = {"spacing": 0.5, "direction": NO_DIRECTION[said]}
+    assert refusal(GridError, make_grid, pear(), **place) == f"direction is {said}"
 
 
 def test_the_precision_follows_the_coordinates_of_the_turned_grid():

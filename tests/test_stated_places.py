@@ -74,43 +74,32 @@ def check(grid: SdfGrid, steps: ArrayLike = STEPS, first: ArrayLike | None = FIR
 # TIFF
 
 
-def imagej(name: str, values: np.ndarray, steps: ArrayLike, about: dict[str, object]) -> None:
-    """Write an ImageJ stack; its resolution is that of x and y."""
-    x, y, z = steps
-    about = {"axes": "ZYX", **({} if z == 1 else {"spacing": z}), **about}
+IMAGEJ = {
+    "a depth of 1": ((0.3, 0.4, 1), (1, 1, 1), {"unit": "um"}, "um"),
+    "an escape": (STEPS, (1, 1, 1), {"unit": "\\u00B5m"}, "µm"),
+    "inches": (STEPS, (1, 1, 1), {"unit": "inch"}, "inch"),
+    "cm, mm": (STEPS, (1, 1, 10), {"unit": "cm", "zunit": "mm"}, "cm"),
+    "µm, nm": (STEPS, (1, 1, 1000), {"unit": "\\u00B5m", "zunit": "nm"}, "µm"),
+    "three": (STEPS, (1, 1000, 0.001), {"unit": "um", "yunit": "nm", "zunit": "mm"}, "um"),
+    "inches, mm": (STEPS, (1, 1, 25.4), {"unit": "inch", "zunit": "mm"}, "inch"),
+}
+
+
+@pytest.mark.parametrize("with_origin", [False, True])
+@pytest.mark.parametrize("name", IMAGEJ)
+def test_imagej_has_a_unit_for_each_axis_and_origins_in_pixels(name, with_origin):
+    """Lengths come out in that of x; a depth of 1 is not written."""
+    steps, factors, about, unit = IMAGEJ[name]
+    x, y, z = np.array(steps) * factors
+    starts = {f"{axis}origin": -at / step for axis, at, step in zip("xyz", FIRST, steps)}
+    about = {"axes": "ZYX", **about, **(starts if with_origin else {})}
+    about |= {} if z == 1 else {"spacing": z}
     options = {"imagej": True, "resolution": (1 / x, 1 / y), "metadata": about}
-    tifffile.imwrite(name, values.T, **options)
-
-
-@pytest.mark.parametrize("unit, shown", [("um", "um"), ("\\u00B5m", "µm"), ("inch", "inch")])
-def test_imagej_leaves_out_a_depth_of_1(unit, shown):
-    steps = 0.3, 0.4, 1
-    imagej("a.tif", sampled(steps), steps, {"unit": unit})
-    assert "spacing" not in tifffile.TiffFile("a.tif").imagej_metadata
+    tifffile.imwrite("a.tif", sampled(steps).T, **options)
+    assert ("spacing" in tifffile.TiffFile("a.tif").imagej_metadata) == (z != 1)
     grid = read_grid("a.tif")
-    check(grid, steps, None)
-    assert grid.notes[0] == f"lengths are in the unit of its axes, {shown}"
-
-
-@pytest.mark.parametrize(
-    "units, factors",
-    [
-        ({"unit": "cm", "zunit": "mm"}, (1, 1, 10)),
-        ({"unit": "\\u00B5m", "zunit": "nm"}, (1, 1, 1000)),
-        ({"unit": "um", "yunit": "nm", "zunit": "mm"}, (1, 1000, 0.001)),
-        ({"unit": "inch", "zunit": "mm"}, (1, 1, 25.4)),
-    ],
-)
-def test_imagej_has_a_unit_for_each_axis(units, factors):
-    """Lengths come out in that of x."""
-    imagej("a.tif", sampled(), STEPS * factors, units)
-    check(read_grid("a.tif"), first=None)
-
-
-def test_imagej_origins_are_in_pixels():
-    starts = {f"{name}origin": -first / step for name, first, step in zip("xyz", FIRST, STEPS)}
-    imagej("a.tif", sampled(), STEPS, {"unit": "mm", **starts})
-    check(read_grid("a.tif"))
+    check(grid, steps, FIRST if with_origin else None)
+    assert grid.notes[0].endswith(f", {unit}") or grid.notes[0].endswith(f"are in {unit}")
 
 
 def test_a_stack_without_calibration_states_no_spacing():
@@ -502,17 +491,6 @@ def test_both_versions_of_nifti_in_both_orders_of_bytes(version, name, order):
     check(read_grid(name))
 
 
-def test_a_truncated_nifti_2_is_refused():
-    nibabel.save(nibabel.Nifti2Image(sampled(), affine()), "a.nii")
-    whole = Path("a.nii").read_bytes()
-    Path("a.nii").write_bytes(whole[:-1])
-    assert refusal(FileError, read_grid, "a.nii").startswith(
-        "a.nii is truncated: its header promises 24 x 20 x"
-    )
-    Path("a.nii").write_bytes(whole[:400])
-    assert refusal(FileError, read_grid, "a.nii").startswith("a.nii cannot be read as NIfTI: ")
-
-
 def test_nifti_without_a_place_is_not_mirrored():
     """Like ITK, whose direction is the identity, and method 1 of the standard."""
     image = nibabel.Nifti1Image(sampled(), None)
@@ -620,7 +598,5 @@ def test_vectors_and_marks_are_read_only_by_name():
     image.cell_data["vtkGhostType"] = np.zeros(image.n_cells, np.uint8)
     image.save("a.vti")
     check(read_grid("a.vti"))
-    assert (
-        refusal(GridError, read_grid, "a.vti:normal")
-        == "a.vti:normal is no array of one number per sample"
-    )
+    said = refusal(GridError, read_grid, "a.vti:normal")
+    assert said == "a.vti:normal is no array of one number per sample"

@@ -22,28 +22,10 @@ def box(x, y, z, *half):
     return np.linalg.norm(np.maximum(q, 0), axis=0) + np.minimum(q.max(0), 0)
 
 
-def ellipse(x, y, a, b, count=4001):
-    """Return the distance to an ellipse with half axes a and b, from outside."""
-    angle = np.linspace(0, 2 * np.pi, count)
-    around = np.stack([a * np.cos(angle), b * np.sin(angle)], 1)
-    flat = np.stack([x.ravel(), y.ravel()], 1)
-    nearest = [np.linalg.norm(around - p, axis=1).min() for p in flat]
-    return np.array(nearest).reshape(x.shape)
-
-
-def disc(thickness):
-    """Return the distance to an ellipsoid of revolution squeezed between two planes of samples."""
-    radius, height = np.meshgrid(np.arange(0, 24, 0.25), np.abs(Z[0, 0]), indexing="ij")
-    table = ellipse(radius, height, 10.0, thickness / 2)
-    at = np.hypot(X, Y)
-    return np.stack([np.interp(at[..., k], radius[:, 0], table[:, k]) for k in range(N)], -1)
-
-
 THIN = {
     "plate": box(X, Y, Z, 9, 7, 0.25),
     "plate of a sixth": box(X, Y, Z + 0.1, 9, 7, 1 / 12),
     "lying along x": box(X, Y, Z, 0.2, 7, 9),
-    "disc": disc(0.8),
     "rod": np.hypot(np.hypot(X - 0.1, Y), np.maximum(np.abs(Z) - 9, 0)) - 0.3,
     "two sheets": np.minimum(box(X, Y, Z - 4, 9, 7, 0.3), box(X, Y - 0.5, Z + 5, 6, 9, 0.2)),
     "hollow ball": np.abs(R - 9.2) - 0.05,  # holds samples
