@@ -5,7 +5,7 @@ import pytest
 from conftest import ball, refusal
 
 from super_sdf.errors import GridError, OptionError
-from super_sdf.grid.sdf_grid import make_grid
+from super_sdf.grid.sdf_grid import SdfGrid, make_grid
 
 
 def torus(n: int, unit: float = 1.0) -> np.ndarray:
@@ -33,6 +33,14 @@ def test_usual_spacings_are_recognised(unit, want, said):
     grid = make_grid(torus(64, unit))
     assert grid.spacing == pytest.approx((want,) * 3, rel=0.003)
     assert any(f"spacing not given: {said}" in note for note in grid.notes)
+
+
+def test_samples_are_negative_inside_whatever_was_stored():
+    values = np.arange(24, dtype=np.uint8).reshape(4, 3, 2)
+    grid = SdfGrid.trusted(values, 1.0, positive_inside=True)
+    for found, stored in ((grid.planes(1, 3), values[1:3]), (grid.values, values)):
+        np.testing.assert_array_equal(found, -stored.astype(float))
+    assert (grid.low, grid.high) == (-23, 0)
 
 
 @pytest.mark.parametrize("inside, flips", [("auto", True), ("positive", True), ("negative", False)])
