@@ -75,11 +75,7 @@ CHECKED = {
     "a.vti": lambda name: save_vti(name, AFFINE),
     "a.npz": lambda name: np.savez_compressed(name, values=VALUES, spacing=0.5),
 }
-ENDS_OF_TEXT = {
-    ".mha": b"= LOCAL\n",
-    ".nrrd": b"\n\n",
-    ".vti": b'<AppendedData encoding="base64">',
-}
+ENDS_OF_TEXT = {".mha": b"= LOCAL\n", ".nrrd": b"\n\n", ".vti": b'<AppendedData encoding="base64">'}
 
 
 @pytest.mark.parametrize("name", CHECKED)

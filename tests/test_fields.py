@@ -322,8 +322,7 @@ def limit_files():
 
 
 @pytest.mark.parametrize(
-    ("suffix", "reason"),
-    [(".npz", "File too large"), (".vti", "VTK says 'File too large'")],
+    ("suffix", "reason"), [(".npz", "File too large"), (".vti", "VTK says 'File too large'")]
 )
 def test_a_file_that_the_system_cuts_off_is_an_error_of_one_line(suffix, reason):
     np.savez("grid.npz", values=ball(12, 3.0).values[:8], spacing=1.0)

@@ -12,14 +12,7 @@ from test_field_kinds import PLACE, box, thin_frame
 from test_slabs import in_pieces
 from trimesh import grouping
 
-from super_sdf import (
-    SdfGrid,
-    extract_mesh,
-    load_network,
-    make_grid,
-    reconstruct,
-    upsample,
-)
+from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruct, upsample
 from super_sdf.errors import GridError
 from super_sdf.grid.census import Census
 from super_sdf.mesh import join_meshes
