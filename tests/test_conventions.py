@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from conftest import ball, refusal
 
-from super_sdf.errors import GridError, OptionError
+from super_sdf.errors import GridError
 from super_sdf.grid.sdf_grid import SdfGrid, make_grid
 
 
@@ -156,8 +156,3 @@ def test_axes_that_show_no_spacing_are_asked_for():
         "spacing not given: the values change by 1 along x, 3 along y from sample to sample, and "
         "do not show it for all axes; give --spacing X,Y,Z"
     )
-
-
-def test_inside_has_three_words():
-    with pytest.raises(OptionError, match="inside is 'out': give one of auto, negative, positive"):
-        make_grid(torus(16), inside="out")

@@ -270,22 +270,6 @@ def test_a_given_spacing_and_origin_replace_those_of_the_file():
     check(read_grid("a.nii", spacing=SPACING, origin=affine[:3, 3]))
 
 
-def save_any(name: str) -> None:
-    """Write the part in the format of the name."""
-    affine = affine_of(np.eye(3))
-    if name in ORIENTED:
-        ORIENTED[name](name, affine)
-    elif name == "a.tif":
-        tifffile.imwrite(name, sampled(affine).T, photometric="minisblack")
-    elif name == "a.h5":
-        with h5py.File(name, "w") as file:
-            file["field"] = sampled(affine).T
-    elif name == "a.vdb":
-        Path(name).write_bytes((DATA / "two-balls.vdb").read_bytes())
-    else:
-        Path(name).write_text(text_sdf(affine))
-
-
 def test_a_mesh_as_input_is_told_to_be_sampled_first(command):
     want = (
         "Error: part.stl is a mesh, not a grid: sample it first with super-sdf sample part.stl "
@@ -341,7 +325,8 @@ def test_components_and_missing_axes_are_refused():
 
 
 def test_the_command_makes_the_mesh_at_its_place(command):
-    save_any("a.h5")
+    with h5py.File("a.h5", "w") as file:
+        file["field"] = sampled(affine_of(np.eye(3))).T
     origin = ",".join(map(str, affine_of(np.eye(3))[:3, 3]))
     place = "--spacing", "0.5", f"--origin={origin}"
     code, _, err = command("upsample", "a.h5:/field", "out.ply", "--quality", "fast", *place)

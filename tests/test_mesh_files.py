@@ -176,7 +176,8 @@ def test_a_mesh_that_its_format_would_flatten_is_refused(folder, mesh):
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".3mf"])
 def test_files_hold_the_very_numbers(tmp_path, monkeypatch, suffix):
-    monkeypatch.setattr(mesh_writers, "CHUNK", 1000)
+    monkeypatch.setattr(mesh_writers, "CHUNK", 100)
+    monkeypatch.setattr(mesh_writers, "TEXT_CHUNK", 100)
     numbers = np.random.default_rng(0).standard_normal((999, 3)) ** 9 * 1e-3
     faces = np.arange(999, dtype=np.int32).reshape(-1, 3)
     for dtype in (np.float32, np.float64):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import random
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from conftest import refusal
+from corpus.case import mutate
+from corpus.meshes import off
 from solids import cube, sphere
 
 from super_sdf import Mesh, write_mesh
@@ -18,33 +18,6 @@ from super_sdf.truth.mesh_files import merged, read_mesh, read_plain_ply
 from super_sdf.truth.solid import load_solid
 
 FORMATS = ("ply", "stl", "stl_ascii", "obj", "off", "glb")
-PIECES = (b"nan", b"-1", b"99999999", b"\xff" * 8, b"1e400", b"\n\n", b"{" * 50, b"")
-
-
-def off_file(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
-    """Write an .off file with all digits."""
-    rows = [" ".join(map(repr, vertex)) for vertex in vertices.tolist()]
-    rows += ["3 " + " ".join(map(str, face)) for face in faces.tolist()]
-    path.write_text(f"OFF\n{len(vertices)} {len(faces)} 0\n" + "\n".join(rows) + "\n")
-    return path
-
-
-def damaged(rng: random.Random, content: bytes) -> bytes:
-    """Cut a file short, change bytes of it, or put something else in a place."""
-    changed, kind = bytearray(content), rng.randrange(3)
-
-    def somewhere() -> int:
-        return rng.randrange(min(len(changed), 10 ** rng.randrange(2, 6)))
-
-    if kind == 0:
-        return content[: rng.randrange(len(content))]
-    if kind == 1:
-        for _ in range(rng.randrange(1, 20)):
-            changed[somewhere()] = rng.randrange(256)
-        return bytes(changed)
-    start = somewhere()
-    changed[start : start + rng.randrange(50)] = rng.choice(PIECES)
-    return bytes(changed)
 
 
 @pytest.mark.parametrize("kind", FORMATS)
@@ -53,9 +26,10 @@ def test_damaged_files_are_read_or_named_in_a_line(tmp_path, capfd, kind):
     content = ball.export(file_type=kind)
     content = content if isinstance(content, bytes) else content.encode()
     path = tmp_path / f"ball.{kind.removesuffix('_ascii')}"
-    rng, refused = random.Random(kind), 0
-    for _ in range(40):
-        path.write_bytes(damaged(rng, content))
+    rng, refused = np.random.default_rng(0), 0
+    for number in range(40):
+        cut = content[: rng.integers(len(content))] if number % 3 == 0 else content
+        path.write_bytes(mutate(cut, rng, 0, 400 if number % 3 == 1 else None))
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             try:
@@ -92,7 +66,7 @@ WRONG = {
 @pytest.mark.parametrize("name", WRONG)
 def test_meshes_that_are_none(tmp_path, name):
     vertices, faces, message = WRONG[name]
-    path = off_file(tmp_path / "box.off", vertices, faces)
+    (path := tmp_path / "box.off").write_bytes(off(vertices, faces))
     assert refusal(SuperSdfError, load_solid, path).startswith(f"{path} {message}")
 
 

@@ -38,16 +38,12 @@ def test_a_sphere_lies_where_its_coordinates_say(order, down):
     assert np.abs(np.linalg.norm(mesh.vertices - CENTRE, axis=1) - RADIUS).max() < 0.06
 
 
-def test_the_constructor_takes_axes_and_origin_too():
-    array = sphere("zyx", "y")
-    for grid in (SdfGrid(array, 0.5), SdfGrid.trusted(array, 0.5)):
-        assert repr(grid) == repr(make_grid(array))
-        assert np.array_equal(grid.values, sphere().values)
-
-
 def test_what_is_given_replaces_the_coordinates():
-    grid = make_grid(sphere("zyx", "z"), spacing=STEP, origin=(7, 8, 9))
-    assert grid.origin == (7.0, 8.0, 9.0)
+    array = sphere("zyx", "z")
+    for grid in (SdfGrid(array, 0.5), SdfGrid.trusted(array, 0.5), make_grid(array)):
+        assert (grid.shape, grid.spacing, grid.origin) == (SHAPE, STEP, FIRST)
+        assert np.array_equal(grid.values, sphere().values)
+    assert make_grid(array, spacing=STEP, origin=(7, 8, 9)).origin == (7.0, 8.0, 9.0)
     scaled = make_grid(sphere() * 2, spacing=1.0)
     assert scaled.spacing == (1.0, 1.0, 1.0) and scaled.origin == FIRST
 

@@ -9,7 +9,7 @@ import zarr
 from conftest import ball, refusal
 
 from super_sdf import read_grid
-from super_sdf.errors import FileError, GridError
+from super_sdf.errors import FileError, GridError, OutOfMemoryError
 from super_sdf.files import grids, unpacking, volume
 
 SHAPE = (30, 26, 22)  # x, y, z
@@ -68,6 +68,17 @@ def test_each_chunk_is_read_once(monkeypatch, values, axes, room, layout):
     assert (touched == 1).all()
 
 
+def test_a_chunk_that_does_not_fit_is_refused_before_it_is_read(monkeypatch, values):
+    store("a.zarr", values.T, chunks=(22, 26, 30))
+    monkeypatch.setattr(grids, "held_memory", lambda: 0)
+    size = 22 * 26 * 30 * 4
+    assert said_of("a.zarr", OutOfMemoryError, spacing=1, max_memory=3 * size - 1) == (
+        "a.zarr is stored in chunks of 22 x 26 x 30 samples, 0 MB each, and to unpack one takes "
+        "0 MB of memory, 0 MB are left; allow more (--max-memory), or store it in smaller chunks"
+    )
+    assert read_grid("a.zarr", spacing=1, max_memory=3 * size).shape == SHAPE
+
+
 def test_a_store_in_a_zip_file(values, command):
     with zarr.storage.ZipStore("a.zarr.zip", mode="w") as zipped:
         store(zipped, values.T, name="deep/field")
@@ -77,15 +88,6 @@ def test_a_store_in_a_zip_file(values, command):
     assert command("upsample", "b.zarr.zip", "o.ply")[2] == (
         "Error: b.zarr.zip cannot be read as Zarr: File is not a zip file\n"
     )
-
-
-@pytest.mark.filterwarnings("ignore:Consolidated metadata")
-def test_consolidated_groups(values):
-    zarr.open_group("g.zarr", mode="w", zarr_format=2)
-    store("g.zarr", values.T, 2, name="a/b")
-    zarr.consolidate_metadata("g.zarr")
-    np.testing.assert_array_equal(read_grid("g.zarr", spacing=1).values, values)
-    assert read_grid("g.zarr:/a/b", spacing=1).shape == SHAPE
 
 
 def image(path, levels, axes="zyx", version="0.5", whole=()):
