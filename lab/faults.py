@@ -31,11 +31,12 @@ from shutil import rmtree
 import numpy as np
 import psutil
 
+from super_sdf.files.meshes import MESH_SUFFIXES
+
 from . import parser_of
 from .batch import COMMAND, workers_of, write_grids
 from .processes import describe_machine
 
-SUFFIXES = (".ply", ".stl", ".obj", ".glb", ".3mf")
 LONG_ENOUGH = 120.0  # seconds; every run is shorter
 AT_ONCE = 0.5  # seconds in which a run ends that was about to end anyway
 KILLS = {
@@ -86,7 +87,7 @@ class Single:
         self.seconds: dict[str, float] = {}
         self.writing: dict[str, float] = {}  # the seconds of these from the first file on
         self.turn = 0
-        for suffix in SUFFIXES:
+        for suffix in MESH_SUFFIXES:
             begun, process = time.perf_counter(), self.start(suffix)
             self.wait_for_file(process)
             first_file = time.perf_counter()
@@ -272,10 +273,10 @@ def main() -> int:
         single = Single(Path(name), words.size)
         many = Many(Path(name), words.count, words.size)
         good = [
-            tally("SIGTERM", words.terms, SUFFIXES, partial(single.kill, signal.SIGTERM)),
-            tally("SIGKILL", words.kills, SUFFIXES, partial(single.kill, signal.SIGKILL)),
-            tally("full disk", words.full, SUFFIXES, single.fill),
-            tally("SIGTERM in checks", words.checks, SUFFIXES, single.check),
+            tally("SIGTERM", words.terms, MESH_SUFFIXES, partial(single.kill, signal.SIGTERM)),
+            tally("SIGKILL", words.kills, MESH_SUFFIXES, partial(single.kill, signal.SIGKILL)),
+            tally("full disk", words.full, MESH_SUFFIXES, single.fill),
+            tally("SIGTERM in checks", words.checks, MESH_SUFFIXES, single.check),
             tally("batch", words.batches, list(KILLS), many.disturb),
             tally("disk of a batch", words.disks, LIMITS, many.disturb),
         ]

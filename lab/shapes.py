@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from super_sdf.arrays import BoolArray, FloatArray, IntArray
 from super_sdf.errors import FileError, OptionError, seen
+from super_sdf.files.meshes import MESH_SUFFIXES
 from super_sdf.files.regular import check_regular_file
 from super_sdf.grid.sdf_grid import SdfGrid, make_grid
 from super_sdf.machine.memory import check_fits
@@ -38,7 +39,7 @@ REFERENCE_POINTS, REFERENCE_EDGES, RESULT_POINTS, NOISE, RESULT_EDGES, TURN, FIE
 
 
 LARGEST_SIZE = 100_000  # samples along an axis; a larger grid fits into no memory
-MESH_SUFFIXES = (".ply", ".stl", ".obj", ".off", ".glb", ".gltf", ".3mf")
+SUFFIXES = (*MESH_SUFFIXES, ".gltf")
 HALVES = ("choose", "final")
 HALVES_SEED = 0
 
@@ -218,9 +219,9 @@ def find_meshes(sources: Sequence[Path]) -> tuple[Path, ...]:
     for source in sources:
         inside = [source]
         if source.is_dir():
-            inside = sorted(p for p in source.iterdir() if p.suffix.lower() in MESH_SUFFIXES)
+            inside = sorted(p for p in source.iterdir() if p.suffix.lower() in SUFFIXES)
         if not inside:
-            raise FileError(f"{source} holds no mesh: give {', '.join(MESH_SUFFIXES)}")
+            raise FileError(f"{source} holds no mesh: give {', '.join(SUFFIXES)}")
         paths += [check_regular_file(path) for path in inside]
     names = [path.stem for path in paths]
     twice = next((name for name in names if names.count(name) > 1), None)

@@ -15,6 +15,8 @@ from conftest import ball
 from super_sdf.batch.inputs import find_jobs
 from super_sdf.convert import ConvertOptions
 from super_sdf.files.formats import GRID_SUFFIXES
+from super_sdf.files.meshes import MESH_SUFFIXES
+from super_sdf.options import BATCH_LISTS
 
 pytestmark = pytest.mark.usefixtures("grid_folder")
 
@@ -62,8 +64,7 @@ LISTS = {
     "": "list.jsonl names no file: give a path a line",
     '{"out": "a.ply"}': "list.jsonl, line 1: 'in' is None: give the path of a grid",
     '{"in": "a.npy", "Factor": 2}': "list.jsonl, line 1: 'Factor' is unknown: give in, out, "
-    "factor, spacing, origin, direction, axes, inside, field, label, level, scale, "
-    "offset, cap, mesher, simplify, triangles",
+    + ", ".join(BATCH_LISTS),
     '{"in": "a.npy", "simplify": 1, "triangles": 9}': "list.jsonl, line 1: simplify 1.0 and "
     "triangles 9: give only one of them",
     '\n{"in": "a.npy", "factor": 3}': "list.jsonl, line 2: 'factor' is 3: give an even number from "
@@ -71,7 +72,7 @@ LISTS = {
     '{"in": "a.npy", "cap": 1}': "list.jsonl, line 1: 'cap' is 1: give True or False, "
     "in JSON true or false",
     '{"in": "a.npy", "out": "a.xyz"}': "list.jsonl, line 1: 'out' is 'a.xyz': give a file, one of "
-    ".ply, .stl, .obj, .off, .glb, .3mf",
+    + ", ".join(MESH_SUFFIXES),
     '{"in": "."}': "list.jsonl, line 1: 'in' is '.': give the path of a grid",
     '{"in": "a\\u0000.npy"}': "list.jsonl, line 1: 'in' is 'a\\x00.npy': no file can have this "
     "name",

@@ -133,14 +133,17 @@ def test_without_locks_of_its_file_system_a_batch_runs_other_errors_are_named(
     assert (code, err if code else "") == (bool(want), want)
 
 
-def test_a_signal_ends_batch_and_workers_in_a_line():
+@pytest.mark.parametrize(
+    ("number", "said"), [(signal.SIGHUP, "ended by SIGHUP"), (signal.SIGINT, "interrupted")]
+)
+def test_a_signal_ends_batch_and_workers_in_a_line(number, said):
     larger_grids(10)
     process = start_batch()
     workers = psutil.Process(process.pid).children()
-    process.send_signal(signal.SIGHUP)
+    process.send_signal(number)
     _, err = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 128 + signal.SIGHUP
-    assert err.startswith("Error: ended by SIGHUP: ") and err.count("\n") == 1
+    assert process.returncode == 128 + number
+    assert err.startswith(f"Error: {said}: ") and err.count("\n") == 1
     assert err.endswith("of 14 are done and kept; run it again to go on\n")
     assert all_end(workers) and not list(Path("out").rglob(".*.part"))
 
@@ -163,6 +166,17 @@ def test_a_file_at_which_two_processes_die_is_named(command, monkeypatch):
     assert [job.source.name for job in seen].count("a.npy") == 2
     assert seen[-1].source.name == "a.npy"  # the others first
     assert {job.options.max_memory for job in seen} != {None}
+
+
+def test_fail_fast_begins_nothing_more_in_several_processes():
+    Path("out").mkdir()
+    settings = Settings(Path("out"), fail_fast=True)
+    run = Run(find_jobs(["in"], ".ply", ConvertOptions()).jobs, settings)
+    queue = Queue(run)
+    assert len(queue) == 4
+    first = queue.popleft()
+    run._take(first, batch_job.failed_row(first, "why"))
+    assert len(queue) == 0 and len(run.batch.waiting) == 3
 
 
 def test_the_bound_is_shared_by_those_that_run(monkeypatch):

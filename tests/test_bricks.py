@@ -4,8 +4,10 @@ import os
 import pickle
 import re
 import signal
+import warnings
 from functools import partial
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
@@ -16,12 +18,15 @@ from test_slabs import bad_samples, rod
 from super_sdf import load_network
 from super_sdf.cluster import bricks, stored
 from super_sdf.cluster.bricks import BrickWork, convert_on_cluster
-from super_sdf.cluster.checking import Needs
+from super_sdf.cluster.checking import Needs, check_workers
 from super_sdf.cluster.connecting import connect
+from super_sdf.cluster.crew import Crew
 from super_sdf.cluster.stored import Source, StoredPlanes
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.errors import ClusterError, GridError, MeshError, OptionError
+from super_sdf.files.volume import PLACE
 from super_sdf.grid.planes import DerivedPlanes
+from super_sdf.options import GRID, Values
 
 NETWORK = Needs("fast", "auto", "cpu")
 LAYOUTS = {"cubes": (8, 8, 8), "first axis whole": (15, 14, 3), "npy": None}
@@ -199,6 +204,37 @@ def test_errors_are_those_of_one_machine(cluster, network):
         np.save("a.npy", cut_off)
         convert("a.npy", "o.ply", network, ConvertOptions(spacing=(1.0,), offset=1.5))
     assert refusal(cluster, network, cut_off, offset=1.5) == str(here.value)
+
+
+def test_workers_that_cannot_run_the_network_say_why(cluster):
+    Path("bad.onnx").write_bytes(b"no network")
+    bad = Path("bad.onnx").absolute()
+    want = rf"^worker tcp://\S+( and 1 other)? cannot run the network: {re.escape(str(bad))} "
+    with pytest.raises(ClusterError, match=want):
+        check_workers(cluster, Needs(str(bad)))
+
+
+def prepare_to_count(limits):
+    """Return work that only returns its task."""
+    return lambda task, check_wanted: task
+
+
+def test_results_that_nobody_takes_may_be_collected_by_the_thread_of_dask(cluster):
+    with Crew(cluster, NETWORK, prepare_to_count, pytest.fail) as crew:
+        results = crew.in_order(range(9))
+        assert next(results) == 0 and (given := list(crew.given))
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            closed = Event()
+            close = lambda: (results.close(), closed.set())  # noqa: E731
+            cluster.client.loop.asyncio_loop.call_soon_threadsafe(close)
+            assert closed.wait(60)
+        assert not [str(one.message) for one in said if "never awaited" in str(one.message)]
+    assert all(future.cancelled() for future in given)
+
+
+def test_workers_know_each_option_of_reading():
+    assert set(GRID) == {*PLACE, "axes", *Values.__annotations__}  # refuse others, or hand them on
 
 
 def test_a_grid_that_the_workers_do_not_see(cluster, network):

@@ -276,7 +276,7 @@ def test_no_command_writes_over_its_own_input(here, command, words, link):
 
 
 TARGETS = {
-    "out.xyz": (2, "out.xyz is not a mesh file: give one of .ply, .stl, .obj, .off, .glb, .3mf"),
+    "out.xyz": (2, f"out.xyz is not a mesh file: give one of {', '.join(MESH_SUFFIXES)}"),
     "there.ply": (1, "there.ply exists: remove it or use --force"),
     "no/out.ply": (1, "no is not a folder: make it first"),
     "dir.ply": (1, "dir.ply is a folder: give a file"),
@@ -381,7 +381,8 @@ def test_each_option_is_in_the_table_once_and_each_mesh_format_in_the_help():
         assert taken[name].default == OPTIONS[name].default
     assert set(Values.__annotations__) < set(GRID)
     assert tuple(f".{name}" for name in MESH_FORMATS) == MESH_SUFFIXES
-    assert all(f" {suffix}" in upsample_command.help for suffix in MESH_SUFFIXES)
+    for text in (upsample_command.help, write_mesh.__doc__):
+        assert all(f" {suffix}" in text for suffix in MESH_SUFFIXES)
 
 
 def test_a_large_file_is_announced_unless_quiet(here, command, monkeypatch):

@@ -273,9 +273,13 @@ def test_a_given_spacing_and_origin_replace_those_of_the_file():
 def test_a_mesh_as_input_is_told_to_be_sampled_first(command):
     want = (
         "Error: part.stl is a mesh, not a grid: sample it first with super-sdf sample part.stl "
-        "part.npz\n"
+        "part.npz -n 64\n"
     )
     assert command("upsample", "part.stl", "out.ply")[::2] == (2, want)
+    assert command("upsample", "part.step", "out.ply")[2] == (
+        "Error: part.step is a CAD model: export it as part.stl, then super-sdf sample part.stl "
+        "part.npz -n 64\n"
+    )
 
 
 STATED = "but {} files state their axes: leave it out"

@@ -40,7 +40,7 @@ def test_a_failed_write_leaves_what_was_there(folder, mesh, monkeypatch):
     said = refusal(FileError, write_mesh, mesh, "out.ply")
     assert said == "out.ply exists: remove it or use --force"
     said = refusal(OptionError, write_mesh, mesh, "out.xyz")
-    assert "give one of .ply, .stl, .obj, .off, .glb, .3mf" in said
+    assert f"give one of {', '.join(MESH_SUFFIXES)}" in said
     assert Path("out.ply").read_text() == "before" and os.listdir() == ["out.ply"]
 
 

@@ -98,4 +98,7 @@ def test_nothing_stands_between_a_product_and_its_rounding(files):
         for body in (a.g for node in nodes for a in node.attribute if a.name == "body"):
             made = {node.output[0]: node.op_type for node in body.node}
             rounded = [node for node in body.node if node.op_type == "QuantizeLinear"]
-            assert {made[node.input[0]] for node in rounded} <= {"Gemm", "Add", "Mul"}, (path, body.name)
+            assert {made[node.input[0]] for node in rounded} <= {"Gemm", "Add", "Mul"}, (
+                path,
+                body.name,
+            )

@@ -15,10 +15,10 @@ from typing import NamedTuple, NoReturn
 
 import numpy as np
 
+from super_sdf.files.meshes import MESH_SUFFIXES
+
 from .case import Case
 from .running import Run
-
-SUFFIXES = (".ply", ".stl", ".obj", ".off", ".glb", ".3mf")
 
 
 def faults_of_mesh(path: Path, *, may_be_open: bool) -> list[str]:
@@ -169,7 +169,7 @@ def _of_files(case: Case, run: Run, before: Snapshot, after: Snapshot, folder: P
         faults.append(Fault("nothing made", "exit code 0"))
     if single and "--force" not in case.words:
         faults += [Fault("overwritten", name) for name in allowed if name in before]
-    meshes = [name for name in allowed if Path(name).suffix in SUFFIXES]
+    meshes = [name for name in allowed if Path(name).suffix in MESH_SUFFIXES]
     return faults + [fault for name in meshes for fault in _of_mesh(case, run, folder / name)]
 
 

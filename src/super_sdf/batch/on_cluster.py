@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Generator, Sequence
-from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -42,9 +41,8 @@ def convert_on_cluster(
     with (
         connect(address, workers=workers, threads=settings.threads, max_memory=memory) as cluster,
         Crew(cluster, _needs_of(jobs, settings), prepare, warn) as crew,
-        closing(crew.completed(queue)) as results,
     ):
-        for job, row in results:
+        for job, row in crew.completed(queue):
             if isinstance(row, Death):
                 row = failed_row(job, f"the process that converted it {row.cause}")
             yield job, row

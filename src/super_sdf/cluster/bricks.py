@@ -24,6 +24,7 @@ from ..convert import Conversion, convert_grid
 from ..errors import ClusterError, OptionError, SuperSdfError
 from ..files.formats import split_member
 from ..files.meshes import Expectation
+from ..files.volume import PLACE
 from ..grid.cubic import check_has_offsets
 from ..grid.planes import Ranges, Result, SamplePlanes
 from ..grid.sdf_grid import SdfGrid, make_grid
@@ -241,7 +242,7 @@ def convert_on_cluster(
 def _read_stored(source: Source, crew: Crew, options: ConvertOptions) -> SdfGrid:
     """Return the grid in a file, whose samples the workers read."""
     store = opened(source)
-    given = {name: getattr(options, name) for name in ("spacing", "origin", "direction")}
+    given = {name: getattr(options, name) for name in PLACE}
     place, notes = store.place(given)
     close_stores()
     grid = make_grid(

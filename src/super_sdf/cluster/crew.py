@@ -68,6 +68,7 @@ class Crew:
         self.members: dict[str, Resources] = {}
         self.refused: set[str] = set()
         self.submitted = 0
+        self.given: set[Future[Any]] = set()  # whose results were not taken
         self.looked = self.seen = time.monotonic()
 
     def __enter__(self) -> Crew:
@@ -79,6 +80,14 @@ class Crew:
         return self
 
     def __exit__(self, *error: object) -> None:
+        """Tell the scheduler what nobody waits for: those tasks end at their next check.
+
+        Here, and not where results are taken: after an error such a generator lives as long as the
+        traceback, and it may be Dask's own thread that collects it, which cannot wait for Dask.
+        """
+        with suppress(Exception):  # the connection may be lost: then the scheduler knows it, too
+            self.cluster.client.cancel(list(self.given))
+        self.given.clear()
         with suppress(SuperSdfError):  # the connection may be lost
             if not self.cluster.is_local:
                 self.cluster.run(_forget, self.run, workers=list(self.members))
@@ -91,15 +100,12 @@ class Crew:
         lost, or there is no worker any more; SuperSdfError as a worker raised it.
         """
         given: dict[Future[Any], Task] = {}
-        try:
-            while given or len(tasks):
-                while len(tasks) and len(given) < max(len(self.members), 1):
-                    task = tasks.popleft()
-                    given[self._submit(task)] = task
-                for future in self._wait(given):
-                    yield given.pop(future), self._result(future)
-        finally:
-            self._cancel(given)
+        while given or len(tasks):
+            while len(tasks) and len(given) < max(len(self.members), 1):
+                task = tasks.popleft()
+                given[self._submit(task)] = task
+            for future in self._wait(given):
+                yield given.pop(future), self._result(future)
 
     def in_order(self, tasks: Iterable[Any]) -> Iterator[Any]:
         """Yield the results of tasks in their order, or a Death; raises what ``completed`` does.
@@ -107,16 +113,13 @@ class Crew:
         Workers keep the few results that are ready too early.
         """
         waiting, given = iter(tasks), deque[Any]()
-        try:
-            while True:
-                room = max(AHEAD * len(self.members) - len(given), 1 - len(given), 0)
-                given.extend(self._submit(task) for task in islice(waiting, room))
-                if not given:
-                    return
-                if self._wait([given[0]]):
-                    yield self._result(given.popleft())
-        finally:
-            self._cancel(given)
+        while True:
+            room = max(AHEAD * len(self.members) - len(given), 1 - len(given), 0)
+            given.extend(self._submit(task) for task in islice(waiting, room))
+            if not given:
+                return
+            if self._wait([given[0]]):
+                yield self._result(given.popleft())
 
     def _admit(self, members: dict[str, Resources]) -> None:
         for address, limits in members.items():
@@ -127,9 +130,11 @@ class Crew:
         self.submitted += 1
         key, submit = f"{self.run}-{self.submitted}", self.cluster.client.submit
         wanted = {self.run: 1}
-        return self.cluster.ask(
+        future = self.cluster.ask(
             lambda: submit(_work, self.run, self.prepare, task, key=key, resources=wanted)
         )
+        self.given.add(future)
+        return future
 
     def _wait(self, futures: Iterable[Future[Any]]) -> set[Future[Any]]:
         """Wait a moment for futures; return those that are done, and look after the workers."""
@@ -147,6 +152,7 @@ class Crew:
 
     def _result(self, future: Future[Any]) -> Any:
         """Return the result of a future that is done, or a Death."""
+        self.given.discard(future)
         while True:
             try:
                 return future.result(timeout=RESULT_SECONDS)
@@ -180,11 +186,6 @@ class Crew:
                 f"the cluster {self.cluster.address} has had no worker for {PATIENCE_SECONDS:g} s: "
                 "start some, and run it again"
             )
-
-    def _cancel(self, futures: Iterable[Future[Any]]) -> None:
-        """Tell the scheduler that nobody waits for futures: their tasks end at their next check."""
-        with suppress(Exception):  # the connection may be lost: then the scheduler knows it, too
-            self.cluster.client.cancel(list(futures))
 
 
 async def _admit(run: str, limits: Resources, dask_worker: Worker) -> None:

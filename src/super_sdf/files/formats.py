@@ -12,12 +12,14 @@ from typing import NamedTuple
 
 from ..errors import OptionError
 from ..machine.extras import check_modules
-from ..options import OPTIONS
+from ..options import MESH_FORMATS, OPTIONS
 
 # What people give by mistake: surfaces, which have to be sampled first.
-MESH_SUFFIXES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf", ".3mf", ".step", ".stp")
+SURFACES = (*(f".{name}" for name in MESH_FORMATS), ".gltf")
 # What is no grid file here, and the way out: {0} is the file, {1} its name without the suffix.
+CAD = "is a CAD model: export it as {1}.stl, then super-sdf sample {1}.stl {1}.npz -n 64"
 WAYS_OUT = {
+    **dict.fromkeys((".step", ".stp", ".iges", ".igs"), CAD),
     ".nvdb": "is NanoVDB: make OpenVDB of it with OpenVDB's tool nanovdb_convert {0} {1}.vdb",
     ".dcm": "is a DICOM image: give the folder that holds its series",
     ".img": "holds the samples of an Analyze file: give its header {1}.hdr",
@@ -79,10 +81,10 @@ def find_format(path: str | Path) -> GridFormat:
         return DICOM
     if file.suffix.lower() in WAYS_OUT:
         raise OptionError(f"{path} {WAYS_OUT[file.suffix.lower()].format(file, file.stem)}")
-    if str(path).lower().endswith(MESH_SUFFIXES):
+    if str(path).lower().endswith(SURFACES):
         raise OptionError(
             f"{path} is a mesh, not a grid: sample it first with "
-            f"super-sdf sample {path} {PurePath(path).stem}.npz"
+            f"super-sdf sample {path} {PurePath(path).stem}.npz -n 64"
         )
     raise OptionError(f"{path} is not a grid file: give one of {', '.join(GRID_SUFFIXES)}")
 
