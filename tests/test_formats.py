@@ -18,14 +18,13 @@ import nibabel
 import nrrd
 import numpy as np
 import pytest
+import pyvista
 import SimpleITK as sitk  # noqa: N813
 import tifffile
 import trimesh
 import zarr
 from conftest import refusal
 from numpy.typing import ArrayLike
-from vtkmodules.util.numpy_support import numpy_to_vtk
-from vtkmodules.vtkCommonDataModel import vtkImageData
 from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
 from super_sdf import SdfGrid, read_grid
@@ -101,19 +100,10 @@ def save_itk(path: str, affine: np.ndarray) -> None:
 
 def save_vti(path: str, affine: np.ndarray, start: tuple[int, ...] = (3, -2, 7)) -> None:
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
-    image = vtkImageData()
-    image.SetExtent(*(n for s, size in zip(start, SIZES) for n in (s, s + size - 1)))
-    image.SetSpacing(spacing)
-    image.SetDirectionMatrix((affine[:3, :3] / spacing).ravel())
-    image.SetOrigin(affine[:3, 3] - affine[:3, :3] @ start)
-    points = np.array([image.GetPoint(i) for i in range(image.GetNumberOfPoints())])
-    values = numpy_to_vtk(part(points).astype(np.float32), deep=True)
-    values.SetName("distance")
-    image.GetPointData().AddArray(values)
-    write_vti(path, image)
-
-
-def write_vti(path: str, image: vtkImageData) -> None:
+    place = {"origin": affine[:3, 3] - affine[:3, :3] @ start, "spacing": spacing}
+    image = pyvista.ImageData(**place, direction_matrix=affine[:3, :3] / spacing)
+    image.extent = [n for s, size in zip(start, SIZES) for n in (s, s + size - 1)]
+    image["distance"] = part(image.points).astype(np.float32)
     writer = vtkXMLImageDataWriter()
     writer.SetFileName(path)
     writer.SetInputData(image)
