@@ -71,30 +71,27 @@ def said_of(path, kind=FileError, **options):
 # Codecs
 
 
-def name_of_another(place, name):
-    """Return what names a codec in the metadata of an array."""
-    codec = {"id": name} if place in ("compressor", "filters") else {"name": name}
-    if place in ("compressor", "filters"):
-        return lambda about: about.update({place: codec if place == "compressor" else [codec]})
-    if place == "within a shard":
-        return lambda about: about["codecs"][0]["configuration"]["codecs"].append(codec)
-    if place == "index of a shard":
-        return lambda about: about["codecs"][0]["configuration"]["index_codecs"].append(codec)
-    return lambda about: about["codecs"].append(name if place == "a bare name" else codec)
-
-
-PLACES = ("compressor", "filters", "codecs", "a bare name", "within a shard", "index of a shard")
+PICKLE = {"name": "pickle"}
+PICKLE_AT = {
+    "compressor": lambda about: about.update(compressor={"id": "pickle"}),
+    "filters": lambda about: about.update(filters=[{"id": "pickle"}]),
+    "codecs": lambda about: about["codecs"].append(PICKLE),
+    "a bare name": lambda about: about["codecs"].append("pickle"),
+    "within a shard": lambda about: about["codecs"][0]["configuration"]["codecs"].append(PICKLE),
+    "index of a shard": (
+        lambda about: about["codecs"][0]["configuration"]["index_codecs"].append(PICKLE)
+    ),
+}
 
 
 @pytest.mark.usefixtures("in_process")
-@pytest.mark.parametrize("place", PLACES)
-def test_a_codec_that_is_not_in_the_list_is_refused_by_its_name(values, place, name="pickle"):
+@pytest.mark.parametrize("place", PICKLE_AT)
+def test_a_codec_that_is_not_in_the_list_is_refused_by_its_name(values, place):
     version = 2 if place in ("compressor", "filters") else 3
-    shards = {"shards": (16, 16, 16)} if "shard" in place else {}
-    store(values, zarr_format=version, **shards)
-    edited("a.zarr/.zarray" if version == 2 else "a.zarr/zarr.json", name_of_another(place, name))
+    store(values, zarr_format=version, **({"shards": (16, 16, 16)} if "shard" in place else {}))
+    edited("a.zarr/.zarray" if version == 2 else "a.zarr/zarr.json", PICKLE_AT[place])
     assert said_of("a.zarr") == (
-        f"a.zarr names the codec {name!r}, which is not among those that are read "
+        "a.zarr names the codec 'pickle', which is not among those that are read "
         f"({', '.join(sorted(CODECS))}): store it with one of these"
     )
 
@@ -103,7 +100,7 @@ def test_only_the_array_that_is_read_must_have_known_codecs(values):
     zarr.open_group("g.zarr", mode="w")
     store(values, "g.zarr/a")
     store(values, "g.zarr/b")
-    edited("g.zarr/b/zarr.json", name_of_another("codecs", "pickle"))
+    edited("g.zarr/b/zarr.json", PICKLE_AT["codecs"])
     assert np.array_equal(read("g.zarr:/a"), values)
     assert "names the codec 'pickle'" in said_of("g.zarr:/b")
 
@@ -228,23 +225,26 @@ def test_files_of_an_ome_set_are_read_beside_the_file(values, tmp_path):
 # Parts that are not stored
 
 
+LAYOUTS = {
+    "2": {"zarr_format": 2},
+    "sharded": {"chunks": (4, 4, 4), "shards": (16, 16, 16)},
+    "in a shard": {"chunks": (8, 8, 8), "shards": (32, 32, 32)},
+}
+
+
 def partly(values, path, kind, fill):
     """Write the first 24 planes of a grid of 30, and leave out the others."""
+    whole = np.where(np.arange(len(values))[:, None, None] < 24, values, values.dtype.type(fill))
     if kind == "hdf5":
         with h5py.File(path, "w") as file:
             about = {"shape": values.shape, "dtype": values.dtype, "chunks": (8, 8, 8)}
             file.create_dataset("d", **about, fillvalue=fill)[:24] = values[:24]
-        return
-    about = {"sharded": {"chunks": (4, 4, 4), "shards": (16, 16, 16)}, "2": {"zarr_format": 2}}
-    if kind == "in a shard":
-        about[kind] = {"chunks": (8, 8, 8), "shards": (32, 32, 32)}
-    whole = np.full_like(values, fill)
-    whole[:24] = values[:24]
-    if kind == "zip":
+    elif kind == "zip":
         with zarr.storage.ZipStore(path, mode="w") as zipped:
             store(whole, zipped, fill_value=fill)
     else:
-        store(whole, path, fill_value=fill, **about.get(kind, {}))
+        store(whole, path, fill_value=fill, **LAYOUTS[kind])
+    return whole
 
 
 @pytest.mark.usefixtures("in_process")
@@ -264,8 +264,7 @@ def test_chunks_that_are_not_stored_are_counted(values, kind):
 @pytest.mark.parametrize("kind", ["hdf5", "2", "sharded"])
 def test_another_fill_value_is_as_good_as_a_stored_one(values, kind):
     path, far = "a.h5" if kind == "hdf5" else "a.zarr", np.float32(9.0)
-    narrow = np.where(np.arange(len(values))[:, None, None] < 24, values, far)
-    partly(narrow, path, kind, far)
+    narrow = partly(values, path, kind, far)
     assert np.array_equal(read(path, field="exact"), narrow)
 
 
