@@ -5,8 +5,8 @@
     shapes, kinds -> methods -> measuring (metrics, edges) -> runner -> rows -> tables
     -> evaluate, figures -> documents
 
-Everything that is measured goes through one runner of processes (``runner``, ``processes``), one
-file of rows (``rows``) and one module of tables (``tables``).
+Methods on shapes go through one runner of tasks (``runner``), what is timed through processes of
+its own (``processes``); all is kept in files of rows (``rows``) and shown by ``tables``.
 """
 
 import argparse

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,14 +20,12 @@ from super_sdf.grid.placement import as_triple
 from super_sdf.grid.sdf_grid import SdfGrid
 from super_sdf.steps.field import FineField
 
-from .drawing import AXES
-from .page import check_page, write_picture
+from .drawing import AXES, SIZE, write_picture
 
 COLOUR_MAP = "RdBu_r"  # blue inside, red outside, white at the surface
 LIMIT = 3.0  # distance at both ends of the colour bar, in voxels
 UNKNOWN = "#c4c4c4"
-INCHES = 7.0  # width of a panel; the pixels per inch follow from the size in pixels
-SECTIONS = 2  # most sections side by side
+INCHES = 7.0  # width of a panel
 TALLEST = 3  # greatest ratio of a panel's height to its width
 STRIP = 1.35  # inches for titles, labels and the colour bar
 BAR_TITLE = f"signed distance (negative inside); colours end at {LIMIT:g} voxels, black line: 0"
@@ -42,43 +39,27 @@ class Section:
     first: tuple[float, float]  # world position of value (0, 0) along the two axes
     step: tuple[float, float]  # world distance between neighbours along them
 
-    def places(self, along: int) -> NDArray[np.floating[Any]]:
-        """Return the world positions of the values along an axis of the plane."""
-        return self.first[along] + self.step[along] * np.arange(self.values.shape[along])
-
     def box(self) -> tuple[float, float, float, float]:
-        """Return left, right, bottom and top of all cells."""
+        """Return left, right, bottom and top of all rectangles."""
         low = np.array(self.first) - np.array(self.step) / 2
         high = low + np.array(self.step) * self.values.shape
         return low[0], high[0], low[1], high[1]
 
 
-def render_section(
-    grid: SdfGrid,
-    target: Path,
-    *,
-    field: FineField | None = None,
-    axis: str = "z",
-    at: float | None = None,
-    size: int = 700,
-    force: bool = True,
-) -> None:
-    """Draw a cross-section of a grid, and beside it the same section refined, as a PNG file."""
-    index, number = find_plane(grid, axis, at), AXES.index(axis)
-    sections = {f"{' x '.join(map(str, grid.shape))} samples": coarse_section(grid, axis, index)}
-    if field is not None:
-        title = f"refined {field.factor} times (grey: far from the surface, not refined)"
-        sections[title] = fine_section(field, grid, axis, index)
-    figure = _draw(sections, axis, grid.voxel_size, size)
+def render_section(grid: SdfGrid, field: FineField, target: Path, axis: str, index: int) -> None:
+    """Draw a plane of samples of a grid, and beside it the same plane refined, as a PNG file."""
+    sections = {
+        f"{' x '.join(map(str, grid.shape))} samples": coarse_section(grid, axis, index),
+        f"refined {field.factor} times (grey: far from the surface, not refined)": fine_section(
+            field, grid, axis, index
+        ),
+    }
+    figure = draw_sections(sections, axis, grid.voxel_size)
+    number = AXES.index(axis)
     position = own_origin(grid)[number] + grid.spacing[number] * index
     along = "" if grid.is_straight else ", along the grid's own axes"
     figure.suptitle(f"section at {axis} = {position:.4g}{along}")
-    write_picture(figure, target, force=force)
-
-
-def check_section(size: int) -> None:
-    """Raise if panels of ``size`` pixels are too large to draw; see ``check_page``."""
-    check_page(size, SECTIONS * TALLEST, columns=SECTIONS)
+    write_picture(figure, target)
 
 
 def find_plane(grid: SdfGrid, axis: str = "z", at: float | None = None) -> int:
@@ -111,65 +92,58 @@ def own_origin(grid: SdfGrid) -> tuple[float, float, float]:
 def coarse_section(grid: SdfGrid, axis: str, index: int) -> Section:
     """Return the plane of samples with this index along an axis."""
     values = np.take(grid.values, index, axis=AXES.index(axis)).astype(np.float64)
-    across, along = _plane_of(axis)
+    across, up = plane_of(axis)
     origin, spacing = own_origin(grid), grid.spacing
-    return Section(values, (origin[across], origin[along]), (spacing[across], spacing[along]))
+    return Section(values, (origin[across], origin[up]), (spacing[across], spacing[up]))
 
 
 def fine_section(field: FineField, grid: SdfGrid, axis: str, index: int) -> Section:
     """Return the fine values on the plane of nodes that coincides with a plane of samples."""
-    lattice, number, factor = cubic_grid(grid), AXES.index(axis), field.factor
+    lattice, number, (across, up) = cubic_grid(grid), AXES.index(axis), plane_of(axis)
+    factor, origin, voxel = field.factor, own_origin(lattice), lattice.voxel_size
     plane = round(index * grid.spacing[number] / lattice.spacing[number])
-    values = _node_plane(field, axis, min(plane, lattice.shape[number] - 1))
-    origin, spacing = own_origin(lattice), lattice.spacing
-    (left, wide), (bottom, high) = ((origin[n], spacing[n]) for n in _plane_of(axis))
-    first, step = (left - wide / 2, bottom - high / 2), (wide / factor, high / factor)
-    return Section(values * (lattice.voxel_size / 2), first, step)
-
-
-def _node_plane(field: FineField, axis: str, index: int) -> NDArray[np.float64]:
-    """Return the values, in half voxels, on the middle nodes of a plane of voxels; else NaN."""
-    factor, number, (across, along) = field.factor, AXES.index(axis), _plane_of(axis)
-    in_grid = ((field.voxel_ijk >= 0) & (field.voxel_ijk < np.array(field.shape))).all(1)
-    rows = np.flatnonzero(in_grid & (field.voxel_ijk[:, number] == index))
+    plane = min(plane, lattice.shape[number] - 1)
+    inside = ((field.voxel_ijk >= 0) & (field.voxel_ijk < np.array(field.shape))).all(1)
+    rows = np.flatnonzero(inside & (field.voxel_ijk[:, number] == plane))
     blocks = field.blocks[:, rows].T.reshape(-1, *(factor + 1,) * 3)
-    place = factor * field.voxel_ijk[rows, :, None] + np.arange(factor + 1)
-    plane = np.full((factor * field.shape[across] + 1, factor * field.shape[along] + 1), np.nan)
-    values = np.take(blocks, factor // 2, axis=number + 1)
-    plane[place[:, across, :, None], place[:, along, None, :]] = values
-    return plane
+    node = factor * field.voxel_ijk[rows, :, None] + np.arange(factor + 1)
+    values = np.full((factor * field.shape[across] + 1, factor * field.shape[up] + 1), np.nan)
+    values[node[:, across, :, None], node[:, up, None, :]] = np.take(
+        blocks, factor // 2, axis=number + 1
+    )
+    first = origin[across] - voxel / 2, origin[up] - voxel / 2
+    return Section(values * (voxel / 2), first, (voxel / factor, voxel / factor))
 
 
-def _plane_of(axis: str) -> tuple[int, int]:
+def plane_of(axis: str) -> tuple[int, int]:
     """Return the two axes of a section's plane: to the right, and up."""
-    across, along = (other for other in range(3) if other != AXES.index(axis))
-    return across, along
+    across, up = (other for other in range(3) if other != AXES.index(axis))
+    return across, up
 
 
-def _draw(sections: dict[str, Section], axis: str, voxel: float, size: int) -> Figure:
+def draw_sections(sections: dict[str, Section], axis: str, voxel: float) -> Figure:
     """Draw sections side by side under their titles, with one colour bar."""
     left, right, bottom, top = next(iter(sections.values())).box()
     tall = float(np.clip((top - bottom) / (right - left), 0.3, TALLEST))
     inches = INCHES * len(sections), INCHES * tall + STRIP
-    figure = Figure(figsize=inches, dpi=size / INCHES, layout="constrained")
+    figure = Figure(figsize=inches, dpi=SIZE / INCHES, layout="constrained")
     plots = figure.subplots(1, len(sections), squeeze=False, sharex=True, sharey=True)[0]
     for ax, (title, section) in zip(plots, sections.items()):
-        image = _draw_section(ax, section, LIMIT * voxel)
+        image = draw_section(ax, section, LIMIT * voxel)
         ax.set(title=title, aspect="equal", xlim=(left, right), ylim=(bottom, top))
-        ax.set_xlabel(AXES[_plane_of(axis)[0]])
-    plots[0].set_ylabel(AXES[_plane_of(axis)[1]])
+        ax.set_xlabel(AXES[plane_of(axis)[0]])
+    plots[0].set_ylabel(AXES[plane_of(axis)[1]])
     where = {"ax": list(plots), "location": "bottom", "shrink": 0.5, "aspect": 35, "pad": 0.03}
     figure.colorbar(image, extend="both", **where).set_label(BAR_TITLE)
     return figure
 
 
-def _draw_section(ax: Axes, section: Section, limit: float) -> AxesImage:
+def draw_section(ax: Axes, section: Section, limit: float) -> AxesImage:
     """Draw the values of a section, and their zero line."""
-    known, scale = np.ma.masked_invalid(section.values.T), {"vmin": -limit, "vmax": limit}
+    known, place = np.ma.masked_invalid(section.values.T), {"extent": section.box()}
     ax.set_facecolor(UNKNOWN)
-    image = ax.imshow(known, COLOUR_MAP, origin="lower", extent=section.box(),
-                      interpolation="nearest", **scale)  # fmt: skip
+    image = ax.imshow(known, COLOUR_MAP, origin="lower", interpolation="nearest",
+                      vmin=-limit, vmax=limit, **place)  # fmt: skip
     if known.count() and known.min() <= 0 < known.max():
-        x, y = section.places(0), section.places(1)
-        ax.contour(x, y, known, levels=[0], colors="black", linewidths=1.4)
+        ax.contour(known, levels=[0], origin="lower", colors="black", linewidths=1.4, **place)
     return image

@@ -12,6 +12,8 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -56,41 +58,32 @@ def best_seconds(work: Callable[..., Any], *arguments: Any) -> float:
     return min(seconds)
 
 
-def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """Print a Markdown table."""
-    print(f"\n{title}\n\n{markdown(head, [list(map(str, row)) for row in rows])}", flush=True)
-
-
-def compare_values(device: str, sizes: Sequence[int]) -> None:
-    """Print the difference between the values of CUDA and of the CPU, and both times."""
+def compare_values(device: str, sizes: Sequence[int]) -> str:
+    """Return the difference between the values of CUDA and of the CPU, and both times."""
     rows, places = [], ("cpu", device)
-    for quality in QUALITIES:
+    for quality, size in product(QUALITIES, sizes):
         networks = [load_network(quality, device=at, precision="float32") for at in places]
-        for size in sizes:
-            inputs = network_inputs(size)
-            here, there = (network(*inputs) for network in networks)
-            seconds = [best_seconds(network, *inputs) for network in networks]
-            rates = [f"{1e6 * value / len(inputs[0]):.2f}" for value in seconds]
-            apart = f"{np.abs(here - there).max() / 2:.1e}"
-            rows.append([quality, f"{size}^3", f"{len(inputs[0]):,}", *rates, apart])
+        inputs = network_inputs(size)
+        here, there = (network(*inputs) for network in networks)
+        seconds = [best_seconds(network, *inputs) for network in networks]
+        rates = [f"{1e6 * value / len(inputs[0]):.2f}" for value in seconds]
+        apart = f"{np.abs(here - there).max() / 2:.1e}"
+        rows.append([quality, f"{size}^3", f"{len(inputs[0]):,}", *rates, apart])
     rates = [f"{at} us per voxel" for at in ("CPU", device)]
-    head = ["network", "grid", "voxels", *rates, "difference, voxels"]
-    print_table("Values and speed of the network", head, rows)
+    return markdown(["network", "grid", "voxels", *rates, "difference, voxels"], rows)
 
 
-def watch_memory(device: str, size: int) -> None:
-    """Print GPU memory after many shapes, each with more voxels than the last."""
+def watch_memory(device: str, size: int) -> str:
+    """Return GPU memory after many shapes, each with more voxels than the last, and a small one."""
     rows = [["nothing", used_memory()]]
     network = load_network("base", device=device)
     rows.append(["loaded", used_memory()])
-    whole = network_inputs(size)
-    for count, share in enumerate(np.linspace(0.2, 1, SHAPES), 1):
-        run_part(network, whole, share)
-        if count in (1, 2, 5, 10, 20, SHAPES):
+    inputs = network_inputs(size)
+    for count, share in enumerate([*np.linspace(0.2, 1, SHAPES), 0.2], 1):
+        run_part(network, inputs, share)
+        if count in (1, 2, 5, 10, 20, SHAPES, SHAPES + 1):
             rows.append([f"{count} shapes", used_memory()])
-    run_part(network, whole, 0.2)
-    rows.append(["a small one", used_memory()])
-    print_table(f"Memory of the GPU in MiB, shapes up to {size}^3", ["after", "used"], rows)
+    return markdown(["after", "used"], rows)
 
 
 def run_part(network: Network, inputs: Sequence[np.ndarray], share: float) -> None:
@@ -106,15 +99,15 @@ def used_memory() -> str:
     return (query_gpu("memory.used") or ["unknown"])[0]
 
 
-def compare_pipeline(device: str, sizes: Sequence[int]) -> None:
-    """Print the seconds from a grid to its mesh, without loading the network."""
+def compare_pipeline(device: str, sizes: Sequence[int]) -> str:
+    """Return the seconds from a grid to its mesh, without loading the network."""
+    networks = [load_network("base", device=place) for place in ("cpu", device)]
     rows = []
     for size in sizes:
         grid = noisy_ball(size)
-        networks = [load_network("base", device=place) for place in ("cpu", device)]
         seconds = [best_seconds(reconstruct, grid, network) for network in networks]
         rows.append([f"{size}^3", *(f"{value:.2f}" for value in seconds)])
-    print_table("From a grid to its mesh", ["grid", "CPU s", f"{device} s"], rows)
+    return markdown(["grid", "CPU s", f"{device} s"], rows)
 
 
 def main() -> None:
@@ -122,14 +115,18 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128, 256])
     parser.add_argument("--device", default="cuda", help="cpu tries this command itself")
-    arguments = parser.parse_args()
+    given = parser.parse_args()
+    device, largest = given.device, max(given.sizes)
     try:
-        load_network("fast", device=arguments.device)
+        load_network("fast", device=device)
     except DeviceError as error:
         print(f"nothing to measure: {error}")
         return
     gpu = describe_gpu() or "no GPU"
     print(f"{gpu}; {os.cpu_count()} cores; {onnxruntime_version()}; least of {RUNS} runs each")
-    compare_values(arguments.device, arguments.sizes)
-    watch_memory(arguments.device, max(arguments.sizes))
-    compare_pipeline(arguments.device, arguments.sizes)
+    for title, table in (
+        ("Values and speed of the network", partial(compare_values, device, given.sizes)),
+        (f"Memory of the GPU in MiB, up to {largest}^3", partial(watch_memory, device, largest)),
+        ("From a grid to its mesh", partial(compare_pipeline, device, given.sizes)),
+    ):
+        print(f"\n{title}\n\n{table()}", flush=True)

@@ -1,4 +1,4 @@
-"""Pictures of meshes side by side, off screen: PyVista draws each, ``page`` lays them out.
+"""Pictures of meshes side by side, off screen: PyVista draws each, matplotlib puts them on a page.
 
 All meshes of a picture share one parallel projection, so lengths can be compared.
 """
@@ -13,16 +13,29 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 from super_sdf.errors import DeviceError, OptionError
+from super_sdf.files.output import replacing
 from super_sdf.mesh import Mesh
 from super_sdf.truth.solid import Distances, Points, Solid
 
 from .metrics import face_vectors
-from .page import COLOUR_MAP, Image, Page, write_picture
 
+Image = NDArray[np.uint8]
+
+COLUMNS = 4  # most panels in a row
+SIZE = 700  # pixels of a panel's long side
+DPI = 72  # so that a font size in points is one in pixels
+# Light where the error is small, so that the shading shows the shape there.
+COLOUR_MAP = "magma_r"
 AXES = ("x", "y", "z")
 COLOURS = ("shaded", "normal", "error")
 # For each axis that may point up: the directions to the right and towards the viewer.
@@ -34,8 +47,6 @@ RIGHT_AND_FRONT = {
 THREE_QUARTER = 0.6, 1.0, 0.5  # right, front and up of the default view
 TOP_PERCENTILE = 99.0  # so that a single stray vertex does not stretch the colours
 NORMALS_LEGEND = "colour: direction of the face; red, green, blue are (1 + normal)/2 along x, y, z"
-ZOOMS = 0.01, 1000.0  # smallest and largest: beyond, a mesh is a dot or a flat colour
-LARGEST_TOP = 1e30  # of the colour bar; the smallest is its inverse: VTK computes in float32
 MARGIN = 1.06  # size of the frame over the size of the meshes
 NARROWEST = 0.5  # least ratio of a panel's short side to its long one: titles need room
 SUPERSAMPLING = 2  # pixels drawn per pixel of the picture, along each axis
@@ -92,14 +103,15 @@ def render_panels(
     *,
     colour: str = "shaded",
     up: str = "z",
-    size: int = 700,
-    zoom: float = 1.0,
+    size: int = SIZE,
     top: float | None = None,
     unit: str = "",
-    force: bool = True,
 ) -> None:
-    """Draw meshes side by side from one camera, as a PNG file; ``size`` is a panel's long side."""
-    frame = fit_frame(panels, view_axes(up), zoom)
+    """Draw meshes side by side from one camera, as a PNG file; ``size`` is a panel's long side.
+
+    ``top`` is the distance at the end of the colour bar, ``unit`` that of distances.
+    """
+    frame = fit_frame(panels, view_axes(up))
     values = np.concatenate([[], *(p.values for p in panels if p.values is not None)])
     if top is None:
         top = (float(np.percentile(values, TOP_PERCENTILE)) if len(values) else 0) or 1.0
@@ -110,7 +122,7 @@ def render_panels(
     elif colour == "error" and len(values):
         title = "distance to the reference" + f" ({unit})" * bool(unit)
         page.add_bar(title, top, clipped=bool(values.max() > top))
-    write_picture(page.figure, target, force=force)
+    write_picture(page.figure, target)
 
 
 def view_axes(up: str = "z", view: tuple[float, float, float] | None = None) -> NDArray[np.float64]:
@@ -124,7 +136,7 @@ def view_axes(up: str = "z", view: tuple[float, float, float] | None = None) -> 
     return np.array([across, np.cross(towards, across), towards])
 
 
-def fit_frame(panels: Sequence[Panel], axes: NDArray[np.float64], zoom: float = 1.0) -> Frame:
+def fit_frame(panels: Sequence[Panel], axes: NDArray[np.float64]) -> Frame:
     """Return the smallest frame with these axes that holds the faces of all panels."""
     drawn = [panel.mesh.vertices[np.unique(panel.mesh.faces)] for panel in panels]
     points = np.concatenate(drawn).astype(np.float64) @ axes.T
@@ -134,7 +146,7 @@ def fit_frame(panels: Sequence[Panel], axes: NDArray[np.float64], zoom: float = 
     sides = (high - low)[:2]
     longest = float(sides.max()) or 1.0
     wide, tall = (max(float(side) / longest, NARROWEST) for side in sides)
-    return Frame(axes, (low + high) / 2, longest / 2 * MARGIN / zoom, (wide, tall))
+    return Frame(axes, (low + high) / 2, longest / 2 * MARGIN, (wide, tall))
 
 
 def face_colours(mesh: Mesh) -> Image:
@@ -143,17 +155,6 @@ def face_colours(mesh: Mesh) -> Image:
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
     return np.round((normals + 1) / 2 * 255).astype(np.uint8)
-
-
-def check_numbers(zoom: float, top: float | None) -> None:
-    """Raise OptionError if the zoom, or the end of the colour bar, is out of range."""
-    least, most = ZOOMS
-    if not least <= zoom <= most:
-        raise OptionError(f"zoom is {zoom:g}: give a number from {least:g} to {most:g}")
-    if top is not None and not 0 < top < np.inf:
-        raise OptionError(f"top is {top:g}: give a number greater than 0")
-    if top is not None and not 1 / LARGEST_TOP <= top <= LARGEST_TOP:
-        raise OptionError(f"top is {top:g}: no colour bar can be drawn to that")
 
 
 def draw_panel(
@@ -193,3 +194,71 @@ def draw_panel(
     plotter.close()
     blocks = image[..., :3].reshape(tall, SUPERSAMPLING, wide, SUPERSAMPLING, 3)
     return np.round(blocks.mean((1, 3))).astype(np.uint8)
+
+
+def write_picture(figure: Figure, target: Path) -> None:
+    """Write a figure as a complete PNG file."""
+    with replacing(target) as part:
+        figure.savefig(part, format="png", dpi=figure.dpi)
+
+
+class Page:
+    """A figure of pictures, (height, width, 3) each; ``size`` is a picture's long side in pixels.
+
+    ``foot`` is the height of the legend, in lines of text; the font size follows from ``size``.
+    """
+
+    def __init__(self, size: int, images: Sequence[Image], titles: Sequence[str], *,
+                 columns: int = COLUMNS, foot: float = 0.0) -> None:  # fmt: skip
+        self.type_size = max(size / 30, 9.0)
+        self.gap = gap = size // 30 + 1
+        strip = round(2 * self.type_size) if any(titles) else 0
+        self.foot = round(foot * self.type_size)
+        self.tall, self.wide = images[0].shape[:2]
+        across = min(len(images), columns)
+        rows = -(-len(images) // across)
+        self.width = across * (self.wide + gap) + gap
+        self.height = rows * (strip + self.tall + gap) + gap + self.foot
+        # plus half a pixel, since the size of the page is rounded down
+        inches = (self.width + 0.5) / DPI, (self.height + 0.5) / DPI
+        self.figure = Figure(figsize=inches, dpi=DPI, facecolor="white")
+        FigureCanvasAgg(self.figure)
+        for number, (image, title) in enumerate(zip(images, titles)):
+            row, column = divmod(number, across)
+            left = gap + column * (self.wide + gap)
+            high = self.height - gap - row * (strip + self.tall + gap)
+            self.figure.figimage(image, left, high - strip - self.tall, origin="upper")
+            self._write(title, left + self.wide / 2, high - strip / 2, 1.0, self.wide)
+
+    def _write(self, line: str, x: float, y: float, scale: float, room: float) -> None:
+        """Write a line centred on (x, y), in pixels; smaller if it is wider than ``room``."""
+        size = scale * self.type_size
+        at = x / self.width, y / self.height
+        # file names may hold dollar signs, which are no formulas
+        text = self.figure.text(*at, line, ha="center", va="center", size=size, parse_math=False)
+        wide = text.get_window_extent().width
+        if wide > room:
+            text.set_fontsize(size * room / wide)
+
+    def add_line(self, line: str, y: float | None = None) -> None:
+        """Add a line of text at the foot of the page."""
+        y = self.foot / 2 if y is None else y
+        self._write(line, self.width / 2, y, 0.9, self.width - 2 * self.gap)
+
+    def add_bar(self, title: str, top: float, *, clipped: bool) -> None:
+        """Add a colour bar from 0 to ``top``, with an arrow if ``clipped`` values lie beyond."""
+        unit = self.type_size
+        wide = min(1.2 * max(self.wide, self.tall), 0.8 * self.width)
+        left, below = (self.width - wide) / 2, 2.0 * unit
+        box = np.divide((left, below, wide, 0.8 * unit), (self.width, self.height) * 2)
+        ax = self.figure.add_axes(tuple(box))
+        self.figure.colorbar(
+            ScalarMappable(Normalize(0, top), matplotlib.colormaps[COLOUR_MAP]),
+            cax=ax,
+            orientation="horizontal",
+            extend="max" if clipped else "neither",
+            ticks=MaxNLocator(4),
+            format=FormatStrFormatter("%.3g"),
+        )
+        ax.tick_params(labelsize=0.8 * unit)
+        self.add_line(title, below + 1.7 * unit)

@@ -5,7 +5,8 @@
 
 Each mesh is scaled to a box diagonal of 1 and sampled at every size; the surface that a method
 reconstructs from the samples is compared with the mesh. OUT is a new or empty folder, or that of an
-earlier evaluation, which is resumed:
+earlier evaluation, which is resumed; there another model is compared without measuring the rest
+again:
 
     OUT/report.md      the tables
     OUT/shapes.md      every figure of every shape
@@ -18,7 +19,7 @@ from __future__ import annotations
 import sys
 import time
 from argparse import ArgumentParser
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,17 +35,26 @@ from .plots import draw_plots
 from .processes import describe_machine
 from .rows import Row, Rows
 from .runner import LeftOut, OnTask, complete
-from .shapes import Case, Setting, Shape, find_meshes, spread
+from .shapes import HALVES, Case, Setting, Shape, draw_halves, find_meshes, spread
 from .tables import (
+    BY_KEY,
     COST,
     EDGES,
-    empty_lines,
-    gap_line,
-    mean_table,
-    shape_table,
+    GAPS,
+    gap_closed,
+    label_of,
+    listed,
+    markdown,
+    mean_of,
+    percent,
+    summary,
     surface_table,
     win_line,
 )
+
+Halves = Mapping[str, Sequence[str]]
+"""Names of shapes: all, and each half."""
+ByMethod = Mapping[str, Sequence[Row]]
 
 ROWS = "results.jsonl"
 EXTREMES = 5  # number of best shapes shown, and of worst
@@ -150,38 +160,83 @@ def check_folder(out: Path) -> None:
         raise FileError(f"{out} cannot be made: {error.strerror}") from error
 
 
-def write_report(
-    results: Results, like: Task, settings: Sequence[Setting], out: Path, up: str | None
-) -> Path:
+def write_report(results: Results, like: Task, halves: Halves, out: Path, up: str | None) -> Path:
     """Write report.md, shapes.md, plots and pictures; return the path of report.md.
 
     ``up`` is the axis that points up in the pictures; None: none are drawn.
     """
+    settings = dict.fromkeys(t.setting for t in results.tasks if t.setting != NO_SETTING)
     by_setting = {s: results.by_method(s, (*like.methods, FLOOR)) for s in settings}
+    means = {setting: [{"method": method, **summary(rows)} for method, rows in found.items()]
+             for setting, found in by_setting.items()}  # fmt: skip
     parts = [f"# Quality of super-sdf on {len(results.floors)} shapes", PROTOCOL_LINES]
     if like.turned is not None:
         parts.append(f"The shapes are turned at random, by seed {like.turned}.")
     parts += [f"Left out, {entry.shape}: {entry.reason}." for entry in results.left_out]
-    for setting, by_method in by_setting.items():
-        wins = ()
-        if {OURS, "bspline"} <= set(by_method):
-            wins = (win_line(by_method[OURS], by_method["bspline"]),)
-        lines = [*wins, gap_line(by_method), *empty_lines(by_method)]
-        parts += [f"## {setting}", surface_table(by_method, setting.size), *filter(None, lines)]
-    parts += ["## Edges and triangles", EDGE_LINES]
-    parts += [f"**{s}**\n\n{mean_table(found, EDGES)}" for s, found in by_setting.items()]
-    parts += ["## Time and memory", describe_machine(), COST_LINES]
-    parts += [f"**{s}**\n\n{mean_table(found, COST)}" for s, found in by_setting.items()]
+    for setting, found in by_setting.items():
+        parts += [f"## {setting}", surface_table(means[setting], setting.size)]
+        parts += [*comparisons(found, halves), *odd_meshes(found)]
+    for title, text, columns in (
+        ("Edges and triangles", EDGE_LINES, EDGES),
+        ("Time and memory", f"{describe_machine()}\n\n{COST_LINES}", COST),
+    ):
+        parts += [f"## {title}", text]
+        parts += [f"**{setting}**\n\n{listed(rows, columns)}" for setting, rows in means.items()]
     plots = draw_plots({s.size: found for s, found in by_setting.items()}, out / "plots")
     parts += ["## Plots", *(f"![{text}](plots/{name})" for name, text in plots.items())]
     if up and OURS in like.methods:
-        parts += picture_lines(results, like, settings[0], out, up)
+        parts += picture_lines(results, like, next(iter(settings)), out, up)
     notes = {name: "; ".join(row["notes"]) for name, row in results.floors.items()}
     lines = [f"- {name}: {said}." for name, said in notes.items() if said]
     parts += ["## Notes on the shapes", "\n".join(lines)] if lines else []
-    shapes = [f"## {s}\n\n{shape_table(found)}" for s, found in by_setting.items()]
+    shapes = [f"## {setting}\n\n{shape_table(found)}" for setting, found in by_setting.items()]
     write_page(out / "shapes.md", shapes)
     return write_page(out / "report.md", parts)
+
+
+def comparisons(by_method: ByMethod, halves: Halves) -> list[str]:
+    """Return on how many shapes ours beats B-spline, and the gap to the bound that it closes."""
+    if not {OURS, "bspline"} <= set(by_method):
+        return []
+    lines = [win_line(by_method[OURS], by_method["bspline"])]
+    if "bound" in by_method:
+        body = []
+        for half, names in halves.items():
+            three = [[row for row in by_method[method] if row["shape"] in names]
+                     for method in (OURS, "bspline", "bound")]  # fmt: skip
+            if three[0]:
+                cells = (f"{mean_of(three[0], key):.4g}, {percent(gap_closed(*three, key), 1)}"
+                         for key in GAPS)  # fmt: skip
+                body.append([f"{half} ({len(three[0])})", *cells])
+        title = "super-sdf, and what it closes of the gap between B-spline and the bound"
+        lines.append(markdown([title, *GAPS.values()], body))
+    return lines
+
+
+def odd_meshes(by_method: ByMethod) -> list[str]:
+    """Return a line for each method that found no surface on some shapes, or one inside out."""
+    lines = []
+    for method, rows in by_method.items():
+        empty = [row["shape"] for row in rows if not row["faces"]]
+        turned = [row["shape"] for row in rows if row["faces"] and not row["outward"]]
+        odd = {"No surface (a dot stands in)": empty, "Inside out": turned}
+        named = {what: names for what, names in odd.items() if names}
+        lines += [f"{what}, {label_of(method)}: {', '.join(n)}." for what, n in named.items()]
+    return lines
+
+
+def shape_table(by_method: ByMethod) -> str:
+    """Return the table of all shapes, with a row for each shape and method."""
+    rows = [
+        {**row, "method": name}
+        for measured in zip(*by_method.values())
+        for name, row in zip(by_method, measured)
+    ]
+
+    def words(row: Row) -> list[str]:
+        return [f"{row['shape']}, {label_of(row['method'])}"]
+
+    return listed(rows, list(BY_KEY.values()), words, ["shape, method"])
 
 
 def write_page(path: Path, parts: Sequence[str]) -> Path:
@@ -258,6 +313,8 @@ def main() -> int:
     parser.add_argument("--factor", type=int, default=4)
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--limit", type=int, help="use only this many meshes, spread over the list")
+    parser.add_argument("--half", choices=("all", *HALVES), default="all",
+                        help="networks are chosen on one half of the meshes")  # fmt: skip
     parser.add_argument("--turned", type=int, metavar="SEED", help="turn meshes at random first")
     parser.add_argument("--model", default=DEFAULT_QUALITY, help="shipped network or ONNX file")
     parser.add_argument("--precision", choices=PRECISIONS, default=AUTO_PRECISION)
@@ -269,6 +326,9 @@ def main() -> int:
     if words.turned is not None and words.turned < 0:
         raise OptionError(f"turned is {seen(words.turned)}: give a seed of 0 or more")
     paths = find_meshes(words.meshes)
+    names = [path.stem for path in paths]
+    halves = {"all": names, **draw_halves(names)}
+    paths = [path for path in paths if path.stem in halves[words.half]]
     paths = spread(paths, words.limit or len(paths))
     settings = [Setting(size, words.factor) for size in dict.fromkeys(words.sizes)]
     for setting in settings:
@@ -283,7 +343,7 @@ def main() -> int:
     if not results.floors:
         raise FileError("no shape could be measured")
     up = None if words.no_pictures else words.up
-    path = write_report(results, like, settings, words.out, up)
+    path = write_report(results, like, halves, words.out, up)
     if not words.quiet:
         print(path.read_text(encoding="utf-8"))
     return int(bool(results.left_out))

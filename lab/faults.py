@@ -1,28 +1,29 @@
 """End conversions and batches at random moments, or fill the disk, and check what is left.
 
-    python -m lab faults                                    # some hours
-    python -m lab faults --terms 3 --kills 3 --full 3 --checks 3 --batches 2 --disks 1
+    python -m lab faults                                    # about an hour
+    python -m lab faults --runs 2 --size 12 --count 4       # a minute
+    python -m lab faults --cluster local
 
-Runs ``super-sdf upsample`` and ends it after a random share of its duration, or in every second run
-after a random share of the time from its first file on; or limits the size of files at random. The
-target must be absent or complete, a terminated run must leave no other file, and the next run must
-leave nothing but the mesh. Runs with ``--check`` and ``--report`` are ended, too: none may go on,
-or say of the mesh what is not so. A batch or one of its workers is killed or terminated, or its
-disk fills up (a RAM disk, which only root may mount); run again it must be complete.
+``super-sdf upsample``, in every format and with checks, and ``super-sdf batch`` are ended by a
+signal, lose a worker, or may write files of a random size only; with ``--disks`` a batch fills a
+RAM disk, which only root may mount. Whatever has its final name must be complete, no run may go on
+after its signal or say what is not so, and a terminated one must leave nothing else. Run again, the
+command must leave what it leaves undisturbed.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
-import os
 import random
 import resource
 import signal
 import subprocess
+import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
@@ -34,210 +35,134 @@ import psutil
 from super_sdf.files.meshes import MESH_SUFFIXES
 
 from . import parser_of
-from .batch import COMMAND, workers_of, write_grids
+from .forms import ball
 from .processes import describe_machine
 
-LONG_ENOUGH = 120.0  # seconds; every run is shorter
+COMMAND = [sys.executable, "-m", "super_sdf"]
+QUICK = ["--quality", "fast", "--quiet"]
+CHECKED = "-checked"
 AT_ONCE = 0.5  # seconds in which a run ends that was about to end anyway
-KILLS = {
-    "batch killed": signal.SIGKILL,
-    "batch ended": signal.SIGTERM,
-    "batch hung up": signal.SIGHUP,
-    "worker killed": signal.SIGKILL,
-    "worker ended": signal.SIGTERM,
+LONG_ENOUGH = 120.0  # seconds; every run is shorter
+SIGNALS = {
+    "SIGTERM": signal.SIGTERM,
+    "SIGHUP": signal.SIGHUP,
+    "SIGKILL": signal.SIGKILL,
+    "worker SIGTERM": signal.SIGTERM,
+    "worker SIGKILL": signal.SIGKILL,
 }
-LIMITS = ("file limit", "full disk")
+LIMIT, DISK = "file limit", "full disk"
 DISK_BYTES = 4 << 20
 BALLAST = "ballast"  # a file that fills the disk until the first run is over
-OWN_FILES = {"report.jsonl", ".super-sdf-batch", ".super-sdf-batch.lock"}
-HARMLESS = ("whole", "right", "left beside")
-OPTIONS = {
-    "--terms": (100, "runs ended by SIGTERM"),
-    "--kills": (100, "runs ended by SIGKILL"),
-    "--full": (50, "runs with a limit on files"),
-    "--checks": (80, "runs with --check and --report"),
-    "--batches": (200, "batches that are disturbed"),
-    "--disks": (50, "batches on a disk that fills"),
-    "--size": (24, "samples along each axis"),
-    "--count": (8, "grids of a batch"),
-    "--seed": (0, "of the random moments"),
-}
+OF_BATCH = {"report.jsonl", ".super-sdf-batch", ".super-sdf-batch.lock"}
 Process = subprocess.Popen[bytes]
-Counts = Counter[str]
 
 
-def start(words: Sequence[object], limit: int | None = None) -> Process:
-    """Start a command, with a limit on the size of files if one is given."""
-    lower = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (limit, limit))
-    words, before = [*COMMAND, *map(str, words)], None if limit is None else lower
-    return subprocess.Popen(words, stderr=subprocess.PIPE, preexec_fn=before)
+class Job:
+    """A command that writes files into a folder, and what it leaves there undisturbed."""
 
-
-class Single:
-    """A folder with the grid of a ball, and the meshes of undisturbed runs in every format."""
-
-    def __init__(self, folder: Path, size: int) -> None:
-        self.folder, self.grid = folder / "out", folder / "g.npy"
-        self.checks = "--check", "--report", folder / "page.html"
-        self.folder.mkdir()
-        ijk = np.indices((size,) * 3, dtype=np.float32)
-        ball = np.linalg.norm(ijk - np.float32(size / 2 - 0.4), axis=0) - size / 3
-        np.save(self.grid, ball.astype(np.float32))
-        self.whole: dict[str, bytes] = {}
-        self.seconds: dict[str, float] = {}
-        self.writing: dict[str, float] = {}  # the seconds of these from the first file on
-        self.turn = 0
-        for suffix in MESH_SUFFIXES:
-            begun, process = time.perf_counter(), self.start(suffix)
-            self.wait_for_file(process)
-            first_file = time.perf_counter()
-            process.wait(LONG_ENOUGH)
-            self.seconds[suffix] = time.perf_counter() - begun
-            self.writing[suffix] = time.perf_counter() - first_file
-            self.whole[suffix] = self.target(suffix).read_bytes()
-            self.target(suffix).unlink()
-        begun = time.perf_counter()
-        self.start(".ply", None, *self.checks).wait(LONG_ENOUGH)
-        self.checking = time.perf_counter() - begun
-        self.target(".ply").unlink()
-
-    def target(self, suffix: str) -> Path:
-        """Return the path of the mesh."""
-        return self.folder / f"ball{suffix}"
-
-    def start(self, suffix: str, limit: int | None = None, *more: object) -> Process:
-        """Start a run."""
-        options = ["--quality", "fast", "--quiet", "--force", *more]
-        return start(["upsample", self.grid, self.target(suffix), *options], limit)
-
-    def wait_for_file(self, process: Process) -> None:
-        """Wait until a run has created a file, or ended."""
-        while process.poll() is None and not os.listdir(self.folder):
+    def __init__(self, words: Sequence[object], out: Path) -> None:
+        self.words, self.out = [*COMMAND, *map(str, words), *QUICK], out
+        self.is_batch = words[0] == "batch"
+        out.mkdir()
+        start, process = time.perf_counter(), self.start()
+        while process.poll() is None and not any(out.iterdir()):
             time.sleep(0.001)
-
-    def faults(self, suffix: str, process: Process, codes: Sequence[int]) -> Counts:
-        """Count what a disturbed run should not have done or left, then complete another run."""
-        _, output = process.communicate(timeout=LONG_ENOUGH)
-        target, found = self.target(suffix), Counts()
-        found["exit codes of others"] += process.returncode not in codes
-        found["more than one line printed"] += output.count(b"\n") > 1
-        if target.exists():
-            found["whole"] += 1
-            found["HALF-WRITTEN"] += target.read_bytes() != self.whole[suffix]
-        found["left beside"] += bool(set(os.listdir(self.folder)) - {target.name})
-        self.start(suffix).wait(LONG_ENOUGH)
-        found["LEFT AFTER THE NEXT RUN"] += os.listdir(self.folder) != [target.name]
-        found["WRONG AFTER THE NEXT RUN"] += target.read_bytes() != self.whole[suffix]
-        target.unlink()
-        return found
-
-    def kill(self, number: signal.Signals, suffix: str) -> Counts:
-        """End a run by a signal at a random moment."""
-        process = self.start(suffix)
-        self.turn += 1
-        if self.turn % 2:
-            self.wait_for_file(process)
-        seconds = self.writing if self.turn % 2 else self.seconds
-        time.sleep(random.uniform(0, 1.05) * seconds[suffix])
-        process.send_signal(number)
-        found = self.faults(suffix, process, (0, 128 + number, -number))
-        found["LEFT BY SIGTERM"] += number == signal.SIGTERM and found["left beside"]
-        return found
-
-    def fill(self, suffix: str) -> Counts:
-        """Limit the size of files at random."""
-        limit = random.randrange(len(self.whole[suffix]) + 1)
-        return self.faults(suffix, self.start(suffix, limit), (0, 1))
-
-    def check(self, suffix: str) -> Counts:
-        """End a run that checks the mesh at a random moment."""
-        process = self.start(suffix, None, *self.checks)
-        target = self.target(suffix)
-        time.sleep(random.uniform(0, 1) * self.checking)
-        process.send_signal(signal.SIGTERM)
-        sent = time.perf_counter()
-        _, output = process.communicate(timeout=LONG_ENOUGH)
-        went_on = process.returncode == 0 and time.perf_counter() - sent > AT_ONCE
-        false = b"nothing was written" in output and target.exists()
-        false |= b"is written" in output and not target.exists()
-        target.unlink(missing_ok=True)
-        found = Counts({"whole": process.returncode == 0 and not went_on, "went on": went_on})
-        found["exit codes of others"] += process.returncode not in (0, 143, -15)
-        found["more than one line printed"] += output.count(b"\n") > 1
-        found["said what is not so"] += false
-        return found
-
-
-class Many:
-    """A folder of grids, their meshes, and the undisturbed duration of the batch."""
-
-    def __init__(self, folder: Path, count: int, size: int) -> None:
-        self.grids, self.meshes = folder / "grids", folder / "meshes"
-        write_grids(self.grids, count, [size])
-        begun = time.perf_counter()
-        _, output = self.start().communicate()
-        if output:
+        self.first_file = time.perf_counter() - start
+        if output := process.communicate(timeout=LONG_ENOUGH)[1]:
             raise SystemExit(output.decode())
-        self.seconds = time.perf_counter() - begun
-        self.right = {name: data for name, data in self.found().items() if name not in OWN_FILES}
+        self.seconds = time.perf_counter() - start
+        self.right = {name: data for name, data in self.found().items() if name not in OF_BATCH}
 
     def start(self, limit: int | None = None) -> Process:
-        """Start the batch."""
-        options = ["--jobs", "2", "--quality", "fast", "--factor", "2", "--quiet"]
-        return start(["batch", self.grids, "--out", self.meshes, *options], limit)
+        """Start the command, with a limit on the size of files if one is given."""
+        lower = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (limit, limit))
+        before = None if limit is None else lower
+        return subprocess.Popen(self.words, stderr=subprocess.PIPE, preexec_fn=before)
 
     def found(self) -> dict[str, bytes]:
-        """Return what is in the output folder, by name."""
-        paths = (path for path in self.meshes.rglob("*") if path.is_file())
-        return {path.relative_to(self.meshes).as_posix(): path.read_bytes() for path in paths}
+        """Return the files of the folder by name; pages hold times, and are not compared."""
+        files = {
+            path.relative_to(self.out).as_posix(): path
+            for path in self.out.rglob("*")
+            if path.is_file()
+        }
+        return {n: b"" if n.endswith(".html") else p.read_bytes() for n, p in files.items()}
 
-    def disturb(self, kind: str) -> Counts:
-        """Cause a fault at a random moment, and run the batch again."""
-        rmtree(self.meshes, ignore_errors=True)
-        self.meshes.mkdir()
-        with small_disk(self.meshes) if kind == "full disk" else nullcontext():
-            output = self.faulty(kind).communicate()[1]
-            (self.meshes / BALLAST).unlink(missing_ok=True)
-            wrong = "TRACEBACK" if b"Traceback" in output else self.half_written()
-            if not wrong:
-                process = self.start()
-                output = process.communicate()[1]
-                wrong = "FAILS WHEN RUN AGAIN" if process.returncode or output else ""
-            return Counts({f"{kind}: {wrong or self.incomplete()}": 1})
+    def disturb(self, fault: str) -> str:
+        """Cause a fault in a run, run the command again; return "right", or what is wrong."""
+        rmtree(self.out)
+        self.out.mkdir()
+        with small_disk(self.out) if fault == DISK else nullcontext():
+            wrong = self.run_with(fault)
+            (self.out / BALLAST).unlink(missing_ok=True)
+            again = self.start()
+            output = again.communicate(timeout=LONG_ENOUGH)[1]
+            if not wrong and (again.returncode or output):
+                wrong = f"fails when run again: {output.decode()}"
+            return wrong or self.half_written() or self.beside() or self.missing() or "right"
 
-    def faulty(self, kind: str) -> Process:
-        """Start the batch, and cause the fault."""
-        if kind == "file limit":
-            return self.start(random.randrange(max(map(len, self.right.values()))))
-        if kind == "full disk":
-            room = random.randrange(sum(map(len, self.right.values())))
-            (self.meshes / BALLAST).write_bytes(bytes(max(0, DISK_BYTES - room)))
-            return self.start()
-        process = self.start()
-        time.sleep(random.uniform(0, self.seconds))
-        with suppress(psutil.Error, IndexError):  # it was through
-            of_batch = kind.startswith("batch")
-            victims = [psutil.Process(process.pid)] if of_batch else workers_of(process.pid)
-            random.choice(victims).send_signal(KILLS[kind])
-        return process
+    def run_with(self, fault: str) -> str:
+        """Run the command with a fault at a random moment; return what is wrong then."""
+        sizes = [len(data) for data in self.right.values()]
+        if fault == DISK:
+            room = random.randrange(sum(sizes))
+            (self.out / BALLAST).write_bytes(bytes(max(0, DISK_BYTES - room)))
+        process = self.start(random.randrange(max(sizes) + 1) if fault == LIMIT else None)
+        sent, number = np.inf, SIGNALS.get(fault, 0)
+        if number:  # half of the runs are ended while they write
+            time.sleep(random.uniform(random.choice((0, self.first_file)), 1.05 * self.seconds))
+            with suppress(psutil.Error, IndexError):  # it was through
+                is_worker = fault.startswith("worker")
+                victims = workers_of(process.pid) if is_worker else [psutil.Process(process.pid)]
+                random.choice(victims).send_signal(number)
+                sent = np.inf if is_worker else time.perf_counter()
+        output = process.communicate(timeout=LONG_ENOUGH)[1]
+        if process.returncode == 0 and time.perf_counter() - sent > AT_ONCE:
+            return "goes on after a signal"
+        if process.returncode not in (0, 1, 128 + number, -number):
+            return f"exit code {process.returncode}"
+        if fault == "SIGKILL":  # of which the workers of a batch may complain
+            output = b""
+        is_ended = fault in ("SIGTERM", "SIGHUP")
+        return self.misleading(output) or self.half_written() or (self.beside() if is_ended else "")
+
+    def misleading(self, output: bytes) -> str:
+        """Return what should not have been printed; empty if nothing is wrong with it."""
+        if b"Traceback" in output or (output.count(b"\n") > 1 and not self.is_batch):
+            return f"prints {output.decode()}"
+        is_there = bool(self.found().keys() & self.right.keys())
+        is_false = b"nothing was written" in output if is_there else b"is written" in output
+        return f"says what is not so: {output.decode()}" if is_false and not self.is_batch else ""
 
     def half_written(self) -> str:
         """Return the files with a final name that are not complete; empty if none is."""
         found = self.found()
-        names = found.keys() & self.right.keys()
-        half = [name for name in names if found[name] != self.right[name]]
-        *lines, _ = found.get("report.jsonl", b"").split(b"\n")
-        rows = [json.loads(line) for line in lines]
-        half += [row["out"] for row in rows if row["status"] == "ok" and row["out"] not in found]
-        return f"HALF-WRITTEN {', '.join(half)}" if half else ""
+        half = [name for name in found.keys() & self.right if found[name] != self.right[name]]
+        half += self.reported() - found.keys()
+        return f"half-written: {', '.join(half)}" if half else ""
 
-    def incomplete(self) -> str:
-        """Return what is wrong after the last run: "right", or the names of files."""
-        found = self.found()
-        rows = [json.loads(line) for line in found.get("report.jsonl", b"").splitlines()]
-        reported = {row["out"] for row in rows if row["status"] == "ok"}
-        names = (found.keys() - OWN_FILES) ^ self.right.keys() | (reported ^ self.right.keys())
-        return f"LEFT OVER OR MISSING {', '.join(names)}" if names else "right"
+    def beside(self) -> str:
+        """Return the files that are neither results nor the report of a batch."""
+        names = self.found().keys() - self.right - OF_BATCH
+        return f"left beside: {', '.join(names)}" if names else ""
+
+    def missing(self) -> str:
+        """Return the results that are not there, or not reported."""
+        names = self.right.keys() - self.found()
+        names |= self.right.keys() - self.reported() if self.is_batch else set()
+        return f"missing: {', '.join(names)}" if names else ""
+
+    def reported(self) -> set[str]:
+        """Return the meshes that the complete lines of a batch's report say are made."""
+        *lines, _ = self.found().get("report.jsonl", b"").split(b"\n")
+        rows = [json.loads(line) for line in lines]
+        return {row["out"] for row in rows if row["status"] == "ok"}
+
+
+def workers_of(pid: int) -> list[psutil.Process]:
+    """Return the worker processes of a batch; none if it has ended."""
+    children = psutil.Process(pid).children(recursive=True)
+    return [child for child in children if "spawn_main" in " ".join(child.cmdline())]
 
 
 @contextmanager
@@ -251,33 +176,60 @@ def small_disk(folder: Path) -> Iterator[None]:
         subprocess.run(["umount", str(folder)], check=True)
 
 
-def tally(name: str, runs: int, kinds: Sequence[str], once: Callable[[str], Counts]) -> bool:
-    """Disturb runs of all kinds in turn; print the results, return whether all were correct."""
-    found = Counts()
-    for turn in range(runs):
-        found.update(once(kinds[turn % len(kinds)]))
-    counts = ", ".join(f"{what}: {n}" for what, n in sorted(found.items()) if n)
-    print(f"{name}: {runs} runs; {counts}", flush=True)
-    return not [what for what, n in found.items() if n and what.split(": ")[-1] not in HARMLESS]
+def write_balls(folder: Path, count: int, size: int) -> Path:
+    """Write grids of balls, no two alike; return the folder."""
+    folder.mkdir()
+    x, y, z = np.indices((size,) * 3) - size / 2 + 0.4
+    for number in range(count):
+        values = ball(x, y, z, 0.1 * number, size / 3 - 0.05 * number).astype(np.float32)
+        np.savez(folder / f"{number}.npz", values=values, spacing=1.0, origin=0.0)
+    return folder
 
 
 def main() -> int:
-    """Run all trials; exit code 1 if any file was incomplete or left over."""
+    """Run all trials, print a line for each fault; exit code 1 if anything was wrong."""
     parser = parser_of(__doc__)
-    for name, (default, what) in OPTIONS.items():
-        parser.add_argument(name, type=int, default=default, help=what)
+    parser.add_argument("--runs", type=int, default=200, help="of each fault")
+    parser.add_argument("--disks", action="store_true", help="also fill a RAM disk, as root")
+    parser.add_argument("--cluster", help="of the batch: local, or the address of a scheduler")
+    parser.add_argument("--size", type=int, default=24, help="samples along each axis")
+    parser.add_argument("--count", type=int, default=8, help="grids of the batch")
+    parser.add_argument("--seed", type=int, default=0, help="of the random moments")
     words = parser.parse_args()
     random.seed(words.seed)
     print(describe_machine(), flush=True)
     with tempfile.TemporaryDirectory() as name:
-        single = Single(Path(name), words.size)
-        many = Many(Path(name), words.count, words.size)
-        good = [
-            tally("SIGTERM", words.terms, MESH_SUFFIXES, partial(single.kill, signal.SIGTERM)),
-            tally("SIGKILL", words.kills, MESH_SUFFIXES, partial(single.kill, signal.SIGKILL)),
-            tally("full disk", words.full, MESH_SUFFIXES, single.fill),
-            tally("SIGTERM in checks", words.checks, MESH_SUFFIXES, single.check),
-            tally("batch", words.batches, list(KILLS), many.disturb),
-            tally("disk of a batch", words.disks, LIMITS, many.disturb),
-        ]
-    return int(not all(good))
+        folder = Path(name)
+        grids = write_balls(folder / "grids", words.count, words.size)
+        jobs = {"upsample": single_jobs(folder, grids), "batch": [batch_job(folder, grids, words)]}
+        of_process = [fault for fault in SIGNALS if not fault.startswith("worker")]
+        faults = {"upsample": [*of_process, LIMIT]}
+        faults["batch"] = [*SIGNALS, LIMIT, *([DISK] if words.disks else [])]
+        trials = [(kind, fault) for kind in jobs for fault in faults[kind]]
+        return int(any([tally(kind, fault, jobs[kind], words.runs) for kind, fault in trials]))
+
+
+def single_jobs(folder: Path, grids: Path) -> list[Job]:
+    """Return conversions of a grid to every format, and one with checks and a report."""
+    jobs = []
+    for suffix in (*MESH_SUFFIXES, CHECKED):
+        out = folder / f"as{suffix}"
+        more = ["--check", "--report", out / "page.html"] if suffix == CHECKED else []
+        target = out / f"mesh{suffix.removesuffix(CHECKED) or '.ply'}"
+        jobs.append(Job(["upsample", grids / "0.npz", target, "--force", *more], out))
+    return jobs
+
+
+def batch_job(folder: Path, grids: Path, words: argparse.Namespace) -> Job:
+    """Return a batch in two processes, or on a cluster."""
+    out, jobs = folder / "batch", ["--jobs", 2] if words.cluster in (None, "local") else []
+    cluster = ["--cluster", words.cluster] if words.cluster else []
+    return Job(["batch", grids, "--out", out, "--factor", 2, *jobs, *cluster], out)
+
+
+def tally(kind: str, fault: str, jobs: Sequence[Job], runs: int) -> bool:
+    """Disturb runs of all jobs in turn, print what came of it; return whether any was wrong."""
+    found = Counter(jobs[turn % len(jobs)].disturb(fault) for turn in range(runs))
+    said = "; ".join(f"{what}: {count}" for what, count in found.items())
+    print(f"{kind}, {fault}: {said}", flush=True)
+    return set(found) != {"right"}

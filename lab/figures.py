@@ -39,14 +39,13 @@ from .methods import FLOOR, ON
 from .processes import describe_machine, machine
 from .rows import Row, Rows
 from .shapes import Setting, draw_halves, find_meshes, spread
-from .tables import BY_KEY, COST, gap_closed, mean_of, means, win_line
+from .tables import GAPS, gap_closed, mean_of, summary, win_line
 
 FOLDER = Path(__file__).parent / "figures"
 ROWS = "rows.jsonl"
 FEW = 10  # shapes of the smaller figures, spread over all
 BASELINES = ("mc", "mc-lewiner", "trilinear", "bspline")
 NETWORKS = ("ours@fast", "ours@noisy", "ours", "ours@base:float32", "ours@best")
-GAPS = ("f1", "nc", "p2s", "p2s_back")
 LATE, FEW_PARTS = 900.0, 6  # seconds for another method on a part, and parts
 
 
@@ -112,12 +111,6 @@ def name_of(method: str) -> str:
     if name != "ours":
         return name
     return model.replace(":", "-") or "base"
-
-
-def summary(rows: Sequence[Row]) -> Row:
-    """Return means of all figures over shapes, how many those are, and how many are closed."""
-    columns = [*BY_KEY.values(), *COST]
-    return {**means(rows, columns), "shapes": len(rows), "closed": sum(r["closed"] for r in rows)}
 
 
 # The figures: each takes the bench and returns rows, with words that tell them apart.

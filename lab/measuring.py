@@ -63,10 +63,6 @@ class Task:
     turned: int | None = None  # seed by which the shape is turned at random
     limit: float | None = None  # seconds
 
-    def __str__(self) -> str:
-        named = [str(self.setting), *(self.methods if self.limit else [])]
-        return f"{self.path.stem} ({', '.join(named)})"
-
     def network(self, method: str) -> tuple[str, str]:
         """Return model and precision of a method."""
         model, _, precision = method.partition("@")[2].partition(":")
@@ -111,17 +107,15 @@ def network_of(model: str, precision: str, threads: int) -> Decoder:
     return load_network(model, device="cpu", threads=threads, precision=precision)
 
 
-def measure_method(
-    shape: Shape, case: Case | None, method: str, task: Task, network: Decoder | None = None
-) -> Measurement:
+def measure_method(shape: Shape, case: Case | None, method: str, task: Task) -> Measurement:
     """Return a method's figures, or the reason in "error" if it raised an exception.
 
     A failure is not a score: its cause is the machine or a bug, not the method. ``seconds`` is the
     time from the grid in memory to the mesh in memory, ``peak_mb`` the peak of memory meanwhile,
-    less what the process held before. ``network`` replaces that of the task.
+    less what the process held before.
     """
     try:
-        network = network or network_of(*task.network(method), task.threads)
+        network = network_of(*task.network(method), task.threads)
         forget_peak()
         held, clock = held_memory(), time.perf_counter()
         surface = make_surface(method, case, network) if case else Surface(shape.mesh)

@@ -149,6 +149,23 @@ def distance_or_dot(solid: Solid, points: Points) -> Distances:
     return nearest_or_dot(solid, points)[0]
 
 
+def distance(truth: Mesh, mesh: Mesh, count: int, within: Points | None = None) -> float:
+    """Return the mean distance between two surfaces, both ways, at points drawn from each.
+
+    NaN without a mesh. ``within``, (3,), leaves out caps: points beside the border of the box from
+    the origin to there.
+    """
+    if not len(mesh.faces):
+        return float("nan")
+    total = 0.0
+    for seed, (one, other) in enumerate(((truth, mesh), (mesh, truth)), 1):
+        points = sample_surface(one, (1, seed), count).points
+        if within is not None:
+            points = points[((points > 0.1) & (points < within - 0.1)).all(1)]
+        total += float(Solid(other).distance(points).mean()) / 2 if len(points) else np.inf
+    return total
+
+
 def compare_triangles(mesh: Mesh) -> Numbers:
     """Return the smallest angle in degrees, and the share of triangles with one under 5 degrees.
 

@@ -29,7 +29,7 @@ from super_sdf.truth.solid import Solid
 from .forms import FORMS, sample, true_surface
 from .kinds import sample_box
 from .measuring import network_of
-from .metrics import compare_distances, distance_or_dot, sample_surface
+from .metrics import compare_distances, distance, distance_or_dot, sample_surface
 from .processes import write_grid
 from .rows import Row
 from .shapes import RESULT_POINTS, Shape, spread
@@ -43,16 +43,6 @@ POINTS = 20_000
 FACTOR = 4
 SLICES, RATIOS, CUTS = 24, (1.5, 2.5, 5.0), (0.5, 1.0, 2.0)
 MOST_PARTS = 4
-
-
-def distance(truth: Mesh, mesh: Mesh, spacing: float) -> float:
-    """Return the mean distance between two surfaces, both ways, in voxels; NaN without a mesh."""
-    if not len(mesh.faces):
-        return float("nan")
-    there = sample_surface(truth, (1, 1), POINTS).points
-    back = sample_surface(mesh, (1, 2), POINTS).points
-    far = Solid(mesh).distance(there).mean() + Solid(truth).distance(back).mean()
-    return float(far) / 2 / spacing
 
 
 def ours(values: Values, spacing: Any, low: Any, network: Decoder) -> tuple[Mesh, str]:
@@ -93,7 +83,10 @@ def measure_form(name: str, size: int, bench: Bench) -> Row:
         "bspline": closed_isosurface(spline, h / FACTOR, low - h / 2),
         "ours": mesh,
     }
-    return {**{m: distance(truth, mesh, h) for m, mesh in meshes.items()}, "taken_as": taken_as}
+    return {
+        **{m: distance(truth, mesh, POINTS) / h for m, mesh in meshes.items()},
+        "taken_as": taken_as,
+    }
 
 
 def slice_rows(bench: Bench) -> list[Row]:
@@ -124,7 +117,7 @@ def measure_slices(path: Path, ratio: float, bench: Bench) -> Row:
     network = network_of(bench.network, "auto", 0)
     found = {}
     for method, mesh in sliced_meshes(values, spacing, network):
-        off = distance(shape.mesh, mesh, float(spacing[2]))
+        off = distance(shape.mesh, mesh, POINTS) / spacing[2]
         found[method] = {
             "distance": off,
             "pieces": count_components(mesh.faces, len(mesh.vertices)),

@@ -21,9 +21,8 @@ from PIL import Image
 from super_sdf import Mesh, load_network, read_grid, reconstruct
 
 from . import parser_of
-from .drawing import Frame, Panel, draw_panel, view_axes
+from .drawing import Frame, Page, Panel, draw_panel, view_axes, write_picture
 from .methods import make_surface
-from .page import Page, write_picture
 from .shapes import Case, Setting, Shape, turn_of
 from .surfaces import isosurface
 

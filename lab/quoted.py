@@ -25,16 +25,18 @@ from .tables import (
     EDGES,
     EF1,
     F1,
+    GAPS,
     NC,
     P2S,
-    SURFACE,
     THERE,
     Column,
     cells,
+    closed_of,
     label_of,
+    listed,
     markdown,
     percent,
-    published_rows,
+    surface_table,
 )
 
 UNKNOWN = "(not measured)"
@@ -100,25 +102,6 @@ def values(rows: Iterable[Row], key: str) -> list[Any]:
     return list(dict.fromkeys(row[key] for row in rows if key in row))
 
 
-def closed_of(row: Row) -> str:
-    """Return how many meshes are closed."""
-    return f"{row['closed']} of {row.get('shapes', row.get('grids'))}"
-
-
-def listed(
-    rows: Iterable[Row],
-    columns: Sequence[Column],
-    words: Callable[[Row], list[str]],
-    heads: Sequence[str] = ("",),
-) -> str:
-    """Return a line for each row: words under ``heads``, figures, and how many are closed."""
-    body, last = [], []
-    for row in rows:
-        last = ["closed"] if "closed" in row else []
-        body.append([*words(row), *cells(row, columns), *(closed_of(row) for _ in last)])
-    return markdown([*heads, *(column.title for column in columns), *last], body)
-
-
 def wide(
     rows: Sequence[Row], labels: Mapping[str, str], word: str, column: Column, among: str = "size"
 ) -> str:
@@ -146,14 +129,12 @@ def summary_table(rows: Sequence[Row]) -> str:
 
 
 def size_table(rows: Sequence[Row], size: int) -> str:
-    """Return all columns of all methods at a size, the published rows below ours."""
-    ours = listed(
-        pick(rows, size=size, half=""),
-        SURFACE,
-        lambda row: [NETWORK_LABELS.get(row["method"]) or label_of(row["method"])],
-        ["method"],
-    )
-    return "\n".join([ours, *(f"| {' | '.join(r)} |" for r in published_rows(size, SURFACE, 1))])
+    """Return all columns of all methods at a size."""
+
+    def words(row: Row) -> list[str]:
+        return [NETWORK_LABELS.get(row["method"]) or label_of(row["method"])]
+
+    return surface_table(pick(rows, size=size, half=""), size, words)
 
 
 def network_table(rows: Sequence[Row]) -> str:
@@ -166,17 +147,15 @@ def network_table(rows: Sequence[Row]) -> str:
 def gap_table(rows: Sequence[Row]) -> str:
     """Return the gap closed by the networks, on all shapes and on each half."""
     halves = {"": "all", "choose": "those that networks were chosen on", "final": "the others"}
-    keys = ("gap_f1", "gap_nc", "gap_p2s", "gap_p2s_back")
     body = [
         [f"{size}^3", f"{halves[row['half']]} ({row['shapes']})", NETWORK_LABELS[row["method"]],
-         *(percent(row[key]) for key in keys)]
+         *(percent(row[f"gap_{key}"]) for key in GAPS)]
         for size in values(rows, "size")
         for half in halves
         for row in pick(rows, size=size, half=half)
         if row["method"] in ("fast", "base", "best")
     ]  # fmt: skip
-    titles = ["grid", "shapes", "network", "F1", "NC", "point to surface", "result to reference"]
-    return markdown(titles, body)
+    return markdown(["grid", "shapes", "network", *GAPS.values()], body)
 
 
 def worse_line(rows: Sequence[Row]) -> str:
@@ -193,7 +172,7 @@ def edge_table(rows: Sequence[Row], name: str, size: int | None = None) -> str:
         label = MESHER_LABELS[row["method"]]
         return [label if size else f"{row['size']}^3, {label}"]
 
-    return listed(chosen, EDGE_COLUMNS, words)
+    return listed(chosen, EDGE_COLUMNS, words, [""])
 
 
 def kind_table(rows: Sequence[Row], wanted: Callable[[str], bool]) -> str:
@@ -321,7 +300,7 @@ def check_table(rows: Sequence[Row]) -> str:
 def peer_table(rows: Sequence[Row]) -> str:
     """Return another method, and ours with as many triangles."""
     columns = (*EDGE_COLUMNS, Column("mean s", "seconds", 1, 1))
-    return listed(rows, columns, lambda row: [label_of(row["method"])])
+    return listed(rows, columns, heads=[""])
 
 
 def is_unequal(kind: str) -> bool:

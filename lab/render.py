@@ -16,8 +16,6 @@ from pathlib import Path
 from super_sdf.errors import OptionError
 from super_sdf.files.formats import is_grid
 from super_sdf.files.grids import read_grid
-from super_sdf.files.output import check_apart, check_free
-from super_sdf.files.regular import files_of
 from super_sdf.network.network import load_network
 from super_sdf.options import check_factor
 from super_sdf.pipeline import upsample
@@ -25,13 +23,12 @@ from super_sdf.truth.mesh_files import read_mesh
 from super_sdf.truth.solid import Solid
 
 from . import parser_of
-from .cross_sections import check_section, find_plane, render_section
-from .drawing import AXES, COLOURS, Panel, check_numbers, render_panels, vertex_errors
-from .page import check_page
+from .cross_sections import find_plane, render_section
+from .drawing import AXES, COLOURS, Panel, render_panels, vertex_errors
 
 # Options that apply to one kind of source only, with their defaults.
 FOR_GRIDS = {"axis": "z", "at": None, "factor": 4}
-FOR_MESHES = {"colour": COLOURS[0], "reference": None, "top": None, "up": "z", "zoom": 1.0}
+FOR_MESHES = {"colour": COLOURS[0], "reference": None, "up": "z"}
 
 
 def main() -> None:
@@ -41,23 +38,16 @@ def main() -> None:
     parser.add_argument("target", metavar="OUT.png", type=Path)
     parser.add_argument("--colour", choices=COLOURS, help="by light, face normal or distance")
     parser.add_argument("--reference", type=Path, help="mesh for --colour error")
-    parser.add_argument("--top", type=float, help="distance at the end of the colour bar")
     parser.add_argument("--up", choices=AXES, help="axis that points up")
-    parser.add_argument("--zoom", type=float, help="1: all meshes fit into the picture")
-    parser.add_argument("--size", type=int, default=700, help="pixels of a panel's long side")
     parser.add_argument("--axis", choices=AXES, help="for a grid: normal to the section")
     parser.add_argument("--at", type=float, help="for a grid: world position on that axis")
     parser.add_argument("--factor", type=int, help="for a grid: refinement per axis")
-    parser.add_argument("--force", action="store_true", help="replace OUT.png if it exists")
     words = parser.parse_args()
     grids = [source for source in words.sources if is_grid(source)]
     if words.target.suffix.lower() != ".png":
         raise OptionError(f"{words.target} is not a picture file: give .png")
     if grids and len(words.sources) > 1:
         raise OptionError(f"{grids[0]} is a grid: give it alone, or meshes only")
-    check_free(words.target, force=words.force)
-    inputs = [*words.sources, *filter(None, [words.reference])]
-    check_apart(words.target, [file for each in inputs for file in files_of(each)])
     for name in FOR_MESHES if grids else FOR_GRIDS:
         if getattr(words, name) is not None:
             drawn = "a grid" if grids else "meshes"
@@ -70,26 +60,19 @@ def main() -> None:
 
 def render_meshes(words: argparse.Namespace) -> None:
     """Draw meshes side by side; with a reference, coloured by their distance to it."""
-    check_numbers(words.zoom, words.top)
-    check_page(words.size, len(words.sources))
-    if words.top is not None and words.colour != "error":
-        raise OptionError("--top is the end of the colour bar: give it with --colour error")
     if (words.colour == "error") != (words.reference is not None):
         raise OptionError("--colour error and --reference MESH go together: give both or neither")
-    meshes = {source: read_mesh(source) for source in words.sources}
+    meshes = {source.name: read_mesh(source) for source in words.sources}
     truth = Solid(read_mesh(words.reference)) if words.reference else None
-    panels = [Panel(mesh, source.name, truth and vertex_errors(mesh, truth))
-              for source, mesh in meshes.items()]  # fmt: skip
-    names = ("colour", "up", "size", "zoom", "top", "force")
-    render_panels(panels, words.target, **{name: getattr(words, name) for name in names})
+    panels = [Panel(mesh, name, truth and vertex_errors(mesh, truth))
+              for name, mesh in meshes.items()]  # fmt: skip
+    render_panels(panels, words.target, colour=words.colour, up=words.up)
 
 
 def render_grid(words: argparse.Namespace) -> None:
     """Draw a grid's section before and after upsampling."""
     check_factor(words.factor)
-    check_section(words.size)
     grid = read_grid(words.sources[0])
-    find_plane(grid, words.axis, words.at)  # raises if it is outside the grid
+    plane = find_plane(grid, words.axis, words.at)  # raises if it is outside the grid
     field = upsample(grid, load_network(), words.factor)
-    chosen = {name: getattr(words, name) for name in ("axis", "at", "size", "force")}
-    render_section(grid, words.target, field=field, **chosen)
+    render_section(grid, field, words.target, words.axis, plane)

@@ -1,7 +1,7 @@
 """The rows of a measurement: a file of JSON lines that makes long runs resumable.
 
-Rows are appended as they come, so a kill costs only the measurement under way. A row is valid as
-long as its key is asked for; a line that is damaged is measured again.
+Rows are appended as they come, so a kill costs only the tasks under way. A row is valid as long as
+its key is asked for; a line that is damaged is measured again.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 from super_sdf.errors import WriteError
@@ -20,11 +19,11 @@ Row = dict[str, Any]
 
 
 class Rows:
-    """The rows of a file, by key; threads may share it."""
+    """The rows of a file, by key."""
 
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        self.file, self.lock = RecordFile(path), Lock()
+        self.file = RecordFile(path)
         self.rows: dict[str, Row] = {}
         for record in self.file.read():
             if isinstance(record, dict) and isinstance(record.get("key"), dict):
@@ -33,15 +32,14 @@ class Rows:
     def add(self, key: Key, figures: Row) -> None:
         """Keep a row, in memory and in the file."""
         record = {"key": dict(key), **figures}
-        with self.lock:
-            try:
-                self.file.append(record)
-            except OSError as error:
-                raise WriteError(
-                    f"{self.file.path} cannot be written: {error.strerror}; the rows in it are "
-                    "kept, and the same command goes on from there"
-                ) from error
-            self.rows[name_of(key)] = record
+        try:
+            self.file.append(record)
+        except OSError as error:
+            raise WriteError(
+                f"{self.file.path} cannot be written: {error.strerror}; the rows in it are kept, "
+                "and the same command goes on from there"
+            ) from error
+        self.rows[name_of(key)] = record
 
     def get(self, key: Key) -> Row | None:
         """Return the row of a key, its entries among the figures; None if there is none."""

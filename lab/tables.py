@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from . import published
-from .methods import LABELS, OURS
+from .methods import LABELS
 from .rows import Row
 
 
@@ -48,19 +48,16 @@ EDGES = (
     *(Column("angle near", "angle_near", 1, 2), Column("angle beyond", "angle_beyond", 1, 2)),
     *(TRIANGLES, Column("slivers %", "slivers", 100, 2), Column("min angle", "min_angle", 1, 2)),
 )
-SHORT = (CD, F1, NC, P2S, BACK)
 COST = (
     Column("mean s", "seconds", 1, 2),
     Column("slowest s", "seconds_max", 1, 2),
     Column("mean peak MB", "peak_mb", 1, 0),
     Column("highest peak MB", "peak_mb_max", 1, 0),
 )
-GAPS = (
-    ("F1", "f1"),
-    ("NC", "nc"),
-    ("point to surface", "p2s"),
-    ("result to reference", "p2s_back"),  # one-sided: lost thin parts do not count
-)
+GAPS = {  # the last is one-sided: lost thin parts do not count
+    **{"f1": "F1", "nc": "NC", "p2s": "point to surface"},
+    "p2s_back": "result to reference",
+}
 BY_KEY = {column.key: column for column in (*SURFACE, *EDGES)}
 
 
@@ -79,45 +76,57 @@ def mean_of(rows: Sequence[Row], key: str) -> float | None:
     return float(max(figures) if key.endswith("_max") else np.mean(figures))
 
 
-def means(rows: Sequence[Row], columns: Sequence[Column]) -> dict[str, float | None]:
-    """Return the means of columns by key."""
-    return {column.key: mean_of(rows, column.key) for column in columns}
-
-
 def cells(figures: Mapping[str, Any], columns: Sequence[Column]) -> list[str]:
     """Return the cells of figures by key."""
     return [column.cell(figures.get(column.key)) for column in columns]
 
 
-def mean_table(by_method: Mapping[str, Sequence[Row]], columns: Sequence[Column]) -> str:
-    """Return a table of the means of methods."""
-    rows = ([label_of(name), *cells(means(found, columns), columns)] for name, found in
-            by_method.items())  # fmt: skip
-    return markdown(["method", *(column.title for column in columns)], rows)
+def summary(rows: Sequence[Row]) -> Row:
+    """Return means of all figures over shapes, how many those are, and how many are closed."""
+    columns = [*BY_KEY.values(), *COST]
+    found = {column.key: mean_of(rows, column.key) for column in columns}
+    return {**found, "shapes": len(rows), "closed": sum(row["closed"] for row in rows)}
 
 
-def surface_table(by_method: Mapping[str, Sequence[Row]], size: int) -> str:
-    """Return the main table of one size, the published rows below ours."""
-    rows = [
-        [label_of(name), *cells(means(measured, SURFACE), SURFACE), *count_row(measured)]
-        for name, measured in by_method.items()
-    ]
-    titles = ["method", *(column.title for column in SURFACE), "closed", "outward"]
-    return markdown(titles, [*rows, *published_rows(size, SURFACE, 2)])
+def method_of(row: Row) -> list[str]:
+    """Return what tables call the method of a row."""
+    return [label_of(row["method"])]
 
 
-def count_row(rows: Sequence[Row]) -> list[str]:
-    """Return how many of the meshes are closed, and how many face outward."""
-    return [f"{sum(row[key] for row in rows)} of {len(rows)}" for key in ("closed", "outward")]
+def listed(
+    rows: Iterable[Row],
+    columns: Sequence[Column],
+    words: Callable[[Row], list[str]] = method_of,
+    heads: Sequence[str] = ("method",),
+) -> str:
+    """Return a line for each row: words under ``heads``, figures, and how many are closed."""
+    body, last = [], []
+    for row in rows:
+        last = ["closed"] if "closed" in row else []
+        body.append([*words(row), *cells(row, columns), *(closed_of(row) for _ in last)])
+    return markdown([*heads, *(column.title for column in columns), *last], body)
 
 
-def published_rows(size: int, columns: Sequence[Column], more: int = 0) -> list[list[str]]:
+def closed_of(row: Row) -> str:
+    """Return how many meshes are closed."""
+    return f"{row['closed']:d} of {row.get('shapes', row.get('grids', 1))}"
+
+
+def surface_table(
+    rows: Iterable[Row], size: int, words: Callable[[Row], list[str]] = method_of
+) -> str:
+    """Return all columns of all methods at a size, the published rows below ours."""
+    published = (f"| {' | '.join([*row, '-'])} |" for row in published_rows(size, SURFACE))
+    return "\n".join([listed(rows, SURFACE, words), *published])
+
+
+def published_rows(size: int, columns: Sequence[Column]) -> list[list[str]]:
     """Return the published rows of a size, marked as such; "-" where a figure is not given."""
     rows = []
     for name, (cd, f1, nc) in published.SURFACES.get(size, {}).items():
         mse, mae = published.FIELDS[size].get(name, (None, None))
         given = {"cd": cd * 1e-5, "f1": f1, "nc": nc, "field_mse": mse, "field_mae": mae}
-        rows.append([f"*{name}, published, Thingi30*", *cells(given, columns), *["-"] * more])
+        rows.append([f"*{name}, published, Thingi30*", *cells(given, columns)])
     return rows
 
 
@@ -132,18 +141,6 @@ def label_of(method: str) -> str:
     if share:
         words.append(f"1/{share}" if share.isdigit() else f"as many triangles as {LABELS[share]}")
     return ", ".join(words)
-
-
-def shape_table(by_method: Mapping[str, Sequence[Row]]) -> str:
-    """Return the table of all shapes, with a row for each shape and method."""
-    columns = (*SURFACE, *(column for column in EDGES if column not in SURFACE))
-    titles = ["shape, method", *(column.title for column in columns), "closed", "outward"]
-    rows = [
-        [f"{row['shape']}, {label_of(name)}", *cells(row, columns), *count_row([row])]
-        for measured in zip(*by_method.values())
-        for name, row in zip(by_method, measured)
-    ]
-    return markdown(titles, rows)
 
 
 def gap_closed(
@@ -161,15 +158,6 @@ def percent(share: float | None, digits: int = 0) -> str:
     return "-" if share is None else f"{100 * share:.{digits}f} %"
 
 
-def gap_line(by_method: Mapping[str, Sequence[Row]]) -> str:
-    """Return a line on the gaps closed, empty unless the three methods were measured."""
-    if not {OURS, "bspline", "bound"} <= set(by_method):
-        return ""
-    three = by_method[OURS], by_method["bspline"], by_method["bound"]
-    shares = [f"{title} {percent(gap_closed(*three, key))}" for title, key in GAPS]
-    return f"Gap between B-spline and the bound closed by super-sdf: {', '.join(shares)}."
-
-
 def win_line(ours: Sequence[Row], others: Sequence[Row]) -> str:
     """Return a line on how many shapes ours has the better F1, with the others by name."""
     lost = [
@@ -179,13 +167,3 @@ def win_line(ours: Sequence[Row], others: Sequence[Row]) -> str:
     ]
     line = f"super-sdf beats B-spline in F1 on {len(ours) - len(lost)} of {len(ours)}."
     return f"{line} Not on: {', '.join(lost)}." if lost else line
-
-
-def empty_lines(by_method: Mapping[str, Sequence[Row]]) -> list[str]:
-    """Return a line for each method that found no surface on some shapes, with their names."""
-    lines = []
-    for method, rows in by_method.items():
-        names = [row["shape"] for row in rows if not row["faces"]]
-        if names:
-            lines.append(f"No surface (a dot stands in), {label_of(method)}: {', '.join(names)}.")
-    return lines

@@ -1,9 +1,8 @@
 """Whether every release of Python and of the dependencies that is allowed works: a table.
 
     python -m lab versions
-    python -m lab versions --releases oldest 1.19 1.20 1.21 1.22 1.23 1.24 newest --no-tests
-    python -m lab versions --only 3.10:newest 3.11:oldest 3.12:2026-07-01
-    python -m lab versions --only 3.11:oldest --extras test --tests tests/test_images.py
+    python -m lab versions 3.10:newest 3.11:oldest 3.12:2026-07-01 3.12:1.23
+    python -m lab versions 3.11:oldest --extras test --tests tests/test_images.py
 
 A cell is an environment of its own, made by ``uv`` (``pip install uv``) from this tree's wheel. It
 runs the main job, ``info --check`` and tests, and has the start of the SHA-256 of the mesh. A
@@ -124,18 +123,12 @@ def find_python(version: str) -> str:
 def main() -> None:
     """Print the table; exit code 1 if anything failed or differs, or if nothing was tried."""
     parser = parser_of(__doc__)
-    parser.add_argument("--pythons", nargs="+", default=PYTHONS)
-    parser.add_argument("--releases", nargs="+", default=RELEASES)
-    parser.add_argument("--only", nargs="+", help="these cells, PYTHON:RELEASES, instead of all")
+    parser.add_argument("cells", nargs="*", metavar="PYTHON:RELEASES", help="instead of all")
     parser.add_argument("--extras", nargs="+", default=[], help="to install, such as formats")
-    parser.add_argument("--tests", nargs="+", default=TESTS, help="test files to run")
-    parser.add_argument("--jobs", type=int, default=count_cores(), help="environments at a time")
-    parser.add_argument("--no-tests", action="store_const", const=[], dest="tests")
+    parser.add_argument("--tests", nargs="*", default=TESTS, help="test files to run")
     given = parser.parse_args()
-    pairs = list(product(given.pythons, given.releases))
-    if given.only:
-        pairs = [tuple(pair.split(":")) for pair in given.only]
-    with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(given.jobs) as pool:
+    pairs = [tuple(cell.split(":")) for cell in given.cells] or list(product(PYTHONS, RELEASES))
+    with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(count_cores()) as pool:
         uv("build", "--wheel", "--out-dir", name, str(ROOT))
         wheel = next(Path(name).glob("*.whl"))
         found = list(pool.map(lambda pair: try_cell(pair, wheel, given), pairs))

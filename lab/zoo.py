@@ -14,6 +14,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -23,11 +24,10 @@ from scipy import ndimage
 from super_sdf import Mesh, load_network, make_grid, reconstruct
 from super_sdf.errors import SuperSdfError
 from super_sdf.network.decoder import Decoder
-from super_sdf.truth.solid import Solid
 
 from . import forms, parser_of
 from .kinds import without_unknown
-from .metrics import sample_surface
+from .metrics import distance
 from .surfaces import closed_isosurface
 
 Array = np.ndarray
@@ -417,18 +417,6 @@ def true_mesh(form: Form, shape: Array, steps: Array) -> Mesh:
     return closed_isosurface(fine, steps / FINE, 0.0)
 
 
-def error(mesh: Mesh, truth: Mesh, top: Array) -> float:
-    """Return the mean distance of two meshes, both ways, in voxels, but for caps at the border."""
-    if not len(mesh.faces):
-        return float("inf")
-    total = 0.0
-    for seed, (one, other) in enumerate(((mesh, truth), (truth, mesh))):
-        points = sample_surface(one, (1, seed), POINTS).points
-        points = points[((points > 0.1) & (points < top - 0.1)).all(1)]
-        total += float(Solid(other).distance(points).mean()) / 2 if len(points) else float("inf")
-    return total
-
-
 @dataclass(frozen=True)
 class Outcome:
     """What came of a call: refused with a message, or errors in voxels."""
@@ -449,37 +437,34 @@ class Outcome:
         return "right" if self.ours <= WORSE * self.theirs + MARGIN else "worse"
 
 
+def spacing_of(words: str) -> list[float] | str:
+    """Return a spacing; as it stands if it is only named, since the user knows it."""
+    return words if "X" in words else [*map(float, words.split(","))]
+
+
 NUMBER = r"-?[\d.]+(?:e[+-]?\d+)?"
 OPTION = re.compile(
     rf"--(?:(field|inside) (\w+)|(level|scale|offset) ({NUMBER})|(label) (-?\d+)"
     rf"|(spacing) ({NUMBER}(?:,{NUMBER})*|X,Y,Z))"
 )
+TYPES = {"field": str, "inside": str, "label": int, "spacing": spacing_of}  # of others float
 
 
 def advised(message: str) -> dict[str, Any]:
     """Return the options that a message names, as ``make_grid`` takes them; the first of each."""
-    found: dict[str, Any] = {}
-    for groups in OPTION.findall(message):
-        name, word = filter(None, groups)
-        if name == "spacing":
-            found.setdefault(name, word if "X" in word else [*map(float, word.split(","))])
-        elif name in ("field", "inside"):
-            found.setdefault(name, word)
-        else:
-            found.setdefault(name, int(word) if name == "label" else float(word))
-    if "give --spacing" in message:
-        found.setdefault("spacing", "X,Y,Z")
-    return found
+    named = [[*filter(None, groups)] for groups in OPTION.findall(message)]
+    named += [["spacing", "X,Y,Z"]] if "give --spacing" in message else []
+    return {name: TYPES.get(name, float)(word) for name, word in reversed(named)}
 
 
 def call(sample: Kind, options: dict[str, Any], network: Decoder) -> Outcome:
     """Make a mesh, and measure it."""
     named = " ".join(f"{key}={value}" for key, value in options.items())
     steps = np.array(sample.steps)
-    told = {"spacing": steps * sample.unit, "origin": 0.0, **options}
+    true = steps * sample.unit
+    told = {"spacing": true, "origin": 0.0, **options}
     offset = told.pop("offset", 0.0)
-    if isinstance(told["spacing"], str):  # the user knows it
-        told["spacing"] = steps * sample.unit
+    told["spacing"] = true if isinstance(told["spacing"], str) else told["spacing"]
     try:
         grid = make_grid(sample.values, **told)
         mesh = reconstruct(grid, network, FACTOR, cap=True, offset=offset)
@@ -493,7 +478,7 @@ def call(sample: Kind, options: dict[str, Any], network: Decoder) -> Outcome:
     other = closed_isosurface(values.astype(np.float32), steps, 0.0)
     shape = np.array(values.shape)
     truth, top = true_mesh(form, shape, steps), (shape - 1) * steps
-    ours, theirs = (error(m, truth, top) for m in (mesh, other))
+    ours, theirs = (distance(truth, m, POINTS, within=top) for m in (mesh, other))
     volume = max(truth.volume(), 1.0)
     ours_off, theirs_off = (abs(m.volume() / volume - 1) for m in (mesh, other))
     return Outcome(named, "", ours, theirs, ours_off - theirs_off)
@@ -525,24 +510,16 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
     parser.add_argument("--only", default="", help="kinds whose names hold this")
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--messages", action="store_true")
     options = parser.parse_args()
-    network = load_network("base", threads=options.threads)
-    wrong = count = 0
+    network, wrong = load_network("base", threads=1), []
     print("| kind | size | call | verdict | voxels off | marching cubes |")
     print("| --- | ---: | --- | --- | ---: | ---: |", flush=True)
-    for name, make in KINDS.items():
-        for size in options.sizes if options.only in name else ():
-            sample = make(size)
-            outcomes = list(follow(sample, network))
-            for o in outcomes:
-                print(f"| {name} | {size} | {o.options} | {o.verdict} | {o.ours:.4f} | "
-                      f"{o.theirs:.4f} |", flush=True)  # fmt: skip
-                if options.messages and o.message:
-                    print("    ", o.message)
-            found = problem(sample, outcomes)
-            count, wrong = count + 1, wrong + bool(found)
-            if found:
-                print(f"WRONG {name} {size}: {found}", flush=True)
-    print(f"\n{len(KINDS)} kinds, {count} grids, {wrong} wrong")
+    for name, size in product([name for name in KINDS if options.only in name], options.sizes):
+        sample = KINDS[name](size)
+        outcomes = list(follow(sample, network))
+        for o in outcomes:
+            figures = f"{o.verdict} {o.message} | {o.ours:.4f} | {o.theirs:.4f}"
+            print(f"| {name} | {size} | {o.options} | {figures} |", flush=True)
+        if found := problem(sample, outcomes):
+            wrong.append(f"{name} {size}: {found}")
+    print("\n".join([f"\n{len(KINDS)} kinds, {len(wrong)} wrong", *wrong]))
